@@ -1,0 +1,59 @@
+"""One exception per exit code.
+
+Every failure that a user can cause or meet is one of these; its message is a single sentence that names the place, what
+was found and what was expected. Anything else that escapes is a bug (exit code 1).
+"""
+
+
+class LfpivError(Exception):
+    """Base of all expected failures; `exit_code` is what the command returns to the shell."""
+
+    exit_code = 1
+
+
+class UsageError(LfpivError):
+    """The command line asks for something that makes no sense, or for an extra that is not installed."""
+
+    exit_code = 2
+
+
+class ConfigError(LfpivError):
+    """The configuration is malformed, contradictory or physically impossible."""
+
+    exit_code = 3
+
+
+class InputError(LfpivError):
+    """An input is missing, broken, or does not belong with the others."""
+
+    exit_code = 4
+
+
+class PartialError(LfpivError):
+    """Some frames of a batch failed; the others were written."""
+
+    exit_code = 5
+
+
+class OutputExistsError(LfpivError):
+    """The output is there already and overwriting was not asked for."""
+
+    exit_code = 6
+
+
+class OutputError(LfpivError):
+    """The output cannot be written: no such folder, no permission, no space."""
+
+    exit_code = 7
+
+
+class LimitMissedError(LfpivError):
+    """A validation ran to its end and a figure missed its limit."""
+
+    exit_code = 8
+
+
+class StoppedEarlyError(LfpivError):
+    """The work was stopped on request; the same command continues it."""
+
+    exit_code = 75

@@ -1,0 +1,104 @@
+"""The light-field camera of Table 2: main lens, microlens array, sensor.
+
+Image frame: (x, y) in mm about the optical axis, x along the sensor's columns, y along its rows; the axis meets the
+sensor's centre, so pixel c of n columns is centred at (c - (n - 1)/2) times the pixel size. With M < 0 the image is
+inverted: a point at +x lights the sensor at M x. Points are given in world axes; `to_image_axes` exchanges x and y where
+the sensor's columns follow world y.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lfpiv_cli.optics.microlenses import Lattice
+
+ColumnAxis = Literal["x", "y"]
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """Everything between the scene and the pixels.
+
+    Attributes
+    ----------
+    magnification : M of the main lens, negative
+    focal_length_mm, aperture_mm : F_m and the diameter p_m of the main lens
+    microlens_focal_length_mm : f_m
+    microlens_distance_mm : s_mu, array to sensor
+    lattice : lens centres on the array, in mm about the axis, image axes
+    pixel_mm : pixel pitch on the sensor
+    columns, rows : sensor size in pixels
+    column_axis : world axis that the sensor's columns follow
+    distortion_per_mm2 : k1 of r' = r (1 + k1 r^2), about the axis, on where rays meet the array
+    """
+
+    magnification: float
+    focal_length_mm: float
+    aperture_mm: float
+    microlens_focal_length_mm: float
+    microlens_distance_mm: float
+    lattice: Lattice
+    pixel_mm: float
+    columns: int
+    rows: int
+    column_axis: ColumnAxis = "x"
+    distortion_per_mm2: float = 0.0
+
+    @property
+    def image_distance_mm(self) -> float:
+        """S_i, main lens to array: F_m (1 - M)."""
+        return self.focal_length_mm * (1.0 - self.magnification)
+
+    @property
+    def focus_distance_mm(self) -> float:
+        """Main lens to the equivalent of the nominal focal point: F_m (M - 1)/M (Eq. 6)."""
+        return self.focal_length_mm * (self.magnification - 1.0) / self.magnification
+
+    @property
+    def aperture_radius_mm(self) -> float:
+        """Radius of the main lens's aperture."""
+        return 0.5 * self.aperture_mm
+
+    @property
+    def micro_image_scale(self) -> float:
+        """Ratio of a micro-image's centre to its lens's centre, 1 + s_mu/s_i, both from the axis."""
+        return 1.0 + self.microlens_distance_mm / self.image_distance_mm
+
+    @property
+    def sensor_centre_px(self) -> NDArray[np.float64]:
+        """Where the optical axis meets the sensor: (column, row)."""
+        return np.array([(self.columns - 1) / 2, (self.rows - 1) / 2])
+
+    def defocus(self, object_distance_mm: ArrayLike) -> NDArray[np.float64]:
+        """Return alpha = 1 + s_i/s_o - s_i/F_m, the spread on the array per unit of main-lens position; 0 in focus."""
+        s_i = self.image_distance_mm
+        return 1.0 + s_i / np.asarray(object_distance_mm, dtype=np.float64) - s_i / self.focal_length_mm
+
+    def px_to_mm(self, px: ArrayLike) -> NDArray[np.float64]:
+        """Convert (column, row) to mm about the axis, shape (..., 2)."""
+        return (np.asarray(px, dtype=np.float64) - self.sensor_centre_px) * self.pixel_mm
+
+    def mm_to_px(self, mm: ArrayLike) -> NDArray[np.float64]:
+        """Convert mm about the axis to (column, row), shape (..., 2)."""
+        return np.asarray(mm, dtype=np.float64) / self.pixel_mm + self.sensor_centre_px
+
+    def micro_image_lattice_px(self) -> Lattice:
+        """Return the centres of the micro-images as (column, row) in pixels."""
+        scale = self.micro_image_scale / self.pixel_mm
+        return self.lattice.scaled(scale).transformed(np.eye(2), self.sensor_centre_px)
+
+    def with_micro_images(self, lattice_px: Lattice) -> Camera:
+        """Return the camera whose micro-images are centred on `lattice_px`: the array moves, the axis stays."""
+        scale = self.pixel_mm / self.micro_image_scale
+        return replace(self, lattice=lattice_px.transformed(np.eye(2), -self.sensor_centre_px).scaled(scale))
+
+    def to_image_axes(self, points_xyz: ArrayLike) -> NDArray[np.float64]:
+        """Return points (..., 2 or 3) with their first two components along the columns and the rows."""
+        points = np.array(points_xyz, dtype=np.float64)
+        if self.column_axis == "y":
+            points[..., [0, 1]] = points[..., [1, 0]]
+        return points
