@@ -1,0 +1,73 @@
+"""Fixtures shared by all tests: cameras in both lattice kinds, media with and without a window, the experiment's folder."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.media import Media, Window
+from lfpiv_cli.optics.microlenses import Lattice
+
+TABLE2 = Camera(
+    magnification=-1.0,
+    focal_length_mm=100.0,
+    aperture_mm=25.0,
+    microlens_focal_length_mm=0.8,
+    microlens_distance_mm=0.8,
+    lattice=Lattice.regular(0.1),
+    pixel_mm=0.0055,
+    columns=2352,
+    rows=1768,
+)
+
+
+@pytest.fixture(params=["square", "hexagonal"])
+def layout(request: pytest.FixtureRequest) -> str:
+    return request.param
+
+
+@pytest.fixture
+def table2() -> Camera:
+    """The paper's camera."""
+    return TABLE2
+
+
+@pytest.fixture
+def camera(layout: str) -> Camera:
+    """The paper's camera with either kind of array."""
+    return replace(TABLE2, lattice=Lattice.regular(0.1, layout))
+
+
+@pytest.fixture(params=["air", "water behind a window"])
+def media(request: pytest.FixtureRequest) -> Media:
+    return Media() if request.param == "air" else Media(1.0, 1.49, 1.33)
+
+
+@pytest.fixture
+def water() -> Media:
+    return Media(1.0, 1.49, 1.33)
+
+
+@pytest.fixture
+def window() -> Window:
+    """The window of the paper's simulation: 98 mm in front of the lens, 2 mm thick."""
+    return Window(98.0, 2.0)
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(20260101)
+
+
+@pytest.fixture(scope="session")
+def data_folder() -> Path:
+    """The folder of the experiment and the photographs, named by LFPIV_DATA."""
+    folder = os.environ.get("LFPIV_DATA")
+    if not folder:
+        pytest.skip("LFPIV_DATA is not set: the experiment and the photographs are not here")
+    return Path(folder)
