@@ -1,0 +1,135 @@
+"""Known flows: what the equations of motion and the given parameters demand of them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.spatial.transform import Rotation
+
+from lfpiv_cli.synthetic.flows import FLOWS, advect, rigid_rotation, shear, square_duct, taylor_green, uniform
+
+WIDTH = 10.0
+MEAN = 0.1082
+CENTRE = (0.3, -0.2, -0.4655)
+
+EXAMPLES = {
+    "square_duct": square_duct(WIDTH, MEAN, CENTRE),
+    "rigid_rotation": rigid_rotation((1.0, -2.0, 3.0), CENTRE, (0.1, 0.0, 0.0)),
+    "taylor_green": taylor_green(0.05, 8.0, CENTRE),
+    "shear": shear(4.0, "z", "x", CENTRE),
+    "uniform": uniform((0.1, -0.02, 0.03)),
+}
+
+
+def section(n, half):
+    """Return midpoints of an n x n division of the duct's section, as points (n*n, 3) about the centre."""
+    line = (np.arange(n) + 0.5) / n * 2 * half - half
+    y, z = np.meshgrid(line, line)
+    return np.stack([np.zeros(n * n), y.ravel(), z.ravel()], axis=1) + CENTRE
+
+
+def gradient(flow, points, step):
+    """Return d v_i / d r_j by central differences, (n, 3, 3), in 1/s."""
+    columns = [(flow(points + step * e) - flow(points - step * e)) / (2e-3 * step) for e in np.eye(3)]
+    return np.stack(columns, axis=2)
+
+
+def test_registry_holds_every_flow():
+    assert set(FLOWS) == set(EXAMPLES)
+    for name, flow in EXAMPLES.items():
+        assert flow(np.zeros((4, 3))).shape == (4, 3), name
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_flows_are_divergence_free(name, rng):
+    points = CENTRE + rng.uniform(-4.0, 4.0, (50, 3))
+    # central differences of smooth functions with a step of 1e-3 of the scale: 1e-6 relative, rounding 1e-11
+    trace = np.trace(gradient(EXAMPLES[name], points, 1e-3), axis1=1, axis2=2)
+    assert np.abs(trace).max() < 1e-5
+
+
+def test_duct_mean_over_the_section_is_the_given_mean():
+    u = EXAMPLES["square_duct"](section(200, WIDTH / 2))[:, 0]
+    assert u.mean() == pytest.approx(MEAN, rel=5e-5)  # midpoint rule with 200 cells: 1/(2 n^2) and its factor
+
+
+def test_duct_peak_to_mean_is_that_of_a_square():
+    peak = EXAMPLES["square_duct"](np.array([CENTRE]))[0, 0]
+    assert peak / MEAN == pytest.approx(2.0963, abs=5e-5)  # tabulated to four decimals
+
+
+def test_duct_solves_poisson_equation(rng):
+    flow, step = EXAMPLES["square_duct"], 0.02
+    points = CENTRE + rng.uniform(-4.5, 4.5, (100, 3))
+    around = [step * np.array(e) for e in [(0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)]]
+    laplacian = (sum(flow(points + e)[:, 0] for e in around) - 4 * flow(points)[:, 0]) / step**2
+    # -u'' / mean is the constant that the peak-free flux integral fixes: 28.454/D^2 for a square (f Re = 56.908)
+    assert laplacian * WIDTH**2 / MEAN == pytest.approx(np.full(100, -28.454), rel=1e-3)
+
+
+def test_duct_vanishes_on_and_beyond_the_walls():
+    half = WIDTH / 2
+    edge = (
+        np.array([(0, half, 1.0), (0, -half, 0), (0, 2.0, half), (0, 1.0, -half), (0, 6.0, 0), (0, 0, -5.1)]) + CENTRE
+    )
+    assert np.all(np.abs(EXAMPLES["square_duct"](edge)) < 1e-15)
+    just_inside = np.array([(0, 1.0, half - 1e-9), (0, half - 1e-9, 1.0)]) + CENTRE
+    assert np.abs(EXAMPLES["square_duct"](just_inside)).max() < 1e-5 * MEAN
+
+
+def test_duct_is_symmetric():
+    flow = EXAMPLES["square_duct"]
+    points = section(9, 4.9) - CENTRE
+    u = flow(points + CENTRE)[:, 0]
+    for turned in (points * (1, -1, 1), points * (1, 1, -1), points[:, [0, 2, 1]]):
+        assert flow(turned + CENTRE)[:, 0] == pytest.approx(u, abs=1e-5 * MEAN)
+
+
+def test_duct_along_y_is_the_duct_along_x_with_axes_exchanged(rng):
+    points = rng.uniform(-4.0, 4.0, (20, 3))
+    along_x = square_duct(WIDTH, MEAN)(points)
+    along_y = square_duct(WIDTH, MEAN, axis="y")(points[:, [1, 0, 2]])
+    assert np.array_equal(along_y[:, [1, 0, 2]], along_x)
+
+
+def test_rotation_has_the_given_rate_sense_and_centre():
+    # omega = 3 rad/s about z: the point 1 mm along +x of the centre moves along +y with 3 mm/s
+    flow = rigid_rotation((0.0, 0.0, 3.0), CENTRE, (0.1, 0.0, 0.0))
+    assert flow(np.array([CENTRE, CENTRE + np.eye(3)[0]])) == pytest.approx(np.array([[0.1, 0, 0], [0.1, 3e-3, 0]]))
+
+
+def test_taylor_green_and_shear_by_hand():
+    # a quarter wavelength along x: v_x = A sin(pi/2) = A; an eighth along both: A/2 and -A/2
+    flow = taylor_green(0.05, 8.0, CENTRE, velocity_m_s=(0.0, 0.01, 0.0))
+    points = np.array([(2.0, 5.0, 0.0), (1.0, 0.0, 1.0)]) + CENTRE
+    assert flow(points) == pytest.approx(np.array([[0.05, 0.01, 0], [0.025, 0.01, -0.025]]), abs=1e-15)
+    # 4 per second over 2 mm: 8 mm/s along z
+    assert shear(4.0, "z", "x", CENTRE)(np.array([(2.0, 1.0, 1.0)]) + CENTRE) == pytest.approx(np.array([[0, 0, 8e-3]]))
+
+
+def test_advection_follows_a_circle(rng):
+    points = CENTRE + rng.uniform(-5, 5, (20, 3))
+    omega, duration = np.array([40.0, -30.0, 20.0]), 5e-3
+    turned = Rotation.from_rotvec(omega * duration).apply(points - CENTRE) + CENTRE
+    # 0.27 rad in four steps of (0.27/4)^5/120 each, 8 mm from the centre at most: 4e-7 mm
+    assert advect(rigid_rotation(omega, CENTRE), points, duration) == pytest.approx(turned, abs=4e-7)
+
+
+def test_advection_forth_and_back_returns(rng):
+    points = CENTRE + rng.uniform(-4, 4, (20, 3))
+    for flow in EXAMPLES.values():
+        assert advect(flow, advect(flow, points, 2e-3), -2e-3) == pytest.approx(points, abs=1e-9)
+
+
+def test_duct_advection_moves_by_velocity_times_time():
+    # at the axis 2.0963 * 0.1082 m/s * 1.8 ms = 0.40827 mm, the pair's four voxels of 0.1 mm
+    moved = advect(EXAMPLES["square_duct"], [CENTRE], 1.8e-3) - CENTRE
+    assert moved[0] == pytest.approx([0.40827, 0, 0], abs=1e-5)
+
+
+def test_duct_line_mean_by_quadrature():
+    """The flux through the section, by nested quadrature, does not depend on the series' own mean."""
+    flow = square_duct(2.0, 1.0)
+    line = lambda z: quad(lambda y: flow(np.array([[0.0, y, z]]))[0, 0], 0, 1, epsabs=1e-7)[0]  # noqa: E731
+    assert quad(line, 0, 1, epsabs=1e-6)[0] == pytest.approx(1.0, abs=1e-5)
