@@ -2,8 +2,8 @@
 
 Image frame: (x, y) in mm about the optical axis, x along the sensor's columns, y along its rows; the axis meets the
 sensor's centre, so pixel c of n columns is centred at (c - (n - 1)/2) times the pixel size. With M < 0 the image is
-inverted: a point at +x lights the sensor at M x. Points are given in world axes; `to_image_axes` exchanges x and y where
-the sensor's columns follow world y.
+inverted: a point at +x lights the sensor at M x. Points are given in world axes; `to_image_axes` exchanges x and y
+where the sensor's columns follow world y.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """Plane layers between the camera and the flow: paraxial and exact Snell refraction, equivalent points.
 
 Axes: z along the optical axis, positive away from the camera, zero at the nominal focal point in the fluid. Slopes are
-tangents of the angle with the axis, positive when the ray moves towards larger |lateral| position on its way to the lens.
-Lengths in mm, refractive indices relative to vacuum. Equation numbers are those of the equivalent-ray-tracing paper.
+tangents of the angle with the axis, positive when the ray moves towards larger |lateral| position on its way to the
+lens. Lengths in mm, refractive indices relative to vacuum. Equation numbers are those of the equivalent-ray-tracing
+paper.
 """
 
 from __future__ import annotations
@@ -111,7 +112,8 @@ def exact_lateral_mm(
 ) -> NDArray[np.float64]:
     """Return how far sideways a ray of given slope in air moves through plane layers: sum t_i tan(angle_i).
 
-    The ray is the one that leaves the layers into `air` with tangent `air_slope`; n_i sin(angle_i) is conserved (Eq. 4).
+    The ray is the one that leaves the layers into `air` with tangent `air_slope`; n_i sin(angle_i) is conserved (Eq.
+    4).
     """
     slope = np.asarray(air_slope, dtype=np.float64)[..., np.newaxis]
     index = np.asarray(indices, dtype=np.float64)

@@ -1,8 +1,8 @@
 """The microlens array as a plane lattice: an origin and two basis vectors.
 
-Lattice point (i, j) lies at origin + i * basis[0] + j * basis[1]. The same class describes the array itself (mm about the
-optical axis) and the centres of its micro-images (pixels, column and row); each holder says which. Components are always
-(image x, image y), that is along the columns first.
+Lattice point (i, j) lies at origin + i * basis[0] + j * basis[1]. The same class describes the array itself (mm about
+the optical axis) and the centres of its micro-images (pixels, column and row); each holder says which. Components are
+always (image x, image y), that is along the columns first.
 """
 
 from __future__ import annotations

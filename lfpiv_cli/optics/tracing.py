@@ -1,7 +1,8 @@
 """Ray-by-ray tracing from a point in the scene to the sensor: the reference for everything that is computed otherwise.
 
-Axes: image axes (x along the columns, y along the rows, see `camera`), z away from the camera from the nominal focal point.
-A ray is named by the point it starts from and by where it crosses the main lens; it fails by flag, never by exception.
+Axes: image axes (x along the columns, y along the rows, see `camera`), z away from the camera from the nominal focal
+point. A ray is named by the point it starts from and by where it crosses the main lens; it fails by flag, never by
+exception.
 """
 
 from __future__ import annotations

@@ -1,0 +1,90 @@
+"""The round aperture seen through the pixels.
+
+Every pixel under a microlens sees its own patch of the main lens, pixel * s_i/s_mu wide. Where a patch straddles the
+rim of the aperture, the pixel gets only the share of it that lies inside; divided by the disc's share of its square
+(pi/4), these shares turn the weights of the square aperture into those of the disc.
+
+Axes: patches are intervals of X (columns) and Y (rows) on the main lens, in mm about the axis.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from lfpiv_cli.weights.axis import AxisOptics
+
+DISC_SHARE_OF_SQUARE = np.pi / 4.0
+
+
+def patch_edges(optics: AxisOptics) -> NDArray[np.float64]:
+    """Return the interval of the main lens that each pixel sees through its lens along one axis, shape (pixels, 2).
+
+    The ray through the lens's centre is taken for all: the place on the lens moves the patch by at most half a pitch.
+    """
+    centre = (np.arange(optics.pixels) - (optics.pixels - 1) / 2) * optics.pixel_mm
+    micro_image_scale = 1.0 + optics.microlens_distance_mm / optics.image_distance_mm
+    n = np.rint((centre / micro_image_scale - optics.lens_origin_mm) / optics.lens_pitch_mm)
+    lens = optics.lens_origin_mm + n * optics.lens_pitch_mm
+    magnify = optics.image_distance_mm / optics.microlens_distance_mm
+    middle = lens - (centre - lens) * magnify
+    half = 0.5 * optics.pixel_mm * magnify
+    return np.stack([middle - half, middle + half], axis=1)
+
+
+def aperture_mask(columns: AxisOptics, rows: AxisOptics) -> NDArray[np.float32]:
+    """Return C (rows, columns): the share of each pixel's patch inside the disc, over the disc's share of its square.
+
+    Only the part of a patch inside the square |X|, |Y| <= R counts: the rest carries no light of the square aperture.
+    """
+    return _mask(patch_edges(columns), patch_edges(rows), columns.aperture_radius_mm)
+
+
+@njit(cache=True)
+def _chord_integral(a: float, b: float, radius: float) -> float:
+    """Return the integral of sqrt(R^2 - x^2) from a to b, both clipped to the disc."""
+    a = min(max(a, -radius), radius)
+    b = min(max(b, -radius), radius)
+    upper = b * np.sqrt(radius * radius - b * b) + radius * radius * np.arcsin(b / radius)
+    lower = a * np.sqrt(radius * radius - a * a) + radius * radius * np.arcsin(a / radius)
+    return 0.5 * (upper - lower)
+
+
+@njit(cache=True)
+def disc_area_below(x: float, y: float, radius: float) -> float:
+    """Return the area of the part of a disc about 0 that lies at X <= x and Y <= y."""
+    if x <= -radius or y <= -radius:
+        return 0.0
+    x = min(x, radius)
+    if y >= radius:
+        return 2.0 * _chord_integral(-radius, x, radius)
+    flat = np.sqrt(radius * radius - y * y)
+    inner = min(x, flat)
+    area = 0.0
+    if inner > -flat:
+        area += _chord_integral(-flat, inner, radius) + y * (inner + flat)
+    if y > 0.0:
+        area += 2.0 * _chord_integral(-radius, min(x, -flat), radius)
+        if x > flat:
+            area += 2.0 * _chord_integral(flat, x, radius)
+    return area
+
+
+@njit(cache=True, parallel=True)
+def _mask(columns: NDArray[np.float64], rows: NDArray[np.float64], radius: float) -> NDArray[np.float32]:
+    mask = np.zeros((rows.shape[0], columns.shape[0]), np.float32)
+    for r in prange(rows.shape[0]):
+        y0, y1 = max(rows[r, 0], -radius), min(rows[r, 1], radius)
+        for c in range(columns.shape[0]):
+            x0, x1 = max(columns[c, 0], -radius), min(columns[c, 1], radius)
+            if x0 >= x1 or y0 >= y1:
+                continue
+            inside = (
+                disc_area_below(x1, y1, radius)
+                - disc_area_below(x0, y1, radius)
+                - disc_area_below(x1, y0, radius)
+                + disc_area_below(x0, y0, radius)
+            )
+            mask[r, c] = max(inside, 0.0) / ((x1 - x0) * (y1 - y0)) / DISC_SHARE_OF_SQUARE
+    return mask

@@ -1,0 +1,98 @@
+"""From the camera and a grid in the flow to the factorised weights (Eqs. 6, 9, 10, 13).
+
+Every voxel is moved to its equivalent point in air, so neither the walls nor their distances enter. Axes: the grid is
+in the frame that the array is aligned with (`rectified`), x and y lateral, z away from the camera from the focal point.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lfpiv_cli.errors import ConfigError
+from lfpiv_cli.grid import Grid
+from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.media import Media, equivalent_object_distance
+from lfpiv_cli.weights.aperture import aperture_mask
+from lfpiv_cli.weights.axis import AxisOptics, axis_weights, depth_nodes
+from lfpiv_cli.weights.operators import FactorisedOperator
+
+# A lattice counts as aligned with the sensor when over its whole width it strays by less than a hundredth of a pixel.
+ALIGNED_PX = 0.01
+
+
+def factorise(camera: Camera, media: Media, grid: Grid) -> FactorisedOperator:
+    """Return the weights of all voxels of a grid by equivalent ray tracing, in factorised form.
+
+    Raises
+    ------
+    ConfigError : the array is hexagonal or turned against the sensor, so that its two axes do not separate.
+    """
+    columns, rows = axis_optics(camera)
+    x, y = (0, 1) if camera.column_axis == "x" else (1, 0)
+    distance = equivalent_object_distance(
+        depth_nodes(grid.axis_mm(2), grid.spacing_mm[2]), camera.focus_distance_mm, media
+    )
+    if distance.min() <= 0.0:
+        raise ConfigError(
+            f"volume: its nearest point lies {grid.bounds_mm(2)[0]:.4g} mm from the focal point, behind the main lens"
+        )
+    spread, scale = camera.defocus(distance), camera.image_distance_mm / distance
+    along_columns = axis_weights(columns, grid.axis_mm(x), grid.spacing_mm[x], spread, scale)
+    along_rows = axis_weights(rows, grid.axis_mm(y), grid.spacing_mm[y], spread, scale)
+    return FactorisedOperator(along_columns, along_rows, aperture_mask(columns, rows))
+
+
+def axis_optics(camera: Camera) -> tuple[AxisOptics, AxisOptics]:
+    """Return the camera's two axes, (columns, rows), each with its lens pitch."""
+    basis = camera.lattice.basis
+    pixels = np.array([camera.columns, camera.rows])
+    stray_px = np.abs([basis[1, 0], basis[0, 1]]) / camera.lattice.pitch[::-1] * pixels[::-1]
+    if camera.lattice.layout != "square" or stray_px.max() > ALIGNED_PX:
+        raise ConfigError(
+            f"camera.microlenses: a {camera.lattice.layout} array turned by "
+            f"{np.degrees(camera.lattice.rotation_rad):.4f} degrees against the sensor does not separate into columns "
+            "and rows; a square one aligned with it is needed (a calibration aligns it)"
+        )
+    first, second = (
+        AxisOptics(
+            image_distance_mm=camera.image_distance_mm,
+            microlens_distance_mm=camera.microlens_distance_mm,
+            microlens_focal_length_mm=camera.microlens_focal_length_mm,
+            aperture_radius_mm=camera.aperture_radius_mm,
+            lens_origin_mm=float(camera.lattice.origin[axis]),
+            lens_pitch_mm=float(basis[axis, axis]),
+            pixel_mm=camera.pixel_mm,
+            pixels=int(pixels[axis]),
+        )
+        for axis in (0, 1)
+    )
+    return first, second
+
+
+def blur_radius_mm(camera: Camera, media: Media, grid: Grid) -> float:
+    """Return how far from its own line of sight a point of the grid can share pixels with others, in mm in the flow.
+
+    A point outside the volume lights pixels of voxels within this distance: alpha R on the array and half a lens, taken
+    back to the flow, at the depth where it is largest.
+    """
+    distance = equivalent_object_distance(grid.bounds_mm(2), camera.focus_distance_mm, media)
+    on_array = np.abs(camera.defocus(distance)) * camera.aperture_radius_mm + 0.5 * camera.lattice.pitch.max()
+    return float(np.max(on_array * distance / camera.image_distance_mm))
+
+
+def default_padding(camera: Camera, media: Media, grid: Grid) -> tuple[int, int, int]:
+    """Return how many voxels to solve for beyond each side of the grid: the blur radius laterally, none in depth."""
+    radius = blur_radius_mm(camera, media, grid)
+    return int(np.ceil(radius / grid.spacing_mm[0])), int(np.ceil(radius / grid.spacing_mm[1])), 0
+
+
+def seen_share(operator: FactorisedOperator) -> tuple[float, float]:
+    """Return the smallest and the largest share of a voxel's light that meets the sensor, over a square aperture."""
+
+    def shares(axis_start: np.ndarray, share: np.ndarray) -> np.ndarray:
+        sums = np.concatenate([[0.0], np.cumsum(share, dtype=np.float64)])
+        return sums[axis_start[1:]] - sums[axis_start[:-1]]
+
+    along_columns = shares(operator.columns.start, operator.columns.share)
+    along_rows = shares(operator.rows.start, operator.rows.share)
+    return float(along_columns.min() * along_rows.min()), float(along_columns.max() * along_rows.max())

@@ -1,0 +1,117 @@
+"""Weights as the later stages see them: a grid, an operator, and the way from a raw image into their frame.
+
+Axes: volumes [z, y, x] on `grid`, in the frame that the microlens array is aligned with (`rectified`; `raw` when
+nothing had to be undone). `to_world` turns a volume back to the axes of the raw sensor.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from lfpiv_cli.errors import InputError
+from lfpiv_cli.grid import Grid
+from lfpiv_cli.weights.operators import FactorisedOperator
+
+if TYPE_CHECKING:
+    from lfpiv_cli.calibration.model import Calibration
+
+
+@dataclass(frozen=True, eq=False)
+class Weights:
+    """The weights of a volume.
+
+    Attributes
+    ----------
+    grid : the voxels asked for
+    padding_xyz : voxels around them that are solved for as well, because tracers there light the same pixels
+    solver_operator : the weights of the padded grid, its lateral axes in the order of the sensor's
+    column_axis : world axis along the sensor's columns
+    calibration : undoes what keeps a raw image from fitting; None where nothing has to be undone
+    """
+
+    grid: Grid
+    padding_xyz: tuple[int, int, int]
+    solver_operator: FactorisedOperator
+    column_axis: str
+    calibration: Calibration | None = None
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Shape (z, y, x) of the volume."""
+        return self.grid.shape_zyx
+
+    @property
+    def image_shape(self) -> tuple[int, int]:
+        """Shape (rows, columns) of the images, raw and prepared."""
+        return self.solver_operator.image_shape
+
+    @property
+    def frame(self) -> str:
+        """`raw` where images are used as they are, `rectified` where `prepare` moves them into the array's frame."""
+        return "raw" if self.calibration is None else "rectified"
+
+    def prepare(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Take a raw image (rows, columns) to the frame of the weights."""
+        if image.shape != self.image_shape:
+            raise InputError(f"an image of {image.shape} pixels does not fit weights made for {self.image_shape}")
+        if self.calibration is None:
+            return image.astype(np.float32)
+        return self.calibration.rectification.apply(image).astype(np.float32)
+
+    def forward(self, volume: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the image (rows, columns) that a volume [z, y, x] gives."""
+        padded = np.zeros(self.grid.padded(self.padding_xyz).shape_zyx, np.float32)
+        padded[self._inner] = volume
+        return self.solver_operator.forward(np.ascontiguousarray(self._to_sensor_order(padded)))
+
+    def adjoint(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the volume [z, y, x] that an image is spread back to."""
+        volume = self.solver_operator.adjoint(np.asarray(image, dtype=np.float32))
+        return np.ascontiguousarray(self._to_sensor_order(volume)[self._inner])
+
+    def column(self, iz: int, iy: int, ix: int) -> tuple[NDArray[np.int64], ...]:
+        """Return the rows, columns and weights of the pixels that voxel (iz, iy, ix) lights."""
+        px, py, pz = self.padding_xyz
+        row_voxel, column_voxel = (iy + py, ix + px) if self.column_axis == "x" else (ix + px, iy + py)
+        return self.solver_operator.column(iz + pz, row_voxel, column_voxel)
+
+    @cached_property
+    def padded(self) -> Weights:
+        """The same weights on the whole grid that is solved for."""
+        if self.padding_xyz == (0, 0, 0):
+            return self
+        grid = self.grid.padded(self.padding_xyz)
+        return Weights(grid, (0, 0, 0), self.solver_operator, self.column_axis, self.calibration)
+
+    def to_world(self, padded_volume: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the volume (z, y, x) on `grid` in world axes, from one on the padded grid in the array's frame.
+
+        A turned array is straightened by turning the image; the volume is turned back here, by cubic splines, negative
+        overshoot cut off.
+        """
+        if self.calibration is None or self.calibration.rectification.rotation_rad == 0.0:
+            return np.ascontiguousarray(padded_volume[self._inner])
+        y, x = np.meshgrid(self.grid.axis_mm(1), self.grid.axis_mm(0), indexing="ij")
+        turned = self.calibration.rectification.from_world(np.stack([x, y], axis=-1))
+        grid = self.padded.grid
+        at = [(turned[..., axis] - grid.origin_mm[axis]) / grid.spacing_mm[axis] for axis in (1, 0)]
+        pz = self.padding_xyz[2]
+        planes = padded_volume[pz : pz + self.shape[0]]
+        turned_planes = [ndimage.map_coordinates(plane, at, order=3, mode="nearest") for plane in planes]
+        return np.maximum(np.stack(turned_planes), 0.0, dtype=np.float32)
+
+    @property
+    def _inner(self) -> tuple[slice, slice, slice]:
+        """The part of the padded volume that was asked for."""
+        (px, py, pz), (nz, ny, nx) = self.padding_xyz, self.shape
+        return slice(pz, pz + nz), slice(py, py + ny), slice(px, px + nx)
+
+    def _to_sensor_order(self, volume: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Exchange the lateral axes of a volume where the sensor's columns follow world y (its own inverse)."""
+        return volume.swapaxes(1, 2) if self.column_axis == "y" else volume
