@@ -1,0 +1,148 @@
+"""The one way in which files are written: beside the target, checked, flushed, then renamed onto it.
+
+A file under its final name is therefore always complete: a fault leaves the old one, or none.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import secrets
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from lfpiv_cli.errors import InputError, LfpivError, OutputError, OutputExistsError, UsageError
+from lfpiv_cli.files.inputs import reason
+
+# How much of the target's name the temporary file keeps: 40 characters of 4 bytes and the rest stay below the 255 bytes
+# that common file systems allow.
+KEPT_CHARACTERS = 40
+
+
+def ensure_writable(target: Path, overwrite: bool, inputs: Iterable[Path] = ()) -> None:
+    """Refuse a target that could not be written, before anything is computed.
+
+    Raises
+    ------
+    UsageError
+        If the target is one of the inputs.
+    OutputExistsError
+        If it exists and `overwrite` is false.
+    OutputError
+        If it is not a regular file, or its folder is missing or read-only.
+    """
+    for path in inputs:
+        if _same_file(target, path):
+            raise UsageError(f"{target}: the output is also an input")
+    if target.is_dir():
+        raise OutputError(f"{target}: cannot be written: it is a folder")
+    if os.path.lexists(target):
+        if not overwrite:
+            raise OutputExistsError(f"{target}: exists already (use --overwrite to replace it)")
+        if not target.is_file():
+            raise OutputError(f"{target}: cannot be replaced: it is not a regular file")
+    folder = target.parent
+    if not folder.is_dir():
+        raise OutputError(f"{target}: cannot be written: the folder {folder} does not exist")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise OutputError(f"{target}: cannot be written: the folder {folder} is read-only")
+
+
+def write_atomically(
+    target: Path,
+    write: Callable[[Path], None],
+    *,
+    overwrite: bool,
+    check: Callable[[Path], None] | None = None,
+) -> None:
+    """Write a file so that it appears under its name only when it is complete.
+
+    Parameters
+    ----------
+    write : fills the temporary file that it is given, which exists, is empty and has the target's suffix
+    check : reads the finished temporary file back and raises `InputError` where it is not what was meant
+
+    Raises
+    ------
+    OutputExistsError, OutputError
+        As `ensure_writable`, and where the system refuses (no space, file too large, no permission).
+    """
+    ensure_writable(target, overwrite)
+    temporary: Path | None = None
+    try:
+        temporary = _reserve(target)
+        write(temporary)
+        if check is not None:
+            check(temporary)
+        _flush(temporary)
+        ensure_writable(target, overwrite)
+        os.replace(temporary, target)
+        temporary = None
+        _flush_folder(target.parent)
+    except InputError as error:
+        raise OutputError(f"{target}: what was written does not read back: {error}") from error
+    except LfpivError:
+        raise
+    except OSError as error:
+        raise OutputError(f"{target}: cannot be written: {reason(error)}") from error
+    finally:
+        if temporary is not None:
+            temporary.unlink(missing_ok=True)
+
+
+def write_json(path: Path, value: Mapping[str, Any], overwrite: bool) -> None:
+    """Write an object as JSON, keys in their order, NaN and infinities as null (JSON has no word for them)."""
+    text = json.dumps(without_nan(value), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+    def write(temporary: Path) -> None:
+        temporary.write_bytes(text.encode("utf-8", "surrogateescape"))
+
+    write_atomically(path, write, overwrite=overwrite)
+
+
+def without_nan(value: Any) -> Any:
+    """Return plain Python data (numpy scalars and arrays unpacked) in which NaN and infinities are None."""
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {str(key): without_nan(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [without_nan(item) for item in value]
+    return value
+
+
+def _reserve(target: Path) -> Path:
+    """Create an empty file beside the target that nobody else has, with the permissions the umask allows."""
+    name = f".{target.stem[:KEPT_CHARACTERS]}.{secrets.token_hex(4)}.partial{target.suffix}"
+    temporary = target.with_name(name)
+    os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+    return temporary
+
+
+def _flush(path: Path) -> None:
+    """Bring a file's content to the disk."""
+    with open(path, "rb+") as file:
+        os.fsync(file.fileno())
+
+
+def _flush_folder(folder: Path) -> None:
+    """Bring a folder's entries to the disk where the system can (Windows cannot open folders)."""
+    with contextlib.suppress(OSError):
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+
+def _same_file(first: Path, second: Path) -> bool:
+    """Return whether two names lead to one file; a name that leads nowhere yet is compared by its resolved path."""
+    try:
+        return os.path.samefile(first, second)
+    except (OSError, ValueError):
+        return os.path.realpath(first) == os.path.realpath(second)

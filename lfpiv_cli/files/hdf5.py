@@ -1,0 +1,264 @@
+"""HDF5, written so that a full disk raises and read so that a broken or hostile file does no harm.
+
+A tree is a nested dict of numpy arrays, scalars, strings and None: dicts are groups, arrays datasets (their unit is the
+attribute `units`), all else attributes. The root says `format`, `format_version` and `provenance` (JSON).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from lfpiv_cli.errors import InputError, LfpivError, OutputError
+from lfpiv_cli.files.atomic import write_atomically
+from lfpiv_cli.files.inputs import ensure_regular_file, physical_memory, reason
+
+Tree = Mapping[str, Any]
+
+# Root attributes that a tree cannot use for itself.
+RESERVED = ("format", "format_version", "provenance")
+# With the chunk cache on, a full disk kills the process with SIGSEGV; without it the write raises.
+CHUNK_CACHE_BYTES = 0
+# The 1.10 format has checksums on all metadata, so that a flipped bit there is noticed too.
+LIBRARY_VERSIONS = ("v110", "v110")
+# Filters that every reader of HDF5 has; without fletcher32 a flipped bit is read as data without a word.
+FILTERS = {"compression": "gzip", "compression_opts": 1, "shuffle": True, "fletcher32": True}
+# A chunk of 1 MiB is read in one piece and compresses as well as a larger one.
+CHUNK_BYTES = 2**20
+# Deflate cannot shrink data by more than 1032; a dataset that claims more was never written.
+LARGEST_RATIO = 1100
+# Our deepest tree has four levels; hard links can form circles.
+DEEPEST = 12
+
+# What h5py raises on a broken file, depending on where it breaks.
+BROKEN_FILE_ERRORS = (
+    OSError,
+    KeyError,
+    ValueError,
+    TypeError,
+    RuntimeError,
+    MemoryError,
+    OverflowError,
+    AttributeError,
+)
+
+
+def write_tree(
+    path: Path,
+    tree: Tree,
+    *,
+    format_name: str,
+    format_version: int,
+    provenance: Mapping[str, Any],
+    overwrite: bool,
+    units: Mapping[str, str] | None = None,
+) -> None:
+    """Write a tree with its format, version and provenance.
+
+    Parameters
+    ----------
+    tree : nested dict of arrays (float, int, uint8), scalars, strings and None
+    units : unit of each array that has one, by its path (`lattice/basis`)
+
+    Raises
+    ------
+    OutputExistsError, OutputError
+    """
+
+    def fill(file: h5py.File) -> None:
+        file.attrs["format"] = np.bytes_(format_name)
+        file.attrs["format_version"] = np.int64(format_version)
+        write_provenance(file, provenance)
+        _write_group(file, tree, "", units or {})
+
+    def check(temporary: Path) -> None:
+        read_tree(temporary, format_name, (format_version,))
+
+    create(path, fill, overwrite=overwrite, check=check)
+
+
+def read_tree(path: Path, format_name: str, format_versions: Collection[int]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Read a file that `write_tree` wrote: the tree and its provenance.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, broken, of another format or version, or leads outside itself.
+    """
+    with open_h5(path) as file:
+        ensure_format(path, file, format_name, format_versions)
+        provenance = read_provenance(file)
+        tree = _read_group(file, path.stat().st_size, DEEPEST)
+    for name in RESERVED:
+        del tree[name]
+    return tree, provenance
+
+
+def create(
+    path: Path,
+    fill: Callable[[h5py.File], None],
+    *,
+    overwrite: bool,
+    check: Callable[[Path], None],
+) -> None:
+    """Create an HDF5 file atomically; `fill` writes into it, `check` reads it back."""
+
+    def write(temporary: Path) -> None:
+        try:
+            with h5py.File(temporary, "w", libver=LIBRARY_VERSIONS, rdcc_nbytes=CHUNK_CACHE_BYTES) as file:
+                fill(file)
+        except RuntimeError as error:  # h5py's word for a write that fails on closing
+            raise OutputError(f"{path}: cannot be written: {reason(error)}") from error
+
+    write_atomically(path, write, overwrite=overwrite, check=check)
+
+
+def write_array(group: h5py.Group, name: str, array: NDArray[Any], units: str | None = None) -> h5py.Dataset:
+    """Write a numeric array with checksums; an array without elements has nothing to check."""
+    array = np.ascontiguousarray(array)
+    if array.dtype.kind not in "fiu":
+        raise TypeError(f"{name}: arrays are floating point or integer, not {array.dtype}")
+    options: dict[str, Any] = {}
+    if array.size and array.ndim:
+        options = {"chunks": _chunk_shape(array.shape, array.itemsize), **FILTERS}
+    dataset = group.create_dataset(name, data=array, track_times=False, **options)
+    if units is not None:
+        dataset.attrs["units"] = np.bytes_(units)
+    return dataset
+
+
+def read_array(dataset: h5py.Dataset, file_bytes: int) -> NDArray[Any]:
+    """Read a numeric array whose bytes lie in this very file, all of them.
+
+    Parameters
+    ----------
+    file_bytes : size of the file, the bound on what may be declared
+    """
+    name = dataset.name
+    if dataset.is_virtual or dataset.external:
+        raise ValueError(f"{name} lies in another file")
+    if dataset.dtype.kind not in "fiu" or dataset.shape is None:
+        raise ValueError(f"{name} has type {dataset.dtype}, expected numbers")
+    allowed = min(LARGEST_RATIO * file_bytes, physical_memory())
+    declared = math.prod(dataset.shape) * dataset.dtype.itemsize
+    if declared > allowed:
+        raise ValueError(f"{name} declares {declared} bytes, more than the {allowed} that are possible")
+    if dataset.chunks is not None and dataset.size:
+        expected = math.prod(-(-n // c) for n, c in zip(dataset.shape, dataset.chunks, strict=True))
+        found = dataset.id.get_num_chunks()
+        if found != expected:
+            raise ValueError(f"{name} has {found} of its {expected} chunks")
+    return dataset[()]
+
+
+@contextmanager
+def open_h5(path: Path) -> Iterator[h5py.File]:
+    """Open an HDF5 file for reading; whatever fails inside is an `InputError` that names the file."""
+    ensure_regular_file(path)
+    try:
+        with h5py.File(path, "r", locking="best-effort") as file:
+            yield file
+    except LfpivError:
+        raise
+    except BROKEN_FILE_ERRORS as error:
+        raise InputError(f"{path}: not a readable HDF5 file of ours: {reason(error)}") from error
+
+
+def member(group: h5py.Group, name: str) -> h5py.Group | h5py.Dataset:
+    """Return a group's member by hard link only: soft and external links can lead anywhere."""
+    link = group.get(name, getlink=True)
+    if not isinstance(link, h5py.HardLink):
+        raise ValueError(f"{group.name}/{name} is not a hard link")
+    return group[name]
+
+
+def ensure_format(path: Path, file: h5py.File, format_name: str, format_versions: Collection[int]) -> None:
+    """Check the root's `format` and `format_version`."""
+    found = file.attrs.get("format")
+    if not isinstance(found, bytes) or found.decode() != format_name:
+        name = found.decode("utf-8", "replace") if isinstance(found, bytes) else "no format of ours"
+        raise InputError(f"{path}: holds {name}, expected {format_name}")
+    version = int(file.attrs["format_version"])
+    if version not in format_versions:
+        known = ", ".join(str(v) for v in sorted(format_versions))
+        raise InputError(f"{path}: has {format_name} version {version}, this program reads {known}")
+
+
+def write_provenance(file: h5py.File, provenance: Mapping[str, Any]) -> None:
+    """Store a provenance record as JSON in a root attribute."""
+    file.attrs["provenance"] = np.bytes_(json.dumps(provenance, allow_nan=False))
+
+
+def read_provenance(file: h5py.File) -> dict[str, Any]:
+    """Return the provenance record."""
+    record = json.loads(file.attrs["provenance"])
+    if not isinstance(record, dict):
+        raise ValueError("its provenance is not a record")
+    return record
+
+
+def _write_group(group: h5py.Group, tree: Tree, prefix: str, units: Mapping[str, str]) -> None:
+    for name, value in tree.items():
+        if not prefix and name in RESERVED:
+            raise ValueError(f"{name} is a name that every file uses for itself")
+        if isinstance(value, Mapping):
+            _write_group(group.create_group(name), value, f"{prefix}{name}/", units)
+        elif isinstance(value, np.ndarray):
+            write_array(group, name, value, units.get(prefix + name))
+        else:
+            group.attrs[name] = _to_attribute(value)
+
+
+def _read_group(group: h5py.Group, file_bytes: int, levels: int) -> dict[str, Any]:
+    if levels == 0:
+        raise ValueError(f"{group.name} lies deeper than {DEEPEST} groups")
+    tree = {name: _from_attribute(name, value) for name, value in group.attrs.items()}
+    for name in group:
+        item = member(group, name)
+        if isinstance(item, h5py.Group):
+            tree[name] = _read_group(item, file_bytes, levels - 1)
+        elif isinstance(item, h5py.Dataset):
+            tree[name] = read_array(item, file_bytes)
+        else:
+            raise ValueError(f"{item.name} is neither a group nor an array")
+    return tree
+
+
+def _to_attribute(value: Any) -> Any:
+    """Return what HDF5 stores for a scalar, a string or None; strings of fixed length lie under the checksums."""
+    if value is None:
+        return h5py.Empty("f8")
+    if isinstance(value, str):
+        return np.bytes_(value.encode()) if value else h5py.Empty("S1")
+    if isinstance(value, (bool, int, float, np.number, np.bool_)):
+        return value
+    raise TypeError(f"cannot store a {type(value).__name__} as an attribute")
+
+
+def _from_attribute(name: str, value: Any) -> Any:
+    """Return the scalar, string or None that an attribute stands for, as plain Python."""
+    if isinstance(value, h5py.Empty):
+        return "" if value.dtype.kind == "S" else None
+    if isinstance(value, bytes):
+        return value.decode()
+    if isinstance(value, np.generic):
+        return value.item()
+    raise ValueError(f"the attribute {name} is a {type(value).__name__}, expected a scalar or a string")
+
+
+def _chunk_shape(shape: tuple[int, ...], item_bytes: int) -> tuple[int, ...]:
+    """Return a chunk of whole rows and planes that stays below `CHUNK_BYTES`."""
+    left = max(CHUNK_BYTES // item_bytes, 1)
+    chunk = []
+    for n in reversed(shape):
+        chunk.append(max(min(n, left), 1))
+        left //= chunk[-1]
+    return tuple(reversed(chunk))

@@ -1,0 +1,54 @@
+"""What every reader asks of a file before it opens it."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+
+from lfpiv_cli.errors import InputError
+
+# Where the system does not tell its memory (Windows), files that declare more than this are refused.
+MEMORY_WHERE_UNKNOWN = 16 * 1024**3
+
+
+def ensure_regular_file(path: Path) -> int:
+    """Return the size of a readable regular file in bytes.
+
+    A FIFO would hang its reader and a folder gives each library another message, so both are named here.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, not a regular file, empty or not readable.
+    """
+    try:
+        status = os.stat(path)
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read: {reason(error)}") from None
+    if not stat.S_ISREG(status.st_mode):
+        kind = "a folder" if stat.S_ISDIR(status.st_mode) else "a pipe or device"
+        raise InputError(f"{path}: is {kind}, expected a regular file")
+    if status.st_size == 0:
+        raise InputError(f"{path}: is empty")
+    if not os.access(path, os.R_OK):
+        raise InputError(f"{path}: cannot be read: permission denied")
+    return status.st_size
+
+
+def reason(error: BaseException) -> str:
+    """Return the cause of an error in one line: the system's words where it has a number, else its first line."""
+    if isinstance(error, OSError) and error.errno:
+        return os.strerror(error.errno)
+    lines = str(error).strip().splitlines()
+    return lines[0] if lines else type(error).__name__
+
+
+def physical_memory() -> int:
+    """Return the machine's memory in bytes."""
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError, OSError):
+        return MEMORY_WHERE_UNKNOWN
