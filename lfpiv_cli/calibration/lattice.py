@@ -1,0 +1,254 @@
+"""From a white image to the lattice of lens images: pitch, rotation, origin, distortion, and how well each is known.
+
+Axes: positions are (column, row) in pixels, pixel centres at integers; angles from the columns towards the rows. The
+pitch is measured, never taken from a data sheet: lens images are projected from the exit pupil, so it differs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import stats
+
+from lfpiv_cli.calibration.spectrum import lattice_vectors
+from lfpiv_cli.calibration.spots import find_spots, index_spots
+from lfpiv_cli.errors import InputError
+from lfpiv_cli.optics.microlenses import Lattice, Layout
+
+# More saturated pixels than this and the lens images have lost their brightness, which the transmission needs.
+SATURATED_SHARE = 0.05
+# The difference of two dark frames reaches 3.3 times the noise of one in its brightest hundredth; light reaches more.
+DARK_SIGMAS = 5.0
+# Fewer lenses leave the cubic's ten coefficients per axis without a check.
+FEWEST_LENSES = 30
+# Of the spots found, the walk must reach this share; else it started on dirt and another start is tried.
+REACHED_SHARE = 0.5
+STARTS = 20
+# Tukey's biweight: the usual constant for 95 % efficiency on a normal distribution, and enough rounds to settle.
+TUKEY = 4.685
+TUKEY_ROUNDS = 10
+MAD_TO_SIGMA = 1.4826
+# The cubic is believed when chance would do as well less than once in 1e6 and it explains this share of the residual's
+# variance: the pixels' own error of a centroid (some hundredths of a pixel) beats slowly with the pitch and would pass
+# for a little distortion.
+CUBIC_CHANCE = 1e-6
+CUBIC_GAIN = 0.2
+# Exponents (i, j) of the cubic polynomial in the indices; the first three are the affine lattice.
+EXPONENTS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
+
+
+@dataclass(frozen=True, eq=False)
+class LatticeFit:
+    """The lens images of a white image and the lattice through them.
+
+    Attributes
+    ----------
+    lattice_px : best plain lattice; index (0, 0) is the lens image nearest the image's centre
+    indices : (n, 2) int, the lenses that were found
+    centres_px : (n, 2) their measured centres, (column, row)
+    cubic_px : (10, 2) coefficients of the cubic polynomial in the indices, in the order of `EXPONENTS`
+    cubic_used : whether the cubic is significantly better than the plain lattice
+    residual_px, residual_affine_px : (2,) rms along columns and rows, of the cubic and of the plain lattice
+    pitch_sigma_px, origin_sigma_px : (2,) standard errors
+    rotation_sigma_rad : standard error
+    """
+
+    lattice_px: Lattice
+    indices: NDArray[np.int64]
+    centres_px: NDArray[np.float64]
+    cubic_px: NDArray[np.float64]
+    cubic_used: bool
+    residual_px: NDArray[np.float64]
+    residual_affine_px: NDArray[np.float64]
+    pitch_sigma_px: NDArray[np.float64]
+    origin_sigma_px: NDArray[np.float64]
+    rotation_sigma_rad: float
+
+    @property
+    def lenses(self) -> int:
+        """Number of lens images found."""
+        return len(self.indices)
+
+    def centres(self, indices: ArrayLike) -> NDArray[np.float64]:
+        """Return the modelled centres of lens images, (column, row), indices of shape (..., 2)."""
+        if not self.cubic_used:
+            return self.lattice_px.points(indices)
+        return polynomial_terms(indices) @ self.cubic_px
+
+
+def fit_lattice(
+    white: ArrayLike, dark: ArrayLike | None = None, layout: Layout = "square", saturation: float | None = None
+) -> LatticeFit:
+    """Find the lens images of a white image and fit a lattice and its cubic distortion.
+
+    Parameters
+    ----------
+    white, dark : (rows, columns) photographs of uniform light and of none
+    layout : of the microlens array
+    saturation : level at which the camera saturates; default: the largest value its integer type holds
+
+    Raises
+    ------
+    InputError
+        when the image is too dark, saturated or shows no lattice
+    """
+    image = checked_white(white, dark, saturation)
+    basis = lattice_vectors(image, layout)
+    points = find_spots(image, float(np.mean(np.hypot(basis[:, 0], basis[:, 1]))))
+    centre = (np.array(image.shape[::-1]) - 1.0) / 2.0
+    indices, points = indexed_from_centre(points, basis, centre)
+    indices, points = without_strays(indices, points, float(np.hypot(*basis[0])))
+    return lattice_through(indices, points, centre, layout)
+
+
+def checked_white(white: ArrayLike, dark: ArrayLike | None, saturation: float | None) -> NDArray[np.float64]:
+    """Return white minus dark, or say why it cannot be used."""
+    raw = np.asarray(white)
+    image = raw.astype(np.float64)
+    if image.ndim != 2:
+        raise InputError(f"the white image has {image.ndim} axes, expected one grey image of rows and columns")
+    if not np.isfinite(image).all():
+        raise InputError("the white image holds values that are not numbers; export it again without them")
+    if saturation is None:
+        saturation = float(np.iinfo(raw.dtype).max) if raw.dtype.kind in "iu" else float(image.max())
+    clipped = float(np.mean(image >= saturation))
+    if image.max() > image.min() and clipped > SATURATED_SHARE:
+        raise InputError(
+            f"{100 * clipped:.0f} % of the white image is saturated (at {saturation:g}), at most "
+            f"{100 * SATURATED_SHARE:.0f} % may be; take it with less light or a shorter exposure"
+        )
+    if dark is not None:
+        darkness = np.asarray(dark, dtype=np.float64)
+        if darkness.shape != image.shape:
+            raise InputError(f"the dark frame is {darkness.shape} and the white image {image.shape} (rows, columns)")
+        image = image - darkness
+        if np.percentile(image, 99.0) <= DARK_SIGMAS * float(darkness.std()):
+            raise InputError(
+                "the white image is no brighter than the dark frame; take it with more light or a longer exposure"
+            )
+    if image.max() <= image.min():
+        raise InputError(f"the white image has one value everywhere ({raw.flat[0]}); it shows no lens images")
+    return image
+
+
+def indexed_from_centre(
+    points: NDArray[np.float64], basis: NDArray[np.float64], centre: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return lattice indices and positions of the spots that a walk from the middle of the image reaches."""
+    best = np.zeros(len(points), dtype=bool)
+    best_indices = np.zeros((len(points), 2), dtype=np.int64)
+    for start in np.argsort(np.hypot(*(points - centre).T), kind="stable")[:STARTS]:
+        indices, reached = index_spots(points, int(start), basis)
+        if reached.sum() > best.sum():
+            best, best_indices = reached, indices
+        if best.sum() >= REACHED_SHARE * len(points):
+            break
+    if best.sum() < FEWEST_LENSES:
+        raise InputError(
+            f"only {int(best.sum())} lens images of the white image form a lattice, at least {FEWEST_LENSES} are "
+            "needed; check microlenses.layout, the exposure, and that it is a white image"
+        )
+    return best_indices[best], points[best]
+
+
+def polynomial_terms(indices: ArrayLike, count: int = len(EXPONENTS)) -> NDArray[np.float64]:
+    """Return the first `count` monomials of the indices, shape (..., count)."""
+    index = np.asarray(indices, dtype=np.float64)
+    return np.stack([index[..., 0] ** a * index[..., 1] ** b for a, b in EXPONENTS[:count]], axis=-1)
+
+
+def robust_fit(
+    terms: NDArray[np.float64], points: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return coefficients (terms, 2) by least squares with Tukey's weights, and these weights (n,)."""
+    scale = np.abs(terms).max(axis=0)
+    weights = np.ones(len(points))
+    for _ in range(TUKEY_ROUNDS):
+        root = np.sqrt(weights)[:, np.newaxis]
+        coefficients = np.linalg.lstsq(root * terms / scale, root * points, rcond=None)[0] / scale[:, np.newaxis]
+        distance = np.hypot(*(points - terms @ coefficients).T)
+        spread = MAD_TO_SIGMA * float(np.median(distance))
+        if spread == 0.0:
+            break
+        weights = np.clip(1.0 - (distance / (TUKEY * spread)) ** 2, 0.0, None) ** 2
+    return coefficients, weights
+
+
+def without_strays(
+    indices: NDArray[np.int64], points: NDArray[np.float64], pitch_px: float
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Drop the spots that lie more than a quarter of the pitch off the cubic: dirt between the lenses."""
+    terms = polynomial_terms(indices)
+    coefficients, _ = robust_fit(terms, points)
+    kept = np.hypot(*(points - terms @ coefficients).T) < 0.25 * pitch_px
+    return indices[kept], points[kept]
+
+
+def lattice_through(
+    indices: NDArray[np.int64], points: NDArray[np.float64], centre: NDArray[np.float64], layout: Layout
+) -> LatticeFit:
+    """Fit the plain lattice and the cubic to numbered lens images and judge whether the cubic is worth it."""
+    first, _ = robust_fit(polynomial_terms(indices, 3), points)
+    indices = indices - Lattice(first[0], first[1:3], layout).nearest(centre)
+    terms = polynomial_terms(indices)
+    affine, affine_weights = robust_fit(terms[:, :3], points)
+    cubic, cubic_weights = robust_fit(terms, points)
+    affine_residual = points - terms[:, :3] @ affine
+    cubic_residual = points - terms @ cubic
+    errors = affine_errors(terms[:, :3], affine, affine_residual, affine_weights)
+    return LatticeFit(
+        lattice_px=Lattice(affine[0], affine[1:3], layout),
+        indices=indices,
+        centres_px=points,
+        cubic_px=cubic,
+        cubic_used=cubic_is_significant(terms, points, np.minimum(affine_weights, cubic_weights)),
+        residual_px=weighted_rms(cubic_residual, cubic_weights),
+        residual_affine_px=weighted_rms(affine_residual, affine_weights),
+        pitch_sigma_px=errors[0],
+        origin_sigma_px=errors[1],
+        rotation_sigma_rad=errors[2],
+    )
+
+
+def weighted_rms(residual: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the rms (2,) of the residuals whose weight is not zero: dirt on a lens is not the fit's error."""
+    return np.sqrt(np.mean(residual[weights > 0.0] ** 2, axis=0))
+
+
+def cubic_is_significant(terms: NDArray[np.float64], points: NDArray[np.float64], weights: NDArray[np.float64]) -> bool:
+    """Tell by an F-test whether the seven further coefficients per axis do enough, and more than chance."""
+    kept = weights > 0.0
+    scale = np.abs(terms).max(axis=0)
+    squares = []
+    for count in (3, terms.shape[1]):
+        design = (terms / scale)[kept, :count]
+        residual = points[kept] - design @ np.linalg.lstsq(design, points[kept], rcond=None)[0]
+        squares.append(float(np.sum(residual**2)))
+    more = 2 * (terms.shape[1] - 3)
+    rest = 2 * (int(kept.sum()) - terms.shape[1])
+    if squares[1] >= (1.0 - CUBIC_GAIN) * squares[0]:
+        return False
+    if squares[1] == 0.0:
+        return True
+    ratio = (squares[0] - squares[1]) / more / (squares[1] / rest)
+    return bool(stats.f.sf(ratio, more, rest) < CUBIC_CHANCE)
+
+
+def affine_errors(
+    terms: NDArray[np.float64],
+    affine: NDArray[np.float64],
+    residual: NDArray[np.float64],
+    weights: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Return the standard errors of pitch (2,) px, origin (2,) px and rotation (rad) of the plain lattice."""
+    kept = weights > 0.0
+    covariance = np.linalg.inv(terms[kept].T @ terms[kept])
+    variance = np.sum(residual[kept] ** 2, axis=0) / (kept.sum() - 3)
+    origin = np.sqrt(covariance[0, 0] * variance)
+    length2 = np.sum(affine[1:3] ** 2, axis=1)
+    spread = np.diag(covariance)[1:3]
+    along = np.sqrt(spread * (affine[1:3] ** 2 @ variance) / length2)
+    across2 = spread * (affine[1:3, ::-1] ** 2 @ variance) / length2
+    return along, origin, float(np.sqrt(np.sum(across2 / length2)) / 2.0)

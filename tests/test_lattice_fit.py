@@ -1,0 +1,179 @@
+"""The lattice fit against spots on known lattices, and against photographs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lfpiv_cli.calibration.lattice import fit_lattice
+from lfpiv_cli.calibration.spectrum import lattice_vectors
+from lfpiv_cli.calibration.spots import index_spots
+from lfpiv_cli.errors import InputError
+from lfpiv_cli.optics.microlenses import Lattice
+
+SHAPE = (220, 260)
+
+
+def discs(centres: NDArray[np.float64], radius_px: float, shape: tuple[int, int] = SHAPE) -> NDArray[np.float64]:
+    """Draw bright discs with a rim one pixel wide, centred at (column, row)."""
+    image = np.full(shape, 100.0)
+    reach = int(radius_px) + 2
+    for x, y in centres:
+        row, column = int(round(y)), int(round(x))
+        rows = np.arange(max(0, row - reach), max(0, min(shape[0], row + reach + 1)))[:, np.newaxis]
+        columns = np.arange(max(0, column - reach), max(0, min(shape[1], column + reach + 1)))
+        image[rows, columns] += 4000.0 * np.clip(radius_px + 0.5 - np.hypot(columns - x, rows - y), 0.0, 1.0)
+    return image
+
+
+def lens_centres(lattice: Lattice, shape: tuple[int, int] = SHAPE) -> NDArray[np.float64]:
+    """All lattice points that can touch the image."""
+    reach = np.arange(-60, 61)
+    points = lattice.points(np.stack(np.meshgrid(reach, reach), axis=-1).reshape(-1, 2))
+    margin = 2 * float(lattice.pitch.max())
+    return points[((points > -margin) & (points < np.array(shape[::-1]) + margin)).all(axis=1)]
+
+
+def white_image(lattice: Lattice, rng: np.random.Generator, radius_per_pitch: float = 0.42) -> NDArray[np.float64]:
+    image = discs(lens_centres(lattice), radius_per_pitch * float(lattice.pitch[0]))
+    return image + rng.normal(0.0, 40.0, image.shape)
+
+
+def tilted(layout: str, pitch: float = 13.37, angle_deg: float = 3.0) -> Lattice:
+    return Lattice.regular(pitch, layout, np.deg2rad(angle_deg), (127.3, 108.9))
+
+
+def test_pitch_rotation_and_origin_are_found(layout: str, rng: np.random.Generator) -> None:
+    truth = tilted(layout)
+    fit = fit_lattice(white_image(truth, rng), layout=layout)
+    # 1 % noise moves a centroid by about 0.02 px; some 200 lenses over 100 px leave a tenth of the tolerances.
+    np.testing.assert_allclose(fit.lattice_px.pitch, truth.pitch, atol=2e-3)
+    assert np.rad2deg(fit.lattice_px.rotation_rad) == pytest.approx(3.0, abs=0.01)
+    np.testing.assert_allclose(fit.lattice_px.origin, truth.points(truth.nearest(fit.lattice_px.origin)), atol=0.02)
+    assert not fit.cubic_used
+    assert np.all(fit.residual_px < 0.05)
+
+
+def test_index_zero_is_the_lens_nearest_the_middle(layout: str, rng: np.random.Generator) -> None:
+    fit = fit_lattice(white_image(tilted(layout), rng), layout=layout)
+    middle = (np.array(SHAPE[::-1]) - 1) / 2
+    distance = np.hypot(*(fit.centres_px - middle).T)
+    np.testing.assert_array_equal(fit.indices[np.argmin(distance)], [0, 0])
+
+
+@pytest.mark.parametrize(
+    ("pitch", "angle_deg"), [(7.2, 44.0), (18.25, -0.12), (18.25, -44.0), (40.0, 20.0), (59.0, 1.0)]
+)
+def test_spectrum_finds_every_pitch_and_direction(pitch: float, angle_deg: float) -> None:
+    truth = Lattice.regular(pitch, "square", np.deg2rad(angle_deg), (300.0, 300.0))
+    basis = lattice_vectors(discs(lens_centres(truth, (600, 600)), 0.48 * pitch, (600, 600)), "square")
+    # The walk takes a neighbour within a quarter of the pitch; a fiftieth leaves room for distortion.
+    np.testing.assert_allclose(basis, truth.basis, atol=pitch / 50)
+
+
+@pytest.mark.parametrize("angle_deg", [-29.0, 0.0, 12.0, 29.0])
+def test_spectrum_of_hexagons_turns_to_the_columns(angle_deg: float) -> None:
+    truth = Lattice.regular(17.0, "hexagonal", np.deg2rad(angle_deg), (130.0, 110.0))
+    basis = lattice_vectors(discs(lens_centres(truth), 7.0), "hexagonal")
+    np.testing.assert_allclose(basis, truth.basis, atol=17.0 / 50)
+
+
+def test_cubic_distortion_is_found_and_plain_lattices_stay_plain(rng: np.random.Generator) -> None:
+    truth = tilted("square")
+    middle = (np.array(SHAPE[::-1]) - 1) / 2
+    centres = lens_centres(truth)
+    offset = centres - middle
+    bent = centres + 1e-6 * offset * np.sum(offset**2, axis=1, keepdims=True)
+    fit = fit_lattice(discs(bent, 5.2) + rng.normal(0.0, 40.0, SHAPE))
+    assert fit.cubic_used
+    assert np.all(fit.residual_px < 0.05)
+    # A radial distortion of 3 px in the corners is no plain lattice.
+    assert np.all(fit.residual_affine_px > 0.15)
+    np.testing.assert_allclose(fit.centres(fit.indices), fit.centres_px, atol=0.2)
+
+
+def test_dirt_and_a_missing_lens_do_not_move_the_lattice(rng: np.random.Generator) -> None:
+    truth = tilted("square")
+    image = white_image(truth, rng)
+    image[60:75, 60:85] = 100.0
+    image[150:158, 40:44] = 9000.0
+    fit = fit_lattice(image)
+    np.testing.assert_allclose(fit.lattice_px.pitch, truth.pitch, atol=4e-3)
+    assert np.rad2deg(fit.lattice_px.rotation_rad) == pytest.approx(3.0, abs=0.02)
+
+
+def test_standard_errors_match_the_scatter_of_repeats(rng: np.random.Generator) -> None:
+    turns, pitches = [], []
+    for _ in range(20):
+        angle, pitch = rng.uniform(-20.0, 20.0), rng.uniform(12.5, 13.5)
+        fit = fit_lattice(discs(lens_centres(tilted("square", pitch, angle)), 5.6) + rng.normal(0.0, 250.0, SHAPE))
+        turns.append((fit.lattice_px.rotation_rad - np.deg2rad(angle)) / fit.rotation_sigma_rad)
+        pitches.append((fit.lattice_px.pitch - pitch) / fit.pitch_sigma_px)
+    # Twenty repeats (forty pitches) know a standard deviation to a sixth (a ninth).
+    assert 0.6 < np.std(turns) < 1.6
+    assert 0.6 < np.std(pitches) < 1.5
+
+
+def test_walk_numbers_follow_the_lattice() -> None:
+    lattice = Lattice.regular(10.0, "square", 0.1, (3.0, 4.0))
+    indices = np.array([(i, j) for i in range(-3, 4) for j in range(-2, 3) if (i, j) != (1, 0)])
+    found, reached = index_spots(lattice.points(indices), 17, lattice.basis)
+    assert reached.all()
+    np.testing.assert_array_equal(found, indices - indices[17])
+
+
+def test_images_that_cannot_serve_are_refused_with_advice(rng: np.random.Generator) -> None:
+    image = white_image(tilted("square"), rng)
+    with pytest.raises(InputError, match="one value everywhere"):
+        fit_lattice(np.zeros(SHAPE))
+    with pytest.raises(InputError, match="no square lattice"):
+        fit_lattice(rng.normal(1000.0, 30.0, SHAPE))
+    with pytest.raises(InputError, match="saturated.*less light"):
+        fit_lattice(image, saturation=2000.0)
+    with pytest.raises(InputError, match="more light"):
+        fit_lattice(rng.normal(100.0, 5.0, SHAPE), rng.normal(100.0, 5.0, SHAPE))
+    with pytest.raises(InputError, match="not numbers"):
+        fit_lattice(np.where(image > 3900.0, np.nan, image))
+    with pytest.raises(InputError, match="dark frame is"):
+        fit_lattice(image, image[:-1])
+    with pytest.raises(InputError, match="no hexagonal lattice"):
+        fit_lattice(image, layout="hexagonal")
+
+
+def read(path: Path) -> NDArray[np.float64]:
+    return cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+
+
+@pytest.mark.parametrize(
+    ("name", "lenses", "pitch", "tolerance"), [("seaurchin", 13500, 17.195, 0.02), ("guv", 650, 15.40, 0.02)]
+)
+def test_photographs(data_folder: Path, name: str, lenses: int, pitch: float, tolerance: float) -> None:
+    folder = data_folder / "real"
+    fit = fit_lattice(read(folder / f"{name}_white.tif"), read(folder / f"{name}_dark.tif"))
+    assert fit.lenses >= lenses
+    np.testing.assert_allclose(fit.lattice_px.pitch, pitch, atol=tolerance)
+    assert fit.cubic_used
+    if name == "seaurchin":
+        assert np.rad2deg(fit.lattice_px.rotation_rad) == pytest.approx(0.177, abs=0.02)
+
+
+@pytest.mark.parametrize("name", ["spots_b", "spots_c"])
+def test_hexagonal_spots_with_known_centres(data_folder: Path, name: str) -> None:
+    fit = fit_lattice(read(data_folder / "real" / f"{name}.png"), layout="hexagonal")
+    known = np.loadtxt(data_folder / "real" / f"{name}_centres.txt")[:, ::-1]
+    error = fit.centres(fit.lattice_px.nearest(known)) - known
+    assert np.hypot(*error.T).mean() < 0.03
+
+
+def test_experiment_gives_the_true_rotation_and_shift(data_folder: Path) -> None:
+    folder = data_folder / "channel"
+    fit = fit_lattice(read(folder / "white.tif"), read(folder / "dark.tif"))
+    # Made with 0.12 degrees and a shift of (3.4, -2.1) px at the array: 1 + s_mu/s_i = 1.004 of it on the sensor.
+    assert np.rad2deg(fit.lattice_px.rotation_rad) == pytest.approx(0.12, abs=0.002)
+    on_axis = np.array([1175.5, 883.5]) + 1.004 * np.array([3.4, -2.1])
+    np.testing.assert_allclose(fit.lattice_px.points(fit.lattice_px.nearest(on_axis)), on_axis, atol=0.02)
+    assert not fit.cubic_used
