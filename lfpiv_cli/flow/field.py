@@ -1,7 +1,7 @@
 """The vector field that two volumes yield: displacements at window centres, with what is known of their quality.
 
-Axes: arrays are indexed `[z, y, x]`; the last axis of a vector holds its components (u, v, w) along (x, y, z). A particle
-that moves towards +x from the first volume to the second has u > 0.
+Axes: arrays are indexed `[z, y, x]`; the last axis of a vector holds its components (u, v, w) along (x, y, z). A
+particle that moves towards +x from the first volume to the second has u > 0.
 """
 
 from __future__ import annotations

@@ -1,0 +1,162 @@
+"""Peaks of correlation maps: place to a fraction of a voxel, width, and the second peak.
+
+Maps are (2r + 1) cubed, indexed by the shift along (z, y, x) plus r; offsets and widths come back as (x, y, z) in
+voxels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+# A ratio beyond this says only that there is no second peak; it keeps the stored numbers finite.
+LARGEST_PEAK_RATIO = 100.0
+
+
+@dataclass(frozen=True, eq=False)
+class Peaks:
+    """What one map per window says; all arrays (nz, ny, nx) with a last axis of 3 for vectors.
+
+    Attributes
+    ----------
+    offset : place of the highest peak; 0 where the map is empty
+    height : its correlation, that of the highest whole shift; 0 where the map is empty
+    second_offset, second_height : the second highest local maximum; height 0 where there is none
+    ratio : height over that of the second maximum or, where there is none, of the highest shift that is no neighbour
+    width : standard deviation of the Gaussian through the peak along each axis; NaN where three points do not bend down
+    """
+
+    offset: NDArray[np.float64]
+    height: NDArray[np.float64]
+    second_offset: NDArray[np.float64]
+    second_height: NDArray[np.float64]
+    ratio: NDArray[np.float64]
+    width: NDArray[np.float64]
+
+    @property
+    def found(self) -> NDArray[np.bool_]:
+        """Where there is a peak at all."""
+        return self.height > 0.0
+
+
+def find_peaks(maps: NDArray[np.float64]) -> Peaks:
+    """Return the peaks of maps of shape (nz, ny, nx, 2r + 1, 2r + 1, 2r + 1)."""
+    windows, shifts = maps.shape[:3], maps.shape[3]
+    flat = np.ascontiguousarray(maps).reshape(-1, shifts, shifts, shifts)
+    offset, second_offset, width, scalars = peaks_of(flat)
+    height, second_height, beyond = (scalars[:, i].reshape(windows) for i in range(3))
+    rival = np.where(second_height > 0.0, second_height, beyond)
+    ratio = np.full(windows, LARGEST_PEAK_RATIO)
+    np.divide(height, rival, out=ratio, where=rival > 0.0)
+    ratio = np.where(height > 0.0, np.minimum(ratio, LARGEST_PEAK_RATIO), 0.0)
+    vectors = (*windows, 3)
+    return Peaks(
+        offset.reshape(vectors),
+        height,
+        second_offset.reshape(vectors),
+        second_height,
+        ratio,
+        width.reshape(vectors),
+    )
+
+
+@njit(cache=True)
+def vertex(before: float, at: float, after: float) -> tuple[float, float]:
+    """Return place and standard deviation of the Gaussian through three values at -1, 0, 1.
+
+    The place is kept within one step. Where a value is not positive a parabola takes the Gaussian's place (and the
+    width is that of the Gaussian with the same curvature at its top); where the three do not bend down, the place is
+    that of the highest one and the width NaN.
+    """
+    if before > 0.0 and at > 0.0 and after > 0.0:
+        slope = 0.5 * np.log(after / before)
+        bend = 2.0 * np.log(at) - np.log(before) - np.log(after)
+    elif at > 0.0:
+        slope = 0.5 * (after - before) / at
+        bend = (2.0 * at - before - after) / at
+    else:
+        slope = after - before
+        bend = 0.0
+    if bend <= 0.0:
+        if at >= before and at >= after:
+            return 0.0, np.nan
+        return (1.0 if after > before else -1.0), np.nan
+    return min(1.0, max(-1.0, slope / bend)), 1.0 / np.sqrt(bend)
+
+
+@njit(cache=True)
+def fit_peak(shifts: NDArray[np.float64], iz: int, iy: int, ix: int) -> tuple[float, float, float, float, float, float]:
+    """Return offset (x, y, z) and width (x, y, z) of the peak at one node, by three points along each axis.
+
+    At the map's border the three outermost points are used: the offset then stays within the map.
+    """
+    last = shifts.shape[0] - 1
+    radius = last // 2
+    cz, cy, cx = min(max(iz, 1), last - 1), min(max(iy, 1), last - 1), min(max(ix, 1), last - 1)
+    x, width_x = vertex(shifts[iz, iy, cx - 1], shifts[iz, iy, cx], shifts[iz, iy, cx + 1])
+    y, width_y = vertex(shifts[iz, cy - 1, ix], shifts[iz, cy, ix], shifts[iz, cy + 1, ix])
+    z, width_z = vertex(shifts[cz - 1, iy, ix], shifts[cz, iy, ix], shifts[cz + 1, iy, ix])
+    return cx + x - radius, cy + y - radius, cz + z - radius, width_x, width_y, width_z
+
+
+@njit(cache=True)
+def is_local_maximum(shifts: NDArray[np.float64], iz: int, iy: int, ix: int) -> bool:
+    """Tell whether no neighbour of a node is higher (of equals, the first in memory counts)."""
+    last = shifts.shape[0] - 1
+    value = shifts[iz, iy, ix]
+    for jz in range(max(iz - 1, 0), min(iz + 1, last) + 1):
+        for jy in range(max(iy - 1, 0), min(iy + 1, last) + 1):
+            for jx in range(max(ix - 1, 0), min(ix + 1, last) + 1):
+                earlier = (jz, jy, jx) < (iz, iy, ix)
+                if shifts[jz, jy, jx] > value or (earlier and shifts[jz, jy, jx] == value):
+                    return False
+    return True
+
+
+@njit(cache=True, parallel=True)
+def peaks_of(
+    maps: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return for each map (n, s, s, s): offset (n, 3), second offset (n, 3), width (n, 3), and heights (n, 3).
+
+    The heights are those of the peak, of the second local maximum, and of the highest node that is no neighbour of the
+    peak.
+    """
+    count, size = maps.shape[0], maps.shape[1]
+    offset = np.zeros((count, 3))
+    second_offset = np.zeros((count, 3))
+    width = np.full((count, 3), np.nan)
+    heights = np.zeros((count, 3))
+    for n in prange(count):
+        shifts = maps[n]
+        best = (0, 0, 0)
+        for iz in range(size):
+            for iy in range(size):
+                for ix in range(size):
+                    if shifts[iz, iy, ix] > heights[n, 0]:
+                        heights[n, 0] = shifts[iz, iy, ix]
+                        best = (iz, iy, ix)
+        if heights[n, 0] <= 0.0:
+            continue
+        x, y, z, width_x, width_y, width_z = fit_peak(shifts, best[0], best[1], best[2])
+        offset[n, 0], offset[n, 1], offset[n, 2] = x, y, z
+        width[n, 0], width[n, 1], width[n, 2] = width_x, width_y, width_z
+        second = (-1, -1, -1)
+        for iz in range(size):
+            for iy in range(size):
+                for ix in range(size):
+                    value = shifts[iz, iy, ix]
+                    near = abs(iz - best[0]) <= 1 and abs(iy - best[1]) <= 1 and abs(ix - best[2]) <= 1
+                    if near:
+                        continue
+                    heights[n, 2] = max(heights[n, 2], value)
+                    if value > heights[n, 1] and is_local_maximum(shifts, iz, iy, ix):
+                        heights[n, 1] = value
+                        second = (iz, iy, ix)
+        if second[0] >= 0:
+            x, y, z, _, _, _ = fit_peak(shifts, second[0], second[1], second[2])
+            second_offset[n, 0], second_offset[n, 1], second_offset[n, 2] = x, y, z
+    return offset, second_offset, width, heights
