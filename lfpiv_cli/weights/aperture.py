@@ -1,7 +1,7 @@
 """The round aperture seen through the pixels.
 
-Every pixel under a microlens sees its own patch of the main lens, pixel * s_i/s_mu wide. Where a patch straddles the
-rim of the aperture, the pixel gets only the share of it that lies inside; divided by the disc's share of its square
+Every cell (a pixel under a microlens) sees its own patch of the main lens, pixel * s_i/s_mu wide. Where a patch straddles the
+rim of the aperture, the cell gets only the share of it that lies inside; divided by the disc's share of its square
 (pi/4), these shares turn the weights of the square aperture into those of the disc.
 
 Axes: patches are intervals of X (columns) and Y (rows) on the main lens, in mm about the axis.
@@ -13,32 +13,14 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from lfpiv_cli.weights.axis import AxisOptics
+from lfpiv_cli.weights.axis import Cells
 
 DISC_SHARE_OF_SQUARE = np.pi / 4.0
 
 
-def patch_edges(optics: AxisOptics) -> NDArray[np.float64]:
-    """Return the interval of the main lens that each pixel sees through its lens along one axis, shape (pixels, 2).
-
-    The ray through the lens's centre is taken for all: the place on the lens moves the patch by at most half a pitch.
-    """
-    centre = (np.arange(optics.pixels) - (optics.pixels - 1) / 2) * optics.pixel_mm
-    micro_image_scale = 1.0 + optics.microlens_distance_mm / optics.image_distance_mm
-    n = np.rint((centre / micro_image_scale - optics.lens_origin_mm) / optics.lens_pitch_mm)
-    lens = optics.lens_origin_mm + n * optics.lens_pitch_mm
-    magnify = optics.image_distance_mm / optics.microlens_distance_mm
-    middle = lens - (centre - lens) * magnify
-    half = 0.5 * optics.pixel_mm * magnify
-    return np.stack([middle - half, middle + half], axis=1)
-
-
-def aperture_mask(columns: AxisOptics, rows: AxisOptics) -> NDArray[np.float32]:
-    """Return C (rows, columns): the share of each pixel's patch inside the disc, over the disc's share of its square.
-
-    Only the part of a patch inside the square |X|, |Y| <= R counts: the rest carries no light of the square aperture.
-    """
-    return _mask(patch_edges(columns), patch_edges(rows), columns.aperture_radius_mm)
+def aperture_mask(columns: Cells, rows: Cells, radius_mm: float) -> NDArray[np.float32]:
+    """Return C (row cells, column cells): the share of each cell's patch inside the disc, over the square's share."""
+    return _mask(columns.patch_mm, rows.patch_mm, radius_mm)
 
 
 @njit(cache=True)
@@ -75,11 +57,9 @@ def disc_area_below(x: float, y: float, radius: float) -> float:
 def _mask(columns: NDArray[np.float64], rows: NDArray[np.float64], radius: float) -> NDArray[np.float32]:
     mask = np.zeros((rows.shape[0], columns.shape[0]), np.float32)
     for r in prange(rows.shape[0]):
-        y0, y1 = max(rows[r, 0], -radius), min(rows[r, 1], radius)
+        y0, y1 = rows[r]
         for c in range(columns.shape[0]):
-            x0, x1 = max(columns[c, 0], -radius), min(columns[c, 1], radius)
-            if x0 >= x1 or y0 >= y1:
-                continue
+            x0, x1 = columns[c]
             inside = (
                 disc_area_below(x1, y1, radius)
                 - disc_area_below(x0, y1, radius)

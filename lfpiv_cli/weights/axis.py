@@ -9,6 +9,9 @@ on the sensor. All are linear in (x, X), so the rays of a voxel that strike one 
 polygon of the rectangle voxel x aperture; its area is the weight (Eq. 13 with the count replaced by its limit). The
 depth of the voxel is integrated by Gauss-Legendre nodes.
 
+A pixel at the border of two micro-images sees the main lens through both, at opposite ends of the aperture. So the
+weights are kept by *cell*, the meeting of one lens and one pixel; pixels add up their cells.
+
 Axes: one image axis at a time (columns or rows), in mm about the optical axis; z as everywhere.
 """
 
@@ -23,8 +26,10 @@ from numpy.typing import NDArray
 # Along z the weights are smooth except where an edge of a lens or pixel passes; three nodes resolve voxels up to the
 # depth in which a ray at the rim moves by a third of a lens.
 DEPTH_NODES = 3
-# A pixel that gets less than this share of a voxel's light is left out: below float32 rounding of the column's sum.
+# A cell that gets less than this share of a voxel's light is left out: below float32 rounding of the column's sum.
 SMALLEST_SHARE = 1e-7
+# Width given to a patch that lies outside the aperture, in radii: small beside the patch of a whole pixel (a tenth).
+SMALLEST_PATCH = 1e-3
 
 
 @dataclass(frozen=True)
@@ -50,36 +55,87 @@ class AxisOptics:
 
 
 @dataclass(frozen=True, eq=False)
+class Cells:
+    """The cells of one axis, lens by lens and pixel by pixel.
+
+    Attributes
+    ----------
+    first_lens : number n of the first lens, centred at lens_origin + n lens_pitch
+    start : (lenses + 1,) int64, the first cell of each lens
+    pixel : (cells,) int32, the pixel of each cell, ascending within a lens
+    patch_mm : (cells, 2) the interval of the main lens that the cell sees through its lens's centre, inside the aperture
+    """
+
+    first_lens: int
+    start: NDArray[np.int64]
+    pixel: NDArray[np.int32]
+    patch_mm: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
 class AxisWeights:
-    """Per-axis weights in compressed rows; row `z * voxels + k` holds the pixels of voxel k in plane z.
+    """Per-axis weights in compressed rows; row `z * voxels + k` holds the cells of voxel k in plane z.
 
     Attributes
     ----------
     planes, voxels, pixels : sizes
+    cells : the cells of the axis
     start : (planes * voxels + 1,) int64
-    pixel : int32, ascending within a row
-    share : float32, the share of the voxel's light through the square aperture that falls on the pixel
+    cell : int32, ascending within a row
+    share : float32, the share of the voxel's light through the square aperture that falls on the cell
     """
 
     planes: int
     voxels: int
     pixels: int
+    cells: Cells
     start: NDArray[np.int64]
-    pixel: NDArray[np.int32]
+    cell: NDArray[np.int32]
     share: NDArray[np.float32]
 
     def row(self, plane: int, voxel: int) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-        """Return the pixels of one voxel and their shares."""
+        """Return the cells of one voxel and their shares."""
         part = slice(*self.start[plane * self.voxels + voxel : plane * self.voxels + voxel + 2])
-        return self.pixel[part], self.share[part]
+        return self.cell[part], self.share[part]
 
     def matrix(self, plane: int) -> NDArray[np.float32]:
-        """Return the dense (pixels, voxels) matrix of one plane."""
-        dense = np.zeros((self.pixels, self.voxels), np.float32)
+        """Return the dense (cells, voxels) matrix of one plane."""
+        dense = np.zeros((self.cells.pixel.size, self.voxels), np.float32)
         for voxel in range(self.voxels):
-            pixel, share = self.row(plane, voxel)
-            dense[pixel, voxel] = share
+            cell, share = self.row(plane, voxel)
+            dense[cell, voxel] = share
         return dense
+
+
+def micro_image_cells(optics: AxisOptics) -> Cells:
+    """Return the cells of all lenses whose micro-image meets the sensor."""
+    tilt = optics.microlens_distance_mm / optics.image_distance_mm
+    bend = 1.0 - optics.microlens_distance_mm / optics.microlens_focal_length_mm
+    reach = tilt * optics.aperture_radius_mm + (tilt + abs(bend)) * 0.5 * optics.lens_pitch_mm
+    half = 0.5 * optics.pixels * optics.pixel_mm
+    edge = np.array([-half - reach, half + reach]) / (1.0 + tilt)
+    first, last = np.rint((edge - optics.lens_origin_mm) / optics.lens_pitch_mm).astype(int)
+    number = np.arange(first, last + 1)
+    lens = optics.lens_origin_mm + number * optics.lens_pitch_mm
+    low = np.floor((lens * (1.0 + tilt) - reach + half) / optics.pixel_mm).astype(int).clip(0, optics.pixels)
+    high = np.floor((lens * (1.0 + tilt) + reach + half) / optics.pixel_mm).astype(int).clip(-1, optics.pixels - 1)
+    counts = np.maximum(high - low + 1, 0)
+    start = np.concatenate([[0], np.cumsum(counts)])
+    owner = np.repeat(np.arange(lens.size), counts)
+    pixel = low[owner] + np.arange(start[-1]) - start[owner]
+    return Cells(int(first), start.astype(np.int64), pixel.astype(np.int32), _patches(optics, lens[owner], pixel))
+
+
+def _patches(optics: AxisOptics, lens_mm: NDArray[np.float64], pixel: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the intervals of the main lens that pixels see through lenses' centres, shape (cells, 2)."""
+    magnify = optics.image_distance_mm / optics.microlens_distance_mm
+    edges = (pixel[:, np.newaxis] + np.array([1, 0]) - 0.5 * optics.pixels) * optics.pixel_mm
+    patch = lens_mm[:, np.newaxis] - (edges - lens_mm[:, np.newaxis]) * magnify
+    radius = optics.aperture_radius_mm
+    patch = np.clip(patch, -radius, radius)
+    # A cell that only rays away from the lens's centre reach sees the very edge of the aperture.
+    sliver = SMALLEST_PATCH * radius
+    return np.stack([np.minimum(patch[:, 0], radius - sliver), np.maximum(patch[:, 1], sliver - radius)], axis=1)
 
 
 def axis_weights(
@@ -110,13 +166,15 @@ def axis_weights(
             optics.pixel_mm,
         ]
     )
-    scene = (camera, optics.pixels, centres_mm, width_mm, spread, scale, node_share)
+    cells = micro_image_cells(optics)
+    layout = (cells.first_lens, cells.start, cells.pixel)
+    scene = (camera, optics.pixels, *layout, centres_mm, width_mm, spread, scale, node_share)
     counts = np.zeros(planes * centres_mm.size, np.int64)
     _integrate(*scene, np.zeros(0, np.int64), counts, np.zeros(0, np.int32), np.zeros(0, np.float32))
     start = np.concatenate([[0], np.cumsum(counts)])
-    pixel, share = np.empty(start[-1], np.int32), np.empty(start[-1], np.float32)
-    _integrate(*scene, start, counts, pixel, share)
-    return AxisWeights(planes, centres_mm.size, optics.pixels, start, pixel, share)
+    cell, share = np.empty(start[-1], np.int32), np.empty(start[-1], np.float32)
+    _integrate(*scene, start, counts, cell, share)
+    return AxisWeights(planes, centres_mm.size, optics.pixels, cells, start, cell, share)
 
 
 def depth_nodes(z_mm: NDArray[np.float64], depth_mm: float) -> NDArray[np.float64]:
@@ -169,34 +227,28 @@ def _add_lens(
     offset: float,
     pixel_mm: float,
     pixels: int,
+    cell_pixel: NDArray[np.int32],
     scale: float,
     scratch: NDArray[np.float64],
     shares: NDArray[np.float64],
-) -> tuple[int, int]:
-    """Spread the polygon's area over the pixels that a x + b X + offset falls on; return the range touched."""
-    lowest, highest = np.inf, -np.inf
-    for k in range(corners):
-        at = a * polygon[k, 0] + b * polygon[k, 1] + offset
-        lowest, highest = min(lowest, at), max(highest, at)
-    half = 0.5 * pixels
-    first = max(int(np.floor(lowest / pixel_mm + half)), 0)
-    last = min(int(np.floor(highest / pixel_mm + half)), pixels - 1)
-    below = 0.0
-    if first <= last:
-        edge = (first - half) * pixel_mm
-        below = _area(scratch, _clip(polygon, corners, a, b, edge - offset, scratch)) if lowest < edge else 0.0
-    for pixel in range(first, last + 1):
-        edge = (pixel + 1 - half) * pixel_mm
+) -> None:
+    """Spread the polygon's area over the cells of its lens: the pixels that a x + b X + offset falls on."""
+    edge = (cell_pixel[0] - 0.5 * pixels) * pixel_mm
+    below = _area(scratch, _clip(polygon, corners, a, b, edge - offset, scratch))
+    for k in range(cell_pixel.size):
+        edge = (cell_pixel[k] + 1 - 0.5 * pixels) * pixel_mm
         upto = _area(scratch, _clip(polygon, corners, a, b, edge - offset, scratch))
-        shares[pixel] += scale * (upto - below)
+        shares[k] += scale * (upto - below)
         below = upto
-    return first, last
 
 
 @njit(cache=True)
 def _voxel_shares(
     camera: NDArray[np.float64],
     pixels: int,
+    first_lens: int,
+    cell_start: NDArray[np.int64],
+    cell_pixel: NDArray[np.int32],
     centre: float,
     width: float,
     spread: NDArray[np.float64],
@@ -205,14 +257,14 @@ def _voxel_shares(
     work: NDArray[np.float64],
     shares: NDArray[np.float64],
 ) -> tuple[int, int]:
-    """Add one voxel's shares to `shares` (pixels,); return the first and last pixel touched."""
+    """Add one voxel's shares to `shares` (cells,); return the first cell touched and the one after the last."""
     s_i, s_mu, f_m, radius, lens_origin, lens_pitch, pixel_mm = camera
     rectangle, upper, lens, scratch = work
     for k, (x, y) in enumerate(((-0.5, -1.0), (0.5, -1.0), (0.5, 1.0), (-0.5, 1.0))):
         rectangle[k, 0] = centre + x * width
         rectangle[k, 1] = y * radius
     bend = 1.0 - s_mu / f_m
-    begin, end = pixels, -1
+    begin, end = cell_pixel.size, 0
     for node in range(spread.size):
         alpha, beta = spread[node], -scale[node]
         middle, reach = beta * centre, abs(alpha) * radius + abs(beta) * 0.5 * width
@@ -220,14 +272,16 @@ def _voxel_shares(
         last = int(np.floor((middle + reach - lens_origin) / lens_pitch + 0.5))
         a = beta * bend + s_mu * beta / s_i
         b = alpha * bend + s_mu * (alpha - 1.0) / s_i
-        for n in range(first, last + 1):
+        for n in range(max(first, first_lens), min(last, first_lens + cell_start.size - 2) + 1):
+            low, high = cell_start[n - first_lens], cell_start[n - first_lens + 1]
             s = lens_origin + n * lens_pitch
             corners = _clip(rectangle, 4, beta, alpha, s + 0.5 * lens_pitch, upper)
             corners = _clip(upper, corners, -beta, -alpha, -(s - 0.5 * lens_pitch), lens)
-            if corners < 3:
+            if corners < 3 or low == high:
                 continue
             share = node_share[node] / (2.0 * radius * width)
-            low, high = _add_lens(lens, corners, a, b, s * (1.0 - bend), pixel_mm, pixels, share, scratch, shares)
+            seen, own = cell_pixel[low:high], shares[low:high]
+            _add_lens(lens, corners, a, b, s * (1.0 - bend), pixel_mm, pixels, seen, share, scratch, own)
             begin, end = min(begin, low), max(end, high)
     return begin, end
 
@@ -236,6 +290,9 @@ def _voxel_shares(
 def _integrate(
     camera: NDArray[np.float64],
     pixels: int,
+    first_lens: int,
+    cell_start: NDArray[np.int64],
+    cell_pixel: NDArray[np.int32],
     centres: NDArray[np.float64],
     width: float,
     spread: NDArray[np.float64],
@@ -243,23 +300,23 @@ def _integrate(
     node_share: NDArray[np.float64],
     start: NDArray[np.int64],
     counts: NDArray[np.int64],
-    pixel: NDArray[np.int32],
+    cell: NDArray[np.int32],
     share: NDArray[np.float32],
 ) -> None:
-    """Fill `counts` (when `start` is empty) or `pixel` and `share`, one plane after the other."""
+    """Fill `counts` (when `start` is empty) or `cell` and `share`, one plane after the other."""
     for plane in prange(spread.shape[0]):
-        shares = np.zeros(pixels)
+        shares = np.zeros(cell_pixel.size)
         work = np.empty((4, 12, 2))
+        layout = (first_lens, cell_start, cell_pixel)
         for k in range(centres.size):
-            begin, end = _voxel_shares(
-                camera, pixels, centres[k], width, spread[plane], scale[plane], node_share, work, shares
-            )
+            scene = (centres[k], width, spread[plane], scale[plane], node_share, work, shares)
+            begin, end = _voxel_shares(camera, pixels, *layout, *scene)
             row = plane * centres.size + k
             found = 0
-            for at in range(begin, end + 1):
+            for at in range(begin, end):
                 if shares[at] > SMALLEST_SHARE:
                     if start.size:
-                        pixel[start[row] + found] = at
+                        cell[start[row] + found] = at
                         share[start[row] + found] = shares[at]
                     found += 1
                 shares[at] = 0.0

@@ -39,7 +39,8 @@ def factorise(camera: Camera, media: Media, grid: Grid) -> FactorisedOperator:
     spread, scale = camera.defocus(distance), camera.image_distance_mm / distance
     along_columns = axis_weights(columns, grid.axis_mm(x), grid.spacing_mm[x], spread, scale)
     along_rows = axis_weights(rows, grid.axis_mm(y), grid.spacing_mm[y], spread, scale)
-    return FactorisedOperator(along_columns, along_rows, aperture_mask(columns, rows))
+    mask = aperture_mask(along_columns.cells, along_rows.cells, camera.aperture_radius_mm)
+    return FactorisedOperator(along_columns, along_rows, mask)
 
 
 def axis_optics(camera: Camera) -> tuple[AxisOptics, AxisOptics]:

@@ -16,7 +16,7 @@ from scipy import ndimage
 
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.grid import Grid
-from lfpiv_cli.weights.operators import FactorisedOperator
+from lfpiv_cli.weights.operators import Column, FactorisedOperator
 
 if TYPE_CHECKING:
     from lfpiv_cli.calibration.model import Calibration
@@ -75,7 +75,7 @@ class Weights:
         volume = self.solver_operator.adjoint(np.asarray(image, dtype=np.float32))
         return np.ascontiguousarray(self._to_sensor_order(volume)[self._inner])
 
-    def column(self, iz: int, iy: int, ix: int) -> tuple[NDArray[np.int64], ...]:
+    def column(self, iz: int, iy: int, ix: int) -> Column:
         """Return the rows, columns and weights of the pixels that voxel (iz, iy, ix) lights."""
         px, py, pz = self.padding_xyz
         row_voxel, column_voxel = (iy + py, ix + px) if self.column_axis == "x" else (ix + px, iy + py)

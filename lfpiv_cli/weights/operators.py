@@ -3,7 +3,9 @@
 Factorised form: w_ij = C_i a_ix(j) b_iy(j) with the per-axis weights a (columns) and b (rows) of each z plane and the
 mask C of the aperture, so that an image is
 
-    I = C * sum_z B_z V_z A_z^T          and its adjoint          V_z = B_z^T (C * I) A_z.
+    I = C * sum_z B_z V_z A_z^T          and its adjoint          V_z = B_z^T (C * I) A_z,
+
+all by cells (see `axis`); pixels add up their cells at the end.
 
 Axes: volumes [z, y, x], images [row, column]; where the sensor's columns follow world y the two lateral axes of the
 volume are exchanged on the way in and out.
@@ -24,6 +26,11 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.weights.axis import AxisWeights
 
+# Pixel rows, pixel columns and weights of one voxel.
+Column = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]
+# Start of each group (groups + 1,), the line of each entry and its `GROUP` shares.
+Groups = tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]
+
 # Rows (or planes) that share the loads of one pass, and terms per pass.
 GROUP = 4
 # Columns per tile: 4 accumulators and 4 operands of 1 kB stay in the first-level cache.
@@ -37,7 +44,7 @@ class FactorisedOperator:
     Attributes
     ----------
     columns, rows : the per-axis weights along the sensor's columns and rows
-    mask : (rows, columns) float32, C and whatever else scales a pixel
+    mask : (row cells, column cells) float32, C and whatever else scales the light
     """
 
     columns: AxisWeights
@@ -57,62 +64,73 @@ class FactorisedOperator:
     def forward(self, volume: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the image (rows, columns) of a volume [plane, row voxel, column voxel]."""
         first, last = self._lit_columns
-        spread = _spread_columns(volume, first, last, self.columns.start, self.columns.pixel, self.columns.share)
-        lit = _sum_rows(spread, self.rows.pixels, *self._row_groups)
-        image = np.zeros(self.image_shape, np.float32)
-        image[:, first:last] = lit
-        image *= self.mask
-        return image
+        spread = _spread_columns(volume, first, last, self.columns.start, self.columns.cell, self.columns.share)
+        by_cell = _sum_rows(spread, self.rows.cells.pixel.size, *self._row_groups)
+        return _fold(by_cell, self.mask, first, self.columns.cells.pixel, *self._cells_of_rows, self.columns.pixels)
 
     def adjoint(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the volume [plane, row voxel, column voxel] that an image is spread back to."""
         first, last = self._lit_columns
-        masked = np.ascontiguousarray((image * self.mask)[:, first:last])
-        gathered = _gather_rows(masked, self.shape[0], self.shape[1], *self._plane_groups)
+        by_cell = _unfold(image, self.mask, self.rows.cells.pixel, self.columns.cells.pixel, first, last)
+        gathered = _gather_rows(by_cell, self.shape[0], self.shape[1], *self._plane_groups)
         return _gather_columns(
-            gathered, first, self.columns.voxels, self.columns.start, self.columns.pixel, self.columns.share
+            gathered, first, self.columns.voxels, self.columns.start, self.columns.cell, self.columns.share
         )
 
-    def column(self, plane: int, row_voxel: int, column_voxel: int) -> tuple[NDArray[np.int64], ...]:
+    def column(self, plane: int, row_voxel: int, column_voxel: int) -> Column:
         """Return the rows, columns (int64) and weights (float32) of the pixels that one voxel lights."""
         row, along_rows = self.rows.row(plane, row_voxel)
         column, along_columns = self.columns.row(plane, column_voxel)
-        weight = np.outer(along_rows, along_columns) * self.mask[np.ix_(row, column)]
-        at_row, at_column = np.nonzero(weight)
-        return row[at_row].astype(np.int64), column[at_column].astype(np.int64), weight[at_row, at_column]
+        by_cell = np.outer(along_rows, along_columns) * self.mask[np.ix_(row, column)]
+        rows, row_of = np.unique(self.rows.cells.pixel[row], return_inverse=True)
+        columns, column_of = np.unique(self.columns.cells.pixel[column], return_inverse=True)
+        weight = np.zeros((rows.size, columns.size), np.float32)
+        np.add.at(weight, (row_of[:, np.newaxis], column_of), by_cell)
+        lit = np.nonzero(weight)
+        return rows[lit[0]].astype(np.int64), columns[lit[1]].astype(np.int64), weight[lit]
 
     @cached_property
     def _lit_columns(self) -> tuple[int, int]:
-        """Range of columns that any voxel reaches."""
-        pixel = self.columns.pixel
-        return (int(pixel.min()), int(pixel.max()) + 1) if pixel.size else (0, 0)
+        """Range of column cells that any voxel reaches."""
+        cell = self.columns.cell
+        return (int(cell.min()), int(cell.max()) + 1) if cell.size else (0, 0)
 
     @cached_property
-    def _row_groups(self) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]:
+    def _cells_of_rows(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Row cells in the order of their pixels, and where each pixel's begin (rows + 1,)."""
+        pixel = self.rows.cells.pixel
+        start = np.searchsorted(np.sort(pixel), np.arange(self.rows.pixels + 1)).astype(np.int64)
+        return np.argsort(pixel, kind="stable"), start
+
+    @cached_property
+    def _row_groups(self) -> Groups:
         return group_terms_by_row(self.rows)
 
     @cached_property
-    def _plane_groups(self) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]:
+    def _plane_groups(self) -> Groups:
         return group_terms_by_plane(self.rows)
 
 
 def forward_reference(operator: FactorisedOperator, volume: NDArray[np.float32]) -> NDArray[np.float64]:
     """Return the image of a volume as dense matrix products: the readable twin of `FactorisedOperator.forward`."""
-    image = np.zeros(operator.image_shape)
+    by_cell = np.zeros(operator.mask.shape)
     for plane in range(operator.shape[0]):
-        image += operator.rows.matrix(plane) @ volume[plane].astype(np.float64) @ operator.columns.matrix(plane).T
-    return image * operator.mask
+        by_cell += operator.rows.matrix(plane) @ volume[plane].astype(np.float64) @ operator.columns.matrix(plane).T
+    image = np.zeros(operator.image_shape)
+    np.add.at(image, np.ix_(operator.rows.cells.pixel, operator.columns.cells.pixel), by_cell * operator.mask)
+    return image
 
 
 def adjoint_reference(operator: FactorisedOperator, image: NDArray[np.float32]) -> NDArray[np.float64]:
     """Return the adjoint as dense matrix products: the readable twin of `FactorisedOperator.adjoint`."""
-    masked = image.astype(np.float64) * operator.mask
+    pixels = np.ix_(operator.rows.cells.pixel, operator.columns.cells.pixel)
+    by_cell = image.astype(np.float64)[pixels] * operator.mask
     planes = range(operator.shape[0])
-    return np.stack([operator.rows.matrix(k).T @ masked @ operator.columns.matrix(k) for k in planes])
+    return np.stack([operator.rows.matrix(k).T @ by_cell @ operator.columns.matrix(k) for k in planes])
 
 
-def group_terms_by_row(rows: AxisWeights) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]:
-    """Return for each four pixel rows the (plane, voxel) lines that reach any of them, and the four shares of each.
+def group_terms_by_row(rows: AxisWeights) -> Groups:
+    """Return for each four row cells the (plane, voxel) lines that reach any of them, and the four shares of each.
 
     Returns
     -------
@@ -120,26 +138,25 @@ def group_terms_by_row(rows: AxisWeights) -> tuple[NDArray[np.int64], NDArray[np
     of share 0 to a multiple of four.
     """
     line_of = np.repeat(np.arange(rows.start.size - 1), np.diff(rows.start))
-    return _pack(rows.pixel // GROUP, line_of, rows.pixel % GROUP, rows.share, -(-rows.pixels // GROUP))
+    return _pack(rows.cell // GROUP, line_of, rows.cell % GROUP, rows.share, -(-rows.cells.pixel.size // GROUP))
 
 
-def group_terms_by_plane(rows: AxisWeights) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]:
-    """Return for each voxel of each four planes the pixel rows it reaches, and the four shares of each; see above."""
+def group_terms_by_plane(rows: AxisWeights) -> Groups:
+    """Return for each voxel of each four planes the row cells it reaches, and the four shares of each; see above."""
     line_of = np.repeat(np.arange(rows.start.size - 1), np.diff(rows.start))
     plane, voxel = np.divmod(line_of, rows.voxels)
     groups = -(-rows.planes // GROUP) * rows.voxels
-    return _pack(plane // GROUP * rows.voxels + voxel, rows.pixel, plane % GROUP, rows.share, groups)
+    return _pack(plane // GROUP * rows.voxels + voxel, rows.cell.astype(np.int64), plane % GROUP, rows.share, groups)
 
 
 def _pack(
-    group: NDArray[np.int64],
+    group: NDArray[np.integer],
     line: NDArray[np.int64],
-    member: NDArray[np.int64],
+    member: NDArray[np.integer],
     share: NDArray[np.float32],
     groups: int,
-) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]:
+) -> Groups:
     """Gather the shares of each (group, line) into one entry of `GROUP` members, groups of a multiple of `GROUP`."""
-    line = line.astype(np.int64)
     keys, entry = np.unique(group.astype(np.int64) * (int(line.max(initial=0)) + 1) + line, return_inverse=True)
     entry_group = keys // (int(line.max(initial=0)) + 1)
     counts = np.bincount(entry_group, minlength=groups)
@@ -159,7 +176,7 @@ def _spread_columns(
     first: int,
     last: int,
     start: NDArray[np.int64],
-    pixel: NDArray[np.int32],
+    cell: NDArray[np.int32],
     share: NDArray[np.float32],
 ) -> NDArray[np.float32]:
     """Return V_z A_z^T for every plane: (planes * row voxels, last - first)."""
@@ -172,7 +189,7 @@ def _spread_columns(
             source = turned[k]
             for at in range(start[plane * width + k], start[plane * width + k + 1]):
                 weight = share[at]
-                target = lines[pixel[at] - first]
+                target = lines[cell[at] - first]
                 for j in range(height):
                     target[j] += weight * source[j]
         for j in range(height):
@@ -184,17 +201,17 @@ def _spread_columns(
 @njit(cache=True, parallel=True, fastmath={"contract"})
 def _sum_rows(
     spread: NDArray[np.float32],
-    pixels: int,
+    cells: int,
     start: NDArray[np.int64],
     line: NDArray[np.int32],
     share: NDArray[np.float32],
 ) -> NDArray[np.float32]:
-    """Return sum_z B_z T_z: (pixels, columns)."""
+    """Return sum_z B_z T_z: (row cells, columns)."""
     columns = spread.shape[1]
     image = np.empty((GROUP * (start.size - 1), columns), np.float32)
     for group in prange(start.size - 1):
         _combine(spread, line, share, start[group], start[group + 1], image[GROUP * group : GROUP * (group + 1)])
-    return image[:pixels]
+    return image[:cells]
 
 
 @njit(cache=True, parallel=True, fastmath={"contract"})
@@ -252,7 +269,7 @@ def _gather_columns(
     first: int,
     width: int,
     start: NDArray[np.int64],
-    pixel: NDArray[np.int32],
+    cell: NDArray[np.int32],
     share: NDArray[np.float32],
 ) -> NDArray[np.float32]:
     """Return T_z A_z for every plane: (planes, row voxels, column voxels)."""
@@ -269,8 +286,46 @@ def _gather_columns(
             total = np.zeros(height, np.float32)
             for at in range(start[plane * width + k], start[plane * width + k + 1]):
                 weight = share[at]
-                source = lines[pixel[at] - first]
+                source = lines[cell[at] - first]
                 for j in range(height):
                     total[j] += weight * source[j]
             volume[plane, :, k] = total
     return volume
+
+
+@njit(cache=True, parallel=True)
+def _fold(
+    by_cell: NDArray[np.float32],
+    mask: NDArray[np.float32],
+    first: int,
+    column_pixel: NDArray[np.int32],
+    row_cell: NDArray[np.int64],
+    row_start: NDArray[np.int64],
+    columns: int,
+) -> NDArray[np.float32]:
+    """Return the image (rows, columns): C times the light of each cell, added up by pixel."""
+    image = np.zeros((row_start.size - 1, columns), np.float32)
+    for row in prange(row_start.size - 1):
+        for at in range(row_start[row], row_start[row + 1]):
+            cell = row_cell[at]
+            for k in range(by_cell.shape[1]):
+                image[row, column_pixel[first + k]] += mask[cell, first + k] * by_cell[cell, k]
+    return image
+
+
+@njit(cache=True, parallel=True)
+def _unfold(
+    image: NDArray[np.float32],
+    mask: NDArray[np.float32],
+    row_pixel: NDArray[np.int32],
+    column_pixel: NDArray[np.int32],
+    first: int,
+    last: int,
+) -> NDArray[np.float32]:
+    """Return C times the pixel that each cell belongs to, (row cells, last - first)."""
+    by_cell = np.empty((row_pixel.size, last - first), np.float32)
+    for cell in prange(row_pixel.size):
+        line = image[row_pixel[cell]]
+        for k in range(last - first):
+            by_cell[cell, k] = mask[cell, first + k] * line[column_pixel[first + k]]
+    return by_cell
