@@ -74,9 +74,7 @@ def write_tree(
     """
 
     def fill(file: h5py.File) -> None:
-        file.attrs["format"] = np.bytes_(format_name)
-        file.attrs["format_version"] = np.int64(format_version)
-        write_provenance(file, provenance)
+        write_header(file, format_name, format_version, provenance)
         _write_group(file, tree, "", units or {})
 
     def check(temporary: Path) -> None:
@@ -192,8 +190,10 @@ def ensure_format(path: Path, file: h5py.File, format_name: str, format_versions
         raise InputError(f"{path}: has {format_name} version {version}, this program reads {known}")
 
 
-def write_provenance(file: h5py.File, provenance: Mapping[str, Any]) -> None:
-    """Store a provenance record as JSON in a root attribute."""
+def write_header(file: h5py.File, format_name: str, format_version: int, provenance: Mapping[str, Any]) -> None:
+    """Write what every file says at its root: format, version, and the provenance record as JSON."""
+    file.attrs["format"] = np.bytes_(format_name)
+    file.attrs["format_version"] = np.int64(format_version)
     file.attrs["provenance"] = np.bytes_(json.dumps(provenance, allow_nan=False))
 
 
@@ -214,13 +214,13 @@ def _write_group(group: h5py.Group, tree: Tree, prefix: str, units: Mapping[str,
         elif isinstance(value, np.ndarray):
             write_array(group, name, value, units.get(prefix + name))
         else:
-            group.attrs[name] = _to_attribute(value)
+            group.attrs[name] = to_attribute(value)
 
 
 def _read_group(group: h5py.Group, file_bytes: int, levels: int) -> dict[str, Any]:
     if levels == 0:
         raise ValueError(f"{group.name} lies deeper than {DEEPEST} groups")
-    tree = {name: _from_attribute(name, value) for name, value in group.attrs.items()}
+    tree = {name: from_attribute(name, value) for name, value in group.attrs.items()}
     for name in group:
         item = member(group, name)
         if isinstance(item, h5py.Group):
@@ -232,7 +232,7 @@ def _read_group(group: h5py.Group, file_bytes: int, levels: int) -> dict[str, An
     return tree
 
 
-def _to_attribute(value: Any) -> Any:
+def to_attribute(value: Any) -> Any:
     """Return what HDF5 stores for a scalar, a string or None; strings of fixed length lie under the checksums."""
     if value is None:
         return h5py.Empty("f8")
@@ -243,7 +243,7 @@ def _to_attribute(value: Any) -> Any:
     raise TypeError(f"cannot store a {type(value).__name__} as an attribute")
 
 
-def _from_attribute(name: str, value: Any) -> Any:
+def from_attribute(name: str, value: Any) -> Any:
     """Return the scalar, string or None that an attribute stands for, as plain Python."""
     if isinstance(value, h5py.Empty):
         return "" if value.dtype.kind == "S" else None

@@ -1,0 +1,84 @@
+"""Where a result comes from: a record that says the same whenever and wherever the same work is done.
+
+It holds no time, folder, host or user, so that the same work gives the same bytes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+from collections.abc import Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import h5py
+
+import lfpiv_cli
+from lfpiv_cli.errors import InputError
+from lfpiv_cli.files.atomic import without_nan
+from lfpiv_cli.files.hdf5 import open_h5, read_provenance
+from lfpiv_cli.files.inputs import ensure_regular_file, reason
+
+# The libraries that the figures pass through.
+LIBRARIES = ("numpy", "scipy", "numba", "h5py", "tifffile", "imagecodecs", "opencv-contrib-python-headless")
+
+
+def record(command: str, config: Mapping[str, Any] | None, inputs: Mapping[str, Path]) -> dict[str, Any]:
+    """Return the record of a result.
+
+    Parameters
+    ----------
+    command : the subcommand and the options that bear on the result
+    config : the resolved config, as plain data, or None where there is none
+    inputs : the files that the result is made from, by their role
+
+    Returns
+    -------
+    dict
+        `program`, `version`, `libraries`, `command`, `config`, `inputs` (name without folder and SHA-256, by role)
+        and `made_from`: the records of those inputs, and of what these were made from, that are results of this
+        program, by SHA-256.
+
+    Raises
+    ------
+    InputError
+        If an input cannot be read.
+    """
+    named: dict[str, dict[str, str]] = {}
+    made_from: dict[str, Any] = {}
+    for role, path in sorted(inputs.items()):
+        digest = sha256(path)
+        named[role] = {"name": path.name, "sha256": digest}
+        earlier = earlier_record(path)
+        if earlier is not None:
+            made_from.update(earlier.pop("made_from", {}))
+            made_from[digest] = earlier
+    return {
+        "program": "lfpiv",
+        "version": lfpiv_cli.__version__,
+        "libraries": {"python": platform.python_version(), **{name: version(name) for name in LIBRARIES}},
+        "command": command,
+        "config": None if config is None else without_nan(config),
+        "inputs": named,
+        "made_from": dict(sorted(made_from.items())),
+    }
+
+
+def sha256(path: Path) -> str:
+    """Return the SHA-256 of a file, in hexadecimal digits."""
+    ensure_regular_file(path)
+    try:
+        with open(path, "rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {reason(error)}") from error
+
+
+def earlier_record(path: Path) -> dict[str, Any] | None:
+    """Return the record that a file of ours carries, None for any other file."""
+    ensure_regular_file(path)
+    if not h5py.is_hdf5(path):
+        return None
+    with open_h5(path) as file:
+        return read_provenance(file) if "provenance" in file.attrs else None

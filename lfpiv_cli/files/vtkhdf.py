@@ -1,0 +1,301 @@
+"""Volumes and vector fields as `*.vtkhdf`: HDF5 that ParaView and xarray open as it is, with one copy of the data.
+
+Layout: the arrays and the netCDF dimension scales `z`, `y`, `x`, `component` lie at the root, and `/VTKHDF/PointData`
+holds hard links to the arrays. Arrays are `[z, y, x]` (and the component last), except that a single plane is `[y, x]`:
+VTK reads the extent of nz = 1 so. `Origin` is the centre of the first cell, mm; origin and spacing are ordered x, y, z.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from lfpiv_cli.errors import InputError
+from lfpiv_cli.files.hdf5 import (
+    RESERVED,
+    create,
+    ensure_format,
+    from_attribute,
+    member,
+    open_h5,
+    read_array,
+    read_provenance,
+    to_attribute,
+    write_array,
+    write_header,
+)
+from lfpiv_cli.flow.field import VectorField
+from lfpiv_cli.grid import Grid
+
+VOLUME_FORMAT = "lfpiv-volume"
+VECTORS_FORMAT = "lfpiv-vectors"
+FORMAT_VERSION = 1
+
+# What VTK wants: the version of its layout, and the type as a fixed string (VTK up to 9.4.2 fails on a variable one).
+VTK_VERSION = (2, 0)
+VTK_TYPE = np.bytes_("ImageData")
+
+# Arrays of a vector field: name on disk, unit, and whether it has three components. `velocity` follows from the rest.
+VECTOR_ARRAYS = {
+    "displacement_voxel": ("voxel", True),
+    "displacement_raw_voxel": ("voxel", True),
+    "correlation": ("1", False),
+    "peak_ratio": ("1", False),
+    "valid_fraction": ("1", False),
+    "flag": ("1", False),
+}
+UNCERTAINTY = "uncertainty_voxel"
+FLAG_MEANINGS = "0 valid, 1 replaced, 2 second peak, 3 rejected and not replaced, 4 masked"
+LARGEST_FLAG = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Volume:
+    """A volume with its place in the world.
+
+    Attributes
+    ----------
+    array : (nz, ny, nx) float32
+    grid : spacing and origin, mm
+    attributes : what the file says about itself, `reference` among it
+    provenance : the record of how it was made
+    """
+
+    array: NDArray[np.float32]
+    grid: Grid
+    attributes: dict[str, Any]
+    provenance: dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Header:
+    """What a file says about itself besides its arrays: attributes at the root, and its provenance."""
+
+    attributes: dict[str, Any]
+    provenance: dict[str, Any]
+
+
+def write_volume(
+    path: Path,
+    array_zyx: NDArray[np.floating[Any]],
+    grid: Grid,
+    *,
+    provenance: Mapping[str, Any],
+    attributes: Mapping[str, Any],
+    overwrite: bool,
+) -> None:
+    """Write a volume as the scalar `intensity`.
+
+    Parameters
+    ----------
+    array_zyx : (nz, ny, nx), stored as float32
+    attributes : scalars and strings for the root, `reference` (focal_point or mid_plane) among them
+
+    Raises
+    ------
+    OutputExistsError, OutputError
+    """
+    if array_zyx.shape != grid.shape_zyx:
+        raise ValueError(f"the array's shape is {array_zyx.shape}, the grid's {grid.shape_zyx}")
+
+    def fill(file: h5py.File) -> None:
+        write_header(file, VOLUME_FORMAT, FORMAT_VERSION, provenance)
+        _write_attributes(file, attributes)
+        points = _write_frame(file, grid, with_component=False)
+        _write_points(file, points, "intensity", array_zyx.astype(np.float32), "1")
+
+    create(path, fill, overwrite=overwrite, check=_reads(open_volume))
+
+
+def open_volume(path: Path | str) -> Volume:
+    """Read a volume.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, broken, not a volume, or holds values that are not finite.
+    """
+    path = Path(path)
+    with open_h5(path) as file:
+        ensure_format(path, file, VOLUME_FORMAT, (FORMAT_VERSION,))
+        grid = _read_grid(file)
+        array = _read_points(file, "intensity", grid, path.stat().st_size, components=False)
+        attributes, provenance = _read_attributes(file), read_provenance(file)
+    bad = int(np.count_nonzero(~np.isfinite(array)))
+    if bad:
+        raise InputError(f"{path}: {bad} voxels are not finite numbers")
+    return Volume(array.astype(np.float32, copy=False), grid, attributes, provenance)
+
+
+def write_vectors(
+    path: Path,
+    field: VectorField,
+    *,
+    provenance: Mapping[str, Any],
+    attributes: Mapping[str, Any],
+    overwrite: bool,
+) -> None:
+    """Write a vector field: `velocity` (m/s), the displacements (voxel) and what is known of their quality.
+
+    Parameters
+    ----------
+    attributes : scalars and strings for the root, `reference` (focal_point or mid_plane) among them
+
+    Raises
+    ------
+    OutputExistsError, OutputError
+    """
+
+    def fill(file: h5py.File) -> None:
+        write_header(file, VECTORS_FORMAT, FORMAT_VERSION, provenance)
+        _write_attributes(file, attributes)
+        file.attrs["voxel_mm"] = np.asarray(field.voxel_mm, dtype=np.float64)
+        file.attrs["window_voxel"] = np.asarray(field.window_voxel, dtype=np.int64)
+        file.attrs["flag_meanings"] = np.bytes_(FLAG_MEANINGS)
+        if field.dt_s is not None:
+            file.attrs["dt_s"] = float(field.dt_s)
+        points = _write_frame(file, field.grid, with_component=True)
+        points.attrs["Vectors"] = np.bytes_("velocity")
+        _write_points(file, points, "velocity", field.velocity, "m/s")
+        for name, (unit, _) in VECTOR_ARRAYS.items():
+            _write_points(file, points, name, getattr(field, name), unit)
+        if field.uncertainty_voxel is not None:
+            _write_points(file, points, UNCERTAINTY, field.uncertainty_voxel, "voxel")
+
+    create(path, fill, overwrite=overwrite, check=_reads(open_vectors))
+
+
+def open_vectors(path: Path | str) -> VectorField:
+    """Read a vector field.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, broken, not a vector field, or a vector counts as valid and is not finite.
+    """
+    path = Path(path)
+    with open_h5(path) as file:
+        ensure_format(path, file, VECTORS_FORMAT, (FORMAT_VERSION,))
+        grid = _read_grid(file)
+        size = path.stat().st_size
+        arrays = {
+            name: _read_points(file, name, grid, size, components=vector) for name, (_, vector) in VECTOR_ARRAYS.items()
+        }
+        uncertainty = _read_points(file, UNCERTAINTY, grid, size, components=True) if UNCERTAINTY in file else None
+        voxel = [float(v) for v in file.attrs["voxel_mm"]]
+        window = [int(v) for v in file.attrs["window_voxel"]]
+        dt_s = float(file.attrs["dt_s"]) if "dt_s" in file.attrs else None
+    if arrays["flag"].max() > LARGEST_FLAG:
+        raise InputError(f"{path}: a flag is {arrays['flag'].max()}, allowed are 0 to {LARGEST_FLAG}")
+    field = VectorField(
+        grid=grid,
+        uncertainty_voxel=uncertainty,
+        voxel_mm=(voxel[0], voxel[1], voxel[2]),
+        dt_s=dt_s,
+        window_voxel=(window[0], window[1], window[2]),
+        **arrays,
+    )
+    if dt_s is not None and np.isnan(field.velocity[field.flag <= 2]).any():
+        raise InputError(f"{path}: a vector that counts as valid is not a finite number")
+    return field
+
+
+def read_header(path: Path | str) -> Header:
+    """Read the attributes and the provenance of a volume or a vector field.
+
+    Raises
+    ------
+    InputError
+    """
+    with open_h5(Path(path)) as file:
+        return Header(_read_attributes(file), read_provenance(file))
+
+
+def _reads(read: Callable[[Path], object]) -> Callable[[Path], None]:
+    """Return a check that reads the file and drops the result."""
+
+    def check(path: Path) -> None:
+        read(path)
+
+    return check
+
+
+def _write_frame(file: h5py.File, grid: Grid, with_component: bool) -> h5py.Group:
+    """Write the dimension scales and `/VTKHDF`, return its `PointData`."""
+    for axis, name in enumerate("xyz"):
+        scale = file.create_dataset(name, data=grid.axis_mm(axis), track_times=False)
+        scale.attrs["units"] = np.bytes_("mm")
+        scale.make_scale(name)
+    if with_component:
+        file.create_dataset("component", data=np.arange(3), track_times=False).make_scale("component")
+    nx, ny, nz = grid.shape_xyz
+    vtk = file.create_group("VTKHDF")
+    vtk.attrs["Version"] = np.array(VTK_VERSION, dtype=np.int64)
+    vtk.attrs["Type"] = VTK_TYPE
+    vtk.attrs["WholeExtent"] = np.array([0, nx - 1, 0, ny - 1, 0, nz - 1], dtype=np.int64)
+    vtk.attrs["Origin"] = np.array(grid.origin_mm, dtype=np.float64)
+    vtk.attrs["Spacing"] = np.array(grid.spacing_mm, dtype=np.float64)
+    vtk.attrs["Direction"] = np.eye(3).ravel()
+    return vtk.create_group("PointData")
+
+
+def _write_points(file: h5py.File, points: h5py.Group, name: str, array: NDArray[Any], unit: str) -> None:
+    """Write an array at the root with its dimension scales and link it under PointData."""
+    axes = ["z", "y", "x"] + ["component"] * (array.ndim - 3)
+    if array.shape[0] == 1:
+        array, axes = array[0], axes[1:]
+    dataset = write_array(file, name, array, unit)
+    for position, axis in enumerate(axes):
+        dataset.dims[position].attach_scale(file[axis])
+    points[name] = dataset
+
+
+def _write_attributes(file: h5py.File, attributes: Mapping[str, Any]) -> None:
+    """Write scalars and strings at the root; what is None is not said (netCDF knows no empty attribute)."""
+    for name, value in attributes.items():
+        if name in RESERVED:
+            raise ValueError(f"{name} is a name that every file uses for itself")
+        if value is not None:
+            file.attrs[name] = to_attribute(value)
+
+
+def _read_attributes(file: h5py.File) -> dict[str, Any]:
+    return {
+        name: value.tolist() if isinstance(value, np.ndarray) else from_attribute(name, value)
+        for name, value in file.attrs.items()
+        if name not in RESERVED
+    }
+
+
+def _read_grid(file: h5py.File) -> Grid:
+    vtk = member(file, "VTKHDF").attrs
+    extent = [int(v) for v in vtk["WholeExtent"]]
+    spacing = [float(v) for v in vtk["Spacing"]]
+    origin = [float(v) for v in vtk["Origin"]]
+    if len(extent) != 6 or len(spacing) != 3 or len(origin) != 3:
+        raise ValueError("its extent, spacing or origin has not one entry for each axis")
+    if extent[0::2] != [0, 0, 0] or min(extent) < 0:
+        raise ValueError(f"its extent is {extent}, expected one that starts at 0")
+    if not (np.isfinite(spacing).all() and min(spacing) > 0 and np.isfinite(origin).all()):
+        raise ValueError(f"its spacing is {spacing} and its origin {origin}")
+    return Grid(
+        (extent[1] + 1, extent[3] + 1, extent[5] + 1),
+        (spacing[0], spacing[1], spacing[2]),
+        (origin[0], origin[1], origin[2]),
+    )
+
+
+def _read_points(file: h5py.File, name: str, grid: Grid, file_bytes: int, components: bool) -> NDArray[Any]:
+    """Read an array of the grid's shape, with the third axis put back on a single plane."""
+    shape = grid.shape_zyx + ((3,) if components else ())
+    stored = shape[1:] if shape[0] == 1 else shape
+    dataset = member(file, name)
+    if dataset.shape != stored:
+        raise ValueError(f"{name} has the shape {dataset.shape}, its extent says {stored}")
+    return read_array(dataset, file_bytes).reshape(shape)
