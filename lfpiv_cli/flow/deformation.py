@@ -15,20 +15,26 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import spline_filter
 
-# Sources lie between -0.5 and N - 0.5; the four taps of a cubic B-spline there reach two coefficients beyond the ends.
+# Sources lie between the first and the last voxel's centre; the four taps of a cubic B-spline at the last one reach two
+# coefficients beyond it.
 SPLINE_PAD = 2
+# The prefilter sees the volume continued by odd reflection, which keeps its slope at the faces: the usual even one
+# makes a kink in every particle that a face cuts, and costs 0.1 voxel there. Its response decays by 3.7 a voxel.
+FACE_PAD = 8
 
 
 def spline_coefficients(volume: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the cubic B-spline coefficients of a volume, mirrored by `SPLINE_PAD` beyond each face.
+    """Return the cubic B-spline coefficients of a volume, with `SPLINE_PAD` of them beyond each face.
 
     Scaled to a largest magnitude of 1 in the volume: the correlation is normalised anyway, and products stay far from
     the limits of float32.
     """
     largest = float(np.max(np.abs(volume)))
     scaled = volume / np.float32(largest) if largest > 0.0 else volume
-    coefficients = spline_filter(scaled, order=3, output=np.float32, mode="mirror")
-    return np.ascontiguousarray(np.pad(coefficients, SPLINE_PAD, mode="reflect"))
+    continued = np.pad(scaled, FACE_PAD, mode="reflect", reflect_type="odd")
+    coefficients = spline_filter(continued, order=3, output=np.float32, mode="mirror")
+    kept = slice(FACE_PAD - SPLINE_PAD, SPLINE_PAD - FACE_PAD)
+    return np.ascontiguousarray(coefficients[kept, kept, kept])
 
 
 def spline_matrix(nodes: NDArray[np.float64], positions: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -78,7 +84,7 @@ def cubic_weights(t: float) -> tuple[float, float, float, float]:
 
 @njit(cache=True)
 def sample(coefficients: NDArray[np.float32], z: float, y: float, x: float) -> float:
-    """Return the spline's value at a point given in voxel indices, within half a voxel of the volume."""
+    """Return the spline's value at a point given in voxel indices, between the outermost voxel centres."""
     iz = int(np.floor(z))
     iy = int(np.floor(y))
     ix = int(np.floor(x))
@@ -102,7 +108,8 @@ def sample(coefficients: NDArray[np.float32], z: float, y: float, x: float) -> f
 @njit(cache=True)
 def is_seen(mask: NDArray[np.bool_], shape: tuple[int, int, int], z: float, y: float, x: float) -> bool:
     """Tell whether a point lies in the volume and, where there is a mask (any size but 0), in a voxel that it keeps."""
-    inside = (-0.5 <= z < shape[0] - 0.5) and (-0.5 <= y < shape[1] - 0.5) and (-0.5 <= x < shape[2] - 0.5)
+    # Not to the outer faces of the outermost voxels: beyond their centres a value would be extrapolated.
+    inside = (0.0 <= z <= shape[0] - 1) and (0.0 <= y <= shape[1] - 1) and (0.0 <= x <= shape[2] - 1)
     if not inside or mask.size == 0:
         return inside
     return mask[int(np.floor(z + 0.5)), int(np.floor(y + 0.5)), int(np.floor(x + 0.5))]

@@ -25,6 +25,9 @@ from lfpiv_cli.flow.windows import Triple, WindowLayout
 
 # Blocks narrower than this cost more in sums of sums than the products they save.
 SMALLEST_BLOCK = 4
+# A window whose energy is below this share of the brightest one's is empty: what the splines carry into empty space
+# reaches amplitudes of 1e-5.
+SMALLEST_ENERGY = 1e-9
 
 
 @dataclass(frozen=True)
@@ -75,7 +78,7 @@ def correlation_maps(
 ) -> NDArray[np.float64]:
     """Return R for all shifts up to `radius`: (nz, ny, nx, 2r + 1, 2r + 1, 2r + 1), the shifts along z, y, x last.
 
-    Zero where a window or its shifted partner holds nothing.
+    Zero where a window holds nothing.
 
     Parameters
     ----------
@@ -90,7 +93,8 @@ def correlation_maps(
         products = _sum_blocks(products, axis, layout.count_zyx[axis], blocks.per_window[axis], blocks.hop[axis])
     energies = _pair_energies(shifted_energies(a, layout, first, radius), -1)
     energies *= _pair_energies(shifted_energies(b, layout, first, radius), 1)
-    return np.divide(products, np.sqrt(energies), out=np.zeros_like(products), where=energies > 0.0)
+    filled = energies > SMALLEST_ENERGY**2 * np.max(energies)
+    return np.divide(products, np.sqrt(energies), out=np.zeros_like(products), where=filled)
 
 
 def window_sums(volume: NDArray, layout: WindowLayout, before: Triple, radius: int = 0) -> NDArray[np.float64]:

@@ -21,6 +21,8 @@ EXPECTED_NOISE_VOXEL = 0.2
 THRESHOLD = 4.0
 # A vector is judged, or replaced, by its neighbours only if at least this share of those in the grid can be used.
 NEEDED_SHARE = 0.5
+# A gap's vectors with almost as many neighbours as the best of them are filled in the same round.
+FILL_TOLERANCE = 0.8
 # Two rounds: outliers found in the first no longer count as neighbours in the second.
 ROUNDS = 2
 
@@ -88,7 +90,9 @@ def fill_field(displacement: NDArray[np.float64]) -> NDArray[np.float64]:
     everywhere = np.ones(known.shape, dtype=np.bool_)
     while not known.all() and known.any():
         predicted, _, share = predict(filled, known, everywhere)
-        rim = ~known & (share > 0.0)
+        # The best known first; without the tolerance a flat rim would be closed from its ends, one vector a round.
+        needed = min(NEEDED_SHARE, FILL_TOLERANCE * float(np.max(share[~known])))
+        rim = ~known & (share >= needed)
         filled[rim] = predicted[rim]
         known |= rim
     return filled
@@ -97,14 +101,17 @@ def fill_field(displacement: NDArray[np.float64]) -> NDArray[np.float64]:
 def smooth_field(displacement: NDArray[np.float64], strength: float) -> NDArray[np.float64]:
     """Return (1 - strength) of a field plus `strength` of it after a (1/4, 1/2, 1/4) filter along x, y and z.
 
-    The field is continued in a straight line beyond its ends, so that linear flows pass unchanged.
+    The first and the last value of a line become those of the straight line fitted to the outer three: linear flows
+    pass unchanged, and noise at the ends does not.
     """
     smoothed = displacement
     for axis in range(3):
-        if smoothed.shape[axis] > 1:
+        if smoothed.shape[axis] > 2:
             moved = np.moveaxis(smoothed, axis, 0)
-            filtered = moved.copy()
+            filtered = np.empty_like(moved)
             filtered[1:-1] = 0.25 * moved[:-2] + 0.5 * moved[1:-1] + 0.25 * moved[2:]
+            filtered[0] = (5.0 * moved[0] + 2.0 * moved[1] - moved[2]) / 6.0
+            filtered[-1] = (5.0 * moved[-1] + 2.0 * moved[-2] - moved[-3]) / 6.0
             smoothed = np.moveaxis(filtered, 0, axis)
     return (1.0 - strength) * displacement + strength * smoothed
 

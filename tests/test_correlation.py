@@ -1,0 +1,351 @@
+"""Displacements of known particle volumes: signs, sub-voxel accuracy, borders, odd windows, empty volumes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lfpiv_cli.errors import ConfigError, InputError
+from lfpiv_cli.flow.correlation import correlate, count_passes
+from lfpiv_cli.flow.deformation import deform_pair, expand_lateral, spline_coefficients, spline_matrix
+from lfpiv_cli.flow.field import MASKED, REJECTED, VectorField
+from lfpiv_cli.flow.maps import correlation_maps, margins
+from lfpiv_cli.flow.peaks import find_peaks, vertex
+from lfpiv_cli.flow.windows import layout_windows
+from lfpiv_cli.grid import Grid
+
+HALF = (0.5, 0.5, 0.5)
+# A corner's window has lost half of its 8 particles, and the faces cut others.
+CORNER = 0.1
+Flow = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+
+
+def unit_grid(shape_xyz: tuple[int, int, int]) -> Grid:
+    """A grid whose mm are voxel indices."""
+    return Grid(shape_xyz, (1.0, 1.0, 1.0), (0.0, 0.0, 0.0))
+
+
+def particle_volume(
+    centres: NDArray[np.float64], shape_xyz: tuple[int, int, int], sigma: tuple[float, float, float]
+) -> NDArray[np.float32]:
+    """Gaussian particles (n, 3), in voxels, as a volume [z, y, x]."""
+    profiles = [
+        np.exp(-0.5 * ((np.arange(n)[:, np.newaxis] - centres[:, axis]) / s) ** 2)
+        for axis, (n, s) in enumerate(zip(shape_xyz, sigma, strict=True))
+    ]
+    return np.einsum("zn,yn,xn->zyx", profiles[2], profiles[1], profiles[0], optimize=True).astype(np.float32)
+
+
+def moving_pair(
+    flow: Flow,
+    shape_xyz: tuple[int, int, int],
+    rng: np.random.Generator,
+    per_window: float = 8.0,
+    sigma: tuple[float, float, float] = (1.0, 1.0, 1.0),
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Two volumes half a displacement before and after; particles also beyond the faces, so that some come and go."""
+    beyond = 8.0
+    sides = np.array(shape_xyz) + 2 * beyond
+    centres = rng.random((int(per_window * np.prod(sides) / 16**3), 3)) * sides - beyond
+    half = 0.5 * flow(centres)
+    return particle_volume(centres - half, shape_xyz, sigma), particle_volume(centres + half, shape_xyz, sigma)
+
+
+def truth_at(field: VectorField, flow: Flow) -> NDArray[np.float64]:
+    z, y, x = np.meshgrid(*(field.grid.axis_mm(axis) for axis in (2, 1, 0)), indexing="ij")
+    points = np.stack([x, y, z], axis=-1)
+    return flow(points.reshape(-1, 3)).reshape(points.shape)
+
+
+def rigid(*shift: float) -> Flow:
+    return lambda points: np.broadcast_to(np.array(shift), points.shape)
+
+
+def root_mean_square(error: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.sqrt(np.mean(error**2, axis=(0, 1, 2)))
+
+
+def test_paper_s_volume_gives_twelve_by_sixteen_by_twelve_windows() -> None:
+    layout = layout_windows((100, 130, 100), (16, 16, 16), HALF)
+    assert layout.count == (12, 16, 12)
+    # 100 = 2 + 12 x 8 + 2 and 130 = 1 + 16 x 8 + 1: cells of 8 in the middle, windows 4 wider on both sides.
+    assert layout.first == (-2, -3, -2)
+
+
+@pytest.mark.parametrize(("voxels", "size", "overlap"), [(100, 16, 0.5), (37, 16, 0.75), (50, 17, 0.5), (5, 16, 0.5)])
+def test_windows_are_centred_in_the_volume(voxels: int, size: int, overlap: float) -> None:
+    layout = layout_windows((voxels, 8, 8), (size, 8, 8), (overlap, 0.0, 0.0))
+    centres = layout.centres_voxel(0)
+    assert layout.count[0] == max(1, voxels // layout.step[0])
+    # Windows start on whole voxels: an odd remainder shifts them by half a voxel.
+    assert abs(0.5 * (centres[0] + centres[-1]) - 0.5 * (voxels - 1)) <= 0.5
+
+
+def test_grid_of_window_centres_is_in_millimetres() -> None:
+    volume = Grid.centred((100, 130, 100), (0.1, 0.1, 0.1), (1.0, 2.0, 3.0))
+    centres = layout_windows((100, 130, 100), (16, 16, 16), HALF).grid(volume)
+    for axis, middle in enumerate((1.0, 2.0, 3.0)):
+        assert np.mean(centres.axis_mm(axis)) == pytest.approx(middle)
+    assert centres.spacing_mm == pytest.approx((0.8, 0.8, 0.8))
+
+
+@pytest.mark.parametrize(("size", "overlap"), [((8, 8, 8), HALF), ((8, 7, 6), (0.75, 0.5, 0.0)), ((16, 12, 8), HALF)])
+def test_maps_are_the_symmetric_normalised_correlation(
+    size: tuple[int, int, int], overlap: tuple[float, float, float], rng: np.random.Generator
+) -> None:
+    a, b = rng.random((2, 18, 20, 22)).astype(np.float32)
+    layout = layout_windows((22, 20, 18), size, overlap)
+    before, after = margins(layout, a.shape, 2)
+    margin = list(zip(before, after, strict=True))
+    padded_a, padded_b = np.pad(a, margin), np.pad(b, margin)
+    maps = correlation_maps(padded_a, padded_b, layout, before, 2)
+
+    def window(volume: NDArray[np.float32], index: tuple[int, ...], shift: tuple[int, ...]) -> NDArray[np.float64]:
+        start = [
+            layout.first[xyz] + k * layout.step[xyz] + s + m
+            for xyz, k, s, m in zip((2, 1, 0), index, shift, before, strict=True)
+        ]
+        slices = tuple(slice(s, s + layout.size[xyz]) for s, xyz in zip(start, (2, 1, 0), strict=True))
+        return volume[slices].astype(np.float64)
+
+    last = tuple(n - 1 for n in layout.count_zyx)
+    for index, shift in (((0, 0, 0), (1, -2, 2)), (last, (2, 0, -1)), ((1, 0, 1), (0, 0, 0))):
+        back = tuple(-s for s in shift)
+        here_a, here_b = window(padded_a, index, (0, 0, 0)), window(padded_b, index, (0, 0, 0))
+        moved_a, moved_b = window(padded_a, index, back), window(padded_b, index, shift)
+        energy_a, energy_b = np.sum(here_a**2) + np.sum(moved_a**2), np.sum(here_b**2) + np.sum(moved_b**2)
+        expected = (np.sum(here_a * moved_b) + np.sum(moved_a * here_b)) / np.sqrt(energy_a * energy_b)
+        # The products are summed in float32 over at most 16 planes.
+        assert maps[index][tuple(s + 2 for s in shift)] == pytest.approx(expected, abs=1e-6)
+
+
+def test_peak_of_a_gaussian_is_exact() -> None:
+    shifts = np.arange(-2, 3)
+    place, width = np.array([0.3, -0.4, 0.2]), np.array([1.4, 1.2, 2.0])
+    x, y, z = (np.exp(-0.5 * ((shifts - p) / w) ** 2) for p, w in zip(place, width, strict=True))
+    peaks = find_peaks(np.einsum("z,y,x->zyx", z, y, x)[np.newaxis, np.newaxis, np.newaxis])
+    np.testing.assert_allclose(peaks.offset[0, 0, 0], place, atol=1e-12)
+    np.testing.assert_allclose(peaks.width[0, 0, 0], width, rtol=1e-12)
+    assert peaks.second_height[0, 0, 0] == 0.0
+
+
+def test_second_peak_is_a_maximum_of_its_own() -> None:
+    shifts = np.arange(-3, 4)
+    first = np.exp(-0.5 * (shifts + 2) ** 2)
+    second = 0.5 * np.exp(-0.5 * (shifts - 2) ** 2)
+    flank = np.exp(-0.5 * shifts**2)
+    peaks = find_peaks(np.einsum("z,y,x->zyx", flank, flank, first + second)[np.newaxis, np.newaxis, np.newaxis])
+    np.testing.assert_allclose(peaks.second_offset[0, 0, 0], [2.0, 0.0, 0.0], atol=0.05)
+    assert peaks.ratio[0, 0, 0] == pytest.approx(2.0, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    "values", [(0.0, 1.0, 0.5), (-0.1, 1.0, 0.5), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0), (1.0, 0.9, 1.0)]
+)
+def test_peak_that_is_no_gaussian_stays_within_one_voxel(values: tuple[float, float, float]) -> None:
+    place, _ = vertex(*values)
+    assert abs(place) <= 1.0
+
+
+def test_spline_matrix_is_exact_for_cubics_and_straight_beyond_the_nodes() -> None:
+    nodes = np.linspace(2.0, 20.0, 7)
+    inside, outside = np.linspace(2.0, 20.0, 40), np.array([-1.0, 23.0])
+    np.testing.assert_allclose(spline_matrix(nodes, inside) @ nodes**3, inside**3, rtol=1e-10)
+    np.testing.assert_allclose(spline_matrix(nodes, outside) @ (2.0 * nodes), 2.0 * outside, rtol=1e-10)
+    assert spline_matrix(nodes, np.array([23.0])) @ nodes**2 == pytest.approx(20.0**2 + 3.0 * 40.0)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_spline_matrix_carries_constants_on_few_nodes(count: int) -> None:
+    matrix = spline_matrix(np.arange(count) * 8.0, np.arange(-4.0, 24.0))
+    np.testing.assert_allclose(matrix.sum(axis=1), 1.0, rtol=1e-12)
+
+
+def deformed(
+    a: NDArray[np.float32], b: NDArray[np.float32], mask: NDArray[np.bool_], shift: tuple[float, float, float]
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
+    """Both volumes deformed by a uniform predictor."""
+    ones = [np.ones((n, 1)) for n in a.shape]
+    field = np.array(shift).reshape(1, 1, 1, 3)
+    lateral = expand_lateral(field, ones[2], ones[1])
+    none = (0, 0, 0)
+    return deform_pair(spline_coefficients(a), spline_coefficients(b), mask, lateral, ones[0], none, none)
+
+
+def test_deformation_brings_a_pair_together() -> None:
+    shape, shift = (24, 26, 22), (1.4, -0.6, 0.8)
+    centre = np.array([[11.0, 13.0, 10.0]])
+    half = 0.5 * np.array(shift)
+    # Wide enough that the spline's own error is below the tolerance.
+    a, b, middle = (particle_volume(centre + s * half, shape, (2.5, 2.5, 2.5)) for s in (-1, 1, 0))
+    got_a, got_b, _ = deformed(a, b, np.zeros((0, 0, 0), dtype=np.bool_), shift)
+    np.testing.assert_allclose(got_a / a.max() ** 0, middle / a.max(), atol=1e-3)
+    np.testing.assert_allclose(got_b, middle / b.max(), atol=1e-3)
+
+
+def test_joint_mask_takes_both_volumes_where_either_source_is_unseen() -> None:
+    a = np.ones((10, 11, 12), dtype=np.float32)
+    mask = np.ones(a.shape, dtype=np.bool_)
+    mask[:, :, 6:] = False
+    got_a, got_b, valid = deformed(a, a, mask, (4.0, 0.0, 0.0))
+    # Sources at x - 2 and x + 2 must both lie in 0 ... 5.
+    assert np.array_equal(np.flatnonzero(valid[5, 5]), [2, 3])
+    np.testing.assert_allclose(got_a[5, 5], valid[5, 5], atol=1e-5)
+    np.testing.assert_array_equal(got_a > 0.5, got_b > 0.5)
+
+
+@pytest.mark.parametrize("shift", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (2.3, -3.6, 0.7)])
+def test_rigid_shift_is_found_with_its_sign_up_to_the_borders(
+    shift: tuple[float, float, float], rng: np.random.Generator
+) -> None:
+    shape = (44, 52, 40)
+    a, b = moving_pair(rigid(*shift), shape, rng)
+    field = correlate(a, b, unit_grid(shape), [(16, 16, 16)], HALF, None)
+    assert field.flag.max() == 0
+    error = field.displacement_voxel - np.array(shift)
+    # A face cuts particles of 8 per window; a corner's window has lost a third of its own.
+    assert np.all(root_mean_square(error) < 0.02)
+    assert np.all(np.abs(error) < 0.15)
+    assert np.all(np.abs(error[1:-1, 1:-1, 1:-1]) < 0.02)
+
+
+def test_linear_shear_is_found_up_to_the_borders(rng: np.random.Generator) -> None:
+    shape = (48, 48, 48)
+
+    def shear(points: NDArray[np.float64]) -> NDArray[np.float64]:
+        moved = np.zeros(points.shape)
+        moved[:, 0] = 0.08 * (points[:, 2] - 23.5)
+        return moved
+
+    a, b = moving_pair(shear, shape, rng)
+    field = correlate(a, b, unit_grid(shape), [(16, 16, 16)], HALF, None)
+    # The windows at the borders see one side of the shear only, and approach its value pass by pass.
+    error = field.displacement_voxel - truth_at(field, shear)
+    assert np.all(root_mean_square(error) < 0.06)
+    assert np.all(root_mean_square(error[1:-1, 1:-1, 1:-1]) < 0.015)
+
+
+def test_elongated_particles_and_windows(rng: np.random.Generator) -> None:
+    shape, shift = (40, 40, 48), (1.3, 0.7, 1.5)
+    a, b = moving_pair(rigid(*shift), shape, rng, sigma=(1.0, 1.0, 4.0))
+    field = correlate(a, b, unit_grid(shape), [(16, 16, 24)], (0.5, 0.5, 0.75), None)
+    assert field.window_voxel == (16, 16, 24)
+    error = root_mean_square(field.displacement_voxel - np.array(shift))
+    # Three neighbouring points of a peak four times as wide differ little: the depth is located ten times less well.
+    assert np.all(error < (0.02, 0.02, 0.2))
+
+
+@pytest.mark.parametrize(
+    ("windows", "overlap"),
+    [
+        ([(32, 32, 32), (16, 16, 16)], HALF),
+        ([(17, 13, 15)], (0.5, 0.3, 0.6)),
+        ([(16, 16, 16)], (0.0, 0.0, 0.0)),
+        ([(48, 48, 48)], HALF),
+    ],
+)
+def test_any_windows_and_overlap_work(
+    windows: list[tuple[int, int, int]], overlap: tuple[float, float, float], rng: np.random.Generator
+) -> None:
+    shape, shift = (40, 44, 36), (1.3, -0.7, 0.4)
+    a, b = moving_pair(rigid(*shift), shape, rng)
+    field = correlate(a, b, unit_grid(shape), windows, overlap, 0.5)
+    np.testing.assert_allclose(field.displacement_voxel, np.broadcast_to(shift, (*field.flag.shape, 3)), atol=0.03)
+
+
+def test_exchanging_the_volumes_turns_the_vectors_round(rng: np.random.Generator) -> None:
+    shape = (40, 40, 40)
+    a, b = moving_pair(rigid(1.3, -0.7, 0.4), shape, rng)
+    there, back = (correlate(*pair, unit_grid(shape), [(16, 16, 16)], HALF, None) for pair in ((a, b), (b, a)))
+    np.testing.assert_allclose(there.displacement_voxel, -back.displacement_voxel, atol=1e-4)
+
+
+def test_exchanging_axes_exchanges_components(rng: np.random.Generator) -> None:
+    a, b = moving_pair(rigid(1.3, -0.7, 0.4), (40, 44, 36), rng)
+    straight = correlate(a, b, unit_grid((40, 44, 36)), [(16, 16, 16)], HALF, None)
+    turned = correlate(
+        np.ascontiguousarray(a.T), np.ascontiguousarray(b.T), unit_grid((36, 44, 40)), [(16, 16, 16)], HALF, None
+    )
+    back = turned.displacement_voxel.transpose(2, 1, 0, 3)[..., ::-1]
+    np.testing.assert_allclose(straight.displacement_voxel, back, atol=1e-4)
+
+
+def test_volumes_with_nothing_in_them_are_flagged() -> None:
+    empty = np.zeros((24, 24, 24), dtype=np.float32)
+    field = correlate(empty, empty, unit_grid((24, 24, 24)), [(16, 16, 16)], HALF, 1.0)
+    assert np.all(field.flag == REJECTED)
+    assert np.all(np.isnan(field.velocity))
+    assert np.all(field.correlation == 0.0)
+    assert np.all(field.valid_fraction > 0.4)
+
+
+def test_constant_volumes_have_finite_or_flagged_vectors() -> None:
+    grey = np.full((24, 24, 24), 7.0, dtype=np.float32)
+    field = correlate(grey, grey, unit_grid((24, 24, 24)), [(16, 16, 16)], HALF, 1.0)
+    assert np.all(np.isfinite(field.velocity[field.flag < REJECTED]))
+
+
+def test_half_empty_volume_keeps_its_other_half(rng: np.random.Generator) -> None:
+    shape, shift = (64, 32, 32), (1.3, -0.7, 0.4)
+    a, b = moving_pair(rigid(*shift), shape, rng)
+    a[:, :, 28:] = 0.0
+    b[:, :, 28:] = 0.0
+    field = correlate(a, b, unit_grid(shape), [(16, 16, 16)], HALF, 1e-3)
+    full = field.grid.axis_mm(0) < 18.0
+    np.testing.assert_allclose(
+        field.displacement_voxel[:, :, full],
+        np.broadcast_to(shift, field.displacement_voxel[:, :, full].shape),
+        atol=CORNER,
+    )
+    assert np.all(field.flag[:, :, -2:] == REJECTED)
+    assert np.array_equal(np.isnan(field.velocity).any(axis=-1), field.flag >= REJECTED)
+
+
+def test_masked_windows_are_masked_and_their_neighbours_unharmed(rng: np.random.Generator) -> None:
+    shape, shift = (64, 32, 32), (1.3, -0.7, 0.4)
+    a, b = moving_pair(rigid(*shift), shape, rng)
+    mask = np.ones(a.shape, dtype=np.bool_)
+    mask[:, :, 32:] = False
+    a[:, :, 32:] = rng.random(a[:, :, 32:].shape)
+    field = correlate(a, b, unit_grid(shape), [(16, 16, 16)], HALF, 1e-3, mask)
+    beyond = field.grid.axis_mm(0) > 40.0
+    assert np.all(field.flag[:, :, beyond] == MASKED)
+    seen = field.flag < REJECTED
+    np.testing.assert_allclose(field.displacement_voxel[seen], np.broadcast_to(shift, (seen.sum(), 3)), atol=CORNER)
+
+
+def test_voxels_that_are_not_finite_are_masked(rng: np.random.Generator) -> None:
+    shape, shift = (40, 40, 40), (1.3, -0.7, 0.4)
+    a, b = moving_pair(rigid(*shift), shape, rng)
+    a[20, 20, 20] = np.nan
+    field = correlate(a, b, unit_grid(shape), [(16, 16, 16)], HALF, 1e-3)
+    np.testing.assert_allclose(field.displacement_voxel, np.broadcast_to(shift, (*field.flag.shape, 3)), atol=CORNER)
+
+
+def test_progress_counts_every_pass(rng: np.random.Generator) -> None:
+    windows = [(16, 16, 16), (8, 8, 8)]
+    a, b = moving_pair(rigid(0.5, 0.0, 0.0), (24, 24, 24), rng)
+    units: list[int] = []
+    correlate(a, b, unit_grid((24, 24, 24)), windows, HALF, None, progress=units.append)
+    assert sum(units) == count_passes(windows)
+
+
+@pytest.mark.parametrize(
+    ("change", "error"),
+    [
+        ({"windows": []}, ConfigError),
+        ({"windows": [(16, 16, 1)]}, ConfigError),
+        ({"overlap": (0.5, 1.0, 0.5)}, ConfigError),
+        ({"dt_s": 0.0}, ConfigError),
+        ({"b": np.zeros((4, 4, 5), dtype=np.float32)}, InputError),
+        ({"mask": np.ones((4, 4, 5), dtype=np.bool_)}, InputError),
+    ],
+)
+def test_arguments_that_do_not_belong_together_are_refused(change: dict, error: type[Exception]) -> None:
+    empty = np.zeros((4, 4, 4), dtype=np.float32)
+    arguments = {"a": empty, "b": empty, "grid": unit_grid((4, 4, 4)), "windows": [(4, 4, 4)], "overlap": HALF}
+    with pytest.raises(error):
+        correlate(**(arguments | {"dt_s": 1.0} | change))
