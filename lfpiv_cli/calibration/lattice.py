@@ -71,11 +71,18 @@ class LatticeFit:
         """Number of lens images found."""
         return len(self.indices)
 
+    @property
+    def coefficients_px(self) -> NDArray[np.float64]:
+        """Coefficients (10, 2) of the chosen model, in the order of `EXPONENTS`."""
+        if self.cubic_used:
+            return self.cubic_px
+        plain = np.zeros((len(EXPONENTS), 2))
+        plain[0], plain[1:3] = self.lattice_px.origin, self.lattice_px.basis
+        return plain
+
     def centres(self, indices: ArrayLike) -> NDArray[np.float64]:
         """Return the modelled centres of lens images, (column, row), indices of shape (..., 2)."""
-        if not self.cubic_used:
-            return self.lattice_px.points(indices)
-        return polynomial_terms(indices) @ self.cubic_px
+        return polynomial_terms(indices) @ self.coefficients_px
 
 
 def fit_lattice(

@@ -1,0 +1,186 @@
+"""From one picture of a dot board to where the focal plane is, how the board is tilted, and the magnification.
+
+Axes: the picture is rectified and its microlenses stand upright; the pose is given in world axes, those of the raw
+sensor: x, y lateral, z away from the camera from the focal plane, in the medium the board stands in.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose, pose_of_dots
+from lfpiv_cli.calibration.dot_model import (
+    DiscFit,
+    checked_disc_radius,
+    fit_disc,
+    lens_crossings,
+    pixel_rays,
+    scene_points,
+)
+from lfpiv_cli.calibration.rectification import turned
+from lfpiv_cli.calibration.spots import find_spots
+from lfpiv_cli.errors import InputError
+from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.media import Media, equivalent_object_distance
+
+# A pixel shows a dot when it is brighter than this share of the brightest thousandth of the picture.
+BRIGHT_SHARE = 0.2
+BRIGHTEST_PERCENTILE = 99.9
+# Depths are tried in steps over which the rim of the main lens moves a dot by half a microlens, up to ten microlenses
+# either way: there the blur is as wide as usual dots are apart.
+FOCUS_STEPS_PER_LENS = 2
+FOCUS_LENSES = 10
+# The refocused picture has two samples per microlens, smoothed by one microlens: finer, the gaps between microlenses
+# that the focal plane has would pass for sharpness.
+SAMPLES_PER_LENS = 2
+# Pixels that see the plane of the dots within this many microlenses of a dot's rim, but not half-way to the next dot,
+# belong to its fit.
+MARGIN_LENSES = 2.5
+# The magnification enters the depth of each dot; one repetition with the measured one leaves the square of its error.
+MAGNIFICATION_ROUNDS = 2
+# Below this a change of magnification moves nothing by a micrometre over a board of 10 mm.
+MAGNIFICATION_TOLERANCE = 1e-4
+
+
+def locate_board(
+    image: NDArray[np.float32],
+    camera: Camera,
+    board: BoardGeometry,
+    media: Media,
+    rotation_rad: float = 0.0,
+    transmission: NDArray[np.float32] | None = None,
+) -> BoardPose:
+    """Find the dots of a board in depth by fitting each one's rendering, and the board through them.
+
+    Parameters
+    ----------
+    image : (rows, columns) rectified picture less the dark frame
+    camera : with the lattice of the rectified frame
+    rotation_rad : angle that rectification took out
+    transmission : (rows, columns) share of light that pixels pass, rectified; default: all the same inside the aperture
+
+    Raises
+    ------
+    InputError
+        when too few dots are found to make a board
+    """
+    medium = media.in_air() if board.medium == "air" else media
+    radius = checked_disc_radius(0.5 * board.dot_diameter_mm, camera)
+    passed = np.ones(image.shape, dtype=np.float32) if transmission is None else transmission
+    signal = dot_signal(image, passed, board)
+    start, depth = first_dots(signal, camera, board, medium)
+    micro_images = camera.micro_image_lattice_px()
+    for _ in range(MAGNIFICATION_ROUNDS):
+        fits = [fit_one_dot(signal, passed, camera, board, medium, (x, y, depth), radius) for x, y in start]
+        places, sigmas = world_places(fits, camera, rotation_rad)
+        pose = pose_of_dots(places, sigmas, seen_px(places, camera, medium), camera.magnification, board)
+        ratio = pose.magnification / camera.magnification
+        if abs(ratio - 1.0) < MAGNIFICATION_TOLERANCE:
+            break
+        camera = replace(camera, magnification=pose.magnification).with_micro_images(micro_images)
+        start, depth = start / ratio, pose.z0_mm
+    return pose
+
+
+def world_places(
+    fits: list[DiscFit], camera: Camera, rotation_rad: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return places and standard errors (n, 3) of the fitted dots, turned back to the raw sensor's axes."""
+    good = [fit for fit in fits if fit.converged and fit.brightness > 0.0]
+    places = np.array([fit.position_mm for fit in good]).reshape(-1, 3)
+    sigmas = np.sqrt(np.array([np.diag(fit.covariance_mm2) for fit in good])).reshape(-1, 3)
+    return camera.to_image_axes(turned(places, rotation_rad)), camera.to_image_axes(sigmas)
+
+
+def seen_px(places_mm: NDArray[np.float64], camera: Camera, media: Media) -> NDArray[np.float64]:
+    """Return where the light from places (n, 3) through the main lens's middle ends on the sensor (column, row)."""
+    distance = equivalent_object_distance(places_mm[:, 2], camera.focus_distance_mm, media)
+    forward = camera.micro_image_scale * camera.image_distance_mm / distance
+    return camera.mm_to_px(-forward[:, np.newaxis] * camera.to_image_axes(places_mm)[:, :2])
+
+
+def dot_signal(image: NDArray[np.float32], passed: NDArray[np.float32], board: BoardGeometry) -> NDArray[np.float64]:
+    """Return the picture with the dots bright on a dim ground; dark dots are what the lit board lacks of full light."""
+    if board.polarity == "bright":
+        return image.astype(np.float64)
+    usable = passed > 0.0
+    level = np.median(image[usable] / passed[usable])
+    return np.asarray(level * passed - image, dtype=np.float64)
+
+
+def first_dots(
+    signal: NDArray[np.float64], camera: Camera, board: BoardGeometry, media: Media
+) -> tuple[NDArray[np.float64], float]:
+    """Return the lateral places (n, 2) of the dots in image axes and their common depth, to within a dot's radius.
+
+    The rays of all bright pixels are carried back to planes at several depths; where the dots are smallest, the sum of
+    squares of the refocused picture is largest.
+    """
+    row, column = np.nonzero(signal > BRIGHT_SHARE * np.percentile(signal, BRIGHTEST_PERCENTILE))
+    light = signal[row, column]
+    if not light.size or light.min() <= 0.0:
+        raise InputError("the board's picture shows no dots; check the exposure and board.polarity")
+    rays = pixel_rays(camera, column, row)
+    through = np.hypot(*lens_crossings(rays, camera).T) <= camera.aperture_radius_mm
+    sample_mm = float(camera.lattice.pitch.min()) / SAMPLES_PER_LENS / abs(camera.magnification)
+    size = np.array([camera.rows, camera.columns]) * camera.pixel_mm / abs(camera.magnification)
+    shape = 2 * np.ceil(0.6 * size / sample_mm).astype(np.int64) + 1
+
+    def refocused(z_mm: float) -> NDArray[np.float64]:
+        place = np.rint(scene_points(rays, camera, media, z_mm) / sample_mm).astype(np.int64)[:, ::-1] + shape // 2
+        seen = through & ((place >= 0) & (place < shape)).all(axis=1)
+        flat = np.ravel_multi_index(tuple(place[seen].T), tuple(shape))
+        picture = np.bincount(flat, light[seen], minlength=int(shape.prod())).reshape(shape)
+        return ndimage.gaussian_filter(picture, SAMPLES_PER_LENS)
+
+    depths = candidate_depths(camera, media)
+    depth = float(depths[np.argmax([np.sum(refocused(z) ** 2) for z in depths])])
+    spots = find_spots(refocused(depth), board.spacing_mm / sample_mm)
+    return (spots - shape[::-1] // 2) * sample_mm, depth
+
+
+def candidate_depths(camera: Camera, media: Media) -> NDArray[np.float64]:
+    """Return depths in the medium at equal steps of defocus alpha about the focal plane."""
+    step = float(camera.lattice.pitch.min()) / camera.aperture_radius_mm / FOCUS_STEPS_PER_LENS
+    count = FOCUS_LENSES * FOCUS_STEPS_PER_LENS
+    alpha = step * np.arange(-count, count + 1)
+    s_i = camera.image_distance_mm
+    distance = s_i / (alpha - 1.0 + s_i / camera.focal_length_mm)
+    depths = (distance[distance > 0.0] - camera.focus_distance_mm) / media.depth_ratio
+    return np.asarray(depths, dtype=np.float64)
+
+
+def fit_one_dot(
+    signal: NDArray[np.float64],
+    passed: NDArray[np.float32],
+    camera: Camera,
+    board: BoardGeometry,
+    media: Media,
+    start_mm: tuple[float, float, float],
+    radius_mm: float,
+) -> DiscFit:
+    """Fit a dot's disc to the pixels that see the surroundings of its first guess, in image axes."""
+    x, y, z = start_mm
+    distance = float(equivalent_object_distance(z, camera.focus_distance_mm, media))
+    forward = camera.image_distance_mm / distance
+    pitch = float(camera.lattice.pitch.max())
+    reach = min(0.5 * board.spacing_mm, radius_mm + MARGIN_LENSES * pitch / forward)
+    blur = abs(float(camera.defocus(distance))) * camera.aperture_radius_mm
+    half = (forward * reach + blur + pitch) / camera.pixel_mm
+    middle = camera.mm_to_px(-forward * np.array([x, y]))
+    low = np.maximum(np.floor(middle - half), 0).astype(np.int64)
+    high = np.minimum(np.ceil(middle + half) + 1, [camera.columns, camera.rows]).astype(np.int64)
+    row, column = (axis.ravel() for axis in np.mgrid[low[1] : high[1], low[0] : high[0]])
+    rays = pixel_rays(camera, column, row)
+    near = np.hypot(*(scene_points(rays, camera, media, z) - (x, y)).T) <= reach
+    through = np.hypot(*lens_crossings(rays, camera).T) <= camera.aperture_radius_mm
+    kept = near & through & (passed[row, column] > 0.0)
+    chosen = replace(rays, place_mm=rays.place_mm[kept], lens_mm=rays.lens_mm[kept], ideal_mm=rays.ideal_mm[kept])
+    light = passed[row, column][kept].astype(np.float64)
+    return fit_disc(
+        signal[row, column][kept], light, chosen, np.array(start_mm, dtype=np.float64), radius_mm, camera, media
+    )

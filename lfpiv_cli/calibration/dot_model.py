@@ -1,0 +1,278 @@
+"""What a small bright disc in the scene looks like on the sensor, and the disc that explains given pixels best.
+
+Axes: image axes (x along the columns, y along the rows), lengths in mm about the optical axis, z away from the camera
+from the focal plane. Rays are followed backwards: a place on the sensor under a microlens names one point of the main
+lens per point of the microlens, and all of a microlens is, seen in the scene, a small polygon. A pixel's light is the
+share of this polygon that the disc covers, exactly, times what the pixel passes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from lfpiv_cli.errors import InputError
+from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.media import Media, equivalent_object_distance
+from lfpiv_cli.optics.microlenses import Lattice
+
+# A pixel's own width is sampled at its middle while the light it stands for is narrower than this share of the disc's
+# radius in the scene, else at 3 x 3 places, which leaves a tenth of the spread out.
+SHARP_SHARE = 0.2
+BLURRED_SAMPLES = 3
+# Differences for derivatives: a thousandth of the radius is far above rounding and far below the disc's own curvature.
+STEP_PER_RADIUS = 1e-3
+# Gauss-Newton starts within the disc and settles in about five rounds; a step that raises the misfit is halved.
+FIT_ROUNDS = 20
+FIT_HALVINGS = 6
+FIT_TOLERANCE_PER_RADIUS = 1e-5
+# Undoing r' = r (1 + k1 r^2) by repetition: each round gains a factor 3 k1 r^2, below 0.01 for usable lenses.
+UNDISTORT_ROUNDS = 6
+
+
+@dataclass(frozen=True, eq=False)
+class PixelRays:
+    """Pixels and the microlenses they lie under.
+
+    Attributes
+    ----------
+    place_mm : (n, 2) the pixels' centres on the sensor
+    lens_mm : (n, 2) centres of their microlenses on the array
+    ideal_mm : (n, 2) where the main lens would have sent the rays to these centres without its distortion
+    """
+
+    place_mm: NDArray[np.float64]
+    lens_mm: NDArray[np.float64]
+    ideal_mm: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class DiscFit:
+    """A disc fitted to pixels.
+
+    Attributes
+    ----------
+    position_mm : (3,) x, y in image axes, z in the medium
+    covariance_mm2 : (3, 3) of the position
+    brightness, background : light of the disc and around it, in the image's unit at full transmission
+    rms : root mean square misfit, in the image's unit
+    converged : the steps became small before the rounds were used up
+    """
+
+    position_mm: NDArray[np.float64]
+    covariance_mm2: NDArray[np.float64]
+    brightness: float
+    background: float
+    rms: float
+    converged: bool
+
+
+def pixel_rays(camera: Camera, column: NDArray[np.int64], row: NDArray[np.int64]) -> PixelRays:
+    """Return the rays of pixels: the microlens of a pixel is that of the nearest micro-image."""
+    px = np.stack([column, row], axis=-1).astype(np.float64)
+    lens = camera.lattice.points(camera.micro_image_lattice_px().nearest(px))
+    return PixelRays(camera.px_to_mm(px), lens, undistorted(lens, camera.distortion_per_mm2))
+
+
+def undistorted(points_mm: NDArray[np.float64], distortion_per_mm2: float) -> NDArray[np.float64]:
+    """Return the points (n, 2) that r' = r (1 + k1 r^2) carries to the given ones."""
+    ideal = points_mm
+    for _ in range(UNDISTORT_ROUNDS if distortion_per_mm2 else 0):
+        ideal = points_mm / (1.0 + distortion_per_mm2 * np.sum(ideal**2, axis=-1, keepdims=True))
+    return ideal
+
+
+def lens_crossings(rays: PixelRays, camera: Camera) -> NDArray[np.float64]:
+    """Return where on the main lens (n, 2) the light comes from that reaches each pixel through its lens's centre."""
+    stretch = camera.image_distance_mm / camera.microlens_distance_mm
+    return rays.ideal_mm - (rays.place_mm - rays.lens_mm) * stretch
+
+
+def scene_points(rays: PixelRays, camera: Camera, media: Media, z_mm: float) -> NDArray[np.float64]:
+    """Return where in the plane z (n, 2) the light starts that reaches each pixel through its lens's centre.
+
+    From x_m = alpha X - x s_i/s_o.
+    """
+    distance = float(equivalent_object_distance(z_mm, camera.focus_distance_mm, media))
+    alpha = float(camera.defocus(distance))
+    back = distance / camera.image_distance_mm
+    return (alpha * lens_crossings(rays, camera) - rays.ideal_mm) * back
+
+
+def lens_cell(lattice: Lattice) -> NDArray[np.float64]:
+    """Return the corners (4 or 6, 2) of the region nearest to one lattice point, about that point, in order."""
+    first, second = lattice.basis
+    if lattice.layout == "square":
+        return np.array([-first - second, first - second, first + second, second - first]) / 2.0
+    half = np.array([first + second, 2.0 * second - first, second - 2.0 * first]) / 3.0
+    return np.concatenate([half, -half])
+
+
+def disc_shares(
+    rays: PixelRays, position_mm: NDArray[np.float64], radius_mm: float, camera: Camera, media: Media
+) -> NDArray[np.float64]:
+    """Return for each pixel the share (n,) of the scene it sees at depth z that a disc there covers.
+
+    `position_mm` is (x, y, z) in image axes.
+    """
+    distance = float(equivalent_object_distance(position_mm[2], camera.focus_distance_mm, media))
+    alpha = float(camera.defocus(distance))
+    back = distance / camera.image_distance_mm
+    stretch = camera.image_distance_mm / camera.microlens_distance_mm
+    # How the scene point moves as the ray moves over its microlens: X follows too where the sensor is out of its focus.
+    unfocused = 1.0 - camera.microlens_distance_mm / camera.microlens_focal_length_mm
+    cell = lens_cell(camera.lattice) * ((alpha * (1.0 + unfocused * stretch) - 1.0) * back)
+    pixel = abs(alpha * stretch * back * camera.pixel_mm)
+    samples = 1 if pixel < SHARP_SHARE * radius_mm else BLURRED_SAMPLES
+    middle = scene_points(rays, camera, media, float(position_mm[2])) - position_mm[:2]
+    return covered_shares(middle, cell, radius_mm, pixel, samples)
+
+
+@njit(cache=True)
+def covered_shares(
+    middle: NDArray[np.float64], cell: NDArray[np.float64], radius: float, width: float, samples: int
+) -> NDArray[np.float64]:
+    """Return the mean share of `cell`, moved to `middle` and over a square of `width` around it, inside the disc."""
+    area = 0.0
+    reach = 0.0
+    for k in range(cell.shape[0]):
+        following = (k + 1) % cell.shape[0]
+        area += 0.5 * (cell[k, 0] * cell[following, 1] - cell[k, 1] * cell[following, 0])
+        reach = max(reach, np.sqrt(cell[k, 0] ** 2 + cell[k, 1] ** 2))
+    shares = np.zeros(middle.shape[0])
+    for n in range(middle.shape[0]):
+        total = 0.0
+        for a in range(samples):
+            for b in range(samples):
+                x = middle[n, 0] + width * ((a + 0.5) / samples - 0.5)
+                y = middle[n, 1] + width * ((b + 0.5) / samples - 0.5)
+                distance = np.sqrt(x * x + y * y)
+                if distance + reach <= radius:
+                    total += 1.0
+                elif distance - reach < radius:
+                    total += disc_polygon_area(x, y, cell, radius) / area
+        shares[n] = total / (samples * samples)
+    return shares
+
+
+@njit(cache=True)
+def disc_polygon_area(x: float, y: float, cell: NDArray[np.float64], radius: float) -> float:
+    """Return the area shared by a disc about (0, 0) and the polygon `cell` moved by (x, y), with the polygon's sign."""
+    area = 0.0
+    for k in range(cell.shape[0]):
+        following = (k + 1) % cell.shape[0]
+        area += disc_triangle_area(
+            x + cell[k, 0], y + cell[k, 1], x + cell[following, 0], y + cell[following, 1], radius
+        )
+    return area
+
+
+@njit(cache=True)
+def sector_area(ax: float, ay: float, bx: float, by: float, radius: float) -> float:
+    """Return the signed area of the disc's sector between the directions of a and b."""
+    return 0.5 * radius * radius * np.arctan2(ax * by - ay * bx, ax * bx + ay * by)
+
+
+@njit(cache=True)
+def disc_triangle_area(ax: float, ay: float, bx: float, by: float, radius: float) -> float:
+    """Return the signed area shared by a disc about the origin and the triangle origin, a, b."""
+    dx, dy = bx - ax, by - ay
+    length2 = dx * dx + dy * dy
+    along = ax * dx + ay * dy
+    inside = along * along - length2 * (ax * ax + ay * ay - radius * radius)
+    if inside <= 0.0:
+        return sector_area(ax, ay, bx, by, radius)
+    enter = (-along - np.sqrt(inside)) / length2
+    leave = (-along + np.sqrt(inside)) / length2
+    if enter >= 1.0 or leave <= 0.0:
+        return sector_area(ax, ay, bx, by, radius)
+    enter, leave = max(enter, 0.0), min(leave, 1.0)
+    px, py = ax + enter * dx, ay + enter * dy
+    qx, qy = ax + leave * dx, ay + leave * dy
+    return sector_area(ax, ay, px, py, radius) + 0.5 * (px * qy - py * qx) + sector_area(qx, qy, bx, by, radius)
+
+
+def fit_disc(
+    signal: NDArray[np.float64],
+    passed: NDArray[np.float64],
+    rays: PixelRays,
+    start_mm: NDArray[np.float64],
+    radius_mm: float,
+    camera: Camera,
+    media: Media,
+) -> DiscFit:
+    """Fit a disc of known radius to pixels by least squares: x, y, z, brightness and background are free.
+
+    Parameters
+    ----------
+    signal, passed : (n,) light on the pixels and the share of light that each passes
+    start_mm : (3,) first guess, in image axes, within about the radius
+    """
+
+    def linear_fit(position: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+        shares = disc_shares(rays, position, radius_mm, camera, media)
+        design = np.stack([passed * shares, passed], axis=1)
+        levels = np.asarray(np.linalg.lstsq(design, signal, rcond=None)[0], dtype=np.float64)
+        return shares, levels, float(np.sum((signal - design @ levels) ** 2))
+
+    step_z = camera.focus_distance_mm / (camera.aperture_radius_mm * media.depth_ratio)
+    steps = STEP_PER_RADIUS * radius_mm * np.array([1.0, 1.0, step_z])
+    position = np.asarray(start_mm, dtype=np.float64)
+    shares, levels, misfit = linear_fit(position)
+    converged = False
+    for _ in range(FIT_ROUNDS):
+        design = disc_design(shares, passed, levels[0], rays, position, steps, radius_mm, camera, media)
+        residual = signal - passed * (levels[0] * shares + levels[1])
+        move = np.linalg.lstsq(design, residual, rcond=None)[0][:3] * steps
+        for _ in range(FIT_HALVINGS):
+            trial = linear_fit(position + move)
+            if trial[2] <= misfit:
+                break
+            move = 0.5 * move
+        if trial[2] <= misfit:
+            position = position + move
+            shares, levels, misfit = trial
+        converged = bool(np.all(np.abs(move) <= FIT_TOLERANCE_PER_RADIUS / STEP_PER_RADIUS * steps))
+        if converged or trial[2] > misfit:
+            break
+    design = disc_design(shares, passed, levels[0], rays, position, steps, radius_mm, camera, media)
+    variance = misfit / max(1, signal.size - design.shape[1])
+    covariance = np.linalg.pinv(design.T @ design)[:3, :3] * variance * np.outer(steps, steps)
+    rms = float(np.sqrt(misfit / signal.size))
+    return DiscFit(position, covariance, float(levels[0]), float(levels[1]), rms, converged)
+
+
+def disc_design(
+    shares: NDArray[np.float64],
+    passed: NDArray[np.float64],
+    brightness: float,
+    rays: PixelRays,
+    position: NDArray[np.float64],
+    steps: NDArray[np.float64],
+    radius_mm: float,
+    camera: Camera,
+    media: Media,
+) -> NDArray[np.float64]:
+    """Return the derivatives (n, 5) of the light to x, y, z (per step), brightness and background."""
+    columns = []
+    for axis in range(3):
+        offset = np.zeros(3)
+        offset[axis] = 0.5 * steps[axis]
+        ahead = disc_shares(rays, position + offset, radius_mm, camera, media)
+        behind = disc_shares(rays, position - offset, radius_mm, camera, media)
+        columns.append(brightness * passed * (ahead - behind))
+    return np.stack([*columns, passed * shares, passed], axis=1)
+
+
+def checked_disc_radius(radius_mm: float, camera: Camera) -> float:
+    """Return the radius, or say that the camera cannot resolve such a dot."""
+    seen = abs(camera.magnification) * radius_mm
+    if seen < 0.25 * float(camera.lattice.pitch.min()):
+        raise InputError(
+            f"the board's dots are {2 * seen:.3g} mm wide on the microlens array, less than half a microlens "
+            f"({float(camera.lattice.pitch.min()):.3g} mm); use a board with larger dots"
+        )
+    return radius_mm

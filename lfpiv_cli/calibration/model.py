@@ -1,0 +1,237 @@
+"""A calibration: what a white image and the picture of a board tell about a camera, and how it is stored.
+
+Axes: pixels are (column, row); world axes are those of the raw sensor, z away from the camera from the focal point.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from threadpoolctl import threadpool_limits
+
+from lfpiv_cli.calibration.board import locate_board
+from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose
+from lfpiv_cli.calibration.lattice import LatticeFit, fit_lattice
+from lfpiv_cli.calibration.rectification import Rectification
+from lfpiv_cli.calibration.transmission import relative_transmission
+from lfpiv_cli.errors import InputError
+from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.media import Media
+from lfpiv_cli.optics.microlenses import Lattice, Layout
+
+# A measured magnification replaces the data sheet's when it differs by more standard errors than chance explains.
+MAGNIFICATION_SIGMAS = 3.0
+
+
+@dataclass(frozen=True)
+class Channel:
+    """The channel that is looked into after the board: its inner width, its wall, and the camera's move in between.
+
+    `camera_move_mm` is positive towards the channel; None stands for Eq. 21's.
+    """
+
+    width_mm: float
+    wall_mm: float
+    camera_move_mm: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """What must be known of the bench to read the picture of a board.
+
+    Attributes
+    ----------
+    camera : as the data sheet has it
+    media : refractive indices in front of it
+    board : the dots
+    channel : to tell its mid plane; None where there is none
+    """
+
+    camera: Camera
+    media: Media
+    board: BoardGeometry
+    channel: Channel | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """What was measured.
+
+    Attributes
+    ----------
+    rectification : lattice of the raw image and the way to an upright one
+    transmission : (rows, columns) float32, share of light that pixels pass, rectified, 0 where unusable; or None
+    pose : of the board, or None
+    camera_move_mm : d_m of Eq. 21, or None
+    mid_plane_z_mm, mid_plane_z_sigma_mm : depth of the channel's mid plane in the fluid, or None
+    """
+
+    rectification: Rectification
+    transmission: NDArray[np.float32] | None = None
+    pose: BoardPose | None = None
+    camera_move_mm: float | None = None
+    mid_plane_z_mm: float | None = None
+    mid_plane_z_sigma_mm: float | None = None
+
+    @property
+    def fit(self) -> LatticeFit:
+        """The lattice of the raw image."""
+        return self.rectification.fit
+
+    @property
+    def image_shape(self) -> tuple[int, int]:
+        """(rows, columns) of the images it serves."""
+        return self.rectification.image_shape
+
+    def camera(self, camera: Camera) -> Camera:
+        """Return the data sheet's camera with the measured lattice, rectified, and the measured magnification.
+
+        Raises
+        ------
+        InputError
+            when the calibration was made with another sensor
+        """
+        if self.image_shape != (camera.rows, camera.columns):
+            raise InputError(
+                f"the calibration was made with images of {self.image_shape[0]} x {self.image_shape[1]} pixels (rows x "
+                f"columns) and the configured sensor has {camera.rows} x {camera.columns}"
+            )
+        if self.pose is not None:
+            difference = abs(self.pose.magnification - camera.magnification)
+            if difference > MAGNIFICATION_SIGMAS * self.pose.magnification_sigma:
+                camera = replace(camera, magnification=self.pose.magnification)
+        return camera.with_micro_images(self.rectification.lattice_px)
+
+    def summary(self) -> dict[str, Any]:
+        """Return the figures as plain numbers and lists, units in their names; None where unknown."""
+        lattice, fit, pose = self.fit.lattice_px, self.fit, self.pose
+        return {
+            "lenses": fit.lenses,
+            "pitch_px": lattice.pitch.tolist(),
+            "pitch_px_sigma": fit.pitch_sigma_px.tolist(),
+            "rotation_deg": float(np.rad2deg(lattice.rotation_rad)),
+            "rotation_deg_sigma": float(np.rad2deg(fit.rotation_sigma_rad)),
+            "origin_px": fit.centres((0, 0)).tolist(),
+            "origin_px_sigma": fit.origin_sigma_px.tolist(),
+            "residual_px": fit.residual_px.tolist(),
+            "k1_per_mm2": None,
+            "k1_per_mm2_sigma": None,
+            "board_z_mm": pose.z0_mm if pose else None,
+            "board_z_mm_sigma": pose.z0_sigma_mm if pose else None,
+            "tilt_deg": pose.tilt_deg.tolist() if pose else None,
+            "tilt_deg_sigma": pose.tilt_sigma_deg.tolist() if pose else None,
+            "offset_mm": pose.offset_mm.tolist() if pose else None,
+            "offset_mm_sigma": pose.offset_sigma_mm.tolist() if pose else None,
+            "magnification": pose.magnification if pose else None,
+            "magnification_sigma": pose.magnification_sigma if pose else None,
+            "camera_move_mm": self.camera_move_mm,
+            "mid_plane_z_mm": self.mid_plane_z_mm,
+            "mid_plane_z_mm_sigma": self.mid_plane_z_sigma_mm,
+        }
+
+    def to_tree(self) -> dict[str, Any]:
+        """Return everything as a nested dict of arrays, numbers, strings and None."""
+        fit = {field.name: getattr(self.fit, field.name) for field in fields(LatticeFit)}
+        lattice = fit.pop("lattice_px")
+        fit |= {"layout": lattice.layout, "origin_px": lattice.origin, "basis_px": lattice.basis}
+        pose = self.pose
+        return {
+            "image_shape": np.array(self.image_shape, dtype=np.int64),
+            "lattice": fit | {"cubic_used": int(self.fit.cubic_used)},
+            "transmission": self.transmission,
+            "board": {field.name: getattr(pose, field.name) for field in fields(BoardPose)} if pose else None,
+            "camera_move_mm": self.camera_move_mm,
+            "mid_plane_z_mm": self.mid_plane_z_mm,
+            "mid_plane_z_sigma_mm": self.mid_plane_z_sigma_mm,
+        }
+
+    @classmethod
+    def from_tree(cls, tree: Mapping[str, Any]) -> Calibration:
+        """Return the calibration that `to_tree` took apart.
+
+        Raises
+        ------
+        InputError
+            when something is missing
+        """
+        try:
+            fit = dict(tree["lattice"])
+            lattice = Lattice(fit.pop("origin_px"), fit.pop("basis_px"), fit.pop("layout"))
+            fit["cubic_used"] = bool(fit["cubic_used"])
+            rows, columns = (int(n) for n in tree["image_shape"])
+            return cls(
+                Rectification(LatticeFit(lattice_px=lattice, **fit), (rows, columns)),
+                tree.get("transmission"),
+                BoardPose(**tree["board"]) if tree.get("board") else None,
+                **{name: tree.get(name) for name in ("camera_move_mm", "mid_plane_z_mm", "mid_plane_z_sigma_mm")},
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(f"the calibration is not complete ({error}); make it again") from error
+
+
+def calibrate(
+    white: ArrayLike,
+    dark: ArrayLike | None = None,
+    board: ArrayLike | None = None,
+    *,
+    layout: Layout = "square",
+    rig: Rig | None = None,
+) -> Calibration:
+    """Calibrate from photographs.
+
+    Parameters
+    ----------
+    white, dark, board : (rows, columns) raw pictures of uniform light, of no light and of the dot board
+    layout : of the microlens array
+    rig : camera, media and board; needed for the board only
+
+    Raises
+    ------
+    InputError
+        when a picture cannot serve; it says why
+    """
+    # One BLAS thread: the same bits on every machine, and small problems gain nothing from more.
+    with threadpool_limits(limits=1, user_api="blas"):
+        fit = fit_lattice(white, dark, layout)
+        darkness = 0.0 if dark is None else np.asarray(dark, dtype=np.float64)
+        image = np.asarray(white, dtype=np.float64) - darkness
+        rectification = Rectification(fit, (image.shape[0], image.shape[1]))
+        transmission = relative_transmission(rectification.apply(image), rectification.lattice_px)
+        calibration = Calibration(rectification, transmission)
+        if board is None or rig is None:
+            return calibration
+        pose = board_pose(np.asarray(board, dtype=np.float64) - darkness, calibration, rig)
+    return with_mid_plane(replace(calibration, pose=pose), pose, rig)
+
+
+def board_pose(image: NDArray[np.float64], calibration: Calibration, rig: Rig) -> BoardPose:
+    """Return the pose of the board in its raw picture less the dark frame."""
+    rectification = calibration.rectification
+    camera = calibration.camera(rig.camera)
+    return locate_board(
+        rectification.apply(image), camera, rig.board, rig.media, rectification.rotation_rad, calibration.transmission
+    )
+
+
+def with_mid_plane(calibration: Calibration, pose: BoardPose, rig: Rig) -> Calibration:
+    """Return the calibration with the channel's mid plane, where there is a channel and the board stood in air."""
+    if rig.channel is None or rig.board.medium != "air":
+        return calibration
+    advised = eq21_move_mm(rig.board, rig.channel, rig.media)
+    moved = advised if rig.channel.camera_move_mm is None else rig.channel.camera_move_mm
+    return replace(
+        calibration,
+        camera_move_mm=advised,
+        mid_plane_z_mm=(pose.z0_mm + advised - moved) / rig.media.depth_ratio,
+        mid_plane_z_sigma_mm=pose.z0_sigma_mm / rig.media.depth_ratio,
+    )
+
+
+def eq21_move_mm(board: BoardGeometry, channel: Channel, media: Media) -> float:
+    """Return d_m = t_b + t_w/n_ag + D/(2 n_w), the camera's move from the board to the mid plane (Eq. 21), n_a = 1."""
+    wall = channel.wall_mm * media.air / media.window
+    return board.thickness_mm + wall + 0.5 * channel.width_mm * media.depth_ratio

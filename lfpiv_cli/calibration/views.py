@@ -1,0 +1,54 @@
+"""Sub-aperture views: what the scene looks like from one point of the main lens.
+
+Axes: images are [row, column]; places on the main lens are (X, Y) in mm in image axes, X along the columns. A view has
+one sample per microlens; neighbouring microlenses are neighbours in it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
+
+from lfpiv_cli.optics.camera import Camera
+
+
+def lens_table(camera: Camera) -> NDArray[np.int64]:
+    """Return the lattice indices (rows, columns, 2) of the lenses whose images are centred on the sensor.
+
+    The table is rectangular: on hexagons, whose second vector leans, each row starts where the leaning has led it.
+    """
+    lattice = camera.micro_image_lattice_px()
+    corners = np.array([(0, 0), (camera.columns - 1, 0), (0, camera.rows - 1), (camera.columns - 1, camera.rows - 1)])
+    j = lattice.coordinates(corners)[:, 1]
+    rows = np.arange(int(np.ceil(j.min())), int(np.floor(j.max())) + 1)
+    lean = rows // 2 if lattice.layout == "hexagonal" else np.zeros_like(rows)
+    left = (0.0 - lattice.points(np.stack([-lean, rows], axis=1))[:, 0]) / lattice.basis[0, 0]
+    right = left + (camera.columns - 1) / lattice.basis[0, 0]
+    columns = np.arange(int(np.ceil(left.max())), int(np.floor(right.min())) + 1)
+    table = np.stack(np.broadcast_arrays(columns[np.newaxis, :] - lean[:, np.newaxis], rows[:, np.newaxis]), axis=-1)
+    return table.astype(np.int64)
+
+
+def view_places_px(camera: Camera, crossing_mm: ArrayLike) -> NDArray[np.float64]:
+    """Return where on the sensor (column, row) the ray through (X, Y) and each lens's centre ends, (rows, columns, 2).
+
+    With x_m = s_ux in Eq. 1 the microlens does not bend the ray: x_s = s_ux + s_mu (s_ux - X)/s_i.
+    """
+    lens = camera.lattice.points(lens_table(camera))
+    step = (lens - np.asarray(crossing_mm, dtype=np.float64)) / camera.image_distance_mm
+    return camera.mm_to_px(lens + camera.microlens_distance_mm * step)
+
+
+def sub_aperture_view(image: ArrayLike, camera: Camera, crossing_mm: ArrayLike) -> NDArray[np.float64]:
+    """Return the view (lens rows, lens columns) from the point (X, Y) of the main lens, linearly interpolated.
+
+    Parameters
+    ----------
+    image : (rows, columns), rectified
+    camera : with the lattice of the rectified frame
+    crossing_mm : (2,) X, Y
+    """
+    places = view_places_px(camera, crossing_mm)
+    pixels = np.asarray(image, dtype=np.float64)
+    return ndimage.map_coordinates(pixels, [places[..., 1], places[..., 0]], order=1, mode="nearest")
