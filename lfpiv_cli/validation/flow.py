@@ -1,0 +1,222 @@
+"""Figures of merit of a measured flow against a known one.
+
+Streamwise figures take the component along the mean of the true flow, v for the measured one and u for the true one.
+A vector that is NaN is a miss: it lowers every share and is counted; means are over the vectors that were found. A
+figure that cannot be given is None, never NaN.
+
+Axes: arrays `[z, y, x]` with components (u, v, w) along (x, y, z) last; velocities in m/s.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from lfpiv_cli.errors import InputError
+from lfpiv_cli.flow.field import MASKED, MM_TO_M, REJECTED, REPLACED, SECOND_PEAK, VALID, VectorField
+
+# The paper's Fig. 18: the share of vectors within a quarter of the truth.
+TOLERANCE = 0.25
+# The cumulative distribution is given at every per cent of relative error up to 100.
+CUMULATIVE_STEPS = 101
+# A mean flow slower than this share of the mean speed is the remainder of a flow that has no direction (a vortex).
+SMALLEST_MEAN_FLOW = 0.05
+# Particles that a local linear fit takes: seven times its four unknowns, and close enough to the size of a window.
+FIT_PARTICLES = 28
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Measured and true velocities of the n windows inside, in m/s, and where each one lies.
+
+    Attributes
+    ----------
+    measured, true : (n, 3); `measured` is NaN for a miss
+    index_zyx : (n, 3) indices of the windows
+    direction : (3,) unit vector of the mean true flow, or None where it has no direction
+    """
+
+    measured: NDArray[np.float64]
+    true: NDArray[np.float64]
+    index_zyx: NDArray[np.int64]
+    direction: NDArray[np.float64] | None
+
+    @property
+    def found(self) -> NDArray[np.bool_]:
+        """Which windows are no miss, (n,)."""
+        return np.asarray(np.isfinite(self.measured).all(axis=1))
+
+
+def compare(field: VectorField, truth_velocity: NDArray[np.float64], inside: NDArray[np.bool_]) -> Comparison:
+    """Pair measured with true velocities at the windows `inside`; the truth may be anything elsewhere.
+
+    Raises
+    ------
+    InputError
+        The truth or the mask has another shape than the field, no window is inside, or the truth is not finite there.
+    """
+    shape = field.flag.shape
+    if truth_velocity.shape != (*shape, 3) or inside.shape != shape:
+        raise InputError(f"truth {truth_velocity.shape} and mask {inside.shape} do not fit vectors of shape {shape}")
+    if not inside.any():
+        raise InputError("none of the window centres lies inside the flow")
+    true = truth_velocity[inside]
+    if not np.isfinite(true).all():
+        raise InputError("the true velocity is not finite at some window centres inside the flow")
+    mean = true.mean(axis=0)
+    speed = float(np.linalg.norm(mean))
+    has_direction = speed > SMALLEST_MEAN_FLOW * float(np.linalg.norm(true, axis=1).mean())
+    return Comparison(field.velocity[inside], true, np.argwhere(inside), mean / speed if has_direction else None)
+
+
+def flow_figures(field: VectorField, truth_velocity: NDArray[np.float64], inside: NDArray[np.bool_]) -> dict[str, Any]:
+    """Return the figures of a measured flow, ready for JSON.
+
+    Parameters
+    ----------
+    truth_velocity : (nz, ny, nx, 3) m/s at the window centres
+    inside : (nz, ny, nx) True for the windows that are judged
+
+    Returns
+    -------
+    dict
+        Counts; `streamwise_mean_error` (sum v / sum u - 1); `within_25_percent_streamwise` and `..._vector` (shares of
+        all windows inside); `rms_u_voxel`, `bias_u_voxel` and so on for v, w; `slices` along each axis; `cumulative`.
+    """
+    pairs = compare(field, truth_velocity, inside)
+    streamwise, vector = relative_errors(pairs)
+    figures: dict[str, Any] = _counts(field, inside)
+    figures["streamwise_direction"] = None if pairs.direction is None else pairs.direction.tolist()
+    figures["streamwise_mean_error"] = _mean_error(*_streamwise_sums(pairs, pairs.found))
+    figures["within_25_percent_streamwise"] = None if streamwise is None else float(np.mean(streamwise < TOLERANCE))
+    figures["within_25_percent_vector"] = float(np.mean(vector < TOLERANCE))
+    figures |= _component_figures(field, pairs)
+    figures["slices"] = {name: _slices(field, pairs, axis) for axis, name in enumerate("xyz")}
+    figures["cumulative"] = cumulative_distribution(pairs)
+    return figures
+
+
+def _counts(field: VectorField, inside: NDArray[np.bool_]) -> dict[str, int]:
+    """Return how many windows there are, of each flag, and how many are missing."""
+    flags = field.flag[inside]
+    names = {VALID: "valid", REPLACED: "replaced", SECOND_PEAK: "second_peak", REJECTED: "rejected", MASKED: "masked"}
+    counts = {"vectors": int(field.flag.size), "vectors_inside": int(flags.size)}
+    counts |= {f"vectors_{name}": int(np.sum(flags == flag)) for flag, name in names.items()}
+    counts["vectors_missing"] = int(np.sum(~np.isfinite(field.velocity[inside]).all(axis=1)))
+    return counts
+
+
+def relative_errors(pairs: Comparison) -> tuple[NDArray[np.float64] | None, NDArray[np.float64]]:
+    """Return |v - u|/|u| streamwise (None without a direction) and of the whole vector, (n,); infinite for a miss.
+
+    Where the truth is zero, only an exact zero is right, and every error infinite.
+    """
+    difference = pairs.measured - pairs.true
+    vector = _ratio(np.linalg.norm(difference, axis=1), np.linalg.norm(pairs.true, axis=1))
+    if pairs.direction is None:
+        return None, vector
+    return _ratio(np.abs(difference @ pairs.direction), np.abs(pairs.true @ pairs.direction)), vector
+
+
+def _ratio(error: NDArray[np.float64], size: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return error / size; 0 for 0/0, infinite for a NaN error or a zero size."""
+    ratio = np.where(error == 0.0, 0.0, np.inf)
+    np.divide(error, size, out=ratio, where=(size > 0.0) & np.isfinite(error))
+    return ratio
+
+
+def _streamwise_sums(pairs: Comparison, chosen: NDArray[np.bool_]) -> tuple[float, float]:
+    """Return the sums of v and u over chosen windows that were found; both 0 where the flow has no direction."""
+    chosen = chosen & pairs.found
+    if pairs.direction is None:
+        return 0.0, 0.0
+    return float(np.sum(pairs.measured[chosen] @ pairs.direction)), float(np.sum(pairs.true[chosen] @ pairs.direction))
+
+
+def _mean_error(measured_sum: float, true_sum: float) -> float | None:
+    """Return sum v / sum u - 1, or None where the true sum is not positive."""
+    return measured_sum / true_sum - 1.0 if true_sum > 0.0 else None
+
+
+def _component_figures(field: VectorField, pairs: Comparison) -> dict[str, float | None]:
+    """Return rms and bias of each component in voxels over the vectors found."""
+    names = [f"{figure}_{component}_voxel" for component in "uvw" for figure in ("rms", "bias")]
+    if field.dt_s is None or not pairs.found.any():
+        return dict.fromkeys(names)
+    to_voxel = field.dt_s / (np.asarray(field.voxel_mm) * MM_TO_M)
+    error = (pairs.measured - pairs.true)[pairs.found] * to_voxel
+    rms, bias = np.sqrt(np.mean(error**2, axis=0)), np.mean(error, axis=0)
+    return dict(zip(names, (float(value) for pair in zip(rms, bias, strict=True) for value in pair), strict=True))
+
+
+def _slices(field: VectorField, pairs: Comparison, axis: int) -> dict[str, list[float | None]]:
+    """Return the streamwise mean error of every plane of windows across an axis (0 for x), with its position."""
+    plane = pairs.index_zyx[:, 2 - axis]
+    count = field.grid.shape_xyz[axis]
+    errors = [_mean_error(*_streamwise_sums(pairs, plane == k)) for k in range(count)]
+    return {"position_mm": [float(p) for p in field.grid.axis_mm(axis)], "streamwise_mean_error": list(errors)}
+
+
+def streamwise_mean_error_at(field: VectorField, pairs: Comparison, axis: int, position_mm: float) -> float | None:
+    """Return the streamwise mean error of a slice across an axis (0 for x), between planes of windows if need be.
+
+    The sums of v and of u, not their ratio, are interpolated; beyond the outer planes the outer one is taken.
+    """
+    plane = pairs.index_zyx[:, 2 - axis]
+    sums = np.array([_streamwise_sums(pairs, plane == k) for k in range(field.grid.shape_xyz[axis])])
+    positions = field.grid.axis_mm(axis)
+    return _mean_error(
+        float(np.interp(position_mm, positions, sums[:, 0])), float(np.interp(position_mm, positions, sums[:, 1]))
+    )
+
+
+def cumulative_distribution(pairs: Comparison) -> dict[str, Any]:
+    """Return the shares of all windows whose relative error is at most 0, 1, ... 100 per cent (the paper's Fig. 18)."""
+    limits = np.linspace(0.0, 1.0, CUMULATIVE_STEPS)
+    streamwise, vector = relative_errors(pairs)
+
+    def shares(errors: NDArray[np.float64]) -> list[float]:
+        return (np.searchsorted(np.sort(errors), limits, side="right") / errors.size).tolist()
+
+    return {
+        "relative_error": limits.tolist(),
+        "streamwise_share": None if streamwise is None else shares(streamwise),
+        "vector_share": shares(vector),
+    }
+
+
+def truth_at_points(
+    positions_mm: NDArray[np.float64], velocities: NDArray[np.float64], centres_mm: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the velocity of a list of true particles at given points, by a linear fit to the nearest ones of each.
+
+    Parameters
+    ----------
+    positions_mm, velocities : (n, 3) of the particles, half-way between the exposures; m/s
+    centres_mm : (..., 3) points, for instance window centres
+
+    Returns
+    -------
+    (..., 3) m/s; exact for a linear flow wherever the particles are enough and not in one plane
+
+    Raises
+    ------
+    InputError
+        There are no particles, or the two lists differ in shape.
+    """
+    if positions_mm.shape != velocities.shape or positions_mm.ndim != 2 or positions_mm.shape[0] == 0:
+        raise InputError(f"{positions_mm.shape} positions and {velocities.shape} velocities make no list of particles")
+    points = centres_mm.reshape(-1, 3)
+    count = min(FIT_PARTICLES, positions_mm.shape[0])
+    distance, nearest = KDTree(positions_mm).query(points, k=np.arange(1, count + 1))
+    # Offsets in units of the fit's reach: the columns of the fit are then comparable, and a rank can be judged.
+    reach = np.where(distance[:, -1:] > 0.0, distance[:, -1:], 1.0)[..., np.newaxis]
+    offsets = (positions_mm[nearest] - points[:, np.newaxis, :]) / reach
+    design = np.concatenate([np.ones((*offsets.shape[:2], 1)), offsets], axis=-1)
+    # The pseudo-inverse's first row is the value at the point; with too few particles it is the smallest solution.
+    fitted = np.einsum("mk,mkc->mc", np.linalg.pinv(design)[:, 0], velocities[nearest])
+    return fitted.reshape(centres_mm.shape)

@@ -1,0 +1,188 @@
+"""Figures of merit, against cases worked out by hand."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lfpiv_cli.errors import InputError
+from lfpiv_cli.flow.field import REJECTED, VALID, VectorField
+from lfpiv_cli.grid import Grid
+from lfpiv_cli.validation.flow import compare, flow_figures, streamwise_mean_error_at, truth_at_points
+
+SHAPE = (4, 3, 5)
+VOXEL_MM = (0.1, 0.1, 0.2)
+DT_S = 0.001
+
+
+def field_of(velocity: NDArray[np.float64]) -> VectorField:
+    """A field with given velocities in m/s, in which every vector is valid."""
+    nz, ny, nx = velocity.shape[:3]
+    displacement = velocity * DT_S / (np.array(VOXEL_MM) * 1e-3)
+    ones = np.ones((nz, ny, nx))
+    flag = np.full((nz, ny, nx), VALID, dtype=np.uint8)
+    grid = Grid((nx, ny, nz), (0.8, 0.8, 1.6), (0.0, 0.0, 0.0))
+    return VectorField(grid, displacement, displacement, ones, ones, ones, flag, None, VOXEL_MM, DT_S, (16, 16, 16))
+
+
+@pytest.fixture
+def truth() -> NDArray[np.float64]:
+    """A flow along y that grows with x."""
+    velocity = np.zeros((*SHAPE, 3))
+    velocity[..., 1] = 0.1 * (1.0 + np.arange(5))
+    return velocity
+
+
+@pytest.fixture
+def inside() -> NDArray[np.bool_]:
+    return np.ones(SHAPE, dtype=np.bool_)
+
+
+def test_the_truth_itself_has_no_error(truth: NDArray[np.float64], inside: NDArray[np.bool_]) -> None:
+    figures = flow_figures(field_of(truth), truth, inside)
+    assert figures["streamwise_mean_error"] == pytest.approx(0.0, abs=1e-12)
+    assert figures["within_25_percent_streamwise"] == figures["within_25_percent_vector"] == 1.0
+    assert figures["rms_v_voxel"] == pytest.approx(0.0, abs=1e-12)
+    assert figures["streamwise_direction"] == pytest.approx([0.0, 1.0, 0.0])
+
+
+def test_components_are_in_their_own_voxels(truth: NDArray[np.float64], inside: NDArray[np.bool_]) -> None:
+    measured = truth + (0.01, -0.02, 0.04)
+    measured[::2] += (0.02, 0.0, 0.0)
+    figures = flow_figures(field_of(measured), truth, inside)
+    # 0.01 m/s in 1 ms is 0.01 mm: 0.1 voxel along x, and 0.05 voxel along z.
+    assert figures["bias_u_voxel"] == pytest.approx(0.2)
+    assert figures["rms_u_voxel"] == pytest.approx(np.sqrt((0.1**2 + 0.3**2) / 2))
+    assert figures["bias_v_voxel"] == pytest.approx(-0.2)
+    assert figures["bias_w_voxel"] == pytest.approx(0.2)
+
+
+def test_streamwise_and_full_vector_shares_differ(truth: NDArray[np.float64], inside: NDArray[np.bool_]) -> None:
+    measured = truth.copy()
+    measured[0, ..., 1] *= 1.3
+    measured[1, ..., 2] += 0.3 * truth[1, ..., 1]
+    measured[2, ..., 1] *= 1.2
+    figures = flow_figures(field_of(measured), truth, inside)
+    assert figures["within_25_percent_streamwise"] == pytest.approx(0.75)
+    assert figures["within_25_percent_vector"] == pytest.approx(0.5)
+    assert figures["streamwise_mean_error"] == pytest.approx(0.5 / 4)
+
+
+def test_a_miss_lowers_the_shares_and_leaves_the_means(truth: NDArray[np.float64], inside: NDArray[np.bool_]) -> None:
+    field = field_of(truth)
+    flag = field.flag.copy()
+    flag[0] = REJECTED
+    figures = flow_figures(replace(field, flag=flag), truth, inside)
+    assert figures["vectors_missing"] == figures["vectors_rejected"] == 15
+    assert figures["within_25_percent_streamwise"] == pytest.approx(0.75)
+    assert figures["streamwise_mean_error"] == pytest.approx(0.0, abs=1e-12)
+    assert figures["cumulative"]["streamwise_share"][-1] == pytest.approx(0.75)
+    assert figures["slices"]["z"]["streamwise_mean_error"][0] is None
+
+
+def test_windows_outside_count_for_nothing(truth: NDArray[np.float64], inside: NDArray[np.bool_]) -> None:
+    measured = truth.copy()
+    inside[:, :, 0] = False
+    measured[:, :, 0] = 9.0
+    truth[:, :, 0] = np.nan
+    figures = flow_figures(field_of(measured), truth, inside)
+    assert figures["vectors_inside"] == 48
+    assert figures["within_25_percent_vector"] == 1.0
+
+
+@pytest.mark.parametrize("dt_s", [None, DT_S])
+def test_figures_are_valid_json_without_nan(
+    dt_s: float | None, truth: NDArray[np.float64], inside: NDArray[np.bool_]
+) -> None:
+    field = field_of(truth)
+    rejected = np.full(SHAPE, REJECTED, dtype=np.uint8)
+    figures = flow_figures(replace(field, flag=rejected, dt_s=dt_s), truth, inside)
+    json.dumps(figures, allow_nan=False)
+    assert figures["within_25_percent_streamwise"] == 0.0
+    assert figures["streamwise_mean_error"] is None
+    assert figures["rms_u_voxel"] is None
+
+
+def test_a_vortex_has_no_streamwise_figures(inside: NDArray[np.bool_]) -> None:
+    x = np.broadcast_to(np.arange(5) - 2.0, SHAPE)
+    truth = np.stack([np.zeros(SHAPE), 0.1 * x, np.zeros(SHAPE)], axis=-1)
+    figures = flow_figures(field_of(truth), truth, inside)
+    assert figures["streamwise_direction"] is None
+    assert figures["within_25_percent_streamwise"] is None
+    assert figures["within_25_percent_vector"] == 1.0
+
+
+def test_slices_are_planes_and_between_them_interpolated(truth: NDArray[np.float64], inside: NDArray[np.bool_]) -> None:
+    measured = truth.copy()
+    measured[..., 0, 1] *= 1.2
+    field = field_of(measured)
+    slices = flow_figures(field, truth, inside)["slices"]
+    np.testing.assert_allclose(slices["x"]["streamwise_mean_error"], [0.2, 0.0, 0.0, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(slices["x"]["position_mm"], [0.0, 0.8, 1.6, 2.4, 3.2])
+    pairs = compare(field, truth, inside)
+    # Half-way between the planes of 0.1 (measured 0.12) and 0.2 m/s.
+    assert streamwise_mean_error_at(field, pairs, 0, 0.4) == pytest.approx(0.32 / 0.3 - 1.0)
+
+
+def test_cumulative_distribution_meets_the_share(
+    truth: NDArray[np.float64], inside: NDArray[np.bool_], rng: np.random.Generator
+) -> None:
+    figures = flow_figures(field_of(truth * rng.uniform(0.5, 1.5, SHAPE)[..., np.newaxis]), truth, inside)
+    shares = figures["cumulative"]["streamwise_share"]
+    assert np.all(np.diff(shares) >= 0.0)
+    assert shares[25] == pytest.approx(figures["within_25_percent_streamwise"])
+
+
+@pytest.mark.parametrize("what", ["shape", "nothing inside", "truth"])
+def test_what_cannot_be_compared_is_refused(what: str, truth: NDArray[np.float64], inside: NDArray[np.bool_]) -> None:
+    field = field_of(truth)
+    if what == "shape":
+        truth = truth[1:]
+    elif what == "truth":
+        truth = np.full_like(truth, np.nan)
+    else:
+        inside = ~inside
+    with pytest.raises(InputError):
+        flow_figures(field, truth, inside)
+
+
+def test_truth_from_particles_is_exact_for_a_linear_flow(rng: np.random.Generator) -> None:
+    gradient = rng.normal(size=(3, 3))
+    positions = rng.uniform(-5.0, 5.0, (400, 3))
+    velocities = positions @ gradient + (0.1, 0.2, 0.3)
+    centres = rng.uniform(-5.0, 5.0, (2, 3, 4, 3))
+    fitted = truth_at_points(positions, velocities, centres)
+    np.testing.assert_allclose(fitted, centres @ gradient + (0.1, 0.2, 0.3), atol=1e-9)
+
+
+@pytest.mark.parametrize("count", [1, 3, 40])
+def test_truth_from_few_or_level_particles_stays_finite(count: int, rng: np.random.Generator) -> None:
+    positions = rng.uniform(-1.0, 1.0, (count, 3))
+    positions[:, 2] = 0.0
+    velocities = np.tile([0.1, 0.0, 0.0], (count, 1))
+    fitted = truth_at_points(positions, velocities, np.zeros((1, 3)))
+    np.testing.assert_allclose(fitted[0, 1:], 0.0, atol=1e-12)
+    assert 0.0 < fitted[0, 0] <= 0.1 + 1e-9
+
+
+def test_truth_needs_particles() -> None:
+    with pytest.raises(InputError):
+        truth_at_points(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((1, 3)))
+
+
+def test_picture_shows_a_field_with_misses(truth: NDArray[np.float64], inside: NDArray[np.bool_]) -> None:
+    pytest.importorskip("matplotlib")
+    from lfpiv_cli.validation.pictures import flow_figure
+
+    field = field_of(truth * 1.1)
+    flag = field.flag.copy()
+    flag[:, 0] = REJECTED
+    figure = flow_figure(replace(field, flag=flag), truth, inside)
+    figure.canvas.draw()
+    measured = figure.axes[3].lines[1].get_ydata()
+    np.testing.assert_allclose(measured, 1.1 * truth[0, 1, :, 1])
+    assert all(axes.get_xlabel() and axes.get_ylabel() for axes in figure.axes[:6])
