@@ -12,7 +12,14 @@ from numpy.typing import NDArray
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.flow.field import REJECTED, VALID, VectorField
 from lfpiv_cli.grid import Grid
-from lfpiv_cli.validation.flow import compare, flow_figures, streamwise_mean_error_at, truth_at_points
+from lfpiv_cli.validation.flow import (
+    compare,
+    cumulative_distribution,
+    flow_figures,
+    relative_errors,
+    streamwise_mean_error_at,
+    truth_at_points,
+)
 
 SHAPE = (4, 3, 5)
 VOXEL_MM = (0.1, 0.1, 0.2)
@@ -82,6 +89,22 @@ def test_a_miss_lowers_the_shares_and_leaves_the_means(truth: NDArray[np.float64
     assert figures["streamwise_mean_error"] == pytest.approx(0.0, abs=1e-12)
     assert figures["cumulative"]["streamwise_share"][-1] == pytest.approx(0.75)
     assert figures["slices"]["z"]["streamwise_mean_error"][0] is None
+
+
+def test_relative_error_of_misses_and_of_fluid_at_rest(inside: NDArray[np.bool_]) -> None:
+    truth = np.zeros((*SHAPE, 3))
+    truth[..., 1] = 0.125
+    truth[0, 0, :2] = 0.0
+    measured = truth.copy()
+    measured[0, 0, 1] = 0.125
+    measured[0, 0, 2] = np.nan
+    pairs = compare(field_of(truth), truth, inside)
+    streamwise, vector = relative_errors(replace(pairs, measured=measured.reshape(-1, 3)))
+    for errors in (streamwise, vector):
+        assert errors is not None
+        np.testing.assert_array_equal(errors[:4], [0.0, np.inf, np.inf, 0.0])
+    shares = cumulative_distribution(replace(pairs, measured=measured.reshape(-1, 3)))
+    assert shares["vector_share"][0] == shares["vector_share"][-1] == pytest.approx(58 / 60)
 
 
 def test_windows_outside_count_for_nothing(truth: NDArray[np.float64], inside: NDArray[np.bool_]) -> None:
