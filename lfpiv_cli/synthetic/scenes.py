@@ -1,0 +1,230 @@
+"""Recorded images of known scenes, with their truth: white light, a board, pairs of tracers in a flow.
+
+Axes: world axes, origin at the nominal focal point in the medium that the scene stands in, z away from the camera. The
+truth of tracers is that of the middle of the pair.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lfpiv_cli.calibration.board_pose import BoardGeometry
+from lfpiv_cli.errors import ConfigError
+from lfpiv_cli.grid import Grid
+from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.media import Media, Window
+from lfpiv_cli.synthetic.board import BoardPlacement, dot_centres, render_board
+from lfpiv_cli.synthetic.flows import Flow, advect
+from lfpiv_cli.synthetic.render import RAYS, ObjectSpace, render_points, render_white
+from lfpiv_cli.synthetic.sensor import Readout
+
+Triple = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Misalignment:
+    """How a real camera departs from its data sheet.
+
+    Attributes
+    ----------
+    rotation_deg : of the microlens array about the axis, from the columns towards the rows
+    shift_px : of the array, (columns, rows), in pixels at the array
+    distortion_per_mm2 : k1
+    """
+
+    rotation_deg: float = 0.0
+    shift_px: tuple[float, float] = (0.0, 0.0)
+    distortion_per_mm2: float = 0.0
+
+    def apply(self, camera: Camera) -> Camera:
+        """Return the camera, turned first, then shifted, with this distortion."""
+        cosine, sine = np.cos(np.deg2rad(self.rotation_deg)), np.sin(np.deg2rad(self.rotation_deg))
+        shift = np.asarray(self.shift_px) * camera.pixel_mm
+        lattice = camera.lattice.transformed([[cosine, -sine], [sine, cosine]], shift)
+        return replace(camera, lattice=lattice, distortion_per_mm2=self.distortion_per_mm2)
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box of space, from `low_mm` to `high_mm`, (x, y, z)."""
+
+    low_mm: Triple
+    high_mm: Triple
+
+    @classmethod
+    def around(cls, volume: Grid, margin_mm: Triple) -> Box:
+        """Return the volume's box with a margin on both sides of each axis: tracers beyond it light its pixels too."""
+        bounds = [volume.bounds_mm(axis) for axis in range(3)]
+        low = [b[0] - m for b, m in zip(bounds, margin_mm, strict=True)]
+        high = [b[1] + m for b, m in zip(bounds, margin_mm, strict=True)]
+        return cls((low[0], low[1], low[2]), (high[0], high[1], high[2]))
+
+    def within(self, other: Box) -> Box:
+        """Return the part that lies in another box.
+
+        Raises
+        ------
+        ConfigError : they have no part in common
+        """
+        low = np.maximum(self.low_mm, other.low_mm)
+        high = np.minimum(self.high_mm, other.high_mm)
+        if np.any(low >= high):
+            raise ConfigError(f"the tracers' box {self} and the channel {other} have no part in common")
+        return Box((low[0], low[1], low[2]), (high[0], high[1], high[2]))
+
+
+@dataclass(frozen=True)
+class Tracers:
+    """What is seeded: `count` tracers, evenly spread over the box at the middle of the pair.
+
+    Attributes
+    ----------
+    light_counts : expected counts of a tracer of brightness 1 that pass the aperture
+    brightness : brightness is evenly spread between these two
+    """
+
+    count: int
+    box: Box
+    diameter_mm: float = 0.05
+    light_counts: float = 6.0e5
+    brightness: tuple[float, float] = (0.6, 1.4)
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedStill:
+    """An image, uint16, a dark frame of the same sensor, and the truth."""
+
+    image: NDArray[np.uint16]
+    dark: NDArray[np.uint16]
+    truth: dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedPair:
+    """Two images, uint16, a dark frame, and the truth: tracers at the middle of the pair.
+
+    Attributes
+    ----------
+    positions_mm : (n, 3), world axes
+    velocities_m_s : (n, 3)
+    brightness : (n,)
+    """
+
+    image_a: NDArray[np.uint16]
+    image_b: NDArray[np.uint16]
+    dark: NDArray[np.uint16]
+    positions_mm: NDArray[np.float64]
+    velocities_m_s: NDArray[np.float64]
+    brightness: NDArray[np.float64]
+    truth: dict[str, Any]
+
+
+def channel_walls(width_mm: float, mid_plane_z_mm: float, axis: str = "x") -> Box:
+    """Return the inside of a square channel, endless along `axis` (x or y), its mid plane at the given depth."""
+    half = 0.5 * width_mm
+    across = 1 if axis == "x" else 0
+    low, high = [-np.inf, -np.inf, mid_plane_z_mm - half], [np.inf, np.inf, mid_plane_z_mm + half]
+    low[across], high[across] = -half, half
+    return Box((low[0], low[1], low[2]), (high[0], high[1], high[2]))
+
+
+def channel_window(camera: Camera, media: Media, width_mm: float, wall_mm: float, mid_plane_z_mm: float) -> Window:
+    """Return the window of a channel whose mid plane lies at a depth, half the width behind the wall (Eq. 6)."""
+    path = 0.5 * width_mm - mid_plane_z_mm
+    distance = camera.focus_distance_mm - path * media.depth_ratio - wall_mm * media.air / media.window
+    return Window(distance, wall_mm)
+
+
+def simulate_white(camera: Camera, level: float, readout: Readout, rng: np.random.Generator) -> SimulatedStill:
+    """Simulate an image of uniform light, `level` expected counts where a pixel sees nothing but the aperture."""
+    image = readout.record(render_white(camera, level), rng)
+    return SimulatedStill(image, dark_frame(camera, readout, rng), camera_truth(camera))
+
+
+def simulate_board(
+    camera: Camera,
+    space: ObjectSpace,
+    board: BoardGeometry,
+    placement: BoardPlacement,
+    level: float,
+    readout: Readout,
+    rng: np.random.Generator,
+) -> SimulatedStill:
+    """Simulate an image of a board, `level` expected counts in a pixel that sees only what is bright."""
+    image = readout.record(render_board(camera, space, board, placement, level, rng), rng)
+    truth = {
+        **camera_truth(camera),
+        "board_z_mm": placement.z_mm,
+        "tilt_deg": list(placement.tilt_deg),
+        "offset_mm": list(placement.offset_mm),
+        "board_rotation_deg": placement.rotation_deg,
+        "dots_mm": dot_centres(board, placement).tolist(),
+    }
+    return SimulatedStill(image, dark_frame(camera, readout, rng), truth)
+
+
+def simulate_particles(
+    camera: Camera,
+    space: ObjectSpace,
+    tracers: Tracers,
+    flow: Flow,
+    dt_s: float,
+    readout: Readout,
+    rng: np.random.Generator,
+    *,
+    rays: int = RAYS,
+    progress: Callable[[int], None] | None = None,
+) -> SimulatedPair:
+    """Simulate a pair of images of tracers: frame a is dt/2 before the truth's positions, frame b dt/2 after.
+
+    `progress` is called with the number of tracers rendered, 2 n in all.
+    """
+    positions = rng.uniform(tracers.box.low_mm, tracers.box.high_mm, (tracers.count, 3))
+    brightness = rng.uniform(*tracers.brightness, tracers.count)
+    images = []
+    for time_s in (-0.5 * dt_s, 0.5 * dt_s):
+        expected = render_points(
+            camera,
+            space,
+            advect(flow, positions, time_s),
+            tracers.light_counts * brightness,
+            tracers.diameter_mm,
+            rng,
+            rays=rays,
+            progress=progress,
+        )
+        images.append(readout.record(expected, rng))
+    truth = {
+        **camera_truth(camera),
+        "dt_s": dt_s,
+        "particles": tracers.count,
+        "window_distance_mm": None if space.window is None else space.window.distance_mm,
+    }
+    dark = dark_frame(camera, readout, rng)
+    return SimulatedPair(images[0], images[1], dark, positions, flow(positions), brightness, truth)
+
+
+def dark_frame(camera: Camera, readout: Readout, rng: np.random.Generator) -> NDArray[np.uint16]:
+    """Return an image recorded without light."""
+    return readout.record(np.zeros((camera.rows, camera.columns)), rng)
+
+
+def camera_truth(camera: Camera) -> dict[str, Any]:
+    """Return what a calibration should find of a camera, by the names it reports, and the lattice on the array."""
+    micro_images = camera.micro_image_lattice_px()
+    centre = micro_images.points(micro_images.nearest(camera.sensor_centre_px))
+    return {
+        "pitch_px": micro_images.pitch.tolist(),
+        "rotation_deg": float(np.rad2deg(camera.lattice.rotation_rad)),
+        "origin_px": centre.tolist(),
+        "k1_per_mm2": camera.distortion_per_mm2,
+        "magnification": camera.magnification,
+        "lattice_origin_mm": camera.lattice.origin.tolist(),
+        "lattice_basis_mm": camera.lattice.basis.tolist(),
+        "layout": camera.lattice.layout,
+    }
