@@ -109,5 +109,7 @@ def _draw_profile(
         mean = np.full(count.shape, np.nan)
         np.divide(total, count, out=mean, where=count > 0)
         axes.plot(field.grid.axis_mm(axis), mean, style, markersize=4, label=label)
+    # Zero belongs in the picture: else the scale would blow up noise of a per mille.
+    axes.axhline(0.0, color="0.7", linewidth=0.8)
     axes.set(xlabel=f"{'xyz'[axis]} (mm)", ylabel=f"{COMPONENT_NAMES[main]} (m/s), mean over the plane")
     axes.legend()
