@@ -40,6 +40,9 @@ SAMPLES_PER_LENS = 2
 # Pixels that see the plane of the dots within this many microlenses of a dot's rim, but not half-way to the next dot,
 # belong to its fit.
 MARGIN_LENSES = 2.5
+# Pixels at the rim of a micro-image are lit in part, by light that does not come from where their middle sees; a pixel
+# is used when the main lens's rim is more than half its patch's diagonal away.
+RIM_PER_PATCH = np.sqrt(0.5)
 # The magnification enters the depth of each dot; one repetition with the measured one leaves the square of its error.
 MAGNIFICATION_ROUNDS = 2
 # Below this a change of magnification moves nothing by a micrometre over a board of 10 mm.
@@ -61,7 +64,7 @@ def locate_board(
     image : (rows, columns) rectified picture less the dark frame
     camera : with the lattice of the rectified frame
     rotation_rad : angle that rectification took out
-    transmission : (rows, columns) share of light that pixels pass, rectified; default: all the same inside the aperture
+    transmission : (rows, columns) share of light that pixels pass, rectified; default: all the same
 
     Raises
     ------
@@ -177,7 +180,8 @@ def fit_one_dot(
     row, column = (axis.ravel() for axis in np.mgrid[low[1] : high[1], low[0] : high[0]])
     rays = pixel_rays(camera, column, row)
     near = np.hypot(*(scene_points(rays, camera, media, z) - (x, y)).T) <= reach
-    through = np.hypot(*lens_crossings(rays, camera).T) <= camera.aperture_radius_mm
+    rim = RIM_PER_PATCH * camera.pixel_mm * camera.image_distance_mm / camera.microlens_distance_mm
+    through = np.hypot(*lens_crossings(rays, camera).T) <= camera.aperture_radius_mm - rim
     kept = near & through & (passed[row, column] > 0.0)
     chosen = replace(rays, place_mm=rays.place_mm[kept], lens_mm=rays.lens_mm[kept], ideal_mm=rays.ideal_mm[kept])
     light = passed[row, column][kept].astype(np.float64)

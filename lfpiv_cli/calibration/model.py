@@ -194,12 +194,15 @@ def calibrate(
     InputError
         when a picture cannot serve; it says why
     """
+    shape = np.shape(white)
+    if board is not None and np.shape(board) != shape:
+        raise InputError(f"the board's picture is {np.shape(board)} and the white image {shape} (rows, columns)")
     # One BLAS thread: the same bits on every machine, and small problems gain nothing from more.
     with threadpool_limits(limits=1, user_api="blas"):
         fit = fit_lattice(white, dark, layout)
         darkness = 0.0 if dark is None else np.asarray(dark, dtype=np.float64)
         image = np.asarray(white, dtype=np.float64) - darkness
-        rectification = Rectification(fit, (image.shape[0], image.shape[1]))
+        rectification = Rectification(fit, (shape[0], shape[1]))
         transmission = relative_transmission(rectification.apply(image), rectification.lattice_px)
         calibration = Calibration(rectification, transmission)
         if board is None or rig is None:

@@ -1,0 +1,179 @@
+"""The board's pose against boards rendered ray by ray, which share nothing with the fit but the optics."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import ArrayLike, NDArray
+
+from lfpiv_cli.calibration.board import locate_board
+from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose, pose_of_dots
+from lfpiv_cli.calibration.dot_model import disc_polygon_area, lens_cell, lens_crossings, pixel_rays, undistorted
+from lfpiv_cli.errors import InputError
+from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.media import Media
+from lfpiv_cli.optics.microlenses import Lattice
+from lfpiv_cli.optics.tracing import disc_points, slopes_equivalent, trace
+
+BOARD = BoardGeometry((3, 3), 0.6, 0.2)
+# Twenty rays per lit pixel: a dot's depth is then known to some 0.03 mm, a board's to 0.01 mm.
+RAYS_PER_DOT = 60_000
+
+
+def small(camera: Camera) -> Camera:
+    """A sensor that holds three by three dots; its lattice is shifted, as a real one is."""
+    shifted = camera.lattice.transformed(np.eye(2), (0.013, -0.021))
+    return replace(camera, columns=480, rows=440, lattice=shifted)
+
+
+def dot_places(board: BoardGeometry, z_mm: float, offset: ArrayLike, tilt_deg: ArrayLike) -> NDArray[np.float64]:
+    """Centres (n, 3) of a rigid board's dots in world axes: z = z0 + tan a x + tan b y from the board's centre."""
+    slope = np.tan(np.deg2rad(tilt_deg))
+    along = np.array([1.0, 0.0, slope[0]]) / np.hypot(1.0, slope[0])
+    normal = np.array([-slope[0], -slope[1], 1.0]) / np.sqrt(1.0 + slope @ slope)
+    i, j = np.meshgrid(*(np.arange(n) - (n - 1) / 2 for n in board.dots), indexing="ij")
+    steps = np.stack([i.ravel(), j.ravel()], axis=1) @ np.stack([along, np.cross(normal, along)])
+    return steps * board.spacing_mm + np.append(offset, z_mm)
+
+
+def picture(
+    camera: Camera, media: Media, dots: NDArray[np.float64], diameter: float, rng: np.random.Generator
+) -> NDArray[np.float32]:
+    """Count rays from uniformly bright discs on the pixels."""
+    image = np.zeros(camera.rows * camera.columns)
+    for dot in dots:
+        start = np.column_stack([disc_points(RAYS_PER_DOT, diameter / 2, rng), np.zeros(RAYS_PER_DOT)]) + dot
+        points = camera.to_image_axes(start)
+        lens = disc_points(RAYS_PER_DOT, camera.aperture_radius_mm, rng)
+        hits = trace(camera, lens, slopes_equivalent(points, lens, camera, media))
+        column, row = np.rint(camera.mm_to_px(hits.sensor_mm)).astype(int).T
+        on = (column >= 0) & (column < camera.columns) & (row >= 0) & (row < camera.rows)
+        image += np.bincount((row * camera.columns + column)[on], minlength=image.size)
+    return image.reshape(camera.rows, camera.columns).astype(np.float32)
+
+
+def agrees(pose: BoardPose, z_mm: float, offset: ArrayLike) -> None:
+    """Within four of its own standard errors, and these are what the rays' noise allows."""
+    assert pose.z0_sigma_mm < 0.03
+    assert abs(pose.z0_mm - z_mm) < 4 * pose.z0_sigma_mm
+    assert np.all(pose.offset_sigma_mm < 1e-3)
+    # The scatter of nine dots knows its own size to a quarter.
+    np.testing.assert_allclose(pose.offset_mm, offset, atol=3e-3)
+
+
+@pytest.mark.parametrize("z_mm", [-0.4, 0.0, 1.7])
+def test_board_in_air_is_found_in_both_layouts(camera: Camera, rng: np.random.Generator, z_mm: float) -> None:
+    camera = small(camera)
+    dots = dot_places(BOARD, z_mm, (0.05, -0.03), (0.0, 0.0))
+    pose = locate_board(picture(camera, Media(), dots, 0.2, rng), camera, BOARD, Media(1.0, 1.49, 1.33))
+    assert len(pose.indices) == 9
+    agrees(pose, z_mm, (0.05, -0.03))
+    assert pose.magnification == pytest.approx(-1.0, abs=4 * pose.magnification_sigma + 1e-4)
+
+
+def test_board_in_water_with_the_columns_along_y(table2: Camera, water: Media, rng: np.random.Generator) -> None:
+    camera = replace(small(table2), column_axis="y")
+    board = replace(BOARD, medium="fluid", dots=(3, 2))
+    dots = dot_places(board, 1.2, (-0.06, 0.02), (20.0, -14.0))
+    pose = locate_board(picture(camera, water, dots, 0.2, rng), camera, board, water)
+    agrees(pose, 1.2, (-0.06, 0.02))
+    # 0.03 mm per dot over six dots 0.6 mm apart: 1.5 and 3 degrees; the sign and the axis are what is tested.
+    np.testing.assert_allclose(pose.tilt_deg, (20.0, -14.0), atol=7.0)
+
+
+def test_a_turned_sensor_is_turned_back(table2: Camera, rng: np.random.Generator) -> None:
+    """The picture of a rectified frame shows the scene turned by minus the lattice's rotation."""
+    camera = small(table2)
+    angle = np.deg2rad(6.0)
+    cosine, sine = np.cos(angle), np.sin(angle)
+    dots = dot_places(BOARD, 0.5, (0.05, -0.03), (0.0, 0.0))
+    seen = dots.copy()
+    seen[:, :2] = dots[:, :2] @ np.array([[cosine, -sine], [sine, cosine]])
+    pose = locate_board(picture(camera, Media(), seen, 0.2, rng), camera, BOARD, Media(), rotation_rad=angle)
+    agrees(pose, 0.5, (0.05, -0.03))
+    assert pose.rotation_deg == pytest.approx(0.0, abs=0.3)
+
+
+def test_dark_dots_and_the_transmission(table2: Camera, rng: np.random.Generator) -> None:
+    camera = small(table2)
+    row, column = np.mgrid[: camera.rows, : camera.columns]
+    crossing = lens_crossings(pixel_rays(camera, column.ravel(), row.ravel()), camera)
+    passed = (np.hypot(*crossing.T) < camera.aperture_radius_mm - 0.7).reshape(row.shape).astype(np.float32)
+    passed *= np.linspace(0.7, 1.0, camera.columns, dtype=np.float32)
+    dots = dot_places(BOARD, 0.6, (0.05, -0.03), (0.0, 0.0))
+    counted = picture(camera, Media(), dots, 0.2, rng)
+    full = 1.1 * np.percentile(counted, 99.9)
+    board = replace(BOARD, polarity="dark")
+    pose = locate_board(((full - counted) * passed).astype(np.float32), camera, board, Media(), transmission=passed)
+    agrees(pose, 0.6, (0.05, -0.03))
+
+
+def test_magnification_is_measured(table2: Camera, rng: np.random.Generator) -> None:
+    true = small(table2)
+    true = replace(true, magnification=-1.01)
+    sheet = replace(true, magnification=-1.0).with_micro_images(true.micro_image_lattice_px())
+    dots = dot_places(BOARD, -0.5, (0.0, 0.0), (0.0, 0.0))
+    pose = locate_board(picture(true, Media(), dots, 0.2, rng), sheet, BOARD, Media())
+    assert pose.magnification == pytest.approx(-1.01, abs=4 * pose.magnification_sigma + 1e-4)
+    assert pose.z0_mm == pytest.approx(-0.5, abs=4 * pose.z0_sigma_mm)
+
+
+def test_pose_of_exact_dots_is_exact_with_dots_missing_and_dirt() -> None:
+    board = BoardGeometry((7, 5), 1.0, 0.2)
+    dots = dot_places(board, 3.0, (0.4, -0.2), (2.0, -3.0))
+    angle = np.deg2rad(1.0)
+    turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    kept = np.delete(dots, [3, 11, 30], axis=0)
+    kept[:, :2] = (kept[:, :2] - (0.4, -0.2)) @ turn + (0.4, -0.2)
+    kept = np.vstack([kept, [[0.9, 0.31, 3.0], [5.0, 5.0, 0.0]]])
+    pose = pose_of_dots(kept, np.full(kept.shape, 1e-3), kept[:, :2], -1.0, board)
+    assert len(pose.indices) == 32
+    assert pose.z0_mm == pytest.approx(3.0, abs=1e-9)
+    np.testing.assert_allclose(pose.offset_mm, (0.4, -0.2), atol=1e-9)
+    # Seen from the front, the columns of a board tilted both ways lean by tan a tan b = 0.1 degrees; half of it counts.
+    assert pose.rotation_deg == pytest.approx(1.0, abs=0.06)
+    assert pose.magnification == pytest.approx(-1.0, abs=1e-12)
+    # The board's own slopes (2, -3) degrees, seen along the world axes, a degree off.
+    slope = np.linalg.solve(turn, np.tan(np.deg2rad([2.0, -3.0])))
+    np.testing.assert_allclose(np.tan(np.deg2rad(pose.tilt_deg)), slope, atol=1e-9)
+    # Index 0 is the dot at the smallest x and y.
+    first = pose.dots_mm[np.argmax((pose.indices == 0).all(axis=1))]
+    assert first[0] < -2.0
+    assert first[1] < -1.5
+
+
+def test_disc_and_polygon_share_what_a_fine_grid_counts(layout: str, rng: np.random.Generator) -> None:
+    cell = lens_cell(Lattice.regular(1.0, layout))
+    step = np.linspace(-1.2, 1.2, 634)
+    px, py = np.meshgrid(step, step)
+    cells = Lattice.regular(1.0, layout)
+    points = np.stack([px, py], axis=-1)
+    own = (np.hypot(px, py) < 0.8) & (cells.nearest(points) == 0).all(axis=-1)
+    for x, y, radius in [(0.0, 0.0, 0.3), (0.0, 0.0, 0.56), (0.4, 0.1, 0.3), (0.3, -0.5, 1.0), (2.0, 0.0, 0.9)]:
+        counted = (own & (np.hypot(px + x, py + y) < radius)).sum() * (step[1] - step[0]) ** 2
+        assert disc_polygon_area(x, y, cell, radius) == pytest.approx(counted, abs=4e-3)
+    assert disc_polygon_area(0.1, 0.1, cell, 0.3) == pytest.approx(np.pi * 0.09, rel=1e-12)
+    assert disc_polygon_area(0.1, 0.1, cell, 3.0) == pytest.approx(1.0 if layout == "square" else np.sqrt(0.75))
+
+
+def test_undistorted_undoes_the_distortion() -> None:
+    ideal = np.array([[3.0, -4.0], [0.0, 0.0], [6.0, 1.0]])
+    seen = ideal * (1 + 2e-4 * np.sum(ideal**2, axis=1, keepdims=True))
+    np.testing.assert_allclose(undistorted(seen, 2e-4), ideal, atol=1e-7)
+
+
+def test_pictures_without_a_board_are_refused(table2: Camera, rng: np.random.Generator) -> None:
+    camera = small(table2)
+    empty = np.zeros((camera.rows, camera.columns), dtype=np.float32)
+    with pytest.raises(InputError, match="no dots"):
+        locate_board(empty, camera, BOARD, Media())
+    one = picture(camera, Media(), np.array([[0.0, 0.0, 0.3]]), 0.2, rng)
+    with pytest.raises(InputError, match="only . of the board's 3 x 3 dots"):
+        locate_board(one, camera, BOARD, Media())
+    with pytest.raises(InputError, match="larger dots"):
+        locate_board(one, camera, replace(BOARD, dot_diameter_mm=0.01), Media())
+    noise = rng.normal(0.0, 5.0, empty.shape).astype(np.float32)
+    with pytest.raises(InputError):
+        locate_board(noise, camera, BOARD, Media())
