@@ -95,7 +95,7 @@ def write_volume(
     Parameters
     ----------
     array_zyx : (nz, ny, nx), stored as float32
-    attributes : scalars and strings for the root, `reference` (focal_point or mid_plane) among them
+    attributes : scalars, strings and short arrays for the root, `reference` (focal_point or mid_plane) among them
 
     Raises
     ------
@@ -145,7 +145,7 @@ def write_vectors(
 
     Parameters
     ----------
-    attributes : scalars and strings for the root, `reference` (focal_point or mid_plane) among them
+    attributes : scalars, strings and short arrays for the root, `reference` (focal_point or mid_plane) among them
 
     Raises
     ------
@@ -257,11 +257,13 @@ def _write_points(file: h5py.File, points: h5py.Group, name: str, array: NDArray
 
 
 def _write_attributes(file: h5py.File, attributes: Mapping[str, Any]) -> None:
-    """Write scalars and strings at the root; what is None is not said (netCDF knows no empty attribute)."""
+    """Write scalars, strings and short numeric arrays at the root; what is None is not said (netCDF knows no empty attribute)."""
     for name, value in attributes.items():
         if name in RESERVED:
             raise ValueError(f"{name} is a name that every file uses for itself")
-        if value is not None:
+        if isinstance(value, np.ndarray):
+            file.attrs[name] = value
+        elif value is not None:
             file.attrs[name] = to_attribute(value)
 
 

@@ -1,0 +1,174 @@
+"""From the sections of the configuration to the objects that the core works with.
+
+What a section leaves out and another of its keys implies (an aperture from an f-number) is worked out here, once.
+"""
+
+from __future__ import annotations
+
+from lfpiv_cli.calibration.board_pose import BoardGeometry
+from lfpiv_cli.calibration.model import Channel
+from lfpiv_cli.files.sections import (
+    BoardSection,
+    CameraSection,
+    ChannelSection,
+    CorrelationSection,
+    FlowSection,
+    MainLens,
+    MediaSection,
+    Microlenses,
+    VolumeSection,
+)
+from lfpiv_cli.grid import Grid
+from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.media import Media, Window
+from lfpiv_cli.optics.microlenses import Lattice
+from lfpiv_cli.synthetic.flows import FLOWS, Flow
+
+UM_TO_MM = 1e-3
+# The paper's final window, and one that a displacement of a quarter of its side (8 voxels) does not leave.
+DEFAULT_WINDOWS = ((32, 32, 32), (16, 16, 16))
+SMALLEST_WINDOW = 4
+# Voxels as wide as a microlens lock depth to the array's grid and swallow its velocity: of 6 voxels, half of one recovers
+# 4.7 where a whole one recovers 2.2, and two along the axis 5.0 (EM volumes, 60 iterations).
+LATERAL_VOXELS_PER_MICROLENS = 2.0
+DEPTH_VOXELS_PER_MICROLENS = 0.5
+
+Triple = tuple[int, int, int]
+Lengths = tuple[float, float, float]
+
+
+def focal_length_mm(lens: MainLens) -> float | None:
+    """Return F_m, given or from S_i = F_m (1 - M)."""
+    if lens.focal_length_mm is not None or lens.image_distance_mm is None:
+        return lens.focal_length_mm
+    return lens.image_distance_mm / (1.0 - lens.magnification)
+
+
+def aperture_mm(lens: MainLens) -> float | None:
+    """Return p_m, given or from the f-number F_m / p_m."""
+    focal_length = focal_length_mm(lens)
+    if lens.aperture_mm is not None or lens.f_number is None or focal_length is None:
+        return lens.aperture_mm
+    return focal_length / lens.f_number
+
+
+def microlens_focal_length_mm(lens: Microlenses) -> float | None:
+    """Return f_m, given or from the f-number f_m / p_l."""
+    if lens.focal_length_mm is not None or lens.f_number is None:
+        return lens.focal_length_mm
+    return lens.f_number * lens.pitch_mm
+
+
+def missing_for_camera(section: CameraSection) -> str | None:
+    """Return the first key that a whole camera lacks, None where nothing is missing."""
+    lens = section.main_lens
+    if lens is None:
+        return "main_lens"
+    if focal_length_mm(lens) is None:
+        return "main_lens.focal_length_mm"
+    if aperture_mm(lens) is None:
+        return "main_lens.aperture_mm"
+    return "microlenses.focal_length_mm" if microlens_focal_length_mm(section.microlenses) is None else None
+
+
+def camera_of(section: CameraSection) -> Camera:
+    """Return the camera of a section that lacks nothing, a lens centre on the axis."""
+    lens, microlenses, sensor = section.main_lens, section.microlenses, section.sensor
+    missing = missing_for_camera(section)
+    if lens is None or missing is not None:
+        raise ValueError(f"camera.{missing} is missing")
+    microlens_focal_length = microlens_focal_length_mm(microlenses)
+    return Camera(
+        magnification=lens.magnification,
+        focal_length_mm=focal_length_mm(lens) or 0.0,
+        aperture_mm=aperture_mm(lens) or 0.0,
+        microlens_focal_length_mm=microlens_focal_length or 0.0,
+        microlens_distance_mm=sensor.microlens_distance_mm or microlens_focal_length or 0.0,
+        lattice=Lattice.regular(microlenses.pitch_mm, microlenses.layout),
+        pixel_mm=sensor.pixel_um * UM_TO_MM,
+        columns=sensor.columns,
+        rows=sensor.rows,
+        column_axis=sensor.column_axis,
+    )
+
+
+def media_of(section: MediaSection) -> Media:
+    """Return the refractive indices."""
+    return Media(section.air, section.window, section.fluid)
+
+
+def wall_as_window(channel: ChannelSection, media: Media, focus_distance_mm: float, mid_plane_z_mm: float) -> Window:
+    """Return the channel's wall as the window in front of the fluid.
+
+    The fluid between wall and focal point is width/2 - mid_plane_z thick; the focal point's equivalent in air lies
+    `focus_distance_mm` in front of the lens (Eq. 6), so what window and fluid leave of that is air.
+    """
+    fluid = 0.5 * channel.width_mm - mid_plane_z_mm
+    apparent = channel.wall_mm * media.air / media.window + fluid * media.depth_ratio
+    return Window(focus_distance_mm - apparent, channel.wall_mm)
+
+
+def board_of(section: BoardSection) -> BoardGeometry:
+    """Return the board."""
+    return BoardGeometry(
+        dots=section.dots,
+        spacing_mm=section.spacing_mm,
+        dot_diameter_mm=section.dot_diameter_mm,
+        thickness_mm=section.thickness_mm,
+        polarity=section.polarity,
+        medium=section.medium,
+    )
+
+
+def channel_of(section: ChannelSection) -> Channel:
+    """Return the channel."""
+    return Channel(section.width_mm, section.wall_mm, section.camera_move_mm)
+
+
+def grid_of(section: VolumeSection, camera: CameraSection | None, origin_z_mm: float) -> Grid:
+    """Return the volume's grid, z moved by `origin_z_mm`.
+
+    `camera` is needed only where the section leaves the voxels to the program.
+    """
+    shape, voxel = section.shape_xyz, section.voxel_mm
+    if shape is None or voxel is None:
+        if section.size_mm is None or camera is None:
+            raise ValueError("neither shape_xyz and voxel_mm nor size_mm with a camera")
+        shape, voxel = choose_voxels(camera, section.size_mm)
+    x, y, z = section.centre_mm
+    return Grid.centred(shape, voxel, (x, y, z + origin_z_mm))
+
+
+def choose_voxels(camera: CameraSection, size_mm: Lengths) -> tuple[Triple, Lengths]:
+    """Return the number and size of the voxels that fill `size_mm` and serve the velocity best.
+
+    They are near half a microlens laterally and two in depth, as it appears in the scene, and divide the size.
+    """
+    if camera.main_lens is None:
+        raise ValueError("camera.main_lens is missing")
+    microlens = camera.microlenses.pitch_mm / abs(camera.main_lens.magnification)
+    lateral, depth = microlens / LATERAL_VOXELS_PER_MICROLENS, microlens / DEPTH_VOXELS_PER_MICROLENS
+    counts = [max(1, round(size / target)) for size, target in zip(size_mm, (lateral, lateral, depth), strict=True)]
+    voxel = [size / count for size, count in zip(size_mm, counts, strict=True)]
+    return (counts[0], counts[1], counts[2]), (voxel[0], voxel[1], voxel[2])
+
+
+def windows_of(section: CorrelationSection, voxel_mm: Lengths) -> tuple[Triple, ...]:
+    """Return the correlation windows in voxels, coarse to fine; `window_mm` is the final one, twice its size the first."""
+    if section.windows is not None:
+        return section.windows
+    if section.window_mm is None:
+        return DEFAULT_WINDOWS
+    final = [
+        max(SMALLEST_WINDOW, round(length / voxel)) for length, voxel in zip(section.window_mm, voxel_mm, strict=True)
+    ]
+    return (2 * final[0], 2 * final[1], 2 * final[2]), (final[0], final[1], final[2])
+
+
+def flow_of(section: FlowSection, origin_z_mm: float) -> Flow:
+    """Return a flow as a function of points, its centre moved by `origin_z_mm` along z."""
+    parameters = section.model_dump(exclude={"kind"})
+    if "centre_mm" in parameters:
+        x, y, z = parameters["centre_mm"]
+        parameters["centre_mm"] = (x, y, z + origin_z_mm)
+    return FLOWS[section.kind](**parameters)

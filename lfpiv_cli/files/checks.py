@@ -1,0 +1,149 @@
+"""What several keys of the configuration say together: contradictions and physics that cannot be."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+from lfpiv_cli.files.bench import (
+    camera_of,
+    focal_length_mm,
+    grid_of,
+    media_of,
+    missing_for_camera,
+)
+from lfpiv_cli.files.sections import Sections
+from lfpiv_cli.files.yaml_nodes import KeyPath
+from lfpiv_cli.optics.media import Window, fluid_path_to_focus
+
+Found = Iterator[tuple[KeyPath, str]]
+
+# Data sheets give three or four digits.
+AGREEMENT = 1e-3
+
+
+def contradictions(sections: Sections) -> Found:
+    """Yield the place and the sentence of everything that cannot be."""
+    yield from _lens(sections)
+    yield from _volume(sections)
+    yield from _scene(sections)
+    yield from _processing(sections)
+    yield from _object_space(sections)
+
+
+def _disagree(first: float, second: float) -> bool:
+    return not math.isclose(first, second, rel_tol=AGREEMENT)
+
+
+def _lens(sections: Sections) -> Found:
+    """Yield what is given twice and differs: S_i = F_m (1 - M) and the f-numbers."""
+    if sections.camera is None:
+        return
+    lens, microlenses = sections.camera.main_lens, sections.camera.microlenses
+    if lens is not None:
+        place = ("camera", "main_lens")
+        focal_length = focal_length_mm(lens)
+        if focal_length is None:
+            yield place, "needs focal_length_mm or image_distance_mm"
+        elif lens.image_distance_mm is not None:
+            expected = focal_length * (1.0 - lens.magnification)
+            if _disagree(lens.image_distance_mm, expected):
+                yield (
+                    (*place, "image_distance_mm"),
+                    f"is {lens.image_distance_mm:g}, but focal_length_mm (1 - magnification) is {expected:g}",
+                )
+        if lens.aperture_mm is None and lens.f_number is None:
+            yield place, "needs aperture_mm or f_number"
+        if lens.aperture_mm and lens.f_number and focal_length:
+            expected = focal_length / lens.aperture_mm
+            if _disagree(lens.f_number, expected):
+                yield (*place, "f_number"), f"is {lens.f_number:g}, but focal_length_mm / aperture_mm is {expected:g}"
+    if microlenses.f_number and microlenses.focal_length_mm:
+        expected = microlenses.focal_length_mm / microlenses.pitch_mm
+        if _disagree(microlenses.f_number, expected):
+            yield (
+                ("camera", "microlenses", "f_number"),
+                f"is {microlenses.f_number:g}, but focal_length_mm / pitch_mm is {expected:g}",
+            )
+
+
+def _volume(sections: Sections) -> Found:
+    """Yield a volume that is given twice or by half."""
+    volume = sections.volume
+    if volume is None:
+        return
+    place = ("volume",)
+    if volume.size_mm is not None:
+        for name in ("shape_xyz", "voxel_mm"):
+            if getattr(volume, name) is not None:
+                yield (*place, name), "contradicts size_mm, which leaves the voxels to the program"
+        if sections.camera is None or sections.camera.main_lens is None:
+            yield (*place, "size_mm"), "needs camera.main_lens to choose the voxels"
+    elif volume.shape_xyz is None or volume.voxel_mm is None:
+        yield place, "needs shape_xyz and voxel_mm, or size_mm"
+    if volume.reference == "mid_plane" and sections.channel is None:
+        yield (*place, "reference"), "is mid_plane, which needs the section channel"
+
+
+def _scene(sections: Sections) -> Found:
+    """Yield dots that overlap, and a wall that is not the window."""
+    board, window, channel = sections.board, sections.window, sections.channel
+    if board is not None and board.dot_diameter_mm >= board.spacing_mm:
+        yield (
+            ("board", "dot_diameter_mm"),
+            f"is {board.dot_diameter_mm:g}, expected less than the spacing of {board.spacing_mm:g}",
+        )
+    if window is not None and channel is not None and _disagree(window.thickness_mm, channel.wall_mm):
+        yield ("window", "thickness_mm"), f"is {window.thickness_mm:g}, but channel.wall_mm is {channel.wall_mm:g}"
+
+
+def _processing(sections: Sections) -> Found:
+    """Yield windows that do not run from coarse to fine, and a range of brightness upside down."""
+    correlation, brightness = sections.correlation, sections.simulation.brightness
+    place: KeyPath = ("correlation", "windows")
+    if correlation.windows is not None:
+        if correlation.window_mm is not None:
+            yield place, "contradicts window_mm"
+        if not correlation.windows:
+            yield place, "is empty, expected at least one window"
+        for k, (coarse, fine) in enumerate(zip(correlation.windows, correlation.windows[1:], strict=False)):
+            if any(a < b for a, b in zip(coarse, fine, strict=True)):
+                yield (*place, k + 1), f"is {list(fine)} after {list(coarse)}, expected coarse to fine"
+    if brightness[0] > brightness[1] or brightness[1] == 0.0:
+        yield ("simulation", "brightness"), f"is {list(brightness)}, expected a range [smallest, largest]"
+
+
+def _object_space(sections: Sections) -> Found:
+    """Yield a volume or a window that lies where light cannot come from.
+
+    With a mid-plane volume the origin is not known yet; it lies within millimetres of the focal point.
+    """
+    volume, section = sections.volume, sections.camera
+    if volume is None or section is None or sections.media is None or missing_for_camera(section) is not None:
+        return
+    if volume.size_mm is None and (volume.shape_xyz is None or volume.voxel_mm is None):
+        return
+    camera, media = camera_of(section), media_of(sections.media)
+    nearest = grid_of(volume, section, 0.0).bounds_mm(2)[0]
+    distance = camera.focus_distance_mm + media.depth_ratio * nearest
+    if distance <= 0.0:
+        yield (
+            ("volume",),
+            f"begins at z = {nearest:g} mm, behind the lens, which is {camera.focus_distance_mm:g} mm away",
+        )
+        return
+    sine = math.sin(math.atan(camera.aperture_radius_mm / distance)) * media.air
+    for name in ("window", "fluid"):
+        if getattr(media, name) <= sine:
+            yield (
+                ("media", name),
+                f"is {getattr(media, name):g}: light at the rim of the lens (n sin = {sine:.3f}) is totally reflected",
+            )
+    if sections.window is not None and sections.channel is None:
+        window = Window(sections.window.distance_mm, sections.window.thickness_mm)
+        path = fluid_path_to_focus(window, camera.focus_distance_mm, media)
+        if path + nearest < 0.0:
+            yield (
+                ("window", "distance_mm"),
+                f"puts the window's far face at z = {-path:.4g} mm, inside the volume that begins at {nearest:.4g}",
+            )

@@ -1,0 +1,246 @@
+"""The configuration: one strict YAML file, and what the commands ask of it.
+
+All errors are reported in one run, each with its place: `rig.yaml:5:16: camera.microlenses.layuot: unknown key; did you
+mean 'layout'?`
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from lfpiv_cli.calibration.model import Rig
+from lfpiv_cli.errors import ConfigError, InputError
+from lfpiv_cli.files import bench
+from lfpiv_cli.files.checks import contradictions
+from lfpiv_cli.files.config_problems import place_of, problem_of, report, sentence
+from lfpiv_cli.files.inputs import ensure_regular_file, reason
+from lfpiv_cli.files.sections import (
+    BoardSection,
+    CameraSection,
+    ChannelSection,
+    CorrelationSection,
+    FlowSection,
+    MediaSection,
+    ReconstructionSection,
+    Sections,
+    SimulationSection,
+    ValidationSection,
+    VolumeSection,
+    WeightsSection,
+)
+from lfpiv_cli.files.yaml_nodes import (
+    LARGEST_BYTES,
+    Document,
+    Problem,
+    YamlError,
+    key_name,
+    read_document,
+)
+from lfpiv_cli.grid import Grid
+from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.media import Media, Window
+from lfpiv_cli.synthetic.flows import Flow
+
+
+@dataclass(frozen=True)
+class Config:
+    """A configuration without contradictions.
+
+    A section that the file leaves out and a command asks for is a `ConfigError` that names it.
+
+    Attributes
+    ----------
+    sections : as they stand in the file, defaults filled in
+    source : the file's name, for messages
+    """
+
+    sections: Sections
+    source: str
+
+    @classmethod
+    def from_resolved(cls, resolved: Mapping[str, Any], source: str = "the stored config") -> Config:
+        """Return the configuration that `resolved` described.
+
+        Raises
+        ------
+        ConfigError
+        """
+        return _validated(Document(data=_tuples(resolved)), source)
+
+    def resolved(self) -> dict[str, Any]:
+        """Return everything, defaults included, as plain data for JSON."""
+        return self.sections.model_dump(mode="json")
+
+    def overridden(self, section: str, **options: Any) -> Config:
+        """Return the configuration with the options of a section replaced; None leaves a value as it is.
+
+        Raises
+        ------
+        ConfigError
+            If the options contradict the rest.
+        """
+        given = {name: value for name, value in options.items() if value is not None}
+        if not given:
+            return self
+        resolved = self.resolved()
+        resolved[section] |= given
+        if "windows" in given:
+            resolved[section]["window_mm"] = None
+        return Config.from_resolved(resolved, f"{self.source} with the options given")
+
+    @property
+    def camera(self) -> CameraSection:
+        """The section `camera`."""
+        return self._needed("camera", self.sections.camera)
+
+    @property
+    def media(self) -> MediaSection:
+        """The section `media`."""
+        return self._needed("media", self.sections.media)
+
+    @property
+    def volume(self) -> VolumeSection:
+        """The section `volume`."""
+        return self._needed("volume", self.sections.volume)
+
+    @property
+    def board(self) -> BoardSection:
+        """The section `board`."""
+        return self._needed("board", self.sections.board)
+
+    @property
+    def channel(self) -> ChannelSection | None:
+        """The section `channel`, None where there is none."""
+        return self.sections.channel
+
+    @property
+    def weights(self) -> WeightsSection:
+        """The section `weights`."""
+        return self.sections.weights
+
+    @property
+    def reconstruction(self) -> ReconstructionSection:
+        """The section `reconstruction`."""
+        return self.sections.reconstruction
+
+    @property
+    def correlation(self) -> CorrelationSection:
+        """The section `correlation`."""
+        return self.sections.correlation
+
+    @property
+    def simulation(self) -> SimulationSection:
+        """The section `simulation`."""
+        return self.sections.simulation
+
+    @property
+    def validation(self) -> ValidationSection:
+        """The section `validation`."""
+        return self.sections.validation
+
+    def image_shape(self) -> tuple[int, int]:
+        """Return the sensor's (rows, columns)."""
+        return self.camera.sensor.rows, self.camera.sensor.columns
+
+    def camera_model(self) -> Camera:
+        """Return the camera as the data sheet has it, a lens centre on the axis."""
+        section = self.camera
+        missing = bench.missing_for_camera(section)
+        if missing is not None:
+            raise self._missing(f"camera.{missing}")
+        return bench.camera_of(section)
+
+    def media_model(self) -> Media:
+        """Return the refractive indices."""
+        return bench.media_of(self.media)
+
+    def window_model(self, mid_plane_z_mm: float | None = None) -> Window:
+        """Return the window: the channel's wall where its mid plane's depth is given, else the section `window`."""
+        if self.channel is not None and mid_plane_z_mm is not None:
+            focus = self.camera_model().focus_distance_mm
+            return bench.wall_as_window(self.channel, self.media_model(), focus, mid_plane_z_mm)
+        section = self._needed("window", self.sections.window)
+        return Window(section.distance_mm, section.thickness_mm)
+
+    def grid(self, origin_z_mm: float = 0.0) -> Grid:
+        """Return the volume's grid, `origin_z_mm` being where its origin lies from the nominal focal point."""
+        return bench.grid_of(self.volume, self.sections.camera, origin_z_mm)
+
+    def rig(self) -> Rig:
+        """Return what must be known to read the picture of a board."""
+        channel = None if self.channel is None else bench.channel_of(self.channel)
+        return Rig(self.camera_model(), self.media_model(), bench.board_of(self.board), channel)
+
+    def windows_voxel(self, voxel_mm: tuple[float, float, float]) -> tuple[tuple[int, int, int], ...]:
+        """Return the correlation windows (x, y, z) in voxels, coarse to fine."""
+        return bench.windows_of(self.correlation, voxel_mm)
+
+    def simulated_flow(self, origin_z_mm: float = 0.0) -> Flow:
+        """Return the flow to render, as a function of points whose z counts from `origin_z_mm` before the volume's."""
+        return bench.flow_of(self._needed("simulation.flow", self.simulation.flow), origin_z_mm)
+
+    def true_flow(self) -> Flow:
+        """Return the flow to compare with, in the volume's coordinates: `validation.flow`, else the simulation's."""
+        flow: FlowSection | None = self.validation.flow or self.simulation.flow
+        return bench.flow_of(self._needed("validation.flow", flow), 0.0)
+
+    def _needed(self, key: str, section: Any) -> Any:
+        if section is None:
+            raise self._missing(key)
+        return section
+
+    def _missing(self, key: str) -> ConfigError:
+        return ConfigError(f"{self.source}: {key}: is missing, and this command needs it")
+
+
+def load_config(path: Path) -> Config:
+    """Read a configuration.
+
+    Raises
+    ------
+    ConfigError
+        If anything in it is malformed, unknown, contradictory or impossible; all errors at once.
+    InputError
+        If the file is missing or not a file.
+    """
+    size = ensure_regular_file(path)
+    if size > LARGEST_BYTES:
+        raise ConfigError(f"{path}: has {size} bytes, expected at most {LARGEST_BYTES}")
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {reason(error)}") from error
+    try:
+        document = read_document(content)
+    except YamlError as error:
+        raise ConfigError(sentence(str(path), error.problem)) from error
+    return _validated(document, str(path))
+
+
+def _validated(document: Document, source: str) -> Config:
+    """Return the configuration of a document, or raise all that is wrong with it."""
+    problems = list(document.problems)
+    sections = None
+    try:
+        sections = Sections.model_validate(document.data)
+    except ValidationError as error:
+        problems += [problem_of(document, details) for details in error.errors()]
+    if sections is not None:
+        problems += [
+            Problem(*place_of(document, path), key_name(path), text) for path, text in contradictions(sections)
+        ]
+    if problems or sections is None:
+        raise ConfigError(report(source, problems))
+    return Config(sections, source)
+
+
+def _tuples(value: Any) -> Any:
+    """Return plain data with its lists as tuples, as the YAML reader gives them."""
+    if isinstance(value, Mapping):
+        return {key: _tuples(item) for key, item in value.items()}
+    return tuple(_tuples(item) for item in value) if isinstance(value, (list, tuple)) else value

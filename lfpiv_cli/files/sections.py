@@ -1,0 +1,314 @@
+"""The sections of the configuration: every key, its unit (in its name), its range and its default.
+
+A key that a section does not know is an error, and so are NaN and infinity. Sequences are tuples. What involves several
+keys is checked in `files.checks`.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+
+Positive = Annotated[float, Field(gt=0.0)]
+NotNegative = Annotated[float, Field(ge=0.0)]
+Count = Annotated[int, Field(ge=1)]
+Index = Annotated[float, Field(ge=1.0, le=5.0)]
+Angle = Annotated[float, Field(gt=-90.0, lt=90.0)]
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+Pair = tuple[float, float]
+Vector = tuple[float, float, float]
+
+# Sizes above these are slips of the keyboard; they would ask for more memory than any machine has.
+MOST_PIXELS_PER_SIDE = 100_000
+MOST_VOXELS_PER_SIDE = 10_000
+MOST_PARTICLES = 10_000_000
+
+
+def _each_axis(value: Any) -> Any:
+    """Let one number stand for the three axes."""
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        return (value, value, value)
+    return value
+
+
+def _each_window(value: Any) -> Any:
+    return tuple(_each_axis(item) for item in value) if isinstance(value, tuple) else value
+
+
+PerAxis = Annotated[tuple[Positive, Positive, Positive], BeforeValidator(_each_axis)]
+Voxels = Annotated[int, Field(ge=1, le=MOST_VOXELS_PER_SIDE)]
+WindowSide = Annotated[int, Field(ge=4, le=MOST_VOXELS_PER_SIDE)]
+Overlap = Annotated[float, Field(ge=0.0, lt=1.0)]
+Pixels = Annotated[int, Field(ge=1, le=MOST_PIXELS_PER_SIDE)]
+
+
+class Section(BaseModel):
+    """What all sections share."""
+
+    model_config = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class MainLens(Section):
+    """The main lens: M and two of its lengths; what is given twice must agree.
+
+    magnification: M, negative, as the image is inverted. focal_length_mm: F_m; or image_distance_mm: S_i = F_m (1 - M).
+    aperture_mm: the diameter p_m; or f_number: F_m / p_m.
+    """
+
+    magnification: Annotated[float, Field(lt=0.0)]
+    focal_length_mm: Positive | None = None
+    image_distance_mm: Positive | None = None
+    aperture_mm: Positive | None = None
+    f_number: Positive | None = None
+
+
+class Microlenses(Section):
+    """The microlens array: pitch p_l, focal length f_m or f_number (f_m / p_l), layout.
+
+    columns and rows document the array; only the lenses that the sensor sees count.
+    """
+
+    pitch_mm: Positive
+    focal_length_mm: Positive | None = None
+    f_number: Positive | None = None
+    columns: Count | None = None
+    rows: Count | None = None
+    layout: Literal["square", "hexagonal"] = "square"
+
+
+class Sensor(Section):
+    """The sensor: pixel pitch, size, and the world axis that its columns follow.
+
+    microlens_distance_mm: s_mu, how far it lies behind the array (default: the microlenses' focal length).
+    """
+
+    pixel_um: Positive
+    columns: Pixels
+    rows: Pixels
+    microlens_distance_mm: Positive | None = None
+    column_axis: Literal["x", "y"] = "x"
+
+
+class CameraSection(Section):
+    """The camera; main_lens may be missing where only the lattice is sought."""
+
+    main_lens: MainLens | None = None
+    microlenses: Microlenses
+    sensor: Sensor
+
+
+class MediaSection(Section):
+    """Refractive indices in front of the lens: of the air, the window and the fluid."""
+
+    air: Index = 1.0
+    window: Index = 1.0
+    fluid: Index = 1.0
+
+
+class WindowSection(Section):
+    """The window: distance d1 from the main lens and thickness d2. Only exact refraction reads it."""
+
+    distance_mm: Positive
+    thickness_mm: NotNegative
+
+
+class VolumeSection(Section):
+    """The volume: shape_xyz and voxel_mm (a number or [x, y, z]), or size_mm, which leaves the voxels to the program.
+
+    reference: the origin of its coordinates, the nominal focal point or the channel's mid plane on the optical axis.
+    """
+
+    shape_xyz: tuple[Voxels, Voxels, Voxels] | None = None
+    voxel_mm: PerAxis | None = None
+    size_mm: tuple[Positive, Positive, Positive] | None = None
+    centre_mm: Vector = (0.0, 0.0, 0.0)
+    reference: Literal["focal_point", "mid_plane"] = "focal_point"
+
+
+class BoardSection(Section):
+    """The calibration board: dots along x and y, their spacing and diameter, the board's thickness t_b.
+
+    medium: what the board stands in. polarity: whether the dots are brighter or darker than the board.
+    """
+
+    dots: tuple[Annotated[int, Field(ge=2)], Annotated[int, Field(ge=2)]]
+    spacing_mm: Positive
+    dot_diameter_mm: Positive
+    thickness_mm: NotNegative = 0.0
+    medium: Literal["air", "fluid"] = "air"
+    polarity: Literal["bright", "dark"] = "bright"
+
+
+class ChannelSection(Section):
+    """The channel of Eq. 21: inner width D, wall t_w, and the camera's move after the board (default: Eq. 21's d_m)."""
+
+    width_mm: Positive
+    wall_mm: NotNegative
+    camera_move_mm: float | None = None
+
+
+class WeightsSection(Section):
+    """How weights are made: equivalent ray tracing, paraxial refraction, exact integrals."""
+
+    method: Literal["ert"] = "ert"
+    refraction: Literal["paraxial"] = "paraxial"
+    sampling: Literal["exact"] = "exact"
+
+
+class ReconstructionSection(Section):
+    """The solver: em (default, better for velocity) or sart (Eq. 12); iterations; SART's relaxation mu.
+
+    padding_voxel: voxels [x, y, z] solved for beyond each side of the volume and cropped on writing (default: derived
+    from how far light spreads).
+    """
+
+    solver: Literal["em", "sart"] = "em"
+    iterations: Annotated[int, Field(ge=1, le=100_000)] = 20
+    relaxation: Annotated[float, Field(gt=0.0, le=2.0)] = 1.0
+    padding_voxel: (
+        tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]] | None
+    ) = None
+
+
+class CorrelationSection(Section):
+    """The correlation windows, coarse to fine, in voxels (numbers or [x, y, z]), or the final one as window_mm.
+
+    overlap: of neighbouring windows, a number or [x, y, z]. dt_s: time between the volumes of a pair.
+    """
+
+    windows: Annotated[tuple[tuple[WindowSide, WindowSide, WindowSide], ...], BeforeValidator(_each_window)] | None = (
+        None
+    )
+    window_mm: PerAxis | None = None
+    overlap: Annotated[tuple[Overlap, Overlap, Overlap], BeforeValidator(_each_axis)] = (0.5, 0.5, 0.5)
+    dt_s: Positive | None = None
+
+    @property
+    def overlap_xyz(self) -> tuple[float, float, float]:
+        """Overlap along x, y, z."""
+        return self.overlap
+
+
+class SquareDuct(Section):
+    """Fully developed laminar flow through a square duct (physics: a Fourier series scaled to the mean velocity)."""
+
+    kind: Literal["square_duct"]
+    width_mm: Positive
+    mean_velocity_m_s: float
+    centre_mm: Vector = (0.0, 0.0, 0.0)
+    axis: Literal["x", "y"] = "x"
+
+
+class RigidRotation(Section):
+    """omega x (r - centre) + velocity, omega in rad/s, right-handed about x, y, z."""
+
+    kind: Literal["rigid_rotation"]
+    angular_velocity_rad_s: Vector
+    centre_mm: Vector = (0.0, 0.0, 0.0)
+    velocity_m_s: Vector = (0.0, 0.0, 0.0)
+
+
+class TaylorGreen(Section):
+    """Plane Taylor-Green vortices plus a uniform velocity."""
+
+    kind: Literal["taylor_green"]
+    amplitude_m_s: float
+    wavelength_mm: Positive
+    centre_mm: Vector = (0.0, 0.0, 0.0)
+    plane: Literal["xy", "xz", "yz"] = "xz"
+    velocity_m_s: Vector = (0.0, 0.0, 0.0)
+
+
+class Shear(Section):
+    """A velocity along one axis that grows across another, plus a uniform velocity."""
+
+    kind: Literal["shear"]
+    rate_per_s: float
+    along: Literal["x", "y", "z"] = "x"
+    across: Literal["x", "y", "z"] = "z"
+    centre_mm: Vector = (0.0, 0.0, 0.0)
+    velocity_m_s: Vector = (0.0, 0.0, 0.0)
+
+
+class Uniform(Section):
+    """The same velocity everywhere."""
+
+    kind: Literal["uniform"]
+    velocity_m_s: Vector
+
+
+FlowSection = Annotated[SquareDuct | RigidRotation | TaylorGreen | Shear | Uniform, Field(discriminator="kind")]
+
+
+class SimulationSection(Section):
+    """What `simulate` renders.
+
+    Scene: flow (its centre in the volume's coordinates), particles (their number in the volume), particle_diameter_mm,
+    brightness (range of each particle's light relative to particle_counts), particle_counts (counts of a whole particle
+    of brightness 1), mid_plane_z_mm (where the origin of a mid_plane volume lies behind the focal point; by default
+    where Eq. 21 puts it for the board at board_z_mm).
+    Board: board_z_mm, board_tilt_deg, board_offset_mm, board_rotation_deg.
+    Camera as it really is: rotation_deg of the array (from the columns towards the rows), shift_px (columns, rows) and
+    distortion_per_mm2.
+    Sensor: peak_counts (of a pixel that sees only light, in white and board images), photons_per_count (null: no shot
+    noise), read_noise_counts, dark_level_counts, bits.
+    Tracing: refraction, rays per particle (null: as many as the noise needs), seed.
+    """
+
+    flow: FlowSection | None = None
+    particles: Annotated[int, Field(ge=0, le=MOST_PARTICLES)] = 1000
+    particle_diameter_mm: NotNegative = 0.05
+    brightness: tuple[NotNegative, NotNegative] = (0.6, 1.4)
+    particle_counts: Positive = 500_000.0
+    mid_plane_z_mm: float | None = None
+    board_z_mm: float = 0.0
+    board_tilt_deg: tuple[Angle, Angle] = (0.0, 0.0)
+    board_offset_mm: Pair = (0.0, 0.0)
+    board_rotation_deg: Angle = 0.0
+    rotation_deg: Angle = 0.0
+    shift_px: Pair = (0.0, 0.0)
+    distortion_per_mm2: float = 0.0
+    peak_counts: Positive = 28_000.0
+    photons_per_count: Positive | None = 0.5
+    read_noise_counts: NotNegative = 6.0
+    dark_level_counts: NotNegative = 96.0
+    bits: Annotated[int, Field(ge=1, le=16)] = 16
+    refraction: Literal["exact", "paraxial"] = "exact"
+    rays: Annotated[int, Field(ge=1)] | None = None
+    seed: Annotated[int, Field(ge=0)] = 0
+
+
+class Limits(Section):
+    """What `validate flow` must reach: shares, 0.05 for 5 %.
+
+    streamwise_mean_error: largest |sum v / sum u - 1|. within_25_percent_streamwise, within_25_percent_vector: smallest
+    share of the windows with an error below a quarter of the true velocity.
+    """
+
+    streamwise_mean_error: NotNegative | None = None
+    within_25_percent_streamwise: Share | None = None
+    within_25_percent_vector: Share | None = None
+
+
+class ValidationSection(Section):
+    """The analytic flow that vectors are compared with (default: the simulation's), and the limits."""
+
+    flow: FlowSection | None = None
+    limits: Limits = Limits()
+
+
+class Sections(Section):
+    """The whole configuration as it stands in the file; `files.config.Config` says what is missing."""
+
+    camera: CameraSection | None = None
+    media: MediaSection | None = None
+    window: WindowSection | None = None
+    volume: VolumeSection | None = None
+    board: BoardSection | None = None
+    channel: ChannelSection | None = None
+    weights: WeightsSection = WeightsSection()
+    reconstruction: ReconstructionSection = ReconstructionSection()
+    correlation: CorrelationSection = CorrelationSection()
+    simulation: SimulationSection = SimulationSection()
+    validation: ValidationSection = ValidationSection()
