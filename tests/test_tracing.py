@@ -79,7 +79,8 @@ def test_one_ray_by_hand(table2):
     """Point (1.03, -0.52, 0) in air, through the lens's point (5, 0), M = -1.
 
     slope x = (5 - 1.03)/200 = 0.01985, behind the lens 0.01985 - 5/100 = -0.03015; at the array
-    5 - 0.03015 * 200 = -1.03: M x, whatever X. Nearest lens -1.0; sensor -1.03 + 0.8 (-0.03015 - (-1.03 + 1.0)/0.8) = -1.02412.
+    5 - 0.03015 * 200 = -1.03: M x, whatever X. Nearest lens -1.0;
+    sensor -1.03 + 0.8 (-0.03015 - (-1.03 + 1.0)/0.8) = -1.02412.
     slope y = 0.52/200 = 0.0026, at the array +0.52, nearest lens 0.5, sensor 0.52 + 0.8 (0.0026 - 0.02/0.8) = 0.50208.
     """
     points, lens = np.array([[1.03, -0.52, 0.0]]), np.array([[5.0, 0.0]])

@@ -41,8 +41,9 @@ RAYS = 40_000
 # constant: through five points of it, a polynomial is right to 1e-10 for lenses up to f/1.4.
 SLOPE_NODES = 5
 
-# Samples of a pixel of a white image: the edge of a micro-image is then known to 1 % of a pixel's light.
-WHITE_SAMPLES = 64
+# A pixel of a white image is sampled on a grid this wide: a micro-image's edge is known to 1 % of a pixel's light, and
+# the grid's symmetry keeps its centre in place.
+WHITE_SAMPLES_PER_SIDE = 8
 
 
 @dataclass(frozen=True)
@@ -236,10 +237,10 @@ def _add_light(image: NDArray[np.float64], pixels: NDArray[np.int32], weights: N
                 image[pixels[i, k]] += weights[i]
 
 
-def render_white(camera: Camera, level: float, samples: int = WHITE_SAMPLES) -> NDArray[np.float64]:
+def render_white(camera: Camera, level: float, samples_per_side: int = WHITE_SAMPLES_PER_SIDE) -> NDArray[np.float64]:
     """Render uniform light: every microlens shows the aperture disc.
 
-    Traced backwards from `samples` points of each pixel, through evenly spread points of each near microlens, to the
+    Traced backwards from a grid of points of each pixel, through evenly spread points of each near microlens, to the
     main lens. Only the nearest lens and its eight neighbours are asked, enough while micro-images overlap less than
     half. The distortion moves light on the array, which uniform light does not show.
 
@@ -251,14 +252,16 @@ def render_white(camera: Camera, level: float, samples: int = WHITE_SAMPLES) -> 
     -------
     (rows, columns) float64, expected counts
     """
-    sequence = (0.5 + np.arange(samples)[:, np.newaxis] * SEQUENCE) % 1.0
+    samples = samples_per_side**2
+    line = (np.arange(samples_per_side) + 0.5) / samples_per_side - 0.5
+    positions = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
     # offsets within a lens's cell: points of the basis cell, moved to the lens that they are nearest to
     lattice = camera.lattice
-    cell = sequence[:, 2:] @ lattice.basis + lattice.origin
+    cell = (np.arange(samples)[:, np.newaxis] * SEQUENCE[:2] % 1.0) @ lattice.basis + lattice.origin
     offsets = cell - lattice.points(lattice.nearest(cell))
     centres = camera.micro_image_lattice_px()
     return _backtrack_white(
-        sequence[:, :2] - 0.5,
+        positions,
         offsets,
         kernel_distances(camera),
         camera.aperture_radius_mm,

@@ -1,0 +1,173 @@
+"""The renderer against the readable tracer, light that is conserved, white light traced both ways, the same bits."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numba
+import numpy as np
+import pytest
+
+from lfpiv_cli.errors import ConfigError
+from lfpiv_cli.optics.media import Media, Window, fluid_path_to_focus
+from lfpiv_cli.optics.microlenses import Lattice
+from lfpiv_cli.optics.tracing import disc_points, exact_slope, slopes_equivalent, slopes_exact, trace
+from lfpiv_cli.synthetic import render
+from lfpiv_cli.synthetic.render import ObjectSpace, render_points, render_white, slope_polynomial, slope_ratio
+
+
+@pytest.fixture
+def small(camera):
+    """A corner of the camera, its array turned, shifted and distorted, with either kind of array."""
+    lattice = Lattice.regular(0.1, camera.lattice.layout, 0.01, (0.013, -0.021))
+    return replace(camera, columns=150, rows=120, lattice=lattice, distortion_per_mm2=1e-3)
+
+
+@pytest.fixture(params=["paraxial", "exact"])
+def space(request, media, window):
+    return ObjectSpace(media, window, request.param)
+
+
+def image_of(camera, sensor_mm, weights):
+    """Count rays into pixels, pixel c reaching from c - 1/2 to c + 1/2."""
+    column, row = np.rint(camera.mm_to_px(sensor_mm)).astype(int).T
+    inside = (column >= 0) & (column < camera.columns) & (row >= 0) & (row < camera.rows)
+    image = np.zeros((camera.rows, camera.columns))
+    np.add.at(image, (row[inside], column[inside]), np.broadcast_to(weights, len(inside))[inside])
+    return image
+
+
+def test_renderer_equals_the_readable_tracer(small, space, rng):
+    points = np.array([[0.05, -0.1, 3.0], [-0.2, 0.1, -4.0]])
+    light, rays, diameter = np.array([1.0, 3.0]), 400, 0.05
+    found = render_points(small, space, points, light, diameter, np.random.default_rng(5), rays=rays)
+
+    expected = np.zeros_like(found)
+    for point, brightness, shift in zip(points, light, np.random.default_rng(5).random((2, 4)), strict=True):
+        a, b, c, d = ((shift + np.arange(rays)[:, np.newaxis] * render.SEQUENCE) % 1.0).T
+        lens = 12.5 * np.sqrt(a)[:, np.newaxis] * np.stack([np.cos(2 * np.pi * b), np.sin(2 * np.pi * b)], axis=1)
+        r = 0.5 * diameter * np.sqrt(1 - c ** (2 / 3))
+        starts = point + np.stack([r * np.cos(2 * np.pi * d), r * np.sin(2 * np.pi * d), 0 * r], axis=1)
+        if space.refraction == "exact":
+            slopes = slopes_exact(starts, lens, small, space.media, space.window)
+        else:
+            slopes = slopes_equivalent(starts, lens, small, space.media)
+        expected += image_of(small, trace(small, lens, slopes).sensor_mm, brightness / rays)
+    assert found.sum() > 3.8  # some rays miss the small sensor
+    # a ray on the edge of a pixel may fall on either side: none is expected among 800
+    assert np.abs(found - expected).sum() < 1e-9
+
+
+def test_column_axis_is_applied_once(small, space, rng):
+    point = np.array([[0.2, -0.05, 2.0]])
+    along_x = render_points(small, space, point, 1.0, 0.05, np.random.default_rng(1), rays=100)
+    turned = replace(small, column_axis="y")
+    along_y = render_points(turned, space, point[:, [1, 0, 2]], 1.0, 0.05, np.random.default_rng(1), rays=100)
+    assert np.array_equal(along_x, along_y)
+
+
+def test_light_off_the_sensor_is_lost(small, space, rng):
+    inside, beyond = np.array([[0.0, 0.0, 1.0]]), np.array([[3.0, 0.0, 1.0]])
+    assert render_points(small, space, inside, 7.0, 0.0, rng, rays=1000).sum() == pytest.approx(7.0)
+    assert render_points(small, space, beyond, 7.0, 0.0, rng, rays=1000).sum() == 0.0
+
+
+def test_no_points_give_a_dark_image(small, space, rng):
+    assert render_points(small, space, np.empty((0, 3)), 1.0, 0.05, rng).sum() == 0.0
+
+
+def test_slope_polynomial_against_exact_snell():
+    layers, indices = np.array([98.0, 2.0, 140.0]), np.array([1.0, 1.49, 1.33])
+    for reach in (20.0, 70.0):  # f/4 and a corner; f/1.4
+        nodes, factors = slope_polynomial(reach, layers, indices)
+        for lateral in np.linspace(0.01, 1.0, 50) * reach:
+            exact = exact_slope(lateral, 0.0, layers, indices)[0]
+            assert lateral * slope_ratio(lateral**2, nodes, factors) == pytest.approx(
+                exact, rel=1e-7 * (reach / 70) ** 8
+            )
+
+
+def test_a_ball_seen_along_the_axis_has_a_fifth_of_the_squared_radius_per_axis(rng):
+    points = np.array([render._in_ball(2.0, *u) for u in rng.random((20000, 2))])
+    assert np.hypot(*points.T).max() <= 2.0
+    # 0.8 +- 0.8 sqrt(8/7)/sqrt(20000): three standard deviations are 0.02
+    assert np.mean(points**2, axis=0) == pytest.approx([0.8, 0.8], abs=0.02)
+
+
+def test_same_bits_for_any_number_of_threads_and_any_batch(small, space, rng, monkeypatch):
+    points = rng.uniform(-0.2, 0.2, (7, 3))
+
+    def picture():
+        return render_points(small, space, points, 1.0, 0.05, np.random.default_rng(3), rays=500)
+
+    threads = numba.get_num_threads()
+    expected = picture()
+    numba.set_num_threads(1)
+    try:
+        assert np.array_equal(picture(), expected)
+    finally:
+        numba.set_num_threads(threads)
+    monkeypatch.setattr(render, "RAYS_AT_ONCE", 1000)
+    assert np.array_equal(picture(), expected)
+
+
+def test_progress_counts_the_points(small, space, rng, monkeypatch):
+    monkeypatch.setattr(render, "RAYS_AT_ONCE", 20)
+    done = []
+    render_points(small, space, np.zeros((5, 3)), 1.0, 0.05, rng, rays=10, progress=done.append)
+    assert done == [2, 2, 1]
+
+
+def test_exact_refraction_needs_a_window(small, water, rng):
+    with pytest.raises(ConfigError, match=r"1\.33 needs a window"):
+        render_points(small, ObjectSpace(water, None, "exact"), np.zeros((1, 3)), 1.0, 0.05, rng)
+
+
+def test_a_point_in_front_of_the_fluid_is_refused(small, water, rng):
+    window = Window(195.0, 1.0)
+    path = fluid_path_to_focus(window, small.focus_distance_mm, water)
+    with pytest.raises(ConfigError, match="in front of the fluid"):
+        render_points(small, ObjectSpace(water, window), np.array([[0, 0, -path - 0.5]]), 1.0, 0.05, rng)
+
+
+@pytest.mark.parametrize("microlens_distance", [0.8, 0.7])
+def test_white_light_backwards_equals_forwards(small, rng, microlens_distance):
+    """Rays from points evenly on the aperture to points evenly on the array, against the backward count."""
+    camera = replace(small, distortion_per_mm2=0.0, microlens_distance_mm=microlens_distance, columns=60, rows=50)
+    count, area = 500_000, (0.7, 0.6)
+    lens = disc_points(count, camera.aperture_radius_mm, rng)
+    array = (rng.random((count, 2)) - 0.5) * area
+    hits = trace(camera, lens, (array - lens) / camera.image_distance_mm + lens / camera.focal_length_mm)
+    # a fully lit pixel is the image of (pixel s_i/s_mu)^2 of the aperture through one cell of the array
+    share = (camera.pixel_mm * camera.image_distance_mm / microlens_distance / 12.5) ** 2 / np.pi
+    per_pixel = count * share * 0.01 * abs(np.linalg.det(camera.lattice.basis / 0.1)) / (area[0] * area[1])
+    forwards = image_of(camera, hits.sensor_mm, 1.0 / per_pixel)
+    difference = forwards - render_white(camera, 1.0)
+    # noise of per_pixel (some 50) rays on lit pixels, 64 samples on the micro-images' edges; no bias
+    assert np.sqrt(np.mean(difference**2)) < 1.3 / np.sqrt(per_pixel)
+    assert abs(difference.mean()) < 0.003
+
+
+def test_white_light_centres_micro_images_on_their_lattice(small):
+    camera = replace(small, aperture_mm=10.0)  # stopped down: round spots apart from each other
+    image = render_white(camera, 1000.0)
+    lattice = camera.micro_image_lattice_px()
+    row, column = np.indices(image.shape)
+    pixels = np.stack([column, row], axis=-1)
+    owner = lattice.nearest(pixels)
+    for index in [(0, 0), (1, 0), (0, -1)]:
+        mine = np.all(owner == index, axis=-1)
+        centre = (pixels[mine] * image[mine][:, np.newaxis]).sum(axis=0) / image[mine].sum()
+        # the grid's share of each of 25 pixels on the edge
+        assert centre == pytest.approx(lattice.points(index), abs=0.01)
+    assert image.max() == pytest.approx(1000.0)
+
+
+def test_white_light_does_not_show_the_distortion(small):
+    assert np.array_equal(render_white(small, 1.0, 2), render_white(replace(small, distortion_per_mm2=0.0), 1.0, 2))
+
+
+def test_paraxial_rays_ignore_the_window(small, water):
+    thicknesses, indices = ObjectSpace(water, Window(50.0, 9.0), "paraxial").layers(small)
+    assert (thicknesses.tolist(), indices.tolist()) == ([200.0], [1.0])
+    assert ObjectSpace(Media()).layers(small)[0].tolist() == [200.0]

@@ -1,0 +1,128 @@
+"""Simulated scenes: what the truth says is what the images show."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lfpiv_cli.calibration.board_pose import BoardGeometry
+from lfpiv_cli.errors import ConfigError
+from lfpiv_cli.grid import Grid
+from lfpiv_cli.optics.media import Media, fluid_path_to_focus
+from lfpiv_cli.synthetic.board import BoardPlacement
+from lfpiv_cli.synthetic.flows import rigid_rotation, uniform
+from lfpiv_cli.synthetic.render import ObjectSpace, render_points
+from lfpiv_cli.synthetic.scenes import (
+    Box,
+    Misalignment,
+    Tracers,
+    channel_walls,
+    channel_window,
+    simulate_board,
+    simulate_particles,
+    simulate_white,
+)
+from lfpiv_cli.synthetic.sensor import Readout
+
+AIR = ObjectSpace(Media())
+NOISELESS = Readout(None, 0.0, 96.0)
+
+
+@pytest.fixture
+def small(camera):
+    return replace(camera, columns=150, rows=120)
+
+
+def test_misalignment_turns_then_shifts(camera):
+    found = Misalignment(0.12, (3.4, -2.1), 2e-5).apply(camera)
+    # the lens on the axis goes to 3.4 px and -2.1 px of 0.0055 mm
+    assert found.lattice.origin == pytest.approx([0.0187, -0.01155])
+    assert np.rad2deg(found.lattice.rotation_rad) == pytest.approx(0.12)
+    assert found.distortion_per_mm2 == 2e-5
+
+
+def test_a_box_around_a_volume_in_a_channel():
+    volume = Grid.centred((130, 100, 100), (0.1, 0.1, 0.1), (0.0, 0.0, -0.5))
+    box = Box.around(volume, (0.5, 0.5, 0.5)).within(channel_walls(10.0, -0.4655))
+    assert box.low_mm == pytest.approx((-7.0, -5.0, -5.4655))
+    assert box.high_mm == pytest.approx((7.0, 5.0, 4.5345))
+    along_y = channel_walls(10.0, 0.0, "y")
+    assert (along_y.low_mm, along_y.high_mm) == ((-5.0, -np.inf, -5.0), (5.0, np.inf, 5.0))
+
+
+def test_boxes_apart_are_refused():
+    with pytest.raises(ConfigError, match="no part in common"):
+        Box((0, 0, 8), (1, 1, 9)).within(channel_walls(10.0, 0.0))
+
+
+def test_channel_window_is_half_the_width_in_front_of_the_mid_plane(table2, water):
+    window = channel_window(table2, water, 10.0, 5.0, -0.4655)
+    assert fluid_path_to_focus(window, table2.focus_distance_mm, water) - 0.4655 == pytest.approx(5.0)
+    # by hand: 200 - 5/1.49 - 5.4655/1.33 = 200 - 3.355705 - 4.109398
+    assert window.distance_mm == pytest.approx(192.534897, abs=1e-6)
+
+
+def test_white_image_has_light_dark_and_truth(small, rng):
+    camera = Misalignment(0.3, (2.0, -1.0)).apply(small)
+    still = simulate_white(camera, 1000.0, NOISELESS, rng)
+    assert (still.image.max(), still.dark.min(), still.dark.max()) == (1096, 96, 96)
+    assert still.truth["rotation_deg"] == pytest.approx(0.3)
+    assert still.truth["pitch_px"] == pytest.approx([18.2545, 18.2545], abs=1e-4)
+
+
+def test_board_s_truth_is_its_placement(small, rng):
+    board = BoardGeometry((1, 1), 1.0, 0.2)
+    still = simulate_board(small, AIR, board, BoardPlacement(-0.35, (0.1, 0.05)), 1000.0, NOISELESS, rng)
+    assert still.truth["dots_mm"] == [pytest.approx([0.1, 0.05, -0.35])]
+    light = still.image.astype(float) - still.dark
+    row, column = np.indices(light.shape)
+    # the image is inverted; within a micro-image light may lie anywhere: a third of a pitch
+    centre = small.px_to_mm([(column * light).sum() / light.sum(), (row * light).sum() / light.sum()])
+    assert centre == pytest.approx([-0.1, -0.05], abs=0.03)
+
+
+def test_pairs_are_half_the_delay_before_and_after_the_truth(small):
+    """Frame a is the truth's tracers carried back, frame b forth: rendered again from the truth alone."""
+    box = Box((-0.2, -0.2, -1.0), (0.2, 0.2, 1.0))
+    tracers = Tracers(5, box, light_counts=1e5)
+    flow = uniform((0.05, -0.02, 0.1))
+    pair = simulate_particles(small, AIR, tracers, flow, 2e-3, NOISELESS, np.random.default_rng(4), rays=20_000)
+    assert pair.velocities_m_s == pytest.approx(np.tile([0.05, -0.02, 0.1], (5, 1)))
+    for image, sign in ((pair.image_a, -1), (pair.image_b, 1)):
+        places = pair.positions_mm + sign * np.array([0.05, -0.02, 0.1])  # 1 ms: metres per second are mm
+        expected = render_points(small, AIR, places, 1e5 * pair.brightness, 0.05, np.random.default_rng(9), rays=20_000)
+        # two sets of rays of the same tracers
+        assert np.corrcoef(image.ravel(), expected.ravel())[0, 1] > 0.97
+
+
+def test_tracers_fill_the_box_and_the_brightness(small, rng):
+    box = Box((-1.0, -2.0, -3.0), (1.0, 2.0, 4.0))
+    tracers = Tracers(2000, box, light_counts=100.0)
+    pair = simulate_particles(small, AIR, tracers, rigid_rotation((0, 0, 5.0)), 1e-3, Readout(), rng, rays=1)
+    for axis in range(3):
+        low, high = box.low_mm[axis], box.high_mm[axis]
+        assert np.histogram(pair.positions_mm[:, axis], 4, (low, high))[0] == pytest.approx([500] * 4, abs=80)
+    assert (pair.brightness.min(), pair.brightness.max()) == (
+        pytest.approx(0.6, abs=0.01),
+        pytest.approx(1.4, abs=0.01),
+    )
+
+
+def test_a_pair_is_decided_by_its_seed(small):
+    pairs = [
+        simulate_particles(
+            small,
+            AIR,
+            Tracers(3, Box((-0.1, -0.1, 0.0), (0.1, 0.1, 1.0))),
+            uniform((0, 0, 0)),
+            1e-3,
+            Readout(),
+            np.random.default_rng(6),
+            rays=100,
+        )
+        for _ in range(2)
+    ]
+    assert np.array_equal(pairs[0].image_b, pairs[1].image_b)
+    assert np.array_equal(pairs[0].positions_mm, pairs[1].positions_mm)
