@@ -28,8 +28,8 @@ UM_TO_MM = 1e-3
 # The paper's final window, and one that a displacement of a quarter of its side (8 voxels) does not leave.
 DEFAULT_WINDOWS = ((32, 32, 32), (16, 16, 16))
 SMALLEST_WINDOW = 4
-# Voxels as wide as a microlens lock depth to the array's grid and swallow its velocity: of 6 voxels, half of one recovers
-# 4.7 where a whole one recovers 2.2, and two along the axis 5.0 (EM volumes, 60 iterations).
+# Voxels as wide as a microlens lock depth to the array's grid and swallow its velocity: of 6 voxels, EM volumes give 2.2
+# with them, 4.7 with half of one, and 5.0 with half of one laterally and two along the axis.
 LATERAL_VOXELS_PER_MICROLENS = 2.0
 DEPTH_VOXELS_PER_MICROLENS = 0.5
 
@@ -154,7 +154,7 @@ def choose_voxels(camera: CameraSection, size_mm: Lengths) -> tuple[Triple, Leng
 
 
 def windows_of(section: CorrelationSection, voxel_mm: Lengths) -> tuple[Triple, ...]:
-    """Return the correlation windows in voxels, coarse to fine; `window_mm` is the final one, twice its size the first."""
+    """Return the correlation windows in voxels, coarse to fine; `window_mm` is the final one of two."""
     if section.windows is not None:
         return section.windows
     if section.window_mm is None:

@@ -257,7 +257,10 @@ def _write_points(file: h5py.File, points: h5py.Group, name: str, array: NDArray
 
 
 def _write_attributes(file: h5py.File, attributes: Mapping[str, Any]) -> None:
-    """Write scalars, strings and short numeric arrays at the root; what is None is not said (netCDF knows no empty attribute)."""
+    """Write scalars, strings and short numeric arrays at the root.
+
+    What is None is not said, as netCDF knows no empty attribute.
+    """
     for name, value in attributes.items():
         if name in RESERVED:
             raise ValueError(f"{name} is a name that every file uses for itself")
