@@ -143,7 +143,7 @@ def test_second_peak_is_a_maximum_of_its_own() -> None:
 
 
 @pytest.mark.parametrize(
-    "values", [(0.0, 1.0, 0.5), (-0.1, 1.0, 0.5), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0), (1.0, 0.9, 1.0)]
+    "values", [(0.0, 1.0, 0.5), (-0.1, 1.0, 0.5), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0), (1.0, 0.9, 1.0), (0.5, 0.6, 0.69)]
 )
 def test_peak_that_is_no_gaussian_stays_within_one_voxel(values: tuple[float, float, float]) -> None:
     place, _ = vertex(*values)

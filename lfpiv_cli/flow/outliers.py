@@ -76,7 +76,6 @@ def validate_vectors(
     flag[replaced] = REPLACED
     displacement[rescued] = second[rescued]
     displacement[replaced] = predicted[replaced]
-    displacement[flag >= REJECTED] = np.nan
     return displacement, flag
 
 
