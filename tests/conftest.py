@@ -1,4 +1,4 @@
-"""Fixtures shared by all tests: cameras in both lattice kinds, media with and without a window, the experiment's folder."""
+"""Fixtures shared by all tests: cameras in both lattice kinds, media with and without a window, the data folder."""
 
 from __future__ import annotations
 

@@ -225,11 +225,10 @@ def with_mid_plane(calibration: Calibration, pose: BoardPose, rig: Rig) -> Calib
     if rig.channel is None or rig.board.medium != "air":
         return calibration
     advised = eq21_move_mm(rig.board, rig.channel, rig.media)
-    moved = advised if rig.channel.camera_move_mm is None else rig.channel.camera_move_mm
     return replace(
         calibration,
         camera_move_mm=advised,
-        mid_plane_z_mm=(pose.z0_mm + advised - moved) / rig.media.depth_ratio,
+        mid_plane_z_mm=mid_plane_z_mm(rig.board, rig.channel, rig.media, pose.z0_mm),
         mid_plane_z_sigma_mm=pose.z0_sigma_mm / rig.media.depth_ratio,
     )
 
@@ -238,3 +237,10 @@ def eq21_move_mm(board: BoardGeometry, channel: Channel, media: Media) -> float:
     """Return d_m = t_b + t_w/n_ag + D/(2 n_w), the camera's move from the board to the mid plane (Eq. 21), n_a = 1."""
     wall = channel.wall_mm * media.air / media.window
     return board.thickness_mm + wall + 0.5 * channel.width_mm * media.depth_ratio
+
+
+def mid_plane_z_mm(board: BoardGeometry, channel: Channel, media: Media, board_z_mm: float) -> float:
+    """Return the depth of the channel's mid plane in the fluid after the camera's move (d_m of Eq. 21 unless given)."""
+    advised = eq21_move_mm(board, channel, media)
+    moved = advised if channel.camera_move_mm is None else channel.camera_move_mm
+    return (board_z_mm + advised - moved) / media.depth_ratio

@@ -64,6 +64,11 @@ class Box:
         high = [b[1] + m for b, m in zip(bounds, margin_mm, strict=True)]
         return cls((low[0], low[1], low[2]), (high[0], high[1], high[2]))
 
+    @property
+    def volume_mm3(self) -> float:
+        """Volume in cubic millimetres."""
+        return float(np.prod(np.subtract(self.high_mm, self.low_mm)))
+
     def within(self, other: Box) -> Box:
         """Return the part that lies in another box.
 

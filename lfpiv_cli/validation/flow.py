@@ -9,6 +9,7 @@ Axes: arrays `[z, y, x]` with components (u, v, w) along (x, y, z) last; velocit
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -220,3 +221,24 @@ def truth_at_points(
     # The pseudo-inverse's first row is the value at the point; with too few particles it is the smallest solution.
     fitted = np.einsum("mk,mkc->mc", np.linalg.pinv(design)[:, 0], velocities[nearest])
     return fitted.reshape(centres_mm.shape)
+
+
+def limits_missed(figures: Mapping[str, Any], limits: Mapping[str, float | None]) -> list[str]:
+    """Return a sentence for each figure of `flow_figures` that misses its limit; a figure that is unknown misses.
+
+    Parameters
+    ----------
+    limits : by the name of the figure; `streamwise_mean_error` is the largest size allowed, the others are the smallest
+        shares; None where there is no limit
+    """
+    missed = []
+    for name, limit in limits.items():
+        figure = figures[name]
+        if limit is None:
+            continue
+        if name == "streamwise_mean_error":
+            if figure is None or abs(figure) > limit:
+                missed.append(f"{name} is {figure}, at most {limit} is allowed")
+        elif figure is None or figure < limit:
+            missed.append(f"{name} is {figure}, at least {limit} is asked for")
+    return missed

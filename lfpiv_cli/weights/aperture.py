@@ -1,8 +1,8 @@
 """The round aperture seen through the pixels.
 
-Every cell (a pixel under a microlens) sees its own patch of the main lens, pixel * s_i/s_mu wide. Where a patch straddles the
-rim of the aperture, the cell gets only the share of it that lies inside; divided by the disc's share of its square
-(pi/4), these shares turn the weights of the square aperture into those of the disc.
+Every cell (a pixel under a microlens) sees its own patch of the main lens, pixel * s_i/s_mu wide. Where a patch
+straddles the rim of the aperture, the cell gets only the share of it that lies inside; divided by the disc's share of
+its square (pi/4), these shares turn the weights of the square aperture into those of the disc.
 
 Axes: patches are intervals of X (columns) and Y (rows) on the main lens, in mm about the axis.
 """

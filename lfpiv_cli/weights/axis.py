@@ -63,7 +63,8 @@ class Cells:
     first_lens : number n of the first lens, centred at lens_origin + n lens_pitch
     start : (lenses + 1,) int64, the first cell of each lens
     pixel : (cells,) int32, the pixel of each cell, ascending within a lens
-    patch_mm : (cells, 2) the interval of the main lens that the cell sees through its lens's centre, inside the aperture
+    patch_mm : (cells, 2) the interval of the main lens that the cell sees through its lens's centre, inside the
+    aperture
     """
 
     first_lens: int

@@ -16,6 +16,7 @@ from scipy import ndimage
 
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.grid import Grid
+from lfpiv_cli.optics.camera import ColumnAxis
 from lfpiv_cli.weights.operators import Column, FactorisedOperator
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ class Weights:
     grid: Grid
     padding_xyz: tuple[int, int, int]
     solver_operator: FactorisedOperator
-    column_axis: str
+    column_axis: ColumnAxis
     calibration: Calibration | None = None
 
     @property
@@ -98,7 +99,7 @@ class Weights:
         if self.calibration is None or self.calibration.rectification.rotation_rad == 0.0:
             return np.ascontiguousarray(padded_volume[self._inner])
         y, x = np.meshgrid(self.grid.axis_mm(1), self.grid.axis_mm(0), indexing="ij")
-        turned = self.calibration.rectification.from_world(np.stack([x, y], axis=-1))
+        turned = self.calibration.rectification.from_world(np.stack([x, y], axis=-1), self.column_axis)
         grid = self.padded.grid
         at = [(turned[..., axis] - grid.origin_mm[axis]) / grid.spacing_mm[axis] for axis in (1, 0)]
         pz = self.padding_xyz[2]

@@ -1,0 +1,233 @@
+"""The command line: parse, call a stage, print its summary; errors become exit codes.
+
+Heavy imports happen inside the commands, so that `--help` answers at once.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+from collections.abc import Callable
+from functools import wraps
+from pathlib import Path
+from types import FrameType
+from typing import Any, NoReturn
+
+import click
+
+from lfpiv_cli import __version__
+from lfpiv_cli.errors import LfpivError
+
+EXIT_BUG = 1
+EXIT_INTERRUPTED = 130
+EXIT_TERMINATED = 143
+
+INPUT = click.Path(path_type=Path)
+
+
+class Terminated(BaseException):
+    """SIGTERM arrived; unwinds like KeyboardInterrupt so that temporary files are removed."""
+
+
+def common_options(command: Callable[..., dict[str, Any]]) -> Callable[..., None]:
+    """Give a command the options that all share, and print the summary it returns."""
+
+    @click.option("--overwrite", is_flag=True, help="Replace outputs that exist.")
+    @click.option("--threads", type=click.IntRange(min=1), help="Threads to use; all cores when not given.")
+    @click.option("--json", "as_json", is_flag=True, help="Print one JSON object to stdout and nothing else.")
+    @click.option("-v", "--verbose", is_flag=True, help="Say more on stderr.")
+    @click.option("-q", "--quiet", is_flag=True, help="Say nothing on stderr but errors.")
+    @wraps(command)
+    def run(threads: int | None, as_json: bool, verbose: bool, quiet: bool, **arguments: Any) -> None:
+        from lfpiv_cli.console import Console
+
+        console = Console(verbose=verbose, quiet=quiet or as_json)
+        if threads is not None:
+            from lfpiv_cli.stages import use_threads
+
+            use_threads(threads)
+        summary = command(console=console, **arguments)
+        if as_json:
+            click.echo(json.dumps(summary, allow_nan=False, sort_keys=True))
+        else:
+            console.summary(summary)
+
+    return run
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="lfpiv")
+@click.option("--debug", is_flag=True, help="Show the traceback of an error.")
+def cli(debug: bool) -> None:
+    """From raw light-field camera images to three-dimensional velocity fields.
+
+    \b
+    lfpiv calibrate-snapshot rig.yaml --white white.tif --board board.tif -o calibration.h5
+    lfpiv build-weights rig.yaml --calibration calibration.h5 -o weights.h5
+    lfpiv reconstruct weights.h5 a.tif b.tif --dark dark.tif -o volumes
+    lfpiv correlate volumes/a.vtkhdf volumes/b.vtkhdf -o vectors.vtkhdf
+    lfpiv validate flow rig.yaml --vectors vectors.vtkhdf -o report
+    """
+
+
+@cli.command("calibrate-snapshot")
+@click.argument("config", type=INPUT)
+@click.option("--white", type=INPUT, required=True, help="White image: uniform light through the lens.")
+@click.option("--dark", type=INPUT, help="Dark image, taken with the cap on.")
+@click.option("--board", type=INPUT, help="Snapshot of the dot board.")
+@click.option("-o", "--output", type=INPUT, required=True, help="Calibration file to write (.h5).")
+@click.option("--picture", type=INPUT, help="Picture of the fitted lattice and board to write (.png).")
+@common_options
+def calibrate_snapshot(**arguments: Any) -> dict[str, Any]:
+    """Find the microlenses and the focal plane from a white image and one snapshot of the board.
+
+    \b
+    Example: lfpiv calibrate-snapshot rig.yaml --white white.tif --dark dark.tif --board board.tif \\
+                 -o calibration.h5 --picture calibration.png
+    """
+    from lfpiv_cli import stages
+
+    return stages.calibrate_snapshot(**arguments)
+
+
+@cli.command("build-weights")
+@click.argument("config", type=INPUT)
+@click.option("--calibration", type=INPUT, help="From calibrate-snapshot; without it the data sheet is believed.")
+@click.option("--method", type=click.Choice(["ert"]), help="How points are traced; default from the config.")
+@click.option("--refraction", type=click.Choice(["paraxial"]), help="Snell's law; default from the config.")
+@click.option("--sampling", type=click.Choice(["exact"]), help="How rays are summed; default from the config.")
+@click.option("-o", "--output", type=INPUT, required=True, help="Weights file to write (.h5).")
+@common_options
+def build_weights(**arguments: Any) -> dict[str, Any]:
+    """Calculate how every voxel lights every pixel, by equivalent ray tracing.
+
+    \b
+    Example: lfpiv build-weights rig.yaml --calibration calibration.h5 -o weights.h5
+    """
+    from lfpiv_cli import stages
+
+    return stages.build_weights(**arguments)
+
+
+@cli.command("reconstruct")
+@click.argument("weights", type=INPUT)
+@click.argument("images", type=INPUT, nargs=-1, required=True)
+@click.option("--solver", type=click.Choice(["em", "sart"]), help="Default from the config.")
+@click.option("--iterations", type=click.IntRange(min=1), help="Default from the config.")
+@click.option("--relaxation", type=click.FloatRange(min=0.0, min_open=True, max=2.0), help="Default from the config.")
+@click.option("--dark", type=INPUT, help="Dark image to subtract.")
+@click.option("--background", help="Image without tracers to subtract, or 'minimum' over the images given.")
+@click.option("--resume", is_flag=True, help="Skip outputs that are complete and made from the same inputs.")
+@click.option("--keep-going", is_flag=True, help="Go on with the next frame when one fails.")
+@click.option("-o", "--output", type=INPUT, required=True, help="File for one image, folder for several.")
+@common_options
+def reconstruct(**arguments: Any) -> dict[str, Any]:
+    """Reconstruct the volume of tracer particles behind each image.
+
+    \b
+    Example: lfpiv reconstruct weights.h5 a.tif b.tif --dark dark.tif -o volumes
+    """
+    from lfpiv_cli import stages
+
+    return stages.reconstruct(**arguments)
+
+
+@cli.command("correlate")
+@click.argument("volumes", type=INPUT, nargs=-1, required=True)
+@click.option("--config", type=INPUT, help="In place of the config carried by the volumes.")
+@click.option("--dt-s", type=click.FloatRange(min=0.0, min_open=True), help="Time between the two volumes.")
+@click.option("--windows", help="Window sizes in voxels, coarse to fine, as 32,16.")
+@click.option("--overlap", type=click.FloatRange(min=0.0, max=1.0, max_open=True), help="Of neighbouring windows.")
+@click.option("--pairing", type=click.Choice(["ab", "sequence"]), help="How more than two volumes are paired.")
+@click.option("--resume", is_flag=True, help="Skip outputs that are complete and made from the same inputs.")
+@click.option("-o", "--output", type=INPUT, required=True, help="File for one pair, folder for several.")
+@common_options
+def correlate(**arguments: Any) -> dict[str, Any]:
+    """Measure the displacement between two volumes by three-dimensional cross-correlation.
+
+    \b
+    Example: lfpiv correlate volumes/a.vtkhdf volumes/b.vtkhdf -o vectors.vtkhdf
+    """
+    from lfpiv_cli import stages
+
+    return stages.correlate(**arguments)
+
+
+@cli.command("validate")
+@click.argument("what", type=click.Choice(["flow"]))
+@click.argument("config", type=INPUT)
+@click.option("--vectors", type=INPUT, required=True, help="Vectors to judge.")
+@click.option("--particles", type=INPUT, help="True particles (.npz) to judge by, in place of the config's flow.")
+@click.option("-o", "--output", type=INPUT, required=True, help="Folder for the report.")
+@common_options
+def validate(what: str, **arguments: Any) -> dict[str, Any]:
+    """Compare a result with what is known: figures as JSON, and a picture.
+
+    \b
+    Example: lfpiv validate flow rig.yaml --vectors vectors.vtkhdf -o report
+    """
+    from lfpiv_cli import stages
+
+    return {"flow": stages.validate_flow}[what](**arguments)
+
+
+@cli.command("simulate")
+@click.argument("what", type=click.Choice(["white", "board", "particles"]))
+@click.argument("config", type=INPUT)
+@click.option("-o", "--output", type=INPUT, required=True, help="Folder for the images and their truth.")
+@common_options
+def simulate(what: str, **arguments: Any) -> dict[str, Any]:
+    """Render raw images through the exact optics, ray by ray, with their truth beside them.
+
+    \b
+    Example: lfpiv simulate particles rig.yaml -o simulated
+    """
+    from lfpiv_cli import stages_simulate
+
+    stage = {
+        "white": stages_simulate.simulate_white,
+        "board": stages_simulate.simulate_board,
+        "particles": stages_simulate.simulate_particles,
+    }[what]
+    return stage(**arguments)
+
+
+def main() -> NoReturn:
+    """Run the command line and leave with the exit code of the outcome."""
+    debug = "--debug" in sys.argv[1:]
+    signal.signal(signal.SIGTERM, _terminate)
+    try:
+        cli.main(standalone_mode=False)
+        code = 0
+        sys.stdout.flush()
+    except click.ClickException as error:
+        error.show()
+        code = error.exit_code
+    except (KeyboardInterrupt, click.Abort):
+        code = EXIT_INTERRUPTED
+    except Terminated:
+        code = EXIT_TERMINATED
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        code = 0
+    except LfpivError as error:
+        if debug:
+            raise
+        _complain(str(error))
+        code = error.exit_code
+    except Exception as error:
+        if debug:
+            raise
+        _complain(f"a bug: {type(error).__name__}: {error} (run again with --debug before the command to see where)")
+        code = EXIT_BUG
+    sys.exit(code)
+
+
+def _terminate(_signal: int, _frame: FrameType | None) -> None:
+    raise Terminated
+
+
+def _complain(message: str) -> None:
+    click.echo(f"lfpiv: {message}".encode("utf-8", "surrogateescape").decode("utf-8", "replace"), err=True)

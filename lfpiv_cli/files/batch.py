@@ -1,0 +1,110 @@
+"""Batches: which frames a command was given, where each result goes, and which of them are there already."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from lfpiv_cli.errors import InputError, OutputExistsError, UsageError
+from lfpiv_cli.files.atomic import ensure_writable
+from lfpiv_cli.files.images import count_pages
+
+VTKHDF_SUFFIX = ".vtkhdf"
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One image of a batch: page `page` of the `pages` of a file."""
+
+    path: Path
+    page: int
+    pages: int
+
+    @property
+    def stem(self) -> str:
+        """The file's stem, numbered where the file holds a sequence."""
+        return self.path.stem if self.pages == 1 else f"{self.path.stem}_{self.page:04d}"
+
+
+@dataclass(frozen=True)
+class Target:
+    """One output of a batch: where it goes and the provenance record it will carry."""
+
+    path: Path
+    record: Mapping[str, Any]
+
+
+def frames_of(paths: Iterable[Path]) -> list[Frame]:
+    """Return the frames of image files in order, every page of a sequence."""
+    frames = []
+    for path in paths:
+        pages = count_pages(path)
+        frames += [Frame(path, page, pages) for page in range(pages)]
+    return frames
+
+
+def output_paths(output: Path, stems: Sequence[str]) -> list[Path]:
+    """Return where the results go: `output` itself for one result, a folder of `stem.vtkhdf` for several.
+
+    An existing folder takes a single result too.
+
+    Raises
+    ------
+    UsageError : two inputs would give the same output, or several results meet an output that is a file.
+    """
+    if len(stems) == 1 and not output.is_dir():
+        if output.suffix != VTKHDF_SUFFIX:
+            raise UsageError(f"{output}: a single result is one file, whose name ends in {VTKHDF_SUFFIX}")
+        return [output]
+    if len(stems) > 1 and output.exists() and not output.is_dir():
+        raise UsageError(f"{output}: {len(stems)} results need a folder, and this is a file")
+    twice = sorted({stem for stem in stems if stems.count(stem) > 1}) if len(set(stems)) < len(stems) else []
+    if twice:
+        raise UsageError(f"{output}: two inputs are called {twice[0]!r} and would give the same output")
+    return [output / f"{stem}{VTKHDF_SUFFIX}" for stem in stems]
+
+
+def prepare_folder(paths: Sequence[Path]) -> None:
+    """Make the folder of a batch where only its last part is missing."""
+    folder = paths[0].parent
+    if not folder.exists() and folder.parent.is_dir():
+        ensure_writable(folder, overwrite=False)
+        folder.mkdir(exist_ok=True)
+
+
+def pending(
+    targets: Sequence[Target],
+    inputs: Iterable[Path],
+    overwrite: bool,
+    resume: bool,
+    read_record: Callable[[Path], Mapping[str, Any]],
+) -> list[int]:
+    """Return the numbers of the targets that have to be made.
+
+    With `resume`, a target that is complete and carries the very record that it would get is left as it is.
+
+    Raises
+    ------
+    OutputExistsError : a target is there and neither `overwrite` nor a matching `resume` covers it.
+    """
+    inputs = list(inputs)
+    needed = []
+    for number, target in enumerate(targets):
+        if resume and target.path.exists() and _made_alike(target, read_record):
+            continue
+        if resume and target.path.exists() and not overwrite:
+            raise OutputExistsError(
+                f"{target.path}: exists and was made from other inputs or settings; --overwrite makes it anew"
+            )
+        ensure_writable(target.path, overwrite, inputs)
+        needed.append(number)
+    return needed
+
+
+def _made_alike(target: Target, read_record: Callable[[Path], Mapping[str, Any]]) -> bool:
+    try:
+        return read_record(target.path) == target.record
+    except InputError:
+        return False

@@ -1,0 +1,384 @@
+"""One function per subcommand: read, call the core, write, return the summary.
+
+Every stage refuses outputs that it could not write before it computes, and leaves a provenance record in what it
+writes. Units stand in the names of the figures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from lfpiv_cli.calibration.model import Calibration
+from lfpiv_cli.calibration.model import calibrate as calibrate_images
+from lfpiv_cli.console import Console
+from lfpiv_cli.errors import ConfigError, InputError, LfpivError, LimitMissedError, PartialError, UsageError
+from lfpiv_cli.files import images as image_files
+from lfpiv_cli.files import vtkhdf
+from lfpiv_cli.files.atomic import ensure_writable, write_json
+from lfpiv_cli.files.batch import Frame, Target, frames_of, output_paths, pending, prepare_folder
+from lfpiv_cli.files.calibration_file import read_calibration, write_calibration
+from lfpiv_cli.files.config import Config, load_config
+from lfpiv_cli.files.particles import read_particles
+from lfpiv_cli.files.pictures import ensure_drawing, write_picture
+from lfpiv_cli.files.provenance import record as provenance_record
+from lfpiv_cli.files.weights_file import WeightsFile, read_weights, write_weights
+from lfpiv_cli.flow.correlation import correlate as correlate_volumes
+from lfpiv_cli.flow.correlation import count_passes
+from lfpiv_cli.flow.field import REJECTED, VectorField
+from lfpiv_cli.grid import Grid
+from lfpiv_cli.reconstruction.images import light, minimum_background
+from lfpiv_cli.reconstruction.solvers import normalisers
+from lfpiv_cli.reconstruction.solvers import reconstruct as solve
+from lfpiv_cli.validation.flow import flow_figures, limits_missed, truth_at_points
+from lfpiv_cli.validation.pictures import flow_figure
+from lfpiv_cli.weights.build import default_padding, factorise, seen_share
+from lfpiv_cli.weights.model import Weights
+from lfpiv_cli.weights.operators import FactorisedOperator
+
+# Below this share of its light on the sensor a voxel counts as out of view.
+LEAST_SEEN = 0.01
+
+
+def use_threads(threads: int) -> None:
+    """Use at most `threads` threads from here on."""
+    numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
+
+
+def calibrate_snapshot(
+    config: Path,
+    white: Path,
+    dark: Path | None,
+    board: Path | None,
+    output: Path,
+    picture: Path | None,
+    overwrite: bool,
+    console: Console,
+) -> dict[str, Any]:
+    """Find the lattice in a white image and the focal plane in a snapshot of the board."""
+    inputs = _given(config=config, white=white, dark=dark, board=board)
+    for target in filter(None, (output, picture)):
+        ensure_writable(target, overwrite, inputs.values())
+    if picture:
+        ensure_drawing()
+    settings = load_config(config)
+    shape = settings.image_shape()
+    frames = {name: image_files.read_image(path, shape) for name, path in inputs.items() if name != "config"}
+    calibration = calibrate_images(
+        frames["white"],
+        frames.get("dark"),
+        frames.get("board"),
+        layout=settings.camera.microlenses.layout,
+        rig=settings.rig() if board else None,
+    )
+    write_calibration(output, calibration, _record("calibrate-snapshot", settings, inputs), overwrite)
+    if picture:
+        from lfpiv_cli.calibration.picture import calibration_figure
+
+        write_picture(picture, calibration_figure(calibration, frames["white"], frames.get("board")), overwrite)
+    return calibration.summary()
+
+
+def build_weights(
+    config: Path,
+    calibration: Path | None,
+    method: str | None,
+    refraction: str | None,
+    sampling: str | None,
+    output: Path,
+    overwrite: bool,
+    console: Console,
+) -> dict[str, Any]:
+    """Calculate the weights of the configured volume, for the calibrated camera where there is a calibration."""
+    inputs = _given(config=config, calibration=calibration)
+    ensure_writable(output, overwrite, inputs.values())
+    settings = load_config(config).overridden("weights", method=method, refraction=refraction, sampling=sampling)
+    found = read_calibration(calibration) if calibration else None
+    camera = settings.camera_model()
+    if found:
+        camera = found.camera(camera)
+    reference_z = _reference_z_mm(settings, found)
+    grid = settings.grid(origin_z_mm=reference_z)
+    media = settings.media_model()
+    padding = settings.reconstruction.padding_voxel or default_padding(camera, media, grid)
+    operator = factorise(camera, media, grid.padded(padding))
+    _judge_view(factorise(camera, media, grid) if any(padding) else operator, grid, console)
+    weights = Weights(grid, padding, operator, camera.column_axis, found)
+    record = _record("build-weights", settings, inputs)
+    write_weights(output, WeightsFile(weights, camera, settings.volume.reference, reference_z, record), overwrite)
+    return {
+        "voxels_xyz": list(grid.shape_xyz),
+        "voxel_mm": list(grid.spacing_mm),
+        "padding_xyz": list(padding),
+        "reference": settings.volume.reference,
+        "reference_z_mm": reference_z,
+        "frame": weights.frame,
+        "file_bytes": output.stat().st_size,
+    }
+
+
+def reconstruct(
+    weights: Path,
+    images: Sequence[Path],
+    solver: str | None,
+    iterations: int | None,
+    relaxation: float | None,
+    dark: Path | None,
+    background: str | None,
+    resume: bool,
+    keep_going: bool,
+    output: Path,
+    overwrite: bool,
+    console: Console,
+) -> dict[str, Any]:
+    """Reconstruct the volume behind each image."""
+    common = _given(weights=weights, dark=dark, background=None if background == "minimum" else background)
+    frames = frames_of(images)
+    paths = output_paths(output, [frame.stem for frame in frames])
+    prepare_folder(paths)
+    content = read_weights(weights)
+    settings = _carried_config(content.provenance, weights).overridden(
+        "reconstruction", solver=solver, iterations=iterations, relaxation=relaxation
+    )
+    targets = [
+        Target(path, _record(f"reconstruct page {frame.page}", settings, common | {"image": frame.path}))
+        for path, frame in zip(paths, frames, strict=True)
+    ]
+    needed = pending(targets, [*common.values(), *images], overwrite, resume, _record_of)
+    shape = content.weights.image_shape
+    dark_image = image_files.read_image(dark, shape) if dark else None
+    background_image = _background(background, frames, shape)
+    operator = content.weights.padded
+    sums = normalisers(operator) if needed else None
+    chosen = settings.reconstruction
+    residuals: list[float] = []
+    failures: list[str] = []
+    with console.progress(len(needed) * chosen.iterations, "reconstruct") as advance:
+        for number in needed:
+            try:
+                raw = image_files.read_page(frames[number].path, frames[number].page, shape)
+                image = content.weights.prepare(light(raw, dark_image, background_image))
+                result = solve(operator, image, chosen.solver, chosen.iterations, chosen.relaxation, sums, advance)
+            except LfpivError as error:
+                if not keep_going:
+                    raise
+                failures.append(str(error))
+                console.say(f"lfpiv: {error}")
+                continue
+            residuals.append(float(result.residual[-1]))
+            vtkhdf.write_volume(
+                targets[number].path,
+                content.weights.to_world(result.volume),
+                _file_grid(content),
+                provenance=targets[number].record,
+                attributes={
+                    "reference": content.reference,
+                    "reference_z_mm": content.reference_z_mm,
+                    "residual": result.residual,
+                },
+                overwrite=overwrite,
+            )
+    if failures:
+        raise PartialError(f"{len(failures)} of {len(frames)} frames failed, the first because {failures[0]}")
+    return {
+        "frames": len(frames),
+        "reconstructed": len(residuals),
+        "skipped": len(frames) - len(needed),
+        "solver": chosen.solver,
+        "iterations": chosen.iterations,
+        "residual": max(residuals, default=None),
+    }
+
+
+def correlate(
+    volumes: Sequence[Path],
+    config: Path | None,
+    dt_s: float | None,
+    windows: str | None,
+    overlap: float | None,
+    pairing: str | None,
+    resume: bool,
+    output: Path,
+    overwrite: bool,
+    console: Console,
+) -> dict[str, Any]:
+    """Measure the displacements between pairs of volumes."""
+    pairs = _pairs(volumes, pairing)
+    paths = output_paths(output, [first.stem for first, _ in pairs])
+    prepare_folder(paths)
+    given = load_config(config) if config else None
+    sizes = [_window(text) for text in windows.split(",")] if windows else None
+    rejected = total = 0
+    settings_of = []
+    for first, _ in pairs:
+        settings = given or _carried_config(vtkhdf.read_header(first).provenance, first)
+        settings_of.append(settings.overridden("correlation", dt_s=dt_s, windows=sizes, overlap=overlap))
+    targets = [
+        Target(path, _record("correlate", settings, _given(config=config, volume_a=pair[0], volume_b=pair[1])))
+        for path, pair, settings in zip(paths, pairs, settings_of, strict=True)
+    ]
+    inputs = [*volumes, *filter(None, [config])]
+    for number in pending(targets, inputs, overwrite, resume, _record_of):
+        volume_a, volume_b = (vtkhdf.open_volume(path) for path in pairs[number])
+        _ensure_alike(pairs[number], volume_a, volume_b)
+        chosen = settings_of[number].correlation
+        grid = volume_a.grid
+        sizes_xyz = settings_of[number].windows_voxel(grid.spacing_mm)
+        with console.progress(count_passes(sizes_xyz), "correlate") as advance:
+            field = correlate_volumes(
+                volume_a.array, volume_b.array, grid, sizes_xyz, chosen.overlap_xyz, chosen.dt_s, progress=advance
+            )
+        vtkhdf.write_vectors(
+            targets[number].path,
+            field,
+            provenance=targets[number].record,
+            attributes={name: volume_a.attributes[name] for name in ("reference", "reference_z_mm")},
+            overwrite=overwrite,
+        )
+        rejected += int(np.count_nonzero(field.flag >= REJECTED))
+        total += field.flag.size
+    return {"pairs": len(pairs), "vectors": total, "rejected": rejected}
+
+
+def validate_flow(
+    config: Path, vectors: Path, particles: Path | None, output: Path, overwrite: bool, console: Console
+) -> dict[str, Any]:
+    """Judge a vector field by an analytic flow or by true particles."""
+    inputs = _given(config=config, vectors=vectors, particles=particles)
+    figures_path, picture_path = output / "flow.json", output / "flow.png"
+    prepare_folder([figures_path])
+    for target in (figures_path, picture_path):
+        ensure_writable(target, overwrite, inputs.values())
+    ensure_drawing()
+    settings = load_config(config)
+    field = vtkhdf.open_vectors(vectors)
+    if field.dt_s is None:
+        raise InputError(f"{vectors}: holds displacements without a time; correlate again with --dt-s")
+    centres = _window_centres_mm(field)
+    if particles:
+        truth, inside = _truth_of_particles(
+            particles, centres, vtkhdf.read_header(vectors).attributes["reference_z_mm"]
+        )
+    else:
+        truth = settings.true_flow()(centres.reshape(-1, 3)).reshape(centres.shape)
+        inside = np.asarray(truth.any(axis=-1))
+    figures = flow_figures(field, truth, inside)
+    record = _record("validate flow", settings, inputs)
+    missed = limits_missed(figures, settings.validation.limits.model_dump())
+    write_json(figures_path, {"figures": figures, "limits_missed": missed, "provenance": record}, overwrite)
+    write_picture(picture_path, flow_figure(field, truth, inside), overwrite)
+    if missed:
+        raise LimitMissedError(f"{figures_path}: {'; '.join(missed)}")
+    return {name: value for name, value in figures.items() if not isinstance(value, (list, dict))}
+
+
+def _given(**inputs: Path | str | None) -> dict[str, Path]:
+    """Return the inputs that were given, by their role."""
+    return {role: Path(path) for role, path in inputs.items() if path is not None}
+
+
+def _record(command: str, settings: Config, inputs: dict[str, Path], **more: Any) -> dict[str, Any]:
+    return provenance_record(command, settings.resolved() | more, inputs)
+
+
+def _carried_config(record: dict[str, Any], path: Path) -> Config:
+    """Return the resolved config that one of our files carries."""
+    config = record.get("config")
+    if not config:
+        raise InputError(f"{path}: carries no config; give one with --config")
+    return Config.from_resolved(config)
+
+
+def _window_centres_mm(field: VectorField) -> NDArray[np.float64]:
+    """Return the window centres (nz, ny, nx, 3) in the coordinates of the file."""
+    z, y, x = np.meshgrid(*(field.grid.axis_mm(axis) for axis in (2, 1, 0)), indexing="ij")
+    return np.stack([x, y, z], axis=-1)
+
+
+def _truth_of_particles(
+    path: Path, centres_mm: NDArray[np.float64], reference_z_mm: float
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return the true velocities at the window centres, and which of these lie among the particles."""
+    particles = read_particles(path)
+    centres = centres_mm + np.array([0.0, 0.0, reference_z_mm])
+    low, high = particles.positions_mm.min(axis=0), particles.positions_mm.max(axis=0)
+    inside = np.all((centres >= low) & (centres <= high), axis=-1)
+    return truth_at_points(particles.positions_mm, particles.velocities_m_s, centres), inside
+
+
+def _record_of(path: Path) -> dict[str, Any]:
+    return vtkhdf.read_header(path).provenance
+
+
+def _reference_z_mm(settings: Config, found: Calibration | None) -> float:
+    """Return where the origin of the volume's coordinates lies, z from the nominal focal point."""
+    if settings.volume.reference == "focal_point":
+        return 0.0
+    if found is None or found.mid_plane_z_mm is None:
+        raise ConfigError(
+            "volume.reference: mid_plane needs a calibration with a board, and the section `channel`, to say where the "
+            "mid plane lies"
+        )
+    return found.mid_plane_z_mm
+
+
+def _judge_view(operator: FactorisedOperator, grid: Grid, console: Console) -> None:
+    """Refuse a volume that the sensor does not see and warn of one that it sees in part."""
+    smallest, largest = seen_share(operator)
+    if largest < LEAST_SEEN:
+        bounds = [grid.bounds_mm(axis) for axis in range(3)]
+        spans = ", ".join(f"{axis} {low:.4g} to {high:.4g}" for axis, (low, high) in zip("xyz", bounds, strict=True))
+        raise ConfigError(f"volume: none of it ({spans} mm) lies in the camera's view")
+    if smallest < LEAST_SEEN:
+        console.say("lfpiv: a part of the volume lies outside the camera's view; nothing will be found there")
+
+
+def _background(background: str | None, frames: Sequence[Frame], shape: tuple[int, int]) -> NDArray[np.float32] | None:
+    """Return the background image: read from a file, or the minimum over the frames."""
+    if background == "minimum":
+        return minimum_background(image_files.read_page(frame.path, frame.page, shape) for frame in frames)
+    return image_files.read_image(Path(background), shape) if background else None
+
+
+def _file_grid(content: WeightsFile) -> Grid:
+    """Return the volume's grid in the coordinates of files, whose z counts from the reference."""
+    grid = content.weights.grid
+    x, y, z = grid.origin_mm
+    return replace(grid, origin_mm=(x, y, z - content.reference_z_mm))
+
+
+def _pairs(volumes: Sequence[Path], pairing: str | None) -> list[tuple[Path, Path]]:
+    """Return the pairs to correlate: (1, 2), (3, 4) ... for `ab`, (1, 2), (2, 3) ... for `sequence`."""
+    if len(volumes) < 2 or (pairing != "sequence" and len(volumes) % 2):
+        raise UsageError(f"correlate needs pairs of volumes, got {len(volumes)}")
+    if len(volumes) > 2 and pairing is None:
+        raise UsageError(
+            f"{len(volumes)} volumes need --pairing: ab for separate pairs or sequence for each with the next"
+        )
+    step = 1 if pairing == "sequence" else 2
+    return [(volumes[k], volumes[k + 1]) for k in range(0, len(volumes) - 1, step)]
+
+
+def _window(text: str) -> int | list[int]:
+    """Return a window given as 32 or 32x32x16."""
+    try:
+        sizes = [int(part) for part in text.lower().split("x")]
+    except ValueError as error:
+        raise UsageError(f"--windows: {text!r} is neither a number of voxels nor three of them as 32x32x16") from error
+    return sizes[0] if len(sizes) == 1 else sizes
+
+
+def _ensure_alike(paths: tuple[Path, Path], first: vtkhdf.Volume, second: vtkhdf.Volume) -> None:
+    """Refuse two volumes that were not made alike."""
+    if first.grid != second.grid:
+        raise InputError(f"{paths[1]}: its grid {second.grid} differs from that of {paths[0]}, {first.grid}")
+    if first.attributes["reference"] != second.attributes["reference"]:
+        raise InputError(f"{paths[1]}: its coordinates have another origin than those of {paths[0]}")
+    if first.provenance.get("config") != second.provenance.get("config"):
+        raise InputError(f"{paths[1]}: was made with another config than {paths[0]}")

@@ -1,0 +1,163 @@
+"""The stages of `simulate`: the configured scene rendered into raw images, with the truth beside them.
+
+File names are those of an experiment: white.tif, dark.tif, board.tif, pair_a.tif, pair_b.tif; the truth is in
+white.json, board.json, particles.json and particles.npz.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lfpiv_cli.calibration.model import mid_plane_z_mm
+from lfpiv_cli.console import Console
+from lfpiv_cli.errors import ConfigError
+from lfpiv_cli.files.atomic import ensure_writable, write_json
+from lfpiv_cli.files.batch import prepare_folder
+from lfpiv_cli.files.config import Config, load_config
+from lfpiv_cli.files.images import write_tiff
+from lfpiv_cli.files.particles import write_particles
+from lfpiv_cli.files.provenance import record
+from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.synthetic import scenes
+from lfpiv_cli.synthetic.board import BoardPlacement
+from lfpiv_cli.synthetic.render import RAYS, ObjectSpace
+from lfpiv_cli.synthetic.sensor import Readout
+from lfpiv_cli.weights.build import blur_radius_mm
+
+
+def simulate_white(config: Path, output: Path, overwrite: bool, console: Console) -> dict[str, Any]:
+    """Render a white image and a dark one."""
+    settings, paths = _begin(config, output, ("white.tif", "dark.tif", "white.json"), overwrite)
+    still = scenes.simulate_white(
+        real_camera(settings), settings.simulation.peak_counts, _readout(settings), _generator(settings, 0)
+    )
+    write_tiff(paths["white.tif"], still.image, overwrite)
+    write_tiff(paths["dark.tif"], still.dark, overwrite)
+    return _write_truth(paths["white.json"], "simulate white", still.truth, settings, config, overwrite)
+
+
+def simulate_board(config: Path, output: Path, overwrite: bool, console: Console) -> dict[str, Any]:
+    """Render the snapshot of the board."""
+    settings, paths = _begin(config, output, ("board.tif", "board.json"), overwrite)
+    scene = settings.simulation
+    still = scenes.simulate_board(
+        real_camera(settings),
+        _board_space(settings),
+        settings.rig().board,
+        BoardPlacement(scene.board_z_mm, scene.board_offset_mm, scene.board_tilt_deg, scene.board_rotation_deg),
+        scene.peak_counts,
+        _readout(settings),
+        _generator(settings, 1),
+    )
+    write_tiff(paths["board.tif"], still.image, overwrite)
+    return _write_truth(paths["board.json"], "simulate board", still.truth, settings, config, overwrite)
+
+
+def simulate_particles(config: Path, output: Path, overwrite: bool, console: Console) -> dict[str, Any]:
+    """Render a pair of images of tracers that follow the configured flow."""
+    names = ("pair_a.tif", "pair_b.tif", "particles.npz", "particles.json")
+    settings, paths = _begin(config, output, names, overwrite)
+    scene = settings.simulation
+    if settings.correlation.dt_s is None:
+        raise ConfigError(f"{config}: correlation.dt_s: is missing, and a pair of images needs it")
+    camera, origin_z = real_camera(settings), simulated_origin_z_mm(settings)
+    tracers = _tracers(settings, camera, origin_z)
+    with console.progress(2 * tracers.count, "simulate") as advance:
+        pair = scenes.simulate_particles(
+            camera,
+            _flow_space(settings, origin_z),
+            tracers,
+            settings.simulated_flow(origin_z),
+            settings.correlation.dt_s,
+            _readout(settings),
+            _generator(settings, 2),
+            rays=scene.rays or RAYS,
+            progress=advance,
+        )
+    write_tiff(paths["pair_a.tif"], pair.image_a, overwrite)
+    write_tiff(paths["pair_b.tif"], pair.image_b, overwrite)
+    write_particles(paths["particles.npz"], pair.positions_mm, pair.velocities_m_s, pair.brightness, overwrite)
+    truth = pair.truth | {"reference_z_mm": origin_z}
+    return _write_truth(paths["particles.json"], "simulate particles", truth, settings, config, overwrite)
+
+
+def real_camera(settings: Config) -> Camera:
+    """Return the data sheet's camera with the imperfections that are simulated."""
+    scene = settings.simulation
+    return scenes.Misalignment(scene.rotation_deg, scene.shift_px, scene.distortion_per_mm2).apply(
+        settings.camera_model()
+    )
+
+
+def simulated_origin_z_mm(settings: Config) -> float:
+    """Return where the origin of the volume's coordinates lies in the simulated scene, z from the focal point."""
+    scene = settings.simulation
+    if settings.volume.reference == "focal_point":
+        return 0.0
+    if scene.mid_plane_z_mm is not None:
+        return scene.mid_plane_z_mm
+    rig = settings.rig()
+    if rig.channel is None:
+        raise ConfigError("volume.reference: mid_plane needs simulation.mid_plane_z_mm or the section `channel`")
+    return mid_plane_z_mm(rig.board, rig.channel, rig.media, scene.board_z_mm)
+
+
+def _begin(config: Path, output: Path, names: tuple[str, ...], overwrite: bool) -> tuple[Config, dict[str, Path]]:
+    """Read the config and make sure that the outputs can be written."""
+    paths = {name: output / name for name in names}
+    prepare_folder(list(paths.values()))
+    for path in paths.values():
+        ensure_writable(path, overwrite, [config])
+    return load_config(config), paths
+
+
+def _write_truth(
+    path: Path, command: str, truth: dict[str, Any], settings: Config, config: Path, overwrite: bool
+) -> dict[str, Any]:
+    provenance = record(command, settings.resolved(), {"config": config})
+    write_json(path, truth | {"provenance": provenance}, overwrite)
+    return {name: value for name, value in truth.items() if not isinstance(value, list) or len(value) <= 3}
+
+
+def _generator(settings: Config, stream: int) -> np.random.Generator:
+    """Return the random numbers of one kind of image: independent streams of one seed."""
+    return np.random.default_rng([settings.simulation.seed, stream])
+
+
+def _readout(settings: Config) -> Readout:
+    scene = settings.simulation
+    return Readout(scene.photons_per_count, scene.read_noise_counts, scene.dark_level_counts, scene.bits)
+
+
+def _board_space(settings: Config) -> ObjectSpace:
+    """Return what the board is seen through: air, or window and fluid."""
+    media = settings.media_model()
+    if settings.board.medium == "air":
+        return ObjectSpace(media.in_air(), None, settings.simulation.refraction)
+    return _flow_space(settings, simulated_origin_z_mm(settings))
+
+
+def _flow_space(settings: Config, origin_z_mm: float) -> ObjectSpace:
+    """Return what the tracers are seen through."""
+    media, refraction = settings.media_model(), settings.simulation.refraction
+    if refraction == "paraxial" or media == media.in_air():
+        return ObjectSpace(media, None, refraction)
+    return ObjectSpace(media, settings.window_model(origin_z_mm), refraction)
+
+
+def _tracers(settings: Config, camera: Camera, origin_z_mm: float) -> scenes.Tracers:
+    """Return the tracers: as many in the volume as configured, and as dense around it as their light reaches."""
+    scene = settings.simulation
+    volume = settings.grid(origin_z_mm)
+    margin = blur_radius_mm(camera, settings.media_model(), volume)
+    box = scenes.Box.around(volume, (margin, margin, 0.0))
+    inside = scenes.Box.around(volume, (0.0, 0.0, 0.0))
+    flow = scene.flow
+    if flow is not None and flow.kind == "square_duct":
+        walls = scenes.channel_walls(flow.width_mm, origin_z_mm + flow.centre_mm[2], flow.axis)
+        box, inside = box.within(walls), inside.within(walls)
+    count = round(scene.particles * box.volume_mm3 / inside.volume_mm3)
+    return scenes.Tracers(count, box, scene.particle_diameter_mm, scene.particle_counts, scene.brightness)
