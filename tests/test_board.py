@@ -144,6 +144,16 @@ def test_pose_of_exact_dots_is_exact_with_dots_missing_and_dirt() -> None:
     assert first[1] < -1.5
 
 
+def test_a_dot_off_the_plane_does_not_move_the_board(rng: np.random.Generator) -> None:
+    board = BoardGeometry((7, 7), 1.0, 0.2)
+    dots = dot_places(board, 3.0, (0.4, -0.2), (0.5, -0.5)) + rng.normal(0.0, 1e-3, (49, 3))
+    dots[5, 2] += 0.5
+    pose = pose_of_dots(dots, np.full(dots.shape, 1e-3), dots[:, :2], -1.0, board)
+    assert len(pose.indices) == 48
+    # One micrometre of noise over 48 dots; with the stray dot the depth would be off by a hundredth.
+    assert pose.z0_mm == pytest.approx(3.0, abs=1e-3)
+
+
 def test_disc_and_polygon_share_what_a_fine_grid_counts(layout: str, rng: np.random.Generator) -> None:
     cell = lens_cell(Lattice.regular(1.0, layout))
     step = np.linspace(-1.2, 1.2, 634)

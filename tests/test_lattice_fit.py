@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lfpiv_cli.calibration.lattice import fit_lattice
+from lfpiv_cli.calibration.lattice import fit_lattice, without_strays
 from lfpiv_cli.calibration.spectrum import lattice_vectors
 from lfpiv_cli.calibration.spots import index_spots
 from lfpiv_cli.errors import InputError
@@ -124,6 +124,15 @@ def test_walk_numbers_follow_the_lattice() -> None:
     found, reached = index_spots(lattice.points(indices), 17, lattice.basis)
     assert reached.all()
     np.testing.assert_array_equal(found, indices - indices[17])
+
+
+def test_a_lens_with_a_wrong_number_is_dropped() -> None:
+    lattice = Lattice.regular(10.0, "square", 0.1, (3.0, 4.0))
+    indices = np.stack(np.meshgrid(np.arange(-4, 5), np.arange(-4, 5)), axis=-1).reshape(-1, 2)
+    points = lattice.points(indices)
+    indices[17] += (1, 0)
+    kept, _ = without_strays(indices, points, 10.0)
+    np.testing.assert_array_equal(kept, np.delete(indices, 17, axis=0))
 
 
 def test_images_that_cannot_serve_are_refused_with_advice(rng: np.random.Generator) -> None:

@@ -43,6 +43,8 @@ MARGIN_LENSES = 2.5
 # Pixels at the rim of a micro-image are lit in part, by light that does not come from where their middle sees; a pixel
 # is used when the main lens's rim is more than half its patch's diagonal away.
 RIM_PER_PATCH = np.sqrt(0.5)
+# Fewer pixels than these are a dot at the sensor's edge: five unknowns need several times as many.
+FEWEST_PIXELS = 50
 # The magnification enters the depth of each dot; one repetition with the measured one leaves the square of its error.
 MAGNIFICATION_ROUNDS = 2
 # Below this a change of magnification moves nothing by a micrometre over a board of 10 mm.
@@ -90,10 +92,10 @@ def locate_board(
 
 
 def world_places(
-    fits: list[DiscFit], camera: Camera, rotation_rad: float
+    fits: list[DiscFit | None], camera: Camera, rotation_rad: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return places and standard errors (n, 3) of the fitted dots, turned back to the raw sensor's axes."""
-    good = [fit for fit in fits if fit.converged and fit.brightness > 0.0]
+    good = [fit for fit in fits if fit is not None and fit.converged and fit.brightness > 0.0]
     places = np.array([fit.position_mm for fit in good]).reshape(-1, 3)
     sigmas = np.sqrt(np.array([np.diag(fit.covariance_mm2) for fit in good])).reshape(-1, 3)
     return camera.to_image_axes(turned(places, rotation_rad)), camera.to_image_axes(sigmas)
@@ -165,8 +167,8 @@ def fit_one_dot(
     media: Media,
     start_mm: tuple[float, float, float],
     radius_mm: float,
-) -> DiscFit:
-    """Fit a dot's disc to the pixels that see the surroundings of its first guess, in image axes."""
+) -> DiscFit | None:
+    """Fit a dot's disc to the pixels that see the surroundings of its first guess, in image axes; None off the sensor."""
     x, y, z = start_mm
     distance = float(equivalent_object_distance(z, camera.focus_distance_mm, media))
     forward = camera.image_distance_mm / distance
@@ -183,6 +185,8 @@ def fit_one_dot(
     rim = RIM_PER_PATCH * camera.pixel_mm * camera.image_distance_mm / camera.microlens_distance_mm
     through = np.hypot(*lens_crossings(rays, camera).T) <= camera.aperture_radius_mm - rim
     kept = near & through & (passed[row, column] > 0.0)
+    if kept.sum() < FEWEST_PIXELS:
+        return None
     chosen = replace(rays, place_mm=rays.place_mm[kept], lens_mm=rays.lens_mm[kept], ideal_mm=rays.ideal_mm[kept])
     light = passed[row, column][kept].astype(np.float64)
     return fit_disc(

@@ -83,5 +83,5 @@ def draw_board(figure: Any, axis: Any, calibration: Calibration, board: ArrayLik
     dots = axis.scatter(*pose.dots_px.T, c=pose.dots_mm[:, 2], s=120, cmap="viridis", marker="+", linewidths=2)
     figure.colorbar(dots, ax=axis, label="depth, mm", shrink=0.8)
     tilt = " and ".join(f"{angle:.2f}" for angle in pose.tilt_deg)
-    axis.set_title(f"board: z = {pose.z0_mm:.3f} mm, tilt {tilt}°, M = {pose.magnification:.4f}")
+    axis.set_title(f"board: z = {pose.z0_mm:.3f} mm, M = {pose.magnification:.4f},\ntilt {tilt} degrees")
     axis.set(xlabel="column, px", ylabel="row, px")

@@ -37,7 +37,9 @@ def find_spots(image: NDArray[np.float64], pitch_px: float) -> NDArray[np.float6
     row, column = np.nonzero(smooth == ndimage.maximum_filter(smooth, size=size, mode="nearest"))
     base = ndimage.minimum_filter(smooth, size=int(np.ceil(pitch_px)), mode="nearest")[row, column]
     height = smooth[row, column] - base
-    strong = height > CONTRAST_SHARE * np.percentile(height, 90.0)
+    if not (height > 0.0).any():
+        return np.zeros((0, 2))
+    strong = height > CONTRAST_SHARE * np.percentile(height[height > 0.0], 90.0)
     start = np.stack([column, row], axis=1)[strong].astype(np.float64)
     centres, good = spot_centroids(image, start, base[strong], height[strong], 0.5 * pitch_px)
     return centres[good]
