@@ -168,7 +168,7 @@ def fit_one_dot(
     start_mm: tuple[float, float, float],
     radius_mm: float,
 ) -> DiscFit | None:
-    """Fit a dot's disc to the pixels that see the surroundings of its first guess, in image axes; None off the sensor."""
+    """Fit a disc to the pixels that see the surroundings of its first guess, in image axes; None off the sensor."""
     x, y, z = start_mm
     distance = float(equivalent_object_distance(z, camera.focus_distance_mm, media))
     forward = camera.image_distance_mm / distance
