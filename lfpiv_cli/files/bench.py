@@ -28,7 +28,7 @@ UM_TO_MM = 1e-3
 # The paper's final window, and one that a displacement of a quarter of its side (8 voxels) does not leave.
 DEFAULT_WINDOWS = ((32, 32, 32), (16, 16, 16))
 SMALLEST_WINDOW = 4
-# Voxels as wide as a microlens lock depth to the array's grid and swallow its velocity: of 6 voxels, EM volumes give 2.2
+# Voxels as wide as a microlens lock depth to the array's grid and swallow its velocity: of 6 voxels EM volumes give 2.2
 # with them, 4.7 with half of one, and 5.0 with half of one laterally and two along the axis.
 LATERAL_VOXELS_PER_MICROLENS = 2.0
 DEPTH_VOXELS_PER_MICROLENS = 0.5

@@ -191,7 +191,10 @@ class CorrelationSection(Section):
 
 
 class SquareDuct(Section):
-    """Fully developed laminar flow through a square duct (physics: a Fourier series scaled to the mean velocity)."""
+    """Fully developed laminar flow along axis (x or y) through a square duct of width_mm.
+
+    mean_velocity_m_s: the mean over its section. centre_mm: of every flow, in the volume's coordinates (default: 0).
+    """
 
     kind: Literal["square_duct"]
     width_mm: Positive
@@ -201,7 +204,7 @@ class SquareDuct(Section):
 
 
 class RigidRotation(Section):
-    """omega x (r - centre) + velocity, omega in rad/s, right-handed about x, y, z."""
+    """angular_velocity_rad_s x (r - centre_mm) + velocity_m_s, right-handed about x, y, z."""
 
     kind: Literal["rigid_rotation"]
     angular_velocity_rad_s: Vector
@@ -210,7 +213,7 @@ class RigidRotation(Section):
 
 
 class TaylorGreen(Section):
-    """Plane Taylor-Green vortices plus a uniform velocity."""
+    """Vortices of amplitude_m_s and wavelength_mm in a plane (xy, xz, yz), four around centre_mm, plus velocity_m_s."""
 
     kind: Literal["taylor_green"]
     amplitude_m_s: float
@@ -221,7 +224,7 @@ class TaylorGreen(Section):
 
 
 class Shear(Section):
-    """A velocity along one axis that grows across another, plus a uniform velocity."""
+    """A velocity along one axis that grows by rate_per_s across another, zero at centre_mm, plus velocity_m_s."""
 
     kind: Literal["shear"]
     rate_per_s: float
@@ -232,7 +235,7 @@ class Shear(Section):
 
 
 class Uniform(Section):
-    """The same velocity everywhere."""
+    """The same velocity_m_s everywhere."""
 
     kind: Literal["uniform"]
     velocity_m_s: Vector

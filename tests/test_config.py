@@ -1,0 +1,300 @@
+"""The configuration: what is refused, where the message points, and what the core gets."""
+
+from __future__ import annotations
+
+import json
+import re
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lfpiv_cli.errors import ConfigError, InputError
+from lfpiv_cli.files.config import Config, load_config
+from lfpiv_cli.files.sections import Section, Sections
+from lfpiv_cli.optics.media import fluid_path_to_focus
+
+CONFIGS = sorted((Path(__file__).parents[1] / "configs").glob("*.yaml"))
+
+RIG = """\
+camera:
+  main_lens:   {magnification: -1.0, focal_length_mm: 100.0, aperture_mm: 25.0}
+  microlenses: {focal_length_mm: 0.8, pitch_mm: 0.1}
+  sensor:      {pixel_um: 5.5, columns: 235, rows: 177}
+media:  {air: 1.0, window: 1.49, fluid: 1.33}
+volume: {shape_xyz: [8, 6, 4], voxel_mm: 0.1}
+"""
+
+
+@pytest.fixture
+def write(tmp_path: Path):
+    """Write a config and return its path."""
+
+    def written(text: str | bytes) -> Path:
+        path = tmp_path / "rig.yaml"
+        path.write_bytes(text.encode() if isinstance(text, str) else text)
+        return path
+
+    return written
+
+
+def refusal(path: Path) -> str:
+    """Return the message with which a config is refused."""
+    start = time.perf_counter()
+    with pytest.raises(ConfigError) as caught:
+        load_config(path)
+    assert time.perf_counter() - start < 1.0
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
+def test_shipped_configs_load_and_return_from_json(path: Path) -> None:
+    config = load_config(path)
+    again = Config.from_resolved(json.loads(json.dumps(config.resolved(), allow_nan=False)))
+    assert again.sections == config.sections
+
+
+def test_shipped_configs_are_there() -> None:
+    assert {path.stem for path in CONFIGS} >= {"table2", "channel", "sample", "seaurchin", "guv"}
+
+
+def sections_in(model: type[Section]) -> set[type[Section]]:
+    found = {model}
+    waiting = [field.annotation for field in model.model_fields.values()]
+    while waiting:
+        kind = waiting.pop()
+        waiting += getattr(kind, "__args__", ())
+        if isinstance(kind, type) and issubclass(kind, Section):
+            found |= sections_in(kind)
+    return found
+
+
+def test_every_key_is_explained() -> None:
+    explained = next(path for path in CONFIGS if path.stem == "table2").read_text()
+    for section in sections_in(Sections):
+        for key in section.model_fields:
+            places = explained + (section.__doc__ or "")
+            assert re.search(rf"\b{key}\b", places) or section is Sections, f"{section.__name__}.{key}"
+
+
+def test_table2_gives_the_papers_camera(table2) -> None:
+    camera = load_config(CONFIGS[[path.stem for path in CONFIGS].index("table2")]).camera_model()
+    for name in ("image_distance_mm", "focus_distance_mm", "aperture_mm", "pixel_mm", "columns", "rows"):
+        assert getattr(camera, name) == pytest.approx(getattr(table2, name))
+    np.testing.assert_array_equal(camera.lattice.basis, table2.lattice.basis)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "place", "words"),
+    [
+        ("pitch_mm: 0.1", "pitch_mm: 0.1, layuot: square", "3:54: camera.microlenses.layuot", "did you mean 'layout'?"),
+        ("media:", "mediums:", "5:1: mediums", "did you mean 'media'?"),
+        ("rows: 177", "rows: 177, rows: 178", "4:57: camera.sensor.rows", "repeated key, first on line 4"),
+        ("rows: 177", "rows: 177.5", "4:52: camera.sensor.rows", "is 177.5, expected a whole number"),
+        ("rows: 177", "rows: '177'", "4:52: camera.sensor.rows", "is '177', expected a whole number"),
+        ("rows: 177", "rows: yes", "4:52: camera.sensor.rows", "is 'yes', expected a whole number"),
+        ("rows: 177", "rows: true", "4:52: camera.sensor.rows", "is true, expected a whole number"),
+        ("rows: 177", "rows: 12:30", "4:52: camera.sensor.rows", "is '12:30', expected a whole number"),
+        ("5.5", ".nan", "4:27: camera.sensor.pixel_um", "is nan, expected a finite number"),
+        ("5.5", "1e400", "4:27: camera.sensor.pixel_um", "is inf, expected a finite number"),
+        ("5.5", "-5.5", "4:27: camera.sensor.pixel_um", "is -5.5, expected more than 0"),
+        ("-1.0", "0.5", "2:32: camera.main_lens.magnification", "is 0.5, expected less than 0"),
+        ("1.33", "0.9", "5:41: media.fluid", "is 0.9, expected at least 1"),
+        ("[8, 6, 4]", "[8, 6]", "6:21: volume.shape_xyz", "is missing"),
+        ("[8, 6, 4]", "[8, 6, x]", "6:28: volume.shape_xyz[2]", "is 'x', expected a whole number"),
+        ("voxel_mm: 0.1", "voxel_mm: 0.1, reference: focus", "6:58: volume.reference", "expected 'focal_point' or"),
+        ("{shape_xyz: [8, 6, 4], voxel_mm: 0.1}", "[1]", "6:9: volume", "is [1], expected a section of keys"),
+    ],
+)
+def test_what_is_wrong_is_named_with_its_place(write, old: str, new: str, place: str, words: str) -> None:
+    path = write(RIG.replace(old, new))
+    message = refusal(path)
+    assert message.startswith(f"{path}:{place}"), message
+    assert words in message
+
+
+def test_all_errors_come_in_one_run_in_the_order_of_the_file(write) -> None:
+    text = RIG.replace("-1.0", "1.0").replace("5.5", "x").replace("media:", "media: {}\nmedia:") + "voulme: 3\n"
+    lines = refusal(write(text)).splitlines()
+    assert [line.split(":")[1] for line in lines] == ["2", "4", "6", "8"]
+
+
+@pytest.mark.parametrize(
+    ("addition", "words"),
+    [
+        ("window: {distance_mm: 250.0, thickness_mm: 2.0}", "window's far face"),
+        ("board: {dots: [7, 7], spacing_mm: 0.2, dot_diameter_mm: 0.2}", "less than the spacing of 0.2"),
+        ("correlation: {windows: [16, 32]}", "expected coarse to fine"),
+        ("correlation: {windows: [16], window_mm: 1.6}", "contradicts window_mm"),
+        ("correlation: {windows: []}", "at least one window"),
+        ("correlation: {overlap: 1.0}", "less than 1"),
+        ("simulation: {brightness: [2, 1]}", "expected a range"),
+        (
+            "window: {distance_mm: 98.0, thickness_mm: 2.0}\nchannel: {width_mm: 10.0, wall_mm: 5.0}",
+            "but channel.wall_mm is 5",
+        ),
+    ],
+)
+def test_contradictions_are_named(write, addition: str, words: str) -> None:
+    assert words in refusal(write(RIG + addition + "\n"))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("aperture_mm: 25.0", "aperture_mm: 25.0, f_number: 5.6", "focal_length_mm / aperture_mm is 4"),
+        (
+            "aperture_mm: 25.0",
+            "aperture_mm: 25.0, image_distance_mm: 210",
+            "focal_length_mm (1 - magnification) is 200",
+        ),
+        ("aperture_mm: 25.0", "f_number: null", "needs aperture_mm or f_number"),
+        ("pitch_mm: 0.1", "pitch_mm: 0.1, f_number: 4.0", "focal_length_mm / pitch_mm is 8"),
+        ("shape_xyz: [8, 6, 4]", "size_mm: [1, 1, 1]", "contradicts size_mm"),
+        ("shape_xyz: [8, 6, 4], ", "", "needs shape_xyz and voxel_mm, or size_mm"),
+        ("voxel_mm: 0.1", "voxel_mm: 0.1, reference: mid_plane", "needs the section channel"),
+        ("voxel_mm: 0.1", "voxel_mm: 0.1, centre_mm: [0, 0, -300]", "behind the lens, which is 200 mm away"),
+    ],
+)
+def test_impossible_physics_is_named_with_its_numbers(write, old: str, new: str, words: str) -> None:
+    assert words in refusal(write(RIG.replace(old, new)))
+
+
+def test_total_reflection_is_named_with_its_numbers(write) -> None:
+    """At the rim of a lens of radius 225 mm, 200 mm away, sin is 0.747: in oil (1.5), n sin = 1.12."""
+    wide = RIG.replace("25.0", "450.0")
+    load_config(write(wide))
+    message = refusal(write(wide.replace("air: 1.0, window: 1.49, fluid: 1.33", "air: 1.5, window: 1.49, fluid: 1.1")))
+    assert "media.fluid: is 1.1" in message
+    assert "n sin = 1.12" in message
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"camera:\n\tmain_lens: 1\n", "2:1: is not YAML: a tab"),
+        (b"a: &x [1]\nb: [*x, *x]\n", "alias"),
+        (b"a: !!python/object:os.system {}\n", "tag"),
+        (b"a: " + b"[" * 5000 + b"]" * 5000, "deeper than 20"),
+        (b"a: " + b"{a: " * 5000, "deeper than 20"),
+        (b"a: 1 \0\n", "control character"),
+        (b"camera: \xff\xfe\n", "1:9: is not UTF-8"),
+        (b"# " + b"x" * 10_000_000, "expected at most 1048576"),
+        (b"- 1\n", "is not a mapping"),
+        (b"a: 1\n---\nb: 1\n", "second document"),
+        (b"a: [1, 2\n", "is not YAML"),
+        (b"a: " + b"9" * 5000 + b"\n", "too long a number"),
+        (b"".join(b"k%d: 1\n" % k for k in range(1000)), "more errors"),
+    ],
+)
+def test_hostile_text_is_refused_quickly(write, content: bytes, words: str) -> None:
+    message = refusal(write(content))
+    assert words in message
+    assert len(message) < 5000
+
+
+def test_alias_bomb_is_refused(write) -> None:
+    bomb = "a0: &a0 [x, x]\n" + "".join(f"a{k}: &a{k} [*a{k - 1}, *a{k - 1}]\n" for k in range(1, 60))
+    assert "alias" in refusal(write(bomb))
+
+
+@pytest.mark.parametrize("kind", ["missing", "folder", "empty"])
+def test_a_config_that_is_no_file_is_an_input_error(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "rig.yaml"
+    if kind == "folder":
+        path.mkdir()
+    if kind == "empty":
+        path.touch()
+    with pytest.raises(InputError, match="rig.yaml"):
+        load_config(path)
+
+
+def test_numbers_mean_what_yaml_1_2_says(write) -> None:
+    config = load_config(write(RIG.replace("0.8,", "8e-1,").replace("177", "0xB1")))
+    assert config.camera_model().microlens_focal_length_mm == 0.8
+    assert config.image_shape() == (177, 235)
+
+
+@pytest.mark.parametrize(
+    ("section", "ask"),
+    [
+        ("camera", Config.camera_model),
+        ("camera", Config.image_shape),
+        ("media", Config.media_model),
+        ("volume", Config.grid),
+        ("window", Config.window_model),
+        ("simulation.flow", Config.simulated_flow),
+        ("validation.flow", Config.true_flow),
+    ],
+)
+def test_what_a_command_needs_and_the_file_lacks_is_named(write, section: str, ask) -> None:
+    config = load_config(write("weights: {}\n"))
+    with pytest.raises(ConfigError, match=f"rig.yaml: {section}: is missing"):
+        ask(config)
+
+
+def test_a_lattice_alone_needs_no_main_lens(write) -> None:
+    config = load_config(write("camera: {microlenses: {pitch_mm: 0.1}, sensor: {pixel_um: 5, columns: 9, rows: 7}}\n"))
+    assert config.image_shape() == (7, 9)
+    with pytest.raises(ConfigError, match="camera.main_lens: is missing"):
+        config.camera_model()
+
+
+def test_lengths_follow_from_f_numbers_and_the_image_distance(write) -> None:
+    text = RIG.replace("focal_length_mm: 100.0, aperture_mm: 25.0", "image_distance_mm: 200, f_number: 4")
+    camera = load_config(write(text.replace("{focal_length_mm: 0.8", "{f_number: 8"))).camera_model()
+    assert (camera.focal_length_mm, camera.aperture_mm) == (100.0, 25.0)
+    assert camera.microlens_distance_mm == camera.microlens_focal_length_mm == pytest.approx(0.8)
+
+
+def test_grid_is_centred_and_moved(write) -> None:
+    grid = load_config(write(RIG.replace("voxel_mm: 0.1", "voxel_mm: [0.1, 0.2, 0.3], centre_mm: [1, 2, 3]"))).grid(
+        origin_z_mm=-0.5
+    )
+    assert grid.spacing_mm == (0.1, 0.2, 0.3)
+    middle = [np.mean(grid.bounds_mm(axis)) for axis in range(3)]
+    assert middle == pytest.approx([1.0, 2.0, 2.5])
+
+
+def test_voxels_chosen_by_the_program_fill_the_size(write) -> None:
+    text = RIG.replace("shape_xyz: [8, 6, 4], voxel_mm: 0.1", "size_mm: [1.3, 1.0, 1.03]")
+    grid = load_config(write(text)).grid()
+    assert np.multiply(grid.shape_xyz, grid.spacing_mm) == pytest.approx([1.3, 1.0, 1.03])
+    assert grid.spacing_mm[0] == pytest.approx(0.05)
+    assert 0.15 < grid.spacing_mm[2] < 0.25
+
+
+def test_windows_in_millimetres_are_the_final_ones(write) -> None:
+    config = load_config(write("correlation: {window_mm: 1.6}\n"))
+    assert config.windows_voxel((0.1, 0.1, 0.2))[-1] == (16, 16, 8)
+    assert load_config(write("correlation: {windows: [32, [16, 16, 8]]}\n")).windows_voxel((1, 1, 1)) == (
+        (32, 32, 32),
+        (16, 16, 8),
+    )
+
+
+def test_the_channels_wall_puts_the_focal_point_where_it_is(write) -> None:
+    """The window implied by wall, channel and mid plane must give back the fluid path width/2 - mid_plane_z."""
+    config = load_config(write(RIG + "channel: {width_mm: 10.0, wall_mm: 5.0}\n"))
+    window = config.window_model(mid_plane_z_mm=-0.4655)
+    assert window.thickness_mm == 5.0
+    path = fluid_path_to_focus(window, config.camera_model().focus_distance_mm, config.media_model())
+    assert path == pytest.approx(5.4655)
+
+
+def test_options_override_and_are_checked(write) -> None:
+    config = load_config(write("reconstruction: {solver: sart, iterations: 200}\ncorrelation: {window_mm: 1.6}\n"))
+    assert config.overridden("reconstruction", solver=None, iterations=5).reconstruction.iterations == 5
+    assert config.overridden("reconstruction", iterations=None) is config
+    assert config.overridden("correlation", windows=[32, [16, 16, 8]]).correlation.windows == ((32,) * 3, (16, 16, 8))
+    with pytest.raises(ConfigError, match="correlation.windows"):
+        config.overridden("correlation", windows=[16, 32])
+
+
+def test_flow_centres_move_with_the_origin(write) -> None:
+    text = "simulation: {flow: {kind: shear, rate_per_s: 1000, centre_mm: [0, 0, 0.5]}}\n"
+    config = load_config(write(text))
+    points = np.array([[0.0, 0.0, 2.5]])
+    assert config.true_flow()(points)[0] == pytest.approx([2.0, 0.0, 0.0])
+    assert config.simulated_flow(origin_z_mm=1.0)(points)[0] == pytest.approx([1.0, 0.0, 0.0])

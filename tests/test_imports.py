@@ -1,0 +1,66 @@
+"""The house rule: imports only point back along the way of the light and then of the data."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[1] / "lfpiv_cli"
+# From the scene to the shell; what stands on one line may not know of a later line.
+LAYERS = (
+    {"errors", "grid"},
+    {"optics"},
+    {"calibration"},
+    {"weights"},
+    {"reconstruction"},
+    {"flow"},
+    {"synthetic"},
+    {"validation"},
+    {"files"},
+    {"console"},
+    {"stages", "stages_simulate"},
+    {"cli"},
+    {"__init__", "__main__"},
+)
+FIRST_OUTER_LAYER = next(k for k, names in enumerate(LAYERS) if "files" in names)
+# What touches disks, terminals and configuration stays in files/ and beyond.
+OUTER_ONLY = {"click", "yaml", "pydantic", "h5py", "tqdm", "logging", "pathlib", "os", "tifffile", "imagecodecs", "sys"}
+MODULES = sorted(PACKAGE.rglob("*.py"))
+
+
+def layer_of(module: Path) -> int:
+    name = module.relative_to(PACKAGE).parts[0].removesuffix(".py")
+    return next(k for k, names in enumerate(LAYERS) if name in names)
+
+
+def imported(module: Path) -> Iterator[str]:
+    """Yield the full names that a module imports, wherever in it."""
+    for node in ast.walk(ast.parse(module.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{module} line {node.lineno}: imports are absolute"
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+@pytest.mark.parametrize("module", MODULES, ids=lambda m: str(m.relative_to(PACKAGE)))
+def test_every_module_has_its_layer(module: Path) -> None:
+    assert any(module.relative_to(PACKAGE).parts[0].removesuffix(".py") in names for names in LAYERS)
+
+
+@pytest.mark.parametrize("module", MODULES, ids=lambda m: str(m.relative_to(PACKAGE)))
+def test_imports_point_back(module: Path) -> None:
+    here = layer_of(module)
+    for name in imported(module):
+        parts = name.split(".")
+        if parts[0] == "lfpiv_cli" and len(parts) > 1 and parts[1] in set().union(*LAYERS):
+            assert layer_of(PACKAGE / parts[1]) <= here, f"{module.name} imports {name}, which lies ahead of it"
+
+
+@pytest.mark.parametrize("module", [m for m in MODULES if layer_of(m) < FIRST_OUTER_LAYER], ids=lambda m: m.name)
+def test_the_core_touches_no_disk_and_no_terminal(module: Path) -> None:
+    outer = {name.split(".")[0] for name in imported(module)} & OUTER_ONLY
+    assert not outer, f"{module.name} imports {outer}"
