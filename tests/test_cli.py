@@ -1,0 +1,98 @@
+"""The process around the commands: exit codes, signals, closed pipes, start-up."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+SAMPLE = ROOT / "sample_data"
+CONFIG = ROOT / "configs" / "sample.yaml"
+
+
+def lfpiv(*arguments: object, **options: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "lfpiv_cli", *(str(argument) for argument in arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, **options)
+
+
+def test_help_imports_nothing_heavy():
+    script = "import sys, lfpiv_cli.cli; print(sorted({'numpy', 'numba', 'h5py', 'scipy'} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", script], capture_output=True, text=True).stdout.strip() == "[]"
+
+
+def test_usage_errors_give_2(tmp_path):
+    assert lfpiv("no-such-command").returncode == 2
+    assert lfpiv("simulate", "white", CONFIG).returncode == 2
+    # an output that is an input
+    assert lfpiv("build-weights", CONFIG, "-o", CONFIG, "--overwrite").returncode == 2
+
+
+def test_config_errors_give_3_with_line_and_near_miss(tmp_path):
+    broken = tmp_path / "rig.yaml"
+    broken.write_text(CONFIG.read_text().replace("layout:", "layuot:"))
+    done = lfpiv("build-weights", broken, "-o", tmp_path / "w.h5")
+    assert done.returncode == 3
+    assert f"{broken}:6:" in done.stderr
+    assert "did you mean 'layout'?" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "w.h5").exists()
+
+
+def test_missing_input_gives_4_and_names_it(tmp_path):
+    done = lfpiv("calibrate-snapshot", CONFIG, "--white", tmp_path / "no such.tif", "-o", tmp_path / "c.h5")
+    assert done.returncode == 4
+    assert "no such.tif" in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_existing_output_gives_6_and_is_untouched(tmp_path):
+    target = tmp_path / "w.h5"
+    target.write_text("mine")
+    assert lfpiv("build-weights", CONFIG, "-o", target).returncode == 6
+    assert target.read_text() == "mine"
+
+
+def test_unwritable_output_gives_7_before_computing(tmp_path):
+    assert lfpiv("build-weights", CONFIG, "-o", tmp_path / "no" / "such" / "w.h5").returncode == 7
+
+
+def test_json_goes_to_stdout_alone(tmp_path):
+    config = tmp_path / "air.yaml"
+    config.write_text(CONFIG.read_text().replace("reference: mid_plane", "reference: focal_point"))
+    done = lfpiv("build-weights", config, "-o", tmp_path / "w.h5", "--json")
+    assert done.returncode == 0
+    assert done.stdout.startswith("{")
+    assert done.stdout.count("\n") == 1
+    assert done.stderr == ""
+
+
+def test_a_closed_pipe_is_quiet():
+    done = subprocess.run(
+        f"'{sys.executable}' -m lfpiv_cli --help | head -1", shell=True, capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == 0
+    assert done.stdout.startswith("Usage")
+    assert done.stderr == ""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGTERM to send")
+@pytest.mark.parametrize(("sent", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_signals_end_the_work_and_leave_nothing(tmp_path, sent, code):
+    config = tmp_path / "air.yaml"
+    config.write_text(CONFIG.read_text().replace("reference: mid_plane", "reference: focal_point"))
+    assert lfpiv("build-weights", config, "-o", tmp_path / "w.h5").returncode == 0
+    images = (tmp_path / "w.h5", SAMPLE / "pair_a.tif", "--iterations", "100000", "-o", tmp_path / "v.vtkhdf")
+    command = [sys.executable, "-m", "lfpiv_cli", "reconstruct", *(str(part) for part in images)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        time.sleep(4.0)
+        process.send_signal(sent)
+        _, words = process.communicate(timeout=5.0)
+    assert process.returncode == code
+    assert "Traceback" not in words
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["air.yaml", "w.h5"]
