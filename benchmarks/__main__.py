@@ -1,0 +1,27 @@
+"""Run the benchmarks that are named, or all of them: `python -m benchmarks [NAME ...]`.
+
+To add one: a function that takes no arguments, prints its figures, and has a line in `BENCHMARKS`; it lives in a function
+of its own with a size, which the tests call with a tiny one.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+
+from benchmarks.weights import bench_weights
+
+BENCHMARKS: dict[str, Callable[[], None]] = {"weights": bench_weights}
+
+
+def main(names: list[str]) -> None:
+    unknown = [name for name in names if name not in BENCHMARKS]
+    if unknown:
+        sys.exit(f"no benchmark is called {unknown[0]!r}; there are {', '.join(BENCHMARKS)}")
+    for name in names or BENCHMARKS:
+        print(f"== {name}", flush=True)
+        BENCHMARKS[name]()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
