@@ -11,8 +11,6 @@ order of the points: the same bits for any number of threads.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numba import njit, prange
@@ -20,11 +18,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.optics.camera import Camera
-from lfpiv_cli.optics.media import Media, Window, fluid_path_to_focus
 from lfpiv_cli.optics.microlenses import nearest_point
-from lfpiv_cli.optics.tracing import exact_slope, kernel_distances, trace_ray
-
-Refraction = Literal["paraxial", "exact"]
+from lfpiv_cli.optics.object_space import ObjectSpace, slope_polynomial, slope_ratio
+from lfpiv_cli.optics.tracing import kernel_distances, trace_ray
 
 # Additive recurrence in four dimensions (aperture and ball): powers of the inverse of the root of x^5 = x + 1, whose
 # multiples fill the unit cube more evenly than random points do.
@@ -37,47 +33,9 @@ RAYS_AT_ONCE = 10_000_000
 # Rays per point. The noise of their sum is about the shot noise of a tracer of 2.5e5 photons on its 5,000 pixels.
 RAYS = 40_000
 
-# The slope of a refracted ray over its lateral distance is an analytic function of that distance squared, nearly
-# constant: through five points of it, a polynomial is right to 1e-10 for lenses up to f/1.4.
-SLOPE_NODES = 5
-
 # A pixel of a white image is sampled on a grid this wide: a micro-image's edge is known to 1 % of a pixel's light, and
 # the grid's symmetry keeps its centre in place.
 WHITE_SAMPLES_PER_SIDE = 8
-
-
-@dataclass(frozen=True)
-class ObjectSpace:
-    """What lies in front of the lens, and how rays are bent there.
-
-    Attributes
-    ----------
-    media : refractive indices
-    window : the window, needed for exact refraction unless all is air
-    refraction : equivalent points (Eqs. 6, 9) or Snell's law at each face (Eq. 4)
-    """
-
-    media: Media
-    window: Window | None = None
-    refraction: Refraction = "exact"
-
-    def layers(self, camera: Camera) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the thicknesses from the lens to the focal point, mm, and their indices; the last one grows with z.
-
-        Paraxial rays and rays in air are straight in one layer, the equivalent one.
-
-        Raises
-        ------
-        ConfigError : exact refraction in a fluid without a window
-        """
-        media = self.media
-        if self.refraction == "paraxial" or media == media.in_air():
-            return np.array([camera.focus_distance_mm]), np.array([media.air])
-        if self.window is None:
-            raise ConfigError(f"exact refraction into a fluid of index {media.fluid} needs a window, none was given")
-        path = fluid_path_to_focus(self.window, camera.focus_distance_mm, media)
-        thicknesses = np.array([self.window.distance_mm, self.window.thickness_mm, path])
-        return thicknesses, np.array([media.air, media.window, media.fluid])
 
 
 def render_points(
@@ -200,32 +158,6 @@ def _in_ball(radius: float, radial: float, turn: float) -> tuple[float, float]:
     """Return a point of an evenly filled ball, seen along the axis: the share 1 - (1 - r^2/R^2)^(3/2) lies within r."""
     r = radius * np.sqrt(1.0 - (radial % 1.0) ** (2.0 / 3.0))
     return r * np.cos(2.0 * np.pi * turn), r * np.sin(2.0 * np.pi * turn)
-
-
-@njit(cache=True)
-def slope_polynomial(
-    reach_mm: float, layers: NDArray[np.float64], indices: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return nodes and divided differences of slope / lateral over lateral^2, up to the lateral distance `reach_mm`."""
-    nodes = np.empty(SLOPE_NODES)
-    factors = np.empty(SLOPE_NODES)
-    for i in range(SLOPE_NODES):
-        nodes[i] = reach_mm**2 * 0.5 * (1.0 - np.cos(np.pi * (i + 0.5) / SLOPE_NODES))
-        lateral = np.sqrt(nodes[i])
-        factors[i] = exact_slope(lateral, 0.0, layers, indices)[0] / lateral
-    for order in range(1, SLOPE_NODES):
-        for i in range(SLOPE_NODES - 1, order - 1, -1):
-            factors[i] = (factors[i] - factors[i - 1]) / (nodes[i] - nodes[i - order])
-    return nodes, factors
-
-
-@njit(cache=True)
-def slope_ratio(lateral2_mm2: float, nodes: NDArray[np.float64], factors: NDArray[np.float64]) -> float:
-    """Return slope / lateral distance from `slope_polynomial`."""
-    value = factors[-1]
-    for i in range(SLOPE_NODES - 2, -1, -1):
-        value = factors[i] + (lateral2_mm2 - nodes[i]) * value
-    return value
 
 
 @njit(cache=True)
