@@ -38,7 +38,7 @@ from lfpiv_cli.reconstruction.solvers import normalisers
 from lfpiv_cli.reconstruction.solvers import reconstruct as solve
 from lfpiv_cli.validation.flow import flow_figures, limits_missed, truth_at_points
 from lfpiv_cli.validation.pictures import flow_figure
-from lfpiv_cli.weights.build import default_padding, factorise, seen_share
+from lfpiv_cli.weights.build import default_padding, factorise, scene_distortion, seen_share
 from lfpiv_cli.weights.model import Weights
 from lfpiv_cli.weights.operators import FactorisedOperator
 
@@ -109,7 +109,8 @@ def build_weights(
     padding = settings.reconstruction.padding_voxel or default_padding(camera, media, grid)
     operator = factorise(camera, media, grid.padded(padding))
     _judge_view(factorise(camera, media, grid) if any(padding) else operator, grid, console)
-    weights = Weights(grid, padding, operator, camera.column_axis, found)
+    bend = scene_distortion(camera, media, grid)
+    weights = Weights(grid, padding, operator, camera.column_axis, found, bend)
     record = _record("build-weights", settings, inputs)
     write_weights(output, WeightsFile(weights, camera, settings.volume.reference, reference_z, record), overwrite)
     return {

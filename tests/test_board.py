@@ -120,7 +120,7 @@ def test_magnification_is_measured(table2: Camera, rng: np.random.Generator) -> 
     assert pose.z0_mm == pytest.approx(-0.5, abs=4 * pose.z0_sigma_mm)
 
 
-def test_pose_of_exact_dots_is_exact_with_dots_missing_and_dirt() -> None:
+def test_pose_of_exact_dots_is_exact_with_dots_missing_and_dirt(table2: Camera) -> None:
     board = BoardGeometry((7, 5), 1.0, 0.2)
     dots = dot_places(board, 3.0, (0.4, -0.2), (2.0, -3.0))
     angle = np.deg2rad(1.0)
@@ -128,7 +128,7 @@ def test_pose_of_exact_dots_is_exact_with_dots_missing_and_dirt() -> None:
     kept = np.delete(dots, [3, 11, 30], axis=0)
     kept[:, :2] = (kept[:, :2] - (0.4, -0.2)) @ turn + (0.4, -0.2)
     kept = np.vstack([kept, [[0.9, 0.31, 3.0], [5.0, 5.0, 0.0]]])
-    pose = pose_of_dots(kept, np.full(kept.shape, 1e-3), kept[:, :2], -1.0, board)
+    pose = pose_of_dots(kept, np.full(kept.shape, 1e-3), -kept[:, :2], table2, board)
     assert len(pose.indices) == 32
     assert pose.z0_mm == pytest.approx(3.0, abs=1e-9)
     np.testing.assert_allclose(pose.offset_mm, (0.4, -0.2), atol=1e-9)
@@ -144,11 +144,11 @@ def test_pose_of_exact_dots_is_exact_with_dots_missing_and_dirt() -> None:
     assert first[1] < -1.5
 
 
-def test_a_dot_off_the_plane_does_not_move_the_board(rng: np.random.Generator) -> None:
+def test_a_dot_off_the_plane_does_not_move_the_board(table2: Camera, rng: np.random.Generator) -> None:
     board = BoardGeometry((7, 7), 1.0, 0.2)
     dots = dot_places(board, 3.0, (0.4, -0.2), (0.5, -0.5)) + rng.normal(0.0, 1e-3, (49, 3))
     dots[5, 2] += 0.5
-    pose = pose_of_dots(dots, np.full(dots.shape, 1e-3), dots[:, :2], -1.0, board)
+    pose = pose_of_dots(dots, np.full(dots.shape, 1e-3), -dots[:, :2], table2, board)
     assert len(pose.indices) == 48
     # One micrometre of noise over 48 dots; with the stray dot the depth would be off by a hundredth.
     assert pose.z0_mm == pytest.approx(3.0, abs=1e-3)

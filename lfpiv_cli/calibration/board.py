@@ -45,10 +45,11 @@ MARGIN_LENSES = 2.5
 RIM_PER_PATCH = np.sqrt(0.5)
 # Fewer pixels than these are a dot at the sensor's edge: five unknowns need several times as many.
 FEWEST_PIXELS = 50
-# The magnification enters the depth of each dot; one repetition with the measured one leaves the square of its error.
-MAGNIFICATION_ROUNDS = 2
-# Below this a change of magnification moves nothing by a micrometre over a board of 10 mm.
-MAGNIFICATION_TOLERANCE = 1e-4
+# Magnification and distortion enter the place of each dot; one repetition with the measured ones leaves the square of
+# their errors.
+LENS_ROUNDS = 2
+# Below this a change of scale at the board's corner moves nothing by a micrometre over a board of 10 mm.
+SCALE_TOLERANCE = 1e-4
 
 
 def locate_board(
@@ -79,14 +80,18 @@ def locate_board(
     signal = dot_signal(image, passed, board)
     start, depth = first_dots(signal, camera, board, medium)
     micro_images = camera.micro_image_lattice_px()
-    for _ in range(MAGNIFICATION_ROUNDS):
+    for _ in range(LENS_ROUNDS):
         fits = [fit_one_dot(signal, passed, camera, board, medium, (x, y, depth), radius) for x, y in start]
         places, sigmas = world_places(fits, camera, rotation_rad)
-        pose = pose_of_dots(places, sigmas, seen_px(places, camera, medium), camera.magnification, board)
+        array = array_places(places, camera, medium)
+        pose = pose_of_dots(places, sigmas, array, camera, board)
         ratio = pose.magnification / camera.magnification
-        if abs(ratio - 1.0) < MAGNIFICATION_TOLERANCE:
+        bend = pose.distortion_per_mm2 - camera.distortion_per_mm2
+        if max(abs(ratio - 1.0), abs(bend) * float(np.sum(array**2, axis=1).max())) < SCALE_TOLERANCE:
             break
-        camera = replace(camera, magnification=pose.magnification).with_micro_images(micro_images)
+        camera = replace(
+            camera, magnification=pose.magnification, distortion_per_mm2=pose.distortion_per_mm2
+        ).with_micro_images(micro_images)
         start, depth = start / ratio, pose.z0_mm
     return pose
 
@@ -101,11 +106,11 @@ def world_places(
     return camera.to_image_axes(turned(places, rotation_rad)), camera.to_image_axes(sigmas)
 
 
-def seen_px(places_mm: NDArray[np.float64], camera: Camera, media: Media) -> NDArray[np.float64]:
-    """Return where the light from places (n, 3) through the main lens's middle ends on the sensor (column, row)."""
+def array_places(places_mm: NDArray[np.float64], camera: Camera, media: Media) -> NDArray[np.float64]:
+    """Return where an ideal main lens shows places (n, 3) on the array (n, 2), seen through its middle, image axes."""
     distance = equivalent_object_distance(places_mm[:, 2], camera.focus_distance_mm, media)
-    forward = camera.micro_image_scale * camera.image_distance_mm / distance
-    return camera.mm_to_px(-forward[:, np.newaxis] * camera.to_image_axes(places_mm)[:, :2])
+    forward = camera.image_distance_mm / distance
+    return -forward[:, np.newaxis] * camera.to_image_axes(places_mm)[:, :2]
 
 
 def dot_signal(image: NDArray[np.float32], passed: NDArray[np.float32], board: BoardGeometry) -> NDArray[np.float64]:

@@ -12,15 +12,17 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.calibration.board_fit import FlatFit, bent_fit, flat_fit, outliers
 from lfpiv_cli.calibration.spots import index_spots
 from lfpiv_cli.errors import InputError
+from lfpiv_cli.optics.camera import Camera
 
 # The plane, the spacing and their errors need more than their own unknowns.
 FEWEST_DOTS = 6
-# A dot whose place or depth is this many robust deviations off the common board is dirt; a second look settles it.
-OUTLIER_SIGMAS = 6.0
+# Dots off the common board are left out; without them others may turn out to be off, and a third look settles it.
 OUTLIER_ROUNDS = 3
-MAD_TO_SIGMA = 1.4826
+# A distortion that chance explains is reported and not applied.
+DISTORTION_SIGMAS = 3.0
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,7 @@ class BoardPose:
     rotation_deg : of the board's rows from x towards y
     offset_mm : (x0, y0), the board's centre
     magnification : of the main lens, from the spacing of the dots
+    k1_per_mm2 : radial distortion at the array, r' = r (1 + k1 r^2); None where the dots cannot tell it
     ..._sigma... : standard errors
     """
 
@@ -77,13 +80,22 @@ class BoardPose:
     offset_sigma_mm: NDArray[np.float64]
     magnification: float
     magnification_sigma: float
+    k1_per_mm2: float | None = None
+    k1_sigma_per_mm2: float | None = None
+
+    @property
+    def distortion_per_mm2(self) -> float:
+        """The distortion to reckon with: k1 where it is more than chance, else 0."""
+        if self.k1_per_mm2 is None or self.k1_sigma_per_mm2 is None:
+            return 0.0
+        return self.k1_per_mm2 if abs(self.k1_per_mm2) > DISTORTION_SIGMAS * self.k1_sigma_per_mm2 else 0.0
 
 
 def pose_of_dots(
     dots_mm: NDArray[np.float64],
     sigma_mm: NDArray[np.float64],
-    dots_px: NDArray[np.float64],
-    magnification: float,
+    array_mm: NDArray[np.float64],
+    camera: Camera,
     board: BoardGeometry,
 ) -> BoardPose:
     """Fit a flat regular board to dots.
@@ -91,8 +103,8 @@ def pose_of_dots(
     Parameters
     ----------
     dots_mm, sigma_mm : (n, 3) places of dots, world axes, in any order, and their standard errors
-    dots_px : (n, 2) the same on the sensor, carried along
-    magnification : that these places were computed with
+    array_mm : (n, 2) where an ideal main lens would show them on the microlens array, image axes
+    camera : that these places were computed with
 
     Raises
     ------
@@ -100,15 +112,45 @@ def pose_of_dots(
         when fewer than six dots lie on a common grid
     """
     kept, indices = on_the_grid(dots_mm, board)
+    radius = np.hypot(array_mm[:, 0], array_mm[:, 1])
     for _ in range(OUTLIER_ROUNDS):
-        coefficients, residual, covariance = flat_fit(dots_mm[kept], indices, board)
-        good = ~outliers(residual)
+        bent = bent_fit(dots_mm[kept], indices, radius[kept], board)
+        good = ~outliers(bent.residual_mm)
         if good.all():
             break
         kept, indices = kept[good], indices[good]
         refuse_few(len(kept), board)
-    lengths = lengths_and_angles(coefficients, residual, covariance, magnification)
-    return BoardPose(indices, dots_mm[kept], sigma_mm[kept], residual, dots_px[kept], **lengths)
+    bent = bent_fit(dots_mm[kept], indices, radius[kept], board)
+    k1, k1_sigma = total_distortion(bent, camera)
+    proven = k1 is not None and k1_sigma is not None and abs(k1) > DISTORTION_SIGMAS * k1_sigma
+    fit = bent if proven else flat_fit(dots_mm[kept], indices, board)
+    shown = array_mm[kept] * (1.0 + (k1 if proven and k1 else 0.0) * radius[kept, np.newaxis] ** 2)
+    return BoardPose(
+        indices=indices,
+        dots_mm=dots_mm[kept],
+        dots_sigma_mm=sigma_mm[kept] * scatter_ratio(fit.residual_mm, sigma_mm[kept]),
+        residual_mm=fit.residual_mm,
+        dots_px=camera.mm_to_px(camera.micro_image_scale * shown),
+        k1_per_mm2=k1,
+        k1_sigma_per_mm2=k1_sigma,
+        **lengths_and_angles(fit, camera.magnification),
+    )
+
+
+def total_distortion(bent: FlatFit, camera: Camera) -> tuple[float | None, float | None]:
+    """Return k1 and its standard error: what the camera already had and what the fit adds."""
+    if bent.k1_per_mm2 is None:
+        return None, None
+    return camera.distortion_per_mm2 + bent.k1_per_mm2, bent.k1_sigma_per_mm2
+
+
+def scatter_ratio(residual_mm: NDArray[np.float64], sigma_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return by how much (3,) the dots scatter about the board beyond their own standard errors, at least 1.
+
+    The errors of single dots come from the scatter of their pixels, which does not know how well a rendering can fit.
+    """
+    freedom = len(residual_mm) / max(1, len(residual_mm) - 3)
+    return np.maximum(1.0, np.sqrt(freedom * np.mean((residual_mm / sigma_mm) ** 2, axis=0)))
 
 
 def on_the_grid(dots_mm: NDArray[np.float64], board: BoardGeometry) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -165,53 +207,22 @@ def best_window(indices: NDArray[np.int64], lateral: NDArray[np.float64], board:
     return best
 
 
-def flat_fit(
-    dots_mm: NDArray[np.float64], indices: NDArray[np.int64], board: BoardGeometry
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return centre and step vectors (3, 3), residuals (n, 3) and the coefficients' covariance for unit errors (3, 3).
-
-    Rows of the coefficients: the board's centre, and the change of (x, y, z) per mm along its rows and columns.
-    """
-    along = (indices - (np.array(board.dots) - 1) / 2.0) * board.spacing_mm
-    terms = np.column_stack([np.ones(len(indices)), along])
-    solution, _, rank, _ = np.linalg.lstsq(terms, dots_mm, rcond=None)
-    if rank < terms.shape[1]:
-        raise InputError("the board's dots that were found stand in one line; a plane needs more of the board in view")
-    coefficients = np.asarray(solution, dtype=np.float64)
-    covariance = np.asarray(np.linalg.inv(terms.T @ terms), dtype=np.float64)
-    return coefficients, dots_mm - terms @ coefficients, covariance
-
-
-def outliers(residual: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which dots (n,) are off the board sideways or in depth by far more than most."""
-    distance = np.stack([np.hypot(residual[:, 0], residual[:, 1]), np.abs(residual[:, 2])], axis=1)
-    limit = OUTLIER_SIGMAS * MAD_TO_SIGMA * np.median(distance, axis=0)
-    return (distance > limit).any(axis=1) & (distance > 0.0).any(axis=1)
-
-
-def lengths_and_angles(
-    coefficients: NDArray[np.float64],
-    residual: NDArray[np.float64],
-    covariance: NDArray[np.float64],
-    magnification: float,
-) -> dict[str, Any]:
+def lengths_and_angles(fit: FlatFit, magnification: float) -> dict[str, Any]:
     """Return the fitted centre and step vectors as the lengths and angles of `BoardPose` with their standard errors."""
-    centre, steps = coefficients[0], coefficients[1:]
-    spread = np.sqrt(np.sum(residual**2, axis=0) / max(1, len(residual) - 3))
-    errors = np.sqrt(np.diag(covariance))[:, np.newaxis] * spread
+    centre, steps = fit.coefficients[0], fit.coefficients[1:]
     slope = np.linalg.solve(steps[:, :2], steps[:, 2])
     stretch = np.sqrt(np.sum(steps**2, axis=1))
     turn = np.array([np.arctan2(steps[0, 1], steps[0, 0]), np.arctan2(-steps[1, 0], steps[1, 1])])
-    step_error = float(np.mean(errors[1:, :2])) / float(np.sqrt(2.0))
+    step_error = float(np.mean(fit.sigma[1:, :2])) / float(np.sqrt(2.0))
     return {
         "z0_mm": float(centre[2]),
-        "z0_sigma_mm": float(errors[0, 2]),
+        "z0_sigma_mm": float(fit.sigma[0, 2]),
         "tilt_deg": np.rad2deg(np.arctan(slope)),
-        "tilt_sigma_deg": np.rad2deg(errors[1:, 2] / (1.0 + slope**2)),
+        "tilt_sigma_deg": np.rad2deg(fit.sigma[1:, 2] / (1.0 + slope**2)),
         "rotation_deg": float(np.rad2deg(turn.mean())),
         "rotation_sigma_deg": float(np.rad2deg(step_error)),
         "offset_mm": centre[:2],
-        "offset_sigma_mm": errors[0, :2],
+        "offset_sigma_mm": fit.sigma[0, :2],
         "magnification": magnification * float(stretch.mean()),
         "magnification_sigma": abs(magnification) * step_error,
     }

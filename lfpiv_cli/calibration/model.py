@@ -88,7 +88,7 @@ class Calibration:
         return self.rectification.image_shape
 
     def camera(self, camera: Camera) -> Camera:
-        """Return the data sheet's camera with the measured lattice, rectified, and the measured magnification.
+        """Return the data sheet's camera with the measured lattice, rectified, magnification and distortion.
 
         Raises
         ------
@@ -104,6 +104,7 @@ class Calibration:
             difference = abs(self.pose.magnification - camera.magnification)
             if difference > MAGNIFICATION_SIGMAS * self.pose.magnification_sigma:
                 camera = replace(camera, magnification=self.pose.magnification)
+            camera = replace(camera, distortion_per_mm2=self.pose.distortion_per_mm2)
         return camera.with_micro_images(self.rectification.lattice_px)
 
     def summary(self) -> dict[str, Any]:
@@ -118,8 +119,8 @@ class Calibration:
             "origin_px": fit.centres((0, 0)).tolist(),
             "origin_px_sigma": fit.origin_sigma_px.tolist(),
             "residual_px": fit.residual_px.tolist(),
-            "k1_per_mm2": None,
-            "k1_per_mm2_sigma": None,
+            "k1_per_mm2": pose.k1_per_mm2 if pose else None,
+            "k1_per_mm2_sigma": pose.k1_sigma_per_mm2 if pose else None,
             "board_z_mm": pose.z0_mm if pose else None,
             "board_z_mm_sigma": pose.z0_sigma_mm if pose else None,
             "tilt_deg": pose.tilt_deg.tolist() if pose else None,

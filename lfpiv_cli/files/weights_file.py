@@ -1,7 +1,8 @@
 """The weights file: everything that a reconstruction needs besides the images.
 
 Layout, version 1 (HDF5; lengths in mm): `camera` (scalars of `optics.camera.Camera`, `lattice_origin_mm` (2,),
-`lattice_basis_mm` (2, 2)), `grid` (`shape_xyz`, `spacing_mm`, `origin_mm`, `padding_xyz`, `reference`), `columns` and
+`lattice_basis_mm` (2, 2)), `grid` (`shape_xyz`, `spacing_mm`, `origin_mm`, `padding_xyz`, `reference`,
+`scene_distortion_per_mm2` of its planes), `columns` and
 `rows` (the per-axis weights: `start`, `cell`, `share`), and `calibration` where one was made. The cells and the
 aperture's mask follow from the camera and are computed again on reading.
 """
@@ -80,6 +81,7 @@ def write_weights(path: Path, content: WeightsFile, overwrite: bool) -> None:
             "padding_xyz": np.asarray(weights.padding_xyz),
             "reference": content.reference,
             "reference_z_mm": content.reference_z_mm,
+            "scene_distortion_per_mm2": weights.scene_distortion_per_mm2,
         },
         "columns": _axis_tree(weights.solver_operator.columns),
         "rows": _axis_tree(weights.solver_operator.rows),
@@ -112,11 +114,14 @@ def read_weights(path: Path) -> WeightsFile:
         optics = axis_optics(camera)
         columns = _axis_weights(tree["columns"], nz, across, optics[0])
         rows = _axis_weights(tree["rows"], nz, along, optics[1])
+        bend = tree["grid"].get("scene_distortion_per_mm2")
+        if bend is not None and (bend.shape != (grid.shape_xyz[2],) or not np.isfinite(bend).all()):
+            raise ValueError(f"a distortion of shape {bend.shape} for {grid.shape_xyz[2]} planes")
         reference, reference_z = str(tree["grid"]["reference"]), float(tree["grid"]["reference_z_mm"])
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: not a whole weights file: {error}") from error
     operator = FactorisedOperator(columns, rows, aperture_mask(columns.cells, rows.cells, camera.aperture_radius_mm))
-    weights = Weights(grid, padding, operator, camera.column_axis, calibration)
+    weights = Weights(grid, padding, operator, camera.column_axis, calibration, bend)
     return WeightsFile(weights, camera, reference, reference_z, provenance)
 
 

@@ -7,6 +7,7 @@ in the frame that the array is aligned with (`rectified`), x and y lateral, z aw
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.grid import Grid
@@ -68,6 +69,17 @@ def axis_optics(camera: Camera) -> tuple[AxisOptics, AxisOptics]:
         for axis in (0, 1)
     )
     return first, second
+
+
+def scene_distortion(camera: Camera, media: Media, grid: Grid) -> NDArray[np.float64] | None:
+    """Return the main lens's distortion as it bends the planes (nz,) of a grid, 1/mm^2; None where there is none.
+
+    A point at p lights the array at r = p s_i/s_o, moved to r (1 + k1 r^2), as one at p (1 + k1 (s_i/s_o)^2 p^2) would.
+    """
+    if camera.distortion_per_mm2 == 0.0:
+        return None
+    distance = equivalent_object_distance(grid.axis_mm(2), camera.focus_distance_mm, media)
+    return np.asarray(camera.distortion_per_mm2 * (camera.image_distance_mm / distance) ** 2, dtype=np.float64)
 
 
 def blur_radius_mm(camera: Camera, media: Media, grid: Grid) -> float:

@@ -34,6 +34,8 @@ class Weights:
     solver_operator : the weights of the padded grid, its lateral axes in the order of the sensor's
     column_axis : world axis along the sensor's columns
     calibration : undoes what keeps a raw image from fitting; None where nothing has to be undone
+    scene_distortion_per_mm2 : (nz,) of the planes of `grid`: the operator takes a point at p for one at
+        p (1 + k |p|^2), as the main lens's distortion is not in it; None where there is none
     """
 
     grid: Grid
@@ -41,6 +43,7 @@ class Weights:
     solver_operator: FactorisedOperator
     column_axis: ColumnAxis
     calibration: Calibration | None = None
+    scene_distortion_per_mm2: NDArray[np.float64] | None = None
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -93,19 +96,26 @@ class Weights:
     def to_world(self, padded_volume: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the volume (z, y, x) on `grid` in world axes, from one on the padded grid in the array's frame.
 
-        A turned array is straightened by turning the image; the volume is turned back here, by cubic splines, negative
-        overshoot cut off.
+        A turned array is straightened by turning the image; the volume is turned back here, and the main lens's
+        distortion undone, by cubic splines, negative overshoot cut off.
         """
-        if self.calibration is None or self.calibration.rectification.rotation_rad == 0.0:
+        turning = self.calibration is not None and self.calibration.rectification.rotation_rad != 0.0
+        if not turning and self.scene_distortion_per_mm2 is None:
             return np.ascontiguousarray(padded_volume[self._inner])
         y, x = np.meshgrid(self.grid.axis_mm(1), self.grid.axis_mm(0), indexing="ij")
-        turned = self.calibration.rectification.from_world(np.stack([x, y], axis=-1), self.column_axis)
+        place = np.stack([x, y], axis=-1)
+        if self.calibration is not None:
+            place = self.calibration.rectification.from_world(place, self.column_axis)
+        radius2 = np.sum(place**2, axis=-1, keepdims=True)
+        bends = np.zeros(self.shape[0]) if self.scene_distortion_per_mm2 is None else self.scene_distortion_per_mm2
         grid = self.padded.grid
-        at = [(turned[..., axis] - grid.origin_mm[axis]) / grid.spacing_mm[axis] for axis in (1, 0)]
         pz = self.padding_xyz[2]
-        planes = padded_volume[pz : pz + self.shape[0]]
-        turned_planes = [ndimage.map_coordinates(plane, at, order=3, mode="nearest") for plane in planes]
-        return np.maximum(np.stack(turned_planes), 0.0, dtype=np.float32)
+        result = np.empty(self.shape, dtype=np.float32)
+        for k, bend in enumerate(bends):
+            taken = place * (1.0 + bend * radius2)
+            at = [(taken[..., axis] - grid.origin_mm[axis]) / grid.spacing_mm[axis] for axis in (1, 0)]
+            result[k] = ndimage.map_coordinates(padded_volume[pz + k], at, order=3, mode="nearest")
+        return np.maximum(result, 0.0)
 
     @property
     def _inner(self) -> tuple[slice, slice, slice]:
