@@ -149,6 +149,8 @@ def read_array(dataset: h5py.Dataset, file_bytes: int) -> NDArray[Any]:
     declared = math.prod(dataset.shape) * dataset.dtype.itemsize
     if declared > allowed:
         raise ValueError(f"{name} declares {declared} bytes, more than the {allowed} that are possible")
+    if dataset.chunks is None and dataset.id.get_storage_size() < declared:
+        raise ValueError(f"{name} was never written")
     if dataset.chunks is not None and dataset.size:
         expected = math.prod(-(-n // c) for n, c in zip(dataset.shape, dataset.chunks, strict=True))
         found = dataset.id.get_num_chunks()
