@@ -39,9 +39,9 @@ def test_quadrature_agrees_with_counted_rays_eq_13(
     space = ObjectSpace(water, window, refraction)
     for centre, voxel in [((0.31, -0.22, 3.0), VOXEL), ((-0.2, 0.1, -4.5), (0.05, 0.05, 0.2))]:
         exact = quadrature_image(camera, space, centre, voxel)
-        counted = count_rays(camera, space, centre, voxel, rng, points=20_000, rays_per_point=25)
-        # A sum over hundreds of pixels stays within some per cent of its mean; the 25 rays of a point add to it.
-        assert np.abs(exact - counted).sum() < 1.25 * sampling_error(exact, 500_000)
+        counted = count_rays(camera, space, centre, voxel, rng, points=100_000, rays_per_point=5)
+        # A sum over hundreds of pixels stays within some per cent of its mean; the 5 rays of a point add to it.
+        assert np.abs(exact - counted).sum() < 1.3 * sampling_error(exact, 500_000)
 
 
 def test_halving_the_tiles_converges_in_second_order(layout, water):

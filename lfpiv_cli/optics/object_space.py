@@ -105,17 +105,27 @@ class ObjectSpace:
         ConfigError : a depth in front of the fluid, or no window where one is needed
         """
         depths = np.asarray(z_mm, dtype=np.float64)
-        nodes, factors = np.zeros((2, depths.size, SLOPE_NODES))
         if self.straight:
+            nodes, factors = np.zeros((2, depths.size, SLOPE_NODES))
             factors[:, 0] = 1.0 / self.distance(camera, depths)
             return nodes, factors
         thicknesses, indices = self.layers(camera)
         if thicknesses[-1] + depths.min() <= 0.0:
             raise ConfigError(f"a point at z = {depths.min():g} mm lies in front of the fluid")
-        for k, depth in enumerate(depths):
-            layers = np.append(thicknesses[:-1], thicknesses[-1] + depth)
-            nodes[k], factors[k] = slope_polynomial(reach_mm, layers, indices)
-        return nodes, factors
+        return _polynomials_at(depths, reach_mm, thicknesses, indices)
+
+
+@njit(cache=True)
+def _polynomials_at(
+    depths: NDArray[np.float64], reach_mm: float, thicknesses: NDArray[np.float64], indices: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return nodes and factors for points at several depths."""
+    nodes, factors = np.empty((depths.size, SLOPE_NODES)), np.empty((depths.size, SLOPE_NODES))
+    layers = thicknesses.copy()
+    for k in range(depths.size):
+        layers[-1] = thicknesses[-1] + depths[k]
+        nodes[k], factors[k] = slope_polynomial(reach_mm, layers, indices)
+    return nodes, factors
 
 
 @njit(cache=True)
