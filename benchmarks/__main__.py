@@ -1,7 +1,7 @@
 """Run the benchmarks that are named, or all of them: `python -m benchmarks [NAME ...]`.
 
-To add one: a function that takes no arguments, prints its figures, and has a line in `BENCHMARKS`; it lives in a function
-of its own with a size, which the tests call with a tiny one.
+To add one: a function that takes no arguments, prints its figures, and has a line in `BENCHMARKS`; it lives in a
+function of its own with a size, which the tests call with a tiny one.
 """
 
 from __future__ import annotations

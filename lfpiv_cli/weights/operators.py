@@ -9,32 +9,27 @@ all by cells (see `axis`); pixels add up their cells at the end.
 
 Axes: volumes [z, y, x], images [row, column]; where the sensor's columns follow world y the two lateral axes of the
 volume are exchanged on the way in and out.
-
-The kernels do the row step, nine tenths of the work, on four rows (forward) or four planes (adjoint) at once and four
-terms at a time, along contiguous columns: every number that is loaded is used four times. All sums are made per output
-element in a fixed order, so the result does not depend on the number of threads.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 
+from lfpiv_cli.weights import kernels
 from lfpiv_cli.weights.axis import AxisWeights
+from lfpiv_cli.weights.microkernel import GROUP, TILE
 
 # Pixel rows, pixel columns and weights of one voxel.
 Column = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]
 # Start of each group (groups + 1,), the line of each entry and its `GROUP` shares.
 Groups = tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]
-
-# Rows (or planes) that share the loads of one pass, and terms per pass.
-GROUP = 4
-# Columns per tile: 4 accumulators and 4 operands of 1 kB stay in the first-level cache.
-TILE = 256
+# Start of each (plane, tile), the first voxel and the shares of each block.
+Blocks = tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,19 +58,22 @@ class FactorisedOperator:
 
     def forward(self, volume: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the image (rows, columns) of a volume [plane, row voxel, column voxel]."""
+        height = _filled(volume.shape[1], GROUP)
+        filled = np.pad(volume, ((0, 0), (0, height - volume.shape[1]), (0, 0)))
         first, last = self._lit_columns
-        spread = _spread_columns(volume, first, last, self.columns.start, self.columns.cell, self.columns.share)
-        by_cell = _sum_rows(spread, self.rows.cells.pixel.size, *self._row_groups)
-        return _fold(by_cell, self.mask, first, self.columns.cells.pixel, *self._cells_of_rows, self.columns.pixels)
+        tiles = _filled(last - first, TILE) // TILE
+        by_cell = kernels.project(filled, *self._column_blocks[0], *self._row_groups, tiles)
+        pixel = self.columns.cells.pixel
+        return kernels.fold(by_cell, self.mask, first, last, pixel, *self._lines_of_rows, self.columns.pixels)
 
     def adjoint(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the volume [plane, row voxel, column voxel] that an image is spread back to."""
-        first, last = self._lit_columns
-        by_cell = _unfold(image, self.mask, self.rows.cells.pixel, self.columns.cells.pixel, first, last)
-        gathered = _gather_rows(by_cell, self.shape[0], self.shape[1], *self._plane_groups)
-        return _gather_columns(
-            gathered, first, self.columns.voxels, self.columns.start, self.columns.cell, self.columns.share
-        )
+        row_pixel, column_pixel = self.rows.cells.pixel, self.columns.cells.pixel
+        by_cell = kernels.unfold(image, self.mask, self._lit_rows, self._lit_columns, row_pixel, column_pixel)
+        planes, height, width = self.shape
+        filled = (_filled(planes, GROUP), _filled(height, GROUP), width)
+        volume = kernels.back_project(by_cell, filled, *self._plane_groups, *self._column_blocks[1])
+        return np.ascontiguousarray(volume[:planes, :height, :width])
 
     def column(self, plane: int, row_voxel: int, column_voxel: int) -> Column:
         """Return the rows, columns (int64) and weights (float32) of the pixels that one voxel lights."""
@@ -90,25 +88,35 @@ class FactorisedOperator:
         return rows[lit[0]].astype(np.int64), columns[lit[1]].astype(np.int64), weight[lit]
 
     @cached_property
-    def _lit_columns(self) -> tuple[int, int]:
-        """Range of column cells that any voxel reaches."""
-        cell = self.columns.cell
-        return (int(cell.min()), int(cell.max()) + 1) if cell.size else (0, 0)
+    def _lit_rows(self) -> tuple[int, int]:
+        """Range of row cells that any voxel reaches."""
+        return _range(self.rows.cell)
 
     @cached_property
-    def _cells_of_rows(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Row cells in the order of their pixels, and where each pixel's begin (rows + 1,)."""
-        pixel = self.rows.cells.pixel
-        start = np.searchsorted(np.sort(pixel), np.arange(self.rows.pixels + 1)).astype(np.int64)
-        return np.argsort(pixel, kind="stable"), start
+    def _lit_columns(self) -> tuple[int, int]:
+        """Range of column cells that any voxel reaches."""
+        return _range(self.columns.cell)
+
+    @cached_property
+    def _lines_of_rows(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+        """Lit row cells in the order of their pixels, their lines in the sum, and where each pixel's begin."""
+        first, last = self._lit_rows
+        pixel = self.rows.cells.pixel[first:last]
+        order = np.argsort(pixel, kind="stable")
+        start = np.searchsorted(pixel[order], np.arange(self.rows.pixels + 1)).astype(np.int64)
+        return first + order, lens_lines(self.rows, first, last)[order], start
+
+    @cached_property
+    def _column_blocks(self) -> tuple[Blocks, Blocks]:
+        return column_blocks(self.columns, *self._lit_columns)
 
     @cached_property
     def _row_groups(self) -> Groups:
-        return group_terms_by_row(self.rows)
+        return group_terms_by_row(self.rows, *self._lit_rows)
 
     @cached_property
     def _plane_groups(self) -> Groups:
-        return group_terms_by_plane(self.rows)
+        return group_terms_by_plane(self.rows, self._lit_rows[0])
 
 
 def forward_reference(operator: FactorisedOperator, volume: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -129,203 +137,90 @@ def adjoint_reference(operator: FactorisedOperator, image: NDArray[np.float32]) 
     return np.stack([operator.rows.matrix(k).T @ by_cell @ operator.columns.matrix(k) for k in planes])
 
 
-def group_terms_by_row(rows: AxisWeights) -> Groups:
-    """Return for each four row cells the (plane, voxel) lines that reach any of them, and the four shares of each.
+def column_blocks(columns: AxisWeights, first: int, last: int) -> tuple[Blocks, Blocks]:
+    """Return the columns' weights as dense blocks of 16 lit cells (from `first` to `last`), forward and back.
 
-    Returns
-    -------
-    start : (groups + 1,), line : index plane * voxels + voxel, share : (lines, 4); each group is filled up with lines
-    of share 0 to a multiple of four.
+    Forward, a block has a row of 16 cells for each of its voxels; back, it is cut into squares (16 cells, 16 voxels).
     """
-    line_of = np.repeat(np.arange(rows.start.size - 1), np.diff(rows.start))
-    return _pack(rows.cell // GROUP, line_of, rows.cell % GROUP, rows.share, -(-rows.cells.pixel.size // GROUP))
+    tiles, planes = _filled(last - first, TILE) // TILE, _filled(columns.planes, GROUP)
+    plane, voxel = np.divmod(_line_of(columns), columns.voxels)
+    tile, cell = np.divmod(columns.cell.astype(np.int64) - first, TILE)
+    block = plane * tiles + tile
+    low, high = np.full(planes * tiles, columns.voxels), np.full(planes * tiles, -1)
+    np.minimum.at(low, block, voxel)
+    np.maximum.at(high, block, voxel)
+    span = np.maximum(high - low + 1, 0)
+    start = np.concatenate([[0], np.cumsum(span)]).astype(np.int64)
+    rows = np.zeros((start[-1], TILE), np.float32)
+    rows[start[block] + voxel - low[block], cell] = columns.share
+    forward = (start, np.minimum(low, columns.voxels - 1).astype(np.int32), rows)
+
+    counts = _filled(span, TILE) // TILE
+    start = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    number, member = np.divmod(voxel - low[block], TILE)
+    squares = np.zeros((start[-1], TILE, TILE), np.float32)
+    squares[start[block] + number, cell, member] = columns.share
+    owner = np.repeat(np.arange(counts.size), counts)
+    first_voxel = low[owner] + TILE * (np.arange(start[-1]) - start[owner])
+    return forward, (start, first_voxel.astype(np.int32), squares)
 
 
-def group_terms_by_plane(rows: AxisWeights) -> Groups:
-    """Return for each voxel of each four planes the row cells it reaches, and the four shares of each; see above."""
-    line_of = np.repeat(np.arange(rows.start.size - 1), np.diff(rows.start))
-    plane, voxel = np.divmod(line_of, rows.voxels)
-    groups = -(-rows.planes // GROUP) * rows.voxels
-    return _pack(plane // GROUP * rows.voxels + voxel, rows.cell.astype(np.int64), plane % GROUP, rows.share, groups)
+def lens_lines(rows: AxisWeights, first: int, last: int) -> NDArray[np.int64]:
+    """Return the line of each lit cell in the sum: no group of four spans two lenses, whose voxels differ."""
+    cell = np.arange(first, last)
+    lens = np.searchsorted(rows.cells.start, cell, side="right") - 1
+    begin = np.maximum(rows.cells.start[lens], first)
+    lenses, which = np.unique(lens, return_inverse=True)
+    start = np.concatenate([[0], np.cumsum(_filled(np.bincount(which, minlength=lenses.size), GROUP))])
+    return start[which] + cell - begin
+
+
+def group_terms_by_row(rows: AxisWeights, first: int, last: int) -> Groups:
+    """Return, for each four row cells of a lens, the lines of the volume that reach any of them, and the four shares.
+
+    `first` and `last` bound the lit cells; a line is plane * filled height + voxel.
+    """
+    line_of_cell = lens_lines(rows, first, last)
+    group, member = np.divmod(line_of_cell[rows.cell - first], GROUP)
+    plane, voxel = np.divmod(_line_of(rows), rows.voxels)
+    line = plane * _filled(rows.voxels, GROUP) + voxel
+    return _pack(group, line, member, rows.share, int(line_of_cell[-1]) // GROUP + 1)
+
+
+def group_terms_by_plane(rows: AxisWeights, first: int) -> Groups:
+    """Return, for each voxel of each four planes, the lit row cells it reaches (from `first` on) and the shares."""
+    plane, voxel = np.divmod(_line_of(rows), rows.voxels)
+    height = _filled(rows.voxels, GROUP)
+    groups = _filled(rows.planes, GROUP) // GROUP * height
+    cell = rows.cell.astype(np.int64) - first
+    return _pack(plane // GROUP * height + voxel, cell, plane % GROUP, rows.share, groups)
 
 
 def _pack(
-    group: NDArray[np.integer],
+    group: NDArray[np.int64],
     line: NDArray[np.int64],
-    member: NDArray[np.integer],
+    member: NDArray[np.int64],
     share: NDArray[np.float32],
     groups: int,
 ) -> Groups:
-    """Gather the shares of each (group, line) into one entry of `GROUP` members, groups of a multiple of `GROUP`."""
-    keys, entry = np.unique(group.astype(np.int64) * (int(line.max(initial=0)) + 1) + line, return_inverse=True)
-    entry_group = keys // (int(line.max(initial=0)) + 1)
-    counts = np.bincount(entry_group, minlength=groups)
-    start = np.concatenate([[0], np.cumsum(-(-counts // GROUP) * GROUP)]).astype(np.int64)
-    begin = np.concatenate([[0], np.cumsum(counts)])
-    place = start[entry_group] + np.arange(keys.size) - begin[entry_group]
-    lines = np.zeros(start[-1], np.int32)
-    shares = np.zeros((start[-1], GROUP), np.float32)
-    lines[place] = keys % (int(line.max(initial=0)) + 1)
-    shares[place[entry], member] = share
-    return start, lines, shares
+    """Gather the shares of each (group, line) into one entry of `GROUP` members."""
+    lines = int(line.max(initial=0)) + 1
+    keys, entry = np.unique(group * lines + line, return_inverse=True)
+    start = np.searchsorted(keys, lines * np.arange(groups + 1)).astype(np.int64)
+    packed = np.zeros((keys.size, GROUP), np.float32)
+    packed[entry, member] = share
+    return start, (keys % lines).astype(np.int32), packed
 
 
-@njit(cache=True, parallel=True, fastmath={"contract"})
-def _spread_columns(
-    volume: NDArray[np.float32],
-    first: int,
-    last: int,
-    start: NDArray[np.int64],
-    cell: NDArray[np.int32],
-    share: NDArray[np.float32],
-) -> NDArray[np.float32]:
-    """Return V_z A_z^T for every plane: (planes * row voxels, last - first)."""
-    planes, height, width = volume.shape
-    out = np.empty((planes * height, last - first), np.float32)
-    for plane in prange(planes):
-        turned = np.ascontiguousarray(volume[plane].T)
-        lines = np.zeros((last - first, height), np.float32)
-        for k in range(width):
-            source = turned[k]
-            for at in range(start[plane * width + k], start[plane * width + k + 1]):
-                weight = share[at]
-                target = lines[cell[at] - first]
-                for j in range(height):
-                    target[j] += weight * source[j]
-        for j in range(height):
-            for c in range(last - first):
-                out[plane * height + j, c] = lines[c, j]
-    return out
+def _filled(size: Any, multiple: int) -> Any:
+    """Return a size, or an array of them, filled up to a multiple."""
+    return -(-size // multiple) * multiple
 
 
-@njit(cache=True, parallel=True, fastmath={"contract"})
-def _sum_rows(
-    spread: NDArray[np.float32],
-    cells: int,
-    start: NDArray[np.int64],
-    line: NDArray[np.int32],
-    share: NDArray[np.float32],
-) -> NDArray[np.float32]:
-    """Return sum_z B_z T_z: (row cells, columns)."""
-    columns = spread.shape[1]
-    image = np.empty((GROUP * (start.size - 1), columns), np.float32)
-    for group in prange(start.size - 1):
-        _combine(spread, line, share, start[group], start[group + 1], image[GROUP * group : GROUP * (group + 1)])
-    return image[:cells]
+def _line_of(axis: AxisWeights) -> NDArray[np.int64]:
+    """Return the row plane * voxels + voxel of each entry of a table."""
+    return np.repeat(np.arange(axis.start.size - 1), np.diff(axis.start))
 
 
-@njit(cache=True, parallel=True, fastmath={"contract"})
-def _gather_rows(
-    image: NDArray[np.float32],
-    planes: int,
-    height: int,
-    start: NDArray[np.int64],
-    line: NDArray[np.int32],
-    share: NDArray[np.float32],
-) -> NDArray[np.float32]:
-    """Return B_z^T I for every plane: (planes, row voxels, columns)."""
-    columns = image.shape[1]
-    groups = -(-planes // GROUP)
-    out = np.empty((groups, height, GROUP, columns), np.float32)
-    for task in prange(groups * height):
-        _combine(image, line, share, start[task], start[task + 1], out[task // height, task % height])
-    return out
-
-
-@njit(cache=True, fastmath={"contract"})
-def _combine(
-    source: NDArray[np.float32],
-    line: NDArray[np.int32],
-    share: NDArray[np.float32],
-    begin: int,
-    end: int,
-    out: NDArray[np.float32],
-) -> None:
-    """Set four rows of `out` to sums of lines of `source`, out[m] = sum_k share[k, m] source[line[k]]."""
-    columns = source.shape[1]
-    for tile in range(0, columns, TILE):
-        stop = min(tile + TILE, columns)
-        out0, out1, out2, out3 = out[0, tile:stop], out[1, tile:stop], out[2, tile:stop], out[3, tile:stop]
-        out[:, tile:stop] = 0.0
-        for k in range(begin, end, 4):
-            a, b, c, d = share[k], share[k + 1], share[k + 2], share[k + 3]
-            a0, a1, a2, a3 = a[0], a[1], a[2], a[3]
-            b0, b1, b2, b3 = b[0], b[1], b[2], b[3]
-            c0, c1, c2, c3 = c[0], c[1], c[2], c[3]
-            d0, d1, d2, d3 = d[0], d[1], d[2], d[3]
-            in0, in1 = source[line[k], tile:stop], source[line[k + 1], tile:stop]
-            in2, in3 = source[line[k + 2], tile:stop], source[line[k + 3], tile:stop]
-            for j in range(stop - tile):
-                p, q, r, s = in0[j], in1[j], in2[j], in3[j]
-                out0[j] += a0 * p + b0 * q + c0 * r + d0 * s
-                out1[j] += a1 * p + b1 * q + c1 * r + d1 * s
-                out2[j] += a2 * p + b2 * q + c2 * r + d2 * s
-                out3[j] += a3 * p + b3 * q + c3 * r + d3 * s
-
-
-@njit(cache=True, parallel=True, fastmath={"contract"})
-def _gather_columns(
-    gathered: NDArray[np.float32],
-    first: int,
-    width: int,
-    start: NDArray[np.int64],
-    cell: NDArray[np.int32],
-    share: NDArray[np.float32],
-) -> NDArray[np.float32]:
-    """Return T_z A_z for every plane: (planes, row voxels, column voxels)."""
-    height, columns = gathered.shape[1], gathered.shape[3]
-    planes = (start.size - 1) // width
-    volume = np.empty((planes, height, width), np.float32)
-    for plane in prange(planes):
-        lines = np.empty((columns, height), np.float32)
-        for j in range(height):
-            source = gathered[plane // GROUP, j, plane % GROUP]
-            for c in range(columns):
-                lines[c, j] = source[c]
-        for k in range(width):
-            total = np.zeros(height, np.float32)
-            for at in range(start[plane * width + k], start[plane * width + k + 1]):
-                weight = share[at]
-                source = lines[cell[at] - first]
-                for j in range(height):
-                    total[j] += weight * source[j]
-            volume[plane, :, k] = total
-    return volume
-
-
-@njit(cache=True, parallel=True)
-def _fold(
-    by_cell: NDArray[np.float32],
-    mask: NDArray[np.float32],
-    first: int,
-    column_pixel: NDArray[np.int32],
-    row_cell: NDArray[np.int64],
-    row_start: NDArray[np.int64],
-    columns: int,
-) -> NDArray[np.float32]:
-    """Return the image (rows, columns): C times the light of each cell, added up by pixel."""
-    image = np.zeros((row_start.size - 1, columns), np.float32)
-    for row in prange(row_start.size - 1):
-        for at in range(row_start[row], row_start[row + 1]):
-            cell = row_cell[at]
-            for k in range(by_cell.shape[1]):
-                image[row, column_pixel[first + k]] += mask[cell, first + k] * by_cell[cell, k]
-    return image
-
-
-@njit(cache=True, parallel=True)
-def _unfold(
-    image: NDArray[np.float32],
-    mask: NDArray[np.float32],
-    row_pixel: NDArray[np.int32],
-    column_pixel: NDArray[np.int32],
-    first: int,
-    last: int,
-) -> NDArray[np.float32]:
-    """Return C times the pixel that each cell belongs to, (row cells, last - first)."""
-    by_cell = np.empty((row_pixel.size, last - first), np.float32)
-    for cell in prange(row_pixel.size):
-        line = image[row_pixel[cell]]
-        for k in range(last - first):
-            by_cell[cell, k] = mask[cell, first + k] * line[column_pixel[first + k]]
-    return by_cell
+def _range(cell: NDArray[np.int32]) -> tuple[int, int]:
+    return (int(cell.min()), int(cell.max()) + 1) if cell.size else (0, 0)
