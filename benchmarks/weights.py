@@ -1,4 +1,4 @@
-"""The weights' operators: against the machine's matrix-product rate, and against a sparse matrix of the same columns."""
+"""The weights' operators against the machine's matrix-product rate and a sparse matrix of the same columns."""
 
 from __future__ import annotations
 
@@ -32,9 +32,8 @@ def bench_weights() -> None:
     print(f"forward + adjoint 80x80x240: {share['pair_s']:.3f} s, {100 * share['share']:.1f} % of the sgemm rate")
     print(f"  sgemm {share['sgemm_gflops']:.0f} GFLOP/s on {os.cpu_count()} cores, {share['repeats']} runs in turn")
     ratios = against_sparse_matrix(Grid.centred((40, 40, 30), (0.1, 0.1, 0.1), (0.0, 0.0, 2.0)), repeats=7)
-    print(
-        f"40x40x30 against scipy.sparse CSR: {ratios['times_faster']:.1f} times faster, {ratios['bytes']:.0f} times smaller"
-    )
+    times, smaller = ratios["times_faster"], ratios["bytes"]
+    print(f"40x40x30 against scipy.sparse CSR: {times:.1f} times faster, {smaller:.0f} times smaller")
 
 
 def share_of_matrix_product_rate(
