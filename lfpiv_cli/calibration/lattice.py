@@ -14,13 +14,10 @@ from scipy import stats
 
 from lfpiv_cli.calibration.spectrum import lattice_vectors
 from lfpiv_cli.calibration.spots import find_spots, index_spots
+from lfpiv_cli.calibration.white import checked_white
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.optics.microlenses import Lattice, Layout
 
-# More saturated pixels than this and the lens images have lost their brightness, which the transmission needs.
-SATURATED_SHARE = 0.05
-# The difference of two dark frames reaches 3.3 times the noise of one in its brightest hundredth; light reaches more.
-DARK_SIGMAS = 5.0
 # Fewer lenses leave the cubic's ten coefficients per axis without a check.
 FEWEST_LENSES = 30
 # Of the spots found, the walk must reach this share; else it started on dirt and another start is tried.
@@ -29,12 +26,17 @@ STARTS = 20
 # Tukey's biweight: the usual constant for 95 % efficiency on a normal distribution, and enough rounds to settle.
 TUKEY = 4.685
 TUKEY_ROUNDS = 10
-MAD_TO_SIGMA = 1.4826
-# The cubic is believed when chance would do as well less than once in 1e6 and it explains this share of the residual's
-# variance: the pixels' own error of a centroid (some hundredths of a pixel) beats slowly with the pitch and would pass
-# for a little distortion.
+# Standard deviation along each axis over the median distance, for normal errors: 1/sqrt(2 ln 2).
+MEDIAN_DISTANCE_TO_SIGMA = 0.8493
+# Errors of lenses near each other are alike (dust, and centroids that beat with the pixels); those of this many parts of
+# the image along each side are taken for independent.
+PARTS_PER_SIDE = 8
+# The cubic is believed when chance would do as well less than once in 1e6, and it explains this share of the residual's
+# variance and this much of it: the pixels' own error of a centroid beats slowly with the pitch and would pass for a
+# little distortion.
 CUBIC_CHANCE = 1e-6
 CUBIC_GAIN = 0.2
+CUBIC_LEAST_PX = 0.018
 # Exponents (i, j) of the cubic polynomial in the indices; the first three are the affine lattice.
 EXPONENTS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
 
@@ -86,15 +88,15 @@ class LatticeFit:
 
 
 def fit_lattice(
-    white: ArrayLike, dark: ArrayLike | None = None, layout: Layout = "square", saturation: float | None = None
+    white: ArrayLike, dark: ArrayLike | None = None, layout: Layout | None = None, saturation: float | None = None
 ) -> LatticeFit:
     """Find the lens images of a white image and fit a lattice and its cubic distortion.
 
     Parameters
     ----------
     white, dark : (rows, columns) photographs of uniform light and of none
-    layout : of the microlens array
-    saturation : level at which the camera saturates; default: the largest value its integer type holds
+    layout : of the microlens array, to be checked; default: what the image shows
+    saturation : level at which the camera saturates; default: that of its bits
 
     Raises
     ------
@@ -102,42 +104,14 @@ def fit_lattice(
         when the image is too dark, saturated or shows no lattice
     """
     image = checked_white(white, dark, saturation)
-    basis = lattice_vectors(image, layout)
+    basis, seen = lattice_vectors(image)
+    if layout is not None and seen != layout:
+        raise InputError(f"the white image shows a {seen} array, and microlenses.layout is {layout}; correct it")
     points = find_spots(image, float(np.mean(np.hypot(basis[:, 0], basis[:, 1]))))
     centre = (np.array(image.shape[::-1]) - 1.0) / 2.0
     indices, points = indexed_from_centre(points, basis, centre)
     indices, points = without_strays(indices, points, float(np.hypot(*basis[0])))
-    return lattice_through(indices, points, centre, layout)
-
-
-def checked_white(white: ArrayLike, dark: ArrayLike | None, saturation: float | None) -> NDArray[np.float64]:
-    """Return white minus dark, or say why it cannot be used."""
-    raw = np.asarray(white)
-    image = raw.astype(np.float64)
-    if image.ndim != 2:
-        raise InputError(f"the white image has {image.ndim} axes, expected one grey image of rows and columns")
-    if not np.isfinite(image).all():
-        raise InputError("the white image holds values that are not numbers; export it again without them")
-    if saturation is None:
-        saturation = float(np.iinfo(raw.dtype).max) if raw.dtype.kind in "iu" else float(image.max())
-    clipped = float(np.mean(image >= saturation))
-    if image.max() > image.min() and clipped > SATURATED_SHARE:
-        raise InputError(
-            f"{100 * clipped:.0f} % of the white image is saturated (at {saturation:g}), at most "
-            f"{100 * SATURATED_SHARE:.0f} % may be; take it with less light or a shorter exposure"
-        )
-    if dark is not None:
-        darkness = np.asarray(dark, dtype=np.float64)
-        if darkness.shape != image.shape:
-            raise InputError(f"the dark frame is {darkness.shape} and the white image {image.shape} (rows, columns)")
-        image = image - darkness
-        if np.percentile(image, 99.0) <= DARK_SIGMAS * float(darkness.std()):
-            raise InputError(
-                "the white image is no brighter than the dark frame; take it with more light or a longer exposure"
-            )
-    if image.max() <= image.min():
-        raise InputError(f"the white image has one value everywhere ({raw.flat[0]}); it shows no lens images")
-    return image
+    return lattice_through(indices, points, centre, seen)
 
 
 def indexed_from_centre(
@@ -176,7 +150,7 @@ def robust_fit(
         root = np.sqrt(weights)[:, np.newaxis]
         coefficients = np.linalg.lstsq(root * terms / scale, root * points, rcond=None)[0] / scale[:, np.newaxis]
         distance = np.hypot(*(points - terms @ coefficients).T)
-        spread = MAD_TO_SIGMA * float(np.median(distance))
+        spread = MEDIAN_DISTANCE_TO_SIGMA * float(np.median(distance))
         if spread == 0.0:
             break
         weights = np.clip(1.0 - (distance / (TUKEY * spread)) ** 2, 0.0, None) ** 2
@@ -204,18 +178,22 @@ def lattice_through(
     cubic, cubic_weights = robust_fit(terms, points)
     affine_residual = points - terms[:, :3] @ affine
     cubic_residual = points - terms @ cubic
-    errors = affine_errors(terms[:, :3], affine, affine_residual, affine_weights)
+    cubic_used = cubic_is_significant(terms, points, np.minimum(affine_weights, cubic_weights))
+    residual, weights = (cubic_residual, cubic_weights) if cubic_used else (affine_residual, affine_weights)
+    spread = coefficient_sigmas(terms[:, :3], residual, weights, points)
+    pitch_sigma, rotation_sigma = affine_errors(affine[1:3], spread[1:3])
+    origin_sigma = coefficient_sigmas(terms, residual, weights, points)[0] if cubic_used else spread[0]
     return LatticeFit(
         lattice_px=Lattice(affine[0], affine[1:3], layout),
         indices=indices,
         centres_px=points,
         cubic_px=cubic,
-        cubic_used=cubic_is_significant(terms, points, np.minimum(affine_weights, cubic_weights)),
+        cubic_used=cubic_used,
         residual_px=weighted_rms(cubic_residual, cubic_weights),
         residual_affine_px=weighted_rms(affine_residual, affine_weights),
-        pitch_sigma_px=errors[0],
-        origin_sigma_px=errors[1],
-        rotation_sigma_rad=errors[2],
+        pitch_sigma_px=pitch_sigma,
+        origin_sigma_px=origin_sigma,
+        rotation_sigma_rad=rotation_sigma,
     )
 
 
@@ -235,7 +213,8 @@ def cubic_is_significant(terms: NDArray[np.float64], points: NDArray[np.float64]
         squares.append(float(np.sum(residual**2)))
     more = 2 * (terms.shape[1] - 3)
     rest = 2 * (int(kept.sum()) - terms.shape[1])
-    if squares[1] >= (1.0 - CUBIC_GAIN) * squares[0]:
+    explained = (squares[0] - squares[1]) / (2 * int(kept.sum()))
+    if squares[1] >= (1.0 - CUBIC_GAIN) * squares[0] or explained < CUBIC_LEAST_PX**2:
         return False
     if squares[1] == 0.0:
         return True
@@ -243,19 +222,34 @@ def cubic_is_significant(terms: NDArray[np.float64], points: NDArray[np.float64]
     return bool(stats.f.sf(ratio, more, rest) < CUBIC_CHANCE)
 
 
-def affine_errors(
-    terms: NDArray[np.float64],
-    affine: NDArray[np.float64],
-    residual: NDArray[np.float64],
-    weights: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Return the standard errors of pitch (2,) px, origin (2,) px and rotation (rad) of the plain lattice."""
+def coefficient_sigmas(
+    terms: NDArray[np.float64], residual: NDArray[np.float64], weights: NDArray[np.float64], places: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return standard errors (terms, 2) of coefficients fitted with weights, errors being alike in parts of the image.
+
+    The sandwich estimate over parts: what the residuals of each part pull at the coefficients counts as one error. Where
+    the parts happen to cancel, what independent errors would give stands.
+    """
     kept = weights > 0.0
-    covariance = np.linalg.inv(terms[kept].T @ terms[kept])
-    variance = np.sum(residual[kept] ** 2, axis=0) / (kept.sum() - 3)
-    origin = np.sqrt(covariance[0, 0] * variance)
-    length2 = np.sum(affine[1:3] ** 2, axis=1)
-    spread = np.diag(covariance)[1:3]
-    along = np.sqrt(spread * (affine[1:3] ** 2 @ variance) / length2)
-    across2 = spread * (affine[1:3, ::-1] ** 2 @ variance) / length2
-    return along, origin, float(np.sqrt(np.sum(across2 / length2)) / 2.0)
+    scale = np.abs(terms).max(axis=0)
+    design, weight = (terms / scale)[kept], weights[kept]
+    low, high = places[kept].min(axis=0), places[kept].max(axis=0)
+    cell = np.minimum((places[kept] - low) / (high - low) * PARTS_PER_SIDE, PARTS_PER_SIDE - 1).astype(np.int64)
+    part = cell[:, 0] * PARTS_PER_SIDE + cell[:, 1]
+    inverse = np.linalg.inv(design.T @ (weight[:, np.newaxis] * design))
+    freedom = kept.sum() / max(1, kept.sum() - terms.shape[1])
+    sigmas = []
+    for axis in range(2):
+        pull = design * (weight * residual[kept, axis])[:, np.newaxis]
+        pulls = np.stack([np.bincount(part, column, minlength=PARTS_PER_SIDE**2) for column in pull.T], axis=1)
+        together, apart = (inverse @ (each.T @ each) @ inverse for each in (pulls, pull))
+        sigmas.append(np.sqrt(freedom * np.maximum(np.diag(together), np.diag(apart))) / scale)
+    return np.stack(sigmas, axis=1)
+
+
+def affine_errors(basis: NDArray[np.float64], sigma: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """Return the standard errors of the pitch (2,) px and the rotation (rad) from those of the basis (2, 2)."""
+    length2 = np.sum(basis**2, axis=1)
+    along = np.sqrt(np.sum((basis * sigma) ** 2, axis=1) / length2)
+    across2 = np.sum((basis[:, ::-1] * sigma) ** 2, axis=1) / length2
+    return along, float(np.sqrt(np.sum(across2 / length2)) / 2.0)

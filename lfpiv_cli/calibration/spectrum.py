@@ -30,13 +30,15 @@ BIN_TOLERANCE = 2
 REFINE_BINS = 2
 
 
-def lattice_vectors(image: NDArray[np.float64], layout: Layout) -> NDArray[np.float64]:
-    """Return two basis vectors (2, 2) of the lattice of bright spots, the first one nearest the column direction.
+def lattice_vectors(image: NDArray[np.float64]) -> tuple[NDArray[np.float64], Layout]:
+    """Return two basis vectors (2, 2) of the lattice of bright spots, the first nearest the columns, and its layout.
+
+    The slowest line that has a partner tells the layout by where this stands: at 90 degrees on squares, at 60 on
+    hexagons, which have no line as slow at 90.
 
     Parameters
     ----------
     image : (rows, columns) white image
-    layout : whether the vectors stand at 90 (square) or 60 degrees (hexagonal)
 
     Raises
     ------
@@ -44,15 +46,16 @@ def lattice_vectors(image: NDArray[np.float64], layout: Layout) -> NDArray[np.fl
         when the spectrum holds no such lattice with a pitch of 6 to 90 px
     """
     power, step = centre_spectrum(image)
-    lines = spectral_lines(power, step)
-    turn = np.deg2rad(90.0 if layout == "square" else 60.0)
-    for first in lines:
-        second = rotated(first, turn)
-        if line_power(power, step, second) >= PARTNER_SHARE * line_power(power, step, first):
-            return column_first(first_basis(power, step, first, second, layout), layout)
+    for first in spectral_lines(power, step):
+        turns: dict[Layout, float] = {"square": np.pi / 2.0, "hexagonal": np.pi / 3.0}
+        partner = {layout: line_power(power, step, rotated(first, turn)) for layout, turn in turns.items()}
+        layout: Layout = "square" if partner["square"] >= partner["hexagonal"] else "hexagonal"
+        if partner[layout] >= PARTNER_SHARE * line_power(power, step, first):
+            second = rotated(first, turns[layout])
+            return column_first(first_basis(power, step, first, second, layout), layout), layout
     raise InputError(
-        f"no {layout} lattice of lens images with a pitch of {SMALLEST_PITCH_PX:g} to {LARGEST_PITCH_PX:g} px is "
-        "visible in the white image; check microlenses.layout, the exposure, and that it is a white image"
+        f"no lattice of lens images with a pitch of {SMALLEST_PITCH_PX:g} to {LARGEST_PITCH_PX:g} px is visible in the "
+        "white image; check the exposure, and that it is a white image"
     )
 
 
