@@ -23,6 +23,8 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
+from lfpiv_cli.optics.object_space import slope_ratio
+
 # Along z the weights are smooth except where an edge of a lens or pixel passes; three nodes resolve voxels up to the
 # depth in which a ray at the rim moves by a third of a lens.
 DEPTH_NODES = 3
@@ -52,6 +54,25 @@ class AxisOptics:
     lens_pitch_mm: float
     pixel_mm: float
     pixels: int
+
+
+@dataclass(frozen=True, eq=False)
+class Bending:
+    """How rays from the planes of a volume are bent on their way to the array, along one axis.
+
+    Attributes
+    ----------
+    nodes, factors : (planes, depth nodes, k) of `object_space.slope_ratio` at the depth nodes of each plane
+    focal_length_mm : F_m
+    beside_mm2 : mean square of the voxels' distance from the optical axis along the other axis
+    strips : straight pieces in which the aperture is worked on; 1 where rays are straight in front of the lens
+    """
+
+    nodes: NDArray[np.float64]
+    factors: NDArray[np.float64]
+    focal_length_mm: float
+    beside_mm2: float = 0.0
+    strips: int = 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,22 +160,16 @@ def _patches(optics: AxisOptics, lens_mm: NDArray[np.float64], pixel: NDArray[np
     return np.stack([np.minimum(patch[:, 0], radius - sliver), np.maximum(patch[:, 1], sliver - radius)], axis=1)
 
 
-def axis_weights(
-    optics: AxisOptics,
-    centres_mm: NDArray[np.float64],
-    width_mm: float,
-    spread: NDArray[np.float64],
-    scale: NDArray[np.float64],
-) -> AxisWeights:
+def axis_weights(optics: AxisOptics, centres_mm: NDArray[np.float64], width_mm: float, bending: Bending) -> AxisWeights:
     """Integrate the weights of all voxels along one axis.
 
     Parameters
     ----------
     centres_mm : (n,) voxel centres along the axis
     width_mm : their width
-    spread, scale : (planes, nodes) alpha and s_i/s_o at the depth nodes of each plane
+    bending : of the rays in front of the array
     """
-    planes, nodes = spread.shape
+    planes, nodes = bending.nodes.shape[:2]
     node_share = np.polynomial.legendre.leggauss(nodes)[1] / 2.0
     camera = np.array(
         [
@@ -165,11 +180,14 @@ def axis_weights(
             optics.lens_origin_mm,
             optics.lens_pitch_mm,
             optics.pixel_mm,
+            bending.focal_length_mm,
+            bending.beside_mm2,
         ]
     )
     cells = micro_image_cells(optics)
     layout = (cells.first_lens, cells.start, cells.pixel)
-    scene = (camera, optics.pixels, *layout, centres_mm, width_mm, spread, scale, node_share)
+    slopes = (bending.nodes, bending.factors, bending.strips)
+    scene = (camera, optics.pixels, *layout, centres_mm, width_mm, *slopes, node_share)
     counts = np.zeros(planes * centres_mm.size, np.int64)
     _integrate(*scene, np.zeros(0, np.int64), counts, np.zeros(0, np.int32), np.zeros(0, np.float32))
     start = np.concatenate([[0], np.cumsum(counts)])
@@ -244,6 +262,26 @@ def _add_lens(
 
 
 @njit(cache=True)
+def _array_place(
+    crossing: float,
+    centre: float,
+    camera: NDArray[np.float64],
+    nodes: NDArray[np.float64],
+    factors: NDArray[np.float64],
+) -> tuple[float, float]:
+    """Return where on the array the ray from `centre` through X = `crossing` arrives, and how much x moves that.
+
+    The other axis enters by its mean square distance: of a disc's chord at X, a third of its half length squared, and
+    of the voxels.
+    """
+    s_i, radius, focal_length, beside = camera[0], camera[3], camera[7], camera[8]
+    lateral = crossing - centre
+    chord = max(radius * radius - crossing * crossing, 0.0) / 3.0
+    ratio = slope_ratio(lateral * lateral + chord + beside, nodes, factors)
+    return crossing + s_i * (ratio * lateral - crossing / focal_length), s_i * ratio
+
+
+@njit(cache=True)
 def _voxel_shares(
     camera: NDArray[np.float64],
     pixels: int,
@@ -252,39 +290,56 @@ def _voxel_shares(
     cell_pixel: NDArray[np.int32],
     centre: float,
     width: float,
-    spread: NDArray[np.float64],
-    scale: NDArray[np.float64],
+    nodes: NDArray[np.float64],
+    factors: NDArray[np.float64],
+    strips: int,
     node_share: NDArray[np.float64],
     work: NDArray[np.float64],
     shares: NDArray[np.float64],
 ) -> tuple[int, int]:
-    """Add one voxel's shares to `shares` (cells,); return the first cell touched and the one after the last."""
-    s_i, s_mu, f_m, radius, lens_origin, lens_pitch, pixel_mm = camera
+    """Add one voxel's shares to `shares` (cells,); return the first cell touched and the one after the last.
+
+    In each strip of X the ray's place on the array is linear, x_m = alpha X - scale x + offset, right at both ends.
+    """
+    s_i, s_mu, f_m, radius, lens_origin, lens_pitch, pixel_mm = camera[:7]
     rectangle, upper, lens, scratch = work
-    for k, (x, y) in enumerate(((-0.5, -1.0), (0.5, -1.0), (0.5, 1.0), (-0.5, 1.0))):
-        rectangle[k, 0] = centre + x * width
-        rectangle[k, 1] = y * radius
     bend = 1.0 - s_mu / f_m
     begin, end = cell_pixel.size, 0
-    for node in range(spread.size):
-        alpha, beta = spread[node], -scale[node]
-        middle, reach = beta * centre, abs(alpha) * radius + abs(beta) * 0.5 * width
-        first = int(np.floor((middle - reach - lens_origin) / lens_pitch + 0.5))
-        last = int(np.floor((middle + reach - lens_origin) / lens_pitch + 0.5))
+    side = 2.0 * radius / strips
+    for task in range(node_share.size * strips):
+        node, strip = task // strips, task % strips
+        low, high = strip * side - radius, (strip + 1) * side - radius
+        _set_rectangle(rectangle, centre - 0.5 * width, centre + 0.5 * width, low, high)
+        place_low, scale_low = _array_place(low, centre, camera, nodes[node], factors[node])
+        place_high, scale_high = _array_place(high, centre, camera, nodes[node], factors[node])
+        alpha, beta = (place_high - place_low) / side, -0.5 * (scale_low + scale_high)
+        offset = place_low - alpha * low - beta * centre
+        reach = abs(beta) * 0.5 * width
+        first = int(np.floor((min(place_low, place_high) - reach - lens_origin) / lens_pitch + 0.5))
+        last = int(np.floor((max(place_low, place_high) + reach - lens_origin) / lens_pitch + 0.5))
         a = beta * bend + s_mu * beta / s_i
         b = alpha * bend + s_mu * (alpha - 1.0) / s_i
         for n in range(max(first, first_lens), min(last, first_lens + cell_start.size - 2) + 1):
-            low, high = cell_start[n - first_lens], cell_start[n - first_lens + 1]
+            at, stop = cell_start[n - first_lens], cell_start[n - first_lens + 1]
             s = lens_origin + n * lens_pitch
-            corners = _clip(rectangle, 4, beta, alpha, s + 0.5 * lens_pitch, upper)
-            corners = _clip(upper, corners, -beta, -alpha, -(s - 0.5 * lens_pitch), lens)
-            if corners < 3 or low == high:
+            corners = _clip(rectangle, 4, beta, alpha, s + 0.5 * lens_pitch - offset, upper)
+            corners = _clip(upper, corners, -beta, -alpha, -(s - 0.5 * lens_pitch - offset), lens)
+            if corners < 3 or at == stop:
                 continue
             share = node_share[node] / (2.0 * radius * width)
-            seen, own = cell_pixel[low:high], shares[low:high]
-            _add_lens(lens, corners, a, b, s * (1.0 - bend), pixel_mm, pixels, seen, share, scratch, own)
-            begin, end = min(begin, low), max(end, high)
+            seen, own = cell_pixel[at:stop], shares[at:stop]
+            shift = s * (1.0 - bend) + offset * (bend + s_mu / s_i)
+            _add_lens(lens, corners, a, b, shift, pixel_mm, pixels, seen, share, scratch, own)
+            begin, end = min(begin, at), max(end, stop)
     return begin, end
+
+
+@njit(cache=True)
+def _set_rectangle(rectangle: NDArray[np.float64], left: float, right: float, low: float, high: float) -> None:
+    """Set the corners (x, X) of a rectangle, in order."""
+    for k, (x, y) in enumerate(((left, low), (right, low), (right, high), (left, high))):
+        rectangle[k, 0] = x
+        rectangle[k, 1] = y
 
 
 @njit(cache=True, parallel=True)
@@ -296,8 +351,9 @@ def _integrate(
     cell_pixel: NDArray[np.int32],
     centres: NDArray[np.float64],
     width: float,
-    spread: NDArray[np.float64],
-    scale: NDArray[np.float64],
+    nodes: NDArray[np.float64],
+    factors: NDArray[np.float64],
+    strips: int,
     node_share: NDArray[np.float64],
     start: NDArray[np.int64],
     counts: NDArray[np.int64],
@@ -305,12 +361,12 @@ def _integrate(
     share: NDArray[np.float32],
 ) -> None:
     """Fill `counts` (when `start` is empty) or `cell` and `share`, one plane after the other."""
-    for plane in prange(spread.shape[0]):
+    for plane in prange(nodes.shape[0]):
         shares = np.zeros(cell_pixel.size)
         work = np.empty((4, 12, 2))
         layout = (first_lens, cell_start, cell_pixel)
         for k in range(centres.size):
-            scene = (centres[k], width, spread[plane], scale[plane], node_share, work, shares)
+            scene = (centres[k], width, nodes[plane], factors[plane], strips, node_share, work, shares)
             begin, end = _voxel_shares(camera, pixels, *layout, *scene)
             row = plane * centres.size + k
             found = 0
