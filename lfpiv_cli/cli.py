@@ -74,7 +74,7 @@ def cli(debug: bool) -> None:
 
 @cli.command("calibrate-snapshot")
 @click.argument("config", type=INPUT)
-@click.option("--white", type=INPUT, required=True, help="White image: uniform light through the lens.")
+@click.option("--white", type=INPUT, multiple=True, help="White image, uniform light; twice: stopped down and not.")
 @click.option("--dark", type=INPUT, help="Dark image, taken with the cap on.")
 @click.option("--board", type=INPUT, help="Snapshot of the dot board.")
 @click.option("-o", "--output", type=INPUT, required=True, help="Calibration file to write (.h5).")
@@ -87,21 +87,21 @@ def calibrate_snapshot(**arguments: Any) -> dict[str, Any]:
     Example: lfpiv calibrate-snapshot rig.yaml --white white.tif --dark dark.tif --board board.tif \\
                  -o calibration.h5 --picture calibration.png
     """
-    from lfpiv_cli import stages
+    from lfpiv_cli import stages_calibrate
 
-    return stages.calibrate_snapshot(**arguments)
+    return stages_calibrate.calibrate_snapshot(**arguments)
 
 
 @cli.command("build-weights")
 @click.argument("config", type=INPUT)
 @click.option("--calibration", type=INPUT, help="From calibrate-snapshot; without it the data sheet is believed.")
-@click.option("--method", type=click.Choice(["ert"]), help="How points are traced; default from the config.")
-@click.option("--refraction", type=click.Choice(["paraxial"]), help="Snell's law; default from the config.")
+@click.option("--method", type=click.Choice(["ert", "drt"]), help="How points are traced; default from the config.")
+@click.option("--refraction", type=click.Choice(["paraxial", "exact"]), help="Snell's law; default from the config.")
 @click.option("--sampling", type=click.Choice(["exact"]), help="How rays are summed; default from the config.")
 @click.option("-o", "--output", type=INPUT, required=True, help="Weights file to write (.h5).")
 @common_options
 def build_weights(**arguments: Any) -> dict[str, Any]:
-    """Calculate how every voxel lights every pixel, by equivalent ray tracing.
+    """Calculate how every voxel lights every pixel.
 
     \b
     Example: lfpiv build-weights rig.yaml --calibration calibration.h5 -o weights.h5

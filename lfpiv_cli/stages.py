@@ -16,14 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.calibration.model import Calibration
-from lfpiv_cli.calibration.model import calibrate as calibrate_images
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import ConfigError, InputError, LfpivError, LimitMissedError, PartialError, UsageError
 from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.files.atomic import ensure_writable, write_json
 from lfpiv_cli.files.batch import Frame, Target, frames_of, output_paths, pending, prepare_folder
-from lfpiv_cli.files.calibration_file import read_calibration, write_calibration
+from lfpiv_cli.files.calibration_file import read_calibration
 from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.particles import read_particles
 from lfpiv_cli.files.pictures import ensure_drawing, write_picture
@@ -38,7 +37,7 @@ from lfpiv_cli.reconstruction.solvers import normalisers
 from lfpiv_cli.reconstruction.solvers import reconstruct as solve
 from lfpiv_cli.validation.flow import flow_figures, limits_missed, truth_at_points
 from lfpiv_cli.validation.pictures import flow_figure
-from lfpiv_cli.weights.build import default_padding, factorise, scene_distortion, seen_share
+from lfpiv_cli.weights.build import default_padding, factorise_through, scene_distortion, seen_share
 from lfpiv_cli.weights.model import Weights
 from lfpiv_cli.weights.operators import FactorisedOperator
 
@@ -49,40 +48,6 @@ LEAST_SEEN = 0.01
 def use_threads(threads: int) -> None:
     """Use at most `threads` threads from here on."""
     numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
-
-
-def calibrate_snapshot(
-    config: Path,
-    white: Path,
-    dark: Path | None,
-    board: Path | None,
-    output: Path,
-    picture: Path | None,
-    overwrite: bool,
-    console: Console,
-) -> dict[str, Any]:
-    """Find the lattice in a white image and the focal plane in a snapshot of the board."""
-    inputs = _given(config=config, white=white, dark=dark, board=board)
-    for target in filter(None, (output, picture)):
-        ensure_writable(target, overwrite, inputs.values())
-    if picture:
-        ensure_drawing()
-    settings = load_config(config)
-    shape = settings.image_shape()
-    frames = {name: image_files.read_image(path, shape) for name, path in inputs.items() if name != "config"}
-    calibration = calibrate_images(
-        frames["white"],
-        frames.get("dark"),
-        frames.get("board"),
-        layout=settings.camera.microlenses.layout,
-        rig=settings.rig() if board else None,
-    )
-    write_calibration(output, calibration, _record("calibrate-snapshot", settings, inputs), overwrite)
-    if picture:
-        from lfpiv_cli.calibration.picture import calibration_figure
-
-        write_picture(picture, calibration_figure(calibration, frames["white"], frames.get("board")), overwrite)
-    return calibration.summary()
 
 
 def build_weights(
@@ -107,8 +72,9 @@ def build_weights(
     grid = settings.grid(origin_z_mm=reference_z)
     media = settings.media_model()
     padding = settings.reconstruction.padding_voxel or default_padding(camera, media, grid)
-    operator = factorise(camera, media, grid.padded(padding))
-    _judge_view(factorise(camera, media, grid) if any(padding) else operator, grid, console)
+    space = settings.object_space(found.mid_plane_z_mm if found else None)
+    operator = factorise_through(camera, space, grid.padded(padding))
+    _judge_view(factorise_through(camera, space, grid) if any(padding) else operator, grid, console)
     bend = scene_distortion(camera, media, grid)
     weights = Weights(grid, padding, operator, camera.column_axis, found, bend)
     record = _record("build-weights", settings, inputs)
@@ -120,6 +86,8 @@ def build_weights(
         "reference": settings.volume.reference,
         "reference_z_mm": reference_z,
         "frame": weights.frame,
+        "method": settings.weights.method,
+        "refraction": settings.weights.refraction,
         "file_bytes": output.stat().st_size,
     }
 

@@ -44,6 +44,7 @@ from lfpiv_cli.files.yaml_nodes import (
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media, Window
+from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.synthetic.flows import Flow
 
 
@@ -155,6 +156,14 @@ class Config:
             raise self._missing(f"camera.{missing}")
         return bench.camera_of(section)
 
+    def complete_camera(self) -> Camera | None:
+        """Return the camera as the data sheet has it, None where it lacks a length."""
+        return None if bench.missing_for_camera(self.camera) is not None else bench.camera_of(self.camera)
+
+    def micro_image_pitch_px(self) -> float:
+        """Return the pitch of the lens images by the data sheet."""
+        return bench.micro_image_pitch_px(self.camera)
+
     def media_model(self) -> Media:
         """Return the refractive indices."""
         return bench.media_of(self.media)
@@ -166,6 +175,13 @@ class Config:
             return bench.wall_as_window(self.channel, self.media_model(), focus, mid_plane_z_mm)
         section = self._needed("window", self.sections.window)
         return Window(section.distance_mm, section.thickness_mm)
+
+    def object_space(self, mid_plane_z_mm: float | None = None) -> ObjectSpace:
+        """Return what rays cross on their way to the lens, as `weights` has it; the window only where it is read."""
+        chosen = self.weights
+        reads_window = chosen.method == "drt" or chosen.refraction == "exact"
+        window = self.window_model(mid_plane_z_mm) if reads_window else None
+        return ObjectSpace(self.media_model(), window, chosen.refraction, chosen.method)
 
     def grid(self, origin_z_mm: float = 0.0) -> Grid:
         """Return the volume's grid, `origin_z_mm` being where its origin lies from the nominal focal point."""

@@ -66,7 +66,8 @@ class MainLens(Section):
 class Microlenses(Section):
     """The microlens array: pitch p_l, focal length f_m or f_number (f_m / p_l), layout.
 
-    columns and rows document the array; only the lenses that the sensor sees count.
+    columns and rows document the array; only the lenses that the sensor sees count. layout: default is what a white
+    image shows, square where there is none.
     """
 
     pitch_mm: Positive
@@ -74,7 +75,7 @@ class Microlenses(Section):
     f_number: Positive | None = None
     columns: Count | None = None
     rows: Count | None = None
-    layout: Literal["square", "hexagonal"] = "square"
+    layout: Literal["square", "hexagonal"] | None = None
 
 
 class Sensor(Section):
@@ -149,10 +150,15 @@ class ChannelSection(Section):
 
 
 class WeightsSection(Section):
-    """How weights are made: equivalent ray tracing, paraxial refraction, exact integrals."""
+    """How weights are made.
 
-    method: Literal["ert"] = "ert"
-    refraction: Literal["paraxial"] = "paraxial"
+    method: equivalent points (ert), or rays traced through window and fluid (drt), which reads the window's distance.
+    refraction: paraxial, or Snell's law with its aberration (exact), which needs the thickness of what lies before the
+    points: the section window, or channel with a calibrated mid plane. sampling: exact integrals.
+    """
+
+    method: Literal["ert", "drt"] = "ert"
+    refraction: Literal["paraxial", "exact"] = "paraxial"
     sampling: Literal["exact"] = "exact"
 
 
