@@ -2,8 +2,7 @@
 
 Every step is one form, four lines of 16 numbers as a sum of many (`microkernel.combine`). The lit column cells are cut
 into tiles of 16, and a tile goes through both steps, along the columns and along the rows, while it is in the cache.
-Tiles are dealt out in a fixed number of chunks and each output element is one sum in a fixed order, so the result does
-not depend on the number of threads.
+Each output element is one sum in a fixed order, so the result does not depend on the number of threads.
 
 Arrays: float32. `height` and `width` count the voxels along the sensor's rows and columns, planes and height filled up
 to a multiple of four where said; `by_cell` is (tiles, row lines, 16).
@@ -21,8 +20,11 @@ Floats = NDArray[np.float32]
 Index = NDArray[np.int64]
 
 
-# Chunks of tiles, one thread each. A chunk costs a volume of its own on the way back.
-CHUNKS = 8
+# Forward, tiles are dealt out in chunks, so that each thread makes its room for a tile's lines but once.
+CHUNKS = 16
+# Back, this many groups of four planes go through all tiles together: few enough to share among many cores, enough
+# that the image is read from beyond the second-level cache only so many times.
+GROUPS_AT_ONCE = 2
 
 
 @njit(cache=True, parallel=True)
@@ -83,16 +85,16 @@ def back_project(
     voxels), from `first_voxel` on; plane * tiles + tile has blocks start[...] to start[... + 1].
     """
     planes, height, width = shape
-    tiles, size = by_cell.shape[0], by_cell.shape[1] * TILE
-    parts = np.zeros((CHUNKS, planes, height, width + TILE), np.float32)
-    flat_parts, flat_share, flat_cell = parts.reshape(-1), share.reshape(-1), by_cell.reshape(-1)
+    tiles, size, groups = by_cell.shape[0], by_cell.shape[1] * TILE, planes // GROUP
+    volume = np.zeros((planes, height, width + TILE), np.float32)
+    flat_volume, flat_share, flat_cell = volume.reshape(-1), share.reshape(-1), by_cell.reshape(-1)
     flat_group = group_share.reshape(-1)
     in_turn = np.arange(TILE).astype(np.int32)
     step, across = width + TILE, height * TILE
-    for chunk in prange(CHUNKS):
+    for task in prange(-(-groups // GROUPS_AT_ONCE)):
         lines = np.empty(GROUP * height * TILE, np.float32)
-        for tile in range(chunk * tiles // CHUNKS, (chunk + 1) * tiles // CHUNKS):
-            for four in range(planes // GROUP):
+        for tile in range(tiles):
+            for four in range(task * GROUPS_AT_ONCE, min((task + 1) * GROUPS_AT_ONCE, groups)):
                 for voxel in range(height):
                     g = four * height + voxel
                     first, terms = group_start[g], group_start[g + 1] - group_start[g]
@@ -104,17 +106,11 @@ def back_project(
                     plane = four * GROUP + member
                     for b in range(start[plane * tiles + tile], start[plane * tiles + tile + 1]):
                         for j in range(0, height, GROUP):
-                            at = ((chunk * planes + plane) * height + j) * step + first_voxel[b]
+                            at = (plane * height + j) * step + first_voxel[b]
                             source, weight = b * TILE * TILE, (member * height + j) * TILE
                             combine_onto(
-                                flat_parts, at, step, flat_share, source, in_turn, 0, TILE, lines, weight, 1, TILE
+                                flat_volume, at, step, flat_share, source, in_turn, 0, TILE, lines, weight, 1, TILE
                             )
-    volume = np.empty(parts.shape[1:], np.float32)
-    for plane in prange(planes):
-        total = parts[0, plane]
-        for chunk in range(1, CHUNKS):
-            total += parts[chunk, plane]
-        volume[plane] = total
     return volume
 
 
