@@ -27,9 +27,10 @@ LENS = Camera(-1.0, 100.0, 25.0, 0.8, 0.8, Lattice.regular(0.1), 0.0055, SHAPE[1
 # The contract's names; whatever has an uncertainty has it under the same name with _sigma.
 MEASURED = [
     "lenses pitch_px rotation_deg origin_px residual_px k1_per_mm2 board_z_mm tilt_deg offset_mm magnification",
-    "camera_move_mm mid_plane_z_mm",
+    "camera_move_mm mid_plane_z_mm layout distortion_model residual_affine_px image_distance_mm",
 ]
 UNCERTAIN = "pitch_px rotation_deg origin_px k1_per_mm2 board_z_mm tilt_deg offset_mm magnification mid_plane_z_mm"
+UNCERTAIN += " image_distance_mm"
 
 
 def white_image() -> NDArray[np.float64]:
@@ -50,7 +51,7 @@ def exact_pose(z_mm: float, magnification: float = -1.0) -> BoardPose:
 
 @pytest.fixture(scope="module")
 def plain() -> Calibration:
-    return calibrate(white_image())
+    return calibrate([white_image()])
 
 
 @pytest.fixture
@@ -87,7 +88,7 @@ def test_summary_has_the_contracts_names_and_no_nan(plain: Calibration, rig: Rig
     assert set(summary) == set(" ".join(MEASURED).split()) | {f"{name}_sigma" for name in UNCERTAIN.split()}
     assert json.loads(json.dumps(summary, allow_nan=False)) == summary
     unknown = {name for name, value in summary.items() if value is None}
-    assert (unknown == set()) == with_board
+    assert (unknown == {"image_distance_mm", "image_distance_mm_sigma"}) == with_board
     assert summary["lenses"] == plain.fit.lenses
 
 
@@ -143,8 +144,8 @@ def test_the_camera_takes_the_magnification_only_when_it_differs(plain: Calibrat
 
 
 def test_a_board_of_another_shape_is_refused(rig: Rig) -> None:
-    with pytest.raises(InputError, match=r"board's picture is \(3, 3\)"):
-        calibrate(white_image(), board=np.zeros((3, 3)), rig=rig)
+    with pytest.raises(InputError, match=r"\(180, 220\), \(3, 3\)"):
+        calibrate([white_image()], board=np.zeros((3, 3)), rig=rig)
 
 
 def test_the_picture_shows_lattice_and_board(plain: Calibration, rig: Rig, tmp_path: Path) -> None:
@@ -169,7 +170,7 @@ def test_experiment(data_folder: Path, table2: Camera, water: Media) -> None:
         cv2.imread(str(folder / f"{name}.tif"), cv2.IMREAD_UNCHANGED).astype(np.uint16)
         for name in ("white", "dark", "board")
     ]
-    calibration = calibrate(*pictures, rig=Rig(table2, water, BOARD, CHANNEL))
+    calibration = calibrate(pictures[:1], *pictures[1:], camera=table2, rig=Rig(table2, water, BOARD, CHANNEL))
     pose = calibration.pose
     assert len(pose.indices) == 49
     assert pose.z0_mm == pytest.approx(truth["board_z_mm"], abs=0.01)
@@ -178,5 +179,7 @@ def test_experiment(data_folder: Path, table2: Camera, water: Media) -> None:
     assert pose.k1_per_mm2 == pytest.approx(truth["camera"]["k1"], rel=0.3)
     assert pose.k1_sigma_per_mm2 < 0.15 * truth["camera"]["k1"]
     assert pose.magnification == pytest.approx(truth["camera"]["M"], abs=2e-4)
+    # 1 + s_mu/s_i is known to 3e-7 here, s_mu/s_i = 0.004 thus to 1e-4.
+    assert calibration.image_distance_mm == pytest.approx(200.0, abs=0.1)
     assert calibration.camera_move_mm == pytest.approx(truth["eq21_d_m_mm"])
     assert calibration.mid_plane_z_mm == pytest.approx(truth["mid_plane_z_mm"], abs=0.02)

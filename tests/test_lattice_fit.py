@@ -101,7 +101,7 @@ def test_untold_lattices_stopped_down_or_at_working_aperture(
 
 
 def test_dirty_photographs(layout: str, rng: np.random.Generator) -> None:
-    """Eight bits, speckle, dead lenses, dust, light that falls to a third on one side, and a sensor that cuts lenses."""
+    """Eight bits, speckle, dead lenses, dust, light that falls to a third on one side, lenses that the sensor cuts."""
     truth = tilted(layout)
     centres = lens_centres(truth)
     image = discs(centres[rng.random(len(centres)) > 0.05], 5.5)

@@ -77,7 +77,7 @@ def flat_fit(
     count = len(indices)
     along = (indices - (np.array(board.dots) - 1) / 2.0) * board.spacing_mm
     terms = np.column_stack([np.ones(count), along])
-    sideways = np.kron(np.eye(2), terms)
+    sideways = np.asarray(np.kron(np.eye(2), terms), dtype=np.float64)
     if bending is not None:
         sideways = np.column_stack([sideways, bending.T.ravel()])
     places, place_sigma, shifts = least_squares(sideways, dots_mm[:, :2].T.ravel())

@@ -28,7 +28,7 @@ TUKEY = 4.685
 TUKEY_ROUNDS = 10
 # Standard deviation along each axis over the median distance, for normal errors: 1/sqrt(2 ln 2).
 MEDIAN_DISTANCE_TO_SIGMA = 0.8493
-# Errors of lenses near each other are alike (dust, and centroids that beat with the pixels); those of this many parts of
+# Errors of lenses near each other are alike (dust, centroids that beat with the pixels); those of this many parts of
 # the image along each side are taken for independent.
 PARTS_PER_SIDE = 8
 # The cubic is believed when chance would do as well less than once in 1e6, and it explains this share of the residual's
@@ -227,8 +227,8 @@ def coefficient_sigmas(
 ) -> NDArray[np.float64]:
     """Return standard errors (terms, 2) of coefficients fitted with weights, errors being alike in parts of the image.
 
-    The sandwich estimate over parts: what the residuals of each part pull at the coefficients counts as one error. Where
-    the parts happen to cancel, what independent errors would give stands.
+    The sandwich estimate over parts: what the residuals of each part pull at the coefficients counts as one error.
+    Where the parts happen to cancel, what independent errors would give stands.
     """
     kept = weights > 0.0
     scale = np.abs(terms).max(axis=0)

@@ -5,7 +5,7 @@ Axes: pixels are (column, row); world axes are those of the raw sensor, z away f
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -17,7 +17,9 @@ from lfpiv_cli.calibration.board import locate_board
 from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose
 from lfpiv_cli.calibration.lattice import LatticeFit, fit_lattice
 from lfpiv_cli.calibration.rectification import Rectification
+from lfpiv_cli.calibration.sheet import check_pitch, image_distance_mm, sheet_fit
 from lfpiv_cli.calibration.transmission import relative_transmission
+from lfpiv_cli.calibration.white import by_aperture
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
@@ -25,6 +27,14 @@ from lfpiv_cli.optics.microlenses import Lattice, Layout
 
 # A measured magnification replaces the data sheet's when it differs by more standard errors than chance explains.
 MAGNIFICATION_SIGMAS = 3.0
+# Numbers that the file keeps as they are.
+CARRIED = (
+    "camera_move_mm",
+    "mid_plane_z_mm",
+    "mid_plane_z_sigma_mm",
+    "image_distance_mm",
+    "image_distance_sigma_mm",
+)
 
 
 @dataclass(frozen=True)
@@ -68,6 +78,7 @@ class Calibration:
     pose : of the board, or None
     camera_move_mm : d_m of Eq. 21, or None
     mid_plane_z_mm, mid_plane_z_sigma_mm : depth of the channel's mid plane in the fluid, or None
+    image_distance_mm, image_distance_sigma_mm : s_i by the pitch of the lens images, a check of the data sheet, or None
     """
 
     rectification: Rectification
@@ -76,6 +87,8 @@ class Calibration:
     camera_move_mm: float | None = None
     mid_plane_z_mm: float | None = None
     mid_plane_z_sigma_mm: float | None = None
+    image_distance_mm: float | None = None
+    image_distance_sigma_mm: float | None = None
 
     @property
     def fit(self) -> LatticeFit:
@@ -113,12 +126,17 @@ class Calibration:
         return {
             "lenses": fit.lenses,
             "pitch_px": lattice.pitch.tolist(),
-            "pitch_px_sigma": fit.pitch_sigma_px.tolist(),
+            "layout": lattice.layout,
+            "pitch_px_sigma": known(fit.pitch_sigma_px),
             "rotation_deg": float(np.rad2deg(lattice.rotation_rad)),
-            "rotation_deg_sigma": float(np.rad2deg(fit.rotation_sigma_rad)),
+            "rotation_deg_sigma": known(np.rad2deg(fit.rotation_sigma_rad)),
             "origin_px": fit.centres((0, 0)).tolist(),
-            "origin_px_sigma": fit.origin_sigma_px.tolist(),
-            "residual_px": fit.residual_px.tolist(),
+            "origin_px_sigma": known(fit.origin_sigma_px),
+            "residual_px": known(fit.residual_px if fit.cubic_used else fit.residual_affine_px),
+            "residual_affine_px": known(fit.residual_affine_px),
+            "distortion_model": "cubic" if fit.cubic_used else "affine",
+            "image_distance_mm": self.image_distance_mm,
+            "image_distance_mm_sigma": self.image_distance_sigma_mm,
             "k1_per_mm2": pose.k1_per_mm2 if pose else None,
             "k1_per_mm2_sigma": pose.k1_sigma_per_mm2 if pose else None,
             "board_z_mm": pose.z0_mm if pose else None,
@@ -145,10 +163,7 @@ class Calibration:
             "lattice": fit | {"cubic_used": int(self.fit.cubic_used)},
             "transmission": self.transmission,
             "board": {field.name: getattr(pose, field.name) for field in fields(BoardPose)} if pose else None,
-            "camera_move_mm": self.camera_move_mm,
-            "mid_plane_z_mm": self.mid_plane_z_mm,
-            "mid_plane_z_sigma_mm": self.mid_plane_z_sigma_mm,
-        }
+        } | {name: getattr(self, name) for name in CARRIED}
 
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any]) -> Calibration:
@@ -168,26 +183,31 @@ class Calibration:
                 Rectification(LatticeFit(lattice_px=lattice, **fit), (rows, columns)),
                 tree.get("transmission"),
                 BoardPose(**tree["board"]) if tree.get("board") else None,
-                **{name: tree.get(name) for name in ("camera_move_mm", "mid_plane_z_mm", "mid_plane_z_sigma_mm")},
+                **{name: tree.get(name) for name in CARRIED},
             )
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(f"the calibration is not complete ({error}); make it again") from error
 
 
 def calibrate(
-    white: ArrayLike,
+    whites: Sequence[ArrayLike],
     dark: ArrayLike | None = None,
     board: ArrayLike | None = None,
     *,
-    layout: Layout = "square",
+    layout: Layout | None = None,
+    sheet_pitch_px: float | None = None,
+    camera: Camera | None = None,
     rig: Rig | None = None,
 ) -> Calibration:
     """Calibrate from photographs.
 
     Parameters
     ----------
-    white, dark, board : (rows, columns) raw pictures of uniform light, of no light and of the dot board
-    layout : of the microlens array
+    whites : (rows, columns) raw pictures of uniform light: the one with the smallest aperture gives the lattice, the
+        one with the widest the transmission; none: the lattice is that of `camera`
+    dark, board : (rows, columns) raw pictures of no light and of the dot board
+    layout, sheet_pitch_px : of the data sheet, to be checked
+    camera : as the data sheet has it, for the image distance; not needed beside whites
     rig : camera, media and board; needed for the board only
 
     Raises
@@ -195,21 +215,56 @@ def calibrate(
     InputError
         when a picture cannot serve; it says why
     """
-    shape = np.shape(white)
-    if board is not None and np.shape(board) != shape:
-        raise InputError(f"the board's picture is {np.shape(board)} and the white image {shape} (rows, columns)")
+    shape = shape_of([*whites, *([] if board is None else [board])], camera)
     # One BLAS thread: the same bits on every machine, and small problems gain nothing from more.
     with threadpool_limits(limits=1, user_api="blas"):
-        fit = fit_lattice(white, dark, layout)
-        darkness = 0.0 if dark is None else np.asarray(dark, dtype=np.float64)
-        image = np.asarray(white, dtype=np.float64) - darkness
-        rectification = Rectification(fit, (shape[0], shape[1]))
-        transmission = relative_transmission(rectification.apply(image), rectification.lattice_px)
-        calibration = Calibration(rectification, transmission)
+        calibration = lattice_calibration(whites, dark, shape, layout, sheet_pitch_px, camera)
         if board is None or rig is None:
             return calibration
+        darkness = 0.0 if dark is None else np.asarray(dark, dtype=np.float64)
         pose = board_pose(np.asarray(board, dtype=np.float64) - darkness, calibration, rig)
     return with_mid_plane(replace(calibration, pose=pose), pose, rig)
+
+
+def shape_of(pictures: Sequence[ArrayLike], camera: Camera | None) -> tuple[int, int]:
+    """Return the common shape (rows, columns) of the pictures, or of the camera's where there are none."""
+    shapes = [np.shape(picture) for picture in pictures]
+    if camera is not None:
+        shapes.append((camera.rows, camera.columns))
+    if len(set(shapes)) != 1 or len(shapes[0]) != 2:
+        raise InputError(f"the pictures are {', '.join(map(str, shapes))} (rows, columns), expected all of one shape")
+    return int(shapes[0][0]), int(shapes[0][1])
+
+
+def lattice_calibration(
+    whites: Sequence[ArrayLike],
+    dark: ArrayLike | None,
+    shape: tuple[int, int],
+    layout: Layout | None,
+    sheet_pitch_px: float | None,
+    camera: Camera | None,
+) -> Calibration:
+    """Return lattice and transmission from white images, or what the data sheet says where there are none."""
+    if not whites:
+        if camera is None:
+            raise InputError("without a white image the lattice needs the whole camera of the data sheet")
+        return Calibration(Rectification(sheet_fit(camera), shape))
+    order = by_aperture(whites, dark)
+    fit = fit_lattice(whites[order[0]], dark, layout)
+    if sheet_pitch_px is not None:
+        check_pitch(fit, sheet_pitch_px)
+    rectification = Rectification(fit, shape)
+    widest = np.asarray(whites[order[-1]], dtype=np.float64)
+    image = widest if dark is None else widest - np.asarray(dark, dtype=np.float64)
+    transmission = relative_transmission(rectification.apply(image), rectification.lattice_px)
+    distance, sigma = (None, None) if camera is None else image_distance_mm(fit, camera) or (None, None)
+    return Calibration(rectification, transmission, image_distance_mm=distance, image_distance_sigma_mm=sigma)
+
+
+def known(value: ArrayLike) -> Any:
+    """Return a number or an array as plain numbers, None where they are not known."""
+    array = np.asarray(value, dtype=np.float64)
+    return array.tolist() if np.isfinite(array).all() else None
 
 
 def board_pose(image: NDArray[np.float64], calibration: Calibration, rig: Rig) -> BoardPose:

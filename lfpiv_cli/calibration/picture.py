@@ -62,7 +62,7 @@ def draw_zoom(axis: Any, image: NDArray[np.float64], fit: LatticeFit, centre: tu
 def draw_residual(figure: Any, axis: Any, fit: LatticeFit, direction: int, shape: tuple[int, int]) -> None:
     """Map measured less modelled centres along the columns (0) or the rows (1)."""
     residual = (fit.centres_px - fit.centres(fit.indices))[:, direction]
-    limit = max(3.0 * float(np.median(np.abs(residual))), 1e-3)
+    limit = max(3.0 * float(np.median(np.abs(residual))), 1e-3) if fit.lenses else 1.0
     dots = axis.scatter(*fit.centres_px.T, c=residual, s=4, cmap="coolwarm", vmin=-limit, vmax=limit, linewidths=0)
     figure.colorbar(dots, ax=axis, label="px", shrink=0.8)
     along = ("columns", "rows")[direction]

@@ -21,7 +21,7 @@ CONTRAST_SHARE = 0.15
 # noise of the gaps, above it speckle, dust and saturation, which say nothing about where the spot's rim is.
 CLIP_LOW = 0.25
 CLIP_HIGH = 0.75
-# Clipping an image as sharp as its pixels makes centroids beat with the pixels by 0.05 px; smoothing by this much halves
+# Clipping an image as sharp as its pixels makes centroids beat with the pixels by 0.05 px; this smoothing halves
 # it, and does not yet mix neighbouring lens images.
 CENTROID_SMOOTHING_PX = 0.8
 # The window follows the centroid. Each round at least halves the rest, so this reaches 1e-4 px from half a pixel.

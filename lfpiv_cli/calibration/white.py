@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -49,7 +50,7 @@ def checked_white(white: ArrayLike, dark: ArrayLike | None, saturation: float | 
     return image
 
 
-def saturation_level(raw: NDArray[np.generic]) -> float:
+def saturation_level(raw: NDArray[Any]) -> float:
     """Return the level at which the camera saturates: its brightest value if some camera's counts end there.
 
     Otherwise nothing is saturated below the largest value that the integer type holds; floats end at their brightest.

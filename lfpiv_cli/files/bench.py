@@ -84,12 +84,19 @@ def camera_of(section: CameraSection) -> Camera:
         aperture_mm=aperture_mm(lens) or 0.0,
         microlens_focal_length_mm=microlens_focal_length or 0.0,
         microlens_distance_mm=sensor.microlens_distance_mm or microlens_focal_length or 0.0,
-        lattice=Lattice.regular(microlenses.pitch_mm, microlenses.layout),
+        lattice=Lattice.regular(microlenses.pitch_mm, microlenses.layout or "square"),
         pixel_mm=sensor.pixel_um * UM_TO_MM,
         columns=sensor.columns,
         rows=sensor.rows,
         column_axis=sensor.column_axis,
     )
+
+
+def micro_image_pitch_px(section: CameraSection) -> float:
+    """Return how far apart the data sheet's micro-images lie, those of parallel light where the lens is not known."""
+    if missing_for_camera(section) is None:
+        return float(camera_of(section).micro_image_lattice_px().pitch.mean())
+    return section.microlenses.pitch_mm / (section.sensor.pixel_um * UM_TO_MM)
 
 
 def media_of(section: MediaSection) -> Media:

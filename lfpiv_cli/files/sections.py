@@ -300,11 +300,46 @@ class Limits(Section):
     within_25_percent_vector: Share | None = None
 
 
+class ColumnLimits(Section):
+    """What columns must reach against their reference: Eq. 16's SSIM, RMSE in grey levels of 255, L1."""
+
+    ssim_smallest: Share | None = None
+    rmse_grey_largest: NotNegative | None = None
+    l1_mean: NotNegative | None = None
+    l1_largest: NotNegative | None = None
+
+
+class WeightsLimits(Section):
+    """What `validate weights` must reach, by comparison."""
+
+    ert_to_drt_paraxial: ColumnLimits = ColumnLimits()
+    ert_to_drt_exact: ColumnLimits = ColumnLimits()
+    ert_exact_to_drt_exact: ColumnLimits = ColumnLimits()
+    factorised_to_converged: ColumnLimits = ColumnLimits()
+    factorised_exact_to_converged: ColumnLimits = ColumnLimits()
+    ray_count_to_converged: ColumnLimits = ColumnLimits()
+    coarser_to_converged: ColumnLimits = ColumnLimits()
+    factorised_to_long_count: ColumnLimits = ColumnLimits()
+
+
+class WeightsValidation(Section):
+    """What `validate weights` looks at: the paper's five voxels and `sample` random ones of the volume.
+
+    long_count_rays: rays of a long count for each of the five (0: none), against which the factorised form is held.
+    """
+
+    sample: Annotated[int, Field(ge=0, le=10_000)] = 20
+    seed: Annotated[int, Field(ge=0)] = 1
+    long_count_rays: Annotated[int, Field(ge=0)] = 0
+    limits: WeightsLimits = WeightsLimits()
+
+
 class ValidationSection(Section):
-    """The analytic flow that vectors are compared with (default: the simulation's), and the limits."""
+    """The analytic flow that vectors are compared with (default: the simulation's), the limits, and the weights'."""
 
     flow: FlowSection | None = None
     limits: Limits = Limits()
+    weights: WeightsValidation = WeightsValidation()
 
 
 class Sections(Section):

@@ -1,0 +1,70 @@
+"""The stage of `calibrate-snapshot`: photographs in, the calibration file and a picture out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from lfpiv_cli.calibration.model import calibrate
+from lfpiv_cli.calibration.sheet import image_distance_doubt
+from lfpiv_cli.calibration.white import by_aperture
+from lfpiv_cli.console import Console
+from lfpiv_cli.errors import UsageError
+from lfpiv_cli.files import images as image_files
+from lfpiv_cli.files.atomic import ensure_writable
+from lfpiv_cli.files.calibration_file import write_calibration
+from lfpiv_cli.files.config import load_config
+from lfpiv_cli.files.pictures import ensure_drawing, write_picture
+from lfpiv_cli.files.provenance import record as provenance_record
+
+
+def calibrate_snapshot(
+    config: Path,
+    white: Sequence[Path],
+    dark: Path | None,
+    board: Path | None,
+    output: Path,
+    picture: Path | None,
+    overwrite: bool,
+    console: Console,
+) -> dict[str, Any]:
+    """Find the lattice in white images and the focal plane in a snapshot of the board."""
+    if not white and board is None:
+        raise UsageError("calibrate-snapshot needs a picture: --white, --board or both")
+    whites = {"white" if k == 0 else f"white_{k + 1}": path for k, path in enumerate(white)}
+    inputs = {"config": config} | whites | ({"dark": dark} if dark else {}) | ({"board": board} if board else {})
+    for target in filter(None, (output, picture)):
+        ensure_writable(target, overwrite, inputs.values())
+    if picture:
+        ensure_drawing()
+    settings = load_config(config)
+    shape = settings.image_shape()
+    frames = {name: image_files.read_image(path, shape) for name, path in inputs.items() if name != "config"}
+    camera = settings.complete_camera() if white else settings.camera_model()
+    if not white:
+        console.say(
+            "lfpiv: no white image: the microlenses are believed to lie as the data sheet says, "
+            "and the standard errors know nothing of how far that is wrong"
+        )
+    calibration = calibrate(
+        [frames[name] for name in whites],
+        frames.get("dark"),
+        frames.get("board"),
+        layout=settings.camera.microlenses.layout,
+        sheet_pitch_px=settings.micro_image_pitch_px(),
+        camera=camera,
+        rig=settings.rig() if board else None,
+    )
+    doubt = None if camera is None else image_distance_doubt(calibration.fit, camera)
+    if doubt:
+        console.say(f"lfpiv: {doubt}")
+    record = provenance_record("calibrate-snapshot", settings.resolved(), inputs)
+    write_calibration(output, calibration, record, overwrite)
+    if picture:
+        from lfpiv_cli.calibration.picture import calibration_figure
+
+        shown = [frames[name] for name in whites] or [frames["board"]]
+        sharpest = shown[by_aperture(shown, frames.get("dark"))[0]]
+        write_picture(picture, calibration_figure(calibration, sharpest, frames.get("board")), overwrite)
+    return calibration.summary()

@@ -1,0 +1,83 @@
+"""The stage of calibrate-snapshot with small pictures: which white image serves for what, and what it refuses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lfpiv_cli.console import Console
+from lfpiv_cli.errors import InputError, UsageError
+from lfpiv_cli.files.calibration_file import read_calibration
+from lfpiv_cli.optics.microlenses import Lattice
+from lfpiv_cli.stages_calibrate import calibrate_snapshot
+
+SHAPE = (200, 240)
+CONFIG = """
+camera:
+  microlenses: {{pitch_mm: {pitch}, {layout}}}
+  sensor:      {{pixel_um: 5.0, columns: 240, rows: 200}}
+"""
+QUIET = Console(quiet=True)
+
+
+def white(path: Path, lattice: Lattice, radius_px: float) -> Path:
+    row, column = np.indices(SHAPE)
+    place = np.stack([column, row], axis=-1).astype(float)
+    distance = np.linalg.norm(place - lattice.points(lattice.nearest(place)), axis=-1)
+    image: NDArray[Any] = 200.0 + 20000.0 * np.clip(radius_px + 0.5 - distance, 0.0, 1.0)
+    noise = np.random.default_rng(3).normal(0.0, 50.0, SHAPE)
+    cv2.imwrite(str(path), (image + noise).astype(np.uint16))
+    return path
+
+
+def config(folder: Path, pitch: float = 0.07, layout: str = "f_number: 8") -> Path:
+    path = folder / "rig.yaml"
+    path.write_text(CONFIG.format(pitch=pitch, layout=layout))
+    return path
+
+
+def calibrated(folder: Path, rig: Path, whites: list[Path], dark: Path | None = None) -> dict[str, Any]:
+    return calibrate_snapshot(rig, whites, dark, None, folder / "c.h5", None, True, QUIET)
+
+
+@pytest.fixture
+def square() -> Lattice:
+    return Lattice.regular(14.2, "square", np.deg2rad(0.7), (117.3, 98.4))
+
+
+def test_layout_is_found_untold_and_checked_when_told(tmp_path: Path) -> None:
+    hexagons = Lattice.regular(14.2, "hexagonal", np.deg2rad(0.7), (117.3, 98.4))
+    picture = white(tmp_path / "w.tif", hexagons, 5.5)
+    assert calibrated(tmp_path, config(tmp_path), [picture])["layout"] == "hexagonal"
+    with pytest.raises(InputError, match="shows a hexagonal array, and microlenses.layout is square"):
+        calibrated(tmp_path, config(tmp_path, layout="layout: square"), [picture])
+
+
+def test_small_aperture_gives_the_lattice_and_wide_the_transmission(tmp_path: Path, square: Lattice) -> None:
+    # The array has moved between the two pictures, so that it shows which one the lattice is from.
+    moved = Lattice(square.origin + (0.5, 0.0), square.basis)
+    wide, small = white(tmp_path / "wide.tif", square, 6.0), white(tmp_path / "small.tif", moved, 3.0)
+    for whites in ([wide, small], [small, wide]):
+        origin = calibrated(tmp_path, config(tmp_path), whites)["origin_px"]
+        np.testing.assert_allclose(origin, moved.points(moved.nearest(origin)), atol=0.03)
+        transmission = read_calibration(tmp_path / "c.h5").transmission
+        assert transmission is not None
+        # pi 6^2 / 14.2^2 of the pixels are lit in the wide picture, a quarter of that in the small one.
+        assert np.mean(transmission > 0.5) == pytest.approx(np.pi * 36 / 14.2**2, abs=0.06)
+
+
+def test_another_pitch_than_the_data_sheets_is_refused(tmp_path: Path, square: Lattice) -> None:
+    picture = white(tmp_path / "w.tif", square, 5.5)
+    assert calibrated(tmp_path, config(tmp_path, pitch=0.0745), [picture])["lenses"] > 150
+    with pytest.raises(InputError, match=r"14\.2 px apart and 15 px by the data sheet, 5 % off.*pixel_um"):
+        calibrated(tmp_path, config(tmp_path, pitch=0.075), [picture])
+
+
+def test_no_picture_is_a_slip_of_the_command(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="--white, --board or both"):
+        calibrated(tmp_path, config(tmp_path), [])
