@@ -156,21 +156,30 @@ def correlate(**arguments: Any) -> dict[str, Any]:
 
 
 @cli.command("validate")
-@click.argument("what", type=click.Choice(["flow"]))
+@click.argument("what", type=click.Choice(["flow", "weights"]))
 @click.argument("config", type=INPUT)
-@click.option("--vectors", type=INPUT, required=True, help="Vectors to judge.")
-@click.option("--particles", type=INPUT, help="True particles (.npz) to judge by, in place of the config's flow.")
+@click.option("--vectors", type=INPUT, help="flow: vectors to judge.")
+@click.option("--particles", type=INPUT, help="flow: true particles (.npz) to judge by, not the config's flow.")
 @click.option("-o", "--output", type=INPUT, required=True, help="Folder for the report.")
 @common_options
-def validate(what: str, **arguments: Any) -> dict[str, Any]:
-    """Compare a result with what is known: figures as JSON, and a picture.
+def validate(what: str, vectors: Path | None, particles: Path | None, **arguments: Any) -> dict[str, Any]:
+    """Compare a result with what is known: figures as JSON, and pictures.
 
     \b
-    Example: lfpiv validate flow rig.yaml --vectors vectors.vtkhdf -o report
+    Examples: lfpiv validate flow rig.yaml --vectors vectors.vtkhdf -o report
+              lfpiv validate weights rig.yaml -o report
     """
-    from lfpiv_cli import stages
+    if what == "flow":
+        if vectors is None:
+            raise click.UsageError("validate flow needs --vectors")
+        from lfpiv_cli import stages
 
-    return {"flow": stages.validate_flow}[what](**arguments)
+        return stages.validate_flow(vectors=vectors, particles=particles, **arguments)
+    if vectors is not None or particles is not None:
+        raise click.UsageError(f"validate {what} takes neither --vectors nor --particles")
+    from lfpiv_cli import stages_weights
+
+    return stages_weights.validate_weights(**arguments)
 
 
 @cli.command("simulate")

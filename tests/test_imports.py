@@ -21,7 +21,7 @@ LAYERS = (
     {"validation"},
     {"files"},
     {"console"},
-    {"stages", "stages_simulate"},
+    {"stages", "stages_simulate", "stages_weights"},
     {"cli"},
     {"__init__", "__main__"},
 )

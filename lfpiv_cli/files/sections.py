@@ -320,12 +320,13 @@ class WeightsLimits(Section):
     ray_count_to_converged: ColumnLimits = ColumnLimits()
     coarser_to_converged: ColumnLimits = ColumnLimits()
     factorised_to_long_count: ColumnLimits = ColumnLimits()
+    ert_exact_to_long_count: ColumnLimits = ColumnLimits()
 
 
 class WeightsValidation(Section):
     """What `validate weights` looks at: the paper's five voxels and `sample` random ones of the volume.
 
-    long_count_rays: rays of a long count for each of the five (0: none), against which the factorised form is held.
+    long_count_rays: rays of long counts of each of the five (0: none), the independent check of what is integrated.
     """
 
     sample: Annotated[int, Field(ge=0, le=10_000)] = 20

@@ -88,8 +88,12 @@ class ObjectSpace:
         if self.window is None:
             raise ConfigError(f"exact refraction into a fluid of index {media.fluid} needs a window, none was given")
         path = fluid_path_to_focus(self.window, camera.focus_distance_mm, media)
-        thicknesses = np.array([self.window.distance_mm, self.window.thickness_mm, path])
-        return thicknesses, np.array([media.air, media.window, media.fluid])
+        wall = self.window.thickness_mm
+        if self.method == "drt":
+            air = self.window.distance_mm
+        else:  # what window and fluid, the only ones that aberrate, leave of the equivalent distance
+            air = camera.focus_distance_mm - wall * media.air / media.window - path * media.depth_ratio
+        return np.array([air, wall, path]), np.array([media.air, media.window, media.fluid])
 
     def slope_polynomials(
         self, camera: Camera, z_mm: ArrayLike, reach_mm: float

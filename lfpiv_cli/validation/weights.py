@@ -1,0 +1,232 @@
+"""How right the weights are, voxel by voxel: methods against each other, and the factorised form against integrals.
+
+Columns are compared as images on the sensor: by L1 (a column sums to 1), by SSIM (Eq. 16) and by the root mean square
+difference in grey levels, the brightest pixel of the reference being 255, over the pixels that either one lights.
+
+Axes: voxels in world axes (x, y, z), z away from the camera from the nominal focal point; images [row, column].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from lfpiv_cli.errors import ConfigError
+from lfpiv_cli.grid import Grid
+from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.object_space import ObjectSpace
+from lfpiv_cli.weights.build import factorise_through
+from lfpiv_cli.weights.quadrature import REFERENCE_DEPTH_NODES, REFERENCE_TILES, integrate_columns
+from lfpiv_cli.weights.rays import POINTS, RAYS_PER_POINT, count_rays, sampling_error
+
+# The voxels p1 to p5 of the equivalent-ray-tracing paper (its Table 1), x, y and depth, mm.
+TABLE1_MM = ((1.0, 0.0, 4.0), (1.5, 0.0, 2.0), (2.0, 0.0, 0.0), (2.5, 0.0, -2.0), (3.0, 0.0, -4.0))
+
+# SSIM as Wang et al. (2004) define it: Gaussian windows of 11 x 11 pixels, K1 and K2, grey levels up to 255.
+WINDOW_SIGMA_PX = 1.5
+WINDOW_RADIUS_PX = 5
+K1, K2 = 0.01, 0.03
+GREY_LEVELS = 255.0
+
+# In the long count every point of a voxel sends this many rays: few enough for the points not to repeat themselves.
+RAYS_PER_POINT_LONG = 100
+
+
+@dataclass(frozen=True, eq=False)
+class Column:
+    """One voxel's column by each way of making it; images (rows, columns) cut to what is lit, None where impossible.
+
+    Attributes
+    ----------
+    centre_mm : (3,) of the voxel, world axes
+    images : by name
+    """
+
+    centre_mm: tuple[float, float, float]
+    images: dict[str, NDArray[np.float64]]
+
+
+# What is compared: reference and judged image.
+COMPARISONS = {
+    "ert_to_drt_paraxial": ("drt_paraxial", "ert"),
+    "ert_to_drt_exact": ("drt_exact", "ert"),
+    "ert_exact_to_drt_exact": ("drt_exact", "ert_exact"),
+    "factorised_to_converged": ("ert", "factorised"),
+    "factorised_exact_to_converged": ("ert_exact", "factorised_exact"),
+    "ray_count_to_converged": ("ert", "ray_count"),
+    "coarser_to_converged": ("ert", "coarser"),
+    "factorised_to_long_count": ("long_count", "factorised"),
+    "ert_exact_to_long_count": ("long_count_exact", "ert_exact"),
+}
+
+
+def ssim(reference: NDArray[np.float64], image: NDArray[np.float64]) -> float:
+    """Return the structural similarity (Eq. 16) of two images in grey levels, the mean over all local windows."""
+
+    def local_mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return ndimage.gaussian_filter(values, WINDOW_SIGMA_PX, mode="constant", radius=WINDOW_RADIUS_PX)
+
+    c1, c2 = (K1 * GREY_LEVELS) ** 2, (K2 * GREY_LEVELS) ** 2
+    mean_1, mean_2 = local_mean(reference), local_mean(image)
+    variance_1 = local_mean(reference**2) - mean_1**2
+    variance_2 = local_mean(image**2) - mean_2**2
+    covariance = local_mean(reference * image) - mean_1 * mean_2
+    above = (2.0 * mean_1 * mean_2 + c1) * (2.0 * covariance + c2)
+    below = (mean_1**2 + mean_2**2 + c1) * (variance_1 + variance_2 + c2)
+    return float(np.mean(above / below))
+
+
+def compare_columns(reference: NDArray[np.float64], image: NDArray[np.float64]) -> dict[str, float]:
+    """Return SSIM, RMSE in grey levels and L1 of one column against its reference."""
+    grey = GREY_LEVELS / reference.max()
+    return {
+        "ssim": ssim(grey * reference, grey * image),
+        "rmse_grey": float(grey * np.sqrt(np.mean((image - reference) ** 2))),
+        "l1": float(np.abs(image - reference).sum()),
+    }
+
+
+def sample_voxels(grid: Grid, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Return the centres (count, 3) of random voxels of a grid, world axes."""
+    indices = np.stack([rng.integers(0, n, count) for n in grid.shape_xyz], axis=1)
+    return grid.voxel_to_mm(indices.astype(np.float64))
+
+
+def make_columns(
+    camera: Camera,
+    space: ObjectSpace,
+    centres_mm: NDArray[np.float64],
+    voxel_mm: tuple[float, float, float],
+    rng: np.random.Generator,
+    long_count: NDArray[np.int64],
+    progress: Callable[[int], None] | None = None,
+) -> list[Column]:
+    """Return the columns of voxels by every way that camera and scene allow.
+
+    Parameters
+    ----------
+    centres_mm : (n, 3), world axes
+    voxel_mm : their sides
+    space : media and window; without a window there is no direct tracing and no exact refraction
+    long_count : (n,) rays of long counts of each voxel, with equivalent points and with exact direct tracing; 0: none
+    progress : called with 1 after each voxel
+    """
+    ways = _quadrature_ways(space)
+    points, sides = camera.to_image_axes(centres_mm), camera.to_image_axes(np.asarray(voxel_mm))
+    columns = []
+    for centre, point, rays in zip(centres_mm, points, long_count, strict=True):
+        images = {
+            name: _integrated(camera, way, point, sides, tiles) for name, (way, tiles) in ways.items()
+        } | _factorised(camera, space, centre, voxel_mm)
+        paraxial = replace(space, refraction="paraxial", method="ert")
+        images["ray_count"] = count_rays(camera, paraxial, point, sides, rng)
+        if rays:
+            per_point = min(RAYS_PER_POINT_LONG, int(rays))
+            number = (int(rays) // per_point, per_point)
+            images["long_count"] = count_rays(camera, paraxial, point, sides, rng, *number)
+            if space.window is not None:
+                direct = replace(space, refraction="exact", method="drt")
+                images["long_count_exact"] = count_rays(camera, direct, point, sides, rng, *number)
+        columns.append(Column((centre[0], centre[1], centre[2]), _cut(images)))
+        if progress:
+            progress(1)
+    return columns
+
+
+def weights_figures(columns: list[Column], long_count: NDArray[np.int64]) -> dict[str, Any]:
+    """Return for each comparison the mean and the worst of SSIM, RMSE and L1, and the figures of each voxel."""
+    voxels = []
+    for column, rays in zip(columns, long_count, strict=True):
+        entry: dict[str, Any] = {"centre_mm": list(column.centre_mm)}
+        for name, (reference, image) in COMPARISONS.items():
+            if reference in column.images and image in column.images:
+                entry[name] = compare_columns(column.images[reference], column.images[image])
+        converged = column.images["ert"]
+        entry["pixels"] = int(np.count_nonzero(converged))
+        entry["independent_rays_l1"] = sampling_error(converged, int(rays) or POINTS * RAYS_PER_POINT)
+        voxels.append(entry)
+    return {name: _summary([v[name] for v in voxels if name in v]) for name in COMPARISONS} | {"voxels": voxels}
+
+
+def limits_missed(figures: dict[str, Any], limits: dict[str, dict[str, float | None]]) -> list[str]:
+    """Return a sentence for each limit that is missed; a limit that cannot be judged is missed too.
+
+    Limits are given by comparison and figure; those on SSIM are lower ones.
+    """
+    missed = []
+    for comparison, each in limits.items():
+        for figure, limit in each.items():
+            if limit is None:
+                continue
+            value = (figures[comparison] or {}).get(figure)
+            if value is None:
+                missed.append(f"{comparison}.{figure} could not be judged")
+            elif (value < limit) if figure.startswith("ssim") else (value > limit):
+                missed.append(f"{comparison}.{figure} is {value:.4g}, the limit {limit:g}")
+    return missed
+
+
+def _quadrature_ways(space: ObjectSpace) -> dict[str, tuple[ObjectSpace, int]]:
+    """Return the object space and the tiles of each column that is integrated on its own."""
+    paraxial = replace(space, refraction="paraxial", method="ert")
+    ways = {"ert": (paraxial, REFERENCE_TILES), "coarser": (paraxial, REFERENCE_TILES // 2)}
+    if space.window is not None:
+        ways["drt_paraxial"] = (replace(space, refraction="paraxial", method="drt"), REFERENCE_TILES)
+        ways["drt_exact"] = (replace(space, refraction="exact", method="drt"), REFERENCE_TILES)
+        ways["ert_exact"] = (replace(space, refraction="exact", method="ert"), REFERENCE_TILES)
+    return ways
+
+
+def _integrated(
+    camera: Camera, space: ObjectSpace, point: NDArray[np.float64], sides: NDArray[np.float64], tiles: int
+) -> NDArray[np.float64]:
+    columns = integrate_columns(camera, space, point, sides, tiles, REFERENCE_DEPTH_NODES)
+    return columns.image(0, (camera.rows, camera.columns))
+
+
+def _factorised(
+    camera: Camera, space: ObjectSpace, centre: NDArray[np.float64], voxel_mm: tuple[float, float, float]
+) -> dict[str, NDArray[np.float64]]:
+    """Return the factorised columns of one voxel; none where the axes do not separate."""
+    grid = Grid((1, 1, 1), voxel_mm, (centre[0], centre[1], centre[2]))
+    spaces = {"factorised": replace(space, refraction="paraxial", method="ert")}
+    if space.window is not None:
+        spaces["factorised_exact"] = replace(space, refraction="exact", method="ert")
+    images = {}
+    for name, each in spaces.items():
+        try:
+            rows, columns, weight = factorise_through(camera, each, grid).column(0, 0, 0)
+        except ConfigError:
+            continue
+        images[name] = np.zeros((camera.rows, camera.columns))
+        images[name][rows, columns] = weight
+    return images
+
+
+def _cut(images: dict[str, NDArray[np.float64]]) -> dict[str, NDArray[np.float64]]:
+    """Return the images cut to the rectangle that any of them lights."""
+    lit = np.any([image > 0.0 for image in images.values()], axis=0)
+    if not lit.any():
+        raise ConfigError("validation: a voxel lies outside the camera's view")
+    rows, columns = np.flatnonzero(lit.any(axis=1)), np.flatnonzero(lit.any(axis=0))
+    part = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    return {name: image[part].copy() for name, image in images.items()}
+
+
+def _summary(each: list[dict[str, float]]) -> dict[str, float] | None:
+    if not each:
+        return None
+    table = {name: np.array([entry[name] for entry in each]) for name in ("ssim", "rmse_grey", "l1")}
+    return {
+        "ssim_mean": float(table["ssim"].mean()),
+        "ssim_smallest": float(table["ssim"].min()),
+        "rmse_grey_mean": float(table["rmse_grey"].mean()),
+        "rmse_grey_largest": float(table["rmse_grey"].max()),
+        "l1_mean": float(table["l1"].mean()),
+        "l1_largest": float(table["l1"].max()),
+    }
