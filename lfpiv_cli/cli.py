@@ -117,6 +117,7 @@ def build_weights(**arguments: Any) -> dict[str, Any]:
 @click.option("--solver", type=click.Choice(["em", "sart"]), help="Default from the config.")
 @click.option("--iterations", type=click.IntRange(min=1), help="Default from the config.")
 @click.option("--relaxation", type=click.FloatRange(min=0.0, min_open=True, max=2.0), help="Default from the config.")
+@click.option("--accelerate/--no-accelerate", default=None, help="Extrapolate between steps; default from the config.")
 @click.option("--dark", type=INPUT, help="Dark image to subtract.")
 @click.option("--background", help="Image without tracers to subtract, or 'minimum' over the images given.")
 @click.option("--resume", is_flag=True, help="Skip outputs that are complete and made from the same inputs.")

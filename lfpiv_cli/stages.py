@@ -98,6 +98,7 @@ def reconstruct(
     solver: str | None,
     iterations: int | None,
     relaxation: float | None,
+    accelerate: bool | None,
     dark: Path | None,
     background: str | None,
     resume: bool,
@@ -113,7 +114,7 @@ def reconstruct(
     prepare_folder(paths)
     content = read_weights(weights)
     settings = _carried_config(content.provenance, weights).overridden(
-        "reconstruction", solver=solver, iterations=iterations, relaxation=relaxation
+        "reconstruction", solver=solver, iterations=iterations, relaxation=relaxation, accelerate=accelerate
     )
     targets = [
         Target(path, _record(f"reconstruct page {frame.page}", settings, common | {"image": frame.path}))
@@ -126,6 +127,7 @@ def reconstruct(
     operator = content.weights.padded
     sums = normalisers(operator) if needed else None
     chosen = settings.reconstruction
+    solver_options = chosen.model_dump(include={"solver", "iterations", "relaxation", "accelerate"})
     residuals: list[float] = []
     failures: list[str] = []
     with console.progress(len(needed) * chosen.iterations, "reconstruct") as advance:
@@ -133,7 +135,7 @@ def reconstruct(
             try:
                 raw = image_files.read_page(frames[number].path, frames[number].page, shape)
                 image = content.weights.prepare(light(raw, dark_image, background_image))
-                result = solve(operator, image, chosen.solver, chosen.iterations, chosen.relaxation, sums, advance)
+                result = solve(operator, image, **solver_options, sums=sums, progress=advance)
             except LfpivError as error:
                 if not keep_going:
                     raise

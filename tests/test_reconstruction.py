@@ -11,7 +11,7 @@ from lfpiv_cli.errors import InputError
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.reconstruction.images import light, minimum_background
-from lfpiv_cli.reconstruction.solvers import SOLVERS, Problem, normalisers, reconstruct, sart_step
+from lfpiv_cli.reconstruction.solvers import SOLVERS, Momentum, Problem, normalisers, reconstruct, sart_step
 from lfpiv_cli.weights.build import factorise
 
 
@@ -111,3 +111,24 @@ def test_minimum_background_needs_two_images_of_one_shape():
         minimum_background([a])
     with pytest.raises(InputError, match="differ in shape"):
         minimum_background([a, b.T])
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_momentum_reaches_the_same_residual_in_fewer_steps(optical, rng, solver):
+    truth = np.zeros(optical.shape, np.float32)
+    truth[rng.integers(0, 6, 8), rng.integers(0, 7, 8), rng.integers(0, 8, 8)] = 100.0
+    image = optical.forward(truth)
+    plain = reconstruct(optical, image, solver, iterations=60)
+    fast = reconstruct(optical, image, solver, iterations=20, accelerate=True)
+    assert fast.residual[-1] < plain.residual[-1]
+    assert fast.volume.min() >= 0.0
+
+
+def test_momentum_restarts_where_a_step_points_back():
+    volume = np.array([[[1.0, 2.0]]], np.float32)
+    ahead = Momentum(5.0).extrapolated(volume, volume - 1, volume)
+    back = Momentum(5.0).extrapolated(volume + 1, volume - 1, volume)
+    pace = 0.5 * (1.0 + np.sqrt(101.0))
+    np.testing.assert_allclose(ahead[1], volume + 4.0 / pace, rtol=1e-6)
+    np.testing.assert_array_equal(back[1], volume)
+    assert back[0].pace < ahead[0].pace

@@ -165,6 +165,7 @@ class WeightsSection(Section):
 class ReconstructionSection(Section):
     """The solver: em (default, better for velocity) or sart (Eq. 12); iterations; SART's relaxation mu.
 
+    accelerate: step from points extrapolated by Nesterov's momentum; a quarter of the iterations will do.
     padding_voxel: voxels [x, y, z] solved for beyond each side of the volume and cropped on writing (default: derived
     from how far light spreads).
     """
@@ -172,6 +173,7 @@ class ReconstructionSection(Section):
     solver: Literal["em", "sart"] = "em"
     iterations: Annotated[int, Field(ge=1, le=100_000)] = 20
     relaxation: Annotated[float, Field(gt=0.0, le=2.0)] = 1.0
+    accelerate: bool = False
     padding_voxel: (
         tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]] | None
     ) = None

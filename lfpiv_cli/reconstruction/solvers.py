@@ -63,7 +63,7 @@ class Normalisers:
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
-    """A volume (z, y, x) and the relative residual ||I - W E|| / ||I|| before each iteration and after the last."""
+    """A volume (z, y, x) and the relative residual ||I - W E|| / ||I||, at the start of each step and of the volume."""
 
     volume: Volume
     residual: NDArray[np.float64]
@@ -110,6 +110,7 @@ def reconstruct(
     solver: str,
     iterations: int,
     relaxation: float = 1.0,
+    accelerate: bool = False,
     sums: Normalisers | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Reconstruction:
@@ -119,6 +120,7 @@ def reconstruct(
     ----------
     image : (rows, columns) in the weights' frame, dark and background taken off; negative values count as 0
     solver : name in `SOLVERS`
+    accelerate : step from points extrapolated by `Momentum`, at the cost of three passes over the volume
     sums : `normalisers(operator)`, where several images share it
     progress : called with 1 after each iteration
     """
@@ -126,18 +128,42 @@ def reconstruct(
     taking_part = sums.inverse_row_sum > 0.0
     image = np.where(taking_part, np.maximum(image, 0.0), 0.0).astype(np.float32)
     problem = Problem(operator, image, sums.inverse_row_sum, sums.inverse_column_sum)
-    volume = uniform_start(problem)
+    volume = point = uniform_start(problem)
+    momentum = Momentum()
     norm = np.sqrt(_square_sum(image))
     residual = np.zeros(iterations + 1)
-    projection = operator.forward(volume)
     for k in range(iterations):
+        projection = operator.forward(point)
         residual[k] = _relative_residual(image, projection, taking_part, norm)
-        volume = SOLVERS[solver](problem, volume, projection, relaxation)
-        projection = operator.forward(volume)
+        previous, volume = volume, SOLVERS[solver](problem, point, projection, relaxation)
+        if accelerate:
+            momentum, point = momentum.extrapolated(point, previous, volume)
+        else:
+            point = volume
         if progress:
             progress(1)
-    residual[iterations] = _relative_residual(image, projection, taking_part, norm)
+    residual[iterations] = _relative_residual(image, operator.forward(volume), taking_part, norm)
     return Reconstruction(volume, residual)
+
+
+@dataclass(frozen=True)
+class Momentum:
+    """Nesterov's extrapolation with restart (B. O'Donoghue and E. Candes, Found. Comput. Math. 15, 2015).
+
+    `pace` is the t of the recursion t' = (1 + sqrt(1 + 4 t^2))/2; the next point lies (t - 1)/t' of the last change
+    beyond the volume. Where a step points back against the change, the memory is dropped.
+    """
+
+    pace: float = 1.0
+
+    def extrapolated(self, point: Volume, previous: Volume, volume: Volume) -> tuple[Momentum, Volume]:
+        """Return the momentum and the point to step from next, when a step from `point` led to `volume`."""
+        change = volume - previous
+        pace = 1.0 if np.sum((point - volume) * change, dtype=np.float64) > 0.0 else self.pace
+        following = 0.5 * (1.0 + np.sqrt(1.0 + 4.0 * pace**2))
+        change *= np.float32((pace - 1.0) / following)
+        change += volume
+        return Momentum(following), np.maximum(change, np.float32(0.0))
 
 
 def uniform_start(problem: Problem) -> Volume:
