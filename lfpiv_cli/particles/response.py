@@ -1,0 +1,239 @@
+"""The light of one particle on the raw image, with analytic derivatives.
+
+A particle is an evenly glowing ball. Through lens n, centred at s, a ray that crosses the main lens at X meets the
+array at x_m = alpha X - beta x, beta = s_i/s_o, and the sensor at
+
+    x_s = (1 - bend) s + bend x_m + (s_mu/s_i)(x_m - X)            (Eq. 1, bend = 1 - s_mu/f_m)
+
+so every pixel sees a patch of X. Seen from there, the share P(X) of the ball whose light falls into the lens's cell
+is a difference of two of the ball's marginal distributions (cubics); mean and slope of P over the patch come from a
+three-point Gauss rule, and the two axes are joined by the patch's covered share and its first moments (`rim`).
+
+Axes: image axes, mm; see `view`. An *entry* is the meeting of a pixel with one lens; a pixel between two micro-images
+can have two.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from lfpiv_cli.particles.rim import covered_share
+from lfpiv_cli.particles.view import View
+
+# Three-point Gauss-Legendre on (-1, 1): exact for the cubic profile wherever it has no kink within the patch.
+GAUSS_AT = np.sqrt(0.6)
+GAUSS_WEIGHT = (5.0 / 18.0, 8.0 / 18.0, 5.0 / 18.0)
+# Rows of a profile: mean and slope of P, their derivatives by x and by z.
+MEAN, SLOPE, MEAN_X, SLOPE_X, MEAN_Z, SLOPE_Z, PATCH = range(7)
+PROFILE_ROWS = 7
+# Pixels that one micro-image may span.
+LONGEST_PROFILE = 96
+# Columns of the entries' values: light, and its derivatives by x, y and z.
+VALUES = 4
+
+
+@njit(cache=True)
+def ball_share(t: float) -> float:
+    """Return the share of a ball of radius 1 that lies below t along one axis."""
+    if t <= -1.0:
+        return 0.0
+    if t >= 1.0:
+        return 1.0
+    return 0.25 * (2.0 + 3.0 * t - t * t * t)
+
+
+@njit(cache=True)
+def ball_density(t: float) -> float:
+    """Return the derivative of `ball_share`."""
+    return 0.75 * (1.0 - t * t) if -1.0 < t < 1.0 else 0.0
+
+
+@njit(cache=True)
+def respond(view: View, x: float, y: float, z: float, pixels: NDArray[np.int32], values: NDArray[np.float64]) -> int:
+    """Write the entries of a particle of unit light; return their number.
+
+    Parameters
+    ----------
+    x, y, z : its centre, image axes, mm
+    pixels : (capacity,) flat pixel numbers, written
+    values : (capacity, 4) light and its derivatives by x, y, z, written
+    """
+    distance = view.focus_distance_mm + view.depth_ratio * z
+    beta = view.image_distance_mm / distance
+    alpha = 1.0 + beta - view.image_distance_mm / view.focal_length_mm
+    slope = -beta * view.depth_ratio / distance
+    x0, y0 = -beta * x, -beta * y
+    r2 = x0 * x0 + y0 * y0
+    at_x = x0 * (1.0 + view.distortion_per_mm2 * r2)
+    at_y = y0 * (1.0 + view.distortion_per_mm2 * r2)
+    stretch_x = 1.0 + view.distortion_per_mm2 * (r2 + 2.0 * x0 * x0)
+    stretch_y = 1.0 + view.distortion_per_mm2 * (r2 + 2.0 * y0 * y0)
+    reach = abs(alpha) * view.aperture_radius_mm * max(stretch_x, stretch_y) + beta * view.particle_radius_mm
+    low_i, high_i, low_j, high_j = _lenses(view, at_x, at_y, reach)
+    along_x = np.empty((PROFILE_ROWS, LONGEST_PROFILE))
+    along_y = np.empty((PROFILE_ROWS, LONGEST_PROFILE))
+    count = 0
+    for j in range(low_j, high_j + 1):
+        for i in range(low_i, high_i + 1):
+            s_x, s_y = view.centres_mm[j, i]
+            column, columns = _profile(
+                view, x, alpha, beta, slope, at_x, stretch_x, s_x, view.half_x_mm, view.columns, along_x
+            )
+            if columns == 0:
+                continue
+            row, rows = _profile(view, y, alpha, beta, slope, at_y, stretch_y, s_y, view.half_y_mm, view.rows, along_y)
+            if rows > 0:
+                count = _join(
+                    view, x, y, alpha, beta, slope, along_x, column, columns, along_y, row, rows, pixels, values, count
+                )
+    return count
+
+
+@njit(cache=True)
+def _lenses(view: View, at_x: float, at_y: float, reach: float) -> tuple[int, int, int, int]:
+    """Return the ranges of lens indices, first and last along i and j, whose cells the light can reach."""
+    basis = view.inverse_basis
+    dx, dy = at_x - view.origin_mm[0], at_y - view.origin_mm[1]
+    i = dx * basis[0, 0] + dy * basis[1, 0]
+    j = dx * basis[0, 1] + dy * basis[1, 1]
+    reach_i = reach * (abs(basis[0, 0]) + abs(basis[1, 0]))
+    reach_j = reach * (abs(basis[0, 1]) + abs(basis[1, 1]))
+    rows, columns = view.centres_mm.shape[0], view.centres_mm.shape[1]
+    low_i = max(int(np.floor(i - reach_i + 0.5)) - view.first_i, 0)
+    high_i = min(int(np.floor(i + reach_i + 0.5)) - view.first_i, columns - 1)
+    low_j = max(int(np.floor(j - reach_j + 0.5)) - view.first_j, 0)
+    high_j = min(int(np.floor(j + reach_j + 0.5)) - view.first_j, rows - 1)
+    return low_i, high_i, low_j, high_j
+
+
+@njit(cache=True)
+def _profile(
+    view: View,
+    x: float,
+    alpha: float,
+    beta: float,
+    slope: float,
+    at: float,
+    stretch: float,
+    s: float,
+    half: float,
+    pixels: int,
+    out: NDArray[np.float64],
+) -> tuple[int, int]:
+    """Fill the profile of one lens along one axis; return its first pixel and their number.
+
+    `slope` is d alpha/dz = d beta/dz, `at` the array point of the ball's centre seen through the middle of the main
+    lens, `stretch` the distortion's local scale: the array point is at + stretch alpha X.
+    """
+    tilt = view.microlens_distance_mm / view.image_distance_mm
+    lever = view.bend + tilt
+    scale = view.bend * alpha + tilt * (alpha - 1.0)
+    radius = beta * view.particle_radius_mm
+    gain = stretch * alpha
+    low, high = -view.aperture_radius_mm, view.aperture_radius_mm
+    if abs(gain) * view.aperture_radius_mm > 1e-3 * half:
+        one, other = (s - at - half - radius) / gain, (s - at + half + radius) / gain
+        low, high = max(low, min(one, other)), min(high, max(one, other))
+    elif abs(at - s) > half + radius + abs(gain) * view.aperture_radius_mm:
+        return 0, 0
+    if low >= high:
+        return 0, 0
+    shift = (1.0 - view.bend) * s - lever * beta * x
+    one, other = scale * low + shift, scale * high + shift
+    first = int(np.floor(min(one, other) / view.pixel_mm + 0.5 * pixels))
+    last = int(np.floor(max(one, other) / view.pixel_mm + 0.5 * pixels))
+    first, last = max(first, 0), min(last, pixels - 1)
+    count = min(last - first + 1, LONGEST_PROFILE)
+    if count <= 0:
+        return 0, 0
+    width = view.pixel_mm / scale
+    for k in range(count):
+        middle = ((first + k + 0.5 - 0.5 * pixels) * view.pixel_mm - shift) / scale
+        out[:PATCH, k] = 0.0
+        out[PATCH, k] = middle
+        for node in range(3):
+            xi = (node - 1) * GAUSS_AT
+            # X of the node, its derivatives, and those of u, the array point relative to the lens.
+            place = middle + 0.5 * abs(width) * xi
+            place_x, place_z = lever * beta / scale, lever * slope * (x - place) / scale
+            u = at + gain * place - s
+            u_x = gain * place_x - beta * stretch
+            u_z = stretch * (slope * place - slope * x) + gain * place_z
+            upper, lower = (u + half) / radius, (u - half) / radius
+            share = ball_share(upper) - ball_share(lower)
+            dense_upper, dense_lower = ball_density(upper), ball_density(lower)
+            by_u = (dense_upper - dense_lower) / radius
+            by_z = by_u * u_z - (dense_upper * upper - dense_lower * lower) * slope / beta
+            weight = GAUSS_WEIGHT[node]
+            out[MEAN, k] += weight * share
+            out[SLOPE, k] += 3.0 * weight * xi * share
+            out[MEAN_X, k] += weight * by_u * u_x
+            out[SLOPE_X, k] += 3.0 * weight * xi * by_u * u_x
+            out[MEAN_Z, k] += weight * by_z
+            out[SLOPE_Z, k] += 3.0 * weight * xi * by_z
+    return first, count
+
+
+@njit(cache=True)
+def _join(
+    view: View,
+    x: float,
+    y: float,
+    alpha: float,
+    beta: float,
+    slope: float,
+    along_x: NDArray[np.float64],
+    column: int,
+    columns: int,
+    along_y: NDArray[np.float64],
+    row: int,
+    rows: int,
+    pixels: NDArray[np.int32],
+    values: NDArray[np.float64],
+    count: int,
+) -> int:
+    """Write the entries of one lens; return how many there are now."""
+    tilt = view.microlens_distance_mm / view.image_distance_mm
+    lever = view.bend + tilt
+    scale = view.bend * alpha + tilt * (alpha - 1.0)
+    width = view.pixel_mm / scale
+    norm = width * width / (np.pi * view.aperture_radius_mm**2)
+    widen_z = -2.0 * lever * slope / scale
+    place_x = lever * beta / scale
+    inside = max(view.aperture_radius_mm - 0.71 * abs(width), 0.0) ** 2
+    outside = (view.aperture_radius_mm + 0.71 * abs(width)) ** 2
+    for m in range(rows):
+        v0, v1 = along_y[MEAN, m], along_y[SLOPE, m]
+        v0_y, v1_y, v0_z, v1_z = along_y[MEAN_X, m], along_y[SLOPE_X, m], along_y[MEAN_Z, m], along_y[SLOPE_Z, m]
+        patch_y = along_y[PATCH, m]
+        for n in range(columns):
+            patch_x = along_x[PATCH, n]
+            r2 = patch_x * patch_x + patch_y * patch_y
+            if r2 >= outside:
+                continue
+            h0, h0_x, h0_z = along_x[MEAN, n], along_x[MEAN_X, n], along_x[MEAN_Z, n]
+            if r2 <= inside:
+                light, by_x, by_y = h0 * v0, h0_x * v0, h0 * v0_y
+                by_z = h0_z * v0 + h0 * v0_z
+            else:
+                h1, h1_x, h1_z = along_x[SLOPE, n], along_x[SLOPE_X, n], along_x[SLOPE_Z, n]
+                share, mean_x, mean_y, share_x, share_y = covered_share(
+                    patch_x, patch_y, view.table, view.table_step_mm
+                )
+                light = share * h0 * v0 + mean_x * h1 * v0 + mean_y * h0 * v1
+                by_x = share * h0_x * v0 + mean_x * h1_x * v0 + mean_y * h0_x * v1 + share_x * place_x * h0 * v0
+                by_y = share * h0 * v0_y + mean_x * h1 * v0_y + mean_y * h0 * v1_y + share_y * place_x * h0 * v0
+                by_z = share * (h0_z * v0 + h0 * v0_z)
+                by_z += mean_x * (h1_z * v0 + h1 * v0_z) + mean_y * (h0_z * v1 + h0 * v1_z)
+                by_z += (share_x * (x - patch_x) + share_y * (y - patch_y)) * lever * slope / scale * h0 * v0
+            if light <= 0.0 or count >= pixels.size:
+                continue
+            pixels[count] = (row + m) * view.columns + column + n
+            values[count, 0] = norm * light
+            values[count, 1] = norm * by_x
+            values[count, 2] = norm * by_y
+            values[count, 3] = norm * (by_z + widen_z * light)
+            count += 1
+    return count

@@ -1,0 +1,312 @@
+"""From a raw image to its particles: rounds of candidates, acceptance, splitting, refinement and pruning.
+
+Each round explains what is left of the image by a volume, takes its peaks as candidates, fits and accepts those whose
+light is there, tells merged ones apart and refines all. Early rounds accept only what is plainly there and let
+unexplained light count for little; later ones ask for less.
+
+Axes: inside, particles are rows (x, y, z, light) in image axes, mm and counts, and images flat; results are in world
+axes of the raw sensor, z from the nominal focal point.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.particles.candidates import explain_rest, find_peaks, points_in_raw_frame
+from lfpiv_cli.particles.fitting import accept, add_all, judge, refine
+from lfpiv_cli.particles.noise import Noise, estimate_noise
+from lfpiv_cli.particles.splitting import split
+from lfpiv_cli.particles.tiles import footprint_px, share_out
+from lfpiv_cli.particles.view import View, entry_capacity
+from lfpiv_cli.reconstruction.solvers import Normalisers
+from lfpiv_cli.weights.model import Weights
+
+
+@dataclass(frozen=True)
+class Round:
+    """One round.
+
+    Attributes
+    ----------
+    iterations : of expectation maximisation
+    claimed_share : least share of its claimed light that a candidate must find
+    unexplained : weight of light above the model in a pixel's variance
+    """
+
+    iterations: int
+    claimed_share: float
+    unexplained: float
+
+
+ROUNDS = (
+    Round(20, 0.9, 0.3),
+    Round(12, 0.85, 0.2),
+    Round(12, 0.8, 0.1),
+    Round(12, 0.75, 0.07),
+    Round(12, 0.7, 0.05),
+    Round(12, 0.6, 0.05),
+)
+# Sweeps of refinement after candidates, after splitting, and at the end (with less weight on unexplained light).
+SWEEPS, SWEEPS_AFTER_SPLIT, LAST_SWEEPS = 4, 2, 4
+LAST_UNEXPLAINED = 0.02
+# Before any particle is known, its light is taken from the peaks: one in ten is brighter than a typical particle.
+FIRST_TYPICAL_PERCENTILE = 90.0
+# Shares of a typical particle's light: the least of a peak to be tried, of a particle to stay.
+CANDIDATE_LIGHT, SMALLEST_LIGHT = 0.15, 0.3
+# A particle stays while it finds this much less of its light than a candidate had to, and this much meets the sensor.
+PRUNING_SLACK, SMALLEST_SEEN = 0.15, 0.2
+# Two particles this close, laterally and in depth, are one.
+MERGE_MM = np.array([0.04, 0.04, 0.25])
+# Particles this far in front of and behind the volume are kept: they light it.
+DEPTH_MARGIN_MM = 0.3
+# Suspected to be two: brighter than typical by this factor and fitting worse by this one than a good particle, which is
+# the one at this percentile; and what chi-squared must fall by, in units of a good particle's.
+SUSPECT_LIGHT, SUSPECT_CHI2, GOOD_PERCENTILE, SPLIT_GAIN = 1.2, 1.0, 20.0, 40.0
+
+
+@dataclass(frozen=True, eq=False)
+class Particles:
+    """The particles of an image.
+
+    Attributes
+    ----------
+    position_mm : (n, 3) world axes
+    light_counts : (n,) all that passes the main lens
+    covariance_mm2 : (n, 3, 3) of the position
+    chi2 : (n,) mean of residual^2 / variance over the particle's light, about 1 where all is explained
+    seen : (n,) share of its light that meets the sensor
+    residual : (rows, columns) what the particles leave of the image, counts
+    noise : of the image
+    """
+
+    position_mm: NDArray[np.float64]
+    light_counts: NDArray[np.float64]
+    covariance_mm2: NDArray[np.float64]
+    chi2: NDArray[np.float64]
+    seen: NDArray[np.float64]
+    residual: NDArray[np.float64]
+    noise: Noise
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """An image to be explained, with all that does not change.
+
+    Attributes
+    ----------
+    view : the raw image's optics
+    image : (rows * columns,) dark-subtracted counts
+    prepared : (rows, columns) the same in the weights' frame
+    depths_mm : between which particles may lie
+    """
+
+    view: View
+    weights: Weights
+    camera: Camera
+    sums: Normalisers
+    image: NDArray[np.float64]
+    prepared: NDArray[np.float32]
+    depths_mm: tuple[float, float]
+
+    @property
+    def capacity(self) -> int:
+        """Entries that a particle can have at most."""
+        return entry_capacity(self.view, *self.depths_mm)
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Particles (n, 4), the residual they leave, a typical particle's light, the noise."""
+
+    particles: NDArray[np.float64]
+    residual: NDArray[np.float64]
+    typical_light: float
+    noise: Noise
+
+
+def find_particles(
+    image: NDArray[np.float32],
+    view: View,
+    weights: Weights,
+    camera: Camera,
+    sums: Normalisers,
+    rounds: tuple[Round, ...] = ROUNDS,
+    progress: Callable[[int], None] | None = None,
+) -> Particles:
+    """Return the particles that explain a raw image.
+
+    Parameters
+    ----------
+    image : (rows, columns) raw, dark and background taken off, counts
+    weights, sums : of the volume in which particles are looked for, and their `normalisers` on the padded grid
+    camera : says which world axis the columns follow
+    progress : called with 1 after each iteration and each round
+    """
+    task = _task(image, view, weights, camera, sums)
+    state = State(np.zeros((0, 4)), task.image.copy(), 0.0, estimate_noise(task.image, 0.0))
+    for settings in rounds:
+        state = _one_round(task, state, settings, progress)
+        if progress:
+            progress(1)
+    _sweep(task, state, LAST_UNEXPLAINED, LAST_SWEEPS)
+    return _result(task, state, image.shape)
+
+
+def _task(image: NDArray[np.float32], view: View, weights: Weights, camera: Camera, sums: Normalisers) -> Task:
+    low, high = weights.grid.bounds_mm(2)
+    return Task(
+        view,
+        weights,
+        camera,
+        sums,
+        np.ascontiguousarray(image, dtype=np.float64).ravel(),
+        weights.prepare(image.astype(np.float32)),
+        (low - DEPTH_MARGIN_MM, high + DEPTH_MARGIN_MM),
+    )
+
+
+def _one_round(task: Task, state: State, settings: Round, progress: Callable[[int], None] | None) -> State:
+    """Return the state after one round."""
+    candidates, light = _candidates(task, state, settings.iterations, progress)
+    typical = state.typical_light
+    if typical == 0.0:
+        typical = float(np.percentile(light, FIRST_TYPICAL_PERCENTILE)) if light.size else 0.0
+    candidates = candidates[light > CANDIDATE_LIGHT * typical]
+    noise = estimate_noise(task.image, typical)
+    state = State(state.particles, state.residual, typical, noise)
+    state = _accept(task, state, candidates, settings)
+    _sweep(task, state, settings.unexplained, SWEEPS)
+    state = _split(task, _with_typical_light(task, state), settings.unexplained)
+    _sweep(task, state, settings.unexplained, SWEEPS_AFTER_SPLIT)
+    state = _prune(task, _merge(task, state), settings)
+    return _with_typical_light(task, state)
+
+
+def _candidates(
+    task: Task, state: State, iterations: int, progress: Callable[[int], None] | None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return candidates (n, 4), brightest first, and their light (n,)."""
+    model = (task.image - state.residual).reshape(task.prepared.shape).astype(np.float32)
+    background = task.weights.prepare(model)
+    volume = explain_rest(task.weights, task.prepared, background, task.sums, iterations, progress)
+    index, light = find_peaks(volume)
+    points = task.camera.to_image_axes(points_in_raw_frame(task.weights, index))
+    return np.column_stack([points, light]), light
+
+
+def _weight(task: Task, state: State, unexplained: float) -> NDArray[np.float64]:
+    return state.noise.weights(task.image - state.residual, state.residual, unexplained)
+
+
+def _sweep(task: Task, state: State, unexplained: float, sweeps: int) -> None:
+    """Refine all particles in place, the residual along with them."""
+    for _ in range(sweeps):
+        tiles = share_out(task.view, state.particles, *task.depths_mm)
+        weight = _weight(task, state, unexplained)
+        refine(task.view, state.particles, tiles, state.residual, weight, *task.depths_mm, task.capacity)
+
+
+def _accept(task: Task, state: State, candidates: NDArray[np.float64], settings: Round) -> State:
+    """Return the state with those candidates that hold."""
+    accepted = accept(
+        task.view,
+        candidates,
+        share_out(task.view, candidates, *task.depths_mm),
+        state.residual,
+        _weight(task, state, settings.unexplained),
+        *task.depths_mm,
+        SMALLEST_LIGHT * state.typical_light,
+        settings.claimed_share,
+        task.capacity,
+    )
+    particles = np.concatenate([state.particles, candidates[accepted]])
+    return State(particles, state.residual, state.typical_light, state.noise)
+
+
+def _split(task: Task, state: State, unexplained: float) -> State:
+    """Return the state with particles that are plainly two told apart."""
+    weight = _weight(task, state, unexplained)
+    chi2, *_ = judge(task.view, state.particles, state.residual, weight, task.capacity)
+    good = max(float(np.percentile(chi2, GOOD_PERCENTILE)), 1.0) if chi2.size else 1.0
+    suspects = (state.particles[:, 3] > SUSPECT_LIGHT * state.typical_light) & (chi2 > SUSPECT_CHI2 * good)
+    twins = split(
+        task.view,
+        state.particles,
+        suspects,
+        share_out(task.view, state.particles, *task.depths_mm),
+        state.residual,
+        weight,
+        *task.depths_mm,
+        SMALLEST_LIGHT * state.typical_light,
+        SPLIT_GAIN * good,
+        task.capacity,
+        footprint_px(task.view, *task.depths_mm),
+    )
+    particles = np.concatenate([state.particles, twins[twins[:, 3] > 0.0]])
+    return State(particles, state.residual, state.typical_light, state.noise)
+
+
+def _merge(task: Task, state: State) -> State:
+    """Return the state with particles that have become one added up, and its residual computed anew."""
+    particles = state.particles.copy()
+    pairs = KDTree(particles[:, :3] / MERGE_MM).query_pairs(1.0, output_type="ndarray")
+    gone = np.zeros(len(particles), dtype=bool)
+    for a, b in pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]:
+        if not (gone[a] or gone[b]):
+            brighter, other = (a, b) if particles[a, 3] >= particles[b, 3] else (b, a)
+            particles[brighter, 3] += particles[other, 3]
+            gone[other] = True
+    return _rebuilt(task, state, particles[~gone])
+
+
+def _prune(task: Task, state: State, settings: Round) -> State:
+    """Return the state without particles that are too faint, hardly seen, or do not find their light."""
+    weight = _weight(task, state, settings.unexplained)
+    _, share, seen, _ = judge(task.view, state.particles, state.residual, weight, task.capacity)
+    keep = (state.particles[:, 3] > SMALLEST_LIGHT * state.typical_light) & (seen > SMALLEST_SEEN)
+    keep &= share > settings.claimed_share - PRUNING_SLACK
+    return _rebuilt(task, state, state.particles[keep])
+
+
+def _rebuilt(task: Task, state: State, particles: NDArray[np.float64]) -> State:
+    """Return the state with other particles, its residual computed from the image."""
+    residual = task.image.copy()
+    tiles = share_out(task.view, particles, *task.depths_mm)
+    add_all(task.view, particles, tiles, -1.0, residual, task.capacity)
+    return State(particles, residual, state.typical_light, state.noise)
+
+
+def _with_typical_light(task: Task, state: State) -> State:
+    """Return the state with the median light of the better fitting half, which holds fewer merged particles."""
+    if not len(state.particles):
+        return state
+    weight = _weight(task, state, LAST_UNEXPLAINED)
+    chi2, *_ = judge(task.view, state.particles, state.residual, weight, task.capacity)
+    typical = float(np.median(state.particles[chi2 <= np.median(chi2), 3]))
+    return State(state.particles, state.residual, typical, estimate_noise(task.image, typical))
+
+
+def _result(task: Task, state: State, shape: tuple[int, int]) -> Particles:
+    """Return the particles in world axes, brightest first."""
+    order = np.argsort(-state.particles[:, 3], kind="stable")
+    particles = state.particles[order]
+    weight = _weight(task, state, 0.0)
+    chi2, _, seen, matrices = judge(task.view, particles, state.residual, weight, task.capacity)
+    # What neighbours leave unexplained is as large an error as noise: the scatter says how large.
+    covariance = np.linalg.inv(matrices) * np.maximum(chi2, 1.0)[:, np.newaxis, np.newaxis]
+    to_world = task.camera.to_image_axes(np.eye(3))
+    return Particles(
+        position_mm=task.camera.to_image_axes(particles[:, :3]),
+        light_counts=particles[:, 3].copy(),
+        covariance_mm2=to_world @ covariance[:, :3, :3] @ to_world.T,
+        chi2=chi2,
+        seen=seen,
+        residual=state.residual.reshape(shape),
+        noise=state.noise,
+    )

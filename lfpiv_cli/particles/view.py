@@ -1,0 +1,135 @@
+"""The camera as particles see it: the raw image, every microlens with its own measured centre.
+
+Nothing is resampled. Each lens has the cell of the plain lattice around its own centre, its edges taken as upright: at
+a rotation of 0.1 degrees that moves 0.1 % of the pitch from one lens to the next.
+
+Axes: image axes (x along the columns, y along the rows, see `optics.camera`), z away from the camera from the nominal
+focal point; lengths in mm about the optical axis.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lfpiv_cli.calibration.model import Calibration
+from lfpiv_cli.errors import ConfigError
+from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.media import Media
+from lfpiv_cli.particles.rim import rim_table
+
+# Particles that are smaller are taken as this large, so that profiles have slopes: a thousandth of a lens.
+SMALLEST_RADIUS_MM = 1e-4
+
+
+class View(NamedTuple):
+    """What the kernels need of the camera, the media and the particles.
+
+    Attributes
+    ----------
+    image_distance_mm, microlens_distance_mm, focal_length_mm : s_i, s_mu, F_m
+    bend : 1 - s_mu/f_m
+    focus_distance_mm, depth_ratio : F_m (M - 1)/M and n_a/n_w (Eqs. 6, 9)
+    distortion_per_mm2 : k1
+    aperture_radius_mm, pixel_mm, columns, rows : of main lens and sensor
+    half_x_mm, half_y_mm : half the cell of a lens
+    particle_radius_mm : of the balls
+    centres_mm : (nj, ni, 2) lens centres on the array; entry [j, i] is lens (first_i + i, first_j + j)
+    origin_mm, inverse_basis : (2,), (2, 2) of the plain lattice, to find lenses
+    table, table_step_mm : see `rim`
+    """
+
+    image_distance_mm: float
+    microlens_distance_mm: float
+    focal_length_mm: float
+    bend: float
+    focus_distance_mm: float
+    depth_ratio: float
+    distortion_per_mm2: float
+    aperture_radius_mm: float
+    pixel_mm: float
+    columns: int
+    rows: int
+    half_x_mm: float
+    half_y_mm: float
+    particle_radius_mm: float
+    centres_mm: NDArray[np.float64]
+    first_i: int
+    first_j: int
+    origin_mm: NDArray[np.float64]
+    inverse_basis: NDArray[np.float64]
+    table: NDArray[np.float64]
+    table_step_mm: float
+
+
+def raw_view(camera: Camera, media: Media, particle_radius_mm: float, calibration: Calibration | None = None) -> View:
+    """Return the view of a camera on the raw image.
+
+    Parameters
+    ----------
+    camera : as the weights have it; its lattice is used where there is no calibration
+    calibration : gives the measured centres of the lens images
+
+    Raises
+    ------
+    ConfigError
+        The array is hexagonal: its cells do not separate into columns and rows.
+    """
+    if camera.lattice.layout != "square":
+        raise ConfigError("camera.microlenses.layout: particles can be fitted behind square arrays only")
+    lattice_px = camera.micro_image_lattice_px() if calibration is None else calibration.fit.lattice_px
+    # One lens more than the sensor's corners: micro-images reach over its edge.
+    corners = [(c, r) for c in (0, camera.columns - 1) for r in (0, camera.rows - 1)]
+    span = lattice_px.nearest(corners)
+    (low_i, low_j), (high_i, high_j) = span.min(axis=0) - 1, span.max(axis=0) + 1
+    indices = np.stack(np.meshgrid(np.arange(low_i, high_i + 1), np.arange(low_j, high_j + 1)), axis=-1)
+    centres_px = lattice_px.points(indices) if calibration is None else calibration.fit.centres(indices)
+    lattice = camera.with_micro_images(lattice_px).lattice
+    table, step = rim_table(
+        camera.aperture_radius_mm, camera.pixel_mm * camera.image_distance_mm / camera.microlens_distance_mm
+    )
+    return View(
+        image_distance_mm=camera.image_distance_mm,
+        microlens_distance_mm=camera.microlens_distance_mm,
+        focal_length_mm=camera.focal_length_mm,
+        bend=1.0 - camera.microlens_distance_mm / camera.microlens_focal_length_mm,
+        focus_distance_mm=camera.focus_distance_mm,
+        depth_ratio=media.depth_ratio,
+        distortion_per_mm2=camera.distortion_per_mm2,
+        aperture_radius_mm=camera.aperture_radius_mm,
+        pixel_mm=camera.pixel_mm,
+        columns=camera.columns,
+        rows=camera.rows,
+        half_x_mm=0.5 * float(lattice.pitch[0]),
+        half_y_mm=0.5 * float(lattice.pitch[1]),
+        particle_radius_mm=max(particle_radius_mm, SMALLEST_RADIUS_MM),
+        centres_mm=np.ascontiguousarray(camera.px_to_mm(centres_px) / camera.micro_image_scale),
+        first_i=int(low_i),
+        first_j=int(low_j),
+        origin_mm=lattice.origin,
+        inverse_basis=np.ascontiguousarray(np.linalg.inv(lattice.basis)),
+        table=table,
+        table_step_mm=step,
+    )
+
+
+def footprint_radius_mm(view: View, z_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return how far on the array the light of particles at depths z spreads from their centres."""
+    distance = view.focus_distance_mm + view.depth_ratio * z_mm
+    alpha = 1.0 + view.image_distance_mm / distance - view.image_distance_mm / view.focal_length_mm
+    return np.abs(alpha) * view.aperture_radius_mm + view.image_distance_mm / distance * view.particle_radius_mm
+
+
+def entry_capacity(view: View, z_low_mm: float, z_high_mm: float) -> int:
+    """Return how many (lens, pixel) entries a particle between two depths can have at most."""
+    per_axis = 0.0
+    patch = view.pixel_mm * view.image_distance_mm / view.microlens_distance_mm
+    for half in (view.half_x_mm, view.half_y_mm):
+        radius = footprint_radius_mm(view, np.linspace(z_low_mm, z_high_mm, 101))
+        lenses = np.ceil(radius / half) + 2.0
+        # A lens sees the part of the aperture whose light falls into its cell.
+        lit = np.minimum(2.0 * view.aperture_radius_mm, 3.0 * half * 2.0 * view.aperture_radius_mm / radius)
+        per_axis = max(per_axis, float(np.max(lenses * (lit / patch + 3.0))))
+    return int(per_axis**2) + 1

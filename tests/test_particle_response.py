@@ -1,0 +1,119 @@
+"""The response of one particle against rays, finite differences and conservation of light."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lfpiv_cli.errors import ConfigError
+from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.media import Media
+from lfpiv_cli.optics.microlenses import Lattice
+from lfpiv_cli.particles.response import respond
+from lfpiv_cli.particles.rim import covered_share, rim_table
+from lfpiv_cli.particles.view import View, entry_capacity, raw_view
+from lfpiv_cli.synthetic.render import ObjectSpace, render_points
+
+RADIUS_MM = 0.025
+# In, near and out of focus, on both sides, off the axis; light goes through 1 to 50 lenses.
+PLACES = [(0.31, -0.2, 3.0), (0.53, 0.21, 0.02), (-0.62, 0.4, 0.4), (0.2, 0.3, -4.0)]
+
+
+@pytest.fixture
+def small(table2: Camera) -> Camera:
+    """The paper's camera with a small sensor and an array that is turned, shifted and seen through distortion."""
+    lattice = Lattice.regular(0.1, "square", np.deg2rad(0.12), (0.013, -0.02))
+    return replace(table2, lattice=lattice, columns=400, rows=360, distortion_per_mm2=2e-4)
+
+
+def entries(view: View, point: tuple[float, float, float]) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+    capacity = entry_capacity(view, -5.0, 5.0)
+    pixels, values = np.empty(capacity, np.int32), np.empty((capacity, 4))
+    count = respond(view, *point, pixels, values)
+    assert count < capacity
+    return pixels[:count], values[:count]
+
+
+def images(view: View, point: tuple[float, float, float]) -> NDArray[np.float64]:
+    """Return light and derivatives as images (pixels, 4)."""
+    pixels, values = entries(view, point)
+    result = np.zeros((view.rows * view.columns, 4))
+    np.add.at(result, pixels, values)
+    return result
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_response_is_what_rays_make(small: Camera, water: Media, place: tuple[float, float, float]) -> None:
+    view = raw_view(small, water, RADIUS_MM)
+    response = images(view, place)
+    rays = 1_000_000
+    space = ObjectSpace(water, None, "paraxial")
+    traced = render_points(small, space, [place], 1.0, 2 * RADIUS_MM, np.random.default_rng(1), rays=rays).ravel()
+    assert response[:, 0].sum() == pytest.approx(1.0, abs=1e-3)
+    # The rays' own noise is 0.8 sqrt(f/n) a pixel, summed over the pixels; the model may add half of a per cent.
+    noise = 0.8 * np.sqrt(traced / rays).sum()
+    assert np.abs(response[:, 0] - traced).sum() < noise + 0.005
+    if abs(place[2]) < 0.1:
+        return  # all light passes one lens, whichever way the particle moves within it: no position to compare
+    lit = (response[:, 0] > 0.0) | (traced > 0.0)
+    bias = np.linalg.lstsq(
+        np.column_stack([response[lit, 1:], response[lit, 0]]), (traced - response[:, 0])[lit], rcond=None
+    )[0]
+    # A fit to the rays would move by this: a thousandth of a voxel's width, and three hundredths in depth.
+    assert np.abs(bias[:2]).max() < 3e-4
+    assert abs(bias[2]) < 3e-3
+
+
+@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_derivatives_are_finite_differences(
+    small: Camera, water: Media, place: tuple[float, float, float], axis: int
+) -> None:
+    view = raw_view(small, water, RADIUS_MM)
+    step = np.zeros(3)
+    step[axis] = 1e-4
+    ahead, behind = (images(view, tuple(np.array(place) + sign * step))[:, 0] for sign in (1, -1))
+    difference = (ahead - behind) / 2e-4
+    analytic = images(view, place)[:, 1 + axis]
+    # The first moments' own slopes are left out: a hundredth of all, seen where a particle in focus hardly changes.
+    assert np.abs(analytic - difference).sum() < 0.01 * np.abs(difference).sum() + 0.005
+
+
+def test_distortion_moves_the_light(small: Camera, water: Media) -> None:
+    place = (0.6, -0.5, 2.0)
+    view = raw_view(small, water, RADIUS_MM)
+    with_it, without = (images(v, place)[:, 0] for v in (view, view._replace(distortion_per_mm2=0.0)))
+    # k1 r^3 = 1e-4 mm of a lens of 0.1 mm: about 2e-3 of the light changes lenses.
+    assert 1e-4 < np.abs(with_it - without).sum() < 1e-2
+
+
+def test_each_lens_has_its_own_centre(small: Camera, water: Media) -> None:
+    view = raw_view(small, water, RADIUS_MM)
+    moved = view._replace(centres_mm=view.centres_mm + np.array([0.004, 0.0]))
+    place = (0.3, 0.1, 3.0)
+    before, after = images(view, place)[:, 0], images(moved, place)[:, 0]
+    columns = np.arange(before.size) % view.columns
+    shift_px = (after @ columns) / after.sum() - (before @ columns) / before.sum()
+    # The light's centre stays (the same rays), moved by the little that the micro-images shift beneath it.
+    assert abs(shift_px) < 1.0
+    assert np.abs(before - after).sum() > 0.1
+
+
+def test_rim_shares_are_areas() -> None:
+    table, step = rim_table(12.5, 1.375)
+    rng = np.random.default_rng(3)
+    for x, y in rng.uniform(-13.0, 13.0, (30, 2)):
+        u, v = np.meshgrid(*[(np.arange(200) + 0.5) / 100 - 1.0] * 2)
+        covered = np.hypot(x + u * 0.6875, y + v * 0.6875) <= 12.5
+        share, mean_x, mean_y, *_ = covered_share(x, y, table, step)
+        assert share == pytest.approx(covered.mean(), abs=4e-3)
+        assert mean_x == pytest.approx((u * covered).mean(), abs=6e-3)
+        assert mean_y == pytest.approx((v * covered).mean(), abs=6e-3)
+
+
+def test_hexagonal_arrays_are_refused(table2: Camera, water: Media) -> None:
+    with pytest.raises(ConfigError, match="square"):
+        raw_view(replace(table2, lattice=Lattice.regular(0.1, "hexagonal")), water, RADIUS_MM)
