@@ -114,7 +114,7 @@ def build_weights(**arguments: Any) -> dict[str, Any]:
 @cli.command("reconstruct")
 @click.argument("weights", type=INPUT)
 @click.argument("images", type=INPUT, nargs=-1, required=True)
-@click.option("--solver", type=click.Choice(["em", "sart"]), help="Default from the config.")
+@click.option("--solver", type=click.Choice(["em", "sart", "particles"]), help="Default from the config.")
 @click.option("--iterations", type=click.IntRange(min=1), help="Default from the config.")
 @click.option("--relaxation", type=click.FloatRange(min=0.0, min_open=True, max=2.0), help="Default from the config.")
 @click.option("--accelerate/--no-accelerate", default=None, help="Extrapolate between steps; default from the config.")
@@ -125,7 +125,7 @@ def build_weights(**arguments: Any) -> dict[str, Any]:
 @click.option("-o", "--output", type=INPUT, required=True, help="File for one image, folder for several.")
 @common_options
 def reconstruct(**arguments: Any) -> dict[str, Any]:
-    """Reconstruct the volume of tracer particles behind each image.
+    """Reconstruct the volume of tracer particles behind each image, or (--solver particles) the particles themselves.
 
     \b
     Example: lfpiv reconstruct weights.h5 a.tif b.tif --dark dark.tif -o volumes
@@ -156,8 +156,28 @@ def correlate(**arguments: Any) -> dict[str, Any]:
     return stages.correlate(**arguments)
 
 
+@cli.command("track")
+@click.argument("particles_a", type=INPUT)
+@click.argument("particles_b", type=INPUT)
+@click.option("--dt-s", type=click.FloatRange(min=0.0, min_open=True), help="Time between the two frames.")
+@click.option("--search", "search_voxel", type=click.FloatRange(min=0.0, min_open=True), help="Largest move, voxels.")
+@click.option("--grid", is_flag=True, help="Also write vectors on correlate's grid, as OUTPUT's name with _grid.")
+@click.option("-o", "--output", type=INPUT, required=True, help="File of tracks to write (.vtkhdf).")
+@common_options
+def track(**arguments: Any) -> dict[str, Any]:
+    """Follow particles from one frame to the next.
+
+    \b
+    Example: lfpiv reconstruct weights.h5 a.tif b.tif --dark dark.tif --solver particles -o particles
+             lfpiv track particles/a.vtkhdf particles/b.vtkhdf -o tracks.vtkhdf --grid
+    """
+    from lfpiv_cli import stages_particles
+
+    return stages_particles.track_particles(**arguments)
+
+
 @cli.command("validate")
-@click.argument("what", type=click.Choice(["flow", "weights"]))
+@click.argument("what", type=click.Choice(["flow", "weights", "board"]))
 @click.argument("config", type=INPUT)
 @click.option("--vectors", type=INPUT, help="flow: vectors to judge.")
 @click.option("--particles", type=INPUT, help="flow: true particles (.npz) to judge by, not the config's flow.")
@@ -169,6 +189,7 @@ def validate(what: str, vectors: Path | None, particles: Path | None, **argument
     \b
     Examples: lfpiv validate flow rig.yaml --vectors vectors.vtkhdf -o report
               lfpiv validate weights rig.yaml -o report
+              lfpiv validate board rig.yaml -o report
     """
     if what == "flow":
         if vectors is None:
@@ -178,6 +199,10 @@ def validate(what: str, vectors: Path | None, particles: Path | None, **argument
         return stages.validate_flow(vectors=vectors, particles=particles, **arguments)
     if vectors is not None or particles is not None:
         raise click.UsageError(f"validate {what} takes neither --vectors nor --particles")
+    if what == "board":
+        from lfpiv_cli import stages_board
+
+        return stages_board.validate_board(**arguments)
     from lfpiv_cli import stages_weights
 
     return stages_weights.validate_weights(**arguments)

@@ -1,0 +1,80 @@
+"""Measures of reconstructed boards: Eqs. 17 to 20 on volumes whose figures are known."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lfpiv_cli.cli import cli
+from lfpiv_cli.errors import InputError
+from lfpiv_cli.grid import Grid
+from lfpiv_cli.validation.board import board_figures, elongation_mm, gaussian_centre_mm, measure_dots
+
+CONFIG = Path(__file__).parent.parent / "configs" / "table2.yaml"
+GRID = Grid.centred((30, 20, 60), (0.1, 0.1, 0.1), (0.0, 0.0, 0.0))
+CENTRES = np.array([(x, y) for y in (-0.5, 0.5) for x in (-1.0, 0.0, 1.0)])
+
+
+def board(z_mm: float, sigma_mm: float = 0.5, spacing: float = 1.0) -> np.ndarray:
+    """A volume of 3 x 2 Gaussian dots."""
+    z, y, x = np.meshgrid(*(GRID.axis_mm(axis) for axis in (2, 1, 0)), indexing="ij")
+    lateral = sum(np.exp(-((x - cx * spacing) ** 2 + (y - cy) ** 2) / (2 * 0.12**2)) for cx, cy in CENTRES)
+    return (lateral * np.exp(-0.5 * ((z - z_mm) / sigma_mm) ** 2)).astype(np.float32)
+
+
+def test_elongation_of_a_gaussian_is_its_width_at_1_over_e():
+    z = np.linspace(-3.0, 3.0, 61)
+    # exp(-z^2 / 2 s^2) = 1/e at z = s sqrt 2; straight lines between samples err by less than a hundredth of a sample
+    assert elongation_mm(z, np.exp(-0.5 * ((z - 0.13) / 0.5) ** 2)) == pytest.approx(2 * np.sqrt(2) * 0.5, abs=0.005)
+
+
+def test_elongation_ends_at_the_volume():
+    z = np.linspace(0.0, 1.0, 11)
+    assert elongation_mm(z, np.ones(11)) == pytest.approx(1.0)
+
+
+def test_gaussian_centre_between_samples():
+    z = np.linspace(-3.0, 3.0, 61)
+    assert gaussian_centre_mm(z, 5.0 * np.exp(-0.5 * ((z - 0.137) / 0.7) ** 2)) == pytest.approx(0.137, abs=1e-6)
+
+
+def test_figures_of_boards_eqs_17_to_20():
+    # true steps of 1 mm measured as 1.1 mm: depth error 10 %; spacing 1.02 mm: lateral error 2 %
+    dots = [measure_dots(board(1.1 * z, spacing=1.02), GRID, CENTRES, 0.5) for z in (-1.0, 0.0, 1.0)]
+    figures = board_figures(dots, (-1.0, 0.0, 1.0), (3, 2), 1.0)
+    assert figures["depth_error"] == pytest.approx(0.10, abs=1e-4)
+    assert figures["depth_error_mass"] == pytest.approx(0.10, abs=0.02)
+    assert figures["lateral_error"] == pytest.approx(0.02, abs=0.002)
+    assert figures["elongation_mm"] == pytest.approx(np.sqrt(2), abs=0.01)
+    assert figures["elongation_sigma_mm"] == pytest.approx(0.0, abs=0.01)
+
+
+def test_a_board_without_light_is_refused():
+    with pytest.raises(InputError, match="no light"):
+        measure_dots(np.zeros(GRID.shape_zyx, np.float32), GRID, CENTRES, 0.5)
+
+
+@pytest.mark.slow
+def test_validate_board_on_a_small_camera(tmp_path):
+    text = CONFIG.read_text()
+    for old, new in (
+        ("columns: 2352", "columns: 460"),
+        ("rows: 1768", "rows: 460"),
+        ("shape_xyz: [80, 80, 240]", "shape_xyz: [22, 22, 120]"),
+        ("voxel_mm: 0.1 ", "voxel_mm: [0.1, 0.1, 0.2] "),
+        ("dots: [7, 7]", "dots: [2, 2]"),
+        ("solver: sart", "solver: em"),
+        ("iterations: 200", "iterations: 8"),
+    ):
+        assert old in text, old
+        text = text.replace(old, new)
+    small = tmp_path / "small.yaml"
+    small.write_text(text)
+    cli.main(["validate", "board", str(small), "-o", str(tmp_path / "report")], standalone_mode=False)
+    figures = json.loads((tmp_path / "report" / "board.json").read_text())["figures"]
+    assert figures["lateral_error"] < 0.02
+    assert figures["depth_error"] < 0.3
+    assert (tmp_path / "report" / "board.png").stat().st_size > 10_000
