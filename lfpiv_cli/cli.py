@@ -97,7 +97,7 @@ def calibrate_snapshot(**arguments: Any) -> dict[str, Any]:
 @click.option("--calibration", type=INPUT, help="From calibrate-snapshot; without it the data sheet is believed.")
 @click.option("--method", type=click.Choice(["ert", "drt"]), help="How points are traced; default from the config.")
 @click.option("--refraction", type=click.Choice(["paraxial", "exact"]), help="Snell's law; default from the config.")
-@click.option("--sampling", type=click.Choice(["exact"]), help="How rays are summed; default from the config.")
+@click.option("--sampling", type=click.Choice(["exact", "rays"]), help="Integrals or rays; default from the config.")
 @click.option("-o", "--output", type=INPUT, required=True, help="Weights file to write (.h5).")
 @common_options
 def build_weights(**arguments: Any) -> dict[str, Any]:

@@ -15,6 +15,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli import stages_particles
 from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import ConfigError, InputError, LfpivError, LimitMissedError, PartialError, UsageError
@@ -35,9 +36,11 @@ from lfpiv_cli.grid import Grid
 from lfpiv_cli.reconstruction.images import light, minimum_background
 from lfpiv_cli.reconstruction.solvers import normalisers
 from lfpiv_cli.reconstruction.solvers import reconstruct as solve
+from lfpiv_cli.stages_weights import make_operator
 from lfpiv_cli.validation.flow import flow_figures, limits_missed, truth_at_points
 from lfpiv_cli.validation.pictures import flow_figure
-from lfpiv_cli.weights.build import default_padding, factorise_through, scene_distortion, seen_share
+from lfpiv_cli.weights.build import default_padding, scene_distortion
+from lfpiv_cli.weights.columns import seen_share
 from lfpiv_cli.weights.model import Weights
 from lfpiv_cli.weights.operators import FactorisedOperator
 
@@ -73,9 +76,9 @@ def build_weights(
     media = settings.media_model()
     padding = settings.reconstruction.padding_voxel or default_padding(camera, media, grid)
     space = settings.object_space(found.mid_plane_z_mm if found else None)
-    operator = factorise_through(camera, space, grid.padded(padding))
-    _judge_view(factorise_through(camera, space, grid) if any(padding) else operator, grid, console)
-    bend = scene_distortion(camera, media, grid)
+    _judge_view(*seen_share(camera, space, grid), grid, console)
+    operator = make_operator(settings.weights, camera, space, grid.padded(padding), console)
+    bend = scene_distortion(camera, media, grid) if isinstance(operator, FactorisedOperator) else None
     weights = Weights(grid, padding, operator, camera.column_axis, found, bend)
     record = _record("build-weights", settings, inputs)
     write_weights(output, WeightsFile(weights, camera, settings.volume.reference, reference_z, record), overwrite)
@@ -125,17 +128,28 @@ def reconstruct(
     dark_image = image_files.read_image(dark, shape) if dark else None
     background_image = _background(background, frames, shape)
     operator = content.weights.padded
-    sums = normalisers(operator) if needed else None
+    sums = normalisers(operator) if needed and not operator.on_demand else None
     chosen = settings.reconstruction
     solver_options = chosen.model_dump(include={"solver", "iterations", "relaxation", "accelerate"})
     residuals: list[float] = []
     failures: list[str] = []
-    with console.progress(len(needed) * chosen.iterations, "reconstruct") as advance:
+    as_particles = chosen.solver == "particles"
+    if as_particles:
+        stages_particles.ensure_solvable(content, settings)
+    steps = stages_particles.STEPS if as_particles else chosen.iterations
+    with console.progress(len(needed) * steps, "reconstruct") as advance:
         for number in needed:
             try:
                 raw = image_files.read_page(frames[number].path, frames[number].page, shape)
-                image = content.weights.prepare(light(raw, dark_image, background_image))
-                result = solve(operator, image, **solver_options, sums=sums, progress=advance)
+                lit = light(raw, dark_image, background_image)
+                if as_particles and sums is not None:
+                    path, made_by = targets[number].path, targets[number].record
+                    residuals.append(
+                        stages_particles.write_frame(content, settings, lit, sums, path, made_by, overwrite, advance)
+                    )
+                    continue
+                image = content.weights.prepare(lit)
+                result = solve(operator.for_image(image), image, **solver_options, sums=sums, progress=advance)
             except LfpivError as error:
                 if not keep_going:
                     raise
@@ -162,7 +176,7 @@ def reconstruct(
         "reconstructed": len(residuals),
         "skipped": len(frames) - len(needed),
         "solver": chosen.solver,
-        "iterations": chosen.iterations,
+        "iterations": None if as_particles else chosen.iterations,
         "residual": max(residuals, default=None),
     }
 
@@ -299,9 +313,8 @@ def _reference_z_mm(settings: Config, found: Calibration | None) -> float:
     return found.mid_plane_z_mm
 
 
-def _judge_view(operator: FactorisedOperator, grid: Grid, console: Console) -> None:
+def _judge_view(smallest: float, largest: float, grid: Grid, console: Console) -> None:
     """Refuse a volume that the sensor does not see and warn of one that it sees in part."""
-    smallest, largest = seen_share(operator)
     if largest < LEAST_SEEN:
         bounds = [grid.bounds_mm(axis) for axis in range(3)]
         spans = ", ".join(f"{axis} {low:.4g} to {high:.4g}" for axis, (low, high) in zip("xyz", bounds, strict=True))

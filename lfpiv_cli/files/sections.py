@@ -154,23 +154,29 @@ class WeightsSection(Section):
 
     method: equivalent points (ert), or rays traced through window and fluid (drt), which reads the window's distance.
     refraction: paraxial, or Snell's law with its aberration (exact), which needs the thickness of what lies before the
-    points: the section window, or channel with a calibrated mid plane. sampling: exact integrals.
+    points: the section window, or channel with a calibrated mid plane. sampling: integrals (exact), or the paper's
+    count of rays_per_point rays from each of `points` random points of a voxel (rays), seeded; for small volumes only.
     """
 
     method: Literal["ert", "drt"] = "ert"
     refraction: Literal["paraxial", "exact"] = "paraxial"
-    sampling: Literal["exact"] = "exact"
+    sampling: Literal["exact", "rays"] = "exact"
+    points: Annotated[int, Field(ge=1, le=10_000_000)] = 500
+    rays_per_point: Annotated[int, Field(ge=1, le=10_000_000)] = 10_000
+    seed: Annotated[int, Field(ge=0)] = 0
 
 
 class ReconstructionSection(Section):
-    """The solver: em (default, better for velocity) or sart (Eq. 12); iterations; SART's relaxation mu.
+    """The solver: em (default, better for velocity), sart (Eq. 12) or particles; iterations; SART's relaxation mu.
 
+    particle_diameter_mm: of the tracers; only the solver `particles` reads it.
     accelerate: step from points extrapolated by Nesterov's momentum; a quarter of the iterations will do.
     padding_voxel: voxels [x, y, z] solved for beyond each side of the volume and cropped on writing (default: derived
     from how far light spreads).
     """
 
-    solver: Literal["em", "sart"] = "em"
+    solver: Literal["em", "sart", "particles"] = "em"
+    particle_diameter_mm: Positive = 0.05
     iterations: Annotated[int, Field(ge=1, le=100_000)] = 20
     relaxation: Annotated[float, Field(gt=0.0, le=2.0)] = 1.0
     accelerate: bool = False

@@ -1,0 +1,156 @@
+"""Particles and tracks as VTKHDF PolyData, which ParaView opens: one vertex for each.
+
+Layout: the arrays lie at the root (`position_mm` (n, 3) and one array of n rows for each quantity, unit in the
+attribute `units`) and are linked under `/VTKHDF`, so that readers of HDF5 and of VTK find the same data. Positions are
+(x, y, z) in mm, z from the reference that the root's attributes name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from lfpiv_cli.errors import InputError
+from lfpiv_cli.files.hdf5 import (
+    RESERVED,
+    create,
+    ensure_format,
+    from_attribute,
+    member,
+    open_h5,
+    read_array,
+    read_provenance,
+    to_attribute,
+    write_array,
+    write_header,
+)
+
+PARTICLES_FORMAT = "lfpiv-particles"
+TRACKS_FORMAT = "lfpiv-tracks"
+FORMAT_VERSION = 1
+
+# Version and type of VTK's layout; the type as a fixed string (VTK up to 9.4.2 fails on a variable one).
+VTK_VERSION = (2, 0)
+VTK_TYPE = np.bytes_("PolyData")
+POSITION = "position_mm"
+
+# Units of the arrays, by format; tensors are symmetric, as xx, yy, zz, xy, yz, xz (VTK's order).
+UNITS = {
+    PARTICLES_FORMAT: {
+        "intensity": "count",
+        "covariance_mm2": "mm^2",
+        "chi2": "1",
+        "seen": "1",
+        "flag": "1",
+    },
+    TRACKS_FORMAT: {
+        "velocity": "m/s",
+        "velocity_sigma": "m/s",
+        "displacement_mm": "mm",
+        "particle_a": "1",
+        "particle_b": "1",
+    },
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Points with their quantities.
+
+    Attributes
+    ----------
+    position_mm : (n, 3)
+    arrays : n rows each, by name
+    attributes, provenance : what the file says about itself
+    """
+
+    position_mm: NDArray[np.float64]
+    arrays: dict[str, NDArray[Any]]
+    attributes: dict[str, Any]
+    provenance: dict[str, Any]
+
+
+def write_points(
+    path: Path,
+    format_name: str,
+    position_mm: NDArray[np.float64],
+    arrays: Mapping[str, NDArray[Any]],
+    *,
+    provenance: Mapping[str, Any],
+    attributes: Mapping[str, Any],
+    overwrite: bool,
+) -> None:
+    """Write points; `arrays` holds all that the format has, each with as many rows as there are points.
+
+    Raises
+    ------
+    OutputExistsError, OutputError
+    """
+    units = UNITS[format_name]
+    if set(arrays) != set(units) or any(len(array) != len(position_mm) for array in arrays.values()):
+        raise ValueError(f"{format_name} has the arrays {sorted(units)} of {len(position_mm)} rows each")
+
+    def fill(file: h5py.File) -> None:
+        write_header(file, format_name, FORMAT_VERSION, provenance)
+        for name, value in attributes.items():
+            file.attrs[name] = to_attribute(value)
+        vtk = file.create_group("VTKHDF")
+        vtk.attrs["Version"] = np.array(VTK_VERSION, dtype=np.int64)
+        vtk.attrs["Type"] = VTK_TYPE
+        vtk["Points"] = write_array(file, POSITION, position_mm, "mm")
+        vtk["NumberOfPoints"] = np.array([len(position_mm)], dtype=np.int64)
+        _write_cells(vtk, len(position_mm))
+        data = vtk.create_group("PointData")
+        for name, unit in units.items():
+            data[name] = write_array(file, name, arrays[name], unit)
+
+    def check(temporary: Path) -> None:
+        read_points(temporary, format_name)
+
+    create(path, fill, overwrite=overwrite, check=check)
+
+
+def read_points(path: Path | str, format_name: str) -> Points:
+    """Read points.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, broken, of another format, or holds values that are not finite.
+    """
+    path = Path(path)
+    with open_h5(path) as file:
+        ensure_format(path, file, format_name, (FORMAT_VERSION,))
+        size = path.stat().st_size
+        position = read_array(member(file, POSITION), size)
+        arrays = {name: read_array(member(file, name), size) for name in UNITS[format_name]}
+        attributes = {name: from_attribute(name, value) for name, value in file.attrs.items() if name not in RESERVED}
+        provenance = read_provenance(file)
+    if position.ndim != 2 or position.shape[1] != 3:
+        raise InputError(f"{path}: its positions have the shape {position.shape}, expected (n, 3)")
+    for name, array in (arrays | {POSITION: position}).items():
+        if len(array) != len(position) or not np.isfinite(array).all():
+            raise InputError(f"{path}: {name} has not one finite value for each of its {len(position)} points")
+    return Points(position.astype(np.float64), arrays, attributes, provenance)
+
+
+def symmetric(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return symmetric matrices (n, 3, 3) as (n, 6): xx, yy, zz, xy, yz, xz."""
+    return np.stack([matrices[:, i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))], axis=1)
+
+
+def _write_cells(vtk: h5py.Group, count: int) -> None:
+    """Write one vertex for each point, and no other cells."""
+    for name in ("Vertices", "Lines", "Polygons", "Strips"):
+        cells = count if name == "Vertices" else 0
+        group = vtk.create_group(name)
+        group["NumberOfCells"] = np.array([cells], dtype=np.int64)
+        group["NumberOfConnectivityIds"] = np.array([cells], dtype=np.int64)
+        group["Offsets"] = np.arange(cells + 1, dtype=np.int64)
+        group["Connectivity"] = np.arange(cells, dtype=np.int64)

@@ -1,0 +1,80 @@
+"""Tracks and their grid: flows with a known answer, strays, noise and what the uncertainty promises."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lfpiv_cli.particles.gridding import on_grid
+from lfpiv_cli.particles.tracking import track
+
+BOX_MM = np.array([4.0, 4.0, 4.0])
+
+
+def moved(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return displacements of a sheared flow that is also turned: up to 0.5 mm, more than the particles' distance."""
+    x, y, z = (points - 2.0).T
+    return np.stack([0.3 + 0.05 * z, 0.04 * x, -0.1 + 0.03 * y], axis=1)
+
+
+@pytest.fixture
+def frames(rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Two frames of 500 particles in 64 mm3, a tenth of each frame alone in it; the first 450 belong together."""
+    both = rng.uniform(0.0, BOX_MM, (450, 3))
+    lone = rng.uniform(0.0, BOX_MM, (2, 50, 3))
+    noise = rng.normal(0.0, (0.003, 0.003, 0.02), (2, 450, 3))
+    return np.concatenate([both + noise[0], lone[0]]), np.concatenate([both + moved(both) + noise[1], lone[1]])
+
+
+def test_particles_are_followed_further_than_their_distance(
+    frames: tuple[NDArray[np.float64], NDArray[np.float64]],
+) -> None:
+    tracks = track(*frames, 0.6)
+    right = (tracks.first == tracks.second) & (tracks.first < 450)
+    assert right.sum() > 0.9 * 450
+    assert right.mean() > 0.98
+    assert np.unique(tracks.second).size == tracks.second.size
+
+
+def test_frames_without_common_particles_give_few_tracks(rng: np.random.Generator) -> None:
+    first, second = rng.uniform(0.0, BOX_MM, (2, 300, 3))
+    assert len(track(first, second, 0.3).first) < 60
+
+
+def test_too_few_particles_give_no_track() -> None:
+    assert track(np.zeros((3, 3)), np.zeros((3, 3)), 0.5).first.size == 0
+
+
+def test_grid_takes_a_quadratic_flow_exactly(rng: np.random.Generator) -> None:
+    points = rng.uniform(0.0, BOX_MM, (800, 3))
+    nodes = rng.uniform(0.5, 3.5, (20, 3))
+
+    def flow(at: NDArray[np.float64]) -> NDArray[np.float64]:
+        x, y, z = at.T
+        return np.stack([1.0 - x**2 + x * z, 0.3 * y + z**2, x * y - 0.2], axis=1)
+
+    value, error = on_grid(points, flow(points), np.full(points.shape, 0.01), nodes, 1.0)
+    np.testing.assert_allclose(value, flow(nodes), atol=1e-9)
+    assert error.max() < 1e-9
+
+
+def test_grid_states_its_error_and_ignores_strays(rng: np.random.Generator) -> None:
+    points = rng.uniform(0.0, BOX_MM, (1500, 3))
+    sigma = np.broadcast_to((0.002, 0.002, 0.02), points.shape)
+    values = moved(points) + rng.normal(0.0, sigma)
+    values[::25] += rng.uniform(-0.5, 0.5, values[::25].shape)
+    nodes = rng.uniform(0.5, 3.5, (200, 3))
+    value, error = on_grid(points, values, sigma, nodes, 1.0)
+    ratio = (value - moved(nodes)) / error
+    # Neighbouring nodes share tracks, so 200 nodes make some 60 independent ones: 10 %; the spread is estimated too.
+    assert np.all(np.abs(np.sqrt(np.mean(ratio**2, axis=0)) - 1.0) < 0.35)
+    assert np.all(error < sigma[0])
+
+
+def test_a_node_without_tracks_has_no_vector(rng: np.random.Generator) -> None:
+    points = rng.uniform(0.0, 1.0, (100, 3))
+    value, error = on_grid(points, moved(points), np.full(points.shape, 0.01), np.array([[0.5] * 3, [3.0] * 3]), 0.8)
+    assert np.isfinite(value[0]).all()
+    assert np.isnan(value[1]).all()
+    assert np.isnan(error[1]).all()
