@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,22 @@ from lfpiv_cli.files.batch import prepare_folder
 from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.pictures import ensure_drawing, write_picture
 from lfpiv_cli.files.provenance import record as provenance_record
+from lfpiv_cli.files.sections import WeightsSection
+from lfpiv_cli.grid import Grid
+from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.validation.weights import TABLE1_MM, limits_missed, make_columns, sample_voxels, weights_figures
 from lfpiv_cli.validation.weights_pictures import columns_figure, similarity_figure
+from lfpiv_cli.weights.build import factorise_through, separates
+from lfpiv_cli.weights.columns import ColumnOperator, OnDemandOperator
+from lfpiv_cli.weights.model import WeightsOperator
+from lfpiv_cli.weights.rays import count_columns
+
+# Half an hour on two cores; a core counts about four million rays a second.
+MOST_RAYS = 3e10
+RAYS_PER_CORE_HOUR = 1.5e10
+# Some 1,500 pixels of 8 bytes.
+BYTES_PER_COLUMN = 12_000
 
 
 def validate_weights(config: Path, output: Path, overwrite: bool, console: Console) -> dict[str, Any]:
@@ -51,6 +65,36 @@ def validate_weights(config: Path, output: Path, overwrite: bool, console: Conso
         console.summary(summary)
         raise LimitMissedError(f"{paths['.json']}: {'; '.join(missed)}")
     return {"voxels": len(columns)} | summary
+
+
+def make_operator(
+    chosen: WeightsSection, camera: Camera, space: ObjectSpace, grid: Grid, console: Console
+) -> WeightsOperator:
+    """Return the weights of a grid: factorised where the axes separate, else on demand; or counted where asked for.
+
+    Raises
+    ------
+    ConfigError : counting would take too long
+    """
+    if chosen.sampling == "exact":
+        if separates(camera):
+            return factorise_through(camera, space, grid)
+        console.say("lfpiv: the array's axes do not separate; columns will be made on demand, for what is lit")
+        return OnDemandOperator(camera, space, grid)
+    layout = OnDemandOperator(camera, space, grid)
+    voxels = math.prod(layout.shape)
+    rays = voxels * chosen.points * chosen.rays_per_point
+    if rays > MOST_RAYS:
+        raise ConfigError(
+            f"weights.sampling: counting {rays:.3g} rays for {voxels} voxels (padding included) would take about "
+            f"{rays / RAYS_PER_CORE_HOUR:.2g} core hours and {voxels * BYTES_PER_COLUMN / 1e9:.2g} GB; at most "
+            f"{MOST_RAYS:.3g} are counted, use sampling: exact"
+        )
+    centres, rng = layout.centres_mm(np.arange(voxels)), np.random.default_rng(chosen.seed)
+    number = (chosen.points, chosen.rays_per_point)
+    with console.progress(voxels, "count rays") as advance:
+        columns = count_columns(camera, space, centres, layout.sides_mm, rng, *number, advance)
+    return ColumnOperator(layout.shape, layout.image_shape, np.arange(voxels), columns)
 
 
 def _space(settings: Config) -> ObjectSpace:

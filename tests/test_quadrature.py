@@ -108,7 +108,9 @@ def test_lens_regions_share_out_a_rectangle(layout, rng):
     low, high = np.array([-0.13, 0.02]), np.array([0.11, 0.09])
     work = np.empty((2, MOST_CORNERS, 2))
     centres = lattice.points([(i, j) for i in range(-4, 5) for j in range(-4, 5)])
-    parts = [shared_rectangle(low, high, x, y, neighbours(lattice), work) for x, y in centres]
+    parts = [
+        shared_rectangle((low[0], low[1]), (high[0], high[1]), x, y, neighbours(lattice), work) for x, y in centres
+    ]
     area = float(np.prod(high - low))
     assert sum(part[0] for part in parts) == pytest.approx(area, rel=1e-12)
     points = low + rng.random((20_000, 2)) * (high - low)

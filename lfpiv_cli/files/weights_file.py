@@ -1,15 +1,19 @@
 """The weights file: everything that a reconstruction needs besides the images.
 
-Layout, version 1 (HDF5; lengths in mm): `camera` (scalars of `optics.camera.Camera`, `lattice_origin_mm` (2,),
+Layout, version 2 (HDF5; lengths in mm): `camera` (scalars of `optics.camera.Camera`, `lattice_origin_mm` (2,),
 `lattice_basis_mm` (2, 2)), `grid` (`shape_xyz`, `spacing_mm`, `origin_mm`, `padding_xyz`, `reference`,
 `scene_distortion_per_mm2` of its planes), `columns` and
 `rows` (the per-axis weights: `start`, `cell`, `share`), and `calibration` where one was made. The cells and the
 aperture's mask follow from the camera and are computed again on reading.
+
+Where the axes do not separate there is, in place of `columns` and `rows`, `on_demand` (what rays cross: `method`,
+`refraction`, refractive indices, window), from which columns are integrated when needed; where rays were counted,
+`counted` (`start`, `pixel`, `share` of each voxel in the order of the sensor's axes). Version 1 had neither.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,15 +24,20 @@ from lfpiv_cli.errors import InputError
 from lfpiv_cli.files.hdf5 import read_tree, write_tree
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.media import Media, Window
 from lfpiv_cli.optics.microlenses import Lattice
+from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.weights.aperture import aperture_mask
 from lfpiv_cli.weights.axis import AxisOptics, AxisWeights, micro_image_cells
 from lfpiv_cli.weights.build import axis_optics
-from lfpiv_cli.weights.model import Weights
+from lfpiv_cli.weights.columns import ColumnOperator, OnDemandOperator
+from lfpiv_cli.weights.model import Weights, WeightsOperator
 from lfpiv_cli.weights.operators import FactorisedOperator
+from lfpiv_cli.weights.quadrature import Columns
 
 FORMAT = "lfpiv-weights"
-VERSION = 1
+VERSION = 2
+READABLE_VERSIONS = (1, 2)
 
 CAMERA_SCALARS = (
     "magnification",
@@ -83,10 +92,8 @@ def write_weights(path: Path, content: WeightsFile, overwrite: bool) -> None:
             "reference_z_mm": content.reference_z_mm,
             "scene_distortion_per_mm2": weights.scene_distortion_per_mm2,
         },
-        "columns": _axis_tree(weights.solver_operator.columns),
-        "rows": _axis_tree(weights.solver_operator.rows),
         "calibration": weights.calibration.to_tree() if weights.calibration else None,
-    }
+    } | _operator_tree(weights.solver_operator)
     write_tree(
         path, tree, format_name=FORMAT, format_version=VERSION, provenance=content.provenance, overwrite=overwrite
     )
@@ -99,7 +106,7 @@ def read_weights(path: Path) -> WeightsFile:
     ------
     InputError : the file is missing, broken, of another format or version, or contradicts itself.
     """
-    tree, provenance = read_tree(path, FORMAT, (VERSION,))
+    tree, provenance = read_tree(path, FORMAT, READABLE_VERSIONS)
     try:
         camera = _camera(tree["camera"])
         grid = Grid(
@@ -109,18 +116,13 @@ def read_weights(path: Path) -> WeightsFile:
         )
         padding = _triple(tree["grid"]["padding_xyz"], int)
         calibration = Calibration.from_tree(tree["calibration"]) if tree.get("calibration") else None
-        nx, ny, nz = grid.padded(padding).shape_xyz
-        across, along = (nx, ny) if camera.column_axis == "x" else (ny, nx)
-        optics = axis_optics(camera)
-        columns = _axis_weights(tree["columns"], nz, across, optics[0])
-        rows = _axis_weights(tree["rows"], nz, along, optics[1])
+        operator = _operator(tree, camera, grid.padded(padding))
         bend = tree["grid"].get("scene_distortion_per_mm2")
         if bend is not None and (bend.shape != (grid.shape_xyz[2],) or not np.isfinite(bend).all()):
             raise ValueError(f"a distortion of shape {bend.shape} for {grid.shape_xyz[2]} planes")
         reference, reference_z = str(tree["grid"]["reference"]), float(tree["grid"]["reference_z_mm"])
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: not a whole weights file: {error}") from error
-    operator = FactorisedOperator(columns, rows, aperture_mask(columns.cells, rows.cells, camera.aperture_radius_mm))
     weights = Weights(grid, padding, operator, camera.column_axis, calibration, bend)
     return WeightsFile(weights, camera, reference, reference_z, provenance)
 
@@ -128,6 +130,60 @@ def read_weights(path: Path) -> WeightsFile:
 def open_weights(path: str | Path) -> Weights:
     """Return the weights stored in a file: `shape`, `image_shape`, `prepare`, `forward`, `adjoint`, `column`."""
     return read_weights(Path(path)).weights
+
+
+def _operator_tree(operator: WeightsOperator) -> dict[str, Any]:
+    """Return the groups that hold an operator."""
+    if isinstance(operator, FactorisedOperator):
+        return {"columns": _axis_tree(operator.columns), "rows": _axis_tree(operator.rows)}
+    if isinstance(operator, ColumnOperator):
+        columns = operator.columns
+        return {"counted": {"start": columns.start, "pixel": columns.pixel, "share": columns.share}}
+    space = operator.source
+    if not isinstance(space, ObjectSpace):
+        raise TypeError("only traced rays are stored")
+    tracing = {"method": space.method, "refraction": space.refraction}
+    face = None if space.window is None else asdict(space.window)
+    return {"on_demand": asdict(space.media) | tracing | {"window_face": face}}
+
+
+def _operator(tree: dict[str, Any], camera: Camera, grid: Grid) -> WeightsOperator:
+    """Return the operator of a padded grid from the groups that hold it."""
+    nx, ny, nz = grid.shape_xyz
+    across, along = (nx, ny) if camera.column_axis == "x" else (ny, nx)
+    if "on_demand" in tree:
+        return OnDemandOperator(camera, _object_space(tree["on_demand"]), grid)
+    if "counted" in tree:
+        columns = _counted(tree["counted"], nx * ny * nz, camera.rows * camera.columns)
+        return ColumnOperator((nz, along, across), (camera.rows, camera.columns), np.arange(nx * ny * nz), columns)
+    optics = axis_optics(camera)
+    column_axis = _axis_weights(tree["columns"], nz, across, optics[0])
+    row_axis = _axis_weights(tree["rows"], nz, along, optics[1])
+    mask = aperture_mask(column_axis.cells, row_axis.cells, camera.aperture_radius_mm)
+    return FactorisedOperator(column_axis, row_axis, mask)
+
+
+def _object_space(tree: dict[str, Any]) -> ObjectSpace:
+    """Return what rays cross."""
+    media = Media(*(float(tree[name]) for name in ("air", "window", "fluid")))
+    face = tree.get("window_face")
+    if tree["method"] not in ("ert", "drt") or tree["refraction"] not in ("paraxial", "exact"):
+        raise ValueError(f"unknown tracing: {tree['method']}, {tree['refraction']}")
+    return ObjectSpace(media, Window(**face) if face else None, tree["refraction"], tree["method"])
+
+
+def _counted(tree: dict[str, Any], voxels: int, pixels: int) -> Columns:
+    """Return counted columns after checking that no index leads outside its array."""
+    start, pixel, share = tree["start"], tree["pixel"], tree["share"]
+    if start.shape != (voxels + 1,) or pixel.shape != share.shape or pixel.ndim != 1:
+        raise ValueError(f"tables of {start.shape} and {pixel.shape} for {voxels} voxels")
+    if start[0] != 0 or start[-1] != pixel.size or np.any(np.diff(start) < 0):
+        raise ValueError("the table's columns do not follow each other")
+    if pixel.size and (pixel.min() < 0 or pixel.max() >= pixels):
+        raise ValueError(f"pixel {pixel.min()} or {pixel.max()} of {pixels}")
+    if not np.all(np.isfinite(share)) or share.min(initial=0.0) < 0.0:
+        raise ValueError("a weight that is negative or not a number")
+    return Columns(start.astype(np.int64), pixel.astype(np.int32), share.astype(np.float32))
 
 
 def _axis_tree(axis: AxisWeights) -> dict[str, Any]:

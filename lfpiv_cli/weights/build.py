@@ -67,12 +67,18 @@ def factorise_through(camera: Camera, space: ObjectSpace, grid: Grid) -> Factori
     return FactorisedOperator(along_columns, along_rows, mask)
 
 
+def separates(camera: Camera) -> bool:
+    """Return whether the array's two axes separate, so that weights factorise."""
+    basis = camera.lattice.basis
+    stray_px = np.abs([basis[1, 0], basis[0, 1]]) / camera.lattice.pitch[::-1] * [camera.rows, camera.columns]
+    return camera.lattice.layout == "square" and bool(stray_px.max() <= ALIGNED_PX)
+
+
 def axis_optics(camera: Camera) -> tuple[AxisOptics, AxisOptics]:
     """Return the camera's two axes, (columns, rows), each with its lens pitch."""
     basis = camera.lattice.basis
     pixels = np.array([camera.columns, camera.rows])
-    stray_px = np.abs([basis[1, 0], basis[0, 1]]) / camera.lattice.pitch[::-1] * pixels[::-1]
-    if camera.lattice.layout != "square" or stray_px.max() > ALIGNED_PX:
+    if not separates(camera):
         raise ConfigError(
             f"camera.microlenses: a {camera.lattice.layout} array turned by "
             f"{np.degrees(camera.lattice.rotation_rad):.4f} degrees against the sensor does not separate into columns "
@@ -120,15 +126,3 @@ def default_padding(camera: Camera, media: Media, grid: Grid) -> tuple[int, int,
     """Return how many voxels to solve for beyond each side of the grid: the blur radius laterally, none in depth."""
     radius = blur_radius_mm(camera, media, grid)
     return int(np.ceil(radius / grid.spacing_mm[0])), int(np.ceil(radius / grid.spacing_mm[1])), 0
-
-
-def seen_share(operator: FactorisedOperator) -> tuple[float, float]:
-    """Return the smallest and the largest share of a voxel's light that meets the sensor, over a square aperture."""
-
-    def shares(axis_start: np.ndarray, share: np.ndarray) -> np.ndarray:
-        sums = np.concatenate([[0.0], np.cumsum(share, dtype=np.float64)])
-        return sums[axis_start[1:]] - sums[axis_start[:-1]]
-
-    along_columns = shares(operator.columns.start, operator.columns.share)
-    along_rows = shares(operator.rows.start, operator.rows.share)
-    return float(along_columns.min() * along_rows.min()), float(along_columns.max() * along_rows.max())

@@ -29,8 +29,8 @@ def cell_radius(lattice: Lattice) -> float:
 
 @njit(cache=True)
 def shared_rectangle(
-    low: NDArray[np.float64],
-    high: NDArray[np.float64],
+    low: tuple[float, float],
+    high: tuple[float, float],
     centre_x: float,
     centre_y: float,
     steps: NDArray[np.float64],
@@ -46,14 +46,18 @@ def shared_rectangle(
     work : (2, MOST_CORNERS, 2) scratch
     """
     now, after = work[0], work[1]
-    now[0, 0], now[0, 1] = low[0] - centre_x, low[1] - centre_y
-    now[1, 0], now[1, 1] = high[0] - centre_x, low[1] - centre_y
-    now[2, 0], now[2, 1] = high[0] - centre_x, high[1] - centre_y
-    now[3, 0], now[3, 1] = low[0] - centre_x, high[1] - centre_y
+    left, right = low[0] - centre_x, high[0] - centre_x
+    bottom, top = low[1] - centre_y, high[1] - centre_y
+    now[0, 0], now[0, 1], now[1, 0], now[1, 1] = left, bottom, right, bottom
+    now[2, 0], now[2, 1], now[3, 0], now[3, 1] = right, top, left, top
     corners = 4
     for k in range(steps.shape[0]):
         a, b = steps[k, 0], steps[k, 1]
         limit = 0.5 * (a * a + b * b)
+        if max(a * left, a * right) + max(b * bottom, b * top) <= limit:
+            continue
+        if min(a * left, a * right) + min(b * bottom, b * top) >= limit:
+            return 0.0, 0.0, 0.0, 0.0, 0.0
         kept = 0
         for m in range(corners):
             x0, y0 = now[m, 0], now[m, 1]

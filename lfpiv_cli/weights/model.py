@@ -6,7 +6,7 @@ nothing had to be undone). `to_world` turns a volume back to the axes of the raw
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -17,10 +17,13 @@ from scipy import ndimage
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import ColumnAxis
+from lfpiv_cli.weights.columns import ColumnOperator, OnDemandOperator
 from lfpiv_cli.weights.operators import Column, FactorisedOperator
 
 if TYPE_CHECKING:
     from lfpiv_cli.calibration.model import Calibration
+
+WeightsOperator = FactorisedOperator | ColumnOperator | OnDemandOperator
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +43,7 @@ class Weights:
 
     grid: Grid
     padding_xyz: tuple[int, int, int]
-    solver_operator: FactorisedOperator
+    solver_operator: WeightsOperator
     column_axis: ColumnAxis
     calibration: Calibration | None = None
     scene_distortion_per_mm2: NDArray[np.float64] | None = None
@@ -92,6 +95,22 @@ class Weights:
             return self
         grid = self.grid.padded(self.padding_xyz)
         return Weights(grid, (0, 0, 0), self.solver_operator, self.column_axis, self.calibration)
+
+    @property
+    def on_demand(self) -> bool:
+        """True where columns are made when asked for; solvers then want `for_image`."""
+        return isinstance(self.solver_operator, OnDemandOperator)
+
+    def for_image(self, image: NDArray[np.float32]) -> Weights:
+        """Return the weights to solve one prepared image with: columns on demand are made once and kept.
+
+        Raises
+        ------
+        InputError : the columns that the image needs do not fit into memory
+        """
+        if not isinstance(self.solver_operator, OnDemandOperator):
+            return self
+        return replace(self, solver_operator=self.solver_operator.restricted(image))
 
     def to_world(self, padded_volume: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the volume (z, y, x) on `grid` in world axes, from one on the padded grid in the array's frame.

@@ -136,8 +136,7 @@ def integrate_columns(
     """
     centres = np.ascontiguousarray(centres_mm, dtype=np.float64).reshape(-1, 3)
     sides = np.asarray(voxel_mm, dtype=np.float64)
-    cut = aperture_tiles(camera.aperture_radius_mm, tiles)
-    scene = _scene(camera, source, centres, sides, cut, depth_nodes)
+    scene = kernel_scene(camera, source, centres, sides, tiles, depth_nodes)
     boxes = _boxes(*scene)
     pixels, shares, counts = [], [], []
     first = 0
@@ -165,15 +164,16 @@ def _block_end(boxes: NDArray[np.int64], first: int) -> int:
     return first + max(1, int(np.searchsorted(bytes_needed, BLOCK_BYTES)))
 
 
-def _scene(
+def kernel_scene(
     camera: Camera,
     source: Source,
     centres: NDArray[np.float64],
     sides: NDArray[np.float64],
-    tiles: Tiles,
+    tiles_per_side: int,
     depth_nodes: int,
 ) -> tuple:
     """Return what the kernels take."""
+    tiles = aperture_tiles(camera.aperture_radius_mm, tiles_per_side)
     depth, plane = np.unique(centres[:, 2], return_inverse=True)
     place, weight = np.polynomial.legendre.leggauss(depth_nodes)
     z = depth[:, np.newaxis] + 0.5 * sides[2] * place
@@ -371,9 +371,7 @@ def _add_tile(
     s_i, f_m, s_mu, pixel, cell = optics[1], optics[2], optics[3], optics[5], optics[7]
     distorted = 1.0 + optics[4] * (x * x + y * y)
     array_x, array_y = x * distorted, y * distorted
-    low, high = work[0, 0].copy(), work[0, 1].copy()
-    low[0], low[1] = array_x - half[0], array_y - half[1]
-    high[0], high[1] = array_x + half[0], array_y + half[1]
+    low, high = (array_x - half[0], array_y - half[1]), (array_x + half[0], array_y + half[1])
     spread = abs(1.0 + s_mu / s_i - s_mu / f_m) / pixel
     width = side * s_mu / s_i / pixel
     determinant = basis[0, 0] * basis[1, 1] - basis[0, 1] * basis[1, 0]

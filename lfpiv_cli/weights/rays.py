@@ -10,6 +10,8 @@ Axes: image axes (x along the columns), mm, z away from the camera from the nomi
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numba import njit, prange
 from numpy.typing import ArrayLike, NDArray
@@ -17,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.object_space import ObjectSpace, slope_ratio
 from lfpiv_cli.optics.tracing import kernel_distances, trace_ray
+from lfpiv_cli.weights.quadrature import Columns
 
 # The paper's numbers.
 POINTS = 500
@@ -73,6 +76,29 @@ def count_rays(
         (camera.rows, camera.columns),
     )
     return counts.sum(axis=0) / (points * rays_per_point)
+
+
+def count_columns(
+    camera: Camera,
+    space: ObjectSpace,
+    centres_mm: NDArray[np.float64],
+    voxel_mm: ArrayLike,
+    rng: np.random.Generator,
+    points: int = POINTS,
+    rays_per_point: int = RAYS_PER_POINT,
+    progress: Callable[[int], None] | None = None,
+) -> Columns:
+    """Return the counted columns of voxels at `centres_mm` (n, 3); the other arguments are those of `count_rays`."""
+    start, pixels, shares = [0], [], []
+    for centre in centres_mm:
+        image = count_rays(camera, space, centre, voxel_mm, rng, points, rays_per_point).ravel()
+        lit = np.flatnonzero(image)
+        pixels.append(lit.astype(np.int32))
+        shares.append(image[lit].astype(np.float32))
+        start.append(start[-1] + lit.size)
+        if progress:
+            progress(1)
+    return Columns(np.array(start, np.int64), np.concatenate(pixels), np.concatenate(shares))
 
 
 def sampling_error(weights: NDArray[np.floating], rays: int) -> float:

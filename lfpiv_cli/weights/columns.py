@@ -1,0 +1,269 @@
+"""Weights as columns, for cameras whose two axes do not separate: made on demand, or kept for chosen voxels.
+
+Both operators have the same three verbs as the factorised one. `OnDemandOperator` keeps nothing and integrates columns
+as they are asked for, a block at a time; `ColumnOperator` keeps those of the voxels that can be lit at all. A column of
+Table 2's camera has some 1,500 pixels, 12 kB.
+
+Axes: volumes [plane, row voxel, column voxel] in the order of the sensor's axes, images [row, column].
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from lfpiv_cli.errors import InputError
+from lfpiv_cli.grid import Grid
+from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.microlenses import nearest_point
+from lfpiv_cli.weights.operators import Column
+from lfpiv_cli.weights.quadrature import DEPTH_NODES, TILES, Columns, Source, integrate_columns, kernel_scene, on_array
+
+# Columns may take this much memory: two thirds of a machine with 24 GiB, the rest is for volumes and images.
+LARGEST_BYTES = 16 * 2**30
+BYTES_PER_SHARE = 8
+# Voxels whose columns are made together.
+VOXELS_AT_ONCE = 8192
+# Light is added up in this many images side by side, whatever the number of threads, so that the bits are the same.
+PARTS = 8
+# A pixel counts as lit above this share of the image's brightest ones (the 99.9th percentile); a voxel can be lit when
+# this share of its lines of sight ends on lit pixels or their neighbours. Noise and a voxel's width cost some lines.
+LIT_SHARE = 0.02
+BRIGHTEST_PERCENTILE = 99.9
+SEEN_SHARE = 0.9
+# Lines of sight: tiles across the aperture.
+SIGHT_TILES = 8
+# Voxels along each axis by which a volume is judged to be in view.
+SEEN_SAMPLES = 5
+
+
+@dataclass(frozen=True, eq=False)
+class ColumnOperator:
+    """The weights of chosen voxels; the others are dark and stay so.
+
+    Attributes
+    ----------
+    shape : of a volume, (planes, row voxels, column voxels)
+    image_shape : of an image, (rows, columns)
+    voxel : (n,) int64, flat indices of the voxels that have columns, ascending
+    columns : their columns
+    """
+
+    shape: tuple[int, int, int]
+    image_shape: tuple[int, int]
+    voxel: NDArray[np.int64]
+    columns: Columns
+
+    def forward(self, volume: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the image (rows, columns) of a volume."""
+        light = np.ascontiguousarray(volume).ravel()[self.voxel]
+        pixels = self.image_shape[0] * self.image_shape[1]
+        return _add_columns(light, self.columns.start, self.columns.pixel, self.columns.share, pixels).reshape(
+            self.image_shape
+        )
+
+    def adjoint(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the volume that an image is spread back to."""
+        volume = np.zeros(self.shape, np.float32)
+        flat = np.ascontiguousarray(image, dtype=np.float32).ravel()
+        volume.ravel()[self.voxel] = _gather(flat, self.columns.start, self.columns.pixel, self.columns.share)
+        return volume
+
+    def column(self, plane: int, row_voxel: int, column_voxel: int) -> Column:
+        """Return the rows, columns (int64) and weights (float32) of the pixels that one voxel lights."""
+        flat = int(np.ravel_multi_index((plane, row_voxel, column_voxel), self.shape))
+        at = int(np.searchsorted(self.voxel, flat))
+        if at == self.voxel.size or self.voxel[at] != flat:
+            return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.float32)
+        return _as_column(self.columns, at, self.image_shape[1])
+
+
+@dataclass(frozen=True, eq=False)
+class OnDemandOperator:
+    """The weights of all voxels of a grid, integrated when asked for.
+
+    Attributes
+    ----------
+    camera : with any lattice
+    source : where rays meet the array
+    grid : the voxels, world axes
+    """
+
+    camera: Camera
+    source: Source
+    grid: Grid
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Shape of a volume: (planes, voxels along the rows, voxels along the columns)."""
+        nz, ny, nx = self.grid.shape_zyx
+        return (nz, ny, nx) if self.camera.column_axis == "x" else (nz, nx, ny)
+
+    @property
+    def image_shape(self) -> tuple[int, int]:
+        """Shape of an image."""
+        return self.camera.rows, self.camera.columns
+
+    def forward(self, volume: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the image (rows, columns) of a volume; dark voxels cost nothing."""
+        flat = np.ascontiguousarray(volume).ravel()
+        lit = np.flatnonzero(flat)
+        image = np.zeros(self.image_shape[0] * self.image_shape[1], np.float32)
+        for first in range(0, lit.size, VOXELS_AT_ONCE):
+            part = lit[first : first + VOXELS_AT_ONCE]
+            columns = self.columns_of(part)
+            image += _add_columns(flat[part], columns.start, columns.pixel, columns.share, image.size)
+        return image.reshape(self.image_shape)
+
+    def adjoint(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the volume that an image is spread back to; makes every column."""
+        volume = np.empty(self.shape, np.float32)
+        flat, pixels = volume.ravel(), np.ascontiguousarray(image, dtype=np.float32).ravel()
+        for first in range(0, flat.size, VOXELS_AT_ONCE):
+            part = np.arange(first, min(first + VOXELS_AT_ONCE, flat.size))
+            columns = self.columns_of(part)
+            flat[part] = _gather(pixels, columns.start, columns.pixel, columns.share)
+        return volume
+
+    def column(self, plane: int, row_voxel: int, column_voxel: int) -> Column:
+        """Return the rows, columns (int64) and weights (float32) of the pixels that one voxel lights."""
+        flat = np.ravel_multi_index((plane, row_voxel, column_voxel), self.shape)
+        return _as_column(self.columns_of(np.array([flat])), 0, self.image_shape[1])
+
+    def columns_of(self, voxel: NDArray[np.int64]) -> Columns:
+        """Return the columns of voxels given by their flat indices."""
+        return integrate_columns(self.camera, self.source, self.centres_mm(voxel), self.sides_mm, TILES, DEPTH_NODES)
+
+    def restricted(self, image: NDArray[np.float32]) -> ColumnOperator:
+        """Return the columns of the voxels that the light of an image can have come from.
+
+        Raises
+        ------
+        InputError : they would take more than `LARGEST_BYTES`
+        """
+        voxel = np.flatnonzero(self.can_be_lit(image))
+        sample = self.columns_of(voxel[:: max(1, voxel.size // 64)])
+        needed = BYTES_PER_SHARE * sample.pixel.size / max(1, sample.start.size - 1) * voxel.size
+        if needed > LARGEST_BYTES:
+            raise InputError(
+                f"the image can come from {voxel.size} voxels, whose columns would take {needed / 2**30:.0f} GiB, more "
+                f"than {LARGEST_BYTES // 2**30}; subtract the background, or take fewer voxels"
+            )
+        return ColumnOperator(self.shape, self.image_shape, voxel, self.columns_of(voxel))
+
+    def can_be_lit(self, image: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """Return which voxels (flat) see only lit pixels along nearly all their lines of sight."""
+        lit = image > LIT_SHARE * np.percentile(image, BRIGHTEST_PERCENTILE)
+        near = ndimage.maximum_filter(lit, size=3)
+        result = np.empty(int(np.prod(self.shape)), np.bool_)
+        for first in range(0, result.size, VOXELS_AT_ONCE * 16):
+            part = np.arange(first, min(first + VOXELS_AT_ONCE * 16, result.size))
+            scene = kernel_scene(self.camera, self.source, self.centres_mm(part), self.sides_mm, SIGHT_TILES, 1)
+            result[part] = _seen_share(*scene, near) >= SEEN_SHARE
+        return result
+
+    @cached_property
+    def sides_mm(self) -> NDArray[np.float64]:
+        """Sides (3,) of a voxel, image axes."""
+        return self.camera.to_image_axes(np.asarray(self.grid.spacing_mm))
+
+    def centres_mm(self, voxel: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the centres (n, 3) of voxels, image axes."""
+        plane, row, column = np.unravel_index(voxel, self.shape)
+        first, second = (0, 1) if self.camera.column_axis == "x" else (1, 0)
+        axes = (self.grid.axis_mm(first)[column], self.grid.axis_mm(second)[row], self.grid.axis_mm(2)[plane])
+        return np.stack(axes, axis=1)
+
+
+def seen_share(camera: Camera, source: Source, grid: Grid) -> tuple[float, float]:
+    """Return the smallest and the largest share of a voxel's light that meets the sensor, over a sample of a grid."""
+    operator = OnDemandOperator(camera, source, grid)
+    places = [np.unique(np.linspace(0, n - 1, SEEN_SAMPLES).round().astype(int)) for n in operator.shape]
+    sample = np.ravel_multi_index(tuple(axis.ravel() for axis in np.meshgrid(*places)), operator.shape)
+    columns = integrate_columns(camera, source, operator.centres_mm(sample), operator.sides_mm, SIGHT_TILES, 1)
+    sums = np.array([columns.share[a:b].sum() for a, b in zip(columns.start, columns.start[1:], strict=False)])
+    return float(sums.min()), float(sums.max())
+
+
+def _as_column(columns: Columns, at: int, width: int) -> Column:
+    part = slice(columns.start[at], columns.start[at + 1])
+    row, column = np.divmod(columns.pixel[part].astype(np.int64), width)
+    return row, column, columns.share[part]
+
+
+@njit(cache=True, parallel=True)
+def _add_columns(
+    light: NDArray[np.float32],
+    start: NDArray[np.int64],
+    pixel: NDArray[np.int32],
+    share: NDArray[np.float32],
+    pixels: int,
+) -> NDArray[np.float32]:
+    """Return the flat image of the voxels' light."""
+    images = np.zeros((PARTS, pixels), np.float32)
+    size = -(-light.size // PARTS)
+    for part in prange(PARTS):
+        for n in range(part * size, min((part + 1) * size, light.size)):
+            if light[n] != 0.0:
+                for at in range(start[n], start[n + 1]):
+                    images[part, pixel[at]] += light[n] * share[at]
+    total = np.empty(pixels, np.float32)
+    for k in prange(pixels):
+        total[k] = images[:, k].sum()
+    return total
+
+
+@njit(cache=True, parallel=True)
+def _gather(
+    image: NDArray[np.float32], start: NDArray[np.int64], pixel: NDArray[np.int32], share: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Return for each voxel the sum of its weights times the pixels."""
+    values = np.empty(start.size - 1, np.float32)
+    for n in prange(start.size - 1):
+        total = np.float32(0.0)
+        for at in range(start[n], start[n + 1]):
+            total += share[at] * image[pixel[at]]
+        values[n] = total
+    return values
+
+
+@njit(cache=True, parallel=True)
+def _seen_share(
+    centres: NDArray[np.float64],
+    sides: NDArray[np.float64],
+    plane: NDArray[np.int64],
+    depth: NDArray[np.float64],
+    depth_share: NDArray[np.float64],
+    slopes: tuple[NDArray[np.float64], NDArray[np.float64]],
+    fitted: tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]],
+    tiles: tuple[NDArray[np.float64], NDArray[np.float64], float],
+    optics: NDArray[np.float64],
+    lattice: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
+    shape: tuple[int, int],
+    lit: NDArray[np.bool_],
+) -> NDArray[np.float64]:
+    """Return the share of each voxel's lines of sight, among those that meet the sensor, that end on lit pixels."""
+    s_i, f_m, s_mu, stretch, pixel = optics[1], optics[2], optics[3], optics[4], optics[5]
+    middles, shares = tiles[0], tiles[1]
+    seen = np.zeros(centres.shape[0])
+    for n in prange(centres.shape[0]):
+        total, found = 0.0, 0.0
+        nodes, factors = slopes[0][plane[n], 0], slopes[1][plane[n], 0]
+        for t in range(shares.size):
+            x, y = on_array(centres[n], middles[t, 0], middles[t, 1], nodes, factors, fitted, optics)
+            distorted = 1.0 + stretch * (x * x + y * y)
+            m_x, m_y = x * distorted, y * distorted
+            centre_x, centre_y = nearest_point(m_x, m_y, lattice[0], lattice[1])
+            x = m_x + s_mu * ((x - middles[t, 0]) / s_i - (m_x - centre_x) / f_m)
+            y = m_y + s_mu * ((y - middles[t, 1]) / s_i - (m_y - centre_y) / f_m)
+            column, row = int(np.floor(x / pixel + 0.5 * shape[1])), int(np.floor(y / pixel + 0.5 * shape[0]))
+            if 0 <= column < shape[1] and 0 <= row < shape[0]:
+                total += shares[t]
+                found += shares[t] * lit[row, column]
+        seen[n] = found / total if total > 0.0 else 0.0
+    return seen

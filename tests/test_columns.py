@@ -1,0 +1,172 @@
+"""Columns on demand and kept: adjointness in both kinds of lattice, agreement of the operators, lines of sight."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import tifffile
+import yaml
+from click.testing import CliRunner
+from numba import get_num_threads, set_num_threads
+
+from lfpiv_cli import open_volume, open_weights
+from lfpiv_cli.cli import cli
+from lfpiv_cli.errors import ConfigError, InputError
+from lfpiv_cli.grid import Grid
+from lfpiv_cli.optics.microlenses import Lattice
+from lfpiv_cli.optics.object_space import ObjectSpace
+from lfpiv_cli.weights import columns as columns_module
+from lfpiv_cli.weights.build import factorise
+from lfpiv_cli.weights.columns import OnDemandOperator
+from lfpiv_cli.weights.model import Weights
+from lfpiv_cli.weights.rays import count_columns
+
+GRID = Grid.centred((4, 3, 5), (0.1, 0.12, 0.8), (0.1, -0.1, 0.5))
+
+
+@pytest.fixture
+def turned(table2, layout):
+    """Table 2 with a small sensor and a turned array of either kind."""
+    return replace(table2, columns=380, rows=260, lattice=Lattice.regular(0.1, layout, 0.01, (0.013, -0.021)))
+
+
+@pytest.mark.parametrize("column_axis", ["x", "y"])
+def test_forward_and_adjoint_are_adjoint(turned, water, window, rng, column_axis):
+    camera = replace(turned, column_axis=column_axis)
+    on_demand = OnDemandOperator(camera, ObjectSpace(water, window, "exact"), GRID)
+    kept = on_demand.restricted(np.ones(on_demand.image_shape, np.float32))
+    for operator in (on_demand, kept, Weights(GRID, (0, 0, 0), on_demand, column_axis)):
+        volume = rng.random(operator.shape, dtype=np.float32)
+        image = rng.random(operator.image_shape, dtype=np.float32)
+        left = np.vdot(operator.forward(volume).astype(np.float64), image)
+        right = np.vdot(volume.astype(np.float64), operator.adjoint(image))
+        assert left == pytest.approx(right, rel=1e-5)  # float32 sums of some thousand terms
+
+
+@pytest.mark.parametrize("column_axis", ["x", "y"])
+def test_columns_agree_with_the_factorised_form(table2, water, rng, column_axis):
+    camera = replace(table2, columns=380, rows=260, column_axis=column_axis)
+    volume = rng.random(GRID.shape_zyx, dtype=np.float32)
+    images = [
+        Weights(GRID, (0, 0, 0), operator, column_axis).forward(volume)
+        for operator in (
+            factorise(camera, water, GRID),
+            OnDemandOperator(camera, ObjectSpace(water, None, "paraxial"), GRID),
+        )
+    ]
+    # Each column of either form is off by one to two per cent; errors of neighbours cancel in part.
+    assert np.abs(images[0] - images[1]).sum() < 0.03 * images[0].sum()
+
+
+def test_column_is_the_image_of_one_voxel(turned, water):
+    operator = OnDemandOperator(turned, ObjectSpace(water, None, "paraxial"), GRID)
+    volume = np.zeros(operator.shape, np.float32)
+    volume[3, 1, 2] = 1.0
+    image = np.zeros(operator.image_shape, np.float32)
+    rows, columns, weights = operator.column(3, 1, 2)
+    image[rows, columns] = weights
+    np.testing.assert_array_equal(operator.forward(volume), image)
+    kept = operator.restricted(operator.forward(volume))
+    for one, other in zip(kept.column(3, 1, 2), operator.column(3, 1, 2), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_lines_of_sight_keep_what_is_lit_and_leave_most_out(turned, water):
+    grid = Grid.centred((12, 12, 12), (0.1, 0.1, 0.6), (0.0, 0.0, 0.0))
+    operator = OnDemandOperator(turned, ObjectSpace(water, None, "paraxial"), grid)
+    volume = np.zeros(operator.shape, np.float32)
+    volume[2, 3, 4] = volume[8, 9, 2] = 1.0
+    kept = operator.can_be_lit(operator.forward(volume)).reshape(operator.shape)
+    assert kept[2, 3, 4]
+    assert kept[8, 9, 2]
+    assert kept.mean() < 0.1
+    restricted = operator.restricted(operator.forward(volume))
+    np.testing.assert_allclose(restricted.forward(volume), operator.forward(volume), atol=1e-7)
+
+
+def test_too_many_columns_are_refused_with_their_size(turned, water, monkeypatch):
+    operator = OnDemandOperator(turned, ObjectSpace(water, None, "paraxial"), GRID)
+    monkeypatch.setattr(columns_module, "LARGEST_BYTES", 1000)
+    with pytest.raises(InputError, match="60 voxels"):
+        operator.restricted(np.ones(operator.image_shape, np.float32))
+
+
+def test_same_bits_for_any_number_of_threads(turned, water, rng):
+    operator = OnDemandOperator(turned, ObjectSpace(water, None, "paraxial"), GRID)
+    volume = rng.random(operator.shape, dtype=np.float32)
+    threads = get_num_threads()
+    try:
+        set_num_threads(1)
+        image = operator.forward(volume)
+        back = operator.adjoint(image)
+    finally:
+        set_num_threads(threads)
+    assert np.array_equal(image, operator.forward(volume))
+    assert np.array_equal(back, operator.adjoint(image))
+
+
+def test_counted_columns_agree_with_integrated_ones(turned, water, rng):
+    grid = Grid.centred((2, 1, 2), (0.1, 0.1, 1.0), (0.0, 0.1, 2.0))
+    operator = OnDemandOperator(turned, ObjectSpace(water, None, "paraxial"), grid)
+    centres = operator.centres_mm(np.arange(4))
+    counted = count_columns(turned, operator.source, centres, turned.to_image_axes(grid.spacing_mm), rng, 2000, 100)
+    for n in range(4):
+        exact = operator.columns_of(np.array([n])).image(0, operator.image_shape)
+        assert np.abs(counted.image(n, operator.image_shape) - exact).sum() < 0.12  # 2000 points: about 0.07
+
+
+RIG = {
+    "camera": {
+        "main_lens": {"magnification": -1.0, "focal_length_mm": 100.0, "aperture_mm": 25.0},
+        "microlenses": {"pitch_mm": 0.1, "focal_length_mm": 0.8, "layout": "hexagonal"},
+        "sensor": {"pixel_um": 5.5, "columns": 240, "rows": 200},
+    },
+    "media": {"air": 1.0, "window": 1.49, "fluid": 1.33},
+    "volume": {"shape_xyz": [5, 4, 3], "voxel_mm": [0.1, 0.1, 0.4]},
+    "reconstruction": {"padding_voxel": [0, 0, 0], "iterations": 5},
+}
+
+
+@pytest.fixture
+def rig(tmp_path):
+    path = tmp_path / "rig.yaml"
+    path.write_text(yaml.safe_dump(RIG))
+    return path
+
+
+def build(path, *options):
+    output = path.with_name("weights.h5")
+    CliRunner().invoke(cli, ["build-weights", str(path), "-o", str(output), *options], catch_exceptions=False)
+    return output
+
+
+def test_a_hexagonal_rig_is_reconstructed_from_columns_on_demand(rig, tmp_path):
+    weights = open_weights(build(rig))
+    assert weights.on_demand
+    volume = np.zeros(weights.shape, np.float32)
+    volume[1, 2, 3] = 1000.0
+    image, output = tmp_path / "image.tif", tmp_path / "volume.vtkhdf"
+    tifffile.imwrite(image, weights.forward(volume))
+    arguments = ["reconstruct", str(tmp_path / "weights.h5"), str(image), "-o", str(output)]
+    CliRunner().invoke(cli, arguments, catch_exceptions=False)
+    found = open_volume(output).array
+    assert np.unravel_index(np.argmax(found), found.shape) == (1, 2, 3)
+
+
+def test_counted_rays_share_the_file_format(rig):
+    small = yaml.safe_dump(RIG | {"weights": {"points": 400, "rays_per_point": 50}})
+    rig.write_text(small)
+    counted = open_weights(build(rig, "--sampling", "rays"))
+    assert not counted.on_demand
+    assert isinstance(open_weights(build(rig, "--overwrite")).solver_operator, OnDemandOperator)
+    rows, columns, weights = counted.column(1, 2, 3)
+    assert weights.sum() == pytest.approx(1.0, abs=1e-5)
+    assert (rows.max(), columns.max()) < counted.image_shape
+
+
+def test_counting_too_many_rays_is_refused_with_its_cost(rig):
+    rig.write_text(yaml.safe_dump(RIG | {"volume": {"shape_xyz": [80, 80, 240], "voxel_mm": 0.1}}))
+    with pytest.raises(ConfigError, match="core hours"):
+        build(rig, "--sampling", "rays")
