@@ -11,7 +11,7 @@ axes of the raw sensor, z from the nominal focal point.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,6 +68,9 @@ DEPTH_MARGIN_MM = 0.3
 # Suspected to be two: brighter than typical by this factor and fitting worse by this one than a good particle, which is
 # the one at this percentile; and what chi-squared must fall by, in units of a good particle's.
 SUSPECT_LIGHT, SUSPECT_CHI2, GOOD_PERCENTILE, SPLIT_GAIN = 1.2, 1.0, 20.0, 40.0
+# A particle that could not be split is not tried again until it has changed by this much: mm laterally, mm in depth,
+# and by these shares in light and in chi-squared.
+CHANGED = np.array([0.005, 0.005, 0.05, 0.05, 0.2])
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,12 +125,22 @@ class Task:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Particles (n, 4), the residual they leave, a typical particle's light, the noise."""
+    """How far the search has come.
+
+    Attributes
+    ----------
+    particles : (n, 4)
+    residual : (rows * columns,) what they leave of the image
+    typical_light : of a particle
+    noise : of the image
+    unsplit : (m, 5) those that could not be split, as `_signature` gives them
+    """
 
     particles: NDArray[np.float64]
     residual: NDArray[np.float64]
     typical_light: float
     noise: Noise
+    unsplit: NDArray[np.float64]
 
 
 def find_particles(
@@ -149,7 +162,7 @@ def find_particles(
     progress : called with 1 after each iteration and each round
     """
     task = _task(image, view, weights, camera, sums)
-    state = State(np.zeros((0, 4)), task.image.copy(), 0.0, estimate_noise(task.image, 0.0))
+    state = State(np.zeros((0, 4)), task.image.copy(), 0.0, estimate_noise(task.image, 0.0), np.zeros((0, 5)))
     for settings in rounds:
         state = _one_round(task, state, settings, progress)
         if progress:
@@ -178,8 +191,7 @@ def _one_round(task: Task, state: State, settings: Round, progress: Callable[[in
     if typical == 0.0:
         typical = float(np.percentile(light, FIRST_TYPICAL_PERCENTILE)) if light.size else 0.0
     candidates = candidates[light > CANDIDATE_LIGHT * typical]
-    noise = estimate_noise(task.image, typical)
-    state = State(state.particles, state.residual, typical, noise)
+    state = replace(state, typical_light=typical, noise=estimate_noise(task.image, typical))
     state = _accept(task, state, candidates, settings)
     _sweep(task, state, settings.unexplained, SWEEPS)
     state = _split(task, _with_typical_light(task, state), settings.unexplained)
@@ -225,8 +237,7 @@ def _accept(task: Task, state: State, candidates: NDArray[np.float64], settings:
         settings.claimed_share,
         task.capacity,
     )
-    particles = np.concatenate([state.particles, candidates[accepted]])
-    return State(particles, state.residual, state.typical_light, state.noise)
+    return replace(state, particles=np.concatenate([state.particles, candidates[accepted]]))
 
 
 def _split(task: Task, state: State, unexplained: float) -> State:
@@ -235,6 +246,8 @@ def _split(task: Task, state: State, unexplained: float) -> State:
     chi2, *_ = judge(task.view, state.particles, state.residual, weight, task.capacity)
     good = max(float(np.percentile(chi2, GOOD_PERCENTILE)), 1.0) if chi2.size else 1.0
     suspects = (state.particles[:, 3] > SUSPECT_LIGHT * state.typical_light) & (chi2 > SUSPECT_CHI2 * good)
+    signature = _signature(state.particles, chi2)
+    suspects &= ~_tried(state, signature)
     twins = split(
         task.view,
         state.particles,
@@ -248,8 +261,29 @@ def _split(task: Task, state: State, unexplained: float) -> State:
         task.capacity,
         footprint_px(task.view, *task.depths_mm),
     )
-    particles = np.concatenate([state.particles, twins[twins[:, 3] > 0.0]])
-    return State(particles, state.residual, state.typical_light, state.noise)
+    found = twins[:, 3] > 0.0
+    return replace(
+        state,
+        particles=np.concatenate([state.particles, twins[found]]),
+        unsplit=np.concatenate([state.unsplit, signature[suspects & ~found]]),
+    )
+
+
+def _signature(particles: NDArray[np.float64], chi2: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (n, 5) numbers that differ by 1 where a particle has changed enough to be looked at again."""
+    tiny = np.finfo(np.float64).tiny
+    return (
+        np.column_stack([particles[:, :3], np.log(np.maximum(np.column_stack([particles[:, 3], chi2]), tiny))])
+        / CHANGED
+    )
+
+
+def _tried(state: State, signature: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Tell which particles could not be split before and have hardly changed since."""
+    if not len(state.unsplit):
+        return np.zeros(len(signature), dtype=bool)
+    distance, _ = KDTree(state.unsplit).query(signature, p=np.inf, distance_upper_bound=1.0)
+    return np.isfinite(distance)
 
 
 def _merge(task: Task, state: State) -> State:
@@ -279,7 +313,7 @@ def _rebuilt(task: Task, state: State, particles: NDArray[np.float64]) -> State:
     residual = task.image.copy()
     tiles = share_out(task.view, particles, *task.depths_mm)
     add_all(task.view, particles, tiles, -1.0, residual, task.capacity)
-    return State(particles, residual, state.typical_light, state.noise)
+    return replace(state, particles=particles, residual=residual)
 
 
 def _with_typical_light(task: Task, state: State) -> State:
@@ -289,7 +323,7 @@ def _with_typical_light(task: Task, state: State) -> State:
     weight = _weight(task, state, LAST_UNEXPLAINED)
     chi2, *_ = judge(task.view, state.particles, state.residual, weight, task.capacity)
     typical = float(np.median(state.particles[chi2 <= np.median(chi2), 3]))
-    return State(state.particles, state.residual, typical, estimate_noise(task.image, typical))
+    return replace(state, typical_light=typical, noise=estimate_noise(task.image, typical))
 
 
 def _result(task: Task, state: State, shape: tuple[int, int]) -> Particles:

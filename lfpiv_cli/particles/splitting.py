@@ -40,6 +40,8 @@ STARTS_MM = np.array(
     ]
 )
 PAIR_STEPS = 12
+# A start that after so many steps has not won this share of what is asked for is given up: half the time is saved.
+EARLY_STEPS, EARLY_GAIN = 4, 0.25
 
 
 @njit(cache=True)
@@ -107,11 +109,15 @@ def _fit_pair(
     weight: NDArray[np.float64],
     z_low: float,
     z_high: float,
+    promising: float,
     pixels: NDArray[np.int32],
     values: NDArray[np.float64],
     place: NDArray[np.int32],
 ) -> float:
-    """Improve two particles (2, 4) in place; return what they add to chi-squared."""
+    """Improve two particles (2, 4) in place; return what they add to chi-squared.
+
+    Gives up early where this is not below `promising` after a few steps.
+    """
     n = 2 * UNKNOWNS
     counts = np.zeros(2, np.int64)
     matrix, trial_matrix = np.empty((n, n)), np.empty((n, n))
@@ -119,7 +125,9 @@ def _fit_pair(
     step, trial, begin = np.zeros(n), np.empty_like(pair), pair.copy()
     change = _pair_equations(view, pair, residual, weight, pixels, values, counts, place, matrix, right)
     damping = DAMPING
-    for _ in range(PAIR_STEPS):
+    for number in range(PAIR_STEPS):
+        if number == EARLY_STEPS and change > promising:
+            break
         if not solve_damped(matrix, right, damping, step) or np.dot(step, right) < SMALLEST_GAIN:
             break
         for m in range(2):
@@ -180,6 +188,7 @@ def split(
                 add_light(pixels[0], values[0], count, light, residual)
                 single = normal_equations(pixels[0], values[0], count, light, residual, weight, matrix, right)
                 lowest = single - smallest_gain
+                promising = single - EARLY_GAIN * smallest_gain
                 found = False
                 for k in range(STARTS_MM.shape[0]):
                     for m in range(2):
@@ -188,7 +197,7 @@ def split(
                         pair[m, 1] = y + sign * STARTS_MM[k, 1]
                         pair[m, 2] = min(max(z + sign * STARTS_MM[k, 2], z_low), z_high)
                         pair[m, 3] = 0.5 * light
-                    change = _fit_pair(view, pair, residual, weight, z_low, z_high, pixels, values, place)
+                    change = _fit_pair(view, pair, residual, weight, z_low, z_high, promising, pixels, values, place)
                     if change < lowest and min(pair[0, 3], pair[1, 3]) >= smallest_light:
                         lowest, found = change, True
                         best[:] = pair

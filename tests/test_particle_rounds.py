@@ -1,0 +1,80 @@
+"""The whole search on a small image: particles are found where they were put, and their errors are as stated."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial import KDTree
+
+from lfpiv_cli.grid import Grid
+from lfpiv_cli.optics.camera import Camera, ColumnAxis
+from lfpiv_cli.optics.media import Media
+from lfpiv_cli.optics.object_space import ObjectSpace
+from lfpiv_cli.particles.candidates import explain_rest, find_peaks
+from lfpiv_cli.particles.rounds import find_particles
+from lfpiv_cli.particles.view import raw_view
+from lfpiv_cli.reconstruction.solvers import normalisers
+from lfpiv_cli.synthetic.render import render_points
+from lfpiv_cli.weights.build import default_padding, factorise
+from lfpiv_cli.weights.model import Weights
+
+
+def weights_of(camera: Camera, media: Media, grid: Grid) -> Weights:
+    padding = default_padding(camera, media, grid)
+    return Weights(grid, padding, factorise(camera, media, grid.padded(padding)), camera.column_axis)
+
+
+@pytest.mark.parametrize("column_axis", ["x", "y"])
+def test_particles_are_found_where_they_are(
+    table2: Camera, water: Media, rng: np.random.Generator, column_axis: ColumnAxis
+) -> None:
+    camera = replace(table2, columns=420, rows=360, column_axis=column_axis)
+    size = (18, 15, 16) if column_axis == "x" else (15, 18, 16)
+    grid = Grid.centred(size, (0.1, 0.1, 0.1), (0.0, 0.0, 1.9))
+    low, high = (np.array([grid.bounds_mm(axis)[side] for axis in range(3)]) for side in (0, 1))
+    true = rng.uniform(low, high, (30, 3))
+    light = rng.uniform(3e5, 6e5, 30)
+    expected = render_points(camera, ObjectSpace(water, None, "paraxial"), true, light, 0.05, rng, rays=100_000)
+    image = rng.poisson(expected).astype(np.float32) + rng.normal(0.0, 6.0, expected.shape).astype(np.float32)
+    weights = weights_of(camera, water, grid)
+    found = find_particles(image, raw_view(camera, water, 0.025), weights, camera, normalisers(weights.padded))
+    scale = np.array([0.05, 0.05, 0.2])
+    distance, nearest = KDTree(found.position_mm / scale).query(true / scale)
+    matched = distance < 1.0
+    assert matched.sum() >= 27
+    assert len(found.position_mm) <= 32
+    error = found.position_mm[nearest[matched]] - true[matched]
+    assert np.median(np.abs(error[:, :2])) < 1e-3
+    assert np.median(np.abs(error[:, 2])) < 0.02
+    assert np.median(np.abs(found.light_counts[nearest[matched]] / light[matched] - 1.0)) < 0.02
+    sigma = np.sqrt(np.diagonal(found.covariance_mm2, axis1=1, axis2=2))[nearest[matched]]
+    # The rays' own noise adds to the sensor's; a factor of two either way is what 27 particles can hold to.
+    assert np.all(np.median(np.abs(error / sigma), axis=0) < 2.0 * 0.6745)
+    assert np.all(np.median(np.abs(error / sigma), axis=0) > 0.5 * 0.6745)
+
+
+def test_an_empty_image_has_no_particles(table2: Camera, water: Media) -> None:
+    camera = replace(table2, columns=200, rows=200)
+    weights = weights_of(camera, water, Grid.centred((6, 6, 4), (0.1, 0.1, 0.1), (0.0, 0.0, 2.0)))
+    image = np.zeros((200, 200), np.float32)
+    found = find_particles(image, raw_view(camera, water, 0.025), weights, camera, normalisers(weights.padded))
+    assert found.position_mm.shape == (0, 3)
+    np.testing.assert_array_equal(found.residual, image)
+
+
+def test_what_is_explained_gives_no_candidate(table2: Camera, water: Media) -> None:
+    camera = replace(table2, columns=300, rows=300)
+    weights = weights_of(camera, water, Grid.centred((10, 10, 5), (0.1, 0.1, 0.2), (0.0, 0.0, 2.0)))
+    volume = np.zeros(weights.shape, np.float32)
+    volume[2, 2, 2] = volume[2, 7, 7] = 1e5
+    one = np.zeros_like(volume)
+    one[2, 2, 2] = 1e5
+    image, background = weights.forward(volume), weights.forward(one)
+    rest = explain_rest(weights, image, background, normalisers(weights.padded), 10)
+    index, light = find_peaks(rest)
+    px, py, pz = weights.padding_xyz
+    np.testing.assert_allclose(index[0], (7 + px, 7 + py, 2 + pz), atol=0.3)
+    assert light[0] > 0.8e5
+    assert np.all(light[np.abs(index - (2 + px, 2 + py, 2 + pz)).max(axis=1) < 2.0] < 0.05e5)
