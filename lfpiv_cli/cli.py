@@ -208,6 +208,22 @@ def validate(what: str, vectors: Path | None, particles: Path | None, **argument
     return stages_weights.validate_weights(**arguments)
 
 
+@cli.command("info")
+@click.argument("file", type=INPUT)
+@click.option("--picture", type=INPUT, help="weights: picture of one voxel's column to write (.png).")
+@click.option("--voxel", type=int, nargs=3, metavar="IX IY IZ", help="weights: which voxel; default the middle one.")
+@common_options
+def info(**arguments: Any) -> dict[str, Any]:
+    """Tell what is in a file of ours; of weights, draw the pixels that one voxel lights.
+
+    \b
+    Example: lfpiv info weights.h5 --picture column.png --voxel 50 40 120
+    """
+    from lfpiv_cli import stages_weights
+
+    return stages_weights.info(**arguments)
+
+
 @cli.command("simulate")
 @click.argument("what", type=click.Choice(["white", "board", "particles"]))
 @click.argument("config", type=INPUT)

@@ -9,18 +9,20 @@ from typing import Any
 import numpy as np
 
 from lfpiv_cli.console import Console
-from lfpiv_cli.errors import ConfigError, LimitMissedError
+from lfpiv_cli.errors import ConfigError, InputError, LimitMissedError, UsageError
 from lfpiv_cli.files.atomic import ensure_writable, write_json
 from lfpiv_cli.files.batch import prepare_folder
 from lfpiv_cli.files.config import Config, load_config
+from lfpiv_cli.files.describe import describe
 from lfpiv_cli.files.pictures import ensure_drawing, write_picture
 from lfpiv_cli.files.provenance import record as provenance_record
 from lfpiv_cli.files.sections import WeightsSection
+from lfpiv_cli.files.weights_file import read_weights
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.validation.weights import TABLE1_MM, limits_missed, make_columns, sample_voxels, weights_figures
-from lfpiv_cli.validation.weights_pictures import columns_figure, similarity_figure
+from lfpiv_cli.validation.weights_pictures import column_figure, columns_figure, similarity_figure
 from lfpiv_cli.weights.build import factorise_through, separates
 from lfpiv_cli.weights.columns import ColumnOperator, OnDemandOperator
 from lfpiv_cli.weights.model import WeightsOperator
@@ -65,6 +67,31 @@ def validate_weights(config: Path, output: Path, overwrite: bool, console: Conso
         console.summary(summary)
         raise LimitMissedError(f"{paths['.json']}: {'; '.join(missed)}")
     return {"voxels": len(columns)} | summary
+
+
+def info(
+    file: Path, picture: Path | None, voxel: tuple[int, int, int] | None, overwrite: bool, console: Console
+) -> dict[str, Any]:
+    """Tell what is in a file of ours; of weights, draw the column of one voxel (ix, iy, iz), by default the middle."""
+    if picture is None:
+        if voxel is not None:
+            raise UsageError("--voxel needs --picture")
+        return describe(file)
+    ensure_writable(picture, overwrite, [file])
+    ensure_drawing()
+    found = describe(file)
+    weights = read_weights(file).weights
+    nx, ny, nz = weights.grid.shape_xyz
+    ix, iy, iz = voxel or (nx // 2, ny // 2, nz // 2)
+    if not (0 <= ix < nx and 0 <= iy < ny and 0 <= iz < nz):
+        raise UsageError(f"--voxel {ix} {iy} {iz}: there are {nx} x {ny} x {nz} voxels, counted from 0")
+    rows, columns, shares = weights.column(iz, iy, ix)
+    if not shares.size:
+        raise InputError(f"{file}: voxel {ix} {iy} {iz} lights no pixel")
+    place = ", ".join(f"{axis:.4g}" for axis in weights.grid.voxel_to_mm(np.array([ix, iy, iz], dtype=np.float64)))
+    title = f"voxel {ix}, {iy}, {iz} at ({place}) mm: {shares.size} pixels, sum {shares.sum():.4f}"
+    write_picture(picture, column_figure(rows, columns, shares, title), overwrite)
+    return found
 
 
 def make_operator(
