@@ -1,0 +1,114 @@
+"""`reconstruct --solver particles` and `track` as commands."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial import KDTree
+
+from lfpiv_cli.cli import cli
+from lfpiv_cli.errors import ConfigError, InputError, OutputExistsError
+from lfpiv_cli.files import vtkhdf
+from lfpiv_cli.files.config import load_config
+from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, read_points, write_points
+from lfpiv_cli.files.particles import read_particles
+from lfpiv_cli.stages_particles import ensure_solvable
+
+ROOT = Path(__file__).parent.parent
+SAMPLE, CONFIG = ROOT / "sample_data", ROOT / "configs" / "sample.yaml"
+
+
+def run(*arguments: object) -> None:
+    cli.main([str(argument) for argument in arguments], standalone_mode=False)
+
+
+def write_frame(path: Path, position_mm: np.ndarray, **changes: object) -> None:
+    """Write particles as `reconstruct` does, for the sample's volume."""
+    n = len(position_mm)
+    covariance = np.tile([1e-6, 1e-6, 1e-4, 0.0, 0.0, 0.0], (n, 1))
+    arrays = {"intensity": np.ones(n), "covariance_mm2": covariance, "chi2": np.ones(n), "seen": np.ones(n)}
+    resolved = load_config(CONFIG).resolved() | changes
+    attributes = {"reference": "mid_plane", "reference_z_mm": 0.5}
+    write_points(
+        path,
+        PARTICLES_FORMAT,
+        position_mm,
+        arrays | {"flag": np.zeros(n, np.uint8)},
+        provenance={"config": resolved},
+        attributes=attributes,
+        overwrite=True,
+    )
+
+
+@pytest.fixture
+def pair(tmp_path: Path, rng: np.random.Generator) -> tuple[Path, Path]:
+    """Particles of two frames in the sample's volume, all moved by (2, -1, 0.5) voxels."""
+    start = rng.uniform((-1.5, -1.1, -2.0), (1.5, 1.1, 2.0), (300, 3))
+    paths = tmp_path / "a.vtkhdf", tmp_path / "b.vtkhdf"
+    write_frame(paths[0], start)
+    write_frame(paths[1], start + (0.2, -0.1, 0.05))
+    return paths
+
+
+def test_track_writes_tracks_and_vectors(pair: tuple[Path, Path], tmp_path: Path, capsys) -> None:
+    run("track", *pair, "-o", tmp_path / "tracks.vtkhdf", "--grid", "--json")
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["tracks"] > 290
+    tracks = read_points(tmp_path / "tracks.vtkhdf", TRACKS_FORMAT)
+    # 2 voxels of 0.1 mm in 2 ms.
+    np.testing.assert_allclose(np.median(tracks.arrays["velocity"], axis=0), (0.1, -0.05, 0.025), atol=1e-9)
+    assert tracks.attributes["reference"] == "mid_plane"
+    field = vtkhdf.open_vectors(tmp_path / "tracks_grid.vtkhdf")
+    assert field.flag.shape == (6, 3, 5)
+    assert np.abs(field.displacement_voxel[field.flag == 0] - (2.0, -1.0, 0.5)).max() < 1e-6
+    assert field.uncertainty_voxel is not None
+
+
+def test_track_replaces_nothing_unasked(pair: tuple[Path, Path], tmp_path: Path) -> None:
+    (tmp_path / "tracks_grid.vtkhdf").write_text("mine")
+    with pytest.raises(OutputExistsError):
+        run("track", *pair, "-o", tmp_path / "tracks.vtkhdf", "--grid")
+    assert not (tmp_path / "tracks.vtkhdf").exists()
+
+
+def test_frames_made_with_other_settings_are_refused(pair: tuple[Path, Path], tmp_path: Path) -> None:
+    write_frame(pair[1], np.zeros((1, 3)), channel=None)
+    with pytest.raises(InputError, match="another config"):
+        run("track", *pair, "-o", tmp_path / "tracks.vtkhdf")
+
+
+def test_exact_refraction_is_refused() -> None:
+    settings = load_config(CONFIG).overridden("weights", refraction="exact")
+    with pytest.raises(ConfigError, match="paraxial"):
+        ensure_solvable(None, settings)  # type: ignore[arg-type]
+
+
+@pytest.mark.slow
+def test_the_sample_from_images_to_vectors(tmp_path: Path) -> None:
+    calibration, weights = tmp_path / "calibration.h5", tmp_path / "weights.h5"
+    still = [SAMPLE / f"{name}.tif" for name in ("white", "dark", "board", "pair_a", "pair_b")]
+    dark = ("--dark", still[1])
+    run("calibrate-snapshot", CONFIG, "--white", still[0], *dark, "--board", still[2], "-o", calibration)
+    run("build-weights", CONFIG, "--calibration", calibration, "-o", weights)
+    run("reconstruct", weights, *still[3:], *dark, "--solver", "particles", "-o", tmp_path / "particles")
+    frames = [tmp_path / "particles" / f"pair_{name}.vtkhdf" for name in "ab"]
+    run("track", *frames, "-o", tmp_path / "tracks.vtkhdf", "--grid")
+
+    truth = read_particles(SAMPLE / "particles.npz")
+    first = read_points(frames[0], PARTICLES_FORMAT)
+    start = truth.positions_mm - truth.velocities_m_s * 1e3 * 0.5 * 0.002
+    start[:, 2] -= first.attributes["reference_z_mm"]
+    inside = first.arrays["flag"] == 0
+    distance, _ = KDTree(start / (0.05, 0.05, 0.2)).query(first.position_mm[inside] / (0.05, 0.05, 0.2))
+    assert np.mean(distance < 1.0) > 0.9
+
+    field = vtkhdf.open_vectors(tmp_path / "tracks_grid.vtkhdf")
+    z, y, x = np.meshgrid(*(field.grid.axis_mm(axis) for axis in (2, 1, 0)), indexing="ij")
+    true = load_config(CONFIG).true_flow()(np.stack([x, y, z], axis=-1).reshape(-1, 3)).reshape(*x.shape, 3)
+    error = field.displacement_voxel - true * 0.002 * 1e4
+    rms = np.sqrt(np.mean(error**2, axis=(0, 1, 2)))
+    # Measured 0.002, 0.001 and 0.04 voxel; correlation of volumes makes 0.1 and, in depth, one.
+    assert np.all(rms < (0.01, 0.01, 0.1))
