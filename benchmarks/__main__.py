@@ -9,9 +9,10 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 
+from benchmarks.calibration import bench_calibration
 from benchmarks.weights import bench_weights
 
-BENCHMARKS: dict[str, Callable[[], None]] = {"weights": bench_weights}
+BENCHMARKS: dict[str, Callable[[], None]] = {"calibration": bench_calibration, "weights": bench_weights}
 
 
 def main(names: list[str]) -> None:

@@ -177,7 +177,7 @@ def test_experiment(data_folder: Path, table2: Camera, water: Media) -> None:
     np.testing.assert_allclose(pose.tilt_deg, truth["board"]["tilt_deg"], atol=4 * pose.tilt_sigma_deg.max())
     np.testing.assert_allclose(pose.offset_mm, truth["board"]["offset"], atol=1e-3)
     assert pose.k1_per_mm2 == pytest.approx(truth["camera"]["k1"], rel=0.3)
-    assert pose.k1_sigma_per_mm2 < 0.15 * truth["camera"]["k1"]
+    assert pose.k1_sigma_per_mm2 < 0.2 * truth["camera"]["k1"]
     assert pose.magnification == pytest.approx(truth["camera"]["M"], abs=2e-4)
     # 1 + s_mu/s_i is known to 3e-7 here, s_mu/s_i = 0.004 thus to 1e-4.
     assert calibration.image_distance_mm == pytest.approx(200.0, abs=0.1)

@@ -35,12 +35,14 @@ class FlatFit:
     coefficients : (3, 3) rows: the centre, and the change of (x, y, z) per mm along the board's rows and columns
     residual_mm : (n, 3) dots less the board
     sigma : (3, 3) standard errors of the coefficients
+    half_span_mm : rms distance of the dots from their middle
     k1_per_mm2, k1_sigma_per_mm2 : the distortion and its standard error; None where it was left out
     """
 
     coefficients: NDArray[np.float64]
     residual_mm: NDArray[np.float64]
     sigma: NDArray[np.float64]
+    half_span_mm: float
     k1_per_mm2: float | None = None
     k1_sigma_per_mm2: float | None = None
 
@@ -86,6 +88,7 @@ def flat_fit(
         coefficients=np.column_stack([places[0:3], places[3:6], depths]),
         residual_mm=np.column_stack([shifts.reshape(2, count).T, rises]),
         sigma=np.column_stack([place_sigma[0:3], place_sigma[3:6], depth_sigma]),
+        half_span_mm=float(np.sqrt(np.sum(np.var(along, axis=0)))),
         k1_per_mm2=None if bending is None else float(places[6]),
         k1_sigma_per_mm2=None if bending is None else float(place_sigma[6]),
     )

@@ -25,10 +25,11 @@ SHARP_SHARE = 0.2
 BLURRED_SAMPLES = 3
 # Differences for derivatives: a thousandth of the radius is far above rounding and far below the disc's own curvature.
 STEP_PER_RADIUS = 1e-3
-# Gauss-Newton starts within the disc and settles in about five rounds; a step that raises the misfit is halved.
+# Gauss-Newton starts within the disc and settles in about five rounds, to a hundredth of what noise leaves; a step
+# that raises the misfit is halved.
 FIT_ROUNDS = 20
 FIT_HALVINGS = 6
-FIT_TOLERANCE_PER_RADIUS = 1e-5
+FIT_TOLERANCE_PER_RADIUS = 1e-4
 # Undoing r' = r (1 + k1 r^2) by repetition: each round gains a factor 3 k1 r^2, below 0.01 for usable lenses.
 UNDISTORT_ROUNDS = 6
 
@@ -68,6 +69,19 @@ class DiscFit:
     background: float
     rms: float
     converged: bool
+
+
+@dataclass(frozen=True, eq=False)
+class LinearFit:
+    """Brightness and background (levels) that explain pixels best for a disc at a given place.
+
+    `design` (n, 4) is what a unit of each level puts on the pixels, `residual` (n,) what is left, `misfit` its square.
+    """
+
+    design: NDArray[np.float64]
+    levels: NDArray[np.float64]
+    residual: NDArray[np.float64]
+    misfit: float
 
 
 def pixel_rays(camera: Camera, column: NDArray[np.int64], row: NDArray[np.int64]) -> PixelRays:
@@ -204,7 +218,7 @@ def fit_disc(
     camera: Camera,
     media: Media,
 ) -> DiscFit:
-    """Fit a disc of known radius to pixels by least squares: x, y, z, brightness and background are free.
+    """Fit a disc of known radius to pixels by least squares: x, y, z, brightness and a sloping background are free.
 
     Parameters
     ----------
@@ -212,41 +226,46 @@ def fit_disc(
     start_mm : (3,) first guess, in image axes, within about the radius
     """
 
-    def linear_fit(position: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    slopes = (scene_points(rays, camera, media, float(start_mm[2])) - start_mm[:2]) / radius_mm
+    ground = passed[:, np.newaxis] * np.column_stack([np.ones(len(passed)), slopes])
+
+    def linear_fit(position: NDArray[np.float64]) -> LinearFit:
         shares = disc_shares(rays, position, radius_mm, camera, media)
-        design = np.stack([passed * shares, passed], axis=1)
+        design = np.column_stack([passed * shares, ground])
         levels = np.asarray(np.linalg.lstsq(design, signal, rcond=None)[0], dtype=np.float64)
-        return shares, levels, float(np.sum((signal - design @ levels) ** 2))
+        residual = signal - design @ levels
+        return LinearFit(design, levels, residual, float(residual @ residual))
+
+    def derivatives(best: LinearFit, position: NDArray[np.float64]) -> NDArray[np.float64]:
+        moves = disc_moves(passed, best.levels[0], rays, position, steps, radius_mm, camera, media)
+        return np.column_stack([moves, best.design])
 
     step_z = camera.focus_distance_mm / (camera.aperture_radius_mm * media.depth_ratio)
     steps = STEP_PER_RADIUS * radius_mm * np.array([1.0, 1.0, step_z])
     position = np.asarray(start_mm, dtype=np.float64)
-    shares, levels, misfit = linear_fit(position)
+    best = linear_fit(position)
     converged = False
     for _ in range(FIT_ROUNDS):
-        design = disc_design(shares, passed, levels[0], rays, position, steps, radius_mm, camera, media)
-        residual = signal - passed * (levels[0] * shares + levels[1])
-        move = np.linalg.lstsq(design, residual, rcond=None)[0][:3] * steps
+        move = np.linalg.lstsq(derivatives(best, position), best.residual, rcond=None)[0][:3] * steps
         for _ in range(FIT_HALVINGS):
             trial = linear_fit(position + move)
-            if trial[2] <= misfit:
+            if trial.misfit <= best.misfit:
                 break
             move = 0.5 * move
-        if trial[2] <= misfit:
-            position = position + move
-            shares, levels, misfit = trial
         converged = bool(np.all(np.abs(move) <= FIT_TOLERANCE_PER_RADIUS / STEP_PER_RADIUS * steps))
-        if converged or trial[2] > misfit:
+        if trial.misfit > best.misfit:
             break
-    design = disc_design(shares, passed, levels[0], rays, position, steps, radius_mm, camera, media)
-    variance = misfit / max(1, signal.size - design.shape[1])
+        position, best = position + move, trial
+        if converged:
+            break
+    design = derivatives(best, position)
+    variance = best.misfit / max(1, signal.size - design.shape[1])
     covariance = np.linalg.pinv(design.T @ design)[:3, :3] * variance * np.outer(steps, steps)
-    rms = float(np.sqrt(misfit / signal.size))
-    return DiscFit(position, covariance, float(levels[0]), float(levels[1]), rms, converged)
+    rms = float(np.sqrt(best.misfit / signal.size))
+    return DiscFit(position, covariance, float(best.levels[0]), float(best.levels[1]), rms, converged)
 
 
-def disc_design(
-    shares: NDArray[np.float64],
+def disc_moves(
     passed: NDArray[np.float64],
     brightness: float,
     rays: PixelRays,
@@ -256,7 +275,7 @@ def disc_design(
     camera: Camera,
     media: Media,
 ) -> NDArray[np.float64]:
-    """Return the derivatives (n, 5) of the light to x, y, z (per step), brightness and background."""
+    """Return the derivatives (n, 3) of the light to x, y, z, per step."""
     columns = []
     for axis in range(3):
         offset = np.zeros(3)
@@ -264,7 +283,7 @@ def disc_design(
         ahead = disc_shares(rays, position + offset, radius_mm, camera, media)
         behind = disc_shares(rays, position - offset, radius_mm, camera, media)
         columns.append(brightness * passed * (ahead - behind))
-    return np.stack([*columns, passed * shares, passed], axis=1)
+    return np.stack(columns, axis=1)
 
 
 def checked_disc_radius(radius_mm: float, camera: Camera) -> float:

@@ -18,7 +18,7 @@ from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose
 from lfpiv_cli.calibration.lattice import LatticeFit, fit_lattice
 from lfpiv_cli.calibration.rectification import Rectification
 from lfpiv_cli.calibration.sheet import check_pitch, image_distance_mm, sheet_fit
-from lfpiv_cli.calibration.transmission import relative_transmission
+from lfpiv_cli.calibration.transmission import fit_vignetting, relative_transmission
 from lfpiv_cli.calibration.white import by_aperture
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.optics.camera import Camera
@@ -119,6 +119,12 @@ class Calibration:
                 camera = replace(camera, magnification=self.pose.magnification)
             camera = replace(camera, distortion_per_mm2=self.pose.distortion_per_mm2)
         return camera.with_micro_images(self.rectification.lattice_px)
+
+    def vignetting(self) -> NDArray[np.float64] | None:
+        """Return the slow part of the transmission as coefficients; None where it was not measured."""
+        if self.transmission is None:
+            return None
+        return fit_vignetting(self.transmission, self.rectification.lattice_px)
 
     def summary(self) -> dict[str, Any]:
         """Return the figures as plain numbers and lists, units in their names; None where unknown."""

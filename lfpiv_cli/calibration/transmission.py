@@ -13,6 +13,12 @@ TRANSMISSION_FLOOR = 0.05
 # a square of this many pixels in the middle of the sensor: wide enough for two hundred lenses of 30 px.
 MIDDLE_PER_PITCH = 0.25
 MIDDLE_SIDE_PX = 512
+# Vignetting is smooth over the sensor: a polynomial of degree four holds cos^4 and the shadow of a barrel. It is
+# fitted to the medians of this many blocks along each side, which dust and dead pixels do not move.
+VIGNETTING_DEGREE = 4
+VIGNETTING_BLOCKS = 24
+# A block of fewer usable middles says nothing.
+FEWEST_MIDDLES = 20
 
 
 def relative_transmission(white: NDArray[np.float32], lattice_px: Lattice) -> NDArray[np.float32]:
@@ -37,3 +43,61 @@ def centre_level(white: NDArray[np.float32], lattice_px: Lattice) -> float:
     offset = place - lattice_px.points(lattice_px.nearest(place))
     middle = np.hypot(offset[..., 0], offset[..., 1]) <= MIDDLE_PER_PITCH * lattice_px.pitch.min()
     return float(np.median(part[middle]))
+
+
+def fit_vignetting(transmission: NDArray[np.float32], lattice_px: Lattice) -> NDArray[np.float64] | None:
+    """Return what of the transmission varies slowly over the lenses, as coefficients [y power, x power]; see below.
+
+    Only the middles of the lens images are used: their rims show the aperture, which the weights hold already. None
+    where there is too little to see it by.
+
+    Parameters
+    ----------
+    transmission : (rows, columns) from `relative_transmission`
+    lattice_px : lens images in the same frame
+    """
+    rows, columns = transmission.shape
+    place, level = _block_levels(transmission, lattice_px)
+    powers = [(i, j) for i in range(VIGNETTING_DEGREE + 1) for j in range(VIGNETTING_DEGREE + 1 - i)]
+    if len(level) < 2 * len(powers):
+        return None
+    half = np.array([columns, rows]) / 2.0
+    x, y = ((place - half) / half).T
+    design = np.stack([x**i * y**j for i, j in powers], axis=1)
+    found = np.linalg.lstsq(design, level, rcond=None)[0]
+    coefficients = np.zeros((VIGNETTING_DEGREE + 1, VIGNETTING_DEGREE + 1))
+    for (i, j), coefficient in zip(powers, found, strict=True):
+        coefficients[j, i] = coefficient / found[0]
+    return coefficients
+
+
+def vignetting_surface(coefficients: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.float32]:
+    """Return the share (rows, columns) of the middle's light that passes: a polynomial in the place over the sensor.
+
+    x and y run from -1 to 1 over the columns and the rows.
+    """
+    y, x = ((np.arange(n) - n / 2.0) / (n / 2.0) for n in shape)
+    surface = np.polynomial.polynomial.polygrid2d(y, x, coefficients)
+    return np.clip(surface, TRANSMISSION_FLOOR, 1.0 / TRANSMISSION_FLOOR).astype(np.float32)
+
+
+def _block_levels(
+    transmission: NDArray[np.float32], lattice_px: Lattice
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return places (n, 2) as (column, row) and medians (n,) of the middles of lens images, block by block."""
+    rows, columns = transmission.shape
+    row_edges = np.linspace(0, rows, VIGNETTING_BLOCKS + 1).astype(int)
+    column_edges = np.linspace(0, columns, VIGNETTING_BLOCKS + 1).astype(int)
+    places, levels = [], []
+    for top, bottom in zip(row_edges, row_edges[1:], strict=False):
+        for left, right in zip(column_edges, column_edges[1:], strict=False):
+            row, column = np.mgrid[top:bottom, left:right]
+            place = np.stack([column, row], axis=-1).astype(np.float64)
+            offset = place - lattice_px.points(lattice_px.nearest(place))
+            part = transmission[top:bottom, left:right]
+            middle = np.hypot(offset[..., 0], offset[..., 1]) <= MIDDLE_PER_PITCH * lattice_px.pitch.min()
+            used = middle & (part > 0.0)
+            if used.sum() >= FEWEST_MIDDLES:
+                places.append(place[used].mean(axis=0))
+                levels.append(float(np.median(part[used])))
+    return np.array(places).reshape(-1, 2), np.array(levels)

@@ -77,6 +77,7 @@ def render_board(
     level: float,
     rng: np.random.Generator,
     progress: Callable[[int], None] | None = None,
+    shown: ArrayLike | None = None,
 ) -> NDArray[np.float64]:
     """Render bright dots on dark ground, or dark dots on ground that fills the view.
 
@@ -84,12 +85,15 @@ def render_board(
     ----------
     level : expected counts of a pixel that sees only what is bright, as in a white image
     progress : called with the number of points done
+    shown : (n,) bool, which dots there are, the first index along x running fastest; default: all
 
     Returns
     -------
     (rows, columns) float64, expected counts
     """
     plate = _plate_centres(board)
+    if shown is not None:
+        plate = plate[np.asarray(shown, dtype=bool)]
     inside = _sunflower(POINTS_PER_DOT, 0.5 * board.dot_diameter_mm)
     points = placement.to_world(plate[:, np.newaxis, :] + inside).reshape(-1, 3)
     area = 0.25 * np.pi * board.dot_diameter_mm**2 / POINTS_PER_DOT
@@ -116,7 +120,8 @@ def light_per_area(camera: Camera, media: Media, z_mm: ArrayLike, level: float) 
 
 
 def _sunflower(count: int, radius: float) -> NDArray[np.float64]:
-    """Return points that fill a disc evenly, (count, 2)."""
+    """Return points that fill a disc evenly, (count, 2), their mean at its centre: the order alone is off by 0.2 %."""
     k = np.arange(count)
     r = radius * np.sqrt((k + 0.5) / count)
-    return np.stack([r * np.cos(k * GOLDEN_ANGLE), r * np.sin(k * GOLDEN_ANGLE)], axis=1)
+    points = np.stack([r * np.cos(k * GOLDEN_ANGLE), r * np.sin(k * GOLDEN_ANGLE)], axis=1)
+    return np.asarray(points - points.mean(axis=0), dtype=np.float64)

@@ -191,6 +191,8 @@ def render_white(camera: Camera, level: float, samples_per_side: int = WHITE_SAM
     lattice = camera.lattice
     cell = (np.arange(samples)[:, np.newaxis] * SEQUENCE[:2] % 1.0) @ lattice.basis + lattice.origin
     offsets = cell - lattice.points(lattice.nearest(cell))
+    # the sequence's mean is not the lens's centre: it would move the micro-images by 0.002 px
+    offsets = offsets - offsets.mean(axis=0)
     centres = camera.micro_image_lattice_px()
     return _backtrack_white(
         positions,
