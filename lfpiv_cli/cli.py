@@ -39,6 +39,7 @@ def common_options(command: Callable[..., dict[str, Any]]) -> Callable[..., None
     @click.option("--json", "as_json", is_flag=True, help="Print one JSON object to stdout and nothing else.")
     @click.option("-v", "--verbose", is_flag=True, help="Say more on stderr.")
     @click.option("-q", "--quiet", is_flag=True, help="Say nothing on stderr but errors.")
+    @click.option("--debug", is_flag=True, expose_value=False, help="Show the traceback of an error.")
     @wraps(command)
     def run(threads: int | None, as_json: bool, verbose: bool, quiet: bool, **arguments: Any) -> None:
         from lfpiv_cli.console import Console
@@ -59,8 +60,7 @@ def common_options(command: Callable[..., dict[str, Any]]) -> Callable[..., None
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="lfpiv")
-@click.option("--debug", is_flag=True, help="Show the traceback of an error.")
-def cli(debug: bool) -> None:
+def cli() -> None:
     """From raw light-field camera images to three-dimensional velocity fields.
 
     \b
@@ -271,7 +271,7 @@ def main() -> NoReturn:
     except Exception as error:
         if debug:
             raise
-        _complain(f"a bug: {type(error).__name__}: {error} (run again with --debug before the command to see where)")
+        _complain(f"a bug: {type(error).__name__}: {error} (run again with --debug to see where)")
         code = EXIT_BUG
     sys.exit(code)
 

@@ -177,9 +177,9 @@ class ReconstructionSection(Section):
 
     solver: Literal["em", "sart", "particles"] = "em"
     particle_diameter_mm: Positive = 0.05
-    iterations: Annotated[int, Field(ge=1, le=100_000)] = 20
+    iterations: Annotated[int, Field(ge=1, le=100_000)] = 16
     relaxation: Annotated[float, Field(gt=0.0, le=2.0)] = 1.0
-    accelerate: bool = False
+    accelerate: bool = True
     padding_voxel: (
         tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]] | None
     ) = None
