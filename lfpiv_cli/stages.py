@@ -81,7 +81,9 @@ def build_weights(
     bend = scene_distortion(camera, media, grid) if isinstance(operator, FactorisedOperator) else None
     weights = Weights(grid, padding, operator, camera.column_axis, found, bend)
     record = _record("build-weights", settings, inputs)
-    write_weights(output, WeightsFile(weights, camera, settings.volume.reference, reference_z, record), overwrite)
+    vignetting = found.vignetting() if found else None
+    content = WeightsFile(weights, camera, settings.volume.reference, reference_z, record, vignetting)
+    write_weights(output, content, overwrite)
     return {
         "voxels_xyz": list(grid.shape_xyz),
         "voxel_mm": list(grid.spacing_mm),

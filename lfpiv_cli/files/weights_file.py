@@ -8,7 +8,8 @@ aperture's mask follow from the camera and are computed again on reading.
 
 Where the axes do not separate there is, in place of `columns` and `rows`, `on_demand` (what rays cross: `method`,
 `refraction`, refractive indices, window), from which columns are integrated when needed; where rays were counted,
-`counted` (`start`, `pixel`, `share` of each voxel in the order of the sensor's axes). Version 1 had neither.
+`counted` (`start`, `pixel`, `share` of each voxel in the order of the sensor's axes). `vignetting` (coefficients, see
+`calibration.transmission`) scales the pixels on reading. Version 1 had none of these.
 """
 
 from __future__ import annotations
@@ -18,8 +19,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lfpiv_cli.calibration.model import Calibration
+from lfpiv_cli.calibration.transmission import vignetting_surface
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.files.hdf5 import read_tree, write_tree
 from lfpiv_cli.grid import Grid
@@ -31,7 +34,7 @@ from lfpiv_cli.weights.aperture import aperture_mask
 from lfpiv_cli.weights.axis import AxisOptics, AxisWeights, micro_image_cells
 from lfpiv_cli.weights.build import axis_optics
 from lfpiv_cli.weights.columns import ColumnOperator, OnDemandOperator
-from lfpiv_cli.weights.model import Weights, WeightsOperator
+from lfpiv_cli.weights.model import Weights, WeightsOperator, behind_transmission
 from lfpiv_cli.weights.operators import FactorisedOperator
 from lfpiv_cli.weights.quadrature import Columns
 
@@ -63,6 +66,7 @@ class WeightsFile:
     camera : the camera they were made for, its lattice in their frame
     reference : origin of the volume's coordinates, `focal_point` or `mid_plane`
     reference_z_mm : where that origin lies, z from the nominal focal point
+    vignetting : of `calibration.transmission`, in the weights once they are read; None where it was not measured
     provenance : record of how the file was made
     """
 
@@ -71,6 +75,7 @@ class WeightsFile:
     reference: str
     reference_z_mm: float
     provenance: dict[str, Any]
+    vignetting: NDArray[np.float64] | None = None
 
 
 def write_weights(path: Path, content: WeightsFile, overwrite: bool) -> None:
@@ -92,6 +97,7 @@ def write_weights(path: Path, content: WeightsFile, overwrite: bool) -> None:
             "reference_z_mm": content.reference_z_mm,
             "scene_distortion_per_mm2": weights.scene_distortion_per_mm2,
         },
+        "vignetting": content.vignetting,
         "calibration": weights.calibration.to_tree() if weights.calibration else None,
     } | _operator_tree(weights.solver_operator)
     write_tree(
@@ -117,6 +123,11 @@ def read_weights(path: Path) -> WeightsFile:
         padding = _triple(tree["grid"]["padding_xyz"], int)
         calibration = Calibration.from_tree(tree["calibration"]) if tree.get("calibration") else None
         operator = _operator(tree, camera, grid.padded(padding))
+        vignetting = tree.get("vignetting")
+        if vignetting is not None:
+            if vignetting.ndim != 2 or not np.isfinite(vignetting).all():
+                raise ValueError(f"a vignetting of shape {vignetting.shape}")
+            operator = behind_transmission(operator, vignetting_surface(vignetting, (camera.rows, camera.columns)))
         bend = tree["grid"].get("scene_distortion_per_mm2")
         if bend is not None and (bend.shape != (grid.shape_xyz[2],) or not np.isfinite(bend).all()):
             raise ValueError(f"a distortion of shape {bend.shape} for {grid.shape_xyz[2]} planes")
@@ -124,7 +135,7 @@ def read_weights(path: Path) -> WeightsFile:
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: not a whole weights file: {error}") from error
     weights = Weights(grid, padding, operator, camera.column_axis, calibration, bend)
-    return WeightsFile(weights, camera, reference, reference_z, provenance)
+    return WeightsFile(weights, camera, reference, reference_z, provenance, vignetting)
 
 
 def open_weights(path: str | Path) -> Weights:

@@ -73,5 +73,6 @@ def column_figure(
     axis = figure.subplots()
     image = axis.imshow(picture, cmap="gray", extent=(left, right, bottom, top), interpolation="nearest")
     figure.colorbar(image, ax=axis, label="weight (share of the voxel's light)")
-    axis.set(xlabel="column", ylabel="row", title=title)
+    axis.set(xlabel="column", ylabel="row")
+    axis.set_title(title, fontsize=8)
     return figure

@@ -92,11 +92,13 @@ class OnDemandOperator:
     camera : with any lattice
     source : where rays meet the array
     grid : the voxels, world axes
+    transmission : (rows, columns) share of the light that each pixel passes; None for all of it
     """
 
     camera: Camera
     source: Source
     grid: Grid
+    transmission: NDArray[np.float32] | None = None
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -137,7 +139,9 @@ class OnDemandOperator:
 
     def columns_of(self, voxel: NDArray[np.int64]) -> Columns:
         """Return the columns of voxels given by their flat indices."""
-        return integrate_columns(self.camera, self.source, self.centres_mm(voxel), self.sides_mm, TILES, DEPTH_NODES)
+        centres = self.centres_mm(voxel)
+        columns = integrate_columns(self.camera, self.source, centres, self.sides_mm, TILES, DEPTH_NODES)
+        return columns if self.transmission is None else columns.dimmed(self.transmission)
 
     def restricted(self, image: NDArray[np.float32]) -> ColumnOperator:
         """Return the columns of the voxels that the light of an image can have come from.

@@ -26,6 +26,16 @@ if TYPE_CHECKING:
 WeightsOperator = FactorisedOperator | ColumnOperator | OnDemandOperator
 
 
+def behind_transmission(operator: WeightsOperator, transmission: NDArray[np.float32]) -> WeightsOperator:
+    """Return the weights of pixels that pass a share (rows, columns) of the light."""
+    if isinstance(operator, OnDemandOperator):
+        return replace(operator, transmission=transmission)
+    if isinstance(operator, ColumnOperator):
+        return replace(operator, columns=operator.columns.dimmed(transmission))
+    cells = np.ix_(operator.rows.cells.pixel, operator.columns.cells.pixel)
+    return replace(operator, mask=operator.mask * transmission[cells])
+
+
 @dataclass(frozen=True, eq=False)
 class Weights:
     """The weights of a volume.

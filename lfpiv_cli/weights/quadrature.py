@@ -78,6 +78,10 @@ class Columns:
     pixel: NDArray[np.int32]
     share: NDArray[np.float32]
 
+    def dimmed(self, transmission: NDArray[np.float32]) -> Columns:
+        """Return the columns behind pixels that pass a share (rows, columns) of the light."""
+        return Columns(self.start, self.pixel, self.share * transmission.ravel()[self.pixel])
+
     def image(self, voxel: int, shape: tuple[int, int]) -> NDArray[np.float64]:
         """Return one column as an image (rows, columns)."""
         part = slice(self.start[voxel], self.start[voxel + 1])

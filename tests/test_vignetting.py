@@ -1,0 +1,55 @@
+"""Vignetting: what a white image says slowly over the lenses, and the weights behind it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lfpiv_cli.calibration.transmission import fit_vignetting, relative_transmission, vignetting_surface
+from lfpiv_cli.grid import Grid
+from lfpiv_cli.optics.microlenses import Lattice
+from lfpiv_cli.optics.object_space import ObjectSpace
+from lfpiv_cli.synthetic.render import render_white
+from lfpiv_cli.weights.build import factorise
+from lfpiv_cli.weights.columns import OnDemandOperator
+from lfpiv_cli.weights.model import behind_transmission
+
+SHAPE = (520, 760)
+
+
+@pytest.fixture
+def small(table2, layout):
+    return replace(table2, rows=SHAPE[0], columns=SHAPE[1], lattice=Lattice.regular(0.1, layout))
+
+
+def shading() -> np.ndarray:
+    """cos^4 of a steep lens, 0.6 in the corners."""
+    y, x = np.meshgrid(*((np.arange(n) - n / 2) / (n / 2) for n in SHAPE), indexing="ij")
+    return 1.0 / (1.0 + 0.145 * (x**2 + y**2)) ** 2
+
+
+def test_vignetting_is_found_under_the_rims_of_the_lens_images(small):
+    white = render_white(small, 1000.0) * shading()
+    lattice = small.micro_image_lattice_px()
+    coefficients = fit_vignetting(relative_transmission(white.astype(np.float32), lattice), lattice)
+    surface = vignetting_surface(coefficients, SHAPE)
+    np.testing.assert_allclose(surface, shading(), atol=0.01)
+
+
+def test_too_few_lit_pixels_say_nothing():
+    assert fit_vignetting(np.zeros((60, 60), np.float32), Lattice.regular(18.0)) is None
+
+
+def test_weights_behind_a_transmission_scale_their_pixels(table2, water, rng):
+    camera = replace(table2, rows=260, columns=380)
+    grid = Grid.centred((3, 3, 2), (0.1, 0.1, 0.5), (0.1, 0.0, 1.0))
+    transmission = rng.random((260, 380), dtype=np.float32)
+    on_demand = OnDemandOperator(camera, ObjectSpace(water, None, "paraxial"), grid)
+    volume = rng.random(grid.shape_zyx, dtype=np.float32)
+    for operator in (factorise(camera, water, grid), on_demand, on_demand.restricted(np.ones((260, 380), np.float32))):
+        dimmed = behind_transmission(operator, transmission)
+        np.testing.assert_allclose(dimmed.forward(volume), operator.forward(volume) * transmission, atol=1e-6)
+        image = rng.random((260, 380), dtype=np.float32)
+        np.testing.assert_allclose(dimmed.adjoint(image), operator.adjoint(image * transmission), rtol=1e-5)
