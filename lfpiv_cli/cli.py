@@ -79,6 +79,7 @@ def cli() -> None:
 @click.option("--board", type=INPUT, help="Snapshot of the dot board.")
 @click.option("-o", "--output", type=INPUT, required=True, help="Calibration file to write (.h5).")
 @click.option("--picture", type=INPUT, help="Picture of the fitted lattice and board to write (.png).")
+@click.option("--views", type=INPUT, help="Picture of views and refocused depths to write (.png).")
 @common_options
 def calibrate_snapshot(**arguments: Any) -> dict[str, Any]:
     """Find the microlenses and the focal plane from a white image and one snapshot of the board.
@@ -187,9 +188,9 @@ def validate(what: str, vectors: Path | None, particles: Path | None, **argument
     """Compare a result with what is known: figures as JSON, and pictures.
 
     \b
-    Examples: lfpiv validate flow rig.yaml --vectors vectors.vtkhdf -o report
-              lfpiv validate weights rig.yaml -o report
-              lfpiv validate board rig.yaml -o report
+    Example: lfpiv validate flow rig.yaml --vectors vectors.vtkhdf -o report
+             lfpiv validate weights rig.yaml -o report
+             lfpiv validate board rig.yaml -o report
     """
     if what == "flow":
         if vectors is None:

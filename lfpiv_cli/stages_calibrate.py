@@ -17,6 +17,8 @@ from lfpiv_cli.files.calibration_file import write_calibration
 from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.pictures import ensure_drawing, write_picture
 from lfpiv_cli.files.provenance import record as provenance_record
+from lfpiv_cli.optics.media import Media
+from lfpiv_cli.reconstruction.images import light
 
 
 def calibrate_snapshot(
@@ -26,6 +28,7 @@ def calibrate_snapshot(
     board: Path | None,
     output: Path,
     picture: Path | None,
+    views: Path | None,
     overwrite: bool,
     console: Console,
 ) -> dict[str, Any]:
@@ -34,14 +37,14 @@ def calibrate_snapshot(
         raise UsageError("calibrate-snapshot needs a picture: --white, --board or both")
     whites = {"white" if k == 0 else f"white_{k + 1}": path for k, path in enumerate(white)}
     inputs = {"config": config} | whites | ({"dark": dark} if dark else {}) | ({"board": board} if board else {})
-    for target in filter(None, (output, picture)):
+    for target in filter(None, (output, picture, views)):
         ensure_writable(target, overwrite, inputs.values())
-    if picture:
+    if picture or views:
         ensure_drawing()
     settings = load_config(config)
     shape = settings.image_shape()
     frames = {name: image_files.read_image(path, shape) for name, path in inputs.items() if name != "config"}
-    camera = settings.complete_camera() if white else settings.camera_model()
+    camera = settings.camera_model() if views or not white else settings.complete_camera()
     if not white:
         console.say(
             "lfpiv: no white image: the microlenses are believed to lie as the data sheet says, "
@@ -67,4 +70,10 @@ def calibrate_snapshot(
         shown = [frames[name] for name in whites] or [frames["board"]]
         sharpest = shown[by_aperture(shown, frames.get("dark"))[0]]
         write_picture(picture, calibration_figure(calibration, sharpest, frames.get("board")), overwrite)
+    if views and camera is not None:
+        from lfpiv_cli.calibration.views_picture import views_figure
+
+        medium = settings.media_model() if board and settings.board.medium == "fluid" else Media()
+        shown_image = light(frames["board" if board else "white"], frames.get("dark"), None)
+        write_picture(views, views_figure(calibration, camera, medium, shown_image), overwrite)
     return calibration.summary()

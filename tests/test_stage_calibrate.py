@@ -42,7 +42,7 @@ def config(folder: Path, pitch: float = 0.07, layout: str = "f_number: 8") -> Pa
 
 
 def calibrated(folder: Path, rig: Path, whites: list[Path], dark: Path | None = None) -> dict[str, Any]:
-    return calibrate_snapshot(rig, whites, dark, None, folder / "c.h5", None, True, QUIET)
+    return calibrate_snapshot(rig, whites, dark, None, folder / "c.h5", None, None, True, QUIET)
 
 
 @pytest.fixture
@@ -81,3 +81,16 @@ def test_another_pitch_than_the_data_sheets_is_refused(tmp_path: Path, square: L
 def test_no_picture_is_a_slip_of_the_command(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="--white, --board or both"):
         calibrated(tmp_path, config(tmp_path), [])
+
+
+def test_a_whole_camera_tells_its_image_distance_and_shows_views(tmp_path: Path, square: Lattice) -> None:
+    pytest.importorskip("matplotlib")
+    rig = config(tmp_path, pitch=14.2 * 0.005 / 1.004, layout="focal_length_mm: 0.8")
+    lens = "  main_lens: {magnification: -1.0, focal_length_mm: 100.0, aperture_mm: 20.0}"
+    rig.write_text(rig.read_text().replace("camera:", f"camera:\n{lens}"))
+    picture = white(tmp_path / "w.tif", square, 5.5)
+    views = tmp_path / "views.png"
+    figures = calibrate_snapshot(rig, [picture], None, None, tmp_path / "c.h5", None, views, True, QUIET)
+    # 0.8 mm / 0.004; the pitch of 200 lenses is good to 2e-5, the excess thus to 1 %.
+    assert figures["image_distance_mm"] == pytest.approx(200.0, abs=max(5.0, 4 * figures["image_distance_mm_sigma"]))
+    assert views.stat().st_size > 10_000

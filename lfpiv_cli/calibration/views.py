@@ -1,4 +1,4 @@
-"""Sub-aperture views: what the scene looks like from one point of the main lens.
+"""Decoding: sub-aperture views, what the scene looks like from one point of the main lens, and refocused pictures.
 
 Axes: images are [row, column]; places on the main lens are (X, Y) in mm in image axes, X along the columns. A view has
 one sample per microlens; neighbouring microlenses are neighbours in it.
@@ -10,7 +10,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
+from lfpiv_cli.calibration.dot_model import lens_crossings, pixel_rays, scene_points
 from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.media import Media
+
+# Refocused pictures have one sample per microlens, the detail that the array records, softened by half of that so that
+# the gaps between microlenses do not beat with the samples.
+REFOCUS_SMOOTHING = 0.5
+# Samples that see less than this share of the usual light lie beyond the sensor.
+LEAST_SEEN = 0.1
 
 
 def lens_table(camera: Camera) -> NDArray[np.int64]:
@@ -52,3 +60,60 @@ def sub_aperture_view(image: ArrayLike, camera: Camera, crossing_mm: ArrayLike) 
     places = view_places_px(camera, crossing_mm)
     pixels = np.asarray(image, dtype=np.float64)
     return ndimage.map_coordinates(pixels, [places[..., 1], places[..., 0]], order=1, mode="nearest")
+
+
+def view_mosaic(image: ArrayLike, camera: Camera, views_per_side: int) -> NDArray[np.float64]:
+    """Return the views from a square grid of points of the main lens side by side, 0 where the aperture ends.
+
+    Views stand as their points do, X growing with the columns and Y with the rows: (views_per_side x lens rows,
+    views_per_side x lens columns). The grid's outermost middles lie on the rim.
+    """
+    line = np.linspace(-1.0, 1.0, views_per_side) * camera.aperture_radius_mm
+    blocks = []
+    for y in line:
+        row = []
+        for x in line:
+            view = sub_aperture_view(image, camera, (x, y))
+            row.append(view if np.hypot(x, y) <= camera.aperture_radius_mm else np.zeros_like(view))
+        blocks.append(row)
+    return np.block(blocks)
+
+
+def refocused_stack(
+    image: ArrayLike, camera: Camera, media: Media, depths_mm: ArrayLike, passed: ArrayLike | None = None
+) -> NDArray[np.float64]:
+    """Return what the scene looks like when focused at depths: (depths, rows, columns), one sample per microlens.
+
+    Every pixel's light is carried back along its ray to the plane and averaged there. The pictures are centred on the
+    axis, x and y grow with columns and rows; samples that no pixel sees are 0.
+
+    Parameters
+    ----------
+    image : (rows, columns), rectified
+    camera : with the lattice of the rectified frame
+    passed : (rows, columns) share of light that pixels pass, 0 where unusable; default: all the same
+    """
+    pixels = np.asarray(image, dtype=np.float64)
+    share = np.ones(pixels.shape) if passed is None else np.asarray(passed, dtype=np.float64)
+    row, column = np.nonzero(share > 0.0)
+    rays = pixel_rays(camera, column, row)
+    through = np.hypot(*lens_crossings(rays, camera).T) <= camera.aperture_radius_mm
+    sample_mm = float(camera.lattice.pitch.min()) / abs(camera.magnification)
+    half = np.ceil(0.5 * np.array(pixels.shape) * camera.pixel_mm / abs(camera.magnification) / sample_mm).astype(int)
+    shape = (int(2 * half[0] + 1), int(2 * half[1] + 1))
+
+    def refocused(z_mm: float) -> NDArray[np.float64]:
+        place = np.rint(scene_points(rays, camera, media, z_mm)[:, ::-1] / sample_mm).astype(np.int64) + half
+        seen = through & ((place >= 0) & (place < shape)).all(axis=1)
+        flat = place[seen, 0] * shape[1] + place[seen, 1]
+        light, passing = (
+            ndimage.gaussian_filter(
+                np.bincount(flat, values[row[seen], column[seen]], minlength=shape[0] * shape[1]).reshape(shape),
+                REFOCUS_SMOOTHING,
+            )
+            for values in (pixels, share)
+        )
+        enough = passing > LEAST_SEEN * np.median(passing)
+        return np.where(enough, light / np.where(enough, passing, 1.0), 0.0)
+
+    return np.stack([refocused(float(z)) for z in np.asarray(depths_mm, dtype=np.float64)])
