@@ -13,6 +13,7 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from lfpiv_cli.flow.field import MASKED, REJECTED, REPLACED, SECOND_PEAK, VALID
+from lfpiv_cli.flow.peaks import typical_width
 
 # Measurement noise that the test takes for granted, in voxels for particle images of 1 voxel standard deviation; it
 # grows with their width. A smaller one flags clean vectors where the neighbours happen to agree.
@@ -32,12 +33,7 @@ def expected_noise(width: NDArray[np.float64]) -> NDArray[np.float64]:
 
     The correlation peak of Gaussian particle images is wider than they are by a factor of sqrt(2).
     """
-    noise = np.full(3, EXPECTED_NOISE_VOXEL)
-    for component in range(3):
-        known = width[..., component][np.isfinite(width[..., component])]
-        if known.size:
-            noise[component] *= max(1.0, float(np.median(known)) / np.sqrt(2.0))
-    return noise
+    return EXPECTED_NOISE_VOXEL * np.maximum(1.0, typical_width(width) / np.sqrt(2.0))
 
 
 def validate_vectors(

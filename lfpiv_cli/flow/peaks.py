@@ -63,6 +63,19 @@ def find_peaks(maps: NDArray[np.float64]) -> Peaks:
     )
 
 
+def typical_width(width: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the median of widths (..., 3) along each axis, leaving out NaN; the square root of 2 where all are NaN.
+
+    That is the width for Gaussian particle images with a standard deviation of 1 voxel.
+    """
+    typical = np.full(3, np.sqrt(2.0))
+    for axis in range(3):
+        known = width[..., axis][np.isfinite(width[..., axis])]
+        if known.size:
+            typical[axis] = np.median(known)
+    return typical
+
+
 @njit(cache=True)
 def vertex(before: float, at: float, after: float) -> tuple[float, float]:
     """Return place and standard deviation of the Gaussian through three values at -1, 0, 1.

@@ -1,0 +1,256 @@
+"""Gauss-Newton steps from moments of two deformed volumes, with their uncertainty.
+
+With M = (A + B) / 2, a rest displacement d and a gain c between the volumes, to first order B - A = -d . grad M + c M.
+Least squares over a window need only the moments of (grad M, M) and B - A, which are summed over cells once and over
+windows from these. Along a particle image that is long and smooth this is far less noisy than the top of a correlation
+peak, where neighbouring shifts hardly differ; along a short one the peak is more robust against lost particles.
+
+The uncertainty is that of the sandwich estimator: how much the groups of cells in a window disagree on the solution,
+whatever the reason. Axes: cells and windows are ordered (z, y, x); vectors hold (u, v, w) along (x, y, z).
+"""
+
+from __future__ import annotations
+
+from math import gcd
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from lfpiv_cli.flow.maps import SMALLEST_BLOCK, Blocks
+from lfpiv_cli.flow.windows import Triple, WindowLayout
+
+# Cells along an axis of a window: groups enough for a variance, each as large as a particle image.
+CELLS_PER_WINDOW = 4
+# Unknowns: three components and the gain. Moments: the ten of their products, and the four with B - A.
+UNKNOWNS = 4
+MOMENTS = UNKNOWNS * (UNKNOWNS + 1) // 2 + UNKNOWNS
+# A group is at least this many standard deviations of a particle image long: smaller ones share their particles, and
+# the spread of what they say is then too small.
+GROUP_SIGMAS = 2.0
+# With fewer independent groups than this their spread says nothing.
+FEWEST_GROUPS = 4
+# A pivot below this share of its diagonal element is rounding: the window does not determine that unknown.
+SMALLEST_PIVOT = 1e-6
+
+
+def cells_of(layout: WindowLayout) -> Blocks:
+    """Return the cells that make up the windows, axis by axis; one a window where windows share no common length."""
+    axes = [_cells_along(layout.size[axis], layout.step[axis], layout.count[axis]) for axis in (2, 1, 0)]
+    size, stride, count, per_window, hop = ((a[0], a[1], a[2]) for a in zip(*axes, strict=True))
+    return Blocks((layout.first[2], layout.first[1], layout.first[0]), size, stride, count, per_window, hop)
+
+
+def _cells_along(size: int, step: int, count: int) -> tuple[int, int, int, int, int]:
+    """Return size, stride, count, cells per window and hop along one axis."""
+    cell = gcd(size, step)
+    if cell < SMALLEST_BLOCK or step > size:
+        return size, step, count, 1, 1
+    while cell % 2 == 0 and cell >= 2 * SMALLEST_BLOCK and size < CELLS_PER_WINDOW * cell:
+        cell //= 2
+    hop, per_window = step // cell, size // cell
+    return cell, cell, (count - 1) * hop + per_window, per_window, hop
+
+
+def gauss_newton(
+    a: NDArray[np.float32],
+    b: NDArray[np.float32],
+    valid: NDArray[np.uint8],
+    layout: WindowLayout,
+    before: Triple,
+    particle_sigma: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the rest displacements of two deformed volumes and their standard deviations, (nz, ny, nx, 3) each.
+
+    NaN where a window does not determine them, and for the standard deviation where its groups are too few.
+
+    Parameters
+    ----------
+    a, b, valid : of `deform_pair`, with a margin of at least 1 around all windows
+    layout : windows, in voxels of the volume without margins
+    before : the margins before the volume, (z, y, x)
+    particle_sigma : (3,) standard deviation of a particle image along x, y, z, voxels
+    """
+    cells = cells_of(layout)
+    first = (cells.first[0] + before[0], cells.first[1] + before[1], cells.first[2] + before[2])
+    moments = cell_moments(a, b, valid, first, cells.size, cells.stride, cells.count)
+    groups = [
+        _cells_a_group(per_window, length, sigma)
+        for per_window, length, sigma in zip(cells.per_window, cells.size, particle_sigma[::-1], strict=True)
+    ]
+    grouped = (groups[0], groups[1], groups[2])
+    return solve_windows(moments, layout.count_zyx, cells.per_window, cells.hop, grouped)
+
+
+def _cells_a_group(per_window: int, length: int, sigma: float) -> int:
+    """Return the fewest cells, a divisor of those of a window, that are `GROUP_SIGMAS` long; or all of them."""
+    for cells in range(1, per_window):
+        if per_window % cells == 0 and cells * length >= GROUP_SIGMAS * sigma:
+            return cells
+    return per_window
+
+
+@njit(cache=True, parallel=True)
+def cell_moments(
+    a: NDArray[np.float32],
+    b: NDArray[np.float32],
+    valid: NDArray[np.uint8],
+    first: Triple,
+    size: Triple,
+    stride: Triple,
+    count: Triple,
+) -> NDArray[np.float64]:
+    """Return the moments of every cell, (cells z, y, x, MOMENTS).
+
+    The upper triangle of the products of (dM/dx, dM/dy, dM/dz, M), row by row, then those of each with B - A. Voxels
+    with a neighbour that is not valid are left out: their gradient would be that of the rim.
+    """
+    moments = np.zeros((count[0], count[1], count[2], MOMENTS))
+    for job in prange(count[0] * count[1]):
+        cz, cy = job // count[1], job % count[1]
+        basis = np.empty(UNKNOWNS)
+        for cx in range(count[2]):
+            sums = moments[cz, cy, cx]
+            for z in range(first[0] + cz * stride[0], first[0] + cz * stride[0] + size[0]):
+                for y in range(first[1] + cy * stride[1], first[1] + cy * stride[1] + size[1]):
+                    for x in range(first[2] + cx * stride[2], first[2] + cx * stride[2] + size[2]):
+                        whole = valid[z - 1, y, x] and valid[z + 1, y, x] and valid[z, y - 1, x]
+                        whole = whole and valid[z, y + 1, x] and valid[z, y, x - 1] and valid[z, y, x + 1]
+                        if not (whole and valid[z, y, x]):
+                            continue
+                        basis[0] = 0.25 * (a[z, y, x + 1] + b[z, y, x + 1] - a[z, y, x - 1] - b[z, y, x - 1])
+                        basis[1] = 0.25 * (a[z, y + 1, x] + b[z, y + 1, x] - a[z, y - 1, x] - b[z, y - 1, x])
+                        basis[2] = 0.25 * (a[z + 1, y, x] + b[z + 1, y, x] - a[z - 1, y, x] - b[z - 1, y, x])
+                        basis[3] = 0.5 * (a[z, y, x] + b[z, y, x])
+                        change = b[z, y, x] - a[z, y, x]
+                        place = 0
+                        for i in range(UNKNOWNS):
+                            for j in range(i, UNKNOWNS):
+                                sums[place] += basis[i] * basis[j]
+                                place += 1
+                            sums[MOMENTS - UNKNOWNS + i] += basis[i] * change
+    return moments
+
+
+@njit(cache=True)
+def unpack(moments: NDArray[np.float64], matrix: NDArray[np.float64], vector: NDArray[np.float64]) -> None:
+    """Write the moments as a symmetric matrix (4, 4) and the vector (4,) of the products with B - A."""
+    place = 0
+    for i in range(UNKNOWNS):
+        for j in range(i, UNKNOWNS):
+            matrix[i, j] = moments[place]
+            matrix[j, i] = moments[place]
+            place += 1
+        vector[i] = moments[MOMENTS - UNKNOWNS + i]
+
+
+@njit(cache=True)
+def invert(matrix: NDArray[np.float64], inverse: NDArray[np.float64]) -> bool:
+    """Write the inverse of a symmetric positive definite matrix (n, n) and tell whether it has one."""
+    n = matrix.shape[0]
+    rest = matrix.copy()
+    inverse[:] = np.eye(n)
+    for k in range(n):
+        if not rest[k, k] > SMALLEST_PIVOT * matrix[k, k]:
+            return False
+        pivot = rest[k, k]
+        rest[k] /= pivot
+        inverse[k] /= pivot
+        for i in range(n):
+            if i != k:
+                factor = rest[i, k]
+                rest[i] -= factor * rest[k]
+                inverse[i] -= factor * inverse[k]
+    return True
+
+
+@njit(cache=True, parallel=True)
+def solve_windows(
+    moments: NDArray[np.float64], count: Triple, per_window: Triple, hop: Triple, grouped: Triple
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return step and standard deviation of every window, (nz, ny, nx, 3) each, from the moments of its cells.
+
+    `grouped` is how many cells along (z, y, x) make one group of the sandwich estimator.
+    """
+    step = np.full((count[0], count[1], count[2], 3), np.nan)
+    deviation = np.full((count[0], count[1], count[2], 3), np.nan)
+    groups = (per_window[0] // grouped[0], per_window[1] // grouped[1], per_window[2] // grouped[2])
+    for job in prange(count[0] * count[1]):
+        kz, ky = job // count[1], job % count[1]
+        matrix, vector = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
+        inverse, solution = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
+        for kx in range(count[2]):
+            sums = np.zeros((groups[0], groups[1], groups[2], MOMENTS))
+            for z in range(per_window[0]):
+                for y in range(per_window[1]):
+                    for x in range(per_window[2]):
+                        cell = moments[kz * hop[0] + z, ky * hop[1] + y, kx * hop[2] + x]
+                        sums[z // grouped[0], y // grouped[1], x // grouped[2]] += cell
+            flat = sums.reshape(-1, MOMENTS)
+            total = np.zeros(MOMENTS)
+            for g in range(flat.shape[0]):
+                total += flat[g]
+            unpack(total, matrix, vector)
+            if not invert(matrix, inverse):
+                continue
+            for i in range(UNKNOWNS):
+                solution[i] = 0.0
+                for j in range(UNKNOWNS):
+                    solution[i] += inverse[i, j] * vector[j]
+            for i in range(3):
+                step[kz, ky, kx, i] = -solution[i]
+            write_deviation(sums, inverse, solution, deviation[kz, ky, kx])
+    return step, deviation
+
+
+@njit(cache=True)
+def write_deviation(
+    groups: NDArray[np.float64],
+    inverse: NDArray[np.float64],
+    solution: NDArray[np.float64],
+    deviation: NDArray[np.float64],
+) -> None:
+    """Write the standard deviations (3,) of a solution from what each group (z, y, x, MOMENTS) leaves of its equations.
+
+    Summed over all blocks of up to two neighbouring groups along each axis before squaring, as particles at the rim of
+    a group are partly in the next one. That the remainders sum to zero is made up for by the share of a block.
+    """
+    matrix, vector = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
+    nz, ny, nx = groups.shape[:3]
+    # One empty group beyond each face: blocks may overhang.
+    rest = np.zeros((nz + 2, ny + 2, nx + 2, 3))
+    used = 0
+    for z in range(nz):
+        for y in range(ny):
+            for x in range(nx):
+                unpack(groups[z, y, x], matrix, vector)
+                if matrix[UNKNOWNS - 1, UNKNOWNS - 1] == 0.0:
+                    continue
+                used += 1
+                for i in range(3):
+                    for j in range(UNKNOWNS):
+                        left = vector[j]
+                        for k in range(UNKNOWNS):
+                            left -= matrix[j, k] * solution[k]
+                        rest[z + 1, y + 1, x + 1, i] += inverse[i, j] * left
+    # A kernel of 1/2, 1, 1/2 along each axis with more than one group: the mean share that a block has in the whole.
+    dependent = 1.0
+    overlap = 1.0
+    for count in (nz, ny, nx):
+        if count > 1:
+            dependent *= 2.0 - 1.0 / count
+        overlap *= 2.0
+    if used < FEWEST_GROUPS * dependent:
+        return
+    for i in range(3):
+        variance = 0.0
+        for z in range(nz + 1):
+            for y in range(ny + 1):
+                for x in range(nx + 1):
+                    block = 0.0
+                    for dz in range(2):
+                        for dy in range(2):
+                            for dx in range(2):
+                                block += rest[z + dz, y + dy, x + dx, i]
+                    variance += block * block
+        deviation[i] = np.sqrt(variance / overlap / (1.0 - dependent / used))
