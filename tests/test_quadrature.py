@@ -13,7 +13,7 @@ from lfpiv_cli.optics.media import Media, Window
 from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.weights.lens_cells import MOST_CORNERS, neighbours, shared_rectangle
-from lfpiv_cli.weights.quadrature import TILES, aperture_tiles, integrate_columns
+from lfpiv_cli.weights.quadrature import TILES, PolynomialRays, aperture_tiles, integrate_columns
 from lfpiv_cli.weights.rays import count_rays, sampling_error
 
 VOXEL = (0.1, 0.1, 0.1)
@@ -130,3 +130,20 @@ def test_twisted_camera_keeps_its_column_axis_out_of_it(water):
         quadrature_image(c, space, (0.2, -0.1, 1.0), tiles=16) for c in (camera, replace(camera, column_axis="y"))
     ]
     assert np.array_equal(*images)
+
+
+@pytest.mark.parametrize("z_mm", [0.5, 3.0])
+def test_fitted_rays_give_the_columns_of_traced_ones(layout, water, z_mm):
+    # At one depth paraxial rays are linear: x_m = alpha X - x s_i/s_o; a flat voxel sees no other depth.
+    camera = replace(small_camera(layout), distortion_per_mm2=0.0)
+    space = ObjectSpace(water, None, "paraxial")
+    distance = float(space.distance(camera, z_mm))
+    alpha, scale = float(camera.defocus(distance)), camera.image_distance_mm / distance
+    exponents = np.array([(1, 0, 0, 0, 0), (0, 0, 0, 1, 0), (0, 1, 0, 0, 0), (0, 0, 0, 0, 1)], np.int64)
+    units = np.array([2.0, 3.0, 5.0, 10.0, 12.5])
+    along = np.array([-scale * units[0], alpha * units[3], 0.0, 0.0])
+    across = np.array([0.0, 0.0, -scale * units[1], alpha * units[4]])
+    fitted = PolynomialRays(units, exponents, np.stack([along, across], axis=1))
+    images = [quadrature_image(camera, each, (0.2, -0.1, z_mm), (0.1, 0.1, 1e-9), 24) for each in (space, fitted)]
+    np.testing.assert_allclose(*images, atol=1e-9)
+    assert images[0].sum() == pytest.approx(1.0, abs=1e-4)
