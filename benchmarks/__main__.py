@@ -10,9 +10,14 @@ import sys
 from collections.abc import Callable
 
 from benchmarks.calibration import bench_calibration
+from benchmarks.particles import bench_particles
 from benchmarks.weights import bench_weights
 
-BENCHMARKS: dict[str, Callable[[], None]] = {"calibration": bench_calibration, "weights": bench_weights}
+BENCHMARKS: dict[str, Callable[[], None]] = {
+    "calibration": bench_calibration,
+    "particles": bench_particles,
+    "weights": bench_weights,
+}
 
 
 def main(names: list[str]) -> None:
