@@ -106,7 +106,8 @@ HAND_POINT = (-3.676779, 2.8659, 2.2977)
 #   x_m = 3.676779 * 0.991436 = 3.645291, y_m = -2.8659 * 0.991436 = -2.841356
 #   1 + 2e-5 * (13.288149 + 8.073305) = 1.00042723: distorted to (3.646848, -2.842570)
 #   less the shift of 3.4, -2.1 px = (0.0187, -0.01155) mm, turned back by 0.12 degrees: (3.622211, -2.838613)
-#   that is lens 36, -28; turned forth and shifted, its centre is 3.6 c + 2.8 s + 0.0187 = 3.624556 and
+#   that is lens 36, -28; turned forth and shifted,
+#   its centre is 3.6 c + 2.8 s + 0.0187 = 3.624556 and
 #   3.6 s - 2.8 c - 0.01155 = -2.804004
 #   on the sensor 3.624556 + 0.8 * 3.645291/200 = 3.639138 and -2.804004 - 0.8 * 2.841356/200 = -2.815369
 #   column 3.639138/0.0055 + 1175.5 = 1837.161, row -2.815369/0.0055 + 883.5 = 371.615
@@ -154,7 +155,7 @@ def test_rays_by_hand_meet_the_light_of_all_tracers(experiment, lens):
     assert found > 2.0
     for name, turn in HAND_TURNS.items():
         turned, camera = turn(places)
-        assert brightness_where(image, hand_pixel(turned, lens, **camera)) < 0.85 * found, name
+        assert brightness_where(image, hand_pixel(turned, lens, **camera)) < 0.75 * found, name
 
 
 # A corner of the sensor, where rotation and distortion show most: the part that tracers with x 3.5 to 6.3 mm and y
@@ -237,7 +238,7 @@ def test_depth_s_origin_is_the_focal_point(experiment, true_likeness):
 def test_frame_a_is_half_a_delay_before_the_middle(experiment, true_likeness):
     assert likeness(experiment, "pair_b", places=experiment.frame_a(0.5)) == pytest.approx(true_likeness, abs=0.01)
     assert likeness(experiment, "pair_a", places=experiment.frame_a(0.5)) < 0.6
-    assert likeness(experiment, "pair_a", places=experiment.frame_a(0.0)) < 0.8
+    assert likeness(experiment, "pair_a", places=experiment.frame_a(0.0)) < 0.5
 
 
 def test_rotation_goes_from_the_columns_towards_the_rows(experiment, true_likeness):
