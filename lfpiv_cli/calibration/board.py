@@ -47,7 +47,7 @@ RIM_PER_PATCH = np.sqrt(0.5) + 1.0
 # Fewer pixels than these are a dot at the sensor's edge: five unknowns need several times as many.
 FEWEST_PIXELS = 50
 # More pixels than these make a dot's fit slower and hardly better: the model's own errors are larger than their noise.
-MOST_PIXELS = 20_000
+MOST_PIXELS = 10_000
 # What is wider than this share of the dots' distance in the refocused picture is light on the board, not a dot.
 DOT_PER_SPACING = 0.5
 # Magnification and distortion enter the place of each dot; one repetition with the measured ones leaves the square of

@@ -21,9 +21,11 @@ from lfpiv_cli.optics.camera import Camera
 FEWEST_DOTS = 6
 # Dots off the common board are left out; without them others may turn out to be off, and a third look settles it.
 OUTLIER_ROUNDS = 3
-# What all dots have in common does not show in their scatter. On rendered boards it was 1 to 4 um of depth, a
-# thousandth of the depth over which the main lens's rim moves a dot by a microlens, and 3e-5 of the magnification.
-COMMON_SHARE_OF_LENS_DEPTH = 1e-3
+# What all dots have in common does not show in their scatter. On rendered boards it was 1 to 8 um of depth, two
+# thousandths of the depth over which the main lens's rim moves a dot by a microlens, up to 0.1 um sideways, a half
+# thousandth of a microlens, and 3e-5 of the magnification.
+COMMON_SHARE_OF_LENS_DEPTH = 2e-3
+COMMON_SHARE_OF_LENS = 5e-4
 COMMON_SCALE = 3e-5
 # A distortion that chance explains is reported and not applied.
 DISTORTION_SIGMAS = 3.0
@@ -137,14 +139,15 @@ def pose_of_dots(
         dots_px=camera.mm_to_px(camera.micro_image_scale * shown),
         k1_per_mm2=k1,
         k1_sigma_per_mm2=k1_sigma,
-        **lengths_and_angles(fit, camera.magnification, common_depth_mm(camera)),
+        **lengths_and_angles(fit, camera.magnification, *common_errors_mm(camera)),
     )
 
 
-def common_depth_mm(camera: Camera) -> float:
-    """Return the standard error of the depth that all dots share."""
-    lens_depth = float(camera.lattice.pitch.max()) / camera.aperture_radius_mm
-    return COMMON_SHARE_OF_LENS_DEPTH * lens_depth * camera.focus_distance_mm**2 / camera.image_distance_mm
+def common_errors_mm(camera: Camera) -> tuple[float, float]:
+    """Return the standard errors of place and depth that all dots share."""
+    lens = float(camera.lattice.pitch.max()) / abs(camera.magnification)
+    lens_depth = lens / camera.aperture_radius_mm * camera.focus_distance_mm
+    return COMMON_SHARE_OF_LENS * lens, COMMON_SHARE_OF_LENS_DEPTH * lens_depth
 
 
 def total_distortion(bent: FlatFit, camera: Camera) -> tuple[float | None, float | None]:
@@ -217,7 +220,7 @@ def best_window(indices: NDArray[np.int64], lateral: NDArray[np.float64], board:
     return best
 
 
-def lengths_and_angles(fit: FlatFit, magnification: float, common_depth_mm: float) -> dict[str, Any]:
+def lengths_and_angles(fit: FlatFit, magnification: float, common_mm: float, common_depth_mm: float) -> dict[str, Any]:
     """Return the fitted centre and step vectors as the lengths and angles of `BoardPose` with their standard errors.
 
     What the dots have in common may differ from one side of the board to the other as well: it counts for the tilt.
@@ -237,7 +240,7 @@ def lengths_and_angles(fit: FlatFit, magnification: float, common_depth_mm: floa
         "rotation_deg": float(np.rad2deg(turn.mean())),
         "rotation_sigma_deg": float(np.rad2deg(step_error)),
         "offset_mm": centre[:2],
-        "offset_sigma_mm": fit.sigma[0, :2],
+        "offset_sigma_mm": np.hypot(fit.sigma[0, :2], common_mm),
         "magnification": magnification * float(stretch.mean()),
         "magnification_sigma": abs(magnification) * float(np.hypot(step_error, COMMON_SCALE)),
     }
