@@ -219,7 +219,14 @@ def correlate(
         sizes_xyz = settings_of[number].windows_voxel(grid.spacing_mm)
         with console.progress(count_passes(sizes_xyz), "correlate") as advance:
             field = correlate_volumes(
-                volume_a.array, volume_b.array, grid, sizes_xyz, chosen.overlap_xyz, chosen.dt_s, progress=advance
+                volume_a.array,
+                volume_b.array,
+                grid,
+                sizes_xyz,
+                chosen.overlap_xyz,
+                chosen.dt_s,
+                progress=advance,
+                exponent=settings_of[number].correlation_exponent(),
             )
         vtkhdf.write_vectors(
             targets[number].path,

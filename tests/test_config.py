@@ -298,3 +298,15 @@ def test_flow_centres_move_with_the_origin(write) -> None:
     points = np.array([[0.0, 0.0, 2.5]])
     assert config.true_flow()(points)[0] == pytest.approx([2.0, 0.0, 0.0])
     assert config.simulated_flow(origin_z_mm=1.0)(points)[0] == pytest.approx([1.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("sections", "exponent"),
+    [
+        ("reconstruction: {solver: em}", 0.5),
+        ("reconstruction: {solver: sart}", 1.0),
+        ("correlation: {exponent: 0.75}", 0.75),
+    ],
+)
+def test_the_exponent_follows_from_the_solver_unless_given(write, sections: str, exponent: float) -> None:
+    assert load_config(write(RIG + sections + "\n")).correlation_exponent() == exponent

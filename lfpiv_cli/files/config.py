@@ -47,6 +47,10 @@ from lfpiv_cli.optics.media import Media, Window
 from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.synthetic.flows import Flow
 
+# Powers of the intensities that are correlated, by solver; 1 where none is named. In EM's volumes the root measured a
+# third less noise in depth, and a depth velocity with 0.94 of its slope in place of 0.81.
+EXPONENTS = {"em": 0.5}
+
 
 @dataclass(frozen=True)
 class Config:
@@ -195,6 +199,10 @@ class Config:
     def windows_voxel(self, voxel_mm: tuple[float, float, float]) -> tuple[tuple[int, int, int], ...]:
         """Return the correlation windows (x, y, z) in voxels, coarse to fine."""
         return bench.windows_of(self.correlation, voxel_mm)
+
+    def correlation_exponent(self) -> float:
+        """Return the power of the intensities that is correlated: the configured one, or the solver's default."""
+        return self.correlation.exponent or EXPONENTS.get(self.reconstruction.solver, 1.0)
 
     def simulated_flow(self, origin_z_mm: float = 0.0) -> Flow:
         """Return the flow to render, as a function of points whose z counts from `origin_z_mm` before the volume's."""

@@ -189,6 +189,8 @@ class CorrelationSection(Section):
     """The correlation windows, coarse to fine, in voxels (numbers or [x, y, z]), or the final one as window_mm.
 
     overlap: of neighbouring windows, a number or [x, y, z]. dt_s: time between the volumes of a pair.
+    exponent: power of the intensities that is correlated (default: 0.5 for volumes of the solver em, whose brightest
+    particles outweigh all others, and 1 for other solvers').
     """
 
     windows: Annotated[tuple[tuple[WindowSide, WindowSide, WindowSide], ...], BeforeValidator(_each_window)] | None = (
@@ -197,6 +199,7 @@ class CorrelationSection(Section):
     window_mm: PerAxis | None = None
     overlap: Annotated[tuple[Overlap, Overlap, Overlap], BeforeValidator(_each_axis)] = (0.5, 0.5, 0.5)
     dt_s: Positive | None = None
+    exponent: Annotated[float, Field(gt=0.0, le=1.0)] | None = None
 
     @property
     def overlap_xyz(self) -> tuple[float, float, float]:
