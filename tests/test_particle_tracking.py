@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lfpiv_cli.particles.gridding import on_grid
-from lfpiv_cli.particles.tracking import track
+from lfpiv_cli.particles.tracking import track, vote
 
 BOX_MM = np.array([4.0, 4.0, 4.0])
 
@@ -37,6 +37,15 @@ def test_particles_are_followed_further_than_their_distance(
     assert np.unique(tracks.second).size == tracks.second.size
 
 
+def test_neighbours_vote_for_the_right_displacement(
+    frames: tuple[NDArray[np.float64], NDArray[np.float64]],
+) -> None:
+    chosen = vote(*frames, 0.6)[:450]
+    right = np.all(np.abs(chosen - moved(frames[0][:450])) < (0.02, 0.02, 0.1), axis=1)
+    # Each has some fourteen particles within reach: chance would find one in fourteen.
+    assert right.mean() > 0.7
+
+
 def test_frames_without_common_particles_give_few_tracks(rng: np.random.Generator) -> None:
     first, second = rng.uniform(0.0, BOX_MM, (2, 300, 3))
     assert len(track(first, second, 0.3).first) < 60
@@ -52,7 +61,7 @@ def test_grid_takes_a_quadratic_flow_exactly(rng: np.random.Generator) -> None:
 
     def flow(at: NDArray[np.float64]) -> NDArray[np.float64]:
         x, y, z = at.T
-        return np.stack([1.0 - x**2 + x * z, 0.3 * y + z**2, x * y - 0.2], axis=1)
+        return np.stack([1.0 - x**2 + x * z, 0.3 * y + z**2, x * y - y * z], axis=1)
 
     value, error = on_grid(points, flow(points), np.full(points.shape, 0.01), nodes, 1.0)
     np.testing.assert_allclose(value, flow(nodes), atol=1e-9)
