@@ -144,6 +144,17 @@ def test_pose_of_exact_dots_is_exact_with_dots_missing_and_dirt(table2: Camera) 
     assert first[1] < -1.5
 
 
+def test_dots_that_gaps_cut_off_belong_to_the_board(table2: Camera) -> None:
+    """A missing row and a missing column leave four islands, and a stray dot lies in the middle."""
+    board = BoardGeometry((5, 5), 1.0, 0.2)
+    dots = dot_places(board, 2.0, (0.1, 0.0), (1.0, 0.0)).reshape(5, 5, 3)
+    kept = np.delete(np.delete(dots, 2, axis=0), 2, axis=1).reshape(-1, 3)
+    kept = np.vstack([kept, [[0.1, 0.05, 2.0]], [[0.5, 0.4, 2.0]]])
+    pose = pose_of_dots(kept, np.full(kept.shape, 1e-3), -kept[:, :2], table2, board)
+    assert len(pose.indices) >= 16
+    np.testing.assert_allclose(pose.offset_mm, (0.1, 0.0), atol=0.02)
+
+
 def test_a_dot_off_the_plane_does_not_move_the_board(table2: Camera, rng: np.random.Generator) -> None:
     board = BoardGeometry((7, 7), 1.0, 0.2)
     dots = dot_places(board, 3.0, (0.4, -0.2), (0.5, -0.5)) + rng.normal(0.0, 1e-3, (49, 3))

@@ -22,8 +22,8 @@ OUTLIER_SIGMAS = 6.0
 MAD_TO_SIGMA = 1.4826
 # Terms of which one is this close to a sum of the others, each scaled to 1, cannot be told apart.
 LEAST_RANK = 1e-6
-# Six numbers place the board sideways, a seventh is the distortion; with fewer dots than these it has no check.
-FEWEST_DOTS_FOR_DISTORTION = 6
+# Six numbers place the board sideways, a seventh is the distortion; with fewer dots than these it has little check.
+FEWEST_DOTS_FOR_DISTORTION = 12
 
 
 @dataclass(frozen=True, eq=False)
