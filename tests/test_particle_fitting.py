@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.microlenses import Lattice
-from lfpiv_cli.particles.fitting import accept, add_all, judge, refine
+from lfpiv_cli.particles.fitting import accept, add_all, claimed_share, judge, refine
 from lfpiv_cli.particles.splitting import split
 from lfpiv_cli.particles.tiles import footprint_px, share_out
 from lfpiv_cli.particles.view import View, entry_capacity, raw_view
@@ -92,6 +92,15 @@ def test_a_ghost_is_not_accepted(view: View, rng: np.random.Generator) -> None:
     )
     assert taken.tolist() == [True, True, False]
     np.testing.assert_allclose(candidates[:2, :3], particles[:, :3], atol=2e-3)
+
+
+def test_a_claim_is_worth_the_light_that_is_there() -> None:
+    pixels, values = np.arange(10, dtype=np.int32), np.full((10, 4), 0.1)
+    residual = np.full(10, 100.0)
+    assert claimed_share(pixels, values, 10, 1000.0, residual) == 1.0
+    residual[:4] = -50.0
+    assert claimed_share(pixels, values, 10, 1000.0, residual) == pytest.approx(0.6)
+    assert claimed_share(pixels, values, 10, 2000.0, residual) == pytest.approx(0.6 * 100.0 / 140.0)
 
 
 def test_two_merged_particles_are_told_apart(view: View) -> None:
