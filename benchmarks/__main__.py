@@ -10,11 +10,14 @@ import sys
 from collections.abc import Callable
 
 from benchmarks.calibration import bench_calibration
+from benchmarks.correlation import bench_correlation, bench_correlation_accuracy
 from benchmarks.particles import bench_particles
 from benchmarks.weights import bench_weights
 
 BENCHMARKS: dict[str, Callable[[], None]] = {
     "calibration": bench_calibration,
+    "correlation": bench_correlation,
+    "correlation-accuracy": bench_correlation_accuracy,
     "particles": bench_particles,
     "weights": bench_weights,
 }

@@ -50,10 +50,11 @@ SMALLEST_VALID_FRACTION = 0.25
 
 @dataclass(frozen=True)
 class Pass:
-    """One pass over the deformed volumes: its windows and how far it looks."""
+    """One pass over the deformed volumes: its windows, how far it looks, and whether its vectors are the result."""
 
     layout: WindowLayout
     radius: int
+    is_last: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,7 +197,7 @@ def _plan(shape_xyz: Triple, windows: Sequence[Triple], overlap: tuple[float, fl
         changed = number == 0 or size != sizes[number - 1]
         radius = FIRST_RADIUS if changed else LATER_RADIUS
         passes.append(Pass(layout_windows(shape_xyz, size, overlap), radius))
-    passes[-1] = Pass(passes[-1].layout, LAST_RADIUS)
+    passes[-1] = Pass(passes[-1].layout, LAST_RADIUS, is_last=True)
     return passes
 
 
@@ -276,7 +277,10 @@ def _refine(pair: Pair, predictor: NDArray[np.float64], step: Pass) -> Measured:
     sums = window_sums(valid, layout, before)
     valid_fraction = sums.reshape(layout.count_zyx) / float(np.prod(layout.size))
     width = _width_when_sparse(typical_width(peaks.width))
-    rest, uncertainty = gauss_newton(a, b, valid, layout, before, width / np.sqrt(2.0))
+    if step.is_last or np.any(width >= ELONGATED_WIDTH):
+        rest, uncertainty = gauss_newton(a, b, valid, layout, before, width / np.sqrt(2.0))
+    else:
+        rest = uncertainty = np.full(peaks.offset.shape, np.nan)
     raw, second = _absolute(_along_elongated(peaks, rest, width), predictor)
     masked = valid_fraction < SMALLEST_VALID_FRACTION
     displacement, flag = validate_vectors(raw, second, peaks.found, masked, expected_noise(peaks.width))

@@ -1,0 +1,117 @@
+"""Pairs of volumes of Gaussian particles in a known flow, for judging the correlation alone.
+
+Axes: volumes `[z, y, x]`; points and displacements in voxels, (x, y, z).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Flow = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+Triple = tuple[int, int, int]
+
+PEAK_DISPLACEMENT = 4.0
+# Particles beyond the faces, in voxels, so that some come and go.
+MARGIN = 10.0
+# Beyond this many standard deviations a particle is below 1e-4 of its peak.
+REACH = 4.3
+REFERENCE_WINDOW = 16**3
+
+
+@dataclass(frozen=True)
+class Seeding:
+    """How the particles look: number in 16^3 voxels, standard deviations in voxels, noise of a peak, share lost."""
+
+    per_window: float
+    sigma: tuple[float, float, float]
+    noise: float = 0.0
+    lost: float = 0.0
+
+
+def channel(shape_xyz: Triple) -> Flow:
+    """Return a parabola along y across the depth, with walls at the volume's faces."""
+    middle, half = 0.5 * (shape_xyz[2] - 1), 0.5 * shape_xyz[2]
+
+    def flow(points: NDArray[np.float64]) -> NDArray[np.float64]:
+        moved = np.zeros_like(points)
+        moved[:, 1] = PEAK_DISPLACEMENT * np.maximum(0.0, 1.0 - ((points[:, 2] - middle) / half) ** 2)
+        return moved
+
+    return flow
+
+
+def ring(shape_xyz: Triple) -> Flow:
+    """Return a vortex ring about the y axis: radius a quarter of the shortest side, core 0.8 of it, peak 2 voxels."""
+    middle = 0.5 * (np.array(shape_xyz) - 1.0)
+    radius = 0.25 * min(shape_xyz)
+    core = 0.8 * radius
+
+    def flow(points: NDArray[np.float64]) -> NDArray[np.float64]:
+        x, y, z = (points - middle).T
+        away = np.hypot(x, z)
+        outwards, along = away - radius, y
+        swirl = 2.0 / core * np.exp(0.5 - 0.5 * (outwards**2 + along**2) / core**2)
+        # Near the axis the direction is lost where the swirl of the far core has faded to nothing.
+        radial = swirl * along / np.maximum(away, 1e-9)
+        return np.stack([radial * x, -swirl * outwards, radial * z], axis=-1)
+
+    return flow
+
+
+def taylor_green(shape_xyz: Triple) -> Flow:
+    """Return Taylor-Green vortices in the x-z plane: one wavelength over the shortest side, 2 voxels."""
+    wave = 2.0 * np.pi / min(shape_xyz)
+
+    def flow(points: NDArray[np.float64]) -> NDArray[np.float64]:
+        x, z = wave * points[:, 0], wave * points[:, 2]
+        zero = np.zeros(len(points))
+        return 2.0 * np.stack([np.sin(x) * np.cos(z), zero, -np.cos(x) * np.sin(z)], axis=-1)
+
+    return flow
+
+
+FLOWS: dict[str, Callable[[Triple], Flow]] = {"channel": channel, "ring": ring, "taylor_green": taylor_green}
+
+
+def volume_pair(
+    flow: Flow, shape_xyz: Triple, seeding: Seeding, rng: np.random.Generator
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return two volumes, half a displacement before and after; a particle lost is another in the second."""
+    sides = np.array(shape_xyz) + 2.0 * MARGIN
+    count = round(seeding.per_window * float(np.prod(sides)) / REFERENCE_WINDOW)
+    centres = rng.random((count, 3)) * sides - MARGIN
+    half = 0.5 * flow(centres)
+    volumes = []
+    for moved, lost in ((centres - half, 0.0), (centres + half, seeding.lost)):
+        strange = rng.random(count) < lost
+        seen = np.where(strange[:, np.newaxis], rng.random((count, 3)) * sides - MARGIN, moved)
+        volume = np.zeros(shape_xyz[::-1], dtype=np.float32)
+        deposit(volume, seen, np.array(seeding.sigma))
+        volumes.append(volume + (seeding.noise * rng.standard_normal(volume.shape)).astype(np.float32))
+    return volumes[0], volumes[1]
+
+
+@njit(cache=True)
+def deposit(volume: NDArray[np.float32], centres: NDArray[np.float64], sigma: NDArray[np.float64]) -> None:
+    """Add Gaussian particles of height 1 at `centres` (n, 3) to a volume."""
+    shape = (volume.shape[2], volume.shape[1], volume.shape[0])
+    widest = int(2.0 * REACH * sigma.max()) + 3
+    profile = np.empty((3, widest))
+    low = np.empty(3, dtype=np.int64)
+    high = np.empty(3, dtype=np.int64)
+    for n in range(centres.shape[0]):
+        for axis in range(3):
+            low[axis] = max(0, int(np.ceil(centres[n, axis] - REACH * sigma[axis])))
+            high[axis] = min(shape[axis], int(np.floor(centres[n, axis] + REACH * sigma[axis])) + 1)
+            for k in range(low[axis], high[axis]):
+                profile[axis, k - low[axis]] = np.exp(-0.5 * ((k - centres[n, axis]) / sigma[axis]) ** 2)
+        for z in range(low[2], high[2]):
+            for y in range(low[1], high[1]):
+                height = profile[2, z - low[2]] * profile[1, y - low[1]]
+                for x in range(low[0], high[0]):
+                    volume[z, y, x] += height * profile[0, x - low[0]]
