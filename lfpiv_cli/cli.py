@@ -169,8 +169,8 @@ def track(**arguments: Any) -> dict[str, Any]:
     """Follow particles from one frame to the next.
 
     \b
-    Example: lfpiv reconstruct weights.h5 a.tif b.tif --dark dark.tif --solver particles -o particles
-             lfpiv track particles/a.vtkhdf particles/b.vtkhdf -o tracks.vtkhdf --grid
+    Example: lfpiv track particles/a.vtkhdf particles/b.vtkhdf -o tracks.vtkhdf --grid
+    after    lfpiv reconstruct weights.h5 a.tif b.tif --dark dark.tif --solver particles -o particles
     """
     from lfpiv_cli import stages_particles
 
