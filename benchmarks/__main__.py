@@ -11,6 +11,7 @@ from collections.abc import Callable
 
 from benchmarks.calibration import bench_calibration
 from benchmarks.correlation import bench_correlation, bench_correlation_accuracy
+from benchmarks.depth import bench_depth
 from benchmarks.particles import bench_particles
 from benchmarks.weights import bench_weights
 
@@ -18,6 +19,7 @@ BENCHMARKS: dict[str, Callable[[], None]] = {
     "calibration": bench_calibration,
     "correlation": bench_correlation,
     "correlation-accuracy": bench_correlation_accuracy,
+    "depth": bench_depth,
     "particles": bench_particles,
     "weights": bench_weights,
 }
