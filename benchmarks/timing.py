@@ -7,7 +7,6 @@ from collections.abc import Callable
 
 import numpy as np
 
-
 # Threads of a matrix library spin for a while after their work and would take the next rival's cores.
 PAUSE_S = 0.3
 
