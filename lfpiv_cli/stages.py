@@ -44,6 +44,11 @@ from lfpiv_cli.weights.columns import seen_share
 from lfpiv_cli.weights.model import Weights
 from lfpiv_cli.weights.operators import FactorisedOperator
 
+# Said where the voxels were left to the program.
+VOXELS_CHOSEN = (
+    "lfpiv: voxels of {:.3g} x {:.3g} x {:.3g} mm were chosen: half a microlens wide, because particles lock to wider "
+    "ones and their motion in depth is lost, and four times as deep, which is as fine as the views tell depths apart"
+)
 # Below this share of its light on the sensor a voxel counts as out of view.
 LEAST_SEEN = 0.01
 
@@ -73,6 +78,8 @@ def build_weights(
         camera = found.camera(camera)
     reference_z = _reference_z_mm(settings, found)
     grid = settings.grid(origin_z_mm=reference_z)
+    if settings.volume.size_mm is not None:
+        console.say(VOXELS_CHOSEN.format(*grid.spacing_mm))
     media = settings.media_model()
     padding = settings.reconstruction.padding_voxel or default_padding(camera, media, grid)
     space = settings.object_space(found.mid_plane_z_mm if found else None)
