@@ -20,7 +20,7 @@ from lfpiv_cli.files.sections import (
 )
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
-from lfpiv_cli.optics.media import Media, Window
+from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.synthetic.flows import FLOWS, Flow
 
@@ -102,17 +102,6 @@ def micro_image_pitch_px(section: CameraSection) -> float:
 def media_of(section: MediaSection) -> Media:
     """Return the refractive indices."""
     return Media(section.air, section.window, section.fluid)
-
-
-def wall_as_window(channel: ChannelSection, media: Media, focus_distance_mm: float, mid_plane_z_mm: float) -> Window:
-    """Return the channel's wall as the window in front of the fluid.
-
-    The fluid between wall and focal point is width/2 - mid_plane_z thick; the focal point's equivalent in air lies
-    `focus_distance_mm` in front of the lens (Eq. 6), so what window and fluid leave of that is air.
-    """
-    fluid = 0.5 * channel.width_mm - mid_plane_z_mm
-    apparent = channel.wall_mm * media.air / media.window + fluid * media.depth_ratio
-    return Window(focus_distance_mm - apparent, channel.wall_mm)
 
 
 def board_of(section: BoardSection) -> BoardGeometry:

@@ -46,6 +46,7 @@ from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media, Window
 from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.synthetic.flows import Flow
+from lfpiv_cli.synthetic.scenes import channel_window
 
 # Powers of the intensities that are correlated, by solver; 1 where none is named. In EM's volumes the root measured a
 # third less noise in depth, and a depth velocity with 0.94 of its slope in place of 0.81.
@@ -175,8 +176,8 @@ class Config:
     def window_model(self, mid_plane_z_mm: float | None = None) -> Window:
         """Return the window: the channel's wall where its mid plane's depth is given, else the section `window`."""
         if self.channel is not None and mid_plane_z_mm is not None:
-            focus = self.camera_model().focus_distance_mm
-            return bench.wall_as_window(self.channel, self.media_model(), focus, mid_plane_z_mm)
+            wall = self.channel.width_mm, self.channel.wall_mm
+            return channel_window(self.camera_model(), self.media_model(), *wall, mid_plane_z_mm)
         section = self._needed("window", self.sections.window)
         return Window(section.distance_mm, section.thickness_mm)
 
