@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import platform
 from collections.abc import Mapping
+from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,8 @@ from lfpiv_cli.files.atomic import without_nan
 from lfpiv_cli.files.hdf5 import open_h5, read_provenance
 from lfpiv_cli.files.inputs import ensure_regular_file, reason
 
+# Files whose hash is remembered: those that a batch has in common are few.
+FILES_REMEMBERED = 64
 # The libraries that the figures pass through.
 LIBRARIES = ("numpy", "scipy", "numba", "h5py", "tifffile", "imagecodecs", "opencv-contrib-python-headless")
 
@@ -67,7 +70,13 @@ def record(command: str, config: Mapping[str, Any] | None, inputs: Mapping[str, 
 
 def sha256(path: Path) -> str:
     """Return the SHA-256 of a file, in hexadecimal digits."""
-    ensure_regular_file(path)
+    size = ensure_regular_file(path)
+    return _sha256(path, size, path.stat().st_mtime_ns)
+
+
+@lru_cache(maxsize=FILES_REMEMBERED)
+def _sha256(path: Path, size: int, modified_ns: int) -> str:
+    """Hash a file once as long as it does not change: what all frames of a batch share is an input of each."""
     try:
         with open(path, "rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
