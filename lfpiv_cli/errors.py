@@ -51,9 +51,3 @@ class LimitMissedError(LfpivError):
     """A validation ran to its end and a figure missed its limit."""
 
     exit_code = 8
-
-
-class StoppedEarlyError(LfpivError):
-    """The work was stopped on request; the same command continues it."""
-
-    exit_code = 75

@@ -284,8 +284,8 @@ def _given(**inputs: Path | str | None) -> dict[str, Path]:
     return {role: Path(path) for role, path in inputs.items() if path is not None}
 
 
-def _record(command: str, settings: Config, inputs: dict[str, Path], **more: Any) -> dict[str, Any]:
-    return provenance_record(command, settings.resolved() | more, inputs)
+def _record(command: str, settings: Config, inputs: dict[str, Path]) -> dict[str, Any]:
+    return provenance_record(command, settings.resolved(), inputs)
 
 
 def _carried_config(record: dict[str, Any], path: Path) -> Config:
