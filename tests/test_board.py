@@ -10,7 +10,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from lfpiv_cli.calibration.board import locate_board
 from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose, pose_of_dots
-from lfpiv_cli.calibration.dot_model import disc_polygon_area, lens_cell, lens_crossings, pixel_rays, undistorted
+from lfpiv_cli.calibration.dot_model import (
+    disc_polygon_area,
+    disc_shares,
+    lens_cell,
+    lens_crossings,
+    pixel_rays,
+    undistorted,
+)
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
@@ -177,6 +184,23 @@ def test_disc_and_polygon_share_what_a_fine_grid_counts(layout: str, rng: np.ran
         assert disc_polygon_area(x, y, cell, radius) == pytest.approx(counted, abs=4e-3)
     assert disc_polygon_area(0.1, 0.1, cell, 0.3) == pytest.approx(np.pi * 0.09, rel=1e-12)
     assert disc_polygon_area(0.1, 0.1, cell, 3.0) == pytest.approx(1.0 if layout == "square" else np.sqrt(0.75))
+
+
+@pytest.mark.parametrize("z_mm", [0.4, -6.0])
+def test_slopes_of_the_shares_are_their_differences(camera: Camera, water: Media, z_mm: float) -> None:
+    # The sensor stands off the microlenses' focus, so that all of the cell's scale counts.
+    camera = replace(small(camera), microlens_distance_mm=1.03 * camera.microlens_distance_mm)
+    row, column = (axis.ravel() for axis in np.mgrid[60:380:3, 60:420:3])
+    rays, place, radius = pixel_rays(camera, column, row), np.array([0.013, -0.021, z_mm]), 0.12
+    _, slopes = disc_shares(rays, place, radius, camera, water)
+    for axis in range(3):
+        step = np.zeros(3)
+        step[axis] = 1e-5
+        ahead, behind = (disc_shares(rays, place + sign * step, radius, camera, water)[0] for sign in (1, -1))
+        # Where a corner meets the circle within the step the slope has a kink; there are few such pixels.
+        off = np.abs((ahead - behind) / 2e-5 - slopes[:, axis])
+        assert np.abs(slopes[:, axis]).max() > 0.02
+        assert np.percentile(off, 99) < 1e-4 * np.abs(slopes[:, axis]).max()
 
 
 def test_undistorted_undoes_the_distortion() -> None:

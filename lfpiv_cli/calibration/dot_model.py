@@ -17,14 +17,12 @@ from numpy.typing import NDArray
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
-from lfpiv_cli.optics.microlenses import Lattice
+from lfpiv_cli.optics.microlenses import Lattice, nearest_point
 
 # A pixel's own width is sampled at its middle while the light it stands for is narrower than this share of the disc's
 # radius in the scene, else at 3 x 3 places, which leaves a tenth of the spread out.
 SHARP_SHARE = 0.2
 BLURRED_SAMPLES = 3
-# Differences for derivatives: a thousandth of the radius is far above rounding and far below the disc's own curvature.
-STEP_PER_RADIUS = 1e-3
 # Gauss-Newton starts within the disc and settles in about five rounds, to a hundredth of what noise leaves; a step
 # that raises the misfit is halved.
 FIT_ROUNDS = 20
@@ -75,7 +73,8 @@ class DiscFit:
 class LinearFit:
     """Brightness and background (levels) that explain pixels best for a disc at a given place.
 
-    `design` (n, 4) is what a unit of each level puts on the pixels, `residual` (n,) what is left, `misfit` its square.
+    `design` (n, 7) is what the disc's moves along x, y, z and a unit of each level put on the pixels, `residual` (n,)
+    what is left, `misfit` its square.
     """
 
     design: NDArray[np.float64]
@@ -87,8 +86,20 @@ class LinearFit:
 def pixel_rays(camera: Camera, column: NDArray[np.int64], row: NDArray[np.int64]) -> PixelRays:
     """Return the rays of pixels: the microlens of a pixel is that of the nearest micro-image."""
     px = np.stack([column, row], axis=-1).astype(np.float64)
-    lens = camera.lattice.points(camera.micro_image_lattice_px().nearest(px))
+    micro_images = camera.micro_image_lattice_px()
+    lens = camera.px_to_mm(nearest_points(px, micro_images.origin, micro_images.basis)) / camera.micro_image_scale
     return PixelRays(camera.px_to_mm(px), lens, undistorted(lens, camera.distortion_per_mm2))
+
+
+@njit(cache=True)
+def nearest_points(
+    points: NDArray[np.float64], origin: NDArray[np.float64], basis: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the lattice points nearest to points, both (n, 2)."""
+    found = np.empty_like(points)
+    for n in range(len(points)):
+        found[n] = nearest_point(points[n, 0], points[n, 1], origin, basis)
+    return found
 
 
 def undistorted(points_mm: NDArray[np.float64], distortion_per_mm2: float) -> NDArray[np.float64]:
@@ -127,29 +138,43 @@ def lens_cell(lattice: Lattice) -> NDArray[np.float64]:
 
 def disc_shares(
     rays: PixelRays, position_mm: NDArray[np.float64], radius_mm: float, camera: Camera, media: Media
-) -> NDArray[np.float64]:
-    """Return for each pixel the share (n,) of the scene it sees at depth z that a disc there covers.
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return for each pixel the share (n,) of the scene it sees at depth z that a disc there covers, and its slopes.
 
-    `position_mm` is (x, y, z) in image axes.
+    `position_mm` is (x, y, z) in image axes; the slopes (n, 3) are the share's derivatives by it, per mm.
     """
     distance = float(equivalent_object_distance(position_mm[2], camera.focus_distance_mm, media))
-    alpha = float(camera.defocus(distance))
     back = distance / camera.image_distance_mm
+    spread = float(camera.defocus(distance)) * back
     stretch = camera.image_distance_mm / camera.microlens_distance_mm
     # How the scene point moves as the ray moves over its microlens: X follows too where the sensor is out of its focus.
-    unfocused = 1.0 - camera.microlens_distance_mm / camera.microlens_focal_length_mm
-    cell = lens_cell(camera.lattice) * ((alpha * (1.0 + unfocused * stretch) - 1.0) * back)
-    pixel = abs(alpha * stretch * back * camera.pixel_mm)
-    samples = 1 if pixel < SHARP_SHARE * radius_mm else BLURRED_SAMPLES
-    middle = scene_points(rays, camera, media, float(position_mm[2])) - position_mm[:2]
-    return covered_shares(middle, cell, radius_mm, pixel, samples)
+    lever = 1.0 + (1.0 - camera.microlens_distance_mm / camera.microlens_focal_length_mm) * stretch
+    cell_scale = spread * lever - back
+    pixel = stretch * camera.pixel_mm
+    # Back, spread and what follows from them are linear in the depth.
+    back_z = media.depth_ratio / camera.image_distance_mm
+    spread_z = (1.0 - camera.image_distance_mm / camera.focal_length_mm) * back_z
+    cell_z, width_z = (spread_z * lever - back_z) / cell_scale, float(np.sign(spread)) * pixel * spread_z
+    crossings = lens_crossings(rays, camera)
+    middle = spread * crossings - back * rays.ideal_mm - position_mm[:2]
+    middle_z = spread_z * crossings - back_z * rays.ideal_mm
+    width = abs(spread) * pixel
+    samples = 1 if width < SHARP_SHARE * radius_mm else BLURRED_SAMPLES
+    shares, slopes = covered_shares(middle, lens_cell(camera.lattice) * cell_scale, radius_mm, width, samples)
+    by_z = (
+        slopes[:, 0] * middle_z[:, 0] + slopes[:, 1] * middle_z[:, 1] + slopes[:, 2] * cell_z + slopes[:, 3] * width_z
+    )
+    return shares, np.column_stack([-slopes[:, :2], by_z])
 
 
 @njit(cache=True)
 def covered_shares(
     middle: NDArray[np.float64], cell: NDArray[np.float64], radius: float, width: float, samples: int
-) -> NDArray[np.float64]:
-    """Return the mean share of `cell`, moved to `middle` and over a square of `width` around it, inside the disc."""
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the mean share of `cell`, moved to `middle` and over a square of `width` around it, inside the disc.
+
+    The slopes (n, 4) are its derivatives by the middle's x and y, the logarithm of the cell's size, and the width.
+    """
     area = 0.0
     reach = 0.0
     for k in range(cell.shape[0]):
@@ -157,19 +182,53 @@ def covered_shares(
         area += 0.5 * (cell[k, 0] * cell[following, 1] - cell[k, 1] * cell[following, 0])
         reach = max(reach, np.sqrt(cell[k, 0] ** 2 + cell[k, 1] ** 2))
     shares = np.zeros(middle.shape[0])
+    slopes = np.zeros((middle.shape[0], 4))
+    growth = np.empty(3)
+    weight = 1.0 / (samples * samples)
     for n in range(middle.shape[0]):
-        total = 0.0
         for a in range(samples):
             for b in range(samples):
-                x = middle[n, 0] + width * ((a + 0.5) / samples - 0.5)
-                y = middle[n, 1] + width * ((b + 0.5) / samples - 0.5)
+                off_x, off_y = (a + 0.5) / samples - 0.5, (b + 0.5) / samples - 0.5
+                x = middle[n, 0] + width * off_x
+                y = middle[n, 1] + width * off_y
                 distance = np.sqrt(x * x + y * y)
                 if distance + reach <= radius:
-                    total += 1.0
+                    shares[n] += weight
                 elif distance - reach < radius:
-                    total += disc_polygon_area(x, y, cell, radius) / area
-        shares[n] = total / (samples * samples)
-    return shares
+                    share = disc_polygon_area(x, y, cell, radius) / area
+                    disc_polygon_growth(x, y, cell, radius, growth)
+                    by_x, by_y = weight * growth[0] / area, weight * growth[1] / area
+                    shares[n] += weight * share
+                    slopes[n, 0] += by_x
+                    slopes[n, 1] += by_y
+                    slopes[n, 2] += weight * (growth[2] / area - 2.0 * share)
+                    slopes[n, 3] += by_x * off_x + by_y * off_y
+    return shares, slopes
+
+
+@njit(cache=True)
+def disc_polygon_growth(
+    x: float, y: float, cell: NDArray[np.float64], radius: float, growth: NDArray[np.float64]
+) -> None:
+    """Write the derivatives of `disc_polygon_area` by x, by y, and by the logarithm of the cell's size.
+
+    Every edge sweeps an area as long as its part inside the disc.
+    """
+    growth[:] = 0.0
+    for k in range(cell.shape[0]):
+        following = (k + 1) % cell.shape[0]
+        dx, dy = cell[following, 0] - cell[k, 0], cell[following, 1] - cell[k, 1]
+        ax, ay = x + cell[k, 0], y + cell[k, 1]
+        length2 = dx * dx + dy * dy
+        along = ax * dx + ay * dy
+        inside = along * along - length2 * (ax * ax + ay * ay - radius * radius)
+        if inside > 0.0:
+            root = np.sqrt(inside)
+            part = min((root - along) / length2, 1.0) - max((-along - root) / length2, 0.0)
+            if part > 0.0:
+                growth[0] += part * dy
+                growth[1] -= part * dx
+                growth[2] += part * (cell[k, 0] * dy - cell[k, 1] * dx)
 
 
 @njit(cache=True)
@@ -228,62 +287,43 @@ def fit_disc(
 
     slopes = (scene_points(rays, camera, media, float(start_mm[2])) - start_mm[:2]) / radius_mm
     ground = passed[:, np.newaxis] * np.column_stack([np.ones(len(passed)), slopes])
+    # Columns of like size: a move of this much in depth changes the light as much as one of a radius sideways.
+    deep = radius_mm * camera.focus_distance_mm / (camera.aperture_radius_mm * media.depth_ratio)
+    unit = np.array([radius_mm, radius_mm, deep])
 
     def linear_fit(position: NDArray[np.float64]) -> LinearFit:
-        shares = disc_shares(rays, position, radius_mm, camera, media)
+        shares, moves = disc_shares(rays, position, radius_mm, camera, media)
         design = np.column_stack([passed * shares, ground])
-        levels = np.asarray(np.linalg.lstsq(design, signal, rcond=None)[0], dtype=np.float64)
+        levels = solved(design, signal)
         residual = signal - design @ levels
-        return LinearFit(design, levels, residual, float(residual @ residual))
+        full = np.column_stack([levels[0] * passed[:, np.newaxis] * moves * unit, design])
+        return LinearFit(full, levels, residual, float(residual @ residual))
 
-    def derivatives(best: LinearFit, position: NDArray[np.float64]) -> NDArray[np.float64]:
-        moves = disc_moves(passed, best.levels[0], rays, position, steps, radius_mm, camera, media)
-        return np.column_stack([moves, best.design])
-
-    step_z = camera.focus_distance_mm / (camera.aperture_radius_mm * media.depth_ratio)
-    steps = STEP_PER_RADIUS * radius_mm * np.array([1.0, 1.0, step_z])
     position = np.asarray(start_mm, dtype=np.float64)
     best = linear_fit(position)
     converged = False
     for _ in range(FIT_ROUNDS):
-        move = np.linalg.lstsq(derivatives(best, position), best.residual, rcond=None)[0][:3] * steps
+        move = solved(best.design, best.residual)[:3] * unit
         for _ in range(FIT_HALVINGS):
             trial = linear_fit(position + move)
             if trial.misfit <= best.misfit:
                 break
             move = 0.5 * move
-        converged = bool(np.all(np.abs(move) <= FIT_TOLERANCE_PER_RADIUS / STEP_PER_RADIUS * steps))
+        converged = bool(np.all(np.abs(move) <= FIT_TOLERANCE_PER_RADIUS * unit))
         if trial.misfit > best.misfit:
             break
         position, best = position + move, trial
         if converged:
             break
-    design = derivatives(best, position)
-    variance = best.misfit / max(1, signal.size - design.shape[1])
-    covariance = np.linalg.pinv(design.T @ design)[:3, :3] * variance * np.outer(steps, steps)
+    variance = best.misfit / max(1, signal.size - best.design.shape[1])
+    covariance = np.linalg.pinv(best.design.T @ best.design)[:3, :3] * variance * np.outer(unit, unit)
     rms = float(np.sqrt(best.misfit / signal.size))
     return DiscFit(position, covariance, float(best.levels[0]), float(best.levels[1]), rms, converged)
 
 
-def disc_moves(
-    passed: NDArray[np.float64],
-    brightness: float,
-    rays: PixelRays,
-    position: NDArray[np.float64],
-    steps: NDArray[np.float64],
-    radius_mm: float,
-    camera: Camera,
-    media: Media,
-) -> NDArray[np.float64]:
-    """Return the derivatives (n, 3) of the light to x, y, z, per step."""
-    columns = []
-    for axis in range(3):
-        offset = np.zeros(3)
-        offset[axis] = 0.5 * steps[axis]
-        ahead = disc_shares(rays, position + offset, radius_mm, camera, media)
-        behind = disc_shares(rays, position - offset, radius_mm, camera, media)
-        columns.append(brightness * passed * (ahead - behind))
-    return np.stack(columns, axis=1)
+def solved(design: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the coefficients of the design's columns that explain the values best."""
+    return np.asarray(np.linalg.lstsq(design, values, rcond=None)[0], dtype=np.float64)
 
 
 def checked_disc_radius(radius_mm: float, camera: Camera) -> float:
