@@ -12,9 +12,11 @@ from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media, Window
 from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.optics.object_space import ObjectSpace
+from lfpiv_cli.optics.polynomial_rays import PolynomialRays, complete_exponents
 from lfpiv_cli.weights.lens_cells import MOST_CORNERS, neighbours, shared_rectangle
-from lfpiv_cli.weights.quadrature import TILES, PolynomialRays, aperture_tiles, integrate_columns
+from lfpiv_cli.weights.quadrature import TILES, integrate_columns
 from lfpiv_cli.weights.rays import count_rays, sampling_error
+from lfpiv_cli.weights.scene import aperture_tiles, kernel_scene, on_array, rays_from
 
 VOXEL = (0.1, 0.1, 0.1)
 SMALL = (260, 380)
@@ -147,3 +149,22 @@ def test_fitted_rays_give_the_columns_of_traced_ones(layout, water, z_mm):
     images = [quadrature_image(camera, each, (0.2, -0.1, z_mm), (0.1, 0.1, 1e-9), 24) for each in (space, fitted)]
     np.testing.assert_allclose(*images, atol=1e-9)
     assert images[0].sum() == pytest.approx(1.0, abs=1e-4)
+
+
+def test_the_kernels_polynomial_is_its_array_twin(water, rng):
+    exponents = complete_exponents(3)
+    fitted = PolynomialRays(np.array([4.0, 3.0, 8.0, 12.0, 11.0]), exponents, rng.normal(size=(len(exponents), 2)))
+    points, crossings = rng.uniform(-4.0, 4.0, (50, 3)), rng.uniform(-12.0, 12.0, (50, 2))
+    scene = kernel_scene(small_camera("square"), fitted, points, np.array(VOXEL), 4, 1)
+    kernel = [
+        on_array(scene, point, rays_from(scene, point, 0, 0), *crossing)
+        for point, crossing in zip(points, crossings, strict=True)
+    ]
+    np.testing.assert_allclose(kernel, fitted.on_array(points, crossings), rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize(("degree", "terms"), [(2, 21), (3, 56)])
+def test_complete_polynomials_have_the_terms_of_hall_et_al(degree, terms):
+    exponents = complete_exponents(degree)
+    assert exponents.shape == (terms, 5)
+    assert len(np.unique(exponents, axis=0)) == terms

@@ -22,7 +22,8 @@ from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.microlenses import nearest_point
 from lfpiv_cli.weights.operators import Column
-from lfpiv_cli.weights.quadrature import DEPTH_NODES, TILES, Columns, Source, integrate_columns, kernel_scene, on_array
+from lfpiv_cli.weights.quadrature import DEPTH_NODES, TILES, Columns, integrate_columns
+from lfpiv_cli.weights.scene import Scene, Source, kernel_scene, on_array, on_sensor, rays_from
 
 # Columns may take this much memory: two thirds of a machine with 24 GiB, the rest is for volumes and images.
 LARGEST_BYTES = 16 * 2**30
@@ -168,7 +169,7 @@ class OnDemandOperator:
         for first in range(0, result.size, VOXELS_AT_ONCE * 16):
             part = np.arange(first, min(first + VOXELS_AT_ONCE * 16, result.size))
             scene = kernel_scene(self.camera, self.source, self.centres_mm(part), self.sides_mm, SIGHT_TILES, 1)
-            result[part] = _seen_share(*scene, near) >= SEEN_SHARE
+            result[part] = _seen_share(scene, near) >= SEEN_SHARE
         return result
 
     @cached_property
@@ -237,37 +238,25 @@ def _gather(
 
 
 @njit(cache=True, parallel=True)
-def _seen_share(
-    centres: NDArray[np.float64],
-    sides: NDArray[np.float64],
-    plane: NDArray[np.int64],
-    depth: NDArray[np.float64],
-    depth_share: NDArray[np.float64],
-    slopes: tuple[NDArray[np.float64], NDArray[np.float64]],
-    fitted: tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]],
-    tiles: tuple[NDArray[np.float64], NDArray[np.float64], float],
-    optics: NDArray[np.float64],
-    lattice: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
-    shape: tuple[int, int],
-    lit: NDArray[np.bool_],
-) -> NDArray[np.float64]:
+def _seen_share(scene: Scene, lit: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Return the share of each voxel's lines of sight, among those that meet the sensor, that end on lit pixels."""
-    s_i, f_m, s_mu, stretch, pixel = optics[1], optics[2], optics[3], optics[4], optics[5]
-    middles, shares = tiles[0], tiles[1]
-    seen = np.zeros(centres.shape[0])
-    for n in prange(centres.shape[0]):
+    pixel = scene.pixel_mm
+    seen = np.zeros(scene.plane.size)
+    for n in prange(scene.plane.size):
         total, found = 0.0, 0.0
-        nodes, factors = slopes[0][plane[n], 0], slopes[1][plane[n], 0]
-        for t in range(shares.size):
-            x, y = on_array(centres[n], middles[t, 0], middles[t, 1], nodes, factors, fitted, optics)
-            distorted = 1.0 + stretch * (x * x + y * y)
+        point = scene.centres_mm[n]
+        rays = rays_from(scene, point, scene.plane[n], 0)
+        for t in range(scene.tile_share.size):
+            crossing = scene.tile_mm[t]
+            x, y = on_array(scene, point, rays, crossing[0], crossing[1])
+            distorted = 1.0 + scene.distortion_per_mm2 * (x * x + y * y)
             m_x, m_y = x * distorted, y * distorted
-            centre_x, centre_y = nearest_point(m_x, m_y, lattice[0], lattice[1])
-            x = m_x + s_mu * ((x - middles[t, 0]) / s_i - (m_x - centre_x) / f_m)
-            y = m_y + s_mu * ((y - middles[t, 1]) / s_i - (m_y - centre_y) / f_m)
-            column, row = int(np.floor(x / pixel + 0.5 * shape[1])), int(np.floor(y / pixel + 0.5 * shape[0]))
-            if 0 <= column < shape[1] and 0 <= row < shape[0]:
-                total += shares[t]
-                found += shares[t] * lit[row, column]
+            centre_x, centre_y = nearest_point(m_x, m_y, scene.origin_mm, scene.basis_mm)
+            x = on_sensor(scene, x, crossing[0], m_x, centre_x)
+            y = on_sensor(scene, y, crossing[1], m_y, centre_y)
+            column, row = int(np.floor(x / pixel + 0.5 * scene.columns)), int(np.floor(y / pixel + 0.5 * scene.rows))
+            if 0 <= column < scene.columns and 0 <= row < scene.rows:
+                total += scene.tile_share[t]
+                found += scene.tile_share[t] * lit[row, column]
         seen[n] = found / total if total > 0.0 else 0.0
     return seen
