@@ -12,7 +12,8 @@ from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.microlenses import Lattice
-from lfpiv_cli.reconstruction.solvers import normalisers, reconstruct
+from lfpiv_cli.reconstruction.equations import normalisers
+from lfpiv_cli.reconstruction.solvers import reconstruct
 from lfpiv_cli.synthetic.render import ObjectSpace, render_points
 from lfpiv_cli.synthetic.sensor import Readout
 from lfpiv_cli.weights.build import default_padding, factorise

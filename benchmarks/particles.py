@@ -19,7 +19,7 @@ from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.particles.rounds import find_particles
 from lfpiv_cli.particles.view import raw_view
-from lfpiv_cli.reconstruction.solvers import normalisers
+from lfpiv_cli.reconstruction.equations import normalisers
 from lfpiv_cli.synthetic.board import BoardPlacement, render_board
 from lfpiv_cli.synthetic.render import ObjectSpace, render_points, render_white
 from lfpiv_cli.synthetic.scenes import Misalignment

@@ -33,8 +33,8 @@ from lfpiv_cli.flow.correlation import correlate as correlate_volumes
 from lfpiv_cli.flow.correlation import count_passes
 from lfpiv_cli.flow.field import REJECTED, VectorField
 from lfpiv_cli.grid import Grid
+from lfpiv_cli.reconstruction.equations import normalisers
 from lfpiv_cli.reconstruction.images import light, minimum_background
-from lfpiv_cli.reconstruction.solvers import normalisers
 from lfpiv_cli.reconstruction.solvers import reconstruct as solve
 from lfpiv_cli.stages_weights import make_operator
 from lfpiv_cli.validation.flow import flow_figures, limits_missed, truth_at_points

@@ -13,7 +13,8 @@ from lfpiv_cli.files.batch import prepare_folder
 from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.pictures import ensure_drawing, write_picture
 from lfpiv_cli.files.provenance import record
-from lfpiv_cli.reconstruction.solvers import normalisers, reconstruct
+from lfpiv_cli.reconstruction.equations import normalisers
+from lfpiv_cli.reconstruction.solvers import reconstruct
 from lfpiv_cli.synthetic.board import BoardPlacement, dot_centres, render_board
 from lfpiv_cli.synthetic.render import ObjectSpace
 from lfpiv_cli.validation.board import DEPTHS_MM, board_figures, measure_dots

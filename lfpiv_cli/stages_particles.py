@@ -24,7 +24,7 @@ from lfpiv_cli.particles.gridding import on_grid
 from lfpiv_cli.particles.rounds import ROUNDS, Particles, find_particles
 from lfpiv_cli.particles.tracking import Tracks, track
 from lfpiv_cli.particles.view import raw_view
-from lfpiv_cli.reconstruction.solvers import Normalisers
+from lfpiv_cli.reconstruction.equations import Normalisers
 
 # A vector needs its twelve nearest tracks within this many windows of its centre.
 REACH_WINDOWS = 1.0

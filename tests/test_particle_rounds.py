@@ -15,7 +15,7 @@ from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.particles.candidates import explain_rest, find_peaks
 from lfpiv_cli.particles.rounds import find_particles
 from lfpiv_cli.particles.view import raw_view
-from lfpiv_cli.reconstruction.solvers import normalisers
+from lfpiv_cli.reconstruction.equations import normalisers
 from lfpiv_cli.synthetic.render import render_points
 from lfpiv_cli.weights.build import default_padding, factorise
 from lfpiv_cli.weights.model import Weights

@@ -10,8 +10,10 @@ import pytest
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.microlenses import Lattice
+from lfpiv_cli.reconstruction.equations import Problem, normalisers
 from lfpiv_cli.reconstruction.images import light, minimum_background
-from lfpiv_cli.reconstruction.solvers import SOLVERS, Momentum, Problem, normalisers, reconstruct, sart_step
+from lfpiv_cli.reconstruction.solvers import SOLVERS, Momentum, Stopping, mart_step, reconstruct, sart_step, smart_step
+from lfpiv_cli.reconstruction.starts import line_of_sight_start, lit_support
 from lfpiv_cli.weights.build import factorise
 
 
@@ -51,8 +53,7 @@ def test_sart_step_is_eq_12_written_as_loops(dense, rng):
                 numerator += (image[i] - sum(w[i, n] * volume[n] for n in range(5))) / row_sum * w[i, j]
                 denominator += w[i, j]
         expected[j] += 0.7 * numerator / denominator
-    sums = normalisers(dense)
-    problem = Problem(dense, image[np.newaxis].astype(np.float32), sums.inverse_row_sum, sums.inverse_column_sum)
+    problem = Problem(dense, image[np.newaxis].astype(np.float32), normalisers(dense))
     start = volume.reshape(dense.shape).astype(np.float32)
     stepped = sart_step(problem, start, dense.forward(start), relaxation=0.7)
     np.testing.assert_allclose(stepped.ravel(), np.maximum(expected, 0.0), rtol=1e-5)
@@ -63,7 +64,7 @@ def test_true_volume_is_a_fixed_point(optical, rng, solver):
     truth = rng.random(optical.shape, dtype=np.float32)
     sums = normalisers(optical)
     image = optical.forward(truth)
-    problem = Problem(optical, image, sums.inverse_row_sum, sums.inverse_column_sum)
+    problem = Problem(optical, image, sums)
     seen = sums.inverse_column_sum > 0
     stepped = SOLVERS[solver](problem, truth, image, 1.0)
     # Pixels below the guard are left out of numerator and denominator alike, so only float32 rounding remains.
@@ -78,6 +79,100 @@ def test_residual_falls_and_volume_stays_non_negative(optical, rng, solver):
     assert np.all(np.diff(result.residual) < 0)
     assert result.residual[-1] < 0.5 * result.residual[0]
     assert result.volume.min() >= 0.0
+
+
+def test_mart_takes_its_pixels_in_turn(dense, rng):
+    # On a 1 x 9 image the blocks of four columns are the pixels 0, 4, 8, then 1, 5, and so on.
+    w, image, volume = dense.matrix, rng.random(9) + 0.5, rng.random(5) + 0.5
+    expected = volume.copy()
+    for first in range(4):
+        block = [i for i in range(first, 9, 4) if w[i].sum() > 0]
+        now = expected.copy()
+        largest = max(sum(w[i, j] for i in block) for j in range(5))
+        for j in range(5):
+            exponent = sum(w[i, j] * np.log(image[i] / (w[i] @ now)) for i in block)
+            expected[j] *= np.exp(0.8 * exponent / largest)
+    problem = Problem(dense, image[np.newaxis].astype(np.float32), normalisers(dense))
+    start = volume.reshape(dense.shape).astype(np.float32)
+    np.testing.assert_allclose(mart_step(problem, start, dense.forward(start), 0.8).ravel(), expected, rtol=1e-4)
+
+
+def test_smart_multiplies_by_the_geometric_mean_of_the_ratios(dense, rng):
+    w, image, volume = dense.matrix, rng.random(9) + 0.5, rng.random(5) + 0.5
+    ratio = np.divide(image, w @ volume, out=np.ones(9), where=w.sum(axis=1) > 0)
+    expected = volume * np.prod(ratio[:, np.newaxis] ** w, axis=0) ** (0.8 / w.sum(axis=0))
+    problem = Problem(dense, image[np.newaxis].astype(np.float32), normalisers(dense))
+    start = volume.reshape(dense.shape).astype(np.float32)
+    np.testing.assert_allclose(smart_step(problem, start, dense.forward(start), 0.8).ravel(), expected, rtol=1e-4)
+
+
+@pytest.mark.parametrize("accelerate", [False, True])
+@pytest.mark.parametrize("solver", ["sart", "em", "smart"])
+def test_excluded_pixels_are_deleted_rows(dense, rng, solver, accelerate):
+    image = (dense.matrix @ rng.random(5) * rng.uniform(0.8, 1.2, 9)).astype(np.float32)
+    excluded = np.array([False, True, False, False, True, False, False, False, False])
+    spoilt = np.where(excluded, np.float32(65535.0), image)[np.newaxis]
+    fewer = DenseOperator(dense.matrix[~excluded])
+    options = {"solver": solver, "iterations": 12, "accelerate": accelerate}
+    expected = reconstruct(fewer, image[np.newaxis, ~excluded], **options)
+    for sums in (
+        normalisers(dense, excluded[np.newaxis]),
+        normalisers(dense).without(dense, excluded[np.newaxis]),
+    ):
+        found = reconstruct(dense, spoilt, **options, sums=sums)
+        np.testing.assert_allclose(found.volume, expected.volume, rtol=1e-4)
+        np.testing.assert_allclose(found.residual, expected.residual, rtol=1e-4)
+
+
+@pytest.mark.parametrize("solver", ["sart", "em", "smart"])
+def test_voxels_out_of_the_support_are_deleted_columns(dense, rng, solver):
+    image = (dense.matrix @ rng.random(5)).astype(np.float32)[np.newaxis]
+    support = np.array([True, False, True, True, False])
+    expected = reconstruct(DenseOperator(dense.matrix[:, support]), image, solver, 12).volume
+    sums = normalisers(dense).within(dense, support.reshape(dense.shape))
+    found = reconstruct(dense, image, solver, 12, sums=sums)
+    np.testing.assert_allclose(found.volume.ravel()[support], expected.ravel(), rtol=1e-4)
+    assert not found.volume.ravel()[~support].any()
+    assert found.support_voxels == 3
+
+
+def test_line_of_sight_start_is_the_geometric_mean_of_what_pixels_allow(dense, rng):
+    w, image = dense.matrix, rng.random(9) + 0.5
+    seen = w.sum(axis=1) > 0
+    level = image[seen] / w[seen].sum(axis=1)
+    expected = np.prod(level[:, np.newaxis] ** w[seen], axis=0) ** (1.0 / w.sum(axis=0))
+    start = line_of_sight_start(Problem.of(dense, image[np.newaxis].astype(np.float32), normalisers(dense))).ravel()
+    np.testing.assert_allclose(start / start[0], expected / expected[0], rtol=1e-4)
+    assert (w @ start)[seen].sum() == pytest.approx(image[seen].sum(), rel=1e-4)
+
+
+def test_line_of_sight_leaves_dark_voxels_out_for_good(optical):
+    truth = np.zeros(optical.shape, np.float32)
+    truth[2, 3, 4] = 100.0
+    image = optical.forward(truth)
+    sums = normalisers(optical)
+    support = lit_support(optical, image, sums)
+    assert support[2, 3, 4]
+    assert support.sum() < 0.5 * support.size
+    start = line_of_sight_start(Problem(optical, image, sums))
+    assert np.unravel_index(start.argmax(), start.shape) == (2, 3, 4)
+    assert start.sum() == pytest.approx(100.0, rel=0.05)
+    # voxels of the support do not light the whole sensor: the pixels they miss are left out with the others
+    volume = reconstruct(optical, image, "sart", 20, start="line_of_sight").volume
+    assert not volume[~support].any()
+    assert volume[2, 3, 4] == volume.max()
+
+
+def test_stopping_by_change_and_by_residual(optical, rng):
+    image = optical.forward(rng.random(optical.shape, dtype=np.float32))
+    whole = reconstruct(optical, image, "em", 60)
+    relative = 1.0 - whole.residual[1:] / whole.residual[:-1]
+    first = int(np.argmax(relative < 0.02))
+    by_change = reconstruct(optical, image, "em", 60, stopping=Stopping(change=0.02))
+    np.testing.assert_array_equal(by_change.residual, whole.residual[: first + 2])
+    limit = float(whole.residual[7])
+    by_residual = reconstruct(optical, image, "em", 60, stopping=Stopping(residual=limit))
+    np.testing.assert_array_equal(by_residual.residual, whole.residual[:8])
 
 
 def test_pixels_and_voxels_out_of_sight_take_no_part():

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from lfpiv_cli.reconstruction.solvers import Normalisers
+from lfpiv_cli.reconstruction.equations import Normalisers
 from lfpiv_cli.weights.model import Weights
 
 # Light-field volumes are sharp laterally and long in depth: a peak is the largest sum over three planes among its

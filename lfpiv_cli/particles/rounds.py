@@ -24,7 +24,7 @@ from lfpiv_cli.particles.noise import Noise, estimate_noise
 from lfpiv_cli.particles.splitting import split
 from lfpiv_cli.particles.tiles import footprint_px, share_out
 from lfpiv_cli.particles.view import View, entry_capacity
-from lfpiv_cli.reconstruction.solvers import Normalisers
+from lfpiv_cli.reconstruction.equations import Normalisers
 from lfpiv_cli.weights.model import Weights
 
 

@@ -11,76 +11,67 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-Volume = NDArray[np.float32]
-Image = NDArray[np.float32]
+from lfpiv_cli.reconstruction.equations import Image, Normalisers, Operator, Problem, Volume, normalisers
+from lfpiv_cli.reconstruction.starts import line_of_sight_start, lit_support, uniform_start
 
-# Row and column sums below this share of the largest one belong to pixels or voxels that are all but unseen (a sliver
-# of the sensor or of the aperture's rim); they stay out of the equations instead of being divided by.
-SMALLEST_SUM = 1e-4
+Start = Literal["uniform", "line_of_sight"]
 
-
-class Operator(Protocol):
-    """What a solver needs of the weights."""
-
-    @property
-    def shape(self) -> tuple[int, int, int]: ...
-
-    def forward(self, volume: Volume) -> Image: ...
-
-    def adjoint(self, image: Image) -> Volume: ...
+# MART takes the pixels in this many by this many interleaved blocks; neighbours, which see the same voxels, apart.
+MART_BLOCKS = 4
+# A pixel darker than this share of what the volume sends it counts as so dark: one of zero would put out, at once and
+# for good, every voxel that it sees.
+SMALLEST_RATIO = 1e-2
 
 
-@dataclass(frozen=True, eq=False)
-class Problem:
-    """The equations of one image.
+@dataclass(frozen=True)
+class Stopping:
+    """When to end before all iterations are done.
 
     Attributes
     ----------
-    operator : the weights
-    image : (rows, columns) >= 0, in the weights' frame; 0 where a pixel takes no part
-    inverse_row_sum : (rows, columns) 1 / sum_n w_in, 0 for pixels that take no part
-    inverse_column_sum : (z, y, x) 1 / sum_i w_ij over the pixels that take part, 0 for voxels that none of them sees
+    change : end when an iteration lowers the residual by less than this share of it; None: never
+    residual : end when the relative residual is this small, as what remains is noise; None: never
     """
 
-    operator: Operator
-    image: Image
-    inverse_row_sum: Image
-    inverse_column_sum: Volume
+    change: float | None = None
+    residual: float | None = None
+
+    def reached(self, residual: NDArray[np.float64]) -> bool:
+        """Return whether the residuals (n,) of the iterations so far are the last ones needed."""
+        if self.residual is not None and residual[-1] <= self.residual:
+            return True
+        if self.change is None or residual.size < 2:
+            return False
+        return bool(residual[-2] - residual[-1] <= self.change * residual[-2])
 
 
-@dataclass(frozen=True, eq=False)
-class Normalisers:
-    """Guarded inverses of the row and column sums; the same for all images of one set of weights."""
-
-    inverse_row_sum: Image
-    inverse_column_sum: Volume
+ALL_ITERATIONS = Stopping()
 
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
-    """A volume (z, y, x) and the relative residual ||I - W E|| / ||I||, at the start of each step and of the volume."""
+    """A volume (z, y, x) and how it came about.
+
+    Attributes
+    ----------
+    residual : (iterations + 1,) relative residual ||I - W E|| / ||I||, at the start of each step and of the volume
+    support_voxels : how many voxels took part
+    """
 
     volume: Volume
     residual: NDArray[np.float64]
-
-
-def normalisers(operator: Operator) -> Normalisers:
-    """Return the guarded inverse row and column sums of the weights (the denominators of Eq. 12)."""
-    row_sum = operator.forward(np.ones(operator.shape, np.float32))
-    inverse_row_sum = _guarded_inverse(row_sum)
-    column_sum = operator.adjoint((inverse_row_sum > 0.0).astype(np.float32))
-    return Normalisers(inverse_row_sum, _guarded_inverse(column_sum))
+    support_voxels: int
 
 
 def sart_step(problem: Problem, volume: Volume, projection: Image, relaxation: float) -> Volume:
     """Return the volume after one step of SART, all pixels at once (Eq. 12), kept non-negative."""
-    correction = (problem.image - projection) * problem.inverse_row_sum
-    update = problem.operator.adjoint(correction) * problem.inverse_column_sum
+    correction = (problem.image - projection) * problem.sums.inverse_row_sum
+    update = problem.operator.adjoint(correction) * problem.sums.inverse_column_sum
     return np.maximum(volume + np.float32(relaxation) * update, np.float32(0.0))
 
 
@@ -93,15 +84,55 @@ def em_step(problem: Problem, volume: Volume, projection: Image, relaxation: flo
         problem.image,
         projection,
         out=np.zeros_like(projection),
-        where=(projection > 0.0) & (problem.inverse_row_sum > 0.0),
+        where=(projection > 0.0) & (problem.sums.inverse_row_sum > 0.0),
     )
-    factor = problem.operator.adjoint(ratio) * problem.inverse_column_sum
+    factor = problem.operator.adjoint(ratio) * problem.sums.inverse_column_sum
     if relaxation != 1.0:
         factor **= np.float32(relaxation)
     return volume * factor
 
 
-SOLVERS: dict[str, Callable[[Problem, Volume, Image, float], Volume]] = {"sart": sart_step, "em": em_step}
+def smart_step(problem: Problem, volume: Volume, projection: Image, relaxation: float) -> Volume:
+    """Return the volume after one step of MART with all pixels at once (SMART).
+
+    E <- E exp(relaxation W^T log(I / W E) / W^T 1).
+    """
+    exponent = problem.operator.adjoint(_log_ratio(problem, projection)) * problem.sums.inverse_column_sum
+    return volume * np.exp(np.float32(relaxation) * exponent)
+
+
+def mart_step(problem: Problem, volume: Volume, projection: Image, relaxation: float) -> Volume:
+    """Return the volume after one step of MART, block by block: of `MART_BLOCKS` squared sets of pixels in turn.
+
+    E <- E exp(relaxation W_b^T log(I / W E) / max(W_b^T 1)) for the pixels b of each block. It costs as many passes
+    over the volume as there are blocks, and is there to compare with.
+    """
+    taking_part = problem.sums.inverse_row_sum > 0.0
+    for number in range(MART_BLOCKS**2):
+        block = np.zeros_like(taking_part)
+        row, column = divmod(number, MART_BLOCKS)
+        block[row::MART_BLOCKS, column::MART_BLOCKS] = taking_part[row::MART_BLOCKS, column::MART_BLOCKS]
+        current = projection if number == 0 else problem.operator.forward(volume)
+        largest = float(problem.operator.adjoint(block.astype(np.float32)).max())
+        if largest > 0.0:
+            exponent = problem.operator.adjoint(np.where(block, _log_ratio(problem, current), np.float32(0.0)))
+            volume = volume * np.exp(exponent * np.float32(relaxation / largest))
+    return volume
+
+
+def _log_ratio(problem: Problem, projection: Image) -> Image:
+    """Return log(I / W E) of each pixel (rows, columns), 0 where it takes no part or the volume does not light it."""
+    lit = (projection > 0.0) & (problem.sums.inverse_row_sum > 0.0)
+    ratio = np.divide(problem.image, projection, out=np.ones_like(projection), where=lit)
+    return np.log(np.maximum(ratio, np.float32(SMALLEST_RATIO)))
+
+
+SOLVERS: dict[str, Callable[[Problem, Volume, Image, float], Volume]] = {
+    "sart": sart_step,
+    "em": em_step,
+    "smart": smart_step,
+    "mart": mart_step,
+}
 
 
 def reconstruct(
@@ -113,28 +144,34 @@ def reconstruct(
     accelerate: bool = False,
     sums: Normalisers | None = None,
     progress: Callable[[int], None] | None = None,
+    start: Start = "uniform",
+    stopping: Stopping = ALL_ITERATIONS,
 ) -> Reconstruction:
-    """Solve for the volume that gives an image, from a uniform start.
+    """Solve for the volume that gives an image.
 
     Parameters
     ----------
     image : (rows, columns) in the weights' frame, dark and background taken off; negative values count as 0
     solver : name in `SOLVERS`
     accelerate : step from points extrapolated by `Momentum`, at the cost of three passes over the volume
-    sums : `normalisers(operator)`, where several images share it
+    sums : `normalisers(operator)`, where several images share it; tells which pixels take part
     progress : called with 1 after each iteration
+    start : `uniform` (the paper), or `line_of_sight`, which also leaves voxels out for good
+    stopping : when to end before all iterations are done
     """
-    sums = sums or normalisers(operator)
-    taking_part = sums.inverse_row_sum > 0.0
-    image = np.where(taking_part, np.maximum(image, 0.0), 0.0).astype(np.float32)
-    problem = Problem(operator, image, sums.inverse_row_sum, sums.inverse_column_sum)
-    volume = point = uniform_start(problem)
+    problem = Problem.of(operator, image, sums or normalisers(operator))
+    if start == "line_of_sight":
+        support = lit_support(operator, problem.image, problem.sums)
+        problem = Problem.of(operator, image, problem.sums.within(operator, support))
+    volume = point = line_of_sight_start(problem) if start == "line_of_sight" else uniform_start(problem)
     momentum = Momentum()
-    norm = np.sqrt(_square_sum(image))
-    residual = np.zeros(iterations + 1)
-    for k in range(iterations):
+    residual: list[float] = []
+    for _ in range(iterations):
         projection = operator.forward(point)
-        residual[k] = _relative_residual(image, projection, taking_part, norm)
+        residual.append(_relative_residual(problem, projection))
+        if stopping.reached(np.array(residual)):
+            residual.pop()
+            break
         previous, volume = volume, SOLVERS[solver](problem, point, projection, relaxation)
         if accelerate:
             momentum, point = momentum.extrapolated(point, previous, volume)
@@ -142,8 +179,9 @@ def reconstruct(
             point = volume
         if progress:
             progress(1)
-    residual[iterations] = _relative_residual(image, operator.forward(volume), taking_part, norm)
-    return Reconstruction(volume, residual)
+    residual.append(_relative_residual(problem, operator.forward(volume)))
+    taking_part = int(np.count_nonzero(problem.sums.inverse_column_sum))
+    return Reconstruction(volume, np.array(residual), taking_part)
 
 
 @dataclass(frozen=True)
@@ -166,24 +204,12 @@ class Momentum:
         return Momentum(following), np.maximum(change, np.float32(0.0))
 
 
-def uniform_start(problem: Problem) -> Volume:
-    """Return the constant volume (z, y, x) that has the image's light, 0 where no pixel sees it."""
-    seen = problem.inverse_column_sum > 0.0
-    gain = np.sum(1.0 / problem.inverse_column_sum[seen], dtype=np.float64)
-    level = np.sum(problem.image, dtype=np.float64) / gain if gain > 0.0 else 0.0
-    return np.where(seen, np.float32(level), np.float32(0.0))
-
-
-def _guarded_inverse(sums: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return 1 / sums, 0 where a sum is negligible beside the largest."""
-    limit = SMALLEST_SUM * float(sums.max(initial=0.0))
-    return np.divide(np.float32(1.0), sums, out=np.zeros_like(sums), where=sums > limit)
-
-
 def _square_sum(image: Image) -> float:
     return float(np.sum(np.square(image, dtype=np.float64)))
 
 
-def _relative_residual(image: Image, projection: Image, taking_part: NDArray[np.bool_], norm: float) -> float:
-    difference = np.where(taking_part, image - projection, np.float32(0.0))
-    return float(np.sqrt(_square_sum(difference))) / norm if norm > 0.0 else 0.0
+def _relative_residual(problem: Problem, projection: Image) -> float:
+    """Return ||I - W E|| / ||I|| over the pixels that take part, 0 for a dark image."""
+    norm = np.sqrt(_square_sum(problem.image))
+    difference = np.where(problem.sums.inverse_row_sum > 0.0, problem.image - projection, np.float32(0.0))
+    return float(np.sqrt(_square_sum(difference)) / norm) if norm > 0.0 else 0.0
