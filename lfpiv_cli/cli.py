@@ -115,12 +115,16 @@ def build_weights(**arguments: Any) -> dict[str, Any]:
 @cli.command("reconstruct")
 @click.argument("weights", type=INPUT)
 @click.argument("images", type=INPUT, nargs=-1, required=True)
-@click.option("--solver", type=click.Choice(["em", "sart", "particles"]), help="Default from the config.")
+@click.option(
+    "--solver", type=click.Choice(["em", "sart", "smart", "mart", "particles"]), help="Default from the config."
+)
 @click.option("--iterations", type=click.IntRange(min=1), help="Default from the config.")
 @click.option("--relaxation", type=click.FloatRange(min=0.0, min_open=True, max=2.0), help="Default from the config.")
 @click.option("--accelerate/--no-accelerate", default=None, help="Extrapolate between steps; default from the config.")
-@click.option("--dark", type=INPUT, help="Dark image to subtract.")
-@click.option("--background", help="Image without tracers to subtract, or 'minimum' over the images given.")
+@click.option("--start", type=click.Choice(["uniform", "line_of_sight"]), help="Default from the config.")
+@click.option("--dark", type=INPUT, help="Dark image to subtract; its hot and dead pixels are left out.")
+@click.option("--background", help="Image to subtract, or minimum or mean over the images given, or as minimum:15.")
+@click.option("--mask", type=INPUT, help="Image that is black where pixels are to be left out (reflections, bubbles).")
 @click.option("--resume", is_flag=True, help="Skip outputs that are complete and made from the same inputs.")
 @click.option("--keep-going", is_flag=True, help="Go on with the next frame when one fails.")
 @click.option("-o", "--output", type=INPUT, required=True, help="File for one image, folder for several.")
@@ -130,10 +134,12 @@ def reconstruct(**arguments: Any) -> dict[str, Any]:
 
     \b
     Example: lfpiv reconstruct weights.h5 a.tif b.tif --dark dark.tif -o volumes
+    over a long sequence, the background of each frame from the fifteen around it:
+             lfpiv reconstruct weights.h5 run.tif --background minimum:15 --mask mask.png -o volumes
     """
-    from lfpiv_cli import stages
+    from lfpiv_cli import stages_reconstruct
 
-    return stages.reconstruct(**arguments)
+    return stages_reconstruct.reconstruct(**arguments)
 
 
 @cli.command("correlate")

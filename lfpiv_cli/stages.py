@@ -7,7 +7,6 @@ writes. Units stand in the names of the figures.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,27 +14,23 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from lfpiv_cli import stages_particles
 from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.console import Console
-from lfpiv_cli.errors import ConfigError, InputError, LfpivError, LimitMissedError, PartialError, UsageError
-from lfpiv_cli.files import images as image_files
+from lfpiv_cli.errors import ConfigError, InputError, LimitMissedError, UsageError
 from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.files.atomic import ensure_writable, write_json
-from lfpiv_cli.files.batch import Frame, Target, frames_of, output_paths, pending, prepare_folder
+from lfpiv_cli.files.batch import Target, output_paths, pending, prepare_folder
 from lfpiv_cli.files.calibration_file import read_calibration
-from lfpiv_cli.files.config import Config, load_config
+from lfpiv_cli.files.config import Config, carried_config, load_config
+from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.particles import read_particles
 from lfpiv_cli.files.pictures import ensure_drawing, write_picture
 from lfpiv_cli.files.provenance import record as provenance_record
-from lfpiv_cli.files.weights_file import WeightsFile, read_weights, write_weights
+from lfpiv_cli.files.weights_file import WeightsFile, write_weights
 from lfpiv_cli.flow.correlation import correlate as correlate_volumes
 from lfpiv_cli.flow.correlation import count_passes
 from lfpiv_cli.flow.field import REJECTED, VectorField
 from lfpiv_cli.grid import Grid
-from lfpiv_cli.reconstruction.equations import normalisers
-from lfpiv_cli.reconstruction.images import light, minimum_background
-from lfpiv_cli.reconstruction.solvers import reconstruct as solve
 from lfpiv_cli.stages_weights import make_operator
 from lfpiv_cli.validation.flow import flow_figures, limits_missed, truth_at_points
 from lfpiv_cli.validation.pictures import flow_figure
@@ -69,7 +64,7 @@ def build_weights(
     console: Console,
 ) -> dict[str, Any]:
     """Calculate the weights of the configured volume, for the calibrated camera where there is a calibration."""
-    inputs = _given(config=config, calibration=calibration)
+    inputs = given(config=config, calibration=calibration)
     ensure_writable(output, overwrite, inputs.values())
     settings = load_config(config).overridden("weights", method=method, refraction=refraction, sampling=sampling)
     found = read_calibration(calibration) if calibration else None
@@ -104,92 +99,6 @@ def build_weights(
     }
 
 
-def reconstruct(
-    weights: Path,
-    images: Sequence[Path],
-    solver: str | None,
-    iterations: int | None,
-    relaxation: float | None,
-    accelerate: bool | None,
-    dark: Path | None,
-    background: str | None,
-    resume: bool,
-    keep_going: bool,
-    output: Path,
-    overwrite: bool,
-    console: Console,
-) -> dict[str, Any]:
-    """Reconstruct the volume behind each image."""
-    common = _given(weights=weights, dark=dark, background=None if background == "minimum" else background)
-    frames = frames_of(images)
-    paths = output_paths(output, [frame.stem for frame in frames])
-    prepare_folder(paths)
-    content = read_weights(weights)
-    settings = _carried_config(content.provenance, weights).overridden(
-        "reconstruction", solver=solver, iterations=iterations, relaxation=relaxation, accelerate=accelerate
-    )
-    targets = [
-        Target(path, _record(f"reconstruct page {frame.page}", settings, common | {"image": frame.path}))
-        for path, frame in zip(paths, frames, strict=True)
-    ]
-    needed = pending(targets, [*common.values(), *images], overwrite, resume, _record_of)
-    shape = content.weights.image_shape
-    dark_image = image_files.read_image(dark, shape) if dark else None
-    background_image = _background(background, frames, shape)
-    operator = content.weights.padded
-    sums = normalisers(operator) if needed and not operator.on_demand else None
-    chosen = settings.reconstruction
-    solver_options = chosen.model_dump(include={"solver", "iterations", "relaxation", "accelerate"})
-    residuals: list[float] = []
-    failures: list[str] = []
-    as_particles = chosen.solver == "particles"
-    if as_particles:
-        stages_particles.ensure_solvable(content, settings)
-    steps = stages_particles.STEPS if as_particles else chosen.iterations
-    with console.progress(len(needed) * steps, "reconstruct") as advance:
-        for number in needed:
-            try:
-                raw = image_files.read_page(frames[number].path, frames[number].page, shape)
-                lit = light(raw, dark_image, background_image)
-                if as_particles and sums is not None:
-                    path, made_by = targets[number].path, targets[number].record
-                    residuals.append(
-                        stages_particles.write_frame(content, settings, lit, sums, path, made_by, overwrite, advance)
-                    )
-                    continue
-                image = content.weights.prepare(lit)
-                result = solve(operator.for_image(image), image, **solver_options, sums=sums, progress=advance)
-            except LfpivError as error:
-                if not keep_going:
-                    raise
-                failures.append(str(error))
-                console.say(f"lfpiv: {error}")
-                continue
-            residuals.append(float(result.residual[-1]))
-            vtkhdf.write_volume(
-                targets[number].path,
-                content.weights.to_world(result.volume),
-                _file_grid(content),
-                provenance=targets[number].record,
-                attributes={
-                    "reference": content.reference,
-                    "reference_z_mm": content.reference_z_mm,
-                    "residual": result.residual,
-                },
-                overwrite=overwrite,
-            )
-    if failures:
-        raise PartialError(f"{len(failures)} of {len(frames)} frames failed, the first because {failures[0]}")
-    return {
-        "frames": len(frames),
-        "reconstructed": len(residuals),
-        "skipped": len(frames) - len(needed),
-        "solver": chosen.solver,
-        "iterations": None if as_particles else chosen.iterations,
-        "residual": max(residuals, default=None),
-    }
-
-
 def correlate(
     volumes: Sequence[Path],
     config: Path | None,
@@ -206,15 +115,15 @@ def correlate(
     pairs = _pairs(volumes, pairing)
     paths = output_paths(output, [first.stem for first, _ in pairs])
     prepare_folder(paths)
-    given = load_config(config) if config else None
+    told = load_config(config) if config else None
     sizes = [_window(text) for text in windows.split(",")] if windows else None
     rejected = total = 0
     settings_of = []
     for first, _ in pairs:
-        settings = given or _carried_config(vtkhdf.read_header(first).provenance, first)
+        settings = told or carried_config(vtkhdf.read_header(first).provenance, first)
         settings_of.append(settings.overridden("correlation", dt_s=dt_s, windows=sizes, overlap=overlap))
     targets = [
-        Target(path, _record("correlate", settings, _given(config=config, volume_a=pair[0], volume_b=pair[1])))
+        Target(path, _record("correlate", settings, given(config=config, volume_a=pair[0], volume_b=pair[1])))
         for path, pair, settings in zip(paths, pairs, settings_of, strict=True)
     ]
     inputs = [*volumes, *filter(None, [config])]
@@ -251,7 +160,7 @@ def validate_flow(
     config: Path, vectors: Path, particles: Path | None, output: Path, overwrite: bool, console: Console
 ) -> dict[str, Any]:
     """Judge a vector field by an analytic flow or by true particles."""
-    inputs = _given(config=config, vectors=vectors, particles=particles)
+    inputs = given(config=config, vectors=vectors, particles=particles)
     figures_path, picture_path = output / "flow.json", output / "flow.png"
     prepare_folder([figures_path])
     for target in (figures_path, picture_path):
@@ -279,21 +188,8 @@ def validate_flow(
     return {name: value for name, value in figures.items() if not isinstance(value, (list, dict))}
 
 
-def _given(**inputs: Path | str | None) -> dict[str, Path]:
-    """Return the inputs that were given, by their role."""
-    return {role: Path(path) for role, path in inputs.items() if path is not None}
-
-
 def _record(command: str, settings: Config, inputs: dict[str, Path]) -> dict[str, Any]:
     return provenance_record(command, settings.resolved(), inputs)
-
-
-def _carried_config(record: dict[str, Any], path: Path) -> Config:
-    """Return the resolved config that one of our files carries."""
-    config = record.get("config")
-    if not config:
-        raise InputError(f"{path}: carries no config; give one with --config")
-    return Config.from_resolved(config)
 
 
 def _window_centres_mm(field: VectorField) -> NDArray[np.float64]:
@@ -337,20 +233,6 @@ def _judge_view(smallest: float, largest: float, grid: Grid, console: Console) -
         raise ConfigError(f"volume: none of it ({spans} mm) lies in the camera's view")
     if smallest < LEAST_SEEN:
         console.say("lfpiv: a part of the volume lies outside the camera's view; nothing will be found there")
-
-
-def _background(background: str | None, frames: Sequence[Frame], shape: tuple[int, int]) -> NDArray[np.float32] | None:
-    """Return the background image: read from a file, or the minimum over the frames."""
-    if background == "minimum":
-        return minimum_background(image_files.read_page(frame.path, frame.page, shape) for frame in frames)
-    return image_files.read_image(Path(background), shape) if background else None
-
-
-def _file_grid(content: WeightsFile) -> Grid:
-    """Return the volume's grid in the coordinates of files, whose z counts from the reference."""
-    grid = content.weights.grid
-    x, y, z = grid.origin_mm
-    return replace(grid, origin_mm=(x, y, z - content.reference_z_mm))
 
 
 def _pairs(volumes: Sequence[Path], pairing: str | None) -> list[tuple[Path, Path]]:

@@ -7,11 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lfpiv_cli.errors import InputError
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.reconstruction.equations import Problem, normalisers
-from lfpiv_cli.reconstruction.images import light, minimum_background
 from lfpiv_cli.reconstruction.solvers import SOLVERS, Momentum, Stopping, mart_step, reconstruct, sart_step, smart_step
 from lfpiv_cli.reconstruction.starts import line_of_sight_start, lit_support
 from lfpiv_cli.weights.build import factorise
@@ -188,24 +186,6 @@ def test_dark_image_gives_an_empty_volume(optical, solver):
     result = reconstruct(optical, np.full(optical.image_shape, -3.0, np.float32), solver, iterations=3)
     assert not result.volume.any()
     assert np.all(np.isfinite(result.residual))
-
-
-def test_light_takes_off_dark_or_background_and_survives_broken_pixels():
-    image = np.array([[10.0, np.nan], [7.0, 3.0]], np.float32)
-    dark = np.full((2, 2), 4.0, np.float32)
-    np.testing.assert_array_equal(light(image, dark), [[6.0, 0.0], [3.0, -1.0]])
-    np.testing.assert_array_equal(light(image, dark, dark + 1), [[5.0, 0.0], [2.0, -2.0]])
-    with pytest.raises(InputError, match="does not fit"):
-        light(image, dark[:1])
-
-
-def test_minimum_background_needs_two_images_of_one_shape():
-    a, b = np.array([[1.0, 5.0]]), np.array([[2.0, 3.0]])
-    np.testing.assert_array_equal(minimum_background([a, b]), [[1.0, 3.0]])
-    with pytest.raises(InputError, match="at least two"):
-        minimum_background([a])
-    with pytest.raises(InputError, match="differ in shape"):
-        minimum_background([a, b.T])
 
 
 @pytest.mark.parametrize("solver", SOLVERS)

@@ -247,6 +247,20 @@ def load_config(path: Path) -> Config:
     return _validated(document, str(path))
 
 
+def carried_config(record: Mapping[str, Any], path: Path) -> Config:
+    """Return the resolved configuration in the record that one of our files carries.
+
+    Raises
+    ------
+    InputError
+        If there is none.
+    """
+    config = record.get("config")
+    if not config:
+        raise InputError(f"{path}: carries no config; give one with --config")
+    return Config.from_resolved(config)
+
+
 def _validated(document: Document, source: str) -> Config:
     """Return the configuration of a document, or raise all that is wrong with it."""
     problems = list(document.problems)

@@ -12,6 +12,11 @@ from lfpiv_cli.errors import InputError
 MEMORY_WHERE_UNKNOWN = 16 * 1024**3
 
 
+def given(**inputs: Path | str | None) -> dict[str, Path]:
+    """Return the inputs of a command that were given, by their role."""
+    return {role: Path(path) for role, path in inputs.items() if path is not None}
+
+
 def ensure_regular_file(path: Path) -> int:
     """Return the size of a readable regular file in bytes.
 

@@ -167,15 +167,21 @@ class WeightsSection(Section):
 
 
 class ReconstructionSection(Section):
-    """The solver: em (default, better for velocity), sart (Eq. 12) or particles; iterations; SART's relaxation mu.
+    """The solver: em (default, better for velocity), sart (Eq. 12), smart, mart or particles; iterations; relaxation.
 
+    start: uniform (as the paper), or line_of_sight, which also leaves out for good what no light can have come from.
+    stop_change: end when an iteration lowers the residual by less than this share of it (default: never).
+    saturation_counts: pixels as bright as this are left out (default: those at the end of 8 to 16 bits).
     particle_diameter_mm: of the tracers; only the solver `particles` reads it.
     accelerate: step from points extrapolated by Nesterov's momentum; a quarter of the iterations will do.
     padding_voxel: voxels [x, y, z] solved for beyond each side of the volume and cropped on writing (default: derived
     from how far light spreads).
     """
 
-    solver: Literal["em", "sart", "particles"] = "em"
+    solver: Literal["em", "sart", "smart", "mart", "particles"] = "em"
+    start: Literal["uniform", "line_of_sight"] = "uniform"
+    stop_change: Annotated[float, Field(gt=0.0, lt=1.0)] | None = None
+    saturation_counts: Positive | None = None
     particle_diameter_mm: Positive = 0.05
     iterations: Annotated[int, Field(ge=1, le=100_000)] = 16
     relaxation: Annotated[float, Field(gt=0.0, le=2.0)] = 1.0

@@ -1,18 +1,31 @@
-"""What is taken off a raw image before its light is shared out among the voxels.
+"""What is taken off a raw image, and which of its pixels are not believed, before its light is shared out.
 
-Order: dark, then background; the way into the weights' frame comes after. Images [row, column], in counts.
+Order: dark or background, unusable pixels filled in, then the way into the weights' frame, in which every pixel that
+took more than a little from an unusable one is left out of the equations. Images [row, column], in counts.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from lfpiv_cli.errors import InputError
 
 Image = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+# A brightest pixel that stands at one of these is where the sensor or its converter ends: 8 to 16 bits, the odd ones
+# either in the low bits or shifted up to fill sixteen.
+FULL_SCALES = (255.0, 1023.0, 4095.0, 16383.0, 65472.0, 65520.0, 65532.0, 65535.0)
+# A hot or dead pixel stands out of its neighbours in the dark image, above or below, by this many standard deviations
+# of such differences: of four million pixels of mere noise none does.
+DEFECT_SIGMAS = 8.0
+# Resampling: a pixel with more than this share of its light from unusable ones is unusable, too.
+TOUCHED_SHARE = 0.1
+MAD_TO_SIGMA = 1.4826
 
 
 def light(image: Image, dark: Image | None = None, background: Image | None = None) -> Image:
@@ -48,13 +61,76 @@ def minimum_background(images: Iterable[Image]) -> Image:
     ------
     InputError : there are fewer than two images, or they differ in shape.
     """
-    lowest: Image | None = None
+    return _over_sequence(images, lambda lowest, image: np.fmin(lowest, image))[0].astype(np.float32)
+
+
+def mean_background(images: Iterable[Image]) -> Image:
+    """Return the pixel-wise mean over a sequence, the mean light of the tracers included.
+
+    Raises
+    ------
+    InputError : there are fewer than two images, or they differ in shape.
+    """
+    total, count = _over_sequence(images, lambda total, image: total + image)
+    return (total / count).astype(np.float32)
+
+
+def _over_sequence(
+    images: Iterable[Image], combine: Callable[[NDArray[np.float64], Image], NDArray[np.float64]]
+) -> tuple[NDArray[np.float64], int]:
+    """Return what a combination of all images, one after the other, comes to, and their number."""
+    result: NDArray[np.float64] | None = None
     count = 0
     for image in images:
-        if lowest is not None and image.shape != lowest.shape:
-            raise InputError(f"images of a sequence differ in shape: {lowest.shape} and {image.shape}")
-        lowest = image.astype(np.float32) if lowest is None else np.fmin(lowest, image)
+        if result is not None and image.shape != result.shape:
+            raise InputError(f"images of a sequence differ in shape: {result.shape} and {image.shape}")
+        result = image.astype(np.float64) if result is None else combine(result, image)
         count += 1
-    if lowest is None or count < 2:
-        raise InputError(f"a minimum background needs at least two images, found {count}")
-    return lowest
+    if result is None or count < 2:
+        raise InputError(f"a background over a sequence needs at least two images, found {count}")
+    return result, count
+
+
+def saturated(image: Image, level_counts: float | None = None) -> Mask:
+    """Return which pixels (rows, columns) of a raw image are as bright as they can be, or not finite.
+
+    Parameters
+    ----------
+    level_counts : counts at which the sensor saturates; None: the image's largest value, where that is one of
+        `FULL_SCALES`
+    """
+    finite = np.isfinite(image)
+    if level_counts is None:
+        largest = float(image[finite].max(initial=0.0))
+        level_counts = largest if largest in FULL_SCALES else np.inf
+    return np.asarray(~finite | (image >= level_counts))
+
+
+def defects(dark: Image) -> Mask:
+    """Return which pixels (rows, columns) of a dark image stand out of their neighbours: hot or dead ones."""
+    difference = dark - ndimage.median_filter(dark, size=3, mode="reflect")
+    varying = np.abs(difference[difference != 0.0])
+    if not varying.size:
+        return np.zeros(dark.shape, np.bool_)
+    return np.asarray(np.abs(difference) > DEFECT_SIGMAS * MAD_TO_SIGMA * np.median(varying))
+
+
+def filled(image: Image, unusable: Mask) -> Image:
+    """Return an image with unusable pixels replaced by the median of their usable neighbours, 0 where there is none.
+
+    What stands there takes no part; but it must not ring through the splines that carry the image into another frame.
+    """
+    rows, columns = np.nonzero(unusable)
+    padded = np.pad(np.where(unusable, np.nan, image).astype(np.float64), 1, constant_values=np.nan)
+    around = np.stack([padded[rows + dy, columns + dx] for dy in range(3) for dx in range(3)], axis=1)
+    known = np.isfinite(around).any(axis=1)
+    values = np.zeros(rows.size, np.float32)
+    values[known] = np.nanmedian(around[known], axis=1)
+    result = image.astype(np.float32)
+    result[rows, columns] = values
+    return result
+
+
+def touched(mask: Mask, prepare: Callable[[Image], Image]) -> Mask:
+    """Return which pixels of the frame that `prepare` carries an image into take light from masked ones."""
+    return np.asarray(np.abs(prepare(mask.astype(np.float32))) > TOUCHED_SHARE)

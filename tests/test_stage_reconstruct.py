@@ -1,0 +1,143 @@
+"""`reconstruct` on images that are not perfect: reflections, saturation, backgrounds made from the frames."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+
+from lfpiv_cli import open_volume
+from lfpiv_cli.cli import cli
+from lfpiv_cli.errors import InputError, OutputExistsError, UsageError
+from lfpiv_cli.files.images import read_image
+from lfpiv_cli.stages_reconstruct import Background
+
+ROOT = Path(__file__).parent.parent
+SAMPLE = ROOT / "sample_data"
+REFLECTION = (slice(180, 230), slice(250, 320))
+
+
+def run(*arguments: object) -> None:
+    cli.main([str(argument) for argument in arguments], standalone_mode=False)
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Weights of a part of the sample's volume, without a calibration."""
+    folder = tmp_path_factory.mktemp("weights")
+    config = folder / "rig.yaml"
+    text = (ROOT / "configs" / "sample.yaml").read_text()
+    for old, new in (
+        ("shape_xyz: [30, 22, 40]", "shape_xyz: [16, 12, 20]"),
+        ("reference: mid_plane", "reference: focal_point"),
+    ):
+        assert old in text, old
+        text = text.replace(old, new)
+    config.write_text(text)
+    run("build-weights", config, "-o", folder / "weights.h5")
+    return folder / "weights.h5"
+
+
+@pytest.fixture
+def frame() -> np.ndarray:
+    return read_image(SAMPLE / "pair_a.tif").astype(np.uint16)
+
+
+def volume_of(weights: Path, image: Path, output: Path, *options: object) -> np.ndarray:
+    run("reconstruct", weights, image, "--iterations", 4, *options, "-o", output)
+    return open_volume(output).array
+
+
+def test_what_the_mask_hides_does_not_matter(weights, frame, tmp_path):
+    mask = np.full(frame.shape, 255, np.uint8)
+    mask[REFLECTION] = 0
+    tifffile.imwrite(tmp_path / "mask.tif", mask)
+    spoilt = frame.copy()
+    spoilt[REFLECTION] = 50_000
+    for name, image in (("clean", frame), ("spoilt", spoilt)):
+        tifffile.imwrite(tmp_path / f"{name}.tif", image)
+    clean = volume_of(weights, tmp_path / "clean.tif", tmp_path / "c.vtkhdf", "--mask", tmp_path / "mask.tif")
+    masked = volume_of(weights, tmp_path / "spoilt.tif", tmp_path / "m.vtkhdf", "--mask", tmp_path / "mask.tif")
+    believed = volume_of(weights, tmp_path / "spoilt.tif", tmp_path / "b.vtkhdf")
+    np.testing.assert_array_equal(masked, clean)
+    assert believed.sum() > 2.0 * masked.sum()
+    assert open_volume(tmp_path / "m.vtkhdf").attributes["excluded_pixels"] == 50 * 70
+
+
+def test_saturated_pixels_and_defects_of_the_dark_image_are_left_out(weights, frame, tmp_path):
+    dark = read_image(SAMPLE / "dark.tif").astype(np.uint16)
+    dark[200, 300] = frame[200, 300] = 9000
+    frame[210, 280:283] = 65535
+    tifffile.imwrite(tmp_path / "a.tif", frame)
+    tifffile.imwrite(tmp_path / "dark.tif", dark)
+    mask = np.ones(frame.shape, np.uint8)
+    mask[200, 300] = mask[210, 280:283] = 0
+    tifffile.imwrite(tmp_path / "mask.tif", mask)
+    found = volume_of(weights, tmp_path / "a.tif", tmp_path / "a.vtkhdf", "--dark", tmp_path / "dark.tif")
+    assert open_volume(tmp_path / "a.vtkhdf").attributes["excluded_pixels"] == 4
+    masked = ("--dark", SAMPLE / "dark.tif", "--mask", tmp_path / "mask.tif")
+    np.testing.assert_array_equal(found, volume_of(weights, tmp_path / "a.tif", tmp_path / "m.vtkhdf", *masked))
+
+
+def test_a_background_over_the_frames_is_that_of_its_image(weights, frame, tmp_path):
+    rng = np.random.default_rng(3)
+    frames = np.stack([frame, *rng.integers(90, 400, (3, *frame.shape)).astype(np.uint16)])
+    tifffile.imwrite(tmp_path / "run.tif", frames, photometric="minisblack")
+    tifffile.imwrite(tmp_path / "first.tif", frame)
+    tifffile.imwrite(tmp_path / "lowest.tif", frames[:2].min(axis=0))
+    sliding = ("reconstruct", weights, tmp_path / "run.tif", "--iterations", 4, "--background", "minimum:2")
+    run(*sliding, "-o", tmp_path / "run")
+    expected = volume_of(
+        weights, tmp_path / "first.tif", tmp_path / "e.vtkhdf", "--background", tmp_path / "lowest.tif"
+    )
+    np.testing.assert_array_equal(open_volume(tmp_path / "run" / "run_0000.vtkhdf").array, expected)
+    with pytest.raises(InputError, match="at least two"):
+        run("reconstruct", weights, tmp_path / "first.tif", "--background", "mean", "-o", tmp_path / "f.vtkhdf")
+
+
+def test_a_background_over_other_frames_is_another_input(weights, frame, tmp_path):
+    for k in range(3):
+        tifffile.imwrite(tmp_path / f"{k}.tif", frame + np.uint16(k))
+    first, second, third = (tmp_path / f"{k}.tif" for k in range(3))
+    options = ("--background", "mean", "--iterations", 1, "-o", tmp_path / "out", "--resume")
+    run("reconstruct", weights, first, second, *options)
+    before = (tmp_path / "out" / "0.vtkhdf").stat().st_mtime_ns
+    run("reconstruct", weights, first, second, *options)
+    assert (tmp_path / "out" / "0.vtkhdf").stat().st_mtime_ns == before
+    with pytest.raises(OutputExistsError, match="other inputs"):
+        run("reconstruct", weights, first, third, *options)
+
+
+def test_frames_around_a_frame():
+    assert [list(Background.parse("minimum:3").around(k, 5)) for k in (0, 2, 4)] == [[0, 1, 2], [1, 2, 3], [2, 3, 4]]
+    assert list(Background.parse("mean:9").around(1, 4)) == [0, 1, 2, 3]
+    assert list(Background.parse("mean").around(1, 4)) == [0, 1, 2, 3]
+    assert Background.parse("minimum:x") == Background(path=Path("minimum:x"))
+    assert not Background.parse("background.tif").around(0, 4)
+
+
+def test_particles_do_not_take_a_mask(weights, tmp_path):
+    mask = SAMPLE / "dark.tif"
+    with pytest.raises(UsageError, match="--mask"):
+        run(
+            "reconstruct",
+            weights,
+            SAMPLE / "pair_a.tif",
+            "--solver",
+            "particles",
+            "--mask",
+            mask,
+            "-o",
+            tmp_path / "p.vtkhdf",
+        )
+
+
+def test_voxels_without_light_stay_out_with_lines_of_sight(weights, tmp_path):
+    dark = ("--dark", SAMPLE / "dark.tif")
+    volume = volume_of(weights, SAMPLE / "pair_a.tif", tmp_path / "a.vtkhdf", *dark, "--start", "line_of_sight")
+    taking_part = open_volume(tmp_path / "a.vtkhdf").attributes["support_voxels"]
+    assert np.count_nonzero(volume) <= taking_part
+    volume_of(weights, SAMPLE / "pair_a.tif", tmp_path / "u.vtkhdf", *dark)
+    assert taking_part < open_volume(tmp_path / "u.vtkhdf").attributes["support_voxels"]
