@@ -76,7 +76,8 @@ def cli() -> None:
 @click.argument("config", type=INPUT)
 @click.option("--white", type=INPUT, multiple=True, help="White image, uniform light; twice: stopped down and not.")
 @click.option("--dark", type=INPUT, help="Dark image, taken with the cap on.")
-@click.option("--board", type=INPUT, help="Snapshot of the dot board.")
+@click.option("--board", type=INPUT, multiple=True, help="Snapshot of the dot board; or several, each with its depth.")
+@click.option("--depth-mm", type=float, multiple=True, help="Depth of each board behind the focal point, for dlfc.")
 @click.option("-o", "--output", type=INPUT, required=True, help="Calibration file to write (.h5).")
 @click.option("--picture", type=INPUT, help="Picture of the fitted lattice and board to write (.png).")
 @click.option("--views", type=INPUT, help="Picture of views and refocused depths to write (.png).")
@@ -87,6 +88,9 @@ def calibrate_snapshot(**arguments: Any) -> dict[str, Any]:
     \b
     Example: lfpiv calibrate-snapshot rig.yaml --white white.tif --dark dark.tif --board board.tif \\
                  -o calibration.h5 --picture calibration.png
+    for `build-weights --method dlfc`, with boards moved through the fluid:
+             lfpiv calibrate-snapshot rig.yaml --white white.tif --board b1.tif --depth-mm -8 \\
+                 --board b2.tif --depth-mm 0 --board b3.tif --depth-mm 8 -o calibration.h5
     """
     from lfpiv_cli import stages_calibrate
 
@@ -96,7 +100,7 @@ def calibrate_snapshot(**arguments: Any) -> dict[str, Any]:
 @cli.command("build-weights")
 @click.argument("config", type=INPUT)
 @click.option("--calibration", type=INPUT, help="From calibrate-snapshot; without it the data sheet is believed.")
-@click.option("--method", type=click.Choice(["ert", "drt"]), help="How points are traced; default from the config.")
+@click.option("--method", type=click.Choice(["ert", "drt", "dlfc"]), help="How rays go; default from the config.")
 @click.option("--refraction", type=click.Choice(["paraxial", "exact"]), help="Snell's law; default from the config.")
 @click.option("--sampling", type=click.Choice(["exact", "rays"]), help="Integrals or rays; default from the config.")
 @click.option("-o", "--output", type=INPUT, required=True, help="Weights file to write (.h5).")
@@ -184,20 +188,33 @@ def track(**arguments: Any) -> dict[str, Any]:
 
 
 @cli.command("validate")
-@click.argument("what", type=click.Choice(["flow", "weights", "board"]))
+@click.argument("what", type=click.Choice(["flow", "weights", "board", "volume"]))
 @click.argument("config", type=INPUT)
 @click.option("--vectors", type=INPUT, help="flow: vectors to judge.")
-@click.option("--particles", type=INPUT, help="flow: true particles (.npz) to judge by, not the config's flow.")
+@click.option("--volume", type=INPUT, help="volume: volume to judge.")
+@click.option("--particles", type=INPUT, help="volume, flow: true particles (.npz) to judge by; flow needs none.")
+@click.option("--frame", type=click.Choice(["a", "middle", "b"]), help="volume: when in the pair it was taken.")
 @click.option("-o", "--output", type=INPUT, required=True, help="Folder for the report.")
 @common_options
-def validate(what: str, vectors: Path | None, particles: Path | None, **arguments: Any) -> dict[str, Any]:
+def validate(
+    what: str, vectors: Path | None, volume: Path | None, particles: Path | None, frame: str | None, **arguments: Any
+) -> dict[str, Any]:
     """Compare a result with what is known: figures as JSON, and pictures.
 
     \b
     Example: lfpiv validate flow rig.yaml --vectors vectors.vtkhdf -o report
              lfpiv validate weights rig.yaml -o report
              lfpiv validate board rig.yaml -o report
+             lfpiv validate volume rig.yaml --volume a.vtkhdf --particles true.npz --frame a -o report
     """
+    if (volume is not None or frame is not None) and what != "volume":
+        raise click.UsageError(f"validate {what} takes neither --volume nor --frame")
+    if what == "volume":
+        if volume is None or particles is None or frame is None or vectors is not None:
+            raise click.UsageError("validate volume needs --volume, --particles and --frame, and takes no --vectors")
+        from lfpiv_cli import stages_volume
+
+        return stages_volume.validate_volume(volume=volume, particles=particles, frame=frame, **arguments)
     if what == "flow":
         if vectors is None:
             raise click.UsageError("validate flow needs --vectors")

@@ -22,10 +22,11 @@ MM_PER_M = 1000.0
 
 @dataclass(frozen=True, eq=False)
 class Particles:
-    """Particles: positions (n, 3) in mm and velocities (n, 3) in m/s."""
+    """Particles: positions (n, 3) in mm, velocities (n, 3) in m/s, brightness (n,), 1 where the file tells none."""
 
     positions_mm: NDArray[np.float64]
     velocities_m_s: NDArray[np.float64]
+    brightness: NDArray[np.float64]
 
 
 def read_particles(path: Path) -> Particles:
@@ -39,13 +40,18 @@ def read_particles(path: Path) -> Particles:
     try:
         with np.load(path, allow_pickle=False) as stored:
             position, velocity = (np.asarray(stored[name], np.float64) for name in ("position_mm", "velocity_mm_s"))
+            brightness = np.asarray(
+                stored["brightness"] if "brightness" in stored else np.ones(len(position)), np.float64
+            )
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(f"{path}: not a list of particles: {reason(error)}") from error
     if position.ndim != 2 or position.shape[1:] != (3,) or position.shape != velocity.shape or not position.size:
         raise InputError(f"{path}: positions {position.shape} and velocities {velocity.shape}, expected twice (n, 3)")
-    if not (np.isfinite(position).all() and np.isfinite(velocity).all()):
-        raise InputError(f"{path}: a position or velocity is not a finite number")
-    return Particles(position, velocity / MM_PER_M)
+    if brightness.shape != position.shape[:1]:
+        raise InputError(f"{path}: {brightness.shape} values of brightness for {len(position)} particles")
+    if not all(np.isfinite(values).all() for values in (position, velocity, brightness)):
+        raise InputError(f"{path}: a position, velocity or brightness is not a finite number")
+    return Particles(position, velocity / MM_PER_M, brightness)
 
 
 def write_particles(

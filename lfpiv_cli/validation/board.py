@@ -71,9 +71,12 @@ def _measure_dot(
     return elongation_mm(z, part.max(axis=(1, 2))), gaussian_centre_mm(z, profile), mass, *lateral
 
 
-def elongation_mm(z_mm: NDArray[np.float64], height: NDArray[np.float64]) -> float:
-    """Return the depth over which a profile around its peak exceeds 1/e of it, linear between samples."""
-    peak = int(np.argmax(height))
+def elongation_mm(z_mm: NDArray[np.float64], height: NDArray[np.float64], peak: int | None = None) -> float:
+    """Return the depth over which a profile around a peak, by default its highest, exceeds 1/e of it.
+
+    Between samples the profile is taken as linear.
+    """
+    peak = int(np.argmax(height)) if peak is None else peak
     limit = height[peak] / np.e
     ends = []
     for step in (-1, 1):

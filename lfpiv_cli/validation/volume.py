@@ -1,0 +1,161 @@
+"""How well a volume shows the particles that were there: correlation with the truth, ghosts, length in depth.
+
+Two lengths stand for the instrument: a microlens as it appears in the scene, and four of them in depth. A peak or some
+light belongs to a particle when it lies in the ellipsoid of these half axes around it.
+
+Axes: volumes [z, y, x] on a grid in mm; points (x, y, z).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from lfpiv_cli.errors import InputError
+from lfpiv_cli.grid import Grid
+from lfpiv_cli.particles.candidates import find_peaks
+from lfpiv_cli.validation.board import elongation_mm
+from lfpiv_cli.validation.particles import DEPTH_VOXEL, LATERAL_VOXEL, match
+
+# Depth reaches so many times farther than a microlens.
+DEPTH_TO_LATERAL = DEPTH_VOXEL / LATERAL_VOXEL
+# Beyond this many standard deviations a Gaussian particle is below 1e-4 of its peak.
+REACH = 4.3
+# Peaks with less light than this share of a typical particle's are noise to any later step.
+FAINTEST = 0.2
+
+
+def volume_figures(
+    volume: NDArray[np.float32],
+    grid: Grid,
+    position_mm: NDArray[np.float64],
+    brightness: NDArray[np.float64],
+    microlens_mm: float,
+) -> dict[str, float | int]:
+    """Return the figures of a volume whose true particles are known.
+
+    Parameters
+    ----------
+    position_mm, brightness : (n, 3) and (n,) of the true particles, those beyond the volume included
+    microlens_mm : pitch of the microlenses as it appears in the scene
+
+    Returns
+    -------
+    dict
+        `q_gaussian`, `q_box`: normalised correlation with the true particles, as Gaussians of a standard deviation of
+        one microlens, and as points shared out among their eight nearest voxels; `completeness` and `precision`: shares
+        of the particles with a peak and of the peaks with a particle; `ghost_light`: share of the light that belongs to
+        no particle, and `ghost_light_uniform`, that of a uniform volume; `elongation_mm`: median depth over which the
+        particles found exceed 1/e of their peak; `peaks`, `particles` (in the volume).
+
+    Raises
+    ------
+    InputError : no particle lies in the volume
+    """
+    low, high = (np.array([grid.bounds_mm(axis)[side] for axis in range(3)]) for side in (0, 1))
+    inside = np.all((position_mm >= low) & (position_mm <= high), axis=1)
+    if not inside.any():
+        raise InputError("none of the true particles lies in the volume")
+    sigma = np.full(3, microlens_mm)
+    figures: dict[str, float | int] = {
+        "q_gaussian": normalised_correlation(volume, known_volume(grid, position_mm, brightness, sigma)),
+        "q_box": normalised_correlation(volume, shared_among_voxels(grid, position_mm, brightness)),
+    }
+    index, light = find_peaks(volume)
+    typical = np.median(light[: int(inside.sum())]) if light.size else 0.0
+    index = index[light > FAINTEST * typical]
+    pairs = match(grid.voxel_to_mm(index), position_mm, microlens_mm / LATERAL_VOXEL)
+    figures |= {
+        "completeness": float(inside[pairs.true].sum() / inside.sum()),
+        "precision": float(len(pairs.found) / max(len(index), 1)),
+        "elongation_mm": _median_elongation(volume, grid, index[pairs.found]),
+        "peaks": len(index),
+        "particles": int(inside.sum()),
+    }
+    near = near_a_particle(grid, position_mm, microlens_mm)
+    total = float(volume.sum(dtype=np.float64))
+    figures["ghost_light"] = float(volume[~near].sum(dtype=np.float64)) / total if total > 0.0 else 0.0
+    figures["ghost_light_uniform"] = float(np.mean(~near))
+    return figures
+
+
+def normalised_correlation(first: NDArray[np.float32], second: NDArray[np.float32]) -> float:
+    """Return Q = sum(E F) / sqrt(sum(E^2) sum(F^2)), 0 where a volume is dark."""
+    product, squares = (
+        np.sum(np.multiply(first, second, dtype=np.float64)),
+        np.sum(np.square(first, dtype=np.float64)) * np.sum(np.square(second, dtype=np.float64)),
+    )
+    return float(product / np.sqrt(squares)) if squares > 0.0 else 0.0
+
+
+def known_volume(
+    grid: Grid, position_mm: NDArray[np.float64], brightness: NDArray[np.float64], sigma_mm: NDArray[np.float64]
+) -> NDArray[np.float32]:
+    """Return particles (n, 3) as Gaussians of standard deviations sigma (3,), each as high as it is bright (n,)."""
+    volume = np.zeros(grid.shape_zyx, np.float32)
+    _add_gaussians(volume, grid.mm_to_voxel(position_mm), brightness, sigma_mm / np.asarray(grid.spacing_mm))
+    return volume
+
+
+def shared_among_voxels(
+    grid: Grid, position_mm: NDArray[np.float64], brightness: NDArray[np.float64]
+) -> NDArray[np.float32]:
+    """Return particles (n, 3) with their light (n,) shared out among their eight nearest voxels, by distance."""
+    volume = np.zeros(grid.shape_zyx)
+    index = grid.mm_to_voxel(position_mm)
+    corner = np.floor(index).astype(np.int64)
+    for offset in np.ndindex(2, 2, 2):
+        at = corner + offset
+        share = brightness * np.prod(1.0 - np.abs(index - at), axis=1)
+        inside = np.all((at >= 0) & (at < grid.shape_xyz), axis=1)
+        np.add.at(volume, tuple(at[inside, ::-1].T), share[inside])
+    return volume.astype(np.float32)
+
+
+def near_a_particle(grid: Grid, position_mm: NDArray[np.float64], microlens_mm: float) -> NDArray[np.bool_]:
+    """Return which voxels (z, y, x) have their centre in the ellipsoid around a particle."""
+    scale = microlens_mm * np.array([1.0, 1.0, DEPTH_TO_LATERAL])
+    tree = KDTree(position_mm / scale)
+    y, x = np.meshgrid(grid.axis_mm(1), grid.axis_mm(0), indexing="ij")
+    near = np.empty(grid.shape_zyx, np.bool_)
+    for k, z in enumerate(grid.axis_mm(2)):
+        points = np.stack([x, y, np.full_like(x, z)], axis=-1) / scale
+        near[k] = np.isfinite(tree.query(points, distance_upper_bound=1.0)[0])
+    return near
+
+
+def _median_elongation(volume: NDArray[np.float32], grid: Grid, index_xyz: NDArray[np.float64]) -> float:
+    """Return the median length in depth of the volume at peaks given by fractional indices, 0 where there are none."""
+    z = grid.axis_mm(2)
+    lengths = []
+    for ix, iy, iz in np.rint(index_xyz).astype(int):
+        height = volume[:, iy, ix].astype(np.float64)
+        if height[iz] > 0.0:
+            lengths.append(elongation_mm(z, height, iz))
+    return float(np.median(lengths)) if lengths else 0.0
+
+
+@njit(cache=True)
+def _add_gaussians(
+    volume: NDArray[np.float32],
+    centres: NDArray[np.float64],
+    height: NDArray[np.float64],
+    sigma: NDArray[np.float64],
+) -> None:
+    """Add Gaussians at `centres` (n, 3) in voxels (x, y, z)."""
+    shape = (volume.shape[2], volume.shape[1], volume.shape[0])
+    profile = np.empty((3, int(2.0 * REACH * sigma.max()) + 3))
+    low, high = np.empty(3, np.int64), np.empty(3, np.int64)
+    for n in range(centres.shape[0]):
+        for axis in range(3):
+            low[axis] = max(0, int(np.ceil(centres[n, axis] - REACH * sigma[axis])))
+            high[axis] = min(shape[axis], int(np.floor(centres[n, axis] + REACH * sigma[axis])) + 1)
+            for k in range(low[axis], high[axis]):
+                profile[axis, k - low[axis]] = np.exp(-0.5 * ((k - centres[n, axis]) / sigma[axis]) ** 2)
+        for z in range(low[2], high[2]):
+            for y in range(low[1], high[1]):
+                beside = height[n] * profile[2, z - low[2]] * profile[1, y - low[1]]
+                for x in range(low[0], high[0]):
+                    volume[z, y, x] += beside * profile[0, x - low[0]]
