@@ -32,7 +32,7 @@ def simulate_white(config: Path, output: Path, overwrite: bool, console: Console
     """Render a white image and a dark one."""
     settings, paths = _begin(config, output, ("white.tif", "dark.tif", "white.json"), overwrite)
     still = scenes.simulate_white(
-        real_camera(settings), settings.simulation.peak_counts, _readout(settings), _generator(settings, 0)
+        real_camera(settings), settings.simulation.peak_counts, readout_of(settings), _generator(settings, 0)
     )
     write_tiff(paths["white.tif"], still.image, overwrite)
     write_tiff(paths["dark.tif"], still.dark, overwrite)
@@ -49,7 +49,7 @@ def simulate_board(config: Path, output: Path, overwrite: bool, console: Console
         settings.rig().board,
         BoardPlacement(scene.board_z_mm, scene.board_offset_mm, scene.board_tilt_deg, scene.board_rotation_deg),
         scene.peak_counts,
-        _readout(settings),
+        readout_of(settings),
         _generator(settings, 1),
     )
     write_tiff(paths["board.tif"], still.image, overwrite)
@@ -72,7 +72,7 @@ def simulate_particles(config: Path, output: Path, overwrite: bool, console: Con
             tracers,
             settings.simulated_flow(origin_z),
             settings.correlation.dt_s,
-            _readout(settings),
+            readout_of(settings),
             _generator(settings, 2),
             rays=scene.rays or RAYS,
             progress=advance,
@@ -86,10 +86,13 @@ def simulate_particles(config: Path, output: Path, overwrite: bool, console: Con
 
 def real_camera(settings: Config) -> Camera:
     """Return the data sheet's camera with the imperfections that are simulated."""
+    return misalignment_of(settings).apply(settings.camera_model())
+
+
+def misalignment_of(settings: Config) -> scenes.Misalignment:
+    """Return how the simulated camera departs from its data sheet."""
     scene = settings.simulation
-    return scenes.Misalignment(scene.rotation_deg, scene.shift_px, scene.distortion_per_mm2).apply(
-        settings.camera_model()
-    )
+    return scenes.Misalignment(scene.rotation_deg, scene.shift_px, scene.distortion_per_mm2)
 
 
 def simulated_origin_z_mm(settings: Config) -> float:
@@ -127,7 +130,7 @@ def _generator(settings: Config, stream: int) -> np.random.Generator:
     return np.random.default_rng([settings.simulation.seed, stream])
 
 
-def _readout(settings: Config) -> Readout:
+def readout_of(settings: Config) -> Readout:
     scene = settings.simulation
     return Readout(scene.photons_per_count, scene.read_noise_counts, scene.dark_level_counts, scene.bits)
 

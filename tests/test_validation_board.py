@@ -61,20 +61,26 @@ def test_a_board_without_light_is_refused():
 def test_validate_board_on_a_small_camera(tmp_path):
     text = CONFIG.read_text()
     for old, new in (
-        ("columns: 2352", "columns: 460"),
-        ("rows: 1768", "rows: 460"),
-        ("shape_xyz: [80, 80, 240]", "shape_xyz: [22, 22, 120]"),
+        ("columns: 2352", "columns: 520"),
+        ("rows: 1768", "rows: 520"),
+        ("shape_xyz: [80, 80, 240]", "shape_xyz: [24, 24, 120]"),
         ("voxel_mm: 0.1 ", "voxel_mm: [0.1, 0.1, 0.2] "),
-        ("dots: [7, 7]", "dots: [2, 2]"),
+        ("dots: [7, 7]", "dots: [3, 3]"),
+        ("spacing_mm: 1.0", "spacing_mm: 0.7"),
         ("solver: sart", "solver: em"),
         ("iterations: 200", "iterations: 8"),
+        ("rotation_deg: 0.0   ", "rotation_deg: 0.4   "),
+        ("images: ideal", "images: both"),
     ):
         assert old in text, old
         text = text.replace(old, new)
     small = tmp_path / "small.yaml"
     small.write_text(text)
     cli.main(["validate", "board", str(small), "-o", str(tmp_path / "report")], standalone_mode=False)
-    figures = json.loads((tmp_path / "report" / "board.json").read_text())["figures"]
-    assert figures["lateral_error"] < 0.02
-    assert figures["depth_error"] < 0.3
-    assert (tmp_path / "report" / "board.png").stat().st_size > 10_000
+    report = json.loads((tmp_path / "report" / "board.json").read_text())["figures"]
+    for half in ("ideal", "recorded"):
+        # a picture that was not straightened would turn the dots by 0.4 degrees and move them in depth
+        assert report[half]["lateral_error"] < 0.02
+        assert report[half]["depth_error"] < 0.3
+        assert (tmp_path / "report" / f"board_{half}.png").stat().st_size > 10_000
+    assert report["recorded"]["by_depth"]["centre_mm"] != report["ideal"]["by_depth"]["centre_mm"]

@@ -352,12 +352,19 @@ class WeightsValidation(Section):
     limits: WeightsLimits = WeightsLimits()
 
 
+class BoardValidation(Section):
+    """The pictures of `validate board`: without faults (ideal), with those of the section simulation (recorded), both."""
+
+    images: Literal["ideal", "recorded", "both"] = "ideal"
+
+
 class ValidationSection(Section):
-    """The analytic flow that vectors are compared with (default: the simulation's), the limits, and the weights'."""
+    """The analytic flow that vectors are compared with (default: the simulation's), the limits, weights and boards."""
 
     flow: FlowSection | None = None
     limits: Limits = Limits()
     weights: WeightsValidation = WeightsValidation()
+    board: BoardValidation = BoardValidation()
 
 
 class Sections(Section):

@@ -18,6 +18,11 @@ from lfpiv_cli.grid import Grid
 
 # The paper's boards: seventeen depths, a millimetre apart.
 DEPTHS_MM = tuple(float(z) for z in range(-8, 9))
+# Table 3's columns of equivalent ray tracing: its simulated boards, and those of its experiment. Eqs. 17 to 20.
+PAPER = {
+    "ideal": {"elongation_mm": 3.54, "elongation_sigma_mm": 0.08, "lateral_error": 0.0009, "depth_error": 0.0263},
+    "recorded": {"elongation_mm": 3.65, "elongation_sigma_mm": 0.27, "lateral_error": 0.0063, "depth_error": 0.056},
+}
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,90 @@
+"""Where the boards of Section 3.3 are photographed: with an ideal camera, or with one that is as real ones are.
+
+The ideal one is the data sheet's, its pictures free of noise and their light refracted paraxially. The real one has an
+array that is turned and shifted, a main lens that distorts, a sensor with noise, and light refracted exactly; it is
+calibrated from a white picture and one of a board in air, and nothing else is known of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lfpiv_cli.calibration.model import Rig, calibrate
+from lfpiv_cli.grid import Grid
+from lfpiv_cli.optics.object_space import ObjectSpace
+from lfpiv_cli.reconstruction.images import Image, Mask, light
+from lfpiv_cli.synthetic.board import BoardPlacement, render_board
+from lfpiv_cli.synthetic.scenes import Misalignment, dark_frame, simulate_board, simulate_white
+from lfpiv_cli.synthetic.sensor import Readout
+from lfpiv_cli.weights.build import factorise_through, scene_distortion
+from lfpiv_cli.weights.model import Weights
+
+# The board that calibrates the real camera stands so far behind the focal plane, in air, where depth shows well.
+CALIBRATION_BOARD_Z_MM = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class BoardBench:
+    """A camera before which boards are held.
+
+    Attributes
+    ----------
+    weights : of the volume in which boards are reconstructed
+    picture : gives the picture (rows, columns) of a board in its place, in the weights' frame, dark taken off
+    excluded : pixels (rows, columns) of that frame that lie off the sensor
+    """
+
+    weights: Weights
+    picture: Callable[[BoardPlacement], Image]
+    excluded: Mask
+
+
+def ideal_bench(rig: Rig, grid: Grid, level: float, rng: np.random.Generator) -> BoardBench:
+    """Return the data sheet's camera, `level` expected counts in a pixel that sees only what is bright."""
+    space = ObjectSpace(rig.media, None, "paraxial")
+    weights = Weights(grid, (0, 0, 0), factorise_through(rig.camera, space, grid), rig.camera.column_axis)
+
+    def picture(placement: BoardPlacement) -> Image:
+        return render_board(rig.camera, space, rig.board, placement, level, rng).astype(np.float32)
+
+    return BoardBench(weights, picture, np.zeros(weights.image_shape, np.bool_))
+
+
+def recorded_bench(
+    rig: Rig,
+    assumed: ObjectSpace,
+    true: ObjectSpace,
+    misalignment: Misalignment,
+    readout: Readout,
+    grid: Grid,
+    level: float,
+    rng: np.random.Generator,
+) -> BoardBench:
+    """Return a camera that departs from its data sheet, calibrated from pictures that it took.
+
+    Parameters
+    ----------
+    rig : as the data sheets have it
+    assumed, true : what lies before the lens, for the weights and for the pictures
+    level : expected counts in a pixel that sees only what is bright
+    """
+    real = misalignment.apply(rig.camera)
+    dark = dark_frame(real, readout, rng)
+    white = simulate_white(real, level, readout, rng).image
+    board = replace(rig.board, medium="air")
+    air = ObjectSpace(rig.media.in_air(), None, "paraxial")
+    snapshot = simulate_board(real, air, board, BoardPlacement(CALIBRATION_BOARD_Z_MM), level, readout, rng).image
+    calibration = calibrate([white], dark, snapshot, rig=replace(rig, board=board))
+    camera = calibration.camera(rig.camera)
+    bend = scene_distortion(camera, rig.media, grid)
+    operator = factorise_through(camera, assumed, grid)
+    weights = Weights(grid, (0, 0, 0), operator, camera.column_axis, calibration, bend)
+
+    def picture(placement: BoardPlacement) -> Image:
+        recorded = simulate_board(real, true, rig.board, placement, level, readout, rng).image
+        return weights.prepare(light(recorded.astype(np.float32), dark.astype(np.float32)))
+
+    return BoardBench(weights, picture, ~calibration.rectification.inside)
