@@ -195,8 +195,8 @@ class CorrelationSection(Section):
     """The correlation windows, coarse to fine, in voxels (numbers or [x, y, z]), or the final one as window_mm.
 
     overlap: of neighbouring windows, a number or [x, y, z]. dt_s: time between the volumes of a pair.
-    exponent: power of the intensities that is correlated (default: 0.5 for volumes of the solver em, whose brightest
-    particles outweigh all others, and 1 for other solvers').
+    exponent: power of the intensities that is correlated (default: 0.5 for volumes of the solvers em, smart and mart,
+    whose brightest particles outweigh all others, and 1 for sart's).
     """
 
     windows: Annotated[tuple[tuple[WindowSide, WindowSide, WindowSide], ...], BeforeValidator(_each_window)] | None = (
@@ -353,7 +353,7 @@ class WeightsValidation(Section):
 
 
 class BoardValidation(Section):
-    """The pictures of `validate board`: without faults (ideal), with those of the section simulation (recorded), both."""
+    """The pictures of `validate board`: without faults (ideal), with the simulation's (recorded), or both."""
 
     images: Literal["ideal", "recorded", "both"] = "ideal"
 
