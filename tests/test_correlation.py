@@ -11,7 +11,14 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.flow.correlation import correlate, count_passes
-from lfpiv_cli.flow.deformation import deform_pair, expand_lateral, spline_coefficients, spline_matrix
+from lfpiv_cli.flow.deformation import (
+    SLACK,
+    SPLINE_PAD,
+    deform_pair,
+    expand_lateral,
+    spline_coefficients,
+    spline_matrix,
+)
 from lfpiv_cli.flow.field import MASKED, REJECTED, VectorField
 from lfpiv_cli.flow.maps import correlation_maps, margins
 from lfpiv_cli.flow.peaks import find_peaks, vertex
@@ -185,6 +192,38 @@ def test_deformation_brings_a_pair_together() -> None:
     got_a, got_b, _ = deformed(a, b, np.zeros((0, 0, 0), dtype=np.bool_), shift)
     np.testing.assert_allclose(got_a / a.max() ** 0, middle / a.max(), atol=1e-3)
     np.testing.assert_allclose(got_b, middle / b.max(), atol=1e-3)
+
+
+def test_deformation_equals_the_spline_summed_by_hand_where_neighbours_move_apart(rng: np.random.Generator) -> None:
+    shape = (9, 8, 40)
+    a, b = rng.random((2, *shape)).astype(np.float32)
+    coefficients = [
+        volume.flat[SLACK:-SLACK].reshape([n + 2 * SPLINE_PAD for n in shape])
+        for volume in map(spline_coefficients, (a, b))
+    ]
+    # One spline node a voxel: neighbours that differ by up to nine voxels need more taps than are taken together.
+    field = rng.uniform(-4.5, 4.5, (*shape, 3))
+    lateral = expand_lateral(field, np.eye(shape[2]), np.eye(shape[1]))
+    nowhere = np.zeros((0, 0, 0), dtype=np.bool_)
+    *found, valid = deform_pair(
+        spline_coefficients(a), spline_coefficients(b), nowhere, lateral, np.eye(shape[0]), (0, 0, 0), (0, 0, 0)
+    )
+    places = np.argwhere(valid)[::37]
+    assert len(places) > 10
+    for place in places:
+        for volume, spline, sign in zip(found, coefficients, (-0.5, 0.5), strict=True):
+            source = place + SPLINE_PAD + sign * field[tuple(place)][::-1]
+            weights = [cubic_spline(np.arange(n) - s) for n, s in zip(spline.shape, source, strict=True)]
+            assert volume[tuple(place)] == pytest.approx(np.einsum("zyx,z,y,x", spline, *weights), abs=1e-5)
+    # The spline goes through the voxels.
+    whole = np.einsum("zyx,z,y,x", coefficients[0], *[cubic_spline(np.arange(n + 4) - 5) for n in shape])
+    assert whole == pytest.approx(a[3, 3, 3] / a.max(), abs=1e-6)
+
+
+def cubic_spline(away: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The cubic B-spline, piece by piece."""
+    s = np.abs(away)
+    return np.where(s < 1, 2 / 3 - s**2 + s**3 / 2, np.where(s < 2, (2 - s) ** 3 / 6, 0.0))
 
 
 def test_joint_mask_takes_both_volumes_where_either_source_is_unseen() -> None:

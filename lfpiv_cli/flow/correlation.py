@@ -18,7 +18,14 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from lfpiv_cli.errors import ConfigError, InputError
-from lfpiv_cli.flow.deformation import deform_pair, expand_lateral, resample_field, spline_coefficients, spline_matrix
+from lfpiv_cli.flow.deformation import (
+    Spline,
+    deform_pair,
+    expand_lateral,
+    resample_field,
+    spline_coefficients,
+    spline_matrix,
+)
 from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.flow.maps import correlation_maps, margins, window_sums
 from lfpiv_cli.flow.moments import gauss_newton
@@ -59,10 +66,10 @@ class Pass:
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Two volumes ready for deformation: spline coefficients, and where both may be used (size 0 for everywhere)."""
+    """Two volumes ready for deformation: their splines, and where both may be used (size 0 for everywhere)."""
 
-    coefficients_a: NDArray[np.float32]
-    coefficients_b: NDArray[np.float32]
+    a: Spline
+    b: Spline
     mask: NDArray[np.bool_]
     shape_xyz: Triple
 
@@ -272,9 +279,9 @@ def _refine(pair: Pair, predictor: NDArray[np.float64], step: Pass) -> Measured:
         spline_matrix(layout.centres_voxel(k), np.arange(shape[k], dtype=np.float64)) for k in range(3)
     )
     lateral = expand_lateral(predictor, along_x, along_y)
-    a, b, valid = deform_pair(pair.coefficients_a, pair.coefficients_b, pair.mask, lateral, along_z, before, after)
+    a, b, valid = deform_pair(pair.a, pair.b, pair.mask, lateral, along_z, before, after)
     peaks = find_peaks(correlation_maps(a, b, layout, before, step.radius))
-    sums = window_sums(valid, layout, before)
+    sums = window_sums(valid, layout, before).astype(np.float64)
     valid_fraction = sums.reshape(layout.count_zyx) / float(np.prod(layout.size))
     width = _width_when_sparse(typical_width(peaks.width))
     if step.is_last or np.any(width >= ELONGATED_WIDTH):

@@ -9,32 +9,112 @@ Axes: volumes `[z, y, x]`, displacements in voxels with components (u, v, w) alo
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
-from scipy.ndimage import spline_filter
 
-# Sources lie between the first and the last voxel's centre; the four taps of a cubic B-spline at the last one reach two
-# coefficients beyond it.
+from lfpiv_cli.flow.lanes import LANES, highest, interpolate, lowest, spline_weights
+from lfpiv_cli.flow.windows import Triple
+
+# Sources lie between the first and the last voxel's centre: the four taps of a cubic B-spline reach one coefficient
+# beyond these, and a fifth of weight zero another.
 SPLINE_PAD = 2
-# The prefilter sees the volume continued by odd reflection, which keeps its slope at the faces: the usual even one
-# makes a kink in every particle that a face cuts, and costs 0.1 voxel there. Its response decays by 3.7 a voxel.
-FACE_PAD = 8
+# Lanes beyond the end of a row are interpolated and dropped; so far they may read.
+SLACK = 2 * LANES
+# Neighbours along x are interpolated together with the taps of all of them. Where their displacements differ too much
+# for this many along an axis, fewer are taken at once.
+MOST_TAPS = 8
+# A tap whose B-spline ends closer than this to a place weighs less than 2e-7 there and is left out: in fluid at rest,
+# where displacements scatter around zero, five taps become three.
+NEGLIGIBLE = 0.01
+# Planes whose displacements are known at a time: all of them would take several times the memory of the volumes.
+SLAB_PLANES = 32
 
 
-def spline_coefficients(volume: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the cubic B-spline coefficients of a volume, with `SPLINE_PAD` of them beyond each face.
+@dataclass(frozen=True, eq=False)
+class Spline:
+    """The cubic B-spline coefficients of a volume.
 
-    Scaled to a largest magnitude of 1 in the volume: the correlation is normalised anyway, and products stay far from
-    the limits of float32.
+    Attributes
+    ----------
+    flat : float32, the coefficients [z, y, x] with `SPLINE_PAD` beyond each face, and `SLACK` zeros before and after
+    shape_zyx : voxels of the volume
+    """
+
+    flat: NDArray[np.float32]
+    shape_zyx: Triple
+
+
+def spline_coefficients(volume: NDArray[np.float32]) -> Spline:
+    """Return the cubic B-spline through a volume's voxels, scaled to a largest magnitude of 1.
+
+    The correlation is normalised anyway, and products stay far from the limits of float32. Beyond the faces the volume
+    is continued by odd reflection, which keeps its slope: the usual even one makes a kink in every particle that a face
+    cuts, and costs 0.1 voxel there.
     """
     largest = float(np.max(np.abs(volume)))
-    scaled = volume / np.float32(largest) if largest > 0.0 else volume
-    continued = np.pad(scaled, FACE_PAD, mode="reflect", reflect_type="odd")
-    coefficients = spline_filter(continued, order=3, output=np.float32, mode="mirror")
-    kept = slice(FACE_PAD - SPLINE_PAD, SPLINE_PAD - FACE_PAD)
-    return np.ascontiguousarray(coefficients[kept, kept, kept])
+    padded = tuple(n + 2 * SPLINE_PAD for n in volume.shape)
+    flat = np.zeros(int(np.prod(padded)) + 2 * SLACK, dtype=np.float32)
+    inside = (slice(SPLINE_PAD, -SPLINE_PAD),) * 3
+    coefficients = flat[SLACK:-SLACK].reshape(padded)
+    np.multiply(volume, np.float32(1.0 / largest if largest > 0.0 else 1.0), out=coefficients[inside])
+    filter_planes(coefficients[inside])
+    filter_depth(coefficients[inside])
+    for axis in range(3):
+        moved = np.moveaxis(coefficients, axis, 0)
+        first, last = moved[SPLINE_PAD], moved[-SPLINE_PAD - 1]
+        moved[SPLINE_PAD - 1] = 2.0 * first - moved[min(SPLINE_PAD + 1, moved.shape[0] - SPLINE_PAD - 1)]
+        moved[-SPLINE_PAD] = 2.0 * last - moved[max(-SPLINE_PAD - 2, SPLINE_PAD - moved.shape[0])]
+    return Spline(flat, (volume.shape[0], volume.shape[1], volume.shape[2]))
+
+
+@njit(cache=True)
+def pivots(count: int) -> NDArray[np.float32]:
+    """Return the factors of the elimination of c[i - 1] + 4 c[i] + c[i + 1] = 6 s[i] with both ends given."""
+    factors = np.zeros(count, dtype=np.float32)
+    for i in range(1, count - 1):
+        factors[i] = np.float32(1.0 / (4.0 - factors[i - 1]))
+    return factors
+
+
+@njit(cache=True)
+def filter_lines(lines: NDArray[np.float32], factors: NDArray[np.float32]) -> None:
+    """Replace samples by B-spline coefficients along the first axis of (n, lines), in place.
+
+    With odd reflection the outermost coefficients are the outermost samples; between them a tridiagonal system remains.
+    """
+    count = lines.shape[0]
+    six = np.float32(6.0)
+    for i in range(1, count - 1):
+        here, before, factor = lines[i], lines[i - 1], factors[i]
+        for x in range(here.size):
+            here[x] = (six * here[x] - before[x]) * factor
+    for i in range(count - 2, 0, -1):
+        here, after, factor = lines[i], lines[i + 1], factors[i]
+        for x in range(here.size):
+            here[x] -= factor * after[x]
+
+
+@njit(cache=True, parallel=True)
+def filter_planes(volume: NDArray[np.float32]) -> None:
+    """Replace samples by B-spline coefficients along x and y, in place."""
+    along_y, along_x = pivots(volume.shape[1]), pivots(volume.shape[2])
+    for z in prange(volume.shape[0]):
+        filter_lines(volume[z], along_y)
+        turned = volume[z].T.copy()
+        filter_lines(turned, along_x)
+        volume[z] = turned.T
+
+
+@njit(cache=True, parallel=True)
+def filter_depth(volume: NDArray[np.float32]) -> None:
+    """Replace samples by B-spline coefficients along z, in place."""
+    factors = pivots(volume.shape[0])
+    for y in prange(volume.shape[1]):
+        filter_lines(volume[:, y], factors)
 
 
 def spline_matrix(nodes: NDArray[np.float64], positions: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -61,101 +141,167 @@ def resample_field(
 
 def expand_lateral(
     field: NDArray[np.float64], along_x: NDArray[np.float64], along_y: NDArray[np.float64]
-) -> NDArray[np.float64]:
+) -> NDArray[np.float32]:
     """Return a field (nz, ny, nx, 3) at every voxel of the x-y planes through the windows: (nz, 3, rows y, columns x).
 
-    The expansion in depth is left to `deform_pair`, plane by plane: a whole volume of vectors would take several times
-    the memory of the volumes.
+    The expansion in depth is left to `deform_pair`.
     """
-    return np.ascontiguousarray(np.einsum("bj,ai,kjid->kdba", along_y, along_x, field, optimize=True))
+    lateral = np.einsum("bj,ai,kjid->kdba", along_y, along_x, field, optimize=True)
+    return np.ascontiguousarray(lateral, dtype=np.float32)
 
 
-@njit(cache=True)
-def cubic_weights(t: float) -> tuple[float, float, float, float]:
-    """Return the weights of the four cubic B-splines around a point at 0 <= t < 1 past the second of them."""
-    s = 1.0 - t
-    return (
-        s * s * s / 6.0,
-        (4.0 - 6.0 * t * t + 3.0 * t * t * t) / 6.0,
-        (4.0 - 6.0 * s * s + 3.0 * s * s * s) / 6.0,
-        t * t * t / 6.0,
-    )
-
-
-@njit(cache=True)
-def sample(coefficients: NDArray[np.float32], z: float, y: float, x: float) -> float:
-    """Return the spline's value at a point given in voxel indices, between the outermost voxel centres."""
-    iz = int(np.floor(z))
-    iy = int(np.floor(y))
-    ix = int(np.floor(x))
-    x0, x1, x2, x3 = cubic_weights(x - ix)
-    weights_y = cubic_weights(y - iy)
-    weights_z = cubic_weights(z - iz)
-    # The first tap lies one voxel before the floor and the padding two voxels before the volume: an offset of one.
-    column = ix + SPLINE_PAD - 1
-    total = 0.0
-    for k in range(4):
-        plane = 0.0
-        for j in range(4):
-            row = coefficients[iz + SPLINE_PAD - 1 + k, iy + SPLINE_PAD - 1 + j]
-            plane += weights_y[j] * (
-                (x0 * row[column] + x1 * row[column + 1]) + (x2 * row[column + 2] + x3 * row[column + 3])
-            )
-        total += weights_z[k] * plane
-    return total
-
-
-@njit(cache=True)
-def is_seen(mask: NDArray[np.bool_], shape: tuple[int, int, int], z: float, y: float, x: float) -> bool:
-    """Tell whether a point lies in the volume and, where there is a mask (any size but 0), in a voxel that it keeps."""
-    # Not to the outer faces of the outermost voxels: beyond their centres a value would be extrapolated.
-    inside = (0.0 <= z <= shape[0] - 1) and (0.0 <= y <= shape[1] - 1) and (0.0 <= x <= shape[2] - 1)
-    if not inside or mask.size == 0:
-        return inside
-    return mask[int(np.floor(z + 0.5)), int(np.floor(y + 0.5)), int(np.floor(x + 0.5))]
-
-
-@njit(cache=True, parallel=True)
 def deform_pair(
-    coefficients_a: NDArray[np.float32],
-    coefficients_b: NDArray[np.float32],
+    a: Spline,
+    b: Spline,
     mask: NDArray[np.bool_],
-    lateral: NDArray[np.float64],
+    lateral: NDArray[np.float32],
     along_z: NDArray[np.float64],
-    before: tuple[int, int, int],
-    after: tuple[int, int, int],
+    before: Triple,
+    after: Triple,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
     """Return both volumes deformed half-way towards each other, and where they are valid, with a margin of zeros.
 
     Parameters
     ----------
-    coefficients_a, coefficients_b : of `spline_coefficients`
+    a, b : of `spline_coefficients`
     mask : (z, y, x) True where the volumes are to be used, or of size 0 for everywhere
     lateral : (nz, 3, rows y, columns x) the predictor in voxels, of `expand_lateral`
     along_z : (planes z, nz) its spline matrix in depth
     before, after : widths of the margin before and after the volume along (z, y, x)
     """
-    nz, ny, nx = along_z.shape[0], lateral.shape[2], lateral.shape[3]
-    shape = (nz, ny, nx)
-    padded = (before[0] + nz + after[0], before[1] + ny + after[1], before[2] + nx + after[2])
-    deformed_a = np.zeros(padded, dtype=np.float32)
-    deformed_b = np.zeros(padded, dtype=np.float32)
+    padded = tuple(m + n + k for m, n, k in zip(before, a.shape_zyx, after, strict=True))
+    deformed_a, deformed_b = np.zeros((2, *padded), dtype=np.float32)
     valid = np.zeros(padded, dtype=np.uint8)
-    for z in prange(nz):
-        half = np.empty((3, nx))
-        for y in range(ny):
-            half[:] = 0.0
-            for k in range(lateral.shape[0]):
-                weight = 0.5 * along_z[z, k]
-                for component in range(3):
-                    row = lateral[k, component, y]
-                    for x in range(nx):
-                        half[component, x] += weight * row[x]
-            for x in range(nx):
-                u, v, w = half[0, x], half[1, x], half[2, x]
-                if is_seen(mask, shape, z - w, y - v, x - u) and is_seen(mask, shape, z + w, y + v, x + u):
-                    target = (z + before[0], y + before[1], x + before[2])
-                    deformed_a[target] = sample(coefficients_a, z - w, y - v, x - u)
-                    deformed_b[target] = sample(coefficients_b, z + w, y + v, x + u)
-                    valid[target] = 1
+    half_along_z = (0.5 * along_z).astype(np.float32)
+    flat = lateral.reshape(lateral.shape[0], -1)
+    for first in range(0, a.shape_zyx[0], SLAB_PLANES):
+        half = (half_along_z[first : first + SLAB_PLANES] @ flat).reshape(-1, *lateral.shape[1:])
+        deform_slab(a.flat, b.flat, a.shape_zyx, mask, half, first, before, deformed_a, deformed_b, valid)
     return deformed_a, deformed_b, valid
+
+
+@njit(cache=True, parallel=True)
+def deform_slab(
+    flat_a: NDArray[np.float32],
+    flat_b: NDArray[np.float32],
+    shape: Triple,
+    mask: NDArray[np.bool_],
+    half: NDArray[np.float32],
+    first: int,
+    before: Triple,
+    deformed_a: NDArray[np.float32],
+    deformed_b: NDArray[np.float32],
+    valid: NDArray[np.uint8],
+) -> None:
+    """Deform the planes from `first` on by half displacements (planes z, 3, rows y, columns x)."""
+    row = shape[2] + 2 * SPLINE_PAD
+    plane = row * (shape[1] + 2 * SPLINE_PAD)
+    for z in prange(first, first + half.shape[0]):
+        moved = np.empty((3, shape[2] + LANES), dtype=np.float32)
+        flat_moved = moved.reshape(moved.size)
+        weights = np.empty(3 * MOST_TAPS * LANES, dtype=np.float32)
+        out = np.empty(2 * LANES, dtype=np.float32)
+        for y in range(shape[1]):
+            target = (z + before[0], y + before[1])
+            here = slice(before[2], before[2] + shape[2])
+            seen, line_a, line_b = valid[target][here], deformed_a[target][here], deformed_b[target][here]
+            bound_row(half[z - first, :, y], shape, z, y, moved, seen)
+            if mask.size:
+                mask_row(mask, moved, z, y, seen)
+            begin = SLACK + (z + SPLINE_PAD) * plane + (y + SPLINE_PAD) * row + SPLINE_PAD
+            x = 0
+            while x < shape[2]:
+                width, low, taps = gather_taps(flat_moved, moved.shape[1], x, weights)
+                interpolate(
+                    out,
+                    flat_a,
+                    flat_b,
+                    begin + x,
+                    plane,
+                    row,
+                    weights,
+                    low[0],
+                    low[1],
+                    low[2],
+                    taps[0],
+                    taps[1],
+                    taps[2],
+                )
+                for lane in range(min(width, shape[2] - x)):
+                    line_a[x + lane] = out[lane] * seen[x + lane]
+                    line_b[x + lane] = out[LANES + lane] * seen[x + lane]
+                x += width
+
+
+@njit(cache=True)
+def gather_taps(
+    moved: NDArray[np.float32], length: int, x: int, weights: NDArray[np.float32]
+) -> tuple[int, Triple, Triple]:
+    """Write the weights of the taps that the lanes from `x` on need; return how many lanes, and the taps along z, y, x.
+
+    As many lanes as `MOST_TAPS` serve; the lowest tap, and the number of taps. `moved` is `length` long an axis.
+    """
+    width = LANES
+    low_x, taps_x = taps_of(moved, x, width)
+    low_y, taps_y = taps_of(moved, length + x, width)
+    low_z, taps_z = taps_of(moved, 2 * length + x, width)
+    while max(taps_x, taps_y, taps_z) > MOST_TAPS:
+        width //= 2
+        low_x, taps_x = taps_of(moved, x, width)
+        low_y, taps_y = taps_of(moved, length + x, width)
+        low_z, taps_z = taps_of(moved, 2 * length + x, width)
+    spline_weights(weights, 0, moved, 2 * length + x, low_z, taps_z)
+    spline_weights(weights, taps_z * LANES, moved, length + x, low_y, taps_y)
+    spline_weights(weights, (taps_z + taps_y) * LANES, moved, x, low_x, taps_x)
+    return width, (low_z, low_y, low_x), (taps_z, taps_y, taps_x)
+
+
+@njit(cache=True)
+def taps_of(places: NDArray[np.float32], at: int, width: int) -> tuple[int, int]:
+    """Return the lowest tap whose B-spline matters at some of `width` places, and how many there are from it on."""
+    if width == LANES:
+        low, high = lowest(places, at), highest(places, at)
+    else:
+        low = high = places[at]
+        for place in places[at : at + width]:
+            low, high = min(low, place), max(high, place)
+    first = int(np.floor(low + np.float32(NEGLIGIBLE))) - 1
+    return first, int(np.ceil(high - np.float32(NEGLIGIBLE))) + 2 - first
+
+
+@njit(cache=True)
+def bound_row(
+    half: NDArray[np.float32],
+    shape: Triple,
+    z: int,
+    y: int,
+    moved: NDArray[np.float32],
+    valid: NDArray[np.uint8],
+) -> None:
+    """Write the half displacements of a row cut off where a source would leave the volume, and which ones are whole.
+
+    The lanes beyond its end repeat its last voxel. Cut off at the centres of the outermost voxels, not at their outer
+    faces: beyond the centres a value would be extrapolated.
+    """
+    columns = shape[2]
+    reach_z = np.float32(min(z, shape[0] - 1 - z))
+    reach_y = np.float32(min(y, shape[1] - 1 - y))
+    for x in range(columns):
+        reach_x = np.float32(min(x, columns - 1 - x))
+        u, v, w = half[0, x], half[1, x], half[2, x]
+        moved[0, x] = min(max(u, -reach_x), reach_x)
+        moved[1, x] = min(max(v, -reach_y), reach_y)
+        moved[2, x] = min(max(w, -reach_z), reach_z)
+        valid[x] = (moved[0, x] == u) & (moved[1, x] == v) & (moved[2, x] == w)
+    for axis in range(3):
+        moved[axis, columns:] = moved[axis, columns - 1]
+
+
+@njit(cache=True)
+def mask_row(mask: NDArray[np.bool_], moved: NDArray[np.float32], z: int, y: int, valid: NDArray[np.uint8]) -> None:
+    """Strike out the voxels of a row for which either source lies nearest to a voxel that the mask leaves out."""
+    for x in range(valid.size):
+        u, v, w = moved[0, x], moved[1, x], moved[2, x]
+        seen_a = mask[int(np.floor(z - w + 0.5)), int(np.floor(y - v + 0.5)), int(np.floor(x - u + 0.5))]
+        seen_b = mask[int(np.floor(z + w + 0.5)), int(np.floor(y + v + 0.5)), int(np.floor(x + u + 0.5))]
+        valid[x] &= np.uint8(seen_a and seen_b)

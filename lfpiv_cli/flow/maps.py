@@ -21,6 +21,7 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
+from lfpiv_cli.flow.lanes import FEW_SHIFTS, LANES, MANY_SHIFTS, few_products, many_products
 from lfpiv_cli.flow.windows import Triple, WindowLayout
 
 # Blocks narrower than this cost more in sums of sums than the products they save.
@@ -28,6 +29,9 @@ SMALLEST_BLOCK = 4
 # A window whose energy is below this share of the brightest one's is empty: what the splines carry into empty space
 # reaches amplitudes of 1e-5.
 SMALLEST_ENERGY = 1e-9
+
+# Columns that are summed at a time: their sums stay in the fastest cache.
+SUM_TILE = 2048
 
 
 @dataclass(frozen=True)
@@ -64,10 +68,15 @@ def _blocks_along(size: int, step: int, count: int) -> tuple[int, int, int, int,
 
 
 def margins(layout: WindowLayout, shape_zyx: Triple, radius: int) -> tuple[Triple, Triple]:
-    """Return how many voxels of zeros windows shifted by `radius` need before and after the volume, (z, y, x)."""
+    """Return how many voxels of zeros windows shifted by `radius` need before and after the volume, (z, y, x).
+
+    Along x there are at least `LANES` voxels from the first window's on, which are multiplied at once.
+    """
     before, after = [], []
     for axis, voxels in zip((2, 1, 0), shape_zyx, strict=True):
         last = layout.first[axis] + (layout.count[axis] - 1) * layout.step[axis] + layout.size[axis]
+        if axis == 0:
+            last = max(last, layout.first[axis] + LANES)
         before.append(max(0, radius - layout.first[axis]))
         after.append(max(0, last + radius - voxels))
     return (before[0], before[1], before[2]), (after[0], after[1], after[2])
@@ -91,38 +100,33 @@ def correlation_maps(
     products = block_products(a, b, first, blocks.size, blocks.stride, blocks.count, radius)
     for axis in range(3):
         products = _sum_blocks(products, axis, layout.count_zyx[axis], blocks.per_window[axis], blocks.hop[axis])
-    energies = _pair_energies(shifted_energies(a, layout, first, radius), -1)
-    energies *= _pair_energies(shifted_energies(b, layout, first, radius), 1)
+    energies = _pair_energies(window_sums(np.square(a), layout, before, radius), -1)
+    energies *= _pair_energies(window_sums(np.square(b), layout, before, radius), 1)
     filled = energies > SMALLEST_ENERGY**2 * np.max(energies)
     return np.divide(products, np.sqrt(energies), out=np.zeros_like(products), where=filled)
 
 
-def window_sums(volume: NDArray, layout: WindowLayout, before: Triple, radius: int = 0) -> NDArray[np.float64]:
-    """Return the sums over all windows at all shifts: (nz, 2r + 1, ny, 2r + 1, nx, 2r + 1)."""
-    sums = volume
+def window_sums(volume: NDArray, layout: WindowLayout, before: Triple, radius: int = 0) -> NDArray[np.float32]:
+    """Return the sums over all windows at all shifts: (nz, ny, nx, 2r + 1, 2r + 1, 2r + 1), the shifts last."""
+    sums = volume.astype(np.float32, copy=False)
     for axis, xyz in enumerate((2, 1, 0)):
-        outer = int(np.prod(sums.shape[:axis]))
-        inner = int(np.prod(sums.shape[axis + 1 :]))
-        rows = sums.reshape(outer, sums.shape[axis], inner)
+        # The axis to sum along comes first, so that whole stretches of memory are added.
+        rows = np.ascontiguousarray(np.moveaxis(sums.reshape(-1, *volume.shape[axis:]), 1, 0))
         first = layout.first[xyz] + before[axis]
-        summed = axis_sums(rows, first, layout.size[xyz], layout.step[xyz], layout.count[xyz], radius)
-        sums = summed.reshape(*sums.shape[:axis], summed.shape[1], *sums.shape[axis + 1 :])
+        flat = rows.reshape(rows.shape[0], -1)
+        summed = axis_sums(flat, first, layout.size[xyz], layout.step[xyz], layout.count[xyz], radius)
+        sums = np.moveaxis(summed.reshape(-1, *rows.shape[1:]), 0, 1)
     shifts = 2 * radius + 1
     nz, ny, nx = layout.count_zyx
-    return sums.reshape(nz, shifts, ny, shifts, nx, shifts)
+    return sums.reshape(nz, shifts, ny, shifts, nx, shifts).transpose(0, 2, 4, 1, 3, 5)
 
 
-def shifted_energies(volume: NDArray[np.float32], layout: WindowLayout, first: Triple, radius: int) -> NDArray:
-    """Return the sums of squares over all windows at all shifts, (nz, ny, nx, 2r + 1, 2r + 1, 2r + 1)."""
-    before = (first[0] - layout.first[2], first[1] - layout.first[1], first[2] - layout.first[0])
-    return window_sums(np.square(volume), layout, before, radius).transpose(0, 2, 4, 1, 3, 5)
-
-
-def _pair_energies(energies: NDArray[np.float64], sign: int) -> NDArray[np.float64]:
+def _pair_energies(energies: NDArray[np.float32], sign: int) -> NDArray[np.float64]:
     """Return E(W) + E(W + sign s) for every shift s."""
-    radius = energies.shape[-1] // 2
-    shifted = energies if sign > 0 else energies[..., ::-1, ::-1, ::-1]
-    return shifted + energies[..., radius, radius, radius][..., np.newaxis, np.newaxis, np.newaxis]
+    whole = energies.astype(np.float64)
+    radius = whole.shape[-1] // 2
+    shifted = whole if sign > 0 else whole[..., ::-1, ::-1, ::-1]
+    return shifted + whole[..., radius, radius, radius][..., np.newaxis, np.newaxis, np.newaxis]
 
 
 def _sum_blocks(products: NDArray[np.float64], axis: int, count: int, per_window: int, hop: int) -> NDArray[np.float64]:
@@ -137,25 +141,42 @@ def _sum_blocks(products: NDArray[np.float64], axis: int, count: int, per_window
 
 
 @njit(cache=True, parallel=True)
-def axis_sums(rows: NDArray, first: int, size: int, step: int, count: int, radius: int) -> NDArray[np.float64]:
-    """Return sums over `size` cells of the middle axis of (outer, cells, inner), at first + k step + shift.
+def axis_sums(
+    rows: NDArray[np.float32], first: int, size: int, step: int, count: int, radius: int
+) -> NDArray[np.float32]:
+    """Return sums over `size` rows of (rows, columns), those from first + k step + shift on: (count x shifts, columns).
 
-    Sums are taken afresh for every window rather than as differences of running sums: an empty window next to bright
-    ones must be exactly zero.
+    The rows that all shifts of a window share are summed once. Differences of running sums would take less, but an
+    empty window next to bright ones must be exactly zero.
     """
     shifts = 2 * radius + 1
-    outer, _, inner = rows.shape
-    sums = np.zeros((outer, count * shifts, inner))
-    for job in prange(outer * count):
-        o, k = job // count, job % count
+    columns = rows.shape[1]
+    sums = np.empty((count * shifts, columns), dtype=np.float32)
+    tiles = -(-columns // SUM_TILE)
+    for job in prange(count * tiles):
+        k, left = job // tiles, (job % tiles) * SUM_TILE
+        right = min(left + SUM_TILE, columns)
+        lowest = first + k * step - radius
+        begin = lowest + shifts - 1
+        end = max(begin, lowest + size)
+        shared = np.zeros(right - left, dtype=np.float32)
+        for row in range(begin, end):
+            add_row(shared, rows[row, left:right])
         for shift in range(shifts):
-            target = sums[o, k * shifts + shift]
-            start = first + k * step + shift - radius
-            for cell in range(start, start + size):
-                source = rows[o, cell]
-                for i in range(inner):
-                    target[i] += source[i]
+            target = sums[k * shifts + shift, left:right]
+            target[:] = shared
+            for row in range(lowest + shift, min(begin, lowest + shift + size)):
+                add_row(target, rows[row, left:right])
+            for row in range(end, lowest + shift + size):
+                add_row(target, rows[row, left:right])
     return sums
+
+
+@njit(cache=True)
+def add_row(target: NDArray[np.float32], row: NDArray[np.float32]) -> None:
+    """Add a row to another."""
+    for i in range(target.size):
+        target[i] += row[i]
 
 
 @njit(cache=True, parallel=True)
@@ -170,43 +191,37 @@ def block_products(
 ) -> NDArray[np.float64]:
     """Return sum A(x) B(x + s) + A(x - s) B(x) over blocks: (blocks z, y, x, shifts z, y, x).
 
-    For one row of blocks and one shift, the products of a slab of whole rows are added plane by plane into a buffer
-    that stays in the cache, which the compiler vectorises without reordering a sum; only then is the buffer split into
-    blocks. The buffer is float32: it adds at most the few planes of a block, and the maps are wanted to 1e-5.
+    For one row of blocks the products are first summed over its planes and rows, many columns and several shifts at
+    once, and only then over the columns of each block. The first sums are float32: the maps are wanted to 1e-5.
     """
     shifts = 2 * radius + 1
-    rows, columns = a.shape[1], a.shape[2]
-    flat_a = a.reshape(a.size)
-    flat_b = b.reshape(b.size)
-    products = np.zeros((count[0], count[1], count[2], shifts, shifts, shifts))
-    # Each slab starts `radius` after its first row begins and ends as much earlier: shifts never leave the volume.
-    length = size[1] * columns - 2 * radius
+    row, plane = a.shape[2], a.shape[1] * a.shape[2]
+    flat_a, flat_b = a.reshape(a.size), b.reshape(b.size)
+    products = np.empty((count[0], count[1], count[2], shifts, shifts, shifts))
+    length = max(LANES, (count[2] - 1) * stride[2] + size[2])
+    together = MANY_SHIFTS if shifts >= MANY_SHIFTS else FEW_SHIFTS
     for job in prange(count[0] * count[1]):
         bz, by = job // count[1], job % count[1]
-        slab = np.empty(size[1] * columns, dtype=np.float32)
-        line = np.empty(columns)
-        for sz in range(-radius, radius + 1):
-            for sy in range(-radius, radius + 1):
-                for sx in range(-radius, radius + 1):
-                    shift = (sz * rows + sy) * columns + sx
-                    slab[:] = np.float32(0.0)
-                    for z in range(size[0]):
-                        start = ((first[0] + bz * stride[0] + z) * rows + first[1] + by * stride[1]) * columns + radius
-                        target = slab[radius : radius + length]
-                        a_here = flat_a[start : start + length]
-                        b_here = flat_b[start : start + length]
-                        a_before = flat_a[start - shift : start - shift + length]
-                        b_after = flat_b[start + shift : start + shift + length]
-                        for i in range(length):
-                            target[i] += a_here[i] * b_after[i] + a_before[i] * b_here[i]
-                    line[:] = 0.0
-                    for y in range(size[1]):
-                        row = slab[y * columns : (y + 1) * columns]
-                        for i in range(columns):
-                            line[i] += row[i]
-                    for bx in range(count[2]):
+        begin = (first[0] + bz * stride[0]) * plane + (first[1] + by * stride[1]) * row + first[2]
+        columns = np.empty((shifts, length), dtype=np.float32)
+        flat = columns.reshape(columns.size)
+        for sz in range(shifts):
+            for sy in range(shifts):
+                for group in range(0, shifts, together):
+                    # The last group and the last lanes begin early enough to end with the others.
+                    sx = min(group, shifts - together)
+                    shift = (sz - radius) * plane + (sy - radius) * row + sx - radius
+                    for start in range(0, length, LANES):
+                        x = min(start, length - LANES)
+                        at, here = sx * length + x, begin + x
+                        if together == MANY_SHIFTS:
+                            many_products(flat, at, length, flat_a, flat_b, here, shift, plane, row, size[0], size[1])
+                        else:
+                            few_products(flat, at, length, flat_a, flat_b, here, shift, plane, row, size[0], size[1])
+                for bx in range(count[2]):
+                    for sx in range(shifts):
                         total = 0.0
-                        for i in range(first[2] + bx * stride[2], first[2] + bx * stride[2] + size[2]):
-                            total += line[i]
-                        products[bz, by, bx, sz + radius, sy + radius, sx + radius] = total
+                        for x in range(bx * stride[2], bx * stride[2] + size[2]):
+                            total += columns[sx, x]
+                        products[bz, by, bx, sz, sy, sx] = total
     return products

@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
 
 from lfpiv_cli.flow.field import MASKED, REJECTED, REPLACED, SECOND_PEAK, VALID
 from lfpiv_cli.flow.peaks import typical_width
@@ -59,9 +60,15 @@ def validate_vectors(
     flag = np.full(measured.shape, VALID, dtype=np.uint8)
     flag[~measured] = REJECTED
     flag[masked] = MASKED
-    for _ in range(ROUNDS):
-        usable = flag == VALID
-        predicted, spread, share = predict(np.where(usable[..., np.newaxis], displacement, 0.0), usable, ~masked)
+    usable = np.ones(measured.shape, dtype=np.bool_)
+    predicted, spread, share = np.zeros(raw.shape), np.zeros(raw.shape), np.zeros(measured.shape)
+    for round_number in range(ROUNDS):
+        before, usable = usable, flag == VALID
+        # In a later round only what has lost or won a neighbour.
+        again = _around(before != usable) if round_number else np.ones(measured.shape, dtype=np.bool_)
+        told = predict(np.where(usable[..., np.newaxis], displacement, 0.0), usable, ~masked, again)
+        for kept, new in zip((predicted, spread, share), told, strict=True):
+            kept[again] = new[again]
         limit = THRESHOLD * (spread + noise)
         judged = measured & ~masked & (share >= NEEDED_SHARE)
         fits = np.all(np.abs(raw - predicted) <= limit, axis=-1)
@@ -84,7 +91,7 @@ def fill_field(displacement: NDArray[np.float64]) -> NDArray[np.float64]:
     known = np.all(np.isfinite(displacement), axis=-1)
     everywhere = np.ones(known.shape, dtype=np.bool_)
     while not known.all() and known.any():
-        predicted, _, share = predict(filled, known, everywhere)
+        predicted, _, share = predict(filled, known, everywhere, ~known)
         # The best known first; without the tolerance a flat rim would be closed from its ends, one vector a round.
         needed = min(NEEDED_SHARE, FILL_TOLERANCE * float(np.max(share[~known])))
         rim = ~known & (share >= needed)
@@ -112,36 +119,60 @@ def smooth_field(displacement: NDArray[np.float64], strength: float) -> NDArray[
 
 
 @njit(cache=True)
-def robust_slope(values: NDArray[np.float64], places: NDArray[np.int64], axis: int) -> float:
+def sorted_median(values: NDArray[np.float64], count: int) -> float:
+    """Return the median of the first `count` values, 1 or more, which are sorted in place."""
+    for i in range(1, count):
+        value = values[i]
+        j = i
+        while j > 0 and values[j - 1] > value:
+            values[j] = values[j - 1]
+            j -= 1
+        values[j] = value
+    return 0.5 * (values[(count - 1) // 2] + values[count // 2])
+
+
+@njit(cache=True)
+def robust_slope(
+    cube: NDArray[np.float64], known: NDArray[np.bool_], stride: int, slopes: NDArray[np.float64]
+) -> float:
     """Return the median slope along an axis over pairs of neighbours that lie on one line along it; 0 without a pair.
 
-    `places` (n, 3) are the neighbours' offsets from the vector along (z, y, x).
+    Parameters
+    ----------
+    cube, known : (27,) the vector's neighbourhood [z, y, x] and which of it may be used
+    stride : 9, 3, 1 for the axes z, y, x
+    slopes : (27,) room to work
     """
-    slopes = np.empty(values.size * 2)
     pairs = 0
-    for i in range(values.size):
-        for j in range(values.size):
-            run = places[j, axis] - places[i, axis]
-            aligned = run > 0
-            for other in range(3):
-                aligned = aligned and (other == axis or places[i, other] == places[j, other])
-            if aligned:
-                slopes[pairs] = (values[j] - values[i]) / run
-                pairs += 1
-    return np.median(slopes[:pairs]) if pairs else 0.0
+    for first in range(27):
+        # The first of three on a line along the axis.
+        if (first // stride) % 3:
+            continue
+        middle, last = first + stride, first + 2 * stride
+        if known[first] and known[middle]:
+            slopes[pairs] = cube[middle] - cube[first]
+            pairs += 1
+        if known[middle] and known[last]:
+            slopes[pairs] = cube[last] - cube[middle]
+            pairs += 1
+        if known[first] and known[last]:
+            slopes[pairs] = 0.5 * (cube[last] - cube[first])
+            pairs += 1
+    return sorted_median(slopes, pairs) if pairs else 0.0
 
 
 @njit(cache=True, parallel=True)
 def predict(
-    field: NDArray[np.float64], usable: NDArray[np.bool_], counted: NDArray[np.bool_]
+    field: NDArray[np.float64], usable: NDArray[np.bool_], counted: NDArray[np.bool_], wanted: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return what the usable neighbours of each vector predict for it.
+    """Return what the usable neighbours of each wanted vector predict for it.
 
     Parameters
     ----------
     field : (nz, ny, nx, 3) finite where `usable`
     usable : (nz, ny, nx) vectors that may serve as neighbours
     counted : (nz, ny, nx) vectors that count in the share
+    wanted : (nz, ny, nx) vectors to predict; for others everything is 0
 
     Returns
     -------
@@ -155,32 +186,48 @@ def predict(
     share = np.zeros((nz, ny, nx))
     for job in prange(nz * ny):
         z, y = job // ny, job % ny
-        places = np.empty((26, 3), dtype=np.int64)
-        values = np.empty((3, 26))
+        cube, carried = np.zeros((3, 27)), np.empty(27)
+        known = np.empty(27, dtype=np.bool_)
         for x in range(nx):
-            used = 0
-            possible = 0
-            for jz in range(max(z - 1, 0), min(z + 2, nz)):
-                for jy in range(max(y - 1, 0), min(y + 2, ny)):
-                    for jx in range(max(x - 1, 0), min(x + 2, nx)):
-                        if (jz == z and jy == y and jx == x) or not counted[jz, jy, jx]:
-                            continue
-                        possible += 1
-                        if usable[jz, jy, jx]:
-                            places[used, 0], places[used, 1], places[used, 2] = jz - z, jy - y, jx - x
-                            for component in range(3):
-                                values[component, used] = field[jz, jy, jx, component]
-                            used += 1
+            if not wanted[z, y, x]:
+                continue
+            used = possible = 0
+            for place in range(27):
+                jz, jy, jx = z + place // 9 - 1, y + place // 3 % 3 - 1, x + place % 3 - 1
+                known[place] = False
+                inside = 0 <= jz < nz and 0 <= jy < ny and 0 <= jx < nx
+                if not inside or place == 13 or not counted[jz, jy, jx]:
+                    continue
+                possible += 1
+                if usable[jz, jy, jx]:
+                    known[place] = True
+                    used += 1
+                    for component in range(3):
+                        cube[component, place] = field[jz, jy, jx, component]
             if used == 0:
                 continue
             share[z, y, x] = used / possible
             for component in range(3):
-                carried = values[component, :used].copy()
-                for axis in range(3):
-                    slope = robust_slope(values[component, :used], places[:used], axis)
-                    for i in range(used):
-                        carried[i] -= slope * places[i, axis]
-                middle = np.median(carried)
+                values = cube[component]
+                slope_z, slope_y, slope_x = (
+                    robust_slope(values, known, 9, carried),
+                    robust_slope(values, known, 3, carried),
+                    robust_slope(values, known, 1, carried),
+                )
+                count = 0
+                for place in range(27):
+                    if known[place]:
+                        away = slope_z * (place // 9 - 1) + slope_y * (place // 3 % 3 - 1) + slope_x * (place % 3 - 1)
+                        carried[count] = values[place] - away
+                        count += 1
+                middle = sorted_median(carried, count)
+                for i in range(count):
+                    carried[i] = abs(carried[i] - middle)
                 predicted[z, y, x, component] = middle
-                spread[z, y, x, component] = np.median(np.abs(carried - middle))
+                spread[z, y, x, component] = sorted_median(carried, count)
     return predicted, spread, share
+
+
+def _around(chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return which vectors have a chosen one among their 26 neighbours (or are one)."""
+    return np.asarray(binary_dilation(chosen, np.ones((3, 3, 3), dtype=np.bool_)))
