@@ -23,6 +23,7 @@ from lfpiv_cli.files.batch import Frame, Target, frames_of, output_paths, pendin
 from lfpiv_cli.files.config import Config, carried_config
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.provenance import record, sha256
+from lfpiv_cli.files.sections import ReconstructionSection
 from lfpiv_cli.files.weights_file import WeightsFile, read_weights
 from lfpiv_cli.reconstruction.equations import Normalisers, normalisers
 from lfpiv_cli.reconstruction.images import (
@@ -33,6 +34,7 @@ from lfpiv_cli.reconstruction.images import (
     light,
     mean_background,
     minimum_background,
+    noise_residual,
     saturated,
     touched,
 )
@@ -236,8 +238,13 @@ def _solved(bench: Bench, image: Image, excluded: Mask, advance: Callable[[int],
         sums,
         advance,
         chosen.start,
-        Stopping(change=chosen.stop_change),
+        Stopping(chosen.stop_change, _noise_limit(chosen, image)),
     )
+
+
+def _noise_limit(chosen: ReconstructionSection, image: Image) -> float | None:
+    """Return the relative residual at which what remains is noise, None where noise does not end the iterations."""
+    return None if chosen.stop_noise is None else chosen.stop_noise * noise_residual(image, chosen.photons_per_count)
 
 
 def _write(target: Target, content: WeightsFile, result: Reconstruction, excluded: int, overwrite: bool) -> None:

@@ -13,6 +13,7 @@ from lfpiv_cli.reconstruction.images import (
     light,
     mean_background,
     minimum_background,
+    noise_residual,
     saturated,
     touched,
 )
@@ -69,3 +70,13 @@ def test_pixels_touched_by_unusable_ones_in_another_frame():
     mask[2, 4] = True
     np.testing.assert_array_equal(np.argwhere(touched(mask, half_a_pixel_on)), [[2, 3], [2, 4], [2, 5], [2, 6]])
     np.testing.assert_array_equal(touched(mask, lambda image: image), mask)
+
+
+def test_noise_alone_leaves_this_residual(rng):
+    light = np.where(rng.random((400, 400)) < 0.3, 2000.0, 0.0)
+    recorded = rng.poisson(light * 0.5) / 0.5 + rng.normal(0.0, 6.0, light.shape)
+    left = np.linalg.norm(recorded - light) / np.linalg.norm(recorded)
+    assert noise_residual(recorded.astype(np.float32), 0.5) == pytest.approx(left, rel=0.02)
+    # without the photons of a count only the read noise is known
+    assert noise_residual(recorded.astype(np.float32)) == pytest.approx(6.0 * 400 / np.linalg.norm(recorded), rel=0.02)
+    assert noise_residual(np.zeros((3, 3), np.float32)) == 0.0

@@ -23,21 +23,22 @@ def run(*arguments: object) -> None:
     cli.main([str(argument) for argument in arguments], standalone_mode=False)
 
 
-@pytest.fixture(scope="module")
-def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Weights of a part of the sample's volume, without a calibration."""
-    folder = tmp_path_factory.mktemp("weights")
-    config = folder / "rig.yaml"
+def build(folder: Path, *changes: tuple[str, str]) -> Path:
+    """Return weights of a part of the sample's volume, without a calibration."""
     text = (ROOT / "configs" / "sample.yaml").read_text()
-    for old, new in (
-        ("shape_xyz: [30, 22, 40]", "shape_xyz: [16, 12, 20]"),
-        ("reference: mid_plane", "reference: focal_point"),
-    ):
+    part = ("shape_xyz: [30, 22, 40]", "shape_xyz: [16, 12, 20]"), ("reference: mid_plane", "reference: focal_point")
+    for old, new in (*part, *changes):
         assert old in text, old
         text = text.replace(old, new)
+    config = folder / "rig.yaml"
     config.write_text(text)
     run("build-weights", config, "-o", folder / "weights.h5")
     return folder / "weights.h5"
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return build(tmp_path_factory.mktemp("weights"))
 
 
 @pytest.fixture
@@ -141,3 +142,13 @@ def test_voxels_without_light_stay_out_with_lines_of_sight(weights, tmp_path):
     assert np.count_nonzero(volume) <= taking_part
     volume_of(weights, SAMPLE / "pair_a.tif", tmp_path / "u.vtkhdf", *dark)
     assert taking_part < open_volume(tmp_path / "u.vtkhdf").attributes["support_voxels"]
+
+
+@pytest.mark.parametrize(
+    ("stop", "done"), [("stop_noise: 1000.0", 0), ("stop_noise: 1.0e-3", 6), ("stop_change: 0.9", 1)]
+)
+def test_iterations_end_where_the_config_says(tmp_path, stop, done):
+    # the first step from a uniform volume lowers the residual by less than nine tenths
+    weights = build(tmp_path, ("iterations: 16", f"iterations: 6, {stop}"))
+    run("reconstruct", weights, SAMPLE / "pair_a.tif", "--dark", SAMPLE / "dark.tif", "-o", tmp_path / "a.vtkhdf")
+    assert len(open_volume(tmp_path / "a.vtkhdf").attributes["residual"]) == done + 1

@@ -171,6 +171,8 @@ class ReconstructionSection(Section):
 
     start: uniform (as the paper), or line_of_sight, which also leaves out for good what no light can have come from.
     stop_change: end when an iteration lowers the residual by less than this share of it (default: never).
+    stop_noise: end when the residual is this many times the image's noise (default: never): read noise and, with
+    photons_per_count, light's own.
     saturation_counts: pixels as bright as this are left out (default: those at the end of 8 to 16 bits).
     particle_diameter_mm: of the tracers; only the solver `particles` reads it.
     accelerate: step from points extrapolated by Nesterov's momentum; a quarter of the iterations will do.
@@ -181,6 +183,8 @@ class ReconstructionSection(Section):
     solver: Literal["em", "sart", "smart", "mart", "particles"] = "em"
     start: Literal["uniform", "line_of_sight"] = "uniform"
     stop_change: Annotated[float, Field(gt=0.0, lt=1.0)] | None = None
+    stop_noise: Positive | None = None
+    photons_per_count: Positive | None = None
     saturation_counts: Positive | None = None
     particle_diameter_mm: Positive = 0.05
     iterations: Annotated[int, Field(ge=1, le=100_000)] = 16

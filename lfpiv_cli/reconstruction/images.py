@@ -26,6 +26,8 @@ DEFECT_SIGMAS = 8.0
 # Resampling: a pixel with more than this share of its light from unusable ones is unusable, too.
 TOUCHED_SHARE = 0.1
 MAD_TO_SIGMA = 1.4826
+# Median of |x| of a normal distribution, in standard deviations.
+HALF_NORMAL_MEDIAN = 0.6745
 
 
 def light(image: Image, dark: Image | None = None, background: Image | None = None) -> Image:
@@ -134,3 +136,16 @@ def filled(image: Image, unusable: Mask) -> Image:
 def touched(mask: Mask, prepare: Callable[[Image], Image]) -> Mask:
     """Return which pixels of the frame that `prepare` carries an image into take light from masked ones."""
     return np.asarray(np.abs(prepare(mask.astype(np.float32))) > TOUCHED_SHARE)
+
+
+def noise_residual(image: Image, photons_per_count: float | None = None) -> float:
+    """Return the relative residual ||noise|| / ||image|| that noise alone would leave of a tracers' image, 0 if dark.
+
+    Read noise is the spread below zero, where no light hides it; light's own noise needs the photons of a count.
+    """
+    lit = np.maximum(image, 0.0).astype(np.float64)
+    norm = float(np.sqrt(np.sum(lit**2)))
+    below = image[image < 0.0]
+    read = float(np.median(-below)) / HALF_NORMAL_MEDIAN if below.size else 0.0
+    shot = float(np.sum(lit)) / photons_per_count if photons_per_count is not None else 0.0
+    return float(np.sqrt(read**2 * image.size + shot)) / norm if norm > 0.0 else 0.0

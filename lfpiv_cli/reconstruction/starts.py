@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from lfpiv_cli.reconstruction.equations import Image, Normalisers, Operator, Problem, Volume
 
 # A pixel counts as lit above this share of the image's brightest ones (the 99.9th percentile); a voxel can be lit when
-# this share of its weights lies on lit pixels. Noise and a voxel's width cost some.
+# this share of its weights lies on lit pixels or their neighbours. Noise and a voxel's width cost some.
 LIT_SHARE = 0.02
 BRIGHTEST_PERCENTILE = 99.9
 SEEN_SHARE = 0.9
@@ -38,9 +39,9 @@ def line_of_sight_start(problem: Problem) -> Volume:
 
 
 def lit_support(operator: Operator, image: Image, sums: Normalisers) -> NDArray[np.bool_]:
-    """Return which voxels (z, y, x) have nearly all of their weight on lit pixels."""
+    """Return which voxels (z, y, x) have nearly all of their weight on lit pixels or their neighbours."""
     taking_part = sums.inverse_row_sum > 0.0
-    lit = taking_part & (image > LIT_SHARE * _brightest(image, sums))
+    lit = taking_part & ndimage.maximum_filter(image > LIT_SHARE * _brightest(image, sums), size=3)
     return np.asarray(operator.adjoint(lit.astype(np.float32)) * sums.inverse_column_sum >= SEEN_SHARE)
 
 
