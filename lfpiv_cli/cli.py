@@ -97,6 +97,26 @@ def calibrate_snapshot(**arguments: Any) -> dict[str, Any]:
     return stages_calibrate.calibrate_snapshot(**arguments)
 
 
+@cli.command("refine-calibration")
+@click.argument("config", type=INPUT)
+@click.argument("images", type=INPUT, nargs=-1, required=True)
+@click.option("--calibration", type=INPUT, required=True, help="From calibrate-snapshot.")
+@click.option("--dark", type=INPUT, help="Dark image to subtract.")
+@click.option("-o", "--output", type=INPUT, help="Mended calibration to write (.h5); without it, only report.")
+@click.option("--picture", type=INPUT, help="Picture of the particles' depths and the walls to write (.png).")
+@common_options
+def refine_calibration(**arguments: Any) -> dict[str, Any]:
+    """Find the channel's walls by the particles between them, and with them what the calibration got wrong.
+
+    \b
+    Example: lfpiv refine-calibration rig.yaml a.tif b.tif --calibration calibration.h5 --dark dark.tif \\
+                 -o refined.h5 --picture walls.png
+    """
+    from lfpiv_cli import stages_refine
+
+    return stages_refine.refine_calibration(**arguments)
+
+
 @cli.command("build-weights")
 @click.argument("config", type=INPUT)
 @click.option("--calibration", type=INPUT, help="From calibrate-snapshot; without it the data sheet is believed.")

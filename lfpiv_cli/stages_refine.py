@@ -1,0 +1,65 @@
+"""The stage of `refine-calibration`: images of particles in, the calibration's remaining error and a mended one out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from lfpiv_cli.console import Console
+from lfpiv_cli.errors import ConfigError
+from lfpiv_cli.files import images as image_files
+from lfpiv_cli.files.atomic import ensure_writable
+from lfpiv_cli.files.batch import frames_of
+from lfpiv_cli.files.calibration_file import read_calibration, write_calibration
+from lfpiv_cli.files.config import load_config
+from lfpiv_cli.files.pictures import ensure_drawing, write_picture
+from lfpiv_cli.files.provenance import record
+from lfpiv_cli.particles.refinement import STEPS
+from lfpiv_cli.particles.refinement import refine_calibration as refine
+from lfpiv_cli.reconstruction.images import light
+
+
+def refine_calibration(
+    config: Path,
+    images: Sequence[Path],
+    calibration: Path,
+    dark: Path | None,
+    output: Path | None,
+    picture: Path | None,
+    overwrite: bool,
+    console: Console,
+) -> dict[str, Any]:
+    """Find the channel's walls by the particles, report where they are, and write the calibration with them."""
+    named = {"image" if k == 0 else f"image_{k + 1}": path for k, path in enumerate(images)}
+    inputs = {"config": config, "calibration": calibration} | ({"dark": dark} if dark else {}) | named
+    for target in filter(None, (output, picture)):
+        ensure_writable(target, overwrite, inputs.values())
+    if picture:
+        ensure_drawing()
+    settings = load_config(config)
+    if settings.channel is None:
+        raise ConfigError(f"{config}: channel: is missing; the walls are known by the channel's width")
+    frames, shape = frames_of(images), settings.image_shape()
+    before = read_calibration(calibration)
+    dark_image = image_files.read_image(dark, shape) if dark else None
+    lit = [light(image_files.read_page(frame.path, frame.page, shape), dark_image, None) for frame in frames]
+    with console.progress(len(lit) * STEPS, "refine") as advance:
+        found = refine(
+            lit,
+            before,
+            settings.camera_model(),
+            settings.media_model(),
+            settings.grid(),
+            settings.channel.width_mm,
+            settings.reconstruction.particle_diameter_mm,
+            advance,
+        )
+    if output:
+        made_by = record("refine-calibration", settings.resolved(), inputs)
+        write_calibration(output, found.applied(before), made_by, overwrite)
+    if picture:
+        from lfpiv_cli.particles.walls_picture import walls_figure
+
+        write_picture(picture, walls_figure(found), overwrite)
+    return found.summary()
