@@ -41,8 +41,8 @@ from lfpiv_cli.weights.operators import FactorisedOperator
 
 # Said where the voxels were left to the program.
 VOXELS_CHOSEN = (
-    "lfpiv: voxels of {:.3g} x {:.3g} x {:.3g} mm were chosen: half a microlens wide, because particles lock to wider "
-    "ones and their motion in depth is lost, and four times as deep, which is as fine as the views tell depths apart"
+    "lfpiv: voxels of {:.3g} x {:.3g} x {:.3g} mm were chosen: a third of a microlens wide, because particles lock to "
+    "wider ones and their motion in depth is lost, and six times as deep, as fine as the views tell depths apart"
 )
 # Below this share of its light on the sensor a voxel counts as out of view.
 LEAST_SEEN = 0.01
