@@ -31,7 +31,7 @@ from lfpiv_cli.flow.correlation import correlate as correlate_volumes
 from lfpiv_cli.flow.correlation import count_passes
 from lfpiv_cli.flow.field import REJECTED, VectorField
 from lfpiv_cli.grid import Grid
-from lfpiv_cli.stages_weights import make_operator
+from lfpiv_cli.stages_weights import make_operator, ray_source
 from lfpiv_cli.validation.flow import flow_figures, limits_missed, truth_at_points
 from lfpiv_cli.validation.pictures import flow_figure
 from lfpiv_cli.weights.build import default_padding, scene_distortion
@@ -77,9 +77,9 @@ def build_weights(
         console.say(VOXELS_CHOSEN.format(*grid.spacing_mm))
     media = settings.media_model()
     padding = settings.reconstruction.padding_voxel or default_padding(camera, media, grid)
-    space = settings.object_space(found.mid_plane_z_mm if found else None)
-    _judge_view(*seen_share(camera, space, grid), grid, console)
-    operator = make_operator(settings.weights, camera, space, grid.padded(padding), console)
+    source = ray_source(settings, found, grid, console)
+    _judge_view(*seen_share(camera, source, grid), grid, console)
+    operator = make_operator(settings.weights, camera, source, grid.padded(padding), console)
     bend = scene_distortion(camera, media, grid) if isinstance(operator, FactorisedOperator) else None
     weights = Weights(grid, padding, operator, camera.column_axis, found, bend)
     record = _record("build-weights", settings, inputs)

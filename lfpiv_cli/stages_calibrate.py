@@ -10,11 +10,11 @@ from lfpiv_cli.calibration.model import calibrate
 from lfpiv_cli.calibration.sheet import image_distance_doubt
 from lfpiv_cli.calibration.white import by_aperture
 from lfpiv_cli.console import Console
-from lfpiv_cli.errors import UsageError
+from lfpiv_cli.errors import ConfigError, UsageError
 from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.calibration_file import write_calibration
-from lfpiv_cli.files.config import load_config
+from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.pictures import ensure_drawing, write_picture
 from lfpiv_cli.files.provenance import record as provenance_record
 from lfpiv_cli.optics.media import Media
@@ -25,18 +25,23 @@ def calibrate_snapshot(
     config: Path,
     white: Sequence[Path],
     dark: Path | None,
-    board: Path | None,
+    board: Sequence[Path],
+    depth_mm: Sequence[float],
     output: Path,
     picture: Path | None,
     views: Path | None,
     overwrite: bool,
     console: Console,
 ) -> dict[str, Any]:
-    """Find the lattice in white images and the focal plane in a snapshot of the board."""
-    if not white and board is None:
+    """Find the lattice in white images and the focal plane in a snapshot of the board, or rays in boards at depths."""
+    if not white and not board:
         raise UsageError("calibrate-snapshot needs a picture: --white, --board or both")
-    whites = {"white" if k == 0 else f"white_{k + 1}": path for k, path in enumerate(white)}
-    inputs = {"config": config} | whites | ({"dark": dark} if dark else {}) | ({"board": board} if board else {})
+    if len(depth_mm) != (len(board) if depth_mm else 0) or (len(board) > 1 and not depth_mm):
+        raise UsageError(
+            f"{len(board)} --board and {len(depth_mm)} --depth-mm; give one board alone, or each with its depth"
+        )
+    whites, boards = _numbered("white", white), _numbered("board", board)
+    inputs = {"config": config} | whites | ({"dark": dark} if dark else {}) | boards
     for target in filter(None, (output, picture, views)):
         ensure_writable(target, overwrite, inputs.values())
     if picture or views:
@@ -50,14 +55,18 @@ def calibrate_snapshot(
             "lfpiv: no white image: the microlenses are believed to lie as the data sheet says, "
             "and the standard errors know nothing of how far that is wrong"
         )
+    if depth_mm:
+        _ensure_in_fluid(settings)
     calibration = calibrate(
         [frames[name] for name in whites],
         frames.get("dark"),
-        frames.get("board"),
+        frames[next(iter(boards))] if boards and not depth_mm else None,
         layout=settings.camera.microlenses.layout,
         sheet_pitch_px=settings.micro_image_pitch_px(),
         camera=camera,
         rig=settings.rig() if board else None,
+        depth_boards=[frames[name] for name in boards] if depth_mm else (),
+        depths_mm=depth_mm,
     )
     doubt = None if camera is None else image_distance_doubt(calibration.fit, camera)
     if doubt:
@@ -77,3 +86,16 @@ def calibrate_snapshot(
         shown_image = light(frames["board" if board else "white"], frames.get("dark"), None)
         write_picture(views, views_figure(calibration, camera, medium, shown_image), overwrite)
     return calibration.summary()
+
+
+def _numbered(role: str, paths: Sequence[Path]) -> dict[str, Path]:
+    """Return the inputs of one role by name: `white`, `white_2`, ..."""
+    return {role if k == 0 else f"{role}_{k + 1}": path for k, path in enumerate(paths)}
+
+
+def _ensure_in_fluid(settings: Config) -> None:
+    """Refuse boards at known depths that did not stand where the particles will be."""
+    if settings.board.medium == "air" and settings.media_model() != settings.media_model().in_air():
+        raise ConfigError(
+            "board.medium: is air, but rays are fitted to boards at known depths in the fluid; expected fluid"
+        )

@@ -42,6 +42,8 @@ def ensure_solvable(content: WeightsFile, settings: Config) -> None:
     ------
     ConfigError
     """
+    if settings.weights.method == "dlfc":
+        raise ConfigError("weights.method: particles are fitted with traced rays; build weights by ert for them")
     if settings.weights.refraction != "paraxial" and settings.media_model() != settings.media_model().in_air():
         raise ConfigError(
             "weights.refraction: particles are fitted with paraxial refraction; build such weights for them"

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import ConfigError, InputError, LimitMissedError, UsageError
 from lfpiv_cli.files.atomic import ensure_writable, write_json
@@ -21,16 +22,20 @@ from lfpiv_cli.files.weights_file import read_weights
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.object_space import ObjectSpace
+from lfpiv_cli.optics.polynomial_rays import PolynomialRays
 from lfpiv_cli.validation.weights import TABLE1_MM, limits_missed, make_columns, sample_voxels, weights_figures
 from lfpiv_cli.validation.weights_pictures import column_figure, columns_figure, similarity_figure
 from lfpiv_cli.weights.build import factorise_through, separates
 from lfpiv_cli.weights.columns import ColumnOperator, OnDemandOperator
 from lfpiv_cli.weights.model import WeightsOperator
 from lfpiv_cli.weights.rays import count_columns
+from lfpiv_cli.weights.scene import Source
 
 # Half an hour on two cores; a core counts about four million rays a second.
 MOST_RAYS = 3e10
 RAYS_PER_CORE_HOUR = 1.5e10
+# Cubic polynomials are good to a third of their range beyond it: the paper's volume reaches a quarter beyond boards.
+FARTHEST_BEYOND = 0.3
 # Some 1,500 pixels of 8 bytes.
 BYTES_PER_COLUMN = 12_000
 
@@ -94,8 +99,39 @@ def info(
     return found
 
 
+def ray_source(settings: Config, found: Calibration | None, grid: Grid, console: Console) -> Source:
+    """Return how rays are found: traced through the configured object space, or as a calibration fitted them.
+
+    Raises
+    ------
+    ConfigError : fitted rays are asked for and there are none, or they know another origin
+    """
+    if settings.weights.method != "dlfc":
+        return settings.object_space(found.mid_plane_z_mm if found else None)
+    if found is None or found.ray_fit is None:
+        raise ConfigError(
+            "weights.method: dlfc needs a --calibration from boards at several depths: calibrate-snapshot with --board "
+            "and --depth-mm, repeated in pairs"
+        )
+    if settings.volume.reference != "focal_point":
+        raise ConfigError(
+            "volume.reference: is mid_plane, but with weights.method dlfc coordinates are those of the boards' depths; "
+            "expected focal_point"
+        )
+    fit = found.ray_fit
+    lateral = fit.reach_mm if settings.camera_model().column_axis == "x" else fit.reach_mm[:, ::-1]
+    for axis, (low, high) in enumerate([*lateral.T, (fit.depths_mm.min(), fit.depths_mm.max())]):
+        beyond = max(low - grid.bounds_mm(axis)[0], grid.bounds_mm(axis)[1] - high)
+        if beyond > FARTHEST_BEYOND * (high - low):
+            console.say(
+                f"lfpiv: the volume reaches {beyond:.3g} mm beyond the dots along {'xyz'[axis]}, where the fitted rays "
+                "are a guess"
+            )
+    return fit.rays
+
+
 def make_operator(
-    chosen: WeightsSection, camera: Camera, space: ObjectSpace, grid: Grid, console: Console
+    chosen: WeightsSection, camera: Camera, source: Source, grid: Grid, console: Console
 ) -> WeightsOperator:
     """Return the weights of a grid: factorised where the axes separate, else on demand; or counted where asked for.
 
@@ -103,12 +139,15 @@ def make_operator(
     ------
     ConfigError : counting would take too long
     """
+    layout = OnDemandOperator(camera, source, grid)
+    if isinstance(source, PolynomialRays):
+        console.say("lfpiv: fitted rays do not separate into two axes; columns will be made on demand, for what is lit")
+        return layout
     if chosen.sampling == "exact":
         if separates(camera):
-            return factorise_through(camera, space, grid)
+            return factorise_through(camera, source, grid)
         console.say("lfpiv: the array's axes do not separate; columns will be made on demand, for what is lit")
-        return OnDemandOperator(camera, space, grid)
-    layout = OnDemandOperator(camera, space, grid)
+        return layout
     voxels = math.prod(layout.shape)
     rays = voxels * chosen.points * chosen.rays_per_point
     if rays > MOST_RAYS:
@@ -120,7 +159,7 @@ def make_operator(
     centres, rng = layout.centres_mm(np.arange(voxels)), np.random.default_rng(chosen.seed)
     number = (chosen.points, chosen.rays_per_point)
     with console.progress(voxels, "count rays") as advance:
-        columns = count_columns(camera, space, centres, layout.sides_mm, rng, *number, advance)
+        columns = count_columns(camera, source, centres, layout.sides_mm, rng, *number, advance)
     return ColumnOperator(layout.shape, layout.image_shape, np.arange(voxels), columns)
 
 

@@ -83,7 +83,7 @@ def locate_board(
     radius = checked_disc_radius(0.5 * board.dot_diameter_mm, camera)
     passed = np.ones(image.shape, dtype=np.float32) if transmission is None else transmission
     signal = dot_signal(image, passed, board)
-    start, depth = first_dots(signal, camera, board, medium)
+    start, depth = first_dots(signal, camera, board, medium, candidate_depths(camera, medium))
     micro_images = camera.micro_image_lattice_px()
     for _ in range(LENS_ROUNDS):
         fits = [fit_one_dot(signal, passed, camera, board, medium, (x, y, depth), radius) for x, y in start]
@@ -128,11 +128,11 @@ def dot_signal(image: NDArray[np.float32], passed: NDArray[np.float32], board: B
 
 
 def first_dots(
-    signal: NDArray[np.float64], camera: Camera, board: BoardGeometry, media: Media
+    signal: NDArray[np.float64], camera: Camera, board: BoardGeometry, media: Media, depths_mm: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], float]:
     """Return the lateral places (n, 2) of the dots in image axes and their common depth, to within a dot's radius.
 
-    The rays of all bright pixels are carried back to planes at several depths; where the dots are smallest, the sum of
+    The rays of all bright pixels are carried back to planes at `depths_mm`; where the dots are smallest, the sum of
     squares of the refocused picture is largest.
     """
     row, column = np.nonzero(signal > BRIGHT_SHARE * np.percentile(signal, BRIGHTEST_PERCENTILE))
@@ -155,8 +155,7 @@ def first_dots(
         smooth = ndimage.gaussian_filter(picture, SAMPLES_PER_LENS)
         return np.asarray(smooth - ndimage.grey_opening(smooth, size=(widest, widest)), dtype=np.float64)
 
-    depths = candidate_depths(camera, media)
-    depth = float(depths[np.argmax([np.sum(refocused(z) ** 2) for z in depths])])
+    depth = float(depths_mm[np.argmax([np.sum(refocused(z) ** 2) for z in depths_mm])])
     spots = find_spots(refocused(depth), board.spacing_mm / sample_mm)
     return (spots - shape[::-1] // 2) * sample_mm, depth
 

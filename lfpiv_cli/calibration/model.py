@@ -15,6 +15,7 @@ from threadpoolctl import threadpool_limits
 
 from lfpiv_cli.calibration.board import locate_board
 from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose
+from lfpiv_cli.calibration.dlfc import RayFit, fit_rays
 from lfpiv_cli.calibration.lattice import LatticeFit, fit_lattice
 from lfpiv_cli.calibration.rectification import Rectification
 from lfpiv_cli.calibration.sheet import check_pitch, image_distance_mm, sheet_fit
@@ -79,6 +80,7 @@ class Calibration:
     camera_move_mm : d_m of Eq. 21, or None
     mid_plane_z_mm, mid_plane_z_sigma_mm : depth of the channel's mid plane in the fluid, or None
     image_distance_mm, image_distance_sigma_mm : s_i by the pitch of the lens images, a check of the data sheet, or None
+    ray_fit : polynomials of rays from boards at several depths, in the rectified frame, or None
     """
 
     rectification: Rectification
@@ -89,6 +91,7 @@ class Calibration:
     mid_plane_z_sigma_mm: float | None = None
     image_distance_mm: float | None = None
     image_distance_sigma_mm: float | None = None
+    ray_fit: RayFit | None = None
 
     @property
     def fit(self) -> LatticeFit:
@@ -128,7 +131,7 @@ class Calibration:
 
     def summary(self) -> dict[str, Any]:
         """Return the figures as plain numbers and lists, units in their names; None where unknown."""
-        lattice, fit, pose = self.fit.lattice_px, self.fit, self.pose
+        lattice, fit, pose, rays = self.fit.lattice_px, self.fit, self.pose, self.ray_fit
         return {
             "lenses": fit.lenses,
             "pitch_px": lattice.pitch.tolist(),
@@ -156,6 +159,10 @@ class Calibration:
             "camera_move_mm": self.camera_move_mm,
             "mid_plane_z_mm": self.mid_plane_z_mm,
             "mid_plane_z_mm_sigma": self.mid_plane_z_sigma_mm,
+            "dlfc_depths_mm": rays.depths_mm.tolist() if rays else None,
+            "dlfc_degree": rays.rays.degree if rays else None,
+            "dlfc_sightings": rays.sightings if rays else None,
+            "dlfc_residual_mm": np.sqrt(np.mean(rays.residual_mm**2, axis=0)).tolist() if rays else None,
         }
 
     def to_tree(self) -> dict[str, Any]:
@@ -169,6 +176,7 @@ class Calibration:
             "lattice": fit | {"cubic_used": int(self.fit.cubic_used)},
             "transmission": self.transmission,
             "board": {field.name: getattr(pose, field.name) for field in fields(BoardPose)} if pose else None,
+            "dlfc": self.ray_fit.to_tree() if self.ray_fit else None,
         } | {name: getattr(self, name) for name in CARRIED}
 
     @classmethod
@@ -189,6 +197,7 @@ class Calibration:
                 Rectification(LatticeFit(lattice_px=lattice, **fit), (rows, columns)),
                 tree.get("transmission"),
                 BoardPose(**tree["board"]) if tree.get("board") else None,
+                ray_fit=RayFit.from_tree(tree["dlfc"]) if tree.get("dlfc") else None,
                 **{name: tree.get(name) for name in CARRIED},
             )
         except (KeyError, TypeError, ValueError) as error:
@@ -204,6 +213,8 @@ def calibrate(
     sheet_pitch_px: float | None = None,
     camera: Camera | None = None,
     rig: Rig | None = None,
+    depth_boards: Sequence[ArrayLike] = (),
+    depths_mm: Sequence[float] = (),
 ) -> Calibration:
     """Calibrate from photographs.
 
@@ -214,20 +225,26 @@ def calibrate(
     dark, board : (rows, columns) raw pictures of no light and of the dot board
     layout, sheet_pitch_px : of the data sheet, to be checked
     camera : as the data sheet has it, for the image distance; not needed beside whites
-    rig : camera, media and board; needed for the board only
+    rig : camera, media and board; needed for boards only
+    depth_boards, depths_mm : (rows, columns) raw pictures of the board at several depths, and these, for `ray_fit`
 
     Raises
     ------
     InputError
         when a picture cannot serve; it says why
     """
-    shape = shape_of([*whites, *([] if board is None else [board])], camera)
+    shape = shape_of([*whites, *([] if board is None else [board]), *depth_boards], camera)
     # One BLAS thread: the same bits on every machine, and small problems gain nothing from more.
     with threadpool_limits(limits=1, user_api="blas"):
         calibration = lattice_calibration(whites, dark, shape, layout, sheet_pitch_px, camera)
-        if board is None or rig is None:
+        if rig is None:
             return calibration
         darkness = 0.0 if dark is None else np.asarray(dark, dtype=np.float64)
+        if len(depth_boards):
+            pictures = [np.asarray(each, dtype=np.float64) - darkness for each in depth_boards]
+            calibration = replace(calibration, ray_fit=ray_fit(pictures, depths_mm, calibration, rig))
+        if board is None:
+            return calibration
         pose = board_pose(np.asarray(board, dtype=np.float64) - darkness, calibration, rig)
     return with_mid_plane(replace(calibration, pose=pose), pose, rig)
 
@@ -280,6 +297,15 @@ def board_pose(image: NDArray[np.float64], calibration: Calibration, rig: Rig) -
     return locate_board(
         rectification.apply(image), camera, rig.board, rig.media, rectification.rotation_rad, calibration.transmission
     )
+
+
+def ray_fit(
+    images: Sequence[NDArray[np.float64]], depths_mm: Sequence[float], calibration: Calibration, rig: Rig
+) -> RayFit:
+    """Return the polynomials through boards in raw pictures less the dark frame."""
+    rectified = [calibration.rectification.apply(image) for image in images]
+    media = rig.media.in_air() if rig.board.medium == "air" else rig.media
+    return fit_rays(rectified, depths_mm, calibration.camera(rig.camera), rig.board, media, calibration.transmission)
 
 
 def with_mid_plane(calibration: Calibration, pose: BoardPose, rig: Rig) -> Calibration:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lfpiv_cli.calibration.dlfc import RayFit
 from lfpiv_cli.calibration.lattice import LatticeFit
 from lfpiv_cli.calibration.model import Calibration
 
@@ -41,7 +42,10 @@ def calibration_figure(calibration: Calibration, white: ArrayLike, board: ArrayL
     axes[0].legend(loc="upper right", framealpha=0.9)
     for axis, direction in ((axes[3], 0), (axes[4], 1)):
         draw_residual(figure, axis, fit, direction, (rows, columns))
-    draw_board(figure, axes[5], calibration, board)
+    if calibration.ray_fit is None:
+        draw_board(figure, axes[5], calibration, board)
+    else:
+        draw_ray_fit(axes[5], calibration.ray_fit)
     pitch, turn = fit.lattice_px.pitch, np.rad2deg(fit.lattice_px.rotation_rad)
     figure.suptitle(f"{fit.lenses} lenses, pitch {pitch[0]:.4f} and {pitch[1]:.4f} px, rotation {turn:.4f} degrees")
     return figure
@@ -69,6 +73,16 @@ def draw_residual(figure: Any, axis: Any, fit: LatticeFit, direction: int, shape
     rms = (fit.residual_px if fit.cubic_used else fit.residual_affine_px)[direction]
     axis.set_title(f"off the lattice along the {along}: rms {rms:.3f} px")
     axis.set(xlim=(0, shape[1]), ylim=(shape[0], 0), aspect="equal", xlabel="column, px", ylabel="row, px")
+
+
+def draw_ray_fit(axis: Any, fit: RayFit) -> None:
+    """Show how far the polynomials miss the dots of each board."""
+    order = np.argsort(fit.depths_mm)
+    for residual, name in zip(fit.residual_mm.T, ("columns", "rows"), strict=True):
+        axis.plot(fit.depths_mm[order], 1e3 * residual[order], "o-", label=f"along the {name}")
+    axis.legend()
+    axis.set(xlabel="depth of the board, mm", ylabel="rms misfit on the array, um", ylim=(0.0, None))
+    axis.set_title(f"polynomials of degree {fit.rays.degree} through {fit.sightings} sightings of dots")
 
 
 def draw_board(figure: Any, axis: Any, calibration: Calibration, board: ArrayLike | None) -> None:

@@ -28,6 +28,7 @@ def contradictions(sections: Sections) -> Found:
     yield from _volume(sections)
     yield from _scene(sections)
     yield from _processing(sections)
+    yield from _rays(sections)
     yield from _object_space(sections)
 
 
@@ -111,6 +112,16 @@ def _processing(sections: Sections) -> Found:
                 yield (*place, k + 1), f"is {list(fine)} after {list(coarse)}, expected coarse to fine"
     if brightness[0] > brightness[1] or brightness[1] == 0.0:
         yield ("simulation", "brightness"), f"is {list(brightness)}, expected a range [smallest, largest]"
+
+
+def _rays(sections: Sections) -> Found:
+    """Yield what polynomials of rays cannot be."""
+    chosen = sections.weights
+    if chosen.method == "dlfc":
+        if chosen.refraction == "exact":
+            yield ("weights", "refraction"), "is exact, but method dlfc knows no refraction besides what the boards saw"
+        if chosen.sampling == "rays":
+            yield ("weights", "sampling"), "is rays, but method dlfc has none to count; expected exact"
 
 
 def _object_space(sections: Sections) -> Found:

@@ -182,8 +182,16 @@ class Config:
         return Window(section.distance_mm, section.thickness_mm)
 
     def object_space(self, mid_plane_z_mm: float | None = None) -> ObjectSpace:
-        """Return what rays cross on their way to the lens, as `weights` has it; the window only where it is read."""
+        """Return what rays cross on their way to the lens, as `weights` has it; the window only where it is read.
+
+        Raises
+        ------
+        ConfigError
+            If rays are fitted (dlfc), not traced.
+        """
         chosen = self.weights
+        if chosen.method == "dlfc":
+            raise ConfigError(f"{self.source}: weights.method: is dlfc, which traces no rays; expected ert or drt")
         reads_window = chosen.method == "drt" or chosen.refraction == "exact"
         window = self.window_model(mid_plane_z_mm) if reads_window else None
         return ObjectSpace(self.media_model(), window, chosen.refraction, chosen.method)

@@ -152,13 +152,14 @@ class ChannelSection(Section):
 class WeightsSection(Section):
     """How weights are made.
 
-    method: equivalent points (ert), or rays traced through window and fluid (drt), which reads the window's distance.
+    method: equivalent points (ert); rays traced through window and fluid (drt), which reads the window's distance; or
+    polynomials fitted to boards at several depths (dlfc), which the calibration holds.
     refraction: paraxial, or Snell's law with its aberration (exact), which needs the thickness of what lies before the
     points: the section window, or channel with a calibrated mid plane. sampling: integrals (exact), or the paper's
     count of rays_per_point rays from each of `points` random points of a voxel (rays), seeded; for small volumes only.
     """
 
-    method: Literal["ert", "drt"] = "ert"
+    method: Literal["ert", "drt", "dlfc"] = "ert"
     refraction: Literal["paraxial", "exact"] = "paraxial"
     sampling: Literal["exact", "rays"] = "exact"
     points: Annotated[int, Field(ge=1, le=10_000_000)] = 500

@@ -7,9 +7,9 @@ Layout, version 2 (HDF5; lengths in mm): `camera` (scalars of `optics.camera.Cam
 aperture's mask follow from the camera and are computed again on reading.
 
 Where the axes do not separate there is, in place of `columns` and `rows`, `on_demand` (what rays cross: `method`,
-`refraction`, refractive indices, window), from which columns are integrated when needed; where rays were counted,
-`counted` (`start`, `pixel`, `share` of each voxel in the order of the sensor's axes). `vignetting` (coefficients, see
-`calibration.transmission`) scales the pixels on reading. Version 1 had none of these.
+`refraction`, refractive indices, window; or the method dlfc alone, whose rays the calibration has), from which columns
+are integrated when needed; where rays were counted, `counted` (`start`, `pixel`, `share` of each voxel in the order of
+the sensor's axes). `vignetting` (coefficients, see `calibration.transmission`) scales the pixels on reading. Version 1 had none of these.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ from lfpiv_cli.weights.columns import ColumnOperator, OnDemandOperator
 from lfpiv_cli.weights.model import Weights, WeightsOperator, behind_transmission
 from lfpiv_cli.weights.operators import FactorisedOperator
 from lfpiv_cli.weights.quadrature import Columns
+from lfpiv_cli.weights.scene import Source
 
 FORMAT = "lfpiv-weights"
 VERSION = 2
@@ -122,7 +123,7 @@ def read_weights(path: Path) -> WeightsFile:
         )
         padding = _triple(tree["grid"]["padding_xyz"], int)
         calibration = Calibration.from_tree(tree["calibration"]) if tree.get("calibration") else None
-        operator = _operator(tree, camera, grid.padded(padding))
+        operator = _operator(tree, camera, grid.padded(padding), calibration)
         vignetting = tree.get("vignetting")
         if vignetting is not None:
             if vignetting.ndim != 2 or not np.isfinite(vignetting).all():
@@ -152,18 +153,18 @@ def _operator_tree(operator: WeightsOperator) -> dict[str, Any]:
         return {"counted": {"start": columns.start, "pixel": columns.pixel, "share": columns.share}}
     space = operator.source
     if not isinstance(space, ObjectSpace):
-        raise TypeError("only traced rays are stored")
+        return {"on_demand": {"method": "dlfc"}}
     tracing = {"method": space.method, "refraction": space.refraction}
     face = None if space.window is None else asdict(space.window)
     return {"on_demand": asdict(space.media) | tracing | {"window_face": face}}
 
 
-def _operator(tree: dict[str, Any], camera: Camera, grid: Grid) -> WeightsOperator:
+def _operator(tree: dict[str, Any], camera: Camera, grid: Grid, calibration: Calibration | None) -> WeightsOperator:
     """Return the operator of a padded grid from the groups that hold it."""
     nx, ny, nz = grid.shape_xyz
     across, along = (nx, ny) if camera.column_axis == "x" else (ny, nx)
     if "on_demand" in tree:
-        return OnDemandOperator(camera, _object_space(tree["on_demand"]), grid)
+        return OnDemandOperator(camera, _source(tree["on_demand"], calibration), grid)
     if "counted" in tree:
         columns = _counted(tree["counted"], nx * ny * nz, camera.rows * camera.columns)
         return ColumnOperator((nz, along, across), (camera.rows, camera.columns), np.arange(nx * ny * nz), columns)
@@ -174,8 +175,12 @@ def _operator(tree: dict[str, Any], camera: Camera, grid: Grid) -> WeightsOperat
     return FactorisedOperator(column_axis, row_axis, mask)
 
 
-def _object_space(tree: dict[str, Any]) -> ObjectSpace:
-    """Return what rays cross."""
+def _source(tree: dict[str, Any], calibration: Calibration | None) -> Source:
+    """Return what rays cross, or the calibration's own rays."""
+    if tree["method"] == "dlfc":
+        if calibration is None or calibration.ray_fit is None:
+            raise ValueError("fitted rays are missing")
+        return calibration.ray_fit.rays
     media = Media(*(float(tree[name]) for name in ("air", "window", "fluid")))
     face = tree.get("window_face")
     if tree["method"] not in ("ert", "drt") or tree["refraction"] not in ("paraxial", "exact"):

@@ -8,14 +8,18 @@ Axes: image axes (x along the columns), mm, z away from the camera from the nomi
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
 from itertools import product
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 # x, y, z of where a ray starts, X, Y of where it crosses the main lens.
 VARIABLES = 5
+# Of degree 3 a polynomial has 56 terms, and lenses need no more.
+LARGEST_DEGREE = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +41,29 @@ class PolynomialRays:
     def degree(self) -> int:
         """Largest sum of exponents."""
         return int(self.exponents.sum(axis=1).max(initial=0))
+
+    def to_tree(self) -> dict[str, Any]:
+        """Return the arrays by name."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    @classmethod
+    def from_tree(cls, tree: Mapping[str, Any]) -> PolynomialRays:
+        """Return the rays that `to_tree` took apart.
+
+        Raises
+        ------
+        KeyError, ValueError : something is missing or cannot be
+        """
+        rays = cls(**{field.name: tree[field.name] for field in fields(cls)})
+        terms = len(rays.exponents)
+        shapes = rays.scale_mm.shape, rays.exponents.shape, rays.coefficients_mm.shape
+        if shapes != ((VARIABLES,), (terms, VARIABLES), (terms, 2)) or not terms:
+            raise ValueError(f"polynomials of {shapes}")
+        if not np.isin(rays.exponents, range(LARGEST_DEGREE + 1)).all() or rays.degree > LARGEST_DEGREE:
+            raise ValueError(f"polynomials with exponents up to {rays.exponents.max()}")
+        if not np.isfinite(rays.coefficients_mm).all() or not np.all(rays.scale_mm > 0.0):
+            raise ValueError("polynomials with coefficients that are no numbers")
+        return rays
 
     def on_array(self, start_mm: ArrayLike, crossing_mm: ArrayLike) -> NDArray[np.float64]:
         """Return where rays from (n, 3) through (n, 2) meet the array, (n, 2)."""

@@ -1,0 +1,301 @@
+"""Direct light-field calibration: where rays go, from boards seen at several known depths (Hall et al. 2018).
+
+Each dot is looked for in every sub-aperture view: a place in the scene, a point of the main lens, and where between the
+microlenses its image falls there. Polynomials through all of these sightings take the place of main lens, window and
+fluid. The data sheet's camera only says where to look for the dots.
+
+Axes: image axes of the rectified frame (x along the columns), mm, z away from the camera from the nominal focal point.
+The boards are taken to stand square to the optical axis and to have moved along it; their common place and turn are
+those under which they are seen, on average.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+from lfpiv_cli.calibration.board import RIM_PER_PATCH, dot_signal, first_dots
+from lfpiv_cli.calibration.board_pose import BoardGeometry, on_the_grid
+from lfpiv_cli.calibration.rectification import turn_matrix
+from lfpiv_cli.calibration.views import lens_table, sub_aperture_view
+from lfpiv_cli.errors import InputError
+from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.media import Media, equivalent_object_distance
+from lfpiv_cli.optics.polynomial_rays import LARGEST_DEGREE, PolynomialRays, complete_exponents, polynomial_terms
+
+# A polynomial of degree k needs k + 1 depths, and as many rows and columns of dots.
+SMALLEST_DEGREE = 2
+# A dot's light in a view reaches as far as the dot and a microlens beyond; the second one is for a wrong first guess.
+MARGIN_LENSES = 2.0
+# The window is centred on the dot by its own centroid; it starts within half a microlens.
+CENTROID_ROUNDS = 3
+# A dot must stand out of its surroundings by this share of what most do.
+CONTRAST_SHARE = 0.3
+# Sightings off the polynomials by this many robust deviations are strays; what is left is looked at once more.
+OUTLIER_SIGMAS = 6.0
+MAD_TO_SIGMA = 1.4826
+FIT_ROUNDS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class RayFit:
+    """Polynomials and how well they tell what was seen.
+
+    Attributes
+    ----------
+    rays : the polynomials
+    depths_mm : (boards,) that they were fitted to
+    reach_mm : (2, 2) lowest and highest x and y of the dots
+    sightings : dots times views that the fit rests on
+    residual_mm : (boards, 2) root mean square misfit on the array, along columns and rows
+    """
+
+    rays: PolynomialRays
+    depths_mm: NDArray[np.float64]
+    reach_mm: NDArray[np.float64]
+    sightings: int
+    residual_mm: NDArray[np.float64]
+
+    def to_tree(self) -> dict[str, Any]:
+        """Return everything as a nested dict of arrays and numbers."""
+        return {field.name: getattr(self, field.name) for field in fields(self)} | {"rays": self.rays.to_tree()}
+
+    @classmethod
+    def from_tree(cls, tree: Mapping[str, Any]) -> RayFit:
+        """Return the fit that `to_tree` took apart.
+
+        Raises
+        ------
+        KeyError, ValueError : something is missing or cannot be
+        """
+        return cls(**(dict(tree) | {"rays": PolynomialRays.from_tree(tree["rays"])}))
+
+
+@dataclass(frozen=True, eq=False)
+class Sightings:
+    """Dots in views: places (n, 3) in the scene, crossings (n, 2) of the main lens, places (n, 2) on the array."""
+
+    start_mm: NDArray[np.float64]
+    crossing_mm: NDArray[np.float64]
+    array_mm: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class SeenBoard:
+    """The dots of one board as a first look has them.
+
+    Attributes
+    ----------
+    signal : (rows, columns), dots bright, divided by the share of light that pixels pass
+    z_mm : depth of the board, as told
+    place_mm : (n, 2) of the dots as the data sheet's camera sees them
+    index : (n, 2) which dots they are
+    """
+
+    signal: NDArray[np.float64]
+    z_mm: float
+    place_mm: NDArray[np.float64]
+    index: NDArray[np.int64]
+
+
+def fit_rays(
+    images: Sequence[ArrayLike],
+    depths_mm: Sequence[float],
+    camera: Camera,
+    board: BoardGeometry,
+    media: Media,
+    transmission: NDArray[np.float32] | None = None,
+) -> RayFit:
+    """Fit the polynomials to pictures of a board at several depths.
+
+    Parameters
+    ----------
+    images : (rows, columns) each, rectified, less the dark frame
+    depths_mm : of the boards
+    camera : with the lattice of the rectified frame
+    transmission : (rows, columns) share of light that pixels pass, rectified; default: all the same
+
+    Raises
+    ------
+    InputError : fewer than three different depths or lines of dots, or a board whose dots are not found
+    """
+    depths = np.asarray(depths_mm, dtype=np.float64)
+    different = np.unique(depths).size
+    if different <= SMALLEST_DEGREE:
+        raise InputError(f"boards at {different} different depths, polynomials need at least {SMALLEST_DEGREE + 1}")
+    passed = np.ones((camera.rows, camera.columns), np.float32) if transmission is None else transmission
+    if camera.column_axis == "y":
+        board = replace(board, dots=board.dots[::-1])
+    boards = aligned(
+        [seen_board(image, z, camera, board, media, passed) for image, z in zip(images, depths, strict=True)], board
+    )
+    lines = [np.unique(np.concatenate([each.index[:, axis] for each in boards])).size for axis in (0, 1)]
+    degree = min(LARGEST_DEGREE, different - 1, lines[0] - 1, lines[1] - 1)
+    if degree < SMALLEST_DEGREE:
+        raise InputError(
+            f"{lines[0]} x {lines[1]} dots were found in a board, polynomials need at least {SMALLEST_DEGREE + 1} "
+            "along each axis"
+        )
+    grid = common_grid(boards, board)
+    seen = [sightings_of(each, grid[each.index[:, 0], each.index[:, 1]], camera, board, media) for each in boards]
+    every = Sightings(*(np.concatenate([getattr(each, name) for each in seen]) for name in vars(seen[0])))
+    rays, residual, used = polynomial_fit(every, degree, camera)
+    lateral = every.start_mm[used, :2]
+    reach = np.stack([lateral.min(axis=0), lateral.max(axis=0)])
+    number = np.repeat(np.arange(len(seen)), [len(each.start_mm) for each in seen])
+    rms = [np.sqrt(np.mean(residual[used & (number == k)] ** 2, axis=0)) for k in range(len(seen))]
+    return RayFit(rays, depths, reach, int(used.sum()), np.array(rms))
+
+
+def seen_board(
+    image: ArrayLike, z_mm: float, camera: Camera, board: BoardGeometry, media: Media, passed: NDArray[np.float32]
+) -> SeenBoard:
+    """Find and number the dots of one board in the picture refocused to its depth."""
+    signal = dot_signal(np.asarray(image, dtype=np.float32), passed, board)
+    try:
+        place, _ = first_dots(signal, camera, board, media, np.array([z_mm]))
+        kept, index = on_the_grid(np.column_stack([place, np.full(len(place), z_mm)]), board)
+    except InputError as error:
+        raise InputError(f"the board at {z_mm:g} mm: {error}") from error
+    usable = passed > 0.0
+    level = np.where(usable, signal / np.where(usable, passed, 1.0), 0.0)
+    return SeenBoard(level, z_mm, place[kept], index)
+
+
+def aligned(boards: list[SeenBoard], board: BoardGeometry) -> list[SeenBoard]:
+    """Return the boards with the same number for the same dot: they move by less than half a spacing sideways."""
+    middles = np.array([_similarity(each, board)[1] for each in boards])
+    steps = np.rint((middles - np.median(middles, axis=0)) / board.spacing_mm).astype(np.int64)
+    result = []
+    for each, step in zip(boards, steps, strict=True):
+        index = each.index + step
+        kept = ((index >= 0) & (index < np.array(board.dots))).all(axis=1)
+        result.append(SeenBoard(each.signal, each.z_mm, each.place_mm[kept], index[kept]))
+    return result
+
+
+def common_grid(boards: list[SeenBoard], board: BoardGeometry) -> NDArray[np.float64]:
+    """Return where the dots stand, (dots along x, dots along y, 2): turned and placed as the boards are on average.
+
+    The scale under which a camera sees a board is that of its magnification; it is taken out about the optical axis.
+    """
+    found = [_similarity(each, board) for each in boards]
+    turn = turn_matrix(float(np.mean([angle for angle, _ in found])))
+    middle = np.mean([place for _, place in found], axis=0)
+    return np.asarray(_plate(np.moveaxis(np.indices(board.dots), 0, -1), board) @ turn.T + middle, dtype=np.float64)
+
+
+def _plate(index: NDArray[np.int64], board: BoardGeometry) -> NDArray[np.float64]:
+    """Return places (..., 2) about the board's middle of dots given by their numbers."""
+    return board.spacing_mm * (index - (np.array(board.dots) - 1) / 2)
+
+
+def _similarity(seen: SeenBoard, board: BoardGeometry) -> tuple[float, NDArray[np.float64]]:
+    """Return turn (rad) and middle (2,) of a board, its scale about the axis taken out."""
+    plate = _plate(seen.index, board)
+    zero, one = np.zeros(len(plate)), np.ones(len(plate))
+    along = np.column_stack([plate[:, 0], -plate[:, 1], one, zero])
+    across = np.column_stack([plate[:, 1], plate[:, 0], zero, one])
+    terms, values = np.concatenate([along, across]), np.concatenate([seen.place_mm[:, 0], seen.place_mm[:, 1]])
+    cosine, sine, x, y = np.linalg.lstsq(terms, values, rcond=None)[0]
+    return float(np.arctan2(sine, cosine)), np.array([x, y]) / np.hypot(cosine, sine)
+
+
+def sightings_of(
+    seen: SeenBoard, dots_mm: NDArray[np.float64], camera: Camera, board: BoardGeometry, media: Media
+) -> Sightings:
+    """Look for the dots of a board, standing at (n, 2), in every view that the aperture gives wholly."""
+    distance = float(equivalent_object_distance(seen.z_mm, camera.focus_distance_mm, media))
+    alpha, forward = float(camera.defocus(distance)), camera.image_distance_mm / distance
+    step = camera.pixel_mm * camera.image_distance_mm / camera.microlens_distance_mm
+    pitch = float(camera.lattice.pitch.max())
+    window = 0.5 * board.dot_diameter_mm * forward + MARGIN_LENSES * pitch
+    reach = max(0.5 * board.spacing_mm * forward, window)
+    lenses = camera.lattice.points(lens_table(camera))
+    crossings = view_crossings(camera.aperture_radius_mm - RIM_PER_PATCH * step, step)
+    found, heights = np.empty((len(crossings), len(dots_mm), 2)), np.empty((len(crossings), len(dots_mm)))
+    for k, crossing in enumerate(crossings):
+        view = sub_aperture_view(seen.signal, camera, crossing)
+        guess = alpha * crossing - forward * seen.place_mm
+        found[k], heights[k] = dot_centroids(view, lenses, guess, window, reach)
+    clear = heights > CONTRAST_SHARE * np.nanmedian(heights)
+    view_of, dot = np.nonzero(clear & np.isfinite(found).all(axis=-1))
+    start = np.column_stack([dots_mm[dot], np.full(dot.size, seen.z_mm)])
+    return Sightings(start, crossings[view_of], found[view_of, dot])
+
+
+def view_crossings(radius_mm: float, step_mm: float) -> NDArray[np.float64]:
+    """Return points (n, 2) of the main lens, a square grid about its middle."""
+    count = int(radius_mm / step_mm)
+    line = step_mm * np.arange(-count, count + 1)
+    points = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+    return points[np.hypot(points[:, 0], points[:, 1]) <= radius_mm]
+
+
+@njit(cache=True)
+def dot_centroids(
+    view: NDArray[np.float64], lenses: NDArray[np.float64], guess: NDArray[np.float64], window: float, reach: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return centroids (n, 2) and heights above the ground (n,) of dots in a view; NaN at its border.
+
+    The ground is the median within `reach` of the guess; the light above it is weighed within `window` of the centroid.
+    Lenses (rows, columns, 2) stand upright: a row has one y and even steps of x.
+    """
+    rows, columns = view.shape
+    pitch_x = lenses[0, 1, 0] - lenses[0, 0, 0]
+    pitch_y = lenses[1, 0, 1] - lenses[0, 0, 1]
+    centroids, heights = np.full(guess.shape, np.nan), np.full(guess.shape[0], np.nan)
+    for n in range(guess.shape[0]):
+        top = int(np.ceil((guess[n, 1] - reach - lenses[0, 0, 1]) / pitch_y))
+        bottom = int(np.floor((guess[n, 1] + reach - lenses[0, 0, 1]) / pitch_y))
+        if top < 0 or bottom >= rows:
+            continue
+        left = int(np.ceil((guess[n, 0] - reach - lenses[top : bottom + 1, 0, 0].min()) / pitch_x))
+        right = int(np.floor((guess[n, 0] + reach - lenses[top : bottom + 1, 0, 0].max()) / pitch_x))
+        if left < 0 or right >= columns:
+            continue
+        part = view[top : bottom + 1, left : right + 1]
+        ground = np.median(part)
+        heights[n] = part.max() - ground
+        x, y = guess[n, 0], guess[n, 1]
+        for _ in range(CENTROID_ROUNDS):
+            total, sum_x, sum_y = 0.0, 0.0, 0.0
+            for row in range(top, bottom + 1):
+                for column in range(left, right + 1):
+                    dx, dy = lenses[row, column, 0] - x, lenses[row, column, 1] - y
+                    if dx * dx + dy * dy <= window * window:
+                        light = view[row, column] - ground
+                        total += light
+                        sum_x += light * dx
+                        sum_y += light * dy
+            if total <= 0.0:
+                break
+            x, y = x + sum_x / total, y + sum_y / total
+        if total > 0.0 and abs(x - guess[n, 0]) < reach and abs(y - guess[n, 1]) < reach:
+            centroids[n, 0], centroids[n, 1] = x, y
+    return centroids, heights
+
+
+def polynomial_fit(
+    seen: Sightings, degree: int, camera: Camera
+) -> tuple[PolynomialRays, NDArray[np.float64], NDArray[np.bool_]]:
+    """Return the complete polynomials through sightings, the misfit (n, 2) in mm, and which were used (n,)."""
+    largest = np.abs(np.concatenate([seen.start_mm, seen.crossing_mm], axis=1)).max(axis=0)
+    scale = np.maximum(largest, float(camera.lattice.pitch.min()))
+    exponents = complete_exponents(degree)
+    terms = polynomial_terms(seen.start_mm, seen.crossing_mm, scale, exponents)
+    used = np.ones(len(terms), dtype=bool)
+    for _ in range(FIT_ROUNDS):
+        coefficients = np.asarray(np.linalg.lstsq(terms[used], seen.array_mm[used], rcond=None)[0], dtype=np.float64)
+        residual = seen.array_mm - terms @ coefficients
+        off = np.abs(residual)
+        good = np.all(off <= OUTLIER_SIGMAS * MAD_TO_SIGMA * np.median(off[used], axis=0), axis=1)
+        if np.array_equal(good, used):
+            break
+        used = good
+    return PolynomialRays(scale, exponents, coefficients), residual, used
