@@ -16,6 +16,7 @@ Flow = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 Triple = tuple[int, int, int]
 
 PEAK_DISPLACEMENT = 4.0
+PEAK_SWIRL = 2.0
 # Particles beyond the faces, in voxels, so that some come and go.
 MARGIN = 10.0
 # Beyond this many standard deviations a particle is below 1e-4 of its peak.
@@ -46,19 +47,28 @@ def channel(shape_xyz: Triple) -> Flow:
 
 
 def ring(shape_xyz: Triple) -> Flow:
-    """Return a vortex ring about the y axis: radius a quarter of the shortest side, core 0.8 of it, peak 2 voxels."""
+    """Return a vortex ring about the y axis: radius a quarter of the shortest side, core 0.8 of it, peak 2 voxels.
+
+    From the stream function r^2 g, g = exp(-[(r - radius)^2 + y^2] / 2 core^2): divergence-free, and single-valued on
+    the axis, where a swirl about the core alone would point in all directions at once.
+    """
     middle = 0.5 * (np.array(shape_xyz) - 1.0)
     radius = 0.25 * min(shape_xyz)
     core = 0.8 * radius
 
+    def parts(away: NDArray[np.float64], along: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the radial component over the distance from the axis, and the one along the axis."""
+        g = np.exp(-0.5 * ((away - radius) ** 2 + along**2) / core**2)
+        return g * along / core**2, g * (2.0 - away * (away - radius) / core**2)
+
+    distances = np.linspace(0.0, 2.0 * radius, 200)
+    outwards, upwards = parts(*np.meshgrid(distances, distances))
+    scale = PEAK_SWIRL / float(np.hypot(outwards * distances, upwards).max())
+
     def flow(points: NDArray[np.float64]) -> NDArray[np.float64]:
         x, y, z = (points - middle).T
-        away = np.hypot(x, z)
-        outwards, along = away - radius, y
-        swirl = 2.0 / core * np.exp(0.5 - 0.5 * (outwards**2 + along**2) / core**2)
-        # Near the axis the direction is lost where the swirl of the far core has faded to nothing.
-        radial = swirl * along / np.maximum(away, 1e-9)
-        return np.stack([radial * x, -swirl * outwards, radial * z], axis=-1)
+        radial, axial = parts(np.hypot(x, z), y)
+        return scale * np.stack([radial * x, axial, radial * z], axis=-1)
 
     return flow
 
@@ -70,7 +80,7 @@ def taylor_green(shape_xyz: Triple) -> Flow:
     def flow(points: NDArray[np.float64]) -> NDArray[np.float64]:
         x, z = wave * points[:, 0], wave * points[:, 2]
         zero = np.zeros(len(points))
-        return 2.0 * np.stack([np.sin(x) * np.cos(z), zero, -np.cos(x) * np.sin(z)], axis=-1)
+        return PEAK_SWIRL * np.stack([np.sin(x) * np.cos(z), zero, -np.cos(x) * np.sin(z)], axis=-1)
 
     return flow
 

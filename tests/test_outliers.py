@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lfpiv_cli.flow.field import MASKED, REJECTED, REPLACED, SECOND_PEAK, VALID
-from lfpiv_cli.flow.outliers import EXPECTED_NOISE_VOXEL, expected_noise, fill_field, smooth_field, validate_vectors
+from lfpiv_cli.flow.outliers import EXPECTED_NOISE_VOXEL, expected_noise, fill_field, validate_vectors
 
 SHAPE = (12, 16, 12)
 NOISE = np.full(3, EXPECTED_NOISE_VOXEL)
@@ -124,17 +124,3 @@ def test_filling_continues_a_linear_flow() -> None:
 
 def test_filling_nothing_gives_zero() -> None:
     assert np.all(fill_field(np.full((3, 3, 3, 3), np.nan)) == 0.0)
-
-
-@pytest.mark.parametrize("strength", [0.5, 1.0])
-def test_filter_keeps_linear_flows_and_damps_noise_everywhere(strength: float, rng: np.random.Generator) -> None:
-    np.testing.assert_allclose(smooth_field(linear_field(), strength), linear_field(), atol=1e-12)
-    noise = rng.normal(size=(*SHAPE, 3))
-    smoothed = smooth_field(noise, strength)
-    assert np.std(smoothed) < 0.7 * np.std(noise)
-    assert np.std(smoothed[0, 0]) < np.std(noise[0, 0])
-
-
-def test_filter_leaves_short_axes_alone() -> None:
-    field = np.arange(12.0).reshape(1, 2, 2, 3)
-    np.testing.assert_array_equal(smooth_field(field, 1.0), field)

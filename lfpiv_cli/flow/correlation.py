@@ -2,8 +2,7 @@
 
 A coarse pass on binned volumes finds displacements up to a quarter of its windows. Each later pass deforms both
 volumes half-way towards each other by what is known, correlates what is left, adds it, and validates. Between passes
-outliers are replaced and the field is filtered: without the filter the passes diverge, at full strength it flattens
-curved flows.
+outliers are replaced and the field is filtered: without the filter the passes diverge.
 
 Axes: volumes `[z, y, x]`, vectors (u, v, w) along (x, y, z); a particle that moves towards +x has u > 0.
 """
@@ -12,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,9 +27,10 @@ from lfpiv_cli.flow.deformation import (
     spline_matrix,
 )
 from lfpiv_cli.flow.field import VectorField
+from lfpiv_cli.flow.filtering import smooth_field, unresolved
 from lfpiv_cli.flow.maps import correlation_maps, margins, window_sums
 from lfpiv_cli.flow.moments import gauss_newton
-from lfpiv_cli.flow.outliers import expected_noise, fill_field, smooth_field, validate_vectors
+from lfpiv_cli.flow.outliers import expected_noise, fill_field, validate_vectors
 from lfpiv_cli.flow.peaks import Peaks, find_peaks, typical_width
 from lfpiv_cli.flow.windows import Triple, WindowLayout, layout_windows
 from lfpiv_cli.grid import Grid
@@ -46,8 +47,6 @@ LATER_RADIUS = 1
 FINAL_PASSES = 4
 # The last pass looks two voxels far again: one has no room for a second peak.
 LAST_RADIUS = 2
-# A compromise: half of it resolves vortices better, all of it is better where particles are few or noisy.
-FILTER_STRENGTH = 0.7
 # Standard deviation in voxels of a correlation peak from which on an axis counts as elongated and takes Gauss-Newton
 # steps. Particles of 1 voxel make peaks of 1.4; three points of a peak of 2.2 span less than a tenth of its height.
 ELONGATED_WIDTH = 2.2
@@ -130,9 +129,10 @@ def correlate(
     with threadpool_limits(1, user_api="blas"):
         for step in _plan(grid.shape_xyz, windows, overlap):
             measured = _refine(pair, _between_layouts(predictor, layout, step.layout), step)
-            predictor = smooth_field(fill_field(measured.displacement), FILTER_STRENGTH)
+            predictor = smooth_field(fill_field(measured.displacement))
             layout = step.layout
             report(1)
+    uncertainty = np.hypot(measured.uncertainty, unresolved(fill_field(measured.displacement)))
     return VectorField(
         grid=layout.grid(grid),
         displacement_voxel=measured.displacement,
@@ -141,7 +141,7 @@ def correlate(
         peak_ratio=measured.peaks.ratio,
         valid_fraction=measured.valid_fraction,
         flag=measured.flag,
-        uncertainty_voxel=measured.uncertainty,
+        uncertainty_voxel=uncertainty,
         voxel_mm=grid.spacing_mm,
         dt_s=dt_s,
         window_voxel=layout.size,
@@ -150,7 +150,7 @@ def correlate(
 
 def count_passes(windows: Sequence[Triple]) -> int:
     """Return how often `correlate` reports progress."""
-    return 1 + len(windows) - 1 + FINAL_PASSES
+    return 1 + len(_refined_sizes(windows))
 
 
 def _check(
@@ -196,9 +196,24 @@ def _compressed(volume: NDArray[np.float32], exponent: float) -> NDArray[np.floa
     return np.power(np.maximum(volume, np.float32(0.0)), np.float32(exponent))
 
 
+def _refined_sizes(windows: Sequence[Triple]) -> list[Triple]:
+    """Return the windows of the passes after the coarse one: each larger one once, the final one `FINAL_PASSES` times.
+
+    Without the first where it is the coarse pass's own: measured again at full resolution it changes no figure.
+    """
+    larger = windows[1:-1] if len(windows) > 1 and _coarse_size(windows) == windows[0] else windows[:-1]
+    return [*larger, *[windows[-1]] * FINAL_PASSES]
+
+
+def _coarse_size(windows: Sequence[Triple]) -> Triple:
+    """Return the windows of the coarse pass in voxels."""
+    x, y, z = (max(first, COARSE_FACTOR * last) for first, last in zip(windows[0], windows[-1], strict=True))
+    return x, y, z
+
+
 def _plan(shape_xyz: Triple, windows: Sequence[Triple], overlap: tuple[float, float, float]) -> list[Pass]:
-    """Return the passes after the coarse one: each larger window once, the final one `FINAL_PASSES` times."""
-    sizes = [*windows[:-1], *[windows[-1]] * FINAL_PASSES]
+    """Return the passes after the coarse one."""
+    sizes = _refined_sizes(windows)
     passes = []
     for number, size in enumerate(sizes):
         changed = number == 0 or size != sizes[number - 1]
@@ -213,7 +228,7 @@ def _coarse_field(
 ) -> tuple[WindowLayout, NDArray[np.float64]]:
     """Return a filled and filtered field of displacements in voxels and the layout of its windows."""
     nz, ny, nx = a.shape
-    size = tuple(max(first, COARSE_FACTOR * last) for first, last in zip(windows[0], windows[-1], strict=True))
+    size = _coarse_size(windows)
     bins = tuple(max(1, round(w / COARSE_CELLS)) for w in size)
     cells = tuple(-(-n // width) for n, width in zip((nx, ny, nz), bins, strict=True))
     binned_size = tuple(max(2, round(w / width)) for w, width in zip(size, bins, strict=True))
@@ -227,7 +242,7 @@ def _coarse_field(
     raw, second = _absolute(peaks, np.zeros(peaks.offset.shape))
     nowhere = np.zeros(peaks.found.shape, dtype=np.bool_)
     displacement, _ = validate_vectors(raw, second, peaks.found, nowhere, expected_noise(peaks.width))
-    field = smooth_field(fill_field(displacement), FILTER_STRENGTH) * np.asarray(bins)
+    field = smooth_field(fill_field(displacement)) * np.asarray(bins)
     return _unbinned(binned, bins), field
 
 
@@ -275,9 +290,7 @@ def _refine(pair: Pair, predictor: NDArray[np.float64], step: Pass) -> Measured:
     """Return what is measured in volumes deformed by `predictor`, given at the windows of `step`, in voxels."""
     layout, shape = step.layout, pair.shape_xyz
     before, after = margins(layout, (shape[2], shape[1], shape[0]), step.radius)
-    along_x, along_y, along_z = (
-        spline_matrix(layout.centres_voxel(k), np.arange(shape[k], dtype=np.float64)) for k in range(3)
-    )
+    along_x, along_y, along_z = _matrices_to_voxels(layout, shape)
     lateral = expand_lateral(predictor, along_x, along_y)
     a, b, valid = deform_pair(pair.a, pair.b, pair.mask, lateral, along_z, before, after)
     peaks = find_peaks(correlation_maps(a, b, layout, before, step.radius))
@@ -293,6 +306,17 @@ def _refine(pair: Pair, predictor: NDArray[np.float64], step: Pass) -> Measured:
     displacement, flag = validate_vectors(raw, second, peaks.found, masked, expected_noise(peaks.width))
     uncertainty[~peaks.found | masked] = np.nan
     return Measured(raw, displacement, flag, peaks, valid_fraction, uncertainty)
+
+
+@lru_cache(maxsize=4)
+def _matrices_to_voxels(
+    layout: WindowLayout, shape_xyz: Triple
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return the spline matrices along x, y, z from window centres to all voxels; most passes have the same ones."""
+    along_x, along_y, along_z = (
+        spline_matrix(layout.centres_voxel(k), np.arange(shape_xyz[k], dtype=np.float64)) for k in range(3)
+    )
+    return along_x, along_y, along_z
 
 
 def _width_when_sparse(width: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -203,25 +203,28 @@ def block_products(
     for job in prange(count[0] * count[1]):
         bz, by = job // count[1], job % count[1]
         begin = (first[0] + bz * stride[0]) * plane + (first[1] + by * stride[1]) * row + first[2]
-        columns = np.empty((shifts, length), dtype=np.float32)
+        # All shifts of a few columns before the next ones: their voxels then stay in the fastest cache.
+        columns = np.empty((shifts, shifts, shifts, length), dtype=np.float32)
         flat = columns.reshape(columns.size)
-        for sz in range(shifts):
-            for sy in range(shifts):
-                for group in range(0, shifts, together):
-                    # The last group and the last lanes begin early enough to end with the others.
-                    sx = min(group, shifts - together)
-                    shift = (sz - radius) * plane + (sy - radius) * row + sx - radius
-                    for start in range(0, length, LANES):
-                        x = min(start, length - LANES)
-                        at, here = sx * length + x, begin + x
+        for start in range(0, length, LANES):
+            # The last lanes, and the last shifts below, begin early enough to end with the others.
+            x = min(start, length - LANES)
+            for sz in range(shifts):
+                for sy in range(shifts):
+                    for group in range(0, shifts, together):
+                        sx = min(group, shifts - together)
+                        shift = (sz - radius) * plane + (sy - radius) * row + sx - radius
+                        at, here = ((sz * shifts + sy) * shifts + sx) * length + x, begin + x
                         if together == MANY_SHIFTS:
                             many_products(flat, at, length, flat_a, flat_b, here, shift, plane, row, size[0], size[1])
                         else:
                             few_products(flat, at, length, flat_a, flat_b, here, shift, plane, row, size[0], size[1])
-                for bx in range(count[2]):
-                    for sx in range(shifts):
-                        total = 0.0
-                        for x in range(bx * stride[2], bx * stride[2] + size[2]):
-                            total += columns[sx, x]
-                        products[bz, by, bx, sz, sy, sx] = total
+        lines = columns.reshape(-1, length)
+        for bx in range(count[2]):
+            sums = products[bz, by, bx].reshape(lines.shape[0])
+            for shift in range(lines.shape[0]):
+                total = 0.0
+                for x in range(bx * stride[2], bx * stride[2] + size[2]):
+                    total += lines[shift, x]
+                sums[shift] = total
     return products

@@ -106,30 +106,59 @@ def cell_moments(
     with a neighbour that is not valid are left out: their gradient would be that of the rim.
     """
     moments = np.zeros((count[0], count[1], count[2], MOMENTS))
+    length = (count[2] - 1) * stride[2] + size[2]
     for job in prange(count[0] * count[1]):
         cz, cy = job // count[1], job % count[1]
-        basis = np.empty(UNKNOWNS)
+        rows = np.empty((UNKNOWNS + 1, length), dtype=np.float32)
+        # Summed over the planes and rows of the cells first, many columns at once; float32 serves for so few.
+        columns = np.zeros((MOMENTS, length), dtype=np.float32)
+        for z in range(first[0] + cz * stride[0], first[0] + cz * stride[0] + size[0]):
+            for y in range(first[1] + cy * stride[1], first[1] + cy * stride[1] + size[1]):
+                write_row(a, b, valid, z, y, first[2], rows)
+                place = 0
+                for i in range(UNKNOWNS):
+                    for j in range(i, UNKNOWNS):
+                        add_products(columns[place], rows[i], rows[j])
+                        place += 1
+                    add_products(columns[MOMENTS - UNKNOWNS + i], rows[i], rows[UNKNOWNS])
         for cx in range(count[2]):
-            sums = moments[cz, cy, cx]
-            for z in range(first[0] + cz * stride[0], first[0] + cz * stride[0] + size[0]):
-                for y in range(first[1] + cy * stride[1], first[1] + cy * stride[1] + size[1]):
-                    for x in range(first[2] + cx * stride[2], first[2] + cx * stride[2] + size[2]):
-                        whole = valid[z - 1, y, x] and valid[z + 1, y, x] and valid[z, y - 1, x]
-                        whole = whole and valid[z, y + 1, x] and valid[z, y, x - 1] and valid[z, y, x + 1]
-                        if not (whole and valid[z, y, x]):
-                            continue
-                        basis[0] = 0.25 * (a[z, y, x + 1] + b[z, y, x + 1] - a[z, y, x - 1] - b[z, y, x - 1])
-                        basis[1] = 0.25 * (a[z, y + 1, x] + b[z, y + 1, x] - a[z, y - 1, x] - b[z, y - 1, x])
-                        basis[2] = 0.25 * (a[z + 1, y, x] + b[z + 1, y, x] - a[z - 1, y, x] - b[z - 1, y, x])
-                        basis[3] = 0.5 * (a[z, y, x] + b[z, y, x])
-                        change = b[z, y, x] - a[z, y, x]
-                        place = 0
-                        for i in range(UNKNOWNS):
-                            for j in range(i, UNKNOWNS):
-                                sums[place] += basis[i] * basis[j]
-                                place += 1
-                            sums[MOMENTS - UNKNOWNS + i] += basis[i] * change
+            for moment in range(MOMENTS):
+                total = 0.0
+                for x in range(cx * stride[2], cx * stride[2] + size[2]):
+                    total += columns[moment, x]
+                moments[cz, cy, cx, moment] = total
     return moments
+
+
+@njit(cache=True)
+def add_products(sums: NDArray[np.float32], one: NDArray[np.float32], other: NDArray[np.float32]) -> None:
+    """Add the products of two rows to a third."""
+    for x in range(sums.size):
+        sums[x] += one[x] * other[x]
+
+
+@njit(cache=True)
+def write_row(
+    a: NDArray[np.float32],
+    b: NDArray[np.float32],
+    valid: NDArray[np.uint8],
+    z: int,
+    y: int,
+    first: int,
+    rows: NDArray[np.float32],
+) -> None:
+    """Write dM/dx, dM/dy, dM/dz, M and B - A of the voxels from `first` on; zeros where a neighbour is not valid."""
+    quarter, half = np.float32(0.25), np.float32(0.5)
+    for x in range(rows.shape[1]):
+        at = first + x
+        whole = valid[z - 1, y, at] & valid[z + 1, y, at] & valid[z, y - 1, at] & valid[z, y + 1, at]
+        whole &= valid[z, y, at - 1] & valid[z, y, at + 1] & valid[z, y, at]
+        kept = np.float32(whole)
+        rows[0, x] = kept * quarter * (a[z, y, at + 1] + b[z, y, at + 1] - a[z, y, at - 1] - b[z, y, at - 1])
+        rows[1, x] = kept * quarter * (a[z, y + 1, at] + b[z, y + 1, at] - a[z, y - 1, at] - b[z, y - 1, at])
+        rows[2, x] = kept * quarter * (a[z + 1, y, at] + b[z + 1, y, at] - a[z - 1, y, at] - b[z - 1, y, at])
+        rows[3, x] = kept * half * (a[z, y, at] + b[z, y, at])
+        rows[4, x] = kept * (b[z, y, at] - a[z, y, at])
 
 
 @njit(cache=True)

@@ -27,6 +27,8 @@ NEEDED_SHARE = 0.5
 FILL_TOLERANCE = 0.8
 # Two rounds: outliers found in the first no longer count as neighbours in the second.
 ROUNDS = 2
+# Values that a median is taken of at most, rounded up to whole vectors of the processor: 26 neighbours, 25 slopes.
+ROOM = 32
 
 
 def expected_noise(width: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -100,35 +102,27 @@ def fill_field(displacement: NDArray[np.float64]) -> NDArray[np.float64]:
     return filled
 
 
-def smooth_field(displacement: NDArray[np.float64], strength: float) -> NDArray[np.float64]:
-    """Return (1 - strength) of a field plus `strength` of it after a (1/4, 1/2, 1/4) filter along x, y and z.
-
-    The first and the last value of a line become those of the straight line fitted to the outer three: linear flows
-    pass unchanged, and noise at the ends does not.
-    """
-    smoothed = displacement
-    for axis in range(3):
-        if smoothed.shape[axis] > 2:
-            moved = np.moveaxis(smoothed, axis, 0)
-            filtered = np.empty_like(moved)
-            filtered[1:-1] = 0.25 * moved[:-2] + 0.5 * moved[1:-1] + 0.25 * moved[2:]
-            filtered[0] = (5.0 * moved[0] + 2.0 * moved[1] - moved[2]) / 6.0
-            filtered[-1] = (5.0 * moved[-1] + 2.0 * moved[-2] - moved[-3]) / 6.0
-            smoothed = np.moveaxis(filtered, 0, axis)
-    return (1.0 - strength) * displacement + strength * smoothed
-
-
 @njit(cache=True)
-def sorted_median(values: NDArray[np.float64], count: int) -> float:
-    """Return the median of the first `count` values, 1 or more, which are sorted in place."""
-    for i in range(1, count):
+def median(values: NDArray[np.float64], count: int) -> float:
+    """Return the median of the first `count` values, 1 or more; infinity must stand in the other ones of `ROOM`.
+
+    By counting what is below each value, which takes no branches: three times faster than sorting so few.
+    """
+    low = high = np.nan
+    for i in range(count):
         value = values[i]
-        j = i
-        while j > 0 and values[j - 1] > value:
-            values[j] = values[j - 1]
-            j -= 1
-        values[j] = value
-    return 0.5 * (values[(count - 1) // 2] + values[count // 2])
+        below = np.int32(0)
+        not_above = np.int32(0)
+        for j in range(ROOM):
+            below += np.int32(values[j] < value)
+            not_above += np.int32(values[j] <= value)
+        if below <= (count - 1) // 2 < not_above:
+            low = value
+        if below <= count // 2 < not_above:
+            high = value
+        if low == low and high == high:
+            break
+    return 0.5 * (low + high)
 
 
 @njit(cache=True)
@@ -141,8 +135,9 @@ def robust_slope(
     ----------
     cube, known : (27,) the vector's neighbourhood [z, y, x] and which of it may be used
     stride : 9, 3, 1 for the axes z, y, x
-    slopes : (27,) room to work
+    slopes : (ROOM,) room to work
     """
+    slopes[:] = np.inf
     pairs = 0
     for first in range(27):
         # The first of three on a line along the axis.
@@ -158,7 +153,7 @@ def robust_slope(
         if known[first] and known[last]:
             slopes[pairs] = 0.5 * (cube[last] - cube[first])
             pairs += 1
-    return sorted_median(slopes, pairs) if pairs else 0.0
+    return median(slopes, pairs) if pairs else 0.0
 
 
 @njit(cache=True, parallel=True)
@@ -186,7 +181,7 @@ def predict(
     share = np.zeros((nz, ny, nx))
     for job in prange(nz * ny):
         z, y = job // ny, job % ny
-        cube, carried = np.zeros((3, 27)), np.empty(27)
+        cube, carried = np.zeros((3, 27)), np.empty(ROOM)
         known = np.empty(27, dtype=np.bool_)
         for x in range(nx):
             if not wanted[z, y, x]:
@@ -214,17 +209,18 @@ def predict(
                     robust_slope(values, known, 3, carried),
                     robust_slope(values, known, 1, carried),
                 )
+                carried[:] = np.inf
                 count = 0
                 for place in range(27):
                     if known[place]:
                         away = slope_z * (place // 9 - 1) + slope_y * (place // 3 % 3 - 1) + slope_x * (place % 3 - 1)
                         carried[count] = values[place] - away
                         count += 1
-                middle = sorted_median(carried, count)
+                middle = median(carried, count)
                 for i in range(count):
                     carried[i] = abs(carried[i] - middle)
                 predicted[z, y, x, component] = middle
-                spread[z, y, x, component] = sorted_median(carried, count)
+                spread[z, y, x, component] = median(carried, count)
     return predicted, spread, share
 
 

@@ -5,6 +5,7 @@ Axes: triples are ordered (x, y, z). Positions are voxel indices; voxel k covers
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,9 @@ from numpy.typing import NDArray
 from lfpiv_cli.grid import Grid
 
 Triple = tuple[int, int, int]
+
+# A quotient of lengths that should be a whole number may fall short of it by this.
+ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -50,7 +54,7 @@ class WindowLayout:
 
 
 def layout_windows(shape_xyz: Triple, size_xyz: Triple, overlap: tuple[float, float, float]) -> WindowLayout:
-    """Return the windows that fill a volume: floor(N / step) along each axis, the remainder split evenly.
+    """Return the windows that fill a volume: floor(N / [size (1 - overlap)]) an axis, the remainder split evenly.
 
     Each window sits in the middle of a cell of `step` voxels, and the cells fill the volume as far as whole cells can.
     The windows therefore overhang the volume where they are larger than their cell.
@@ -59,8 +63,8 @@ def layout_windows(shape_xyz: Triple, size_xyz: Triple, overlap: tuple[float, fl
     ----------
     shape_xyz : voxels of the volume
     size_xyz : voxels of a window
-    overlap : share of a window that it has in common with the next one, 0 <= overlap < 1; the step is rounded to whole
-        voxels
+    overlap : share of a window that it has in common with the next one, 0 <= overlap < 1; the step is then rounded to
+        whole voxels, or rounded down where so many windows would not fit
     """
     axes = [_layout_axis(n, w, o) for n, w, o in zip(shape_xyz, size_xyz, overlap, strict=True)]
     (sx, nx, fx), (sy, ny, fy), (sz, nz, fz) = axes
@@ -69,8 +73,10 @@ def layout_windows(shape_xyz: Triple, size_xyz: Triple, overlap: tuple[float, fl
 
 def _layout_axis(voxels: int, size: int, overlap: float) -> Triple:
     """Return step, count and first voxel along one axis."""
-    step = max(1, round(size * (1.0 - overlap)))
-    count = max(1, voxels // step)
+    exact = size * (1.0 - overlap)
+    count = max(1, math.floor(voxels / exact + ROUNDING))
+    # Of whole voxels, and no more than leave all windows' cells inside the volume.
+    step = max(1, min(math.floor(exact + 0.5), voxels // count))
     # Doubled, to stay in whole numbers; an odd remainder leaves its last voxel at the far end.
     twice_first = (voxels - count * step) + step - size
     return step, count, twice_first // 2
