@@ -139,7 +139,7 @@ def correlate(
                 volume_b.array,
                 grid,
                 sizes_xyz,
-                chosen.overlap_xyz,
+                settings_of[number].overlap(grid.spacing_mm),
                 chosen.dt_s,
                 progress=advance,
                 exponent=settings_of[number].correlation_exponent(),

@@ -170,7 +170,7 @@ def _vectors(
 ) -> VectorField:
     """Return the vectors at the centres of the correlation windows."""
     size = settings.windows_voxel(volume.spacing_mm)[-1]
-    grid = layout_windows(volume.shape_xyz, size, settings.correlation.overlap_xyz).grid(volume)
+    grid = layout_windows(volume.shape_xyz, size, settings.overlap(volume.spacing_mm)).grid(volume)
     z, y, x = np.meshgrid(*(grid.axis_mm(axis) for axis in (2, 1, 0)), indexing="ij")
     nodes = np.stack([x, y, z], axis=-1)
     reach = REACH_WINDOWS * max(n * d for n, d in zip(size, volume.spacing_mm, strict=True))

@@ -13,6 +13,7 @@ import pytest
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.sections import Section, Sections
+from lfpiv_cli.flow.windows import layout_windows
 from lfpiv_cli.optics.media import fluid_path_to_focus
 
 CONFIGS = sorted((Path(__file__).parents[1] / "configs").glob("*.yaml"))
@@ -272,6 +273,21 @@ def test_windows_in_millimetres_are_the_final_ones(write) -> None:
         (32, 32, 32),
         (16, 16, 8),
     )
+
+
+@pytest.mark.parametrize("voxel_mm", np.linspace(0.04, 0.22, 37))
+def test_windows_in_millimetres_always_give_the_paper_s_number(write, voxel_mm: float) -> None:
+    config = load_config(write("correlation: {window_mm: 1.6}\n"))
+    voxel = (voxel_mm,) * 3
+    shape = tuple(round(length / voxel_mm) for length in (10.0, 13.0, 10.0))
+    layout = layout_windows(shape, config.windows_voxel(voxel)[-1], config.overlap(voxel))
+    # Where rounding has made the volume shorter than it takes, a window is missing.
+    expected = tuple(int(n * voxel_mm / 0.8 + 1e-9) for n in shape)
+    assert layout.count == expected
+    assert expected[0] == 12
+    for axis in range(3):
+        cells = layout.count[axis] * layout.step[axis]
+        assert cells <= shape[axis] < cells + layout.count[axis] + layout.step[axis]
 
 
 def test_the_channels_wall_puts_the_focal_point_where_it_is(write) -> None:

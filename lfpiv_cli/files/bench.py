@@ -162,6 +162,22 @@ def windows_of(section: CorrelationSection, voxel_mm: Lengths) -> tuple[Triple, 
     return (2 * final[0], 2 * final[1], 2 * final[2]), (final[0], final[1], final[2])
 
 
+def overlap_of(section: CorrelationSection, voxel_mm: Lengths) -> Lengths:
+    """Return the overlap of the final windows in voxels along x, y, z.
+
+    Windows given as `window_mm` are whole voxels only nearly; their overlap is then what leaves the distance between
+    them, and with it their number, as in mm.
+    """
+    if section.window_mm is None:
+        return section.overlap
+    *_, final = windows_of(section, voxel_mm)
+    x, y, z = (
+        max(0.0, 1.0 - length * (1.0 - overlap) / (voxel * size))
+        for length, overlap, voxel, size in zip(section.window_mm, section.overlap, voxel_mm, final, strict=True)
+    )
+    return x, y, z
+
+
 def flow_of(section: FlowSection, origin_z_mm: float) -> Flow:
     """Return a flow as a function of points, its centre moved by `origin_z_mm` along z."""
     parameters = section.model_dump(exclude={"kind"})

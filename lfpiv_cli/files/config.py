@@ -209,6 +209,10 @@ class Config:
         """Return the correlation windows (x, y, z) in voxels, coarse to fine."""
         return bench.windows_of(self.correlation, voxel_mm)
 
+    def overlap(self, voxel_mm: tuple[float, float, float]) -> tuple[float, float, float]:
+        """Return the overlap of the correlation windows along x, y, z."""
+        return bench.overlap_of(self.correlation, voxel_mm)
+
     def correlation_exponent(self) -> float:
         """Return the power of the intensities that is correlated: the configured one, or the solver's default."""
         return self.correlation.exponent or EXPONENTS.get(self.reconstruction.solver, 1.0)
