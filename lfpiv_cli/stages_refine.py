@@ -44,7 +44,7 @@ def refine_calibration(
     before = read_calibration(calibration)
     dark_image = image_files.read_image(dark, shape) if dark else None
     lit = [light(image_files.read_page(frame.path, frame.page, shape), dark_image, None) for frame in frames]
-    with console.progress(len(lit) * STEPS, "refine") as advance:
+    with console.progress(len(lit) * STEPS + 1, "refine") as advance:
         found = refine(
             lit,
             before,

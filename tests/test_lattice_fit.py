@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -241,3 +242,15 @@ def test_experiment_gives_the_true_rotation_and_shift(data_folder: Path) -> None
     on_axis = np.array([1175.5, 883.5]) + 1.004 * np.array([3.4, -2.1])
     np.testing.assert_allclose(fit.lattice_px.points(fit.lattice_px.nearest(on_axis)), on_axis, atol=0.02)
     assert not fit.cubic_used
+
+
+@pytest.mark.parametrize("cubic_used", [False, True])
+def test_a_shift_moves_all_lens_images_alike(rng: np.random.Generator, cubic_used: bool) -> None:
+    fit = replace(fit_lattice(white_image(tilted("square"), rng)), cubic_used=cubic_used)
+    moved = fit.shifted(np.array([0.3, -0.2]))
+    indices = np.array([(0, 0), (5, -3), (-4, 6)])
+    np.testing.assert_allclose(moved.centres(indices) - fit.centres(indices), np.tile((0.3, -0.2), (3, 1)), atol=1e-10)
+    np.testing.assert_allclose(moved.lattice_px.origin - fit.lattice_px.origin, (0.3, -0.2), atol=1e-10)
+    np.testing.assert_allclose(
+        moved.centres_px - moved.centres(moved.indices), fit.centres_px - fit.centres(fit.indices)
+    )

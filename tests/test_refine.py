@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from lfpiv_cli.cli import cli
@@ -50,6 +51,11 @@ def test_a_wrong_mid_plane_is_found_and_mended(wrong: Path, tmp_path: Path, caps
     mended = read_calibration(output)
     assert mended.mid_plane_z_mm == summary["mid_plane_z_mm"]
     assert mended.pose is not None
+    moved = mended.fit.centres((3, -2)) - read_calibration(wrong).fit.centres((3, -2))
+    np.testing.assert_allclose(moved, summary["lattice_shift_px"], atol=1e-12)
+    # The shipped images belong together: nothing has moved, and the tracers are 0.05 mm wide.
+    assert np.abs(moved).max() < 0.01
+    assert abs(summary["particle_diameter_mm"] - 0.05) < 3 * summary["particle_diameter_mm_sigma"]
     with open_h5(output) as file:
         made_by = read_provenance(file)
     assert made_by["command"] == "refine-calibration"

@@ -6,7 +6,7 @@ pitch is measured, never taken from a data sheet: lens images are projected from
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -85,6 +85,17 @@ class LatticeFit:
     def centres(self, indices: ArrayLike) -> NDArray[np.float64]:
         """Return the modelled centres of lens images, (column, row), indices of shape (..., 2)."""
         return polynomial_terms(indices) @ self.coefficients_px
+
+    def shifted(self, shift_px: NDArray[np.float64]) -> LatticeFit:
+        """Return the lattice with all lens images moved by a shift (2,), (columns, rows)."""
+        cubic = self.cubic_px.copy()
+        cubic[0] += shift_px
+        return replace(
+            self,
+            lattice_px=self.lattice_px.transformed(np.eye(2), shift_px),
+            centres_px=self.centres_px + shift_px,
+            cubic_px=cubic,
+        )
 
 
 def fit_lattice(

@@ -1,7 +1,8 @@
 """A calibration held against the particles of a flow: where the channel's walls are, by the particles between them.
 
 Told by where the particles end: the depth of the mid plane, the walls' tilt, and the scale of depths, which goes with
-the square of the magnification. The images of the particles alone tell none of these: unknown places absorb them.
+the square of the magnification. Their images tell none of these: unknown places absorb them. What the images do tell
+(`nuisances`) is asked of the first one.
 
 Axes: world axes of the raw sensor, z from the nominal focal point; lengths in mm.
 """
@@ -19,16 +20,17 @@ from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
+from lfpiv_cli.particles.nuisances import Nuisances, fit_nuisances
 from lfpiv_cli.particles.rounds import ROUNDS, Particles, find_particles
-from lfpiv_cli.particles.view import raw_view
-from lfpiv_cli.particles.walls import Walls, find_walls
+from lfpiv_cli.particles.view import View, raw_view
+from lfpiv_cli.particles.walls import Walls, find_walls, refuse_few
 from lfpiv_cli.reconstruction.equations import normalisers
 from lfpiv_cli.weights.build import default_padding, factorise
 from lfpiv_cli.weights.model import Weights
 
 # Three rounds find nine particles in ten; the walls of six rounds lie within two micrometres of theirs.
 REFINING_ROUNDS = ROUNDS[:3]
-# Units of progress for one image.
+# Units of progress for each image; there is one more for the first.
 STEPS = sum(settings.iterations + 1 for settings in REFINING_ROUNDS)
 # Particles are looked for this share of the channel's width beyond the walls on each side.
 MARGIN_PER_WIDTH = 0.15
@@ -47,16 +49,19 @@ class Refinement:
     Attributes
     ----------
     walls : where they end
+    nuisances, nuisances_sigma : changes of the camera and of the particles' size by their images
     position_mm : (n, 3) of the particles, all images together
     depths_mm : between which they were looked for
     frames : number of images
     expected_z_mm, expected_sigma_mm : depth of the mid plane before, and its standard error where it was known
     common_depth_mm : standard error that all depths share
-    width_mm, particle_diameter_mm : true width of the channel, diameter of the particles
-    magnification : that the depths were found with
+    width_mm, particle_diameter_mm : true width of the channel, diameter of the particles before
+    camera : that the particles were found with
     """
 
     walls: Walls
+    nuisances: Nuisances
+    nuisances_sigma: Nuisances
     position_mm: NDArray[np.float64]
     depths_mm: tuple[float, float]
     frames: int
@@ -65,7 +70,17 @@ class Refinement:
     common_depth_mm: float
     width_mm: float
     particle_diameter_mm: float
-    magnification: float
+    camera: Camera
+
+    @property
+    def shift_px(self) -> NDArray[np.float64]:
+        """How far (2,) all lens images have moved since the white image, (columns, rows)."""
+        shift = np.array([self.nuisances.shift_x_mm, self.nuisances.shift_y_mm])
+        return np.asarray(shift * self._image_px_per_mm, dtype=np.float64)
+
+    @property
+    def _image_px_per_mm(self) -> float:
+        return self.camera.micro_image_scale / self.camera.pixel_mm
 
     @property
     def middle_sigma_mm(self) -> float:
@@ -78,12 +93,17 @@ class Refinement:
         return float(np.linalg.norm([self.walls.width_sigma_mm, self.common_depth_mm, self.particle_diameter_mm]))
 
     def applied(self, calibration: Calibration) -> Calibration:
-        """Return the calibration with the mid plane where the particles have it."""
-        return replace(calibration, mid_plane_z_mm=self.walls.middle_mm, mid_plane_z_sigma_mm=self.middle_sigma_mm)
+        """Return the calibration with mid plane and lens images where the particles have them."""
+        return replace(
+            calibration,
+            rectification=replace(calibration.rectification, fit=calibration.fit.shifted(self.shift_px)),
+            mid_plane_z_mm=self.walls.middle_mm,
+            mid_plane_z_sigma_mm=self.middle_sigma_mm,
+        )
 
     def summary(self) -> dict[str, Any]:
         """Return the figures as plain numbers and lists, units in their names; None where unknown."""
-        walls = self.walls
+        walls, change, error, camera = self.walls, self.nuisances, self.nuisances_sigma, self.camera
         half_span = np.sqrt(np.var(self.position_mm[:, :2], axis=0))
         slope_sigma = np.hypot(walls.slope_sigma, self.common_depth_mm / half_span)
         scale, before = walls.width_mm / self.width_mm, self.expected_sigma_mm
@@ -99,8 +119,16 @@ class Refinement:
             "wall_tilt_deg_sigma": np.rad2deg(slope_sigma / (1.0 + walls.slope**2)).tolist(),
             "apparent_width_mm": walls.width_mm,
             "apparent_width_mm_sigma": self.width_sigma_mm,
-            "magnification": self.magnification * float(np.sqrt(scale)),
-            "magnification_sigma": 0.5 * abs(self.magnification) * self.width_sigma_mm / self.width_mm,
+            "magnification": camera.magnification * float(np.sqrt(scale)),
+            "magnification_sigma": 0.5 * abs(camera.magnification) * self.width_sigma_mm / self.width_mm,
+            "lattice_shift_px": self.shift_px.tolist(),
+            "lattice_shift_px_sigma": [self._image_px_per_mm * sigma for sigma in (error.shift_x_mm, error.shift_y_mm)],
+            "aperture_mm": camera.aperture_mm + 2.0 * change.aperture_radius_mm,
+            "aperture_mm_sigma": 2.0 * error.aperture_radius_mm,
+            "particle_diameter_mm": self.particle_diameter_mm + 2.0 * change.particle_radius_mm,
+            "particle_diameter_mm_sigma": 2.0 * error.particle_radius_mm,
+            "k1_per_mm2": camera.distortion_per_mm2 + change.distortion_per_mm2,
+            "k1_per_mm2_sigma": error.distortion_per_mm2,
             "edge_blur_mm": walls.blur_mm,
             "stray_share": walls.stray_share,
         }
@@ -140,23 +168,41 @@ def refine_calibration(
     operator = factorise(camera, media, grid.padded(padding))
     weights = Weights(grid, padding, operator, camera.column_axis, calibration)
     sums = normalisers(weights.padded)
-    found = [find_particles(image, view, weights, camera, sums, REFINING_ROUNDS, progress=progress) for image in images]
+
+    def search(image: NDArray[np.float32], seen: View) -> Particles:
+        return find_particles(image, seen, weights, camera, sums, REFINING_ROUNDS, progress=progress)
+
+    first = search(images[0], view)
+    refuse_few(len(first.position_mm))
+    rows = np.column_stack([camera.to_image_axes(first.position_mm), first.light_counts])
+    fit = fit_nuisances(images[0].astype(np.float64).ravel(), view, rows, first.noise, grid.bounds_mm(2))
+    if progress:
+        progress(1)
+    found = [replace(first, position_mm=camera.to_image_axes(fit.particles[:, :3]))]
+    found += [search(image, fit.view) for image in images[1:]]
     position = np.concatenate([each.position_mm for each in found])
-    sigma = np.concatenate([_depth_sigma_mm(each) for each in found])
-    lens_depth = float(camera.lattice.pitch.max() / abs(camera.magnification)) / camera.aperture_radius_mm
-    lens_depth *= camera.focus_distance_mm / media.depth_ratio
+    sigma = np.concatenate([np.sqrt(each.covariance_mm2[:, 2, 2]) for each in found])
     return Refinement(
         walls=find_walls(position, sigma, grid.bounds_mm(2), width_mm, len(images)),
+        nuisances=fit.found,
+        nuisances_sigma=fit.sigma,
         position_mm=position,
         depths_mm=grid.bounds_mm(2),
         frames=len(images),
         expected_z_mm=expected,
         expected_sigma_mm=calibration.mid_plane_z_sigma_mm,
-        common_depth_mm=COMMON_SHARE_OF_LENS_DEPTH * lens_depth,
+        common_depth_mm=_common_depth_mm(camera, media),
         width_mm=width_mm,
         particle_diameter_mm=particle_diameter_mm,
-        magnification=camera.magnification,
+        camera=camera,
     )
+
+
+def _common_depth_mm(camera: Camera, media: Media) -> float:
+    """Return the standard error that the depths of all particles share."""
+    lens = float(camera.lattice.pitch.max()) / abs(camera.magnification)
+    lens_depth = lens / camera.aperture_radius_mm * camera.focus_distance_mm / media.depth_ratio
+    return COMMON_SHARE_OF_LENS_DEPTH * lens_depth
 
 
 def _deep_grid(volume: Grid, middle_mm: float, width_mm: float) -> Grid:
@@ -166,7 +212,3 @@ def _deep_grid(volume: Grid, middle_mm: float, width_mm: float) -> Grid:
     count = int(np.ceil(width_mm * (1.0 + 2.0 * MARGIN_PER_WIDTH) / deep))
     x, y = (0.5 * sum(volume.bounds_mm(axis)) for axis in (0, 1))
     return Grid.centred((shape[0], shape[1], count), (spacing[0], spacing[1], deep), (x, y, middle_mm))
-
-
-def _depth_sigma_mm(found: Particles) -> NDArray[np.float64]:
-    return np.asarray(np.sqrt(found.covariance_mm2[:, 2, 2]), dtype=np.float64)

@@ -96,11 +96,7 @@ def find_walls(
     InputError
         There are too few particles, or they do not end at two walls as far apart as the channel is wide.
     """
-    if len(position_mm) < FEWEST_PARTICLES:
-        raise InputError(
-            f"only {len(position_mm)} particles were found; at least {FEWEST_PARTICLES} are needed to see where they "
-            "end at the walls"
-        )
+    refuse_few(len(position_mm))
     searched = depths_mm[1] - depths_mm[0]
     best = _most_likely(position_mm, depth_sigma_mm, searched, width_mm)
     sigma = _standard_errors(best, position_mm, depth_sigma_mm, searched, width_mm) * np.sqrt(frames)
@@ -122,6 +118,15 @@ def find_walls(
     )
     _ensure_walls(walls, depths_mm, width_mm)
     return walls
+
+
+def refuse_few(count: int) -> None:
+    """Raise where too few particles were found."""
+    if count < FEWEST_PARTICLES:
+        raise InputError(
+            f"only {count} particles were found; at least {FEWEST_PARTICLES} are needed to see where they end at the "
+            "walls"
+        )
 
 
 def _ensure_walls(walls: Walls, depths_mm: tuple[float, float], width_mm: float) -> None:

@@ -1,0 +1,250 @@
+"""What an image of particles says about the camera that saw it: Gauss-Newton on camera and particles at once.
+
+The unknowns of the camera change the light of all particles, those of a particle (x, y, z, light) its own alone. With
+the columns of the former freed of all that the latter can do (the Schur complement, by least squares with one sparse
+matrix), a small system is left. Told this way are the mean shift of the lens images against those of the white image,
+the main lens's aperture, the particles' size and the radial distortion. Focus and magnification are not: the particles'
+places make up for them.
+
+Axes: image axes, mm; see `view`. Particles are rows (x, y, z, light), images flat.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.sparse import csc_matrix
+from scipy.sparse.linalg import lsqr
+
+from lfpiv_cli.particles.fitting import UNKNOWNS, add_all, refine
+from lfpiv_cli.particles.noise import Noise
+from lfpiv_cli.particles.response import VALUES, respond
+from lfpiv_cli.particles.rim import rim_table
+from lfpiv_cli.particles.tiles import share_out
+from lfpiv_cli.particles.view import View, entry_capacity
+
+# A round with this many sweeps over the particles leaves a sixth of an error, four leave 1e-3 of it. They end earlier
+# when a step is within what the optics model gets wrong.
+ROUNDS, SWEEPS = 4, 3
+# What is not explained yet counts for little, as in the last sweeps of the search.
+UNEXPLAINED = 0.02
+# Least squares: the columns are good to a thousandth after some forty steps.
+LEAST_SQUARES_STEPS, LEAST_SQUARES_TOLERANCE = 50, 1e-4
+# Differences: shift in mm (a twentieth of a small pixel), shares of aperture and particle radius, and distortion in
+# stretch at the sensor's corner.
+SHIFT_STEP_MM, SHARE_STEP, STRETCH_STEP = 2.5e-4, 0.004, 1e-4
+# What the optics model itself gets wrong: on an image traced ray by ray by another program, true to 4e-5 of the pitch,
+# aperture, radius and distortion came out 0.05 %, 0.7 % and 8e-5 (of stretch at the corner) off.
+MODEL_SHARE_OF_PITCH, MODEL_SHARE_OF_APERTURE, MODEL_SHARE_OF_RADIUS, MODEL_STRETCH = 1e-4, 6e-4, 0.01, 1.5e-4
+# Noise about zero is no light: pixels count as lit above this many standard deviations of the read noise.
+LIT_SIGMAS = 5.0
+
+
+@dataclass(frozen=True)
+class Nuisances:
+    """Unknowns of the camera, as changes of a view or as their standard errors.
+
+    Attributes
+    ----------
+    shift_x_mm, shift_y_mm : of all lens centres, on the array
+    aperture_radius_mm, particle_radius_mm : of main lens and particles
+    distortion_per_mm2 : k1
+    """
+
+    shift_x_mm: float = 0.0
+    shift_y_mm: float = 0.0
+    aperture_radius_mm: float = 0.0
+    particle_radius_mm: float = 0.0
+    distortion_per_mm2: float = 0.0
+
+    @property
+    def values(self) -> NDArray[np.float64]:
+        """All of them as an array, in the order of the attributes."""
+        return np.array([getattr(self, field.name) for field in fields(self)])
+
+    @classmethod
+    def of(cls, values: NDArray[np.float64]) -> Nuisances:
+        """Return them from an array in the order of the attributes."""
+        return cls(*(float(value) for value in values))
+
+    def applied(self, view: View) -> View:
+        """Return the view with these changes."""
+        shift = np.array([self.shift_x_mm, self.shift_y_mm])
+        radius, table, step = view.aperture_radius_mm, view.table, view.table_step_mm
+        if self.aperture_radius_mm != 0.0:
+            radius += self.aperture_radius_mm
+            table, step = rim_table(radius, view.pixel_mm * view.image_distance_mm / view.microlens_distance_mm)
+        return view._replace(
+            centres_mm=view.centres_mm + shift,
+            origin_mm=view.origin_mm + shift,
+            aperture_radius_mm=radius,
+            particle_radius_mm=view.particle_radius_mm + self.particle_radius_mm,
+            distortion_per_mm2=view.distortion_per_mm2 + self.distortion_per_mm2,
+            table=table,
+            table_step_mm=step,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class NuisanceFit:
+    """What was found.
+
+    Attributes
+    ----------
+    found, sigma : changes of the view that was given, and their standard errors
+    view : with these changes
+    particles : (n, 4) refined with it
+    """
+
+    found: Nuisances
+    sigma: Nuisances
+    view: View
+    particles: NDArray[np.float64]
+
+
+def fit_nuisances(
+    image: NDArray[np.float64],
+    view: View,
+    particles: NDArray[np.float64],
+    noise: Noise,
+    depths_mm: tuple[float, float],
+) -> NuisanceFit:
+    """Find what explains an image better, the camera and all particles free.
+
+    Parameters
+    ----------
+    image : (rows * columns,) raw, dark and background taken off, counts
+    particles : (n, 4) that explain it with the view as it is
+    depths_mm : between which they may lie
+    """
+    model = _model_errors(view)
+    particles, total, sigma = particles.copy(), np.zeros(model.size), model
+    for _ in range(ROUNDS):
+        changed = Nuisances.of(total).applied(view)
+        residual, weight = _refined(image, changed, particles, noise, depths_mm)
+        lit = image - residual > LIT_SIGMAS * noise.read_counts
+        step, sigma = _gauss_newton(changed, particles, residual, np.sqrt(weight), lit, depths_mm)
+        total = total + step
+        if np.all(np.abs(step) < model):
+            break
+    found = Nuisances.of(total)
+    changed = found.applied(view)
+    _refined(image, changed, particles, noise, depths_mm)
+    return NuisanceFit(found, Nuisances.of(np.hypot(sigma, model)), changed, particles)
+
+
+def _model_errors(view: View) -> NDArray[np.float64]:
+    """Return what the optics model gets wrong of the unknowns (5,)."""
+    return np.array(
+        [
+            2.0 * MODEL_SHARE_OF_PITCH * view.half_x_mm,
+            2.0 * MODEL_SHARE_OF_PITCH * view.half_y_mm,
+            MODEL_SHARE_OF_APERTURE * view.aperture_radius_mm,
+            MODEL_SHARE_OF_RADIUS * view.particle_radius_mm,
+            MODEL_STRETCH / _corner_mm(view) ** 2,
+        ]
+    )
+
+
+def _refined(
+    image: NDArray[np.float64],
+    view: View,
+    particles: NDArray[np.float64],
+    noise: Noise,
+    depths_mm: tuple[float, float],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Refine particles in place; return what they leave of the image, and the weights of its pixels."""
+    residual = image - _light(view, particles, image.size, depths_mm)
+    capacity = entry_capacity(view, *depths_mm)
+    for _ in range(SWEEPS):
+        weight = noise.weights(image - residual, residual, UNEXPLAINED)
+        refine(view, particles, share_out(view, particles, *depths_mm), residual, weight, *depths_mm, capacity)
+    return residual, noise.weights(image - residual, residual, UNEXPLAINED)
+
+
+def _light(
+    view: View, particles: NDArray[np.float64], pixels: int, depths_mm: tuple[float, float]
+) -> NDArray[np.float64]:
+    """Return the light (pixels,) of all particles."""
+    image = np.zeros(pixels)
+    tiles = share_out(view, particles, *depths_mm)
+    add_all(view, particles, tiles, 1.0, image, entry_capacity(view, *depths_mm))
+    return image
+
+
+def _gauss_newton(
+    view: View,
+    particles: NDArray[np.float64],
+    residual: NDArray[np.float64],
+    root_weight: NDArray[np.float64],
+    lit: NDArray[np.bool_],
+    depths_mm: tuple[float, float],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the next step of the camera's unknowns and their standard errors, (5,) each."""
+    values, rows, starts = _columns(view, particles, root_weight, entry_capacity(view, *depths_mm))
+    own = csc_matrix((values, rows, starts), shape=(residual.size, UNKNOWNS * len(particles)))
+    unit = _steps(view)
+    free = []
+    for step in np.diag(unit):
+        ahead, behind = (Nuisances.of(sign * step).applied(view) for sign in (1.0, -1.0))
+        difference = _light(ahead, particles, residual.size, depths_mm)
+        difference -= _light(behind, particles, residual.size, depths_mm)
+        free.append(_freed(own, 0.5 * root_weight * difference))
+    left = _freed(own, root_weight * residual)
+    design = np.stack(free, axis=1)
+    covariance = np.linalg.inv(design.T @ design)
+    # What neighbours leave unexplained is as large an error as noise: the scatter says how large.
+    scatter = float(left[lit] @ left[lit]) / max(1, int(lit.sum()))
+    sigma = np.sqrt(np.diag(covariance) * max(scatter, 1.0))
+    return covariance @ (design.T @ left) * unit, sigma * unit
+
+
+def _freed(own: csc_matrix, column: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return what of a column no particle can make up for."""
+    solution = lsqr(
+        own,
+        column.astype(np.float32),
+        atol=LEAST_SQUARES_TOLERANCE,
+        btol=LEAST_SQUARES_TOLERANCE,
+        iter_lim=LEAST_SQUARES_STEPS,
+    )[0]
+    return np.asarray(column - own @ solution, dtype=np.float64)
+
+
+def _steps(view: View) -> NDArray[np.float64]:
+    """Return the steps (5,) of the differences."""
+    shares = SHARE_STEP * np.array([view.aperture_radius_mm, view.particle_radius_mm])
+    return np.array([SHIFT_STEP_MM, SHIFT_STEP_MM, *shares, STRETCH_STEP / _corner_mm(view) ** 2])
+
+
+def _corner_mm(view: View) -> float:
+    """Return how far the sensor's corner is from the axis."""
+    return 0.5 * view.pixel_mm * float(np.hypot(view.columns, view.rows))
+
+
+@njit(cache=True)
+def _columns(
+    view: View, particles: NDArray[np.float64], root_weight: NDArray[np.float64], capacity: int
+) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.int64]]:
+    """Return the weighted derivatives by x, y, z and light of each particle, scaled to length 1, as sparse columns."""
+    pixels, values = np.empty(capacity, np.int32), np.empty((capacity, VALUES))
+    starts = np.zeros(UNKNOWNS * len(particles) + 1, np.int64)
+    for n in range(len(particles)):
+        count = respond(view, particles[n, 0], particles[n, 1], particles[n, 2], pixels, values)
+        for k in range(UNKNOWNS):
+            starts[UNKNOWNS * n + k + 1] = starts[UNKNOWNS * n + k] + count
+    data, rows = np.empty(starts[-1], np.float32), np.empty(starts[-1], np.int32)
+    for n in range(len(particles)):
+        count = respond(view, particles[n, 0], particles[n, 1], particles[n, 2], pixels, values)
+        for k in range(UNKNOWNS):
+            start, length2 = starts[UNKNOWNS * n + k], 0.0
+            for entry in range(count):
+                length2 += (root_weight[pixels[entry]] * values[entry, k]) ** 2
+            scale = 1.0 / np.sqrt(length2) if length2 > 0.0 else 0.0
+            for entry in range(count):
+                rows[start + entry] = pixels[entry]
+                data[start + entry] = scale * root_weight[pixels[entry]] * values[entry, k]
+    return data, rows, starts

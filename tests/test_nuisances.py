@@ -1,0 +1,54 @@
+"""What an image tells of the camera that saw it: rendered with a camera that differs, the difference is found."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.media import Media
+from lfpiv_cli.particles.fitting import add_all
+from lfpiv_cli.particles.noise import Noise
+from lfpiv_cli.particles.nuisances import Nuisances, fit_nuisances
+from lfpiv_cli.particles.tiles import share_out
+from lfpiv_cli.particles.view import View, entry_capacity, raw_view
+
+DEPTHS = (-4.0, 4.0)
+# Half a pixel and a third; a hundredth of the aperture; a fifth of the radius; 2e-4 of stretch at the corner.
+TRUE = Nuisances(2.7e-3, -1.8e-3, -0.12, 5e-3, 3e-5)
+NOISE = Noise(6.0, 2.0)
+
+
+@pytest.fixture
+def view(table2: Camera, water: Media) -> View:
+    return raw_view(replace(table2, columns=460, rows=420), water, 0.025)
+
+
+def picture(view: View, particles: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
+    """The light of particles with the noise that is told of it."""
+    image = np.zeros(view.rows * view.columns)
+    add_all(view, particles, share_out(view, particles, *DEPTHS), 1.0, image, entry_capacity(view, *DEPTHS))
+    return image + rng.normal(0.0, np.sqrt(NOISE.read_counts**2 + NOISE.gain_counts * image))
+
+
+def test_what_the_camera_lacks_is_found(view: View, rng: np.random.Generator) -> None:
+    true = rng.uniform((-1.0, -0.9, -3.5, 4e5), (1.0, 0.9, 3.5, 6e5), (60, 4))
+    image = picture(TRUE.applied(view), true, rng)
+    start = true + rng.normal(0.0, (2e-3, 2e-3, 0.03, 1e4), true.shape)
+    fit = fit_nuisances(image, view, start, NOISE, DEPTHS)
+    off, sigma = fit.found.values - TRUE.values, fit.sigma.values
+    assert np.all(np.abs(off) < 4.0 * sigma)
+    # All but the distortion, which is not to be told on so small a sensor, are far outside their errors before.
+    assert np.all(np.abs(TRUE.values[:4]) > 8.0 * sigma[:4])
+    np.testing.assert_allclose(fit.view.centres_mm, TRUE.applied(view).centres_mm, atol=4.0 * sigma[0])
+    depth_error = np.median(np.abs(fit.particles[:, 2] - true[:, 2]))
+    assert depth_error < 0.01
+
+
+def test_a_camera_that_is_right_is_left_as_it_is(view: View, rng: np.random.Generator) -> None:
+    true = rng.uniform((-1.0, -0.9, -3.5, 4e5), (1.0, 0.9, 3.5, 6e5), (30, 4))
+    fit = fit_nuisances(picture(view, true, rng), view, true, NOISE, DEPTHS)
+    assert np.all(np.abs(fit.found.values) < 4.0 * fit.sigma.values)
