@@ -36,7 +36,7 @@ class Case:
     noisy: bool
     voxel_mm: tuple[float, float, float] = (0.1 / 3.0, 0.1 / 3.0, 0.2)
     solver: str = "em"
-    iterations: int = 16
+    iterations: int = 24
     accelerate: bool = True
     exponent: float = 0.5
 

@@ -29,6 +29,7 @@ from lfpiv_cli.reconstruction.equations import Normalisers, normalisers
 from lfpiv_cli.reconstruction.images import (
     Image,
     Mask,
+    as_if_lit,
     defects,
     filled,
     light,
@@ -222,8 +223,7 @@ def _solved(bench: Bench, image: Image, excluded: Mask, advance: Callable[[int],
     """Return the reconstruction of an image in the weights' frame."""
     operator, sums = bench.content.weights.padded, bench.sums
     if sums is None:
-        # where nothing is known, a line of sight must not count as dark
-        operator = operator.for_image(np.where(excluded, image.max(), image))
+        operator = operator.for_image(as_if_lit(image, excluded))
         sums = normalisers(operator, excluded)
     elif excluded is not bench.excluded:
         sums = sums.without(operator, excluded)

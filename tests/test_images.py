@@ -8,6 +8,7 @@ from scipy import ndimage
 
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.reconstruction.images import (
+    as_if_lit,
     defects,
     filled,
     light,
@@ -80,3 +81,10 @@ def test_noise_alone_leaves_this_residual(rng):
     # without the photons of a count only the read noise is known
     assert noise_residual(recorded.astype(np.float32)) == pytest.approx(6.0 * 400 / np.linalg.norm(recorded), rel=0.02)
     assert noise_residual(np.zeros((3, 3), np.float32)) == 0.0
+
+
+def test_excluded_pixels_may_be_lit():
+    image = np.array([[1.0, 9.0, 5.0, 7.0]], np.float32)
+    excluded = np.array([[True, False, False, False]])
+    np.testing.assert_allclose(as_if_lit(image, excluded), [[9.0, 9.0, 5.0, 7.0]], rtol=1e-3)
+    assert not as_if_lit(image, np.ones((1, 4), bool)).any()

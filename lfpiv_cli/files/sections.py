@@ -188,7 +188,7 @@ class ReconstructionSection(Section):
     photons_per_count: Positive | None = None
     saturation_counts: Positive | None = None
     particle_diameter_mm: Positive = 0.05
-    iterations: Annotated[int, Field(ge=1, le=100_000)] = 16
+    iterations: Annotated[int, Field(ge=1, le=100_000)] = 24
     relaxation: Annotated[float, Field(gt=0.0, le=2.0)] = 1.0
     accelerate: bool = True
     padding_voxel: (

@@ -26,6 +26,8 @@ DEFECT_SIGMAS = 8.0
 # Resampling: a pixel with more than this share of its light from unusable ones is unusable, too.
 TOUCHED_SHARE = 0.1
 MAD_TO_SIGMA = 1.4826
+# Bright pixels are as bright as this percentile of all; single ones may be brighter for any reason.
+BRIGHTEST_PERCENTILE = 99.9
 # Median of |x| of a normal distribution, in standard deviations.
 HALF_NORMAL_MEDIAN = 0.6745
 
@@ -136,6 +138,13 @@ def filled(image: Image, unusable: Mask) -> Image:
 def touched(mask: Mask, prepare: Callable[[Image], Image]) -> Mask:
     """Return which pixels of the frame that `prepare` carries an image into take light from masked ones."""
     return np.asarray(np.abs(prepare(mask.astype(np.float32))) > TOUCHED_SHARE)
+
+
+def as_if_lit(image: Image, excluded: Mask) -> Image:
+    """Return an image whose excluded pixels are as bright as its bright ones: a line of sight may end on them."""
+    usable = image[~excluded]
+    bright = np.percentile(usable, BRIGHTEST_PERCENTILE) if usable.size else 0.0
+    return np.where(excluded, np.float32(bright), image)
 
 
 def noise_residual(image: Image, photons_per_count: float | None = None) -> float:
