@@ -21,10 +21,12 @@ from lfpiv_cli.optics.camera import Camera
 FEWEST_DOTS = 6
 # Dots off the common board are left out; without them others may turn out to be off, and a third look settles it.
 OUTLIER_ROUNDS = 3
-# What all dots have in common does not show in their scatter. On rendered boards it was 1 to 8 um of depth, two
-# thousandths of the depth over which the main lens's rim moves a dot by a microlens, up to 0.1 um sideways, a half
-# thousandth of a microlens, and 3e-5 of the magnification.
+# What all dots have in common does not show in their scatter. On rendered boards it was 1 to 10 um of depth, two
+# thousandths of the depth over which the main lens's rim moves a dot by a microlens, and more behind microlenses of few
+# pixels, which see the main lens in coarse patches: as the inverse square of their width below this many pixels.
+# Sideways it was up to 0.1 um, a half thousandth of a microlens, and 3e-5 of the magnification.
 COMMON_SHARE_OF_LENS_DEPTH = 2e-3
+COARSE_LENS_PX = 18.0
 COMMON_SHARE_OF_LENS = 5e-4
 COMMON_SCALE = 3e-5
 # A distortion that chance explains is reported and not applied: few dots know their scatter badly.
@@ -153,7 +155,8 @@ def common_errors_mm(camera: Camera) -> tuple[float, float]:
     """Return the standard errors of place and depth that all dots share."""
     lens = float(camera.lattice.pitch.max()) / abs(camera.magnification)
     lens_depth = lens / camera.aperture_radius_mm * camera.focus_distance_mm
-    return COMMON_SHARE_OF_LENS * lens, COMMON_SHARE_OF_LENS_DEPTH * lens_depth
+    coarse = max(1.0, COARSE_LENS_PX * camera.pixel_mm / float(camera.lattice.pitch.min())) ** 2
+    return COMMON_SHARE_OF_LENS * lens, COMMON_SHARE_OF_LENS_DEPTH * coarse * lens_depth
 
 
 def total_distortion(bent: FlatFit, camera: Camera) -> tuple[float | None, float | None]:
