@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from lfpiv_cli.reconstruction.equations import normalisers
 from lfpiv_cli.reconstruction.solvers import reconstruct
 from lfpiv_cli.stages_simulate import misalignment_of, readout_of
 from lfpiv_cli.synthetic.board import BoardPlacement, dot_centres
-from lfpiv_cli.validation.board import DEPTHS_MM, PAPER, DotFigures, board_figures, measure_dots
+from lfpiv_cli.validation.board import DEPTHS_MM, MEASURES, PAPER, DotFigures, board_figures, measure_dots
 from lfpiv_cli.validation.board_bench import BoardBench, ideal_bench, recorded_bench
 from lfpiv_cli.validation.board_pictures import board_figure
 
@@ -32,24 +32,39 @@ def validate_board(config: Path, output: Path, overwrite: bool, console: Console
     simulation gives it (recorded), or both, as validation.board.images has it.
     """
     settings = load_config(config)
-    chosen = settings.validation.board.images
-    halves = ("ideal", "recorded") if chosen == "both" else (chosen,)
+    chosen = settings.validation.board
+    halves = ("ideal", "recorded") if chosen.images == "both" else (chosen.images,)
+    columns = [(half, method) for half in halves for method in chosen.methods]
     report = output / "board.json"
-    pictures = {half: output / f"board_{half}.png" for half in halves}
+    drawings = {column: output / f"board_{'_'.join(column)}.png" for column in columns}
     prepare_folder([report])
-    for path in (report, *pictures.values()):
+    for path in (report, *drawings.values()):
         ensure_writable(path, overwrite, [config])
     ensure_drawing()
-    figures: dict[str, dict[str, Any]] = {}
-    with console.progress(len(halves) * len(DEPTHS_MM) * settings.reconstruction.iterations, "boards") as advance:
+    figures: dict[str, dict[str, Any]] = {half: {} for half in halves}
+    board = settings.rig().board
+    with console.progress(len(columns) * len(DEPTHS_MM) * settings.reconstruction.iterations, "boards") as advance:
         for half in halves:
-            dots, drawn = _boards(_bench(settings, half), settings, console, advance)
-            board = settings.rig().board
-            figures[half] = board_figures(dots, DEPTHS_MM, board.dots, board.spacing_mm) | {"paper": PAPER[half]}
-            write_picture(pictures[half], board_figure(figures[half], drawn, settings.grid()), overwrite)
+            bench = _bench(settings, half)
+            pictures = [bench.picture(_placement(settings, depth)) for depth in DEPTHS_MM]
+            for method in chosen.methods:
+                judged = bench if method == "ert" else bench.with_fitted_rays(pictures, DEPTHS_MM)
+                dots, drawn = _boards(judged, pictures, settings, console, advance)
+                measured = board_figures(dots, DEPTHS_MM, board.dots, board.spacing_mm)
+                figures[half][method] = measured | {"paper": PAPER[half, method]}
+                write_picture(drawings[half, method], board_figure(measured, drawn, settings.grid()), overwrite)
     provenance = record("validate board", settings.resolved(), {"config": config})
     write_json(report, {"figures": figures, "provenance": provenance}, overwrite)
-    return {f"{half}.{name}": figures[half][name] for half in halves for name in (*PAPER[half], "depth_error_mass")}
+    return {
+        f"{half}.{method}.{name}": figures[half][method][name]
+        for half, method in columns
+        for name in (*MEASURES, "depth_error_mass")
+    }
+
+
+def _placement(settings: Config, depth_mm: float) -> BoardPlacement:
+    scene = settings.simulation
+    return BoardPlacement(depth_mm, scene.board_offset_mm, scene.board_tilt_deg, scene.board_rotation_deg)
 
 
 def _bench(settings: Config, half: str) -> BoardBench:
@@ -72,28 +87,31 @@ def _bench(settings: Config, half: str) -> BoardBench:
 
 
 def _boards(
-    bench: BoardBench, settings: Config, console: Console, advance: Callable[[int], None]
+    bench: BoardBench,
+    pictures: Sequence[NDArray[np.float32]],
+    settings: Config,
+    console: Console,
+    advance: Callable[[int], None],
 ) -> tuple[list[DotFigures], NDArray[np.float32]]:
-    """Return what is measured of the boards at all depths, and the volume of the one in the focal plane."""
-    board, scene, solver = settings.rig().board, settings.simulation, settings.reconstruction
-    operator = bench.weights.padded
-    sums = normalisers(operator, bench.excluded)
+    """Return what is measured of the boards in pictures at all depths, and the volume of the one in the focal plane."""
+    board, solver = settings.rig().board, settings.reconstruction
+    sums = None if bench.weights.on_demand else normalisers(bench.weights.padded, bench.excluded)
     dots, drawn = [], np.zeros(bench.weights.shape, np.float32)
-    for depth in DEPTHS_MM:
-        placement = BoardPlacement(depth, scene.board_offset_mm, scene.board_tilt_deg, scene.board_rotation_deg)
+    for depth, picture in zip(DEPTHS_MM, pictures, strict=True):
+        operator = bench.weights.padded.for_image(picture)
         result = reconstruct(
             operator,
-            bench.picture(placement),
+            picture,
             solver.solver,
             solver.iterations,
             solver.relaxation,
             solver.accelerate,
-            sums,
+            sums or normalisers(operator, bench.excluded),
             advance,
             solver.start,
         )
         volume = bench.weights.to_world(result.volume)
-        centres = dot_centres(board, placement)[:, :2]
+        centres = dot_centres(board, _placement(settings, depth))[:, :2]
         dots.append(measure_dots(volume, bench.weights.grid, centres, 0.5 * board.spacing_mm))
         drawn = volume if depth == 0.0 else drawn
         console.detail(f"board at {depth:+.0f} mm: residual {result.residual[-1]:.3f}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -79,8 +80,9 @@ def test_validate_board_on_a_small_camera(tmp_path):
     small.write_text(text)
     cli.main(["validate", "board", str(small), "-o", str(tmp_path / "report")], standalone_mode=False)
     report = json.loads((tmp_path / "report" / "board.json").read_text())["figures"]
-    for half in ("ideal", "recorded"):
-        assert report[half]["lateral_error"] < 0.02
-        assert report[half]["depth_error"] < 0.3
-        assert (tmp_path / "report" / f"board_{half}.png").stat().st_size > 10_000
-    assert report["recorded"]["by_depth"]["centre_mm"] != report["ideal"]["by_depth"]["centre_mm"]
+    for half, method in product(("ideal", "recorded"), ("ert", "dlfc")):
+        assert report[half][method]["lateral_error"] < 0.02
+        assert report[half][method]["depth_error"] < 0.3
+        assert (tmp_path / "report" / f"board_{half}_{method}.png").stat().st_size > 10_000
+    centres = {str(each["by_depth"]["centre_mm"]) for half in report.values() for each in half.values()}
+    assert len(centres) == 4

@@ -358,9 +358,14 @@ class WeightsValidation(Section):
 
 
 class BoardValidation(Section):
-    """The pictures of `validate board`: without faults (ideal), with the simulation's (recorded), or both."""
+    """What `validate board` does.
+
+    images: without faults (ideal), with the simulation's (recorded), or both. methods: ways to the weights, equivalent
+    points (ert) and rays fitted to the boards (dlfc), whose columns take some minutes a board.
+    """
 
     images: Literal["ideal", "recorded", "both"] = "ideal"
+    methods: Annotated[tuple[Literal["ert", "dlfc"], ...], Field(min_length=1)] = ("ert",)
 
 
 class ValidationSection(Section):

@@ -9,7 +9,8 @@ aperture's mask follow from the camera and are computed again on reading.
 Where the axes do not separate there is, in place of `columns` and `rows`, `on_demand` (what rays cross: `method`,
 `refraction`, refractive indices, window; or the method dlfc alone, whose rays the calibration has), from which columns
 are integrated when needed; where rays were counted, `counted` (`start`, `pixel`, `share` of each voxel in the order of
-the sensor's axes). `vignetting` (coefficients, see `calibration.transmission`) scales the pixels on reading. Version 1 had none of these.
+the sensor's axes). `vignetting` (coefficients, see `calibration.transmission`) scales the pixels on reading. Version 1
+had none of these.
 """
 
 from __future__ import annotations

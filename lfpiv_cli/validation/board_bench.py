@@ -2,16 +2,18 @@
 
 The ideal one is the data sheet's, its pictures free of noise and their light refracted paraxially. The real one has an
 array that is turned and shifted, a main lens that distorts, a sensor with noise, and light refracted exactly; it is
-calibrated from a white picture and one of a board in air, and nothing else is known of it.
+calibrated from a white picture and one of a board in air, and nothing else is known of it. Weights are those of
+equivalent points, or of rays fitted to the very boards (DLFC).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lfpiv_cli.calibration.dlfc import fit_rays
 from lfpiv_cli.calibration.model import Rig, calibrate
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.object_space import ObjectSpace
@@ -20,6 +22,7 @@ from lfpiv_cli.synthetic.board import BoardPlacement, render_board
 from lfpiv_cli.synthetic.scenes import Misalignment, dark_frame, simulate_board, simulate_white
 from lfpiv_cli.synthetic.sensor import Readout
 from lfpiv_cli.weights.build import factorise_through, scene_distortion
+from lfpiv_cli.weights.columns import OnDemandOperator
 from lfpiv_cli.weights.model import Weights
 
 # The board that calibrates the real camera stands so far behind the focal plane, in air, where depth shows well.
@@ -32,14 +35,22 @@ class BoardBench:
 
     Attributes
     ----------
+    rig : its camera with the lattice of the weights' frame
     weights : of the volume in which boards are reconstructed
     picture : gives the picture (rows, columns) of a board in its place, in the weights' frame, dark taken off
     excluded : pixels (rows, columns) of that frame that lie off the sensor
     """
 
+    rig: Rig
     weights: Weights
     picture: Callable[[BoardPlacement], Image]
     excluded: Mask
+
+    def with_fitted_rays(self, pictures: Sequence[Image], depths_mm: Sequence[float]) -> BoardBench:
+        """Return the bench with weights of rays fitted to pictures of its board at depths."""
+        rays = fit_rays(pictures, depths_mm, self.rig.camera, self.rig.board, self.rig.media).rays
+        operator = OnDemandOperator(self.rig.camera, rays, self.weights.grid)
+        return replace(self, weights=replace(self.weights, solver_operator=operator, scene_distortion_per_mm2=None))
 
 
 def ideal_bench(rig: Rig, grid: Grid, level: float, rng: np.random.Generator) -> BoardBench:
@@ -50,7 +61,7 @@ def ideal_bench(rig: Rig, grid: Grid, level: float, rng: np.random.Generator) ->
     def picture(placement: BoardPlacement) -> Image:
         return render_board(rig.camera, space, rig.board, placement, level, rng).astype(np.float32)
 
-    return BoardBench(weights, picture, np.zeros(weights.image_shape, np.bool_))
+    return BoardBench(rig, weights, picture, np.zeros(weights.image_shape, np.bool_))
 
 
 def recorded_bench(
@@ -87,4 +98,4 @@ def recorded_bench(
         recorded = simulate_board(real, true, rig.board, placement, level, readout, rng).image
         return weights.prepare(light(recorded.astype(np.float32), dark.astype(np.float32)))
 
-    return BoardBench(weights, picture, ~calibration.rectification.inside)
+    return BoardBench(replace(rig, camera=camera), weights, picture, ~calibration.rectification.inside)

@@ -86,7 +86,8 @@ def flow_figures(field: VectorField, truth_velocity: NDArray[np.float64], inside
     -------
     dict
         Counts; `streamwise_mean_error` (sum v / sum u - 1); `within_25_percent_streamwise` and `..._vector` (shares of
-        all windows inside); `rms_u_voxel`, `bias_u_voxel` and so on for v, w; `slices` along each axis; `cumulative`.
+        all windows inside); `rms_u_voxel`, `bias_u_voxel`, `slope_u` (of measured on true through zero) and so on for
+        v, w; `slices` along each axis; `cumulative`.
     """
     pairs = compare(field, truth_velocity, inside)
     streamwise, vector = relative_errors(pairs)
@@ -144,14 +145,19 @@ def _mean_error(measured_sum: float, true_sum: float) -> float | None:
 
 
 def _component_figures(field: VectorField, pairs: Comparison) -> dict[str, float | None]:
-    """Return rms and bias of each component in voxels over the vectors found."""
-    names = [f"{figure}_{component}_voxel" for component in "uvw" for figure in ("rms", "bias")]
+    """Return rms and bias of each component in voxels, and its slope of measured on true, over the vectors found."""
+    names = [f"{figure}_{component}" for component in "uvw" for figure in ("rms", "bias", "slope")]
+    names = [name if name.startswith("slope") else f"{name}_voxel" for name in names]
     if field.dt_s is None or not pairs.found.any():
         return dict.fromkeys(names)
     to_voxel = field.dt_s / (np.asarray(field.voxel_mm) * MM_TO_M)
-    error = (pairs.measured - pairs.true)[pairs.found] * to_voxel
+    measured, true = pairs.measured[pairs.found], pairs.true[pairs.found]
+    error = (measured - true) * to_voxel
     rms, bias = np.sqrt(np.mean(error**2, axis=0)), np.mean(error, axis=0)
-    return dict(zip(names, (float(value) for pair in zip(rms, bias, strict=True) for value in pair), strict=True))
+    power = np.sum(true**2, axis=0)
+    slope = [float(m @ t / p) if p > 0.0 else None for m, t, p in zip(measured.T, true.T, power, strict=True)]
+    values = [value for k in range(3) for value in (float(rms[k]), float(bias[k]), slope[k])]
+    return dict(zip(names, values, strict=True))
 
 
 def _slices(field: VectorField, pairs: Comparison, axis: int) -> dict[str, list[float | None]]:

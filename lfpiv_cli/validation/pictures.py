@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.flow.field import VectorField
+from lfpiv_cli.validation.channel import PAPER_SLICES, Duct, table_4
 from lfpiv_cli.validation.flow import Comparison, compare, cumulative_distribution
 
 if TYPE_CHECKING:
@@ -40,6 +41,55 @@ def flow_figure(field: VectorField, truth_velocity: NDArray[np.float64], inside:
     for axis in range(3):
         _draw_profile(axes[1, axis], field, truth_velocity, inside, axis, main)
     return figure
+
+
+def slices_figure(
+    field: VectorField, truth_velocity: NDArray[np.float64], inside: NDArray[np.bool_], duct: Duct
+) -> Figure:
+    """Return the paper's six slices: streamwise profiles across each (Fig. 16), and their errors beside Table 4's.
+
+    Profiles are means along the flow, over the planes of windows on both sides of a slice.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(12.0, 7.0), layout="constrained")
+    axes = figure.subplots(2, 3)
+    table = table_4(field, truth_velocity, inside, duct)
+    main = "xyz".index(duct.axis)
+    measured = np.where(inside[..., np.newaxis], field.velocity, np.nan)
+    for row, (name, axis) in zip(axes, duct.across.items(), strict=True):
+        other = 3 - axis - main
+        for panel, share in zip(row, PAPER_SLICES[name], strict=True):
+            position = duct.position_mm(axis, share)
+            places = field.grid.axis_mm(other)
+            for values, style, label in ((truth_velocity, "-", "true"), (measured, "o", "measured")):
+                profile = _profile_at(values[..., main], field.grid.axis_mm(axis), position, axis, main)
+                panel.plot(places, profile, style, markersize=4, label=label)
+            errors = table[f"{name} {share}"]
+            ours = "unknown" if errors["ours_percent"] is None else f"{errors['ours_percent']:.2f} %"
+            panel.set(
+                title=f"{name} = {share}: {ours} (paper {errors['paper_ert_percent']:.2f} %)",
+                xlabel=f"{'xyz'[other]} (mm)",
+                ylabel=f"{COMPONENT_NAMES[main]} (m/s)",
+            )
+            panel.legend()
+    return figure
+
+
+def _profile_at(
+    values: NDArray[np.float64], places: NDArray[np.float64], position: float, axis: int, along: int
+) -> NDArray[np.float64]:
+    """Return a slice across one axis (0 for x) of values [z, y, x], interpolated, and its mean along another."""
+    at = float(np.clip(np.interp(position, places, np.arange(places.size)), 0, places.size - 1))
+    low = min(int(at), max(0, places.size - 2))
+    high = min(low + 1, places.size - 1)
+    planes = np.moveaxis(values, (2 - axis, 2 - along), (0, 1))
+    known = np.isfinite(planes[low]) & np.isfinite(planes[high])
+    between = np.where(known, (1.0 - (at - low)) * planes[low] + (at - low) * planes[high], 0.0)
+    count = known.sum(axis=0)
+    profile = np.full(count.shape, np.nan)
+    np.divide(between.sum(axis=0), count, out=profile, where=count > 0)
+    return profile
 
 
 def _mid_plane(values: NDArray) -> NDArray:
