@@ -182,9 +182,9 @@ def correlate(**arguments: Any) -> dict[str, Any]:
     \b
     Example: lfpiv correlate volumes/a.vtkhdf volumes/b.vtkhdf -o vectors.vtkhdf
     """
-    from lfpiv_cli import stages
+    from lfpiv_cli import stages_correlate
 
-    return stages.correlate(**arguments)
+    return stages_correlate.correlate(**arguments)
 
 
 @cli.command("track")
@@ -210,7 +210,7 @@ def track(**arguments: Any) -> dict[str, Any]:
 @cli.command("validate")
 @click.argument("what", type=click.Choice(["flow", "weights", "board", "volume"]))
 @click.argument("config", type=INPUT)
-@click.option("--vectors", type=INPUT, help="flow: vectors to judge.")
+@click.option("--vectors", type=INPUT, help="flow: vectors to judge, not those of a simulation.")
 @click.option("--volume", type=INPUT, help="volume: volume to judge.")
 @click.option("--particles", type=INPUT, help="volume, flow: true particles (.npz) to judge by; flow needs none.")
 @click.option("--frame", type=click.Choice(["a", "middle", "b"]), help="volume: when in the pair it was taken.")
@@ -223,6 +223,7 @@ def validate(
 
     \b
     Example: lfpiv validate flow rig.yaml --vectors vectors.vtkhdf -o report
+             lfpiv validate flow rig.yaml -o report    (simulates the rig's experiment first)
              lfpiv validate weights rig.yaml -o report
              lfpiv validate board rig.yaml -o report
              lfpiv validate volume rig.yaml --volume a.vtkhdf --particles true.npz --frame a -o report
@@ -236,11 +237,9 @@ def validate(
 
         return stages_volume.validate_volume(volume=volume, particles=particles, frame=frame, **arguments)
     if what == "flow":
-        if vectors is None:
-            raise click.UsageError("validate flow needs --vectors")
-        from lfpiv_cli import stages
+        from lfpiv_cli import stages_flow
 
-        return stages.validate_flow(vectors=vectors, particles=particles, **arguments)
+        return stages_flow.validate_flow(vectors=vectors, particles=particles, **arguments)
     if vectors is not None or particles is not None:
         raise click.UsageError(f"validate {what} takes neither --vectors nor --particles")
     if what == "board":

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.flow.field import REJECTED, VALID, VectorField
 from lfpiv_cli.grid import Grid
+from lfpiv_cli.validation.channel import Duct, table_4
 from lfpiv_cli.validation.flow import (
     compare,
     cumulative_distribution,
@@ -66,6 +67,9 @@ def test_components_are_in_their_own_voxels(truth: NDArray[np.float64], inside: 
     assert figures["rms_u_voxel"] == pytest.approx(np.sqrt((0.1**2 + 0.3**2) / 2))
     assert figures["bias_v_voxel"] == pytest.approx(-0.2)
     assert figures["bias_w_voxel"] == pytest.approx(0.2)
+    # Only v flows at all: 1.0 less 0.02 m/s at speeds of 0.1 to 0.5 m/s.
+    assert figures["slope_u"] is figures["slope_w"] is None
+    assert figures["slope_v"] == pytest.approx(1.0 - 0.02 * 1.5 / 0.55)
 
 
 def test_streamwise_and_full_vector_shares_differ(truth: NDArray[np.float64], inside: NDArray[np.bool_]) -> None:
@@ -149,6 +153,30 @@ def test_slices_are_planes_and_between_them_interpolated(truth: NDArray[np.float
     pairs = compare(field, truth, inside)
     # Half-way between the planes of 0.1 (measured 0.12) and 0.2 m/s.
     assert streamwise_mean_error_at(field, pairs, 0, 0.4) == pytest.approx(0.32 / 0.3 - 1.0)
+
+
+def test_table_4_takes_the_paper_s_slices_of_a_duct() -> None:
+    across = np.linspace(-4.5, 4.5, 10)
+    grid = Grid((3, 10, 10), (1.0, 1.0, 1.0), (0.0, -4.5, -5.5))
+    truth = np.zeros((10, 10, 3, 3))
+    truth[..., 0] = 0.1
+    # Errors that grow along y and along z: 1 % a mm from the middle of the duct, which lies at z = -1 mm.
+    measured = truth * (1.0 + 0.01 * across[:, np.newaxis] + 0.02 * across[:, np.newaxis, np.newaxis])[..., np.newaxis]
+    everywhere = np.ones(truth.shape[:3], dtype=np.bool_)
+    field = replace(field_of(truth), grid=grid, displacement_voxel=measured * DT_S / (np.array(VOXEL_MM) * 1e-3))
+    duct = Duct(10.0, (0.0, 0.0, -1.0), "x")
+    table = table_4(field, truth, everywhere, duct)
+    assert table["overall"]["ours_percent"] == pytest.approx(0.0, abs=1e-9)
+    for share in (0.3, 0.54, 0.78):
+        assert table[f"z/D {share}"]["ours_percent"] == pytest.approx(20.0 * abs(share - 0.5))
+    assert table["x/D 0.24"]["ours_percent"] == pytest.approx(2.6)
+    assert table["x/D 0.24"]["paper_ert_percent"] == 10.43
+    pytest.importorskip("matplotlib")
+    from lfpiv_cli.validation.pictures import slices_figure
+
+    panel = slices_figure(field, truth, everywhere, duct).axes[0]
+    profile = 0.1 * (1.0 + 0.01 * across + 0.02 * -2.0)
+    np.testing.assert_allclose(panel.lines[1].get_ydata(), profile)
 
 
 def test_cumulative_distribution_meets_the_share(
