@@ -17,6 +17,7 @@ from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.optics.object_space import ObjectSpace
+from lfpiv_cli.optics.polynomial_rays import PolynomialRays, complete_exponents
 from lfpiv_cli.weights import columns as columns_module
 from lfpiv_cli.weights.build import factorise
 from lfpiv_cli.weights.columns import OnDemandOperator
@@ -32,10 +33,21 @@ def turned(table2, layout):
     return replace(table2, columns=380, rows=260, lattice=Lattice.regular(0.1, layout, 0.01, (0.013, -0.021)))
 
 
+def cubic_rays():
+    """Rays fitted somewhere: Table 2's in focus, bent by all terms of third degree."""
+    exponents = complete_exponents(3)
+    bent = np.random.default_rng(5).normal(0.0, 2e-3, (len(exponents), 2))
+    for axis in range(2):
+        bent[exponents[:, axis] * (exponents.sum(axis=1) == 1) == 1, axis] -= 1.0
+    return PolynomialRays(np.array([1.0, 1.0, 4.0, 12.5, 12.5]), exponents, bent)
+
+
+@pytest.mark.parametrize("method", ["ert", "drt", "dlfc"])
 @pytest.mark.parametrize("column_axis", ["x", "y"])
-def test_forward_and_adjoint_are_adjoint(turned, water, window, rng, column_axis):
+def test_forward_and_adjoint_are_adjoint(turned, water, window, rng, column_axis, method):
     camera = replace(turned, column_axis=column_axis)
-    on_demand = OnDemandOperator(camera, ObjectSpace(water, window, "exact"), GRID)
+    source = cubic_rays() if method == "dlfc" else ObjectSpace(water, window, "exact", method)
+    on_demand = OnDemandOperator(camera, source, GRID)
     kept = on_demand.restricted(np.ones(on_demand.image_shape, np.float32))
     for operator in (on_demand, kept, Weights(GRID, (0, 0, 0), on_demand, column_axis)):
         volume = rng.random(operator.shape, dtype=np.float32)
