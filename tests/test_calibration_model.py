@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose, pose_of_dots
 from lfpiv_cli.calibration.lattice import LatticeFit
-from lfpiv_cli.calibration.model import Calibration, Channel, Rig, calibrate, eq21_move_mm, with_mid_plane
+from lfpiv_cli.calibration.model import Calibration, Channel, Rig, advised_move_mm, calibrate, with_mid_plane
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
@@ -62,7 +62,9 @@ def rig(table2: Camera, water: Media) -> Rig:
 
 def test_eq21_by_hand(water: Media) -> None:
     # t_b + t_w/n_ag + D/(2 n_w) = 1.5 + 5/1.49 + 10/2.66
-    assert eq21_move_mm(replace(BOARD, thickness_mm=1.5), CHANNEL, water) == pytest.approx(1.5 + 3.3557047 + 3.7593985)
+    assert advised_move_mm(replace(BOARD, thickness_mm=1.5), CHANNEL, water) == pytest.approx(
+        1.5 + 3.3557047 + 3.7593985
+    )
 
 
 def test_mid_plane_follows_from_board_and_move(plain: Calibration, rig: Rig) -> None:
@@ -77,6 +79,20 @@ def test_mid_plane_follows_from_board_and_move(plain: Calibration, rig: Rig) -> 
     assert with_mid_plane(plain, pose, replace(rig, channel=None)).mid_plane_z_mm is None
     in_water = replace(rig, board=replace(BOARD, medium="fluid"))
     assert with_mid_plane(plain, pose, in_water).camera_move_mm is None
+
+
+def test_mid_plane_follows_from_a_board_in_the_fluid(plain: Calibration, rig: Rig) -> None:
+    pose = exact_pose(-0.35)
+    near_wall = replace(
+        rig, board=replace(BOARD, medium="fluid"), channel=replace(CHANNEL, board_from_mid_plane_mm=-5.0)
+    )
+    advised = with_mid_plane(plain, pose, near_wall)
+    # From the near wall it is 5 mm of water, for the camera 3.76 mm of air; what is missed is missed before and after.
+    assert advised.camera_move_mm == pytest.approx(5.0 / 1.33)
+    assert advised.mid_plane_z_mm == pytest.approx(pose.z0_mm)
+    assert advised.mid_plane_z_sigma_mm == pytest.approx(pose.z0_sigma_mm)
+    unmoved = replace(near_wall, channel=replace(near_wall.channel, camera_move_mm=0.0))
+    assert with_mid_plane(plain, pose, unmoved).mid_plane_z_mm == pytest.approx(pose.z0_mm + 5.0)
 
 
 @pytest.mark.parametrize("with_board", [False, True])

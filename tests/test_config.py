@@ -128,6 +128,7 @@ def test_all_errors_come_in_one_run_in_the_order_of_the_file(write) -> None:
         ("board: {dots: [7, 7], spacing_mm: 0.2, dot_diameter_mm: 0.2}", "less than the spacing of 0.2"),
         ("correlation: {windows: [16, 32]}", "expected coarse to fine"),
         ("correlation: {windows: [16], window_mm: 1.6}", "contradicts window_mm"),
+        ("channel: {width_mm: 9, wall_mm: 2, board_from_mid_plane_mm: 1}", "is for a board in the fluid"),
         ("correlation: {windows: []}", "at least one window"),
         ("correlation: {overlap: 1.0}", "less than 1"),
         ("simulation: {brightness: [2, 1]}", "expected a range"),

@@ -42,12 +42,14 @@ CARRIED = (
 class Channel:
     """The channel that is looked into after the board: its inner width, its wall, and the camera's move in between.
 
-    `camera_move_mm` is positive towards the channel; None stands for Eq. 21's.
+    `camera_move_mm` is positive towards the channel; None stands for the advised one, Eq. 21's. A board in the fluid
+    stood `board_from_mid_plane_mm` behind the mid plane; None: nobody knows.
     """
 
     width_mm: float
     wall_mm: float
     camera_move_mm: float | None = None
+    board_from_mid_plane_mm: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -309,26 +311,35 @@ def ray_fit(
 
 
 def with_mid_plane(calibration: Calibration, pose: BoardPose, rig: Rig) -> Calibration:
-    """Return the calibration with the channel's mid plane, where there is a channel and the board stood in air."""
-    if rig.channel is None or rig.board.medium != "air":
+    """Return the calibration with the channel's mid plane, where there is a channel and the board's place in it known.
+
+    That place is its outer wall for a board in air.
+    """
+    in_fluid = rig.board.medium == "fluid"
+    if rig.channel is None or (in_fluid and rig.channel.board_from_mid_plane_mm is None):
         return calibration
-    advised = eq21_move_mm(rig.board, rig.channel, rig.media)
     return replace(
         calibration,
-        camera_move_mm=advised,
+        camera_move_mm=advised_move_mm(rig.board, rig.channel, rig.media),
         mid_plane_z_mm=mid_plane_z_mm(rig.board, rig.channel, rig.media, pose.z0_mm),
-        mid_plane_z_sigma_mm=pose.z0_sigma_mm / rig.media.depth_ratio,
+        mid_plane_z_sigma_mm=pose.z0_sigma_mm / (1.0 if in_fluid else rig.media.depth_ratio),
     )
 
 
-def eq21_move_mm(board: BoardGeometry, channel: Channel, media: Media) -> float:
-    """Return d_m = t_b + t_w/n_ag + D/(2 n_w), the camera's move from the board to the mid plane (Eq. 21), n_a = 1."""
+def advised_move_mm(board: BoardGeometry, channel: Channel, media: Media) -> float:
+    """Return the camera's move that takes its focal plane from the board to the mid plane.
+
+    In air d_m = t_b + t_w/n_ag + D/(2 n_w) (Eq. 21, n_a = 1); from a board in the fluid n_a/n_w times its distance.
+    """
+    if board.medium == "fluid":
+        return -(channel.board_from_mid_plane_mm or 0.0) * media.depth_ratio
     wall = channel.wall_mm * media.air / media.window
     return board.thickness_mm + wall + 0.5 * channel.width_mm * media.depth_ratio
 
 
 def mid_plane_z_mm(board: BoardGeometry, channel: Channel, media: Media, board_z_mm: float) -> float:
-    """Return the depth of the channel's mid plane in the fluid after the camera's move (d_m of Eq. 21 unless given)."""
-    advised = eq21_move_mm(board, channel, media)
+    """Return the depth of the channel's mid plane in the fluid after the camera's move; `board_z_mm` in its medium."""
+    advised = advised_move_mm(board, channel, media)
     moved = advised if channel.camera_move_mm is None else channel.camera_move_mm
-    return (board_z_mm + advised - moved) / media.depth_ratio
+    apparent = board_z_mm * (media.depth_ratio if board.medium == "fluid" else 1.0)
+    return (apparent + advised - moved) / media.depth_ratio

@@ -119,7 +119,7 @@ def board_of(section: BoardSection) -> BoardGeometry:
 
 def channel_of(section: ChannelSection) -> Channel:
     """Return the channel."""
-    return Channel(section.width_mm, section.wall_mm, section.camera_move_mm)
+    return Channel(section.width_mm, section.wall_mm, section.camera_move_mm, section.board_from_mid_plane_mm)
 
 
 def grid_of(section: VolumeSection, camera: CameraSection | None, origin_z_mm: float) -> Grid:

@@ -94,6 +94,9 @@ def _scene(sections: Sections) -> Found:
             ("board", "dot_diameter_mm"),
             f"is {board.dot_diameter_mm:g}, expected less than the spacing of {board.spacing_mm:g}",
         )
+    in_fluid = board is not None and board.medium == "fluid"
+    if channel is not None and channel.board_from_mid_plane_mm is not None and not in_fluid:
+        yield ("channel", "board_from_mid_plane_mm"), "is for a board in the fluid; one in air stands on the outer wall"
     if window is not None and channel is not None and _disagree(window.thickness_mm, channel.wall_mm):
         yield ("window", "thickness_mm"), f"is {window.thickness_mm:g}, but channel.wall_mm is {channel.wall_mm:g}"
 

@@ -142,11 +142,15 @@ class BoardSection(Section):
 
 
 class ChannelSection(Section):
-    """The channel of Eq. 21: inner width D, wall t_w, and the camera's move after the board (default: Eq. 21's d_m)."""
+    """The channel of Eq. 21: inner width D, wall t_w, and the camera's move after the board (default: Eq. 21's d_m).
+
+    board_from_mid_plane_mm: how far behind the mid plane a board in the fluid stood; one in air: on the wall.
+    """
 
     width_mm: Positive
     wall_mm: NotNegative
     camera_move_mm: float | None = None
+    board_from_mid_plane_mm: float | None = None
 
 
 class WeightsSection(Section):
