@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from lfpiv_cli import stages_particles
 from lfpiv_cli.console import Console
-from lfpiv_cli.errors import LfpivError, PartialError, UsageError
+from lfpiv_cli.errors import InputError, PartialError, UsageError
 from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.files.batch import Frame, Target, frames_of, output_paths, pending, prepare_folder
@@ -100,6 +100,14 @@ class Bench:
     sums: Normalisers | None
 
 
+@dataclass(frozen=True)
+class Outcome:
+    """What is told of a frame: its relative residual, and how many of its pixels took no part."""
+
+    residual: float
+    excluded_pixels: int
+
+
 def reconstruct(
     weights: Path,
     images: Sequence[Path],
@@ -132,19 +140,8 @@ def reconstruct(
         accelerate=accelerate,
         start=start,
     )
-    made_of = _sequence_digests(level, frames)
-    targets = [
-        Target(
-            path,
-            record(
-                f"reconstruct page {frame.page}{made_of[number]}", settings.resolved(), common | {"image": frame.path}
-            ),
-        )
-        for number, (path, frame) in enumerate(zip(paths, frames, strict=True))
-    ]
-    needed = pending(
-        targets, [*common.values(), *images], overwrite, resume, lambda p: vtkhdf.read_header(p).provenance
-    )
+    targets = _targets(paths, frames, level, settings, common)
+    needed = pending(targets, [*common.values(), *images], overwrite, resume, _record_of)
     as_particles = settings.reconstruction.solver == "particles"
     if as_particles:
         if mask is not None:
@@ -153,43 +150,42 @@ def reconstruct(
     bench = _bench(content, settings, dark, mask, bool(needed))
     read = _reader(level, frames, bench)
     steps = stages_particles.STEPS if as_particles else settings.reconstruction.iterations
-    residuals: list[float] = []
-    excluded: list[int] = []
+    outcomes: list[Outcome] = []
     failures: list[str] = []
     with console.progress(len(needed) * steps, "reconstruct") as advance:
         for number, future in _ahead(read, needed):
-            target = targets[number]
             try:
                 raw, lit = future.result()
-                if as_particles and bench.sums is not None:
-                    residuals.append(
-                        stages_particles.write_frame(
-                            content, settings, lit, bench.sums, target.path, target.record, overwrite, advance
-                        )
-                    )
-                    continue
-                image, out = _prepared(bench, raw, lit)
-                result = _solved(bench, image, out, advance)
-            except LfpivError as error:
+                outcomes.append(_make(bench, targets[number], raw, lit, overwrite, advance))
+            except InputError as error:
                 if not keep_going:
                     raise
                 failures.append(str(error))
                 console.say(f"lfpiv: {error}")
-                continue
-            residuals.append(float(result.residual[-1]))
-            excluded.append(int(np.count_nonzero(out)))
-            _write(target, content, result, excluded[-1], overwrite)
     if failures:
         raise PartialError(f"{len(failures)} of {len(frames)} frames failed, the first because {failures[0]}")
     return {
         "frames": len(frames),
-        "reconstructed": len(residuals),
+        "reconstructed": len(outcomes),
         "skipped": len(frames) - len(needed),
         "solver": settings.reconstruction.solver,
         "iterations": None if as_particles else settings.reconstruction.iterations,
-        "residual": max(residuals, default=None),
-        "excluded_pixels": max(excluded, default=None),
+        "residual": max((outcome.residual for outcome in outcomes), default=None),
+        "excluded_pixels": max((outcome.excluded_pixels for outcome in outcomes), default=None),
     }
+
+
+def _targets(
+    paths: Sequence[Path], frames: Sequence[Frame], level: Background, settings: Config, common: Mapping[str, Path]
+) -> list[Target]:
+    """Return where each frame's result goes and the record that it will carry."""
+    made_of = _sequence_digests(level, frames)
+    return [
+        Target(
+            path, record(f"reconstruct page {frame.page}{words}", settings.resolved(), {**common, "image": frame.path})
+        )
+        for path, frame, words in zip(paths, frames, made_of, strict=True)
+    ]
 
 
 def _record_of(path: Path) -> dict[str, Any]:
@@ -209,6 +205,22 @@ def _bench(content: WeightsFile, settings: Config, dark: Path | None, mask: Path
         excluded |= ~weights.calibration.rectification.inside
     sums = normalisers(weights.padded, excluded) if needed and not weights.on_demand else None
     return Bench(content, settings, dark_image, lasting, excluded, sums)
+
+
+def _make(
+    bench: Bench, target: Target, raw: Image, lit: Image, overwrite: bool, advance: Callable[[int], None]
+) -> Outcome:
+    """Make and write the particles or the volume of a frame."""
+    if bench.sums is not None and bench.settings.reconstruction.solver == "particles":
+        residual = stages_particles.write_frame(
+            bench.content, bench.settings, lit, bench.sums, target.path, target.record, overwrite, advance
+        )
+        return Outcome(residual, 0)
+    image, excluded = _prepared(bench, raw, lit)
+    result = _solved(bench, image, excluded, advance)
+    outcome = Outcome(float(result.residual[-1]), int(np.count_nonzero(excluded)))
+    _write(target, bench.content, result, outcome.excluded_pixels, overwrite)
+    return outcome
 
 
 def _prepared(bench: Bench, raw: Image, lit: Image) -> tuple[Image, Mask]:
