@@ -51,7 +51,10 @@ def volume_of(weights: Path, image: Path, output: Path, *options: object) -> np.
     return open_volume(output).array
 
 
-def test_what_the_mask_hides_does_not_matter(weights, frame, tmp_path):
+@pytest.mark.parametrize("layout", ["square", "hexagonal"])
+def test_what_the_mask_hides_does_not_matter(weights, layout, frame, tmp_path):
+    if layout == "hexagonal":  # whose columns are made on demand
+        weights = build(tmp_path, ("layout: square", "layout: hexagonal"), ("[16, 12, 20]", "[6, 5, 4]"))
     mask = np.full(frame.shape, 255, np.uint8)
     mask[REFLECTION] = 0
     tifffile.imwrite(tmp_path / "mask.tif", mask)
