@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lfpiv_cli.errors import ConfigError, InputError
-from lfpiv_cli.flow.correlation import correlate, count_passes
+from lfpiv_cli.flow.correlation import correlate, correlate_ensemble, count_passes
 from lfpiv_cli.flow.deformation import (
     SLACK,
     SPLINE_PAD,
@@ -20,7 +20,7 @@ from lfpiv_cli.flow.deformation import (
     spline_matrix,
 )
 from lfpiv_cli.flow.field import MASKED, REJECTED, VectorField
-from lfpiv_cli.flow.maps import correlation_maps, margins
+from lfpiv_cli.flow.maps import map_sums, margins
 from lfpiv_cli.flow.peaks import find_peaks, vertex
 from lfpiv_cli.flow.windows import layout_windows
 from lfpiv_cli.grid import Grid
@@ -109,7 +109,7 @@ def test_maps_are_the_symmetric_normalised_correlation(
     before, after = margins(layout, a.shape, 2)
     margin = list(zip(before, after, strict=True))
     padded_a, padded_b = np.pad(a, margin), np.pad(b, margin)
-    maps = correlation_maps(padded_a, padded_b, layout, before, 2)
+    maps = map_sums(padded_a, padded_b, layout, before, 2).correlation()
 
     def window(volume: NDArray[np.float32], index: tuple[int, ...], shift: tuple[int, ...]) -> NDArray[np.float64]:
         start = [
@@ -376,6 +376,27 @@ def test_voxels_that_are_not_finite_are_masked(rng: np.random.Generator) -> None
     a[20, 20, 20] = np.nan
     field = correlate(a, b, unit_grid(shape), [(16, 16, 16)], HALF, 1e-3)
     np.testing.assert_allclose(field.displacement_voxel, np.broadcast_to(shift, (*field.flag.shape, 3)), atol=CORNER)
+
+
+def test_an_ensemble_finds_what_its_pairs_are_too_sparse_for(rng: np.random.Generator) -> None:
+    shape, shift = (40, 40, 40), (1.3, -0.7, 0.4)
+    pairs = [moving_pair(rigid(*shift), shape, rng, per_window=1.0) for _ in range(12)]
+    together = correlate_ensemble(iter(pairs), unit_grid(shape), [(16, 16, 16)], HALF, None)
+    single = correlate(*pairs[0], unit_grid(shape), [(16, 16, 16)], HALF, None)
+    errors = [np.abs(field.displacement_raw_voxel - np.array(shift)) for field in (together, single)]
+    assert np.all(errors[0] < 0.1)
+    assert not np.all(errors[1] < 0.5)
+    with pytest.raises(InputError):
+        correlate_ensemble([], unit_grid(shape), [(16, 16, 16)], HALF, None)
+
+
+def test_an_ensemble_of_one_pair_twice_is_that_pair(rng: np.random.Generator) -> None:
+    shape = (32, 32, 32)
+    a, b = moving_pair(rigid(1.3, -0.7, 0.4), shape, rng)
+    once = correlate(a, b, unit_grid(shape), [(16, 16, 16)], HALF, None)
+    twice = correlate_ensemble([(a, b), (a, b)], unit_grid(shape), [(16, 16, 16)], HALF, None)
+    np.testing.assert_allclose(twice.displacement_voxel, once.displacement_voxel, atol=1e-6)
+    np.testing.assert_allclose(twice.correlation, once.correlation, atol=1e-6)
 
 
 def test_threads_do_not_change_a_bit(rng: np.random.Generator) -> None:

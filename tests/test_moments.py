@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from benchmarks.volumes import Seeding, volume_pair
 from lfpiv_cli.flow.maps import margins
-from lfpiv_cli.flow.moments import CELLS_PER_WINDOW, cells_of, gauss_newton
+from lfpiv_cli.flow.moments import CELLS_PER_WINDOW, cells_of, gauss_newton, pair_moments
 from lfpiv_cli.flow.windows import WindowLayout, layout_windows
 
 HALF = (0.5, 0.5, 0.5)
@@ -22,9 +22,8 @@ def steps(
     """Gauss-Newton steps of two volumes that are valid everywhere."""
     before, after = margins(layout, a.shape, 1)
     margin = list(zip(before, after, strict=True))
-    return gauss_newton(
-        np.pad(a, margin), np.pad(b, margin), np.pad(np.ones(a.shape, np.uint8), margin), layout, before, sigma
-    )
+    padded = (np.pad(volume, margin) for volume in (a, b, np.ones(a.shape, np.uint8)))
+    return gauss_newton(pair_moments(*padded, layout, before), layout, sigma)
 
 
 def shifted(

@@ -82,12 +82,37 @@ def margins(layout: WindowLayout, shape_zyx: Triple, radius: int) -> tuple[Tripl
     return (before[0], before[1], before[2]), (after[0], after[1], after[2])
 
 
-def correlation_maps(
-    a: NDArray[np.float32], b: NDArray[np.float32], layout: WindowLayout, before: Triple, radius: int
-) -> NDArray[np.float64]:
-    """Return R for all shifts up to `radius`: (nz, ny, nx, 2r + 1, 2r + 1, 2r + 1), the shifts along z, y, x last.
+@dataclass(frozen=True, eq=False)
+class MapSums:
+    """What a correlation is made of, over all windows and shifts; of several pairs of volumes these add up.
 
-    Zero where a window holds nothing.
+    Attributes
+    ----------
+    products : sum_W A(x) B(x + s) + A(x - s) B(x), (nz, ny, nx, 2r + 1, 2r + 1, 2r + 1)
+    energies_a, energies_b : the two brackets of R, of the same shape
+    """
+
+    products: NDArray[np.float64]
+    energies_a: NDArray[np.float64]
+    energies_b: NDArray[np.float64]
+
+    def __add__(self, other: MapSums) -> MapSums:
+        """Return the sums over two sets of pairs."""
+        return MapSums(
+            self.products + other.products, self.energies_a + other.energies_a, self.energies_b + other.energies_b
+        )
+
+    def correlation(self) -> NDArray[np.float64]:
+        """Return R, zero where a window holds nothing."""
+        energies = self.energies_a * self.energies_b
+        filled = energies > SMALLEST_ENERGY**2 * np.max(energies)
+        return np.divide(self.products, np.sqrt(energies), out=np.zeros(energies.shape), where=filled)
+
+
+def map_sums(
+    a: NDArray[np.float32], b: NDArray[np.float32], layout: WindowLayout, before: Triple, radius: int
+) -> MapSums:
+    """Return the sums that R is made of for all shifts up to `radius`, those along z, y, x last.
 
     Parameters
     ----------
@@ -100,10 +125,8 @@ def correlation_maps(
     products = block_products(a, b, first, blocks.size, blocks.stride, blocks.count, radius)
     for axis in range(3):
         products = _sum_blocks(products, axis, layout.count_zyx[axis], blocks.per_window[axis], blocks.hop[axis])
-    energies = _pair_energies(window_sums(np.square(a), layout, before, radius), -1)
-    energies *= _pair_energies(window_sums(np.square(b), layout, before, radius), 1)
-    filled = energies > SMALLEST_ENERGY**2 * np.max(energies)
-    return np.divide(products, np.sqrt(energies), out=np.zeros_like(products), where=filled)
+    energies_a, energies_b = (window_sums(np.square(volume), layout, before, radius) for volume in (a, b))
+    return MapSums(products, _pair_energies(energies_a, -1), _pair_energies(energies_b, 1))
 
 
 def window_sums(volume: NDArray, layout: WindowLayout, before: Triple, radius: int = 0) -> NDArray[np.float32]:

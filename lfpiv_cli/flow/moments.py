@@ -52,28 +52,36 @@ def _cells_along(size: int, step: int, count: int) -> tuple[int, int, int, int, 
     return cell, cell, (count - 1) * hop + per_window, per_window, hop
 
 
-def gauss_newton(
-    a: NDArray[np.float32],
-    b: NDArray[np.float32],
-    valid: NDArray[np.uint8],
-    layout: WindowLayout,
-    before: Triple,
-    particle_sigma: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the rest displacements of two deformed volumes and their standard deviations, (nz, ny, nx, 3) each.
-
-    NaN where a window does not determine them, and for the standard deviation where its groups are too few.
+def pair_moments(
+    a: NDArray[np.float32], b: NDArray[np.float32], valid: NDArray[np.uint8], layout: WindowLayout, before: Triple
+) -> NDArray[np.float64]:
+    """Return the moments of all cells of two deformed volumes; of several pairs these add up.
 
     Parameters
     ----------
     a, b, valid : of `deform_pair`, with a margin of at least 1 around all windows
     layout : windows, in voxels of the volume without margins
     before : the margins before the volume, (z, y, x)
-    particle_sigma : (3,) standard deviation of a particle image along x, y, z, voxels
     """
     cells = cells_of(layout)
     first = (cells.first[0] + before[0], cells.first[1] + before[1], cells.first[2] + before[2])
-    moments = cell_moments(a, b, valid, first, cells.size, cells.stride, cells.count)
+    return cell_moments(a, b, valid, first, cells.size, cells.stride, cells.count)
+
+
+def gauss_newton(
+    moments: NDArray[np.float64], layout: WindowLayout, particle_sigma: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the rest displacements and their standard deviations, (nz, ny, nx, 3) each.
+
+    NaN where a window does not determine them, and for the standard deviation where its groups are too few.
+
+    Parameters
+    ----------
+    moments : of `pair_moments`, or a sum of such
+    layout : windows, in voxels of the volume without margins
+    particle_sigma : (3,) standard deviation of a particle image along x, y, z, voxels
+    """
+    cells = cells_of(layout)
     groups = [
         _cells_a_group(per_window, length, sigma)
         for per_window, length, sigma in zip(cells.per_window, cells.size, particle_sigma[::-1], strict=True)

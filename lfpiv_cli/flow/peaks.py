@@ -14,6 +14,9 @@ from numpy.typing import NDArray
 
 # A ratio beyond this says only that there is no second peak; it keeps the stored numbers finite.
 LARGEST_PEAK_RATIO = 100.0
+# Standard deviation in voxels of a correlation peak from which on an axis counts as elongated and takes Gauss-Newton
+# steps. Particles of 1 voxel make peaks of 1.4; three points of a peak of 2.2 span less than a tenth of its height.
+ELONGATED_WIDTH = 2.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +77,21 @@ def typical_width(width: NDArray[np.float64]) -> NDArray[np.float64]:
         if known.size:
             typical[axis] = np.median(known)
     return typical
+
+
+def undiluted(width: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the widths of peaks without the pedestal of dense seeding, which widens all axes by about one factor.
+
+    Taken as undiluted where the narrowest is that of particles of up to 1 voxel, which volumes are made for.
+    """
+    return width * min(1.0, float(np.sqrt(2.0) / width.min()))
+
+
+def absolute(peaks: Peaks, predictor: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the displacements of the first and the second peak, NaN where there is none."""
+    first = np.where(peaks.found[..., np.newaxis], predictor + peaks.offset, np.nan)
+    has_second = (peaks.second_height > 0.0)[..., np.newaxis]
+    return first, np.where(has_second, predictor + peaks.second_offset, np.nan)
 
 
 @njit(cache=True)
