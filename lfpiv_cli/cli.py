@@ -102,6 +102,7 @@ def calibrate_snapshot(**arguments: Any) -> dict[str, Any]:
 @click.argument("images", type=INPUT, nargs=-1, required=True)
 @click.option("--calibration", type=INPUT, required=True, help="From calibrate-snapshot.")
 @click.option("--dark", type=INPUT, help="Dark image to subtract.")
+@click.option("--background", type=INPUT, help="Image without tracers to subtract, in place of the dark one.")
 @click.option("-o", "--output", type=INPUT, help="Mended calibration to write (.h5); without it, only report.")
 @click.option("--picture", type=INPUT, help="Picture of the particles' depths and the walls to write (.png).")
 @common_options

@@ -13,6 +13,7 @@ from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.batch import frames_of
 from lfpiv_cli.files.calibration_file import read_calibration, write_calibration
 from lfpiv_cli.files.config import load_config
+from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.pictures import ensure_drawing, write_picture
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.particles.refinement import STEPS
@@ -25,6 +26,7 @@ def refine_calibration(
     images: Sequence[Path],
     calibration: Path,
     dark: Path | None,
+    background: Path | None,
     output: Path | None,
     picture: Path | None,
     overwrite: bool,
@@ -32,7 +34,7 @@ def refine_calibration(
 ) -> dict[str, Any]:
     """Find the channel's walls by the particles, report where they are, and write the calibration with them."""
     named = {"image" if k == 0 else f"image_{k + 1}": path for k, path in enumerate(images)}
-    inputs = {"config": config, "calibration": calibration} | ({"dark": dark} if dark else {}) | named
+    inputs = given(config=config, calibration=calibration, dark=dark, background=background) | named
     for target in filter(None, (output, picture)):
         ensure_writable(target, overwrite, inputs.values())
     if picture:
@@ -42,8 +44,8 @@ def refine_calibration(
         raise ConfigError(f"{config}: channel: is missing; the walls are known by the channel's width")
     frames, shape = frames_of(images), settings.image_shape()
     before = read_calibration(calibration)
-    dark_image = image_files.read_image(dark, shape) if dark else None
-    lit = [light(image_files.read_page(frame.path, frame.page, shape), dark_image, None) for frame in frames]
+    dark_image, empty = (image_files.read_image(path, shape) if path else None for path in (dark, background))
+    lit = [light(image_files.read_page(frame.path, frame.page, shape), dark_image, empty) for frame in frames]
     with console.progress(len(lit) * STEPS + 1, "refine") as advance:
         found = refine(
             lit,
