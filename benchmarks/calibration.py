@@ -19,7 +19,7 @@ from lfpiv_cli.errors import LfpivError
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.microlenses import Lattice, Layout
-from lfpiv_cli.synthetic.board import BoardPlacement, render_board
+from lfpiv_cli.synthetic.board import BoardPlacement, dot_centres, render_board
 from lfpiv_cli.synthetic.render import ObjectSpace, render_white
 from lfpiv_cli.synthetic.scenes import Misalignment
 from lfpiv_cli.synthetic.sensor import Readout
@@ -208,11 +208,10 @@ def pose_errors(bench: Bench, found: Calibration) -> dict[str, tuple[float, floa
     """
     pose, placement = found.pose, bench.placement
     assert pose is not None
-    turn = np.deg2rad(pose.rotation_deg)
     aside = np.array(placement.offset_mm) - pose.offset_mm
-    rows = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
-    skipped = np.rint(rows @ aside / bench.board.spacing_mm)
-    shift = aside - rows.T @ (skipped * bench.board.spacing_mm)
+    corner = dot_centres(replace(bench.board, dots=(2, 2)), placement)[:, :2]
+    steps = corner[1:3] - corner[0]
+    shift = aside - np.rint(aside @ np.linalg.inv(steps)) @ steps
     depth = pose.z0_mm + np.tan(np.deg2rad(pose.tilt_deg)) @ aside
     return {
         "board_z_mm": (float(depth - placement.z_mm), pose.z0_sigma_mm),
