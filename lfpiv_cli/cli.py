@@ -174,6 +174,10 @@ def reconstruct(**arguments: Any) -> dict[str, Any]:
 @click.option("--windows", help="Window sizes in voxels, coarse to fine, as 32,16.")
 @click.option("--overlap", type=click.FloatRange(min=0.0, max=1.0, max_open=True), help="Of neighbouring windows.")
 @click.option("--pairing", type=click.Choice(["ab", "sequence"]), help="How more than two volumes are paired.")
+@click.option("--mask", type=INPUT, help="Volume on the same grid: voxels of 0 are left out.")
+@click.option("--ensemble", is_flag=True, help="One field of all pairs together, for a flow that does not change.")
+@click.option("--derived", is_flag=True, help="Also write vorticity, divergence, strain rate and Q criterion.")
+@click.option("--mean", type=INPUT, help="File of the pairs' mean and fluctuations to write (.vtkhdf).")
 @click.option("--resume", is_flag=True, help="Skip outputs that are complete and made from the same inputs.")
 @click.option("-o", "--output", type=INPUT, required=True, help="File for one pair, folder for several.")
 @common_options
@@ -182,6 +186,7 @@ def correlate(**arguments: Any) -> dict[str, Any]:
 
     \b
     Example: lfpiv correlate volumes/a.vtkhdf volumes/b.vtkhdf -o vectors.vtkhdf
+             lfpiv correlate volumes/*.vtkhdf --pairing sequence --mean mean.vtkhdf -o vectors
     """
     from lfpiv_cli import stages_correlate
 

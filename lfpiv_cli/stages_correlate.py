@@ -1,23 +1,48 @@
-"""The stage of `correlate`: displacements between pairs of volumes."""
+"""The stage of `correlate`: displacements between pairs of volumes, of each or of all together."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files import vtkhdf
+from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.batch import Target, output_paths, pending, prepare_folder
-from lfpiv_cli.files.config import carried_config, load_config
+from lfpiv_cli.files.config import Config, carried_config, load_config
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.provenance import record
-from lfpiv_cli.flow.correlation import correlate as correlate_volumes
-from lfpiv_cli.flow.correlation import count_passes
-from lfpiv_cli.flow.field import REJECTED
+from lfpiv_cli.flow.correlation import correlate_ensemble, count_passes
+from lfpiv_cli.flow.derived import Derived, derived_fields
+from lfpiv_cli.flow.field import MM_TO_M, REJECTED, VectorField
+from lfpiv_cli.flow.statistics import statistics_of
+from lfpiv_cli.grid import Grid
+
+Extra = dict[str, tuple[NDArray[Any], str]]
+
+
+@dataclass(frozen=True)
+class Job:
+    """One result: the pairs of volumes that it is made of, and the settings."""
+
+    pairs: Sequence[tuple[Path, Path]]
+    settings: Config
+
+    def inputs(self) -> dict[str, Path]:
+        """Return the volumes by their role."""
+        if len(self.pairs) == 1:
+            return given(volume_a=self.pairs[0][0], volume_b=self.pairs[0][1])
+        return {
+            f"volume_{name}_{number:04d}": path
+            for number, pair in enumerate(self.pairs)
+            for name, path in zip("ab", pair, strict=True)
+        }
 
 
 def correlate(
@@ -27,6 +52,10 @@ def correlate(
     windows: str | None,
     overlap: float | None,
     pairing: str | None,
+    mask: Path | None,
+    ensemble: bool,
+    derived: bool,
+    mean: Path | None,
     resume: bool,
     output: Path,
     overwrite: bool,
@@ -34,50 +63,132 @@ def correlate(
 ) -> dict[str, Any]:
     """Measure the displacements between pairs of volumes."""
     pairs = _pairs(volumes, pairing)
-    paths = output_paths(output, [first.stem for first, _ in pairs])
+    if mean is not None and (ensemble or len(pairs) < 2):
+        raise UsageError("--mean needs several pairs, each correlated by itself")
+    together = [pairs] if ensemble else [[pair] for pair in pairs]
+    paths = output_paths(output, [group[0][0].stem for group in together])
     prepare_folder(paths)
     told = load_config(config) if config else None
     sizes = [_window(text) for text in windows.split(",")] if windows else None
-    rejected = total = 0
-    settings_of = []
-    for first, _ in pairs:
+    jobs = []
+    for group in together:
+        first = group[0][0]
         settings = told or carried_config(vtkhdf.read_header(first).provenance, first)
-        settings_of.append(settings.overridden("correlation", dt_s=dt_s, windows=sizes, overlap=overlap))
+        jobs.append(Job(group, settings.overridden("correlation", dt_s=dt_s, windows=sizes, overlap=overlap)))
+    common = given(config=config, mask=mask)
+    command = " ".join(["correlate", *["ensemble"] * ensemble, *["derived"] * derived])
     targets = [
-        Target(path, record("correlate", settings.resolved(), given(config=config, volume_a=pair[0], volume_b=pair[1])))
-        for path, pair, settings in zip(paths, pairs, settings_of, strict=True)
+        Target(path, record(command, job.settings.resolved(), common | job.inputs()))
+        for path, job in zip(paths, jobs, strict=True)
     ]
-    inputs = [*volumes, *filter(None, [config])]
-    for number in pending(targets, inputs, overwrite, resume, _record_of):
-        volume_a, volume_b = (vtkhdf.open_volume(path) for path in pairs[number])
-        _ensure_alike(pairs[number], volume_a, volume_b)
-        chosen = settings_of[number].correlation
-        grid = volume_a.grid
-        sizes_xyz = settings_of[number].windows_voxel(grid.spacing_mm)
-        with console.progress(count_passes(sizes_xyz), "correlate") as advance:
-            field = correlate_volumes(
-                volume_a.array,
-                volume_b.array,
-                grid,
-                sizes_xyz,
-                settings_of[number].overlap(grid.spacing_mm),
-                chosen.dt_s,
-                progress=advance,
-                exponent=settings_of[number].correlation_exponent(),
-            )
+    if mean is not None:
+        ensure_writable(mean, overwrite, [*volumes, *common.values()])
+    summary: dict[str, Any] = {"pairs": len(pairs), "vectors": 0, "rejected": 0}
+    divergence = []
+    for number in pending(targets, [*volumes, *common.values()], overwrite, resume, _record_of):
+        field, attributes = _measure(jobs[number], mask, console)
+        told_more = derived_fields(field) if derived else None
         vtkhdf.write_vectors(
             targets[number].path,
             field,
             provenance=targets[number].record,
-            attributes={name: volume_a.attributes[name] for name in ("reference", "reference_z_mm")},
+            attributes=attributes,
             overwrite=overwrite,
+            extra=_arrays_of(told_more) if told_more else None,
         )
-        rejected += int(np.count_nonzero(field.flag >= REJECTED))
-        total += field.flag.size
-    return {"pairs": len(pairs), "vectors": total, "rejected": rejected}
+        summary["rejected"] += int(np.count_nonzero(field.flag >= REJECTED))
+        summary["vectors"] += field.flag.size
+        if told_more and told_more.divergence_rms is not None:
+            divergence.append(told_more.divergence_rms)
+    if divergence:
+        summary["divergence_rms_per_s"] = float(np.mean(divergence))
+    if mean is not None:
+        _write_mean(mean, paths, jobs[0].settings, derived, overwrite)
+    return summary
 
 
-def _record_of(path: Path) -> dict[str, Any]:
+def _measure(job: Job, mask: Path | None, console: Console) -> tuple[VectorField, dict[str, Any]]:
+    """Return the vectors of a job, and where the coordinates of its volumes begin."""
+    first = vtkhdf.open_volume(job.pairs[0][0])
+    grid, settings = first.grid, job.settings
+    attributes = {name: first.attributes[name] for name in ("reference", "reference_z_mm")}
+
+    def volumes() -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
+        for pair in job.pairs:
+            a, b = (first if path == job.pairs[0][0] else vtkhdf.open_volume(path) for path in pair)
+            for path, volume in zip(pair, (a, b), strict=True):
+                _ensure_alike((job.pairs[0][0], path), first, volume)
+            yield a.array, b.array
+
+    sizes = settings.windows_voxel(grid.spacing_mm)
+    with console.progress(count_passes(sizes), "correlate") as advance:
+        field = correlate_ensemble(
+            volumes(),
+            grid,
+            sizes,
+            settings.overlap(grid.spacing_mm),
+            settings.correlation.dt_s,
+            _usable(settings, mask, first, job.pairs[0][0]),
+            progress=advance,
+            exponent=settings.correlation_exponent(),
+        )
+    return field, attributes
+
+
+def _usable(settings: Config, mask: Path | None, volume: vtkhdf.Volume, path: Path) -> NDArray[np.bool_] | None:
+    """Return where the volumes may be used: between the walls and inside the mask; None for everywhere."""
+    usable = None
+    if settings.correlation.mask == "channel":
+        usable = between_walls(volume.grid, settings.channel_width_mm())
+    if mask is not None:
+        drawn = vtkhdf.open_volume(mask)
+        if drawn.grid != volume.grid:
+            raise InputError(f"{mask}: its grid {drawn.grid} differs from that of {path}, {volume.grid}")
+        usable = drawn.array > 0.0 if usable is None else usable & (drawn.array > 0.0)
+    return usable
+
+
+def between_walls(grid: Grid, width_mm: float) -> NDArray[np.bool_]:
+    """Return the voxels (nz, ny, nx) whose centres lie between walls across z, half the width from z = 0."""
+    inside = np.abs(grid.axis_mm(2)) <= 0.5 * width_mm
+    return np.broadcast_to(inside[:, np.newaxis, np.newaxis], grid.shape_zyx).copy()
+
+
+def _arrays_of(derived: Derived) -> Extra:
+    """Return derived fields with the names and units that files give them."""
+    return {
+        "vorticity": (derived.vorticity, "1/s"),
+        "divergence": (derived.divergence, "1/s"),
+        "strain_rate": (derived.strain_rate, "1/s"),
+        "q_criterion": (derived.q_criterion, "1/s2"),
+    }
+
+
+def _write_mean(path: Path, members: Sequence[Path], settings: Config, derived: bool, overwrite: bool) -> None:
+    """Write the mean of a batch's vectors, and their fluctuations as `velocity_rms` and `displacement_rms_voxel`."""
+    found = statistics_of(vtkhdf.open_vectors(member) for member in members)
+    extra: Extra = {
+        "displacement_rms_voxel": (found.rms_voxel, "voxel"),
+        "samples": (found.samples, "1"),
+    }
+    if found.mean.dt_s is not None:
+        to_velocity = np.asarray(found.mean.voxel_mm) * MM_TO_M / found.mean.dt_s
+        extra["velocity_rms"] = (found.rms_voxel * to_velocity, "m/s")
+    if derived:
+        extra |= _arrays_of(derived_fields(found.mean))
+    header = vtkhdf.read_header(members[0]).attributes
+    inputs = {f"vectors_{number:04d}": member for number, member in enumerate(members)}
+    vtkhdf.write_vectors(
+        path,
+        found.mean,
+        provenance=record("correlate mean", settings.resolved(), inputs),
+        attributes={name: header[name] for name in ("reference", "reference_z_mm")},
+        overwrite=overwrite,
+        extra=extra,
+    )
+
+
+def _record_of(path: Path) -> Mapping[str, Any]:
     return vtkhdf.read_header(path).provenance
 
 

@@ -20,7 +20,7 @@ from lfpiv_cli.files.particles import read_particles
 from lfpiv_cli.files.pictures import ensure_drawing, write_picture
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.flow.field import VectorField
-from lfpiv_cli.validation.channel import Duct, table_4
+from lfpiv_cli.validation.channel import Duct, table_4, worst_slice
 from lfpiv_cli.validation.flow import flow_figures, limits_missed, truth_at_points
 from lfpiv_cli.validation.pictures import flow_figure, slices_figure
 
@@ -55,6 +55,7 @@ def validate_flow(
     figures = flow_figures(field, truth, inside)
     if duct is not None:
         figures["table_4"] = table_4(field, truth, inside, duct)
+        figures["slice_mean_error"] = worst_slice(figures["table_4"])
         write_picture(paths["flow_slices.png"], slices_figure(field, truth, inside, duct), overwrite)
     missed = limits_missed(figures, settings.validation.limits.model_dump())
     made_by = record("validate flow", settings.resolved(), inputs)
@@ -128,6 +129,10 @@ def run_chain(config: Path, output: Path, overwrite: bool, console: Console) -> 
         windows=None,
         overlap=None,
         pairing=None,
+        mask=None,
+        ensemble=False,
+        derived=False,
+        mean=None,
         resume=False,
         output=vectors,
         **common,

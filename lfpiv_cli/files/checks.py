@@ -102,7 +102,7 @@ def _scene(sections: Sections) -> Found:
 
 
 def _processing(sections: Sections) -> Found:
-    """Yield windows that do not run from coarse to fine, and a range of brightness upside down."""
+    """Yield windows not from coarse to fine, a mask without walls, and a range of brightness upside down."""
     correlation, brightness = sections.correlation, sections.simulation.brightness
     place: KeyPath = ("correlation", "windows")
     if correlation.windows is not None:
@@ -113,6 +113,8 @@ def _processing(sections: Sections) -> Found:
         for k, (coarse, fine) in enumerate(zip(correlation.windows, correlation.windows[1:], strict=False)):
             if any(a < b for a, b in zip(coarse, fine, strict=True)):
                 yield (*place, k + 1), f"is {list(fine)} after {list(coarse)}, expected coarse to fine"
+    if correlation.mask == "channel" and (sections.volume is None or sections.volume.reference != "mid_plane"):
+        yield ("correlation", "mask"), "is channel, which needs volume.reference: mid_plane"
     if brightness[0] > brightness[1] or brightness[1] == 0.0:
         yield ("simulation", "brightness"), f"is {list(brightness)}, expected a range [smallest, largest]"
 

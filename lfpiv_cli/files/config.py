@@ -213,6 +213,11 @@ class Config:
         """Return the overlap of the correlation windows along x, y, z."""
         return bench.overlap_of(self.correlation, voxel_mm)
 
+    def channel_width_mm(self) -> float:
+        """Return the channel's inner width."""
+        section: ChannelSection = self._needed("channel", self.channel)
+        return section.width_mm
+
     def correlation_exponent(self) -> float:
         """Return the power of the intensities that is correlated: the configured one, or the solver's default."""
         return self.correlation.exponent or EXPONENTS.get(self.reconstruction.solver, 1.0)

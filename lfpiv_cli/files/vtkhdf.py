@@ -140,12 +140,14 @@ def write_vectors(
     provenance: Mapping[str, Any],
     attributes: Mapping[str, Any],
     overwrite: bool,
+    extra: Mapping[str, tuple[NDArray[Any], str]] | None = None,
 ) -> None:
     """Write a vector field: `velocity` (m/s), the displacements (voxel) and what is known of their quality.
 
     Parameters
     ----------
     attributes : scalars, strings and short arrays for the root, `reference` (focal_point or mid_plane) among them
+    extra : arrays (nz, ny, nx) or (nz, ny, nx, 3) to store besides, by their name, with their unit
 
     Raises
     ------
@@ -167,6 +169,8 @@ def write_vectors(
             _write_points(file, points, name, getattr(field, name), unit)
         if field.uncertainty_voxel is not None:
             _write_points(file, points, UNCERTAINTY, field.uncertainty_voxel, "voxel")
+        for name, (array, unit) in (extra or {}).items():
+            _write_points(file, points, name, array, unit)
 
     create(path, fill, overwrite=overwrite, check=_reads(open_vectors))
 

@@ -6,6 +6,7 @@ x/D. Its flow runs along its y; ours along x or y, so that its x is our other la
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -60,6 +61,12 @@ def table_4(
             error = streamwise_mean_error_at(field, pairs, axis, duct.position_mm(axis, share))
             table[f"{name} {share}"] = _row(error, *paper)
     return table
+
+
+def worst_slice(table: Mapping[str, Mapping[str, float | None]]) -> float | None:
+    """Return the largest mean velocity error of the six slices (a share, not per cent); None where one is unknown."""
+    errors = [row["ours_percent"] for name, row in table.items() if name != "overall"]
+    return None if None in errors else 0.01 * max(error for error in errors if error is not None)
 
 
 def _row(error: float | None, paper_dlfc: float, paper_ert: float) -> dict[str, float | None]:
