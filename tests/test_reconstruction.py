@@ -9,6 +9,7 @@ import pytest
 
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.microlenses import Lattice
+from lfpiv_cli.reconstruction import kernels
 from lfpiv_cli.reconstruction.equations import Problem, normalisers
 from lfpiv_cli.reconstruction.solvers import SOLVERS, Momentum, Stopping, mart_step, reconstruct, sart_step, smart_step
 from lfpiv_cli.reconstruction.starts import line_of_sight_start, lit_support
@@ -207,3 +208,16 @@ def test_momentum_restarts_where_a_step_points_back():
     np.testing.assert_allclose(ahead[1], volume + 4.0 / pace, rtol=1e-6)
     np.testing.assert_array_equal(back[1], volume)
     assert back[0].pace < ahead[0].pace
+
+
+def test_kernels_are_their_array_twins(rng):
+    image, projection = rng.random((2, 7, 5), dtype=np.float32)
+    inverse = rng.random((7, 5), dtype=np.float32) * (rng.random((7, 5)) < 0.7).astype(np.float32)
+    projection[2, 3] = 0.0
+    inverse[2, 3] = 1.0
+    np.testing.assert_array_equal(kernels.correction(image, projection, inverse), (image - projection) * inverse)
+    lit = (projection > 0.0) & (inverse > 0.0)
+    expected = np.divide(image, projection, out=np.zeros_like(image), where=lit)
+    np.testing.assert_array_equal(kernels.ratio(image, projection, inverse), expected)
+    squares = np.where(inverse > 0.0, (image - projection).astype(np.float64) ** 2, 0.0).sum(axis=1)
+    np.testing.assert_allclose(kernels.square_differences(image, projection, inverse), squares, rtol=1e-14)

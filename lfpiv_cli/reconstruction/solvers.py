@@ -16,6 +16,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.reconstruction import kernels
 from lfpiv_cli.reconstruction.equations import Image, Normalisers, Operator, Problem, Volume, normalisers
 from lfpiv_cli.reconstruction.starts import line_of_sight_start, lit_support, uniform_start
 
@@ -70,7 +71,7 @@ class Reconstruction:
 
 def sart_step(problem: Problem, volume: Volume, projection: Image, relaxation: float) -> Volume:
     """Return the volume after one step of SART, all pixels at once (Eq. 12), kept non-negative."""
-    correction = (problem.image - projection) * problem.sums.inverse_row_sum
+    correction = kernels.correction(problem.image, projection, problem.sums.inverse_row_sum)
     update = problem.operator.adjoint(correction) * problem.sums.inverse_column_sum
     return np.maximum(volume + np.float32(relaxation) * update, np.float32(0.0))
 
@@ -80,12 +81,7 @@ def em_step(problem: Problem, volume: Volume, projection: Image, relaxation: flo
 
     E <- E (W^T (I / W E) / W^T 1)^relaxation. A pixel that the volume does not light explains nothing and is left out.
     """
-    ratio = np.divide(
-        problem.image,
-        projection,
-        out=np.zeros_like(projection),
-        where=(projection > 0.0) & (problem.sums.inverse_row_sum > 0.0),
-    )
+    ratio = kernels.ratio(problem.image, projection, problem.sums.inverse_row_sum)
     factor = problem.operator.adjoint(ratio) * problem.sums.inverse_column_sum
     if relaxation != 1.0:
         factor **= np.float32(relaxation)
@@ -165,10 +161,11 @@ def reconstruct(
         problem = Problem.of(operator, image, problem.sums.within(operator, support))
     volume = point = line_of_sight_start(problem) if start == "line_of_sight" else uniform_start(problem)
     momentum = Momentum()
+    norm = float(np.sqrt(np.sum(np.square(problem.image, dtype=np.float64))))
     residual: list[float] = []
     for _ in range(iterations):
         projection = operator.forward(point)
-        residual.append(_relative_residual(problem, projection))
+        residual.append(_relative_residual(problem, projection, norm))
         if stopping.reached(np.array(residual)):
             residual.pop()
             break
@@ -179,7 +176,7 @@ def reconstruct(
             point = volume
         if progress:
             progress(1)
-    residual.append(_relative_residual(problem, operator.forward(volume)))
+    residual.append(_relative_residual(problem, operator.forward(volume), norm))
     taking_part = int(np.count_nonzero(problem.sums.inverse_column_sum))
     return Reconstruction(volume, np.array(residual), taking_part)
 
@@ -204,12 +201,7 @@ class Momentum:
         return Momentum(following), np.maximum(change, np.float32(0.0))
 
 
-def _square_sum(image: Image) -> float:
-    return float(np.sum(np.square(image, dtype=np.float64)))
-
-
-def _relative_residual(problem: Problem, projection: Image) -> float:
+def _relative_residual(problem: Problem, projection: Image, norm: float) -> float:
     """Return ||I - W E|| / ||I|| over the pixels that take part, 0 for a dark image."""
-    norm = np.sqrt(_square_sum(problem.image))
-    difference = np.where(problem.sums.inverse_row_sum > 0.0, problem.image - projection, np.float32(0.0))
-    return float(np.sqrt(_square_sum(difference)) / norm) if norm > 0.0 else 0.0
+    sums = kernels.square_differences(problem.image, projection, problem.sums.inverse_row_sum)
+    return float(np.sqrt(sums.sum())) / norm if norm > 0.0 else 0.0
