@@ -24,7 +24,7 @@ BOARD_Z_MM, LEVEL = 4.0, 28_000.0
 PAPER_ITERATIONS, MOST_ACCELERATED = 200, 60
 # A size whose matrix fits into memory twice (as it is and transposed), and few iterations of it.
 SPARSE_GRID = Grid.centred((40, 40, 30), (0.1, 0.1, 0.1), (0.0, 0.0, 2.0))
-SPARSE_ITERATIONS, SPARSE_REPEATS = 4, 5
+SPARSE_ITERATIONS, SPARSE_REPEATS = 20, 3
 
 
 @dataclass(frozen=True, eq=False)
