@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.calibration.board import dots_in_world
 from lfpiv_cli.console import Console
 from lfpiv_cli.files.atomic import ensure_writable, write_json
 from lfpiv_cli.files.batch import prepare_folder
@@ -20,7 +21,7 @@ from lfpiv_cli.reconstruction.equations import normalisers
 from lfpiv_cli.reconstruction.solvers import reconstruct
 from lfpiv_cli.stages_simulate import misalignment_of, readout_of
 from lfpiv_cli.synthetic.board import BoardPlacement, dot_centres
-from lfpiv_cli.validation.board import DEPTHS_MM, MEASURES, PAPER, DotFigures, board_figures, measure_dots
+from lfpiv_cli.validation.board import DEPTHS_MM, PAPER, DotFigures, board_figures, measure_dots, place_figures
 from lfpiv_cli.validation.board_bench import BoardBench, ideal_bench, recorded_bench
 from lfpiv_cli.validation.board_pictures import board_figure
 
@@ -34,31 +35,36 @@ def validate_board(config: Path, output: Path, overwrite: bool, console: Console
     settings = load_config(config)
     chosen = settings.validation.board
     halves = ("ideal", "recorded") if chosen.images == "both" else (chosen.images,)
-    columns = [(half, method) for half in halves for method in chosen.methods]
+    solved = [method for method in chosen.methods if method != "discs"]
     report = output / "board.json"
-    drawings = {column: output / f"board_{'_'.join(column)}.png" for column in columns}
+    drawings = {(half, method): output / f"board_{half}_{method}.png" for half in halves for method in solved}
     prepare_folder([report])
     for path in (report, *drawings.values()):
         ensure_writable(path, overwrite, [config])
     ensure_drawing()
     figures: dict[str, dict[str, Any]] = {half: {} for half in halves}
-    board = settings.rig().board
-    with console.progress(len(columns) * len(DEPTHS_MM) * settings.reconstruction.iterations, "boards") as advance:
+    steps = len(halves) * (len(solved) * settings.reconstruction.iterations + len(chosen.methods) - len(solved))
+    with console.progress(steps * len(DEPTHS_MM), "boards") as advance:
         for half in halves:
             bench = _bench(settings, half)
             pictures = [bench.picture(_placement(settings, depth)) for depth in DEPTHS_MM]
             for method in chosen.methods:
+                if method == "discs":
+                    figures[half][method] = _discs(bench, pictures, advance)
+                    continue
                 judged = bench if method == "ert" else bench.with_fitted_rays(pictures, DEPTHS_MM)
                 dots, drawn = _boards(judged, pictures, settings, console, advance)
-                measured = board_figures(dots, DEPTHS_MM, board.dots, board.spacing_mm)
+                measured = board_figures(dots, DEPTHS_MM, bench.rig.board.dots, bench.rig.board.spacing_mm)
                 figures[half][method] = measured | {"paper": PAPER[half, method]}
                 write_picture(drawings[half, method], board_figure(measured, drawn, settings.grid()), overwrite)
     provenance = record("validate board", settings.resolved(), {"config": config})
     write_json(report, {"figures": figures, "provenance": provenance}, overwrite)
     return {
-        f"{half}.{method}.{name}": figures[half][method][name]
-        for half, method in columns
-        for name in (*MEASURES, "depth_error_mass")
+        f"{half}.{method}.{name}": value
+        for half, methods in figures.items()
+        for method, measured in methods.items()
+        for name, value in measured.items()
+        if isinstance(value, float)
     }
 
 
@@ -84,6 +90,20 @@ def _bench(settings: Config, half: str) -> BoardBench:
         scene.peak_counts,
         rng,
     )
+
+
+def _discs(
+    bench: BoardBench, pictures: Sequence[NDArray[np.float32]], advance: Callable[[int], None]
+) -> dict[str, Any]:
+    """Return the errors of place of dots that are fitted to the pictures as discs."""
+    calibration, rig = bench.weights.calibration, bench.rig
+    rotation = 0.0 if calibration is None else calibration.rectification.rotation_rad
+    places = []
+    for picture in pictures:
+        places.append(dots_in_world(picture, rig.camera, rig.board, rig.media, rotation))
+        advance(1)
+    x, z = ([each[..., axis] for each in places] for axis in (0, 2))
+    return place_figures(x, z, DEPTHS_MM, rig.board.spacing_mm)
 
 
 def _boards(

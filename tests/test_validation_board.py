@@ -73,6 +73,7 @@ def test_validate_board_on_a_small_camera(tmp_path):
         ("rotation_deg: 0.0   ", "rotation_deg: 0.4   "),
         ("shift_px: [0.0, 0.0]  ", "shift_px: [5.0, -4.0]  "),
         ("images: ideal", "images: both"),
+        ("methods: [ert, dlfc]", "methods: [ert, dlfc, discs]"),
     ):
         assert old in text, old
         text = text.replace(old, new)
@@ -84,5 +85,7 @@ def test_validate_board_on_a_small_camera(tmp_path):
         assert report[half][method]["lateral_error"] < 0.02
         assert report[half][method]["depth_error"] < 0.3
         assert (tmp_path / "report" / f"board_{half}_{method}.png").stat().st_size > 10_000
+        assert report[half]["discs"]["depth_error"] < 0.02
+        assert report[half]["discs"]["lateral_error"] < 0.002
     centres = {str(each["by_depth"]["centre_mm"]) for half in report.values() for each in half.values()}
-    assert len(centres) == 4
+    assert len(centres) == 6

@@ -6,13 +6,13 @@ sensor: x, y lateral, z away from the camera from the focal plane, in the medium
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose, pose_of_dots
+from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose, on_the_grid, pose_of_dots
 from lfpiv_cli.calibration.dot_model import (
     DiscFit,
     checked_disc_radius,
@@ -57,6 +57,52 @@ LENS_ROUNDS = 2
 SCALE_TOLERANCE = 1e-4
 
 
+@dataclass(frozen=True, eq=False)
+class FirstLook:
+    """A picture of a board and the dots in it, to within a dot's radius.
+
+    Attributes
+    ----------
+    signal : (rows, columns), dots bright
+    passed : (rows, columns) share of light that pixels pass
+    medium : what the board stands in
+    radius_mm : of the dots
+    start_mm : (n, 2) their lateral places, image axes
+    depth_mm : of all of them
+    """
+
+    signal: NDArray[np.float64]
+    passed: NDArray[np.float32]
+    medium: Media
+    radius_mm: float
+    start_mm: NDArray[np.float64]
+    depth_mm: float
+
+    def fits(
+        self, camera: Camera, board: BoardGeometry, start_mm: NDArray[np.float64], depth_mm: float
+    ) -> list[DiscFit | None]:
+        """Fit a disc to each dot from a first guess of all."""
+        scene = (self.signal, self.passed, camera, board, self.medium)
+        return [fit_one_dot(*scene, (x, y, depth_mm), self.radius_mm) for x, y in start_mm]
+
+
+def first_look(
+    image: NDArray[np.float32],
+    camera: Camera,
+    board: BoardGeometry,
+    media: Media,
+    transmission: NDArray[np.float32] | None = None,
+) -> FirstLook:
+    """Find the dots of a board; parameters and errors are those of `locate_board`."""
+    medium = media.in_air() if board.medium == "air" else media
+    radius = checked_disc_radius(0.5 * board.dot_diameter_mm, camera)
+    passed = np.ones(image.shape, dtype=np.float32) if transmission is None else transmission
+    signal = dot_signal(image, passed, board)
+    return FirstLook(
+        signal, passed, medium, radius, *first_dots(signal, camera, board, medium, candidate_depths(camera, medium))
+    )
+
+
 def locate_board(
     image: NDArray[np.float32],
     camera: Camera,
@@ -79,16 +125,13 @@ def locate_board(
     InputError
         when too few dots are found to make a board
     """
-    medium = media.in_air() if board.medium == "air" else media
-    radius = checked_disc_radius(0.5 * board.dot_diameter_mm, camera)
-    passed = np.ones(image.shape, dtype=np.float32) if transmission is None else transmission
-    signal = dot_signal(image, passed, board)
-    start, depth = first_dots(signal, camera, board, medium, candidate_depths(camera, medium))
+    look = first_look(image, camera, board, media, transmission)
+    start, depth = look.start_mm, look.depth_mm
     micro_images = camera.micro_image_lattice_px()
     for _ in range(LENS_ROUNDS):
-        fits = [fit_one_dot(signal, passed, camera, board, medium, (x, y, depth), radius) for x, y in start]
+        fits = look.fits(camera, board, start, depth)
         places, sigmas = world_places(fits, camera, rotation_rad)
-        array = array_places(places, camera, medium)
+        array = array_places(places, camera, look.medium)
         pose = pose_of_dots(places, sigmas, array, camera, board)
         ratio = pose.magnification / camera.magnification
         bend = pose.distortion_per_mm2 - camera.distortion_per_mm2
@@ -99,6 +142,21 @@ def locate_board(
         ).with_micro_images(micro_images)
         start, depth = start / ratio, pose.z0_mm
     return pose
+
+
+def dots_in_world(
+    image: NDArray[np.float32], camera: Camera, board: BoardGeometry, media: Media, rotation_rad: float = 0.0
+) -> NDArray[np.float64]:
+    """Return where the camera, believed as it is, sees each dot: (dots along y, dots along x, 3); NaN where none is.
+
+    Parameters and errors are those of `locate_board`, which believes in the spacing and asks what the camera is.
+    """
+    look = first_look(image, camera, board, media)
+    places, _ = world_places(look.fits(camera, board, look.start_mm, look.depth_mm), camera, rotation_rad)
+    kept, index = on_the_grid(places, board)
+    dots = np.full((board.dots[1], board.dots[0], 3), np.nan)
+    dots[index[:, 1], index[:, 0]] = places[kept]
+    return dots
 
 
 def world_places(

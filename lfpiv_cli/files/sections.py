@@ -365,11 +365,12 @@ class BoardValidation(Section):
     """What `validate board` does.
 
     images: without faults (ideal), with the simulation's (recorded), or both. methods: ways to the weights, equivalent
-    points (ert) and rays fitted to the boards (dlfc), whose columns take some minutes a board.
+    points (ert) and rays fitted to the boards (dlfc), whose columns take some minutes a board; or no weights, the dots
+    fitted as discs to the pictures (discs), as particles are.
     """
 
     images: Literal["ideal", "recorded", "both"] = "ideal"
-    methods: Annotated[tuple[Literal["ert", "dlfc"], ...], Field(min_length=1)] = ("ert",)
+    methods: Annotated[tuple[Literal["ert", "dlfc", "discs"], ...], Field(min_length=1)] = ("ert",)
 
 
 class ValidationSection(Section):

@@ -6,6 +6,7 @@ else is measured.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -132,22 +133,41 @@ def board_figures(
         `elongation_mm` and `elongation_sigma_mm` (Eqs. 17, 18, averaged over the depths), `lateral_error` (Eq. 19) and
         `depth_error` (Eq. 20, averaged over the steps; `depth_error_mass` by centres of mass), and `by_depth`.
     """
-    spacing = [np.diff(each.lateral_mm[:, 0].reshape(shape[1], shape[0]), axis=1).mean() for each in dots]
-    steps = np.diff(depths_mm)
-    gaussian = np.array([each.depth_mm.mean() for each in dots])
+    lateral = [each.lateral_mm[:, 0].reshape(shape[1], shape[0]) for each in dots]
+    places = place_figures(lateral, [each.depth_mm for each in dots], depths_mm, spacing_mm)
     mass = np.array([each.mass_depth_mm.mean() for each in dots])
-    return {
+    steps = np.diff(depths_mm)
+    return places | {
         "elongation_mm": float(np.mean([each.elongation_mm.mean() for each in dots])),
         "elongation_sigma_mm": float(np.mean([each.elongation_mm.std() for each in dots])),
-        "lateral_error": float(np.mean(np.abs(np.array(spacing) - spacing_mm)) / spacing_mm),
-        "depth_error": float(np.mean(np.abs(np.diff(gaussian) - steps) / steps)),
         "depth_error_mass": float(np.mean(np.abs(np.diff(mass) - steps) / steps)),
-        "by_depth": {
-            "depth_mm": list(depths_mm),
+        "by_depth": places["by_depth"]
+        | {
             "elongation_mm": [float(each.elongation_mm.mean()) for each in dots],
             "elongation_sigma_mm": [float(each.elongation_mm.std()) for each in dots],
-            "spacing_mm": [float(value) for value in spacing],
-            "centre_mm": gaussian.tolist(),
             "centre_mass_mm": mass.tolist(),
         },
+    }
+
+
+def place_figures(
+    x_mm: Sequence[NDArray[np.float64]],
+    depth_mm: Sequence[NDArray[np.float64]],
+    depths_mm: tuple[float, ...],
+    spacing_mm: float,
+) -> dict[str, Any]:
+    """Return the errors of place (Eqs. 19, 20) and the table by depth; dots that were not found are NaN.
+
+    Parameters
+    ----------
+    x_mm : of each board, (dots along y, dots along x)
+    depth_mm : of the dots of each board, any shape
+    """
+    spacing = [float(np.nanmean(np.diff(each, axis=1))) for each in x_mm]
+    centre = [float(np.nanmean(each)) for each in depth_mm]
+    steps = np.diff(depths_mm)
+    return {
+        "lateral_error": float(np.mean(np.abs(np.array(spacing) - spacing_mm)) / spacing_mm),
+        "depth_error": float(np.mean(np.abs(np.diff(centre) - steps) / steps)),
+        "by_depth": {"depth_mm": list(depths_mm), "spacing_mm": spacing, "centre_mm": centre},
     }
