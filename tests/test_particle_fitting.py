@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.microlenses import Lattice
+from lfpiv_cli.particles.covariance import joint_covariance
 from lfpiv_cli.particles.fitting import accept, add_all, claimed_share, judge, refine
 from lfpiv_cli.particles.splitting import split
 from lfpiv_cli.particles.tiles import footprint_px, share_out
@@ -97,10 +98,49 @@ def test_a_ghost_is_not_accepted(view: View, rng: np.random.Generator) -> None:
 def test_a_claim_is_worth_the_light_that_is_there() -> None:
     pixels, values = np.arange(10, dtype=np.int32), np.full((10, 4), 0.1)
     residual = np.full(10, 100.0)
-    assert claimed_share(pixels, values, 10, 1000.0, residual) == 1.0
+    weight = np.ones_like(residual)
+    assert claimed_share(pixels, values, 10, 1000.0, residual, weight) == 1.0
     residual[:4] = -50.0
-    assert claimed_share(pixels, values, 10, 1000.0, residual) == pytest.approx(0.6)
-    assert claimed_share(pixels, values, 10, 2000.0, residual) == pytest.approx(0.6 * 100.0 / 140.0)
+    assert claimed_share(pixels, values, 10, 1000.0, residual, weight) == pytest.approx(0.6)
+    assert claimed_share(pixels, values, 10, 2000.0, residual, weight) == pytest.approx(0.6 * 100.0 / 140.0)
+
+
+def test_pixels_without_weight_claim_and_see_nothing(view: View) -> None:
+    particle = np.array([[0.21, -0.13, 2.3, 2.5e5]])
+    clean = image_of(view, particle)
+    capacity = entry_capacity(view, *DEPTHS)
+    weight = np.where(np.arange(clean.size) % view.columns < 330, 1.0, 0.0)
+    blind = np.where(weight > 0.0, 0.0, -1e6)  # what stands there must not matter
+    chi2, share, seen, _ = judge(view, particle, blind, weight, capacity)
+    assert chi2[0] == 0.0
+    assert share[0] == 1.0
+    assert seen[0] == pytest.approx(clean[weight > 0.0].sum() / 2.5e5)
+    assert 0.1 < seen[0] < 0.9
+
+
+def test_neighbours_that_are_free_widen_the_errors(view: View) -> None:
+    particles = np.array(
+        [[0.20, 0.10, 2.0, 5e5], [0.23, 0.09, 2.2, 4e5], [0.26, 0.17, 1.5, 4e5], [-1.0, 0.9, 1.0, 4e5]]
+    )
+    clean = image_of(view, particles)
+    weight = 1.0 / (clean + 36.0)
+    capacity = entry_capacity(view, *DEPTHS)
+    *_, matrices = judge(view, particles, np.zeros_like(clean), weight, capacity)
+    found = joint_covariance(view, particles, matrices, weight, capacity)
+    slopes = []
+    for number, unknown in np.ndindex(particles.shape):
+        step = np.zeros_like(particles)
+        step[number, unknown] = (1e-4, 1e-4, 1e-4, 1.0)[unknown]
+        slopes.append((image_of(view, particles + step) - image_of(view, particles - step)) / 2.0 / step.max())
+    jacobian = np.array(slopes)
+    whole = np.linalg.inv((jacobian * weight) @ jacobian.T)
+    for number in range(4):
+        part = slice(4 * number, 4 * number + 4)
+        # Pixels between two micro-images count twice in a particle's own matrix; slopes are float32 and differences.
+        np.testing.assert_allclose(np.sqrt(np.diag(found[number])), np.sqrt(np.diag(whole[part, part])), rtol=0.02)
+    alone = np.linalg.inv(matrices)
+    np.testing.assert_allclose(found[3], alone[3])
+    assert found[0, 2, 2] > 1.1 * alone[0, 2, 2]
 
 
 def test_two_merged_particles_are_told_apart(view: View) -> None:

@@ -195,14 +195,23 @@ def fit_particle(
 
 @njit(cache=True)
 def claimed_share(
-    pixels: NDArray[np.int32], values: NDArray[np.float64], count: int, light: float, residual: NDArray[np.float64]
+    pixels: NDArray[np.int32],
+    values: NDArray[np.float64],
+    count: int,
+    light: float,
+    residual: NDArray[np.float64],
+    weight: NDArray[np.float64],
 ) -> float:
-    """Return the share of the light that a particle would claim which is there: sum min(r+, c I f) / sum c I f."""
+    """Return the share of the light that a particle would claim which is there: sum min(r+, c I f) / sum c I f.
+
+    Pixels without weight do not count.
+    """
     found = wanted = 0.0
     for k in range(count):
-        claim = CLAIM * light * values[k, 0]
-        wanted += claim
-        found += min(max(residual[pixels[k]], 0.0), claim)
+        if weight[pixels[k]] > 0.0:
+            claim = CLAIM * light * values[k, 0]
+            wanted += claim
+            found += min(max(residual[pixels[k]], 0.0), claim)
     return found / wanted if wanted > 0.0 else 0.0
 
 
@@ -265,7 +274,7 @@ def accept(
                 if lowest == 0.0 or best[3] < smallest_light:
                     continue
                 count = respond(view, best[0], best[1], best[2], pixels, values)
-                if claimed_share(pixels, values, count, best[3], residual) >= smallest_share:
+                if claimed_share(pixels, values, count, best[3], residual, weight) >= smallest_share:
                     candidates[number] = best
                     accepted[number] = True
                     add_light(pixels, values, count, -best[3], residual)
@@ -299,9 +308,10 @@ def judge(
     weight: NDArray[np.float64],
     capacity: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return local chi-squared, claimed share, share of the light on the sensor and normal matrix of each particle.
+    """Return local chi-squared, claimed share, share of the light that is seen and normal matrix of each particle.
 
-    Local chi-squared is the mean of w r^2 over the particle's light; 1 for a perfect model.
+    Local chi-squared is the mean of w r^2 over the particle's light; 1 for a perfect model. Pixels without weight see
+    nothing.
     """
     chi2, share, seen = np.zeros(len(particles)), np.zeros(len(particles)), np.zeros(len(particles))
     matrices = np.zeros((len(particles), UNKNOWNS, UNKNOWNS))
@@ -314,6 +324,8 @@ def judge(
         found = wanted = total = squares = 0.0
         for k in range(count):
             f, r = values[k, 0], residual[pixels[k]]
+            if weight[pixels[k]] == 0.0:
+                continue
             total += f
             squares += f * weight[pixels[k]] * r * r
             wanted += CLAIM * light * f

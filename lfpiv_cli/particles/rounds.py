@@ -19,6 +19,7 @@ from scipy.spatial import KDTree
 
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.particles.candidates import explain_rest, find_peaks, points_in_raw_frame
+from lfpiv_cli.particles.covariance import joint_covariance
 from lfpiv_cli.particles.fitting import accept, add_all, judge, refine
 from lfpiv_cli.particles.noise import Noise, estimate_noise
 from lfpiv_cli.particles.splitting import split
@@ -105,6 +106,7 @@ class Task:
     ----------
     view : the raw image's optics
     image : (rows * columns,) dark-subtracted counts
+    believed : (rows * columns,) which pixels take part
     prepared : (rows, columns) the same in the weights' frame
     depths_mm : between which particles may lie
     """
@@ -114,6 +116,7 @@ class Task:
     camera: Camera
     sums: Normalisers
     image: NDArray[np.float64]
+    believed: NDArray[np.bool_]
     prepared: NDArray[np.float32]
     depths_mm: tuple[float, float]
 
@@ -151,6 +154,7 @@ def find_particles(
     sums: Normalisers,
     rounds: tuple[Round, ...] = ROUNDS,
     progress: Callable[[int], None] | None = None,
+    excluded: NDArray[np.bool_] | None = None,
 ) -> Particles:
     """Return the particles that explain a raw image.
 
@@ -160,8 +164,9 @@ def find_particles(
     weights, sums : of the volume in which particles are looked for, and their `normalisers` on the padded grid
     camera : says which world axis the columns follow
     progress : called with 1 after each iteration and each round
+    excluded : (rows, columns) raw pixels that are not believed; `sums` must leave out what they touch; default: none
     """
-    task = _task(image, view, weights, camera, sums)
+    task = _task(image, view, weights, camera, sums, excluded)
     state = State(np.zeros((0, 4)), task.image.copy(), 0.0, estimate_noise(task.image, 0.0), np.zeros((0, 5)))
     for settings in rounds:
         state = _one_round(task, state, settings, progress)
@@ -171,7 +176,14 @@ def find_particles(
     return _result(task, state, image.shape)
 
 
-def _task(image: NDArray[np.float32], view: View, weights: Weights, camera: Camera, sums: Normalisers) -> Task:
+def _task(
+    image: NDArray[np.float32],
+    view: View,
+    weights: Weights,
+    camera: Camera,
+    sums: Normalisers,
+    excluded: NDArray[np.bool_] | None,
+) -> Task:
     low, high = weights.grid.bounds_mm(2)
     return Task(
         view,
@@ -179,6 +191,7 @@ def _task(image: NDArray[np.float32], view: View, weights: Weights, camera: Came
         camera,
         sums,
         np.ascontiguousarray(image, dtype=np.float64).ravel(),
+        np.ones(image.size, np.bool_) if excluded is None else ~excluded.ravel(),
         weights.prepare(image.astype(np.float32)),
         (low - DEPTH_MARGIN_MM, high + DEPTH_MARGIN_MM),
     )
@@ -213,7 +226,7 @@ def _candidates(
 
 
 def _weight(task: Task, state: State, unexplained: float) -> NDArray[np.float64]:
-    return state.noise.weights(task.image - state.residual, state.residual, unexplained)
+    return np.where(task.believed, state.noise.weights(task.image - state.residual, state.residual, unexplained), 0.0)
 
 
 def _sweep(task: Task, state: State, unexplained: float, sweeps: int) -> None:
@@ -333,7 +346,8 @@ def _result(task: Task, state: State, shape: tuple[int, int]) -> Particles:
     weight = _weight(task, state, 0.0)
     chi2, _, seen, matrices = judge(task.view, particles, state.residual, weight, task.capacity)
     # What neighbours leave unexplained is as large an error as noise: the scatter says how large.
-    covariance = np.linalg.inv(matrices) * np.maximum(chi2, 1.0)[:, np.newaxis, np.newaxis]
+    joint = joint_covariance(task.view, particles, matrices, weight, task.capacity)
+    covariance = joint * np.maximum(chi2, 1.0)[:, np.newaxis, np.newaxis]
     to_world = task.camera.to_image_axes(np.eye(3))
     return Particles(
         position_mm=task.camera.to_image_axes(particles[:, :3]),
