@@ -86,18 +86,6 @@ def read_page(path: Path, page: int, shape: tuple[int, int] | None = None) -> Im
         return _decode_page(tiff, page, shape)
 
 
-def read_frames(path: Path, shape: tuple[int, int] | None = None) -> Iterator[Image]:
-    """Read all frames of a file, one at a time: see `read_image`. They must have one shape."""
-    if _is_png(path):
-        yield _read_png(path, shape)
-        return
-    with _open_tiff(path) as (tiff, pages):
-        for page in range(pages):
-            frame = _decode_page(tiff, page, shape)
-            shape = (frame.shape[0], frame.shape[1])
-            yield frame
-
-
 def write_tiff(path: Path, array: NDArray[Any], overwrite: bool) -> None:
     """Write an image (rows, columns) of type uint8 or uint16, packed without loss and without time stamps.
 
