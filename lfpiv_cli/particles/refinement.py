@@ -181,7 +181,10 @@ def refine_calibration(
     found = [replace(first, position_mm=camera.to_image_axes(fit.particles[:, :3]))]
     found += [search(image, fit.view) for image in images[1:]]
     position = np.concatenate([each.position_mm for each in found])
-    sigma = np.concatenate([np.sqrt(each.covariance_mm2[:, 2, 2]) for each in found])
+    variance = np.concatenate([each.covariance_mm2[:, 2, 2] for each in found])
+    # A particle that hardly lights the sensor may have no depth that can be told.
+    told = np.isfinite(variance) & (variance > 0.0)
+    position, sigma = position[told], np.sqrt(variance[told])
     return Refinement(
         walls=find_walls(position, sigma, grid.bounds_mm(2), width_mm, len(images)),
         nuisances=fit.found,
