@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.config import Config
+from lfpiv_cli.files.images import write_tiff
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, Points, read_points, symmetric, write_points
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.files.weights_file import WeightsFile
@@ -51,22 +53,53 @@ def ensure_solvable(content: WeightsFile, settings: Config) -> None:
     raw_view(content.camera, settings.media_model(), 0.0, content.weights.calibration)
 
 
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """An image and what of it takes part.
+
+    Attributes
+    ----------
+    image : (rows, columns) raw but for dark and background
+    unusable : (rows, columns) pixels that are not believed
+    sums : of the padded weights without what these touch
+    """
+
+    image: NDArray[np.float32]
+    unusable: NDArray[np.bool_]
+    sums: Normalisers
+
+
+def residual_path(particles: Path) -> Path:
+    """Return where the residual image of a file of particles goes."""
+    return particles.with_name(f"{particles.stem}_residual.tif")
+
+
 def write_frame(
     content: WeightsFile,
     settings: Config,
-    image: NDArray[np.float32],
-    sums: Normalisers,
+    frame: Frame,
     path: Path,
     provenance: Mapping[str, Any],
     overwrite: bool,
     progress: Callable[[int], None],
 ) -> float:
-    """Find the particles behind an image, raw but for dark and background, and write them; return the residual."""
+    """Find the particles behind an image and write them and what they leave of it; return the relative residual."""
     radius = 0.5 * settings.reconstruction.particle_diameter_mm
     view = raw_view(content.camera, settings.media_model(), radius, content.weights.calibration)
-    found = find_particles(image, view, content.weights, content.camera, sums, progress=progress)
-    norm = float(np.linalg.norm(image.astype(np.float64)))
-    residual = float(np.linalg.norm(found.residual)) / norm if norm > 0.0 else 0.0
+    found = find_particles(
+        frame.image,
+        view,
+        content.weights,
+        content.camera,
+        frame.sums,
+        progress=progress,
+        excluded=frame.unusable,
+    )
+    left = np.where(frame.unusable, 0.0, found.residual)
+    norm = float(np.linalg.norm(np.where(frame.unusable, 0.0, frame.image)))
+    residual = float(np.linalg.norm(left)) / norm if norm > 0.0 else 0.0
+    # Made again whenever the particles are: an interrupted batch may have left one without them.
+    write_tiff(residual_path(path), left.astype(np.float32), overwrite=True)
     write_points(
         path,
         PARTICLES_FORMAT,
@@ -83,6 +116,8 @@ def write_frame(
             "reference": content.reference,
             "reference_z_mm": content.reference_z_mm,
             "residual": residual,
+            "residual_rms_counts": float(np.sqrt(np.mean(left[~frame.unusable] ** 2))),
+            "excluded_pixels": int(np.count_nonzero(frame.unusable)),
             "read_noise_counts": found.noise.read_counts,
         },
         overwrite=overwrite,

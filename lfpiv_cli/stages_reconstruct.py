@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 
 from lfpiv_cli import stages_particles
 from lfpiv_cli.console import Console
-from lfpiv_cli.errors import InputError, PartialError, UsageError
+from lfpiv_cli.errors import InputError, PartialError
 from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files import vtkhdf
+from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.batch import Frame, Target, frames_of, output_paths, pending, prepare_folder
 from lfpiv_cli.files.config import Config, carried_config
 from lfpiv_cli.files.inputs import given
@@ -144,9 +145,9 @@ def reconstruct(
     needed = pending(targets, [*common.values(), *images], overwrite, resume, _record_of)
     as_particles = settings.reconstruction.solver == "particles"
     if as_particles:
-        if mask is not None:
-            raise UsageError("--mask: particles are fitted to the whole image; leave the mask to the other solvers")
         stages_particles.ensure_solvable(content, settings)
+        for number in needed:
+            ensure_writable(stages_particles.residual_path(paths[number]), overwrite or resume, images)
     bench = _bench(content, settings, dark, mask, bool(needed))
     read = _reader(level, frames, bench)
     steps = stages_particles.STEPS if as_particles else settings.reconstruction.iterations
@@ -211,24 +212,27 @@ def _make(
     bench: Bench, target: Target, raw: Image, lit: Image, overwrite: bool, advance: Callable[[int], None]
 ) -> Outcome:
     """Make and write the particles or the volume of a frame."""
+    unusable = bench.lasting | saturated(raw, bench.settings.reconstruction.saturation_counts)
+    lit = filled(lit, unusable)
+    image, excluded = _prepared(bench, lit, unusable)
     if bench.sums is not None and bench.settings.reconstruction.solver == "particles":
+        sums = bench.sums if excluded is bench.excluded else bench.sums.without(bench.content.weights.padded, excluded)
+        frame = stages_particles.Frame(lit, unusable, sums)
         residual = stages_particles.write_frame(
-            bench.content, bench.settings, lit, bench.sums, target.path, target.record, overwrite, advance
+            bench.content, bench.settings, frame, target.path, target.record, overwrite, advance
         )
-        return Outcome(residual, 0)
-    image, excluded = _prepared(bench, raw, lit)
+        return Outcome(residual, int(np.count_nonzero(unusable)))
     result = _solved(bench, image, excluded, advance)
     outcome = Outcome(float(result.residual[-1]), int(np.count_nonzero(excluded)))
     _write(target, bench.content, result, outcome.excluded_pixels, overwrite)
     return outcome
 
 
-def _prepared(bench: Bench, raw: Image, lit: Image) -> tuple[Image, Mask]:
+def _prepared(bench: Bench, lit: Image, unusable: Mask) -> tuple[Image, Mask]:
     """Return an image in the weights' frame and which of its pixels take no part."""
     prepare = bench.content.weights.prepare
-    too_bright = saturated(raw, bench.settings.reconstruction.saturation_counts)
-    image = prepare(filled(lit, bench.lasting | too_bright))
-    return image, bench.excluded | touched(too_bright, prepare) if too_bright.any() else bench.excluded
+    too_bright = unusable & ~bench.lasting
+    return prepare(lit), bench.excluded | touched(too_bright, prepare) if too_bright.any() else bench.excluded
 
 
 def _solved(bench: Bench, image: Image, excluded: Mask, advance: Callable[[int], None]) -> Reconstruction:

@@ -55,6 +55,29 @@ def test_particles_are_found_where_they_are(
     assert np.all(np.median(np.abs(error / sigma), axis=0) > 0.5 * 0.6745)
 
 
+def test_pixels_that_are_left_out_do_not_matter(table2: Camera, water: Media, rng: np.random.Generator) -> None:
+    camera = replace(table2, columns=360, rows=300)
+    grid = Grid.centred((14, 11, 10), (0.1, 0.1, 0.1), (0.0, 0.0, 1.9))
+    true = rng.uniform(*(np.array([grid.bounds_mm(axis)[side] for axis in range(3)]) for side in (0, 1)), (12, 3))
+    space = ObjectSpace(water, None, "paraxial")
+    image = render_points(camera, space, true, np.full(12, 4e5), 0.05, rng, rays=50_000).astype(np.float32)
+    image += rng.normal(0.0, 6.0, image.shape).astype(np.float32)
+    left_out = np.zeros(image.shape, np.bool_)
+    left_out[100:140, 150:200] = True
+    weights = weights_of(camera, water, grid)
+    sums = normalisers(weights.padded, left_out)
+    found = []
+    for reflection in (0.0, 5e4):
+        spoilt = np.where(left_out, np.float32(reflection), image)
+        view = raw_view(camera, water, 0.025)
+        found.append(find_particles(spoilt, view, weights, camera, sums, excluded=left_out))
+    np.testing.assert_array_equal(found[1].position_mm, found[0].position_mm)
+    np.testing.assert_array_equal(found[1].covariance_mm2, found[0].covariance_mm2)
+    distance, _ = KDTree(found[0].position_mm / (0.05, 0.05, 0.2)).query(true / (0.05, 0.05, 0.2))
+    assert np.sum(distance < 1.0) >= 10
+    assert len(found[0].position_mm) <= 13
+
+
 def test_an_empty_image_has_no_particles(table2: Camera, water: Media) -> None:
     camera = replace(table2, columns=200, rows=200)
     weights = weights_of(camera, water, Grid.centred((6, 6, 4), (0.1, 0.1, 0.1), (0.0, 0.0, 2.0)))

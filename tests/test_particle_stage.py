@@ -7,12 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tifffile
 from scipy.spatial import KDTree
 
 from lfpiv_cli.cli import cli
 from lfpiv_cli.errors import ConfigError, InputError, OutputExistsError
 from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.files.config import load_config
+from lfpiv_cli.files.images import read_image
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, read_points, write_points
 from lfpiv_cli.files.particles import read_particles
 from lfpiv_cli.stages_particles import ensure_solvable
@@ -93,8 +95,18 @@ def test_the_sample_from_images_to_vectors(tmp_path: Path) -> None:
     dark = ("--dark", still[1])
     run("calibrate-snapshot", CONFIG, "--white", still[0], *dark, "--board", still[2], "-o", calibration)
     run("build-weights", CONFIG, "--calibration", calibration, "-o", weights)
-    run("reconstruct", weights, *still[3:], *dark, "--solver", "particles", "-o", tmp_path / "particles")
+    mask = np.full(read_image(still[1]).shape, 255, np.uint8)
+    mask[:20, :30] = 0
+    tifffile.imwrite(tmp_path / "mask.tif", mask)
+    masked = (*dark, "--mask", tmp_path / "mask.tif")
+    run("reconstruct", weights, *still[3:], *masked, "--solver", "particles", "-o", tmp_path / "particles")
     frames = [tmp_path / "particles" / f"pair_{name}.vtkhdf" for name in "ab"]
+    attributes = vtkhdf.read_header(frames[0]).attributes
+    assert attributes["excluded_pixels"] == 600
+    left = read_image(tmp_path / "particles" / "pair_a_residual.tif")
+    assert not left[:20, :30].any()
+    rms = np.sqrt(np.sum(left**2, dtype=np.float64) / (left.size - 600))
+    assert attributes["residual_rms_counts"] == pytest.approx(rms, rel=1e-5)
     run("track", *frames, "-o", tmp_path / "tracks.vtkhdf", "--grid")
 
     truth = read_particles(SAMPLE / "particles.npz")

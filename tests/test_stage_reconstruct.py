@@ -10,7 +10,7 @@ import tifffile
 
 from lfpiv_cli import open_volume
 from lfpiv_cli.cli import cli
-from lfpiv_cli.errors import InputError, OutputExistsError, UsageError
+from lfpiv_cli.errors import InputError, OutputExistsError
 from lfpiv_cli.files.images import read_image
 from lfpiv_cli.stages_reconstruct import Background
 
@@ -121,22 +121,6 @@ def test_frames_around_a_frame():
     assert list(Background.parse("mean").around(1, 4)) == [0, 1, 2, 3]
     assert Background.parse("minimum:x") == Background(path=Path("minimum:x"))
     assert not Background.parse("background.tif").around(0, 4)
-
-
-def test_particles_do_not_take_a_mask(weights, tmp_path):
-    mask = SAMPLE / "dark.tif"
-    with pytest.raises(UsageError, match="--mask"):
-        run(
-            "reconstruct",
-            weights,
-            SAMPLE / "pair_a.tif",
-            "--solver",
-            "particles",
-            "--mask",
-            mask,
-            "-o",
-            tmp_path / "p.vtkhdf",
-        )
 
 
 def test_voxels_without_light_stay_out_with_lines_of_sight(weights, tmp_path):

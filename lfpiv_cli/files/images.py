@@ -93,8 +93,8 @@ def write_tiff(path: Path, array: NDArray[Any], overwrite: bool) -> None:
     ------
     OutputExistsError, OutputError
     """
-    if array.dtype not in (np.uint8, np.uint16) or array.ndim != 2:
-        raise TypeError(f"images are written as uint8 or uint16 (rows, columns), not {array.dtype} {array.shape}")
+    if array.dtype not in (np.uint8, np.uint16, np.float32) or array.ndim != 2:
+        raise TypeError(f"images are uint8, uint16 or float32 (rows, columns), not {array.dtype} {array.shape}")
 
     def write(temporary: Path) -> None:
         tifffile.imwrite(
@@ -102,7 +102,7 @@ def write_tiff(path: Path, array: NDArray[Any], overwrite: bool) -> None:
             array,
             photometric="minisblack",
             compression="zlib",
-            predictor=True,
+            predictor=array.dtype != np.float32,
             metadata=None,
             software=False,
         )
