@@ -10,15 +10,16 @@ from numpy.typing import NDArray
 
 from lfpiv_cli import stages, stages_calibrate, stages_correlate, stages_reconstruct, stages_simulate
 from lfpiv_cli.console import Console
-from lfpiv_cli.errors import InputError, LimitMissedError
+from lfpiv_cli.errors import InputError, LimitMissedError, UsageError
 from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.files.atomic import ensure_writable, write_json
 from lfpiv_cli.files.batch import prepare_folder
-from lfpiv_cli.files.config import Config, load_config
+from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.particles import read_particles
 from lfpiv_cli.files.pictures import ensure_drawing, write_picture
 from lfpiv_cli.files.provenance import record
+from lfpiv_cli.files.sections import FlowSection
 from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.validation.channel import Duct, table_4, worst_slice
 from lfpiv_cli.validation.flow import flow_figures, limits_missed, truth_at_points
@@ -29,10 +30,13 @@ def validate_flow(
     config: Path, vectors: Path | None, particles: Path | None, output: Path, overwrite: bool, console: Console
 ) -> dict[str, Any]:
     """Judge a vector field by an analytic flow or by true particles; without one, make it from simulated images."""
+    is_simulated = vectors is None
+    if is_simulated and particles is not None:
+        raise UsageError("--particles needs --vectors: the flow of a simulation is known")
     paths = {name: output / name for name in ("flow.json", "flow.png", "flow_slices.png")}
     prepare_folder(list(paths.values()))
     settings = load_config(config)
-    duct = duct_of(settings)
+    duct = duct_of(settings.simulation.flow if is_simulated else settings.validation.flow or settings.simulation.flow)
     if duct is None:
         del paths["flow_slices.png"]
     for target in paths.values():
@@ -50,7 +54,8 @@ def validate_flow(
             particles, centres, vtkhdf.read_header(vectors).attributes["reference_z_mm"]
         )
     else:
-        truth = settings.true_flow()(centres.reshape(-1, 3)).reshape(centres.shape)
+        flow = settings.simulated_flow() if is_simulated else settings.true_flow()
+        truth = flow(centres.reshape(-1, 3)).reshape(centres.shape)
         inside = np.asarray(truth.any(axis=-1))
     figures = flow_figures(field, truth, inside)
     if duct is not None:
@@ -68,9 +73,8 @@ def validate_flow(
     return summary
 
 
-def duct_of(settings: Config) -> Duct | None:
-    """Return the duct whose flow is the truth, None where it is another flow."""
-    flow = settings.validation.flow or settings.simulation.flow
+def duct_of(flow: FlowSection | None) -> Duct | None:
+    """Return the duct of a flow, None where it is another one."""
     if flow is None or flow.kind != "square_duct":
         return None
     return Duct(flow.width_mm, flow.centre_mm, flow.axis)

@@ -8,13 +8,18 @@ from pathlib import Path
 import pytest
 
 from lfpiv_cli.cli import cli
-from lfpiv_cli.errors import OutputExistsError
+from lfpiv_cli.errors import OutputExistsError, UsageError
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 
 
 def run(*arguments: object) -> None:
     cli.main([str(argument) for argument in arguments], standalone_mode=False)
+
+
+def test_particles_are_no_truth_for_what_is_simulated(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="--vectors"):
+        run("validate", "flow", CONFIGS / "sample.yaml", "--particles", "p.npz", "-o", tmp_path / "report")
 
 
 @pytest.mark.slow
