@@ -63,6 +63,32 @@ def test_a_wrong_mid_plane_is_found_and_mended(wrong: Path, tmp_path: Path, caps
     assert picture.stat().st_size > 10_000
 
 
+@pytest.mark.slow
+def test_half_a_millimetre_on_the_recorded_pair(
+    data_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data, config = data_folder / "channel", ROOT / "configs" / "channel.yaml"
+    dark, off = ("--dark", data / "dark.tif"), tmp_path / "off.h5"
+    stills = ("--white", data / "white.tif", "--board", data / "board.tif")
+    run("calibrate-snapshot", config, *stills, *dark, "-o", tmp_path / "calibration.h5")
+    right = read_calibration(tmp_path / "calibration.h5")
+    assert right.mid_plane_z_mm is not None
+    moved = replace(right.rectification, fit=right.fit.shifted(np.array([0.2, -0.1])))
+    write_calibration(off, replace(right, rectification=moved, mid_plane_z_mm=right.mid_plane_z_mm + 0.5), {}, False)
+    capsys.readouterr()
+    run("refine-calibration", config, data / "pair_a.tif", "--calibration", off, *dark, "--json")
+    summary = json.loads(capsys.readouterr().out)
+    truth = json.loads((data / "truth.json").read_text())
+    # Measured: 0.005 mm and 0.0004 px are left.
+    left = summary["mid_plane_z_mm"] - truth["mid_plane_z_mm"]
+    assert abs(left) < min(0.02, 2 * summary["mid_plane_z_mm_sigma"])
+    np.testing.assert_allclose(summary["lattice_shift_px"], (-0.2, 0.1), atol=4e-3)
+    assert np.all(np.abs(summary["wall_tilt_deg"]) < 2 * np.array(summary["wall_tilt_deg_sigma"]))
+    for name, true in (("magnification", -1.0), ("aperture_mm", 25.0), ("particle_diameter_mm", 0.05)):
+        assert abs(summary[name] - true) < 2 * summary[f"{name}_sigma"], name
+    assert abs(summary["k1_per_mm2"] - truth["camera"]["k1"]) < 2 * summary["k1_per_mm2_sigma"]
+
+
 def test_a_config_without_a_channel_is_refused(wrong: Path, tmp_path: Path) -> None:
     config = tmp_path / "rig.yaml"
     lines = [line for line in CONFIG.read_text().splitlines() if not line.startswith("channel")]
