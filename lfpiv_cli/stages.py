@@ -21,6 +21,7 @@ from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.provenance import record as provenance_record
 from lfpiv_cli.files.weights_file import WeightsFile, write_weights
 from lfpiv_cli.grid import Grid
+from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.stages_weights import make_operator, ray_source
 from lfpiv_cli.weights.build import default_padding, scene_distortion
 from lfpiv_cli.weights.columns import seen_share
@@ -68,7 +69,8 @@ def build_weights(
     source = ray_source(settings, found, grid, console)
     _judge_view(*seen_share(camera, source, grid), grid, console)
     operator = make_operator(settings.weights, camera, source, grid.padded(padding), console)
-    bend = scene_distortion(camera, media, grid) if isinstance(operator, FactorisedOperator) else None
+    traced = isinstance(source, ObjectSpace) and isinstance(operator, FactorisedOperator)
+    bend = scene_distortion(camera, media, grid) if traced else None
     weights = Weights(grid, padding, operator, camera.column_axis, found, bend)
     record = _record("build-weights", settings, inputs)
     vignetting = found.vignetting() if found else None

@@ -25,8 +25,7 @@ from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.optics.polynomial_rays import PolynomialRays
 from lfpiv_cli.validation.weights import TABLE1_MM, limits_missed, make_columns, sample_voxels, weights_figures
 from lfpiv_cli.validation.weights_pictures import column_figure, columns_figure, similarity_figure
-from lfpiv_cli.weights.build import factorise_through, separates
-from lfpiv_cli.weights.columns import ColumnOperator, OnDemandOperator
+from lfpiv_cli.weights.columns import ColumnOperator, OnDemandOperator, operator_of
 from lfpiv_cli.weights.model import WeightsOperator
 from lfpiv_cli.weights.rays import count_columns
 from lfpiv_cli.weights.scene import Source
@@ -139,15 +138,12 @@ def make_operator(
     ------
     ConfigError : counting would take too long
     """
+    if chosen.sampling == "exact" or isinstance(source, PolynomialRays):
+        operator = operator_of(camera, source, grid)
+        if isinstance(operator, OnDemandOperator):
+            console.say("lfpiv: array or rays do not separate into axes; columns are made on demand, for what is lit")
+        return operator
     layout = OnDemandOperator(camera, source, grid)
-    if isinstance(source, PolynomialRays):
-        console.say("lfpiv: fitted rays do not separate into two axes; columns will be made on demand, for what is lit")
-        return layout
-    if chosen.sampling == "exact":
-        if separates(camera):
-            return factorise_through(camera, source, grid)
-        console.say("lfpiv: the array's axes do not separate; columns will be made on demand, for what is lit")
-        return layout
     voxels = math.prod(layout.shape)
     rays = voxels * chosen.points * chosen.rays_per_point
     if rays > MOST_RAYS:

@@ -365,8 +365,8 @@ class BoardValidation(Section):
     """What `validate board` does.
 
     images: without faults (ideal), with the simulation's (recorded), or both. methods: ways to the weights, equivalent
-    points (ert) and rays fitted to the boards (dlfc), whose columns take some minutes a board; or no weights, the dots
-    fitted as discs to the pictures (discs), as particles are.
+    points (ert) and rays fitted to the boards (dlfc); or no weights, the dots fitted as discs to the pictures (discs), as
+    particles are.
     """
 
     images: Literal["ideal", "recorded", "both"] = "ideal"

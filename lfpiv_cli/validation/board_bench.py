@@ -22,7 +22,7 @@ from lfpiv_cli.synthetic.board import BoardPlacement, render_board
 from lfpiv_cli.synthetic.scenes import Misalignment, dark_frame, simulate_board, simulate_white
 from lfpiv_cli.synthetic.sensor import Readout
 from lfpiv_cli.weights.build import factorise_through, scene_distortion
-from lfpiv_cli.weights.columns import OnDemandOperator
+from lfpiv_cli.weights.columns import operator_of
 from lfpiv_cli.weights.model import Weights
 
 # The board that calibrates the real camera stands so far behind the focal plane, in air, where depth shows well.
@@ -49,7 +49,7 @@ class BoardBench:
     def with_fitted_rays(self, pictures: Sequence[Image], depths_mm: Sequence[float]) -> BoardBench:
         """Return the bench with weights of rays fitted to pictures of its board at depths."""
         rays = fit_rays(pictures, depths_mm, self.rig.camera, self.rig.board, self.rig.media).rays
-        operator = OnDemandOperator(self.rig.camera, rays, self.weights.grid)
+        operator = operator_of(self.rig.camera, rays, self.weights.grid)
         return replace(self, weights=replace(self.weights, solver_operator=operator, scene_distortion_per_mm2=None))
 
 

@@ -76,6 +76,22 @@ class Bending:
 
 
 @dataclass(frozen=True, eq=False)
+class FittedBending:
+    """How rays from the planes of a volume meet the array, along one axis, as polynomials.
+
+    Attributes
+    ----------
+    coefficients_mm : (planes, depth nodes, degree + 1, degree + 1) of the place on the array by the powers of x and X
+    scale_mm : (2,) what x and X are divided by
+    strips : straight pieces in which the aperture is worked on
+    """
+
+    coefficients_mm: NDArray[np.float64]
+    scale_mm: NDArray[np.float64]
+    strips: int
+
+
+@dataclass(frozen=True, eq=False)
 class Cells:
     """The cells of one axis, lens by lens and pixel by pixel.
 
@@ -160,7 +176,9 @@ def _patches(optics: AxisOptics, lens_mm: NDArray[np.float64], pixel: NDArray[np
     return np.stack([np.minimum(patch[:, 0], radius - sliver), np.maximum(patch[:, 1], sliver - radius)], axis=1)
 
 
-def axis_weights(optics: AxisOptics, centres_mm: NDArray[np.float64], width_mm: float, bending: Bending) -> AxisWeights:
+def axis_weights(
+    optics: AxisOptics, centres_mm: NDArray[np.float64], width_mm: float, bending: Bending | FittedBending
+) -> AxisWeights:
     """Integrate the weights of all voxels along one axis.
 
     Parameters
@@ -169,7 +187,13 @@ def axis_weights(optics: AxisOptics, centres_mm: NDArray[np.float64], width_mm: 
     width_mm : their width
     bending : of the rays in front of the array
     """
-    planes, nodes = bending.nodes.shape[:2]
+    if isinstance(bending, FittedBending):
+        fitted, scale = bending.coefficients_mm, bending.scale_mm
+        slopes = np.zeros((*fitted.shape[:2], 1))
+        traced = Bending(slopes, slopes, 1.0)
+    else:
+        fitted, scale, traced = np.zeros((*bending.nodes.shape[:2], 0, 0)), np.ones(2), bending
+    planes, nodes = fitted.shape[:2]
     node_share = np.polynomial.legendre.leggauss(nodes)[1] / 2.0
     camera = np.array(
         [
@@ -180,14 +204,14 @@ def axis_weights(optics: AxisOptics, centres_mm: NDArray[np.float64], width_mm: 
             optics.lens_origin_mm,
             optics.lens_pitch_mm,
             optics.pixel_mm,
-            bending.focal_length_mm,
-            bending.beside_mm2,
+            traced.focal_length_mm,
+            traced.beside_mm2,
         ]
     )
     cells = micro_image_cells(optics)
     layout = (cells.first_lens, cells.start, cells.pixel)
-    slopes = (bending.nodes, bending.factors, bending.strips)
-    scene = (camera, optics.pixels, *layout, centres_mm, width_mm, *slopes, node_share)
+    bent = (traced.nodes, traced.factors, fitted, scale, bending.strips)
+    scene = (camera, optics.pixels, *layout, centres_mm, width_mm, *bent, node_share)
     counts = np.zeros(planes * centres_mm.size, np.int64)
     _integrate(*scene, np.zeros(0, np.int64), counts, np.zeros(0, np.int32), np.zeros(0, np.float32))
     start = np.concatenate([[0], np.cumsum(counts)])
@@ -268,12 +292,24 @@ def _array_place(
     camera: NDArray[np.float64],
     nodes: NDArray[np.float64],
     factors: NDArray[np.float64],
+    fitted: NDArray[np.float64],
+    scale: NDArray[np.float64],
 ) -> tuple[float, float]:
-    """Return where on the array the ray from `centre` through X = `crossing` arrives, and how much x moves that.
+    """Return where on the array the ray from `centre` through X = `crossing` arrives, and how much -x moves that.
 
-    The other axis enters by its mean square distance: of a disc's chord at X, a third of its half length squared, and
-    of the voxels.
+    Where rays are traced, the other axis enters by its mean square distance: of a disc's chord at X, a third of its
+    half length squared, and of the voxels.
     """
+    if fitted.shape[0] > 0:
+        x, across = centre / scale[0], crossing / scale[1]
+        place, slope = 0.0, 0.0
+        for a in range(fitted.shape[0] - 1, -1, -1):
+            part = 0.0
+            for b in range(fitted.shape[1] - 1, -1, -1):
+                part = part * across + fitted[a, b]
+            slope = slope * x + place
+            place = place * x + part
+        return place, -slope / scale[0]
     s_i, radius, focal_length, beside = camera[0], camera[3], camera[7], camera[8]
     lateral = crossing - centre
     chord = max(radius * radius - crossing * crossing, 0.0) / 3.0
@@ -292,6 +328,8 @@ def _voxel_shares(
     width: float,
     nodes: NDArray[np.float64],
     factors: NDArray[np.float64],
+    fitted: NDArray[np.float64],
+    scale: NDArray[np.float64],
     strips: int,
     node_share: NDArray[np.float64],
     work: NDArray[np.float64],
@@ -310,8 +348,8 @@ def _voxel_shares(
         node, strip = task // strips, task % strips
         low, high = strip * side - radius, (strip + 1) * side - radius
         _set_rectangle(rectangle, centre - 0.5 * width, centre + 0.5 * width, low, high)
-        place_low, scale_low = _array_place(low, centre, camera, nodes[node], factors[node])
-        place_high, scale_high = _array_place(high, centre, camera, nodes[node], factors[node])
+        place_low, scale_low = _array_place(low, centre, camera, nodes[node], factors[node], fitted[node], scale)
+        place_high, scale_high = _array_place(high, centre, camera, nodes[node], factors[node], fitted[node], scale)
         alpha, beta = (place_high - place_low) / side, -0.5 * (scale_low + scale_high)
         offset = place_low - alpha * low - beta * centre
         reach = abs(beta) * 0.5 * width
@@ -353,6 +391,8 @@ def _integrate(
     width: float,
     nodes: NDArray[np.float64],
     factors: NDArray[np.float64],
+    fitted: NDArray[np.float64],
+    scale: NDArray[np.float64],
     strips: int,
     node_share: NDArray[np.float64],
     start: NDArray[np.int64],
@@ -361,12 +401,13 @@ def _integrate(
     share: NDArray[np.float32],
 ) -> None:
     """Fill `counts` (when `start` is empty) or `cell` and `share`, one plane after the other."""
-    for plane in prange(nodes.shape[0]):
+    for plane in prange(fitted.shape[0]):
         shares = np.zeros(cell_pixel.size)
         work = np.empty((4, 12, 2))
         layout = (first_lens, cell_start, cell_pixel)
         for k in range(centres.size):
-            scene = (centres[k], width, nodes[plane], factors[plane], strips, node_share, work, shares)
+            slopes = (nodes[plane], factors[plane], fitted[plane], scale, strips)
+            scene = (centres[k], width, *slopes, node_share, work, shares)
             begin, end = _voxel_shares(camera, pixels, *layout, *scene)
             row = plane * centres.size + k
             found = 0

@@ -6,6 +6,8 @@ in the frame that the array is aligned with (`rectified`), x and y lateral, z aw
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,15 +16,22 @@ from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
 from lfpiv_cli.optics.object_space import ObjectSpace
+from lfpiv_cli.optics.polynomial_rays import PolynomialRays
+from lfpiv_cli.optics.tracing import disc_points
 from lfpiv_cli.weights.aperture import aperture_mask
-from lfpiv_cli.weights.axis import AxisOptics, AxisWeights, Bending, axis_weights, depth_nodes
+from lfpiv_cli.weights.axis import AxisOptics, Bending, FittedBending, axis_weights, depth_nodes
 from lfpiv_cli.weights.operators import FactorisedOperator
+from lfpiv_cli.weights.scene import Source
 
 # A lattice counts as aligned with the sensor when over its whole width it strays by less than a hundredth of a pixel.
 ALIGNED_PX = 0.01
 # Straight pieces of the bent ray's place on the array over X, a cubic: with eight they are off by 0.2 % of a lens pitch
 # in the paper's simulation.
 STRIPS = 8
+# Fitted rays separate when what each axis knows of the other only on average moves them by less than this share of a
+# lens pitch, rms over so many rays: columns are then off by less than the factors' own 0.01 to 0.02 in L1.
+LARGEST_COUPLING = 0.02
+COUPLING_RAYS = 4000
 
 
 def factorise(camera: Camera, media: Media, grid: Grid) -> FactorisedOperator:
@@ -35,10 +44,10 @@ def factorise(camera: Camera, media: Media, grid: Grid) -> FactorisedOperator:
     return factorise_through(camera, ObjectSpace(media, None, "paraxial"), grid)
 
 
-def factorise_through(camera: Camera, space: ObjectSpace, grid: Grid) -> FactorisedOperator:
-    """Return the weights of all voxels of a grid seen through an object space, in factorised form.
+def factorise_through(camera: Camera, source: Source, grid: Grid) -> FactorisedOperator:
+    """Return the weights of all voxels of a grid seen along traced or fitted rays, in factorised form.
 
-    Exact refraction couples the axes by the square of the lateral distance; each axis takes the other's mean.
+    Exact refraction, and fitted rays, couple the axes; each axis takes the other's mean.
 
     Raises
     ------
@@ -46,6 +55,19 @@ def factorise_through(camera: Camera, space: ObjectSpace, grid: Grid) -> Factori
     """
     columns, rows = axis_optics(camera)
     x, y = (0, 1) if camera.column_axis == "x" else (1, 0)
+    bent: Sequence[Bending | FittedBending]
+    if isinstance(source, PolynomialRays):
+        bent = [fitted_bending(source, camera, grid, axis) for axis in (0, 1)]
+    else:
+        bent = traced_bending(source, camera, grid, (x, y))
+    along_columns = axis_weights(columns, grid.axis_mm(x), grid.spacing_mm[x], bent[0])
+    along_rows = axis_weights(rows, grid.axis_mm(y), grid.spacing_mm[y], bent[1])
+    mask = aperture_mask(along_columns.cells, along_rows.cells, camera.aperture_radius_mm)
+    return FactorisedOperator(along_columns, along_rows, mask)
+
+
+def traced_bending(space: ObjectSpace, camera: Camera, grid: Grid, axes: tuple[int, int]) -> list[Bending]:
+    """Return how rays are bent along the columns and along the rows, which follow world `axes`."""
     depths = depth_nodes(grid.axis_mm(2), grid.spacing_mm[2])
     if camera.focus_distance_mm + space.media.depth_ratio * depths.min() <= 0.0:
         raise ConfigError(
@@ -57,18 +79,67 @@ def factorise_through(camera: Camera, space: ObjectSpace, grid: Grid) -> Factori
     )
     strips = 1 if space.straight else STRIPS
 
-    def along(optics: AxisOptics, axis: int, other: int) -> AxisWeights:
-        beside = float(np.mean(grid.axis_mm(other) ** 2))
-        bending = Bending(nodes, factors, camera.focal_length_mm, beside, strips)
-        return axis_weights(optics, grid.axis_mm(axis), grid.spacing_mm[axis], bending)
-
-    along_columns, along_rows = along(columns, x, y), along(rows, y, x)
-    mask = aperture_mask(along_columns.cells, along_rows.cells, camera.aperture_radius_mm)
-    return FactorisedOperator(along_columns, along_rows, mask)
+    beside = [float(np.mean(grid.axis_mm(other) ** 2)) for other in axes[::-1]]
+    return [Bending(nodes, factors, camera.focal_length_mm, each, strips) for each in beside]
 
 
-def separates(camera: Camera) -> bool:
-    """Return whether the array's two axes separate, so that weights factorise."""
+def fitted_bending(rays: PolynomialRays, camera: Camera, grid: Grid, axis: int) -> FittedBending:
+    """Return the polynomials along the columns (axis 0) or rows (1), the other axis taken at its mean.
+
+    Of the other axis the powers of y enter by their mean over the voxels; of Y the odd ones vanish and the square is
+    that of the disc's chord at X, on average (R^2 - X^2)/3.
+    """
+    own, other = (0, 3), (1, 4)
+    if axis == 1:
+        own, other = other, own
+    world = grid.axis_mm(other[0] if camera.column_axis == "x" else 1 - other[0])
+    depths = depth_nodes(grid.axis_mm(2), grid.spacing_mm[2])
+    table = np.zeros((*depths.shape, rays.degree + 1, rays.degree + 1))
+    chord = np.array([camera.aperture_radius_mm**2, -(rays.scale_mm[own[1]] ** 2)]) / 3.0 / rays.scale_mm[other[1]] ** 2
+    for powers, coefficient in zip(rays.exponents, rays.coefficients_mm[:, axis], strict=True):
+        x, crossing, beyond = powers[own[0]], powers[own[1]], powers[other[1]]
+        if beyond % 2:
+            continue
+        beside = np.mean((world / rays.scale_mm[other[0]]) ** powers[other[0]])
+        part = coefficient * beside * (depths / rays.scale_mm[2]) ** powers[2]
+        if beyond == 0:
+            table[..., x, crossing] += part
+        else:
+            table[..., x, crossing] += chord[0] * part
+            table[..., x, crossing + 2] += chord[1] * part
+    return FittedBending(table, rays.scale_mm[list(own)], STRIPS)
+
+
+def coupling_mm(rays: PolynomialRays, camera: Camera, grid: Grid) -> float:
+    """Return how far on the array, rms over voxels and aperture, fitted rays are from those that separate."""
+    rng = np.random.default_rng(0)
+    bounds = np.array([grid.bounds_mm(axis) for axis in range(3)])
+    planes = rng.integers(0, grid.shape_xyz[2], COUPLING_RAYS)
+    points = rng.uniform(bounds[:, 0], bounds[:, 1], (COUPLING_RAYS, 3))
+    points[:, 2] = depth_nodes(grid.axis_mm(2), grid.spacing_mm[2])[planes, 0]
+    points = camera.to_image_axes(points)
+    crossings = disc_points(COUPLING_RAYS, camera.aperture_radius_mm, rng)
+    off = rays.on_array(points, crossings)
+    for axis in (0, 1):
+        bent = fitted_bending(rays, camera, grid, axis)
+        x, crossing = points[:, axis] / bent.scale_mm[0], crossings[:, axis] / bent.scale_mm[1]
+        powers = np.arange(rays.degree + 1)
+        terms = x[:, np.newaxis, np.newaxis] ** powers[:, np.newaxis] * crossing[:, np.newaxis, np.newaxis] ** powers
+        off[:, axis] -= np.sum(terms * bent.coefficients_mm[planes, 0], axis=(1, 2))
+    return float(np.sqrt(np.mean(off**2)))
+
+
+def separates(camera: Camera, source: Source, grid: Grid) -> bool:
+    """Return whether array and rays separate into two axes, so that weights factorise."""
+    if not aligned(camera):
+        return False
+    if isinstance(source, PolynomialRays):
+        return coupling_mm(source, camera, grid) < LARGEST_COUPLING * float(camera.lattice.pitch.min())
+    return True
+
+
+def aligned(camera: Camera) -> bool:
+    """Return whether the array is square and stands upright on the sensor."""
     basis = camera.lattice.basis
     stray_px = np.abs([basis[1, 0], basis[0, 1]]) / camera.lattice.pitch[::-1] * [camera.rows, camera.columns]
     return camera.lattice.layout == "square" and bool(stray_px.max() <= ALIGNED_PX)
@@ -78,7 +149,7 @@ def axis_optics(camera: Camera) -> tuple[AxisOptics, AxisOptics]:
     """Return the camera's two axes, (columns, rows), each with its lens pitch."""
     basis = camera.lattice.basis
     pixels = np.array([camera.columns, camera.rows])
-    if not separates(camera):
+    if not aligned(camera):
         raise ConfigError(
             f"camera.microlenses: a {camera.lattice.layout} array turned by "
             f"{np.degrees(camera.lattice.rotation_rad):.4f} degrees against the sensor does not separate into columns "

@@ -21,7 +21,8 @@ from lfpiv_cli.errors import InputError
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.microlenses import nearest_point
-from lfpiv_cli.weights.operators import Column
+from lfpiv_cli.weights.build import factorise_through, separates
+from lfpiv_cli.weights.operators import Column, FactorisedOperator
 from lfpiv_cli.weights.quadrature import DEPTH_NODES, TILES, Columns, integrate_columns
 from lfpiv_cli.weights.scene import Scene, Source, kernel_scene, on_array, on_sensor, rays_from
 
@@ -183,6 +184,18 @@ class OnDemandOperator:
         first, second = (0, 1) if self.camera.column_axis == "x" else (1, 0)
         axes = (self.grid.axis_mm(first)[column], self.grid.axis_mm(second)[row], self.grid.axis_mm(2)[plane])
         return np.stack(axes, axis=1)
+
+
+def operator_of(camera: Camera, source: Source, grid: Grid) -> FactorisedOperator | OnDemandOperator:
+    """Return the weights of a grid: factorised where array and rays separate into two axes, else made on demand.
+
+    Raises
+    ------
+    ConfigError : a voxel lies where it cannot be
+    """
+    if separates(camera, source, grid):
+        return factorise_through(camera, source, grid)
+    return OnDemandOperator(camera, source, grid)
 
 
 def seen_share(camera: Camera, source: Source, grid: Grid) -> tuple[float, float]:
