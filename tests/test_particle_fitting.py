@@ -8,12 +8,14 @@ import numba
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.particles.covariance import joint_covariance
 from lfpiv_cli.particles.fitting import accept, add_all, claimed_share, judge, refine
+from lfpiv_cli.particles.noise import WHITE, Correlation, Noise, error_correlation
 from lfpiv_cli.particles.splitting import split
 from lfpiv_cli.particles.tiles import footprint_px, share_out
 from lfpiv_cli.particles.view import View, entry_capacity, raw_view
@@ -43,8 +45,7 @@ def test_spread_is_the_least_possible(view: View, rng: np.random.Generator) -> N
     clean = image_of(view, particle)
     weight = 1.0 / (clean + 36.0)
     capacity = entry_capacity(view, *DEPTHS)
-    *_, matrices = judge(view, particle, np.zeros_like(clean), weight, capacity)
-    sigma = np.sqrt(np.diagonal(np.linalg.inv(matrices[0])))
+    sigma = np.sqrt(np.diagonal(joint_covariance(view, particle, weight, WHITE, capacity)[0]))
     errors = []
     for _ in range(60):
         start = particle + rng.normal(0.0, (0.01, 0.01, 0.1, 1e4))
@@ -111,7 +112,7 @@ def test_pixels_without_weight_claim_and_see_nothing(view: View) -> None:
     capacity = entry_capacity(view, *DEPTHS)
     weight = np.where(np.arange(clean.size) % view.columns < 330, 1.0, 0.0)
     blind = np.where(weight > 0.0, 0.0, -1e6)  # what stands there must not matter
-    chi2, share, seen, _ = judge(view, particle, blind, weight, capacity)
+    chi2, share, seen = judge(view, particle, blind, weight, capacity)
     assert chi2[0] == 0.0
     assert share[0] == 1.0
     assert seen[0] == pytest.approx(clean[weight > 0.0].sum() / 2.5e5)
@@ -125,8 +126,7 @@ def test_neighbours_that_are_free_widen_the_errors(view: View) -> None:
     clean = image_of(view, particles)
     weight = 1.0 / (clean + 36.0)
     capacity = entry_capacity(view, *DEPTHS)
-    *_, matrices = judge(view, particles, np.zeros_like(clean), weight, capacity)
-    found = joint_covariance(view, particles, matrices, weight, capacity)
+    found = joint_covariance(view, particles, weight, WHITE, capacity)
     slopes = []
     for number, unknown in np.ndindex(particles.shape):
         step = np.zeros_like(particles)
@@ -136,11 +136,16 @@ def test_neighbours_that_are_free_widen_the_errors(view: View) -> None:
     whole = np.linalg.inv((jacobian * weight) @ jacobian.T)
     for number in range(4):
         part = slice(4 * number, 4 * number + 4)
-        # Pixels between two micro-images count twice in a particle's own matrix; slopes are float32 and differences.
-        np.testing.assert_allclose(np.sqrt(np.diag(found[number])), np.sqrt(np.diag(whole[part, part])), rtol=0.02)
-    alone = np.linalg.inv(matrices)
-    np.testing.assert_allclose(found[3], alone[3])
+        np.testing.assert_allclose(np.sqrt(np.diag(found[number])), np.sqrt(np.diag(whole[part, part])), rtol=2e-3)
+    alone = joint_covariance(view, particles[[0]], weight, WHITE, capacity)
     assert found[0, 2, 2] > 1.1 * alone[0, 2, 2]
+
+
+def test_particles_that_nearly_coincide_have_errors(view: View) -> None:
+    particles = np.array([[0.2, 0.1, 0.4, 5e5], [0.203, 0.1, 0.4, 5e5], [0.2, 0.103, 0.42, 5e5]])
+    weight = 1.0 / (image_of(view, particles) + 36.0)
+    found = joint_covariance(view, particles, weight, WHITE, entry_capacity(view, *DEPTHS))
+    assert np.all(np.diagonal(found, axis1=1, axis2=2) > 0.0)
 
 
 def test_two_merged_particles_are_told_apart(view: View) -> None:
@@ -208,3 +213,37 @@ def test_tiles_of_a_group_share_no_pixel(view: View, rng: np.random.Generator) -
             members = particles[tiles.order[tiles.start[tile] : tiles.start[tile + 1]]]
             lit += image_of(view, members) > 0.0
         assert lit.max() <= 1.0
+
+
+def test_errors_that_are_alike_widen_a_particles(view: View) -> None:
+    particle = np.array([[0.20, 0.10, 1.5, 5e5]])
+    weight = 1.0 / (image_of(view, particle) + 36.0)
+    found = joint_covariance(view, particle, weight, Correlation(0.2, 0.8), entry_capacity(view, *DEPTHS))[0]
+    slopes = []
+    for unknown in range(4):
+        step = np.zeros_like(particle)
+        step[0, unknown] = (1e-4, 1e-4, 1e-4, 1.0)[unknown]
+        slopes.append((image_of(view, particle + step) - image_of(view, particle - step)) / 2.0 / step.max())
+    jacobian = np.array(slopes)
+    lit = np.flatnonzero(jacobian.any(axis=0))
+    row, column = np.divmod(lit, view.columns)
+    distance = np.abs(row[:, np.newaxis] - row) + np.abs(column[:, np.newaxis] - column)
+    alike = np.where(distance == 0, 1.0, 0.2 * 0.8**distance)
+    whitened = jacobian[:, lit] * np.sqrt(weight[lit])
+    moved_by = np.linalg.inv(whitened @ whitened.T) @ whitened
+    np.testing.assert_allclose(np.diag(found), np.diag(moved_by @ alike @ moved_by.T), rtol=5e-3)
+    assert found[2, 2] > 1.5 * np.linalg.inv(whitened @ whitened.T)[2, 2]
+
+
+def test_correlation_is_read_off_what_is_left(rng: np.random.Generator) -> None:
+    carried = rng.normal(size=(340, 340))
+    for axis in (0, 1):
+        carried = lfilter([np.sqrt(1.0 - 0.8**2)], [1.0, -0.8], carried, axis=axis)
+    error = np.sqrt(0.7) * rng.normal(size=(300, 300)) + np.sqrt(0.3) * carried[40:, 40:]
+    lit, noise = np.full(error.shape, 100.0), Noise(6.0, 2.0)
+    found = error_correlation(lit, 9.0 * error, np.full(error.shape, 0.01), noise)
+    # Some 90,000 / 80 patches that are alike tell a correlation to 3 % of the share.
+    assert found == pytest.approx((0.3, 0.8), abs=0.03)
+    white = error_correlation(lit, rng.normal(size=error.shape), np.ones(error.shape), noise)
+    assert white.share < 0.02
+    assert error_correlation(lit, 9.0 * error, np.zeros(error.shape), noise) == WHITE

@@ -4,6 +4,10 @@ Particles whose light overlaps give way to each other, so that the inverse of a 
 small an error. The normal matrix of all particles together is sparse; a particle's part of its inverse is taken from
 the particle and the neighbours it is tied to most, these free and the others held.
 
+What is left of an image is not white either: a particle that was not found, or found wrongly, leaves the same sign in
+pixels side by side. With H the normal matrix, K = H^-1 J^T W^(1/2) tells how far each pixel's error moves a particle,
+and errors with the correlation R move it by the covariance K R K^T.
+
 Axes: image axes, mm; see `fitting`. A particle's unknowns are x, y, z and light.
 """
 
@@ -17,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from lfpiv_cli.particles.fitting import UNKNOWNS
+from lfpiv_cli.particles.noise import Correlation
 from lfpiv_cli.particles.response import VALUES, respond
 from lfpiv_cli.particles.view import View, footprint_radius_mm
 
@@ -56,8 +61,8 @@ class Ties(NamedTuple):
 def joint_covariance(
     view: View,
     particles: NDArray[np.float64],
-    matrices: NDArray[np.float64],
     weight: NDArray[np.float64],
+    correlation: Correlation,
     capacity: int,
 ) -> NDArray[np.float64]:
     """Return the covariance (n, 4, 4) of each particle with its neighbours free.
@@ -65,14 +70,14 @@ def joint_covariance(
     Parameters
     ----------
     particles : (n, 4)
-    matrices : (n, 4, 4) normal matrix of each alone, positive definite
     weight : (rows * columns,) 1/variance of the pixels
+    correlation : of their errors
     capacity : entries that a particle can have at most
     """
     slopes = _slopes(view, particles, capacity)
     start, other = _overlapping(view, particles)
-    ties = Ties(start, other, _cross_blocks(slopes, weight, view.columns, start, other))
-    return _covariances(ties, matrices)
+    alone, block = _blocks(slopes, weight, view.columns, start, other)
+    return _covariances(slopes, Ties(start, other, block), alone, weight, correlation, view.columns)
 
 
 def _slopes(view: View, particles: NDArray[np.float64], capacity: int) -> Slopes:
@@ -127,50 +132,132 @@ def _fill_slopes(
 
 
 @njit(cache=True, parallel=True)
-def _cross_blocks(
+def _blocks(
     slopes: Slopes, weight: NDArray[np.float64], columns: int, start: NDArray[np.int64], other: NDArray[np.int64]
-) -> NDArray[np.float64]:
-    """Return J_n^T W J_m (pairs, 4, 4) for every particle n and neighbour m, from the pixels that both light."""
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return J_n^T W J_n (n, 4, 4) of every particle, and J_n^T W J_m (pairs, 4, 4) with each of its neighbours m.
+
+    Both from whole pixels: a pixel that two lenses light has one error, and with two it would be less than its
+    neighbours' blocks ask for.
+    """
+    alone = np.zeros((start.size - 1, UNKNOWNS, UNKNOWNS))
     blocks = np.zeros((other.size, UNKNOWNS, UNKNOWNS))
     for n in prange(start.size - 1):
         begin, end = slopes.start[n], slopes.start[n + 1]
-        if start[n] == start[n + 1] or begin == end:
+        if begin == end:
             continue
         row, column = slopes.pixel[begin:end] // columns, slopes.pixel[begin:end] % columns
         top, left = row.min(), column.min()
-        height, width = row.max() - top + 1, column.max() - left + 1
-        own = np.zeros((height, width, UNKNOWNS))
+        own = np.zeros((row.max() - top + 1, column.max() - left + 1, UNKNOWNS))
         for k in range(end - begin):
             own[row[k] - top, column[k] - left] += weight[slopes.pixel[begin + k]] * slopes.slope[begin + k]
+        _add_products(slopes, n, own, top, left, columns, alone[n])
         for at in range(start[n], start[n + 1]):
-            for k in range(slopes.start[other[at]], slopes.start[other[at] + 1]):
-                i, j = slopes.pixel[k] // columns - top, slopes.pixel[k] % columns - left
-                if 0 <= i < height and 0 <= j < width:
-                    for a in range(UNKNOWNS):
-                        for b in range(UNKNOWNS):
-                            blocks[at, a, b] += own[i, j, a] * slopes.slope[k, b]
-    return blocks
+            _add_products(slopes, other[at], own, top, left, columns, blocks[at])
+    return alone, blocks
+
+
+@njit(cache=True)
+def _add_products(
+    slopes: Slopes, m: int, own: NDArray[np.float64], top: int, left: int, columns: int, block: NDArray[np.float64]
+) -> None:
+    """Add own^T J_m to a block (4, 4), with `own` on a rectangle of pixels."""
+    for k in range(slopes.start[m], slopes.start[m + 1]):
+        i, j = slopes.pixel[k] // columns - top, slopes.pixel[k] % columns - left
+        if 0 <= i < own.shape[0] and 0 <= j < own.shape[1]:
+            for a in range(UNKNOWNS):
+                for b in range(UNKNOWNS):
+                    block[a, b] += own[i, j, a] * slopes.slope[k, b]
 
 
 @njit(cache=True, parallel=True)
-def _covariances(ties: Ties, matrices: NDArray[np.float64]) -> NDArray[np.float64]:
+def _covariances(
+    slopes: Slopes,
+    ties: Ties,
+    matrices: NDArray[np.float64],
+    weight: NDArray[np.float64],
+    correlation: Correlation,
+    columns: int,
+) -> NDArray[np.float64]:
     """Return each particle's part of the inverse of the normal matrix of itself and its strongest neighbours."""
     inverses = np.empty_like(matrices)
     for n in prange(matrices.shape[0]):
         inverses[n] = np.linalg.inv(matrices[n])
     result = inverses.copy()
     for n in prange(matrices.shape[0]):
-        begin, end = ties.start[n], ties.start[n + 1]
-        strength = np.zeros(end - begin)
-        for k in range(end - begin):
-            block = ties.block[begin + k]
-            strength[k] = np.trace(inverses[n] @ block @ inverses[ties.other[begin + k]] @ block.T)
-        chosen = np.argsort(-strength)[:FREE_NEIGHBOURS]
-        members = np.empty(chosen.size + 1, np.int64)
-        members[0] = n
-        for k in range(chosen.size):
-            members[k + 1] = ties.other[begin + chosen[k]]
-        result[n] = np.linalg.inv(_normal_matrix(ties, matrices, members))[:UNKNOWNS, :UNKNOWNS]
+        members = _strongest(ties, inverses, n)
+        whole = _normal_matrix(ties, matrices, members)
+        # Millimetres beside counts: inverted with a diagonal of ones.
+        scale = 1.0 / np.sqrt(np.diag(whole))
+        inverse = np.linalg.inv(whole * scale * scale.reshape(-1, 1)) * scale * scale.reshape(-1, 1)
+        result[n] = inverse[:UNKNOWNS, :UNKNOWNS]
+        if correlation.share > 0.0:
+            moved_by = _moved_by(slopes, members, inverse, weight, columns)
+            result[n] += correlation.share * _excess(moved_by, correlation.decay)
+    return result
+
+
+@njit(cache=True)
+def _strongest(ties: Ties, inverses: NDArray[np.float64], n: int) -> NDArray[np.int64]:
+    """Return a particle's number and those of the neighbours that it is tied to most."""
+    begin, end = ties.start[n], ties.start[n + 1]
+    strength = np.zeros(end - begin)
+    for k in range(end - begin):
+        block = ties.block[begin + k]
+        strength[k] = np.trace(inverses[n] @ block @ inverses[ties.other[begin + k]] @ block.T)
+    chosen = np.argsort(-strength)[:FREE_NEIGHBOURS]
+    members = np.empty(chosen.size + 1, np.int64)
+    members[0] = n
+    for k in range(chosen.size):
+        members[k + 1] = ties.other[begin + chosen[k]]
+    return members
+
+
+@njit(cache=True)
+def _moved_by(
+    slopes: Slopes, members: NDArray[np.int64], inverse: NDArray[np.float64], weight: NDArray[np.float64], columns: int
+) -> NDArray[np.float64]:
+    """Return K (4, rows, columns) of the first member on the rectangle that it lights, its neighbours free."""
+    begin, end = slopes.start[members[0]], slopes.start[members[0] + 1]
+    row, column = slopes.pixel[begin:end] // columns, slopes.pixel[begin:end] % columns
+    top, left = row.min(), column.min()
+    moved_by = np.zeros((UNKNOWNS, row.max() - top + 1, column.max() - left + 1))
+    for m in range(members.size):
+        for k in range(slopes.start[members[m]], slopes.start[members[m] + 1]):
+            i, j = slopes.pixel[k] // columns - top, slopes.pixel[k] % columns - left
+            if 0 <= i < moved_by.shape[1] and 0 <= j < moved_by.shape[2]:
+                root = np.sqrt(weight[slopes.pixel[k]])
+                for a in range(UNKNOWNS):
+                    for b in range(UNKNOWNS):
+                        moved_by[a, i, j] += inverse[a, UNKNOWNS * m + b] * slopes.slope[k, b] * root
+    return moved_by
+
+
+@njit(cache=True)
+def _excess(moved_by: NDArray[np.float64], decay: float) -> NDArray[np.float64]:
+    """Return K (R - 1) K^T (4, 4) for errors whose correlation falls by `decay` from pixel to pixel along each axis."""
+    excess = np.empty((UNKNOWNS, UNKNOWNS))
+    for b in range(UNKNOWNS):
+        others = _correlated(_correlated(moved_by[b], decay).T, decay).T - moved_by[b]
+        for a in range(UNKNOWNS):
+            excess[a, b] = np.sum(moved_by[a] * others)
+    return excess
+
+
+@njit(cache=True)
+def _correlated(values: NDArray[np.float64], decay: float) -> NDArray[np.float64]:
+    """Return sum_k decay^|j - k| values[i, k], by one pass each way."""
+    result = np.empty_like(values)
+    for i in range(values.shape[0]):
+        carried = 0.0
+        for j in range(values.shape[1]):
+            carried = carried * decay + values[i, j]
+            result[i, j] = carried
+        carried = 0.0
+        for j in range(values.shape[1] - 1, -1, -1):
+            carried *= decay
+            result[i, j] += carried
+            carried += values[i, j]
     return result
 
 

@@ -307,20 +307,17 @@ def judge(
     residual: NDArray[np.float64],
     weight: NDArray[np.float64],
     capacity: int,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return local chi-squared, claimed share, share of the light that is seen and normal matrix of each particle.
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return local chi-squared, claimed share and share of the light that is seen of each particle.
 
     Local chi-squared is the mean of w r^2 over the particle's light; 1 for a perfect model. Pixels without weight see
     nothing.
     """
     chi2, share, seen = np.zeros(len(particles)), np.zeros(len(particles)), np.zeros(len(particles))
-    matrices = np.zeros((len(particles), UNKNOWNS, UNKNOWNS))
     for number in prange(len(particles)):
         pixels, values = np.empty(capacity, np.int32), np.empty((capacity, VALUES))
-        right = np.empty(UNKNOWNS)
         x, y, z, light = particles[number]
         count = respond(view, x, y, z, pixels, values)
-        normal_equations(pixels, values, count, light, residual, weight, matrices[number], right)
         found = wanted = total = squares = 0.0
         for k in range(count):
             f, r = values[k, 0], residual[pixels[k]]
@@ -334,4 +331,4 @@ def judge(
             chi2[number], seen[number] = squares / total, total
         if wanted > 0.0:
             share[number] = found / wanted
-    return chi2, share, seen, matrices
+    return chi2, share, seen

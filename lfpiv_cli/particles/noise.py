@@ -7,6 +7,7 @@ are in counts squared.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,11 @@ PHOTONS_PER_PARTICLE = 2.5e5
 HALF_NORMAL_MEDIAN = 0.6745
 # Rounding to whole counts alone makes this standard deviation.
 ROUNDING_COUNTS = 0.29
+# Pixels are lit above this many standard deviations of the read noise; what lies further than so many from the model is
+# light that was not found, not an error's usual size.
+LIT_SIGMAS, USUAL_SIGMAS = 3.0, 3.5
+# Distances in pixels at which errors are compared: from where white noise is gone to within a micro-image.
+LAGS_PX = range(1, 9)
 
 
 @dataclass(frozen=True)
@@ -36,6 +42,45 @@ class Noise:
         model = np.maximum(model, 0.0)
         variance = self.read_counts**2 + self.gain_counts * model + (MODEL_ERROR * model) ** 2
         return 1.0 / (variance + unexplained * np.maximum(residual, 0.0) ** 2)
+
+
+class Correlation(NamedTuple):
+    """How alike the errors of two pixels are: share * decay^(|di| + |dj|), and 1 for a pixel and itself."""
+
+    share: float
+    decay: float
+
+
+WHITE = Correlation(0.0, 0.0)
+
+
+def error_correlation(
+    model: NDArray[np.float64], residual: NDArray[np.float64], weight: NDArray[np.float64], noise: Noise
+) -> Correlation:
+    """Return the correlation of what is left of an image (rows, columns) where the model lights it.
+
+    `weight` (rows, columns) is each pixel's 1/variance, 0 where it is not believed. A geometric series is fitted to the
+    correlations along rows and columns.
+    """
+    error = residual * np.sqrt(weight)
+    lit = (model > LIT_SIGMAS * noise.read_counts) & (weight > 0.0)
+    usual = float(np.median(np.abs(error[lit]))) / HALF_NORMAL_MEDIAN if lit.any() else 0.0
+    if usual == 0.0:
+        return WHITE
+    error = np.where(lit, np.clip(error / usual, -USUAL_SIGMAS, USUAL_SIGMAS), 0.0)
+    found = np.array([0.5 * (_at_lag(error, lit, lag) + _at_lag(error.T, lit.T, lag)) for lag in LAGS_PX])
+    decay = float(np.sum(found[1:] * found[:-1]) / np.sum(found[:-1] ** 2))
+    if not 0.0 < decay < 1.0:
+        return WHITE
+    series = decay ** np.array(LAGS_PX)
+    return Correlation(float(np.clip(np.sum(series * found) / np.sum(series**2), 0.0, 1.0)), decay)
+
+
+def _at_lag(error: NDArray[np.float64], lit: NDArray[np.bool_], lag: int) -> float:
+    """Return the correlation of errors `lag` pixels apart along the rows; `error` is 0 where not `lit`."""
+    pairs = np.count_nonzero(lit[:, lag:] & lit[:, :-lag])
+    variance = np.sum(error**2) / np.count_nonzero(lit)
+    return float(np.sum(error[:, lag:] * error[:, :-lag]) / pairs / variance) if pairs else 0.0
 
 
 def estimate_noise(image: NDArray[np.float64], typical_light: float) -> Noise:

@@ -21,7 +21,7 @@ from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.particles.candidates import explain_rest, find_peaks, points_in_raw_frame
 from lfpiv_cli.particles.covariance import joint_covariance
 from lfpiv_cli.particles.fitting import accept, add_all, judge, refine
-from lfpiv_cli.particles.noise import Noise, estimate_noise
+from lfpiv_cli.particles.noise import Noise, error_correlation, estimate_noise
 from lfpiv_cli.particles.splitting import split
 from lfpiv_cli.particles.tiles import footprint_px, share_out
 from lfpiv_cli.particles.view import View, entry_capacity
@@ -315,7 +315,7 @@ def _merge(task: Task, state: State) -> State:
 def _prune(task: Task, state: State, settings: Round) -> State:
     """Return the state without particles that are too faint, hardly seen, or do not find their light."""
     weight = _weight(task, state, settings.unexplained)
-    _, share, seen, _ = judge(task.view, state.particles, state.residual, weight, task.capacity)
+    _, share, seen = judge(task.view, state.particles, state.residual, weight, task.capacity)
     keep = (state.particles[:, 3] > SMALLEST_LIGHT * state.typical_light) & (seen > SMALLEST_SEEN)
     keep &= share > settings.claimed_share - PRUNING_SLACK
     return _rebuilt(task, state, state.particles[keep])
@@ -344,9 +344,11 @@ def _result(task: Task, state: State, shape: tuple[int, int]) -> Particles:
     order = np.argsort(-state.particles[:, 3], kind="stable")
     particles = state.particles[order]
     weight = _weight(task, state, 0.0)
-    chi2, _, seen, matrices = judge(task.view, particles, state.residual, weight, task.capacity)
+    chi2, _, seen = judge(task.view, particles, state.residual, weight, task.capacity)
     # What neighbours leave unexplained is as large an error as noise: the scatter says how large.
-    joint = joint_covariance(task.view, particles, matrices, weight, task.capacity)
+    model, left, trust = (values.reshape(shape) for values in (task.image - state.residual, state.residual, weight))
+    correlation = error_correlation(model, left, trust, state.noise)
+    joint = joint_covariance(task.view, particles, weight, correlation, task.capacity)
     covariance = joint * np.maximum(chi2, 1.0)[:, np.newaxis, np.newaxis]
     to_world = task.camera.to_image_axes(np.eye(3))
     return Particles(
