@@ -22,8 +22,10 @@ from lfpiv_cli.files.weights_file import WeightsFile
 from lfpiv_cli.flow.field import MM_TO_M, REJECTED, VALID, VectorField
 from lfpiv_cli.flow.windows import layout_windows
 from lfpiv_cli.grid import Grid
+from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.particles.gridding import on_grid
-from lfpiv_cli.particles.rounds import ROUNDS, Particles, find_particles
+from lfpiv_cli.particles.refraction import places_by_snell
+from lfpiv_cli.particles.rounds import ROUNDS, find_particles
 from lfpiv_cli.particles.tracking import Tracks, track
 from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.reconstruction.equations import Normalisers
@@ -46,10 +48,6 @@ def ensure_solvable(content: WeightsFile, settings: Config) -> None:
     """
     if settings.weights.method == "dlfc":
         raise ConfigError("weights.method: particles are fitted with traced rays; build weights by ert for them")
-    if settings.weights.refraction != "paraxial" and settings.media_model() != settings.media_model().in_air():
-        raise ConfigError(
-            "weights.refraction: particles are fitted with paraxial refraction; build such weights for them"
-        )
     raw_view(content.camera, settings.media_model(), 0.0, content.weights.calibration)
 
 
@@ -95,6 +93,8 @@ def write_frame(
         progress=progress,
         excluded=frame.unusable,
     )
+    space = _space(content, settings)
+    places = places_by_snell(found.position_mm, space, content.camera)
     left = np.where(frame.unusable, 0.0, found.residual)
     norm = float(np.linalg.norm(np.where(frame.unusable, 0.0, frame.image)))
     residual = float(np.linalg.norm(left)) / norm if norm > 0.0 else 0.0
@@ -103,18 +103,19 @@ def write_frame(
     write_points(
         path,
         PARTICLES_FORMAT,
-        found.position_mm - np.array([0.0, 0.0, content.reference_z_mm]),
+        places - np.array([0.0, 0.0, content.reference_z_mm]),
         {
             "intensity": found.light_counts,
             "covariance_mm2": symmetric(found.covariance_mm2),
             "chi2": found.chi2,
             "seen": found.seen,
-            "flag": _outside(found, content.weights.grid),
+            "flag": _outside(places, content.weights.grid),
         },
         provenance=provenance,
         attributes={
             "reference": content.reference,
             "reference_z_mm": content.reference_z_mm,
+            "refraction": "paraxial" if space.straight else "exact",
             "residual": residual,
             "residual_rms_counts": float(np.sqrt(np.mean(left[~frame.unusable] ** 2))),
             "excluded_pixels": int(np.count_nonzero(frame.unusable)),
@@ -180,10 +181,19 @@ def track_particles(
     return summary
 
 
-def _outside(found: Particles, grid: Grid) -> NDArray[np.uint8]:
+def _space(content: WeightsFile, settings: Config) -> ObjectSpace:
+    """Return what lies before the particles: by Snell's law where the window's thickness and place are known."""
+    calibration = content.weights.calibration
+    mid_plane = calibration.mid_plane_z_mm if calibration else None
+    if (settings.channel is None or mid_plane is None) and settings.sections.window is None:
+        return ObjectSpace(settings.media_model(), None, "paraxial")
+    return ObjectSpace(settings.media_model(), settings.window_model(mid_plane), "exact")
+
+
+def _outside(position_mm: NDArray[np.float64], grid: Grid) -> NDArray[np.uint8]:
     """Return 1 for particles outside the volume, kept because they light it, 0 for those inside."""
     bounds = np.array([grid.bounds_mm(axis) for axis in range(3)])
-    inside = np.all((found.position_mm >= bounds[:, 0]) & (found.position_mm <= bounds[:, 1]), axis=1)
+    inside = np.all((position_mm >= bounds[:, 0]) & (position_mm <= bounds[:, 1]), axis=1)
     return (~inside).astype(np.uint8)
 
 

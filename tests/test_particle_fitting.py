@@ -142,7 +142,8 @@ def test_neighbours_that_are_free_widen_the_errors(view: View) -> None:
 
 
 def test_particles_that_nearly_coincide_have_errors(view: View) -> None:
-    particles = np.array([[0.2, 0.1, 0.4, 5e5], [0.203, 0.1, 0.4, 5e5], [0.2, 0.103, 0.42, 5e5]])
+    # Near the focal plane many pixels are lit through two lenses, and count once all the same.
+    particles = np.array([[0.2295, 0.0436, 0.1066, 5e5], [0.2168, 0.0374, 0.1087, 5e5]])
     weight = 1.0 / (image_of(view, particles) + 36.0)
     found = joint_covariance(view, particles, weight, WHITE, entry_capacity(view, *DEPTHS))
     assert np.all(np.diagonal(found, axis1=1, axis2=2) > 0.0)

@@ -11,13 +11,12 @@ import tifffile
 from scipy.spatial import KDTree
 
 from lfpiv_cli.cli import cli
-from lfpiv_cli.errors import ConfigError, InputError, OutputExistsError
+from lfpiv_cli.errors import InputError, OutputExistsError
 from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.images import read_image
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, read_points, write_points
 from lfpiv_cli.files.particles import read_particles
-from lfpiv_cli.stages_particles import ensure_solvable
 
 ROOT = Path(__file__).parent.parent
 SAMPLE, CONFIG = ROOT / "sample_data", ROOT / "configs" / "sample.yaml"
@@ -80,12 +79,6 @@ def test_frames_made_with_other_settings_are_refused(pair: tuple[Path, Path], tm
     write_frame(pair[1], np.zeros((1, 3)), channel=None)
     with pytest.raises(InputError, match="another config"):
         run("track", *pair, "-o", tmp_path / "tracks.vtkhdf")
-
-
-def test_exact_refraction_is_refused() -> None:
-    settings = load_config(CONFIG).overridden("weights", refraction="exact")
-    with pytest.raises(ConfigError, match="paraxial"):
-        ensure_solvable(None, settings)  # type: ignore[arg-type]
 
 
 @pytest.mark.slow
