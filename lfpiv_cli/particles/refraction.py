@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.object_space import ObjectSpace, slope_ratio
 
-# Rings of equal area and rays on each: the slope is a cubic in the place on the lens, and its moments are right to 0.4 %.
+# Rings of equal area and rays on each: the slope is a cubic in the place on the lens, its moments are right to 0.4 %.
 RINGS, RAYS_PER_RING = 8, 8
 # The shift changes by some 1e-3 of what a point moves: twice leaves a millionth of it.
 REPEATS = 2
