@@ -12,7 +12,7 @@ from collections.abc import Callable
 from benchmarks.calibration import bench_calibration
 from benchmarks.correlation import bench_correlation, bench_correlation_accuracy
 from benchmarks.depth import bench_depth
-from benchmarks.particles import bench_particles
+from benchmarks.particles import bench_particles, bench_particles_thrice
 from benchmarks.solvers import bench_solvers
 from benchmarks.weights import bench_weights
 
@@ -22,6 +22,7 @@ BENCHMARKS: dict[str, Callable[[], None]] = {
     "correlation-accuracy": bench_correlation_accuracy,
     "depth": bench_depth,
     "particles": bench_particles,
+    "particles-thrice": bench_particles_thrice,
     "solvers": bench_solvers,
     "weights": bench_weights,
 }

@@ -41,3 +41,20 @@ def test_particles_outside_the_volume_count_for_nothing() -> None:
     true = np.array([[1.0, 1.0, 1.0], [6.0, 1.0, 1.0]])
     figures = particle_figures(np.array([[1.0, 1.0, 1.0], [7.0, 1.0, 1.0]]), true, LOW, HIGH, 0.1)
     assert figures["recall"] == figures["precision"] == 1.0
+
+
+def test_coverage_and_depths_are_those_asked_for(rng: np.random.Generator) -> None:
+    true = rng.uniform((0.0, 0.0, -5.0), (50.0, 50.0, 5.0), (2000, 3))
+    near = np.abs(true[:, 2]) < 2.0
+    sigma = np.full(true.shape, 0.002)
+    found = true + np.where(near[:, np.newaxis], 3.0, 1.0) * rng.normal(0.0, sigma)
+    found = found[~near | (rng.uniform(size=2000) < 0.5)]
+    bounds = np.array([0.0, 0.0, -5.0]), np.array([50.0, 50.0, 5.0])
+    inner, outer = (
+        particle_figures(found, true, *bounds, 0.1, sigma[: len(found)], band) for band in ((0.0, 2.0), (2.0, np.inf))
+    )
+    # Within 1.96/3 standard deviations lie 48.6 %; three standard errors of 400 and of 1,200 particles.
+    assert inner["coverage_z"] == pytest.approx(0.486, abs=0.08)
+    assert outer["coverage_z"] == pytest.approx(0.95, abs=0.02)
+    assert inner["recall"] == pytest.approx(0.5, abs=0.06)
+    assert outer["recall"] > 0.995

@@ -14,6 +14,8 @@ from scipy.spatial import KDTree
 # A particle counts as found within so many voxels laterally and in depth.
 LATERAL_VOXEL, DEPTH_VOXEL = 0.5, 2.0
 MAD_TO_SIGMA = 1.4826
+# Of normal errors 95 % lie within so many standard deviations.
+COVERED_SIGMAS = 1.96
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,25 +51,38 @@ def particle_figures(
     low_mm: NDArray[np.float64],
     high_mm: NDArray[np.float64],
     voxel_mm: float,
+    sigma_mm: NDArray[np.float64] | None = None,
+    distances_mm: tuple[float, float] = (0.0, np.inf),
 ) -> dict[str, float]:
     """Return recall, precision, and per component bias, rms and robust spread (1.48 median deviation) in voxels.
 
-    `low_mm` and `high_mm` (3,) bound the volume that is judged; what lies outside may be matched and is not counted.
+    Parameters
+    ----------
+    found_mm, true_mm : (n, 3), (m, 3)
+    low_mm, high_mm : (3,) of the volume that is judged; what lies outside may be matched and is not counted
+    sigma_mm : (n, 3) standard errors; they add the share of errors within 1.96 of them
+    distances_mm : only what lies this far from z = 0, the focal plane, on either side is judged
     """
 
     def inside(points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        return np.asarray(np.all((points >= low_mm) & (points <= high_mm), axis=1))
+        distance = np.abs(points[:, 2])
+        band = (distance >= distances_mm[0]) & (distance < distances_mm[1])
+        return np.asarray(band & np.all((points >= low_mm) & (points <= high_mm), axis=1))
 
     pairs = match(found_mm, true_mm, voxel_mm)
     figures = {
         "recall": inside(true_mm[pairs.true]).sum() / max(inside(true_mm).sum(), 1),
         "precision": inside(found_mm[pairs.found]).sum() / max(inside(found_mm).sum(), 1),
     }
-    error = pairs.error_voxel[inside(true_mm[pairs.true])]
-    for name, values in zip("xyz", error.T, strict=True):
+    judged = inside(true_mm[pairs.true])
+    error = pairs.error_voxel[judged]
+    for axis, (name, values) in enumerate(zip("xyz", error.T, strict=True)):
         if values.size:
             middle = np.median(values)
             figures[f"bias_{name}_voxel"] = middle
             figures[f"rms_{name}_voxel"] = np.sqrt(np.mean(values**2))
             figures[f"spread_{name}_voxel"] = MAD_TO_SIGMA * np.median(np.abs(values - middle))
+            if sigma_mm is not None:
+                covered = COVERED_SIGMAS * sigma_mm[pairs.found[judged], axis] / voxel_mm
+                figures[f"coverage_{name}"] = np.mean(np.abs(values) <= covered)
     return {name: float(value) for name, value in figures.items()}
