@@ -21,6 +21,8 @@ SMALLEST_SIGMA_MM = 1e-6
 TUKEY = 4.685
 TUKEY_ROUNDS = 5
 MAD_TO_SIGMA = 1.4826
+# The biweight takes its weighted mean square from the middle of a normal distribution: this share of the variance.
+TUKEY_VARIANCE = 0.827
 
 
 def on_grid(
@@ -84,8 +86,17 @@ def _robust_value(
         robust = np.clip(1.0 - (off / (TUKEY * spread)) ** 2, 0.0, None) ** 2
     weight = kernel * robust / sigma**2
     inverse = np.linalg.pinv(used.T @ (weight[:, np.newaxis] * used))
-    freedom = max(1.0 - used.shape[1] / len(values), 1.0 / len(values))
-    scatter2 = float(np.sum(kernel * robust * off**2) / np.sum(kernel * robust)) / freedom
+    expected = TUKEY_VARIANCE * _left_by_fit(used @ inverse @ used.T * weight, sigma)
+    scatter2 = float(np.sum(kernel * robust * off**2) / np.sum(kernel * robust * expected))
     # The kernel favours what is near, which is no statement about noise: the sandwich of weighted least squares.
     meat = used.T @ (((weight * sigma) ** 2)[:, np.newaxis] * used)
     return float(coefficients[0]), float(np.sqrt(scatter2 * max((inverse @ meat @ inverse)[0, 0], 0.0)))
+
+
+def _left_by_fit(hat: NDArray[np.float64], sigma: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the share (n,) of each track's variance that a fit leaves in its residual, with fit = hat @ values.
+
+    The kernel lets the tracks next to the node draw the polynomial to them, where their number alone tells little.
+    """
+    from_all = (hat * sigma / sigma[:, np.newaxis]) ** 2
+    return np.asarray(1.0 - 2.0 * np.diag(hat) + from_all.sum(axis=1))
