@@ -16,6 +16,7 @@ from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.pictures import ensure_drawing, write_picture
 from lfpiv_cli.files.provenance import record
+from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.particles.refinement import STEPS
 from lfpiv_cli.particles.refinement import refine_calibration as refine
 from lfpiv_cli.reconstruction.images import light
@@ -44,6 +45,7 @@ def refine_calibration(
         raise ConfigError(f"{config}: channel: is missing; the walls are known by the channel's width")
     frames, shape = frames_of(images), settings.image_shape()
     before = read_calibration(calibration)
+    window = settings.window_model(before.mid_plane_z_mm or 0.0)
     dark_image, empty = (image_files.read_image(path, shape) if path else None for path in (dark, background))
     lit = [light(image_files.read_page(frame.path, frame.page, shape), dark_image, empty) for frame in frames]
     with console.progress(len(lit) * STEPS + 1, "refine") as advance:
@@ -51,7 +53,7 @@ def refine_calibration(
             lit,
             before,
             settings.camera_model(),
-            settings.media_model(),
+            ObjectSpace(settings.media_model(), window, "exact"),
             settings.grid(),
             settings.channel.width_mm,
             settings.reconstruction.particle_diameter_mm,

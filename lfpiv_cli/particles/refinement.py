@@ -20,7 +20,9 @@ from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
+from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.particles.nuisances import Nuisances, fit_nuisances
+from lfpiv_cli.particles.refraction import places_by_snell
 from lfpiv_cli.particles.rounds import ROUNDS, Particles, find_particles
 from lfpiv_cli.particles.view import View, raw_view
 from lfpiv_cli.particles.walls import Walls, find_walls, refuse_few
@@ -36,10 +38,10 @@ STEPS = sum(settings.iterations + 1 for settings in REFINING_ROUNDS)
 MARGIN_PER_WIDTH = 0.15
 # Candidates' depths need planes only this many lateral voxels apart; the fit finds the rest.
 DEPTH_PER_LATERAL = 2.0
-# What all particles' depths have in common (rays bent more at the rim than paraxial ones, the rim's own model) was 4 to
-# 13 um on an image traced through 5 mm of acrylic and up to 10 mm of water: this share of the depth over which the main
-# lens's rim moves a point by a microlens.
-COMMON_SHARE_OF_LENS_DEPTH = 5e-3
+# What all particles' depths have in common (the lens's rim, best focus of refracted rays) was 1 to 3 um on an image
+# traced through 5 mm of acrylic and up to 10 mm of water: this share of the depth over which the main lens's rim moves a
+# point by a microlens, with room for as much again.
+COMMON_SHARE_OF_LENS_DEPTH = 2.5e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +140,7 @@ def refine_calibration(
     images: Sequence[NDArray[np.float32]],
     calibration: Calibration,
     sheet: Camera,
-    media: Media,
+    space: ObjectSpace,
     volume: Grid,
     width_mm: float,
     particle_diameter_mm: float,
@@ -150,6 +152,7 @@ def refine_calibration(
     ----------
     images : (rows, columns) raw, dark and background taken off, counts
     sheet : camera as the data sheet has it
+    space : what lies before the particles, by the calibration
     volume : says where particles are looked for laterally, and how fine
     width_mm : of the channel
 
@@ -161,6 +164,7 @@ def refine_calibration(
         The array is hexagonal.
     """
     camera = calibration.camera(sheet)
+    media = space.media
     view = raw_view(camera, media, 0.5 * particle_diameter_mm, calibration)
     expected = 0.0 if calibration.mid_plane_z_mm is None else calibration.mid_plane_z_mm
     grid = _deep_grid(volume, expected, width_mm)
@@ -184,7 +188,7 @@ def refine_calibration(
     variance = np.concatenate([each.covariance_mm2[:, 2, 2] for each in found])
     # A particle that hardly lights the sensor may have no depth that can be told.
     told = np.isfinite(variance) & (variance > 0.0)
-    position, sigma = position[told], np.sqrt(variance[told])
+    position, sigma = places_by_snell(position[told], space, camera), np.sqrt(variance[told])
     return Refinement(
         walls=find_walls(position, sigma, grid.bounds_mm(2), width_mm, len(images)),
         nuisances=fit.found,
