@@ -77,7 +77,7 @@ def cli() -> None:
 @click.option("--white", type=INPUT, multiple=True, help="White image, uniform light; twice: stopped down and not.")
 @click.option("--dark", type=INPUT, help="Dark image, taken with the cap on.")
 @click.option("--board", type=INPUT, multiple=True, help="Snapshot of the dot board; or several, each with its depth.")
-@click.option("--depth-mm", type=float, multiple=True, help="Depth of each board behind the focal point, for dlfc.")
+@click.option("--depth-mm", type=float, multiple=True, help="Depth of each board in the fluid, for dlfc.")
 @click.option("-o", "--output", type=INPUT, required=True, help="Calibration file to write (.h5).")
 @click.option("--picture", type=INPUT, help="Picture of the fitted lattice and board to write (.png).")
 @click.option("--views", type=INPUT, help="Picture of views and refocused depths to write (.png).")
@@ -276,16 +276,22 @@ def info(**arguments: Any) -> dict[str, Any]:
 @cli.command("simulate")
 @click.argument("what", type=click.Choice(["white", "board", "particles"]))
 @click.argument("config", type=INPUT)
+@click.option("--depth-mm", type=float, multiple=True, help="With board: in the fluid at this depth; repeatable.")
 @click.option("-o", "--output", type=INPUT, required=True, help="Folder for the images and their truth.")
 @common_options
-def simulate(what: str, **arguments: Any) -> dict[str, Any]:
+def simulate(what: str, depth_mm: tuple[float, ...], **arguments: Any) -> dict[str, Any]:
     """Render raw images through the exact optics, ray by ray, with their truth beside them.
 
     \b
     Example: lfpiv simulate particles rig.yaml -o simulated
+             lfpiv simulate board rig.yaml --depth-mm -4 --depth-mm 0 --depth-mm 4 -o simulated
     """
     from lfpiv_cli import stages_simulate
 
+    if depth_mm:
+        if what != "board":
+            raise click.UsageError(f"simulate {what} takes no --depth-mm")
+        return stages_simulate.simulate_boards(depth_mm=depth_mm, **arguments)
     stage = {
         "white": stages_simulate.simulate_white,
         "board": stages_simulate.simulate_board,

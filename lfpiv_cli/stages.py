@@ -94,8 +94,11 @@ def _record(command: str, settings: Config, inputs: dict[str, Path]) -> dict[str
 
 
 def _reference_z_mm(settings: Config, found: Calibration | None) -> float:
-    """Return where the origin of the volume's coordinates lies, z from the nominal focal point."""
-    if settings.volume.reference == "focal_point":
+    """Return where the origin of the volume's coordinates lies, z from the nominal focal point.
+
+    Fitted rays count z from the origin that the boards' depths were told from.
+    """
+    if settings.volume.reference == "focal_point" or settings.weights.method == "dlfc":
         return 0.0
     if found is None or found.mid_plane_z_mm is None:
         raise ConfigError(

@@ -10,11 +10,11 @@ from lfpiv_cli.calibration.model import calibrate
 from lfpiv_cli.calibration.sheet import image_distance_doubt
 from lfpiv_cli.calibration.white import by_aperture
 from lfpiv_cli.console import Console
-from lfpiv_cli.errors import ConfigError, UsageError
+from lfpiv_cli.errors import UsageError
 from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.calibration_file import write_calibration
-from lfpiv_cli.files.config import Config, load_config
+from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.pictures import ensure_drawing, write_picture
 from lfpiv_cli.files.provenance import record as provenance_record
 from lfpiv_cli.optics.media import Media
@@ -55,8 +55,6 @@ def calibrate_snapshot(
             "lfpiv: no white image: the microlenses are believed to lie as the data sheet says, "
             "and the standard errors know nothing of how far that is wrong"
         )
-    if depth_mm:
-        _ensure_in_fluid(settings)
     calibration = calibrate(
         [frames[name] for name in whites],
         frames.get("dark"),
@@ -91,11 +89,3 @@ def calibrate_snapshot(
 def _numbered(role: str, paths: Sequence[Path]) -> dict[str, Path]:
     """Return the inputs of one role by name: `white`, `white_2`, ..."""
     return {role if k == 0 else f"{role}_{k + 1}": path for k, path in enumerate(paths)}
-
-
-def _ensure_in_fluid(settings: Config) -> None:
-    """Refuse boards at known depths that did not stand where the particles will be."""
-    if settings.board.medium == "air" and settings.media_model() != settings.media_model().in_air():
-        raise ConfigError(
-            "board.medium: is air, but rays are fitted to boards at known depths in the fluid; expected fluid"
-        )

@@ -25,6 +25,11 @@ from lfpiv_cli.validation.channel import Duct, table_4, worst_slice
 from lfpiv_cli.validation.flow import flow_figures, limits_missed, truth_at_points
 from lfpiv_cli.validation.pictures import flow_figure, slices_figure
 
+# Boards over the depth of the volume: cubic polynomials need four, a fifth tells how well they fit. They leave this
+# share of the depth free at both ends: there may be walls, and boards are tilted.
+DLFC_BOARDS = 5
+DLFC_MARGIN = 0.05
+
 
 def validate_flow(
     config: Path, vectors: Path | None, particles: Path | None, output: Path, overwrite: bool, console: Console
@@ -88,19 +93,25 @@ def run_chain(config: Path, output: Path, overwrite: bool, console: Console) -> 
     images, volumes = output / "images", output / "volumes"
     calibration, weights, vectors = (output / name for name in ("calibration.h5", "weights.h5", "vectors.vtkhdf"))
     common: dict[str, Any] = {"overwrite": overwrite, "console": console}
-    for simulate in (
-        stages_simulate.simulate_white,
-        stages_simulate.simulate_board,
-        stages_simulate.simulate_particles,
-    ):
-        simulate(config=config, output=images, **common)
+    stages_simulate.simulate_white(config=config, output=images, **common)
+    stages_simulate.simulate_particles(config=config, output=images, **common)
     dark = images / "dark.tif"
+    settings, depths = load_config(config), []
+    boards = [images / "board.tif"]
+    if settings.weights.method == "dlfc":
+        low, high = settings.grid().bounds_mm(2)
+        margin = DLFC_MARGIN * (high - low)
+        depths = np.linspace(low + margin, high - margin, DLFC_BOARDS).round(2).tolist()
+        boards = [images / stages_simulate.board_at(depth) for depth in depths]
+        stages_simulate.simulate_boards(config=config, output=images, depth_mm=depths, **common)
+    else:
+        stages_simulate.simulate_board(config=config, output=images, **common)
     stages_calibrate.calibrate_snapshot(
         config=config,
         white=[images / "white.tif"],
         dark=dark,
-        board=[images / "board.tif"],
-        depth_mm=[],
+        board=boards,
+        depth_mm=depths,
         output=calibration,
         picture=None,
         views=None,

@@ -1,16 +1,19 @@
 """The stages of `simulate`: the configured scene rendered into raw images, with the truth beside them.
 
-File names are those of an experiment: white.tif, dark.tif, board.tif, pair_a.tif, pair_b.tif; the truth is in
-white.json, board.json, particles.json and particles.npz.
+File names are those of an experiment: white.tif, dark.tif, board.tif (at a depth: board_+4mm.tif), pair_a.tif,
+pair_b.tif; the truth is in white.json, board.json, particles.json and particles.npz.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.calibration.model import mid_plane_z_mm
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import ConfigError
@@ -42,18 +45,32 @@ def simulate_white(config: Path, output: Path, overwrite: bool, console: Console
 def simulate_board(config: Path, output: Path, overwrite: bool, console: Console) -> dict[str, Any]:
     """Render the snapshot of the board."""
     settings, paths = _begin(config, output, ("board.tif", "board.json"), overwrite)
-    scene = settings.simulation
-    still = scenes.simulate_board(
-        real_camera(settings),
-        _board_space(settings),
-        settings.rig().board,
-        BoardPlacement(scene.board_z_mm, scene.board_offset_mm, scene.board_tilt_deg, scene.board_rotation_deg),
-        scene.peak_counts,
-        readout_of(settings),
-        _generator(settings, 1),
+    still = _board_still(
+        settings, settings.rig().board, _board_space(settings), settings.simulation.board_z_mm, _generator(settings, 1)
     )
     write_tiff(paths["board.tif"], still.image, overwrite)
     return _write_truth(paths["board.json"], "simulate board", still.truth, settings, config, overwrite)
+
+
+def simulate_boards(
+    config: Path, output: Path, depth_mm: Sequence[float], overwrite: bool, console: Console
+) -> dict[str, Any]:
+    """Render the board moved through the fluid, at depths from the origin of the volume's coordinates."""
+    names = {depth: board_at(depth) for depth in depth_mm}
+    settings, paths = _begin(config, output, tuple(names.values()), overwrite)
+    origin_z = simulated_origin_z_mm(settings)
+    rng, space = _generator(settings, 3), _flow_space(settings, origin_z)
+    board = replace(settings.rig().board, medium="fluid")
+    with console.progress(len(names), "simulate") as advance:
+        for depth, name in names.items():
+            write_tiff(paths[name], _board_still(settings, board, space, origin_z + depth, rng).image, overwrite)
+            advance(1)
+    return {"boards": len(names), "reference_z_mm": origin_z}
+
+
+def board_at(depth_mm: float) -> str:
+    """Return the name of the picture of a board at a depth."""
+    return f"board_{depth_mm:+g}mm.tif"
 
 
 def simulate_particles(config: Path, output: Path, overwrite: bool, console: Console) -> dict[str, Any]:
@@ -106,6 +123,15 @@ def simulated_origin_z_mm(settings: Config) -> float:
     if rig.channel is None:
         raise ConfigError("volume.reference: mid_plane needs simulation.mid_plane_z_mm or the section `channel`")
     return mid_plane_z_mm(rig.board, rig.channel, rig.media, scene.board_z_mm)
+
+
+def _board_still(
+    settings: Config, board: BoardGeometry, space: ObjectSpace, z_mm: float, rng: np.random.Generator
+) -> scenes.SimulatedStill:
+    scene = settings.simulation
+    placement = BoardPlacement(z_mm, scene.board_offset_mm, scene.board_tilt_deg, scene.board_rotation_deg)
+    camera, readout = real_camera(settings), readout_of(settings)
+    return scenes.simulate_board(camera, space, board, placement, scene.peak_counts, readout, rng)
 
 
 def _begin(config: Path, output: Path, names: tuple[str, ...], overwrite: bool) -> tuple[Config, dict[str, Path]]:

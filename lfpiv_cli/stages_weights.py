@@ -103,7 +103,7 @@ def ray_source(settings: Config, found: Calibration | None, grid: Grid, console:
 
     Raises
     ------
-    ConfigError : fitted rays are asked for and there are none, or they know another origin
+    ConfigError : fitted rays are asked for and there are none
     """
     if settings.weights.method != "dlfc":
         return settings.object_space(found.mid_plane_z_mm if found else None)
@@ -111,11 +111,6 @@ def ray_source(settings: Config, found: Calibration | None, grid: Grid, console:
         raise ConfigError(
             "weights.method: dlfc needs a --calibration from boards at several depths: calibrate-snapshot with --board "
             "and --depth-mm, repeated in pairs"
-        )
-    if settings.volume.reference != "focal_point":
-        raise ConfigError(
-            "volume.reference: is mid_plane, but with weights.method dlfc coordinates are those of the boards' depths; "
-            "expected focal_point"
         )
     fit = found.ray_fit
     lateral = fit.reach_mm if settings.camera_model().column_axis == "x" else fit.reach_mm[:, ::-1]

@@ -50,7 +50,7 @@ def test_fitted_rays_meet_the_array_where_traced_ones_do_eq_1(camera, water, rng
     told = replace(seen_by, distortion_per_mm2=0.0)  # the data sheet knows nothing of it
     fit = fit_rays(pictures(seen_by, water, rng, places), DEPTHS, told, BOARD, water)
     assert fit.rays.degree == 3
-    assert fit.sightings > 14_000  # of 20 dots, 4 boards, 177 views
+    assert fit.sightings > 13_900  # of 14,160: 20 dots, 4 boards, 177 views
     points = seen_by.to_image_axes(rng.uniform((-0.8, -0.5, -4.0), (0.8, 0.5, 5.0), (500, 3)))
     lens = disc_points(500, 10.0, rng)
     truth = trace(seen_by, lens, slopes_equivalent(points, lens, seen_by, water)).array_mm
@@ -78,8 +78,8 @@ def test_boards_that_lost_dots_are_numbered_as_the_others():
     index = np.stack(np.meshgrid(np.arange(5), np.arange(4), indexing="ij"), axis=-1).reshape(-1, 2)
     place = 0.5 * (index - np.array([2.0, 1.5])) + (0.02, 0.01)
     lost = index[:, 0] > 0  # its first column; the others were numbered from 0
-    boards = [SeenBoard(np.zeros((1, 1)), z, place, index) for z in (-1.0, 1.0)]
-    boards.append(SeenBoard(np.zeros((1, 1)), 2.0, place[lost], index[lost] - (1, 0)))
+    boards = [SeenBoard(np.zeros((1, 1)), z, z, place, index) for z in (-1.0, 1.0)]
+    boards.append(SeenBoard(np.zeros((1, 1)), 2.0, 2.0, place[lost], index[lost] - (1, 0)))
     np.testing.assert_array_equal(aligned(boards, BOARD)[2].index, index[lost])
 
 

@@ -37,6 +37,17 @@ def test_the_sample_s_experiment_is_simulated_and_measured(tmp_path: Path) -> No
 
 
 @pytest.mark.slow
+def test_rays_fitted_to_boards_moved_through_the_sample_measure_its_flow(tmp_path: Path) -> None:
+    text = (CONFIGS / "sample.yaml").read_text().replace("medium: air", "medium: fluid")
+    rig = tmp_path / "rig.yaml"
+    rig.write_text(text.replace("reconstruction:", "weights: {method: dlfc}\nreconstruction:"))
+    run("validate", "flow", rig, "-o", tmp_path / "report")
+    figures = json.loads((tmp_path / "report" / "flow.json").read_text())["figures"]
+    assert figures["within_25_percent_streamwise"] > 0.95
+    assert abs(figures["streamwise_mean_error"]) < 0.02
+
+
+@pytest.mark.slow
 def test_section_4_2_beats_the_paper_in_five_slices_of_six_and_as_a_whole(tmp_path: Path) -> None:
     run("validate", "flow", CONFIGS / "channel.yaml", "-o", tmp_path / "report")
     figures = json.loads((tmp_path / "report" / "flow.json").read_text())["figures"]

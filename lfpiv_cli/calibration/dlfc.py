@@ -4,7 +4,8 @@ Each dot is looked for in every sub-aperture view: a place in the scene, a point
 microlenses its image falls there. Polynomials through all of these sightings take the place of main lens, window and
 fluid. The data sheet's camera only says where to look for the dots.
 
-Axes: image axes of the rectified frame (x along the columns), mm, z away from the camera from the nominal focal point.
+Axes: image axes of the rectified frame (x along the columns), mm, z away from the camera, from where the depths of the
+boards are counted.
 The boards are taken to stand square to the optical axis and to have moved along it; their common place and turn are
 those under which they are seen, on average.
 """
@@ -19,7 +20,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from lfpiv_cli.calibration.board import RIM_PER_PATCH, dot_signal, first_dots
+from lfpiv_cli.calibration.board import RIM_PER_PATCH, candidate_depths, dot_signal, first_dots
 from lfpiv_cli.calibration.board_pose import BoardGeometry, on_the_grid
 from lfpiv_cli.calibration.rectification import turn_matrix
 from lfpiv_cli.calibration.views import lens_table, sub_aperture_view
@@ -78,9 +79,9 @@ class RayFit:
 
 @dataclass(frozen=True, eq=False)
 class Sightings:
-    """Dots in views: places (n, 3) in the scene, crossings (n, 2) of the main lens, places (n, 2) on the array."""
+    """A board's dots in views: which dot (n,), crossings (n, 2) of the main lens, places (n, 2) on the array."""
 
-    start_mm: NDArray[np.float64]
+    dot: NDArray[np.int64]
     crossing_mm: NDArray[np.float64]
     array_mm: NDArray[np.float64]
 
@@ -92,13 +93,15 @@ class SeenBoard:
     Attributes
     ----------
     signal : (rows, columns), dots bright, divided by the share of light that pixels pass
-    z_mm : depth of the board, as told
+    z_mm : depth of the board, as told, from any origin
+    seen_z_mm : the same as the data sheet's camera sees it, from the focal point
     place_mm : (n, 2) of the dots as the data sheet's camera sees them
     index : (n, 2) which dots they are
     """
 
     signal: NDArray[np.float64]
     z_mm: float
+    seen_z_mm: float
     place_mm: NDArray[np.float64]
     index: NDArray[np.int64]
 
@@ -141,13 +144,17 @@ def fit_rays(
             f"{lines[0]} x {lines[1]} dots were found in a board, polynomials need at least {SMALLEST_DEGREE + 1} "
             "along each axis"
         )
-    grid = common_grid(boards, board)
-    seen = [sightings_of(each, grid[each.index[:, 0], each.index[:, 1]], camera, board, media) for each in boards]
-    every = Sightings(*(np.concatenate([getattr(each, name) for each in seen]) for name in vars(seen[0])))
-    rays, residual, used = polynomial_fit(every, degree, camera)
-    lateral = every.start_mm[used, :2]
-    reach = np.stack([lateral.min(axis=0), lateral.max(axis=0)])
-    number = np.repeat(np.arange(len(seen)), [len(each.start_mm) for each in seen])
+    seen = [sightings_of(each, camera, board, media) for each in boards]
+    grid = common_grid([settled(*pair, camera, media) for pair in zip(boards, seen, strict=True)], board)
+    starts = []
+    for one, sightings in zip(boards, seen, strict=True):
+        lateral = grid[tuple(one.index[sightings.dot].T)]
+        starts.append(np.column_stack([lateral, np.full(len(lateral), one.z_mm)]))
+    start = np.concatenate(starts)
+    crossing, array = (np.concatenate([getattr(each, name) for each in seen]) for name in ("crossing_mm", "array_mm"))
+    rays, residual, used = polynomial_fit(start, crossing, array, degree, camera)
+    reach = np.stack([start[used, :2].min(axis=0), start[used, :2].max(axis=0)])
+    number = np.repeat(np.arange(len(seen)), [len(each.dot) for each in seen])
     rms = [np.sqrt(np.mean(residual[used & (number == k)] ** 2, axis=0)) for k in range(len(seen))]
     return RayFit(rays, depths, reach, int(used.sum()), np.array(rms))
 
@@ -155,16 +162,16 @@ def fit_rays(
 def seen_board(
     image: ArrayLike, z_mm: float, camera: Camera, board: BoardGeometry, media: Media, passed: NDArray[np.float32]
 ) -> SeenBoard:
-    """Find and number the dots of one board in the picture refocused to its depth."""
+    """Find and number the dots of one board in the picture refocused to where they are sharpest."""
     signal = dot_signal(np.asarray(image, dtype=np.float32), passed, board)
     try:
-        place, _ = first_dots(signal, camera, board, media, np.array([z_mm]))
+        place, seen_z = first_dots(signal, camera, board, media, candidate_depths(camera, media))
         kept, index = on_the_grid(np.column_stack([place, np.full(len(place), z_mm)]), board)
     except InputError as error:
         raise InputError(f"the board at {z_mm:g} mm: {error}") from error
     usable = passed > 0.0
     level = np.where(usable, signal / np.where(usable, passed, 1.0), 0.0)
-    return SeenBoard(level, z_mm, place[kept], index)
+    return SeenBoard(level, z_mm, seen_z, place[kept], index)
 
 
 def aligned(boards: list[SeenBoard], board: BoardGeometry) -> list[SeenBoard]:
@@ -175,7 +182,7 @@ def aligned(boards: list[SeenBoard], board: BoardGeometry) -> list[SeenBoard]:
     for each, step in zip(boards, steps, strict=True):
         index = each.index + step
         kept = ((index >= 0) & (index < np.array(board.dots))).all(axis=1)
-        result.append(SeenBoard(each.signal, each.z_mm, each.place_mm[kept], index[kept]))
+        result.append(replace(each, place_mm=each.place_mm[kept], index=index[kept]))
     return result
 
 
@@ -206,27 +213,39 @@ def _similarity(seen: SeenBoard, board: BoardGeometry) -> tuple[float, NDArray[n
     return float(np.arctan2(sine, cosine)), np.array([x, y]) / np.hypot(cosine, sine)
 
 
-def sightings_of(
-    seen: SeenBoard, dots_mm: NDArray[np.float64], camera: Camera, board: BoardGeometry, media: Media
-) -> Sightings:
-    """Look for the dots of a board, standing at (n, 2), in every view that the aperture gives wholly."""
-    distance = float(equivalent_object_distance(seen.z_mm, camera.focus_distance_mm, media))
-    alpha, forward = float(camera.defocus(distance)), camera.image_distance_mm / distance
+def settled(seen: SeenBoard, sightings: Sightings, camera: Camera, media: Media) -> SeenBoard:
+    """Return a board with its dots where all their sightings together have them, for the data sheet's camera."""
+    alpha, forward = _paraxial(seen, camera, media)
+    place = (alpha * sightings.crossing_mm - sightings.array_mm) / forward
+    counts = np.bincount(sightings.dot, minlength=len(seen.index))
+    sums = np.stack([np.bincount(sightings.dot, values, minlength=counts.size) for values in place.T], axis=1)
+    found = counts > 0
+    return replace(seen, place_mm=sums[found] / counts[found, np.newaxis], index=seen.index[found])
+
+
+def _paraxial(seen: SeenBoard, camera: Camera, media: Media) -> tuple[float, float]:
+    """Return alpha and s_i/s_o of x_m = alpha X - x s_i/s_o at the depth at which a board is seen."""
+    distance = float(equivalent_object_distance(seen.seen_z_mm, camera.focus_distance_mm, media))
+    return float(camera.defocus(distance)), camera.image_distance_mm / distance
+
+
+def sightings_of(seen: SeenBoard, camera: Camera, board: BoardGeometry, media: Media) -> Sightings:
+    """Look for the dots of a board in every view that the aperture gives wholly."""
+    alpha, forward = _paraxial(seen, camera, media)
     step = camera.pixel_mm * camera.image_distance_mm / camera.microlens_distance_mm
     pitch = float(camera.lattice.pitch.max())
     window = 0.5 * board.dot_diameter_mm * forward + MARGIN_LENSES * pitch
     reach = max(0.5 * board.spacing_mm * forward, window)
     lenses = camera.lattice.points(lens_table(camera))
     crossings = view_crossings(camera.aperture_radius_mm - RIM_PER_PATCH * step, step)
-    found, heights = np.empty((len(crossings), len(dots_mm), 2)), np.empty((len(crossings), len(dots_mm)))
+    found, heights = np.empty((len(crossings), len(seen.index), 2)), np.empty((len(crossings), len(seen.index)))
     for k, crossing in enumerate(crossings):
         view = sub_aperture_view(seen.signal, camera, crossing)
         guess = alpha * crossing - forward * seen.place_mm
         found[k], heights[k] = dot_centroids(view, lenses, guess, window, reach)
     clear = heights > CONTRAST_SHARE * np.nanmedian(heights)
     view_of, dot = np.nonzero(clear & np.isfinite(found).all(axis=-1))
-    start = np.column_stack([dots_mm[dot], np.full(dot.size, seen.z_mm)])
-    return Sightings(start, crossings[view_of], found[view_of, dot])
+    return Sightings(dot, crossings[view_of], found[view_of, dot])
 
 
 def view_crossings(radius_mm: float, step_mm: float) -> NDArray[np.float64]:
@@ -282,17 +301,24 @@ def dot_centroids(
 
 
 def polynomial_fit(
-    seen: Sightings, degree: int, camera: Camera
+    start_mm: NDArray[np.float64],
+    crossing_mm: NDArray[np.float64],
+    array_mm: NDArray[np.float64],
+    degree: int,
+    camera: Camera,
 ) -> tuple[PolynomialRays, NDArray[np.float64], NDArray[np.bool_]]:
-    """Return the complete polynomials through sightings, the misfit (n, 2) in mm, and which were used (n,)."""
-    largest = np.abs(np.concatenate([seen.start_mm, seen.crossing_mm], axis=1)).max(axis=0)
+    """Return the complete polynomials through rays from (n, 3) through (n, 2) to (n, 2), and how well they fit.
+
+    That is the misfit (n, 2) in mm, and which rays were used (n,).
+    """
+    largest = np.abs(np.concatenate([start_mm, crossing_mm], axis=1)).max(axis=0)
     scale = np.maximum(largest, float(camera.lattice.pitch.min()))
     exponents = complete_exponents(degree)
-    terms = polynomial_terms(seen.start_mm, seen.crossing_mm, scale, exponents)
+    terms = polynomial_terms(start_mm, crossing_mm, scale, exponents)
     used = np.ones(len(terms), dtype=bool)
     for _ in range(FIT_ROUNDS):
-        coefficients = np.asarray(np.linalg.lstsq(terms[used], seen.array_mm[used], rcond=None)[0], dtype=np.float64)
-        residual = seen.array_mm - terms @ coefficients
+        coefficients = np.asarray(np.linalg.lstsq(terms[used], array_mm[used], rcond=None)[0], dtype=np.float64)
+        residual = array_mm - terms @ coefficients
         off = np.abs(residual)
         good = np.all(off <= OUTLIER_SIGMAS * MAD_TO_SIGMA * np.median(off[used], axis=0), axis=1)
         if np.array_equal(good, used):

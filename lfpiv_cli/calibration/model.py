@@ -304,10 +304,10 @@ def board_pose(image: NDArray[np.float64], calibration: Calibration, rig: Rig) -
 def ray_fit(
     images: Sequence[NDArray[np.float64]], depths_mm: Sequence[float], calibration: Calibration, rig: Rig
 ) -> RayFit:
-    """Return the polynomials through boards in raw pictures less the dark frame."""
+    """Return the polynomials through boards in the fluid, in raw pictures less the dark frame."""
     rectified = [calibration.rectification.apply(image) for image in images]
-    media = rig.media.in_air() if rig.board.medium == "air" else rig.media
-    return fit_rays(rectified, depths_mm, calibration.camera(rig.camera), rig.board, media, calibration.transmission)
+    camera = calibration.camera(rig.camera)
+    return fit_rays(rectified, depths_mm, camera, rig.board, rig.media, calibration.transmission)
 
 
 def with_mid_plane(calibration: Calibration, pose: BoardPose, rig: Rig) -> Calibration:

@@ -365,8 +365,7 @@ class BoardValidation(Section):
     """What `validate board` does.
 
     images: without faults (ideal), with the simulation's (recorded), or both. methods: ways to the weights, equivalent
-    points (ert) and rays fitted to the boards (dlfc); or no weights, the dots fitted as discs to the pictures (discs), as
-    particles are.
+    points (ert) and rays fitted to the boards (dlfc); or no weights, the dots fitted to the pictures as discs (discs).
     """
 
     images: Literal["ideal", "recorded", "both"] = "ideal"
