@@ -39,8 +39,8 @@ MARGIN_PER_WIDTH = 0.15
 # Candidates' depths need planes only this many lateral voxels apart; the fit finds the rest.
 DEPTH_PER_LATERAL = 2.0
 # What all particles' depths have in common (the lens's rim, best focus of refracted rays) was 1 to 3 um on an image
-# traced through 5 mm of acrylic and up to 10 mm of water: this share of the depth over which the main lens's rim moves a
-# point by a microlens, with room for as much again.
+# traced through 5 mm of acrylic and up to 10 mm of water: this share of the depth over which the main lens's rim moves
+# a point by a microlens, with room for as much again.
 COMMON_SHARE_OF_LENS_DEPTH = 2.5e-3
 
 
