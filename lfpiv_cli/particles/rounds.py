@@ -82,7 +82,7 @@ class Particles:
     ----------
     position_mm : (n, 3) world axes
     light_counts : (n,) all that passes the main lens
-    covariance_mm2 : (n, 3, 3) of the position
+    covariance_mm2 : (n, 3, 3) of the position, the camera taken to be as calibrated
     chi2 : (n,) mean of residual^2 / variance over the particle's light, about 1 where all is explained
     seen : (n,) share of its light that meets the sensor
     residual : (rows, columns) what the particles leave of the image, counts
