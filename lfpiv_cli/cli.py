@@ -214,7 +214,7 @@ def track(**arguments: Any) -> dict[str, Any]:
 
 
 @cli.command("validate")
-@click.argument("what", type=click.Choice(["flow", "weights", "board", "volume"]))
+@click.argument("what", type=click.Choice(["flow", "weights", "board", "volume", "all"]))
 @click.argument("config", type=INPUT)
 @click.option("--vectors", type=INPUT, help="flow: vectors to judge, not those of a simulation.")
 @click.option("--volume", type=INPUT, help="volume: volume to judge.")
@@ -232,6 +232,7 @@ def validate(
              lfpiv validate flow rig.yaml -o report    (simulates the rig's experiment first)
              lfpiv validate weights rig.yaml -o report
              lfpiv validate board rig.yaml -o report
+             lfpiv validate all rig.yaml -o report     (weights, board, and flow as it is simulated)
              lfpiv validate volume rig.yaml --volume a.vtkhdf --particles true.npz --frame a -o report
     """
     if (volume is not None or frame is not None) and what != "volume":
@@ -248,6 +249,10 @@ def validate(
         return stages_flow.validate_flow(vectors=vectors, particles=particles, **arguments)
     if vectors is not None or particles is not None:
         raise click.UsageError(f"validate {what} takes neither --vectors nor --particles")
+    if what == "all":
+        from lfpiv_cli import stages_validate
+
+        return stages_validate.validate_all(**arguments)
     if what == "board":
         from lfpiv_cli import stages_board
 

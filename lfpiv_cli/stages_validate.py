@@ -1,0 +1,34 @@
+"""The stage of `validate all`: weights, boards and flow of one config, one after the other."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from lfpiv_cli.console import Console
+from lfpiv_cli.errors import LimitMissedError
+from lfpiv_cli.stages_board import validate_board
+from lfpiv_cli.stages_flow import validate_flow
+from lfpiv_cli.stages_weights import validate_weights
+
+
+def validate_all(config: Path, output: Path, overwrite: bool, console: Console) -> dict[str, Any]:
+    """Write every report into one folder; a limit that one of them misses does not keep the others from being made."""
+    stages = {
+        "weights": validate_weights,
+        "board": validate_board,
+        "flow": lambda **arguments: validate_flow(vectors=None, particles=None, **arguments),
+    }
+    summary: dict[str, Any] = {}
+    missed = []
+    for name, stage in stages.items():
+        try:
+            found = stage(config=config, output=output, overwrite=overwrite, console=console)
+        except LimitMissedError as error:
+            missed.append(str(error))
+            continue
+        summary |= {f"{name}.{figure}": value for figure, value in found.items()}
+    if missed:
+        console.summary(summary)
+        raise LimitMissedError("; ".join(missed))
+    return summary

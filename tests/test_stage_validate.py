@@ -1,0 +1,33 @@
+"""`validate all`: every report, whatever limit one of them misses."""
+
+from __future__ import annotations
+
+import pytest
+
+from lfpiv_cli import stages_validate
+from lfpiv_cli.console import Console
+from lfpiv_cli.errors import LimitMissedError
+
+
+def test_a_missed_limit_keeps_no_other_report_from_being_made(monkeypatch, tmp_path):
+    made = []
+
+    def stage(name, fails):
+        def run(config, output, overwrite, console, **others):
+            made.append((name, config, output, overwrite, others))
+            if fails:
+                raise LimitMissedError(f"{name} is bad")
+            return {"error": 0.1}
+
+        return run
+
+    for name, fails in (("weights", True), ("board", False), ("flow", True)):
+        monkeypatch.setattr(stages_validate, f"validate_{name}", stage(name, fails))
+    with pytest.raises(LimitMissedError, match="weights is bad; flow is bad"):
+        stages_validate.validate_all(tmp_path / "c.yaml", tmp_path, False, Console(quiet=True))
+    assert [name for name, *_ in made] == ["weights", "board", "flow"]
+    assert made[2][4] == {"vectors": None, "particles": None}
+    monkeypatch.setattr(stages_validate, "validate_weights", stage("weights", False))
+    monkeypatch.setattr(stages_validate, "validate_flow", stage("flow", False))
+    summary = stages_validate.validate_all(tmp_path / "c.yaml", tmp_path, False, Console(quiet=True))
+    assert summary == {"weights.error": 0.1, "board.error": 0.1, "flow.error": 0.1}
