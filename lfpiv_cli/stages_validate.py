@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from lfpiv_cli.stages_weights import validate_weights
 
 def validate_all(config: Path, output: Path, overwrite: bool, console: Console) -> dict[str, Any]:
     """Write every report into one folder; a limit that one of them misses does not keep the others from being made."""
-    stages = {
+    stages: dict[str, Callable[..., dict[str, Any]]] = {
         "weights": validate_weights,
         "board": validate_board,
         "flow": lambda **arguments: validate_flow(vectors=None, particles=None, **arguments),
