@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.calibration.board import dots_in_world
 from lfpiv_cli.console import Console
+from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files.atomic import ensure_writable, write_json
 from lfpiv_cli.files.batch import prepare_folder
 from lfpiv_cli.files.config import Config, load_config
@@ -25,6 +26,9 @@ from lfpiv_cli.validation.board import DEPTHS_MM, PAPER, DotFigures, board_figur
 from lfpiv_cli.validation.board_bench import BoardBench, ideal_bench, recorded_bench
 from lfpiv_cli.validation.board_pictures import board_figure
 
+# Two make a step in depth, a third the polynomials of fitted rays.
+FEWEST_DEPTHS = 3
+
 
 def validate_board(config: Path, output: Path, overwrite: bool, console: Console) -> dict[str, Any]:
     """Reconstruct the configured board at the paper's depths, with the configured solver.
@@ -35,6 +39,7 @@ def validate_board(config: Path, output: Path, overwrite: bool, console: Console
     settings = load_config(config)
     chosen = settings.validation.board
     halves = ("ideal", "recorded") if chosen.images == "both" else (chosen.images,)
+    depths = _depths(settings, config)
     solved = [method for method in chosen.methods if method != "discs"]
     report = output / "board.json"
     drawings = {(half, method): output / f"board_{half}_{method}.png" for half in halves for method in solved}
@@ -44,17 +49,17 @@ def validate_board(config: Path, output: Path, overwrite: bool, console: Console
     ensure_drawing()
     figures: dict[str, dict[str, Any]] = {half: {} for half in halves}
     steps = len(halves) * (len(solved) * settings.reconstruction.iterations + len(chosen.methods) - len(solved))
-    with console.progress(steps * len(DEPTHS_MM), "boards") as advance:
+    with console.progress(steps * len(depths), "boards") as advance:
         for half in halves:
             bench = _bench(settings, half)
-            pictures = [bench.picture(_placement(settings, depth)) for depth in DEPTHS_MM]
+            pictures = [bench.picture(_placement(settings, depth)) for depth in depths]
             for method in chosen.methods:
                 if method == "discs":
-                    figures[half][method] = _discs(bench, pictures, advance)
+                    figures[half][method] = _discs(bench, pictures, depths, advance)
                     continue
-                judged = bench if method == "ert" else bench.with_fitted_rays(pictures, DEPTHS_MM)
-                dots, drawn = _boards(judged, pictures, settings, console, advance)
-                measured = board_figures(dots, DEPTHS_MM, bench.rig.board.dots, bench.rig.board.spacing_mm)
+                judged = bench if method == "ert" else bench.with_fitted_rays(pictures, depths)
+                dots, drawn = _boards(judged, pictures, depths, settings, console, advance)
+                measured = board_figures(dots, depths, bench.rig.board.dots, bench.rig.board.spacing_mm)
                 figures[half][method] = measured | {"paper": PAPER[half, method]}
                 write_picture(drawings[half, method], board_figure(measured, drawn, settings.grid()), overwrite)
     provenance = record("validate board", settings.resolved(), {"config": config})
@@ -66,6 +71,18 @@ def validate_board(config: Path, output: Path, overwrite: bool, console: Console
         for name, value in measured.items()
         if isinstance(value, float)
     }
+
+
+def _depths(settings: Config, config: Path) -> tuple[float, ...]:
+    """Return those of the paper's depths that lie in the volume."""
+    low, high = settings.grid().bounds_mm(2)
+    depths = tuple(depth for depth in DEPTHS_MM if low < depth < high)
+    if len(depths) < FEWEST_DEPTHS:
+        raise ConfigError(
+            f"{config}: volume: reaches from z = {low:g} to {high:g} mm and holds {len(depths)} of the boards, which are "
+            f"1 mm apart; expected at least {FEWEST_DEPTHS}"
+        )
+    return depths
 
 
 def _placement(settings: Config, depth_mm: float) -> BoardPlacement:
@@ -93,7 +110,10 @@ def _bench(settings: Config, half: str) -> BoardBench:
 
 
 def _discs(
-    bench: BoardBench, pictures: Sequence[NDArray[np.float32]], advance: Callable[[int], None]
+    bench: BoardBench,
+    pictures: Sequence[NDArray[np.float32]],
+    depths_mm: tuple[float, ...],
+    advance: Callable[[int], None],
 ) -> dict[str, Any]:
     """Return the errors of place of dots that are fitted to the pictures as discs."""
     calibration, rig = bench.weights.calibration, bench.rig
@@ -103,12 +123,13 @@ def _discs(
         places.append(dots_in_world(picture, rig.camera, rig.board, rig.media, rotation))
         advance(1)
     x, z = ([each[..., axis] for each in places] for axis in (0, 2))
-    return place_figures(x, z, DEPTHS_MM, rig.board.spacing_mm)
+    return place_figures(x, z, depths_mm, rig.board.spacing_mm)
 
 
 def _boards(
     bench: BoardBench,
     pictures: Sequence[NDArray[np.float32]],
+    depths_mm: tuple[float, ...],
     settings: Config,
     console: Console,
     advance: Callable[[int], None],
@@ -117,7 +138,7 @@ def _boards(
     board, solver = settings.rig().board, settings.reconstruction
     sums = None if bench.weights.on_demand else normalisers(bench.weights.padded, bench.excluded)
     dots, drawn = [], np.zeros(bench.weights.shape, np.float32)
-    for depth, picture in zip(DEPTHS_MM, pictures, strict=True):
+    for depth, picture in zip(depths_mm, pictures, strict=True):
         operator = bench.weights.padded.for_image(picture)
         result = reconstruct(
             operator,

@@ -23,7 +23,7 @@ from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.optics.polynomial_rays import PolynomialRays
-from lfpiv_cli.validation.weights import TABLE1_MM, limits_missed, make_columns, sample_voxels, weights_figures
+from lfpiv_cli.validation.weights import TABLE1_MM, in_view, limits_missed, make_columns, sample_voxels, weights_figures
 from lfpiv_cli.validation.weights_pictures import column_figure, columns_figure, similarity_figure
 from lfpiv_cli.weights.columns import ColumnOperator, OnDemandOperator, operator_of
 from lfpiv_cli.weights.model import WeightsOperator
@@ -50,15 +50,16 @@ def validate_weights(config: Path, output: Path, overwrite: bool, console: Conso
     chosen = settings.validation.weights
     camera, grid = settings.camera_model(), settings.grid()
     rng = np.random.default_rng(chosen.seed)
-    centres = np.concatenate([np.array(TABLE1_MM), sample_voxels(grid, chosen.sample, rng)])
-    long_count = np.where(np.arange(len(centres)) < len(TABLE1_MM), chosen.long_count_rays, 0)
+    known = [centre for centre in TABLE1_MM if in_view(camera, _space(settings), centre, grid.spacing_mm)]
+    centres = np.concatenate([np.array(known).reshape(-1, 3), sample_voxels(grid, chosen.sample, rng)])
+    long_count = np.where(np.arange(len(centres)) < len(known), chosen.long_count_rays, 0)
     with console.progress(len(centres), "validate weights") as advance:
         columns = make_columns(camera, _space(settings), centres, grid.spacing_mm, rng, long_count, advance)
     figures = weights_figures(columns, long_count)
     missed = limits_missed(figures, chosen.limits.model_dump())
     record = provenance_record("validate weights", settings.resolved(), {"config": config})
     write_json(paths[".json"], {"figures": figures, "limits_missed": missed, "provenance": record}, overwrite)
-    shown = len(TABLE1_MM)
+    shown = min(len(TABLE1_MM), len(columns))
     write_picture(paths["_columns.png"], columns_figure(columns[:shown]), overwrite)
     write_picture(paths["_similarity.png"], similarity_figure(figures, shown), overwrite)
     summary = {

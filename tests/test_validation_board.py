@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from lfpiv_cli.cli import cli
-from lfpiv_cli.errors import InputError
+from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.validation.board import board_figures, elongation_mm, gaussian_centre_mm, measure_dots
 
@@ -89,3 +89,11 @@ def test_validate_board_on_a_small_camera(tmp_path):
         assert report[half]["discs"]["lateral_error"] < 0.002
     centres = {str(each["by_depth"]["centre_mm"]) for half in report.values() for each in half.values()}
     assert len(centres) == 6
+
+
+def test_a_volume_too_thin_for_boards_is_refused(tmp_path):
+    text = CONFIG.read_text().replace("shape_xyz: [80, 80, 240]", "shape_xyz: [80, 80, 18]")
+    thin = tmp_path / "thin.yaml"
+    thin.write_text(text)
+    with pytest.raises(ConfigError, match="holds 1 of the boards"):
+        cli.main(["validate", "board", str(thin), "-o", str(tmp_path / "report")], standalone_mode=False)

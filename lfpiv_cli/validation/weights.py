@@ -33,6 +33,9 @@ WINDOW_RADIUS_PX = 5
 K1, K2 = 0.01, 0.03
 GREY_LEVELS = 255.0
 
+# Tiles across the aperture, and the share of its light, by which a voxel counts as wholly in view.
+VIEW_TILES, WHOLLY_SEEN = 8, 0.999
+
 # In the long count every point of a voxel sends this many rays: few enough for the points not to repeat themselves.
 RAYS_PER_POINT_LONG = 100
 
@@ -95,6 +98,15 @@ def sample_voxels(grid: Grid, count: int, rng: np.random.Generator) -> NDArray[n
     """Return the centres (count, 3) of random voxels of a grid, world axes."""
     indices = np.stack([rng.integers(0, n, count) for n in grid.shape_xyz], axis=1)
     return grid.voxel_to_mm(indices.astype(np.float64))
+
+
+def in_view(
+    camera: Camera, space: ObjectSpace, centre_mm: tuple[float, float, float], voxel_mm: tuple[float, float, float]
+) -> bool:
+    """Return whether all light of a voxel, world axes, meets the sensor."""
+    point, sides = camera.to_image_axes(np.array(centre_mm)), camera.to_image_axes(np.asarray(voxel_mm))
+    column = integrate_columns(camera, replace(space, refraction="paraxial", method="ert"), point, sides, VIEW_TILES, 1)
+    return bool(column.share.sum() > WHOLLY_SEEN)
 
 
 def make_columns(
