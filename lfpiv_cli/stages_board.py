@@ -79,8 +79,8 @@ def _depths(settings: Config, config: Path) -> tuple[float, ...]:
     depths = tuple(depth for depth in DEPTHS_MM if low < depth < high)
     if len(depths) < FEWEST_DEPTHS:
         raise ConfigError(
-            f"{config}: volume: reaches from z = {low:g} to {high:g} mm and holds {len(depths)} of the boards, which are "
-            f"1 mm apart; expected at least {FEWEST_DEPTHS}"
+            f"{config}: volume: reaches from z = {low:g} to {high:g} mm and holds {len(depths)} of the boards, "
+            f"1 mm apart each; expected at least {FEWEST_DEPTHS}"
         )
     return depths
 
