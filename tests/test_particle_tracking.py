@@ -76,8 +76,8 @@ def test_grid_states_its_error_and_ignores_strays(rng: np.random.Generator) -> N
     nodes = rng.uniform(0.5, 3.5, (200, 3))
     value, error = on_grid(points, values, sigma, nodes, 1.0)
     ratio = (value - moved(nodes)) / error
-    # Neighbouring nodes share tracks, so 200 nodes make some 60 independent ones: 10 %; the spread is estimated too, from
-    # 45 tracks, which makes 4 % more of the ratio.
+    # Neighbouring nodes share tracks, so 200 nodes make some 60 independent ones: 10 %; the spread is estimated too,
+    # from 45 tracks, which makes 4 % more of the ratio.
     assert np.all(np.abs(np.sqrt(np.mean(ratio**2, axis=0)) - 1.0) < 0.3)
     assert np.sqrt(np.mean(ratio**2)) == pytest.approx(1.04, abs=0.12)
     assert np.all(error < sigma[0])
