@@ -55,8 +55,9 @@ $(OUT)/report/flow.json: $(CONFIG) $(OUT)/vectors.vtkhdf $(TRUTH) | $(INSTALLED)
 	$(LFPIV) validate flow $(CONFIG) --vectors $(OUT)/vectors.vtkhdf $(if $(TRUTH),--particles $(TRUTH)) \
 	    --output $(@D) --overwrite
 
+# Two processes: the first run is all compilation, which takes one core each.
 test: $(INSTALLED)
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile
 
 test-all: $(INSTALLED)
 	$(BIN)/python -m pytest -m "slow or not slow"
