@@ -9,8 +9,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from lfpiv_cli.validation.volume import add_gaussians
 
 Flow = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 Triple = tuple[int, int, int]
@@ -19,8 +20,6 @@ PEAK_DISPLACEMENT = 4.0
 PEAK_SWIRL = 2.0
 # Particles beyond the faces, in voxels, so that some come and go.
 MARGIN = 10.0
-# Beyond this many standard deviations a particle is below 1e-4 of its peak.
-REACH = 4.3
 REFERENCE_WINDOW = 16**3
 
 
@@ -101,27 +100,6 @@ def volume_pair(
         strange = rng.random(count) < lost
         seen = np.where(strange[:, np.newaxis], rng.random((count, 3)) * sides - MARGIN, moved)
         volume = np.zeros(shape_xyz[::-1], dtype=np.float32)
-        deposit(volume, seen, np.array(seeding.sigma))
+        add_gaussians(volume, seen, np.ones(len(seen)), np.array(seeding.sigma))
         volumes.append(volume + (seeding.noise * rng.standard_normal(volume.shape)).astype(np.float32))
     return volumes[0], volumes[1]
-
-
-@njit(cache=True)
-def deposit(volume: NDArray[np.float32], centres: NDArray[np.float64], sigma: NDArray[np.float64]) -> None:
-    """Add Gaussian particles of height 1 at `centres` (n, 3) to a volume."""
-    shape = (volume.shape[2], volume.shape[1], volume.shape[0])
-    widest = int(2.0 * REACH * sigma.max()) + 3
-    profile = np.empty((3, widest))
-    low = np.empty(3, dtype=np.int64)
-    high = np.empty(3, dtype=np.int64)
-    for n in range(centres.shape[0]):
-        for axis in range(3):
-            low[axis] = max(0, int(np.ceil(centres[n, axis] - REACH * sigma[axis])))
-            high[axis] = min(shape[axis], int(np.floor(centres[n, axis] + REACH * sigma[axis])) + 1)
-            for k in range(low[axis], high[axis]):
-                profile[axis, k - low[axis]] = np.exp(-0.5 * ((k - centres[n, axis]) / sigma[axis]) ** 2)
-        for z in range(low[2], high[2]):
-            for y in range(low[1], high[1]):
-                height = profile[2, z - low[2]] * profile[1, y - low[1]]
-                for x in range(low[0], high[0]):
-                    volume[z, y, x] += height * profile[0, x - low[0]]

@@ -95,7 +95,7 @@ def known_volume(
 ) -> NDArray[np.float32]:
     """Return particles (n, 3) as Gaussians of standard deviations sigma (3,), each as high as it is bright (n,)."""
     volume = np.zeros(grid.shape_zyx, np.float32)
-    _add_gaussians(volume, grid.mm_to_voxel(position_mm), brightness, sigma_mm / np.asarray(grid.spacing_mm))
+    add_gaussians(volume, grid.mm_to_voxel(position_mm), brightness, sigma_mm / np.asarray(grid.spacing_mm))
     return volume
 
 
@@ -138,13 +138,13 @@ def _median_elongation(volume: NDArray[np.float32], grid: Grid, index_xyz: NDArr
 
 
 @njit(cache=True)
-def _add_gaussians(
+def add_gaussians(
     volume: NDArray[np.float32],
     centres: NDArray[np.float64],
     height: NDArray[np.float64],
     sigma: NDArray[np.float64],
 ) -> None:
-    """Add Gaussians at `centres` (n, 3) in voxels (x, y, z)."""
+    """Add Gaussians of heights (n,) to a volume [z, y, x]; `centres` (n, 3) and `sigma` (3,) in voxels (x, y, z)."""
     shape = (volume.shape[2], volume.shape[1], volume.shape[0])
     profile = np.empty((3, int(2.0 * REACH * sigma.max()) + 3))
     low, high = np.empty(3, np.int64), np.empty(3, np.int64)
