@@ -23,7 +23,7 @@ from scipy.spatial import KDTree
 from lfpiv_cli.particles.fitting import UNKNOWNS
 from lfpiv_cli.particles.noise import Correlation
 from lfpiv_cli.particles.response import VALUES, respond
-from lfpiv_cli.particles.view import View, footprint_radius_mm
+from lfpiv_cli.particles.view import View, footprint_radius_mm, on_array_mm
 
 # Neighbours that are left free: with twice as many the errors of 8,300 particles change by a thousandth.
 FREE_NEIGHBOURS = 12
@@ -90,8 +90,7 @@ def _slopes(view: View, particles: NDArray[np.float64], capacity: int) -> Slopes
 
 def _overlapping(view: View, particles: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the particles whose footprints may overlap: where each one's neighbours begin, and their numbers."""
-    distance = view.focus_distance_mm + view.depth_ratio * particles[:, 2]
-    on_array = -particles[:, :2] * (view.image_distance_mm / distance)[:, np.newaxis]
+    on_array = on_array_mm(view, particles)
     # Light that touches a lens's cell spreads over it.
     reach = footprint_radius_mm(view, particles[:, 2]) + 2.0 * max(view.half_x_mm, view.half_y_mm)
     first, second = KDTree(on_array).query_pairs(2.0 * float(reach.max(initial=0.0)), p=np.inf, output_type="ndarray").T

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lfpiv_cli.particles.view import View, footprint_radius_mm
+from lfpiv_cli.particles.view import View, footprint_radius_mm, on_array_mm
 
 # How far a particle may be moved within one sweep, on the array: footprints must not grow into other tiles.
 LARGEST_MOVE_MM = 0.15
@@ -36,9 +36,7 @@ class Tiles(NamedTuple):
 def share_out(view: View, points: NDArray[np.float64], z_low_mm: float, z_high_mm: float) -> Tiles:
     """Return the tiles of particles (n, 3 or more), image axes, whose depths stay between two limits."""
     side = tile_side_mm(view, z_low_mm, z_high_mm)
-    distance = view.focus_distance_mm + view.depth_ratio * points[:, 2]
-    on_array = -points[:, :2] * (view.image_distance_mm / distance)[:, np.newaxis]
-    tile = np.floor(on_array / side).astype(np.int64)
+    tile = np.floor(on_array_mm(view, points) / side).astype(np.int64)
     group = tile[:, 0] % 2 + 2 * (tile[:, 1] % 2)
     order = np.lexsort((np.arange(len(points)), tile[:, 0], tile[:, 1], group))
     keys = np.column_stack([group, tile])[order]

@@ -115,6 +115,12 @@ def raw_view(camera: Camera, media: Media, particle_radius_mm: float, calibratio
     )
 
 
+def on_array_mm(view: View, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return where the main lens's middle shows points (n, 3 or more) on the array (n, 2), without its distortion."""
+    distance = view.focus_distance_mm + view.depth_ratio * points[:, 2]
+    return -points[:, :2] * (view.image_distance_mm / distance)[:, np.newaxis]
+
+
 def footprint_radius_mm(view: View, z_mm: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return how far on the array the light of particles at depths z spreads from their centres."""
     distance = view.focus_distance_mm + view.depth_ratio * z_mm
