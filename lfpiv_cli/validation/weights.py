@@ -21,6 +21,7 @@ from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.weights.build import factorise_through
+from lfpiv_cli.weights.columns import seen_share
 from lfpiv_cli.weights.quadrature import REFERENCE_DEPTH_NODES, REFERENCE_TILES, integrate_columns
 from lfpiv_cli.weights.rays import POINTS, RAYS_PER_POINT, count_rays, sampling_error
 
@@ -33,8 +34,8 @@ WINDOW_RADIUS_PX = 5
 K1, K2 = 0.01, 0.03
 GREY_LEVELS = 255.0
 
-# Tiles across the aperture, and the share of its light, by which a voxel counts as wholly in view.
-VIEW_TILES, WHOLLY_SEEN = 8, 0.999
+# Share of its light by which a voxel counts as wholly in view.
+WHOLLY_SEEN = 0.999
 
 # In the long count every point of a voxel sends this many rays: few enough for the points not to repeat themselves.
 RAYS_PER_POINT_LONG = 100
@@ -104,9 +105,8 @@ def in_view(
     camera: Camera, space: ObjectSpace, centre_mm: tuple[float, float, float], voxel_mm: tuple[float, float, float]
 ) -> bool:
     """Return whether all light of a voxel, world axes, meets the sensor."""
-    point, sides = camera.to_image_axes(np.array(centre_mm)), camera.to_image_axes(np.asarray(voxel_mm))
-    column = integrate_columns(camera, replace(space, refraction="paraxial", method="ert"), point, sides, VIEW_TILES, 1)
-    return bool(column.share.sum() > WHOLLY_SEEN)
+    paraxial = replace(space, refraction="paraxial", method="ert")
+    return seen_share(camera, paraxial, Grid((1, 1, 1), voxel_mm, centre_mm))[0] > WHOLLY_SEEN
 
 
 def make_columns(
