@@ -214,25 +214,28 @@ def _make(
     """Make and write the particles or the volume of a frame."""
     unusable = bench.lasting | saturated(raw, bench.settings.reconstruction.saturation_counts)
     lit = filled(lit, unusable)
-    image, excluded = _prepared(bench, lit, unusable)
+    excluded = _excluded(bench, unusable)
     if bench.sums is not None and bench.settings.reconstruction.solver == "particles":
-        sums = bench.sums if excluded is bench.excluded else bench.sums.without(bench.content.weights.padded, excluded)
-        frame = stages_particles.Frame(lit, unusable, sums)
+        frame = stages_particles.Frame(lit, unusable, _sums_without(bench, bench.sums, excluded))
         residual = stages_particles.write_frame(
             bench.content, bench.settings, frame, target.path, target.record, overwrite, advance
         )
         return Outcome(residual, int(np.count_nonzero(unusable)))
-    result = _solved(bench, image, excluded, advance)
+    result = _solved(bench, bench.content.weights.prepare(lit), excluded, advance)
     outcome = Outcome(float(result.residual[-1]), int(np.count_nonzero(excluded)))
     _write(target, bench.content, result, outcome.excluded_pixels, overwrite)
     return outcome
 
 
-def _prepared(bench: Bench, lit: Image, unusable: Mask) -> tuple[Image, Mask]:
-    """Return an image in the weights' frame and which of its pixels take no part."""
-    prepare = bench.content.weights.prepare
+def _excluded(bench: Bench, unusable: Mask) -> Mask:
+    """Return which pixels in the weights' frame take no part in a frame whose raw pixels are partly unusable."""
     too_bright = unusable & ~bench.lasting
-    return prepare(lit), bench.excluded | touched(too_bright, prepare) if too_bright.any() else bench.excluded
+    return bench.excluded | touched(too_bright, bench.content.weights.prepare) if too_bright.any() else bench.excluded
+
+
+def _sums_without(bench: Bench, sums: Normalisers, excluded: Mask) -> Normalisers:
+    """Return the sums that all frames share, with what only this one excludes left out."""
+    return sums if excluded is bench.excluded else sums.without(bench.content.weights.padded, excluded)
 
 
 def _solved(bench: Bench, image: Image, excluded: Mask, advance: Callable[[int], None]) -> Reconstruction:
@@ -241,8 +244,8 @@ def _solved(bench: Bench, image: Image, excluded: Mask, advance: Callable[[int],
     if sums is None:
         operator = operator.for_image(as_if_lit(image, excluded))
         sums = normalisers(operator, excluded)
-    elif excluded is not bench.excluded:
-        sums = sums.without(operator, excluded)
+    else:
+        sums = _sums_without(bench, sums, excluded)
     chosen = bench.settings.reconstruction
     return solve(
         operator,
