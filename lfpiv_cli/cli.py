@@ -208,9 +208,9 @@ def track(**arguments: Any) -> dict[str, Any]:
     Example: lfpiv track particles/a.vtkhdf particles/b.vtkhdf -o tracks.vtkhdf --grid
     after    lfpiv reconstruct weights.h5 a.tif b.tif --dark dark.tif --solver particles -o particles
     """
-    from lfpiv_cli import stages_particles
+    from lfpiv_cli import stages_track
 
-    return stages_particles.track_particles(**arguments)
+    return stages_track.track_particles(**arguments)
 
 
 @cli.command("validate")
