@@ -18,26 +18,21 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.files.hdf5 import (
-    RESERVED,
     create,
     ensure_format,
-    from_attribute,
     member,
     open_h5,
     read_array,
     read_provenance,
-    to_attribute,
     write_array,
     write_header,
 )
+from lfpiv_cli.files.vtk import create_vtk_group, read_attributes, write_attributes
 
 PARTICLES_FORMAT = "lfpiv-particles"
 TRACKS_FORMAT = "lfpiv-tracks"
 FORMAT_VERSION = 1
 
-# Version and type of VTK's layout; the type as a fixed string (VTK up to 9.4.2 fails on a variable one).
-VTK_VERSION = (2, 0)
-VTK_TYPE = np.bytes_("PolyData")
 POSITION = "position_mm"
 
 # Units of the arrays, by format; tensors are symmetric, as xx, yy, zz, xy, yz, xz (VTK's order).
@@ -98,11 +93,8 @@ def write_points(
 
     def fill(file: h5py.File) -> None:
         write_header(file, format_name, FORMAT_VERSION, provenance)
-        for name, value in attributes.items():
-            file.attrs[name] = to_attribute(value)
-        vtk = file.create_group("VTKHDF")
-        vtk.attrs["Version"] = np.array(VTK_VERSION, dtype=np.int64)
-        vtk.attrs["Type"] = VTK_TYPE
+        write_attributes(file, attributes)
+        vtk = create_vtk_group(file, "PolyData")
         vtk["Points"] = write_array(file, POSITION, position_mm, "mm")
         vtk["NumberOfPoints"] = np.array([len(position_mm)], dtype=np.int64)
         _write_cells(vtk, len(position_mm))
@@ -130,8 +122,7 @@ def read_points(path: Path | str, format_name: str) -> Points:
         size = path.stat().st_size
         position = read_array(member(file, POSITION), size)
         arrays = {name: read_array(member(file, name), size) for name in UNITS[format_name]}
-        attributes = {name: from_attribute(name, value) for name, value in file.attrs.items() if name not in RESERVED}
-        provenance = read_provenance(file)
+        attributes, provenance = read_attributes(file), read_provenance(file)
     if position.ndim != 2 or position.shape[1] != 3:
         raise InputError(f"{path}: its positions have the shape {position.shape}, expected (n, 3)")
     for name, array in (arrays | {POSITION: position}).items():

@@ -18,28 +18,22 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.files.hdf5 import (
-    RESERVED,
     create,
     ensure_format,
-    from_attribute,
     member,
     open_h5,
     read_array,
     read_provenance,
-    to_attribute,
     write_array,
     write_header,
 )
+from lfpiv_cli.files.vtk import create_vtk_group, read_attributes, write_attributes
 from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.grid import Grid
 
 VOLUME_FORMAT = "lfpiv-volume"
 VECTORS_FORMAT = "lfpiv-vectors"
 FORMAT_VERSION = 1
-
-# What VTK wants: the version of its layout, and the type as a fixed string (VTK up to 9.4.2 fails on a variable one).
-VTK_VERSION = (2, 0)
-VTK_TYPE = np.bytes_("ImageData")
 
 # Arrays of a vector field: name on disk, unit, and whether it has three components. `velocity` follows from the rest.
 VECTOR_ARRAYS = {
@@ -106,7 +100,7 @@ def write_volume(
 
     def fill(file: h5py.File) -> None:
         write_header(file, VOLUME_FORMAT, FORMAT_VERSION, provenance)
-        _write_attributes(file, attributes)
+        write_attributes(file, attributes)
         points = _write_frame(file, grid, with_component=False)
         _write_points(file, points, "intensity", array_zyx.astype(np.float32), "1")
 
@@ -126,7 +120,7 @@ def open_volume(path: Path | str) -> Volume:
         ensure_format(path, file, VOLUME_FORMAT, (FORMAT_VERSION,))
         grid = _read_grid(file)
         array = _read_points(file, "intensity", grid, path.stat().st_size, components=False)
-        attributes, provenance = _read_attributes(file), read_provenance(file)
+        attributes, provenance = read_attributes(file), read_provenance(file)
     bad = int(np.count_nonzero(~np.isfinite(array)))
     if bad:
         raise InputError(f"{path}: {bad} voxels are not finite numbers")
@@ -156,7 +150,7 @@ def write_vectors(
 
     def fill(file: h5py.File) -> None:
         write_header(file, VECTORS_FORMAT, FORMAT_VERSION, provenance)
-        _write_attributes(file, attributes)
+        write_attributes(file, attributes)
         file.attrs["voxel_mm"] = np.asarray(field.voxel_mm, dtype=np.float64)
         file.attrs["window_voxel"] = np.asarray(field.window_voxel, dtype=np.int64)
         file.attrs["flag_meanings"] = np.bytes_(FLAG_MEANINGS)
@@ -218,7 +212,7 @@ def read_header(path: Path | str) -> Header:
     InputError
     """
     with open_h5(Path(path)) as file:
-        return Header(_read_attributes(file), read_provenance(file))
+        return Header(read_attributes(file), read_provenance(file))
 
 
 def _reads(read: Callable[[Path], object]) -> Callable[[Path], None]:
@@ -239,9 +233,7 @@ def _write_frame(file: h5py.File, grid: Grid, with_component: bool) -> h5py.Grou
     if with_component:
         file.create_dataset("component", data=np.arange(3), track_times=False).make_scale("component")
     nx, ny, nz = grid.shape_xyz
-    vtk = file.create_group("VTKHDF")
-    vtk.attrs["Version"] = np.array(VTK_VERSION, dtype=np.int64)
-    vtk.attrs["Type"] = VTK_TYPE
+    vtk = create_vtk_group(file, "ImageData")
     vtk.attrs["WholeExtent"] = np.array([0, nx - 1, 0, ny - 1, 0, nz - 1], dtype=np.int64)
     vtk.attrs["Origin"] = np.array(grid.origin_mm, dtype=np.float64)
     vtk.attrs["Spacing"] = np.array(grid.spacing_mm, dtype=np.float64)
@@ -258,28 +250,6 @@ def _write_points(file: h5py.File, points: h5py.Group, name: str, array: NDArray
     for position, axis in enumerate(axes):
         dataset.dims[position].attach_scale(file[axis])
     points[name] = dataset
-
-
-def _write_attributes(file: h5py.File, attributes: Mapping[str, Any]) -> None:
-    """Write scalars, strings and short numeric arrays at the root.
-
-    What is None is not said, as netCDF knows no empty attribute.
-    """
-    for name, value in attributes.items():
-        if name in RESERVED:
-            raise ValueError(f"{name} is a name that every file uses for itself")
-        if isinstance(value, np.ndarray):
-            file.attrs[name] = value
-        elif value is not None:
-            file.attrs[name] = to_attribute(value)
-
-
-def _read_attributes(file: h5py.File) -> dict[str, Any]:
-    return {
-        name: value.tolist() if isinstance(value, np.ndarray) else from_attribute(name, value)
-        for name, value in file.attrs.items()
-        if name not in RESERVED
-    }
 
 
 def _read_grid(file: h5py.File) -> Grid:
