@@ -56,6 +56,8 @@ def _readable(value: Any) -> str:
         return "unknown"
     if isinstance(value, float):
         return f"{value:.6g}"
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {_readable(each)}" for name, each in value.items())
     if isinstance(value, (list, tuple)):
         return ", ".join(_readable(each) for each in value)
     return str(value)

@@ -132,6 +132,8 @@ def test_all_errors_come_in_one_run_in_the_order_of_the_file(write) -> None:
         ("correlation: {windows: []}", "at least one window"),
         ("correlation: {overlap: 1.0}", "less than 1"),
         ("simulation: {brightness: [2, 1]}", "expected a range"),
+        ("validation: {flow_methods: [volumes, volumes]}", "expected each method once"),
+        ("weights: {method: dlfc}\nvalidation: {flow_methods: [particles]}", "fitted with traced rays"),
         (
             "window: {distance_mm: 98.0, thickness_mm: 2.0}\nchannel: {width_mm: 10.0, wall_mm: 5.0}",
             "but channel.wall_mm is 5",
@@ -327,3 +329,22 @@ def test_flow_centres_move_with_the_origin(write) -> None:
 )
 def test_the_exponent_follows_from_the_solver_unless_given(write, sections: str, exponent: float) -> None:
     assert load_config(write(RIG + sections + "\n")).correlation_exponent() == exponent
+
+
+@pytest.mark.parametrize(
+    ("sections", "methods"),
+    [
+        ("", ("volumes", "particles")),
+        ("weights: {method: dlfc}", ("volumes",)),
+        ("reconstruction: {solver: particles}", ("particles",)),
+        ("validation: {flow_methods: [particles]}", ("particles",)),
+    ],
+)
+def test_a_flow_is_measured_in_every_way_that_is_possible(write, sections: str, methods: tuple[str, ...]) -> None:
+    assert load_config(write(RIG + sections + "\n")).flow_methods() == methods
+
+
+def test_volumes_are_none_that_a_solver_of_particles_makes(write) -> None:
+    text = "reconstruction: {solver: particles}\nvalidation: {flow_methods: [volumes, particles]}\n"
+    with pytest.raises(ConfigError, match="flow_methods: holds volumes"):
+        load_config(write(RIG + text)).flow_methods()

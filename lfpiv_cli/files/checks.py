@@ -120,13 +120,18 @@ def _processing(sections: Sections) -> Found:
 
 
 def _rays(sections: Sections) -> Found:
-    """Yield what polynomials of rays cannot be."""
+    """Yield what polynomials of rays cannot be, and particles with them."""
     chosen = sections.weights
     if chosen.method == "dlfc":
         if chosen.refraction == "exact":
             yield ("weights", "refraction"), "is exact, but method dlfc knows no refraction besides what the boards saw"
         if chosen.sampling == "rays":
             yield ("weights", "sampling"), "is rays, but method dlfc has none to count; expected exact"
+    methods, place = sections.validation.flow_methods or (), ("validation", "flow_methods")
+    if len(set(methods)) < len(methods):
+        yield place, f"is {list(methods)}, expected each method once"
+    if chosen.method == "dlfc" and "particles" in methods:
+        yield place, "holds particles, which are fitted with traced rays; weights.method is dlfc"
 
 
 def _object_space(sections: Sections) -> Found:

@@ -231,6 +231,24 @@ class Config:
         flow: FlowSection | None = self.validation.flow or self.simulation.flow
         return bench.flow_of(self._needed("validation.flow", flow), 0.0)
 
+    def flow_methods(self) -> tuple[str, ...]:
+        """Return how a simulated flow is measured: as `validation.flow_methods` has it, else every possible way.
+
+        Raises
+        ------
+        ConfigError
+            If volumes are asked for and the solver makes none.
+        """
+        asked, makes_volumes = self.validation.flow_methods, self.reconstruction.solver != "particles"
+        if asked is None:
+            fits_particles = self.weights.method != "dlfc"
+            return ("volumes",) * makes_volumes + ("particles",) * fits_particles
+        if "volumes" in asked and not makes_volumes:
+            raise ConfigError(
+                f"{self.source}: validation.flow_methods: holds volumes, but reconstruction.solver is particles"
+            )
+        return asked
+
     def _needed(self, key: str, section: Any) -> Any:
         if section is None:
             raise self._missing(key)

@@ -373,9 +373,15 @@ class BoardValidation(Section):
 
 
 class ValidationSection(Section):
-    """The analytic flow that vectors are compared with (default: the simulation's), the limits, weights and boards."""
+    """The analytic flow that vectors are compared with (default: the simulation's), the limits, weights and boards.
+
+    flow_methods: how `validate flow` measures what it simulates, by volumes and their correlation (volumes), by fitted
+    tracers that are followed (particles), or both (default: both, but for particles where the weights are dlfc and
+    for volumes where the solver is particles).
+    """
 
     flow: FlowSection | None = None
+    flow_methods: Annotated[tuple[Literal["volumes", "particles"], ...], Field(min_length=1)] | None = None
     limits: Limits = Limits()
     weights: WeightsValidation = WeightsValidation()
     board: BoardValidation = BoardValidation()

@@ -5,6 +5,7 @@ matplotlib is imported inside: it is an optional extra, and slow to load.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,39 +14,43 @@ from numpy.typing import NDArray
 from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.validation.channel import PAPER_SLICES, Duct, table_4
 from lfpiv_cli.validation.flow import Comparison, compare, cumulative_distribution
+from lfpiv_cli.validation.methods import Measured
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 COMPONENT_NAMES = ("u", "v", "w")
+# Of the truth, and of the methods in their order.
+STYLES = ("-", "o", "x")
 
 
-def flow_figure(field: VectorField, truth_velocity: NDArray[np.float64], inside: NDArray[np.bool_]) -> Figure:
-    """Return a picture of a measured flow: mid-plane vectors and errors, profiles, cumulative distribution.
+def flow_figure(methods: Mapping[str, Measured]) -> Figure:
+    """Return a picture of flows measured on one grid, at least one of them.
 
-    Parameters
-    ----------
-    truth_velocity : (nz, ny, nx, 3) m/s at the window centres
-    inside : (nz, ny, nx) True for the windows that are judged
+    A row for each: vectors and errors in the mid plane (errors on one scale), cumulative distribution; below them the
+    profiles of all.
     """
     from matplotlib.figure import Figure
 
-    pairs = compare(field, truth_velocity, inside)
-    figure = Figure(figsize=(12.0, 7.5), layout="constrained")
-    axes = figure.subplots(2, 3)
-    main = int(np.argmax(np.abs(pairs.direction))) if pairs.direction is not None else 0
-    _draw_plane(axes[0, 0], field, main)
-    _draw_error(axes[0, 1], field, truth_velocity, inside, main)
-    _draw_cumulative(axes[0, 2], pairs)
+    pairs = {name: compare(m.field, m.truth, m.inside) for name, m in methods.items()}
+    direction = next(iter(pairs.values())).direction
+    main = int(np.argmax(np.abs(direction))) if direction is not None else 0
+    errors = {name: _mid_plane_error(m, main) for name, m in methods.items()}
+    found = np.concatenate([np.abs(error[np.isfinite(error)]) for error in errors.values()])
+    limit = float(found.max()) if found.size and found.max() > 0.0 else 1.0
+    figure = Figure(figsize=(12.0, 3.75 * (len(methods) + 1)), layout="constrained")
+    axes = figure.subplots(len(methods) + 1, 3)
+    for row, (name, m) in zip(axes, methods.items(), strict=False):
+        _draw_plane(row[0], m.field, main, name)
+        _draw_error(row[1], m.field, errors[name], limit, main, name)
+        _draw_cumulative(row[2], pairs[name], name)
     for axis in range(3):
-        _draw_profile(axes[1, axis], field, truth_velocity, inside, axis, main)
+        _draw_profile(axes[-1, axis], methods, axis, main)
     return figure
 
 
-def slices_figure(
-    field: VectorField, truth_velocity: NDArray[np.float64], inside: NDArray[np.bool_], duct: Duct
-) -> Figure:
+def slices_figure(methods: Mapping[str, Measured], duct: Duct) -> Figure:
     """Return the paper's six slices: streamwise profiles across each (Fig. 16), and their errors beside Table 4's.
 
     Profiles are means along the flow, over the planes of windows on both sides of a slice.
@@ -54,26 +59,34 @@ def slices_figure(
 
     figure = Figure(figsize=(12.0, 7.0), layout="constrained")
     axes = figure.subplots(2, 3)
-    table = table_4(field, truth_velocity, inside, duct)
+    tables = {name: table_4(m.field, m.truth, m.inside, duct) for name, m in methods.items()}
     main = "xyz".index(duct.axis)
-    measured = np.where(inside[..., np.newaxis], field.velocity, np.nan)
+    first = next(iter(methods.values()))
+    grid = first.field.grid
+    curves = {"true": first.truth} | {
+        name: np.where(m.inside[..., np.newaxis], m.field.velocity, np.nan) for name, m in methods.items()
+    }
     for row, (name, axis) in zip(axes, duct.across.items(), strict=True):
         other = 3 - axis - main
         for panel, share in zip(row, PAPER_SLICES[name], strict=True):
             position = duct.position_mm(axis, share)
-            places = field.grid.axis_mm(other)
-            for values, style, label in ((truth_velocity, "-", "true"), (measured, "o", "measured")):
-                profile = _profile_at(values[..., main], field.grid.axis_mm(axis), position, axis, main)
-                panel.plot(places, profile, style, markersize=4, label=label)
-            errors = table[f"{name} {share}"]
-            ours = "unknown" if errors["ours_percent"] is None else f"{errors['ours_percent']:.2f} %"
+            for (label, values), style in zip(curves.items(), STYLES, strict=False):
+                profile = _profile_at(values[..., main], grid.axis_mm(axis), position, axis, main)
+                panel.plot(grid.axis_mm(other), profile, style, markersize=4, label=label)
+            rows = {method: table[f"{name} {share}"] for method, table in tables.items()}
+            told = [_told(method, errors["ours_percent"]) for method, errors in rows.items()]
+            paper = next(iter(rows.values()))["paper_ert_percent"]
             panel.set(
-                title=f"{name} = {share}: {ours} (paper {errors['paper_ert_percent']:.2f} %)",
+                title=f"{name} = {share} (paper {paper:.2f} %)\n{', '.join(told)}",
                 xlabel=f"{'xyz'[other]} (mm)",
                 ylabel=f"{COMPONENT_NAMES[main]} (m/s)",
             )
             panel.legend()
     return figure
+
+
+def _told(method: str, percent: float | None) -> str:
+    return f"{method} unknown" if percent is None else f"{method} {percent:.2f} %"
 
 
 def _profile_at(
@@ -97,7 +110,7 @@ def _mid_plane(values: NDArray) -> NDArray:
     return values[values.shape[0] // 2]
 
 
-def _draw_plane(axes: Axes, field: VectorField, main: int) -> None:
+def _draw_plane(axes: Axes, field: VectorField, main: int, name: str) -> None:
     """Draw the measured vectors of the mid plane, coloured by the main component."""
     velocity = _mid_plane(field.velocity)
     x, y = np.meshgrid(field.grid.axis_mm(0), field.grid.axis_mm(1))
@@ -106,23 +119,24 @@ def _draw_plane(axes: Axes, field: VectorField, main: int) -> None:
         u, v = velocity[shown, 0], velocity[shown, 1]
         arrows = axes.quiver(x[shown], y[shown], u, v, velocity[shown, main], angles="xy")
         axes.figure.colorbar(arrows, ax=axes, label=f"{COMPONENT_NAMES[main]} (m/s)")
-    _label_plane(axes, field, "measured")
+    _label_plane(axes, field, name)
 
 
-def _draw_error(
-    axes: Axes, field: VectorField, truth: NDArray[np.float64], inside: NDArray[np.bool_], main: int
-) -> None:
-    """Draw measured less true main component in the mid plane; blank where missing or outside."""
-    error = np.where(_mid_plane(inside), _mid_plane(field.velocity - truth)[..., main], np.nan)
-    found = np.abs(error[np.isfinite(error)])
-    limit = float(found.max()) if found.size and found.max() > 0.0 else 1.0
+def _mid_plane_error(measured: Measured, main: int) -> NDArray[np.float64]:
+    """Return measured less true main component in the mid plane, m/s; NaN where missing or outside."""
+    error = _mid_plane(measured.field.velocity - measured.truth)[..., main]
+    return np.asarray(np.where(_mid_plane(measured.inside), error, np.nan))
+
+
+def _draw_error(axes: Axes, field: VectorField, error: NDArray[np.float64], limit: float, main: int, name: str) -> None:
+    """Draw errors of the main component in the mid plane, from -limit to limit; blank where unknown."""
     x_low, x_high = field.grid.bounds_mm(0)
     y_low, y_high = field.grid.bounds_mm(1)
     image = axes.imshow(
         error, origin="lower", extent=(x_low, x_high, y_low, y_high), cmap="RdBu_r", vmin=-limit, vmax=limit
     )
     axes.figure.colorbar(image, ax=axes, label=f"{COMPONENT_NAMES[main]} measured - true (m/s)")
-    _label_plane(axes, field, "error")
+    _label_plane(axes, field, f"error of {name}")
 
 
 def _label_plane(axes: Axes, field: VectorField, title: str) -> None:
@@ -131,34 +145,31 @@ def _label_plane(axes: Axes, field: VectorField, title: str) -> None:
     axes.set(xlabel="x (mm)", ylabel="y (mm)", title=f"{title}, z = {depth:.2f} mm", aspect="equal")
 
 
-def _draw_cumulative(axes: Axes, pairs: Comparison) -> None:
+def _draw_cumulative(axes: Axes, pairs: Comparison, name: str) -> None:
     """Draw the share of vectors over their relative error."""
     shares = cumulative_distribution(pairs)
-    for name, label in (("streamwise_share", "streamwise"), ("vector_share", "whole vector")):
-        if shares[name] is not None:
-            axes.plot(shares["relative_error"], shares[name], label=label)
+    for share, label in (("streamwise_share", "streamwise"), ("vector_share", "whole vector")):
+        if shares[share] is not None:
+            axes.plot(shares["relative_error"], shares[share], label=label)
     axes.axvline(0.25, color="0.7", linewidth=0.8)
-    axes.set(xlabel="relative error", ylabel="share of vectors", title="cumulative distribution", ylim=(0.0, 1.0))
+    axes.set(
+        xlabel="relative error", ylabel="share of vectors", title=f"cumulative distribution, {name}", ylim=(0.0, 1.0)
+    )
     axes.legend()
 
 
-def _draw_profile(
-    axes: Axes,
-    field: VectorField,
-    truth: NDArray[np.float64],
-    inside: NDArray[np.bool_],
-    axis: int,
-    main: int,
-) -> None:
-    """Draw the means over planes across an axis: the main component, measured and true, over the same windows."""
-    judged = inside & np.isfinite(field.velocity).all(axis=-1)
+def _draw_profile(axes: Axes, methods: Mapping[str, Measured], axis: int, main: int) -> None:
+    """Draw the means over planes across an axis: the main component, over the windows that all methods have found."""
     others = tuple(k for k in range(3) if k != 2 - axis)
+    first = next(iter(methods.values()))
+    curves = {"true": first.truth} | {name: m.field.velocity for name, m in methods.items()}
+    judged = np.all([m.inside & np.isfinite(m.field.velocity).all(axis=-1) for m in methods.values()], axis=0)
     count = judged.sum(axis=others)
-    for values, style, label in ((truth, "-", "true"), (field.velocity, "o", "measured")):
+    for (label, values), style in zip(curves.items(), STYLES, strict=False):
         total = np.where(judged, values[..., main], 0.0).sum(axis=others)
         mean = np.full(count.shape, np.nan)
         np.divide(total, count, out=mean, where=count > 0)
-        axes.plot(field.grid.axis_mm(axis), mean, style, markersize=4, label=label)
+        axes.plot(first.field.grid.axis_mm(axis), mean, style, markersize=4, label=label)
     # Zero belongs in the picture: else the scale would blow up noise of a per mille.
     axes.axhline(0.0, color="0.7", linewidth=0.8)
     axes.set(xlabel=f"{'xyz'[axis]} (mm)", ylabel=f"{COMPONENT_NAMES[main]} (m/s), mean over the plane")
