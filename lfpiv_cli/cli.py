@@ -213,6 +213,25 @@ def track(**arguments: Any) -> dict[str, Any]:
     return stages_track.track_particles(**arguments)
 
 
+@cli.command("combine")
+@click.argument("vectors_a", type=INPUT)
+@click.argument("vectors_b", type=INPUT)
+@click.option("-o", "--output", type=INPUT, required=True, help="File of combined vectors to write (.vtkhdf).")
+@common_options
+def combine(**arguments: Any) -> dict[str, Any]:
+    """Weight two vector fields on one grid by their uncertainties, those of correlate and of track --grid.
+
+    A vector that has none, or that disagrees with the other and with those around it, is left out; share_a tells the
+    weight of the first file in each component, disagreement how many standard errors the two are apart.
+
+    \b
+    Example: lfpiv combine vectors.vtkhdf tracks_grid.vtkhdf -o combined.vtkhdf
+    """
+    from lfpiv_cli import stages_combine
+
+    return stages_combine.combine_vectors(**arguments)
+
+
 @cli.command("validate")
 @click.argument("what", type=click.Choice(["flow", "weights", "board", "volume", "all"]))
 @click.argument("config", type=INPUT)

@@ -1,0 +1,195 @@
+"""One vector field of two that measure the same flow in different ways, weighted by their stated uncertainties.
+
+A volume's correlation errs by its particles' elongation, a fit of tracks by where no track is near: errors of different
+origin, so that each component takes the weighted mean of both. What cannot be weighed is not: a vector without an
+uncertainty serves only where the other field has none, one that neighbours replaced only where nothing was measured.
+
+The differences of the two are a check of what they state. Where these are larger than stated all over the field, it is
+the field with the larger uncertainties that makes most of them, and those above all are widened until they explain
+them. Two vectors that lie further apart even so cannot both be right, and their mean would be wrong for certain: the
+one that fits the vectors around it is kept, as a whole.
+
+Axes: arrays `[z, y, x]`, components last; displacements in voxels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lfpiv_cli.errors import InputError
+from lfpiv_cli.flow.field import MASKED, REJECTED, REPLACED, SECOND_PEAK, VALID, VectorField
+from lfpiv_cli.flow.outliers import NEEDED_SHARE, predict
+
+# Vectors further apart than this, in units of the uncertainty of their difference, are not of one flow: by chance one
+# of a hundred has a component that far out.
+LARGEST_DISAGREEMENT = 3.0
+MAD_TO_SIGMA = 1.4826
+# Fewer vectors than this tell no spread of their differences.
+FEWEST_DIFFERENCES = 30
+# Positions that should be the same differ by the rounding of sums: far less than this, in mm.
+SAME_PLACE_MM = 1e-6
+
+# How far a vector can be relied on: measured with an uncertainty, without one, only replaced, not there.
+WEIGHED, UNWEIGHED, FILLED, NONE = 3, 2, 1, 0
+
+
+@dataclass(frozen=True, eq=False)
+class Combined:
+    """A combined field, and how it came about.
+
+    Attributes
+    ----------
+    field : the vectors
+    first_share : (nz, ny, nx, 3) the weight of the first field in each component, 0 to 1; NaN where there is no vector
+    disagreement : (nz, ny, nx) largest difference of the two over its uncertainty, over the components; NaN where one
+        has no vector or states no uncertainty
+    left_out : (nz, ny, nx) one of the two was left out because they disagree
+    widened : (2, 3) by how much the uncertainties of each field were widened, by component
+    """
+
+    field: VectorField
+    first_share: NDArray[np.float64]
+    disagreement: NDArray[np.float64]
+    left_out: NDArray[np.bool_]
+    widened: NDArray[np.float64]
+
+
+def combine(first: VectorField, second: VectorField) -> Combined:
+    """Return the combined field of two on one grid.
+
+    Masked is what either masks; rejected is where neither has a vector. Correlation and peak ratio are those of a field
+    that takes part and knows them. The raw displacement is the mean before a vector was left out for disagreeing.
+
+    Raises
+    ------
+    InputError
+        The fields differ in grid, voxels or time.
+    """
+    _ensure_alike(first, second)
+    masked = (first.flag == MASKED) | (second.flag == MASKED)
+    ranks = np.stack([_rank(field) for field in (first, second)])
+    used = (ranks == ranks.max(axis=0)) & (ranks > NONE) & ~masked
+    # Of two that cannot be weighed the first one is taken.
+    used[1] &= ~(used.all(axis=0) & (ranks[0] < WEIGHED))
+    both = used.all(axis=0)
+    values, stated = (np.stack(pair) for pair in zip(_vectors(first), _vectors(second), strict=True))
+    widened = _widening(values[0] - values[1], stated, both)
+    sigma = stated * widened[:, np.newaxis, np.newaxis, np.newaxis]
+    apart = np.abs(values[0] - values[1]) / np.hypot(*sigma)
+    disagreement = np.where(both, apart.max(axis=-1), np.nan)
+    left_out = both & (disagreement > LARGEST_DISAGREEMENT)
+    raw, _ = _mean(np.stack([first.displacement_raw_voxel, second.displacement_raw_voxel]), sigma, used)
+    second_is_kept = _second_fits_better(values, sigma, used, left_out, masked)
+    used[0] &= ~(left_out & second_is_kept)
+    used[1] &= ~(left_out & ~second_is_kept)
+    displacement, share = _mean(values, sigma, used)
+    flag = np.where(used[0], first.flag, np.where(used[1], second.flag, REJECTED))
+    flag = np.where(used.all(axis=0), VALID, np.where(masked, MASKED, flag))
+    field = replace(
+        first,
+        displacement_voxel=displacement,
+        displacement_raw_voxel=raw,
+        correlation=_of_one(first.correlation, second.correlation, used),
+        peak_ratio=_of_one(first.peak_ratio, second.peak_ratio, used),
+        valid_fraction=np.maximum(np.where(used[0], first.valid_fraction, 0.0), used[1] * second.valid_fraction),
+        flag=flag.astype(np.uint8),
+        uncertainty_voxel=_uncertainty(sigma, used),
+    )
+    return Combined(field, share, disagreement, left_out, widened)
+
+
+def _ensure_alike(first: VectorField, second: VectorField) -> None:
+    """Refuse fields whose vectors are not of the same places and times."""
+    exact, lengths = zip(
+        *(
+            ((f.grid.shape_xyz, f.dt_s), np.array([f.grid.spacing_mm, f.grid.origin_mm, f.voxel_mm]))
+            for f in (first, second)
+        ),
+        strict=True,
+    )
+    if exact[0] != exact[1] or np.abs(lengths[0] - lengths[1]).max() > SAME_PLACE_MM:
+        told = [f"{field.grid}, voxels of {field.voxel_mm} mm, {field.dt_s} s" for field in (first, second)]
+        raise InputError(f"the two vector fields differ in grid, voxels or time: {told[0]} and {told[1]}")
+
+
+def _rank(field: VectorField) -> NDArray[np.int64]:
+    """Return how far each vector (nz, ny, nx) can be relied on."""
+    rank = np.full(field.flag.shape, NONE)
+    rank[field.flag == REPLACED] = FILLED
+    measured = (field.flag == VALID) | (field.flag == SECOND_PEAK)
+    rank[measured] = UNWEIGHED
+    if field.uncertainty_voxel is not None:
+        rank[measured & np.all(field.uncertainty_voxel > 0.0, axis=-1)] = WEIGHED
+    return rank
+
+
+def _vectors(field: VectorField) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the displacements and their stated uncertainties, NaN where there are none."""
+    known = field.uncertainty_voxel
+    return field.displacement_voxel, np.full(field.displacement_voxel.shape, np.nan) if known is None else known
+
+
+def _widening(
+    difference: NDArray[np.float64], stated: NDArray[np.float64], both: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """Return the factors (2, 3), one or more, with which the uncertainties of two fields explain their differences.
+
+    What is missing in the variance is shared as the squares of the stated variances: alike between equals, and almost
+    all of it for the one that makes almost all of the difference.
+    """
+    if np.count_nonzero(both) < FEWEST_DIFFERENCES:
+        return np.ones((2, 3))
+    variance = stated[:, both] ** 2
+    total = variance.sum(axis=0)
+    spread = MAD_TO_SIGMA * np.median(np.abs(difference[both]) / np.sqrt(total), axis=0)
+    share = np.median(variance / total, axis=1)
+    return np.asarray(np.sqrt(1.0 + np.maximum(spread**2 - 1.0, 0.0) * share / np.sum(share**2, axis=0)))
+
+
+def _mean(
+    values: NDArray[np.float64], sigma: NDArray[np.float64], used: NDArray[np.bool_]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the mean of two fields' values, weighted where both are used, and the first one's weight; NaN for none."""
+    both = np.all(used, axis=0, keepdims=True)[0][..., np.newaxis]
+    variance = np.where(both, sigma**2, 1.0)
+    share = np.where(both, variance[1] / variance.sum(axis=0), used[0][..., np.newaxis])
+    parts = np.where(used[..., np.newaxis], values, 0.0) * np.stack([share, 1.0 - share])
+    some = np.any(used, axis=0, keepdims=True)[0][..., np.newaxis]
+    return np.where(some, parts.sum(axis=0), np.nan), np.where(some, share, np.nan)
+
+
+def _uncertainty(sigma: NDArray[np.float64], used: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return the uncertainty of the mean of what is used: that of one, or that of independent errors of both."""
+    known = used[..., np.newaxis] & (sigma > 0.0)
+    total = np.where(known, np.where(known, sigma, 1.0) ** -2.0, 0.0).sum(axis=0)
+    return np.asarray(np.where(total > 0.0, total, np.nan) ** -0.5)
+
+
+def _second_fits_better(
+    values: NDArray[np.float64],
+    sigma: NDArray[np.float64],
+    used: NDArray[np.bool_],
+    disagree: NDArray[np.bool_],
+    masked: NDArray[np.bool_],
+) -> NDArray[np.bool_]:
+    """Return where, of two that disagree, the second is nearer to what the vectors around both let expect.
+
+    Around them count the vectors that are not in doubt themselves; where too few are at hand, the smaller stated
+    uncertainty decides.
+    """
+    sure = used.any(axis=0) & ~disagree
+    mean, _ = _mean(values, sigma, used)
+    predicted, spread, share = predict(np.where(sure[..., np.newaxis], mean, 0.0), sure, ~masked, disagree)
+    of_those = disagree[..., np.newaxis]
+    sigmas = np.where(of_those, sigma, 1.0)
+    off = (np.where(of_those, values, 0.0) - predicted) / (spread + sigmas.min(axis=0))
+    fits = np.sum(off[1] ** 2, axis=-1) < np.sum(off[0] ** 2, axis=-1)
+    return np.asarray(np.where(share >= NEEDED_SHARE, fits, sigmas[1].prod(axis=-1) < sigmas[0].prod(axis=-1)))
+
+
+def _of_one(first: NDArray[np.float64], second: NDArray[np.float64], used: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return the first field's values where it is used and knows them, else the second's; NaN where neither does."""
+    return np.asarray(np.where(used[0] & np.isfinite(first), first, np.where(used[1], second, np.nan)))

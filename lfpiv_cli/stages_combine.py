@@ -1,0 +1,46 @@
+"""The stage of `combine`: one vector field of two that measured the same flow in different ways."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lfpiv_cli.console import Console
+from lfpiv_cli.errors import InputError
+from lfpiv_cli.files import vtkhdf
+from lfpiv_cli.files.atomic import ensure_writable
+from lfpiv_cli.files.provenance import record
+from lfpiv_cli.flow.combining import combine
+from lfpiv_cli.flow.field import MASKED, REJECTED
+
+
+def combine_vectors(
+    vectors_a: Path, vectors_b: Path, output: Path, overwrite: bool, console: Console
+) -> dict[str, Any]:
+    """Weight the vectors of two files by their uncertainties."""
+    inputs = {"vectors_a": vectors_a, "vectors_b": vectors_b}
+    ensure_writable(output, overwrite, inputs.values())
+    headers = [vtkhdf.read_header(path) for path in inputs.values()]
+    attributes = [{name: h.attributes[name] for name in ("reference", "reference_z_mm")} for h in headers]
+    if attributes[0] != attributes[1]:
+        raise InputError(f"{vectors_b}: its coordinates have another origin than those of {vectors_a}")
+    found = combine(*(vtkhdf.open_vectors(path) for path in inputs.values()))
+    vtkhdf.write_vectors(
+        output,
+        found.field,
+        provenance=record("combine", headers[0].provenance.get("config"), inputs),
+        attributes=attributes[0],
+        overwrite=overwrite,
+        extra={"share_a": (found.first_share, "1"), "disagreement": (found.disagreement, "1")},
+    )
+    return {
+        "vectors": found.field.flag.size,
+        "weighted": int(np.count_nonzero(np.isfinite(found.disagreement) & ~found.left_out)),
+        "left_out_for_disagreement": int(np.count_nonzero(found.left_out)),
+        "rejected": int(np.count_nonzero(found.field.flag == REJECTED)),
+        "masked": int(np.count_nonzero(found.field.flag == MASKED)),
+        "uncertainty_widened_a": found.widened[0].tolist(),
+        "uncertainty_widened_b": found.widened[1].tolist(),
+    }
