@@ -21,7 +21,7 @@ def run_chain(config: Path, output: Path, overwrite: bool, console: Console) -> 
     """Simulate the config's experiment in a folder and measure its flow; return the vectors by their method.
 
     From raw images with all imperfections on, which every method gets alike, through the same stages and files as
-    recorded ones.
+    recorded ones; of a longer sequence, the first two.
     """
     settings, images = load_config(config), output / "images"
     methods = settings.flow_methods()
@@ -29,8 +29,9 @@ def run_chain(config: Path, output: Path, overwrite: bool, console: Console) -> 
     stages_simulate.simulate_white(config=config, output=images, **common)
     stages_simulate.simulate_particles(config=config, output=images, **common)
     weights = _weights(config, settings, images, output, common)
+    pair = [images / name for name in stages_simulate.frame_names(settings.simulation.frames)[:2]]
     makers = {"volumes": _by_volumes, "particles": _by_particles}
-    return {name: makers[name](weights, images, output, common) for name in methods}
+    return {name: makers[name](weights, pair, output, common) for name in methods}
 
 
 def _weights(config: Path, settings: Config, images: Path, output: Path, common: dict[str, Any]) -> Path:
@@ -62,11 +63,11 @@ def _weights(config: Path, settings: Config, images: Path, output: Path, common:
     return weights
 
 
-def _by_volumes(weights: Path, images: Path, output: Path, common: dict[str, Any]) -> Path:
+def _by_volumes(weights: Path, pair: list[Path], output: Path, common: dict[str, Any]) -> Path:
     """Reconstruct both images as volumes and correlate them."""
     vectors = output / "vectors.vtkhdf"
     stages_correlate.correlate(
-        volumes=_reconstructed(weights, images, output / "volumes", None, common),
+        volumes=_reconstructed(weights, pair, output / "volumes", None, common),
         config=None,
         dt_s=None,
         windows=None,
@@ -83,9 +84,9 @@ def _by_volumes(weights: Path, images: Path, output: Path, common: dict[str, Any
     return vectors
 
 
-def _by_particles(weights: Path, images: Path, output: Path, common: dict[str, Any]) -> Path:
+def _by_particles(weights: Path, pair: list[Path], output: Path, common: dict[str, Any]) -> Path:
     """Find the particles of both images and follow them."""
-    first, second = _reconstructed(weights, images, output / "particles", "particles", common)
+    first, second = _reconstructed(weights, pair, output / "particles", "particles", common)
     stages_track.track_particles(
         particles_a=first,
         particles_b=second,
@@ -99,18 +100,18 @@ def _by_particles(weights: Path, images: Path, output: Path, common: dict[str, A
 
 
 def _reconstructed(
-    weights: Path, images: Path, output: Path, solver: str | None, common: dict[str, Any]
-) -> tuple[Path, Path]:
+    weights: Path, pair: list[Path], output: Path, solver: str | None, common: dict[str, Any]
+) -> list[Path]:
     """Reconstruct the pair in a folder, by the configured solver where none is named."""
     stages_reconstruct.reconstruct(
         weights=weights,
-        images=[images / "pair_a.tif", images / "pair_b.tif"],
+        images=pair,
         solver=solver,
         iterations=None,
         relaxation=None,
         accelerate=None,
         start=None,
-        dark=images / "dark.tif",
+        dark=pair[0].with_name("dark.tif"),
         background=None,
         mask=None,
         resume=False,
@@ -118,4 +119,4 @@ def _reconstructed(
         output=output,
         **common,
     )
-    return output / "pair_a.vtkhdf", output / "pair_b.vtkhdf"
+    return [output / f"{image.stem}.vtkhdf" for image in pair]

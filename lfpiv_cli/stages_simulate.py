@@ -1,7 +1,8 @@
 """The stages of `simulate`: the configured scene rendered into raw images, with the truth beside them.
 
 File names are those of an experiment: white.tif, dark.tif, board.tif (at a depth: board_+4mm.tif), pair_a.tif,
-pair_b.tif; the truth is in white.json, board.json, particles.json and particles.npz.
+pair_b.tif (of a longer sequence: frame_0000.tif and so on); the truth is in white.json, board.json, particles.json,
+particles.npz.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.calibration.model import mid_plane_z_mm
@@ -26,9 +28,14 @@ from lfpiv_cli.files.provenance import record
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.synthetic import scenes
 from lfpiv_cli.synthetic.board import BoardPlacement
+from lfpiv_cli.synthetic.flows import MM_PER_M, Flow
 from lfpiv_cli.synthetic.render import RAYS, ObjectSpace
 from lfpiv_cli.synthetic.sensor import Readout
 from lfpiv_cli.weights.build import blur_radius_mm
+
+# Points along each side of the volume at which the flow is asked for its speed: smooth flows change less than this
+# resolves, and the faster tracer that it misses is one at the rim of a sequence's first or last frame.
+SPEED_POINTS = 21
 
 
 def simulate_white(config: Path, output: Path, overwrite: bool, console: Console) -> dict[str, Any]:
@@ -74,16 +81,16 @@ def board_at(depth_mm: float) -> str:
 
 
 def simulate_particles(config: Path, output: Path, overwrite: bool, console: Console) -> dict[str, Any]:
-    """Render a pair of images of tracers that follow the configured flow."""
-    names = ("pair_a.tif", "pair_b.tif", "particles.npz", "particles.json")
-    settings, paths = _begin(config, output, names, overwrite)
+    """Render images of tracers that follow the configured flow: a pair, or a longer sequence."""
+    images = frame_names(load_config(config).simulation.frames)
+    settings, paths = _begin(config, output, (*images, "particles.npz", "particles.json"), overwrite)
     scene = settings.simulation
     if settings.correlation.dt_s is None:
-        raise ConfigError(f"{config}: correlation.dt_s: is missing, and a pair of images needs it")
+        raise ConfigError(f"{config}: correlation.dt_s: is missing, and images of a flow need it")
     camera, origin_z = real_camera(settings), simulated_origin_z_mm(settings)
-    tracers = _tracers(settings, camera, origin_z)
-    with console.progress(2 * tracers.count, "simulate") as advance:
-        pair = scenes.simulate_particles(
+    tracers = _tracers(settings, camera, origin_z, settings.correlation.dt_s)
+    with console.progress(scene.frames * tracers.count, "simulate") as advance:
+        found = scenes.simulate_particles(
             camera,
             _flow_space(settings, origin_z),
             tracers,
@@ -91,14 +98,22 @@ def simulate_particles(config: Path, output: Path, overwrite: bool, console: Con
             settings.correlation.dt_s,
             readout_of(settings),
             _generator(settings, 2),
+            frames=scene.frames,
             rays=scene.rays or RAYS,
             progress=advance,
         )
-    write_tiff(paths["pair_a.tif"], pair.image_a, overwrite)
-    write_tiff(paths["pair_b.tif"], pair.image_b, overwrite)
-    write_particles(paths["particles.npz"], pair.positions_mm, pair.velocities_m_s, pair.brightness, overwrite)
-    truth = pair.truth | {"reference_z_mm": origin_z}
+    for name, image in zip(images, found.images, strict=True):
+        write_tiff(paths[name], image, overwrite)
+    write_particles(paths["particles.npz"], found.positions_mm, found.velocities_m_s, found.brightness, overwrite)
+    truth = found.truth | {"reference_z_mm": origin_z}
     return _write_truth(paths["particles.json"], "simulate particles", truth, settings, config, overwrite)
+
+
+def frame_names(frames: int) -> tuple[str, ...]:
+    """Return the names of the images of a flow: of a pair, or of a longer sequence."""
+    if frames == 2:
+        return "pair_a.tif", "pair_b.tif"
+    return tuple(f"frame_{number:04d}.tif" for number in range(frames))
 
 
 def real_camera(settings: Config) -> Camera:
@@ -177,16 +192,27 @@ def _flow_space(settings: Config, origin_z_mm: float) -> ObjectSpace:
     return ObjectSpace(media, settings.window_model(origin_z_mm), refraction)
 
 
-def _tracers(settings: Config, camera: Camera, origin_z_mm: float) -> scenes.Tracers:
-    """Return the tracers: as many in the volume as configured, and as dense around it as their light reaches."""
+def _tracers(settings: Config, camera: Camera, origin_z_mm: float, dt_s: float) -> scenes.Tracers:
+    """Return the tracers: as many in the volume as configured, and as dense around it as their light reaches.
+
+    Those that are carried into the volume before a longer sequence ends, or out of it, are there too.
+    """
     scene = settings.simulation
     volume = settings.grid(origin_z_mm)
     margin = blur_radius_mm(camera, settings.media_model(), volume)
-    box = scenes.Box.around(volume, (margin, margin, 0.0))
     inside = scenes.Box.around(volume, (0.0, 0.0, 0.0))
+    carried = 0.5 * (scene.frames - 2) * dt_s * _largest_speed_mm_s(settings.simulated_flow(origin_z_mm), inside)
+    box = inside.wider((margin + carried[0], margin + carried[1], carried[2]))
     flow = scene.flow
     if flow is not None and flow.kind == "square_duct":
         walls = scenes.channel_walls(flow.width_mm, origin_z_mm + flow.centre_mm[2], flow.axis)
         box, inside = box.within(walls), inside.within(walls)
     count = round(scene.particles * box.volume_mm3 / inside.volume_mm3)
     return scenes.Tracers(count, box, scene.particle_diameter_mm, scene.particle_counts, scene.brightness)
+
+
+def _largest_speed_mm_s(flow: Flow, box: scenes.Box) -> NDArray[np.float64]:
+    """Return the largest speed along each axis (3,) on a lattice of points of a box."""
+    sides = [np.linspace(low, high, SPEED_POINTS) for low, high in zip(box.low_mm, box.high_mm, strict=True)]
+    points = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, 3)
+    return np.asarray(MM_PER_M * np.abs(flow(points)).max(axis=0))

@@ -23,6 +23,7 @@ Vector = tuple[float, float, float]
 MOST_PIXELS_PER_SIDE = 100_000
 MOST_VOXELS_PER_SIDE = 10_000
 MOST_PARTICLES = 10_000_000
+MOST_FRAMES = 10_000
 
 
 def _each_axis(value: Any) -> Any:
@@ -276,7 +277,8 @@ FlowSection = Annotated[SquareDuct | RigidRotation | TaylorGreen | Shear | Unifo
 class SimulationSection(Section):
     """What `simulate` renders.
 
-    Scene: flow (its centre in the volume's coordinates), particles (their number in the volume), particle_diameter_mm,
+    Scene: flow (its centre in the volume's coordinates), frames (images of it, correlation.dt_s apart; 2 are a pair),
+    particles (their number in the volume), particle_diameter_mm,
     brightness (range of each particle's light relative to particle_counts), particle_counts (counts of a whole particle
     of brightness 1), mid_plane_z_mm (where the origin of a mid_plane volume lies behind the focal point; by default
     where Eq. 21 puts it for the board at board_z_mm).
@@ -289,6 +291,7 @@ class SimulationSection(Section):
     """
 
     flow: FlowSection | None = None
+    frames: Annotated[int, Field(ge=2, le=MOST_FRAMES)] = 2
     particles: Annotated[int, Field(ge=0, le=MOST_PARTICLES)] = 1000
     particle_diameter_mm: NotNegative = 0.05
     brightness: tuple[NotNegative, NotNegative] = (0.6, 1.4)

@@ -1,7 +1,7 @@
-"""Recorded images of known scenes, with their truth: white light, a board, pairs of tracers in a flow.
+"""Recorded images of known scenes, with their truth: white light, a board, tracers in a flow.
 
 Axes: world axes, origin at the nominal focal point in the medium that the scene stands in, z away from the camera. The
-truth of tracers is that of the middle of the pair.
+truth of tracers is that of the middle of the pair or sequence.
 """
 
 from __future__ import annotations
@@ -64,6 +64,11 @@ class Box:
         high = [b[1] + m for b, m in zip(bounds, margin_mm, strict=True)]
         return cls((low[0], low[1], low[2]), (high[0], high[1], high[2]))
 
+    def wider(self, margin_mm: Triple) -> Box:
+        """Return the box with a margin on both sides of each axis."""
+        low, high = np.subtract(self.low_mm, margin_mm), np.add(self.high_mm, margin_mm)
+        return Box((low[0], low[1], low[2]), (high[0], high[1], high[2]))
+
     @property
     def volume_mm3(self) -> float:
         """Volume in cubic millimetres."""
@@ -85,7 +90,7 @@ class Box:
 
 @dataclass(frozen=True)
 class Tracers:
-    """What is seeded: `count` tracers, evenly spread over the box at the middle of the pair.
+    """What is seeded: `count` tracers, evenly spread over the box at the middle of the sequence.
 
     Attributes
     ----------
@@ -110,18 +115,18 @@ class SimulatedStill:
 
 
 @dataclass(frozen=True, eq=False)
-class SimulatedPair:
-    """Two images, uint16, a dark frame, and the truth: tracers at the middle of the pair.
+class SimulatedFrames:
+    """Images of moving tracers, uint16, a dark frame, and the truth: tracers at the middle of the sequence.
 
     Attributes
     ----------
+    images : in the order of time
     positions_mm : (n, 3), world axes
     velocities_m_s : (n, 3)
     brightness : (n,)
     """
 
-    image_a: NDArray[np.uint16]
-    image_b: NDArray[np.uint16]
+    images: tuple[NDArray[np.uint16], ...]
     dark: NDArray[np.uint16]
     positions_mm: NDArray[np.float64]
     velocities_m_s: NDArray[np.float64]
@@ -182,21 +187,22 @@ def simulate_particles(
     readout: Readout,
     rng: np.random.Generator,
     *,
+    frames: int = 2,
     rays: int = RAYS,
     progress: Callable[[int], None] | None = None,
-) -> SimulatedPair:
-    """Simulate a pair of images of tracers: frame a is dt/2 before the truth's positions, frame b dt/2 after.
+) -> SimulatedFrames:
+    """Simulate images of tracers, dt apart, half of them before the time of the truth's positions and half after.
 
-    `progress` is called with the number of tracers rendered, 2 n in all.
+    `progress` is called with the number of tracers rendered, n for each frame.
     """
     positions = rng.uniform(tracers.box.low_mm, tracers.box.high_mm, (tracers.count, 3))
     brightness = rng.uniform(*tracers.brightness, tracers.count)
     images = []
-    for time_s in (-0.5 * dt_s, 0.5 * dt_s):
+    for number in range(frames):
         expected = render_points(
             camera,
             space,
-            advect(flow, positions, time_s),
+            advect(flow, positions, (number - 0.5 * (frames - 1)) * dt_s),
             tracers.light_counts * brightness,
             tracers.diameter_mm,
             rng,
@@ -211,7 +217,7 @@ def simulate_particles(
         "window_distance_mm": None if space.window is None else space.window.distance_mm,
     }
     dark = dark_frame(camera, readout, rng)
-    return SimulatedPair(images[0], images[1], dark, positions, flow(positions), brightness, truth)
+    return SimulatedFrames(tuple(images), dark, positions, flow(positions), brightness, truth)
 
 
 def dark_frame(camera: Camera, readout: Readout, rng: np.random.Generator) -> NDArray[np.uint16]:
