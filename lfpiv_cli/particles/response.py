@@ -6,8 +6,10 @@ array at x_m = alpha X - beta x, beta = s_i/s_o, and the sensor at
     x_s = (1 - bend) s + bend x_m + (s_mu/s_i)(x_m - X)            (Eq. 1, bend = 1 - s_mu/f_m)
 
 so every pixel sees a patch of X. Seen from there, the share P(X) of the ball whose light falls into the lens's cell
-is a difference of two of the ball's marginal distributions (cubics); mean and slope of P over the patch come from a
-three-point Gauss rule, and the two axes are joined by the patch's covered share and its first moments (`rim`).
+is, along each axis of a square cell, a difference of two of the ball's marginal distributions (cubics); mean and slope
+of P over the patch come from a three-point Gauss rule, and the two axes are joined by the patch's covered share and its
+first moments (`rim`). In a hexagonal cell P does not separate; it is taken from a table of its means over
+patches (`cells`).
 
 Axes: image axes, mm; see `view`. An *entry* is the meeting of a pixel with one lens; a pixel between two micro-images
 can have two.
@@ -19,6 +21,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from lfpiv_cli.particles.cells import level_at, share_at
 from lfpiv_cli.particles.rim import covered_share
 from lfpiv_cli.particles.view import View
 
@@ -78,6 +81,10 @@ def respond(view: View, x: float, y: float, z: float, pixels: NDArray[np.int32],
     for j in range(low_j, high_j + 1):
         for i in range(low_i, high_i + 1):
             s_x, s_y = view.centres_mm[j, i]
+            if view.cell_table.shape[0] > 0:
+                place = (x, y, alpha, beta, slope, at_x - s_x, at_y - s_y, stretch_x, stretch_y, s_x, s_y)
+                count = _join_cell(view, place, pixels, values, count)
+                continue
             column, columns = _profile(
                 view, x, alpha, beta, slope, at_x, stretch_x, s_x, view.half_x_mm, view.columns, along_x
             )
@@ -101,11 +108,35 @@ def _lenses(view: View, at_x: float, at_y: float, reach: float) -> tuple[int, in
     reach_i = reach * (abs(basis[0, 0]) + abs(basis[1, 0]))
     reach_j = reach * (abs(basis[0, 1]) + abs(basis[1, 1]))
     rows, columns = view.centres_mm.shape[0], view.centres_mm.shape[1]
-    low_i = max(int(np.floor(i - reach_i + 0.5)) - view.first_i, 0)
-    high_i = min(int(np.floor(i + reach_i + 0.5)) - view.first_i, columns - 1)
-    low_j = max(int(np.floor(j - reach_j + 0.5)) - view.first_j, 0)
-    high_j = min(int(np.floor(j + reach_j + 0.5)) - view.first_j, rows - 1)
+    low_i = max(int(np.ceil(i - reach_i - view.cell_reach)) - view.first_i, 0)
+    high_i = min(int(np.floor(i + reach_i + view.cell_reach)) - view.first_i, columns - 1)
+    low_j = max(int(np.ceil(j - reach_j - view.cell_reach)) - view.first_j, 0)
+    high_j = min(int(np.floor(j + reach_j + view.cell_reach)) - view.first_j, rows - 1)
     return low_i, high_i, low_j, high_j
+
+
+@njit(cache=True)
+def _lit_pixels(
+    view: View, gain: float, offset: float, reach: float, scale: float, shift: float, pixels: int
+) -> tuple[int, int]:
+    """Return the first pixel that a lens can light along one axis, and how many.
+
+    A crossing X of the main lens meets the array at `offset` + `gain` X from the lens, within `reach` of it, and the
+    sensor at `scale` X + `shift`.
+    """
+    low, high = -view.aperture_radius_mm, view.aperture_radius_mm
+    if abs(gain) * view.aperture_radius_mm > 1e-3 * reach:
+        one, other = (-offset - reach) / gain, (-offset + reach) / gain
+        low, high = max(low, min(one, other)), min(high, max(one, other))
+    elif abs(offset) > reach + abs(gain) * view.aperture_radius_mm:
+        return 0, 0
+    if low >= high:
+        return 0, 0
+    one, other = scale * low + shift, scale * high + shift
+    first = int(np.floor(min(one, other) / view.pixel_mm + 0.5 * pixels))
+    last = int(np.floor(max(one, other) / view.pixel_mm + 0.5 * pixels))
+    first, last = max(first, 0), min(last, pixels - 1)
+    return first, max(min(last - first + 1, LONGEST_PROFILE), 0)
 
 
 @njit(cache=True)
@@ -132,22 +163,8 @@ def _profile(
     scale = view.bend * alpha + tilt * (alpha - 1.0)
     radius = beta * view.particle_radius_mm
     gain = stretch * alpha
-    low, high = -view.aperture_radius_mm, view.aperture_radius_mm
-    if abs(gain) * view.aperture_radius_mm > 1e-3 * half:
-        one, other = (s - at - half - radius) / gain, (s - at + half + radius) / gain
-        low, high = max(low, min(one, other)), min(high, max(one, other))
-    elif abs(at - s) > half + radius + abs(gain) * view.aperture_radius_mm:
-        return 0, 0
-    if low >= high:
-        return 0, 0
     shift = (1.0 - view.bend) * s - lever * beta * x
-    one, other = scale * low + shift, scale * high + shift
-    first = int(np.floor(min(one, other) / view.pixel_mm + 0.5 * pixels))
-    last = int(np.floor(max(one, other) / view.pixel_mm + 0.5 * pixels))
-    first, last = max(first, 0), min(last, pixels - 1)
-    count = min(last - first + 1, LONGEST_PROFILE)
-    if count <= 0:
-        return 0, 0
+    first, count = _lit_pixels(view, gain, at - s, half + radius, scale, shift, pixels)
     width = view.pixel_mm / scale
     for k in range(count):
         middle = ((first + k + 0.5 - 0.5 * pixels) * view.pixel_mm - shift) / scale
@@ -235,5 +252,85 @@ def _join(
             values[count, 1] = norm * by_x
             values[count, 2] = norm * by_y
             values[count, 3] = norm * (by_z + widen_z * light)
+            count += 1
+    return count
+
+
+@njit(cache=True)
+def _join_cell(
+    view: View,
+    place: tuple[float, ...],
+    pixels: NDArray[np.int32],
+    values: NDArray[np.float64],
+    count: int,
+) -> int:
+    """Write the entries of one lens whose cell is no rectangle; return how many there are now.
+
+    Parameters
+    ----------
+    place : x, y, alpha, beta, slope as in `_join`; where the ball's centre meets the array from the lens, and the
+        distortion's scales there, along x and y
+    """
+    x, y, alpha, beta, slope, off_x, off_y, stretch_x, stretch_y, s_x, s_y = place
+    tilt = view.microlens_distance_mm / view.image_distance_mm
+    scale = view.bend * alpha + tilt * (alpha - 1.0)
+    lever = (view.bend + tilt) / scale
+    gain_x, gain_y = stretch_x * alpha, stretch_y * alpha
+    shift_x = (1.0 - view.bend) * s_x - lever * scale * beta * x
+    shift_y = (1.0 - view.bend) * s_y - lever * scale * beta * y
+    radius = beta * view.particle_radius_mm
+    column, columns = _lit_pixels(view, gain_x, off_x, view.half_x_mm + radius, scale, shift_x, view.columns)
+    row, rows = _lit_pixels(view, gain_y, off_y, view.half_y_mm + radius, scale, shift_y, view.rows)
+    width = abs(view.pixel_mm / scale)
+    norm = width * width / (np.pi * view.aperture_radius_mm**2)
+    inside = max(view.aperture_radius_mm - 0.71 * width, 0.0) ** 2
+    outside = (view.aperture_radius_mm + 0.71 * width) ** 2
+    # No ray of a patch further from the lens than this meets its cell.
+    furthest = (view.half_x_mm + radius + 0.71 * width * max(abs(gain_x), abs(gain_y))) ** 2
+    move_x, move_y = (lever * alpha - 1.0) * beta * stretch_x, (lever * alpha - 1.0) * beta * stretch_y
+    # The patch on the array. It blurs the ball; so does more of a radius, and of either the variance tells how much.
+    stretch = 0.5 * (stretch_x + stretch_y)
+    side = stretch * abs(alpha) * width
+    side_z = stretch * slope * width * (np.sign(alpha) - abs(alpha) * lever)
+    level, blend = level_at(side, view.cell_side2_mm2)
+    wider = 0.1 * (radius * radius - view.cell_ball_mm**2)
+    wider_z = 0.2 * radius * view.particle_radius_mm * slope + side * side_z / 12.0
+    low, high = view.cell_table[level], view.cell_table[level + 1]
+    half_x, half_y = 0.5 * width * gain_x, 0.5 * width * gain_y
+    for m in range(rows):
+        patch_y = ((row + m + 0.5 - 0.5 * view.rows) * view.pixel_mm - shift_y) / scale
+        v_z = stretch_y * slope * (patch_y - y) * (1.0 - alpha * lever)
+        for n in range(columns):
+            patch_x = ((column + n + 0.5 - 0.5 * view.columns) * view.pixel_mm - shift_x) / scale
+            r2 = patch_x * patch_x + patch_y * patch_y
+            if r2 >= outside or count >= pixels.size:
+                continue
+            u, v = off_x + gain_x * patch_x, off_y + gain_y * patch_y
+            if u * u + v * v >= furthest:
+                continue
+            part, by_u, by_v, by_uu, by_uv, by_vv = share_at(u, v, low, high, blend, view.cell_step_mm)
+            part += wider * (by_uu + by_vv)
+            u_z = stretch_x * slope * (patch_x - x) * (1.0 - alpha * lever)
+            by_z = by_u * u_z + by_v * v_z + wider_z * (by_uu + by_vv)
+            by_x, by_y = by_u * move_x, by_v * move_y
+            light = part
+            if r2 > inside:
+                share, mean_x, mean_y, share_x, share_y = covered_share(
+                    patch_x, patch_y, view.table, view.table_step_mm
+                )
+                lean_x, lean_y = mean_x * half_x, mean_y * half_y
+                light = share * part + lean_x * by_u + lean_y * by_v
+                by_x = (share * by_u + lean_x * by_uu + lean_y * by_uv) * move_x + share_x * lever * beta * part
+                by_y = (share * by_v + lean_x * by_uv + lean_y * by_vv) * move_y + share_y * lever * beta * part
+                by_z *= share
+                by_z += lean_x * (by_uu * u_z + by_uv * v_z) + lean_y * (by_uv * u_z + by_vv * v_z)
+                by_z += (share_x * (x - patch_x) + share_y * (y - patch_y)) * lever * slope * part
+            if light <= 0.0:
+                continue
+            pixels[count] = (row + m) * view.columns + column + n
+            values[count, 0] = norm * light
+            values[count, 1] = norm * by_x
+            values[count, 2] = norm * by_y
+            values[count, 3] = norm * (by_z - 2.0 * lever * slope * light)
             count += 1
     return count

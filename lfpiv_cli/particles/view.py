@@ -1,7 +1,7 @@
 """The camera as particles see it: the raw image, every microlens with its own measured centre.
 
-Nothing is resampled. Each lens has the cell of the plain lattice around its own centre, its edges taken as upright: at
-a rotation of 0.1 degrees that moves 0.1 % of the pitch from one lens to the next.
+Nothing is resampled. Each lens has the cell of the plain lattice around its own centre. The edges of square cells are
+taken as upright: at a rotation of 0.1 degrees that moves 0.1 % of the pitch from one lens to the next.
 
 Axes: image axes (x along the columns, y along the rows, see `optics.camera`), z away from the camera from the nominal
 focal point; lengths in mm about the optical axis.
@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.calibration.model import Calibration
-from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
+from lfpiv_cli.particles.cells import cell_shares, hexagon_radius, no_shares
 from lfpiv_cli.particles.rim import rim_table
 
 # Particles that are smaller are taken as this large, so that profiles have slopes: a thousandth of a lens.
@@ -34,7 +34,9 @@ class View(NamedTuple):
     focus_distance_mm, depth_ratio : F_m (M - 1)/M and n_a/n_w (Eqs. 6, 9)
     distortion_per_mm2 : k1
     aperture_radius_mm, pixel_mm, columns, rows : of main lens and sensor
-    half_x_mm, half_y_mm : half the cell of a lens
+    half_x_mm, half_y_mm : half the rectangle that holds a lens's cell
+    cell_reach : how far a cell reaches at most from its lens, in steps of the lattice
+    cell_table, cell_side2_mm2, cell_step_mm, cell_ball_mm : of cells that are no rectangles, see `cells.CellShares`
     particle_radius_mm : of the balls
     centres_mm : (nj, ni, 2) lens centres on the array; entry [j, i] is lens (first_i + i, first_j + j)
     origin_mm, inverse_basis : (2,), (2, 2) of the plain lattice, to find lenses
@@ -54,6 +56,11 @@ class View(NamedTuple):
     rows: int
     half_x_mm: float
     half_y_mm: float
+    cell_reach: float
+    cell_table: NDArray[np.float64]
+    cell_side2_mm2: NDArray[np.float64]
+    cell_step_mm: float
+    cell_ball_mm: float
     particle_radius_mm: float
     centres_mm: NDArray[np.float64]
     first_i: int
@@ -71,14 +78,7 @@ def raw_view(camera: Camera, media: Media, particle_radius_mm: float, calibratio
     ----------
     camera : as the weights have it; its lattice is used where there is no calibration
     calibration : gives the measured centres of the lens images
-
-    Raises
-    ------
-    ConfigError
-        The array is hexagonal: its cells do not separate into columns and rows.
     """
-    if camera.lattice.layout != "square":
-        raise ConfigError("camera.microlenses.layout: particles can be fitted behind square arrays only")
     lattice_px = camera.micro_image_lattice_px() if calibration is None else calibration.fit.lattice_px
     # One lens more than the sensor's corners: micro-images reach over its edge.
     corners = [(c, r) for c in (0, camera.columns - 1) for r in (0, camera.rows - 1)]
@@ -87,6 +87,14 @@ def raw_view(camera: Camera, media: Media, particle_radius_mm: float, calibratio
     indices = np.stack(np.meshgrid(np.arange(low_i, high_i + 1), np.arange(low_j, high_j + 1)), axis=-1)
     centres_px = lattice_px.points(indices) if calibration is None else calibration.fit.centres(indices)
     lattice = camera.with_micro_images(lattice_px).lattice
+    radius = max(particle_radius_mm, SMALLEST_RADIUS_MM)
+    if lattice.layout == "square":
+        half_x, half_y = 0.5 * lattice.pitch
+        cell_reach, shares = 0.5, no_shares()
+    else:
+        half_x = half_y = hexagon_radius(lattice)
+        cell_reach = 2.0 / 3.0
+        shares = cell_shares(lattice, radius * camera.image_distance_mm / camera.focus_distance_mm)
     table, step = rim_table(
         camera.aperture_radius_mm, camera.pixel_mm * camera.image_distance_mm / camera.microlens_distance_mm
     )
@@ -102,9 +110,14 @@ def raw_view(camera: Camera, media: Media, particle_radius_mm: float, calibratio
         pixel_mm=camera.pixel_mm,
         columns=camera.columns,
         rows=camera.rows,
-        half_x_mm=0.5 * float(lattice.pitch[0]),
-        half_y_mm=0.5 * float(lattice.pitch[1]),
-        particle_radius_mm=max(particle_radius_mm, SMALLEST_RADIUS_MM),
+        half_x_mm=float(half_x),
+        half_y_mm=float(half_y),
+        cell_reach=cell_reach,
+        cell_table=shares.table,
+        cell_side2_mm2=shares.side2_mm2,
+        cell_step_mm=shares.step_mm,
+        cell_ball_mm=shares.radius_mm,
+        particle_radius_mm=radius,
         centres_mm=np.ascontiguousarray(camera.px_to_mm(centres_px) / camera.micro_image_scale),
         first_i=int(low_i),
         first_j=int(low_j),

@@ -1,0 +1,164 @@
+"""How much of a ball's light falls into a lens's cell where the cell is no rectangle.
+
+In a rectangle the share is a product of two of the ball's marginal distributions. Otherwise it is tabulated over the
+ball's place, as a mean over square patches of several sizes: a pixel sees the ball from everywhere in such a patch.
+
+Axes: image axes on the array, mm from the lens's centre.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from lfpiv_cli.optics.microlenses import Lattice
+from lfpiv_cli.weights.lens_cells import neighbours
+
+# Entries per radius of the ball. Between them second-order terms do: what is left is a quarter of (1/16)^3.
+ENTRIES_PER_RADIUS = 8
+# Points between entries at which shares are computed, and their means over patches taken.
+FINER = 4
+# Sides of the patches: none, then from this share of the ball's radius on, each longer by this factor, up to the pitch
+# of the lenses. Shares are almost linear in the side's square. Beyond, two pixels see more than two lenses apart.
+FIRST_SIDE, NEXT_SIDE = 0.5, 1.35
+# Balls whose images are smaller than this share of the pitch are taken as this large: their shares are almost steps.
+SMALLEST_SHARE_OF_PITCH = 1.0 / 16.0
+# Chords into which a ball is cut; Gauss's rule on them is right to 1e-4 where an edge ends within the ball.
+CHORDS = 96
+# Columns of the table: the share, its first and its second derivatives.
+SHARE, BY_U, BY_V, BY_UU, BY_UV, BY_VV = range(6)
+COLUMNS = 6
+
+
+class CellShares(NamedTuple):
+    """Shares of a ball's light that fall into a cell.
+
+    Attributes
+    ----------
+    table : (sides, n, n, 6), index [side, v, u] of the ball's centre, the middle entry the lens's; empty for cells
+        that are rectangles
+    side2_mm2 : (sides,) the patches' sides squared
+    step_mm : distance of entries
+    radius_mm : the ball's radius on the array
+    """
+
+    table: NDArray[np.float64]
+    side2_mm2: NDArray[np.float64]
+    step_mm: float
+    radius_mm: float
+
+
+def no_shares() -> CellShares:
+    """Return the empty table of rectangular cells."""
+    return CellShares(np.zeros((0, 0, 0, COLUMNS)), np.zeros(0), 1.0, 1.0)
+
+
+def hexagon_radius(lattice: Lattice) -> float:
+    """Return how far the corners of a hexagonal cell are from its lens."""
+    return float(lattice.pitch.max()) / np.sqrt(3.0)
+
+
+def cell_shares(lattice: Lattice, radius_mm: float) -> CellShares:
+    """Return the shares for the cells of a hexagonal lattice and a ball whose image has about this radius."""
+    radius = max(radius_mm, SMALLEST_SHARE_OF_PITCH * float(lattice.pitch.min()))
+    step, pitch = radius / ENTRIES_PER_RADIUS, float(lattice.pitch.max())
+    levels = max(int(np.ceil(np.log(pitch / (FIRST_SIDE * radius)) / np.log(NEXT_SIDE))), 0)
+    sides = np.array([0.0, *(FIRST_SIDE * radius * NEXT_SIDE**level for level in range(levels)), pitch])
+    count = int(np.ceil((hexagon_radius(lattice) + 1.5 * radius + 0.75 * pitch) / step))
+    axis = step * np.arange(-count, count + 1, dtype=np.float64)
+    fine = step / FINER * np.arange(-count * FINER, count * FINER + 1, dtype=np.float64)
+    share = _share(lattice, fine, radius)
+    by_v, by_u = np.gradient(share, fine[1] - fine[0])
+    by_uv, by_uu = np.gradient(by_u, fine[1] - fine[0])
+    by_vv = np.gradient(by_v, fine[1] - fine[0], axis=0)
+    table = np.zeros((sides.size, axis.size, axis.size, COLUMNS))
+    for level, side in enumerate(sides):
+        mean = _mean_over(axis, fine, side)
+        for column, values in enumerate((share, by_u, by_v, by_uu, by_uv, by_vv)):
+            table[level, ..., column] = mean @ values @ mean.T
+    return CellShares(table, sides**2, step, radius)
+
+
+def _mean_over(axis: NDArray[np.float64], fine: NDArray[np.float64], side: float) -> NDArray[np.float64]:
+    """Return the matrix (n, m) that takes values on the fine axis to their means over `side` around the coarse one."""
+    if side == 0.0:
+        return np.asarray(np.abs(axis[:, np.newaxis] - fine) < 0.5 * (fine[1] - fine[0]), dtype=np.float64)
+    # The part of each fine point's interval that lies within the patch.
+    half = 0.5 * (fine[1] - fine[0])
+    low = np.maximum(axis[:, np.newaxis] - 0.5 * side, fine - half)
+    high = np.minimum(axis[:, np.newaxis] + 0.5 * side, fine + half)
+    return np.asarray(np.maximum(high - low, 0.0) / side)
+
+
+def _share(lattice: Lattice, axis_mm: NDArray[np.float64], radius_mm: float) -> NDArray[np.float64]:
+    """Return the share (n, n) of a ball's light inside the cell, index [v, u] of its centre.
+
+    The ball is cut into chords along u; where each enters and leaves the cell is known, and so is its light between.
+    """
+    eta, weight = np.polynomial.legendre.leggauss(CHORDS)
+    light = 0.75 * weight * (1.0 - eta**2)
+    half = radius_mm * np.sqrt(1.0 - eta**2)
+    height = axis_mm[:, np.newaxis] + radius_mm * eta
+    low, high = np.full(height.shape, -np.inf), np.full(height.shape, np.inf)
+    for a, b in neighbours(lattice):
+        rest = 0.5 * (a * a + b * b) - b * height
+        if abs(a) <= 1e-12 * abs(b):
+            high = np.where(rest < 0.0, -np.inf, high)
+        elif a > 0.0:
+            high = np.minimum(high, rest / a)
+        else:
+            low = np.maximum(low, rest / a)
+    high = np.maximum(high, low)
+    u = axis_mm[:, np.newaxis]
+    # The cell is the same turned by half a turn, and so is the axis.
+    rows = [
+        (_below((b - u) / half) - _below((a - u) / half)) @ light
+        for a, b in zip(low[: axis_mm.size // 2 + 1], high[: axis_mm.size // 2 + 1], strict=True)
+    ]
+    return np.stack(rows + [row[::-1] for row in rows[-2::-1]])
+
+
+def _below(t: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the share of a chord's light on its part below t, from -1 to 1 along it."""
+    t = np.clip(t, -1.0, 1.0)
+    return np.asarray(0.5 + (t * np.sqrt(1.0 - t * t) + np.arcsin(t)) / np.pi)
+
+
+@njit(cache=True)
+def level_at(side_mm: float, side2_mm2: NDArray[np.float64]) -> tuple[int, float]:
+    """Return the table's level below a patch's side and the share of the next one."""
+    level = 0
+    square = min(side_mm * side_mm, side2_mm2[-1])
+    while level < side2_mm2.size - 2 and side2_mm2[level + 1] < square:
+        level += 1
+    return level, (square - side2_mm2[level]) / (side2_mm2[level + 1] - side2_mm2[level])
+
+
+@njit(cache=True)
+def share_at(
+    u: float, v: float, low: NDArray[np.float64], high: NDArray[np.float64], blend: float, step: float
+) -> tuple[float, float, float, float, float, float]:
+    """Return the share, its first and its second derivatives for a ball centred at (u, v).
+
+    Parameters
+    ----------
+    low, high : (n, n, 6) two levels of the table
+    blend : share of the second
+    """
+    middle = low.shape[0] // 2
+    i, j = int(np.rint(u / step)) + middle, int(np.rint(v / step)) + middle
+    if not (0 <= i < low.shape[0] and 0 <= j < low.shape[0]):
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    p, q = u - (i - middle) * step, v - (j - middle) * step
+    a, b = low[j, i], high[j, i]
+    by_uu = a[BY_UU] + blend * (b[BY_UU] - a[BY_UU])
+    by_uv = a[BY_UV] + blend * (b[BY_UV] - a[BY_UV])
+    by_vv = a[BY_VV] + blend * (b[BY_VV] - a[BY_VV])
+    at_u = a[BY_U] + blend * (b[BY_U] - a[BY_U])
+    at_v = a[BY_V] + blend * (b[BY_V] - a[BY_V])
+    by_u, by_v = at_u + by_uu * p + by_uv * q, at_v + by_uv * p + by_vv * q
+    share = a[SHARE] + blend * (b[SHARE] - a[SHARE]) + 0.5 * ((at_u + by_u) * p + (at_v + by_v) * q)
+    return share, by_u, by_v, by_uu, by_uv, by_vv
