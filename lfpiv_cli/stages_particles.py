@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,21 +21,30 @@ from lfpiv_cli.particles.refraction import places_by_snell
 from lfpiv_cli.particles.rounds import ROUNDS, find_particles
 from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.reconstruction.equations import Normalisers
+from lfpiv_cli.weights.build import factorise_bricks
+from lfpiv_cli.weights.columns import OnDemandOperator
+from lfpiv_cli.weights.model import behind_transmission
 
 # Units of progress that `write_frame` reports.
 STEPS = sum(settings.iterations + 1 for settings in ROUNDS)
 
 
-def ensure_solvable(content: WeightsFile, settings: Config) -> None:
-    """Refuse weights of a kind that particles cannot follow.
+def searchable(content: WeightsFile, settings: Config) -> WeightsFile:
+    """Return weights to look for particles with: where an array is hexagonal, those of bricks for its cells.
 
     Raises
     ------
     ConfigError
+        Rays are fitted, or the array does not stand upright.
     """
     if settings.weights.method == "dlfc":
         raise ConfigError("weights.method: particles are fitted with traced rays; build weights by ert for them")
-    raw_view(content.camera, settings.media_model(), 0.0, content.weights.calibration)
+    weights, operator = content.weights, content.weights.solver_operator
+    if not isinstance(operator, OnDemandOperator):
+        return content
+    bricks = factorise_bricks(content.camera, settings.media_model(), weights.padded.grid)
+    passing = bricks if operator.transmission is None else behind_transmission(bricks, operator.transmission)
+    return replace(content, weights=replace(weights, solver_operator=passing))
 
 
 @dataclass(frozen=True, eq=False)

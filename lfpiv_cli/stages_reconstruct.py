@@ -145,7 +145,7 @@ def reconstruct(
     needed = pending(targets, [*common.values(), *images], overwrite, resume, _record_of)
     as_particles = settings.reconstruction.solver == "particles"
     if as_particles:
-        stages_particles.ensure_solvable(content, settings)
+        content = stages_particles.searchable(content, settings)
         for number in needed:
             ensure_writable(stages_particles.residual_path(paths[number]), overwrite or resume, images)
     bench = _bench(content, settings, dark, mask, bool(needed))

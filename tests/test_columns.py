@@ -20,7 +20,7 @@ from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.optics.polynomial_rays import PolynomialRays, complete_exponents, polynomial_terms
 from lfpiv_cli.optics.tracing import disc_points, slopes_equivalent, trace
 from lfpiv_cli.weights import columns as columns_module
-from lfpiv_cli.weights.build import factorise
+from lfpiv_cli.weights.build import factorise, factorise_bricks
 from lfpiv_cli.weights.columns import OnDemandOperator, operator_of
 from lfpiv_cli.weights.model import Weights
 from lfpiv_cli.weights.operators import FactorisedOperator
@@ -163,6 +163,44 @@ def test_counted_columns_agree_with_integrated_ones(turned, water, rng):
     for n in range(4):
         exact = operator.columns_of(np.array([n])).image(0, operator.image_shape)
         assert np.abs(counted.image(n, operator.image_shape) - exact).sum() < 0.12  # 2000 points: about 0.07
+
+
+@pytest.mark.parametrize("column_axis", ["x", "y"])
+def test_bricks_are_adjoint_and_nearly_hexagons(table2, water, rng, column_axis):
+    lattice = Lattice.regular(0.1, "hexagonal", 0.0, (0.013, -0.021))
+    camera = replace(table2, columns=380, rows=260, lattice=lattice, column_axis=column_axis)
+    bricks = factorise_bricks(camera, water, GRID)
+    hexagons = OnDemandOperator(camera, ObjectSpace(water, None, "paraxial"), GRID)
+    volume = rng.random(bricks.shape, dtype=np.float32)
+    image = rng.random(bricks.image_shape, dtype=np.float32)
+    right = np.vdot(volume.astype(np.float64), bricks.adjoint(image))
+    assert np.vdot(bricks.forward(volume).astype(np.float64), image) == pytest.approx(right, rel=1e-5)
+    alone = np.zeros_like(volume)
+    alone[2, 1, 1] = 1.0
+    rows, columns, weights = bricks.column(2, 1, 1)
+    by_column = np.zeros_like(image)
+    by_column[rows, columns] = weights
+    np.testing.assert_allclose(by_column, bricks.forward(alone), atol=1e-8)
+    # One ray in twelve goes to the next lens; a displaced row or half a pitch would move half of them and more.
+    off = [np.abs(bricks.forward(unit) - hexagons.forward(unit)).sum() for unit in units(volume, rng)]
+    assert np.mean(off) < 2.0 / 12.0 + 0.05
+    assert bricks.forward(alone).sum() == pytest.approx(1.0, abs=1e-3)
+
+
+def units(like, rng):
+    """Ten volumes of one voxel each."""
+    for flat in rng.choice(like.size, 10, replace=False):
+        unit = np.zeros_like(like)
+        unit.flat[flat] = 1.0
+        yield unit
+
+
+@pytest.mark.parametrize(
+    "lattice", [Lattice.regular(0.1), Lattice.regular(0.1, "hexagonal", 0.01)], ids=["square", "turned"]
+)
+def test_bricks_need_an_upright_hexagonal_array(table2, water, lattice):
+    with pytest.raises(ConfigError, match="rows along the sensor's"):
+        factorise_bricks(replace(table2, lattice=lattice), water, GRID)
 
 
 RIG = {

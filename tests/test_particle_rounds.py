@@ -11,26 +11,29 @@ from scipy.spatial import KDTree
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera, ColumnAxis
 from lfpiv_cli.optics.media import Media
+from lfpiv_cli.optics.microlenses import Lattice, Layout
 from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.particles.candidates import explain_rest, find_peaks
 from lfpiv_cli.particles.rounds import find_particles
 from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.reconstruction.equations import normalisers
 from lfpiv_cli.synthetic.render import render_points
-from lfpiv_cli.weights.build import default_padding, factorise
+from lfpiv_cli.weights.build import default_padding, factorise, factorise_bricks
 from lfpiv_cli.weights.model import Weights
 
 
 def weights_of(camera: Camera, media: Media, grid: Grid) -> Weights:
     padding = default_padding(camera, media, grid)
-    return Weights(grid, padding, factorise(camera, media, grid.padded(padding)), camera.column_axis)
+    factorised = factorise if camera.lattice.layout == "square" else factorise_bricks
+    return Weights(grid, padding, factorised(camera, media, grid.padded(padding)), camera.column_axis)
 
 
-@pytest.mark.parametrize("column_axis", ["x", "y"])
+@pytest.mark.parametrize(("column_axis", "layout"), [("x", "square"), ("y", "square"), ("y", "hexagonal")])
 def test_particles_are_found_where_they_are(
-    table2: Camera, water: Media, rng: np.random.Generator, column_axis: ColumnAxis
+    table2: Camera, water: Media, rng: np.random.Generator, column_axis: ColumnAxis, layout: Layout
 ) -> None:
-    camera = replace(table2, columns=420, rows=360, column_axis=column_axis)
+    lattice = Lattice.regular(0.1, layout)
+    camera = replace(table2, columns=420, rows=360, column_axis=column_axis, lattice=lattice)
     size = (18, 15, 16) if column_axis == "x" else (15, 18, 16)
     grid = Grid.centred(size, (0.1, 0.1, 0.1), (0.0, 0.0, 1.9))
     low, high = (np.array([grid.bounds_mm(axis)[side] for axis in range(3)]) for side in (0, 1))

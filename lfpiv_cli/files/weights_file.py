@@ -36,7 +36,7 @@ from lfpiv_cli.weights.axis import AxisOptics, AxisWeights, micro_image_cells
 from lfpiv_cli.weights.build import axis_optics
 from lfpiv_cli.weights.columns import ColumnOperator, OnDemandOperator
 from lfpiv_cli.weights.model import Weights, WeightsOperator, behind_transmission
-from lfpiv_cli.weights.operators import FactorisedOperator
+from lfpiv_cli.weights.operators import BrickOperator, FactorisedOperator
 from lfpiv_cli.weights.quadrature import Columns
 from lfpiv_cli.weights.scene import Source
 
@@ -152,6 +152,8 @@ def _operator_tree(operator: WeightsOperator) -> dict[str, Any]:
     if isinstance(operator, ColumnOperator):
         columns = operator.columns
         return {"counted": {"start": columns.start, "pixel": columns.pixel, "share": columns.share}}
+    if isinstance(operator, BrickOperator):
+        raise TypeError("bricks stand for hexagonal cells where particles are looked for, and are not stored")
     space = operator.source
     if not isinstance(space, ObjectSpace):
         return {"on_demand": {"method": "dlfc"}}

@@ -43,6 +43,7 @@ class AxisOptics:
     image_distance_mm, microlens_distance_mm, microlens_focal_length_mm : s_i, s_mu, f_m
     aperture_radius_mm : half the side of the square aperture
     lens_origin_mm, lens_pitch_mm : a lens centre on the array and the pitch along this axis
+    lens_width_mm : what of the pitch a lens takes in, half of it to either side
     pixel_mm, pixels : pixel pitch and count
     """
 
@@ -52,6 +53,7 @@ class AxisOptics:
     aperture_radius_mm: float
     lens_origin_mm: float
     lens_pitch_mm: float
+    lens_width_mm: float
     pixel_mm: float
     pixels: int
 
@@ -149,7 +151,7 @@ def micro_image_cells(optics: AxisOptics) -> Cells:
     """Return the cells of all lenses whose micro-image meets the sensor."""
     tilt = optics.microlens_distance_mm / optics.image_distance_mm
     bend = 1.0 - optics.microlens_distance_mm / optics.microlens_focal_length_mm
-    reach = tilt * optics.aperture_radius_mm + (tilt + abs(bend)) * 0.5 * optics.lens_pitch_mm
+    reach = tilt * optics.aperture_radius_mm + (tilt + abs(bend)) * 0.5 * optics.lens_width_mm
     half = 0.5 * optics.pixels * optics.pixel_mm
     edge = np.array([-half - reach, half + reach]) / (1.0 + tilt)
     first, last = np.rint((edge - optics.lens_origin_mm) / optics.lens_pitch_mm).astype(int)
@@ -203,6 +205,7 @@ def axis_weights(
             optics.aperture_radius_mm,
             optics.lens_origin_mm,
             optics.lens_pitch_mm,
+            optics.lens_width_mm,
             optics.pixel_mm,
             traced.focal_length_mm,
             traced.beside_mm2,
@@ -310,7 +313,7 @@ def _array_place(
             slope = slope * x + place
             place = place * x + part
         return place, -slope / scale[0]
-    s_i, radius, focal_length, beside = camera[0], camera[3], camera[7], camera[8]
+    s_i, radius, focal_length, beside = camera[0], camera[3], camera[8], camera[9]
     lateral = crossing - centre
     chord = max(radius * radius - crossing * crossing, 0.0) / 3.0
     ratio = slope_ratio(lateral * lateral + chord + beside, nodes, factors)
@@ -339,7 +342,7 @@ def _voxel_shares(
 
     In each strip of X the ray's place on the array is linear, x_m = alpha X - scale x + offset, right at both ends.
     """
-    s_i, s_mu, f_m, radius, lens_origin, lens_pitch, pixel_mm = camera[:7]
+    s_i, s_mu, f_m, radius, lens_origin, lens_pitch, lens_width, pixel_mm = camera[:8]
     rectangle, upper, lens, scratch = work
     bend = 1.0 - s_mu / f_m
     begin, end = cell_pixel.size, 0
@@ -360,8 +363,8 @@ def _voxel_shares(
         for n in range(max(first, first_lens), min(last, first_lens + cell_start.size - 2) + 1):
             at, stop = cell_start[n - first_lens], cell_start[n - first_lens + 1]
             s = lens_origin + n * lens_pitch
-            corners = _clip(rectangle, 4, beta, alpha, s + 0.5 * lens_pitch - offset, upper)
-            corners = _clip(upper, corners, -beta, -alpha, -(s - 0.5 * lens_pitch - offset), lens)
+            corners = _clip(rectangle, 4, beta, alpha, s + 0.5 * lens_width - offset, upper)
+            corners = _clip(upper, corners, -beta, -alpha, -(s - 0.5 * lens_width - offset), lens)
             if corners < 3 or at == stop:
                 continue
             share = node_share[node] / (2.0 * radius * width)

@@ -7,6 +7,7 @@ in the frame that the array is aligned with (`rectified`), x and y lateral, z aw
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +16,13 @@ from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
+from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.optics.polynomial_rays import PolynomialRays
 from lfpiv_cli.optics.tracing import disc_points
 from lfpiv_cli.weights.aperture import aperture_mask
 from lfpiv_cli.weights.axis import AxisOptics, Bending, FittedBending, axis_weights, depth_nodes
-from lfpiv_cli.weights.operators import FactorisedOperator
+from lfpiv_cli.weights.operators import BrickOperator, FactorisedOperator
 from lfpiv_cli.weights.scene import Source
 
 # A lattice counts as aligned with the sensor when over its whole width it strays by less than a hundredth of a pixel.
@@ -53,7 +55,41 @@ def factorise_through(camera: Camera, source: Source, grid: Grid) -> FactorisedO
     ------
     ConfigError : the array's axes do not separate, or a voxel lies where it cannot be.
     """
-    columns, rows = axis_optics(camera)
+    return _factorised(axis_optics(camera), camera, source, grid)
+
+
+def factorise_bricks(camera: Camera, media: Media, grid: Grid) -> BrickOperator:
+    """Return the weights of a hexagonal array whose cells are taken for bricks, in factorised form.
+
+    A brick is as wide as the lenses' pitch and as high as their rows are apart. One ray in twelve is given to the lens
+    next to its own: good enough to look for particles, which then are fitted behind true hexagons.
+
+    Raises
+    ------
+    ConfigError : the array's rows are not those of the sensor
+    """
+    lattice = camera.lattice
+    (pitch, slant), (side, height) = lattice.basis
+    if lattice.layout != "hexagonal" or not np.allclose([slant, side], [0.0, 0.5 * pitch], atol=1e-4 * pitch):
+        raise ConfigError(
+            f"camera.microlenses: a {lattice.layout} array turned by {np.degrees(lattice.rotation_rad):.4f} degrees; "
+            "a hexagonal one with rows along the sensor's is needed (a calibration aligns it)"
+        )
+    space = ObjectSpace(media, None, "paraxial")
+    rows = [
+        Lattice(lattice.origin + row * lattice.basis[1], np.diag([pitch, 2.0 * height]), "square") for row in (0, 1)
+    ]
+    even, odd = (
+        _factorised(axis_optics(replace(camera, lattice=each), (pitch, height)), camera, space, grid) for each in rows
+    )
+    return BrickOperator(even, odd)
+
+
+def _factorised(
+    optics: tuple[AxisOptics, AxisOptics], camera: Camera, source: Source, grid: Grid
+) -> FactorisedOperator:
+    """Return the weights of a grid through an array whose two axes are given."""
+    columns, rows = optics
     x, y = (0, 1) if camera.column_axis == "x" else (1, 0)
     bent: Sequence[Bending | FittedBending]
     if isinstance(source, PolynomialRays):
@@ -145,8 +181,8 @@ def aligned(camera: Camera) -> bool:
     return camera.lattice.layout == "square" and bool(stray_px.max() <= ALIGNED_PX)
 
 
-def axis_optics(camera: Camera) -> tuple[AxisOptics, AxisOptics]:
-    """Return the camera's two axes, (columns, rows), each with its lens pitch."""
+def axis_optics(camera: Camera, widths_mm: tuple[float, float] | None = None) -> tuple[AxisOptics, AxisOptics]:
+    """Return the camera's two axes, (columns, rows); the widths of the lenses are their pitches if not given."""
     basis = camera.lattice.basis
     pixels = np.array([camera.columns, camera.rows])
     if not aligned(camera):
@@ -155,6 +191,7 @@ def axis_optics(camera: Camera) -> tuple[AxisOptics, AxisOptics]:
             f"{np.degrees(camera.lattice.rotation_rad):.4f} degrees against the sensor does not separate into columns "
             "and rows; a square one aligned with it is needed (a calibration aligns it)"
         )
+    widths = widths_mm or (float(basis[0, 0]), float(basis[1, 1]))
     first, second = (
         AxisOptics(
             image_distance_mm=camera.image_distance_mm,
@@ -163,6 +200,7 @@ def axis_optics(camera: Camera) -> tuple[AxisOptics, AxisOptics]:
             aperture_radius_mm=camera.aperture_radius_mm,
             lens_origin_mm=float(camera.lattice.origin[axis]),
             lens_pitch_mm=float(basis[axis, axis]),
+            lens_width_mm=widths[axis],
             pixel_mm=camera.pixel_mm,
             pixels=int(pixels[axis]),
         )

@@ -18,12 +18,12 @@ from lfpiv_cli.errors import InputError
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import ColumnAxis
 from lfpiv_cli.weights.columns import ColumnOperator, OnDemandOperator
-from lfpiv_cli.weights.operators import Column, FactorisedOperator
+from lfpiv_cli.weights.operators import BrickOperator, Column, FactorisedOperator
 
 if TYPE_CHECKING:
     from lfpiv_cli.calibration.model import Calibration
 
-WeightsOperator = FactorisedOperator | ColumnOperator | OnDemandOperator
+WeightsOperator = FactorisedOperator | BrickOperator | ColumnOperator | OnDemandOperator
 
 
 def behind_transmission(operator: WeightsOperator, transmission: NDArray[np.float32]) -> WeightsOperator:
@@ -32,6 +32,12 @@ def behind_transmission(operator: WeightsOperator, transmission: NDArray[np.floa
         return replace(operator, transmission=transmission)
     if isinstance(operator, ColumnOperator):
         return replace(operator, columns=operator.columns.dimmed(transmission))
+    if isinstance(operator, BrickOperator):
+        return BrickOperator(*(_behind(each, transmission) for each in (operator.even, operator.odd)))
+    return _behind(operator, transmission)
+
+
+def _behind(operator: FactorisedOperator, transmission: NDArray[np.float32]) -> FactorisedOperator:
     cells = np.ix_(operator.rows.cells.pixel, operator.columns.cells.pixel)
     return replace(operator, mask=operator.mask * transmission[cells])
 

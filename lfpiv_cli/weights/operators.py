@@ -119,6 +119,46 @@ class FactorisedOperator:
         return group_terms_by_plane(self.rows, self._lit_rows[0])
 
 
+@dataclass(frozen=True, eq=False)
+class BrickOperator:
+    """The weights of an array whose rows of lenses are moved against each other, every second one alike.
+
+    Attributes
+    ----------
+    even, odd : the weights through the lenses of every second row
+    """
+
+    even: FactorisedOperator
+    odd: FactorisedOperator
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Shape of a volume: (planes, voxels along the rows, voxels along the columns)."""
+        return self.even.shape
+
+    @property
+    def image_shape(self) -> tuple[int, int]:
+        """Shape of an image."""
+        return self.even.image_shape
+
+    def forward(self, volume: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the image (rows, columns) of a volume [plane, row voxel, column voxel]."""
+        return self.even.forward(volume) + self.odd.forward(volume)
+
+    def adjoint(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the volume [plane, row voxel, column voxel] that an image is spread back to."""
+        return self.even.adjoint(image) + self.odd.adjoint(image)
+
+    def column(self, plane: int, row_voxel: int, column_voxel: int) -> Column:
+        """Return the rows, columns (int64) and weights (float32) of the pixels that one voxel lights."""
+        both = [each.column(plane, row_voxel, column_voxel) for each in (self.even, self.odd)]
+        row, column, weight = (np.concatenate(parts) for parts in zip(*both, strict=True))
+        width = self.image_shape[1]
+        pixel, place = np.unique(row * width + column, return_inverse=True)
+        total = np.bincount(place, weight, pixel.size).astype(np.float32)
+        return pixel // width, pixel % width, total
+
+
 def forward_reference(operator: FactorisedOperator, volume: NDArray[np.float32]) -> NDArray[np.float64]:
     """Return the image of a volume as dense matrix products: the readable twin of `FactorisedOperator.forward`."""
     by_cell = np.zeros(operator.mask.shape)
