@@ -194,18 +194,23 @@ def correlate(**arguments: Any) -> dict[str, Any]:
 
 
 @cli.command("track")
-@click.argument("particles_a", type=INPUT)
-@click.argument("particles_b", type=INPUT)
-@click.option("--dt-s", type=click.FloatRange(min=0.0, min_open=True), help="Time between the two frames.")
+@click.argument("particles", type=INPUT, nargs=-1, required=True)
+@click.option("--dt-s", type=click.FloatRange(min=0.0, min_open=True), help="Time from one frame to the next.")
 @click.option("--search", "search_voxel", type=click.FloatRange(min=0.0, min_open=True), help="Largest move, voxels.")
+@click.option("--shortest", type=click.IntRange(min=2), help="Sequence: fewest frames of a track; 3 when not given.")
 @click.option("--grid", is_flag=True, help="Also write vectors on correlate's grid, as OUTPUT's name with _grid.")
 @click.option("-o", "--output", type=INPUT, required=True, help="File of tracks to write (.vtkhdf).")
 @common_options
 def track(**arguments: Any) -> dict[str, Any]:
-    """Follow particles from one frame to the next.
+    """Follow particles from one frame to the next, or over a sequence of frames.
+
+    Two files give a displacement for each particle that is in both. More than two, in the order of time, give tracks:
+    each place with the number of its track and frame and with a velocity by a local polynomial in time; --grid then
+    writes one file for each interval between frames (OUTPUT's name with _grid_0000, ...).
 
     \b
     Example: lfpiv track particles/a.vtkhdf particles/b.vtkhdf -o tracks.vtkhdf --grid
+             lfpiv track particles/frame_*.vtkhdf -o tracks.vtkhdf --grid
     after    lfpiv reconstruct weights.h5 a.tif b.tif --dark dark.tif --solver particles -o particles
     """
     from lfpiv_cli import stages_track

@@ -86,12 +86,11 @@ def _by_volumes(weights: Path, pair: list[Path], output: Path, common: dict[str,
 
 def _by_particles(weights: Path, pair: list[Path], output: Path, common: dict[str, Any]) -> Path:
     """Find the particles of both images and follow them."""
-    first, second = _reconstructed(weights, pair, output / "particles", "particles", common)
     stages_track.track_particles(
-        particles_a=first,
-        particles_b=second,
+        particles=_reconstructed(weights, pair, output / "particles", "particles", common),
         dt_s=None,
         search_voxel=None,
+        shortest=None,
         grid=True,
         output=output / "tracks.vtkhdf",
         **common,

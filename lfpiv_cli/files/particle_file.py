@@ -1,4 +1,4 @@
-"""Particles and tracks as VTKHDF PolyData, which ParaView opens: one vertex for each.
+"""Particles and tracks as VTKHDF PolyData, which ParaView opens: one vertex for each, a line for each long track.
 
 Layout: the arrays lie at the root (`position_mm` (n, 3) and one array of n rows for each quantity, unit in the
 attribute `units`) and are linked under `/VTKHDF`, so that readers of HDF5 and of VTK find the same data. Positions are
@@ -31,6 +31,7 @@ from lfpiv_cli.files.vtk import create_vtk_group, read_attributes, write_attribu
 
 PARTICLES_FORMAT = "lfpiv-particles"
 TRACKS_FORMAT = "lfpiv-tracks"
+TRAJECTORIES_FORMAT = "lfpiv-trajectories"
 FORMAT_VERSION = 1
 
 POSITION = "position_mm"
@@ -50,6 +51,14 @@ UNITS = {
         "displacement_mm": "mm",
         "particle_a": "1",
         "particle_b": "1",
+    },
+    # Rows are ordered by track, then by frame.
+    TRAJECTORIES_FORMAT: {
+        "velocity": "m/s",
+        "velocity_sigma": "m/s",
+        "track": "1",
+        "frame": "1",
+        "particle": "1",
     },
 }
 
@@ -97,7 +106,7 @@ def write_points(
         vtk = create_vtk_group(file, "PolyData")
         vtk["Points"] = write_array(file, POSITION, position_mm, "mm")
         vtk["NumberOfPoints"] = np.array([len(position_mm)], dtype=np.int64)
-        _write_cells(vtk, len(position_mm))
+        _write_cells(vtk, len(position_mm), _lines(arrays["track"]) if "track" in arrays else np.zeros(1, np.int64))
         data = vtk.create_group("PointData")
         for name, unit in units.items():
             data[name] = write_array(file, name, arrays[name], unit)
@@ -136,12 +145,18 @@ def symmetric(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack([matrices[:, i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))], axis=1)
 
 
-def _write_cells(vtk: h5py.Group, count: int) -> None:
-    """Write one vertex for each point, and no other cells."""
+def _lines(track: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return where each track's rows begin, and where the last one's end."""
+    return np.concatenate([[0], np.flatnonzero(np.diff(track)) + 1, [len(track)]]) if len(track) else np.zeros(1, int)
+
+
+def _write_cells(vtk: h5py.Group, count: int, lines: NDArray[np.int64]) -> None:
+    """Write one vertex for each point, lines of consecutive points that begin and end as told, and no other cells."""
+    offsets = {"Vertices": np.arange(count + 1, dtype=np.int64), "Lines": lines.astype(np.int64)}
     for name in ("Vertices", "Lines", "Polygons", "Strips"):
-        cells = count if name == "Vertices" else 0
+        of_cells = offsets.get(name, np.zeros(1, dtype=np.int64))
         group = vtk.create_group(name)
-        group["NumberOfCells"] = np.array([cells], dtype=np.int64)
-        group["NumberOfConnectivityIds"] = np.array([cells], dtype=np.int64)
-        group["Offsets"] = np.arange(cells + 1, dtype=np.int64)
-        group["Connectivity"] = np.arange(cells, dtype=np.int64)
+        group["NumberOfCells"] = np.array([len(of_cells) - 1], dtype=np.int64)
+        group["NumberOfConnectivityIds"] = of_cells[-1:]
+        group["Offsets"] = of_cells
+        group["Connectivity"] = np.arange(of_cells[-1], dtype=np.int64)

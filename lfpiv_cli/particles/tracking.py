@@ -2,7 +2,8 @@
 
 Neighbours move alike: a displacement that takes a particle to one of the next frame takes many of its neighbours to
 others there. The displacement with most votes starts the match; then each particle is sought where a local linear fit
-through its neighbours' displacements expects it, and matches that stray from such a fit are dropped.
+through its neighbours' displacements expects it, and matches that stray from such a fit are dropped. In a sequence,
+what a particle's own past forecasts takes the place of the votes, and joins what its neighbours let expect.
 
 Axes: points (n, 3) in mm. Depth is known worse than the lateral place, so distances in depth count for less.
 """
@@ -45,22 +46,43 @@ class Tracks:
     residual_mm: NDArray[np.float64]
 
 
-def track(points_a: NDArray[np.float64], points_b: NDArray[np.float64], search_mm: float) -> Tracks:
-    """Match two frames' particles, whose displacements are at most `search_mm` along each axis."""
+@dataclass(frozen=True, eq=False)
+class Forecast:
+    """Displacements (n, 3) that particles' own pasts let expect and their standard errors, mm; NaN without a past."""
+
+    displacement_mm: NDArray[np.float64]
+    sigma_mm: NDArray[np.float64]
+
+
+def track(
+    points_a: NDArray[np.float64],
+    points_b: NDArray[np.float64],
+    search_mm: float,
+    forecast: Forecast | None = None,
+) -> Tracks:
+    """Match two frames' particles, whose displacements are at most `search_mm` along each axis unless forecast."""
     empty = np.zeros(0, dtype=np.int64)
+    none = Tracks(empty, empty, np.zeros((0, 3)))
     if len(points_a) < FIT_TRACKS or len(points_b) < FIT_TRACKS:
-        return Tracks(empty, empty, np.zeros((0, 3)))
-    displacement = vote(points_a, points_b, search_mm)
+        return none
+    if forecast is None or np.count_nonzero(np.isfinite(forecast.sigma_mm[:, 0])) < FIT_TRACKS:
+        displacement = vote(points_a, points_b, search_mm)
+    else:
+        displacement = forecast.displacement_mm
     for _ in range(ROUNDS):
-        expected = _expected(points_a, displacement)
-        first, second = _mutual(points_a + expected, points_b, _gate_mm(displacement - expected))
+        if np.count_nonzero(np.isfinite(displacement[:, 0])) < FIT_TRACKS:
+            return none
+        expected = expected_displacement(points_a, displacement, forecast)
+        first, second = mutual(points_a + expected, points_b, gate_mm(displacement - expected))
         displacement = np.full(points_a.shape, np.nan)
         displacement[first] = points_b[second] - points_a[first]
-        residual = displacement - _expected(points_a, displacement)
+        if len(first) < FIT_TRACKS:
+            return none
+        residual = displacement - expected_displacement(points_a, displacement, forecast)
         stray = _strays(residual[first])
         displacement[first[stray]] = np.nan
-        if np.count_nonzero(~stray) < FIT_TRACKS:
-            return Tracks(empty, empty, np.zeros((0, 3)))
+    if np.count_nonzero(~stray) < FIT_TRACKS:
+        return none
     return Tracks(first[~stray], second[~stray], residual[first[~stray]])
 
 
@@ -88,7 +110,21 @@ def vote(points_a: NDArray[np.float64], points_b: NDArray[np.float64], search_mm
     return result
 
 
-def _expected(points: NDArray[np.float64], displacement: NDArray[np.float64]) -> NDArray[np.float64]:
+def expected_displacement(
+    points: NDArray[np.float64], displacement: NDArray[np.float64], forecast: Forecast | None
+) -> NDArray[np.float64]:
+    """Return the displacements (n, 3) that the known ones of the neighbours, and a particle's own past, let expect."""
+    by_neighbours = _by_neighbours(points, displacement)
+    if forecast is None:
+        return by_neighbours
+    off = displacement - by_neighbours
+    spread = _spread(off[np.isfinite(off[:, 0])])
+    weight = spread**2 / (spread**2 + forecast.sigma_mm**2)
+    past = np.isfinite(weight)
+    return np.where(past, by_neighbours + weight * (forecast.displacement_mm - by_neighbours), by_neighbours)
+
+
+def _by_neighbours(points: NDArray[np.float64], displacement: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return at each point the displacement that a robust local linear fit through the known ones gives.
 
     A particle's own displacement takes no part in what is expected of it.
@@ -107,17 +143,17 @@ def _expected(points: NDArray[np.float64], displacement: NDArray[np.float64]) ->
         off = np.linalg.norm((values - middle) / (1.0, 1.0, DEPTH_RATIO), axis=2)
         spread = np.maximum(MAD_TO_SIGMA * np.median(off, axis=1, keepdims=True), SMALLEST_SPREAD_MM)
         weight = np.where(own, 0.0, 1.0 / (1.0 + (off / spread) ** 2) ** 2)
-        matrix = np.einsum("nki,nk,nkj->nij", design, weight, design)
+        weighted = (design * weight[..., np.newaxis]).swapaxes(1, 2)
+        matrix = weighted @ design
         # A share of the trace on the slopes' diagonal: neighbours in a plane do not tell the slope across it.
         ridge = 1e-3 * np.mean(distance**2, axis=1)[:, np.newaxis] * weight.sum(axis=1, keepdims=True)
         matrix[:, [1, 2, 3], [1, 2, 3]] += ridge
-        right = np.einsum("nki,nk,nkc->nic", design, weight, values)
-        fitted = np.linalg.solve(matrix, right)
-        middle = np.einsum("nki,nic->nkc", design, fitted)
+        fitted = np.linalg.solve(matrix, weighted @ values)
+        middle = design @ fitted
     return fitted[:, 0]
 
 
-def _gate_mm(residual: NDArray[np.float64]) -> float:
+def gate_mm(residual: NDArray[np.float64]) -> float:
     """Return how far from its expected place a particle is sought: some robust deviations of the last round's."""
     known = residual[np.isfinite(residual[:, 0])]
     distance = np.linalg.norm(known / (1.0, 1.0, DEPTH_RATIO), axis=1)
@@ -125,7 +161,7 @@ def _gate_mm(residual: NDArray[np.float64]) -> float:
     return min(max(OUTLIER_SIGMAS * spread, 2.0 * SMALLEST_SPREAD_MM), 3.0 * ALIKE_MM)
 
 
-def _mutual(
+def mutual(
     expected: NDArray[np.float64], points: NDArray[np.float64], gate_mm: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the pairs that are nearest to each other, within the gate."""
@@ -138,5 +174,9 @@ def _mutual(
 
 def _strays(residual: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Tell which residuals (n, 3) lie far outside the others', component by component."""
-    spread = np.maximum(MAD_TO_SIGMA * np.median(np.abs(residual), axis=0), SMALLEST_SPREAD_MM)
-    return np.any(np.abs(residual) > OUTLIER_SIGMAS * spread, axis=1)
+    return np.any(np.abs(residual) > OUTLIER_SIGMAS * _spread(residual), axis=1)
+
+
+def _spread(residual: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the robust standard deviation (3,) of residuals (n, 3), no smaller than particles are known."""
+    return np.maximum(MAD_TO_SIGMA * np.median(np.abs(residual), axis=0), SMALLEST_SPREAD_MM)
