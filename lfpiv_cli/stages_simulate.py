@@ -208,7 +208,14 @@ def _tracers(settings: Config, camera: Camera, origin_z_mm: float, dt_s: float) 
         walls = scenes.channel_walls(flow.width_mm, origin_z_mm + flow.centre_mm[2], flow.axis)
         box, inside = box.within(walls), inside.within(walls)
     count = round(scene.particles * box.volume_mm3 / inside.volume_mm3)
-    return scenes.Tracers(count, box, scene.particle_diameter_mm, scene.particle_counts, scene.brightness)
+    return scenes.Tracers(
+        count,
+        box,
+        scene.particle_diameter_mm,
+        scene.particle_counts,
+        scene.brightness,
+        scene.brightness_log_sigma,
+    )
 
 
 def _largest_speed_mm_s(flow: Flow, box: scenes.Box) -> NDArray[np.float64]:

@@ -113,6 +113,12 @@ def test_tracers_fill_the_box_and_the_brightness(small, rng):
     )
 
 
+def test_brightness_can_be_log_normal(rng):
+    brightness = Tracers(4000, Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), brightness_log_sigma=0.5).draw_brightness(rng)
+    assert np.mean(np.log(brightness)) == pytest.approx(0.0, abs=0.03)  # 0.5/sqrt(4000) is 0.008
+    assert np.std(np.log(brightness)) == pytest.approx(0.5, abs=0.02)
+
+
 def test_a_pair_is_decided_by_its_seed(small):
     pairs = [
         simulate_particles(

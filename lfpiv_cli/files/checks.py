@@ -12,7 +12,7 @@ from lfpiv_cli.files.bench import (
     media_of,
     missing_for_camera,
 )
-from lfpiv_cli.files.sections import Sections
+from lfpiv_cli.files.sections import Sections, SimulationSection
 from lfpiv_cli.files.yaml_nodes import KeyPath
 from lfpiv_cli.optics.media import Window, fluid_path_to_focus
 
@@ -117,6 +117,8 @@ def _processing(sections: Sections) -> Found:
         yield ("correlation", "mask"), "is channel, which needs volume.reference: mid_plane"
     if brightness[0] > brightness[1] or brightness[1] == 0.0:
         yield ("simulation", "brightness"), f"is {list(brightness)}, expected a range [smallest, largest]"
+    if sections.simulation.brightness_log_sigma is not None and brightness != SimulationSection().brightness:
+        yield ("simulation", "brightness_log_sigma"), "contradicts brightness, expected one of the two"
 
 
 def _rays(sections: Sections) -> Found:

@@ -279,9 +279,9 @@ class SimulationSection(Section):
 
     Scene: flow (its centre in the volume's coordinates), frames (images of it, correlation.dt_s apart; 2 are a pair),
     particles (their number in the volume), particle_diameter_mm,
-    brightness (range of each particle's light relative to particle_counts), particle_counts (counts of a whole particle
-    of brightness 1), mid_plane_z_mm (where the origin of a mid_plane volume lies behind the focal point; by default
-    where Eq. 21 puts it for the board at board_z_mm).
+    brightness (range of each particle's light relative to particle_counts) or brightness_log_sigma (log-normal instead,
+    of median 1), particle_counts (counts of a whole particle of brightness 1), mid_plane_z_mm (where the origin of a
+    mid_plane volume lies behind the focal point; by default where Eq. 21 puts it for the board at board_z_mm).
     Board: board_z_mm, board_tilt_deg, board_offset_mm, board_rotation_deg.
     Camera as it really is: rotation_deg of the array (from the columns towards the rows), shift_px (columns, rows) and
     distortion_per_mm2.
@@ -295,6 +295,7 @@ class SimulationSection(Section):
     particles: Annotated[int, Field(ge=0, le=MOST_PARTICLES)] = 1000
     particle_diameter_mm: NotNegative = 0.05
     brightness: tuple[NotNegative, NotNegative] = (0.6, 1.4)
+    brightness_log_sigma: NotNegative | None = None
     particle_counts: Positive = 500_000.0
     mid_plane_z_mm: float | None = None
     board_z_mm: float = 0.0

@@ -96,6 +96,7 @@ class Tracers:
     ----------
     light_counts : expected counts of a tracer of brightness 1 that pass the aperture
     brightness : brightness is evenly spread between these two
+    brightness_log_sigma : log-normal instead, of median 1, with this standard deviation of the logarithm
     """
 
     count: int
@@ -103,6 +104,13 @@ class Tracers:
     diameter_mm: float = 0.05
     light_counts: float = 6.0e5
     brightness: tuple[float, float] = (0.6, 1.4)
+    brightness_log_sigma: float | None = None
+
+    def draw_brightness(self, rng: np.random.Generator) -> NDArray[np.float64]:
+        """Return the brightness (count,) of each tracer."""
+        if self.brightness_log_sigma is None:
+            return rng.uniform(*self.brightness, self.count)
+        return rng.lognormal(0.0, self.brightness_log_sigma, self.count)
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,7 +204,7 @@ def simulate_particles(
     `progress` is called with the number of tracers rendered, n for each frame.
     """
     positions = rng.uniform(tracers.box.low_mm, tracers.box.high_mm, (tracers.count, 3))
-    brightness = rng.uniform(*tracers.brightness, tracers.count)
+    brightness = tracers.draw_brightness(rng)
     images = []
     for number in range(frames):
         expected = render_points(
