@@ -18,7 +18,7 @@ from typing import Any, NoReturn
 import click
 
 from lfpiv_cli import __version__
-from lfpiv_cli.errors import LfpivError
+from lfpiv_cli.errors import LfpivError, LimitMissedError
 
 EXIT_BUG = 1
 EXIT_INTERRUPTED = 130
@@ -49,11 +49,17 @@ def common_options(command: Callable[..., dict[str, Any]]) -> Callable[..., None
             from lfpiv_cli.stages import use_threads
 
             use_threads(threads)
-        summary = command(console=console, **arguments)
+        missed: LimitMissedError | None = None
+        try:
+            summary = command(console=console, **arguments)
+        except LimitMissedError as error:
+            missed, summary = error, error.figures
         if as_json:
             click.echo(json.dumps(summary, allow_nan=False, sort_keys=True))
         else:
             console.summary(summary)
+        if missed:
+            raise missed
 
     return run
 

@@ -4,6 +4,8 @@ Every failure that a user can cause or meet is one of these; its message is a si
 was found and what was expected. Anything else that escapes is a bug (exit code 1).
 """
 
+from typing import Any
+
 
 class LfpivError(Exception):
     """Base of all expected failures; `exit_code` is what the command returns to the shell."""
@@ -48,6 +50,10 @@ class OutputError(LfpivError):
 
 
 class LimitMissedError(LfpivError):
-    """A validation ran to its end and a figure missed its limit."""
+    """A validation ran to its end and a figure missed its limit; `figures` are what it would have returned."""
 
     exit_code = 8
+
+    def __init__(self, message: str, figures: dict[str, Any]) -> None:
+        super().__init__(message)
+        self.figures = figures

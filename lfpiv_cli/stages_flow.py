@@ -66,8 +66,7 @@ def validate_flow(
     if len(methods) > 1:
         summary["lower_error"] = report["lower_error"]
     if missed:
-        console.summary(summary)
-        raise LimitMissedError(f"{paths['flow.json']}: {'; '.join(missed)}")
+        raise LimitMissedError(f"{paths['flow.json']}: {'; '.join(missed)}", summary)
     return summary
 
 

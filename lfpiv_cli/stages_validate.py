@@ -27,9 +27,8 @@ def validate_all(config: Path, output: Path, overwrite: bool, console: Console) 
             found = stage(config=config, output=output, overwrite=overwrite, console=console)
         except LimitMissedError as error:
             missed.append(str(error))
-            continue
+            found = error.figures
         summary |= {f"{name}.{figure}": value for figure, value in found.items()}
     if missed:
-        console.summary(summary)
-        raise LimitMissedError("; ".join(missed))
+        raise LimitMissedError("; ".join(missed), summary)
     return summary

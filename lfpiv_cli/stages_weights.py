@@ -69,8 +69,7 @@ def validate_weights(config: Path, output: Path, overwrite: bool, console: Conso
         for figure in ("ssim_smallest", "rmse_grey_largest", "l1_mean", "l1_largest")
     }
     if missed:
-        console.summary(summary)
-        raise LimitMissedError(f"{paths['.json']}: {'; '.join(missed)}")
+        raise LimitMissedError(f"{paths['.json']}: {'; '.join(missed)}", summary)
     return {"voxels": len(columns)} | summary
 
 

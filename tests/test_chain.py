@@ -167,11 +167,12 @@ def test_one_bad_frame_leaves_the_others(chain, tmp_path):
     assert not (tmp_path / "go" / "bad.vtkhdf").exists()
 
 
-def test_missed_limit_is_told_after_the_report_is_written(chain, tmp_path):
+def test_missed_limit_is_told_after_report_and_figures(chain, tmp_path, capsys):
     strict = tmp_path / "strict.yaml"
     strict.write_text(CONFIG.read_text() + "  limits: {streamwise_mean_error: 0.0}\n")
     with pytest.raises(LimitMissedError, match="streamwise_mean_error"):
-        run("validate", "flow", strict, "--vectors", chain / "vectors.vtkhdf", "-o", tmp_path / "report")
+        run("validate", "flow", strict, "--vectors", chain / "vectors.vtkhdf", "-o", tmp_path / "report", "--json")
+    assert json.loads(capsys.readouterr().out)["streamwise_mean_error"] != 0.0
     assert (tmp_path / "report" / "flow.json").exists()
 
 

@@ -16,15 +16,16 @@ def test_a_missed_limit_keeps_no_other_report_from_being_made(monkeypatch, tmp_p
         def run(config, output, overwrite, console, **others):
             made.append((name, config, output, overwrite, others))
             if fails:
-                raise LimitMissedError(f"{name} is bad")
+                raise LimitMissedError(f"{name} is bad", {"error": 0.9})
             return {"error": 0.1}
 
         return run
 
     for name, fails in (("weights", True), ("board", False), ("flow", True)):
         monkeypatch.setattr(stages_validate, f"validate_{name}", stage(name, fails))
-    with pytest.raises(LimitMissedError, match="weights is bad; flow is bad"):
+    with pytest.raises(LimitMissedError, match="weights is bad; flow is bad") as missed:
         stages_validate.validate_all(tmp_path / "c.yaml", tmp_path, False, Console(quiet=True))
+    assert missed.value.figures == {"weights.error": 0.9, "board.error": 0.1, "flow.error": 0.9}
     assert [name for name, *_ in made] == ["weights", "board", "flow"]
     assert made[2][4] == {"vectors": None, "particles": None}
     monkeypatch.setattr(stages_validate, "validate_weights", stage("weights", False))
