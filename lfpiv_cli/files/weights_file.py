@@ -32,7 +32,8 @@ from lfpiv_cli.optics.media import Media, Window
 from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.weights.aperture import aperture_mask
-from lfpiv_cli.weights.axis import AxisOptics, AxisWeights, micro_image_cells
+from lfpiv_cli.weights.axis import AxisWeights
+from lfpiv_cli.weights.axis_cells import AxisOptics, micro_image_cells
 from lfpiv_cli.weights.build import axis_optics
 from lfpiv_cli.weights.columns import ColumnOperator, OnDemandOperator
 from lfpiv_cli.weights.model import Weights, WeightsOperator, behind_transmission

@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from lfpiv_cli.weights.axis import Cells
+from lfpiv_cli.weights.axis_cells import Cells
 
 DISC_SHARE_OF_SQUARE = np.pi / 4.0
 

@@ -21,7 +21,8 @@ from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.optics.polynomial_rays import PolynomialRays
 from lfpiv_cli.optics.tracing import disc_points
 from lfpiv_cli.weights.aperture import aperture_mask
-from lfpiv_cli.weights.axis import AxisOptics, Bending, FittedBending, axis_weights, depth_nodes
+from lfpiv_cli.weights.axis import Bending, FittedBending, axis_weights, depth_nodes
+from lfpiv_cli.weights.axis_cells import AxisOptics
 from lfpiv_cli.weights.operators import BrickOperator, FactorisedOperator
 from lfpiv_cli.weights.scene import Source
 
