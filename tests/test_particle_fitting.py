@@ -15,6 +15,7 @@ from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.particles.covariance import joint_covariance
 from lfpiv_cli.particles.fitting import accept, add_all, claimed_share, judge, refine
+from lfpiv_cli.particles.least_squares import normal_equations, respond_once
 from lfpiv_cli.particles.noise import WHITE, Correlation, Noise, error_correlation
 from lfpiv_cli.particles.splitting import split
 from lfpiv_cli.particles.tiles import footprint_px, share_out
@@ -59,6 +60,21 @@ def test_spread_is_the_least_possible(view: View, rng: np.random.Generator) -> N
     # A hundredth of a voxel sideways, a tenth in depth: what makes particles worth fitting.
     assert sigma[0] < 1e-3
     assert sigma[2] < 1e-2
+
+
+@pytest.mark.parametrize("depth", [-0.1, 0.2, 2.0])
+def test_a_pixel_between_micro_images_counts_once(view: View, rng: np.random.Generator, depth: float) -> None:
+    # On the corner of four lenses, where near the focal plane many pixels are lit through two of them.
+    particle = np.array([[-0.063 / 0.9995, 0.07, depth, 5e5]])
+    residual = rng.normal(0.0, 50.0, view.rows * view.columns)
+    weight = rng.uniform(0.5, 1.5, residual.size)
+    capacity = entry_capacity(view, *DEPTHS)
+    pixels, values = np.empty(capacity, np.int32), np.empty((capacity, 4))
+    count = respond_once(view, *particle[0, :3], pixels, values)
+    assert np.unique(pixels[:count]).size == count
+    change = normal_equations(pixels, values, count, 5e5, residual, weight, np.empty((4, 4)), np.empty(4))
+    direct = np.sum(weight * ((residual - image_of(view, particle)) ** 2 - residual**2))
+    assert change == pytest.approx(direct, rel=1e-9)
 
 
 def test_neighbours_are_found_without_noise(view: View, rng: np.random.Generator) -> None:

@@ -20,7 +20,7 @@ from numba import njit, prange
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from lfpiv_cli.particles.fitting import UNKNOWNS
+from lfpiv_cli.particles.least_squares import UNKNOWNS
 from lfpiv_cli.particles.noise import Correlation
 from lfpiv_cli.particles.response import VALUES, respond
 from lfpiv_cli.particles.view import View, footprint_radius_mm, on_array_mm

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import lsqr
 
-from lfpiv_cli.particles.fitting import UNKNOWNS, add_all, refine
+from lfpiv_cli.particles.fitting import add_all, refine
+from lfpiv_cli.particles.least_squares import UNKNOWNS
 from lfpiv_cli.particles.noise import Noise
 from lfpiv_cli.particles.response import VALUES, respond
 from lfpiv_cli.particles.rim import rim_table

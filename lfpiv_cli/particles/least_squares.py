@@ -1,0 +1,346 @@
+"""Levenberg-Marquardt for one particle, or two together, in x, y, z and light.
+
+With r the residual without the particles, w the weights and f a response, chi-squared differs from that without a
+particle of light I by
+
+    sum w (I^2 f^2 - 2 I f r),
+
+a sum over the pixels that it lights wherever it moves.
+
+Axes: image axes, mm; light in counts; residual and weights as flat images. A particle is a row (x, y, z, light).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from lfpiv_cli.particles.response import VALUES, respond
+from lfpiv_cli.particles.tiles import LARGEST_MOVE_MM
+from lfpiv_cli.particles.view import View
+
+UNKNOWNS = 4
+# Damping relative to the diagonal: its start, and the factors after a step that failed or helped.
+DAMPING = 1e-3
+DAMPING_UP = 10.0
+DAMPING_DOWN = 0.2
+# A step that lowers chi-squared by less ends the fit: a hundredth of what one standard error costs.
+SMALLEST_GAIN = 0.01
+# Longest step in depth, mm: further away the response is another one and its slope says nothing.
+LONGEST_DEPTH_STEP_MM = 0.5
+# A fit that may be given up early is judged after so many steps.
+EARLY_STEPS = 4
+
+
+@njit(cache=True)
+def respond_once(
+    view: View, x: float, y: float, z: float, pixels: NDArray[np.int32], values: NDArray[np.float64]
+) -> int:
+    """Write the response of a particle of unit light with each pixel named once; return the number of pixels.
+
+    `respond` names a pixel between two micro-images twice where it is lit through both. Its light is squared in
+    chi-squared, so that its two parts must be added first: near the focal plane depths would be wrong by half a
+    millimetre otherwise.
+    """
+    entries = respond(view, x, y, z, pixels, values)
+    if entries == 0:
+        return 0
+    top, bottom, left, right = view.rows, 0, view.columns, 0
+    for k in range(entries):
+        row, column = _row_and_column(pixels[k], view.columns)
+        top, bottom, left, right = min(top, row), max(bottom, row), min(left, column), max(right, column)
+    place = np.zeros((bottom - top + 1, right - left + 1), np.int32)
+    count = 0
+    for k in range(entries):
+        row, column = _row_and_column(pixels[k], view.columns)
+        at = place[row - top, column - left]
+        if at > 0:
+            for m in range(VALUES):
+                values[at - 1, m] += values[k, m]
+            continue
+        if count < k:
+            pixels[count] = pixels[k]
+            for m in range(VALUES):
+                values[count, m] = values[k, m]
+        count += 1
+        place[row - top, column - left] = count
+    return count
+
+
+@njit(cache=True)
+def _row_and_column(pixel: int, columns: int) -> tuple[int, int]:
+    """Return where a flat pixel lies, without a division of integers, which is slow."""
+    row = int((pixel + 0.5) / columns)
+    return row, pixel - row * columns
+
+
+@njit(cache=True)
+def normal_equations(
+    pixels: NDArray[np.int32],
+    values: NDArray[np.float64],
+    count: int,
+    light: float,
+    residual: NDArray[np.float64],
+    weight: NDArray[np.float64],
+    matrix: NDArray[np.float64],
+    right: NDArray[np.float64],
+) -> float:
+    """Fill J^T W J (4, 4) and J^T W (r - I f); return what the particle adds to chi-squared."""
+    matrix[:] = 0.0
+    right[:] = 0.0
+    change = 0.0
+    for k in range(count):
+        at = pixels[k]
+        w = weight[at]
+        f, r = light * values[k, 0], residual[at]
+        change += w * f * (f - 2.0 * r)
+        a, b, c, d = light * values[k, 1], light * values[k, 2], light * values[k, 3], values[k, 0]
+        left = w * (r - f)
+        right[0] += a * left
+        right[1] += b * left
+        right[2] += c * left
+        right[3] += d * left
+        matrix[0, 0] += w * a * a
+        matrix[0, 1] += w * a * b
+        matrix[0, 2] += w * a * c
+        matrix[0, 3] += w * a * d
+        matrix[1, 1] += w * b * b
+        matrix[1, 2] += w * b * c
+        matrix[1, 3] += w * b * d
+        matrix[2, 2] += w * c * c
+        matrix[2, 3] += w * c * d
+        matrix[3, 3] += w * d * d
+    for row in range(1, UNKNOWNS):
+        for column in range(row):
+            matrix[row, column] = matrix[column, row]
+    return change
+
+
+@njit(cache=True)
+def _pair_equations(
+    view: View,
+    pair: NDArray[np.float64],
+    residual: NDArray[np.float64],
+    weight: NDArray[np.float64],
+    counts: NDArray[np.int64],
+    pixels: NDArray[np.int32],
+    values: NDArray[np.float64],
+    place: NDArray[np.int32],
+    matrix: NDArray[np.float64],
+    right: NDArray[np.float64],
+) -> float:
+    """Fill the normal equations (8, 8) of two particles (2, 4); return what they add to chi-squared together.
+
+    `place` (side, side) is zero and serves to find common pixels; it is zero again on return.
+    """
+    side = place.shape[0]
+    first, second = slice(0, UNKNOWNS), slice(UNKNOWNS, 2 * UNKNOWNS)
+    block = np.empty((UNKNOWNS, UNKNOWNS))
+    change = normal_equations(pixels[0], values[0], counts[0], pair[0, 3], residual, weight, block, right[first])
+    matrix[first, first] = block
+    add_light(pixels[0], values[0], counts[0], -pair[0, 3], residual)
+    change += normal_equations(pixels[1], values[1], counts[1], pair[1, 3], residual, weight, block, right[second])
+    matrix[second, second] = block
+    add_light(pixels[0], values[0], counts[0], pair[0, 3], residual)
+    # What the first explains is off the second's side already; the first's side still lacks the second's light.
+    top, left = view.rows, view.columns
+    for k in range(counts[0]):
+        row, column = _row_and_column(pixels[0, k], view.columns)
+        top, left = min(top, row), min(left, column)
+    for k in range(counts[0]):
+        row, column = _row_and_column(pixels[0, k], view.columns)
+        place[row - top, column - left] = k + 1
+    cross = np.zeros((UNKNOWNS, UNKNOWNS))
+    one, two = np.empty(UNKNOWNS), np.empty(UNKNOWNS)
+    for k in range(counts[1]):
+        row, column = _row_and_column(pixels[1, k], view.columns)
+        row, column = row - top, column - left
+        if not (0 <= row < side and 0 <= column < side) or place[row, column] == 0:
+            continue
+        at = place[row, column] - 1
+        w = weight[pixels[1, k]]
+        for i in range(3):
+            one[i] = pair[0, 3] * values[0, at, i + 1]
+            two[i] = pair[1, 3] * values[1, k, i + 1]
+        one[3], two[3] = values[0, at, 0], values[1, k, 0]
+        for i in range(UNKNOWNS):
+            right[i] -= w * one[i] * pair[1, 3] * values[1, k, 0]
+            for j in range(UNKNOWNS):
+                cross[i, j] += w * one[i] * two[j]
+    matrix[first, second] = cross
+    matrix[second, first] = cross.T
+    for k in range(counts[0]):
+        row, column = _row_and_column(pixels[0, k], view.columns)
+        place[row - top, column - left] = 0
+    return change
+
+
+@njit(cache=True)
+def solve_damped(
+    matrix: NDArray[np.float64], right: NDArray[np.float64], damping: float, step: NDArray[np.float64]
+) -> bool:
+    """Solve (A + damping diag A) step = b by Cholesky's method; return False where A is not positive definite."""
+    n = right.size
+    lower = np.empty((n, n))
+    for i in range(n):
+        for j in range(i + 1):
+            total = matrix[i, j]
+            if i == j:
+                total *= 1.0 + damping
+            for k in range(j):
+                total -= lower[i, k] * lower[j, k]
+            if i == j:
+                if not total > 0.0:
+                    return False
+                lower[i, i] = np.sqrt(total)
+            else:
+                lower[i, j] = total / lower[j, j]
+    for i in range(n):
+        total = right[i]
+        for k in range(i):
+            total -= lower[i, k] * step[k]
+        step[i] = total / lower[i, i]
+    for i in range(n - 1, -1, -1):
+        total = step[i]
+        for k in range(i + 1, n):
+            total -= lower[k, i] * step[k]
+        step[i] = total / lower[i, i]
+    return True
+
+
+@njit(cache=True)
+def fit(
+    view: View,
+    members: NDArray[np.float64],
+    residual: NDArray[np.float64],
+    weight: NDArray[np.float64],
+    z_low: float,
+    z_high: float,
+    steps: int,
+    promising: float,
+    counts: NDArray[np.int64],
+    pixels: NDArray[np.int32],
+    values: NDArray[np.float64],
+    place: NDArray[np.int32],
+) -> float:
+    """Improve one particle or two (k, 4) in place; return what they add to chi-squared (below 0 where they help).
+
+    The residual must contain none of them. Particles without pixels (off the sensor) are left as they are.
+
+    Parameters
+    ----------
+    promising : given up early where this is not undercut after a few steps
+    counts, pixels, values : (k,), (k, capacity), (k, capacity, 4) their responses, on entry as on return
+    place : (side, side) zeros, as wide as a footprint, where there are two
+    """
+    n = UNKNOWNS * members.shape[0]
+    matrix, trial_matrix = np.empty((n, n)), np.empty((n, n))
+    right, trial_right = np.empty(n), np.empty(n)
+    step, trial, begin = np.zeros(n), np.empty_like(members), members.copy()
+    change = _equations(view, members, residual, weight, counts, pixels, values, place, matrix, right)
+    damping, last_failed = DAMPING, False
+    for number in range(steps):
+        if number == EARLY_STEPS and change > promising:
+            break
+        if not solve_damped(matrix, right, damping, step):
+            break
+        predicted = 0.0
+        for i in range(n):
+            predicted += step[i] * right[i]
+        if predicted < SMALLEST_GAIN:
+            break
+        _move(members, begin, step, z_low, z_high, trial)
+        respond_all(view, trial, counts, pixels, values)
+        trial_change = _equations(
+            view, trial, residual, weight, counts, pixels, values, place, trial_matrix, trial_right
+        )
+        last_failed = not trial_change < change
+        if last_failed:
+            damping *= DAMPING_UP
+            continue
+        gain = change - trial_change
+        members[:], matrix[:], right[:], change = trial, trial_matrix, trial_right, trial_change
+        damping *= DAMPING_DOWN
+        if gain < SMALLEST_GAIN:
+            break
+    if last_failed:
+        respond_all(view, members, counts, pixels, values)
+    return change
+
+
+@njit(cache=True)
+def _equations(
+    view: View,
+    members: NDArray[np.float64],
+    residual: NDArray[np.float64],
+    weight: NDArray[np.float64],
+    counts: NDArray[np.int64],
+    pixels: NDArray[np.int32],
+    values: NDArray[np.float64],
+    place: NDArray[np.int32],
+    matrix: NDArray[np.float64],
+    right: NDArray[np.float64],
+) -> float:
+    if members.shape[0] == 1:
+        return normal_equations(pixels[0], values[0], counts[0], members[0, 3], residual, weight, matrix, right)
+    return _pair_equations(view, members, residual, weight, counts, pixels, values, place, matrix, right)
+
+
+@njit(cache=True)
+def _move(
+    members: NDArray[np.float64],
+    begin: NDArray[np.float64],
+    step: NDArray[np.float64],
+    z_low: float,
+    z_high: float,
+    trial: NDArray[np.float64],
+) -> None:
+    """Fill `trial` (k, 4) with particles moved by a step, within what a sweep and a linear model allow."""
+    for m in range(members.shape[0]):
+        for i in range(UNKNOWNS):
+            trial[m, i] = members[m, i] + step[m * UNKNOWNS + i]
+        for i in range(2):
+            trial[m, i] = min(max(trial[m, i], begin[m, i] - LARGEST_MOVE_MM), begin[m, i] + LARGEST_MOVE_MM)
+        low, high = members[m, 2] - LONGEST_DEPTH_STEP_MM, members[m, 2] + LONGEST_DEPTH_STEP_MM
+        trial[m, 2] = min(max(trial[m, 2], low, z_low), high, z_high)
+        trial[m, 3] = max(trial[m, 3], 0.0)
+
+
+@njit(cache=True)
+def respond_all(
+    view: View,
+    members: NDArray[np.float64],
+    counts: NDArray[np.int64],
+    pixels: NDArray[np.int32],
+    values: NDArray[np.float64],
+) -> None:
+    """Write the responses of particles (k, 4): their numbers of pixels (k,), these (k, capacity) and their values."""
+    for m in range(members.shape[0]):
+        counts[m] = respond_once(view, members[m, 0], members[m, 1], members[m, 2], pixels[m], values[m])
+
+
+@njit(cache=True)
+def best_light(
+    pixels: NDArray[np.int32],
+    values: NDArray[np.float64],
+    count: int,
+    residual: NDArray[np.float64],
+    weight: NDArray[np.float64],
+) -> float:
+    """Return the light, at least 0, that a particle at this place gets by weighted least squares."""
+    top = bottom = 0.0
+    for k in range(count):
+        w = weight[pixels[k]]
+        top += w * values[k, 0] * residual[pixels[k]]
+        bottom += w * values[k, 0] ** 2
+    return max(top / bottom, 0.0) if bottom > 0.0 else 0.0
+
+
+@njit(cache=True)
+def add_light(
+    pixels: NDArray[np.int32], values: NDArray[np.float64], count: int, light: float, image: NDArray[np.float64]
+) -> None:
+    """Add light times the response to an image."""
+    for k in range(count):
+        image[pixels[k]] += light * values[k, 0]
