@@ -15,6 +15,7 @@ from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.particles.covariance import joint_covariance
 from lfpiv_cli.particles.fitting import accept, add_all, claimed_share, judge, refine
+from lfpiv_cli.particles.jumping import jump
 from lfpiv_cli.particles.least_squares import normal_equations, respond_once
 from lfpiv_cli.particles.noise import WHITE, Correlation, Noise, error_correlation
 from lfpiv_cli.particles.splitting import split
@@ -198,6 +199,20 @@ def test_a_single_particle_is_not_split(view: View) -> None:
     twins = split(view, one, np.array([True]), *common, *limits)
     assert not twins.any()
     np.testing.assert_allclose(residual, 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("wrong", [-0.5, -1.5])
+def test_a_particle_jumps_to_its_depth(view: View, wrong: float) -> None:
+    true = np.array([[0.21, 0.13, 0.5, 5e5], [-0.9, 0.6, 1.5, 5e5]])
+    image = image_of(view, true)
+    found = true.copy()
+    found[0, 2] = wrong
+    residual = image - image_of(view, found)
+    common = (share_out(view, found, *DEPTHS), residual, 1.0 / (image + 36.0), *DEPTHS, 1e5, 10.0)
+    moved = jump(view, found, np.array([True, True]), *common, entry_capacity(view, *DEPTHS))
+    assert moved.tolist() == [True, False]
+    np.testing.assert_allclose(found[:, :3], true[:, :3], atol=2e-3)
+    np.testing.assert_allclose(residual, image - image_of(view, found), atol=1e-6)
 
 
 def test_result_does_not_depend_on_threads(view: View, rng: np.random.Generator) -> None:

@@ -2,7 +2,7 @@
 
 Each round explains what is left of the image by a volume, takes its peaks as candidates, fits and accepts those whose
 light is there, tells merged ones apart and refines all. Early rounds accept only what is plainly there and let
-unexplained light count for little; later ones ask for less.
+unexplained light count for little; later ones ask for less, doubt every particle that fits badly, and try other depths.
 
 Axes: inside, particles are rows (x, y, z, light) in image axes, mm and counts, and images flat; results are in world
 axes of the raw sensor, z from the nominal focal point.
@@ -21,10 +21,11 @@ from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.particles.candidates import explain_rest, find_peaks, points_in_raw_frame
 from lfpiv_cli.particles.covariance import joint_covariance
 from lfpiv_cli.particles.fitting import accept, add_all, judge, refine
+from lfpiv_cli.particles.jumping import jump
 from lfpiv_cli.particles.noise import Noise, error_correlation, estimate_noise
 from lfpiv_cli.particles.splitting import split
 from lfpiv_cli.particles.tiles import footprint_px, share_out
-from lfpiv_cli.particles.view import View, entry_capacity
+from lfpiv_cli.particles.view import View, entry_capacity, footprint_radius_mm
 from lfpiv_cli.reconstruction.equations import Normalisers
 from lfpiv_cli.weights.model import Weights
 
@@ -38,20 +39,23 @@ class Round:
     iterations : of expectation maximisation
     claimed_share : least share of its claimed light that a candidate must find
     unexplained : weight of light above the model in a pixel's variance
+    thorough : whether particles of usual brightness are doubted, too, and other depths tried
     """
 
     iterations: int
     claimed_share: float
     unexplained: float
+    thorough: bool
 
 
+# As long as half the light is unexplained most particles fit badly, and doubting them all is in vain.
 ROUNDS = (
-    Round(20, 0.9, 0.3),
-    Round(12, 0.85, 0.2),
-    Round(12, 0.8, 0.1),
-    Round(12, 0.75, 0.07),
-    Round(12, 0.7, 0.05),
-    Round(12, 0.6, 0.05),
+    Round(20, 0.9, 0.3, thorough=False),
+    Round(12, 0.85, 0.2, thorough=False),
+    Round(12, 0.8, 0.1, thorough=True),
+    Round(12, 0.75, 0.07, thorough=True),
+    Round(12, 0.7, 0.05, thorough=True),
+    Round(12, 0.6, 0.05, thorough=True),
 )
 # Sweeps of refinement after candidates, after splitting, and at the end (with less weight on unexplained light).
 SWEEPS, SWEEPS_AFTER_SPLIT, LAST_SWEEPS = 4, 2, 4
@@ -59,18 +63,21 @@ LAST_UNEXPLAINED = 0.02
 # Before any particle is known, its light is taken from the peaks: one in ten is brighter than a typical particle.
 FIRST_TYPICAL_PERCENTILE = 90.0
 # Shares of a typical particle's light: the least of a peak to be tried, of a particle to stay.
-CANDIDATE_LIGHT, SMALLEST_LIGHT = 0.15, 0.3
+CANDIDATE_LIGHT, SMALLEST_LIGHT = 0.1, 0.3
 # A particle stays while it finds this much less of its light than a candidate had to, and this much meets the sensor.
-PRUNING_SLACK, SMALLEST_SEEN = 0.15, 0.2
+PRUNING_SLACK, SMALLEST_SEEN = 0.3, 0.1
 # Two particles this close, laterally and in depth, are one.
 MERGE_MM = np.array([0.04, 0.04, 0.25])
 # Particles this far in front of and behind the volume are kept: they light it.
 DEPTH_MARGIN_MM = 0.3
-# Suspected to be two: brighter than typical by this factor and fitting worse by this one than a good particle, which is
-# the one at this percentile; and what chi-squared must fall by, in units of a good particle's.
-SUSPECT_LIGHT, SUSPECT_CHI2, GOOD_PERCENTILE, SPLIT_GAIN = 1.2, 1.0, 20.0, 40.0
-# A particle that could not be split is not tried again until it has changed by this much: mm laterally, mm in depth,
-# and by these shares in light and in chi-squared.
+# A good particle's chi-squared is the one at this percentile; particles that fit worse by this factor are doubted.
+GOOD_PERCENTILE, SUSPECT_CHI2 = 20.0, 1.5
+# Suspected to be two: brighter than typical by this factor, or, in thorough rounds, bright enough for two.
+BRIGHT, ENOUGH_FOR_TWO = 1.2, 2.0 * SMALLEST_LIGHT
+# What chi-squared must fall by, in units of a good particle's, where one becomes two, and where it jumps in depth.
+SPLIT_GAIN, JUMP_GAIN = 40.0, 10.0
+# A particle that could not be split or moved is not tried again until it has changed by this much: mm laterally, mm in
+# depth, and by these shares in light and in chi-squared.
 CHANGED = np.array([0.005, 0.005, 0.05, 0.05, 0.2])
 
 
@@ -136,7 +143,7 @@ class State:
     residual : (rows * columns,) what they leave of the image
     typical_light : of a particle
     noise : of the image
-    unsplit : (m, 5) those that could not be split, as `_signature` gives them
+    unsplit, unmoved : (m, 5) those that could not be split, and not be moved in depth, as `_signature` gives them
     """
 
     particles: NDArray[np.float64]
@@ -144,6 +151,7 @@ class State:
     typical_light: float
     noise: Noise
     unsplit: NDArray[np.float64]
+    unmoved: NDArray[np.float64]
 
 
 def find_particles(
@@ -167,7 +175,8 @@ def find_particles(
     excluded : (rows, columns) raw pixels that are not believed; `sums` must leave out what they touch; default: none
     """
     task = _task(image, view, weights, camera, sums, excluded)
-    state = State(np.zeros((0, 4)), task.image.copy(), 0.0, estimate_noise(task.image, 0.0), np.zeros((0, 5)))
+    none = np.zeros((0, 5))
+    state = State(np.zeros((0, 4)), task.image.copy(), 0.0, estimate_noise(task.image, 0.0), none, none)
     for settings in rounds:
         state = _one_round(task, state, settings, progress)
         if progress:
@@ -207,7 +216,10 @@ def _one_round(task: Task, state: State, settings: Round, progress: Callable[[in
     state = replace(state, typical_light=typical, noise=estimate_noise(task.image, typical))
     state = _accept(task, state, candidates, settings)
     _sweep(task, state, settings.unexplained, SWEEPS)
-    state = _split(task, _with_typical_light(task, state), settings.unexplained)
+    state = _with_typical_light(task, state)
+    if settings.thorough:
+        state = _jump(task, state, settings.unexplained)
+    state = _split(task, state, settings)
     _sweep(task, state, settings.unexplained, SWEEPS_AFTER_SPLIT)
     state = _prune(task, _merge(task, state), settings)
     return _with_typical_light(task, state)
@@ -253,14 +265,38 @@ def _accept(task: Task, state: State, candidates: NDArray[np.float64], settings:
     return replace(state, particles=np.concatenate([state.particles, candidates[accepted]]))
 
 
-def _split(task: Task, state: State, unexplained: float) -> State:
-    """Return the state with particles that are plainly two told apart."""
+def _jump(task: Task, state: State, unexplained: float) -> State:
+    """Return the state with particles at other depths that explain the light better, the residual in place."""
     weight = _weight(task, state, unexplained)
     chi2, *_ = judge(task.view, state.particles, state.residual, weight, task.capacity)
-    good = max(float(np.percentile(chi2, GOOD_PERCENTILE)), 1.0) if chi2.size else 1.0
-    suspects = (state.particles[:, 3] > SUSPECT_LIGHT * state.typical_light) & (chi2 > SUSPECT_CHI2 * good)
+    good = _good(chi2)
+    # Light that stays within about one lens fits well at many depths.
+    near_focus = footprint_radius_mm(task.view, state.particles[:, 2]) < 2.0 * task.view.half_x_mm
     signature = _signature(state.particles, chi2)
-    suspects &= ~_tried(state, signature)
+    suspects = (near_focus | (chi2 > SUSPECT_CHI2 * good)) & ~_among(state.unmoved, signature)
+    moved = jump(
+        task.view,
+        state.particles,
+        suspects,
+        share_out(task.view, state.particles, *task.depths_mm),
+        state.residual,
+        weight,
+        *task.depths_mm,
+        SMALLEST_LIGHT * state.typical_light,
+        JUMP_GAIN * good,
+        task.capacity,
+    )
+    return replace(state, unmoved=np.concatenate([state.unmoved, signature[suspects & ~moved]]))
+
+
+def _split(task: Task, state: State, settings: Round) -> State:
+    """Return the state with particles that are plainly two told apart."""
+    weight = _weight(task, state, settings.unexplained)
+    chi2, *_ = judge(task.view, state.particles, state.residual, weight, task.capacity)
+    good = _good(chi2)
+    bright = state.particles[:, 3] > (ENOUGH_FOR_TWO if settings.thorough else BRIGHT) * state.typical_light
+    signature = _signature(state.particles, chi2)
+    suspects = bright & (chi2 > SUSPECT_CHI2 * good) & ~_among(state.unsplit, signature)
     twins = split(
         task.view,
         state.particles,
@@ -282,6 +318,11 @@ def _split(task: Task, state: State, unexplained: float) -> State:
     )
 
 
+def _good(chi2: NDArray[np.float64]) -> float:
+    """Return chi-squared of a particle that fits well."""
+    return max(float(np.percentile(chi2, GOOD_PERCENTILE)), 1.0) if chi2.size else 1.0
+
+
 def _signature(particles: NDArray[np.float64], chi2: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return (n, 5) numbers that differ by 1 where a particle has changed enough to be looked at again."""
     tiny = np.finfo(np.float64).tiny
@@ -291,11 +332,11 @@ def _signature(particles: NDArray[np.float64], chi2: NDArray[np.float64]) -> NDA
     )
 
 
-def _tried(state: State, signature: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Tell which particles could not be split before and have hardly changed since."""
-    if not len(state.unsplit):
+def _among(tried: NDArray[np.float64], signature: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Tell which particles were tried before and have hardly changed since."""
+    if not len(tried):
         return np.zeros(len(signature), dtype=bool)
-    distance, _ = KDTree(state.unsplit).query(signature, p=np.inf, distance_upper_bound=1.0)
+    distance, _ = KDTree(tried).query(signature, p=np.inf, distance_upper_bound=1.0)
     return np.isfinite(distance)
 
 
