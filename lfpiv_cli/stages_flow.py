@@ -19,7 +19,7 @@ from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.particles import read_particles
 from lfpiv_cli.files.pictures import ensure_drawing, write_picture
 from lfpiv_cli.files.provenance import record
-from lfpiv_cli.files.sections import FlowSection
+from lfpiv_cli.files.sections_simulated import FlowSection
 from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.stages_chain import run_chain
 from lfpiv_cli.validation.channel import Duct

@@ -12,12 +12,12 @@ from lfpiv_cli.files.sections import (
     CameraSection,
     ChannelSection,
     CorrelationSection,
-    FlowSection,
     MainLens,
     MediaSection,
     Microlenses,
     VolumeSection,
 )
+from lfpiv_cli.files.sections_simulated import FlowSection
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media

@@ -12,7 +12,8 @@ from lfpiv_cli.files.bench import (
     media_of,
     missing_for_camera,
 )
-from lfpiv_cli.files.sections import Sections, SimulationSection
+from lfpiv_cli.files.sections import Sections
+from lfpiv_cli.files.sections_simulated import SimulationSection
 from lfpiv_cli.files.yaml_nodes import KeyPath
 from lfpiv_cli.optics.media import Window, fluid_path_to_focus
 

@@ -24,15 +24,13 @@ from lfpiv_cli.files.sections import (
     CameraSection,
     ChannelSection,
     CorrelationSection,
-    FlowSection,
     MediaSection,
     ReconstructionSection,
     Sections,
-    SimulationSection,
-    ValidationSection,
     VolumeSection,
     WeightsSection,
 )
+from lfpiv_cli.files.sections_simulated import FlowSection, SimulationSection, ValidationSection
 from lfpiv_cli.files.yaml_nodes import (
     LARGEST_BYTES,
     Document,

@@ -1,0 +1,190 @@
+"""The sections of what is not the rig: flows, what `simulate` renders, and what `validate` asks for."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from lfpiv_cli.files.section_types import (
+    MOST_FRAMES,
+    MOST_PARTICLES,
+    Angle,
+    NotNegative,
+    Pair,
+    Positive,
+    Section,
+    Share,
+    Vector,
+)
+
+
+class SquareDuct(Section):
+    """Fully developed laminar flow along axis (x or y) through a square duct of width_mm.
+
+    mean_velocity_m_s: the mean over its section. centre_mm: of every flow, in the volume's coordinates (default: 0).
+    """
+
+    kind: Literal["square_duct"]
+    width_mm: Positive
+    mean_velocity_m_s: float
+    centre_mm: Vector = (0.0, 0.0, 0.0)
+    axis: Literal["x", "y"] = "x"
+
+
+class RigidRotation(Section):
+    """angular_velocity_rad_s x (r - centre_mm) + velocity_m_s, right-handed about x, y, z."""
+
+    kind: Literal["rigid_rotation"]
+    angular_velocity_rad_s: Vector
+    centre_mm: Vector = (0.0, 0.0, 0.0)
+    velocity_m_s: Vector = (0.0, 0.0, 0.0)
+
+
+class TaylorGreen(Section):
+    """Vortices of amplitude_m_s and wavelength_mm in a plane (xy, xz, yz), four around centre_mm, plus velocity_m_s."""
+
+    kind: Literal["taylor_green"]
+    amplitude_m_s: float
+    wavelength_mm: Positive
+    centre_mm: Vector = (0.0, 0.0, 0.0)
+    plane: Literal["xy", "xz", "yz"] = "xz"
+    velocity_m_s: Vector = (0.0, 0.0, 0.0)
+
+
+class Shear(Section):
+    """A velocity along one axis that grows by rate_per_s across another, zero at centre_mm, plus velocity_m_s."""
+
+    kind: Literal["shear"]
+    rate_per_s: float
+    along: Literal["x", "y", "z"] = "x"
+    across: Literal["x", "y", "z"] = "z"
+    centre_mm: Vector = (0.0, 0.0, 0.0)
+    velocity_m_s: Vector = (0.0, 0.0, 0.0)
+
+
+class Uniform(Section):
+    """The same velocity_m_s everywhere."""
+
+    kind: Literal["uniform"]
+    velocity_m_s: Vector
+
+
+FlowSection = Annotated[SquareDuct | RigidRotation | TaylorGreen | Shear | Uniform, Field(discriminator="kind")]
+
+
+class SimulationSection(Section):
+    """What `simulate` renders.
+
+    Scene: flow (its centre in the volume's coordinates), frames (images of it, correlation.dt_s apart; 2 are a pair),
+    particles (their number in the volume), particle_diameter_mm,
+    brightness (range of each particle's light relative to particle_counts) or brightness_log_sigma (log-normal instead,
+    of median 1), particle_counts (counts of a whole particle of brightness 1), mid_plane_z_mm (where the origin of a
+    mid_plane volume lies behind the focal point; by default where Eq. 21 puts it for the board at board_z_mm).
+    Board: board_z_mm, board_tilt_deg, board_offset_mm, board_rotation_deg.
+    Camera as it really is: rotation_deg of the array (from the columns towards the rows), shift_px (columns, rows) and
+    distortion_per_mm2.
+    Sensor: peak_counts (of a pixel that sees only light, in white and board images), photons_per_count (null: no shot
+    noise), read_noise_counts, dark_level_counts, bits.
+    Tracing: refraction, rays per particle (null: as many as the noise needs), seed.
+    """
+
+    flow: FlowSection | None = None
+    frames: Annotated[int, Field(ge=2, le=MOST_FRAMES)] = 2
+    particles: Annotated[int, Field(ge=0, le=MOST_PARTICLES)] = 1000
+    particle_diameter_mm: NotNegative = 0.05
+    brightness: tuple[NotNegative, NotNegative] = (0.6, 1.4)
+    brightness_log_sigma: NotNegative | None = None
+    particle_counts: Positive = 500_000.0
+    mid_plane_z_mm: float | None = None
+    board_z_mm: float = 0.0
+    board_tilt_deg: tuple[Angle, Angle] = (0.0, 0.0)
+    board_offset_mm: Pair = (0.0, 0.0)
+    board_rotation_deg: Angle = 0.0
+    rotation_deg: Angle = 0.0
+    shift_px: Pair = (0.0, 0.0)
+    distortion_per_mm2: float = 0.0
+    peak_counts: Positive = 28_000.0
+    photons_per_count: Positive | None = 0.5
+    read_noise_counts: NotNegative = 6.0
+    dark_level_counts: NotNegative = 96.0
+    bits: Annotated[int, Field(ge=1, le=16)] = 16
+    refraction: Literal["exact", "paraxial"] = "exact"
+    rays: Annotated[int, Field(ge=1)] | None = None
+    seed: Annotated[int, Field(ge=0)] = 0
+
+
+class Limits(Section):
+    """What `validate flow` must reach: shares, 0.05 for 5 %.
+
+    streamwise_mean_error: largest |sum v / sum u - 1|; slice_mean_error: that of the worst of Table 4's six slices of a
+    duct. smallest_slope: of measured on true, over the components that flow at all. within_25_percent_streamwise,
+    within_25_percent_vector: smallest share of the windows with an error below a quarter of the true velocity.
+    """
+
+    streamwise_mean_error: NotNegative | None = None
+    slice_mean_error: NotNegative | None = None
+    smallest_slope: NotNegative | None = None
+    within_25_percent_streamwise: Share | None = None
+    within_25_percent_vector: Share | None = None
+
+
+class ColumnLimits(Section):
+    """What columns must reach against their reference: Eq. 16's SSIM, RMSE in grey levels of 255, L1."""
+
+    ssim_smallest: Share | None = None
+    rmse_grey_largest: NotNegative | None = None
+    l1_mean: NotNegative | None = None
+    l1_largest: NotNegative | None = None
+
+
+class WeightsLimits(Section):
+    """What `validate weights` must reach, by comparison."""
+
+    ert_to_drt_paraxial: ColumnLimits = ColumnLimits()
+    ert_to_drt_exact: ColumnLimits = ColumnLimits()
+    ert_exact_to_drt_exact: ColumnLimits = ColumnLimits()
+    factorised_to_converged: ColumnLimits = ColumnLimits()
+    factorised_exact_to_converged: ColumnLimits = ColumnLimits()
+    ray_count_to_converged: ColumnLimits = ColumnLimits()
+    coarser_to_converged: ColumnLimits = ColumnLimits()
+    factorised_to_long_count: ColumnLimits = ColumnLimits()
+    ert_exact_to_long_count: ColumnLimits = ColumnLimits()
+
+
+class WeightsValidation(Section):
+    """What `validate weights` looks at: the paper's five voxels and `sample` random ones of the volume.
+
+    long_count_rays: rays of long counts of each of the five (0: none), the independent check of what is integrated.
+    """
+
+    sample: Annotated[int, Field(ge=0, le=10_000)] = 20
+    seed: Annotated[int, Field(ge=0)] = 1
+    long_count_rays: Annotated[int, Field(ge=0)] = 0
+    limits: WeightsLimits = WeightsLimits()
+
+
+class BoardValidation(Section):
+    """What `validate board` does.
+
+    images: without faults (ideal), with the simulation's (recorded), or both. methods: ways to the weights, equivalent
+    points (ert) and rays fitted to the boards (dlfc); or no weights, the dots fitted to the pictures as discs (discs).
+    """
+
+    images: Literal["ideal", "recorded", "both"] = "ideal"
+    methods: Annotated[tuple[Literal["ert", "dlfc", "discs"], ...], Field(min_length=1)] = ("ert",)
+
+
+class ValidationSection(Section):
+    """The analytic flow that vectors are compared with (default: the simulation's), the limits, weights and boards.
+
+    flow_methods: how `validate flow` measures what it simulates, by volumes and their correlation (volumes), by fitted
+    tracers that are followed (particles), or both (default: both, but for particles where the weights are dlfc and
+    for volumes where the solver is particles).
+    """
+
+    flow: FlowSection | None = None
+    flow_methods: Annotated[tuple[Literal["volumes", "particles"], ...], Field(min_length=1)] | None = None
+    limits: Limits = Limits()
+    weights: WeightsValidation = WeightsValidation()
+    board: BoardValidation = BoardValidation()
