@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lfpiv_cli.flow.field import MASKED, REJECTED, REPLACED, SECOND_PEAK, VALID
-from lfpiv_cli.flow.outliers import EXPECTED_NOISE_VOXEL, expected_noise, fill_field, validate_vectors
+from lfpiv_cli.flow.outliers import EXPECTED_NOISE_VOXEL, expected_noise, fill_field, predict, validate_vectors
 
 SHAPE = (12, 16, 12)
 NOISE = np.full(3, EXPECTED_NOISE_VOXEL)
@@ -113,6 +113,31 @@ def test_expected_noise_follows_the_peak_s_width() -> None:
     width[0, 0, 0] = np.nan
     np.testing.assert_allclose(expected_noise(width), EXPECTED_NOISE_VOXEL * np.array([1.0, 1.0, 8.0]))
     np.testing.assert_allclose(expected_noise(np.full((1, 1, 1, 3), np.nan)), EXPECTED_NOISE_VOXEL)
+
+
+def test_prediction_is_the_median_of_neighbours_carried_by_median_slopes(rng: np.random.Generator) -> None:
+    field = rng.standard_normal((4, 5, 4, 3))
+    counted = rng.random(field.shape[:3]) < 0.9
+    usable = counted & (rng.random(field.shape[:3]) < 0.7)
+    told = predict(field, usable, counted, np.arange(usable.size))
+    known = np.pad(np.where(usable[..., np.newaxis], field, np.nan), [(1, 1)] * 3 + [(0, 0)], constant_values=np.nan)
+    places = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), axis=-1)
+    for number, (z, y, x) in enumerate(np.ndindex(usable.shape)):
+        cube = known[z : z + 3, y : y + 3, x : x + 3].copy()
+        cube[1, 1, 1] = np.nan
+        seen = np.pad(counted, 1)[z : z + 3, y : y + 3, x : x + 3].copy()
+        seen[1, 1, 1] = False
+        slopes = []
+        for axis in range(3):
+            first, middle, last = np.moveaxis(cube, axis, 0)
+            pairs = np.stack([middle - first, last - middle, 0.5 * (last - first)]).reshape(-1, 3)
+            slopes.append([np.median(s[np.isfinite(s)]) if np.isfinite(s).any() else 0.0 for s in pairs.T])
+        carried = (cube - places @ np.array(slopes))[np.isfinite(cube[..., 0])]
+        assert len(carried) > 0
+        middle = np.median(carried, axis=0)
+        np.testing.assert_allclose(told[0][number], middle, atol=1e-12)
+        np.testing.assert_allclose(told[1][number], np.median(np.abs(carried - middle), axis=0), atol=1e-12)
+        assert told[2][number] == pytest.approx(len(carried) / seen.sum())
 
 
 def test_filling_continues_a_linear_flow() -> None:
