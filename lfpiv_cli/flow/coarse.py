@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit, prange
 from numpy.typing import NDArray
 
 from lfpiv_cli.errors import ConfigError
@@ -73,8 +74,7 @@ def coarse_layout(shape_xyz: Triple, windows: Sequence[Triple], overlap: tuple[f
 def coarse_sums(a: NDArray[np.float32], b: NDArray[np.float32], coarse: CoarseLayout) -> MapSums:
     """Return what the correlation of two volumes is made of after binning."""
     before, after = margins(coarse.binned, coarse.cells_zyx, COARSE_RADIUS)
-    margin = list(zip(before, after, strict=True))
-    binned_a, binned_b = (np.pad(_bin_volume(volume, coarse.bins), margin) for volume in (a, b))
+    binned_a, binned_b = (bin_volume(volume, coarse, before, after) for volume in (a, b))
     return map_sums(binned_a, binned_b, coarse.binned, before, COARSE_RADIUS)
 
 
@@ -89,16 +89,35 @@ def coarse_field(sums: MapSums, coarse: CoarseLayout) -> tuple[NDArray[np.float6
     return smooth_field(fill_field(displacement), is_elongated) * np.asarray(coarse.bins), is_elongated
 
 
-def _bin_volume(volume: NDArray[np.float32], bins_xyz: tuple[int, ...]) -> NDArray[np.float32]:
-    """Return sums over bins, the last ones filled up with zeros, scaled to a largest magnitude of 1."""
-    summed = volume
-    for axis, width in enumerate(bins_xyz[::-1]):
-        short = -summed.shape[axis] % width
-        padded = np.pad(summed, [(0, short if k == axis else 0) for k in range(3)])
-        shape = (*padded.shape[:axis], padded.shape[axis] // width, width, *padded.shape[axis + 1 :])
-        summed = padded.reshape(shape).sum(axis=axis + 1, dtype=np.float64)
-    largest = float(np.max(np.abs(summed)))
-    return (summed / largest if largest > 0.0 else summed).astype(np.float32)
+def bin_volume(volume: NDArray[np.float32], coarse: CoarseLayout, before: Triple, after: Triple) -> NDArray[np.float32]:
+    """Return sums over bins, scaled to a largest magnitude of 1, with margins of zeros; the last bins may be cut."""
+    padded = tuple(m + n + k for m, n, k in zip(before, coarse.cells_zyx, after, strict=True))
+    sums = np.zeros(padded, dtype=np.float32)
+    inside = tuple(slice(m, m + n) for m, n in zip(before, coarse.cells_zyx, strict=True))
+    sum_bins(volume, coarse.bins[::-1], sums[inside])
+    largest = float(max(np.max(sums), -np.min(sums)))
+    if largest > 0.0:
+        sums *= np.float32(1.0 / largest)
+    return sums
+
+
+@njit(cache=True, parallel=True)
+def sum_bins(volume: NDArray[np.float32], bins: Triple, sums: NDArray[np.float32]) -> None:
+    """Write sums over bins of `bins` voxels along (z, y, x)."""
+    for cell_z in prange(sums.shape[0]):
+        line = np.empty(volume.shape[2])
+        for cell_y in range(sums.shape[1]):
+            line[:] = 0.0
+            for z in range(cell_z * bins[0], min((cell_z + 1) * bins[0], volume.shape[0])):
+                for y in range(cell_y * bins[1], min((cell_y + 1) * bins[1], volume.shape[1])):
+                    row = volume[z, y]
+                    for x in range(row.size):
+                        line[x] += row[x]
+            for cell_x in range(sums.shape[2]):
+                total = 0.0
+                for x in range(cell_x * bins[2], min((cell_x + 1) * bins[2], line.size)):
+                    total += line[x]
+                sums[cell_z, cell_y, cell_x] = total
 
 
 def _triple(values: tuple[int, ...]) -> Triple:
