@@ -15,7 +15,6 @@ from lfpiv_cli.flow.deformation import (
     SLACK,
     SPLINE_PAD,
     deform_pair,
-    expand_lateral,
     spline_coefficients,
     spline_matrix,
 )
@@ -176,11 +175,11 @@ def deformed(
     a: NDArray[np.float32], b: NDArray[np.float32], mask: NDArray[np.bool_], shift: tuple[float, float, float]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
     """Both volumes deformed by a uniform predictor."""
-    ones = [np.ones((n, 1)) for n in a.shape]
+    along_z, along_y, along_x = (np.ones((n, 1), np.float32) for n in a.shape)
     field = np.array(shift).reshape(1, 1, 1, 3)
-    lateral = expand_lateral(field, ones[2], ones[1])
     none = (0, 0, 0)
-    return deform_pair(spline_coefficients(a), spline_coefficients(b), mask, lateral, ones[0], none, none)
+    splines = (spline_coefficients(a), spline_coefficients(b))
+    return deform_pair(*splines, mask, field, (along_x, along_y, along_z), none, none)
 
 
 def test_deformation_brings_a_pair_together() -> None:
@@ -203,11 +202,10 @@ def test_deformation_equals_the_spline_summed_by_hand_where_neighbours_move_apar
     ]
     # One spline node a voxel: neighbours that differ by up to nine voxels need more taps than are taken together.
     field = rng.uniform(-4.5, 4.5, (*shape, 3))
-    lateral = expand_lateral(field, np.eye(shape[2]), np.eye(shape[1]))
+    along_z, along_y, along_x = (np.eye(n, dtype=np.float32) for n in shape)
     nowhere = np.zeros((0, 0, 0), dtype=np.bool_)
-    *found, valid = deform_pair(
-        spline_coefficients(a), spline_coefficients(b), nowhere, lateral, np.eye(shape[0]), (0, 0, 0), (0, 0, 0)
-    )
+    splines = (spline_coefficients(a), spline_coefficients(b))
+    *found, valid = deform_pair(*splines, nowhere, field, (along_x, along_y, along_z), (0, 0, 0), (0, 0, 0))
     places = np.argwhere(valid)[::37]
     assert len(places) > 10
     for place in places:

@@ -16,21 +16,21 @@ from operator import add
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.flow.coarse import coarse_field, coarse_layout, coarse_size, coarse_sums
 from lfpiv_cli.flow.deformation import (
     Spline,
     deform_pair,
-    expand_lateral,
+    matrices_to_voxels,
     resample_field,
     spline_coefficients,
     spline_matrix,
 )
 from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.flow.filtering import smooth_field, unresolved
-from lfpiv_cli.flow.maps import map_sums, margins, window_sums
+from lfpiv_cli.flow.maps import map_sums, margins, valid_shares
 from lfpiv_cli.flow.moments import gauss_newton, pair_moments
 from lfpiv_cli.flow.outliers import expected_noise, fill_field, validate_vectors
 from lfpiv_cli.flow.peaks import ELONGATED_WIDTH, Peaks, absolute, find_peaks, typical_width, undiluted
@@ -153,7 +153,7 @@ def correlate_ensemble(
     layout = coarse.in_voxels
     report(1)
     # One BLAS thread: with more, the bits of the predictor would depend on their number.
-    with threadpool_limits(1, user_api="blas"):
+    with _matrix_libraries().limit(limits=1, user_api="blas"):
         for step in _plan(grid.shape_xyz, windows, overlap):
             measured = _refine(ready, _between_layouts(predictor, layout, step.layout), step, is_elongated)
             filled, is_elongated = fill_field(measured.displacement), measured.is_elongated
@@ -199,13 +199,20 @@ def _check(
         raise ConfigError(f"the exponent of the correlated intensities is {exponent}; it must be above 0 and at most 1")
 
 
+@lru_cache(maxsize=1)
+def _matrix_libraries() -> ThreadpoolController:
+    """Return the libraries whose threads can be limited; looking for them takes milliseconds."""
+    return ThreadpoolController()
+
+
 def _usable_voxels(
     a: NDArray[np.float32], b: NDArray[np.float32], mask: NDArray[np.bool_] | None
 ) -> tuple[NDArray[np.bool_], NDArray[np.float32], NDArray[np.float32]]:
     """Return where both volumes may be used (size 0 for everywhere), and both with zeros elsewhere."""
-    finite = np.isfinite(a) & np.isfinite(b)
-    if mask is None and finite.all():
+    # What is not finite in a volume shows in its extremes.
+    if mask is None and all(np.isfinite(end(volume)) for volume in (a, b) for end in (np.min, np.max)):
         return np.zeros((0, 0, 0), dtype=np.bool_), a, b
+    finite = np.isfinite(a) & np.isfinite(b)
     usable = finite if mask is None else finite & mask
     zero = np.float32(0.0)
     return usable, np.where(usable, a, zero), np.where(usable, b, zero)
@@ -251,12 +258,11 @@ def _refine(pairs: Sequence[Pair], predictor: NDArray[np.float64], step: Pass, i
     """Return what is measured in volumes deformed by `predictor`, given at the windows of `step`, in voxels."""
     layout, shape = step.layout, pairs[0].shape_xyz
     before, after = margins(layout, (shape[2], shape[1], shape[0]), step.radius)
-    along_x, along_y, along_z = _matrices_to_voxels(layout, shape)
-    lateral = expand_lateral(predictor, along_x, along_y)
+    to_voxels = matrices_to_voxels(layout, shape)
     parts = []
     for pair in pairs:
-        a, b, valid = deform_pair(pair.a, pair.b, pair.mask, lateral, along_z, before, after)
-        fraction = window_sums(valid, layout, before).reshape(layout.count_zyx) / float(np.prod(layout.size))
+        a, b, valid = deform_pair(pair.a, pair.b, pair.mask, predictor, to_voxels, before, after)
+        fraction = valid_shares(valid, layout, before)
         moments = pair_moments(a, b, valid, layout, before) if step.is_last or is_elongated else None
         parts.append((map_sums(a, b, layout, before, step.radius), fraction, moments))
     sums, fractions, moments_of = zip(*parts, strict=True)
@@ -272,17 +278,6 @@ def _refine(pairs: Sequence[Pair], predictor: NDArray[np.float64], step: Pass, i
     uncertainty[~peaks.found | masked] = np.nan
     is_elongated = bool(np.any(width >= ELONGATED_WIDTH))
     return Measured(raw, displacement, flag, peaks, valid_fraction, uncertainty, is_elongated)
-
-
-@lru_cache(maxsize=4)
-def _matrices_to_voxels(
-    layout: WindowLayout, shape_xyz: Triple
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return the spline matrices along x, y, z from window centres to all voxels; most passes have the same ones."""
-    along_x, along_y, along_z = (
-        spline_matrix(layout.centres_voxel(k), np.arange(shape_xyz[k], dtype=np.float64)) for k in range(3)
-    )
-    return along_x, along_y, along_z
 
 
 def _along_elongated(peaks: Peaks, rest: NDArray[np.float64], width: NDArray[np.float64]) -> Peaks:

@@ -10,28 +10,25 @@ Axes: volumes `[z, y, x]`, displacements in voxels with components (u, v, w) alo
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from lfpiv_cli.flow.lanes import LANES, highest, interpolate, lowest, spline_weights
-from lfpiv_cli.flow.windows import Triple
+from lfpiv_cli.flow.lanes import MOST_TAPS, highest, interpolate, lowest, spline_weights
+from lfpiv_cli.flow.vectors import LANES
+from lfpiv_cli.flow.windows import Triple, WindowLayout
 
 # Sources lie between the first and the last voxel's centre: the four taps of a cubic B-spline reach one coefficient
 # beyond these, and a fifth of weight zero another.
 SPLINE_PAD = 2
 # Lanes beyond the end of a row are interpolated and dropped; so far they may read.
 SLACK = 2 * LANES
-# Neighbours along x are interpolated together with the taps of all of them. Where their displacements differ too much
-# for this many along an axis, fewer are taken at once.
-MOST_TAPS = 8
 # A tap whose B-spline ends closer than this to a place weighs less than 2e-7 there and is left out: in fluid at rest,
 # where displacements scatter around zero, five taps become three.
 NEGLIGIBLE = 0.01
-# Planes whose displacements are known at a time: all of them would take several times the memory of the volumes.
-SLAB_PLANES = 32
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +52,7 @@ def spline_coefficients(volume: NDArray[np.float32]) -> Spline:
     is continued by odd reflection, which keeps its slope: the usual even one makes a kink in every particle that a face
     cuts, and costs 0.1 voxel there.
     """
-    largest = float(np.max(np.abs(volume)))
+    largest = float(max(np.max(volume), -np.min(volume)))
     padded = tuple(n + 2 * SPLINE_PAD for n in volume.shape)
     flat = np.zeros(int(np.prod(padded)) + 2 * SLACK, dtype=np.float32)
     inside = (slice(SPLINE_PAD, -SPLINE_PAD),) * 3
@@ -139,23 +136,27 @@ def resample_field(
     return np.einsum("ck,bj,ai,kjid->cbad", along_z, along_y, along_x, field, optimize=True)
 
 
-def expand_lateral(
-    field: NDArray[np.float64], along_x: NDArray[np.float64], along_y: NDArray[np.float64]
-) -> NDArray[np.float32]:
-    """Return a field (nz, ny, nx, 3) at every voxel of the x-y planes through the windows: (nz, 3, rows y, columns x).
+@lru_cache(maxsize=4)
+def matrices_to_voxels(
+    layout: WindowLayout, shape_xyz: Triple
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """Return the spline matrices (voxels, windows) along x, y, z from window centres to all voxels.
 
-    The expansion in depth is left to `deform_pair`.
+    Most passes have the same ones.
     """
-    lateral = np.einsum("bj,ai,kjid->kdba", along_y, along_x, field, optimize=True)
-    return np.ascontiguousarray(lateral, dtype=np.float32)
+    along_x, along_y, along_z = (
+        spline_matrix(layout.centres_voxel(k), np.arange(shape_xyz[k], dtype=np.float64)).astype(np.float32)
+        for k in range(3)
+    )
+    return along_x, along_y, along_z
 
 
 def deform_pair(
     a: Spline,
     b: Spline,
     mask: NDArray[np.bool_],
-    lateral: NDArray[np.float32],
-    along_z: NDArray[np.float64],
+    predictor: NDArray[np.float64],
+    to_voxels: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]],
     before: Triple,
     after: Triple,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
@@ -165,47 +166,55 @@ def deform_pair(
     ----------
     a, b : of `spline_coefficients`
     mask : (z, y, x) True where the volumes are to be used, or of size 0 for everywhere
-    lateral : (nz, 3, rows y, columns x) the predictor in voxels, of `expand_lateral`
-    along_z : (planes z, nz) its spline matrix in depth
+    predictor : (nz, ny, nx, 3) displacements at the windows, voxels
+    to_voxels : of `matrices_to_voxels`
     before, after : widths of the margin before and after the volume along (z, y, x)
     """
     padded = tuple(m + n + k for m, n, k in zip(before, a.shape_zyx, after, strict=True))
     deformed_a, deformed_b = np.zeros((2, *padded), dtype=np.float32)
     valid = np.zeros(padded, dtype=np.uint8)
-    half_along_z = (0.5 * along_z).astype(np.float32)
-    flat = lateral.reshape(lateral.shape[0], -1)
-    for first in range(0, a.shape_zyx[0], SLAB_PLANES):
-        half = (half_along_z[first : first + SLAB_PLANES] @ flat).reshape(-1, *lateral.shape[1:])
-        deform_slab(a.flat, b.flat, a.shape_zyx, mask, half, first, before, deformed_a, deformed_b, valid)
+    half = np.ascontiguousarray(0.5 * predictor.transpose(0, 3, 1, 2), dtype=np.float32)
+    along_x, along_y, along_z = to_voxels
+    across = np.ascontiguousarray(along_x.T)
+    deform_planes(
+        a.flat, b.flat, a.shape_zyx, mask, half, across, along_y, along_z, before, deformed_a, deformed_b, valid
+    )
     return deformed_a, deformed_b, valid
 
 
 @njit(cache=True, parallel=True)
-def deform_slab(
+def deform_planes(
     flat_a: NDArray[np.float32],
     flat_b: NDArray[np.float32],
     shape: Triple,
     mask: NDArray[np.bool_],
     half: NDArray[np.float32],
-    first: int,
+    along_x: NDArray[np.float32],
+    along_y: NDArray[np.float32],
+    along_z: NDArray[np.float32],
     before: Triple,
     deformed_a: NDArray[np.float32],
     deformed_b: NDArray[np.float32],
     valid: NDArray[np.uint8],
 ) -> None:
-    """Deform the planes from `first` on by half displacements (planes z, 3, rows y, columns x)."""
+    """Deform all planes by half displacements (nz, 3, ny, nx) that the matrices carry to the voxels.
+
+    `along_x` is (nx, voxels), the others (voxels, windows).
+    """
     row = shape[2] + 2 * SPLINE_PAD
     plane = row * (shape[1] + 2 * SPLINE_PAD)
-    for z in prange(first, first + half.shape[0]):
+    for z in prange(shape[0]):
+        half_here = expand_plane(half, along_z[z], along_y, along_x)
         moved = np.empty((3, shape[2] + LANES), dtype=np.float32)
         flat_moved = moved.reshape(moved.size)
         weights = np.empty(3 * MOST_TAPS * LANES, dtype=np.float32)
-        out = np.empty(2 * LANES, dtype=np.float32)
+        lines = np.empty((2, shape[2] + LANES), dtype=np.float32)
+        line_a, line_b = lines[0], lines[1]
         for y in range(shape[1]):
             target = (z + before[0], y + before[1])
             here = slice(before[2], before[2] + shape[2])
-            seen, line_a, line_b = valid[target][here], deformed_a[target][here], deformed_b[target][here]
-            bound_row(half[z - first, :, y], shape, z, y, moved, seen)
+            seen = valid[target][here]
+            bound_row(half_here[:, y], shape, z, y, moved, seen)
             if mask.size:
                 mask_row(mask, moved, z, y, seen)
             begin = SLACK + (z + SPLINE_PAD) * plane + (y + SPLINE_PAD) * row + SPLINE_PAD
@@ -213,7 +222,9 @@ def deform_slab(
             while x < shape[2]:
                 width, low, taps = gather_taps(flat_moved, moved.shape[1], x, weights)
                 interpolate(
-                    out,
+                    line_a,
+                    line_b,
+                    x,
                     flat_a,
                     flat_b,
                     begin + x,
@@ -227,10 +238,29 @@ def deform_slab(
                     taps[1],
                     taps[2],
                 )
-                for lane in range(min(width, shape[2] - x)):
-                    line_a[x + lane] = out[lane] * seen[x + lane]
-                    line_b[x + lane] = out[LANES + lane] * seen[x + lane]
                 x += width
+            copy_seen(line_a, seen, deformed_a[target][here])
+            copy_seen(line_b, seen, deformed_b[target][here])
+
+
+@njit(cache=True)
+def expand_plane(
+    half: NDArray[np.float32], along_z: NDArray[np.float32], along_y: NDArray[np.float32], along_x: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Return the half displacements (3, rows, columns) of one plane; `along_z` is its row of the matrix."""
+    nz, _, ny, nx = half.shape
+    at_windows = np.dot(along_z, half.reshape(nz, 3 * ny * nx)).reshape(3, ny, nx)
+    at_voxels = np.empty((3, along_y.shape[0], along_x.shape[1]), dtype=np.float32)
+    for axis in range(3):
+        np.dot(np.dot(along_y, at_windows[axis]), along_x, at_voxels[axis])
+    return at_voxels
+
+
+@njit(cache=True)
+def copy_seen(line: NDArray[np.float32], seen: NDArray[np.uint8], target: NDArray[np.float32]) -> None:
+    """Copy what is seen of a row, and zero where it is not."""
+    for x in range(seen.size):
+        target[x] = line[x] * np.float32(seen[x])
 
 
 @njit(cache=True)
@@ -239,7 +269,8 @@ def gather_taps(
 ) -> tuple[int, Triple, Triple]:
     """Write the weights of the taps that the lanes from `x` on need; return how many lanes, and the taps along z, y, x.
 
-    As many lanes as `MOST_TAPS` serve; the lowest tap, and the number of taps. `moved` is `length` long an axis.
+    As many lanes as `MOST_TAPS` serve: where displacements differ too much for all, fewer are taken at once. `moved` is
+    `length` long an axis.
     """
     width = LANES
     low_x, taps_x = taps_of(moved, x, width)
@@ -286,13 +317,15 @@ def bound_row(
     columns = shape[2]
     reach_z = np.float32(min(z, shape[0] - 1 - z))
     reach_y = np.float32(min(y, shape[1] - 1 - y))
+    along_x, along_y, along_z = half[0], half[1], half[2]
+    moved_x, moved_y, moved_z = moved[0], moved[1], moved[2]
     for x in range(columns):
-        reach_x = np.float32(min(x, columns - 1 - x))
-        u, v, w = half[0, x], half[1, x], half[2, x]
-        moved[0, x] = min(max(u, -reach_x), reach_x)
-        moved[1, x] = min(max(v, -reach_y), reach_y)
-        moved[2, x] = min(max(w, -reach_z), reach_z)
-        valid[x] = (moved[0, x] == u) & (moved[1, x] == v) & (moved[2, x] == w)
+        reach_x = min(np.float32(x), np.float32(columns - 1 - x))
+        u, v, w = along_x[x], along_y[x], along_z[x]
+        moved_x[x] = min(max(u, -reach_x), reach_x)
+        moved_y[x] = min(max(v, -reach_y), reach_y)
+        moved_z[x] = min(max(w, -reach_z), reach_z)
+        valid[x] = (abs(u) <= reach_x) & (abs(v) <= reach_y) & (abs(w) <= reach_z)
     for axis in range(3):
         moved[axis, columns:] = moved[axis, columns - 1]
 

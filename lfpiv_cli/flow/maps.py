@@ -21,7 +21,8 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from lfpiv_cli.flow.lanes import FEW_SHIFTS, LANES, MANY_SHIFTS, few_products, many_products
+from lfpiv_cli.flow.lane_sums import FEW_SHIFTS, MANY_SHIFTS, products
+from lfpiv_cli.flow.vectors import LANES
 from lfpiv_cli.flow.windows import Triple, WindowLayout
 
 # Blocks narrower than this cost more in sums of sums than the products they save.
@@ -30,13 +31,10 @@ SMALLEST_BLOCK = 4
 # reaches amplitudes of 1e-5.
 SMALLEST_ENERGY = 1e-9
 
-# Columns that are summed at a time: their sums stay in the fastest cache.
-SUM_TILE = 2048
-
 
 @dataclass(frozen=True)
 class Blocks:
-    """How the windows of one layout are made of blocks, along (z, y, x).
+    """How the windows of one layout are made of blocks, along (z, y, x); along x each is a block of its own.
 
     Block k along an axis covers voxels first + k stride ... + size - 1; window k is the sum of blocks k hop ... k hop +
     per_window - 1.
@@ -52,7 +50,8 @@ class Blocks:
 
 def blocks_of(layout: WindowLayout) -> Blocks:
     """Return the blocks that make up the windows, axis by axis; one block a window where sharing does not pay."""
-    axes = [_blocks_along(layout.size[axis], layout.step[axis], layout.count[axis]) for axis in (2, 1, 0)]
+    axes = [_blocks_along(layout.size[axis], layout.step[axis], layout.count[axis]) for axis in (2, 1)]
+    axes.append((layout.size[0], layout.step[0], layout.count[0], 1, 1))
     size, stride, count, per_window, hop = ((a[0], a[1], a[2]) for a in zip(*axes, strict=True))
     first = (layout.first[2], layout.first[1], layout.first[0])
     return Blocks(first, size, stride, count, per_window, hop)
@@ -84,29 +83,38 @@ def margins(layout: WindowLayout, shape_zyx: Triple, radius: int) -> tuple[Tripl
 
 @dataclass(frozen=True, eq=False)
 class MapSums:
-    """What a correlation is made of, over all windows and shifts; of several pairs of volumes these add up.
+    """What a correlation is made of, over all shifts; of several pairs of volumes these add up.
 
     Attributes
     ----------
-    products : sum_W A(x) B(x + s) + A(x - s) B(x), (nz, ny, nx, 2r + 1, 2r + 1, 2r + 1)
-    energies_a, energies_b : the two brackets of R, of the same shape
+    products : sum A(x) B(x + s) + A(x - s) B(x) over blocks along z and y, (blocks z, blocks y, windows x, 2r + 1,
+        2r + 1, 2r + 1)
+    energies_a, energies_b : sums of squares over the shifted windows, of `window_energies`
+    blocks : how windows are made of blocks
     """
 
     products: NDArray[np.float64]
-    energies_a: NDArray[np.float64]
-    energies_b: NDArray[np.float64]
+    energies_a: NDArray[np.float32]
+    energies_b: NDArray[np.float32]
+    blocks: Blocks
 
     def __add__(self, other: MapSums) -> MapSums:
         """Return the sums over two sets of pairs."""
         return MapSums(
-            self.products + other.products, self.energies_a + other.energies_a, self.energies_b + other.energies_b
+            self.products + other.products,
+            self.energies_a + other.energies_a,
+            self.energies_b + other.energies_b,
+            self.blocks,
         )
 
     def correlation(self) -> NDArray[np.float64]:
-        """Return R, zero where a window holds nothing."""
-        energies = self.energies_a * self.energies_b
-        filled = energies > SMALLEST_ENERGY**2 * np.max(energies)
-        return np.divide(self.products, np.sqrt(energies), out=np.zeros(energies.shape), where=filled)
+        """Return R, (nz, ny, nx, 2r + 1, 2r + 1, 2r + 1), zero where a window holds nothing."""
+        # The brackets of R hold two windows each.
+        brightest = 4.0 * float(np.max(self.energies_a)) * float(np.max(self.energies_b))
+        per_window, hop = self.blocks.per_window[:2], self.blocks.hop[:2]
+        return normalise(
+            self.products, self.energies_a, self.energies_b, per_window, hop, SMALLEST_ENERGY**2 * brightest
+        )
 
 
 def map_sums(
@@ -123,82 +131,155 @@ def map_sums(
     blocks = blocks_of(layout)
     first = (blocks.first[0] + before[0], blocks.first[1] + before[1], blocks.first[2] + before[2])
     products = block_products(a, b, first, blocks.size, blocks.stride, blocks.count, radius)
-    for axis in range(3):
-        products = _sum_blocks(products, axis, layout.count_zyx[axis], blocks.per_window[axis], blocks.hop[axis])
-    energies_a, energies_b = (window_sums(np.square(volume), layout, before, radius) for volume in (a, b))
-    return MapSums(products, _pair_energies(energies_a, -1), _pair_energies(energies_b, 1))
+    energies_a, energies_b = (energies_of(volume, layout, before, radius) for volume in (a, b))
+    return MapSums(products, energies_a, energies_b, blocks)
 
 
-def window_sums(volume: NDArray, layout: WindowLayout, before: Triple, radius: int = 0) -> NDArray[np.float32]:
-    """Return the sums over all windows at all shifts: (nz, ny, nx, 2r + 1, 2r + 1, 2r + 1), the shifts last."""
-    sums = volume.astype(np.float32, copy=False)
-    for axis, xyz in enumerate((2, 1, 0)):
-        # The axis to sum along comes first, so that whole stretches of memory are added.
-        rows = np.ascontiguousarray(np.moveaxis(sums.reshape(-1, *volume.shape[axis:]), 1, 0))
-        first = layout.first[xyz] + before[axis]
-        flat = rows.reshape(rows.shape[0], -1)
-        summed = axis_sums(flat, first, layout.size[xyz], layout.step[xyz], layout.count[xyz], radius)
-        sums = np.moveaxis(summed.reshape(-1, *rows.shape[1:]), 0, 1)
-    shifts = 2 * radius + 1
-    nz, ny, nx = layout.count_zyx
-    return sums.reshape(nz, shifts, ny, shifts, nx, shifts).transpose(0, 2, 4, 1, 3, 5)
+def energies_of(volume: NDArray, layout: WindowLayout, before: Triple, radius: int = 0) -> NDArray[np.float32]:
+    """Return the sums of squares over all windows at all shifts along each axis, of `window_energies`."""
+    size, step, count, low = (triple[::-1] for triple in (layout.size, layout.step, layout.count, layout.first))
+    first = (low[0] + before[0], low[1] + before[1], low[2] + before[2])
+    return window_energies(volume, first, size, step, count, radius)
 
 
-def _pair_energies(energies: NDArray[np.float32], sign: int) -> NDArray[np.float64]:
-    """Return E(W) + E(W + sign s) for every shift s."""
-    whole = energies.astype(np.float64)
-    radius = whole.shape[-1] // 2
-    shifted = whole if sign > 0 else whole[..., ::-1, ::-1, ::-1]
-    return shifted + whole[..., radius, radius, radius][..., np.newaxis, np.newaxis, np.newaxis]
-
-
-def _sum_blocks(products: NDArray[np.float64], axis: int, count: int, per_window: int, hop: int) -> NDArray[np.float64]:
-    """Return the sums of `per_window` neighbouring blocks, every `hop` blocks, along one axis."""
-    if per_window == 1 and hop == 1:
-        return products
-    moved = np.moveaxis(products, axis, 0)
-    total = moved[: (count - 1) * hop + 1 : hop].copy()
-    for k in range(1, per_window):
-        total += moved[k : k + (count - 1) * hop + 1 : hop]
-    return np.moveaxis(total, 0, axis)
+def valid_shares(valid: NDArray[np.uint8], layout: WindowLayout, before: Triple) -> NDArray[np.float64]:
+    """Return the share of each window's voxels that are valid, (nz, ny, nx), from their flags 0 or 1."""
+    # The squares of 0 and 1 are themselves.
+    seen = energies_of(valid, layout, before)[:, 0, :, 0, :, 0].transpose(0, 2, 1)
+    return seen / np.prod(layout.size, dtype=np.float64)
 
 
 @njit(cache=True, parallel=True)
-def axis_sums(
-    rows: NDArray[np.float32], first: int, size: int, step: int, count: int, radius: int
+def window_energies(
+    volume: NDArray, first: Triple, size: Triple, step: Triple, count: Triple, radius: int
 ) -> NDArray[np.float32]:
-    """Return sums over `size` rows of (rows, columns), those from first + k step + shift on: (count x shifts, columns).
+    """Return the sums of squares over shifted windows: (windows z, shifts z, windows x, shifts x, windows y, shifts y).
 
-    The rows that all shifts of a window share are summed once. Differences of running sums would take less, but an
-    empty window next to bright ones must be exactly zero.
+    One axis after the other. Differences of running sums would take less, but an empty window next to bright ones must
+    be exactly zero.
     """
     shifts = 2 * radius + 1
-    columns = rows.shape[1]
-    sums = np.empty((count * shifts, columns), dtype=np.float32)
-    tiles = -(-columns // SUM_TILE)
-    for job in prange(count * tiles):
-        k, left = job // tiles, (job % tiles) * SUM_TILE
-        right = min(left + SUM_TILE, columns)
-        lowest = first + k * step - radius
-        begin = lowest + shifts - 1
-        end = max(begin, lowest + size)
-        shared = np.zeros(right - left, dtype=np.float32)
-        for row in range(begin, end):
-            add_row(shared, rows[row, left:right])
-        for shift in range(shifts):
-            target = sums[k * shifts + shift, left:right]
+    nz, ny, nx = count
+    lowest = first[0] - radius
+    planes = (nz - 1) * step[0] + size[0] + 2 * radius
+    lateral = np.empty((planes, nx * shifts, ny * shifts), dtype=np.float32)
+    for z in prange(planes):
+        squares = np.empty(volume.shape[1:], dtype=np.float32)
+        for y in range(volume.shape[1]):
+            square_row(volume[lowest + z, y], squares[y])
+        along_y = np.empty((ny * shifts, volume.shape[2]), dtype=np.float32)
+        for k in range(ny):
+            sum_rows(squares, first[1] + k * step[1], size[1], radius, along_y[k * shifts : (k + 1) * shifts])
+        turned = along_y.T.copy()
+        for k in range(nx):
+            sum_rows(turned, first[2] + k * step[2], size[2], radius, lateral[z, k * shifts : (k + 1) * shifts])
+    rows = lateral.reshape(planes, nx * shifts * ny * shifts)
+    found = np.empty((nz, shifts, rows.shape[1]), dtype=np.float32)
+    for k in prange(nz):
+        sum_rows(rows, k * step[0] + radius, size[0], radius, found[k])
+    return found.reshape(nz, shifts, nx, shifts, ny, shifts)
+
+
+@njit(cache=True)
+def sum_ahead(values: NDArray[np.float32], spare: NDArray[np.float32], size: int, sums: NDArray[np.float32]) -> None:
+    """Write the sum of the `size` values from each place on to `sums`; nothing of use near the end.
+
+    By sums of one, two, four ... values. All are flat and equally long; `values` and `spare` are overwritten.
+    """
+    sums[:] = 0.0
+    length, done = 1, 0
+    while True:
+        if size & length:
+            add_row(sums, values[done:])
+            done += length
+        if 2 * length > size:
+            return
+        write_sum(spare, values, values[length:])
+        values, spare = spare, values
+        length *= 2
+
+
+@njit(cache=True)
+def sum_rows(rows: NDArray[np.float32], first: int, size: int, radius: int, sums: NDArray[np.float32]) -> None:
+    """Write sums of `size` rows of (rows, columns), those from first + shift on for each shift up to `radius`.
+
+    The rows that all shifts share are summed once.
+    """
+    lowest = first - radius
+    begin = lowest + 2 * radius
+    end = max(begin, lowest + size)
+    shared = sums[0]
+    shared[:] = 0.0
+    for row in range(begin, end):
+        add_row(shared, rows[row])
+    # The first one last: it holds what is shared.
+    for shift in range(2 * radius, -1, -1):
+        target = sums[shift]
+        if shift > 0:
             target[:] = shared
-            for row in range(lowest + shift, min(begin, lowest + shift + size)):
-                add_row(target, rows[row, left:right])
-            for row in range(end, lowest + shift + size):
-                add_row(target, rows[row, left:right])
-    return sums
+        for row in range(lowest + shift, min(begin, lowest + shift + size)):
+            add_row(target, rows[row])
+        for row in range(end, lowest + shift + size):
+            add_row(target, rows[row])
+
+
+@njit(cache=True)
+def write_sum(target: NDArray[np.float32], one: NDArray[np.float32], other: NDArray[np.float32]) -> None:
+    """Write the sum of two rows, as far as the second one goes."""
+    for i in range(other.size):
+        target[i] = one[i] + other[i]
+
+
+@njit(cache=True)
+def square_row(row: NDArray, squares: NDArray[np.float32]) -> None:
+    """Write the squares of a row."""
+    for x in range(row.size):
+        squares[x] = np.float32(row[x]) * np.float32(row[x])
+
+
+@njit(cache=True, parallel=True)
+def normalise(
+    products: NDArray[np.float64],
+    energies_a: NDArray[np.float32],
+    energies_b: NDArray[np.float32],
+    per_window: tuple[int, int],
+    hop: tuple[int, int],
+    least: float,
+) -> NDArray[np.float64]:
+    """Return R from the members of `MapSums`; zero where the product of the energies is `least` or less."""
+    nz, shifts, nx, _, ny, _ = energies_a.shape
+    radius, last = shifts // 2, shifts - 1
+    blocks = products.reshape(products.shape[0], products.shape[1], nx, shifts**3)
+    maps = np.zeros((nz, ny, nx, shifts**3))
+    for job in prange(nz * ny):
+        kz, ky = job // ny, job % ny
+        scale = np.empty(shifts**3)
+        for kx in range(nx):
+            whole_a = np.float64(energies_a[kz, radius, kx, radius, ky, radius])
+            whole_b = np.float64(energies_b[kz, radius, kx, radius, ky, radius])
+            at = 0
+            for sz in range(shifts):
+                for sy in range(shifts):
+                    for sx in range(shifts):
+                        # E_A(W - s), E_B(W + s)
+                        moved_a = energies_a[kz, last - sz, kx, last - sx, ky, last - sy]
+                        scale[at] = (whole_a + moved_a) * (whole_b + energies_b[kz, sz, kx, sx, ky, sy])
+                        at += 1
+            window = maps[kz, ky, kx]
+            for bz in range(kz * hop[0], kz * hop[0] + per_window[0]):
+                for by in range(ky * hop[1], ky * hop[1] + per_window[1]):
+                    block = blocks[bz, by, kx]
+                    for at in range(shifts**3):
+                        window[at] += block[at]
+            for at in range(shifts**3):
+                window[at] *= 1.0 / np.sqrt(scale[at]) if scale[at] > least else 0.0
+    return maps.reshape(nz, ny, nx, shifts, shifts, shifts)
 
 
 @njit(cache=True)
 def add_row(target: NDArray[np.float32], row: NDArray[np.float32]) -> None:
-    """Add a row to another."""
-    for i in range(target.size):
+    """Add a row to another, as far as it goes."""
+    for i in range(row.size):
         target[i] += row[i]
 
 
@@ -212,23 +293,23 @@ def block_products(
     count: Triple,
     radius: int,
 ) -> NDArray[np.float64]:
-    """Return sum A(x) B(x + s) + A(x - s) B(x) over blocks: (blocks z, y, x, shifts z, y, x).
+    """Return sum A(x) B(x + s) + A(x - s) B(x) over blocks along z and y, windows along x: (z, y, x, shifts z, y, x).
 
     For one row of blocks the products are first summed over its planes and rows, many columns and several shifts at
-    once, and only then over the columns of each block. The first sums are float32: the maps are wanted to 1e-5.
+    once, and only then over the columns of each window. These sums are float32: the maps are wanted to 1e-5.
     """
     shifts = 2 * radius + 1
     row, plane = a.shape[2], a.shape[1] * a.shape[2]
     flat_a, flat_b = a.reshape(a.size), b.reshape(b.size)
-    products = np.empty((count[0], count[1], count[2], shifts, shifts, shifts))
+    found = np.empty((count[0], count[1], count[2], shifts, shifts, shifts))
     length = max(LANES, (count[2] - 1) * stride[2] + size[2])
     together = MANY_SHIFTS if shifts >= MANY_SHIFTS else FEW_SHIFTS
     for job in prange(count[0] * count[1]):
         bz, by = job // count[1], job % count[1]
         begin = (first[0] + bz * stride[0]) * plane + (first[1] + by * stride[1]) * row + first[2]
+        room = np.empty((3, shifts**3 * length), dtype=np.float32)
+        flat, spare, sums = room[0], room[1], room[2]
         # All shifts of a few columns before the next ones: their voxels then stay in the fastest cache.
-        columns = np.empty((shifts, shifts, shifts, length), dtype=np.float32)
-        flat = columns.reshape(columns.size)
         for start in range(0, length, LANES):
             # The last lanes, and the last shifts below, begin early enough to end with the others.
             x = min(start, length - LANES)
@@ -236,18 +317,15 @@ def block_products(
                 for sy in range(shifts):
                     for group in range(0, shifts, together):
                         sx = min(group, shifts - together)
+                        at = ((sz * shifts + sy) * shifts + sx) * length + x
                         shift = (sz - radius) * plane + (sy - radius) * row + sx - radius
-                        at, here = ((sz * shifts + sy) * shifts + sx) * length + x, begin + x
-                        if together == MANY_SHIFTS:
-                            many_products(flat, at, length, flat_a, flat_b, here, shift, plane, row, size[0], size[1])
-                        else:
-                            few_products(flat, at, length, flat_a, flat_b, here, shift, plane, row, size[0], size[1])
-        lines = columns.reshape(-1, length)
-        for bx in range(count[2]):
-            sums = products[bz, by, bx].reshape(lines.shape[0])
-            for shift in range(lines.shape[0]):
-                total = 0.0
-                for x in range(bx * stride[2], bx * stride[2] + size[2]):
-                    total += lines[shift, x]
-                sums[shift] = total
-    return products
+                        products(
+                            flat, at, length, flat_a, flat_b, begin + x, shift, plane, row, size[0], size[1], together
+                        )
+        sum_ahead(flat, spare, size[2], sums)
+        lines = sums.reshape(-1, length)
+        for kx in range(count[2]):
+            window = found[bz, by, kx].reshape(lines.shape[0])
+            for shift in range(window.size):
+                window[shift] = lines[shift, kx * stride[2]]
+    return found

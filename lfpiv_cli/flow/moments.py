@@ -17,14 +17,16 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
+from lfpiv_cli.flow.lane_sums import MOMENTS
+from lfpiv_cli.flow.lane_sums import moments as lane_moments
 from lfpiv_cli.flow.maps import SMALLEST_BLOCK, Blocks
+from lfpiv_cli.flow.vectors import LANES
 from lfpiv_cli.flow.windows import Triple, WindowLayout
 
 # Cells along an axis of a window: groups enough for a variance, each as large as a particle image.
 CELLS_PER_WINDOW = 4
-# Unknowns: three components and the gain. Moments: the ten of their products, and the four with B - A.
+# Three components and the gain. Moments are those of their derivatives, and those of these with B - A.
 UNKNOWNS = 4
-MOMENTS = UNKNOWNS * (UNKNOWNS + 1) // 2 + UNKNOWNS
 # A group is at least this many standard deviations of a particle image long: smaller ones share their particles, and
 # the spread of what they say is then too small.
 GROUP_SIGMAS = 2.0
@@ -113,60 +115,27 @@ def cell_moments(
     The upper triangle of the products of (dM/dx, dM/dy, dM/dz, M), row by row, then those of each with B - A. Voxels
     with a neighbour that is not valid are left out: their gradient would be that of the rim.
     """
-    moments = np.zeros((count[0], count[1], count[2], MOMENTS))
-    length = (count[2] - 1) * stride[2] + size[2]
+    found = np.empty((count[0], count[1], count[2], MOMENTS))
+    row, plane = a.shape[2], a.shape[1] * a.shape[2]
+    flat_a, flat_b, flat_valid = a.reshape(a.size), b.reshape(b.size), valid.reshape(valid.size)
+    length = max(LANES, (count[2] - 1) * stride[2] + size[2])
     for job in prange(count[0] * count[1]):
         cz, cy = job // count[1], job % count[1]
-        rows = np.empty((UNKNOWNS + 1, length), dtype=np.float32)
+        begin = (first[0] + cz * stride[0]) * plane + (first[1] + cy * stride[1]) * row + first[2]
         # Summed over the planes and rows of the cells first, many columns at once; float32 serves for so few.
-        columns = np.zeros((MOMENTS, length), dtype=np.float32)
-        for z in range(first[0] + cz * stride[0], first[0] + cz * stride[0] + size[0]):
-            for y in range(first[1] + cy * stride[1], first[1] + cy * stride[1] + size[1]):
-                write_row(a, b, valid, z, y, first[2], rows)
-                place = 0
-                for i in range(UNKNOWNS):
-                    for j in range(i, UNKNOWNS):
-                        add_products(columns[place], rows[i], rows[j])
-                        place += 1
-                    add_products(columns[MOMENTS - UNKNOWNS + i], rows[i], rows[UNKNOWNS])
+        columns = np.empty((MOMENTS, length), dtype=np.float32)
+        flat = columns.reshape(columns.size)
+        for start in range(0, length, LANES):
+            # The last lanes begin early enough to end with the others.
+            x = min(start, length - LANES)
+            lane_moments(flat, x, length, flat_a, flat_b, flat_valid, begin + x, plane, row, size[0], size[1])
         for cx in range(count[2]):
             for moment in range(MOMENTS):
                 total = 0.0
                 for x in range(cx * stride[2], cx * stride[2] + size[2]):
                     total += columns[moment, x]
-                moments[cz, cy, cx, moment] = total
-    return moments
-
-
-@njit(cache=True)
-def add_products(sums: NDArray[np.float32], one: NDArray[np.float32], other: NDArray[np.float32]) -> None:
-    """Add the products of two rows to a third."""
-    for x in range(sums.size):
-        sums[x] += one[x] * other[x]
-
-
-@njit(cache=True)
-def write_row(
-    a: NDArray[np.float32],
-    b: NDArray[np.float32],
-    valid: NDArray[np.uint8],
-    z: int,
-    y: int,
-    first: int,
-    rows: NDArray[np.float32],
-) -> None:
-    """Write dM/dx, dM/dy, dM/dz, M and B - A of the voxels from `first` on; zeros where a neighbour is not valid."""
-    quarter, half = np.float32(0.25), np.float32(0.5)
-    for x in range(rows.shape[1]):
-        at = first + x
-        whole = valid[z - 1, y, at] & valid[z + 1, y, at] & valid[z, y - 1, at] & valid[z, y + 1, at]
-        whole &= valid[z, y, at - 1] & valid[z, y, at + 1] & valid[z, y, at]
-        kept = np.float32(whole)
-        rows[0, x] = kept * quarter * (a[z, y, at + 1] + b[z, y, at + 1] - a[z, y, at - 1] - b[z, y, at - 1])
-        rows[1, x] = kept * quarter * (a[z, y + 1, at] + b[z, y + 1, at] - a[z, y - 1, at] - b[z, y - 1, at])
-        rows[2, x] = kept * quarter * (a[z + 1, y, at] + b[z + 1, y, at] - a[z - 1, y, at] - b[z - 1, y, at])
-        rows[3, x] = kept * half * (a[z, y, at] + b[z, y, at])
-        rows[4, x] = kept * (b[z, y, at] - a[z, y, at])
+                found[cz, cy, cx, moment] = total
+    return found
 
 
 @njit(cache=True)
@@ -186,18 +155,23 @@ def invert(matrix: NDArray[np.float64], inverse: NDArray[np.float64]) -> bool:
     """Write the inverse of a symmetric positive definite matrix (n, n) and tell whether it has one."""
     n = matrix.shape[0]
     rest = matrix.copy()
-    inverse[:] = np.eye(n)
+    for i in range(n):
+        for j in range(n):
+            inverse[i, j] = 1.0 if i == j else 0.0
+    # Element by element: an expression of whole rows would allocate each time.
     for k in range(n):
         if not rest[k, k] > SMALLEST_PIVOT * matrix[k, k]:
             return False
-        pivot = rest[k, k]
-        rest[k] /= pivot
-        inverse[k] /= pivot
+        scale = 1.0 / rest[k, k]
+        for j in range(n):
+            rest[k, j] *= scale
+            inverse[k, j] *= scale
         for i in range(n):
+            factor = rest[i, k]
             if i != k:
-                factor = rest[i, k]
-                rest[i] -= factor * rest[k]
-                inverse[i] -= factor * inverse[k]
+                for j in range(n):
+                    rest[i, j] -= factor * rest[k, j]
+                    inverse[i, j] -= factor * inverse[k, j]
     return True
 
 
@@ -222,11 +196,14 @@ def solve_windows(
                 for y in range(per_window[1]):
                     for x in range(per_window[2]):
                         cell = moments[kz * hop[0] + z, ky * hop[1] + y, kx * hop[2] + x]
-                        sums[z // grouped[0], y // grouped[1], x // grouped[2]] += cell
+                        group = sums[z // grouped[0], y // grouped[1], x // grouped[2]]
+                        for m in range(MOMENTS):
+                            group[m] += cell[m]
             flat = sums.reshape(-1, MOMENTS)
             total = np.zeros(MOMENTS)
             for g in range(flat.shape[0]):
-                total += flat[g]
+                for m in range(MOMENTS):
+                    total[m] += flat[g, m]
             unpack(total, matrix, vector)
             if not invert(matrix, inverse):
                 continue
@@ -264,11 +241,11 @@ def write_deviation(
                 if matrix[UNKNOWNS - 1, UNKNOWNS - 1] == 0.0:
                     continue
                 used += 1
-                for i in range(3):
-                    for j in range(UNKNOWNS):
-                        left = vector[j]
-                        for k in range(UNKNOWNS):
-                            left -= matrix[j, k] * solution[k]
+                for j in range(UNKNOWNS):
+                    left = vector[j]
+                    for k in range(UNKNOWNS):
+                        left -= matrix[j, k] * solution[k]
+                    for i in range(3):
                         rest[z + 1, y + 1, x + 1, i] += inverse[i, j] * left
     # A kernel of 1/2, 1, 1/2 along each axis with more than one group: the mean share that a block has in the whole.
     dependent = 1.0
@@ -279,15 +256,24 @@ def write_deviation(
         overlap *= 2.0
     if used < FEWEST_GROUPS * dependent:
         return
+    sum_neighbours(rest)
     for i in range(3):
         variance = 0.0
         for z in range(nz + 1):
             for y in range(ny + 1):
                 for x in range(nx + 1):
-                    block = 0.0
-                    for dz in range(2):
-                        for dy in range(2):
-                            for dx in range(2):
-                                block += rest[z + dz, y + dy, x + dx, i]
-                    variance += block * block
+                    variance += rest[z, y, x, i] * rest[z, y, x, i]
         deviation[i] = np.sqrt(variance / overlap / (1.0 - dependent / used))
+
+
+@njit(cache=True)
+def sum_neighbours(values: NDArray[np.float64]) -> None:
+    """Replace values (z, y, x, 3) by the sums of those from each place to the next along z, y and x, in place.
+
+    The last ones along each axis are left half done.
+    """
+    for stride in (values[0].size, values[0, 0].size, values[0, 0, 0].size):
+        flat = values.reshape(values.size)
+        here, after = flat[: flat.size - stride], flat[stride:]
+        for i in range(here.size):
+            here[i] += after[i]
