@@ -182,12 +182,13 @@ def _second_fits_better(
     """
     sure = used.any(axis=0) & ~disagree
     mean, _ = _mean(values, sigma, used)
-    predicted, spread, share = predict(np.where(sure[..., np.newaxis], mean, 0.0), sure, ~masked, disagree)
-    of_those = disagree[..., np.newaxis]
-    sigmas = np.where(of_those, sigma, 1.0)
-    off = (np.where(of_those, values, 0.0) - predicted) / (spread + sigmas.min(axis=0))
-    fits = np.sum(off[1] ** 2, axis=-1) < np.sum(off[0] ** 2, axis=-1)
-    return np.asarray(np.where(share >= NEEDED_SHARE, fits, sigmas[1].prod(axis=-1) < sigmas[0].prod(axis=-1)))
+    predicted, spread, share = predict(mean, sure, ~masked, np.flatnonzero(disagree))
+    sigmas = sigma[:, disagree]
+    off = np.sum(((values[:, disagree] - predicted) / (spread + sigmas.min(axis=0))) ** 2, axis=-1)
+    stated = sigmas.prod(axis=-1)
+    second = np.zeros(disagree.shape, dtype=np.bool_)
+    second[disagree] = np.where(share >= NEEDED_SHARE, off[1] < off[0], stated[1] < stated[0])
+    return second
 
 
 def _of_one(first: NDArray[np.float64], second: NDArray[np.float64], used: NDArray[np.bool_]) -> NDArray[np.float64]:
