@@ -31,8 +31,9 @@ from lfpiv_cli.particles.gridding import on_grid
 from lfpiv_cli.particles.sequences import follow, scatter_in, states_at
 from lfpiv_cli.particles.tracking import Tracks, track
 
-# A vector needs its twelve nearest tracks within this many windows of its centre.
-REACH_WINDOWS = 1.0
+# A vector needs its twelve nearest tracks within this many windows of its centre: in sparse images tracks are further
+# apart than windows, and what a wide fit misses of the flow is in the stated error.
+REACH_WINDOWS = 2.0
 # Displacements are sought up to this many voxels along each axis unless told otherwise.
 SEARCH_VOXEL = 6.0
 # A ghost finds a partner in the next frame by chance, hardly ever in two.

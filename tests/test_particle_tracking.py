@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.particles.gridding import on_grid
 from lfpiv_cli.particles.tracking import track, vote
+from lfpiv_cli.synthetic.flows import taylor_green
 
 BOX_MM = np.array([4.0, 4.0, 4.0])
 
@@ -76,11 +77,28 @@ def test_grid_states_its_error_and_ignores_strays(rng: np.random.Generator) -> N
     nodes = rng.uniform(0.5, 3.5, (200, 3))
     value, error = on_grid(points, values, sigma, nodes, 1.0)
     ratio = (value - moved(nodes)) / error
-    # Neighbouring nodes share tracks, so 200 nodes make some 60 independent ones: 10 %; the spread is estimated too,
-    # from 45 tracks, which makes 4 % more of the ratio.
-    assert np.all(np.abs(np.sqrt(np.mean(ratio**2, axis=0)) - 1.0) < 0.3)
-    assert np.sqrt(np.mean(ratio**2)) == pytest.approx(1.04, abs=0.12)
-    assert np.all(error < sigma[0])
+    # A linear flow: nothing is missed, and what is stated for it is what chance makes of nothing. Neighbouring nodes
+    # share tracks, so 200 nodes make some 60 independent ones: 10 %.
+    assert np.all(np.sqrt(np.mean(ratio**2, axis=0)) < 1.2)
+    assert np.all(np.sqrt(np.mean(ratio**2, axis=0)) > 0.55)
+    # As well as the sixty tracks of the widest line, and not the ten unknowns of a parabola, let it.
+    assert np.all(np.median(np.abs(value - moved(nodes)), axis=0) < 0.25 * sigma[0])
+
+
+@pytest.mark.parametrize(("wavelength_mm", "tracks"), [(4.0, 1500), (8.0, 300), (2.5, 1500)])
+def test_errors_are_stated_whatever_the_density_and_the_flow(
+    wavelength_mm: float, tracks: int, rng: np.random.Generator
+) -> None:
+    """Vortices seen by many tracks and by few: a component that is all noise, and two that bend."""
+    flow = taylor_green(0.1, wavelength_mm, (2.0, 2.0, 2.0), "xy")
+    points = rng.uniform(0.0, BOX_MM, (tracks, 3))
+    sigma = np.full(points.shape, 0.001)
+    nodes = np.stack(np.meshgrid(*[np.linspace(0.4, 3.6, 7)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    value, error = on_grid(points, 2.0 * flow(points) + rng.normal(0.0, sigma), sigma, nodes, 4.0)
+    covered = np.mean(np.abs(value - 2.0 * flow(nodes)) < 1.96 * error, axis=0)
+    # One fit for all, a parabola through 45, covers about .82 of x and y, and has nearly twice the noise in z.
+    assert np.all(covered > 0.88)
+    assert np.sqrt(np.mean(value[:, 2] ** 2)) < 0.5 * sigma[0, 2]
 
 
 def test_a_node_without_tracks_has_no_vector(rng: np.random.Generator) -> None:

@@ -1,28 +1,62 @@
-"""From scattered tracks to vectors on a grid: local polynomials, each with its uncertainty.
+"""From scattered tracks to vectors on a grid: local polynomials whose degree and reach follow the tracks.
+
+A wide fit has little noise and misses what the flow does within its reach; a narrow one is the other way round. Which
+is better depends on the tracks' density and errors and on the flow, and differs from component to component: depth is
+noise, the streamwise component shear. The noise of a fit is known from its tracks. What it misses is seen in the
+differences of fits, less the noise of these: among parabolas it grows with the cube of the radius, and a line misses
+what tells it from a parabola. Each component of a node takes the fit whose error, of both kinds, is the smallest, and
+states it.
 
 Axes: points (n, 3) and displacements in mm, at the middle of each track.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
+from scipy.stats import chi2
 
-# Tracks for a local quadratic: four and a half for each of its ten unknowns. With fewer at hand, or with all on one
-# side, a linear one through at least three for each of its four unknowns.
-QUADRATIC_TRACKS = 45
-LINEAR_TRACKS = 12
-QUADRATIC_TERMS = 10
-LINEAR_TERMS = 4
-# No particle is known better than this; guards against a standard error of zero.
-SMALLEST_SIGMA_MM = 1e-6
-# Tukey's biweight drops tracks that stray; settled after a few rounds.
-TUKEY = 4.685
-TUKEY_ROUNDS = 5
-MAD_TO_SIGMA = 1.4826
-# The biweight takes its weighted mean square from the middle of a normal distribution: this share of the variance.
-TUKEY_VARIANCE = 0.827
+from lfpiv_cli.particles.local_fits import LocalFits, fit_around
+
+# Degrees and numbers of tracks to choose from: three to ten tracks for each of ten unknowns, five to fifteen for each
+# of four. The first one, whose noise and what it misses are both moderate, is what the others are compared with.
+CHOICES = ((2, 45), (2, 30), (2, 70), (2, 100), (1, 20), (1, 30), (1, 60))
+REFERENCE, WIDER = 0, 2
+# What a parabola misses is of third order in its radius.
+MISSED_ORDER = 3
+# Tracks that a node needs within reach, three for each unknown of a linear fit.
+NEEDED_TRACKS = 12
+# One difference of two fits tells little; so many nodes together tell how large such differences are there.
+NODES_TOGETHER = 27
+# Of these the share with the largest is left out: a stray at the rim must not speak for all.
+TRIMMED = 0.15
+# A fit further from the middle one of all than so many of its errors is led astray, whatever it states.
+LARGEST_DEVIATION = 4.0
+# Nodes that are worked on at a time, which bounds the memory: some 100 MB.
+NODES_AT_ONCE = 2000
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """What c fits say at m nodes.
+
+    Attributes
+    ----------
+    value : (c, m, 3) mm
+    variance : (c, m, 3) of the noise, if the tracks' errors are as stated
+    apart : (c, m, 3) variance of the difference from the reference, likewise
+    radius_mm : (c, m)
+    scatter2 : (m, 3) how large the tracks' variances are over the stated ones
+    """
+
+    value: NDArray[np.float64]
+    variance: NDArray[np.float64]
+    apart: NDArray[np.float64]
+    radius_mm: NDArray[np.float64]
+    scatter2: NDArray[np.float64]
 
 
 def on_grid(
@@ -41,62 +75,101 @@ def on_grid(
     reach_mm : a node whose twelfth track lies further away gets no vector
     """
     value, error = (np.full(nodes_mm.shape, np.nan) for _ in range(2))
-    if len(middle_mm) < LINEAR_TRACKS:
+    if len(middle_mm) < NEEDED_TRACKS:
         return value, error
-    count = min(QUADRATIC_TRACKS, len(middle_mm))
-    distance, near = KDTree(middle_mm).query(nodes_mm, k=count)
-    for node in np.flatnonzero(distance[:, LINEAR_TRACKS - 1] <= reach_mm):
-        radius = distance[node, -1]
-        terms = _terms((middle_mm[near[node]] - nodes_mm[node]) / radius)
-        # A Gaussian on which the furthest track still counts for a quarter.
-        kernel = np.exp(-0.5 * (distance[node] / (0.6 * radius)) ** 2)
-        for axis in range(3):
-            sigma = np.maximum(sigma_mm[near[node], axis], SMALLEST_SIGMA_MM)
-            value[node, axis], error[node, axis] = _robust_value(
-                terms, displacement_mm[near[node], axis], sigma, kernel
-            )
+    tree = KDTree(middle_mm)
+    reached = np.flatnonzero(tree.query(nodes_mm, k=[NEEDED_TRACKS])[0][:, 0] <= reach_mm)
+    if not reached.size:
+        return value, error
+    choices = [(degree, count) for degree, count in CHOICES if count <= len(middle_mm)]
+    if len(middle_mm) < CHOICES[WIDER][1]:
+        # Too few for two fits to differ: all of them in one.
+        choices = [(2 if len(middle_mm) >= CHOICES[REFERENCE][1] else 1, len(middle_mm))]
+    parts = []
+    for start in range(0, len(reached), NODES_AT_ONCE):
+        nodes = nodes_mm[reached[start : start + NODES_AT_ONCE]]
+        near = tree.query(nodes, k=np.arange(1, max(count for _, count in choices) + 1))[1]
+        offset = middle_mm[near] - nodes[:, np.newaxis]
+        parts.append(_candidates(offset, displacement_mm[near], sigma_mm[near], choices))
+    value[reached], error[reached] = _best(_joined(parts), nodes_mm[reached], choices)
     return value, error
 
 
-def _terms(offset: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the monomials up to degree two (n, 10), the constant and the linear ones first."""
-    x, y, z = offset.T
-    return np.stack([np.ones_like(x), x, y, z, x * x, y * y, z * z, x * y, x * z, y * z], axis=1)
-
-
-def _robust_value(
-    terms: NDArray[np.float64],
+def _candidates(
+    offset_mm: NDArray[np.float64],
     values: NDArray[np.float64],
     sigma: NDArray[np.float64],
-    kernel: NDArray[np.float64],
-) -> tuple[float, float]:
-    """Return the polynomial's value at the node and its standard error.
-
-    The stated errors weigh the tracks; how large they really are is taken from the scatter about the polynomial.
-    """
-    used = terms if len(values) >= QUADRATIC_TRACKS else terms[:, :LINEAR_TERMS]
-    robust = np.ones(len(values))
-    for _ in range(TUKEY_ROUNDS):
-        root = np.sqrt(kernel * robust) / sigma
-        coefficients = np.linalg.lstsq(root[:, np.newaxis] * used, root * values, rcond=None)[0]
-        off = np.abs(values - used @ coefficients) / sigma
-        spread = MAD_TO_SIGMA * float(np.median(off))
-        if spread == 0.0:
-            break
-        robust = np.clip(1.0 - (off / (TUKEY * spread)) ** 2, 0.0, None) ** 2
-    weight = kernel * robust / sigma**2
-    inverse = np.linalg.pinv(used.T @ (weight[:, np.newaxis] * used))
-    expected = TUKEY_VARIANCE * _left_by_fit(used @ inverse @ used.T * weight, sigma)
-    scatter2 = float(np.sum(kernel * robust * off**2) / np.sum(kernel * robust * expected))
-    # The kernel favours what is near, which is no statement about noise: the sandwich of weighted least squares.
-    meat = used.T @ (((weight * sigma) ** 2)[:, np.newaxis] * used)
-    return float(coefficients[0]), float(np.sqrt(scatter2 * max((inverse @ meat @ inverse)[0, 0], 0.0)))
+    choices: list[tuple[int, int]],
+) -> Candidates:
+    """Return what the choices say at nodes whose nearest tracks (m, k, 3) are given."""
+    fits = [fit_around(offset_mm[:, :k], values[:, :k], sigma[:, :k], degree) for degree, k in choices]
+    return Candidates(
+        value=np.stack([fit.value for fit in fits]),
+        variance=np.stack([np.sum(fit.weights**2, axis=2) for fit in fits]),
+        apart=np.stack([_apart(fit, fits[REFERENCE]) for fit in fits]),
+        radius_mm=np.stack([fit.radius_mm for fit in fits]),
+        scatter2=fits[REFERENCE].scatter2,
+    )
 
 
-def _left_by_fit(hat: NDArray[np.float64], sigma: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the share (n,) of each track's variance that a fit leaves in its residual, with fit = hat @ values.
+def _apart(fit: LocalFits, reference: LocalFits) -> NDArray[np.float64]:
+    """Return the variance (m, 3) of the difference of two fits, which share their nearest tracks."""
+    common = min(fit.weights.shape[2], reference.weights.shape[2])
+    difference = fit.weights[..., :common] - reference.weights[..., :common]
+    rest = [np.sum(each.weights[..., common:] ** 2, axis=2) for each in (fit, reference)]
+    return np.asarray(np.sum(difference**2, axis=2) + rest[0] + rest[1])
 
-    The kernel lets the tracks next to the node draw the polynomial to them, where their number alone tells little.
-    """
-    from_all = (hat * sigma / sigma[:, np.newaxis]) ** 2
-    return np.asarray(1.0 - 2.0 * np.diag(hat) + from_all.sum(axis=1))
+
+def _joined(parts: list[Candidates]) -> Candidates:
+    """Return the candidates of all nodes."""
+    value, variance, apart, radius = (
+        np.concatenate([getattr(part, name) for part in parts], axis=1)
+        for name in ("value", "variance", "apart", "radius_mm")
+    )
+    return Candidates(value, variance, apart, radius, np.concatenate([part.scatter2 for part in parts]))
+
+
+def _best(
+    found: Candidates, nodes_mm: NDArray[np.float64], choices: list[tuple[int, int]]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return each node's value with the smallest error, component by component, and that error, (m, 3)."""
+    together = KDTree(nodes_mm).query(nodes_mm, k=np.arange(1, min(NODES_TOGETHER, len(nodes_mm)) + 1))[1]
+    scatter2 = np.median(found.scatter2[together], axis=1)
+    error2 = found.variance * scatter2
+    if len(choices) > 1:
+        error2 = error2 + _missed2(found, scatter2, together, choices)
+        off = np.abs(found.value - np.median(found.value, axis=0))
+        astray = off > LARGEST_DEVIATION * np.sqrt(error2)
+        error2 = np.where(astray & ~astray.all(axis=0), np.inf, error2)
+    best = np.argmin(error2, axis=0)[np.newaxis]
+    value, smallest = (np.take_along_axis(array, best, axis=0)[0] for array in (found.value, error2))
+    return value, np.sqrt(smallest)
+
+
+def _missed2(
+    found: Candidates, scatter2: NDArray[np.float64], together: NDArray[np.int64], choices: list[tuple[int, int]]
+) -> NDArray[np.float64]:
+    """Return the mean square (c, m, 3) of what each fit misses of the flow around a node."""
+    excess = np.stack(
+        [
+            _excess(value - found.value[REFERENCE], apart * scatter2, together)
+            for value, apart in zip(found.value, found.apart, strict=True)
+        ]
+    )
+    missed = found.radius_mm[..., np.newaxis] ** MISSED_ORDER
+    growth = np.maximum(missed[WIDER] - missed[REFERENCE], np.finfo(np.float64).tiny)
+    of_parabolas = excess[WIDER] * (missed / growth) ** 2
+    is_parabola = np.array([degree == 2 for degree, _ in choices])[:, np.newaxis, np.newaxis]
+    return np.where(is_parabola, of_parabolas, of_parabolas[REFERENCE] + excess)
+
+
+def _excess(
+    difference: NDArray[np.float64], noise2: NDArray[np.float64], together: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Return by how much the mean square of differences (m, 3), over nodes that go together, exceeds their noise."""
+    dropped = int(TRIMMED * together.shape[1])
+    kept = np.sort((difference**2)[together], axis=1)[:, : together.shape[1] - dropped].mean(axis=1)
+    # What the mean of the kept ones is of that of all, if the differences are normal.
+    share = 1.0 - dropped / together.shape[1]
+    kept_share = float(chi2.cdf(chi2.ppf(share, 1), 3)) / share
+    return np.asarray(np.maximum(kept / kept_share - noise2[together].mean(axis=1), 0.0))
