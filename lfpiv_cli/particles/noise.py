@@ -11,8 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 
-# The optics model of a pixel's light is trusted to this share.
+# The optics model of a pixel's light is trusted to this share until what it leaves has been seen.
 MODEL_ERROR = 0.03
 # Photons of a typical tracer. Only the ratio of bright to dark pixels' weights depends on it, and positions hardly do:
 # a fourth or four times of it leaves their spread the same.
@@ -26,21 +27,24 @@ ROUNDING_COUNTS = 0.29
 LIT_SIGMAS, USUAL_SIGMAS = 3.0, 3.5
 # Distances in pixels at which errors are compared: from where white noise is gone to within a micro-image.
 LAGS_PX = range(1, 9)
+# Lit pixels are sorted by brightness into so many classes, of at least so many pixels, to see how their errors grow.
+CLASSES, SMALLEST_CLASS = 32, 100
 
 
 @dataclass(frozen=True)
 class Noise:
-    """Variance of a pixel: read^2 + gain M + (MODEL_ERROR M)^2, with the model M and the gain in counts per photon."""
+    """Variance of a pixel: read^2 + gain M + (model_error M)^2, with the model M and the gain in counts per photon."""
 
     read_counts: float
     gain_counts: float
+    model_error: float = MODEL_ERROR
 
     def weights(
         self, model: NDArray[np.float64], residual: NDArray[np.float64], unexplained: float
     ) -> NDArray[np.float64]:
         """Return 1/variance of each pixel; light above the model adds `unexplained` times its square."""
         model = np.maximum(model, 0.0)
-        variance = self.read_counts**2 + self.gain_counts * model + (MODEL_ERROR * model) ** 2
+        variance = self.read_counts**2 + self.gain_counts * model + (self.model_error * model) ** 2
         return 1.0 / (variance + unexplained * np.maximum(residual, 0.0) ** 2)
 
 
@@ -81,6 +85,33 @@ def _at_lag(error: NDArray[np.float64], lit: NDArray[np.bool_], lag: int) -> flo
     pairs = np.count_nonzero(lit[:, lag:] & lit[:, :-lag])
     variance = np.sum(error**2) / np.count_nonzero(lit)
     return float(np.sum(error[:, lag:] * error[:, :-lag]) / pairs / variance) if pairs else 0.0
+
+
+def measured_noise(
+    model: NDArray[np.float64], residual: NDArray[np.float64], believed: NDArray[np.bool_], noise: Noise
+) -> Noise:
+    """Return noise whose gain and model error are those that a fit leaves of an image.
+
+    Light that was not found does not count: the median of the squares in each class of brightness is taken.
+
+    Parameters
+    ----------
+    model, residual, believed : (pixels,)
+    noise : taken for the read noise, and as it is where too little is lit
+    """
+    lit = believed & (model > LIT_SIGMAS * noise.read_counts)
+    if np.count_nonzero(lit) < CLASSES * SMALLEST_CLASS:
+        return noise
+    order = np.argsort(model[lit], kind="stable")
+    classes = np.array_split(order, CLASSES)
+    brightness = np.array([np.mean(model[lit][members]) for members in classes])
+    variance = np.array([np.median(residual[lit][members] ** 2) for members in classes]) / HALF_NORMAL_MEDIAN**2
+    if not np.all(variance > 0.0):
+        return noise
+    terms = np.column_stack([brightness, brightness**2])
+    # A variance is as sure as it is large.
+    (gain, error2), _ = nnls(terms / variance[:, np.newaxis], 1.0 - noise.read_counts**2 / variance)
+    return Noise(noise.read_counts, float(gain), float(np.sqrt(error2)))
 
 
 def estimate_noise(image: NDArray[np.float64], typical_light: float) -> Noise:

@@ -22,7 +22,7 @@ from lfpiv_cli.particles.candidates import explain_rest, find_peaks, points_in_r
 from lfpiv_cli.particles.covariance import joint_covariance
 from lfpiv_cli.particles.fitting import accept, add_all, judge, refine
 from lfpiv_cli.particles.jumping import jump
-from lfpiv_cli.particles.noise import Noise, error_correlation, estimate_noise
+from lfpiv_cli.particles.noise import Noise, error_correlation, estimate_noise, measured_noise
 from lfpiv_cli.particles.splitting import split
 from lfpiv_cli.particles.tiles import footprint_px, share_out
 from lfpiv_cli.particles.view import View, entry_capacity, footprint_radius_mm
@@ -181,7 +181,10 @@ def find_particles(
         state = _one_round(task, state, settings, progress)
         if progress:
             progress(1)
+    noise = measured_noise(task.image - state.residual, state.residual, task.believed, state.noise)
+    state = replace(state, noise=noise)
     _sweep(task, state, LAST_UNEXPLAINED, LAST_SWEEPS)
+    state = _prune(task, state, rounds[-1])
     return _result(task, state, image.shape)
 
 
