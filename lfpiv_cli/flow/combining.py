@@ -1,8 +1,9 @@
 """One vector field of two that measure the same flow in different ways, weighted by their stated uncertainties.
 
 A volume's correlation errs by its particles' elongation, a fit of tracks by where no track is near: errors of different
-origin, so that each component takes the weighted mean of both. What cannot be weighed is not: a vector without an
-uncertainty serves only where the other field has none, one that neighbours replaced only where nothing was measured.
+origin, so that each component takes the weighted mean of both. Measured vectors that state no uncertainty have the one
+that their distances from the other field's show; where these are too few to tell, they serve only where the other field
+has none. A vector that neighbours replaced serves only where nothing was measured.
 
 The differences of the two are a check of what they state. Where these are larger than stated all over the field, it is
 the field with the larger uncertainties that makes most of them, and those above all are widened until they explain
@@ -26,13 +27,17 @@ from lfpiv_cli.flow.outliers import NEEDED_SHARE, predict
 # Vectors further apart than this, in units of the uncertainty of their difference, are not of one flow: by chance one
 # of a hundred has a component that far out.
 LARGEST_DISAGREEMENT = 3.0
-MAD_TO_SIGMA = 1.4826
+# The spread of differences is that within which nine of ten lie: it sees more of wide tails than a median does, and
+# outliers, up to a tenth, leave it as it is.
+SPREAD_SHARE, SPREAD_SIGMAS = 0.9, 1.645
 # Fewer vectors than this tell no spread of their differences.
 FEWEST_DIFFERENCES = 30
+# No vector is known better than this.
+SMALLEST_SIGMA_VOXEL = 1e-6
 # Positions that should be the same differ by the rounding of sums: far less than this, in mm.
 SAME_PLACE_MM = 1e-6
 
-# How far a vector can be relied on: measured with an uncertainty, without one, only replaced, not there.
+# How far a vector can be relied on: measured with an uncertainty, with none to be had, only replaced, not there.
 WEIGHED, UNWEIGHED, FILLED, NONE = 3, 2, 1, 0
 
 
@@ -71,11 +76,13 @@ def combine(first: VectorField, second: VectorField) -> Combined:
     _ensure_alike(first, second)
     masked = (first.flag == MASKED) | (second.flag == MASKED)
     ranks = np.stack([_rank(field) for field in (first, second)])
+    values, stated = (np.stack(pair) for pair in zip(_vectors(first), _vectors(second), strict=True))
+    _estimate_unstated(values, stated, np.where(masked, NONE, ranks))
+    ranks[np.isfinite(stated).all(axis=-1) & (ranks == UNWEIGHED)] = WEIGHED
     used = (ranks == ranks.max(axis=0)) & (ranks > NONE) & ~masked
     # Of two that cannot be weighed the first one is taken.
     used[1] &= ~(used.all(axis=0) & (ranks[0] < WEIGHED))
     both = used.all(axis=0)
-    values, stated = (np.stack(pair) for pair in zip(_vectors(first), _vectors(second), strict=True))
     widened = _widening(values[0] - values[1], stated, both)
     sigma = stated * widened[:, np.newaxis, np.newaxis, np.newaxis]
     apart = np.abs(values[0] - values[1]) / np.hypot(*sigma)
@@ -132,6 +139,26 @@ def _vectors(field: VectorField) -> tuple[NDArray[np.float64], NDArray[np.float6
     return field.displacement_voxel, np.full(field.displacement_voxel.shape, np.nan) if known is None else known
 
 
+def _estimate_unstated(values: NDArray[np.float64], stated: NDArray[np.float64], ranks: NDArray[np.int64]) -> None:
+    """Give measured vectors without an uncertainty the one that their distances from the other field's show.
+
+    It is no smaller than that of a typical vector of their field that states one.
+    """
+    for own, other in ((0, 1), (1, 0)):
+        silent = (ranks[own] == UNWEIGHED) & (ranks[other] == WEIGHED)
+        if np.count_nonzero(silent) < FEWEST_DIFFERENCES:
+            continue
+        variance = _spread((values[0] - values[1])[silent]) ** 2 - np.median(stated[other, silent] ** 2, axis=0)
+        known = stated[own, ranks[own] == WEIGHED]
+        typical = np.median(known, axis=0) if len(known) else np.zeros(3)
+        stated[own, silent] = np.sqrt(np.maximum(variance, np.maximum(typical, SMALLEST_SIGMA_VOXEL) ** 2))
+
+
+def _spread(difference: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the standard deviation (3,) of differences (n, 3), or of ratios, whatever the largest tenth."""
+    return np.asarray(np.quantile(np.abs(difference), SPREAD_SHARE, axis=0) / SPREAD_SIGMAS)
+
+
 def _widening(
     difference: NDArray[np.float64], stated: NDArray[np.float64], both: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
@@ -144,7 +171,7 @@ def _widening(
         return np.ones((2, 3))
     variance = stated[:, both] ** 2
     total = variance.sum(axis=0)
-    spread = MAD_TO_SIGMA * np.median(np.abs(difference[both]) / np.sqrt(total), axis=0)
+    spread = _spread(difference[both] / np.sqrt(total))
     share = np.median(variance / total, axis=1)
     return np.asarray(np.sqrt(1.0 + np.maximum(spread**2 - 1.0, 0.0) * share / np.sum(share**2, axis=0)))
 
