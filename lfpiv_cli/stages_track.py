@@ -24,7 +24,8 @@ from lfpiv_cli.files.particle_file import (
     write_points,
 )
 from lfpiv_cli.files.provenance import record
-from lfpiv_cli.flow.field import MM_TO_M, REJECTED, VALID, VectorField
+from lfpiv_cli.flow.correlation import SMALLEST_VALID_FRACTION
+from lfpiv_cli.flow.field import MASKED, MM_TO_M, REJECTED, VALID, VectorField
 from lfpiv_cli.flow.windows import layout_windows
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.particles.gridding import on_grid
@@ -206,7 +207,9 @@ def _vectors(settings: Config, volume: Grid, paths: Paths) -> VectorField:
     nodes = np.stack([x, y, z], axis=-1)
     reach = REACH_WINDOWS * max(n * d for n, d in zip(size, volume.spacing_mm, strict=True))
     values, errors = on_grid(paths.middle_mm, paths.displacement_mm, paths.sigma_mm, nodes.reshape(-1, 3), reach)
-    displacement = values.reshape(nodes.shape) / volume.spacing_mm
+    inside = _share_between_walls(settings, grid, size[2] * volume.spacing_mm[2])
+    masked = inside < SMALLEST_VALID_FRACTION
+    displacement = np.where(masked[..., np.newaxis], np.nan, values.reshape(nodes.shape) / volume.spacing_mm)
     found = np.isfinite(displacement).all(axis=-1)
     unknown = np.full(found.shape, np.nan)
     return VectorField(
@@ -215,10 +218,20 @@ def _vectors(settings: Config, volume: Grid, paths: Paths) -> VectorField:
         displacement_raw_voxel=displacement,
         correlation=unknown,
         peak_ratio=unknown,
-        valid_fraction=np.where(found, 1.0, 0.0),
-        flag=np.where(found, VALID, REJECTED).astype(np.uint8),
+        valid_fraction=np.where(found | masked, inside, 0.0),
+        flag=np.where(masked, MASKED, np.where(found, VALID, REJECTED)).astype(np.uint8),
         uncertainty_voxel=errors.reshape(nodes.shape) / volume.spacing_mm,
         voxel_mm=volume.spacing_mm,
         dt_s=settings.correlation.dt_s,
         window_voxel=size,
     )
+
+
+def _share_between_walls(settings: Config, grid: Grid, window_mm: float) -> NDArray[np.float64]:
+    """Return the share of each window's depth (nz, ny, nx) between the channel's walls; 1 where these mask nothing."""
+    share = np.ones(grid.shape_xyz[2])
+    if settings.correlation.mask == "channel":
+        wall, half = 0.5 * settings.channel_width_mm(), 0.5 * window_mm
+        z = grid.axis_mm(2)
+        share = np.clip(np.minimum(z + half, wall) - np.maximum(z - half, -wall), 0.0, None) / window_mm
+    return np.broadcast_to(share[:, np.newaxis, np.newaxis], grid.shape_zyx).copy()

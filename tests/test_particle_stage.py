@@ -74,6 +74,23 @@ def test_track_writes_tracks_and_vectors(pair: tuple[Path, Path], tmp_path: Path
     assert field.uncertainty_voxel is not None
 
 
+def test_vectors_beyond_the_walls_are_masked(tmp_path: Path, rng: np.random.Generator) -> None:
+    start = rng.uniform((-1.5, -1.1, -2.0), (1.5, 1.1, 2.0), (300, 3))
+    resolved = load_config(CONFIG).resolved()
+    changes = {
+        "correlation": resolved["correlation"] | {"mask": "channel"},
+        "channel": resolved["channel"] | {"width_mm": 2.0},
+    }
+    paths = tmp_path / "a.vtkhdf", tmp_path / "b.vtkhdf"
+    for path, moved in zip(paths, (0.0, 0.1), strict=True):
+        write_frame(path, start + (moved, 0.0, 0.0), **changes)
+    run("track", *paths, "-o", tmp_path / "tracks.vtkhdf", "--grid")
+    field = vtkhdf.open_vectors(tmp_path / "tracks_grid.vtkhdf")
+    # Windows of 1.2 mm, 0.6 mm apart from z = -1.5 mm, of which 0.1, 0.7 and all 1.2 mm lie within 1 mm of the middle.
+    assert field.flag[:, 0, 0].tolist() == [4, 0, 0, 0, 0, 4]
+    np.testing.assert_allclose(field.valid_fraction[:3, 1, 1], [0.1 / 1.2, 0.7 / 1.2, 1.0])
+
+
 def test_track_replaces_nothing_unasked(pair: tuple[Path, Path], tmp_path: Path) -> None:
     (tmp_path / "tracks_grid.vtkhdf").write_text("mine")
     with pytest.raises(OutputExistsError):
