@@ -148,10 +148,10 @@ def _sequence(frames: Sequence[Points], search_mm: float, shortest: int, dt_s: f
     points = [frame.position_mm for frame in frames]
     sigma = [np.sqrt(frame.arrays["covariance_mm2"][:, :3]) for frame in frames]
     found = follow(points, sigma, search_mm, shortest)
-    scatter = scatter_in(found, points, sigma)
+    scatter, half = scatter_in(found, points, sigma)
     rows: list[tuple[NDArray[Any], ...]] = []
     for number in range(len(frames)):
-        tracks, state = states_at(found, points, sigma, float(number), scatter)
+        tracks, state = states_at(found, points, sigma, float(number), scatter, half)
         frame = np.full(len(tracks), number)
         particle = found.particles(number, tracks)
         rows.append((state.position_mm, state.velocity, state.velocity_sigma, tracks, frame, particle))
@@ -164,7 +164,7 @@ def _sequence(frames: Sequence[Points], search_mm: float, shortest: int, dt_s: f
         "frame": frame[order],
         "particle": particle[order],
     }
-    between = [states_at(found, points, sigma, number + 0.5, scatter)[1] for number in range(len(frames) - 1)]
+    between = [states_at(found, points, sigma, number + 0.5, scatter, half)[1] for number in range(len(frames) - 1)]
     paths = [Paths(state.position_mm, state.velocity, state.velocity_sigma) for state in between]
     summary = {
         "frames": len(frames),

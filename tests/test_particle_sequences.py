@@ -69,9 +69,9 @@ def followed(recorded: Recorded) -> Trajectories:
 def error_over_sigma(recorded: Recorded, found: Trajectories, frames: int) -> NDArray[np.float64]:
     """Return errors of velocity and these over their stated standard errors, (2, n, 3), of what is no ghost."""
     points, sigma = recorded.points[:frames], recorded.sigma[:frames]
-    scatter, both = scatter_in(found, points, sigma), []
+    (scatter, half), both = scatter_in(found, points, sigma), []
     for number in range(frames):
-        tracks, state = states_at(found, points, sigma, float(number), scatter)
+        tracks, state = states_at(found, points, sigma, float(number), scatter, half)
         particle = found.particles(number, tracks)
         error = state.velocity - FLOW(recorded.true_mm[number][particle]) * DT_S * 1e3
         real = recorded.true_number[number][particle] >= 0
@@ -138,7 +138,7 @@ def test_frames_of_nothing_give_no_tracks() -> None:
     empty = [np.zeros((0, 3))] * 4
     found = follow(empty, empty, 0.4, 3)
     assert found.count == 0
-    assert states_at(found, empty, empty, 1.5, scatter_in(found, empty, empty))[0].size == 0
+    assert states_at(found, empty, empty, 1.5, *scatter_in(found, empty, empty))[0].size == 0
 
 
 @pytest.mark.parametrize("frames", [3, 7])
@@ -178,3 +178,18 @@ def test_a_track_s_own_past_goes_before_its_neighbours(rng: np.random.Generator)
     for told, least, most in ((forecast, 0.95, 1.0), (None, 0.0, 0.5)):
         links = track(start, start + moved, 0.4, told)
         assert least * 400 <= np.sum(links.first == links.second) <= most * 400
+
+
+@pytest.mark.parametrize(("turn_rad", "half_frames"), [(0.0, 3), (0.8, 2)])
+def test_velocities_take_fewer_frames_where_parabolas_do_not_follow(
+    turn_rad: float, half_frames: int, rng: np.random.Generator
+) -> None:
+    """Particles on circles of 0.05 mm that turn by so much from frame to frame."""
+    phase, centre = rng.uniform(0.0, 2.0 * np.pi, 300), rng.uniform(0.0, BOX_MM, (300, 3))
+    points = []
+    for number in range(7):
+        angle = phase + number * turn_rad
+        circle = 0.05 * np.stack([np.cos(angle), np.sin(angle), np.zeros(300)], axis=1)
+        points.append(centre + circle + rng.normal(0.0, NOISE_MM, centre.shape))
+    sigma = [np.broadcast_to(NOISE_MM, centre.shape)] * 7
+    assert scatter_in(Trajectories((np.arange(300),) * 7, 300), points, sigma)[1] == half_frames

@@ -20,8 +20,10 @@ from lfpiv_cli.particles.tracking import FIT_TRACKS, Forecast, expected_displace
 
 # A forecast takes a track's last four places: enough for a parabola and to see its noise.
 PAST_FRAMES = 4
-# A velocity takes the places of three frames on either side, as long as a parabola follows most flows.
-HALF_FRAMES = 3
+# A velocity takes the places of three frames on either side, or of two, if what three leave is larger than the noise
+# that two show by more than this: a parabola then no longer follows the tracks.
+HALVES_FRAMES = (3, 2)
+LARGEST_MISFIT = 1.1
 NO_TRACK = -1
 
 Frames = Sequence[NDArray[np.float64]]
@@ -70,9 +72,15 @@ def follow(points: Frames, sigma_mm: Frames, search_mm: float, shortest: int) ->
     return _long_ones(found, shortest)
 
 
-def scatter_in(found: Trajectories, points: Frames, sigma_mm: Frames) -> Scatter:
-    """Return noise and bending of the tracks of a sequence, from windows that do not overlap."""
-    width = 2 * HALF_FRAMES + 1
+def scatter_in(found: Trajectories, points: Frames, sigma_mm: Frames) -> tuple[Scatter, int]:
+    """Return noise and bending of the tracks of a sequence, and how many frames on either side of a time to take."""
+    wide, narrow = (_scatter_of_windows(found, points, sigma_mm, 2 * half + 1) for half in HALVES_FRAMES)
+    is_followed = np.all(wide.noise <= LARGEST_MISFIT * narrow.noise)
+    return (wide, HALVES_FRAMES[0]) if is_followed else (narrow, HALVES_FRAMES[1])
+
+
+def _scatter_of_windows(found: Trajectories, points: Frames, sigma_mm: Frames, width: int) -> Scatter:
+    """Return noise and bending of the tracks in windows of so many frames that do not overlap."""
     windows = [_frames_before(end, width) for end in range(min(width, len(points)), len(points) + 1, width)]
     pieces = [_places(found, points, sigma_mm, window, np.arange(found.count)) for window in windows]
     position, sigma = (np.concatenate(pair) for pair in zip(*pieces, strict=True))
@@ -80,11 +88,12 @@ def scatter_in(found: Trajectories, points: Frames, sigma_mm: Frames) -> Scatter
 
 
 def states_at(
-    found: Trajectories, points: Frames, sigma_mm: Frames, time: float, scatter: Scatter
+    found: Trajectories, points: Frames, sigma_mm: Frames, time: float, scatter: Scatter, half_frames: int
 ) -> tuple[NDArray[np.int64], State]:
     """Return the tracks that pass a time, given in frames, and their states then.
 
-    Half-way between two frames these are the tracks with a place before and one after, at most two frames apart.
+    Half-way between two frames these are the tracks with a place before and one after, at most two frames apart, and
+    the places of so many frames on either side are taken; at a frame, besides, its own.
     """
     before, after = int(np.floor(time)), int(np.ceil(time))
     present = [
@@ -93,8 +102,7 @@ def states_at(
     ]
     passing = present[1] if before == after else (present[0] | present[1]) & (present[2] | present[3])
     numbers = np.array(sorted(passing), dtype=np.int64)
-    reach = HALF_FRAMES if before == after else HALF_FRAMES - 1
-    window = [k for k in range(before - reach, after + reach + 1) if 0 <= k < len(points)]
+    window = [k for k in range(int(np.ceil(time - half_frames)), int(time + half_frames) + 1) if 0 <= k < len(points)]
     position, sigma = _places(found, points, sigma_mm, window, numbers)
     return numbers, fit_in_time(position, sigma, np.array(window) - time, scatter)
 
