@@ -74,7 +74,7 @@ def test_true_volume_is_a_fixed_point(optical, rng, solver):
 def test_residual_falls_and_volume_stays_non_negative(optical, rng, solver):
     truth = np.zeros(optical.shape, np.float32)
     truth[rng.integers(0, 6, 8), rng.integers(0, 7, 8), rng.integers(0, 8, 8)] = 100.0
-    result = reconstruct(optical, optical.forward(truth), solver, iterations=30)
+    result = reconstruct(optical, optical.forward(truth), solver, iterations=12)
     assert np.all(np.diff(result.residual) < 0)
     assert result.residual[-1] < 0.5 * result.residual[0]
     assert result.volume.min() >= 0.0
@@ -194,8 +194,8 @@ def test_momentum_reaches_the_same_residual_in_fewer_steps(optical, rng, solver)
     truth = np.zeros(optical.shape, np.float32)
     truth[rng.integers(0, 6, 8), rng.integers(0, 7, 8), rng.integers(0, 8, 8)] = 100.0
     image = optical.forward(truth)
-    plain = reconstruct(optical, image, solver, iterations=60)
-    fast = reconstruct(optical, image, solver, iterations=20, accelerate=True)
+    plain = reconstruct(optical, image, solver, iterations=24)
+    fast = reconstruct(optical, image, solver, iterations=12, accelerate=True)
     assert fast.residual[-1] < plain.residual[-1]
     assert fast.volume.min() >= 0.0
 
