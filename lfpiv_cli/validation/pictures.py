@@ -152,9 +152,7 @@ def _draw_cumulative(axes: Axes, pairs: Comparison, name: str) -> None:
         if shares[share] is not None:
             axes.plot(shares["relative_error"], shares[share], label=label)
     axes.axvline(0.25, color="0.7", linewidth=0.8)
-    axes.set(
-        xlabel="relative error", ylabel="share of vectors", title=f"cumulative distribution, {name}", ylim=(0.0, 1.0)
-    )
+    axes.set(xlabel="relative error", ylabel="share of vectors", title=f"{name}, cumulative", ylim=(0.0, 1.0))
     axes.legend()
 
 
