@@ -88,6 +88,22 @@ def test_windows_without_light_or_with_few_groups_say_that_nothing_is_known(rng:
     assert np.isnan(deviation).all()
 
 
+def test_windows_that_overhang_have_an_uncertainty_of_their_own(rng: np.random.Generator) -> None:
+    a, b = shifted(rng, (1.0, 1.0, 1.0), noise=0.02)
+    layout = layout_windows(SHAPE, (16, 16, 8), HALF)
+    before, after = margins(layout, a.shape, 1)
+    margin = list(zip(before, after, strict=True))
+    valid = np.ones(a.shape, np.uint8)
+    # As where particles move 4 voxels in depth: of the outermost windows half is left.
+    valid[:2] = valid[-2:] = 0
+    padded = (np.pad(volume, margin) for volume in (a, b, valid))
+    _, deviation = gauss_newton(pair_moments(*padded, layout, before), layout, ROUND)
+    assert np.isfinite(deviation).all()
+    inside = np.median(deviation[1:-1])
+    # Half the voxels, and some of the particles cut: a root of two more, or a little beyond.
+    assert 1.0 < np.median(deviation[[0, -1]]) / inside < 2.5
+
+
 def test_a_window_of_sixteen_has_four_cells_an_axis() -> None:
     cells = cells_of(layout_windows(SHAPE, (16, 16, 16), HALF))
     assert cells.per_window == (CELLS_PER_WINDOW,) * 3

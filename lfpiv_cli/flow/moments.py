@@ -30,8 +30,9 @@ UNKNOWNS = 4
 # A group is at least this many standard deviations of a particle image long: smaller ones share their particles, and
 # the spread of what they say is then too small.
 GROUP_SIGMAS = 2.0
-# With fewer independent groups than this their spread says nothing.
-FEWEST_GROUPS = 4
+# With fewer independent groups than this their spread says nothing. A window of 16 x 16 x 8 that overhangs at a corner
+# has 3 x 3 x 1 groups left, 3.2 of them independent.
+FEWEST_GROUPS = 3
 # A pivot below this share of its diagonal element is rounding: the window does not determine that unknown.
 SMALLEST_PIVOT = 1e-6
 
@@ -234,6 +235,8 @@ def write_deviation(
     # One empty group beyond each face: blocks may overhang.
     rest = np.zeros((nz + 2, ny + 2, nx + 2, 3))
     used = 0
+    # How many layers of groups along each axis hold anything: a window that overhangs has fewer.
+    seen_z, seen_y, seen_x = np.zeros(nz), np.zeros(ny), np.zeros(nx)
     for z in range(nz):
         for y in range(ny):
             for x in range(nx):
@@ -241,6 +244,7 @@ def write_deviation(
                 if matrix[UNKNOWNS - 1, UNKNOWNS - 1] == 0.0:
                     continue
                 used += 1
+                seen_z[z] = seen_y[y] = seen_x[x] = 1.0
                 for j in range(UNKNOWNS):
                     left = vector[j]
                     for k in range(UNKNOWNS):
@@ -249,11 +253,9 @@ def write_deviation(
                         rest[z + 1, y + 1, x + 1, i] += inverse[i, j] * left
     # A kernel of 1/2, 1, 1/2 along each axis with more than one group: the mean share that a block has in the whole.
     dependent = 1.0
-    overlap = 1.0
-    for count in (nz, ny, nx):
-        if count > 1:
-            dependent *= 2.0 - 1.0 / count
-        overlap *= 2.0
+    for layers in (seen_z.sum(), seen_y.sum(), seen_x.sum()):
+        if layers > 1.0:
+            dependent *= 2.0 - 1.0 / layers
     if used < FEWEST_GROUPS * dependent:
         return
     sum_neighbours(rest)
@@ -263,7 +265,8 @@ def write_deviation(
             for y in range(ny + 1):
                 for x in range(nx + 1):
                     variance += rest[z, y, x, i] * rest[z, y, x, i]
-        deviation[i] = np.sqrt(variance / overlap / (1.0 - dependent / used))
+        # Each group is in two blocks along each axis.
+        deviation[i] = np.sqrt(variance / 8.0 / (1.0 - dependent / used))
 
 
 @njit(cache=True)
