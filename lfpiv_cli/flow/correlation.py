@@ -29,7 +29,7 @@ from lfpiv_cli.flow.deformation import (
     spline_matrix,
 )
 from lfpiv_cli.flow.field import VectorField
-from lfpiv_cli.flow.filtering import smooth_field, unresolved
+from lfpiv_cli.flow.filtering import mixing, smooth_field, unresolved
 from lfpiv_cli.flow.maps import map_sums, margins, valid_shares
 from lfpiv_cli.flow.moments import gauss_newton, pair_moments
 from lfpiv_cli.flow.outliers import expected_noise, fill_field, validate_vectors
@@ -44,6 +44,10 @@ LATER_RADIUS = 1
 FINAL_PASSES = 4
 # The last pass looks two voxels far again: one has no room for a second peak.
 LAST_RADIUS = 2
+# Share of a Gauss-Newton step in the place of a peak of short particles, and how far apart they are at most, in voxels.
+# More of it takes more of the error in clean volumes, and adds noise where particles are lost.
+STEP_SHARE = 0.25
+LARGEST_DIFFERENCE = 0.5
 # With less of its voxels seen in both volumes a window is masked rather than judged by the few particles in it.
 SMALLEST_VALID_FRACTION = 0.25
 
@@ -69,7 +73,7 @@ class Pair:
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """What one pass measured, at the centres of its windows, and whether particle images are long along some axis."""
+    """What one pass measured, at the centres of its windows, and the typical width of the peaks along x, y, z."""
 
     raw: NDArray[np.float64]
     displacement: NDArray[np.float64]
@@ -77,7 +81,12 @@ class Measured:
     peaks: Peaks
     valid_fraction: NDArray[np.float64]
     uncertainty: NDArray[np.float64]
-    is_elongated: bool
+    width: NDArray[np.float64]
+
+    @property
+    def is_long(self) -> NDArray[np.bool_]:
+        """Along which of x, y, z particle images are long."""
+        return self.width >= ELONGATED_WIDTH
 
 
 def correlate(
@@ -156,14 +165,14 @@ def correlate_ensemble(
     with _matrix_libraries().limit(limits=1, user_api="blas"):
         for step in _plan(grid.shape_xyz, windows, overlap):
             measured = _refine(ready, _between_layouts(predictor, layout, step.layout), step, is_elongated)
-            filled, is_elongated = fill_field(measured.displacement), measured.is_elongated
+            filled, is_elongated = fill_field(measured.displacement), bool(measured.is_long.any())
             predictor = smooth_field(filled, is_elongated)
             layout = step.layout
             report(1)
     uncertainty = np.hypot(measured.uncertainty, unresolved(filled, is_elongated))
     return VectorField(
         grid=layout.grid(grid),
-        displacement_voxel=measured.displacement,
+        displacement_voxel=_unmixed(measured, filled, layout),
         displacement_raw_voxel=measured.raw,
         correlation=measured.peaks.height,
         peak_ratio=measured.peaks.ratio,
@@ -272,18 +281,31 @@ def _refine(pairs: Sequence[Pair], predictor: NDArray[np.float64], step: Pass, i
     rest = uncertainty = np.full(peaks.offset.shape, np.nan)
     if moments_of[0] is not None:
         rest, uncertainty = gauss_newton(reduce(add, moments_of), layout, width / np.sqrt(2.0))
-    raw, second = absolute(_along_elongated(peaks, rest, width), predictor)
+    raw, second = absolute(_with_steps(peaks, rest, width), predictor)
     masked = valid_fraction < SMALLEST_VALID_FRACTION
     displacement, flag = validate_vectors(raw, second, peaks.found, masked, expected_noise(peaks.width))
     uncertainty[~peaks.found | masked] = np.nan
-    is_elongated = bool(np.any(width >= ELONGATED_WIDTH))
-    return Measured(raw, displacement, flag, peaks, valid_fraction, uncertainty, is_elongated)
+    return Measured(raw, displacement, flag, peaks, valid_fraction, uncertainty, width)
 
 
-def _along_elongated(peaks: Peaks, rest: NDArray[np.float64], width: NDArray[np.float64]) -> Peaks:
-    """Return the peaks with Gauss-Newton steps in place of their offsets along elongated axes.
+def _unmixed(measured: Measured, filled: NDArray[np.float64], layout: WindowLayout) -> NDArray[np.float64]:
+    """Return the displacements without what long particles mix into the components that are located well.
 
-    A step longer than the peak is wide lies outside the range in which the volumes change linearly.
+    Along the particles' length noise is worse than the mixture.
     """
-    taken = (width >= ELONGATED_WIDTH) & (np.abs(rest) <= width)
-    return replace(peaks, offset=np.where(taken, rest, peaks.offset))
+    sigma = np.where(measured.is_long, measured.width / np.sqrt(2.0), 0.0)
+    return measured.displacement - np.where(measured.is_long, 0.0, mixing(filled, sigma, layout.step))
+
+
+def _with_steps(peaks: Peaks, rest: NDArray[np.float64], width: NDArray[np.float64]) -> Peaks:
+    """Return the peaks with Gauss-Newton steps in place of their offsets along elongated axes, and a share elsewhere.
+
+    A step longer than the peak is wide lies outside the range in which the volumes change linearly. Where all axes are
+    short, steps and peaks err in part independently; where they differ by half a voxel the step has met a lost
+    particle, and the peak is believed.
+    """
+    elongated = width >= ELONGATED_WIDTH
+    differ = rest - peaks.offset
+    elsewhere = 0.0 if elongated.any() else STEP_SHARE * (np.abs(differ) < LARGEST_DIFFERENCE)
+    share = np.where(elongated, np.abs(rest) <= width, elsewhere)
+    return replace(peaks, offset=np.where(share > 0.0, peaks.offset + share * differ, peaks.offset))
