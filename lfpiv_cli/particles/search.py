@@ -1,0 +1,216 @@
+"""A search for the particles of an image: what it is given, how far it has come, and the steps that keep it in order.
+
+Axes: inside, particles are rows (x, y, z, light) in image axes, mm and counts, and images flat; results are in world
+axes of the raw sensor, z from the nominal focal point.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.particles.covariance import joint_covariance
+from lfpiv_cli.particles.fitting import add_all, judge, refine
+from lfpiv_cli.particles.noise import Noise, error_correlation, estimate_noise, measured_noise
+from lfpiv_cli.particles.tiles import share_out
+from lfpiv_cli.particles.view import View, entry_capacity
+from lfpiv_cli.reconstruction.equations import Normalisers
+from lfpiv_cli.weights.model import Weights
+
+# Sweeps at the end, where light that is not explained counts for little more than noise.
+LAST_SWEEPS, LAST_UNEXPLAINED = 4, 0.02
+# Share of a typical particle's light that a particle must have.
+SMALLEST_LIGHT = 0.3
+# A particle stays while at least this much of it meets the sensor.
+SMALLEST_SEEN = 0.1
+# Two particles this close, laterally and in depth, are one.
+MERGE_MM = np.array([0.04, 0.04, 0.25])
+# Particles this far in front of and behind the volume are kept: they light it.
+DEPTH_MARGIN_MM = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class Particles:
+    """The particles of an image.
+
+    Attributes
+    ----------
+    position_mm : (n, 3) world axes
+    light_counts : (n,) all that passes the main lens
+    covariance_mm2 : (n, 3, 3) of the position, the camera taken to be as calibrated
+    chi2 : (n,) mean of residual^2 / variance over the particle's light, about 1 where all is explained
+    seen : (n,) share of its light that meets the sensor
+    residual : (rows, columns) what the particles leave of the image, counts
+    noise : of the image
+    """
+
+    position_mm: NDArray[np.float64]
+    light_counts: NDArray[np.float64]
+    covariance_mm2: NDArray[np.float64]
+    chi2: NDArray[np.float64]
+    seen: NDArray[np.float64]
+    residual: NDArray[np.float64]
+    noise: Noise
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """An image to be explained, with all that does not change.
+
+    Attributes
+    ----------
+    view : the raw image's optics
+    image : (rows * columns,) dark-subtracted counts
+    believed : (rows * columns,) which pixels take part
+    prepared : (rows, columns) the same in the weights' frame
+    depths_mm : between which particles may lie
+    """
+
+    view: View
+    weights: Weights
+    camera: Camera
+    sums: Normalisers
+    image: NDArray[np.float64]
+    believed: NDArray[np.bool_]
+    prepared: NDArray[np.float32]
+    depths_mm: tuple[float, float]
+
+    @property
+    def capacity(self) -> int:
+        """Entries that a particle can have at most."""
+        return entry_capacity(self.view, *self.depths_mm)
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """How far the search has come.
+
+    Attributes
+    ----------
+    particles : (n, 4)
+    residual : (rows * columns,) what they leave of the image
+    typical_light : of a particle
+    noise : of the image
+    unsplit, unmoved : (m, 5) those that could not be split, and not be moved in depth, as `_signature` gives them
+    """
+
+    particles: NDArray[np.float64]
+    residual: NDArray[np.float64]
+    typical_light: float
+    noise: Noise
+    unsplit: NDArray[np.float64]
+    unmoved: NDArray[np.float64]
+
+
+def task_of(
+    image: NDArray[np.float32],
+    view: View,
+    weights: Weights,
+    camera: Camera,
+    sums: Normalisers,
+    excluded: NDArray[np.bool_] | None,
+) -> Task:
+    """Return the task that an image sets; see `rounds.find_particles`."""
+    low, high = weights.grid.bounds_mm(2)
+    return Task(
+        view,
+        weights,
+        camera,
+        sums,
+        np.ascontiguousarray(image, dtype=np.float64).ravel(),
+        np.ones(image.size, np.bool_) if excluded is None else ~excluded.ravel(),
+        weights.prepare(image.astype(np.float32)),
+        (low - DEPTH_MARGIN_MM, high + DEPTH_MARGIN_MM),
+    )
+
+
+def blank(task: Task) -> State:
+    """Return the state in which nothing has been found."""
+    none = np.zeros((0, 5))
+    return State(np.zeros((0, 4)), task.image.copy(), 0.0, estimate_noise(task.image, 0.0), none, none)
+
+
+def pixel_weight(task: Task, state: State, unexplained: float) -> NDArray[np.float64]:
+    """Return the weight of each pixel, zero where it is not believed; light above the model counts for less."""
+    return np.where(task.believed, state.noise.weights(task.image - state.residual, state.residual, unexplained), 0.0)
+
+
+def sweep(task: Task, state: State, unexplained: float, sweeps: int) -> None:
+    """Refine all particles in place, the residual along with them."""
+    for _ in range(sweeps):
+        tiles = share_out(task.view, state.particles, *task.depths_mm)
+        weight = pixel_weight(task, state, unexplained)
+        refine(task.view, state.particles, tiles, state.residual, weight, *task.depths_mm, task.capacity)
+
+
+def merge(task: Task, state: State) -> State:
+    """Return the state with particles that have become one added up, and its residual computed anew."""
+    particles = state.particles.copy()
+    pairs = KDTree(particles[:, :3] / MERGE_MM).query_pairs(1.0, output_type="ndarray")
+    gone = np.zeros(len(particles), dtype=bool)
+    for a, b in pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]:
+        if not (gone[a] or gone[b]):
+            brighter, other = (a, b) if particles[a, 3] >= particles[b, 3] else (b, a)
+            particles[brighter, 3] += particles[other, 3]
+            gone[other] = True
+    return rebuilt(task, state, particles[~gone])
+
+
+def prune(task: Task, state: State, claimed_share: float, unexplained: float) -> State:
+    """Return the state without particles that are too faint, hardly seen, or do not find their light."""
+    weight = pixel_weight(task, state, unexplained)
+    _, share, seen = judge(task.view, state.particles, state.residual, weight, task.capacity)
+    keep = (state.particles[:, 3] > SMALLEST_LIGHT * state.typical_light) & (seen > SMALLEST_SEEN)
+    keep &= share > claimed_share
+    return rebuilt(task, state, state.particles[keep])
+
+
+def rebuilt(task: Task, state: State, particles: NDArray[np.float64]) -> State:
+    """Return the state with other particles, its residual computed from the image."""
+    residual = task.image.copy()
+    tiles = share_out(task.view, particles, *task.depths_mm)
+    add_all(task.view, particles, tiles, -1.0, residual, task.capacity)
+    return replace(state, particles=particles, residual=residual)
+
+
+def with_typical_light(task: Task, state: State) -> State:
+    """Return the state with the median light of the better fitting half, which holds fewer merged particles."""
+    if not len(state.particles):
+        return state
+    weight = pixel_weight(task, state, LAST_UNEXPLAINED)
+    chi2, *_ = judge(task.view, state.particles, state.residual, weight, task.capacity)
+    typical = float(np.median(state.particles[chi2 <= np.median(chi2), 3]))
+    return replace(state, typical_light=typical, noise=estimate_noise(task.image, typical))
+
+
+def with_measured_noise(task: Task, state: State) -> State:
+    """Return the state with the noise that its particles leave of the image."""
+    return replace(state, noise=measured_noise(task.image - state.residual, state.residual, task.believed, state.noise))
+
+
+def result(task: Task, state: State) -> Particles:
+    """Return the particles in world axes, brightest first."""
+    shape = task.prepared.shape
+    order = np.argsort(-state.particles[:, 3], kind="stable")
+    particles = state.particles[order]
+    weight = pixel_weight(task, state, 0.0)
+    chi2, _, seen = judge(task.view, particles, state.residual, weight, task.capacity)
+    # What neighbours leave unexplained is as large an error as noise: the scatter says how large.
+    model, left, trust = (values.reshape(shape) for values in (task.image - state.residual, state.residual, weight))
+    correlation = error_correlation(model, left, trust, state.noise)
+    joint = joint_covariance(task.view, particles, weight, correlation, task.capacity)
+    covariance = joint * np.maximum(chi2, 1.0)[:, np.newaxis, np.newaxis]
+    to_world = task.camera.to_image_axes(np.eye(3))
+    return Particles(
+        position_mm=task.camera.to_image_axes(particles[:, :3]),
+        light_counts=particles[:, 3].copy(),
+        covariance_mm2=to_world @ covariance[:, :3, :3] @ to_world.T,
+        chi2=chi2,
+        seen=seen,
+        residual=state.residual.reshape(shape),
+        noise=state.noise,
+    )
