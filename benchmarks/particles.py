@@ -1,13 +1,14 @@
 """Particles as unknowns: renderings with known tracers, found with a camera calibrated from rendered pictures.
 
 The camera of Table 2 with an array that is turned, shifted and seen through distortion; tracers of 50 um in water
-behind the channel's wall, by Snell's law, brightness 0.6 to 1.4; the volume of the paper's flow at full size.
+behind the channel's wall, by Snell's law, brightness 0.6 to 1.4 or log-normal; the volume of the paper's flow at full
+size.
 """
 
 from __future__ import annotations
 
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.particles.refraction import places_by_snell
 from lfpiv_cli.particles.rounds import find_particles
 from lfpiv_cli.particles.view import raw_view
-from lfpiv_cli.reconstruction.equations import normalisers
+from lfpiv_cli.reconstruction.equations import Normalisers, normalisers
 from lfpiv_cli.synthetic.board import BoardPlacement, render_board
 from lfpiv_cli.synthetic.render import ObjectSpace, render_points, render_white
 from lfpiv_cli.synthetic.scenes import Misalignment, channel_window
@@ -34,6 +35,8 @@ SHAPE = (1768, 2352)
 VOLUME_XYZ = (130, 100, 100)
 COUNTS = (300, 1000, 3000, 8300, 16000)
 REALISATIONS = 3
+# One more line: this number with brightness spread so much (standard deviation of the logarithm).
+LOG_NORMAL = (8300, 0.5)
 # Figures are also given for these distances from the focal plane, mm: light stays within one lens, few, many.
 DISTANCES_MM = ((0.0, 0.5), (0.5, 2.0), (2.0, np.inf))
 WALL_MM, CHANNEL_MM = 5.0, 10.0
@@ -42,51 +45,83 @@ MISALIGNMENT = Misalignment(-0.31, (2.2, -1.7), -2e-5)
 BOARD = BoardGeometry((7, 7), 1.0, 0.2)
 
 
+@dataclass(frozen=True, eq=False)
+class Bench:
+    """A camera that was calibrated from rendered pictures, and weights built for it.
+
+    Attributes
+    ----------
+    sheet, real : the data sheet's camera and the one that takes the pictures
+    grid : of the volume in which tracers are judged
+    """
+
+    sheet: Camera
+    real: Camera
+    calibration: Calibration
+    grid: Grid
+    weights: Weights
+    sums: Normalisers
+
+
 def bench_particles() -> None:
     """Print recall, precision, errors, their coverage and time for growing numbers of tracers at full size."""
-    for count in COUNTS:
-        print_figures(count, SHAPE, VOLUME_XYZ, seed=count)
+    _print_all(1)
 
 
 def bench_particles_thrice() -> None:
     """Print the same for three realisations of each number."""
-    for count in COUNTS:
-        for number in range(REALISATIONS):
-            print_figures(count, SHAPE, VOLUME_XYZ, seed=count + number)
+    _print_all(REALISATIONS)
 
 
-def print_figures(count: int, shape: tuple[int, int], volume_xyz: tuple[int, int, int], seed: int) -> None:
-    """Render, calibrate, search and print a line for the whole volume and one for each range of depths."""
-    rng = np.random.default_rng(seed)
+def _print_all(realisations: int) -> None:
+    # One calibration for all: rendering its pictures takes as long as finding a thousand tracers.
+    bench = calibrated(SHAPE, VOLUME_XYZ, seed=0)
+    for count, spread in (*((count, None) for count in COUNTS), LOG_NORMAL):
+        for number in range(realisations):
+            print_figures(bench, count, count + number, spread)
+
+
+def calibrated(shape: tuple[int, int], volume_xyz: tuple[int, int, int], seed: int) -> Bench:
+    """Render a white image and a board, calibrate from them and build weights."""
     sheet = Camera(-1.0, 100.0, 25.0, 0.8, 0.8, Lattice.regular(0.1), 0.0055, shape[1], shape[0])
     real = MISALIGNMENT.apply(sheet)
-    calibration = _calibration(sheet, real, rng)
+    calibration = _calibration(sheet, real, np.random.default_rng(seed))
     grid = Grid.centred(volume_xyz, (VOXEL_MM,) * 3, (0.0, 0.0, 0.0))
-    low, high = (np.array([grid.bounds_mm(axis)[side] for axis in range(3)]) for side in (0, 1))
-    margin = np.array([0.4, 0.4, 0.0])
-    around = round(count * np.prod(high - low + 2.0 * margin) / np.prod(high - low))
-    true = rng.uniform(low - margin, high + margin, (around, 3))
-    light = LIGHT_COUNTS * rng.uniform(0.6, 1.4, around)
-    readout = Readout()
-    window = channel_window(sheet, WATER, CHANNEL_MM, WALL_MM, mid_plane_z_mm=0.0)
-    space = ObjectSpace(WATER, window, "exact")
-    expected = render_points(real, space, true, light, DIAMETER_MM, rng)
-    image = readout.record(expected, rng).astype(np.float32) - np.float32(readout.dark_level_counts)
-
     camera = calibration.camera(sheet)
     padding = default_padding(camera, WATER, grid)
     weights = Weights(grid, padding, factorise(camera, WATER, grid.padded(padding)), camera.column_axis, calibration)
-    view = raw_view(camera, WATER, 0.5 * DIAMETER_MM, calibration)
-    sums = normalisers(weights.padded)
+    return Bench(sheet, real, calibration, grid, weights, normalisers(weights.padded))
+
+
+def print_figures(bench: Bench, count: int, seed: int, log_spread: float | None = None) -> None:
+    """Render tracers, search and print a line for the whole volume and one for each range of depths.
+
+    Their brightness is log-normal of this standard deviation of its logarithm, or uniform from 0.6 to 1.4.
+    """
+    rng = np.random.default_rng(seed)
+    low, high = (np.array([bench.grid.bounds_mm(axis)[side] for axis in range(3)]) for side in (0, 1))
+    margin = np.array([0.4, 0.4, 0.0])
+    around = round(count * np.prod(high - low + 2.0 * margin) / np.prod(high - low))
+    true = rng.uniform(low - margin, high + margin, (around, 3))
+    brightness = rng.uniform(0.6, 1.4, around) if log_spread is None else rng.lognormal(0.0, log_spread, around)
+    readout = Readout()
+    window = channel_window(bench.sheet, WATER, CHANNEL_MM, WALL_MM, mid_plane_z_mm=0.0)
+    space = ObjectSpace(WATER, window, "exact")
+    expected = render_points(bench.real, space, true, LIGHT_COUNTS * brightness, DIAMETER_MM, rng)
+    image = readout.record(expected, rng).astype(np.float32) - np.float32(readout.dark_level_counts)
+
+    camera = bench.calibration.camera(bench.sheet)
+    view = raw_view(camera, WATER, 0.5 * DIAMETER_MM, bench.calibration)
     began = time.perf_counter()
-    found = find_particles(image, view, weights, camera, sums)
+    found = find_particles(image, view, bench.weights, camera, bench.sums)
     seconds = time.perf_counter() - began
     places = places_by_snell(found.position_mm, space, camera)
     sigma = np.sqrt(np.diagonal(found.covariance_mm2, axis1=1, axis2=2))
+    what = f"{count} particles" if log_spread is None else f"{count} particles of log-normal brightness {log_spread:g}"
     for distances in ((0.0, np.inf), *DISTANCES_MM):
         figures = particle_figures(places, true, low, high, VOXEL_MM, sigma, distances)
         text = "  ".join(f"{name} {value:.4f}" for name, value in figures.items())
-        print(f"{count} particles, {seconds:.1f} s, |z| {distances[0]:g} to {distances[1]:g} mm: {text}", flush=True)
+        print(f"{what}, {seconds:.1f} s, |z| {distances[0]:g} to {distances[1]:g} mm: {text}", flush=True)
 
 
 def _calibration(sheet: Camera, real: Camera, rng: np.random.Generator) -> Calibration:
