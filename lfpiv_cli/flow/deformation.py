@@ -57,8 +57,7 @@ def spline_coefficients(volume: NDArray[np.float32]) -> Spline:
     flat = np.zeros(int(np.prod(padded)) + 2 * SLACK, dtype=np.float32)
     inside = (slice(SPLINE_PAD, -SPLINE_PAD),) * 3
     coefficients = flat[SLACK:-SLACK].reshape(padded)
-    np.multiply(volume, np.float32(1.0 / largest if largest > 0.0 else 1.0), out=coefficients[inside])
-    filter_planes(coefficients[inside])
+    filter_planes(volume, np.float32(1.0 / largest if largest > 0.0 else 1.0), coefficients[inside])
     filter_depth(coefficients[inside])
     for axis in range(3):
         moved = np.moveaxis(coefficients, axis, 0)
@@ -96,14 +95,15 @@ def filter_lines(lines: NDArray[np.float32], factors: NDArray[np.float32]) -> No
 
 
 @njit(cache=True, parallel=True)
-def filter_planes(volume: NDArray[np.float32]) -> None:
-    """Replace samples by B-spline coefficients along x and y, in place."""
+def filter_planes(volume: NDArray[np.float32], scale: np.float32, coefficients: NDArray[np.float32]) -> None:
+    """Write the B-spline coefficients along x and y of a volume times `scale`."""
     along_y, along_x = pivots(volume.shape[1]), pivots(volume.shape[2])
     for z in prange(volume.shape[0]):
-        filter_lines(volume[z], along_y)
-        turned = volume[z].T.copy()
+        plane = volume[z] * scale
+        filter_lines(plane, along_y)
+        turned = plane.T.copy()
         filter_lines(turned, along_x)
-        volume[z] = turned.T
+        coefficients[z] = turned.T
 
 
 @njit(cache=True, parallel=True)
