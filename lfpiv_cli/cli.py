@@ -156,6 +156,9 @@ def build_weights(**arguments: Any) -> dict[str, Any]:
 @click.option("--dark", type=INPUT, help="Dark image to subtract; its hot and dead pixels are left out.")
 @click.option("--background", help="Image to subtract, or minimum or mean over the images given, or as minimum:15.")
 @click.option("--mask", type=INPUT, help="Image that is black where pixels are to be left out (reflections, bubbles).")
+@click.option(
+    "--pairing", type=click.Choice(["ab", "sequence"]), help="Find particles with the help of the frames beside."
+)
 @click.option("--resume", is_flag=True, help="Skip outputs that are complete and made from the same inputs.")
 @click.option("--keep-going", is_flag=True, help="Go on with the next frame when one fails.")
 @click.option("-o", "--output", type=INPUT, required=True, help="File for one image, folder for several.")

@@ -113,6 +113,7 @@ def _reconstructed(
         dark=pair[0].with_name("dark.tif"),
         background=None,
         mask=None,
+        pairing="ab" if solver == "particles" else None,
         resume=False,
         keep_going=False,
         output=output,

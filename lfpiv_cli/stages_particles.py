@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,15 +17,18 @@ from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, symmetric, write_poi
 from lfpiv_cli.files.weights_file import WeightsFile
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.object_space import ObjectSpace
+from lfpiv_cli.particles.neighbour_frames import second_look
 from lfpiv_cli.particles.refraction import places_by_snell
-from lfpiv_cli.particles.rounds import ROUNDS, find_particles
+from lfpiv_cli.particles.rounds import ROUNDS, first_look
+from lfpiv_cli.particles.search import Particles, Task, result, task_of
 from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.reconstruction.equations import Normalisers
+from lfpiv_cli.stages_track import SEARCH_VOXEL
 from lfpiv_cli.weights.build import factorise_bricks
 from lfpiv_cli.weights.columns import OnDemandOperator
 from lfpiv_cli.weights.model import behind_transmission
 
-# Units of progress that `write_frame` reports.
+# Units of progress that `find` and `glance` report.
 STEPS = sum(settings.iterations + 1 for settings in ROUNDS)
 
 
@@ -68,27 +71,48 @@ def residual_path(particles: Path) -> Path:
     return particles.with_name(f"{particles.stem}_residual.tif")
 
 
+def find(content: WeightsFile, settings: Config, frame: Frame, progress: Callable[[int], None]) -> Particles:
+    """Return the particles behind an image."""
+    task = _task(content, settings, frame)
+    return result(task, first_look(task, progress=progress))
+
+
+def glance(
+    content: WeightsFile, settings: Config, frame: Frame, progress: Callable[[int], None]
+) -> NDArray[np.float64]:
+    """Return the particles (n, 4) that a first look finds, for their frame's second look and its neighbours'."""
+    return first_look(_task(content, settings, frame), progress=progress).particles
+
+
+def find_beside(
+    content: WeightsFile,
+    settings: Config,
+    frame: Frame,
+    own: NDArray[np.float64],
+    neighbours: Sequence[NDArray[np.float64]],
+) -> Particles:
+    """Return the particles behind an image with the help of what `glance` found in it and in the frames beside it."""
+    task = _task(content, settings, frame)
+    search_mm = SEARCH_VOXEL * max(content.weights.grid.spacing_mm)
+    return result(task, second_look(task, own, neighbours, search_mm))
+
+
+def _task(content: WeightsFile, settings: Config, frame: Frame) -> Task:
+    radius = 0.5 * settings.reconstruction.particle_diameter_mm
+    view = raw_view(content.camera, settings.media_model(), radius, content.weights.calibration)
+    return task_of(frame.image, view, content.weights, content.camera, frame.sums, frame.unusable)
+
+
 def write_frame(
     content: WeightsFile,
     settings: Config,
     frame: Frame,
+    found: Particles,
     path: Path,
     provenance: Mapping[str, Any],
     overwrite: bool,
-    progress: Callable[[int], None],
 ) -> float:
-    """Find the particles behind an image and write them and what they leave of it; return the relative residual."""
-    radius = 0.5 * settings.reconstruction.particle_diameter_mm
-    view = raw_view(content.camera, settings.media_model(), radius, content.weights.calibration)
-    found = find_particles(
-        frame.image,
-        view,
-        content.weights,
-        content.camera,
-        frame.sums,
-        progress=progress,
-        excluded=frame.unusable,
-    )
+    """Write the particles found behind an image and what they leave of it; return the relative residual."""
     space = _space(content, settings)
     places = places_by_snell(found.position_mm, space, content.camera)
     left = np.where(frame.unusable, 0.0, found.residual)

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
-import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -16,16 +13,17 @@ from numpy.typing import NDArray
 
 from lfpiv_cli import stages_particles
 from lfpiv_cli.console import Console
-from lfpiv_cli.errors import InputError, PartialError
+from lfpiv_cli.errors import InputError, PartialError, UsageError
 from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.files.atomic import ensure_writable
-from lfpiv_cli.files.batch import Frame, Target, frames_of, output_paths, pending, prepare_folder
+from lfpiv_cli.files.batch import Frame, Target, frames_beside, frames_of, output_paths, pending, prepare_folder
 from lfpiv_cli.files.config import Config, carried_config
 from lfpiv_cli.files.inputs import given
-from lfpiv_cli.files.provenance import record, sha256
+from lfpiv_cli.files.provenance import record
 from lfpiv_cli.files.sections import ReconstructionSection
 from lfpiv_cli.files.weights_file import WeightsFile, read_weights
+from lfpiv_cli.particles.search import Particles
 from lfpiv_cli.reconstruction.equations import Normalisers, normalisers
 from lfpiv_cli.reconstruction.images import (
     Image,
@@ -33,52 +31,16 @@ from lfpiv_cli.reconstruction.images import (
     as_if_lit,
     defects,
     filled,
-    light,
-    mean_background,
-    minimum_background,
     noise_residual,
     saturated,
     touched,
 )
 from lfpiv_cli.reconstruction.solvers import Reconstruction, Stopping
 from lfpiv_cli.reconstruction.solvers import reconstruct as solve
+from lfpiv_cli.stages_frames import Background, ahead, reader, sequence_digests, with_those_beside
 
-BACKGROUNDS = {"minimum": minimum_background, "mean": mean_background}
-
-
-@dataclass(frozen=True)
-class Background:
-    """What is subtracted as background: an image, or the minimum or mean over the frames, or over some around each.
-
-    Attributes
-    ----------
-    path : of the image, None where it is made from the frames
-    kind : name in `BACKGROUNDS`
-    frames : how many around each frame; None: all of them
-    """
-
-    path: Path | None = None
-    kind: str | None = None
-    frames: int | None = None
-
-    @classmethod
-    def parse(cls, text: str | None) -> Background:
-        """Return the background given as a file's name, `minimum`, `mean`, or `minimum:15` for fifteen frames."""
-        if text is None:
-            return cls()
-        over_frames = re.fullmatch(rf"({'|'.join(BACKGROUNDS)})(?::(\d+))?", text)
-        if over_frames is None:
-            return cls(path=Path(text))
-        kind, count = over_frames.groups()
-        return cls(kind=kind, frames=None if count is None else int(count))
-
-    def around(self, number: int, total: int) -> range:
-        """Return the numbers of the frames, of `total`, that the background of one is made from."""
-        if self.kind is None:
-            return range(0)
-        count = total if self.frames is None else min(self.frames, total)
-        first = min(max(number - count // 2, 0), total - count)
-        return range(first, first + count)
+# Finds the particles of frame `number`.
+Find = Callable[[int, stages_particles.Frame], Particles]
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,6 +82,7 @@ def reconstruct(
     dark: Path | None,
     background: str | None,
     mask: Path | None,
+    pairing: str | None,
     resume: bool,
     keep_going: bool,
     output: Path,
@@ -130,6 +93,7 @@ def reconstruct(
     level = Background.parse(background)
     common = given(weights=weights, dark=dark, background=level.path, mask=mask)
     frames = frames_of(images)
+    beside = None if pairing is None else frames_beside(len(frames), pairing)
     paths = output_paths(output, [frame.stem for frame in frames])
     prepare_folder(paths)
     content = read_weights(weights)
@@ -141,23 +105,29 @@ def reconstruct(
         accelerate=accelerate,
         start=start,
     )
-    targets = _targets(paths, frames, level, settings, common)
-    needed = pending(targets, [*common.values(), *images], overwrite, resume, _record_of)
     as_particles = settings.reconstruction.solver == "particles"
+    if beside is not None and not as_particles:
+        raise UsageError(
+            f"--pairing: {settings.reconstruction.solver} takes each frame alone; --solver particles does not"
+        )
+    targets = _targets(paths, frames, level, settings, common, beside)
+    needed = pending(targets, [*common.values(), *images], overwrite, resume, _record_of)
     if as_particles:
         content = stages_particles.searchable(content, settings)
         for number in needed:
             ensure_writable(stages_particles.residual_path(paths[number]), overwrite or resume, images)
     bench = _bench(content, settings, dark, mask, bool(needed))
-    read = _reader(level, frames, bench)
+    read = reader(level, frames, content.weights.image_shape, bench.dark)
     steps = stages_particles.STEPS if as_particles else settings.reconstruction.iterations
     outcomes: list[Outcome] = []
     failures: list[str] = []
-    with console.progress(len(needed) * steps, "reconstruct") as advance:
-        for number, future in _ahead(read, needed):
+    looked_at = needed if beside is None else {k for number in needed for k in (number, *beside[number])}
+    with console.progress(len(looked_at) * steps, "reconstruct") as advance:
+        find = _finder(bench, read, beside, advance)
+        for number, future in ahead(read, needed):
             try:
                 raw, lit = future.result()
-                outcomes.append(_make(bench, targets[number], raw, lit, overwrite, advance))
+                outcomes.append(_make(bench, targets[number], number, raw, lit, find, overwrite, advance))
             except InputError as error:
                 if not keep_going:
                     raise
@@ -177,10 +147,17 @@ def reconstruct(
 
 
 def _targets(
-    paths: Sequence[Path], frames: Sequence[Frame], level: Background, settings: Config, common: Mapping[str, Path]
+    paths: Sequence[Path],
+    frames: Sequence[Frame],
+    level: Background,
+    settings: Config,
+    common: Mapping[str, Path],
+    beside: Sequence[tuple[int, ...]] | None,
 ) -> list[Target]:
     """Return where each frame's result goes and the record that it will carry."""
-    made_of = _sequence_digests(level, frames)
+    made_of = sequence_digests(level, frames)
+    if beside is not None:
+        made_of = with_those_beside(made_of, frames, beside)
     return [
         Target(
             path, record(f"reconstruct page {frame.page}{words}", settings.resolved(), {**common, "image": frame.path})
@@ -209,22 +186,64 @@ def _bench(content: WeightsFile, settings: Config, dark: Path | None, mask: Path
 
 
 def _make(
-    bench: Bench, target: Target, raw: Image, lit: Image, overwrite: bool, advance: Callable[[int], None]
+    bench: Bench,
+    target: Target,
+    number: int,
+    raw: Image,
+    lit: Image,
+    find: Find,
+    overwrite: bool,
+    advance: Callable[[int], None],
 ) -> Outcome:
     """Make and write the particles or the volume of a frame."""
-    unusable = bench.lasting | saturated(raw, bench.settings.reconstruction.saturation_counts)
-    lit = filled(lit, unusable)
-    excluded = _excluded(bench, unusable)
-    if bench.sums is not None and bench.settings.reconstruction.solver == "particles":
-        frame = stages_particles.Frame(lit, unusable, _sums_without(bench, bench.sums, excluded))
+    if bench.settings.reconstruction.solver == "particles":
+        frame = _particle_frame(bench, raw, lit)
         residual = stages_particles.write_frame(
-            bench.content, bench.settings, frame, target.path, target.record, overwrite, advance
+            bench.content, bench.settings, frame, find(number, frame), target.path, target.record, overwrite
         )
-        return Outcome(residual, int(np.count_nonzero(unusable)))
+        return Outcome(residual, int(np.count_nonzero(frame.unusable)))
+    lit, _, excluded = _usable(bench, raw, lit)
     result = _solved(bench, bench.content.weights.prepare(lit), excluded, advance)
     outcome = Outcome(float(result.residual[-1]), int(np.count_nonzero(excluded)))
     _write(target, bench.content, result, outcome.excluded_pixels, overwrite)
     return outcome
+
+
+def _usable(bench: Bench, raw: Image, lit: Image) -> tuple[Image, Mask, Mask]:
+    """Return a frame with its unusable pixels filled, these, and what takes no part in the weights' frame."""
+    unusable = bench.lasting | saturated(raw, bench.settings.reconstruction.saturation_counts)
+    return filled(lit, unusable), unusable, _excluded(bench, unusable)
+
+
+def _particle_frame(bench: Bench, raw: Image, lit: Image) -> stages_particles.Frame:
+    """Return a frame as particles are sought in it."""
+    lit, unusable, excluded = _usable(bench, raw, lit)
+    weights, sums = bench.content.weights, bench.sums
+    sums = normalisers(weights.padded, excluded) if sums is None else _sums_without(bench, sums, excluded)
+    return stages_particles.Frame(lit, unusable, sums)
+
+
+def _finder(
+    bench: Bench,
+    read: Callable[[int], tuple[Image, Image]],
+    beside: Sequence[tuple[int, ...]] | None,
+    advance: Callable[[int], None],
+) -> Find:
+    """Return the function that finds the particles of a frame, alone or with what first looks find in those beside."""
+    content, settings = bench.content, bench.settings
+
+    # A frame needs itself and one at either side, the next one two of these again.
+    @lru_cache(maxsize=3)
+    def glance(number: int) -> NDArray[np.float64]:
+        return stages_particles.glance(content, settings, _particle_frame(bench, *read(number)), advance)
+
+    def find(number: int, frame: stages_particles.Frame) -> Particles:
+        if beside is None:
+            return stages_particles.find(content, settings, frame, advance)
+        seen = {k: glance(k) for k in sorted((number, *beside[number]))}
+        return stages_particles.find_beside(content, settings, frame, seen[number], [seen[k] for k in beside[number]])
+
+    return find
 
 
 def _excluded(bench: Bench, unusable: Mask) -> Mask:
@@ -284,50 +303,3 @@ def _write(target: Target, content: WeightsFile, result: Reconstruction, exclude
         },
         overwrite=overwrite,
     )
-
-
-def _reader(level: Background, frames: Sequence[Frame], bench: Bench) -> Callable[[int], tuple[Image, Image]]:
-    """Return the function that reads frame `number`: raw, and with dark or background taken off."""
-    shape = bench.content.weights.image_shape
-    fixed = image_files.read_image(level.path, shape) if level.path else None
-    window = len(level.around(0, len(frames)))
-
-    @lru_cache(maxsize=window if level.frames else 1)
-    def page(number: int) -> Image:
-        return image_files.read_page(frames[number].path, frames[number].page, shape)
-
-    @lru_cache(maxsize=1)
-    def over(numbers: range) -> NDArray[np.float32]:
-        return BACKGROUNDS[level.kind or ""](page(k) for k in numbers)
-
-    def read(number: int) -> tuple[Image, Image]:
-        numbers = level.around(number, len(frames))
-        raw = page(number)
-        return raw, light(raw, bench.dark, over(numbers) if level.kind else fixed)
-
-    return read
-
-
-def _ahead(
-    read: Callable[[int], tuple[Image, Image]], numbers: Sequence[int]
-) -> Iterator[tuple[int, Future[tuple[Image, Image]]]]:
-    """Yield each number with its frame, read while the one before is worked on."""
-    with ThreadPoolExecutor(max_workers=1) as pool:
-        coming = [pool.submit(read, number) for number in numbers[:1]]
-        for place, number in enumerate(numbers):
-            current = coming.pop()
-            coming = [pool.submit(read, following) for following in numbers[place + 1 : place + 2]]
-            yield number, current
-
-
-def _sequence_digests(level: Background, frames: Sequence[Frame]) -> list[str]:
-    """Return for each frame which other frames its background is made from, as words for its record."""
-    if level.kind is None:
-        return [""] * len(frames)
-    pages = [f"{sha256(frame.path)} {frame.page}\n" for frame in frames]
-    words = []
-    for number in range(len(frames)):
-        numbers = level.around(number, len(frames))
-        digest = hashlib.sha256("".join(pages[k] for k in numbers).encode()).hexdigest()
-        words.append(f", background: {level.kind} over {len(numbers)} frames, SHA-256 {digest}")
-    return words

@@ -108,3 +108,19 @@ def _made_alike(target: Target, read_record: Callable[[Path], Mapping[str, Any]]
         return read_record(target.path) == target.record
     except InputError:
         return False
+
+
+def frames_beside(count: int, pairing: str) -> list[tuple[int, ...]]:
+    """Return for each frame the numbers of those it belongs with: its partner (`ab`), or the one before and after.
+
+    Raises
+    ------
+    UsageError : there is only one frame, or one of the last pair is missing.
+    """
+    if count < 2 or (pairing == "ab" and count % 2):
+        raise UsageError(
+            f"--pairing {pairing}: needs {'pairs' if pairing == 'ab' else 'two or more'}, got {count} frames"
+        )
+    if pairing == "ab":
+        return [(number ^ 1,) for number in range(count)]
+    return [tuple(k for k in (number - 1, number + 1) if 0 <= k < count) for number in range(count)]

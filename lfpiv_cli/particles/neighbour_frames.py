@@ -1,0 +1,110 @@
+"""A second look at an image, knowing what was found in the frames before and after it.
+
+A particle that was found in a neighbour frame and has no partner here is put where the displacements around it lead,
+whether its light seems free or not; then all particles settle, and those that do not find their light go. So a pair of
+particles that was taken for one becomes two, which splitting did not find. Only first looks serve as neighbours: each
+frame's result depends on the images alone, not on the order in which frames are done.
+
+Axes: particles are rows (x, y, z, light) in image axes, mm and counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from lfpiv_cli.particles.doubts import moved_in_depth, told_apart
+from lfpiv_cli.particles.noise import estimate_noise
+from lfpiv_cli.particles.rounds import ROUNDS, finished, pruned
+from lfpiv_cli.particles.search import (
+    LAST_UNEXPLAINED,
+    State,
+    Task,
+    blank,
+    merge,
+    prune,
+    rebuilt,
+    sweep,
+    with_measured_noise,
+    with_typical_light,
+)
+from lfpiv_cli.particles.tracking import expected_displacement, track
+
+# A particle without a partner this near to where one is expected is that one, at another depth: near the focal plane
+# depths may be wrong by a millimetre.
+SAME_MM = np.array([0.05, 0.05, 1.25])
+# Newcomers begin with this share of the light that they have in their own frame: some of it is others' for now.
+FIRST_SHARE = 0.5
+# Sweeps in which they settle, and how little unexplained light counts then: first as in early rounds, then as at the
+# end. The share of its light that each particle must find afterwards.
+SETTLING = ((3, 0.1), (4, LAST_UNEXPLAINED))
+CLAIMED_SHARE = 0.6
+
+
+def second_look(
+    task: Task, own: NDArray[np.float64], neighbours: Sequence[NDArray[np.float64]], search_mm: float
+) -> State:
+    """Return what is found with the help of neighbour frames.
+
+    Parameters
+    ----------
+    task : the image
+    own, neighbours : (n, 4) what first looks found in it and in the frames beside it
+    search_mm : largest displacement along each axis
+    """
+    state = with_typical_light(task, rebuilt(task, blank(task), own))
+    state = with_measured_noise(task, replace(state, noise=estimate_noise(task.image, state.typical_light)))
+    state = rebuilt(task, state, np.concatenate([own, _newcomers(task, own, neighbours, search_mm)]))
+    for sweeps, unexplained in SETTLING:
+        sweep(task, state, unexplained, sweeps)
+    state = prune(task, merge(task, state), CLAIMED_SHARE, LAST_UNEXPLAINED)
+    settings = ROUNDS[-1]
+    state = moved_in_depth(task, state, settings.unexplained)
+    state = told_apart(task, state, settings.unexplained, settings.thorough)
+    sweep(task, state, settings.unexplained, 2)
+    return finished(task, pruned(task, merge(task, state), settings), settings)
+
+
+def _newcomers(
+    task: Task, own: NDArray[np.float64], neighbours: Sequence[NDArray[np.float64]], search_mm: float
+) -> NDArray[np.float64]:
+    """Return the neighbours' particles (m, 4) that are missing here, where they are expected."""
+    missing = np.zeros((0, 4))
+    for other in neighbours:
+        expected, partnerless = _without_partner(own, other, search_mm)
+        known = np.concatenate([own[partnerless, :3], missing[:, :3]])
+        seen = (expected[:, 2] >= task.depths_mm[0]) & (expected[:, 2] <= task.depths_mm[1])
+        seen &= ~_same(expected[:, :3], known)
+        missing = np.concatenate([missing, expected[seen]])
+    return missing * (1.0, 1.0, 1.0, FIRST_SHARE)
+
+
+def _same(points: NDArray[np.float64], known: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Tell which points (n, 3) are known ones (m, 3): near and each other's nearest."""
+    if not len(points) or not len(known):
+        return np.zeros(len(points), np.bool_)
+    distance, to = KDTree(known / SAME_MM).query(points / SAME_MM)
+    _, back = KDTree(points / SAME_MM).query(known / SAME_MM)
+    return np.asarray((distance <= 1.0) & (back[to] == np.arange(len(points))))
+
+
+def _without_partner(
+    own: NDArray[np.float64], other: NDArray[np.float64], search_mm: float
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return another frame's particles (m, 4) that were not tracked, where they are expected here, and which own ones
+    were not.
+    """
+    tracks = track(other[:, :3], own[:, :3], search_mm)
+    alone, partnerless = np.ones(len(other), np.bool_), np.ones(len(own), np.bool_)
+    alone[tracks.first] = partnerless[tracks.second] = False
+    if not len(tracks.first):
+        return np.zeros((0, 4)), partnerless
+    displacement = np.full((len(other), 3), np.nan)
+    displacement[tracks.first] = own[tracks.second, :3] - other[tracks.first, :3]
+    expected = other.copy()
+    expected[:, :3] += expected_displacement(other[:, :3], displacement, None)
+    return expected[alone], partnerless

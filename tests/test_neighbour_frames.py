@@ -1,0 +1,73 @@
+"""A second look: what a neighbour frame found is found here too, and what it only believed in is not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from lfpiv_cli.errors import UsageError
+from lfpiv_cli.files.batch import frames_beside
+from lfpiv_cli.grid import Grid
+from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.media import Media
+from lfpiv_cli.particles.fitting import add_all
+from lfpiv_cli.particles.neighbour_frames import second_look
+from lfpiv_cli.particles.search import Task, task_of
+from lfpiv_cli.particles.tiles import share_out
+from lfpiv_cli.particles.view import entry_capacity, raw_view
+from lfpiv_cli.reconstruction.equations import normalisers
+from lfpiv_cli.weights.build import default_padding, factorise
+from lfpiv_cli.weights.model import Weights
+
+MOVED_MM = np.array([0.12, -0.05, 0.04, 0.0])
+
+
+def task_with(table2: Camera, water: Media, true: NDArray[np.float64], rng: np.random.Generator) -> Task:
+    """Return the task that a noisy image of particles sets."""
+    camera = replace(table2, columns=500, rows=420)
+    grid = Grid.centred((20, 16, 20), (0.1, 0.1, 0.1), (0.0, 0.0, 1.9))
+    padding = default_padding(camera, water, grid)
+    weights = Weights(grid, padding, factorise(camera, water, grid.padded(padding)), camera.column_axis)
+    view, depths = raw_view(camera, water, 0.025), grid.bounds_mm(2)
+    image = np.zeros(camera.rows * camera.columns)
+    add_all(view, true, share_out(view, true, *depths), 1.0, image, entry_capacity(view, *depths))
+    image += rng.normal(0.0, 6.0, image.size)
+    shaped = image.reshape(camera.rows, camera.columns).astype(np.float32)
+    return task_of(shaped, view, weights, camera, normalisers(weights.padded), None)
+
+
+def found(particles: NDArray[np.float64], true: NDArray[np.float64]) -> NDArray[np.bool_]:
+    distance, _ = KDTree(particles[:, :3] / (0.02, 0.02, 0.1)).query(true[:, :3] / (0.02, 0.02, 0.1))
+    return np.asarray(distance < 1.0)
+
+
+def test_what_a_neighbour_found_is_found(table2: Camera, water: Media, rng: np.random.Generator) -> None:
+    true = rng.uniform((-1.0, -0.8, 1.0, 4e5), (1.0, 0.8, 2.8, 6e5), (45, 4))
+    # One at its double's side, as splitting may not have told them apart: what it explains is not free.
+    true[1] = true[0] + (0.03, -0.02, 0.2, 0.0)
+    task = task_with(table2, water, true, rng)
+    own = true[3:].copy()
+    own = np.concatenate([own, [[*(0.5 * (true[0] + true[1]))[:3], true[0, 3] + true[1, 3]]]])
+    ghosts = rng.uniform((-0.9, -0.7, 1.2, 4e5), (0.9, 0.7, 2.6, 6e5), (3, 4))
+    before = np.concatenate([true, ghosts]) - MOVED_MM
+    alone = second_look(task, own, [], 0.6).particles
+    assert not found(alone, true)[2]
+    beside = second_look(task, own, [before], 0.6).particles
+    assert found(beside, true).all()
+    assert len(beside) == len(true)
+    # Two neighbours that know the same name it once.
+    both = second_look(task, own, [before, np.concatenate([true, ghosts]) + MOVED_MM], 0.6).particles
+    assert found(both, true).all()
+    assert len(both) == len(true)
+
+
+def test_frames_know_those_beside_them() -> None:
+    assert frames_beside(4, "ab") == [(1,), (0,), (3,), (2,)]
+    assert frames_beside(3, "sequence") == [(1,), (0, 2), (1,)]
+    for count, pairing in ((3, "ab"), (1, "sequence")):
+        with pytest.raises(UsageError, match="--pairing"):
+            frames_beside(count, pairing)
