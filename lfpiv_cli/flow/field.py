@@ -30,7 +30,7 @@ class VectorField:
     Attributes
     ----------
     grid : the window centres, mm
-    displacement_voxel : (nz, ny, nx, 3) float64, after validation
+    displacement_voxel : (nz, ny, nx, 3) float64, after validation and without what long particles mix
     displacement_raw_voxel : (nz, ny, nx, 3) float64, as the correlation peak gave it, before validation
     correlation : (nz, ny, nx) normalised correlation at the peak, 1 for identical windows
     peak_ratio : (nz, ny, nx) height of the peak over that of the second one
