@@ -47,7 +47,7 @@ def test_spread_is_the_least_possible(view: View, rng: np.random.Generator) -> N
     clean = image_of(view, particle)
     weight = 1.0 / (clean + 36.0)
     capacity = entry_capacity(view, *DEPTHS)
-    sigma = np.sqrt(np.diagonal(joint_covariance(view, particle, weight, WHITE, capacity)[0]))
+    sigma = np.sqrt(np.diagonal(joint_covariance(view, particle, weight, WHITE, np.ones(len(particle)), capacity)[0]))
     errors = []
     for _ in range(60):
         start = particle + rng.normal(0.0, (0.01, 0.01, 0.1, 1e4))
@@ -143,7 +143,7 @@ def test_neighbours_that_are_free_widen_the_errors(view: View) -> None:
     clean = image_of(view, particles)
     weight = 1.0 / (clean + 36.0)
     capacity = entry_capacity(view, *DEPTHS)
-    found = joint_covariance(view, particles, weight, WHITE, capacity)
+    found = joint_covariance(view, particles, weight, WHITE, np.ones(len(particles)), capacity)
     slopes = []
     for number, unknown in np.ndindex(particles.shape):
         step = np.zeros_like(particles)
@@ -154,7 +154,7 @@ def test_neighbours_that_are_free_widen_the_errors(view: View) -> None:
     for number in range(4):
         part = slice(4 * number, 4 * number + 4)
         np.testing.assert_allclose(np.sqrt(np.diag(found[number])), np.sqrt(np.diag(whole[part, part])), rtol=2e-3)
-    alone = joint_covariance(view, particles[[0]], weight, WHITE, capacity)
+    alone = joint_covariance(view, particles[[0]], weight, WHITE, np.ones(len(particles[[0]])), capacity)
     assert found[0, 2, 2] > 1.1 * alone[0, 2, 2]
 
 
@@ -162,7 +162,7 @@ def test_particles_that_nearly_coincide_have_errors(view: View) -> None:
     # Near the focal plane many pixels are lit through two lenses, and count once all the same.
     particles = np.array([[0.2295, 0.0436, 0.1066, 5e5], [0.2168, 0.0374, 0.1087, 5e5]])
     weight = 1.0 / (image_of(view, particles) + 36.0)
-    found = joint_covariance(view, particles, weight, WHITE, entry_capacity(view, *DEPTHS))
+    found = joint_covariance(view, particles, weight, WHITE, np.ones(len(particles)), entry_capacity(view, *DEPTHS))
     assert np.all(np.diagonal(found, axis1=1, axis2=2) > 0.0)
 
 
@@ -250,7 +250,8 @@ def test_tiles_of_a_group_share_no_pixel(view: View, rng: np.random.Generator) -
 def test_errors_that_are_alike_widen_a_particles(view: View) -> None:
     particle = np.array([[0.20, 0.10, 1.5, 5e5]])
     weight = 1.0 / (image_of(view, particle) + 36.0)
-    found = joint_covariance(view, particle, weight, Correlation(0.2, 0.8), entry_capacity(view, *DEPTHS))[0]
+    capacity = entry_capacity(view, *DEPTHS)
+    found = joint_covariance(view, particle, weight, Correlation(0.2, 0.8), np.ones(1), capacity)[0]
     slopes = []
     for unknown in range(4):
         step = np.zeros_like(particle)
@@ -264,6 +265,10 @@ def test_errors_that_are_alike_widen_a_particles(view: View) -> None:
     whitened = jacobian[:, lit] * np.sqrt(weight[lit])
     moved_by = np.linalg.inv(whitened @ whitened.T) @ whitened
     np.testing.assert_allclose(np.diag(found), np.diag(moved_by @ alike @ moved_by.T), rtol=5e-3)
+    # What chi-squared exceeds 1 by is alike throughout.
+    worse = joint_covariance(view, particle, weight, Correlation(0.2, 0.8), np.array([1.5]), capacity)[0]
+    law = alike + 0.5 * 0.8**distance
+    np.testing.assert_allclose(np.diag(worse), np.diag(moved_by @ law @ moved_by.T), rtol=5e-3)
     assert found[2, 2] > 1.5 * np.linalg.inv(whitened @ whitened.T)[2, 2]
 
 

@@ -6,7 +6,8 @@ the particle and the neighbours it is tied to most, these free and the others he
 
 What is left of an image is not white either: a particle that was not found, or found wrongly, leaves the same sign in
 pixels side by side. With H the normal matrix, K = H^-1 J^T W^(1/2) tells how far each pixel's error moves a particle,
-and errors with the correlation R move it by the covariance K R K^T.
+and errors with the correlation R move it by the covariance K R K^T. What a particle's chi-squared exceeds 1 by is not
+noise but such a sign: it counts as errors that are all alike.
 
 Axes: image axes, mm; see `fitting`. A particle's unknowns are x, y, z and light.
 """
@@ -63,6 +64,7 @@ def joint_covariance(
     particles: NDArray[np.float64],
     weight: NDArray[np.float64],
     correlation: Correlation,
+    chi2: NDArray[np.float64],
     capacity: int,
 ) -> NDArray[np.float64]:
     """Return the covariance (n, 4, 4) of each particle with its neighbours free.
@@ -71,13 +73,14 @@ def joint_covariance(
     ----------
     particles : (n, 4)
     weight : (rows * columns,) 1/variance of the pixels
-    correlation : of their errors
+    correlation : of their errors, and how it falls with distance for errors that are alike
+    chi2 : (n,) local chi-squared, 1 where the weights say all
     capacity : entries that a particle can have at most
     """
     slopes = _slopes(view, particles, capacity)
     start, other = _overlapping(view, particles)
     alone, block = _blocks(slopes, weight, view.columns, start, other)
-    return _covariances(slopes, Ties(start, other, block), alone, weight, correlation, view.columns)
+    return _covariances(slopes, Ties(start, other, block), alone, weight, correlation, chi2, view.columns)
 
 
 def _slopes(view: View, particles: NDArray[np.float64], capacity: int) -> Slopes:
@@ -176,6 +179,7 @@ def _covariances(
     matrices: NDArray[np.float64],
     weight: NDArray[np.float64],
     correlation: Correlation,
+    chi2: NDArray[np.float64],
     columns: int,
 ) -> NDArray[np.float64]:
     """Return each particle's part of the inverse of the normal matrix of itself and its strongest neighbours."""
@@ -189,10 +193,11 @@ def _covariances(
         # Millimetres beside counts: inverted with a diagonal of ones.
         scale = 1.0 / np.sqrt(np.diag(whole))
         inverse = np.linalg.inv(whole * scale * scale.reshape(-1, 1)) * scale * scale.reshape(-1, 1)
-        result[n] = inverse[:UNKNOWNS, :UNKNOWNS]
-        if correlation.share > 0.0:
+        excess = max(chi2[n] - 1.0, 0.0)
+        result[n] = (1.0 + excess) * inverse[:UNKNOWNS, :UNKNOWNS]
+        if correlation.share + excess > 0.0:
             moved_by = _moved_by(slopes, members, inverse, weight, columns)
-            result[n] += correlation.share * _excess(moved_by, correlation.decay)
+            result[n] += (correlation.share + excess) * _excess(moved_by, correlation.decay)
     return result
 
 

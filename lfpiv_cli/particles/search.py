@@ -199,11 +199,9 @@ def result(task: Task, state: State) -> Particles:
     particles = state.particles[order]
     weight = pixel_weight(task, state, 0.0)
     chi2, _, seen = judge(task.view, particles, state.residual, weight, task.capacity)
-    # What neighbours leave unexplained is as large an error as noise: the scatter says how large.
     model, left, trust = (values.reshape(shape) for values in (task.image - state.residual, state.residual, weight))
     correlation = error_correlation(model, left, trust, state.noise)
-    joint = joint_covariance(task.view, particles, weight, correlation, task.capacity)
-    covariance = joint * np.maximum(chi2, 1.0)[:, np.newaxis, np.newaxis]
+    covariance = joint_covariance(task.view, particles, weight, correlation, chi2, task.capacity)
     to_world = task.camera.to_image_axes(np.eye(3))
     return Particles(
         position_mm=task.camera.to_image_axes(particles[:, :3]),
