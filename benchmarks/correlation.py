@@ -73,13 +73,13 @@ def bench_correlation() -> None:
     if find_spec("openpiv") is None:
         print("OpenPIV is not installed: nothing to compare the speed with")
     else:
-        ratios = against_openpiv(a, b, WINDOWS, repeats=3)
+        ratios = against_openpiv(a, b, WINDOWS, repeats=5)
         print(
             f"one core, {'x'.join(map(str, SHAPE))}: {ratios['ours_s']:.2f} s; OpenPIV's one pass takes "
             f"{ratios['one_pass']:.1f} times as long, four passes of its pieces and scipy {ratios['four_passes']:.1f}"
         )
     if threads > 1:
-        print(f"two threads: {second_core(a, b, WINDOWS, repeats=3):.2f} times faster than one")
+        print(f"two threads: {second_core(a, b, WINDOWS, repeats=15):.2f} times faster than one")
     numba.set_num_threads(threads)
     large = (300, 300, 200)
     seconds, memory = time_and_memory(large, WINDOWS)
