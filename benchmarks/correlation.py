@@ -79,7 +79,7 @@ def bench_correlation() -> None:
             f"{ratios['one_pass']:.1f} times as long, four passes of its pieces and scipy {ratios['four_passes']:.1f}"
         )
     if threads > 1:
-        print(f"two threads: {second_core(a, b, WINDOWS, repeats=15):.2f} times faster than one")
+        print(f"two threads: {second_core(a, b, WINDOWS, repeats=7):.2f} times faster than one")
     numba.set_num_threads(threads)
     large = (300, 300, 200)
     seconds, memory = time_and_memory(large, WINDOWS)
