@@ -17,9 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from lfpiv_cli.particles.doubts import moved_in_depth, told_apart
 from lfpiv_cli.particles.noise import estimate_noise
-from lfpiv_cli.particles.rounds import ROUNDS, finished, pruned
+from lfpiv_cli.particles.rounds import ROUNDS, doubted, finished
 from lfpiv_cli.particles.search import (
     LAST_UNEXPLAINED,
     State,
@@ -62,11 +61,7 @@ def second_look(
     for sweeps, unexplained in SETTLING:
         sweep(task, state, unexplained, sweeps)
     state = prune(task, merge(task, state), CLAIMED_SHARE, LAST_UNEXPLAINED)
-    settings = ROUNDS[-1]
-    state = moved_in_depth(task, state, settings.unexplained)
-    state = told_apart(task, state, settings.unexplained, settings.thorough)
-    sweep(task, state, settings.unexplained, 2)
-    return finished(task, pruned(task, merge(task, state), settings), settings)
+    return finished(task, doubted(task, state, ROUNDS[-1]), ROUNDS[-1])
 
 
 def _newcomers(

@@ -138,12 +138,16 @@ def _one_round(task: Task, state: State, settings: Round, progress: Callable[[in
     state = _accept(task, state, candidates, settings)
     sweep(task, state, settings.unexplained, SWEEPS)
     state = with_typical_light(task, state)
+    return with_typical_light(task, doubted(task, state, settings))
+
+
+def doubted(task: Task, state: State, settings: Round) -> State:
+    """Return the state after what fits badly was tried at other depths or as two, as far as a round does."""
     if settings.thorough:
         state = moved_in_depth(task, state, settings.unexplained)
     state = told_apart(task, state, settings.unexplained, settings.thorough)
     sweep(task, state, settings.unexplained, SWEEPS_AFTER_SPLIT)
-    state = pruned(task, merge(task, state), settings)
-    return with_typical_light(task, state)
+    return pruned(task, merge(task, state), settings)
 
 
 def _candidates(
