@@ -12,9 +12,9 @@ from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.particles.fitting import add_all
 from lfpiv_cli.particles.noise import Noise
-from lfpiv_cli.particles.nuisances import Nuisances, fit_nuisances
 from lfpiv_cli.particles.tiles import share_out
 from lfpiv_cli.particles.view import View, entry_capacity, raw_view
+from lfpiv_cli.self_calibration.nuisances import Nuisances, fit_nuisances
 
 DEPTHS = (-4.0, 4.0)
 # Half a pixel and a third; a hundredth of the aperture; a fifth of the radius; 2e-4 of stretch at the corner.

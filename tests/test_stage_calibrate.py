@@ -14,7 +14,7 @@ from lfpiv_cli.console import Console
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files.calibration_file import read_calibration
 from lfpiv_cli.optics.microlenses import Lattice
-from lfpiv_cli.stages_calibrate import calibrate_snapshot
+from lfpiv_cli.stages.calibrate import calibrate_snapshot
 
 SHAPE = (200, 240)
 CONFIG = """

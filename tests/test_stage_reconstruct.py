@@ -12,7 +12,7 @@ from lfpiv_cli import open_volume
 from lfpiv_cli.cli import cli
 from lfpiv_cli.errors import InputError, OutputExistsError
 from lfpiv_cli.files.images import read_image
-from lfpiv_cli.stages_frames import Background
+from lfpiv_cli.stages.frames import Background
 
 ROOT = Path(__file__).parent.parent
 SAMPLE = ROOT / "sample_data"

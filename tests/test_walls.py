@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lfpiv_cli.errors import InputError
-from lfpiv_cli.particles.walls import Walls, find_walls
+from lfpiv_cli.self_calibration.walls import Walls, find_walls
 
 WIDTH, MIDDLE, SLOPE = 8.0, -0.37, np.array([0.02, -0.013])
 SEARCHED = (-6.0, 6.0)

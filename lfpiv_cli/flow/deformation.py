@@ -17,9 +17,9 @@ from numba import njit, prange
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from lfpiv_cli.flow.lanes import MOST_TAPS, highest, interpolate, lowest, spline_weights
-from lfpiv_cli.flow.vectors import LANES
 from lfpiv_cli.flow.windows import Triple, WindowLayout
+from lfpiv_cli.simd.splines import MOST_TAPS, highest, interpolate, lowest, spline_weights
+from lfpiv_cli.simd.vectors import LANES
 
 # Sources lie between the first and the last voxel's centre: the four taps of a cubic B-spline reach one coefficient
 # beyond these, and a fifth of weight zero another.

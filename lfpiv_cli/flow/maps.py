@@ -21,9 +21,9 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from lfpiv_cli.flow.lane_sums import FEW_SHIFTS, MANY_SHIFTS, products
-from lfpiv_cli.flow.vectors import LANES
 from lfpiv_cli.flow.windows import Triple, WindowLayout
+from lfpiv_cli.simd.block_sums import FEW_SHIFTS, MANY_SHIFTS, products
+from lfpiv_cli.simd.vectors import LANES
 
 # Blocks narrower than this cost more in sums of sums than the products they save.
 SMALLEST_BLOCK = 4

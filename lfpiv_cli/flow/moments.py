@@ -17,11 +17,11 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from lfpiv_cli.flow.lane_sums import MOMENTS
-from lfpiv_cli.flow.lane_sums import moments as lane_moments
 from lfpiv_cli.flow.maps import SMALLEST_BLOCK, Blocks
-from lfpiv_cli.flow.vectors import LANES
 from lfpiv_cli.flow.windows import Triple, WindowLayout
+from lfpiv_cli.simd.block_sums import MOMENTS
+from lfpiv_cli.simd.block_sums import moments as lane_moments
+from lfpiv_cli.simd.vectors import LANES
 
 # Cells along an axis of a window: groups enough for a variance, each as large as a particle image.
 CELLS_PER_WINDOW = 4

@@ -31,7 +31,7 @@ from lfpiv_cli.particles.search import (
     with_measured_noise,
     with_typical_light,
 )
-from lfpiv_cli.particles.tracking import expected_displacement, track
+from lfpiv_cli.tracks.tracking import expected_displacement, track
 
 # A particle without a partner this near to where one is expected is that one, at another depth: near the focal plane
 # depths may be wrong by a millimetre.

@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from lfpiv_cli.weights.microkernel import GROUP, TILE, combine, combine_onto
+from lfpiv_cli.simd.combine import GROUP, TILE, combine, combine_onto
 
 Floats = NDArray[np.float32]
 Index = NDArray[np.int64]

@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.simd.combine import GROUP, TILE
 from lfpiv_cli.weights import kernels
 from lfpiv_cli.weights.axis import AxisWeights
-from lfpiv_cli.weights.microkernel import GROUP, TILE
 
 # Pixel rows, pixel columns and weights of one voxel.
 Column = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lfpiv_cli.particles.gridding import on_grid
-from lfpiv_cli.particles.tracking import track, vote
 from lfpiv_cli.synthetic.flows import taylor_green
+from lfpiv_cli.tracks.gridding import on_grid
+from lfpiv_cli.tracks.tracking import track, vote
 
 BOX_MM = np.array([4.0, 4.0, 4.0])
 

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lfpiv_cli import stages_particles
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import InputError, PartialError, UsageError
 from lfpiv_cli.files import images as image_files
@@ -37,10 +36,11 @@ from lfpiv_cli.reconstruction.images import (
 )
 from lfpiv_cli.reconstruction.solvers import Reconstruction, Stopping
 from lfpiv_cli.reconstruction.solvers import reconstruct as solve
-from lfpiv_cli.stages_frames import Background, ahead, reader, sequence_digests, with_those_beside
+from lfpiv_cli.stages import particles
+from lfpiv_cli.stages.frames import Background, ahead, reader, sequence_digests, with_those_beside
 
 # Finds the particles of frame `number`.
-Find = Callable[[int, stages_particles.Frame], Particles]
+Find = Callable[[int, particles.Frame], Particles]
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,12 +113,12 @@ def reconstruct(
     targets = _targets(paths, frames, level, settings, common, beside)
     needed = pending(targets, [*common.values(), *images], overwrite, resume, _record_of)
     if as_particles:
-        content = stages_particles.searchable(content, settings)
+        content = particles.searchable(content, settings)
         for number in needed:
-            ensure_writable(stages_particles.residual_path(paths[number]), overwrite or resume, images)
+            ensure_writable(particles.residual_path(paths[number]), overwrite or resume, images)
     bench = _bench(content, settings, dark, mask, bool(needed))
     read = reader(level, frames, content.weights.image_shape, bench.dark)
-    steps = stages_particles.STEPS if as_particles else settings.reconstruction.iterations
+    steps = particles.STEPS if as_particles else settings.reconstruction.iterations
     outcomes: list[Outcome] = []
     failures: list[str] = []
     looked_at = needed if beside is None else {k for number in needed for k in (number, *beside[number])}
@@ -198,7 +198,7 @@ def _make(
     """Make and write the particles or the volume of a frame."""
     if bench.settings.reconstruction.solver == "particles":
         frame = _particle_frame(bench, raw, lit)
-        residual = stages_particles.write_frame(
+        residual = particles.write_frame(
             bench.content, bench.settings, frame, find(number, frame), target.path, target.record, overwrite
         )
         return Outcome(residual, int(np.count_nonzero(frame.unusable)))
@@ -215,12 +215,12 @@ def _usable(bench: Bench, raw: Image, lit: Image) -> tuple[Image, Mask, Mask]:
     return filled(lit, unusable), unusable, _excluded(bench, unusable)
 
 
-def _particle_frame(bench: Bench, raw: Image, lit: Image) -> stages_particles.Frame:
+def _particle_frame(bench: Bench, raw: Image, lit: Image) -> particles.Frame:
     """Return a frame as particles are sought in it."""
     lit, unusable, excluded = _usable(bench, raw, lit)
     weights, sums = bench.content.weights, bench.sums
     sums = normalisers(weights.padded, excluded) if sums is None else _sums_without(bench, sums, excluded)
-    return stages_particles.Frame(lit, unusable, sums)
+    return particles.Frame(lit, unusable, sums)
 
 
 def _finder(
@@ -235,13 +235,13 @@ def _finder(
     # A frame needs itself and one at either side, the next one two of these again.
     @lru_cache(maxsize=3)
     def glance(number: int) -> NDArray[np.float64]:
-        return stages_particles.glance(content, settings, _particle_frame(bench, *read(number)), advance)
+        return particles.glance(content, settings, _particle_frame(bench, *read(number)), advance)
 
-    def find(number: int, frame: stages_particles.Frame) -> Particles:
+    def find(number: int, frame: particles.Frame) -> Particles:
         if beside is None:
-            return stages_particles.find(content, settings, frame, advance)
+            return particles.find(content, settings, frame, advance)
         seen = {k: glance(k) for k in sorted((number, *beside[number]))}
-        return stages_particles.find_beside(content, settings, frame, seen[number], [seen[k] for k in beside[number]])
+        return particles.find_beside(content, settings, frame, seen[number], [seen[k] for k in beside[number]])
 
     return find
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lfpiv_cli.particles.refinement import Refinement
+from lfpiv_cli.self_calibration.refinement import Refinement
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

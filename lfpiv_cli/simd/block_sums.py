@@ -15,7 +15,7 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from lfpiv_cli.flow.vectors import (
+from lfpiv_cli.simd.vectors import (
     FLAGS,
     LANES,
     VECTOR,

@@ -8,9 +8,9 @@ from typing import Any
 
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import LimitMissedError
-from lfpiv_cli.stages_board import validate_board
-from lfpiv_cli.stages_flow import validate_flow
-from lfpiv_cli.stages_weights import validate_weights
+from lfpiv_cli.stages.validate_board import validate_board
+from lfpiv_cli.stages.validate_flow import validate_flow
+from lfpiv_cli.stages.validate_weights import validate_weights
 
 
 def validate_all(config: Path, output: Path, overwrite: bool, console: Console) -> dict[str, Any]:

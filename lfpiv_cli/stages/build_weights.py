@@ -1,15 +1,12 @@
-"""One function per subcommand: read, call the core, write, return the summary.
-
-Every stage refuses outputs that it could not write before it computes, and leaves a provenance record in what it
-writes. Units stand in the names of the figures.
-"""
+"""The stage of `build-weights`: how every voxel of the configured volume lights every pixel."""
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
-import numba
+import numpy as np
 
 from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.console import Console
@@ -19,14 +16,18 @@ from lfpiv_cli.files.calibration_file import read_calibration
 from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.provenance import record as provenance_record
+from lfpiv_cli.files.sections import WeightsSection
 from lfpiv_cli.files.weights_file import WeightsFile, write_weights
 from lfpiv_cli.grid import Grid
+from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.object_space import ObjectSpace
-from lfpiv_cli.stages_weights import make_operator, ray_source
+from lfpiv_cli.optics.polynomial_rays import PolynomialRays
 from lfpiv_cli.weights.build import default_padding, scene_distortion
-from lfpiv_cli.weights.columns import seen_share
-from lfpiv_cli.weights.model import Weights
+from lfpiv_cli.weights.columns import ColumnOperator, OnDemandOperator, operator_of, seen_share
+from lfpiv_cli.weights.model import Weights, WeightsOperator
 from lfpiv_cli.weights.operators import FactorisedOperator
+from lfpiv_cli.weights.rays import count_columns
+from lfpiv_cli.weights.scene import Source
 
 # Said where the voxels were left to the program.
 VOXELS_CHOSEN = (
@@ -35,11 +36,13 @@ VOXELS_CHOSEN = (
 )
 # Below this share of its light on the sensor a voxel counts as out of view.
 LEAST_SEEN = 0.01
-
-
-def use_threads(threads: int) -> None:
-    """Use at most `threads` threads from here on."""
-    numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
+# Half an hour on two cores; a core counts about four million rays a second.
+MOST_RAYS = 3e10
+RAYS_PER_CORE_HOUR = 1.5e10
+# Cubic polynomials are good to a third of their range beyond it: the paper's volume reaches a quarter beyond boards.
+FARTHEST_BEYOND = 0.3
+# Some 1,500 pixels of 8 bytes.
+BYTES_PER_COLUMN = 12_000
 
 
 def build_weights(
@@ -87,6 +90,62 @@ def build_weights(
         "refraction": settings.weights.refraction,
         "file_bytes": output.stat().st_size,
     }
+
+
+def ray_source(settings: Config, found: Calibration | None, grid: Grid, console: Console) -> Source:
+    """Return how rays are found: traced through the configured object space, or as a calibration fitted them.
+
+    Raises
+    ------
+    ConfigError : fitted rays are asked for and there are none
+    """
+    if settings.weights.method != "dlfc":
+        return settings.object_space(found.mid_plane_z_mm if found else None)
+    if found is None or found.ray_fit is None:
+        raise ConfigError(
+            "weights.method: dlfc needs a --calibration from boards at several depths: calibrate-snapshot with --board "
+            "and --depth-mm, repeated in pairs"
+        )
+    fit = found.ray_fit
+    lateral = fit.reach_mm if settings.camera_model().column_axis == "x" else fit.reach_mm[:, ::-1]
+    for axis, (low, high) in enumerate([*lateral.T, (fit.depths_mm.min(), fit.depths_mm.max())]):
+        beyond = max(low - grid.bounds_mm(axis)[0], grid.bounds_mm(axis)[1] - high)
+        if beyond > FARTHEST_BEYOND * (high - low):
+            console.say(
+                f"lfpiv: the volume reaches {beyond:.3g} mm beyond the dots along {'xyz'[axis]}, where the fitted rays "
+                "are a guess"
+            )
+    return fit.rays
+
+
+def make_operator(
+    chosen: WeightsSection, camera: Camera, source: Source, grid: Grid, console: Console
+) -> WeightsOperator:
+    """Return the weights of a grid: factorised where the axes separate, else on demand; or counted where asked for.
+
+    Raises
+    ------
+    ConfigError : counting would take too long
+    """
+    if chosen.sampling == "exact" or isinstance(source, PolynomialRays):
+        operator = operator_of(camera, source, grid)
+        if isinstance(operator, OnDemandOperator):
+            console.say("lfpiv: array or rays do not separate into axes; columns are made on demand, for what is lit")
+        return operator
+    layout = OnDemandOperator(camera, source, grid)
+    voxels = math.prod(layout.shape)
+    rays = voxels * chosen.points * chosen.rays_per_point
+    if rays > MOST_RAYS:
+        raise ConfigError(
+            f"weights.sampling: counting {rays:.3g} rays for {voxels} voxels (padding included) would take about "
+            f"{rays / RAYS_PER_CORE_HOUR:.2g} core hours and {voxels * BYTES_PER_COLUMN / 1e9:.2g} GB; at most "
+            f"{MOST_RAYS:.3g} are counted, use sampling: exact"
+        )
+    centres, rng = layout.centres_mm(np.arange(voxels)), np.random.default_rng(chosen.seed)
+    number = (chosen.points, chosen.rays_per_point)
+    with console.progress(voxels, "count rays") as advance:
+        columns = count_columns(camera, source, centres, layout.sides_mm, rng, *number, advance)
+    return ColumnOperator(layout.shape, layout.image_shape, np.arange(voxels), columns)
 
 
 def _record(command: str, settings: Config, inputs: dict[str, Path]) -> dict[str, Any]:

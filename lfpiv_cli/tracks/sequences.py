@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lfpiv_cli.particles.in_time import Scatter, State, fit_in_time, scatter_of
-from lfpiv_cli.particles.tracking import FIT_TRACKS, Forecast, expected_displacement, gate_mm, mutual, track
+from lfpiv_cli.tracks.in_time import Scatter, State, fit_in_time, scatter_of
+from lfpiv_cli.tracks.tracking import FIT_TRACKS, Forecast, expected_displacement, gate_mm, mutual, track
 
 # A forecast takes a track's last four places: enough for a parabola and to see its noise.
 PAST_FRAMES = 4

@@ -17,9 +17,9 @@ from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.pictures import ensure_drawing, write_picture
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.optics.object_space import ObjectSpace
-from lfpiv_cli.particles.refinement import STEPS
-from lfpiv_cli.particles.refinement import refine_calibration as refine
 from lfpiv_cli.reconstruction.images import light
+from lfpiv_cli.self_calibration.refinement import STEPS
+from lfpiv_cli.self_calibration.refinement import refine_calibration as refine
 
 
 def refine_calibration(
@@ -63,7 +63,7 @@ def refine_calibration(
         made_by = record("refine-calibration", settings.resolved(), inputs)
         write_calibration(output, found.applied(before), made_by, overwrite)
     if picture:
-        from lfpiv_cli.particles.walls_picture import walls_figure
+        from lfpiv_cli.self_calibration.walls_picture import walls_figure
 
         write_picture(picture, walls_figure(found), overwrite)
     return found.summary()

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from lfpiv_cli import stages, stages_calibrate, stages_correlate, stages_reconstruct, stages_simulate, stages_track
 from lfpiv_cli.console import Console
 from lfpiv_cli.files.config import Config, load_config
+from lfpiv_cli.stages import build_weights, calibrate, correlate, reconstruct, simulate, track
 
 # Boards over the depth of the volume: cubic polynomials need four, a fifth tells how well they fit. They leave this
 # share of the depth free at both ends: there may be walls, and boards are tilted.
@@ -26,10 +26,10 @@ def run_chain(config: Path, output: Path, overwrite: bool, console: Console) -> 
     settings, images = load_config(config), output / "images"
     methods = settings.flow_methods()
     common: dict[str, Any] = {"overwrite": overwrite, "console": console}
-    stages_simulate.simulate_white(config=config, output=images, **common)
-    stages_simulate.simulate_particles(config=config, output=images, **common)
+    simulate.simulate_white(config=config, output=images, **common)
+    simulate.simulate_particles(config=config, output=images, **common)
     weights = _weights(config, settings, images, output, common)
-    pair = [images / name for name in stages_simulate.frame_names(settings.simulation.frames)[:2]]
+    pair = [images / name for name in simulate.frame_names(settings.simulation.frames)[:2]]
     makers = {"volumes": _by_volumes, "particles": _by_particles}
     return {name: makers[name](weights, pair, output, common) for name in methods}
 
@@ -42,11 +42,11 @@ def _weights(config: Path, settings: Config, images: Path, output: Path, common:
         low, high = settings.grid().bounds_mm(2)
         margin = DLFC_MARGIN * (high - low)
         depths = np.linspace(low + margin, high - margin, DLFC_BOARDS).round(2).tolist()
-        boards = [images / stages_simulate.board_at(depth) for depth in depths]
-        stages_simulate.simulate_boards(config=config, output=images, depth_mm=depths, **common)
+        boards = [images / simulate.board_at(depth) for depth in depths]
+        simulate.simulate_boards(config=config, output=images, depth_mm=depths, **common)
     else:
-        stages_simulate.simulate_board(config=config, output=images, **common)
-    stages_calibrate.calibrate_snapshot(
+        simulate.simulate_board(config=config, output=images, **common)
+    calibrate.calibrate_snapshot(
         config=config,
         white=[images / "white.tif"],
         dark=images / "dark.tif",
@@ -57,7 +57,7 @@ def _weights(config: Path, settings: Config, images: Path, output: Path, common:
         views=None,
         **common,
     )
-    stages.build_weights(
+    build_weights.build_weights(
         config=config, calibration=calibration, method=None, refraction=None, sampling=None, output=weights, **common
     )
     return weights
@@ -66,7 +66,7 @@ def _weights(config: Path, settings: Config, images: Path, output: Path, common:
 def _by_volumes(weights: Path, pair: list[Path], output: Path, common: dict[str, Any]) -> Path:
     """Reconstruct both images as volumes and correlate them."""
     vectors = output / "vectors.vtkhdf"
-    stages_correlate.correlate(
+    correlate.correlate(
         volumes=_reconstructed(weights, pair, output / "volumes", None, common),
         config=None,
         dt_s=None,
@@ -86,7 +86,7 @@ def _by_volumes(weights: Path, pair: list[Path], output: Path, common: dict[str,
 
 def _by_particles(weights: Path, pair: list[Path], output: Path, common: dict[str, Any]) -> Path:
     """Find the particles of both images and follow them."""
-    stages_track.track_particles(
+    track.track_particles(
         particles=_reconstructed(weights, pair, output / "particles", "particles", common),
         dt_s=None,
         search_voxel=None,
@@ -102,7 +102,7 @@ def _reconstructed(
     weights: Path, pair: list[Path], output: Path, solver: str | None, common: dict[str, Any]
 ) -> list[Path]:
     """Reconstruct the pair in a folder, by the configured solver where none is named."""
-    stages_reconstruct.reconstruct(
+    reconstruct.reconstruct(
         weights=weights,
         images=pair,
         solver=solver,

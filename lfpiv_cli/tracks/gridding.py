@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from scipy.stats import chi2
 
-from lfpiv_cli.particles.local_fits import LocalFits, fit_around
+from lfpiv_cli.tracks.local_fits import LocalFits, fit_around
 
 # Degrees and numbers of tracks to choose from: three to ten tracks for each of ten unknowns, five to fifteen for each
 # of four. The first one, whose noise and what it misses are both moderate, is what the others are compared with.

@@ -46,7 +46,7 @@ def common_options(command: Callable[..., dict[str, Any]]) -> Callable[..., None
 
         console = Console(verbose=verbose, quiet=quiet or as_json)
         if threads is not None:
-            from lfpiv_cli.stages import use_threads
+            from lfpiv_cli.threads import use_threads
 
             use_threads(threads)
         missed: LimitMissedError | None = None
@@ -98,9 +98,9 @@ def calibrate_snapshot(**arguments: Any) -> dict[str, Any]:
              lfpiv calibrate-snapshot rig.yaml --white white.tif --board b1.tif --depth-mm -8 \\
                  --board b2.tif --depth-mm 0 --board b3.tif --depth-mm 8 -o calibration.h5
     """
-    from lfpiv_cli import stages_calibrate
+    from lfpiv_cli.stages import calibrate
 
-    return stages_calibrate.calibrate_snapshot(**arguments)
+    return calibrate.calibrate_snapshot(**arguments)
 
 
 @cli.command("refine-calibration")
@@ -119,9 +119,9 @@ def refine_calibration(**arguments: Any) -> dict[str, Any]:
     Example: lfpiv refine-calibration rig.yaml a.tif b.tif --calibration calibration.h5 --dark dark.tif \\
                  -o refined.h5 --picture walls.png
     """
-    from lfpiv_cli import stages_refine
+    from lfpiv_cli.stages import refine
 
-    return stages_refine.refine_calibration(**arguments)
+    return refine.refine_calibration(**arguments)
 
 
 @cli.command("build-weights")
@@ -138,9 +138,9 @@ def build_weights(**arguments: Any) -> dict[str, Any]:
     \b
     Example: lfpiv build-weights rig.yaml --calibration calibration.h5 -o weights.h5
     """
-    from lfpiv_cli import stages
+    from lfpiv_cli.stages import build_weights
 
-    return stages.build_weights(**arguments)
+    return build_weights.build_weights(**arguments)
 
 
 @cli.command("reconstruct")
@@ -171,9 +171,9 @@ def reconstruct(**arguments: Any) -> dict[str, Any]:
     over a long sequence, the background of each frame from the fifteen around it:
              lfpiv reconstruct weights.h5 run.tif --background minimum:15 --mask mask.png -o volumes
     """
-    from lfpiv_cli import stages_reconstruct
+    from lfpiv_cli.stages import reconstruct
 
-    return stages_reconstruct.reconstruct(**arguments)
+    return reconstruct.reconstruct(**arguments)
 
 
 @cli.command("correlate")
@@ -197,9 +197,9 @@ def correlate(**arguments: Any) -> dict[str, Any]:
     Example: lfpiv correlate volumes/a.vtkhdf volumes/b.vtkhdf -o vectors.vtkhdf
              lfpiv correlate volumes/*.vtkhdf --pairing sequence --mean mean.vtkhdf -o vectors
     """
-    from lfpiv_cli import stages_correlate
+    from lfpiv_cli.stages import correlate
 
-    return stages_correlate.correlate(**arguments)
+    return correlate.correlate(**arguments)
 
 
 @cli.command("track")
@@ -222,9 +222,9 @@ def track(**arguments: Any) -> dict[str, Any]:
              lfpiv track particles/frame_*.vtkhdf -o tracks.vtkhdf --grid
     after    lfpiv reconstruct weights.h5 a.tif b.tif --dark dark.tif --solver particles -o particles
     """
-    from lfpiv_cli import stages_track
+    from lfpiv_cli.stages import track
 
-    return stages_track.track_particles(**arguments)
+    return track.track_particles(**arguments)
 
 
 @cli.command("combine")
@@ -241,9 +241,9 @@ def combine(**arguments: Any) -> dict[str, Any]:
     \b
     Example: lfpiv combine vectors.vtkhdf tracks_grid.vtkhdf -o combined.vtkhdf
     """
-    from lfpiv_cli import stages_combine
+    from lfpiv_cli.stages import combine
 
-    return stages_combine.combine_vectors(**arguments)
+    return combine.combine_vectors(**arguments)
 
 
 @cli.command("validate")
@@ -273,26 +273,26 @@ def validate(
     if what == "volume":
         if volume is None or particles is None or frame is None or vectors is not None:
             raise click.UsageError("validate volume needs --volume, --particles and --frame, and takes no --vectors")
-        from lfpiv_cli import stages_volume
+        from lfpiv_cli.stages import validate_volume
 
-        return stages_volume.validate_volume(volume=volume, particles=particles, frame=frame, **arguments)
+        return validate_volume.validate_volume(volume=volume, particles=particles, frame=frame, **arguments)
     if what == "flow":
-        from lfpiv_cli import stages_flow
+        from lfpiv_cli.stages import validate_flow
 
-        return stages_flow.validate_flow(vectors=vectors, particles=particles, **arguments)
+        return validate_flow.validate_flow(vectors=vectors, particles=particles, **arguments)
     if vectors is not None or particles is not None:
         raise click.UsageError(f"validate {what} takes neither --vectors nor --particles")
     if what == "all":
-        from lfpiv_cli import stages_validate
+        from lfpiv_cli.stages import validate_all
 
-        return stages_validate.validate_all(**arguments)
+        return validate_all.validate_all(**arguments)
     if what == "board":
-        from lfpiv_cli import stages_board
+        from lfpiv_cli.stages import validate_board
 
-        return stages_board.validate_board(**arguments)
-    from lfpiv_cli import stages_weights
+        return validate_board.validate_board(**arguments)
+    from lfpiv_cli.stages import validate_weights
 
-    return stages_weights.validate_weights(**arguments)
+    return validate_weights.validate_weights(**arguments)
 
 
 @cli.command("info")
@@ -306,9 +306,9 @@ def info(**arguments: Any) -> dict[str, Any]:
     \b
     Example: lfpiv info weights.h5 --picture column.png --voxel 50 40 120
     """
-    from lfpiv_cli import stages_weights
+    from lfpiv_cli.stages import info as stage
 
-    return stages_weights.info(**arguments)
+    return stage.info(**arguments)
 
 
 @cli.command("simulate")
@@ -324,16 +324,16 @@ def simulate(what: str, depth_mm: tuple[float, ...], **arguments: Any) -> dict[s
     Example: lfpiv simulate particles rig.yaml -o simulated
              lfpiv simulate board rig.yaml --depth-mm -4 --depth-mm 0 --depth-mm 4 -o simulated
     """
-    from lfpiv_cli import stages_simulate
+    from lfpiv_cli.stages import simulate
 
     if depth_mm:
         if what != "board":
             raise click.UsageError(f"simulate {what} takes no --depth-mm")
-        return stages_simulate.simulate_boards(depth_mm=depth_mm, **arguments)
+        return simulate.simulate_boards(depth_mm=depth_mm, **arguments)
     stage = {
-        "white": stages_simulate.simulate_white,
-        "board": stages_simulate.simulate_board,
-        "particles": stages_simulate.simulate_particles,
+        "white": simulate.simulate_white,
+        "board": simulate.simulate_board,
+        "particles": simulate.simulate_particles,
     }[what]
     return stage(**arguments)
 

@@ -7,9 +7,9 @@ import pytest
 from numba import njit
 
 from lfpiv_cli.flow import lane_sums, lanes
-from lfpiv_cli.flow.lane_sums import FEW_SHIFTS, MANY_SHIFTS, MOMENTS
-from lfpiv_cli.flow.lanes import MOST_TAPS
-from lfpiv_cli.flow.vectors import LANES
+from lfpiv_cli.simd.block_sums import FEW_SHIFTS, MANY_SHIFTS, MOMENTS
+from lfpiv_cli.simd.splines import MOST_TAPS
+from lfpiv_cli.simd.vectors import LANES
 
 # Fused multiply-adds round once where the twins round twice.
 ROUNDING = {"rtol": 1e-5, "atol": 1e-5}

@@ -9,8 +9,8 @@ from numba import njit
 from benchmarks.weights import against_sparse_matrix, share_of_matrix_product_rate
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.media import Media
+from lfpiv_cli.simd.combine import GROUP, TILE, combine, combine_onto, combine_reference
 from lfpiv_cli.weights.build import factorise
-from lfpiv_cli.weights.microkernel import GROUP, TILE, combine, combine_onto, combine_reference
 
 
 @njit

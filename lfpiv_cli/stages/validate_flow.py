@@ -21,7 +21,7 @@ from lfpiv_cli.files.pictures import ensure_drawing, write_picture
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.files.sections_simulated import FlowSection
 from lfpiv_cli.flow.field import VectorField
-from lfpiv_cli.stages_chain import run_chain
+from lfpiv_cli.stages.chain import run_chain
 from lfpiv_cli.validation.channel import Duct
 from lfpiv_cli.validation.flow import limits_missed, truth_at_points
 from lfpiv_cli.validation.methods import Measured, lower_error

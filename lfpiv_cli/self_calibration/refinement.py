@@ -21,13 +21,13 @@ from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.object_space import ObjectSpace
-from lfpiv_cli.particles.nuisances import Nuisances, fit_nuisances
 from lfpiv_cli.particles.refraction import places_by_snell
 from lfpiv_cli.particles.rounds import ROUNDS, find_particles
 from lfpiv_cli.particles.search import Particles
 from lfpiv_cli.particles.view import View, raw_view
-from lfpiv_cli.particles.walls import Walls, find_walls, refuse_few
 from lfpiv_cli.reconstruction.equations import normalisers
+from lfpiv_cli.self_calibration.nuisances import Nuisances, fit_nuisances
+from lfpiv_cli.self_calibration.walls import Walls, find_walls, refuse_few
 from lfpiv_cli.weights.build import default_padding, factorise
 from lfpiv_cli.weights.model import Weights
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lfpiv_cli.particles.in_time import Scatter, fit_in_time, scatter_of
-from lfpiv_cli.particles.sequences import NO_TRACK, Trajectories, follow, scatter_in, states_at
-from lfpiv_cli.particles.tracking import Forecast, track
 from lfpiv_cli.synthetic.flows import advect, rigid_rotation
+from lfpiv_cli.tracks.in_time import Scatter, fit_in_time, scatter_of
+from lfpiv_cli.tracks.sequences import NO_TRACK, Trajectories, follow, scatter_in, states_at
+from lfpiv_cli.tracks.tracking import Forecast, track
 
 BOX_MM, DT_S = 4.0, 0.002
 NOISE_MM = np.array([0.003, 0.003, 0.02])

@@ -20,7 +20,7 @@ from lfpiv_cli.files.provenance import record
 from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.reconstruction.equations import normalisers
 from lfpiv_cli.reconstruction.solvers import reconstruct
-from lfpiv_cli.stages_simulate import misalignment_of, readout_of
+from lfpiv_cli.stages.simulate import misalignment_of, readout_of
 from lfpiv_cli.synthetic.board import BoardPlacement, dot_centres
 from lfpiv_cli.validation.board import DEPTHS_MM, PAPER, DotFigures, board_figures, measure_dots, place_figures
 from lfpiv_cli.validation.board_bench import BoardBench, ideal_bench, recorded_bench

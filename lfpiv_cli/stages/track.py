@@ -28,9 +28,9 @@ from lfpiv_cli.flow.correlation import SMALLEST_VALID_FRACTION
 from lfpiv_cli.flow.field import MASKED, MM_TO_M, REJECTED, VALID, VectorField
 from lfpiv_cli.flow.windows import layout_windows
 from lfpiv_cli.grid import Grid
-from lfpiv_cli.particles.gridding import on_grid
-from lfpiv_cli.particles.sequences import follow, scatter_in, states_at
-from lfpiv_cli.particles.tracking import Tracks, track
+from lfpiv_cli.tracks.gridding import on_grid
+from lfpiv_cli.tracks.sequences import follow, scatter_in, states_at
+from lfpiv_cli.tracks.tracking import Tracks, track
 
 # A vector needs its twelve nearest tracks within this many windows of its centre: in sparse images tracks are further
 # apart than windows, and what a wide fit misses of the flow is in the stated error.
