@@ -26,10 +26,10 @@ from lfpiv_cli.calibration.spots import find_spots
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
+from lfpiv_cli.robust import BRIGHTEST_PERCENTILE
 
 # A pixel shows a dot when it is brighter than this share of the brightest thousandth of the picture.
 BRIGHT_SHARE = 0.2
-BRIGHTEST_PERCENTILE = 99.9
 # Depths are tried in steps over which the rim of the main lens moves a dot by half a microlens, up to ten microlenses
 # either way: there the blur is as wide as usual dots are apart.
 FOCUS_STEPS_PER_LENS = 2

@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.errors import InputError
+from lfpiv_cli.robust import MAD_TO_SIGMA
 
 if TYPE_CHECKING:
     from lfpiv_cli.calibration.board_pose import BoardGeometry
 
 # A dot whose place or depth is this many robust deviations off the common board is dirt.
 OUTLIER_SIGMAS = 6.0
-MAD_TO_SIGMA = 1.4826
 # Terms of which one is this close to a sum of the others, each scaled to 1, cannot be told apart.
 LEAST_RANK = 1e-6
 # Six numbers place the board sideways, a seventh is the distortion; with fewer dots than these it has little check.

@@ -28,6 +28,7 @@ from lfpiv_cli.errors import InputError
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
 from lfpiv_cli.optics.polynomial_rays import LARGEST_DEGREE, PolynomialRays, complete_exponents, polynomial_terms
+from lfpiv_cli.robust import MAD_TO_SIGMA
 
 # A polynomial of degree k needs k + 1 depths, and as many rows and columns of dots.
 SMALLEST_DEGREE = 2
@@ -39,7 +40,6 @@ CENTROID_ROUNDS = 3
 CONTRAST_SHARE = 0.3
 # Sightings off the polynomials by this many robust deviations are strays; what is left is looked at once more.
 OUTLIER_SIGMAS = 6.0
-MAD_TO_SIGMA = 1.4826
 FIT_ROUNDS = 3
 
 

@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
+from lfpiv_cli.robust import HALF_NORMAL_MEDIAN
+
 # The optics model of a pixel's light is trusted to this share until what it leaves has been seen.
 MODEL_ERROR = 0.03
 # Photons of a typical tracer. Only the ratio of bright to dark pixels' weights depends on it, and positions hardly do:
 # a fourth or four times of it leaves their spread the same.
 PHOTONS_PER_PARTICLE = 2.5e5
-# Median of |x| of a normal distribution, in standard deviations.
-HALF_NORMAL_MEDIAN = 0.6745
 # Rounding to whole counts alone makes this standard deviation.
 ROUNDING_COUNTS = 0.29
 # Pixels are lit above this many standard deviations of the read noise; what lies further than so many from the model is

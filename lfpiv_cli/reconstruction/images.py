@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from lfpiv_cli.errors import InputError
+from lfpiv_cli.robust import BRIGHTEST_PERCENTILE, HALF_NORMAL_MEDIAN, MAD_TO_SIGMA
 
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -25,11 +26,6 @@ FULL_SCALES = (255.0, 1023.0, 4095.0, 16383.0, 65472.0, 65520.0, 65532.0, 65535.
 DEFECT_SIGMAS = 8.0
 # Resampling: a pixel with more than this share of its light from unusable ones is unusable, too.
 TOUCHED_SHARE = 0.1
-MAD_TO_SIGMA = 1.4826
-# Bright pixels are as bright as this percentile of all; single ones may be brighter for any reason.
-BRIGHTEST_PERCENTILE = 99.9
-# Median of |x| of a normal distribution, in standard deviations.
-HALF_NORMAL_MEDIAN = 0.6745
 
 
 def light(image: Image, dark: Image | None = None, background: Image | None = None) -> Image:

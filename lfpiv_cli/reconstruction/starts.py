@@ -10,12 +10,11 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from lfpiv_cli.reconstruction.equations import Image, Normalisers, Operator, Problem, Volume
-from lfpiv_cli.reconstruction.images import BRIGHTEST_PERCENTILE
+from lfpiv_cli.robust import BRIGHTEST_PERCENTILE, LIT_SHARE
 
-# A pixel counts as lit above this share of the image's bright ones (the 99.9th percentile); a voxel can be lit when
-# this share of its weights lies on lit pixels or their neighbours. Noise and a voxel's width cost some: of nine tenths,
-# voxels as wide as a microlens keep so few that a twentieth more of the image is left unexplained.
-LIT_SHARE = 0.02
+# A voxel can be lit when this share of its weights lies on lit pixels or their neighbours. Noise and a voxel's width
+# cost some: of nine tenths, voxels as wide as a microlens keep so few that a twentieth more of the image is left
+# unexplained.
 SEEN_SHARE = 0.8
 
 

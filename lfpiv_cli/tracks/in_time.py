@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-MAD_TO_SIGMA = 1.4826
+from lfpiv_cli.robust import MAD_TO_SIGMA
+
 # A parabola has three unknowns; with one place more its residual tells the noise.
 TERMS = 3
 # Fewer tracks than this tell neither noise nor bending.

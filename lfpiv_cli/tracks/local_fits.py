@@ -13,12 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.robust import MAD_TO_SIGMA
+
 # The furthest track of a fit still counts for a quarter: a Gaussian whose deviation is this share of the radius.
 KERNEL_WIDTH = 0.6
 # First rounds that no stray can lead astray (Cauchy's weights never vanish), then Tukey's biweight, which drops strays.
 CAUCHY_ROUNDS, TUKEY_ROUNDS = 3, 5
 TUKEY = 4.685
-MAD_TO_SIGMA = 1.4826
 # The biweight takes its weighted mean square from the middle of a normal distribution: this share of the variance.
 TUKEY_VARIANCE = 0.827
 # A share of the mean of the diagonal that keeps the equations of tracks in one plane solvable.

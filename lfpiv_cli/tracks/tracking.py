@@ -16,6 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from lfpiv_cli.robust import MAD_TO_SIGMA
+
 # Standard error of a depth beside that of a lateral place: distances are measured with depth divided by this.
 DEPTH_RATIO = 4.0
 NEIGHBOURS = 14
@@ -26,7 +28,6 @@ FIT_TRACKS = 28
 ROUNDS = 4
 # A match stays within so many robust standard deviations of the fit around it.
 OUTLIER_SIGMAS = 5.0
-MAD_TO_SIGMA = 1.4826
 # The spread below which no match is dropped, mm: particles are not known better.
 SMALLEST_SPREAD_MM = 0.004
 

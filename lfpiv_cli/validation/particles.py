@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from lfpiv_cli.robust import MAD_TO_SIGMA
+
 # A particle counts as found within so many voxels laterally and in depth.
 LATERAL_VOXEL, DEPTH_VOXEL = 0.5, 2.0
-MAD_TO_SIGMA = 1.4826
 # Of normal errors 95 % lie within so many standard deviations.
 COVERED_SIGMAS = 1.96
 

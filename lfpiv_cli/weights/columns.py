@@ -21,6 +21,7 @@ from lfpiv_cli.errors import InputError
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.microlenses import nearest_point
+from lfpiv_cli.robust import BRIGHTEST_PERCENTILE, LIT_SHARE
 from lfpiv_cli.weights.build import factorise_through, separates
 from lfpiv_cli.weights.operators import Column, FactorisedOperator
 from lfpiv_cli.weights.quadrature import DEPTH_NODES, TILES, Columns, integrate_columns
@@ -33,10 +34,8 @@ BYTES_PER_SHARE = 8
 VOXELS_AT_ONCE = 8192
 # Light is added up in this many images side by side, whatever the number of threads, so that the bits are the same.
 PARTS = 8
-# A pixel counts as lit above this share of the image's brightest ones (the 99.9th percentile); a voxel can be lit when
-# this share of its lines of sight ends on lit pixels or their neighbours. Noise and a voxel's width cost some lines.
-LIT_SHARE = 0.02
-BRIGHTEST_PERCENTILE = 99.9
+# A voxel can be lit when this share of its lines of sight ends on lit pixels or their neighbours. Noise and a voxel's
+# width cost some lines.
 SEEN_SHARE = 0.9
 # Lines of sight: tiles across the aperture.
 SIGHT_TILES = 8
