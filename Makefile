@@ -4,6 +4,7 @@
 #   make flow CONFIG=rig.yaml DATA=images OUT=results A=img_a B=img_b      the same on your own images
 #   make test       quick tests           make test-all   the slow ones too
 #   make check      ruff and mypy         make bench      speed as ratios against a stated peer
+#   make docs       the documents, with pictures from the sample, into out/docs/
 #
 # DATA holds white.tif, dark.tif, board.tif and the images A.tif and B.tif. Safe under -j; a failed step leaves no target.
 
@@ -22,7 +23,7 @@ B ?= pair_b
 TRUTH ?= $(wildcard $(DATA)/particles.npz)
 
 .DELETE_ON_ERROR:
-.PHONY: flow install test test-all check format bench clean
+.PHONY: flow install test test-all check format docs bench clean
 .SECONDARY:
 
 flow: $(OUT)/report/flow.json
@@ -71,8 +72,11 @@ format: $(INSTALLED)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
+docs: $(INSTALLED)
+	$(BIN)/python -m sphinx -W --keep-going -q -b html -d out/doctrees docs out/docs
+
 bench: $(INSTALLED)
 	$(BIN)/python -m benchmarks
 
 clean:
-	rm -rf out
+	rm -rf out docs/_generated
