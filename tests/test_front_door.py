@@ -1,0 +1,134 @@
+"""What stands at the door: version, citation, the guide for contributors, the workflow."""
+
+from __future__ import annotations
+
+import ast
+import re
+import tomllib
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pytest
+import yaml
+
+import lfpiv_cli
+from lfpiv_cli.files.bench import flow_of
+from lfpiv_cli.files.section_types import Section
+from lfpiv_cli.reconstruction.solvers import SOLVERS, reconstruct
+from lfpiv_cli.synthetic.flows import FLOWS
+
+ROOT = Path(__file__).parent.parent
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+GUIDE = (ROOT / "CONTRIBUTING.md").read_text()
+WORKFLOW = yaml.safe_load((ROOT / ".github" / "workflows" / "ci.yml").read_text())
+
+# Paths of this repository that stand in backticks, and what is named in them: `file::name`.
+PLACE = re.compile(r"`((?:lfpiv_cli|tests|configs|benchmarks|docs)/[\w/.-]+)(?:::(\w+))?`")
+PLACES = sorted({match.groups() for match in PLACE.finditer(GUIDE)}, key=str)
+
+
+def names_in(module: Path) -> set[str]:
+    """Return the functions, classes and constants at the top of a module."""
+    names = set()
+    for node in ast.parse(module.read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            names.add(node.name)
+        elif isinstance(node, ast.Assign | ast.AnnAssign):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            names |= {target.id for target in targets if isinstance(target, ast.Name)}
+    return names
+
+
+def test_version_stands_in_one_place():
+    assert "version" not in PROJECT["project"]
+    assert PROJECT["tool"]["setuptools"]["dynamic"]["version"] == {"attr": "lfpiv_cli.__version__"}
+    # a literal: setuptools then reads it without importing the package, whose dependencies a build does not have
+    tree = ast.parse(Path(lfpiv_cli.__file__).read_text(encoding="utf-8"))
+    values = [node.value for node in tree.body if isinstance(node, ast.Assign) and node.targets[0].id == "__version__"]
+    assert [ast.literal_eval(value) for value in values] == [lfpiv_cli.__version__]
+    assert "version" not in yaml.safe_load((ROOT / "CITATION.cff").read_text())
+
+
+def test_changelog_says_what_is_not_released():
+    headings = re.findall(r"^## \[(.+?)\]", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert headings[0] == "Unreleased"
+
+
+def test_citation_names_program_and_method():
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert {"cff-version", "message", "title", "authors"} <= citation.keys()
+    assert citation["license"] == PROJECT["project"]["license"]
+    (paper,) = citation["references"]
+    assert re.fullmatch(r"10\.\d{4,}/\S+", paper["doi"])
+    assert paper["authors"][0]["family-names"] == "Zhu"
+
+
+@pytest.mark.parametrize(("path", "name"), PLACES)
+def test_guide_names_what_exists(path, name):
+    place = ROOT / path
+    assert place.exists()
+    if name is not None:
+        assert name in names_in(place)
+
+
+def test_guide_lists_files_and_tests_for_each_addition():
+    sections = GUIDE.split("## How to add", 1)[1].split("\n### ")[1:]
+    assert len(sections) >= 4
+    for section in sections:
+        paths = [match.group(1) for match in PLACE.finditer(section)]
+        assert any(path.startswith("lfpiv_cli/") for path in paths)
+        assert any(path.startswith("tests/") for path in paths), section.splitlines()[0]
+
+
+class Pixels:
+    """Two voxels, each of which lights its own pixel."""
+
+    shape = (1, 1, 2)
+
+    def forward(self, volume: np.ndarray) -> np.ndarray:
+        return volume[0]
+
+    def adjoint(self, image: np.ndarray) -> np.ndarray:
+        return image[np.newaxis]
+
+
+def test_a_solver_is_added_by_its_step_and_its_name(monkeypatch):
+    monkeypatch.setitem(SOLVERS, "halve", lambda problem, volume, projection, relaxation: volume / 2)
+    result = reconstruct(Pixels(), np.array([[4.0, 2.0]], np.float32), "halve", iterations=3)
+    start = reconstruct(Pixels(), np.array([[4.0, 2.0]], np.float32), "halve", iterations=0)
+    np.testing.assert_array_equal(result.volume, start.volume / 8)
+    assert result.residual.shape == (4,)
+
+
+class Expansion(Section):
+    kind: Literal["expansion"]
+    rate_per_s: float
+    centre_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+def test_a_flow_is_added_by_its_factory_and_its_section(monkeypatch):
+    def expansion(rate_per_s, centre_mm):
+        return lambda points_mm: 1e-3 * rate_per_s * (points_mm - np.asarray(centre_mm))
+
+    monkeypatch.setitem(FLOWS, "expansion", expansion)
+    flow = flow_of(Expansion(kind="expansion", rate_per_s=2.0), origin_z_mm=-0.5)
+    np.testing.assert_allclose(flow(np.array([[1.0, 0.0, -0.5]])), [[0.002, 0.0, 0.0]])
+
+
+def test_workflow_runs_make_on_what_is_promised():
+    job = WORKFLOW["jobs"]["make"]
+    pythons = {line.rsplit(" ", 1)[1] for line in PROJECT["project"]["classifiers"] if re.search(r":: 3\.\d+$", line)}
+    assert set(job["strategy"]["matrix"]["python"]) == pythons
+    assert {system.split("-")[0] for system in job["strategy"]["matrix"]["system"]} == {"ubuntu", "macos", "windows"}
+    commands = [step["run"].split() for step in job["steps"] if step.get("run", "").startswith("make")]
+    targets = {word for command in commands for word in command[1:] if "=" not in word}
+    assert targets == {"check", "test", "docs"}
+    phony = re.search(r"^\.PHONY: (.+)$", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    assert phony is not None
+    assert targets <= set(phony.group(1).split())
+
+
+def test_hooks_are_those_of_make_check():
+    hooks = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())["repos"][0]["hooks"]
+    assert {hook["id"] for hook in hooks} == {"ruff-check", "ruff-format", "mypy"}
