@@ -28,7 +28,7 @@ def view(table2: Camera, water: Media) -> View:
 
 
 def picture(view: View, particles: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
-    """The light of particles with the noise that is told of it."""
+    """The light of particles with the noise that is stated for it."""
     image = np.zeros(view.rows * view.columns)
     add_all(view, particles, share_out(view, particles, *DEPTHS), 1.0, image, entry_capacity(view, *DEPTHS))
     return image + rng.normal(0.0, np.sqrt(NOISE.read_counts**2 + NOISE.gain_counts * image))
@@ -41,7 +41,7 @@ def test_what_the_camera_lacks_is_found(view: View, rng: np.random.Generator) ->
     fit = fit_nuisances(image, view, start, NOISE, DEPTHS)
     off, sigma = fit.found.values - TRUE.values, fit.sigma.values
     assert np.all(np.abs(off) < 4.0 * sigma)
-    # All but the distortion, which is not to be told on so small a sensor, are far outside their errors before.
+    # All but the distortion, which so small a sensor does not show, are far outside their errors before.
     assert np.all(np.abs(TRUE.values[:4]) > 8.0 * sigma[:4])
     np.testing.assert_allclose(fit.view.centres_mm, TRUE.applied(view).centres_mm, atol=4.0 * sigma[0])
     depth_error = np.median(np.abs(fit.particles[:, 2] - true[:, 2]))

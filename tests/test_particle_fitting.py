@@ -13,9 +13,9 @@ from scipy.signal import lfilter
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.microlenses import Lattice
+from lfpiv_cli.particles.alternative_depths import try_other_depths
 from lfpiv_cli.particles.covariance import joint_covariance
 from lfpiv_cli.particles.fitting import accept, add_all, claimed_share, judge, refine
-from lfpiv_cli.particles.jumping import jump
 from lfpiv_cli.particles.least_squares import normal_equations, respond_once
 from lfpiv_cli.particles.noise import WHITE, Correlation, Noise, error_correlation, measured_noise
 from lfpiv_cli.particles.splitting import split
@@ -166,12 +166,12 @@ def test_particles_that_nearly_coincide_have_errors(view: View) -> None:
     assert np.all(np.diagonal(found, axis1=1, axis2=2) > 0.0)
 
 
-def test_two_merged_particles_are_told_apart(view: View) -> None:
+def test_overlapping_particles_are_separated(view: View) -> None:
     pair = np.array([[0.20, 0.10, 2.0, 5e5], [0.25, 0.08, 2.2, 4e5]])
     image = image_of(view, pair)
     one = np.array([[0.225, 0.09, 2.1, 9e5]])
     residual = image - image_of(view, one)
-    twins = split(
+    partners = split(
         view,
         one,
         np.array([True]),
@@ -184,7 +184,7 @@ def test_two_merged_particles_are_told_apart(view: View) -> None:
         entry_capacity(view, *DEPTHS),
         footprint_px(view, *DEPTHS),
     )
-    found = np.concatenate([one, twins])
+    found = np.concatenate([one, partners])
     found = found[np.argsort(found[:, 0])]
     np.testing.assert_allclose(found[:, :2], pair[:, :2], atol=1e-3)
     np.testing.assert_allclose(found[:, 2], pair[:, 2], atol=1e-2)
@@ -196,20 +196,20 @@ def test_a_single_particle_is_not_split(view: View) -> None:
     residual = np.zeros(view.rows * view.columns)
     common = (share_out(view, one, *DEPTHS), residual, np.ones_like(residual), *DEPTHS, 1e5, 1.0)
     limits = (entry_capacity(view, *DEPTHS), footprint_px(view, *DEPTHS))
-    twins = split(view, one, np.array([True]), *common, *limits)
-    assert not twins.any()
+    partners = split(view, one, np.array([True]), *common, *limits)
+    assert not partners.any()
     np.testing.assert_allclose(residual, 0.0, atol=1e-9)
 
 
 @pytest.mark.parametrize("wrong", [-0.5, -1.5])
-def test_a_particle_jumps_to_its_depth(view: View, wrong: float) -> None:
+def test_a_particle_at_a_wrong_depth_finds_its_own(view: View, wrong: float) -> None:
     true = np.array([[0.21, 0.13, 0.5, 5e5], [-0.9, 0.6, 1.5, 5e5]])
     image = image_of(view, true)
     found = true.copy()
     found[0, 2] = wrong
     residual = image - image_of(view, found)
     common = (share_out(view, found, *DEPTHS), residual, 1.0 / (image + 36.0), *DEPTHS, 1e5, 10.0)
-    moved = jump(view, found, np.array([True, True]), *common, entry_capacity(view, *DEPTHS))
+    moved = try_other_depths(view, found, np.array([True, True]), *common, entry_capacity(view, *DEPTHS))
     assert moved.tolist() == [True, False]
     np.testing.assert_allclose(found[:, :3], true[:, :3], atol=2e-3)
     np.testing.assert_allclose(residual, image - image_of(view, found), atol=1e-6)
@@ -290,14 +290,14 @@ def test_noise_is_what_a_fit_leaves(rng: np.random.Generator) -> None:
     model = rng.uniform(0.0, 2000.0, 100_000)
     true = Noise(6.0, 5.0, 0.05)
     residual = rng.normal(size=model.size) / np.sqrt(true.weights(model, np.zeros_like(model), 0.0))
-    # A tenth of the pixels hold light that was not found, or are not believed.
+    # A tenth of the pixels hold light that was not found, or are not usable.
     residual[::20] += 5e3
-    believed = np.ones(model.size, np.bool_)
-    believed[1::20], residual[1::20] = False, 1e6
-    found = measured_noise(model, residual, believed, Noise(6.0, 2.0))
+    usable = np.ones(model.size, np.bool_)
+    usable[1::20], residual[1::20] = False, 1e6
+    found = measured_noise(model, residual, usable, Noise(6.0, 2.0))
     # Of some 3,000 pixels a median of squares is known to 4 %; the strays widen it by a tenth.
     assert found.read_counts == 6.0
     assert found.gain_counts == pytest.approx(5.0, rel=0.2)
     assert found.model_error == pytest.approx(0.05, rel=0.2)
-    few = measured_noise(model[:100], residual[:100], believed[:100], Noise(6.0, 2.0))
+    few = measured_noise(model[:100], residual[:100], usable[:100], Noise(6.0, 2.0))
     assert few == Noise(6.0, 2.0)

@@ -175,8 +175,8 @@ def test_a_track_s_own_past_goes_before_its_neighbours(rng: np.random.Generator)
     moved = rng.normal(0.0, 0.1, start.shape)
     noise = rng.normal(0.0, NOISE_MM, start.shape)
     forecast = Forecast(moved + noise, np.broadcast_to(NOISE_MM, start.shape))
-    for told, least, most in ((forecast, 0.95, 1.0), (None, 0.0, 0.5)):
-        links = track(start, start + moved, 0.4, told)
+    for prediction, least, most in ((forecast, 0.95, 1.0), (None, 0.0, 0.5)):
+        links = track(start, start + moved, 0.4, prediction)
         assert least * 400 <= np.sum(links.first == links.second) <= most * 400
 
 

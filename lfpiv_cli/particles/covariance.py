@@ -5,7 +5,7 @@ small an error. The normal matrix of all particles together is sparse; a particl
 the particle and the neighbours it is tied to most, these free and the others held.
 
 What is left of an image is not white either: a particle that was not found, or found wrongly, leaves the same sign in
-pixels side by side. With H the normal matrix, K = H^-1 J^T W^(1/2) tells how far each pixel's error moves a particle,
+pixels side by side. With H the normal matrix, K = H^-1 J^T W^(1/2) is how far each pixel's error moves a particle,
 and errors with the correlation R move it by the covariance K R K^T. What a particle's chi-squared exceeds 1 by is not
 noise but such a sign: it counts as errors that are all alike.
 

@@ -1,8 +1,8 @@
-"""A second look at an image, knowing what was found in the frames before and after it.
+"""A second pass over an image with the particles found in the frames before and after it, as in time-resolved PTV.
 
 A particle that was found in a neighbour frame and has no partner here is put where the displacements around it lead,
-whether its light seems free or not; then all particles settle, and those that do not find their light go. So a pair of
-particles that was taken for one becomes two, which splitting did not find. Only first looks serve as neighbours: each
+whether its light seems free or not; then all particles are refined, and those that do not find their light are
+dropped. So overlapping particles that splitting did not find are separated. Only first passes serve as neighbours: each
 frame's result depends on the images alone, not on the order in which frames are done.
 
 Axes: particles are rows (x, y, z, light) in image axes, mm and counts.
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from lfpiv_cli.particles.noise import estimate_noise
-from lfpiv_cli.particles.rounds import ROUNDS, doubted, finished
+from lfpiv_cli.particles.rounds import ROUNDS, finished, with_suspects_checked
 from lfpiv_cli.particles.search import (
     LAST_UNEXPLAINED,
     State,
@@ -36,15 +36,15 @@ from lfpiv_cli.tracks.tracking import expected_displacement, track
 # A particle without a partner this near to where one is expected is that one, at another depth: near the focal plane
 # depths may be wrong by a millimetre.
 SAME_MM = np.array([0.05, 0.05, 1.25])
-# Newcomers begin with this share of the light that they have in their own frame: some of it is others' for now.
+# Added particles begin with this share of the light that they have in their own frame: some of it is others' for now.
 FIRST_SHARE = 0.5
-# Sweeps in which they settle, and how little unexplained light counts then: first as in early rounds, then as at the
-# end. The share of its light that each particle must find afterwards.
-SETTLING = ((3, 0.1), (4, LAST_UNEXPLAINED))
+# Sweeps in which they are refined, and how little unexplained light counts then: first as in early rounds, then as at
+# the end. The share of its light that each particle must find afterwards.
+REFINING = ((3, 0.1), (4, LAST_UNEXPLAINED))
 CLAIMED_SHARE = 0.6
 
 
-def second_look(
+def second_pass(
     task: Task, own: NDArray[np.float64], neighbours: Sequence[NDArray[np.float64]], search_mm: float
 ) -> State:
     """Return what is found with the help of neighbour frames.
@@ -52,19 +52,19 @@ def second_look(
     Parameters
     ----------
     task : the image
-    own, neighbours : (n, 4) what first looks found in it and in the frames beside it
+    own, neighbours : (n, 4) what first passes found in it and in the frames beside it
     search_mm : largest displacement along each axis
     """
     state = with_typical_light(task, rebuilt(task, blank(task), own))
     state = with_measured_noise(task, replace(state, noise=estimate_noise(task.image, state.typical_light)))
-    state = rebuilt(task, state, np.concatenate([own, _newcomers(task, own, neighbours, search_mm)]))
-    for sweeps, unexplained in SETTLING:
+    state = rebuilt(task, state, np.concatenate([own, _missing_particles(task, own, neighbours, search_mm)]))
+    for sweeps, unexplained in REFINING:
         sweep(task, state, unexplained, sweeps)
     state = prune(task, merge(task, state), CLAIMED_SHARE, LAST_UNEXPLAINED)
-    return finished(task, doubted(task, state, ROUNDS[-1]), ROUNDS[-1])
+    return finished(task, with_suspects_checked(task, state, ROUNDS[-1]), ROUNDS[-1])
 
 
-def _newcomers(
+def _missing_particles(
     task: Task, own: NDArray[np.float64], neighbours: Sequence[NDArray[np.float64]], search_mm: float
 ) -> NDArray[np.float64]:
     """Return the neighbours' particles (m, 4) that are missing here, where they are expected."""
@@ -79,7 +79,7 @@ def _newcomers(
 
 
 def _same(points: NDArray[np.float64], known: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Tell which points (n, 3) are known ones (m, 3): near and each other's nearest."""
+    """Return which points (n, 3) are known ones (m, 3): near and each other's nearest."""
     if not len(points) or not len(known):
         return np.zeros(len(points), np.bool_)
     distance, to = KDTree(known / SAME_MM).query(points / SAME_MM)

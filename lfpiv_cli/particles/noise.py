@@ -25,7 +25,7 @@ ROUNDING_COUNTS = 0.29
 # Pixels are lit above this many standard deviations of the read noise; what lies further than so many from the model is
 # light that was not found, not an error's usual size.
 LIT_SIGMAS, USUAL_SIGMAS = 3.0, 3.5
-# Distances in pixels at which errors are compared: from where white noise is gone to within a micro-image.
+# Distances in pixels at which errors are compared: from where white noise has ended to within a micro-image.
 LAGS_PX = range(1, 9)
 # Lit pixels are sorted by brightness into so many classes, of at least so many pixels, to see how their errors grow.
 CLASSES, SMALLEST_CLASS = 32, 100
@@ -63,7 +63,7 @@ def error_correlation(
 ) -> Correlation:
     """Return the correlation of what is left of an image (rows, columns) where the model lights it.
 
-    `weight` (rows, columns) is each pixel's 1/variance, 0 where it is not believed. A geometric series is fitted to the
+    `weight` (rows, columns) is each pixel's 1/variance, 0 where it is not usable. A geometric series is fitted to the
     correlations along rows and columns.
     """
     error = residual * np.sqrt(weight)
@@ -88,7 +88,7 @@ def _at_lag(error: NDArray[np.float64], lit: NDArray[np.bool_], lag: int) -> flo
 
 
 def measured_noise(
-    model: NDArray[np.float64], residual: NDArray[np.float64], believed: NDArray[np.bool_], noise: Noise
+    model: NDArray[np.float64], residual: NDArray[np.float64], usable: NDArray[np.bool_], noise: Noise
 ) -> Noise:
     """Return noise whose gain and model error are those that a fit leaves of an image.
 
@@ -96,10 +96,10 @@ def measured_noise(
 
     Parameters
     ----------
-    model, residual, believed : (pixels,)
+    model, residual, usable : (pixels,)
     noise : taken for the read noise, and as it is where too little is lit
     """
-    lit = believed & (model > LIT_SIGMAS * noise.read_counts)
+    lit = usable & (model > LIT_SIGMAS * noise.read_counts)
     if np.count_nonzero(lit) < CLASSES * SMALLEST_CLASS:
         return noise
     order = np.argsort(model[lit], kind="stable")

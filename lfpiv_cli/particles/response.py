@@ -1,4 +1,4 @@
-"""The light of one particle on the raw image, with analytic derivatives.
+"""The point-spread function: the light of one particle on the raw image, with analytic derivatives.
 
 A particle is an evenly glowing ball. Through lens n, centred at s, a ray that crosses the main lens at X meets the
 array at x_m = alpha X - beta x, beta = s_i/s_o, and the sensor at
@@ -288,7 +288,7 @@ def _join_cell(
     # No ray of a patch further from the lens than this meets its cell.
     furthest = (view.half_x_mm + radius + 0.71 * width * max(abs(gain_x), abs(gain_y))) ** 2
     move_x, move_y = (lever * alpha - 1.0) * beta * stretch_x, (lever * alpha - 1.0) * beta * stretch_y
-    # The patch on the array. It blurs the ball; so does more of a radius, and of either the variance tells how much.
+    # The patch on the array. It blurs the ball; so does more of a radius, and the variance of either is what counts.
     stretch = 0.5 * (stretch_x + stretch_y)
     side = stretch * abs(alpha) * width
     side_z = stretch * slope * width * (np.sign(alpha) - abs(alpha) * lever)

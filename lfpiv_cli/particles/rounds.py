@@ -1,8 +1,9 @@
-"""From a raw image to its particles: rounds of candidates, acceptance, splitting, refinement and pruning.
+"""Iterative particle reconstruction from a raw image: candidates, acceptance, splitting, refinement and pruning.
 
 Each round explains what is left of the image by a volume, takes its peaks as candidates, fits and accepts those whose
-light is there, tells merged ones apart and refines all. Early rounds accept only what is plainly there and let
-unexplained light count for little; later ones ask for less, doubt every particle that fits badly, and try other depths.
+light is there, separates overlapping ones and refines all. Early rounds accept only what is plainly there and let
+unexplained light count for little; later ones ask for less, verify every particle that fits badly, and try other
+depths. Ghost particles find too little light and are pruned.
 
 Axes: see `search`.
 """
@@ -17,7 +18,6 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.particles.candidates import explain_rest, find_peaks, points_in_raw_frame
-from lfpiv_cli.particles.doubts import moved_in_depth, told_apart
 from lfpiv_cli.particles.fitting import accept
 from lfpiv_cli.particles.noise import estimate_noise
 from lfpiv_cli.particles.search import (
@@ -37,6 +37,7 @@ from lfpiv_cli.particles.search import (
     with_measured_noise,
     with_typical_light,
 )
+from lfpiv_cli.particles.suspects import with_depths_corrected, with_overlaps_split
 from lfpiv_cli.particles.tiles import share_out
 from lfpiv_cli.particles.view import View
 from lfpiv_cli.reconstruction.equations import Normalisers
@@ -52,7 +53,7 @@ class Round:
     iterations : of expectation maximisation
     claimed_share : least share of its claimed light that a candidate must find
     unexplained : weight of light above the model in a pixel's variance
-    thorough : whether particles of usual brightness are doubted, too, and other depths tried
+    thorough : whether particles of usual brightness are suspects, too, and other depths tried
     """
 
     iterations: int
@@ -61,7 +62,7 @@ class Round:
     thorough: bool
 
 
-# As long as half the light is unexplained most particles fit badly, and doubting them all is in vain.
+# As long as half the light is unexplained most particles fit badly, and verifying them all is in vain.
 ROUNDS = (
     Round(20, 0.9, 0.3, thorough=False),
     Round(12, 0.85, 0.2, thorough=False),
@@ -99,14 +100,14 @@ def find_particles(
     weights, sums : of the volume in which particles are looked for, and their `normalisers` on the padded grid
     camera : says which world axis the columns follow
     progress : called with 1 after each iteration and each round
-    excluded : (rows, columns) raw pixels that are not believed; `sums` must leave out what they touch; default: none
+    excluded : (rows, columns) raw pixels that take no part; `sums` must leave out what they touch; default: none
     """
     task = task_of(image, view, weights, camera, sums, excluded)
-    return result(task, first_look(task, rounds, progress))
+    return result(task, first_pass(task, rounds, progress))
 
 
-def first_look(task: Task, rounds: tuple[Round, ...] = ROUNDS, progress: Callable[[int], None] | None = None) -> State:
-    """Return how far the rounds lead; see `find_particles`."""
+def first_pass(task: Task, rounds: tuple[Round, ...] = ROUNDS, progress: Callable[[int], None] | None = None) -> State:
+    """Return the state after the rounds, without the help of other frames; see `find_particles`."""
     state = blank(task)
     for settings in rounds:
         state = _one_round(task, state, settings, progress)
@@ -138,14 +139,14 @@ def _one_round(task: Task, state: State, settings: Round, progress: Callable[[in
     state = _accept(task, state, candidates, settings)
     sweep(task, state, settings.unexplained, SWEEPS)
     state = with_typical_light(task, state)
-    return with_typical_light(task, doubted(task, state, settings))
+    return with_typical_light(task, with_suspects_checked(task, state, settings))
 
 
-def doubted(task: Task, state: State, settings: Round) -> State:
-    """Return the state after what fits badly was tried at other depths or as two, as far as a round does."""
+def with_suspects_checked(task: Task, state: State, settings: Round) -> State:
+    """Return the state after particles that fit badly were tried at other depths or as two, as far as a round does."""
     if settings.thorough:
-        state = moved_in_depth(task, state, settings.unexplained)
-    state = told_apart(task, state, settings.unexplained, settings.thorough)
+        state = with_depths_corrected(task, state, settings.unexplained)
+    state = with_overlaps_split(task, state, settings.unexplained, settings.thorough)
     sweep(task, state, settings.unexplained, SWEEPS_AFTER_SPLIT)
     return pruned(task, merge(task, state), settings)
 

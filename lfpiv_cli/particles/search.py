@@ -1,4 +1,4 @@
-"""A search for the particles of an image: what it is given, how far it has come, and the steps that keep it in order.
+"""The state of an iterative particle reconstruction, and the steps that keep it in order.
 
 Axes: inside, particles are rows (x, y, z, light) in image axes, mm and counts, and images flat; results are in world
 axes of the raw sensor, z from the nominal focal point.
@@ -65,7 +65,7 @@ class Task:
     ----------
     view : the raw image's optics
     image : (rows * columns,) dark-subtracted counts
-    believed : (rows * columns,) which pixels take part
+    usable : (rows * columns,) which pixels take part
     prepared : (rows, columns) the same in the weights' frame
     depths_mm : between which particles may lie
     """
@@ -75,7 +75,7 @@ class Task:
     camera: Camera
     sums: Normalisers
     image: NDArray[np.float64]
-    believed: NDArray[np.bool_]
+    usable: NDArray[np.bool_]
     prepared: NDArray[np.float32]
     depths_mm: tuple[float, float]
 
@@ -135,8 +135,8 @@ def blank(task: Task) -> State:
 
 
 def pixel_weight(task: Task, state: State, unexplained: float) -> NDArray[np.float64]:
-    """Return the weight of each pixel, zero where it is not believed; light above the model counts for less."""
-    return np.where(task.believed, state.noise.weights(task.image - state.residual, state.residual, unexplained), 0.0)
+    """Return the weight of each pixel, zero where it is not usable; light above the model counts for less."""
+    return np.where(task.usable, state.noise.weights(task.image - state.residual, state.residual, unexplained), 0.0)
 
 
 def sweep(task: Task, state: State, unexplained: float, sweeps: int) -> None:
@@ -151,13 +151,13 @@ def merge(task: Task, state: State) -> State:
     """Return the state with particles that have become one added up, and its residual computed anew."""
     particles = state.particles.copy()
     pairs = KDTree(particles[:, :3] / MERGE_MM).query_pairs(1.0, output_type="ndarray")
-    gone = np.zeros(len(particles), dtype=bool)
+    merged = np.zeros(len(particles), dtype=bool)
     for a, b in pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]:
-        if not (gone[a] or gone[b]):
+        if not (merged[a] or merged[b]):
             brighter, other = (a, b) if particles[a, 3] >= particles[b, 3] else (b, a)
             particles[brighter, 3] += particles[other, 3]
-            gone[other] = True
-    return rebuilt(task, state, particles[~gone])
+            merged[other] = True
+    return rebuilt(task, state, particles[~merged])
 
 
 def prune(task: Task, state: State, claimed_share: float, unexplained: float) -> State:
@@ -189,7 +189,7 @@ def with_typical_light(task: Task, state: State) -> State:
 
 def with_measured_noise(task: Task, state: State) -> State:
     """Return the state with the noise that its particles leave of the image."""
-    return replace(state, noise=measured_noise(task.image - state.residual, state.residual, task.believed, state.noise))
+    return replace(state, noise=measured_noise(task.image - state.residual, state.residual, task.usable, state.noise))
 
 
 def result(task: Task, state: State) -> Particles:

@@ -1,4 +1,4 @@
-"""Two for one: particles so close that they were found as one, told apart where two explain the light much better.
+"""Overlapping particle images: two particles where one was found, if two explain the light much better.
 
 Both are fitted together, eight unknowns: block coordinates creep where two responses nearly coincide.
 
@@ -24,7 +24,7 @@ from lfpiv_cli.particles.tiles import Tiles
 from lfpiv_cli.particles.view import View
 
 # Half the distance (x, y, z) of two particles at the start, mm: half a voxel of Table 2 sideways, or along the depth in
-# which a volume cannot tell two from one.
+# which a volume shows two as one.
 STARTS_MM = np.array(
     [
         (0.03, 0.0, 0.0),
@@ -37,7 +37,7 @@ STARTS_MM = np.array(
     ]
 )
 PAIR_STEPS = 12
-# A start that after the first steps has not won this share of what is asked for is given up: half the time is saved.
+# A start that after the first steps has not gained this share of what is asked for is given up: half the time is saved.
 EARLY_GAIN = 0.25
 
 
@@ -61,7 +61,7 @@ def split(
     The first of the two takes the suspect's place in `particles` (n, 4); the second ones are returned in an array of
     the same shape whose other rows are zero. The residual is kept up to date.
     """
-    twins = np.zeros_like(particles)
+    partners = np.zeros_like(particles)
     for group in range(4):
         for tile in prange(tiles.groups[group], tiles.groups[group + 1]):
             pixels, values = np.empty((2, capacity), np.int32), np.empty((2, capacity, VALUES))
@@ -106,11 +106,11 @@ def split(
                         best[:] = pair
                 if found:
                     particles[number] = best[0]
-                    twins[number] = best[1]
+                    partners[number] = best[1]
                     respond_all(view, best, counts, pixels, values)
                     for m in range(2):
                         add_light(pixels[m], values[m], counts[m], -best[m, 3], residual)
                 else:
                     count = respond_once(view, x, y, z, pixels[0], values[0])
                     add_light(pixels[0], values[0], count, -light, residual)
-    return twins
+    return partners

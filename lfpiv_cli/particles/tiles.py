@@ -1,4 +1,4 @@
-"""Sharing particles out among threads so that the result does not depend on their number.
+"""Particles by tiles of the image, so that threads work on them at once and their number does not matter.
 
 The image is cut into square tiles at least as wide as two footprints. Tiles whose numbers are even along both axes form
 one group, and so on: four groups. Particles of different tiles of one group light no common pixel, so a group's tiles

@@ -1,8 +1,8 @@
-"""What an image of particles says about the camera that saw it: Gauss-Newton on camera and particles at once.
+"""Volume self-calibration of the camera from an image of particles: Gauss-Newton on camera and particles at once.
 
 The unknowns of the camera change the light of all particles, those of a particle (x, y, z, light) its own alone. With
 the columns of the former freed of all that the latter can do (the Schur complement, by least squares with one sparse
-matrix), a small system is left. Told this way are the mean shift of the lens images against those of the white image,
+matrix), a small system is left. Found this way are the mean shift of the lens images against those of the white image,
 the main lens's aperture, the particles' size and the radial distortion. Focus and magnification are not: the particles'
 places make up for them.
 

@@ -1,7 +1,7 @@
-"""A calibration held against the particles of a flow: where the channel's walls are, by the particles between them.
+"""Volume self-calibration from the particles of a flow: where the channel's walls are, by the particles between them.
 
-Told by where the particles end: the depth of the mid plane, the walls' tilt, and the scale of depths, which goes with
-the square of the magnification. Their images tell none of these: unknown places absorb them. What the images do tell
+Where the particles end gives the depth of the mid plane, the walls' tilt, and the scale of depths, which goes with
+the square of the magnification. Their images show none of these: unknown places absorb them. What the images do show
 (`nuisances`) is asked of the first one.
 
 Axes: world axes of the raw sensor, z from the nominal focal point; lengths in mm.
@@ -47,7 +47,7 @@ COMMON_SHARE_OF_LENS_DEPTH = 2.5e-3
 
 @dataclass(frozen=True, eq=False)
 class Refinement:
-    """What the particles told.
+    """What the particles show.
 
     Attributes
     ----------
@@ -187,9 +187,9 @@ def refine_calibration(
     found += [search(image, fit.view) for image in images[1:]]
     position = np.concatenate([each.position_mm for each in found])
     variance = np.concatenate([each.covariance_mm2[:, 2, 2] for each in found])
-    # A particle that hardly lights the sensor may have no depth that can be told.
-    told = np.isfinite(variance) & (variance > 0.0)
-    position, sigma = places_by_snell(position[told], space, camera), np.sqrt(variance[told])
+    # A particle that hardly lights the sensor may have no depth that can be determined.
+    known = np.isfinite(variance) & (variance > 0.0)
+    position, sigma = places_by_snell(position[known], space, camera), np.sqrt(variance[known])
     return Refinement(
         walls=find_walls(position, sigma, grid.bounds_mm(2), width_mm, len(images)),
         nuisances=fit.found,

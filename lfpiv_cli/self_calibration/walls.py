@@ -1,6 +1,6 @@
 """The walls of a channel from the particles between them: where these begin and end in depth.
 
-Evenly seeded water ends at the two walls, so the depths of the particles tell where the channel lies from the focal
+Evenly seeded water ends at the two walls, so the depths of the particles show where the channel lies from the focal
 plane, how it is tilted, and by their extent whether depths have the right scale. The particles' own images cannot: a
 point nearer to the focal plane and a camera focused further away look the same.
 

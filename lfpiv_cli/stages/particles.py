@@ -17,9 +17,9 @@ from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, symmetric, write_poi
 from lfpiv_cli.files.weights_file import WeightsFile
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.object_space import ObjectSpace
-from lfpiv_cli.particles.neighbour_frames import second_look
+from lfpiv_cli.particles.neighbour_frames import second_pass
 from lfpiv_cli.particles.refraction import places_by_snell
-from lfpiv_cli.particles.rounds import ROUNDS, first_look
+from lfpiv_cli.particles.rounds import ROUNDS, first_pass
 from lfpiv_cli.particles.search import Particles, Task, result, task_of
 from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.reconstruction.equations import Normalisers
@@ -28,7 +28,7 @@ from lfpiv_cli.weights.build import factorise_bricks
 from lfpiv_cli.weights.columns import OnDemandOperator
 from lfpiv_cli.weights.model import behind_transmission
 
-# Units of progress that `find` and `glance` report.
+# Units of progress that `find` and `find_first` report.
 STEPS = sum(settings.iterations + 1 for settings in ROUNDS)
 
 
@@ -57,7 +57,7 @@ class Frame:
     Attributes
     ----------
     image : (rows, columns) raw but for dark and background
-    unusable : (rows, columns) pixels that are not believed
+    unusable : (rows, columns) pixels that take no part
     sums : of the padded weights without what these touch
     """
 
@@ -74,14 +74,14 @@ def residual_path(particles: Path) -> Path:
 def find(content: WeightsFile, settings: Config, frame: Frame, progress: Callable[[int], None]) -> Particles:
     """Return the particles behind an image."""
     task = _task(content, settings, frame)
-    return result(task, first_look(task, progress=progress))
+    return result(task, first_pass(task, progress=progress))
 
 
-def glance(
+def find_first(
     content: WeightsFile, settings: Config, frame: Frame, progress: Callable[[int], None]
 ) -> NDArray[np.float64]:
-    """Return the particles (n, 4) that a first look finds, for their frame's second look and its neighbours'."""
-    return first_look(_task(content, settings, frame), progress=progress).particles
+    """Return the particles (n, 4) of a frame's first pass, for its own second pass and those of its neighbours."""
+    return first_pass(_task(content, settings, frame), progress=progress).particles
 
 
 def find_beside(
@@ -91,10 +91,10 @@ def find_beside(
     own: NDArray[np.float64],
     neighbours: Sequence[NDArray[np.float64]],
 ) -> Particles:
-    """Return the particles behind an image with the help of what `glance` found in it and in the frames beside it."""
+    """Return the particles behind an image with the help of the first passes of it and of the frames beside it."""
     task = _task(content, settings, frame)
     search_mm = SEARCH_VOXEL * max(content.weights.grid.spacing_mm)
-    return result(task, second_look(task, own, neighbours, search_mm))
+    return result(task, second_pass(task, own, neighbours, search_mm))
 
 
 def _task(content: WeightsFile, settings: Config, frame: Frame) -> Task:

@@ -50,7 +50,7 @@ class Bench:
     Attributes
     ----------
     dark : dark image (rows, columns) or None
-    lasting : raw pixels that are never believed: defects of the dark image, and where the mask is black
+    lasting : raw pixels that are never usable: defects of the dark image, and where the mask is black
     excluded : pixels in the weights' frame that never take part: off the sensor, or touched by `lasting`
     sums : of the weights without `excluded`; None where weights are made for each image
     """
@@ -229,18 +229,18 @@ def _finder(
     beside: Sequence[tuple[int, ...]] | None,
     advance: Callable[[int], None],
 ) -> Find:
-    """Return the function that finds the particles of a frame, alone or with what first looks find in those beside."""
+    """Return the function that finds the particles of a frame, alone or with the first passes of those beside it."""
     content, settings = bench.content, bench.settings
 
     # A frame needs itself and one at either side, the next one two of these again.
     @lru_cache(maxsize=3)
-    def glance(number: int) -> NDArray[np.float64]:
-        return particles.glance(content, settings, _particle_frame(bench, *read(number)), advance)
+    def first_pass_of(number: int) -> NDArray[np.float64]:
+        return particles.find_first(content, settings, _particle_frame(bench, *read(number)), advance)
 
     def find(number: int, frame: particles.Frame) -> Particles:
         if beside is None:
             return particles.find(content, settings, frame, advance)
-        seen = {k: glance(k) for k in sorted((number, *beside[number]))}
+        seen = {k: first_pass_of(k) for k in sorted((number, *beside[number]))}
         return particles.find_beside(content, settings, frame, seen[number], [seen[k] for k in beside[number]])
 
     return find

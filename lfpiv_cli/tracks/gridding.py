@@ -1,11 +1,11 @@
-"""From scattered tracks to vectors on a grid: local polynomials whose degree and reach follow the tracks.
+"""Scattered tracks interpolated to vectors on a grid: local polynomials whose degree and reach follow the tracks.
 
 A wide fit has little noise and misses what the flow does within its reach; a narrow one is the other way round. Which
 is better depends on the tracks' density and errors and on the flow, and differs from component to component: depth is
 noise, the streamwise component shear. The noise of a fit is known from its tracks. What it misses is seen in the
 differences of fits, less the noise of these: among parabolas it grows with the cube of the radius, and a line misses
-what tells it from a parabola. Each component of a node takes the fit whose error, of both kinds, is the smallest, and
-states it.
+what distinguishes it from a parabola. Each component of a node takes the fit whose error, of both kinds, is the
+smallest, and states it.
 
 Axes: points (n, 3) and displacements in mm, at the middle of each track.
 """
@@ -29,11 +29,11 @@ REFERENCE, WIDER = 0, 2
 MISSED_ORDER = 3
 # Tracks that a node needs within reach, three for each unknown of a linear fit.
 NEEDED_TRACKS = 12
-# One difference of two fits tells little; so many nodes together tell how large such differences are there.
+# One difference of two fits says little; so many nodes together show how large such differences are there.
 NODES_TOGETHER = 27
-# Of these the share with the largest is left out: a stray at the rim must not speak for all.
+# Of these the share with the largest is left out: an outlier at the rim must not speak for all.
 TRIMMED = 0.15
-# A fit further from the middle one of all than so many of its errors is led astray, whatever it states.
+# A fit further from the middle one of all than so many of its errors is an outlier, whatever it states.
 LARGEST_DEVIATION = 4.0
 # Nodes that are worked on at a time, which bounds the memory: some 100 MB.
 NODES_AT_ONCE = 2000
@@ -47,14 +47,14 @@ class Candidates:
     ----------
     value : (c, m, 3) mm
     variance : (c, m, 3) of the noise, if the tracks' errors are as stated
-    apart : (c, m, 3) variance of the difference from the reference, likewise
+    difference_variance : (c, m, 3) variance of the difference from the reference, likewise
     radius_mm : (c, m)
     scatter2 : (m, 3) how large the tracks' variances are over the stated ones
     """
 
     value: NDArray[np.float64]
     variance: NDArray[np.float64]
-    apart: NDArray[np.float64]
+    difference_variance: NDArray[np.float64]
     radius_mm: NDArray[np.float64]
     scatter2: NDArray[np.float64]
 
@@ -106,13 +106,13 @@ def _candidates(
     return Candidates(
         value=np.stack([fit.value for fit in fits]),
         variance=np.stack([np.sum(fit.weights**2, axis=2) for fit in fits]),
-        apart=np.stack([_apart(fit, fits[REFERENCE]) for fit in fits]),
+        difference_variance=np.stack([_difference_variance(fit, fits[REFERENCE]) for fit in fits]),
         radius_mm=np.stack([fit.radius_mm for fit in fits]),
         scatter2=fits[REFERENCE].scatter2,
     )
 
 
-def _apart(fit: LocalFits, reference: LocalFits) -> NDArray[np.float64]:
+def _difference_variance(fit: LocalFits, reference: LocalFits) -> NDArray[np.float64]:
     """Return the variance (m, 3) of the difference of two fits, which share their nearest tracks."""
     common = min(fit.weights.shape[2], reference.weights.shape[2])
     difference = fit.weights[..., :common] - reference.weights[..., :common]
@@ -122,11 +122,11 @@ def _apart(fit: LocalFits, reference: LocalFits) -> NDArray[np.float64]:
 
 def _joined(parts: list[Candidates]) -> Candidates:
     """Return the candidates of all nodes."""
-    value, variance, apart, radius = (
+    value, variance, difference_variance, radius = (
         np.concatenate([getattr(part, name) for part in parts], axis=1)
-        for name in ("value", "variance", "apart", "radius_mm")
+        for name in ("value", "variance", "difference_variance", "radius_mm")
     )
-    return Candidates(value, variance, apart, radius, np.concatenate([part.scatter2 for part in parts]))
+    return Candidates(value, variance, difference_variance, radius, np.concatenate([part.scatter2 for part in parts]))
 
 
 def _best(
@@ -139,8 +139,8 @@ def _best(
     if len(choices) > 1:
         error2 = error2 + _missed2(found, scatter2, together, choices)
         off = np.abs(found.value - np.median(found.value, axis=0))
-        astray = off > LARGEST_DEVIATION * np.sqrt(error2)
-        error2 = np.where(astray & ~astray.all(axis=0), np.inf, error2)
+        outlier = off > LARGEST_DEVIATION * np.sqrt(error2)
+        error2 = np.where(outlier & ~outlier.all(axis=0), np.inf, error2)
     best = np.argmin(error2, axis=0)[np.newaxis]
     value, smallest = (np.take_along_axis(array, best, axis=0)[0] for array in (found.value, error2))
     return value, np.sqrt(smallest)
@@ -152,8 +152,8 @@ def _missed2(
     """Return the mean square (c, m, 3) of what each fit misses of the flow around a node."""
     excess = np.stack(
         [
-            _excess(value - found.value[REFERENCE], apart * scatter2, together)
-            for value, apart in zip(found.value, found.apart, strict=True)
+            _excess(value - found.value[REFERENCE], variance * scatter2, together)
+            for value, variance in zip(found.value, found.difference_variance, strict=True)
         ]
     )
     missed = found.radius_mm[..., np.newaxis] ** MISSED_ORDER

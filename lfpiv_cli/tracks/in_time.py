@@ -1,4 +1,4 @@
-"""Tracks in time: place and velocity by local polynomials, with what their noise and their bending are.
+"""Trajectory fits: position and velocity by local polynomials in time, with the noise and the bending of trajectories.
 
 A track is a parabola over a few frames. How much tracks bend is a property of the flow, and is taken from all of them:
 each bending is drawn to zero as far as bendings of that size are what noise makes. In a straight flow the fit is a
@@ -17,9 +17,9 @@ from scipy.stats import chi2
 
 from lfpiv_cli.robust import MAD_TO_SIGMA
 
-# A parabola has three unknowns; with one place more its residual tells the noise.
+# A parabola has three unknowns; with one place more its residual shows the noise.
 TERMS = 3
-# Fewer tracks than this tell neither noise nor bending.
+# Fewer tracks than this show neither noise nor bending.
 FEWEST_TRACKS = 30
 # No bending is known to be smaller than this, mm^2 per frame^4: a nanometre; it keeps the equations finite.
 SMALLEST_BENDING = 1e-12
@@ -76,7 +76,7 @@ def fit_in_time(
 
 
 def scatter_of(position_mm: NDArray[np.float64], sigma_mm: NDArray[np.float64], time: NDArray[np.float64]) -> Scatter:
-    """Return noise and bending of tracks; the unknown ones where too few tracks are long enough to tell."""
+    """Return noise and bending of tracks; the unknown ones where too few tracks are long enough."""
     count = np.isfinite(position_mm[..., 0]).sum(axis=1)
     bent = count >= TERMS
     if np.count_nonzero(bent) < FEWEST_TRACKS:

@@ -1,6 +1,6 @@
 """Robust polynomials through the tracks around many places at once.
 
-Each component is fitted for itself. A fit is linear in the displacements once the tracks that stray are weighed down,
+Each component is fitted for itself. A fit is linear in the displacements once outliers are weighed down,
 so that its noise, and that of the difference of two fits, follow from the tracks' stated errors.
 
 Axes: m places, k tracks around each, nearest first; points and displacements in mm.
@@ -17,7 +17,7 @@ from lfpiv_cli.robust import MAD_TO_SIGMA
 
 # The furthest track of a fit still counts for a quarter: a Gaussian whose deviation is this share of the radius.
 KERNEL_WIDTH = 0.6
-# First rounds that no stray can lead astray (Cauchy's weights never vanish), then Tukey's biweight, which drops strays.
+# First rounds that no outlier can mislead (Cauchy's weights never vanish), then Tukey's biweight, which drops outliers.
 CAUCHY_ROUNDS, TUKEY_ROUNDS = 3, 5
 TUKEY = 4.685
 # The biweight takes its weighted mean square from the middle of a normal distribution: this share of the variance.
@@ -117,7 +117,7 @@ def _left_by_fit(
 ) -> NDArray[np.float64]:
     """Return the share (m, k) of each track's variance that a fit leaves in its residual, fit = solved @ weighted @ v.
 
-    The kernel lets the tracks next to a place draw the polynomial to them, where their number alone tells little.
+    The kernel lets the tracks next to a place draw the polynomial to them, where their number alone says little.
     """
     own = np.einsum("mkp,mpk->mk", solved, weighted)
     noise = (weighted * sigma[:, np.newaxis] ** 2) @ weighted.swapaxes(1, 2)

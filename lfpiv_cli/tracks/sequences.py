@@ -1,4 +1,4 @@
-"""Particles followed over many frames: each link foretold by a track's own past and by its neighbours.
+"""Lagrangian particle tracking over many frames: a trajectory's own past and its neighbours predict each link.
 
 What is no particle does not move with the others for long: a ghost finds a partner in the next frame by chance, hardly
 in the one after it where its past says it should be. Tracks that are short are therefore dropped. A particle that one

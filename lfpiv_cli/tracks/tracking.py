@@ -1,8 +1,8 @@
-"""Which particle of one frame is which of the next, without knowing the flow beforehand.
+"""Two-frame particle tracking velocimetry (PTV) without a predictor: which particle of one frame is which of the next.
 
 Neighbours move alike: a displacement that takes a particle to one of the next frame takes many of its neighbours to
 others there. The displacement with most votes starts the match; then each particle is sought where a local linear fit
-through its neighbours' displacements expects it, and matches that stray from such a fit are dropped. In a sequence,
+through its neighbours' displacements expects it, and matches that deviate from such a fit are dropped. In a sequence,
 what a particle's own past forecasts takes the place of the votes, and joins what its neighbours let expect.
 
 Axes: points (n, 3) in mm. Depth is known worse than the lateral place, so distances in depth count for less.
@@ -80,11 +80,11 @@ def track(
         if len(first) < FIT_TRACKS:
             return none
         residual = displacement - expected_displacement(points_a, displacement, forecast)
-        stray = _strays(residual[first])
-        displacement[first[stray]] = np.nan
-    if np.count_nonzero(~stray) < FIT_TRACKS:
+        outlier = _outliers(residual[first])
+        displacement[first[outlier]] = np.nan
+    if np.count_nonzero(~outlier) < FIT_TRACKS:
         return none
-    return Tracks(first[~stray], second[~stray], residual[first[~stray]])
+    return Tracks(first[~outlier], second[~outlier], residual[first[~outlier]])
 
 
 def vote(points_a: NDArray[np.float64], points_b: NDArray[np.float64], search_mm: float) -> NDArray[np.float64]:
@@ -146,7 +146,7 @@ def _by_neighbours(points: NDArray[np.float64], displacement: NDArray[np.float64
         weight = np.where(own, 0.0, 1.0 / (1.0 + (off / spread) ** 2) ** 2)
         weighted = (design * weight[..., np.newaxis]).swapaxes(1, 2)
         matrix = weighted @ design
-        # A share of the trace on the slopes' diagonal: neighbours in a plane do not tell the slope across it.
+        # A share of the trace on the slopes' diagonal: neighbours in a plane do not determine the slope across it.
         ridge = 1e-3 * np.mean(distance**2, axis=1)[:, np.newaxis] * weight.sum(axis=1, keepdims=True)
         matrix[:, [1, 2, 3], [1, 2, 3]] += ridge
         fitted = np.linalg.solve(matrix, weighted @ values)
@@ -173,8 +173,8 @@ def mutual(
     return first, to[first]
 
 
-def _strays(residual: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Tell which residuals (n, 3) lie far outside the others', component by component."""
+def _outliers(residual: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which residuals (n, 3) lie far outside the others', component by component."""
     return np.any(np.abs(residual) > OUTLIER_SIGMAS * _spread(residual), axis=1)
 
 

@@ -1,6 +1,6 @@
-"""Other depths for particles that fit badly there, and for those near the focal plane, where many depths look alike.
+"""Alternative depths for particles that fit badly, and for those near the focal plane, where many depths look alike.
 
-A fit walks to the nearest minimum of chi-squared. Near the focal plane, where one lens holds most of a particle's
+A fit finds the nearest minimum of chi-squared. Near the focal plane, where one lens holds most of a particle's
 light, chi-squared has several minima along the depth, one of them mirrored; elsewhere a neighbour that was not known
 yet may have led to the wrong one.
 
@@ -19,12 +19,12 @@ from lfpiv_cli.particles.tiles import Tiles
 from lfpiv_cli.particles.view import View
 
 # Starts relative to the particle's depth, mm; its mirrored depth is another.
-JUMPS_MM = np.array([-2.0, -1.5, -1.0, -0.7, -0.4, -0.2, 0.2, 0.4, 0.7, 1.0, 1.5, 2.0])
-JUMP_STEPS = 8
+OTHER_DEPTHS_MM = np.array([-2.0, -1.5, -1.0, -0.7, -0.4, -0.2, 0.2, 0.4, 0.7, 1.0, 1.5, 2.0])
+DEPTH_STEPS = 8
 
 
 @njit(cache=True, parallel=True)
-def jump(
+def try_other_depths(
     view: View,
     particles: NDArray[np.float64],
     suspects: NDArray[np.bool_],
@@ -55,18 +55,18 @@ def jump(
                 respond_all(view, best, counts, pixels, values)
                 add_light(pixels[0], values[0], counts[0], best[0, 3], residual)
                 own = fit(
-                    view, best, residual, weight, z_low, z_high, JUMP_STEPS, np.inf, counts, pixels, values, place
+                    view, best, residual, weight, z_low, z_high, DEPTH_STEPS, np.inf, counts, pixels, values, place
                 )
                 lowest = own - smallest_gain
-                for k in range(JUMPS_MM.size + 1):
+                for k in range(OTHER_DEPTHS_MM.size + 1):
                     trial[0] = particles[number]
-                    trial[0, 2] = -trial[0, 2] if k == JUMPS_MM.size else trial[0, 2] + JUMPS_MM[k]
+                    trial[0, 2] = -trial[0, 2] if k == OTHER_DEPTHS_MM.size else trial[0, 2] + OTHER_DEPTHS_MM[k]
                     if not z_low <= trial[0, 2] <= z_high:
                         continue
                     respond_all(view, trial, counts, pixels, values)
                     trial[0, 3] = best_light(pixels[0], values[0], counts[0], residual, weight)
                     change = fit(
-                        view, trial, residual, weight, z_low, z_high, JUMP_STEPS, np.inf, counts, pixels, values, place
+                        view, trial, residual, weight, z_low, z_high, DEPTH_STEPS, np.inf, counts, pixels, values, place
                     )
                     if change < lowest and trial[0, 3] >= smallest_light:
                         lowest = change

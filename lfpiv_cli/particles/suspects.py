@@ -1,4 +1,4 @@
-"""Particles that may be wrong: those that fit badly may be two, or at another depth.
+"""Verification of particles that fit badly: two overlapping ones found as one, or one at a wrong depth.
 
 Axes: see `search`.
 """
@@ -11,26 +11,27 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from lfpiv_cli.particles.alternative_depths import try_other_depths
 from lfpiv_cli.particles.fitting import judge
-from lfpiv_cli.particles.jumping import jump
 from lfpiv_cli.particles.search import SMALLEST_LIGHT, State, Task, pixel_weight
 from lfpiv_cli.particles.splitting import split
 from lfpiv_cli.particles.tiles import footprint_px, share_out
 from lfpiv_cli.particles.view import footprint_radius_mm
 
-# A good particle's chi-squared is the one at this percentile; particles that fit worse by this factor are doubted.
+# A good particle's chi-squared is the one at this percentile; particles that fit worse by this factor are
+# suspects.
 GOOD_PERCENTILE, SUSPECT_CHI2 = 20.0, 1.5
 # Suspected to be two: brighter than typical by this factor, or, in thorough rounds, bright enough for two.
 BRIGHT, ENOUGH_FOR_TWO = 1.2, 2.0 * SMALLEST_LIGHT
-# What chi-squared must fall by, in units of a good particle's, where one becomes two, and where it jumps in depth.
-SPLIT_GAIN, JUMP_GAIN = 40.0, 10.0
+# What chi-squared must fall by, in units of a good particle's, where one becomes two, and where it changes its depth.
+SPLIT_GAIN, DEPTH_GAIN = 40.0, 10.0
 # A particle that could not be split or moved is not tried again until it has changed by this much: mm laterally, mm in
 # depth, and by these shares in light and in chi-squared.
 CHANGED = np.array([0.005, 0.005, 0.05, 0.05, 0.2])
 
 
-def moved_in_depth(task: Task, state: State, unexplained: float) -> State:
-    """Return the state with particles at other depths that explain the light better, the residual in place."""
+def with_depths_corrected(task: Task, state: State, unexplained: float) -> State:
+    """Return the state with particles moved to depths that explain the light better, the residual in place."""
     weight = pixel_weight(task, state, unexplained)
     chi2, *_ = judge(task.view, state.particles, state.residual, weight, task.capacity)
     good = _good(chi2)
@@ -38,7 +39,7 @@ def moved_in_depth(task: Task, state: State, unexplained: float) -> State:
     near_focus = footprint_radius_mm(task.view, state.particles[:, 2]) < 2.0 * task.view.half_x_mm
     signature = _signature(state.particles, chi2)
     suspects = (near_focus | (chi2 > SUSPECT_CHI2 * good)) & ~_among(state.unmoved, signature)
-    moved = jump(
+    moved = try_other_depths(
         task.view,
         state.particles,
         suspects,
@@ -47,21 +48,21 @@ def moved_in_depth(task: Task, state: State, unexplained: float) -> State:
         weight,
         *task.depths_mm,
         SMALLEST_LIGHT * state.typical_light,
-        JUMP_GAIN * good,
+        DEPTH_GAIN * good,
         task.capacity,
     )
     return replace(state, unmoved=np.concatenate([state.unmoved, signature[suspects & ~moved]]))
 
 
-def told_apart(task: Task, state: State, unexplained: float, thorough: bool) -> State:
-    """Return the state with particles that are plainly two told apart; `thorough`: also those of usual brightness."""
+def with_overlaps_split(task: Task, state: State, unexplained: float, thorough: bool) -> State:
+    """Return the state with overlapping particles separated; `thorough`: also those of usual brightness."""
     weight = pixel_weight(task, state, unexplained)
     chi2, *_ = judge(task.view, state.particles, state.residual, weight, task.capacity)
     good = _good(chi2)
     bright = state.particles[:, 3] > (ENOUGH_FOR_TWO if thorough else BRIGHT) * state.typical_light
     signature = _signature(state.particles, chi2)
     suspects = bright & (chi2 > SUSPECT_CHI2 * good) & ~_among(state.unsplit, signature)
-    twins = split(
+    partners = split(
         task.view,
         state.particles,
         suspects,
@@ -74,10 +75,10 @@ def told_apart(task: Task, state: State, unexplained: float, thorough: bool) -> 
         task.capacity,
         footprint_px(task.view, *task.depths_mm),
     )
-    found = twins[:, 3] > 0.0
+    found = partners[:, 3] > 0.0
     return replace(
         state,
-        particles=np.concatenate([state.particles, twins[found]]),
+        particles=np.concatenate([state.particles, partners[found]]),
         unsplit=np.concatenate([state.unsplit, signature[suspects & ~found]]),
     )
 
@@ -88,7 +89,7 @@ def _good(chi2: NDArray[np.float64]) -> float:
 
 
 def _signature(particles: NDArray[np.float64], chi2: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (n, 5) numbers that differ by 1 where a particle has changed enough to be looked at again."""
+    """Return (n, 5) numbers that differ by 1 where a particle has changed enough to be tried again."""
     tiny = np.finfo(np.float64).tiny
     return (
         np.column_stack([particles[:, :3], np.log(np.maximum(np.column_stack([particles[:, 3], chi2]), tiny))])
@@ -97,7 +98,7 @@ def _signature(particles: NDArray[np.float64], chi2: NDArray[np.float64]) -> NDA
 
 
 def _among(tried: NDArray[np.float64], signature: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Tell which particles were tried before and have hardly changed since."""
+    """Return which particles were tried before and have hardly changed since."""
     if not len(tried):
         return np.zeros(len(signature), dtype=bool)
     distance, _ = KDTree(tried).query(signature, p=np.inf, distance_upper_bound=1.0)
