@@ -23,7 +23,7 @@ from lfpiv_cli.files.provenance import record
 from lfpiv_cli.files.sections import ReconstructionSection
 from lfpiv_cli.files.weights_file import WeightsFile, read_weights
 from lfpiv_cli.particles.search import Particles
-from lfpiv_cli.reconstruction.equations import Normalisers, normalisers
+from lfpiv_cli.reconstruction.equations import Normalisers, Operator, normalisers
 from lfpiv_cli.reconstruction.images import (
     Image,
     Mask,
@@ -218,9 +218,7 @@ def _usable(bench: Bench, raw: Image, lit: Image) -> tuple[Image, Mask, Mask]:
 def _particle_frame(bench: Bench, raw: Image, lit: Image) -> particles.Frame:
     """Return a frame as particles are sought in it."""
     lit, unusable, excluded = _usable(bench, raw, lit)
-    weights, sums = bench.content.weights, bench.sums
-    sums = normalisers(weights.padded, excluded) if sums is None else _sums_without(bench, sums, excluded)
-    return particles.Frame(lit, unusable, sums)
+    return particles.Frame(lit, unusable, _sums_without(bench, bench.content.weights.padded, excluded))
 
 
 def _finder(
@@ -252,19 +250,19 @@ def _excluded(bench: Bench, unusable: Mask) -> Mask:
     return bench.excluded | touched(too_bright, bench.content.weights.prepare) if too_bright.any() else bench.excluded
 
 
-def _sums_without(bench: Bench, sums: Normalisers, excluded: Mask) -> Normalisers:
-    """Return the sums that all frames share, with what only this one excludes left out."""
-    return sums if excluded is bench.excluded else sums.without(bench.content.weights.padded, excluded)
+def _sums_without(bench: Bench, operator: Operator, excluded: Mask) -> Normalisers:
+    """Return an operator's sums without what a frame excludes: from those that all frames share, if they do."""
+    if bench.sums is None:
+        return normalisers(operator, excluded)
+    return bench.sums if excluded is bench.excluded else bench.sums.without(operator, excluded)
 
 
 def _solved(bench: Bench, image: Image, excluded: Mask, advance: Callable[[int], None]) -> Reconstruction:
     """Return the reconstruction of an image in the weights' frame."""
-    operator, sums = bench.content.weights.padded, bench.sums
-    if sums is None:
+    operator = bench.content.weights.padded
+    if bench.sums is None:
         operator = operator.for_image(as_if_lit(image, excluded))
-        sums = normalisers(operator, excluded)
-    else:
-        sums = _sums_without(bench, sums, excluded)
+    sums = _sums_without(bench, operator, excluded)
     chosen = bench.settings.reconstruction
     return solve(
         operator,
