@@ -24,6 +24,7 @@ from lfpiv_cli.calibration.dot_model import (
 from lfpiv_cli.calibration.rectification import turned
 from lfpiv_cli.calibration.spots import find_spots
 from lfpiv_cli.errors import InputError
+from lfpiv_cli.neighbourhoods import opened
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
 from lfpiv_cli.robust import BRIGHTEST_PERCENTILE
@@ -211,7 +212,7 @@ def first_dots(
         flat = np.ravel_multi_index(tuple(place[seen].T), tuple(shape))
         picture = np.bincount(flat, light[seen], minlength=int(shape.prod())).reshape(shape)
         smooth = ndimage.gaussian_filter(picture, SAMPLES_PER_LENS)
-        return np.asarray(smooth - ndimage.grey_opening(smooth, size=(widest, widest)), dtype=np.float64)
+        return smooth - opened(smooth, widest)
 
     depth = float(depths_mm[np.argmax([np.sum(refocused(z) ** 2) for z in depths_mm])])
     spots = find_spots(refocused(depth), board.spacing_mm / sample_mm)

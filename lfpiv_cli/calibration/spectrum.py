@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage
 
 from lfpiv_cli.errors import InputError
+from lfpiv_cli.neighbourhoods import largest_around
 from lfpiv_cli.optics.microlenses import Layout
 
 # Below 6 px a lens image has no shape left to measure; the upper end leaves room beyond the 60 px of any known camera.
@@ -80,8 +81,9 @@ def spectral_lines(power: NDArray[np.float64], step: NDArray[np.float64]) -> lis
     in_range = (frequency >= 1.0 / LARGEST_PITCH_PX) & (frequency <= 1.0 / (SMALLEST_PITCH_PX * np.sqrt(0.75)))
     masked = np.where(in_range, power, 0.0)
     floor = max(RELEVANT_SHARE * masked.max(), LINE_ABOVE_MEDIAN * np.median(power[in_range]))
-    neighbourhood = ndimage.maximum_filter(masked, size=2 * BIN_TOLERANCE + 1, mode="wrap")
-    row, column = np.nonzero((masked == neighbourhood) & (masked > floor))
+    around = largest_around(np.pad(masked, BIN_TOLERANCE, mode="wrap"), 2 * BIN_TOLERANCE + 1)
+    strongest = around[BIN_TOLERANCE:-BIN_TOLERANCE, BIN_TOLERANCE:-BIN_TOLERANCE]
+    row, column = np.nonzero((masked == strongest) & (masked > floor))
     lines = np.stack([step[0] * column, fft.fftfreq(power.shape[0])[row]], axis=1)
     return list(lines[np.argsort(np.hypot(lines[:, 0], lines[:, 1]), kind="stable")])
 

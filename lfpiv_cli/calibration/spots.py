@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from lfpiv_cli.neighbourhoods import largest_around, smallest_around
+
 # Smoothing by a sixth of the pitch leaves one maximum per lens image and does not merge neighbours.
 SMOOTHING_PER_PITCH = 1.0 / 6.0
 # Two maxima closer than this share of the pitch belong to one spot.
@@ -37,8 +39,8 @@ def find_spots(image: NDArray[np.float64], pitch_px: float) -> NDArray[np.float6
     """Return the centres (n, 2) of the bright spots that lie wholly inside the image, in no particular order."""
     smooth = ndimage.gaussian_filter(image, SMOOTHING_PER_PITCH * pitch_px, mode="nearest")
     size = max(3, int(np.rint(SEPARATION_PER_PITCH * pitch_px)))
-    row, column = np.nonzero(smooth == ndimage.maximum_filter(smooth, size=size, mode="nearest"))
-    base = ndimage.minimum_filter(smooth, size=int(np.ceil(pitch_px)), mode="nearest")[row, column]
+    row, column = np.nonzero(smooth == largest_around(smooth, size))
+    base = smallest_around(smooth, int(np.ceil(pitch_px)))[row, column]
     height = smooth[row, column] - base
     if not (height > 0.0).any():
         return np.zeros((0, 2))

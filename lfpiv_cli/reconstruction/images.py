@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.robust import BRIGHTEST_PERCENTILE, HALF_NORMAL_MEDIAN, MAD_TO_SIGMA
@@ -108,7 +108,7 @@ def saturated(image: Image, level_counts: float | None = None) -> Mask:
 
 def defects(dark: Image) -> Mask:
     """Return which pixels (rows, columns) of a dark image stand out of their neighbours: hot or dead ones."""
-    difference = dark - ndimage.median_filter(dark, size=3, mode="reflect")
+    difference = dark - cv2.medianBlur(dark, 3)
     varying = np.abs(difference[difference != 0.0])
     if not varying.size:
         return np.zeros(dark.shape, np.bool_)

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
+from lfpiv_cli.neighbourhoods import with_neighbours
 from lfpiv_cli.reconstruction.equations import Image, Normalisers, Operator, Problem, Volume
 from lfpiv_cli.robust import BRIGHTEST_PERCENTILE, LIT_SHARE
 
@@ -41,7 +41,7 @@ def line_of_sight_start(problem: Problem) -> Volume:
 def lit_support(operator: Operator, image: Image, sums: Normalisers) -> NDArray[np.bool_]:
     """Return which voxels (z, y, x) have nearly all of their weight on lit pixels or their neighbours."""
     taking_part = sums.inverse_row_sum > 0.0
-    lit = taking_part & ndimage.maximum_filter(image > LIT_SHARE * _brightest(image, sums), size=3)
+    lit = taking_part & with_neighbours(image > LIT_SHARE * _brightest(image, sums))
     return np.asarray(operator.adjoint(lit.astype(np.float32)) * sums.inverse_column_sum >= SEEN_SHARE)
 
 

@@ -15,10 +15,10 @@ from functools import cached_property
 import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.grid import Grid
+from lfpiv_cli.neighbourhoods import with_neighbours
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.microlenses import nearest_point
 from lfpiv_cli.robust import BRIGHTEST_PERCENTILE, LIT_SHARE
@@ -164,7 +164,7 @@ class OnDemandOperator:
     def can_be_lit(self, image: NDArray[np.float32]) -> NDArray[np.bool_]:
         """Return which voxels (flat) see only lit pixels along nearly all their lines of sight."""
         lit = image > LIT_SHARE * np.percentile(image, BRIGHTEST_PERCENTILE)
-        near = ndimage.maximum_filter(lit, size=3)
+        near = with_neighbours(lit)
         result = np.empty(int(np.prod(self.shape)), np.bool_)
         for first in range(0, result.size, VOXELS_AT_ONCE * 16):
             part = np.arange(first, min(first + VOXELS_AT_ONCE * 16, result.size))
