@@ -51,6 +51,10 @@ class Console:
             yield lambda steps: bar.update(steps) and None
 
 
+# For those who call a stage from Python and say nothing of it.
+CONSOLE = Console()
+
+
 def _readable(value: Any) -> str:
     if value is None:
         return "unknown"

@@ -15,6 +15,7 @@ from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.sections import Section, Sections
 from lfpiv_cli.flow.windows import layout_windows
 from lfpiv_cli.optics.media import fluid_path_to_focus
+from lfpiv_cli.stages.reconstruct import ReconstructOptions
 
 CONFIGS = sorted((Path(__file__).parents[1] / "configs").glob("*.yaml"))
 
@@ -306,6 +307,8 @@ def test_the_channels_wall_puts_the_focal_point_where_it_is(write) -> None:
 def test_options_override_and_are_checked(write) -> None:
     config = load_config(write("reconstruction: {solver: sart, iterations: 200}\ncorrelation: {window_mm: 1.6}\n"))
     assert config.overridden("reconstruction", solver=None, iterations=5).reconstruction.iterations == 5
+    options = ReconstructOptions(iterations=7, solver=None, mask=Path("mask.png"))
+    assert config.overridden_by("reconstruction", options) == config.overridden("reconstruction", iterations=7)
     assert config.overridden("reconstruction", iterations=None) is config
     assert config.overridden("correlation", windows=[32, [16, 16, 8]]).correlation.windows == ((32,) * 3, (16, 16, 8))
     with pytest.raises(ConfigError, match="correlation.windows"):

@@ -14,7 +14,7 @@ from lfpiv_cli.console import Console
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files.calibration_file import read_calibration
 from lfpiv_cli.optics.microlenses import Lattice
-from lfpiv_cli.stages.calibrate import calibrate_snapshot
+from lfpiv_cli.stages.calibrate import CalibrateOptions, calibrate_snapshot
 
 SHAPE = (200, 240)
 CONFIG = """
@@ -42,7 +42,9 @@ def config(folder: Path, pitch: float = 0.07, layout: str = "f_number: 8") -> Pa
 
 
 def calibrated(folder: Path, rig: Path, whites: list[Path], dark: Path | None = None) -> dict[str, Any]:
-    return calibrate_snapshot(rig, whites, dark, (), (), folder / "c.h5", None, None, True, QUIET)
+    return calibrate_snapshot(
+        rig, folder / "c.h5", CalibrateOptions(white=whites, dark=dark), overwrite=True, console=QUIET
+    )
 
 
 @pytest.fixture
@@ -90,7 +92,7 @@ def test_a_whole_camera_tells_its_image_distance_and_shows_views(tmp_path: Path,
     rig.write_text(rig.read_text().replace("camera:", f"camera:\n{lens}"))
     picture = white(tmp_path / "w.tif", square, 5.5)
     views = tmp_path / "views.png"
-    figures = calibrate_snapshot(rig, [picture], None, (), (), tmp_path / "c.h5", None, views, True, QUIET)
+    figures = calibrate_snapshot(rig, tmp_path / "c.h5", CalibrateOptions(white=[picture], views=views), console=QUIET)
     # 0.8 mm / 0.004; the pitch of 200 lenses is good to 2e-5, the excess thus to 1 %.
     assert figures["image_distance_mm"] == pytest.approx(200.0, abs=max(5.0, 4 * figures["image_distance_mm_sigma"]))
     assert views.stat().st_size > 10_000

@@ -7,7 +7,7 @@ mean 'layout'?`
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -96,6 +96,16 @@ class Config:
         if "windows" in given:
             resolved[section]["window_mm"] = None
         return Config.from_resolved(resolved, f"{self.source} with the options given")
+
+    def overridden_by(self, section: str, options: Any) -> Config:
+        """Return the configuration with a section's keys replaced by a dataclass's fields of the same names.
+
+        A field that is None leaves its key as it is; other fields say nothing of the section.
+        """
+        keys = type(getattr(self.sections, section)).model_fields
+        return self.overridden(
+            section, **{field.name: getattr(options, field.name) for field in fields(options) if field.name in keys}
+        )
 
     @property
     def camera(self) -> CameraSection:

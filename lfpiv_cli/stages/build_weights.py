@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from lfpiv_cli.calibration.model import Calibration
-from lfpiv_cli.console import Console
+from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.calibration_file import read_calibration
@@ -45,21 +46,38 @@ FARTHEST_BEYOND = 0.3
 BYTES_PER_COLUMN = 12_000
 
 
+@dataclass(frozen=True, kw_only=True)
+class BuildWeightsOptions:
+    """What `build_weights` is given besides the config.
+
+    Attributes
+    ----------
+    calibration : file of `calibrate_snapshot`; None: the data sheet is believed
+    method, refraction, sampling : in place of the config's, see its section `weights`
+    """
+
+    calibration: Path | None = None
+    method: str | None = None
+    refraction: str | None = None
+    sampling: str | None = None
+
+
+NO_OPTIONS = BuildWeightsOptions()
+
+
 def build_weights(
     config: Path,
-    calibration: Path | None,
-    method: str | None,
-    refraction: str | None,
-    sampling: str | None,
     output: Path,
-    overwrite: bool,
-    console: Console,
+    options: BuildWeightsOptions = NO_OPTIONS,
+    *,
+    overwrite: bool = False,
+    console: Console = CONSOLE,
 ) -> dict[str, Any]:
     """Calculate the weights of the configured volume, for the calibrated camera where there is a calibration."""
-    inputs = given(config=config, calibration=calibration)
+    inputs = given(config=config, calibration=options.calibration)
     ensure_writable(output, overwrite, inputs.values())
-    settings = load_config(config).overridden("weights", method=method, refraction=refraction, sampling=sampling)
-    found = read_calibration(calibration) if calibration else None
+    settings = load_config(config).overridden_by("weights", options)
+    found = read_calibration(options.calibration) if options.calibration else None
     camera = settings.camera_model()
     if found:
         camera = found.camera(camera)

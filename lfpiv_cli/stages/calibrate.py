@@ -3,37 +3,58 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from lfpiv_cli.calibration.model import calibrate
 from lfpiv_cli.calibration.sheet import image_distance_doubt
 from lfpiv_cli.calibration.white import by_aperture
-from lfpiv_cli.console import Console
+from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import UsageError
 from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.calibration_file import write_calibration
 from lfpiv_cli.files.config import load_config
+from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.pictures import ensure_drawing, write_picture
 from lfpiv_cli.files.provenance import record as provenance_record
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.reconstruction.images import light
 
 
+@dataclass(frozen=True, kw_only=True)
+class CalibrateOptions:
+    """What `calibrate_snapshot` is given besides the config.
+
+    Attributes
+    ----------
+    white : images of uniform light, one stopped down and one not where there are two
+    dark : image taken with the cap on
+    board : snapshot of the dot board; or several, each with its depth
+    depth_mm : depths of the boards in the fluid, for fitted rays; empty for a single snapshot
+    picture, views : pictures to write: lattice and board; views and refocused depths
+    """
+
+    white: Sequence[Path] = ()
+    dark: Path | None = None
+    board: Sequence[Path] = ()
+    depth_mm: Sequence[float] = ()
+    picture: Path | None = None
+    views: Path | None = None
+
+
 def calibrate_snapshot(
     config: Path,
-    white: Sequence[Path],
-    dark: Path | None,
-    board: Sequence[Path],
-    depth_mm: Sequence[float],
     output: Path,
-    picture: Path | None,
-    views: Path | None,
-    overwrite: bool,
-    console: Console,
+    options: CalibrateOptions,
+    *,
+    overwrite: bool = False,
+    console: Console = CONSOLE,
 ) -> dict[str, Any]:
     """Find the lattice in white images and the focal plane in a snapshot of the board, or rays in boards at depths."""
+    white, board, depth_mm = options.white, options.board, options.depth_mm
+    picture, views = options.picture, options.views
     if not white and not board:
         raise UsageError("calibrate-snapshot needs a picture: --white, --board or both")
     if len(depth_mm) != (len(board) if depth_mm else 0) or (len(board) > 1 and not depth_mm):
@@ -41,7 +62,7 @@ def calibrate_snapshot(
             f"{len(board)} --board and {len(depth_mm)} --depth-mm; give one board alone, or each with its depth"
         )
     whites, boards = _numbered("white", white), _numbered("board", board)
-    inputs = {"config": config} | whites | ({"dark": dark} if dark else {}) | boards
+    inputs = given(config=config, dark=options.dark) | whites | boards
     for target in filter(None, (output, picture, views)):
         ensure_writable(target, overwrite, inputs.values())
     if picture or views:

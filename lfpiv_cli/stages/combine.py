@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lfpiv_cli.console import Console
+from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.files.atomic import ensure_writable
@@ -17,7 +17,7 @@ from lfpiv_cli.flow.field import MASKED, REJECTED
 
 
 def combine_vectors(
-    vectors_a: Path, vectors_b: Path, output: Path, overwrite: bool, console: Console
+    vectors_a: Path, vectors_b: Path, output: Path, *, overwrite: bool = False, console: Console = CONSOLE
 ) -> dict[str, Any]:
     """Weight the vectors of two files by their uncertainties."""
     inputs = {"vectors_a": vectors_a, "vectors_b": vectors_b}

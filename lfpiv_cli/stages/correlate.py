@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lfpiv_cli.console import Console
+from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.files.atomic import ensure_writable
@@ -45,38 +45,61 @@ class Job:
         }
 
 
+@dataclass(frozen=True, kw_only=True)
+class CorrelateOptions:
+    """What `correlate` is given besides the volumes.
+
+    Attributes
+    ----------
+    config : in place of the one that the volumes carry
+    dt_s, windows, overlap : in place of the config's, see its section `correlation`
+    pairing : `ab` for separate pairs, `sequence` for each volume with the next; needed for more than two
+    mask_volume : volume on the same grid, 0 where the volumes are left out
+    ensemble : one field of all pairs together
+    derived : vorticity, divergence, strain rate and Q criterion, too
+    mean : file of the pairs' mean and fluctuations, to write
+    resume : skip what is complete and made from the same inputs
+    """
+
+    config: Path | None = None
+    dt_s: float | None = None
+    windows: Sequence[int | Sequence[int]] | None = None
+    overlap: float | Sequence[float] | None = None
+    pairing: str | None = None
+    mask_volume: Path | None = None
+    ensemble: bool = False
+    derived: bool = False
+    mean: Path | None = None
+    resume: bool = False
+
+
+NO_OPTIONS = CorrelateOptions()
+
+
 def correlate(
     volumes: Sequence[Path],
-    config: Path | None,
-    dt_s: float | None,
-    windows: str | None,
-    overlap: float | None,
-    pairing: str | None,
-    mask: Path | None,
-    ensemble: bool,
-    derived: bool,
-    mean: Path | None,
-    resume: bool,
     output: Path,
-    overwrite: bool,
-    console: Console,
+    options: CorrelateOptions = NO_OPTIONS,
+    *,
+    overwrite: bool = False,
+    console: Console = CONSOLE,
 ) -> dict[str, Any]:
     """Measure the displacements between pairs of volumes."""
-    pairs = _pairs(volumes, pairing)
-    if mean is not None and (ensemble or len(pairs) < 2):
+    mean, derived = options.mean, options.derived
+    pairs = _pairs(volumes, options.pairing)
+    if mean is not None and (options.ensemble or len(pairs) < 2):
         raise UsageError("--mean needs several pairs, each correlated by itself")
-    together = [pairs] if ensemble else [[pair] for pair in pairs]
+    together = [pairs] if options.ensemble else [[pair] for pair in pairs]
     paths = output_paths(output, [group[0][0].stem for group in together])
     prepare_folder(paths)
-    told = load_config(config) if config else None
-    sizes = [_window(text) for text in windows.split(",")] if windows else None
+    told = load_config(options.config) if options.config else None
     jobs = []
     for group in together:
         first = group[0][0]
         settings = told or carried_config(vtkhdf.read_header(first).provenance, first)
-        jobs.append(Job(group, settings.overridden("correlation", dt_s=dt_s, windows=sizes, overlap=overlap)))
-    common = given(config=config, mask=mask)
-    command = " ".join(["correlate", *["ensemble"] * ensemble, *["derived"] * derived])
+        jobs.append(Job(group, settings.overridden_by("correlation", options)))
+    common = given(config=options.config, mask=options.mask_volume)
+    command = " ".join(["correlate", *["ensemble"] * options.ensemble, *["derived"] * derived])
     targets = [
         Target(path, record(command, job.settings.resolved(), common | job.inputs()))
         for path, job in zip(paths, jobs, strict=True)
@@ -85,8 +108,8 @@ def correlate(
         ensure_writable(mean, overwrite, [*volumes, *common.values()])
     summary: dict[str, Any] = {"pairs": len(pairs), "vectors": 0, "rejected": 0}
     divergence = []
-    for number in pending(targets, [*volumes, *common.values()], overwrite, resume, _record_of):
-        field, attributes = _measure(jobs[number], mask, console)
+    for number in pending(targets, [*volumes, *common.values()], overwrite, options.resume, _record_of):
+        field, attributes = _measure(jobs[number], options.mask_volume, console)
         told_more = derived_fields(field) if derived else None
         vtkhdf.write_vectors(
             targets[number].path,
@@ -202,15 +225,6 @@ def _pairs(volumes: Sequence[Path], pairing: str | None) -> list[tuple[Path, Pat
         )
     step = 1 if pairing == "sequence" else 2
     return [(volumes[k], volumes[k + 1]) for k in range(0, len(volumes) - 1, step)]
-
-
-def _window(text: str) -> int | list[int]:
-    """Return a window given as 32 or 32x32x16."""
-    try:
-        sizes = [int(part) for part in text.lower().split("x")]
-    except ValueError as error:
-        raise UsageError(f"--windows: {text!r} is neither a number of voxels nor three of them as 32x32x16") from error
-    return sizes[0] if len(sizes) == 1 else sizes
 
 
 def _ensure_alike(paths: tuple[Path, Path], first: vtkhdf.Volume, second: vtkhdf.Volume) -> None:

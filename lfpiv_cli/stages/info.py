@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lfpiv_cli.console import Console
+from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.describe import describe
@@ -16,10 +17,22 @@ from lfpiv_cli.files.weights_file import read_weights
 from lfpiv_cli.validation.weights_pictures import column_figure
 
 
+@dataclass(frozen=True, kw_only=True)
+class InfoOptions:
+    """What `info` draws of weights: a picture to write, and which voxel (ix, iy, iz), by default the middle one."""
+
+    picture: Path | None = None
+    voxel: tuple[int, int, int] | None = None
+
+
+NO_OPTIONS = InfoOptions()
+
+
 def info(
-    file: Path, picture: Path | None, voxel: tuple[int, int, int] | None, overwrite: bool, console: Console
+    file: Path, options: InfoOptions = NO_OPTIONS, *, overwrite: bool = False, console: Console = CONSOLE
 ) -> dict[str, Any]:
-    """Tell what is in a file of ours; of weights, draw the column of one voxel (ix, iy, iz), by default the middle."""
+    """Tell what is in a file of ours; of weights, draw the column of one voxel."""
+    picture, voxel = options.picture, options.voxel
     if picture is None:
         if voxel is not None:
             raise UsageError("--voxel needs --picture")

@@ -23,7 +23,7 @@ from lfpiv_cli.particles.rounds import ROUNDS, first_pass
 from lfpiv_cli.particles.search import Particles, Task, result, task_of
 from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.reconstruction.equations import Normalisers
-from lfpiv_cli.stages.track import SEARCH_VOXEL
+from lfpiv_cli.tracks.tracking import SEARCH_VOXEL
 from lfpiv_cli.weights.build import factorise_bricks
 from lfpiv_cli.weights.columns import OnDemandOperator
 from lfpiv_cli.weights.model import behind_transmission

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lfpiv_cli.console import Console
+from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import InputError, PartialError, UsageError
 from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files import vtkhdf
@@ -71,52 +71,67 @@ class Outcome:
     excluded_pixels: int
 
 
+@dataclass(frozen=True, kw_only=True)
+class ReconstructOptions:
+    """What `reconstruct` is given besides weights and images.
+
+    Attributes
+    ----------
+    solver, iterations, relaxation, accelerate, start : in place of the config's, see its section `reconstruction`
+    dark : image taken with the cap on; its hot and dead pixels are left out
+    background : image to subtract, or `minimum` or `mean` over the images, or as `minimum:15`
+    mask : image that is black where pixels are left out
+    pairing : `ab` or `sequence`: find particles with the help of the frames beside
+    resume : skip what is complete and made from the same inputs
+    keep_going : go on with the next frame when one fails
+    """
+
+    solver: str | None = None
+    iterations: int | None = None
+    relaxation: float | None = None
+    accelerate: bool | None = None
+    start: str | None = None
+    dark: Path | None = None
+    background: str | None = None
+    mask: Path | None = None
+    pairing: str | None = None
+    resume: bool = False
+    keep_going: bool = False
+
+
+NO_OPTIONS = ReconstructOptions()
+
+
 def reconstruct(
     weights: Path,
     images: Sequence[Path],
-    solver: str | None,
-    iterations: int | None,
-    relaxation: float | None,
-    accelerate: bool | None,
-    start: str | None,
-    dark: Path | None,
-    background: str | None,
-    mask: Path | None,
-    pairing: str | None,
-    resume: bool,
-    keep_going: bool,
     output: Path,
-    overwrite: bool,
-    console: Console,
+    options: ReconstructOptions = NO_OPTIONS,
+    *,
+    overwrite: bool = False,
+    console: Console = CONSOLE,
 ) -> dict[str, Any]:
-    """Reconstruct the volume behind each image."""
-    level = Background.parse(background)
-    common = given(weights=weights, dark=dark, background=level.path, mask=mask)
+    """Reconstruct the volume behind each image, or find its particles."""
+    level = Background.parse(options.background)
+    common = given(weights=weights, dark=options.dark, background=level.path, mask=options.mask)
     frames = frames_of(images)
-    beside = None if pairing is None else frames_beside(len(frames), pairing)
+    beside = None if options.pairing is None else frames_beside(len(frames), options.pairing)
     paths = output_paths(output, [frame.stem for frame in frames])
     prepare_folder(paths)
     content = read_weights(weights)
-    settings = carried_config(content.provenance, weights).overridden(
-        "reconstruction",
-        solver=solver,
-        iterations=iterations,
-        relaxation=relaxation,
-        accelerate=accelerate,
-        start=start,
-    )
+    settings = carried_config(content.provenance, weights).overridden_by("reconstruction", options)
     as_particles = settings.reconstruction.solver == "particles"
     if beside is not None and not as_particles:
         raise UsageError(
             f"--pairing: {settings.reconstruction.solver} takes each frame alone; --solver particles does not"
         )
     targets = _targets(paths, frames, level, settings, common, beside)
-    needed = pending(targets, [*common.values(), *images], overwrite, resume, _record_of)
+    needed = pending(targets, [*common.values(), *images], overwrite, options.resume, _record_of)
     if as_particles:
         content = particles.searchable(content, settings)
         for number in needed:
-            ensure_writable(particles.residual_path(paths[number]), overwrite or resume, images)
-    bench = _bench(content, settings, dark, mask, bool(needed))
+            ensure_writable(particles.residual_path(paths[number]), overwrite or options.resume, images)
+    bench = _bench(content, settings, options.dark, options.mask, bool(needed))
     read = reader(level, frames, content.weights.image_shape, bench.dark)
     steps = particles.STEPS if as_particles else settings.reconstruction.iterations
     outcomes: list[Outcome] = []
@@ -129,7 +144,7 @@ def reconstruct(
                 raw, lit = future.result()
                 outcomes.append(_make(bench, targets[number], number, raw, lit, find, overwrite, advance))
             except InputError as error:
-                if not keep_going:
+                if not options.keep_going:
                     raise
                 failures.append(str(error))
                 console.say(f"lfpiv: {error}")

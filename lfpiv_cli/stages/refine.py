@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lfpiv_cli.console import Console
+from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files.atomic import ensure_writable
@@ -22,18 +23,38 @@ from lfpiv_cli.self_calibration.refinement import STEPS
 from lfpiv_cli.self_calibration.refinement import refine_calibration as refine
 
 
+@dataclass(frozen=True, kw_only=True)
+class RefineOptions:
+    """What `refine_calibration` takes off the images and what it writes; without `output` it only reports.
+
+    Attributes
+    ----------
+    dark : image taken with the cap on
+    background : image without tracers, in place of the dark one
+    output : mended calibration to write
+    picture : of the particles' depths and the walls, to write
+    """
+
+    dark: Path | None = None
+    background: Path | None = None
+    output: Path | None = None
+    picture: Path | None = None
+
+
+NO_OPTIONS = RefineOptions()
+
+
 def refine_calibration(
     config: Path,
     images: Sequence[Path],
     calibration: Path,
-    dark: Path | None,
-    background: Path | None,
-    output: Path | None,
-    picture: Path | None,
-    overwrite: bool,
-    console: Console,
+    options: RefineOptions = NO_OPTIONS,
+    *,
+    overwrite: bool = False,
+    console: Console = CONSOLE,
 ) -> dict[str, Any]:
     """Find the channel's walls by the particles, report where they are, and write the calibration with them."""
+    dark, background, output, picture = options.dark, options.background, options.output, options.picture
     named = {"image" if k == 0 else f"image_{k + 1}": path for k, path in enumerate(images)}
     inputs = given(config=config, calibration=calibration, dark=dark, background=background) | named
     for target in filter(None, (output, picture)):

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.calibration.model import mid_plane_z_mm
-from lfpiv_cli.console import Console
+from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files.atomic import ensure_writable, write_json
 from lfpiv_cli.files.batch import prepare_folder
@@ -38,7 +38,9 @@ from lfpiv_cli.weights.build import blur_radius_mm
 SPEED_POINTS = 21
 
 
-def simulate_white(config: Path, output: Path, overwrite: bool, console: Console) -> dict[str, Any]:
+def simulate_white(
+    config: Path, output: Path, *, overwrite: bool = False, console: Console = CONSOLE
+) -> dict[str, Any]:
     """Render a white image and a dark one."""
     settings, paths = _begin(config, output, ("white.tif", "dark.tif", "white.json"), overwrite)
     still = scenes.simulate_white(
@@ -49,7 +51,9 @@ def simulate_white(config: Path, output: Path, overwrite: bool, console: Console
     return _write_truth(paths["white.json"], "simulate white", still.truth, settings, config, overwrite)
 
 
-def simulate_board(config: Path, output: Path, overwrite: bool, console: Console) -> dict[str, Any]:
+def simulate_board(
+    config: Path, output: Path, *, overwrite: bool = False, console: Console = CONSOLE
+) -> dict[str, Any]:
     """Render the snapshot of the board."""
     settings, paths = _begin(config, output, ("board.tif", "board.json"), overwrite)
     still = _board_still(
@@ -60,7 +64,7 @@ def simulate_board(config: Path, output: Path, overwrite: bool, console: Console
 
 
 def simulate_boards(
-    config: Path, output: Path, depth_mm: Sequence[float], overwrite: bool, console: Console
+    config: Path, output: Path, depth_mm: Sequence[float], *, overwrite: bool = False, console: Console = CONSOLE
 ) -> dict[str, Any]:
     """Render the board moved through the fluid, at depths from the origin of the volume's coordinates."""
     names = {depth: board_at(depth) for depth in depth_mm}
@@ -80,7 +84,9 @@ def board_at(depth_mm: float) -> str:
     return f"board_{depth_mm:+g}mm.tif"
 
 
-def simulate_particles(config: Path, output: Path, overwrite: bool, console: Console) -> dict[str, Any]:
+def simulate_particles(
+    config: Path, output: Path, *, overwrite: bool = False, console: Console = CONSOLE
+) -> dict[str, Any]:
     """Render images of tracers that follow the configured flow: a pair, or a longer sequence."""
     images = frame_names(load_config(config).simulation.frames)
     settings, paths = _begin(config, output, (*images, "particles.npz", "particles.json"), overwrite)
@@ -107,6 +113,10 @@ def simulate_particles(config: Path, output: Path, overwrite: bool, console: Con
     write_particles(paths["particles.npz"], found.positions_mm, found.velocities_m_s, found.brightness, overwrite)
     truth = found.truth | {"reference_z_mm": origin_z}
     return _write_truth(paths["particles.json"], "simulate particles", truth, settings, config, overwrite)
+
+
+# What can be simulated, by the name that the command has for it.
+SCENES = {"white": simulate_white, "board": simulate_board, "particles": simulate_particles}
 
 
 def frame_names(frames: int) -> tuple[str, ...]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lfpiv_cli.console import Console
+from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.files.atomic import ensure_writable
@@ -29,37 +29,52 @@ from lfpiv_cli.flow.field import MASKED, MM_TO_M, REJECTED, VALID, VectorField
 from lfpiv_cli.flow.windows import layout_windows
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.tracks.gridding import on_grid
-from lfpiv_cli.tracks.sequences import follow, scatter_in, states_at
-from lfpiv_cli.tracks.tracking import Tracks, track
+from lfpiv_cli.tracks.sequences import SHORTEST, follow, scatter_in, states_at
+from lfpiv_cli.tracks.tracking import SEARCH_VOXEL, Tracks, track
 
 # A vector needs its twelve nearest tracks within this many windows of its centre: in sparse images tracks are further
 # apart than windows, and what a wide fit misses of the flow is in the stated error.
 REACH_WINDOWS = 2.0
-# Displacements are sought up to this many voxels along each axis unless told otherwise.
-SEARCH_VOXEL = 6.0
-# A ghost finds a partner in the next frame by chance, hardly ever in two.
-SHORTEST = 3
 ROLES_OF_TWO = ["particles_a", "particles_b"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackOptions:
+    """What `track_particles` is given besides the particles.
+
+    Attributes
+    ----------
+    dt_s : time from one frame to the next, in place of the config's
+    search_voxel : displacements are sought up to this along each axis
+    shortest : fewest frames of a track in a sequence, `SHORTEST` where None
+    grid : vectors on the grid of the correlation windows, too
+    """
+
+    dt_s: float | None = None
+    search_voxel: float = SEARCH_VOXEL
+    shortest: int | None = None
+    grid: bool = False
+
+
+NO_OPTIONS = TrackOptions()
 
 
 def track_particles(
     particles: Sequence[Path],
-    dt_s: float | None,
-    search_voxel: float | None,
-    shortest: int | None,
-    grid: bool,
     output: Path,
-    overwrite: bool,
-    console: Console,
+    options: TrackOptions = NO_OPTIONS,
+    *,
+    overwrite: bool = False,
+    console: Console = CONSOLE,
 ) -> dict[str, Any]:
-    """Follow particles from frame to frame; with `grid`, also write vectors on the windows' grid."""
+    """Follow particles from frame to frame."""
     if len(particles) < 2:
         raise UsageError("track needs the particles of two frames at least")
-    if len(particles) == 2 and shortest is not None:
+    if len(particles) == 2 and options.shortest is not None:
         raise UsageError("--shortest is for sequences: two frames make tracks of two")
     intervals = len(particles) - 1
     names = [f"_grid_{number:04d}" for number in range(intervals)] if intervals > 1 else ["_grid"]
-    grids = [output.with_name(f"{output.stem}{name}{output.suffix}") for name in names] if grid else []
+    grids = [output.with_name(f"{output.stem}{name}{output.suffix}") for name in names] if options.grid else []
     roles = [f"particles_{number:04d}" for number in range(len(particles))] if intervals > 1 else ROLES_OF_TWO
     inputs = dict(zip(roles, particles, strict=True))
     for target in (output, *grids):
@@ -68,13 +83,13 @@ def track_particles(
     for path, frame in zip(particles[1:], frames[1:], strict=True):
         if frame.provenance.get("config") != frames[0].provenance.get("config"):
             raise InputError(f"{path}: was made with another config than {particles[0]}")
-    settings = Config.from_resolved(frames[0].provenance["config"]).overridden("correlation", dt_s=dt_s)
+    settings = Config.from_resolved(frames[0].provenance["config"]).overridden_by("correlation", options)
     if settings.correlation.dt_s is None:
         raise InputError(f"{particles[0]}: its config has no correlation.dt_s; give --dt-s")
-    told = {"search_voxel": SEARCH_VOXEL if search_voxel is None else search_voxel}
+    told = {"search_voxel": options.search_voxel}
     search_mm = told["search_voxel"] * max(settings.grid().spacing_mm)
     if intervals > 1:
-        told["shortest"] = SHORTEST if shortest is None else shortest
+        told["shortest"] = SHORTEST if options.shortest is None else options.shortest
         found = _sequence(frames, search_mm, int(told["shortest"]), settings.correlation.dt_s)
     else:
         found = _pair(frames[0], frames[1], search_mm, settings.correlation.dt_s)

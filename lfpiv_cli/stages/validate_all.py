@@ -6,25 +6,25 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from lfpiv_cli.console import Console
+from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import LimitMissedError
 from lfpiv_cli.stages.validate_board import validate_board
 from lfpiv_cli.stages.validate_flow import validate_flow
 from lfpiv_cli.stages.validate_weights import validate_weights
 
 
-def validate_all(config: Path, output: Path, overwrite: bool, console: Console) -> dict[str, Any]:
+def validate_all(config: Path, output: Path, *, overwrite: bool = False, console: Console = CONSOLE) -> dict[str, Any]:
     """Write every report into one folder; a limit that one of them misses does not keep the others from being made."""
     stages: dict[str, Callable[..., dict[str, Any]]] = {
         "weights": validate_weights,
         "board": validate_board,
-        "flow": lambda **arguments: validate_flow(vectors=None, particles=None, **arguments),
+        "flow": validate_flow,
     }
     summary: dict[str, Any] = {}
     missed = []
     for name, stage in stages.items():
         try:
-            found = stage(config=config, output=output, overwrite=overwrite, console=console)
+            found = stage(config, output, overwrite=overwrite, console=console)
         except LimitMissedError as error:
             missed.append(str(error))
             found = error.figures

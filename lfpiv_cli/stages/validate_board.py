@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.calibration.board import dots_in_world
-from lfpiv_cli.console import Console
+from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files.atomic import ensure_writable, write_json
 from lfpiv_cli.files.batch import prepare_folder
@@ -30,7 +30,9 @@ from lfpiv_cli.validation.board_pictures import board_figure
 FEWEST_DEPTHS = 3
 
 
-def validate_board(config: Path, output: Path, overwrite: bool, console: Console) -> dict[str, Any]:
+def validate_board(
+    config: Path, output: Path, *, overwrite: bool = False, console: Console = CONSOLE
+) -> dict[str, Any]:
     """Reconstruct the configured board at the paper's depths, with the configured solver.
 
     The pictures are those of the data sheet's camera without noise (ideal), of one with the faults that the section

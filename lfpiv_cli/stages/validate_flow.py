@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lfpiv_cli.console import Console
+from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import InputError, LimitMissedError, UsageError
 from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.files.atomic import ensure_writable, write_json
@@ -29,7 +29,13 @@ from lfpiv_cli.validation.pictures import flow_figure, slices_figure
 
 
 def validate_flow(
-    config: Path, vectors: Path | None, particles: Path | None, output: Path, overwrite: bool, console: Console
+    config: Path,
+    output: Path,
+    *,
+    vectors: Path | None = None,
+    particles: Path | None = None,
+    overwrite: bool = False,
+    console: Console = CONSOLE,
 ) -> dict[str, Any]:
     """Judge a vector field by an analytic flow or by true particles; without one, make it from simulated images."""
     is_simulated = vectors is None
@@ -44,7 +50,7 @@ def validate_flow(
     for target in paths.values():
         ensure_writable(target, overwrite, given(config=config, vectors=vectors, particles=particles).values())
     ensure_drawing()
-    made = {"measured": vectors} if vectors else run_chain(config, output, overwrite, console)
+    made = {"measured": vectors} if vectors else run_chain(config, output, overwrite=overwrite, console=console)
     inputs = given(config=config, particles=particles) | (given(vectors=vectors) if vectors else made)
     methods = {name: _measured(path, settings, particles, is_simulated) for name, path in made.items()}
     figures = {name: measured.figures(duct) for name, measured in methods.items()}

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lfpiv_cli.console import Console
+from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.files.atomic import ensure_writable, write_json
@@ -23,7 +23,14 @@ MOMENTS = {"a": -0.5, "middle": 0.0, "b": 0.5}
 
 
 def validate_volume(
-    config: Path, volume: Path, particles: Path, frame: str, output: Path, overwrite: bool, console: Console
+    config: Path,
+    output: Path,
+    *,
+    volume: Path,
+    particles: Path,
+    frame: str,
+    overwrite: bool = False,
+    console: Console = CONSOLE,
 ) -> dict[str, Any]:
     """Judge a volume by the true particles, which are known at the middle of a pair."""
     inputs = given(config=config, volume=volume, particles=particles)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lfpiv_cli.console import Console
+from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import ConfigError, LimitMissedError
 from lfpiv_cli.files.atomic import ensure_writable, write_json
 from lfpiv_cli.files.batch import prepare_folder
@@ -19,7 +19,9 @@ from lfpiv_cli.validation.weights import TABLE1_MM, in_view, limits_missed, make
 from lfpiv_cli.validation.weights_pictures import columns_figure, similarity_figure
 
 
-def validate_weights(config: Path, output: Path, overwrite: bool, console: Console) -> dict[str, Any]:
+def validate_weights(
+    config: Path, output: Path, *, overwrite: bool = False, console: Console = CONSOLE
+) -> dict[str, Any]:
     """Hold the weights of the paper's voxels and of a random sample against each other and against integrals."""
     paths = {name: output / f"weights{name}" for name in (".json", "_columns.png", "_similarity.png")}
     prepare_folder(list(paths.values()))

@@ -24,6 +24,8 @@ PAST_FRAMES = 4
 # that two show by more than this: a parabola then no longer follows the tracks.
 HALVES_FRAMES = (3, 2)
 LARGEST_MISFIT = 1.1
+# A ghost finds a partner in the next frame by chance, hardly ever in two.
+SHORTEST = 3
 NO_TRACK = -1
 
 Frames = Sequence[NDArray[np.float64]]

@@ -20,6 +20,8 @@ from lfpiv_cli.robust import MAD_TO_SIGMA
 
 # Standard error of a depth beside that of a lateral place: distances are measured with depth divided by this.
 DEPTH_RATIO = 4.0
+# Displacements are sought up to this many voxels along each axis unless told otherwise.
+SEARCH_VOXEL = 6.0
 NEIGHBOURS = 14
 # How far two displacements of neighbours may differ to count as alike, first and after a fit, in mm laterally.
 ALIKE_MM = 0.04

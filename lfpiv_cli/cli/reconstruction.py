@@ -1,0 +1,48 @@
+"""The command that reconstructs volumes, or the particles themselves."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from lfpiv_cli.cli.options import FILE, common_options, dark_option, output_option, pairing_option, resume_option
+from lfpiv_cli.console import Console
+
+
+@click.command("reconstruct")
+@click.argument("weights", type=FILE)
+@click.argument("images", type=FILE, nargs=-1, required=True)
+@click.option(
+    "--solver", type=click.Choice(["em", "sart", "smart", "mart", "particles"]), help="Default from the config."
+)
+@click.option("--iterations", type=click.IntRange(min=1), help="Default from the config.")
+@click.option("--relaxation", type=click.FloatRange(min=0.0, min_open=True, max=2.0), help="Default from the config.")
+@click.option("--accelerate/--no-accelerate", default=None, help="Extrapolate between steps; default from the config.")
+@click.option("--start", type=click.Choice(["uniform", "line_of_sight"]), help="Default from the config.")
+@dark_option
+@click.option("--background", help="Image to subtract, or minimum or mean over the images given, or as minimum:15.")
+@click.option("--mask", type=FILE, help="Image that is black where pixels are to be left out (reflections, bubbles).")
+@pairing_option
+@resume_option
+@click.option("--keep-going", is_flag=True, help="Go on with the next frame when one fails.")
+@output_option("File for one image, folder for several.")
+@common_options
+def reconstruct(
+    weights: Path, images: tuple[Path, ...], output: Path, overwrite: bool, console: Console, **chosen: Any
+) -> dict[str, Any]:
+    """Reconstruct the volume of tracer particles behind each image, or (--solver particles) the particles themselves.
+
+    Hot and dead pixels of the dark image are left out. With --pairing, particles are found with the help of the frames
+    beside.
+
+    \b
+    Example: lfpiv reconstruct weights.h5 a.tif b.tif --dark dark.tif -o volumes
+    over a long sequence, the background of each frame from the fifteen around it:
+             lfpiv reconstruct weights.h5 run.tif --background minimum:15 --mask mask.png -o volumes
+    """
+    from lfpiv_cli.stages import reconstruct as stage
+
+    options = stage.ReconstructOptions(**chosen)
+    return stage.reconstruct(weights, images, output, options, overwrite=overwrite, console=console)

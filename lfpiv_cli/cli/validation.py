@@ -1,0 +1,57 @@
+"""The command that judges results."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pathlib import Path
+from typing import Any, cast
+
+import click
+
+from lfpiv_cli.cli.options import FILE, common_options, config_argument, output_option
+from lfpiv_cli.console import Console
+
+# The options that each kind of validation takes, and those that it cannot do without.
+TAKEN: dict[str, set[str]] = {
+    "flow": {"vectors", "particles"},
+    "weights": set(),
+    "board": set(),
+    "volume": {"volume", "particles", "frame"},
+    "all": set(),
+}
+NEEDED = {"volume": ("volume", "particles", "frame")}
+
+
+@click.command("validate")
+@click.argument("what", type=click.Choice(list(TAKEN)))
+@config_argument
+@click.option("--vectors", type=FILE, help="flow: vectors to judge, not those of a simulation.")
+@click.option("--volume", type=FILE, help="volume: volume to judge.")
+@click.option("--particles", type=FILE, help="volume, flow: true particles (.npz) to judge by; flow needs none.")
+@click.option("--frame", type=click.Choice(["a", "middle", "b"]), help="volume: when in the pair it was taken.")
+@output_option("Folder for the report.")
+@common_options
+def validate(what: str, config: Path, output: Path, overwrite: bool, console: Console, **chosen: Any) -> dict[str, Any]:
+    """Compare a result with what is known: figures as JSON, and pictures.
+
+    \b
+    Example: lfpiv validate flow rig.yaml --vectors vectors.vtkhdf -o report
+             lfpiv validate flow rig.yaml -o report    (simulates the rig's experiment first)
+             lfpiv validate weights rig.yaml -o report
+             lfpiv validate board rig.yaml -o report
+             lfpiv validate all rig.yaml -o report     (weights, board, and flow as it is simulated)
+             lfpiv validate volume rig.yaml --volume a.vtkhdf --particles true.npz --frame a -o report
+    """
+    _refuse_misplaced(what, chosen)
+    stage = getattr(import_module(f"lfpiv_cli.stages.validate_{what}"), f"validate_{what}")
+    return cast(dict[str, Any], stage(config, output, overwrite=overwrite, console=console, **chosen))
+
+
+def _refuse_misplaced(what: str, chosen: dict[str, Any]) -> None:
+    """Raise where an option is given that a validation does not take, or missing that it needs."""
+    misplaced = [f"--{name}" for name in chosen if name not in TAKEN[what]]
+    if misplaced:
+        raise click.UsageError(f"validate {what} takes no {' and no '.join(misplaced)}")
+    missing = [f"--{name}" for name in NEEDED.get(what, ()) if name not in chosen]
+    if missing:
+        raise click.UsageError(f"validate {what} needs {' and '.join(missing)}")

@@ -1,0 +1,77 @@
+"""Commands that measure vector fields and put them together."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from lfpiv_cli.cli.options import FILE, common_options, dt_option, output_option, pairing_option, resume_option
+from lfpiv_cli.console import Console
+from lfpiv_cli.errors import UsageError
+
+
+def parse_windows(
+    _context: click.Context, _parameter: click.Parameter, text: str | None
+) -> tuple[int | tuple[int, ...], ...] | None:
+    """Return windows given as 32,16 or 32x32x16,16x16x8."""
+    return None if text is None else tuple(_window(part) for part in text.split(","))
+
+
+def _window(text: str) -> int | tuple[int, ...]:
+    try:
+        sizes = tuple(int(part) for part in text.lower().split("x"))
+    except ValueError as error:
+        raise UsageError(f"--windows: {text!r} is neither a number of voxels nor three of them as 32x32x16") from error
+    return sizes[0] if len(sizes) == 1 else sizes
+
+
+@click.command("correlate")
+@click.argument("volumes", type=FILE, nargs=-1, required=True)
+@click.option("--config", type=FILE, help="In place of the config carried by the volumes.")
+@dt_option
+@click.option("--windows", callback=parse_windows, help="Window sizes in voxels, coarse to fine, as 32,16.")
+@click.option("--overlap", type=click.FloatRange(min=0.0, max=1.0, max_open=True), help="Of neighbouring windows.")
+@pairing_option
+@click.option("--mask", "mask_volume", type=FILE, help="Volume on the same grid: voxels of 0 are left out.")
+@click.option("--ensemble", is_flag=True, help="One field of all pairs together, for a flow that does not change.")
+@click.option("--derived", is_flag=True, help="Also write vorticity, divergence, strain rate and Q criterion.")
+@click.option("--mean", type=FILE, help="File of the pairs' mean and fluctuations to write (.vtkhdf).")
+@resume_option
+@output_option("File for one pair, folder for several.")
+@common_options
+def correlate(
+    volumes: tuple[Path, ...], output: Path, overwrite: bool, console: Console, **chosen: Any
+) -> dict[str, Any]:
+    """Measure the displacement between two volumes by three-dimensional cross-correlation.
+
+    More than two volumes need --pairing.
+
+    \b
+    Example: lfpiv correlate volumes/a.vtkhdf volumes/b.vtkhdf -o vectors.vtkhdf
+             lfpiv correlate volumes/*.vtkhdf --pairing sequence --mean mean.vtkhdf -o vectors
+    """
+    from lfpiv_cli.stages import correlate as stage
+
+    options = stage.CorrelateOptions(**chosen)
+    return stage.correlate(volumes, output, options, overwrite=overwrite, console=console)
+
+
+@click.command("combine")
+@click.argument("vectors_a", type=FILE)
+@click.argument("vectors_b", type=FILE)
+@output_option("File of combined vectors to write (.vtkhdf).")
+@common_options
+def combine(vectors_a: Path, vectors_b: Path, output: Path, overwrite: bool, console: Console) -> dict[str, Any]:
+    """Weight two vector fields on one grid by their uncertainties, those of correlate and of track --grid.
+
+    A vector that has none, or that disagrees with the other and with those around it, is left out; share_a tells the
+    weight of the first file in each component, disagreement how many standard errors the two are apart.
+
+    \b
+    Example: lfpiv combine vectors.vtkhdf tracks_grid.vtkhdf -o combined.vtkhdf
+    """
+    from lfpiv_cli.stages import combine as stage
+
+    return stage.combine_vectors(vectors_a, vectors_b, output, overwrite=overwrite, console=console)

@@ -1,0 +1,31 @@
+"""The command that builds weights."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from lfpiv_cli.cli.options import FILE, common_options, config_argument, output_option
+from lfpiv_cli.console import Console
+
+
+@click.command("build-weights")
+@config_argument
+@click.option("--calibration", type=FILE, help="From calibrate-snapshot; without it the data sheet is believed.")
+@click.option("--method", type=click.Choice(["ert", "drt", "dlfc"]), help="How rays go; default from the config.")
+@click.option("--refraction", type=click.Choice(["paraxial", "exact"]), help="Snell's law; default from the config.")
+@click.option("--sampling", type=click.Choice(["exact", "rays"]), help="Integrals or rays; default from the config.")
+@output_option("Weights file to write (.h5).")
+@common_options
+def build_weights(config: Path, output: Path, overwrite: bool, console: Console, **chosen: Any) -> dict[str, Any]:
+    """Calculate how every voxel lights every pixel.
+
+    \b
+    Example: lfpiv build-weights rig.yaml --calibration calibration.h5 -o weights.h5
+    """
+    from lfpiv_cli.stages import build_weights as stage
+
+    options = stage.BuildWeightsOptions(**chosen)
+    return stage.build_weights(config, output, options, overwrite=overwrite, console=console)
