@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import shlex
 from pathlib import Path
 
-import click
 import numpy as np
 import pytest
 
@@ -197,19 +195,6 @@ def test_weights_with_an_index_out_of_range_are_refused(chain, tmp_path):
     write_tree(broken, tree, format_name=FORMAT, format_version=VERSION, provenance=provenance, overwrite=False)
     with pytest.raises(InputError, match="broken.h5.*1000000"):
         read_weights(broken)
-
-
-def readme_commands() -> list[str]:
-    text = (ROOT / "README.md").read_text()
-    return [line.strip() for line in text.splitlines() if line.startswith("    lfpiv ")]
-
-
-@pytest.mark.parametrize("line", readme_commands())
-def test_every_command_of_the_readme_is_understood(line):
-    name, *arguments = shlex.split(line)[1:]
-    command = cli.commands[name]
-    context = command.make_context(name, list(arguments), resilient_parsing=False)
-    assert isinstance(context, click.Context)
 
 
 @pytest.mark.parametrize("name", sorted(cli.commands))

@@ -1,0 +1,174 @@
+"""What these documents take from the code and from the sample, made anew when either has changed.
+
+Everything goes into `docs/_generated`, which is not kept: the sample's chain with its pictures and what it prints, a
+page for each command, the Python interface, the tree of the package, and the drawing of the light's way.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import inspect
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import click_commands
+import drawing
+
+import lfpiv_cli
+
+DOCS = Path(__file__).parent
+ROOT = DOCS.parent
+PACKAGE = ROOT / "lfpiv_cli"
+GENERATED = DOCS / "_generated"
+SAMPLE = GENERATED / "sample"
+
+RIG = "--dark dark.tif"
+# The sample's chain as the page Start types it, and the pictures that other pages show.
+CHAIN = {
+    "calibrate": f"calibrate-snapshot rig.yaml --white white.tif {RIG} --board board.tif -o calibration.h5 "
+    "--picture calibration.png --views views.png",
+    "weights": "build-weights rig.yaml --calibration calibration.h5 -o weights.h5",
+    "reconstruct": f"reconstruct weights.h5 a.tif b.tif {RIG} -o volumes",
+    "correlate": "correlate volumes/a.vtkhdf volumes/b.vtkhdf -o vectors.vtkhdf",
+    "flow": "validate flow rig.yaml --vectors vectors.vtkhdf -o report",
+    "info": "info weights.h5 --picture column.png --voxel 15 11 30",
+    "particles": f"reconstruct weights.h5 a.tif b.tif {RIG} --solver particles --pairing ab -o particles",
+    "track": "track particles/a.vtkhdf particles/b.vtkhdf -o tracks.vtkhdf --grid",
+    "flow_particles": "validate flow rig.yaml --vectors tracks_grid.vtkhdf -o report_particles",
+    "refine": f"refine-calibration rig.yaml a.tif b.tif --calibration calibration.h5 {RIG} --picture walls.png",
+}
+# The sample's files under the names that the pages use.
+INPUTS = {
+    "rig.yaml": ROOT / "configs" / "sample.yaml",
+    "white.tif": ROOT / "sample_data" / "white.tif",
+    "dark.tif": ROOT / "sample_data" / "dark.tif",
+    "board.tif": ROOT / "sample_data" / "board.tif",
+    "a.tif": ROOT / "sample_data" / "pair_a.tif",
+    "b.tif": ROOT / "sample_data" / "pair_b.tif",
+}
+
+
+def everything() -> None:
+    """Make all that is generated."""
+    GENERATED.mkdir(exist_ok=True)
+    (GENERATED / "light.svg").write_text(drawing.light(), encoding="utf-8")
+    (GENERATED / "tree.md").write_text("\n".join(tree()) + "\n", encoding="utf-8")
+    (GENERATED / "interface.md").write_text("\n".join(interface()) + "\n", encoding="utf-8")
+    write_command_pages()
+    run_sample()
+
+
+def run_sample() -> None:
+    """Run the sample's chain, unless it was run with the same code and the same data."""
+    stamp = SAMPLE / "made_from"
+    made_from = fingerprint()
+    if stamp.exists() and stamp.read_text() == made_from:
+        return
+    shutil.rmtree(SAMPLE, ignore_errors=True)
+    SAMPLE.mkdir(parents=True)
+    for name, source in INPUTS.items():
+        shutil.copyfile(source, SAMPLE / name)
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "NO_COLOR": "1"}
+    for name, arguments in CHAIN.items():
+        command = [sys.executable, "-m", "lfpiv_cli", *arguments.split()]
+        done = subprocess.run(command, cwd=SAMPLE, env=environment, capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise RuntimeError(f"lfpiv {arguments}: exit code {done.returncode}: {done.stderr}")
+        (SAMPLE / f"{name}.txt").write_text(f"$ lfpiv {arguments}\n{done.stderr}", encoding="utf-8")
+    stamp.write_text(made_from)
+
+
+def fingerprint() -> str:
+    """Return a hash of the package, the sample and the chain."""
+    digest = hashlib.sha256(repr(CHAIN).encode())
+    for path in [*sorted(PACKAGE.rglob("*.py")), *INPUTS.values()]:
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def write_command_pages() -> None:
+    """Write a page for each command, which sphinx-click fills."""
+    folder = GENERATED / "commands"
+    folder.mkdir(exist_ok=True)
+    names = click_commands.names()
+    for old in folder.iterdir():
+        if old.stem not in names:
+            old.unlink()
+    for name in names:
+        page = f".. click:: click_commands:{name.replace('-', '_')}\n   :prog: lfpiv {name}\n   :nested: full\n"
+        (folder / f"{name}.rst").write_text(page, encoding="utf-8")
+
+
+def example(lines: list[str]) -> Iterator[str]:
+    """Yield a help's example as reStructuredText: commands with what continues them as code, words between as text."""
+    code: list[str] = []
+    for line in (line.removeprefix("|").strip() for line in lines):
+        goes_on = bool(code) and code[-1].endswith("\\")
+        words, command = ("", line) if goes_on else re.fullmatch(r"(.*?)\s*((?:lfpiv .*)?)", line).groups()
+        if words:
+            yield from code_block(code)
+            code = []
+            yield from (words, "")
+        if command:
+            code.append(f"    {command}" if goes_on else command)
+    yield from code_block(code)
+
+
+def code_block(code: list[str]) -> Iterator[str]:
+    """Yield lines as a block of code, if there are any."""
+    if code:
+        yield from (".. code-block:: text", "", *(f"   {line}" for line in code), "")
+
+
+def interface() -> Iterator[str]:
+    """Yield what the package promises to Python, as directives: functions first, then classes, then the rest."""
+    functions, classes = [], []
+    for name in lfpiv_cli.__all__:
+        thing = getattr(lfpiv_cli, name)
+        if inspect.isclass(thing):
+            classes.append(name)
+        elif callable(thing):
+            functions.append(name)
+    yield "```{eval-rst}"
+    for name in functions:
+        yield f".. autofunction:: lfpiv_cli.{name}"
+        yield ""
+    for name in classes:
+        yield f".. autoclass:: lfpiv_cli.{name}"
+        yield "   :members:"
+        yield ""
+    yield "```"
+
+
+def tree() -> Iterator[str]:
+    """Yield the package's folders and modules with the first sentence of their docstrings."""
+    yield from module_lines(PACKAGE, sorted(PACKAGE.glob("*.py")))
+    for folder in sorted(path for path in PACKAGE.iterdir() if (path / "__init__.py").exists()):
+        yield f"\n### {folder.name}/\n"
+        own = first_sentence(folder / "__init__.py")
+        if own:
+            yield f"{own}\n"
+        modules = sorted(path for path in folder.rglob("*.py") if path != folder / "__init__.py")
+        yield from module_lines(folder, modules)
+
+
+def module_lines(folder: Path, modules: list[Path]) -> Iterator[str]:
+    """Yield a table of modules."""
+    if modules:
+        yield "| module | what it does |\n|---|---|"
+    for path in modules:
+        yield f"| `{path.relative_to(folder).as_posix()}` | {first_sentence(path) or ''} |"
+
+
+def first_sentence(module: Path) -> str | None:
+    """Return the first line of a module's docstring, as text in which nothing is markup."""
+    text = ast.get_docstring(ast.parse(module.read_text(encoding="utf-8")))
+    return (
+        text.split("\n\n")[0].replace("\n", " ").replace("|", r"\|").replace("*.vtkhdf", r"\*.vtkhdf") if text else None
+    )

@@ -1,0 +1,274 @@
+"""The documents: each command in them is understood, and (slow) run on the sample; what they name exists.
+
+Each page runs in a folder of its own that holds the sample under the names that pages use (`rig.yaml`, `a.tif`, ...),
+and what the chain makes of it, so that a page can begin anywhere. Small configs stand in for those of the paper's size.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import glob
+import re
+import shlex
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+import h5py
+import imagecodecs
+import numpy as np
+import pytest
+import tifffile
+
+from lfpiv_cli.cli import cli
+from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, read_points, write_points
+
+ROOT = Path(__file__).parent.parent
+SAMPLE = ROOT / "sample_data"
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+MAKEFILE = (ROOT / "Makefile").read_text()
+
+# Of the sample's config.
+DT_S = 0.002
+
+CODE_LINE = re.compile(r"^    (?=\S)(.*)$", re.MULTILINE)
+INLINE = re.compile(r"`((?:lfpiv|make|python -m benchmarks)(?: [^`]*)?)`")
+
+
+def commands_of(page: Path) -> list[str]:
+    """Return what a page tells to type: lines of indented code, and inline code that is more than a command's name."""
+    text = page.read_text(encoding="utf-8")
+    found = [match.group(1) for match in CODE_LINE.finditer(text)]
+    # `lfpiv info` alone speaks of the command
+    found += [command for command in INLINE.findall(text) if len(command.split()) > 2 or command.startswith("make")]
+    return [command.split("#")[0].strip() for command in found]
+
+
+def commands_that_begin_with(program: str) -> Iterator[tuple[Path, str]]:
+    """Yield the pages and their commands that begin with a program's name."""
+    for page in PAGES:
+        for command in commands_of(page):
+            if command == program or command.startswith(f"{program} "):
+                yield page, command
+
+
+LFPIV = list(commands_that_begin_with("lfpiv"))
+
+
+def test_there_are_commands_to_test():
+    assert len(LFPIV) > 40
+    assert {page.name for page, _ in LFPIV} >= {"README.md", "start.md", "your-rig.md", "batches.md"}
+
+
+@pytest.mark.parametrize("command", sorted({command for _, command in LFPIV}))
+def test_every_command_is_understood(command):
+    name, *arguments = shlex.split(command)[1:]
+    found = cli.get_command(click.Context(cli), name)
+    assert found is not None
+    assert isinstance(found.make_context(name, arguments), click.Context)
+
+
+@pytest.mark.parametrize("command", sorted({command for _, command in commands_that_begin_with("make")}))
+def test_every_make_is_understood(command):
+    _, *words = shlex.split(command)
+    targets = [word for word in words if "=" not in word]
+    phony = re.search(r"^\.PHONY: (.+)$", MAKEFILE, re.MULTILINE)
+    assert phony is not None
+    assert set(targets) <= set(phony.group(1).split())
+    for variable in (word.split("=")[0] for word in words if "=" in word):
+        assert re.search(rf"^{variable} \?=", MAKEFILE, re.MULTILINE), variable
+
+
+@pytest.mark.parametrize(
+    "command", sorted({command for _, command in commands_that_begin_with("python -m benchmarks")})
+)
+def test_every_benchmark_exists(command):
+    from benchmarks.__main__ import BENCHMARKS
+
+    assert set(command.split()[3:]) - {"NAME"} <= set(BENCHMARKS)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_link_leads_somewhere(page):
+    for target in re.findall(r"\]\((?!https?:)([^)#]+)\)", page.read_text(encoding="utf-8")):
+        assert (page.parent / target).exists(), target
+
+
+PLACE = re.compile(r"`((?:lfpiv_cli|tests|configs|benchmarks)/[\w/.-]*)`")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_file_that_is_named_exists(page):
+    for place in PLACE.findall(page.read_text(encoding="utf-8")):
+        assert (ROOT / place).exists(), place
+
+
+def test_readme_is_short():
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 80
+
+
+# --- what is longer: the commands themselves
+
+
+def run(command: str) -> None:
+    """Run a command of this program in the current folder, with wildcards as a shell would have them."""
+    arguments = []
+    for word in shlex.split(command)[1:]:
+        arguments += sorted(glob.glob(word)) or [word] if "*" in word else [word]
+    cli.main([*arguments, "--overwrite", "--quiet"], standalone_mode=False)
+
+
+def changed(text: str, *changes: tuple[str, str]) -> str:
+    """Return a config's text with pieces of it replaced, each of which must be there."""
+    for old, new in changes:
+        assert old in text, old
+        text = text.replace(old, new)
+    return text
+
+
+def write_images(folder: Path) -> None:
+    """Write the sample's images under the names of the pages."""
+    for name, source in {"a": "pair_a", "b": "pair_b", "white": "white", "dark": "dark", "board": "board"}.items():
+        shutil.copyfile(SAMPLE / f"{source}.tif", folder / f"{name}.tif")
+    shutil.copyfile(SAMPLE / "particles.npz", folder / "true.npz")
+    pages = [tifffile.imread(folder / f"{name}.tif") for name in "aba"]
+    tifffile.imwrite(folder / "run.tif", np.stack(pages), photometric="minisblack")
+    imagecodecs.imwrite(folder / "mask.png", np.full(pages[0].shape, 255, np.uint8))
+
+
+def write_configs(folder: Path) -> None:
+    """Write the sample's config as `rig.yaml`, and small ones in place of those of the paper's size."""
+    sample, table2 = ((ROOT / "configs" / f"{name}.yaml").read_text() for name in ("sample", "table2"))
+    (folder / "rig.yaml").write_text(sample)
+    (folder / "configs").mkdir()
+    for source in (ROOT / "configs").glob("*.yaml"):
+        (folder / "configs" / source.name).write_text(sample)
+    small = changed(
+        table2,
+        ("columns: 2352", "columns: 520"),
+        ("rows: 1768", "rows: 520"),
+        ("shape_xyz: [80, 80, 240]", "shape_xyz: [24, 24, 30]"),
+        ("voxel_mm: 0.1 ", "voxel_mm: [0.1, 0.1, 0.2] "),
+        ("dots: [7, 7]", "dots: [3, 3]"),
+        ("spacing_mm: 1.0", "spacing_mm: 0.7"),
+        ("iterations: 200", "iterations: 8"),
+        ("methods: [ert, dlfc]", "methods: [ert]"),
+    )
+    for name in ("table2", "board"):
+        (folder / "configs" / f"{name}.yaml").write_text(small)
+
+
+def write_third_frame(folder: Path) -> None:
+    """Write a sequence of three frames of particles, the third one where the sample's shear takes the second's."""
+    particles = folder / "particles"
+    for number, name in enumerate("ab"):
+        shutil.copyfile(particles / f"{name}.vtkhdf", particles / f"frame_{number}.vtkhdf")
+    last = read_points(particles / "b.vtkhdf", PARTICLES_FORMAT)
+    moved = last.position_mm.copy()
+    moved[:, 0] += DT_S * (1e3 * 0.12 + 30.0 * moved[:, 2])
+    write_points(
+        particles / "frame_2.vtkhdf",
+        PARTICLES_FORMAT,
+        moved,
+        last.arrays,
+        provenance=last.provenance,
+        attributes=last.attributes,
+        overwrite=False,
+    )
+
+
+def chain_of(page: Path) -> list[str]:
+    """Return the commands of a page, those that write what others read first."""
+    return [command for command in commands_of(page) if command.startswith("lfpiv ")]
+
+
+@pytest.fixture(scope="module")
+def furnished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder in which a page begins: the sample, and what the README's chain makes of it."""
+    folder = tmp_path_factory.mktemp("furnished")
+    write_images(folder)
+    write_configs(folder)
+    with contextlib.chdir(folder):
+        for command in chain_of(ROOT / "README.md"):
+            run(command)
+    write_third_frame(folder)
+    return folder
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", [page for page in PAGES if chain_of(page)], ids=lambda page: page.name)
+def test_every_command_runs(page, furnished, tmp_path):
+    shutil.copytree(furnished, tmp_path, dirs_exist_ok=True)
+    with contextlib.chdir(tmp_path):
+        for command in chain_of(page):
+            run(command)
+
+
+@pytest.mark.slow
+def test_the_python_page_runs(furnished, capsys):
+    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "python.md").read_text(), re.DOTALL)
+    with contextlib.chdir(furnished):
+        exec(compile(code, "docs/python.md", "exec"), {})
+    assert "m/s" in capsys.readouterr().out
+
+
+# The section of docs/files.md that specifies each file of the sample's chain.
+SPECIFIED = {
+    "calibration.h5": (1, 2),
+    "weights.h5": (1, 2, 3),
+    "volumes/a.vtkhdf": (1, 4),
+    "vectors.vtkhdf": (1, 4, 5),
+    "combined.vtkhdf": (1, 4, 5),
+    "tracks_grid.vtkhdf": (1, 4, 5),
+    "particles/a.vtkhdf": (1, 6),
+    "tracks.vtkhdf": (1, 6, 7),
+}
+# What HDF5 itself keeps beside dimension scales, and the datasets of VTK's cells, are named once for all.
+GENERIC = {"CLASS", "NAME", "REFERENCE_LIST", "DIMENSION_LIST", "units"}
+
+
+def members_of(path: Path) -> Iterator[str]:
+    """Yield each dataset as `group/name` and each attribute as `group@name`."""
+    with h5py.File(path) as file:
+        objects: list[tuple[str, h5py.Group | h5py.Dataset]] = [("", file)]
+        file.visititems(lambda name, item: objects.append((name, item)))
+        for name, item in objects:
+            yield from (f"{name}@{attribute}" for attribute in item.attrs)
+            if isinstance(item, h5py.Dataset):
+                yield name
+
+
+def is_named(member: str, text: str) -> bool:
+    """Return whether a page names a member, by its whole path or as one of several that are alike."""
+    member = member.removeprefix("calibration/").removeprefix("VTKHDF/PointData/")
+    place, _, attribute = member.rpartition("@")
+    if attribute in GENERIC and place:
+        return f"`{attribute}`" in text
+    if member.startswith("VTKHDF/") and "/" in member.removeprefix("VTKHDF/"):
+        group, _, name = member.rpartition("/")
+        return f"`{group}`" in text and f"`{name}`" in text
+    return f"`{member.removeprefix('calibration')}`" in text or f"`{member}`" in text
+
+
+def unnamed(path: Path, sections: tuple[int, ...]) -> list[str]:
+    """Return the members of a file that its specification does not name."""
+    page = (ROOT / "docs" / "files.md").read_text(encoding="utf-8")
+    parts = {int(part.split(".", 1)[0]): part for part in page.split("\n## ") if part[0].isdigit()}
+    text = "\n".join(parts[number] for number in sections)
+    return [member for member in members_of(path) if not is_named(member, text)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SPECIFIED)
+def test_files_hold_nothing_that_is_not_specified(furnished, name):
+    assert unnamed(furnished / name, SPECIFIED[name]) == []
+
+
+def test_a_member_that_is_not_specified_is_found(tmp_path):
+    with h5py.File(tmp_path / "c.h5", "w") as file:
+        file.attrs["format"] = np.bytes_("lfpiv-calibration")
+        file["lattice/origin_px"] = np.zeros(2)
+        file["lattice/secret_px"] = np.zeros(2)
+        file["lattice"].attrs["secret"] = 1
+    assert set(unnamed(tmp_path / "c.h5", SPECIFIED["calibration.h5"])) == {"lattice/secret_px", "lattice@secret"}
