@@ -14,7 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from lfpiv_cli.reconstruction.equations import Normalisers
+from lfpiv_cli.reconstruction.equations import Normalisers, Problem
+from lfpiv_cli.reconstruction.solvers import em_step
+from lfpiv_cli.reconstruction.starts import uniform_start
 from lfpiv_cli.weights.model import Weights
 
 # Light-field volumes are sharp laterally and long in depth: a peak is the largest sum over three planes among its
@@ -41,17 +43,11 @@ def explain_rest(
     sums : `normalisers` of the padded weights
     """
     operator = weights.padded
-    taking_part = sums.inverse_row_sum > 0.0
-    image = np.where(taking_part, np.maximum(image, 0.0), 0.0).astype(np.float32)
     background = np.maximum(background, 0.0)
-    rest = float(np.sum(np.maximum(image - background, 0.0), dtype=np.float64))
-    seen = sums.inverse_column_sum > 0.0
-    gain = float(np.sum(1.0 / sums.inverse_column_sum[seen], dtype=np.float64))
-    volume = np.where(seen, np.float32(rest / gain if gain > 0.0 else 0.0), np.float32(0.0))
+    problem = Problem.of(operator, image, sums)
+    volume = uniform_start(Problem.of(operator, image - background, sums))
     for _ in range(iterations):
-        projection = operator.forward(volume) + background
-        ratio = np.divide(image, projection, out=np.zeros_like(projection), where=taking_part & (projection > 0.0))
-        volume *= operator.adjoint(ratio) * sums.inverse_column_sum
+        volume = em_step(problem, volume, operator.forward(volume) + background, 1.0)
         if progress:
             progress(1)
     return volume
