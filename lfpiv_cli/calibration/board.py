@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose, on_the_grid, pose_of_dots
 from lfpiv_cli.calibration.dot_model import (
@@ -22,6 +21,7 @@ from lfpiv_cli.calibration.dot_model import (
     scene_points,
 )
 from lfpiv_cli.calibration.rectification import turned
+from lfpiv_cli.calibration.refocusing import Refocusing
 from lfpiv_cli.calibration.spots import find_spots
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.neighbourhoods import opened
@@ -38,6 +38,9 @@ FOCUS_LENSES = 10
 # The refocused picture has two samples per microlens, smoothed by one microlens: finer, the gaps between microlenses
 # that the focal plane has would pass for sharpness.
 SAMPLES_PER_LENS = 2
+# The refocused picture reaches this many widths of the sensor to either side: a tenth more than the focal plane has, as
+# what lies behind it is seen wider.
+HALF_WIDTH = 0.6
 # Pixels that see the plane of the dots within this many microlenses of a dot's rim, but not half-way to the next dot,
 # belong to its fit.
 MARGIN_LENSES = 2.5
@@ -198,25 +201,16 @@ def first_dots(
     light = signal[row, column]
     if not light.size or light.min() <= 0.0:
         raise InputError("the board's picture shows no dots; check the exposure and board.polarity")
-    rays = pixel_rays(camera, column, row)
-    through = np.hypot(*lens_crossings(rays, camera).T) <= camera.aperture_radius_mm
-    sample_mm = float(camera.lattice.pitch.min()) / SAMPLES_PER_LENS / abs(camera.magnification)
-    size = np.array([camera.rows, camera.columns]) * camera.pixel_mm / abs(camera.magnification)
-    shape = 2 * np.ceil(0.6 * size / sample_mm).astype(np.int64) + 1
-
-    widest = max(3, round(DOT_PER_SPACING * board.spacing_mm / sample_mm))
+    planes = Refocusing.of(camera, media, (row, column), SAMPLES_PER_LENS, HALF_WIDTH)
+    widest = max(3, round(DOT_PER_SPACING * board.spacing_mm / planes.sample_mm))
 
     def refocused(z_mm: float) -> NDArray[np.float64]:
-        place = np.rint(scene_points(rays, camera, media, z_mm) / sample_mm).astype(np.int64)[:, ::-1] + shape // 2
-        seen = through & ((place >= 0) & (place < shape)).all(axis=1)
-        flat = np.ravel_multi_index(tuple(place[seen].T), tuple(shape))
-        picture = np.bincount(flat, light[seen], minlength=int(shape.prod())).reshape(shape)
-        smooth = ndimage.gaussian_filter(picture, SAMPLES_PER_LENS)
+        (smooth,) = planes.pictures(z_mm, (light,), SAMPLES_PER_LENS)
         return smooth - opened(smooth, widest)
 
     depth = float(depths_mm[np.argmax([np.sum(refocused(z) ** 2) for z in depths_mm])])
-    spots = find_spots(refocused(depth), board.spacing_mm / sample_mm)
-    return (spots - shape[::-1] // 2) * sample_mm, depth
+    spots = find_spots(refocused(depth), board.spacing_mm / planes.sample_mm)
+    return (spots - planes.half[::-1]) * planes.sample_mm, depth
 
 
 def candidate_depths(camera: Camera, media: Media) -> NDArray[np.float64]:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from lfpiv_cli.calibration.dot_model import lens_crossings, pixel_rays, scene_points
+from lfpiv_cli.calibration.refocusing import Refocusing
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 
@@ -96,23 +96,10 @@ def refocused_stack(
     pixels = np.asarray(image, dtype=np.float64)
     share = np.ones(pixels.shape) if passed is None else np.asarray(passed, dtype=np.float64)
     row, column = np.nonzero(share > 0.0)
-    rays = pixel_rays(camera, column, row)
-    through = np.hypot(*lens_crossings(rays, camera).T) <= camera.aperture_radius_mm
-    sample_mm = float(camera.lattice.pitch.min()) / abs(camera.magnification)
-    half = np.ceil(0.5 * np.array(pixels.shape) * camera.pixel_mm / abs(camera.magnification) / sample_mm).astype(int)
-    shape = (int(2 * half[0] + 1), int(2 * half[1] + 1))
+    planes = Refocusing.of(camera, media, (row, column), samples_per_lens=1, half_width=0.5)
 
     def refocused(z_mm: float) -> NDArray[np.float64]:
-        place = np.rint(scene_points(rays, camera, media, z_mm)[:, ::-1] / sample_mm).astype(np.int64) + half
-        seen = through & ((place >= 0) & (place < shape)).all(axis=1)
-        flat = place[seen, 0] * shape[1] + place[seen, 1]
-        light, passing = (
-            ndimage.gaussian_filter(
-                np.bincount(flat, values[row[seen], column[seen]], minlength=shape[0] * shape[1]).reshape(shape),
-                REFOCUS_SMOOTHING,
-            )
-            for values in (pixels, share)
-        )
+        light, passing = planes.pictures(z_mm, (pixels[row, column], share[row, column]), REFOCUS_SMOOTHING)
         enough = passing > LEAST_SEEN * np.median(passing)
         return np.where(enough, light / np.where(enough, passing, 1.0), 0.0)
 
