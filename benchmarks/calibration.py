@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.calibration.model import Calibration, Rig, calibrate
 from lfpiv_cli.errors import LfpivError
+from lfpiv_cli.names import Layout
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.optics.microlenses import Lattice, Layout
+from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.synthetic.board import BoardPlacement, dot_centres, render_board
 from lfpiv_cli.synthetic.render import ObjectSpace, render_white
 from lfpiv_cli.synthetic.scenes import Misalignment

@@ -15,7 +15,8 @@ import yaml
 import lfpiv_cli
 from lfpiv_cli.files.bench import flow_of
 from lfpiv_cli.files.section_types import Section
-from lfpiv_cli.reconstruction.solvers import SOLVERS, reconstruct
+from lfpiv_cli.reconstruction.registry import SOLVERS, Solver
+from lfpiv_cli.reconstruction.solvers import reconstruct
 from lfpiv_cli.synthetic.flows import FLOWS
 
 ROOT = Path(__file__).parent.parent
@@ -93,8 +94,12 @@ class Pixels:
         return image[np.newaxis]
 
 
+def halve(problem, volume, projection, relaxation):
+    return volume / 2
+
+
 def test_a_solver_is_added_by_its_step_and_its_name(monkeypatch):
-    monkeypatch.setitem(SOLVERS, "halve", lambda problem, volume, projection, relaxation: volume / 2)
+    monkeypatch.setitem(SOLVERS, "halve", Solver(f"{__name__}:{halve.__name__}"))
     result = reconstruct(Pixels(), np.array([[4.0, 2.0]], np.float32), "halve", iterations=3)
     start = reconstruct(Pixels(), np.array([[4.0, 2.0]], np.float32), "halve", iterations=0)
     np.testing.assert_array_equal(result.volume, start.volume / 8)

@@ -9,9 +9,10 @@ import pytest
 from scipy.spatial import KDTree
 
 from lfpiv_cli.grid import Grid
-from lfpiv_cli.optics.camera import Camera, ColumnAxis
+from lfpiv_cli.names import ColumnAxis, Layout
+from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.optics.microlenses import Lattice, Layout
+from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.particles.candidates import explain_rest, find_peaks
 from lfpiv_cli.particles.rounds import find_particles

@@ -7,7 +7,7 @@ board stands in. Lengths in mm.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from lfpiv_cli.calibration.board_fit import FlatFit, bent_fit, flat_fit, outliers
 from lfpiv_cli.calibration.spots import first_of_each
 from lfpiv_cli.errors import InputError
+from lfpiv_cli.names import Medium, Polarity
 from lfpiv_cli.optics.camera import Camera
 
 # The plane, the spacing and their errors need more than their own unknowns.
@@ -56,8 +57,8 @@ class BoardGeometry:
     spacing_mm: float
     dot_diameter_mm: float
     thickness_mm: float = 0.0
-    polarity: Literal["bright", "dark"] = "bright"
-    medium: Literal["air", "fluid"] = "air"
+    polarity: Polarity = "bright"
+    medium: Medium = "air"
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,8 @@ from lfpiv_cli.calibration.spectrum import lattice_vectors
 from lfpiv_cli.calibration.spots import find_spots, index_spots
 from lfpiv_cli.calibration.white import checked_white
 from lfpiv_cli.errors import InputError
-from lfpiv_cli.optics.microlenses import Lattice, Layout
+from lfpiv_cli.names import Layout
+from lfpiv_cli.optics.microlenses import Lattice
 
 # Fewer lenses leave the cubic's ten coefficients per axis without a check.
 FEWEST_LENSES = 30

@@ -22,9 +22,10 @@ from lfpiv_cli.calibration.sheet import check_pitch, image_distance_mm, sheet_fi
 from lfpiv_cli.calibration.transmission import fit_vignetting, relative_transmission
 from lfpiv_cli.calibration.white import by_aperture
 from lfpiv_cli.errors import InputError
+from lfpiv_cli.names import Layout
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.optics.microlenses import Lattice, Layout
+from lfpiv_cli.optics.microlenses import Lattice
 
 # A measured magnification replaces the data sheet's when it differs by more standard errors than chance explains.
 MAGNIFICATION_SIGMAS = 3.0

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage
 
 from lfpiv_cli.errors import InputError
+from lfpiv_cli.names import Layout
 from lfpiv_cli.neighbourhoods import largest_around
-from lfpiv_cli.optics.microlenses import Layout
 
 # Below 6 px a lens image has no shape left to measure; the upper end leaves room beyond the 60 px of any known camera.
 SMALLEST_PITCH_PX = 6.0

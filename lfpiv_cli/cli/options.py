@@ -11,6 +11,7 @@ from typing import Any
 import click
 
 from lfpiv_cli.errors import LimitMissedError
+from lfpiv_cli.names import Pairing, names_in
 
 FILE = click.Path(path_type=Path)
 POSITIVE = click.FloatRange(min=0.0, min_open=True)
@@ -20,7 +21,7 @@ dark_option = click.option("--dark", type=FILE, help="Dark image, taken with the
 dt_option = click.option("--dt-s", type=POSITIVE, help="Time from one frame to the next; default from the config.")
 pairing_option = click.option(
     "--pairing",
-    type=click.Choice(["ab", "sequence"]),
+    type=click.Choice(names_in(Pairing)),
     help="Frames belong together in separate pairs, or each with the next.",
 )
 resume_option = click.option(

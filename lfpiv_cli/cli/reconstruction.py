@@ -9,18 +9,18 @@ import click
 
 from lfpiv_cli.cli.options import FILE, common_options, dark_option, output_option, pairing_option, resume_option
 from lfpiv_cli.console import Console
+from lfpiv_cli.names import Start, names_in
+from lfpiv_cli.reconstruction.registry import SOLVER_NAMES
 
 
 @click.command("reconstruct")
 @click.argument("weights", type=FILE)
 @click.argument("images", type=FILE, nargs=-1, required=True)
-@click.option(
-    "--solver", type=click.Choice(["em", "sart", "smart", "mart", "particles"]), help="Default from the config."
-)
+@click.option("--solver", type=click.Choice(SOLVER_NAMES), help="Default from the config.")
 @click.option("--iterations", type=click.IntRange(min=1), help="Default from the config.")
 @click.option("--relaxation", type=click.FloatRange(min=0.0, min_open=True, max=2.0), help="Default from the config.")
 @click.option("--accelerate/--no-accelerate", default=None, help="Extrapolate between steps; default from the config.")
-@click.option("--start", type=click.Choice(["uniform", "line_of_sight"]), help="Default from the config.")
+@click.option("--start", type=click.Choice(names_in(Start)), help="Default from the config.")
 @dark_option
 @click.option("--background", help="Image to subtract, or minimum or mean over the images given, or as minimum:15.")
 @click.option("--mask", type=FILE, help="Image that is black where pixels are to be left out (reflections, bubbles).")

@@ -10,6 +10,7 @@ import click
 
 from lfpiv_cli.cli.options import FILE, common_options, config_argument, output_option
 from lfpiv_cli.console import Console
+from lfpiv_cli.names import Moment, names_in
 
 # The options that each kind of validation takes, and those that it cannot do without.
 TAKEN: dict[str, set[str]] = {
@@ -28,7 +29,7 @@ NEEDED = {"volume": ("volume", "particles", "frame")}
 @click.option("--vectors", type=FILE, help="flow: vectors to judge, not those of a simulation.")
 @click.option("--volume", type=FILE, help="volume: volume to judge.")
 @click.option("--particles", type=FILE, help="volume, flow: true particles (.npz) to judge by; flow needs none.")
-@click.option("--frame", type=click.Choice(["a", "middle", "b"]), help="volume: when in the pair it was taken.")
+@click.option("--frame", type=click.Choice(names_in(Moment)), help="volume: when in the pair it was taken.")
 @output_option("Folder for the report.")
 @common_options
 def validate(what: str, config: Path, output: Path, overwrite: bool, console: Console, **chosen: Any) -> dict[str, Any]:

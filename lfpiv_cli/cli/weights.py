@@ -9,14 +9,15 @@ import click
 
 from lfpiv_cli.cli.options import FILE, common_options, config_argument, output_option
 from lfpiv_cli.console import Console
+from lfpiv_cli.names import Method, Refraction, Sampling, names_in
 
 
 @click.command("build-weights")
 @config_argument
 @click.option("--calibration", type=FILE, help="From calibrate-snapshot; without it the data sheet is believed.")
-@click.option("--method", type=click.Choice(["ert", "drt", "dlfc"]), help="How rays go; default from the config.")
-@click.option("--refraction", type=click.Choice(["paraxial", "exact"]), help="Snell's law; default from the config.")
-@click.option("--sampling", type=click.Choice(["exact", "rays"]), help="Integrals or rays; default from the config.")
+@click.option("--method", type=click.Choice(names_in(Method)), help="How rays go; default from the config.")
+@click.option("--refraction", type=click.Choice(names_in(Refraction)), help="Snell's law; default from the config.")
+@click.option("--sampling", type=click.Choice(names_in(Sampling)), help="Integrals or rays; default from the config.")
 @output_option("Weights file to write (.h5).")
 @common_options
 def build_weights(config: Path, output: Path, overwrite: bool, console: Console, **chosen: Any) -> dict[str, Any]:

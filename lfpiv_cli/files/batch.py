@@ -10,6 +10,7 @@ from typing import Any
 from lfpiv_cli.errors import InputError, OutputExistsError, UsageError
 from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.images import count_pages
+from lfpiv_cli.names import Pairing
 
 VTKHDF_SUFFIX = ".vtkhdf"
 
@@ -110,7 +111,7 @@ def _made_alike(target: Target, read_record: Callable[[Path], Mapping[str, Any]]
         return False
 
 
-def frames_beside(count: int, pairing: str) -> list[tuple[int, ...]]:
+def frames_beside(count: int, pairing: Pairing) -> list[tuple[int, ...]]:
     """Return for each frame the numbers of those it belongs with: its partner (`ab`), or the one before and after.
 
     Raises

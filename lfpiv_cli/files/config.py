@@ -43,12 +43,9 @@ from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media, Window
 from lfpiv_cli.optics.object_space import ObjectSpace
+from lfpiv_cli.reconstruction.registry import SOLVERS
 from lfpiv_cli.synthetic.flows import Flow
 from lfpiv_cli.synthetic.scenes import channel_window
-
-# Powers of the intensities that are correlated, by solver; 1 where none is named. In EM's volumes the root measured a
-# third less noise in depth, and a depth velocity with 0.94 of its slope in place of 0.81; in MART's two fifths less.
-EXPONENTS = {"em": 0.5, "smart": 0.5, "mart": 0.5}
 
 
 @dataclass(frozen=True)
@@ -228,7 +225,8 @@ class Config:
 
     def correlation_exponent(self) -> float:
         """Return the power of the intensities that is correlated: the configured one, or the solver's default."""
-        return self.correlation.exponent or EXPONENTS.get(self.reconstruction.solver, 1.0)
+        solver = SOLVERS.get(self.reconstruction.solver)
+        return self.correlation.exponent or (solver.exponent if solver else 1.0)
 
     def simulated_flow(self, origin_z_mm: float = 0.0) -> Flow:
         """Return the flow to render, as a function of points whose z counts from `origin_z_mm` before the volume's."""

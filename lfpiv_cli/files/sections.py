@@ -24,6 +24,8 @@ from lfpiv_cli.files.section_types import (
     Windows,
 )
 from lfpiv_cli.files.sections_simulated import SimulationSection, ValidationSection
+from lfpiv_cli.names import ColumnAxis, Layout, Medium, Method, Polarity, ReferenceName, Refraction, Sampling, Start
+from lfpiv_cli.reconstruction.registry import SolverName
 
 
 class MainLens(Section):
@@ -43,8 +45,8 @@ class MainLens(Section):
 class Microlenses(Section):
     """The microlens array: pitch p_l, focal length f_m or f_number (f_m / p_l), layout.
 
-    columns and rows document the array; only the lenses that the sensor sees count. layout: default is what a white
-    image shows, square where there is none.
+    columns and rows document the array; only the lenses that the sensor sees count. layout: square or hexagonal; by
+    default as a white image shows, square where there is none.
     """
 
     pitch_mm: Positive
@@ -52,7 +54,7 @@ class Microlenses(Section):
     f_number: Positive | None = None
     columns: Count | None = None
     rows: Count | None = None
-    layout: Literal["square", "hexagonal"] | None = None
+    layout: Layout | None = None
 
 
 class Sensor(Section):
@@ -65,7 +67,7 @@ class Sensor(Section):
     columns: Pixels
     rows: Pixels
     microlens_distance_mm: Positive | None = None
-    column_axis: Literal["x", "y"] = "x"
+    column_axis: ColumnAxis = "x"
 
 
 class CameraSection(Section):
@@ -94,28 +96,30 @@ class WindowSection(Section):
 class VolumeSection(Section):
     """The volume: shape_xyz and voxel_mm (a number or [x, y, z]), or size_mm, which leaves the voxels to the program.
 
-    reference: the origin of its coordinates, the nominal focal point or the channel's mid plane on the optical axis.
+    reference: the origin of its coordinates, the nominal focal point (focal_point) or the channel's mid plane on the
+    optical axis (mid_plane).
     """
 
     shape_xyz: tuple[Voxels, Voxels, Voxels] | None = None
     voxel_mm: PerAxis | None = None
     size_mm: tuple[Positive, Positive, Positive] | None = None
     centre_mm: Vector = (0.0, 0.0, 0.0)
-    reference: Literal["focal_point", "mid_plane"] = "focal_point"
+    reference: ReferenceName = "focal_point"
 
 
 class BoardSection(Section):
     """The calibration board: dots along x and y, their spacing and diameter, the board's thickness t_b.
 
-    medium: what the board stands in. polarity: whether the dots are brighter or darker than the board.
+    medium: what the board stands in, air or fluid. polarity: whether the dots are brighter than the board (bright) or
+    darker (dark).
     """
 
     dots: tuple[Annotated[int, Field(ge=2)], Annotated[int, Field(ge=2)]]
     spacing_mm: Positive
     dot_diameter_mm: Positive
     thickness_mm: NotNegative = 0.0
-    medium: Literal["air", "fluid"] = "air"
-    polarity: Literal["bright", "dark"] = "bright"
+    medium: Medium = "air"
+    polarity: Polarity = "bright"
 
 
 class ChannelSection(Section):
@@ -140,9 +144,9 @@ class WeightsSection(Section):
     count of rays_per_point rays from each of `points` random points of a voxel (rays), seeded; for small volumes only.
     """
 
-    method: Literal["ert", "drt", "dlfc"] = "ert"
-    refraction: Literal["paraxial", "exact"] = "paraxial"
-    sampling: Literal["exact", "rays"] = "exact"
+    method: Method = "ert"
+    refraction: Refraction = "paraxial"
+    sampling: Sampling = "exact"
     points: Annotated[int, Field(ge=1, le=10_000_000)] = 500
     rays_per_point: Annotated[int, Field(ge=1, le=10_000_000)] = 10_000
     seed: Annotated[int, Field(ge=0)] = 0
@@ -162,8 +166,8 @@ class ReconstructionSection(Section):
     from how far light spreads).
     """
 
-    solver: Literal["em", "sart", "smart", "mart", "particles"] = "em"
-    start: Literal["uniform", "line_of_sight"] = "uniform"
+    solver: SolverName = "em"
+    start: Start = "uniform"
     stop_change: Annotated[float, Field(gt=0.0, lt=1.0)] | None = None
     stop_noise: Positive | None = None
     photons_per_count: Positive | None = None
@@ -182,8 +186,8 @@ class CorrelationSection(Section):
 
     overlap: of neighbouring windows, a number or [x, y, z]. dt_s: time between the volumes of a pair.
     mask: channel leaves out what lies beyond the channel's walls across the depth (needs reference: mid_plane).
-    exponent: power of the intensities that is correlated (default: 0.5 for volumes of the solvers em, smart and mart,
-    whose brightest particles outweigh all others, and 1 for sart's).
+    exponent: power of the intensities that is correlated (default: 0.5 for volumes of the solvers em, smart and mart;
+    their brightest particles outweigh all others; and 1 for sart's).
     """
 
     windows: Windows | None = None

@@ -17,6 +17,7 @@ from lfpiv_cli.files.section_types import (
     Share,
     Vector,
 )
+from lfpiv_cli.names import BoardImages, BoardMethod, FlowMethod, Refraction
 
 
 class SquareDuct(Section):
@@ -86,7 +87,7 @@ class SimulationSection(Section):
     distortion_per_mm2.
     Sensor: peak_counts (of a pixel that sees only light, in white and board images), photons_per_count (null: no shot
     noise), read_noise_counts, dark_level_counts, bits.
-    Tracing: refraction, rays per particle (null: as many as the noise needs), seed.
+    Tracing: refraction (exact or paraxial), rays per particle (null: as many as the noise needs), seed.
     """
 
     flow: FlowSection | None = None
@@ -109,7 +110,7 @@ class SimulationSection(Section):
     read_noise_counts: NotNegative = 6.0
     dark_level_counts: NotNegative = 96.0
     bits: Annotated[int, Field(ge=1, le=16)] = 16
-    refraction: Literal["exact", "paraxial"] = "exact"
+    refraction: Refraction = "exact"
     rays: Annotated[int, Field(ge=1)] | None = None
     seed: Annotated[int, Field(ge=0)] = 0
 
@@ -171,8 +172,8 @@ class BoardValidation(Section):
     points (ert) and rays fitted to the boards (dlfc); or no weights, the dots fitted to the pictures as discs (discs).
     """
 
-    images: Literal["ideal", "recorded", "both"] = "ideal"
-    methods: Annotated[tuple[Literal["ert", "dlfc", "discs"], ...], Field(min_length=1)] = ("ert",)
+    images: BoardImages = "ideal"
+    methods: Annotated[tuple[BoardMethod, ...], Field(min_length=1)] = ("ert",)
 
 
 class ValidationSection(Section):
@@ -184,7 +185,7 @@ class ValidationSection(Section):
     """
 
     flow: FlowSection | None = None
-    flow_methods: Annotated[tuple[Literal["volumes", "particles"], ...], Field(min_length=1)] | None = None
+    flow_methods: Annotated[tuple[FlowMethod, ...], Field(min_length=1)] | None = None
     limits: Limits = Limits()
     weights: WeightsValidation = WeightsValidation()
     board: BoardValidation = BoardValidation()

@@ -27,6 +27,7 @@ from lfpiv_cli.calibration.transmission import vignetting_surface
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.files.hdf5 import read_tree, write_tree
 from lfpiv_cli.grid import Grid
+from lfpiv_cli.names import Refraction, TracedMethod, names_in
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media, Window
 from lfpiv_cli.optics.microlenses import Lattice
@@ -187,7 +188,7 @@ def _source(tree: dict[str, Any], calibration: Calibration | None) -> Source:
         return calibration.ray_fit.rays
     media = Media(*(float(tree[name]) for name in ("air", "window", "fluid")))
     face = tree.get("window_face")
-    if tree["method"] not in ("ert", "drt") or tree["refraction"] not in ("paraxial", "exact"):
+    if tree["method"] not in names_in(TracedMethod) or tree["refraction"] not in names_in(Refraction):
         raise ValueError(f"unknown tracing: {tree['method']}, {tree['refraction']}")
     return ObjectSpace(media, Window(**face) if face else None, tree["refraction"], tree["method"])
 

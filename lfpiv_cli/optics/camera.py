@@ -9,14 +9,12 @@ where the sensor's columns follow world y.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lfpiv_cli.names import ColumnAxis
 from lfpiv_cli.optics.microlenses import Lattice
-
-ColumnAxis = Literal["x", "y"]
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,13 +8,12 @@ always (image x, image y), that is along the columns first.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-Layout = Literal["square", "hexagonal"]
+from lfpiv_cli.names import Layout
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,13 +10,13 @@ lens, mm.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from lfpiv_cli.errors import ConfigError
+from lfpiv_cli.names import Refraction, TracedMethod
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import (
     Media,
@@ -26,9 +26,6 @@ from lfpiv_cli.optics.media import (
     object_space_matrix,
 )
 from lfpiv_cli.optics.tracing import exact_slope
-
-Refraction = Literal["paraxial", "exact"]
-Method = Literal["ert", "drt"]
 
 # The slope of a refracted ray over its lateral distance is an analytic function of that distance squared, nearly
 # constant: through five points of it, a polynomial is right to 1e-10 for lenses up to f/1.4.
@@ -50,7 +47,7 @@ class ObjectSpace:
     media: Media
     window: Window | None = None
     refraction: Refraction = "exact"
-    method: Method = "ert"
+    method: TracedMethod = "ert"
 
     @property
     def straight(self) -> bool:

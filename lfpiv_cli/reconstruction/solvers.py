@@ -2,7 +2,8 @@
 
 A solver is a function `step(problem, volume, projection, relaxation) -> volume`; the loop in `reconstruct` owns the
 iterations and hands each step the projection of the current volume, which also gives the residual. To add a solver:
-write its step, name it in `SOLVERS`, and test that a true volume is a fixed point and that the residual falls.
+write its step, name it in `registry.SOLVERS`, and test it; that a true volume is a fixed point and that the residual
+falls is tested for all.
 
 Axes: volumes [z, y, x], images [row, column], float32.
 """
@@ -11,16 +12,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.names import Start
 from lfpiv_cli.reconstruction import kernels
 from lfpiv_cli.reconstruction.equations import Image, Normalisers, Operator, Problem, Volume, normalisers
+from lfpiv_cli.reconstruction.registry import SOLVERS
 from lfpiv_cli.reconstruction.starts import line_of_sight_start, lit_support, uniform_start
-
-Start = Literal["uniform", "line_of_sight"]
 
 # MART takes the pixels in this many by this many interleaved blocks; neighbours, which see the same voxels, apart.
 MART_BLOCKS = 4
@@ -123,14 +123,6 @@ def _log_ratio(problem: Problem, projection: Image) -> Image:
     return np.log(np.maximum(ratio, np.float32(SMALLEST_RATIO)))
 
 
-SOLVERS: dict[str, Callable[[Problem, Volume, Image, float], Volume]] = {
-    "sart": sart_step,
-    "em": em_step,
-    "smart": smart_step,
-    "mart": mart_step,
-}
-
-
 def reconstruct(
     operator: Operator,
     image: Image,
@@ -148,7 +140,7 @@ def reconstruct(
     Parameters
     ----------
     image : (rows, columns) in the weights' frame, dark and background taken off; negative values count as 0
-    solver : name in `SOLVERS`
+    solver : name in `registry.SOLVERS`
     accelerate : step from points extrapolated by `Momentum`, at the cost of three passes over the volume
     sums : `normalisers(operator)`, where several images share it; tells which pixels take part
     progress : called with 1 after each iteration
@@ -160,7 +152,7 @@ def reconstruct(
         support = lit_support(operator, problem.image, problem.sums)
         problem = Problem.of(operator, image, problem.sums.within(operator, support))
     volume = point = line_of_sight_start(problem) if start == "line_of_sight" else uniform_start(problem)
-    momentum = Momentum()
+    step, momentum = SOLVERS[solver].step(), Momentum()
     norm = float(np.sqrt(np.sum(np.square(problem.image, dtype=np.float64))))
     residual: list[float] = []
     for _ in range(iterations):
@@ -169,7 +161,7 @@ def reconstruct(
         if stopping.reached(np.array(residual)):
             residual.pop()
             break
-        previous, volume = volume, SOLVERS[solver](problem, point, projection, relaxation)
+        previous, volume = volume, step(problem, point, projection, relaxation)
         if accelerate:
             momentum, point = momentum.extrapolated(point, previous, volume)
         else:

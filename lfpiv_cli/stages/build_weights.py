@@ -20,6 +20,7 @@ from lfpiv_cli.files.provenance import record as provenance_record
 from lfpiv_cli.files.sections import WeightsSection
 from lfpiv_cli.files.weights_file import WeightsFile, write_weights
 from lfpiv_cli.grid import Grid
+from lfpiv_cli.names import Method, Refraction, Sampling
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.optics.polynomial_rays import PolynomialRays
@@ -57,9 +58,9 @@ class BuildWeightsOptions:
     """
 
     calibration: Path | None = None
-    method: str | None = None
-    refraction: str | None = None
-    sampling: str | None = None
+    method: Method | None = None
+    refraction: Refraction | None = None
+    sampling: Sampling | None = None
 
 
 NO_OPTIONS = BuildWeightsOptions()

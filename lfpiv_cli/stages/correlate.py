@@ -23,6 +23,7 @@ from lfpiv_cli.flow.derived import Derived, derived_fields
 from lfpiv_cli.flow.field import MM_TO_M, REJECTED, VectorField
 from lfpiv_cli.flow.statistics import statistics_of
 from lfpiv_cli.grid import Grid
+from lfpiv_cli.names import Pairing
 
 Extra = dict[str, tuple[NDArray[Any], str]]
 
@@ -65,7 +66,7 @@ class CorrelateOptions:
     dt_s: float | None = None
     windows: Sequence[int | Sequence[int]] | None = None
     overlap: float | Sequence[float] | None = None
-    pairing: str | None = None
+    pairing: Pairing | None = None
     mask_volume: Path | None = None
     ensemble: bool = False
     derived: bool = False
@@ -215,7 +216,7 @@ def _record_of(path: Path) -> Mapping[str, Any]:
     return vtkhdf.read_header(path).provenance
 
 
-def _pairs(volumes: Sequence[Path], pairing: str | None) -> list[tuple[Path, Path]]:
+def _pairs(volumes: Sequence[Path], pairing: Pairing | None) -> list[tuple[Path, Path]]:
     """Return the pairs to correlate: (1, 2), (3, 4) ... for `ab`, (1, 2), (2, 3) ... for `sequence`."""
     if len(volumes) < 2 or (pairing != "sequence" and len(volumes) % 2):
         raise UsageError(f"correlate needs pairs of volumes, got {len(volumes)}")

@@ -22,6 +22,7 @@ from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.files.sections import ReconstructionSection
 from lfpiv_cli.files.weights_file import WeightsFile, read_weights
+from lfpiv_cli.names import Pairing, Start
 from lfpiv_cli.particles.search import Particles
 from lfpiv_cli.reconstruction.equations import Normalisers, Operator, normalisers
 from lfpiv_cli.reconstruction.images import (
@@ -34,6 +35,7 @@ from lfpiv_cli.reconstruction.images import (
     saturated,
     touched,
 )
+from lfpiv_cli.reconstruction.registry import SolverName
 from lfpiv_cli.reconstruction.solvers import Reconstruction, Stopping
 from lfpiv_cli.reconstruction.solvers import reconstruct as solve
 from lfpiv_cli.stages import particles
@@ -86,15 +88,15 @@ class ReconstructOptions:
     keep_going : go on with the next frame when one fails
     """
 
-    solver: str | None = None
+    solver: SolverName | None = None
     iterations: int | None = None
     relaxation: float | None = None
     accelerate: bool | None = None
-    start: str | None = None
+    start: Start | None = None
     dark: Path | None = None
     background: str | None = None
     mask: Path | None = None
-    pairing: str | None = None
+    pairing: Pairing | None = None
     resume: bool = False
     keep_going: bool = False
 

@@ -16,10 +16,11 @@ from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.particles import MM_PER_M, read_particles
 from lfpiv_cli.files.provenance import record
+from lfpiv_cli.names import Moment
 from lfpiv_cli.validation.volume import volume_figures
 
 # When the frames of a pair are taken, in units of the time between them, counted from the middle of the pair.
-MOMENTS = {"a": -0.5, "middle": 0.0, "b": 0.5}
+MOMENTS: dict[Moment, float] = {"a": -0.5, "middle": 0.0, "b": 0.5}
 
 
 def validate_volume(
@@ -28,7 +29,7 @@ def validate_volume(
     *,
     volume: Path,
     particles: Path,
-    frame: str,
+    frame: Moment,
     overwrite: bool = False,
     console: Console = CONSOLE,
 ) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from scipy import ndimage
 
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.grid import Grid
-from lfpiv_cli.optics.camera import ColumnAxis
+from lfpiv_cli.names import ColumnAxis
 from lfpiv_cli.weights.columns import ColumnOperator, OnDemandOperator
 from lfpiv_cli.weights.operators import BrickOperator, Column, FactorisedOperator
 

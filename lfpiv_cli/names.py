@@ -1,0 +1,42 @@
+"""The names that a configuration, a command and the code share: each list stands here once.
+
+Nothing heavy is imported, as `--help` shows them. Solvers have a registry of their own, `reconstruction.registry`, and
+flows theirs, `synthetic.flows`.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal, get_args
+
+# The microlens array, and the board: what it stands in, and its dots beside its ground.
+Layout = Literal["square", "hexagonal"]
+Medium = Literal["air", "fluid"]
+Polarity = Literal["bright", "dark"]
+
+# The world axis that the sensor's columns follow.
+ColumnAxis = Literal["x", "y"]
+
+# Where the coordinates of volumes, vectors and points begin.
+ReferenceName = Literal["focal_point", "mid_plane"]
+
+# How rays are found: by equivalent points, traced through window and fluid, or fitted to boards at several depths; what
+# they are refracted by; and how they are added up.
+TracedMethod = Literal["ert", "drt"]
+Method = Literal[TracedMethod, "dlfc"]
+Refraction = Literal["paraxial", "exact"]
+Sampling = Literal["exact", "rays"]
+
+# What a solver starts from, and which frames belong together.
+Start = Literal["uniform", "line_of_sight"]
+Pairing = Literal["ab", "sequence"]
+
+# What is validated: flows and boards by which methods, boards in which images, and volumes of which moment of a pair.
+FlowMethod = Literal["volumes", "particles"]
+BoardMethod = Literal["ert", "dlfc", "discs"]
+BoardImages = Literal["ideal", "recorded", "both"]
+Moment = Literal["a", "middle", "b"]
+
+
+def names_in(kind: Any) -> tuple[str, ...]:
+    """Return the names of one of the kinds above, in their order."""
+    return get_args(kind)

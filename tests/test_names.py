@@ -1,0 +1,172 @@
+"""Each list of names stands once: what configuration, commands, comments and documents say is held against it."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from itertools import takewhile
+from pathlib import Path
+from typing import Any, Literal, get_args, get_origin
+
+import click
+import pytest
+
+from lfpiv_cli.cli import cli
+from lfpiv_cli.files.section_types import Section
+from lfpiv_cli.files.sections import CorrelationSection, Sections
+from lfpiv_cli.files.sections_simulated import FlowSection
+from lfpiv_cli.names import BoardMethod, Method, Moment, Pairing, Refraction, Sampling, Start, names_in
+from lfpiv_cli.reconstruction.registry import PARTICLES, SOLVER_NAMES, SOLVERS
+from lfpiv_cli.synthetic.flows import FLOWS
+
+ROOT = Path(__file__).parents[1]
+TABLE2 = ROOT / "configs" / "table2.yaml"
+# Documents that may list names: README, the guide for contributors, and the pages.
+DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+# The options whose choices are names that others share, by command and option.
+OPTIONS = {
+    ("build-weights", "method"): names_in(Method),
+    ("build-weights", "refraction"): names_in(Refraction),
+    ("build-weights", "sampling"): names_in(Sampling),
+    ("reconstruct", "solver"): SOLVER_NAMES,
+    ("reconstruct", "start"): names_in(Start),
+    ("reconstruct", "pairing"): names_in(Pairing),
+    ("correlate", "pairing"): names_in(Pairing),
+    ("validate", "frame"): names_in(Moment),
+}
+# Names that are no words of plain English: where two of them stand side by side in a text, it lists names.
+LISTED = [SOLVER_NAMES, names_in(Method), names_in(BoardMethod), tuple(FLOWS)]
+JOINTS = re.compile(r",? and |,? or |, |/|\|")
+
+
+def choices(annotation: Any) -> tuple[str, ...]:
+    """Return the names that a type allows, those of a flow's `kind` for flows; none where it is no choice of names."""
+    if get_origin(annotation) is Literal:
+        return get_args(annotation)
+    return tuple(name for inner in get_args(annotation) for name in choices(inner))
+
+
+def keys_with_names() -> Iterator[tuple[tuple[str, ...], type[Section], tuple[str, ...]]]:
+    """Yield every key of the configuration whose values are names: its path, its section and the names."""
+    sections: list[tuple[tuple[str, ...], type[Section]]] = [((), Sections)]
+    for path, section in sections:
+        for name, field in section.model_fields.items():
+            sections += [((*path, name), inner) for inner in sections_in(field.annotation)]
+            # Single letters are axes.
+            if names := tuple(n for n in choices(field.annotation) if len(n) > 2):
+                yield (*path, name), section, names
+
+
+def sections_in(annotation: Any) -> list[type[Section]]:
+    """Return the sections that a type holds, but for the kinds of flows, which share their keys."""
+    if annotation is FlowSection or get_origin(annotation) is Literal:
+        return []
+    if isinstance(annotation, type) and issubclass(annotation, Section):
+        return [annotation] if "kind" not in annotation.model_fields else []
+    return [section for inner in get_args(annotation) for section in sections_in(inner)]
+
+
+def flow_kinds() -> tuple[str, ...]:
+    """Return the kinds of flows that the configuration knows."""
+    return tuple(choices(kind.model_fields["kind"].annotation)[0] for kind in get_args(get_args(FlowSection)[0]))
+
+
+def explained(path: tuple[str, ...]) -> str:
+    """Return the line of a key in table2.yaml, commented out or not, with the comment that goes on below it."""
+    place: list[tuple[int, str]] = []
+    lines = TABLE2.read_text(encoding="utf-8").splitlines()
+    for number, line in enumerate(lines):
+        found = re.match(r"(# {0,2})?( *)([a-z_0-9]+):", line)
+        if not found:
+            continue
+        depth = len(found[1] or "") + len(found[2])
+        place = [*(above for above in place if above[0] < depth), (depth, found[3])]
+        if tuple(name for _, name in place) == path:
+            below = takewhile(lambda rest: re.match(r" {4,}#", rest), lines[number + 1 :])
+            return " ".join([line, *below])
+    raise AssertionError(f"{TABLE2.name} does not explain {'.'.join(path)}")
+
+
+def lists_in(text: str) -> Iterator[list[str]]:
+    """Yield what a text lists, word by word, where two names or more of `LISTED` stand side by side."""
+    plain = re.sub(r"\s+", " ", re.sub(r"[`*\"'#]", "", text))
+    # What stands in brackets interrupts a list, and may be one.
+    parts = [re.sub(r" ?\([^()]*\)", "", plain), *re.findall(r"\(([^()]*)\)", plain)]
+    for run in re.finditer(rf"[a-z_]+(?:(?:{JOINTS.pattern})[a-z_]+)+", "\n".join(parts)):
+        words = JOINTS.split(run[0])
+        if any(len(set(words) & set(names)) >= 2 for names in LISTED):
+            yield words
+
+
+def commands() -> Iterator[tuple[str, click.Command]]:
+    for name in cli.list_commands(click.Context(cli)):
+        command = cli.get_command(click.Context(cli), name)
+        assert command is not None
+        yield name, command
+
+
+KEYS = list(keys_with_names())
+
+
+def test_keys_with_names_are_found() -> None:
+    found = {path for path, _, _ in KEYS}
+    assert {("reconstruction", "solver"), ("weights", "method"), ("validation", "board", "methods")} <= found
+    assert len(found) >= 14
+
+
+@pytest.mark.parametrize(("path", "section", "names"), KEYS, ids=[".".join(path) for path, _, _ in KEYS])
+def test_section_and_table2_explain_every_name(path: tuple[str, ...], section: type[Section], names: tuple) -> None:
+    for text in (section.__doc__ or "", explained(path)):
+        missing = [name for name in names if not re.search(rf"\b{name}\b", text)]
+        assert not missing, f"{'.'.join(path)}: {missing} not in {text}"
+
+
+def test_flows_are_those_of_the_registry() -> None:
+    assert set(flow_kinds()) == set(FLOWS)
+    assert all(re.search(rf"\b{kind}\b", explained(("simulation", "flow"))) for kind in FLOWS)
+
+
+def test_options_offer_the_shared_names() -> None:
+    offered = {
+        (name, str(option.name)): tuple(option.type.choices)
+        for name, command in commands()
+        for option in command.params
+        if isinstance(option, click.Option) and isinstance(option.type, click.Choice)
+    }
+    assert offered == OPTIONS
+
+
+def test_texts_tell_which_solvers_have_an_exponent_of_their_own() -> None:
+    own = sorted(name for name, solver in SOLVERS.items() if solver.exponent != 1.0)
+    for text in (CorrelationSection.__doc__ or "", explained(("correlation", "exponent"))):
+        assert own in [sorted(words) for words in lists_in(text)], text
+
+
+def test_what_texts_list_are_names() -> None:
+    """A list of names that holds a word which is none has outlived a change, or was never right."""
+    texts = {str(path.relative_to(ROOT)): path.read_text(encoding="utf-8") for path in (TABLE2, *DOCUMENTS)}
+    texts |= {f"lfpiv {name}": command.help or "" for name, command in commands()}
+    texts |= {section.__name__: section.__doc__ or "" for _, section, _ in KEYS}
+    listed = [(place, words) for place, text in texts.items() for words in lists_in(text)]
+    assert len(listed) >= 4
+    for place, words in listed:
+        assert any(set(words) <= set(names) for names in LISTED), f"{place} lists {words}"
+
+
+def test_a_list_with_a_word_that_is_no_name_is_seen() -> None:
+    assert list(lists_in("the default, em (here), `smart` and artt; sart")) == [["default", "em", "smart", "artt"]]
+    assert not list(lists_in("sart, which the paper has; em"))
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_every_solver_has_its_step(name: str) -> None:
+    assert callable(SOLVERS[name].step())
+    assert name != PARTICLES
+
+
+def test_names_load_nothing_heavy() -> None:
+    code = "import sys, lfpiv_cli.names, lfpiv_cli.reconstruction.registry; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT).stdout
+    assert not {"numpy", "numba", "pydantic", "scipy"} & set(loaded.split())
