@@ -18,14 +18,20 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from lfpiv_cli.flow.windows import Triple, WindowLayout
-from lfpiv_cli.simd.splines import MOST_TAPS, highest, interpolate, lowest, spline_weights
-from lfpiv_cli.simd.vectors import LANES
+from lfpiv_cli.simd.splines import (
+    MOST_TAPS,
+    NEIGHBOURS,
+    interpolate,
+    range_of_all,
+    range_reference,
+    spline_weights,
+)
 
 # Sources lie between the first and the last voxel's centre: the four taps of a cubic B-spline reach one coefficient
 # beyond these, and a fifth of weight zero another.
 SPLINE_PAD = 2
-# Lanes beyond the end of a row are interpolated and dropped; so far they may read.
-SLACK = 2 * LANES
+# Neighbours beyond the end of a row are interpolated and dropped; so far they may read.
+SLACK = 2 * NEIGHBOURS
 # A tap whose B-spline ends closer than this to a place weighs less than 2e-7 there and is left out: in fluid at rest,
 # where displacements scatter around zero, five taps become three.
 NEGLIGIBLE = 0.01
@@ -205,11 +211,11 @@ def deform_planes(
     plane = row * (shape[1] + 2 * SPLINE_PAD)
     for z in prange(shape[0]):
         half_here = expand_plane(half, along_z[z], along_y, along_x)
-        moved = np.empty((3, shape[2] + LANES), dtype=np.float32)
+        moved = np.empty((3, shape[2] + NEIGHBOURS), dtype=np.float32)
         flat_moved = moved.reshape(moved.size)
-        weights = np.empty(3 * MOST_TAPS * LANES, dtype=np.float32)
-        lines = np.empty((2, shape[2] + LANES), dtype=np.float32)
-        line_a, line_b = lines[0], lines[1]
+        weights = np.empty(3 * MOST_TAPS * NEIGHBOURS, dtype=np.float32)
+        lines = np.empty((2, shape[2] + NEIGHBOURS), dtype=np.float32)
+        flat_lines = lines.reshape(lines.size)
         for y in range(shape[1]):
             target = (z + before[0], y + before[1])
             here = slice(before[2], before[2] + shape[2])
@@ -220,27 +226,12 @@ def deform_planes(
             begin = SLACK + (z + SPLINE_PAD) * plane + (y + SPLINE_PAD) * row + SPLINE_PAD
             x = 0
             while x < shape[2]:
-                width, low, taps = gather_taps(flat_moved, moved.shape[1], x, weights)
-                interpolate(
-                    line_a,
-                    line_b,
-                    x,
-                    flat_a,
-                    flat_b,
-                    begin + x,
-                    plane,
-                    row,
-                    weights,
-                    low[0],
-                    low[1],
-                    low[2],
-                    taps[0],
-                    taps[1],
-                    taps[2],
-                )
+                width, taps = gather_taps(flat_moved, moved.shape[1], x, weights)
+                places = (begin + x, plane, row)
+                interpolate(flat_lines, (x, lines.shape[1]), flat_a, flat_b, places, weights, taps)
                 x += width
-            copy_seen(line_a, seen, deformed_a[target][here])
-            copy_seen(line_b, seen, deformed_b[target][here])
+            copy_seen(lines[0], seen, deformed_a[target][here])
+            copy_seen(lines[1], seen, deformed_b[target][here])
 
 
 @njit(cache=True)
@@ -266,13 +257,13 @@ def copy_seen(line: NDArray[np.float32], seen: NDArray[np.uint8], target: NDArra
 @njit(cache=True)
 def gather_taps(
     moved: NDArray[np.float32], length: int, x: int, weights: NDArray[np.float32]
-) -> tuple[int, Triple, Triple]:
-    """Write the weights of the taps that the lanes from `x` on need; return how many lanes, and the taps along z, y, x.
+) -> tuple[int, tuple[int, int, int, int, int, int]]:
+    """Write the weights of the taps that the neighbours from `x` on need; return how many neighbours, and the taps.
 
-    As many lanes as `MOST_TAPS` serve: where displacements differ too much for all, fewer are taken at once. `moved` is
-    `length` long an axis.
+    These are the lowest along z, y, x and how many follow along each. As many neighbours as `MOST_TAPS` serve: where
+    displacements differ too much for all, fewer are taken at once. `moved` is `length` long an axis.
     """
-    width = LANES
+    width = NEIGHBOURS
     low_x, taps_x = taps_of(moved, x, width)
     low_y, taps_y = taps_of(moved, length + x, width)
     low_z, taps_z = taps_of(moved, 2 * length + x, width)
@@ -282,20 +273,15 @@ def gather_taps(
         low_y, taps_y = taps_of(moved, length + x, width)
         low_z, taps_z = taps_of(moved, 2 * length + x, width)
     spline_weights(weights, 0, moved, 2 * length + x, low_z, taps_z)
-    spline_weights(weights, taps_z * LANES, moved, length + x, low_y, taps_y)
-    spline_weights(weights, (taps_z + taps_y) * LANES, moved, x, low_x, taps_x)
-    return width, (low_z, low_y, low_x), (taps_z, taps_y, taps_x)
+    spline_weights(weights, taps_z * NEIGHBOURS, moved, length + x, low_y, taps_y)
+    spline_weights(weights, (taps_z + taps_y) * NEIGHBOURS, moved, x, low_x, taps_x)
+    return width, (low_z, low_y, low_x, taps_z, taps_y, taps_x)
 
 
 @njit(cache=True)
 def taps_of(places: NDArray[np.float32], at: int, width: int) -> tuple[int, int]:
     """Return the lowest tap whose B-spline matters at some of `width` places, and how many there are from it on."""
-    if width == LANES:
-        low, high = lowest(places, at), highest(places, at)
-    else:
-        low = high = places[at]
-        for place in places[at : at + width]:
-            low, high = min(low, place), max(high, place)
+    low, high = range_of_all(places, at) if width == NEIGHBOURS else range_reference(places, at, width)
     first = int(np.floor(low + np.float32(NEGLIGIBLE))) - 1
     return first, int(np.ceil(high - np.float32(NEGLIGIBLE))) + 2 - first
 
@@ -311,8 +297,8 @@ def bound_row(
 ) -> None:
     """Write the half displacements of a row cut off where a source would leave the volume, and which ones are whole.
 
-    The lanes beyond its end repeat its last voxel. Cut off at the centres of the outermost voxels, not at their outer
-    faces: beyond the centres a value would be extrapolated.
+    The neighbours beyond its end repeat its last voxel. Cut off at the centres of the outermost voxels, not at their
+    outer faces: beyond the centres a value would be extrapolated.
     """
     columns = shape[2]
     reach_z = np.float32(min(z, shape[0] - 1 - z))

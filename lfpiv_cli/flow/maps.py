@@ -319,9 +319,8 @@ def block_products(
                         sx = min(group, shifts - together)
                         at = ((sz * shifts + sy) * shifts + sx) * length + x
                         shift = (sz - radius) * plane + (sy - radius) * row + sx - radius
-                        products(
-                            flat, at, length, flat_a, flat_b, begin + x, shift, plane, row, size[0], size[1], together
-                        )
+                        places, shifted = (begin + x, plane, row), (shift, together)
+                        products(flat, (at, length), flat_a, flat_b, places, (size[0], size[1]), shifted)
         sum_ahead(flat, spare, size[2], sums)
         lines = sums.reshape(-1, length)
         for kx in range(count[2]):

@@ -129,7 +129,8 @@ def cell_moments(
         for start in range(0, length, LANES):
             # The last lanes begin early enough to end with the others.
             x = min(start, length - LANES)
-            lane_moments(flat, x, length, flat_a, flat_b, flat_valid, begin + x, plane, row, size[0], size[1])
+            places = (begin + x, plane, row)
+            lane_moments(flat, (x, length), flat_a, flat_b, flat_valid, places, (size[0], size[1]))
         for cx in range(count[2]):
             for moment in range(MOMENTS):
                 total = 0.0

@@ -1,7 +1,10 @@
-"""Building blocks of code for the vector unit: 16 neighbours along x at once.
+"""Building blocks of code for the vector unit: as many neighbours at once as one of its registers holds.
 
-They generate LLVM's instructions inside numba's intrinsics. A `place` counts elements from the start of a flat array;
-sums live in slots that the compiler keeps in registers.
+They generate LLVM's instructions inside numba's intrinsics. A `place` counts elements from the start of a flat array.
+Each lane is a sum of its own with fused multiply-adds in a fixed order, so the number of lanes changes no result.
+
+Every intrinsic has a readable twin, which stands in its place where compilation is switched off (`NUMBA_DISABLE_JIT`),
+and beside it how much faster it is than that twin compiled as a plain loop (`python -m benchmarks simd`).
 """
 
 from __future__ import annotations
@@ -10,14 +13,34 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from llvmlite import ir
+from numba import config
 from numba.core import cgutils
+from numba.core.registry import cpu_target
+from numba.core.types import int64
+from numba.core.types.containers import UniTuple
+from numba.extending import intrinsic
 
-LANES = 16
+
+def lanes_of(features: str) -> int:
+    """Return how many float32 numbers a register holds, from LLVM's list of a processor's features.
+
+    Elsewhere 8: LLVM halves these where registers are shorter still.
+    """
+    return 16 if "+avx512f" in features.split(",") else 8
+
+
+# Of the processor that numba compiles for, which names its cached code as well.
+LANES = lanes_of(cpu_target.target_context.codegen().magic_tuple()[2])
 
 INDEX = ir.IntType(64)
 VECTOR = ir.VectorType(ir.FloatType(), LANES)
 FLAGS = ir.VectorType(ir.IntType(8), LANES)
 ZERO = ir.Constant(VECTOR, [0.0] * LANES)
+
+
+def in_place_of(twin: Callable[..., Any]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Make an intrinsic of the decorated typing function, or give its readable twin where nothing is compiled."""
+    return lambda typing: twin if config.DISABLE_JIT else intrinsic(typing)
 
 
 def for_each(builder: ir.IRBuilder, value: Any, cases: Sequence[int], generate: Callable[[int], None]) -> None:
@@ -36,6 +59,11 @@ def for_each(builder: ir.IRBuilder, value: Any, cases: Sequence[int], generate: 
 def pointers(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Any, positions: Sequence[int]) -> Any:
     """Return where the arrays among the arguments begin."""
     return [context.make_array(signature.args[p])(context, builder, arguments[p]).data for p in positions]
+
+
+def integers(count: int) -> UniTuple:
+    """Return the type of some places, steps and counts that belong together."""
+    return UniTuple(int64, count)
 
 
 def index(value: int) -> ir.Constant:
@@ -59,11 +87,11 @@ def call(builder: ir.IRBuilder, name: str, *vectors: Any) -> Any:
     return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v{LANES}f32"), vectors)
 
 
-def registers(builder: ir.IRBuilder, count: int) -> list[Any]:
-    """Return sums that start at zero; the compiler keeps them in registers."""
-    slots = [cgutils.alloca_once(builder, VECTOR) for _ in range(count)]
-    for slot in slots:
-        builder.store(ZERO, slot)
+def registers(builder: ir.IRBuilder, starts: Sequence[Any]) -> list[Any]:
+    """Return sums that start at some vectors; the compiler keeps them in registers."""
+    slots = [cgutils.alloca_once(builder, VECTOR) for _ in starts]
+    for slot, start in zip(slots, starts, strict=True):
+        builder.store(start, slot)
     return slots
 
 
@@ -73,12 +101,12 @@ def load(builder: ir.IRBuilder, array: Any, place: Any, kind: ir.VectorType = VE
     return loaded
 
 
-def store(builder: ir.IRBuilder, sums: Sequence[Any], array: Any, places: Sequence[Any]) -> None:
-    for slot, place in zip(sums, places, strict=True):
-        store_vector(builder, builder.load(slot), array, place)
+def load_one(builder: ir.IRBuilder, array: Any, place: Any) -> Any:
+    """Return a single element of an array."""
+    return builder.load(builder.gep(array, [place]))
 
 
-def store_vector(builder: ir.IRBuilder, vector: Any, array: Any, place: Any) -> None:
+def store(builder: ir.IRBuilder, vector: Any, array: Any, place: Any) -> None:
     pointer = builder.bitcast(builder.gep(array, [place]), VECTOR.as_pointer())
     builder.store(vector, pointer).align = 4
 
