@@ -9,34 +9,41 @@ from numba import njit
 from benchmarks.weights import against_sparse_matrix, share_of_matrix_product_rate
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.simd.combine import GROUP, TILE, combine, combine_onto, combine_reference
+from lfpiv_cli.simd.combine import GROUP, ROWS, TILE, combine_long, combine_reference, combine_short
+from lfpiv_cli.simd.vectors import LANES, lanes_of
 from lfpiv_cli.weights.build import factorise
 
 
 @njit
-def set_lines(out, at, out_step, source, source_at, line, first, count, share, share_at, term_step, row_step):
-    combine(out, at, out_step, source, source_at, line, first, count, share, share_at, term_step, row_step)
+def long_lines(out, to, source, line, terms, share, shares):
+    combine_long(out, to, source, line, terms, share, shares)
 
 
 @njit
-def add_lines(out, at, out_step, source, source_at, line, first, count, share, share_at, term_step, row_step):
-    combine_onto(out, at, out_step, source, source_at, line, first, count, share, share_at, term_step, row_step)
+def short_lines(out, to, source, line, terms, share, shares):
+    combine_short(out, to, source, line, terms, share, shares)
 
 
-@pytest.mark.parametrize(("compiled", "accumulate"), [(set_lines, False), (add_lines, True)])
+@pytest.mark.parametrize("onto", [0, 3])
 @pytest.mark.parametrize("count", [0, 1, 7])
-@pytest.mark.parametrize(("term_step", "row_step"), [(GROUP, 1), (1, 11)])
-def test_combine_equals_its_reference(rng, compiled, accumulate, count, term_step, row_step):
+@pytest.mark.parametrize(("compiled", "shape"), [(long_lines, (GROUP, TILE)), (short_lines, (ROWS, LANES))])
+@pytest.mark.parametrize(("term_step", "line_step"), [(ROWS, 1), (1, 11)])
+def test_combine_equals_its_reference(rng, compiled, shape, onto, count, term_step, line_step):
     source = rng.standard_normal(12 * TILE, np.float32)
-    share = rng.standard_normal(60, np.float32)
+    share = rng.standard_normal(100, np.float32)
     line = rng.integers(0, 10, 9).astype(np.int32)
-    start = rng.standard_normal(6 * TILE * GROUP, np.float32)
+    start = rng.standard_normal(ROWS * (TILE + 3) * GROUP, np.float32)
     expected, found = start.copy(), start.copy()
-    places = (5, TILE + 3, source, TILE, line, 2, count, share, 4, term_step, row_step)
-    combine_reference(expected, *places, accumulate=accumulate)
+    places = ((5, shape[1] + 3, onto), source, line, (TILE, 2, count), share, (4, term_step, line_step))
+    combine_reference(shape, expected, *places)
     compiled(found, *places)
     # a fused multiply-add rounds once where the twin rounds twice
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_lanes_are_those_of_the_processor():
+    assert lanes_of("+avx2,-avx512vl,+avx512f") == 16
+    assert lanes_of("+avx2,-avx512f") == lanes_of("") == 8
 
 
 def test_benchmarks_run_at_a_tiny_size(water: Media, table2):

@@ -1,178 +1,128 @@
 """The innermost loop of the operators, written for the vector unit.
 
-    out[m] (+)= sum_k share[k, m] source[line[k]],    m = 0..3, lines of 16 float32
+    out[m] (+)= sum_k share[k, m] source[line[k]]
 
-Four lines are kept in registers over the whole sum, so each number that is loaded is used four times and nothing is
-stored in between. A plain loop does the same (`combine_reference`); the compiler does not find this form in it and
-reaches half the speed. The sums run over k in order, with fused multiply-adds.
+Some lines of the output are kept in registers over the whole sum, so each number that is loaded is used for all of them
+and nothing is stored in between. A plain loop does the same (`combine_reference`); the compiler does not find this form
+in it. The sums run over k in order, with fused multiply-adds.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from llvmlite import ir
 from numba.core import cgutils, types
-from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-# Lines of the output that share every load, and their length: 4 x 2 vectors of 8 are the 8 independent sums that keep
-# two fused multiply-add units of latency 4 busy, and fit the 16 registers of the narrowest machines in use.
-GROUP = 4
-TILE = 16
-LANES = 8
+from lfpiv_cli.simd.vectors import (
+    LANES,
+    ZERO,
+    add_product,
+    in_place_of,
+    index,
+    integers,
+    load,
+    load_one,
+    pointers,
+    registers,
+    splat,
+    store,
+)
 
-INDEX = ir.IntType(64)
-VECTOR = ir.VectorType(ir.FloatType(), LANES)
-SPLAT = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
+# Lines of the output that share every load, and vectors a line: 8 independent sums keep two fused multiply-add units
+# of latency 4 busy and fit the 16 registers of machines with 8 lanes. Two long lines where few terms are shared by
+# more of them (a third of the products of four would be with zero), eight short ones where lines are short.
+GROUP, VECTORS = 2, 4
+ROWS = 8
+TILE = VECTORS * LANES
+
+Floats = NDArray[np.float32]
 
 
 def combine_reference(
-    out: NDArray[np.float32],
-    at: int,
-    out_step: int,
-    source: NDArray[np.float32],
-    source_at: int,
+    shape: tuple[int, int],
+    out: Floats,
+    to: tuple[int, int, int],
+    source: Floats,
     line: NDArray[np.int32],
-    first: int,
-    count: int,
-    share: NDArray[np.float32],
-    share_at: int,
-    term_step: int,
-    row_step: int,
-    accumulate: bool,
+    terms: tuple[int, int, int],
+    share: Floats,
+    shares: tuple[int, int, int],
 ) -> None:
-    """Combine lines of 16: the readable twin of `combine` and `combine_onto`.
+    """Set lines to sums of lines, or add these to them: the readable twin of `combine_long` and `combine_short`.
 
-    All arrays are flat; places and steps count elements. Output line m starts at `at + m out_step`; term k is the line
-    `line[first + k]` of the lines from `source_at` on, times `share[share_at + k term_step + m row_step]`.
+    Parameters
+    ----------
+    shape : how many lines are written, and the length of all lines
+    out, to : flat; where the first line starts, the step to the next, and 0 where what they hold is overwritten
+    source, line, terms : flat; (at, first, count), term k is line number `line[first + k]` of the lines from `at` on
+    share, shares : flat; (at, term step, line step), term k in line m is taken `share[at + k term step + m line step]`
+        times
     """
-    for m in range(GROUP):
-        target = out[at + m * out_step : at + m * out_step + TILE]
-        if not accumulate:
-            target[:] = 0.0
+    lines, length = shape
+    at, first, count = terms
+    share_at, term_step, line_step = shares
+    for m in range(lines):
+        begin = to[0] + m * to[1]
+        if to[2] == 0:
+            out[begin : begin + length] = 0.0
         for k in range(count):
-            begin = source_at + TILE * int(line[first + k])
-            target += share[share_at + k * term_step + m * row_step] * source[begin : begin + TILE]
+            here = at + length * line[first + k]
+            weight = share[share_at + k * term_step + m * line_step]
+            for lane in range(length):
+                out[begin + lane] += weight * source[here + lane]
 
 
-def _signature(out: Any, source: Any, line: Any, share: Any) -> Any:
-    i = types.int64
-    return types.void(out, i, i, source, i, line, i, i, share, i, i, i)
+def _combine(lines: int, vectors: int) -> Any:
+    """Return what combines into some lines of some vectors; see `combine_reference`."""
+
+    def twin(out: Any, to: Any, source: Any, line: Any, terms: Any, share: Any, shares: Any) -> None:
+        combine_reference((lines, vectors * LANES), out, to, source, line, terms, share, shares)
+
+    @in_place_of(twin)
+    def combine(
+        typing_context: Any, out: Any, to: Any, source: Any, line: Any, terms: Any, share: Any, shares: Any
+    ) -> Any:
+        three = integers(3)
+        return types.void(out, three, source, line, three, share, three), _generator(lines, vectors)
+
+    return combine
 
 
-@intrinsic
-def combine(
-    typing_context: Any,
-    out: Any,
-    at: Any,
-    out_step: Any,
-    source: Any,
-    source_at: Any,
-    line: Any,
-    first: Any,
-    count: Any,
-    share: Any,
-    share_at: Any,
-    term_step: Any,
-    row_step: Any,
-) -> Any:
-    """Set four lines of 16 to sums of lines; see `combine_reference`."""
-    return _signature(out, source, line, share), _generator(accumulate=False)
-
-
-@intrinsic
-def combine_onto(
-    typing_context: Any,
-    out: Any,
-    at: Any,
-    out_step: Any,
-    source: Any,
-    source_at: Any,
-    line: Any,
-    first: Any,
-    count: Any,
-    share: Any,
-    share_at: Any,
-    term_step: Any,
-    row_step: Any,
-) -> Any:
-    """Add sums of lines to four lines of 16; see `combine_reference`."""
-    return _signature(out, source, line, share), _generator(accumulate=True)
-
-
-def _generator(accumulate: bool) -> Any:
-    """Return the code generator of `combine` or `combine_onto`."""
+def _generator(lines: int, vectors: int) -> Callable[..., Any]:
+    """Return the code generator for some lines of some vectors."""
 
     def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Any) -> Any:
-        def pointer(position: int) -> Any:
-            return context.make_array(signature.args[position])(context, builder, arguments[position]).data
-
-        out, source, line, share = (pointer(position) for position in (0, 3, 5, 8))
-        _, at, out_step, _, source_at, _, first, count, _, share_at, term_step, row_step = arguments
-        places = [_vector_places(builder, at, out_step, m) for m in range(GROUP)]
-        start = [[_load(builder, out, place) if accumulate else _zero() for place in row] for row in places]
-        before = builder.block
-        test, body, after = (builder.append_basic_block(name) for name in ("terms", "term", "summed"))
-        builder.branch(test)
-
-        builder.position_at_end(test)
-        k = builder.phi(INDEX)
-        sums = [[builder.phi(VECTOR) for _ in row] for row in start]
-        builder.cbranch(builder.icmp_signed("<", k, count), body, after)
-
-        builder.position_at_end(body)
-        number = builder.sext(builder.load(builder.gep(line, [builder.add(first, k)])), INDEX)
-        begin = builder.add(source_at, builder.mul(number, ir.Constant(INDEX, TILE)))
-        vectors = [_load(builder, source, builder.add(begin, ir.Constant(INDEX, v))) for v in range(0, TILE, LANES)]
-        weight_at = builder.add(share_at, builder.mul(k, term_step))
-        for m in range(GROUP):
-            weight = _splat(builder, share, builder.add(weight_at, builder.mul(row_step, ir.Constant(INDEX, m))))
-            for vector, phi, initial in zip(vectors, sums[m], start[m], strict=True):
-                phi.add_incoming(initial, before)
-                phi.add_incoming(_multiply_add(builder, vector, weight, phi), body)
-        k.add_incoming(ir.Constant(INDEX, 0), before)
-        k.add_incoming(builder.add(k, ir.Constant(INDEX, 1)), body)
-        builder.branch(test)
-
-        builder.position_at_end(after)
-        for row, phis in zip(places, sums, strict=True):
-            for place, phi in zip(row, phis, strict=True):
-                builder.store(phi, _vector_pointer(builder, out, place)).align = 4
+        out, source, line, share = pointers(context, builder, signature, arguments, (0, 2, 3, 5))
+        at, step, kept = cgutils.unpack_tuple(builder, arguments[1], 3)
+        source_at, first, count = cgutils.unpack_tuple(builder, arguments[4], 3)
+        share_at, term_step, line_step = cgutils.unpack_tuple(builder, arguments[6], 3)
+        places = []
+        for m in range(lines):
+            begin = builder.add(at, builder.mul(step, index(m)))
+            places += [builder.add(begin, index(v * LANES)) for v in range(vectors)]
+        onto = builder.icmp_signed("!=", kept, index(0))
+        sums = registers(builder, [builder.select(onto, load(builder, out, place), ZERO) for place in places])
+        with cgutils.for_range(builder, count) as k:
+            number = builder.sext(load_one(builder, line, builder.add(first, k.index)), count.type)
+            begin = builder.add(source_at, builder.mul(number, index(vectors * LANES)))
+            taken = [load(builder, source, builder.add(begin, index(v * LANES))) for v in range(vectors)]
+            weight_at = builder.add(share_at, builder.mul(k.index, term_step))
+            for m in range(lines):
+                weight = splat(
+                    builder, load_one(builder, share, builder.add(weight_at, builder.mul(line_step, index(m))))
+                )
+                for v in range(vectors):
+                    add_product(builder, sums[m * vectors + v], taken[v], weight)
+        for slot, place in zip(sums, places, strict=True):
+            store(builder, builder.load(slot), out, place)
         return context.get_dummy_value()
 
     return generate
 
 
-def _vector_places(builder: ir.IRBuilder, at: Any, step: Any, line: int) -> list[Any]:
-    """Return where the vectors of one output line start."""
-    begin = builder.add(at, builder.mul(step, ir.Constant(INDEX, line)))
-    return [builder.add(begin, ir.Constant(INDEX, v)) for v in range(0, TILE, LANES)]
-
-
-def _vector_pointer(builder: ir.IRBuilder, array: Any, place: Any) -> Any:
-    return builder.bitcast(builder.gep(array, [place]), VECTOR.as_pointer())
-
-
-def _load(builder: ir.IRBuilder, array: Any, place: Any) -> Any:
-    loaded = builder.load(_vector_pointer(builder, array, place))
-    loaded.align = 4
-    return loaded
-
-
-def _zero() -> Any:
-    return ir.Constant(VECTOR, [0.0] * LANES)
-
-
-def _splat(builder: ir.IRBuilder, array: Any, place: Any) -> Any:
-    """Return a vector with one number of an array in every lane."""
-    undefined = ir.Constant(VECTOR, ir.Undefined)
-    one = builder.insert_element(undefined, builder.load(builder.gep(array, [place])), ir.Constant(ir.IntType(32), 0))
-    return builder.shuffle_vector(one, undefined, SPLAT)
-
-
-def _multiply_add(builder: ir.IRBuilder, a: Any, b: Any, c: Any) -> Any:
-    kind = ir.FunctionType(VECTOR, [VECTOR] * 3)
-    fused = cgutils.get_or_insert_function(builder.module, kind, f"llvm.fma.v{LANES}f32")
-    return builder.call(fused, [a, b, c])
+combine_long = _combine(GROUP, VECTORS)
+combine_short = _combine(ROWS, 1)

@@ -20,16 +20,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lfpiv_cli.simd.combine import GROUP, TILE
+from lfpiv_cli.simd.combine import GROUP, ROWS, TILE
+from lfpiv_cli.simd.vectors import LANES
 from lfpiv_cli.weights import kernels
 from lfpiv_cli.weights.axis import AxisWeights
+from lfpiv_cli.weights.kernels import PLANES_BACK, PLANES_FORWARD, ColumnBlocks, RowTerms
 
 # Pixel rows, pixel columns and weights of one voxel.
 Column = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]
-# Start of each group (groups + 1,), the line of each entry and its `GROUP` shares.
-Groups = tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]
-# Start of each (plane, tile), the first voxel and the shares of each block.
-Blocks = tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,22 +56,21 @@ class FactorisedOperator:
 
     def forward(self, volume: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the image (rows, columns) of a volume [plane, row voxel, column voxel]."""
-        height = _filled(volume.shape[1], GROUP)
-        filled = np.pad(volume, ((0, 0), (0, height - volume.shape[1]), (0, 0)))
         first, last = self._lit_columns
         tiles = _filled(last - first, TILE) // TILE
-        by_cell = kernels.project(filled, *self._column_blocks[0], *self._row_groups, tiles)
-        pixel = self.columns.cells.pixel
-        return kernels.fold(by_cell, self.mask, first, last, pixel, *self._lines_of_rows, self.columns.pixels)
+        by_cell = kernels.project(kernels.turned(volume), self._columns_forward, self._rows_forward, tiles)
+        image = np.zeros(self.image_shape, np.float32)
+        kernels.fold(by_cell, self.mask, self._lit_columns, self.columns.cells.pixel, *self._lines_of_rows, image)
+        return image
 
     def adjoint(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the volume [plane, row voxel, column voxel] that an image is spread back to."""
         row_pixel, column_pixel = self.rows.cells.pixel, self.columns.cells.pixel
         by_cell = kernels.unfold(image, self.mask, self._lit_rows, self._lit_columns, row_pixel, column_pixel)
         planes, height, width = self.shape
-        filled = (_filled(planes, GROUP), _filled(height, GROUP), width)
-        volume = kernels.back_project(by_cell, filled, *self._plane_groups, *self._column_blocks[1])
-        return np.ascontiguousarray(volume[:planes, :height, :width])
+        filled = (planes, _filled(height, ROWS), max(width, LANES))
+        volume = kernels.back_project(by_cell, filled, self._rows_back, *self._columns_back)
+        return np.ascontiguousarray(volume[:, :height, :width])
 
     def column(self, plane: int, row_voxel: int, column_voxel: int) -> Column:
         """Return the rows, columns (int64) and weights (float32) of the pixels that one voxel lights."""
@@ -107,16 +104,20 @@ class FactorisedOperator:
         return first + order, lens_lines(self.rows, first, last)[order], start
 
     @cached_property
-    def _column_blocks(self) -> tuple[Blocks, Blocks]:
-        return column_blocks(self.columns, *self._lit_columns)
+    def _columns_forward(self) -> ColumnBlocks:
+        return blocks_of_cells(self.columns, *self._lit_columns)
 
     @cached_property
-    def _row_groups(self) -> Groups:
-        return group_terms_by_row(self.rows, *self._lit_rows)
+    def _columns_back(self) -> tuple[ColumnBlocks, NDArray[np.int64]]:
+        return blocks_of_voxels(self.columns, *self._lit_columns)
 
     @cached_property
-    def _plane_groups(self) -> Groups:
-        return group_terms_by_plane(self.rows, self._lit_rows[0])
+    def _rows_forward(self) -> RowTerms:
+        return row_terms_of_cells(self.rows, *self._lit_rows)
+
+    @cached_property
+    def _rows_back(self) -> RowTerms:
+        return row_terms_of_voxels(self.rows, self._lit_rows[0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,36 +178,63 @@ def adjoint_reference(operator: FactorisedOperator, image: NDArray[np.float32]) 
     return np.stack([operator.rows.matrix(k).T @ by_cell @ operator.columns.matrix(k) for k in planes])
 
 
-def column_blocks(columns: AxisWeights, first: int, last: int) -> tuple[Blocks, Blocks]:
-    """Return the columns' weights as dense blocks of 16 lit cells (from `first` to `last`), forward and back.
+def blocks_of_cells(columns: AxisWeights, first: int, last: int) -> ColumnBlocks:
+    """Return the columns' weights as blocks of `LANES` lit cells (from `first` to `last`), a row for each voxel."""
+    pieces = _filled(last - first, TILE) // LANES
+    plane, voxel = np.divmod(_line_of(columns), columns.voxels)
+    piece, cell = np.divmod(columns.cell.astype(np.int64) - first, LANES)
+    blocks = columns.planes * pieces
+    return _dense(plane * pieces + piece, voxel, cell, columns.share, blocks)
 
-    Forward, a block has a row of 16 cells for each of its voxels; back, it is cut into squares (16 cells, 16 voxels).
+
+def blocks_of_voxels(columns: AxisWeights, first: int, last: int) -> tuple[ColumnBlocks, NDArray[np.int64]]:
+    """Return the columns' weights as blocks of `LANES` voxels, a row for each cell of a tile, and which a tile owns.
+
+    The blocks of a tile of lit cells (from `first` to `last`) begin with its lowest voxel, or so that they end with the
+    row of voxels.
     """
-    tiles, planes = _filled(last - first, TILE) // TILE, _filled(columns.planes, GROUP)
+    tiles = _filled(last - first, TILE) // TILE
     plane, voxel = np.divmod(_line_of(columns), columns.voxels)
     tile, cell = np.divmod(columns.cell.astype(np.int64) - first, TILE)
-    block = plane * tiles + tile
-    low, high = np.full(planes * tiles, columns.voxels), np.full(planes * tiles, -1)
-    np.minimum.at(low, block, voxel)
-    np.maximum.at(high, block, voxel)
-    span = np.maximum(high - low + 1, 0)
-    start = np.concatenate([[0], np.cumsum(span)]).astype(np.int64)
-    rows = np.zeros((start[-1], TILE), np.float32)
-    rows[start[block] + voxel - low[block], cell] = columns.share
-    forward = (start, np.minimum(low, columns.voxels - 1).astype(np.int32), rows)
+    owner = plane * tiles + tile
+    low, span = _spans(owner, voxel, columns.planes * tiles)
+    owned = np.concatenate([[0], np.cumsum(_filled(span, LANES) // LANES)]).astype(np.int64)
+    number = (voxel - low[owner]) // LANES
+    begin = np.minimum(low[owner] + LANES * number, max(columns.voxels - LANES, 0))
+    block = owned[owner] + number
+    by_cell = _dense(block, cell, voxel - begin, columns.share, int(owned[-1]))
+    by_cell.first[block, 0] = begin
+    return by_cell, owned
 
-    counts = _filled(span, TILE) // TILE
-    start = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-    number, member = np.divmod(voxel - low[block], TILE)
-    squares = np.zeros((start[-1], TILE, TILE), np.float32)
-    squares[start[block] + number, cell, member] = columns.share
-    owner = np.repeat(np.arange(counts.size), counts)
-    first_voxel = low[owner] + TILE * (np.arange(start[-1]) - start[owner])
-    return forward, (start, first_voxel.astype(np.int32), squares)
+
+def _dense(
+    block: NDArray[np.int64],
+    row: NDArray[np.int64],
+    lane: NDArray[np.int64],
+    share: NDArray[np.float32],
+    blocks: int,
+) -> ColumnBlocks:
+    """Gather shares into blocks of the rows between their lowest and their highest."""
+    low, span = _spans(block, row, blocks)
+    start = np.concatenate([[0], np.cumsum(span)]).astype(np.int64)
+    dense = np.zeros((start[-1], LANES), np.float32)
+    dense[start[block] + row - low[block], lane] = share
+    return ColumnBlocks(start, np.stack([low, low], axis=1).astype(np.int32), dense)
+
+
+def _spans(
+    owner: NDArray[np.int64], place: NDArray[np.int64], owners: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the lowest place of each owner and how far it is to the highest, one included; 0, 0 where it has none."""
+    low, high = np.full(owners, np.iinfo(np.int64).max), np.full(owners, -1)
+    np.minimum.at(low, owner, place)
+    np.maximum.at(high, owner, place)
+    low[high < 0] = 0
+    return low, high - low + 1
 
 
 def lens_lines(rows: AxisWeights, first: int, last: int) -> NDArray[np.int64]:
-    """Return the line of each lit cell in the sum: no group of four spans two lenses, whose voxels differ."""
+    """Return the line of each lit cell in the sum: no group spans two lenses, whose voxels differ."""
     cell = np.arange(first, last)
     lens = np.searchsorted(rows.cells.start, cell, side="right") - 1
     begin = np.maximum(rows.cells.start[lens], first)
@@ -215,25 +243,29 @@ def lens_lines(rows: AxisWeights, first: int, last: int) -> NDArray[np.int64]:
     return start[which] + cell - begin
 
 
-def group_terms_by_row(rows: AxisWeights, first: int, last: int) -> Groups:
-    """Return, for each four row cells of a lens, the lines of the volume that reach any of them, and the four shares.
+def row_terms_of_cells(rows: AxisWeights, first: int, last: int) -> RowTerms:
+    """Return, for each `GROUP` row cells of a lens, the lines of the volume that reach any of them, and the shares.
 
-    `first` and `last` bound the lit cells; a line is plane * filled height + voxel.
+    `first` and `last` bound the lit cells; a line is plane * filled height + voxel, with the planes of each
+    `PLANES_FORWARD` counted on their own, whose terms follow each other.
     """
     line_of_cell = lens_lines(rows, first, last)
     group, member = np.divmod(line_of_cell[rows.cell - first], GROUP)
+    groups = int(line_of_cell[-1]) // GROUP + 1
     plane, voxel = np.divmod(_line_of(rows), rows.voxels)
-    line = plane * _filled(rows.voxels, GROUP) + voxel
-    return _pack(group, line, member, rows.share, int(line_of_cell[-1]) // GROUP + 1)
+    chunk, plane = np.divmod(plane, PLANES_FORWARD)
+    line = plane * _filled(rows.voxels, ROWS) + voxel
+    return _pack(chunk * groups + group, line, member, rows.share, _chunks(rows, PLANES_FORWARD) * groups)
 
 
-def group_terms_by_plane(rows: AxisWeights, first: int) -> Groups:
-    """Return, for each voxel of each four planes, the lit row cells it reaches (from `first` on) and the shares."""
+def row_terms_of_voxels(rows: AxisWeights, first: int) -> RowTerms:
+    """Return, for each voxel of each `GROUP` planes, the lit row cells it reaches (from `first` on) and the shares."""
     plane, voxel = np.divmod(_line_of(rows), rows.voxels)
-    height = _filled(rows.voxels, GROUP)
-    groups = _filled(rows.planes, GROUP) // GROUP * height
+    chunk, plane = np.divmod(plane, PLANES_BACK)
+    height, pairs = _filled(rows.voxels, ROWS), PLANES_BACK // GROUP
     cell = rows.cell.astype(np.int64) - first
-    return _pack(plane // GROUP * height + voxel, cell, plane % GROUP, rows.share, groups)
+    group = (chunk * height + voxel) * pairs + plane // GROUP
+    return _pack(group, cell, plane % GROUP, rows.share, _chunks(rows, PLANES_BACK) * height * pairs)
 
 
 def _pack(
@@ -242,14 +274,19 @@ def _pack(
     member: NDArray[np.int64],
     share: NDArray[np.float32],
     groups: int,
-) -> Groups:
-    """Gather the shares of each (group, line) into one entry of `GROUP` members."""
+) -> RowTerms:
+    """Gather the shares of each (group, line) into one term of `GROUP` members."""
     lines = int(line.max(initial=0)) + 1
-    keys, entry = np.unique(group * lines + line, return_inverse=True)
+    keys, term = np.unique(group * lines + line, return_inverse=True)
     start = np.searchsorted(keys, lines * np.arange(groups + 1)).astype(np.int64)
     packed = np.zeros((keys.size, GROUP), np.float32)
-    packed[entry, member] = share
-    return start, (keys % lines).astype(np.int32), packed
+    packed[term, member] = share
+    return RowTerms(start, (keys % lines).astype(np.int32), packed)
+
+
+def _chunks(axis: AxisWeights, planes: int) -> int:
+    """Return how many times so many planes there are, the last time perhaps fewer."""
+    return _filled(axis.planes, planes) // planes
 
 
 def _filled(size: Any, multiple: int) -> Any:
