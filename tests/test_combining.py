@@ -15,6 +15,7 @@ from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.flow.combining import combine
 from lfpiv_cli.flow.field import MASKED, REJECTED, REPLACED, SECOND_PEAK, VALID, VectorField
 from lfpiv_cli.grid import Grid
+from lfpiv_cli.reference import Reference
 
 GRID = Grid((10, 11, 12), (0.8, 0.8, 0.8), (-3.6, -4.0, -4.4))
 SHAPE = GRID.shape_zyx
@@ -139,12 +140,12 @@ def test_fields_that_do_not_fit_are_refused(pair: tuple[VectorField, VectorField
 
 def test_the_command_writes_vectors_of_the_contract(pair: tuple[VectorField, VectorField], tmp_path: Path) -> None:
     paths = tmp_path / "a.vtkhdf", tmp_path / "b.vtkhdf"
-    attributes = {"reference": "mid_plane", "reference_z_mm": -0.3}
+    reference = Reference("mid_plane", -0.3)
     for path, field in zip(paths, pair, strict=True):
-        vtkhdf.write_vectors(path, field, provenance={}, attributes=attributes, overwrite=False)
+        vtkhdf.write_vectors(path, field, reference, provenance={}, overwrite=False)
     output = tmp_path / "c.vtkhdf"
     cli.main(["combine", *map(str, paths), "-o", str(output)], standalone_mode=False)
     written, found = vtkhdf.open_vectors(output), combine(*pair).field
     np.testing.assert_array_equal(written.displacement_voxel, found.displacement_voxel)
     np.testing.assert_array_equal(written.uncertainty_voxel, found.uncertainty_voxel)
-    assert vtkhdf.read_header(output).attributes["reference"] == "mid_plane"
+    assert vtkhdf.read_header(output).reference == reference

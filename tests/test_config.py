@@ -15,6 +15,7 @@ from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.sections import Section, Sections
 from lfpiv_cli.flow.windows import layout_windows
 from lfpiv_cli.optics.media import fluid_path_to_focus
+from lfpiv_cli.reference import Reference
 from lfpiv_cli.stages.reconstruct import ReconstructOptions
 
 CONFIGS = sorted((Path(__file__).parents[1] / "configs").glob("*.yaml"))
@@ -256,7 +257,7 @@ def test_lengths_follow_from_f_numbers_and_the_image_distance(write) -> None:
 
 def test_grid_is_centred_and_moved(write) -> None:
     grid = load_config(write(RIG.replace("voxel_mm: 0.1", "voxel_mm: [0.1, 0.2, 0.3], centre_mm: [1, 2, 3]"))).grid(
-        origin_z_mm=-0.5
+        Reference("mid_plane", -0.5)
     )
     assert grid.spacing_mm == (0.1, 0.2, 0.3)
     middle = [np.mean(grid.bounds_mm(axis)) for axis in range(3)]
@@ -320,7 +321,7 @@ def test_flow_centres_move_with_the_origin(write) -> None:
     config = load_config(write(text))
     points = np.array([[0.0, 0.0, 2.5]])
     assert config.true_flow()(points)[0] == pytest.approx([2.0, 0.0, 0.0])
-    assert config.simulated_flow(origin_z_mm=1.0)(points)[0] == pytest.approx([1.0, 0.0, 0.0])
+    assert config.simulated_flow(Reference("mid_plane", 1.0))(points)[0] == pytest.approx([1.0, 0.0, 0.0])
 
 
 @pytest.mark.parametrize(

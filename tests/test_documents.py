@@ -172,6 +172,7 @@ def write_third_frame(folder: Path) -> None:
         PARTICLES_FORMAT,
         moved,
         last.arrays,
+        last.reference,
         provenance=last.provenance,
         attributes=last.attributes,
         overwrite=False,

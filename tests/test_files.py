@@ -29,8 +29,10 @@ from lfpiv_cli.files.provenance import record
 from lfpiv_cli.files.vtkhdf import open_vectors, open_volume, read_header, write_vectors, write_volume
 from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.grid import Grid
+from lfpiv_cli.reference import Reference
 
 GRID = Grid.centred((4, 3, 2), (0.1, 0.2, 0.3), (1.0, 2.0, 3.0))
+REFERENCE = Reference("mid_plane", -0.3)
 TREE = {
     "array": np.arange(24.0).reshape(2, 3, 4),
     "group": {
@@ -333,8 +335,10 @@ def vectors(grid: Grid = GRID, uncertainty: bool = True) -> VectorField:
 
 
 def save_volume(path: Path, array: np.ndarray, grid: Grid = GRID) -> Path:
-    attributes = {"reference": "mid_plane", "residual": np.array([1.0, 0.5]), "unknown": None}
-    write_volume(path, array, grid, provenance=record("test", None, {}), attributes=attributes, overwrite=False)
+    attributes = {"residual": np.array([1.0, 0.5]), "unknown": None}
+    write_volume(
+        path, array, grid, REFERENCE, provenance=record("test", None, {}), attributes=attributes, overwrite=False
+    )
     return path
 
 
@@ -345,7 +349,8 @@ def test_volume_round_trip(tmp_path: Path, rng: np.random.Generator, shape: tupl
     volume = open_volume(save_volume(tmp_path / "v.vtkhdf", array, grid))
     np.testing.assert_array_equal(volume.array, array)
     assert volume.grid == grid
-    assert volume.attributes == {"reference": "mid_plane", "residual": [1.0, 0.5]}
+    assert volume.attributes == {"reference": "mid_plane", "reference_z_mm": -0.3, "residual": [1.0, 0.5]}
+    assert volume.reference == REFERENCE
     assert volume.provenance["command"] == "test"
 
 
@@ -353,14 +358,14 @@ def test_volume_round_trip(tmp_path: Path, rng: np.random.Generator, shape: tupl
 def test_vectors_round_trip(tmp_path: Path, uncertainty: bool) -> None:
     field = vectors(uncertainty=uncertainty)
     path = tmp_path / "v.vtkhdf"
-    write_vectors(path, field, provenance={}, attributes={"reference": "focal_point"}, overwrite=False)
+    write_vectors(path, field, REFERENCE, provenance={}, overwrite=False)
     found = open_vectors(path)
     for name in ("displacement_voxel", "displacement_raw_voxel", "correlation", "peak_ratio", "valid_fraction", "flag"):
         np.testing.assert_array_equal(getattr(found, name), getattr(field, name))
     np.testing.assert_array_equal(found.velocity, field.velocity)
     assert (found.uncertainty_voxel is not None) == uncertainty
     assert (found.grid, found.voxel_mm, found.dt_s, found.window_voxel) == (GRID, (0.1, 0.1, 0.2), 0.0018, (16, 16, 8))
-    assert read_header(path).attributes["reference"] == "focal_point"
+    assert read_header(path).reference == REFERENCE
     with h5py.File(path) as file:
         velocity = file["VTKHDF/PointData/velocity"][()]
     np.testing.assert_array_equal(np.isfinite(velocity).all(-1), field.flag <= 2)
@@ -374,7 +379,7 @@ def test_paraviews_reader_opens_the_very_files(tmp_path: Path, rng: np.random.Ge
     grid = Grid.centred((4, 3, nz), (0.1, 0.2, 0.3), (1.0, 2.0, 3.0))
     array = rng.random(grid.shape_zyx)
     field = vectors(grid)
-    write_vectors(tmp_path / "w.vtkhdf", field, provenance={}, attributes={"reference": "mid_plane"}, overwrite=False)
+    write_vectors(tmp_path / "w.vtkhdf", field, REFERENCE, provenance={}, overwrite=False)
     found = {}
     for name in (save_volume(tmp_path / "v.vtkhdf", array, grid), tmp_path / "w.vtkhdf"):
         reader = vtk.vtkHDFReader()

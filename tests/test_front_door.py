@@ -17,6 +17,7 @@ from lfpiv_cli.files.bench import flow_of
 from lfpiv_cli.files.section_types import Section
 from lfpiv_cli.reconstruction.registry import SOLVERS, Solver
 from lfpiv_cli.reconstruction.solvers import reconstruct
+from lfpiv_cli.reference import Reference
 from lfpiv_cli.synthetic.flows import FLOWS
 
 ROOT = Path(__file__).parent.parent
@@ -117,7 +118,7 @@ def test_a_flow_is_added_by_its_factory_and_its_section(monkeypatch):
         return lambda points_mm: 1e-3 * rate_per_s * (points_mm - np.asarray(centre_mm))
 
     monkeypatch.setitem(FLOWS, "expansion", expansion)
-    flow = flow_of(Expansion(kind="expansion", rate_per_s=2.0), origin_z_mm=-0.5)
+    flow = flow_of(Expansion(kind="expansion", rate_per_s=2.0), Reference("mid_plane", -0.5))
     np.testing.assert_allclose(flow(np.array([[1.0, 0.0, -0.5]])), [[0.002, 0.0, 0.0]])
 
 

@@ -10,6 +10,9 @@ import pytest
 
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, read_points, symmetric, write_points
+from lfpiv_cli.reference import Reference
+
+REFERENCE = Reference("mid_plane", -0.4)
 
 
 @pytest.fixture
@@ -22,10 +25,9 @@ def path(tmp_path: Path, rng: np.random.Generator) -> Path:
         "seen": np.ones(5),
         "flag": np.zeros(5, np.uint8),
     }
-    attributes = {"reference": "focal_point", "reference_z_mm": 0.0}
     position = np.arange(15.0).reshape(5, 3)
     write_points(
-        target, PARTICLES_FORMAT, position, arrays, provenance={"a": 1}, attributes=attributes, overwrite=False
+        target, PARTICLES_FORMAT, position, arrays, REFERENCE, provenance={"a": 1}, attributes={}, overwrite=False
     )
     return target
 
@@ -34,7 +36,7 @@ def test_what_is_written_is_read(path: Path) -> None:
     points = read_points(path, PARTICLES_FORMAT)
     np.testing.assert_array_equal(points.position_mm, np.arange(15.0).reshape(5, 3))
     assert points.arrays["covariance_mm2"].shape == (5, 6)
-    assert points.attributes["reference"] == "focal_point"
+    assert points.reference == REFERENCE
     assert points.provenance == {"a": 1}
 
 
@@ -57,7 +59,14 @@ def test_an_empty_set_is_a_set(tmp_path: Path) -> None:
     vectors = {name: np.zeros((0, 3)) for name in ("velocity", "velocity_sigma", "displacement_mm")}
     numbers = {name: np.zeros(0, np.int64) for name in ("particle_a", "particle_b")}
     write_points(
-        target, TRACKS_FORMAT, np.zeros((0, 3)), vectors | numbers, provenance={}, attributes={}, overwrite=False
+        target,
+        TRACKS_FORMAT,
+        np.zeros((0, 3)),
+        vectors | numbers,
+        REFERENCE,
+        provenance={},
+        attributes={},
+        overwrite=False,
     )
     assert read_points(target, TRACKS_FORMAT).position_mm.shape == (0, 3)
 

@@ -42,7 +42,7 @@ def figures_of(config: Path, vectors: Path, folder: Path) -> dict[str, float]:
 def check_particles(frame: Path, truth: Path, time_s: float) -> None:
     """Hold the particles of the recorded pair to the figures that they reached when this was written."""
     found, true = read_points(frame, PARTICLES_FORMAT), read_particles(truth)
-    places = found.position_mm + (0.0, 0.0, found.attributes["reference_z_mm"])
+    places = found.reference.points_to_focal_point(found.position_mm)
     moved = true.positions_mm + true.velocities_m_s * 1e3 * time_s
     low, high = np.array([-6.5, -5.0, -5.46]), np.array([6.5, 5.0, 4.53])
     figures = particle_figures(places, moved, low, high, 0.1, np.sqrt(found.arrays["covariance_mm2"][:, :3]))

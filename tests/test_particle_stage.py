@@ -23,6 +23,7 @@ from lfpiv_cli.files.particle_file import (
     write_points,
 )
 from lfpiv_cli.files.particles import read_particles
+from lfpiv_cli.reference import Reference
 
 ROOT = Path(__file__).parent.parent
 SAMPLE, CONFIG = ROOT / "sample_data", ROOT / "configs" / "sample.yaml"
@@ -38,14 +39,14 @@ def write_frame(path: Path, position_mm: np.ndarray, **changes: object) -> None:
     covariance = np.tile([1e-6, 1e-6, 1e-4, 0.0, 0.0, 0.0], (n, 1))
     arrays = {"intensity": np.ones(n), "covariance_mm2": covariance, "chi2": np.ones(n), "seen": np.ones(n)}
     resolved = load_config(CONFIG).resolved() | changes
-    attributes = {"reference": "mid_plane", "reference_z_mm": 0.5}
     write_points(
         path,
         PARTICLES_FORMAT,
         position_mm,
         arrays | {"flag": np.zeros(n, np.uint8)},
+        Reference("mid_plane", 0.5),
         provenance={"config": resolved},
-        attributes=attributes,
+        attributes={},
         overwrite=True,
     )
 
@@ -67,7 +68,7 @@ def test_track_writes_tracks_and_vectors(pair: tuple[Path, Path], tmp_path: Path
     tracks = read_points(tmp_path / "tracks.vtkhdf", TRACKS_FORMAT)
     # 2 voxels of 0.1 mm in 2 ms.
     np.testing.assert_allclose(np.median(tracks.arrays["velocity"], axis=0), (0.1, -0.05, 0.025), atol=1e-9)
-    assert tracks.attributes["reference"] == "mid_plane"
+    assert tracks.reference == Reference("mid_plane", 0.5)
     field = vtkhdf.open_vectors(tmp_path / "tracks_grid.vtkhdf")
     assert field.flag.shape == (6, 3, 5)
     assert np.abs(field.displacement_voxel[field.flag == 0] - (2.0, -1.0, 0.5)).max() < 1e-6
@@ -168,7 +169,7 @@ def test_the_sample_from_images_to_vectors(tmp_path: Path) -> None:
     truth = read_particles(SAMPLE / "particles.npz")
     first = read_points(frames[0], PARTICLES_FORMAT)
     start = truth.positions_mm - truth.velocities_m_s * 1e3 * 0.5 * 0.002
-    start[:, 2] -= first.attributes["reference_z_mm"]
+    start = first.reference.points_from_focal_point(start)
     inside = first.arrays["flag"] == 0
     distance, _ = KDTree(start / (0.05, 0.05, 0.2)).query(first.position_mm[inside] / (0.05, 0.05, 0.2))
     assert np.mean(distance < 1.0) > 0.9

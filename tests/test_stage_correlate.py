@@ -18,12 +18,13 @@ from lfpiv_cli.files.provenance import record
 from lfpiv_cli.files.vtkhdf import write_volume
 from lfpiv_cli.flow.field import MASKED
 from lfpiv_cli.grid import Grid
+from lfpiv_cli.reference import Reference
 
 CONFIG = Path(__file__).parent.parent / "configs" / "sample.yaml"
 SHAPE = (30, 22, 40)
 GRID = Grid.centred(SHAPE, (0.1, 0.1, 0.1), (0.0, 0.0, 0.0))
 SHIFT = (0.9, -0.5, 0.3)
-ATTRIBUTES = {"reference": "mid_plane", "reference_z_mm": 0.0}
+REFERENCE = Reference("mid_plane", 0.0)
 
 
 def run(*arguments: object) -> None:
@@ -46,7 +47,7 @@ def volumes(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     paths = []
     for name, array in arrays.items():
         paths.append(folder / f"{name}.vtkhdf")
-        write_volume(paths[-1], array, GRID, provenance=made_by, attributes=ATTRIBUTES, overwrite=False)
+        write_volume(paths[-1], array, GRID, REFERENCE, provenance=made_by, attributes={}, overwrite=False)
     return paths
 
 
@@ -58,7 +59,7 @@ def test_a_mask_volume_masks_its_windows(volumes: list[Path], tmp_path: Path) ->
     np.testing.assert_allclose(np.median(kept, axis=(0, 1, 2)), SHIFT, atol=0.05)
     other = tmp_path / "other.vtkhdf"
     grid = Grid.centred((3, 3, 3), (0.1,) * 3, (0.0,) * 3)
-    write_volume(other, np.ones((3, 3, 3)), grid, provenance={}, attributes=ATTRIBUTES, overwrite=False)
+    write_volume(other, np.ones((3, 3, 3)), grid, REFERENCE, provenance={}, attributes={}, overwrite=False)
     with pytest.raises(InputError, match="other.vtkhdf: its grid"):
         run("correlate", *volumes[:2], "--mask", other, "-o", tmp_path / "w.vtkhdf")
 

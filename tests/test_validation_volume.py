@@ -14,6 +14,7 @@ from lfpiv_cli.errors import InputError
 from lfpiv_cli.files.particles import write_particles
 from lfpiv_cli.files.vtkhdf import write_volume
 from lfpiv_cli.grid import Grid
+from lfpiv_cli.reference import Reference
 from lfpiv_cli.validation.volume import (
     known_volume,
     near_a_particle,
@@ -100,8 +101,9 @@ def test_validate_volume_moves_the_particles_to_the_frame(particles, tmp_path):
         tmp_path / "b.vtkhdf",
         known_volume(GRID, moved, np.ones(10), SIGMA),
         GRID,
+        Reference("mid_plane", 0.5),
         provenance={},
-        attributes={"reference": "focal_point", "reference_z_mm": 0.5, "residual": np.array([0.4, 0.3, 0.2])},
+        attributes={"residual": np.array([0.4, 0.3, 0.2])},
         overwrite=False,
     )
     write_particles(tmp_path / "true.npz", particles + [0.0, 0.0, 0.5], speed, np.ones(10), overwrite=False)

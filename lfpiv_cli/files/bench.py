@@ -22,6 +22,7 @@ from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.microlenses import Lattice
+from lfpiv_cli.reference import Reference
 from lfpiv_cli.synthetic.flows import FLOWS, Flow
 
 UM_TO_MM = 1e-3
@@ -122,8 +123,8 @@ def channel_of(section: ChannelSection) -> Channel:
     return Channel(section.width_mm, section.wall_mm, section.camera_move_mm, section.board_from_mid_plane_mm)
 
 
-def grid_of(section: VolumeSection, camera: CameraSection | None, origin_z_mm: float) -> Grid:
-    """Return the volume's grid, z moved by `origin_z_mm`.
+def grid_of(section: VolumeSection, camera: CameraSection | None, reference: Reference) -> Grid:
+    """Return the volume's grid, z from the focal point, where the section counts z from a reference.
 
     `camera` is needed only where the section leaves the voxels to the program.
     """
@@ -133,7 +134,7 @@ def grid_of(section: VolumeSection, camera: CameraSection | None, origin_z_mm: f
             raise ValueError("neither shape_xyz and voxel_mm nor size_mm with a camera")
         shape, voxel = choose_voxels(camera, section.size_mm)
     x, y, z = section.centre_mm
-    return Grid.centred(shape, voxel, (x, y, z + origin_z_mm))
+    return Grid.centred(shape, voxel, (x, y, reference.depth_to_focal_point(z)))
 
 
 def choose_voxels(camera: CameraSection, size_mm: Lengths) -> tuple[Triple, Lengths]:
@@ -178,10 +179,10 @@ def overlap_of(section: CorrelationSection, voxel_mm: Lengths) -> Lengths:
     return x, y, z
 
 
-def flow_of(section: FlowSection, origin_z_mm: float) -> Flow:
-    """Return a flow as a function of points, its centre moved by `origin_z_mm` along z."""
+def flow_of(section: FlowSection, reference: Reference) -> Flow:
+    """Return a flow as a function of points, z from the focal point, where the section counts z from a reference."""
     parameters = section.model_dump(exclude={"kind"})
     if "centre_mm" in parameters:
         x, y, z = parameters["centre_mm"]
-        parameters["centre_mm"] = (x, y, z + origin_z_mm)
+        parameters["centre_mm"] = (x, y, reference.depth_to_focal_point(z))
     return FLOWS[section.kind](**parameters)

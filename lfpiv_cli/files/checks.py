@@ -16,6 +16,7 @@ from lfpiv_cli.files.sections import Sections
 from lfpiv_cli.files.sections_simulated import SimulationSection
 from lfpiv_cli.files.yaml_nodes import KeyPath
 from lfpiv_cli.optics.media import Window, fluid_path_to_focus
+from lfpiv_cli.reference import FOCAL_POINT
 
 Found = Iterator[tuple[KeyPath, str]]
 
@@ -148,7 +149,7 @@ def _object_space(sections: Sections) -> Found:
     if volume.size_mm is None and (volume.shape_xyz is None or volume.voxel_mm is None):
         return
     camera, media = camera_of(section), media_of(sections.media)
-    nearest = grid_of(volume, section, 0.0).bounds_mm(2)[0]
+    nearest = grid_of(volume, section, FOCAL_POINT).bounds_mm(2)[0]
     distance = camera.focus_distance_mm + media.depth_ratio * nearest
     if distance <= 0.0:
         yield (

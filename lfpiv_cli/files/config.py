@@ -44,6 +44,7 @@ from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media, Window
 from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.reconstruction.registry import SOLVERS
+from lfpiv_cli.reference import FOCAL_POINT, Reference
 from lfpiv_cli.synthetic.flows import Flow
 from lfpiv_cli.synthetic.scenes import channel_window
 
@@ -201,9 +202,9 @@ class Config:
         window = self.window_model(mid_plane_z_mm) if reads_window else None
         return ObjectSpace(self.media_model(), window, chosen.refraction, chosen.method)
 
-    def grid(self, origin_z_mm: float = 0.0) -> Grid:
-        """Return the volume's grid, `origin_z_mm` being where its origin lies from the nominal focal point."""
-        return bench.grid_of(self.volume, self.sections.camera, origin_z_mm)
+    def grid(self, reference: Reference = FOCAL_POINT) -> Grid:
+        """Return the volume's grid: z as in the config, or from the focal point where its reference is given."""
+        return bench.grid_of(self.volume, self.sections.camera, reference)
 
     def rig(self) -> Rig:
         """Return what must be known to read the picture of a board."""
@@ -228,14 +229,14 @@ class Config:
         solver = SOLVERS.get(self.reconstruction.solver)
         return self.correlation.exponent or (solver.exponent if solver else 1.0)
 
-    def simulated_flow(self, origin_z_mm: float = 0.0) -> Flow:
-        """Return the flow to render, as a function of points whose z counts from `origin_z_mm` before the volume's."""
-        return bench.flow_of(self._needed("simulation.flow", self.simulation.flow), origin_z_mm)
+    def simulated_flow(self, reference: Reference = FOCAL_POINT) -> Flow:
+        """Return the flow to render, a function of points: z as in the config, or from the focal point as in `grid`."""
+        return bench.flow_of(self._needed("simulation.flow", self.simulation.flow), reference)
 
     def true_flow(self) -> Flow:
         """Return the flow to compare with, in the volume's coordinates: `validation.flow`, else the simulation's."""
         flow: FlowSection | None = self.validation.flow or self.simulation.flow
-        return bench.flow_of(self._needed("validation.flow", flow), 0.0)
+        return bench.flow_of(self._needed("validation.flow", flow), FOCAL_POINT)
 
     def flow_methods(self) -> tuple[str, ...]:
         """Return how a simulated flow is measured: as `validation.flow_methods` has it, else every possible way.

@@ -28,6 +28,7 @@ from lfpiv_cli.files.hdf5 import (
     write_header,
 )
 from lfpiv_cli.files.vtk import create_vtk_group, read_attributes, write_attributes
+from lfpiv_cli.reference import Reference
 
 PARTICLES_FORMAT = "lfpiv-particles"
 TRACKS_FORMAT = "lfpiv-tracks"
@@ -69,13 +70,15 @@ class Points:
 
     Attributes
     ----------
-    position_mm : (n, 3)
+    position_mm : (n, 3), z from the reference
     arrays : n rows each, by name
+    reference : the origin of its coordinates
     attributes, provenance : what the file says about itself
     """
 
     position_mm: NDArray[np.float64]
     arrays: dict[str, NDArray[Any]]
+    reference: Reference
     attributes: dict[str, Any]
     provenance: dict[str, Any]
 
@@ -85,12 +88,15 @@ def write_points(
     format_name: str,
     position_mm: NDArray[np.float64],
     arrays: Mapping[str, NDArray[Any]],
+    reference: Reference,
     *,
     provenance: Mapping[str, Any],
     attributes: Mapping[str, Any],
     overwrite: bool,
 ) -> None:
     """Write points; `arrays` holds all that the format has, each with as many rows as there are points.
+
+    Their z counts from the reference.
 
     Raises
     ------
@@ -102,7 +108,7 @@ def write_points(
 
     def fill(file: h5py.File) -> None:
         write_header(file, format_name, FORMAT_VERSION, provenance)
-        write_attributes(file, attributes)
+        write_attributes(file, reference.attributes() | dict(attributes))
         vtk = create_vtk_group(file, "PolyData")
         vtk["Points"] = write_array(file, POSITION, position_mm, "mm")
         vtk["NumberOfPoints"] = np.array([len(position_mm)], dtype=np.int64)
@@ -132,12 +138,13 @@ def read_points(path: Path | str, format_name: str) -> Points:
         position = read_array(member(file, POSITION), size)
         arrays = {name: read_array(member(file, name), size) for name in UNITS[format_name]}
         attributes, provenance = read_attributes(file), read_provenance(file)
+        reference = Reference.from_attributes(attributes)
     if position.ndim != 2 or position.shape[1] != 3:
         raise InputError(f"{path}: its positions have the shape {position.shape}, expected (n, 3)")
     for name, array in (arrays | {POSITION: position}).items():
         if len(array) != len(position) or not np.isfinite(array).all():
             raise InputError(f"{path}: {name} has not one finite value for each of its {len(position)} points")
-    return Points(position.astype(np.float64), arrays, attributes, provenance)
+    return Points(position.astype(np.float64), arrays, reference, attributes, provenance)
 
 
 def symmetric(matrices: NDArray[np.float64]) -> NDArray[np.float64]:

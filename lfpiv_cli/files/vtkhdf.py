@@ -30,6 +30,7 @@ from lfpiv_cli.files.hdf5 import (
 from lfpiv_cli.files.vtk import create_vtk_group, read_attributes, write_attributes
 from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.grid import Grid
+from lfpiv_cli.reference import Reference
 
 VOLUME_FORMAT = "lfpiv-volume"
 VECTORS_FORMAT = "lfpiv-vectors"
@@ -56,21 +57,24 @@ class Volume:
     Attributes
     ----------
     array : (nz, ny, nx) float32
-    grid : spacing and origin, mm
-    attributes : what the file says about itself, `reference` among it
+    grid : spacing and origin, mm, z from the reference
+    reference : the origin of its coordinates
+    attributes : what the file says about itself, the reference among it
     provenance : the record of how it was made
     """
 
     array: NDArray[np.float32]
     grid: Grid
+    reference: Reference
     attributes: dict[str, Any]
     provenance: dict[str, Any]
 
 
 @dataclass(frozen=True, eq=False)
 class Header:
-    """What a file says about itself besides its arrays: attributes at the root, and its provenance."""
+    """What a file says about itself besides its arrays: its coordinates' origin, attributes at the root, provenance."""
 
+    reference: Reference
     attributes: dict[str, Any]
     provenance: dict[str, Any]
 
@@ -79,6 +83,7 @@ def write_volume(
     path: Path,
     array_zyx: NDArray[np.floating[Any]],
     grid: Grid,
+    reference: Reference,
     *,
     provenance: Mapping[str, Any],
     attributes: Mapping[str, Any],
@@ -89,7 +94,8 @@ def write_volume(
     Parameters
     ----------
     array_zyx : (nz, ny, nx), stored as float32
-    attributes : scalars, strings and short arrays for the root, `reference` (focal_point or mid_plane) among them
+    reference : the origin that the grid's z counts from
+    attributes : scalars, strings and short arrays for the root
 
     Raises
     ------
@@ -100,7 +106,7 @@ def write_volume(
 
     def fill(file: h5py.File) -> None:
         write_header(file, VOLUME_FORMAT, FORMAT_VERSION, provenance)
-        write_attributes(file, attributes)
+        write_attributes(file, reference.attributes() | dict(attributes))
         points = _write_frame(file, grid, with_component=False)
         _write_points(file, points, "intensity", array_zyx.astype(np.float32), "1")
 
@@ -121,18 +127,19 @@ def open_volume(path: Path | str) -> Volume:
         grid = _read_grid(file)
         array = _read_points(file, "intensity", grid, path.stat().st_size, components=False)
         attributes, provenance = read_attributes(file), read_provenance(file)
+        reference = Reference.from_attributes(attributes)
     bad = int(np.count_nonzero(~np.isfinite(array)))
     if bad:
         raise InputError(f"{path}: {bad} voxels are not finite numbers")
-    return Volume(array.astype(np.float32, copy=False), grid, attributes, provenance)
+    return Volume(array.astype(np.float32, copy=False), grid, reference, attributes, provenance)
 
 
 def write_vectors(
     path: Path,
     field: VectorField,
+    reference: Reference,
     *,
     provenance: Mapping[str, Any],
-    attributes: Mapping[str, Any],
     overwrite: bool,
     extra: Mapping[str, tuple[NDArray[Any], str]] | None = None,
 ) -> None:
@@ -140,7 +147,7 @@ def write_vectors(
 
     Parameters
     ----------
-    attributes : scalars, strings and short arrays for the root, `reference` (focal_point or mid_plane) among them
+    reference : the origin that the grid's z counts from
     extra : arrays (nz, ny, nx) or (nz, ny, nx, 3) to store besides, by their name, with their unit
 
     Raises
@@ -150,7 +157,7 @@ def write_vectors(
 
     def fill(file: h5py.File) -> None:
         write_header(file, VECTORS_FORMAT, FORMAT_VERSION, provenance)
-        write_attributes(file, attributes)
+        write_attributes(file, reference.attributes())
         file.attrs["voxel_mm"] = np.asarray(field.voxel_mm, dtype=np.float64)
         file.attrs["window_voxel"] = np.asarray(field.window_voxel, dtype=np.int64)
         file.attrs["flag_meanings"] = np.bytes_(FLAG_MEANINGS)
@@ -205,14 +212,15 @@ def open_vectors(path: Path | str) -> VectorField:
 
 
 def read_header(path: Path | str) -> Header:
-    """Read the attributes and the provenance of a volume or a vector field.
+    """Read what a volume, a vector field or points say about themselves.
 
     Raises
     ------
     InputError
     """
     with open_h5(Path(path)) as file:
-        return Header(read_attributes(file), read_provenance(file))
+        attributes = read_attributes(file)
+        return Header(Reference.from_attributes(attributes), attributes, read_provenance(file))
 
 
 def _reads(read: Callable[[Path], object]) -> Callable[[Path], None]:

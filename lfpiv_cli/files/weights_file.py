@@ -32,6 +32,7 @@ from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media, Window
 from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.optics.object_space import ObjectSpace
+from lfpiv_cli.reference import Reference
 from lfpiv_cli.weights.aperture import aperture_mask
 from lfpiv_cli.weights.axis import AxisWeights
 from lfpiv_cli.weights.axis_cells import AxisOptics, micro_image_cells
@@ -68,16 +69,14 @@ class WeightsFile:
     ----------
     weights : ready to use
     camera : the camera they were made for, its lattice in their frame
-    reference : origin of the volume's coordinates, `focal_point` or `mid_plane`
-    reference_z_mm : where that origin lies, z from the nominal focal point
+    reference : the origin of the coordinates of volumes; the weights' own grid counts z from the nominal focal point
     vignetting : of `calibration.transmission`, in the weights once they are read; None where it was not measured
     provenance : record of how the file was made
     """
 
     weights: Weights
     camera: Camera
-    reference: str
-    reference_z_mm: float
+    reference: Reference
     provenance: dict[str, Any]
     vignetting: NDArray[np.float64] | None = None
 
@@ -97,8 +96,7 @@ def write_weights(path: Path, content: WeightsFile, overwrite: bool) -> None:
             "spacing_mm": np.asarray(weights.grid.spacing_mm),
             "origin_mm": np.asarray(weights.grid.origin_mm),
             "padding_xyz": np.asarray(weights.padding_xyz),
-            "reference": content.reference,
-            "reference_z_mm": content.reference_z_mm,
+            **content.reference.attributes(),
             "scene_distortion_per_mm2": weights.scene_distortion_per_mm2,
         },
         "vignetting": content.vignetting,
@@ -135,11 +133,11 @@ def read_weights(path: Path) -> WeightsFile:
         bend = tree["grid"].get("scene_distortion_per_mm2")
         if bend is not None and (bend.shape != (grid.shape_xyz[2],) or not np.isfinite(bend).all()):
             raise ValueError(f"a distortion of shape {bend.shape} for {grid.shape_xyz[2]} planes")
-        reference, reference_z = str(tree["grid"]["reference"]), float(tree["grid"]["reference_z_mm"])
+        reference = Reference.from_attributes(tree["grid"])
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: not a whole weights file: {error}") from error
     weights = Weights(grid, padding, operator, camera.column_axis, calibration, bend)
-    return WeightsFile(weights, camera, reference, reference_z, provenance, vignetting)
+    return WeightsFile(weights, camera, reference, provenance, vignetting)
 
 
 def open_weights(path: str | Path) -> Weights:

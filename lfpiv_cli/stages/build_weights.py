@@ -24,6 +24,7 @@ from lfpiv_cli.names import Method, Refraction, Sampling
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.optics.polynomial_rays import PolynomialRays
+from lfpiv_cli.reference import Reference
 from lfpiv_cli.weights.build import default_padding, scene_distortion
 from lfpiv_cli.weights.columns import ColumnOperator, OnDemandOperator, operator_of, seen_share
 from lfpiv_cli.weights.model import Weights, WeightsOperator
@@ -82,8 +83,8 @@ def build_weights(
     camera = settings.camera_model()
     if found:
         camera = found.camera(camera)
-    reference_z = _reference_z_mm(settings, found)
-    grid = settings.grid(origin_z_mm=reference_z)
+    reference = _reference(settings, found)
+    grid = settings.grid(reference)
     if settings.volume.size_mm is not None:
         console.say(VOXELS_CHOSEN.format(*grid.spacing_mm))
     media = settings.media_model()
@@ -96,14 +97,13 @@ def build_weights(
     weights = Weights(grid, padding, operator, camera.column_axis, found, bend)
     record = _record("build-weights", settings, inputs)
     vignetting = found.vignetting() if found else None
-    content = WeightsFile(weights, camera, settings.volume.reference, reference_z, record, vignetting)
+    content = WeightsFile(weights, camera, reference, record, vignetting)
     write_weights(output, content, overwrite)
     return {
         "voxels_xyz": list(grid.shape_xyz),
         "voxel_mm": list(grid.spacing_mm),
         "padding_xyz": list(padding),
-        "reference": settings.volume.reference,
-        "reference_z_mm": reference_z,
+        **reference.attributes(),
         "frame": weights.frame,
         "method": settings.weights.method,
         "refraction": settings.weights.refraction,
@@ -171,19 +171,20 @@ def _record(command: str, settings: Config, inputs: dict[str, Path]) -> dict[str
     return provenance_record(command, settings.resolved(), inputs)
 
 
-def _reference_z_mm(settings: Config, found: Calibration | None) -> float:
-    """Return where the origin of the volume's coordinates lies, z from the nominal focal point.
+def _reference(settings: Config, found: Calibration | None) -> Reference:
+    """Return the origin of the volume's coordinates.
 
     Fitted rays count z from the origin that the boards' depths were told from.
     """
-    if settings.volume.reference == "focal_point" or settings.weights.method == "dlfc":
-        return 0.0
+    name = settings.volume.reference
+    if name == "focal_point" or settings.weights.method == "dlfc":
+        return Reference(name, 0.0)
     if found is None or found.mid_plane_z_mm is None:
         raise ConfigError(
             "volume.reference: mid_plane needs a calibration with a board, and the section `channel`, to say where the "
             "mid plane lies"
         )
-    return found.mid_plane_z_mm
+    return Reference(name, found.mid_plane_z_mm)
 
 
 def _judge_view(smallest: float, largest: float, grid: Grid, console: Console) -> None:

@@ -23,15 +23,14 @@ def combine_vectors(
     inputs = {"vectors_a": vectors_a, "vectors_b": vectors_b}
     ensure_writable(output, overwrite, inputs.values())
     headers = [vtkhdf.read_header(path) for path in inputs.values()]
-    attributes = [{name: h.attributes[name] for name in ("reference", "reference_z_mm")} for h in headers]
-    if attributes[0] != attributes[1]:
+    if headers[0].reference != headers[1].reference:
         raise InputError(f"{vectors_b}: its coordinates have another origin than those of {vectors_a}")
     found = combine(*(vtkhdf.open_vectors(path) for path in inputs.values()))
     vtkhdf.write_vectors(
         output,
         found.field,
+        headers[0].reference,
         provenance=record("combine", headers[0].provenance.get("config"), inputs),
-        attributes=attributes[0],
         overwrite=overwrite,
         extra={"share_a": (found.first_share, "1"), "disagreement": (found.disagreement, "1")},
     )

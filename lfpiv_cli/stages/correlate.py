@@ -24,6 +24,7 @@ from lfpiv_cli.flow.field import MM_TO_M, REJECTED, VectorField
 from lfpiv_cli.flow.statistics import statistics_of
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import Pairing
+from lfpiv_cli.reference import Reference
 
 Extra = dict[str, tuple[NDArray[Any], str]]
 
@@ -110,13 +111,13 @@ def correlate(
     summary: dict[str, Any] = {"pairs": len(pairs), "vectors": 0, "rejected": 0}
     divergence = []
     for number in pending(targets, [*volumes, *common.values()], overwrite, options.resume, _record_of):
-        field, attributes = _measure(jobs[number], options.mask_volume, console)
+        field, reference = _measure(jobs[number], options.mask_volume, console)
         told_more = derived_fields(field) if derived else None
         vtkhdf.write_vectors(
             targets[number].path,
             field,
+            reference,
             provenance=targets[number].record,
-            attributes=attributes,
             overwrite=overwrite,
             extra=_arrays_of(told_more) if told_more else None,
         )
@@ -131,11 +132,10 @@ def correlate(
     return summary
 
 
-def _measure(job: Job, mask: Path | None, console: Console) -> tuple[VectorField, dict[str, Any]]:
-    """Return the vectors of a job, and where the coordinates of its volumes begin."""
+def _measure(job: Job, mask: Path | None, console: Console) -> tuple[VectorField, Reference]:
+    """Return the vectors of a job, and the origin of its volumes' coordinates."""
     first = vtkhdf.open_volume(job.pairs[0][0])
     grid, settings = first.grid, job.settings
-    attributes = {name: first.attributes[name] for name in ("reference", "reference_z_mm")}
 
     def volumes() -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
         for pair in job.pairs:
@@ -156,7 +156,7 @@ def _measure(job: Job, mask: Path | None, console: Console) -> tuple[VectorField
             progress=advance,
             exponent=settings.correlation_exponent(),
         )
-    return field, attributes
+    return field, first.reference
 
 
 def _usable(settings: Config, mask: Path | None, volume: vtkhdf.Volume, path: Path) -> NDArray[np.bool_] | None:
@@ -200,13 +200,12 @@ def _write_mean(path: Path, members: Sequence[Path], settings: Config, derived: 
         extra["velocity_rms"] = (found.rms_voxel * to_velocity, "m/s")
     if derived:
         extra |= _arrays_of(derived_fields(found.mean))
-    header = vtkhdf.read_header(members[0]).attributes
     inputs = {f"vectors_{number:04d}": member for number, member in enumerate(members)}
     vtkhdf.write_vectors(
         path,
         found.mean,
+        vtkhdf.read_header(members[0]).reference,
         provenance=record("correlate mean", settings.resolved(), inputs),
-        attributes={name: header[name] for name in ("reference", "reference_z_mm")},
         overwrite=overwrite,
         extra=extra,
     )
@@ -232,7 +231,7 @@ def _ensure_alike(paths: tuple[Path, Path], first: vtkhdf.Volume, second: vtkhdf
     """Refuse two volumes that were not made alike."""
     if first.grid != second.grid:
         raise InputError(f"{paths[1]}: its grid {second.grid} differs from that of {paths[0]}, {first.grid}")
-    if first.attributes["reference"] != second.attributes["reference"]:
+    if first.reference.name != second.reference.name:
         raise InputError(f"{paths[1]}: its coordinates have another origin than those of {paths[0]}")
     if first.provenance.get("config") != second.provenance.get("config"):
         raise InputError(f"{paths[1]}: was made with another config than {paths[0]}")

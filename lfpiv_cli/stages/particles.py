@@ -123,7 +123,7 @@ def write_frame(
     write_points(
         path,
         PARTICLES_FORMAT,
-        places - np.array([0.0, 0.0, content.reference_z_mm]),
+        content.reference.points_from_focal_point(places),
         {
             "intensity": found.light_counts,
             "covariance_mm2": symmetric(found.covariance_mm2),
@@ -131,10 +131,9 @@ def write_frame(
             "seen": found.seen,
             "flag": _outside(places, content.weights.grid),
         },
+        content.reference,
         provenance=provenance,
         attributes={
-            "reference": content.reference,
-            "reference_z_mm": content.reference_z_mm,
             "refraction": "paraxial" if space.straight else "exact",
             "residual": residual,
             "residual_rms_counts": float(np.sqrt(np.mean(left[~frame.unusable] ** 2))),

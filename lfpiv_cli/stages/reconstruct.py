@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -301,17 +301,13 @@ def _noise_limit(chosen: ReconstructionSection, image: Image) -> float | None:
 
 
 def _write(target: Target, content: WeightsFile, result: Reconstruction, excluded: int, overwrite: bool) -> None:
-    grid = content.weights.grid
-    x, y, z = grid.origin_mm
     vtkhdf.write_volume(
         target.path,
         content.weights.to_world(result.volume),
-        # in the coordinates of files, whose z counts from the reference
-        replace(grid, origin_mm=(x, y, z - content.reference_z_mm)),
+        content.reference.grid_from_focal_point(content.weights.grid),
+        content.reference,
         provenance=target.record,
         attributes={
-            "reference": content.reference,
-            "reference_z_mm": content.reference_z_mm,
             "residual": result.residual,
             "excluded_pixels": excluded,
             "support_voxels": result.support_voxels,

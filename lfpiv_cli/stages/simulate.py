@@ -26,6 +26,7 @@ from lfpiv_cli.files.images import write_tiff
 from lfpiv_cli.files.particles import write_particles
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.reference import FOCAL_POINT, Reference
 from lfpiv_cli.synthetic import scenes
 from lfpiv_cli.synthetic.board import BoardPlacement
 from lfpiv_cli.synthetic.flows import MM_PER_M, Flow
@@ -69,14 +70,18 @@ def simulate_boards(
     """Render the board moved through the fluid, at depths from the origin of the volume's coordinates."""
     names = {depth: board_at(depth) for depth in depth_mm}
     settings, paths = _begin(config, output, tuple(names.values()), overwrite)
-    origin_z = simulated_origin_z_mm(settings)
-    rng, space = _generator(settings, 3), _flow_space(settings, origin_z)
+    reference = simulated_reference(settings)
+    rng, space = _generator(settings, 3), _flow_space(settings, reference)
     board = replace(settings.rig().board, medium="fluid")
     with console.progress(len(names), "simulate") as advance:
         for depth, name in names.items():
-            write_tiff(paths[name], _board_still(settings, board, space, origin_z + depth, rng).image, overwrite)
+            write_tiff(
+                paths[name],
+                _board_still(settings, board, space, reference.depth_to_focal_point(depth), rng).image,
+                overwrite,
+            )
             advance(1)
-    return {"boards": len(names), "reference_z_mm": origin_z}
+    return {"boards": len(names), "reference_z_mm": reference.z_mm}
 
 
 def board_at(depth_mm: float) -> str:
@@ -93,14 +98,14 @@ def simulate_particles(
     scene = settings.simulation
     if settings.correlation.dt_s is None:
         raise ConfigError(f"{config}: correlation.dt_s: is missing, and images of a flow need it")
-    camera, origin_z = real_camera(settings), simulated_origin_z_mm(settings)
-    tracers = _tracers(settings, camera, origin_z, settings.correlation.dt_s)
+    camera, reference = real_camera(settings), simulated_reference(settings)
+    tracers = _tracers(settings, camera, reference, settings.correlation.dt_s)
     with console.progress(scene.frames * tracers.count, "simulate") as advance:
         found = scenes.simulate_particles(
             camera,
-            _flow_space(settings, origin_z),
+            _flow_space(settings, reference),
             tracers,
-            settings.simulated_flow(origin_z),
+            settings.simulated_flow(reference),
             settings.correlation.dt_s,
             readout_of(settings),
             _generator(settings, 2),
@@ -111,7 +116,7 @@ def simulate_particles(
     for name, image in zip(images, found.images, strict=True):
         write_tiff(paths[name], image, overwrite)
     write_particles(paths["particles.npz"], found.positions_mm, found.velocities_m_s, found.brightness, overwrite)
-    truth = found.truth | {"reference_z_mm": origin_z}
+    truth = found.truth | {"reference_z_mm": reference.z_mm}
     return _write_truth(paths["particles.json"], "simulate particles", truth, settings, config, overwrite)
 
 
@@ -137,17 +142,17 @@ def misalignment_of(settings: Config) -> scenes.Misalignment:
     return scenes.Misalignment(scene.rotation_deg, scene.shift_px, scene.distortion_per_mm2)
 
 
-def simulated_origin_z_mm(settings: Config) -> float:
-    """Return where the origin of the volume's coordinates lies in the simulated scene, z from the focal point."""
-    scene = settings.simulation
-    if settings.volume.reference == "focal_point":
-        return 0.0
+def simulated_reference(settings: Config) -> Reference:
+    """Return the origin of the volume's coordinates in the simulated scene."""
+    scene, name = settings.simulation, settings.volume.reference
+    if name == "focal_point":
+        return FOCAL_POINT
     if scene.mid_plane_z_mm is not None:
-        return scene.mid_plane_z_mm
+        return Reference(name, scene.mid_plane_z_mm)
     rig = settings.rig()
     if rig.channel is None:
         raise ConfigError("volume.reference: mid_plane needs simulation.mid_plane_z_mm or the section `channel`")
-    return mid_plane_z_mm(rig.board, rig.channel, rig.media, scene.board_z_mm)
+    return Reference(name, mid_plane_z_mm(rig.board, rig.channel, rig.media, scene.board_z_mm))
 
 
 def _board_still(
@@ -191,31 +196,31 @@ def _board_space(settings: Config) -> ObjectSpace:
     media = settings.media_model()
     if settings.board.medium == "air":
         return ObjectSpace(media.in_air(), None, settings.simulation.refraction)
-    return _flow_space(settings, simulated_origin_z_mm(settings))
+    return _flow_space(settings, simulated_reference(settings))
 
 
-def _flow_space(settings: Config, origin_z_mm: float) -> ObjectSpace:
+def _flow_space(settings: Config, reference: Reference) -> ObjectSpace:
     """Return what the tracers are seen through."""
     media, refraction = settings.media_model(), settings.simulation.refraction
     if refraction == "paraxial" or media == media.in_air():
         return ObjectSpace(media, None, refraction)
-    return ObjectSpace(media, settings.window_model(origin_z_mm), refraction)
+    return ObjectSpace(media, settings.window_model(reference.z_mm), refraction)
 
 
-def _tracers(settings: Config, camera: Camera, origin_z_mm: float, dt_s: float) -> scenes.Tracers:
+def _tracers(settings: Config, camera: Camera, reference: Reference, dt_s: float) -> scenes.Tracers:
     """Return the tracers: as many in the volume as configured, and as dense around it as their light reaches.
 
     Those that are carried into the volume before a longer sequence ends, or out of it, are there too.
     """
     scene = settings.simulation
-    volume = settings.grid(origin_z_mm)
+    volume = settings.grid(reference)
     margin = blur_radius_mm(camera, settings.media_model(), volume)
     inside = scenes.Box.around(volume, (0.0, 0.0, 0.0))
-    carried = 0.5 * (scene.frames - 2) * dt_s * _largest_speed_mm_s(settings.simulated_flow(origin_z_mm), inside)
+    carried = 0.5 * (scene.frames - 2) * dt_s * _largest_speed_mm_s(settings.simulated_flow(reference), inside)
     box = inside.wider((margin + carried[0], margin + carried[1], carried[2]))
     flow = scene.flow
     if flow is not None and flow.kind == "square_duct":
-        walls = scenes.channel_walls(flow.width_mm, origin_z_mm + flow.centre_mm[2], flow.axis)
+        walls = scenes.channel_walls(flow.width_mm, reference.depth_to_focal_point(flow.centre_mm[2]), flow.axis)
         box, inside = box.within(walls), inside.within(walls)
     count = round(scene.particles * box.volume_mm3 / inside.volume_mm3)
     return scenes.Tracers(

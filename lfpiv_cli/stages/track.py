@@ -28,6 +28,7 @@ from lfpiv_cli.flow.correlation import SMALLEST_VALID_FRACTION
 from lfpiv_cli.flow.field import MASKED, MM_TO_M, REJECTED, VALID, VectorField
 from lfpiv_cli.flow.windows import layout_windows
 from lfpiv_cli.grid import Grid
+from lfpiv_cli.reference import Reference
 from lfpiv_cli.tracks.gridding import on_grid
 from lfpiv_cli.tracks.sequences import SHORTEST, follow, scatter_in, states_at
 from lfpiv_cli.tracks.tracking import SEARCH_VOXEL, Tracks, track
@@ -95,7 +96,7 @@ def track_particles(
         found = _pair(frames[0], frames[1], search_mm, settings.correlation.dt_s)
     files = Files(
         record("track", settings.resolved() | told, inputs),
-        {name: frames[0].attributes[name] for name in ("reference", "reference_z_mm")},
+        frames[0].reference,
         overwrite,
     )
     write_points(
@@ -103,8 +104,9 @@ def track_particles(
         found.format_name,
         found.position_mm,
         found.arrays,
+        files.reference,
         provenance=files.provenance,
-        attributes=files.attributes | {"dt_s": settings.correlation.dt_s},
+        attributes={"dt_s": settings.correlation.dt_s},
         overwrite=overwrite,
     )
     return found.summary | _write_grids(grids, found.paths, settings, files)
@@ -135,7 +137,7 @@ class Files:
     """What all files that are written share."""
 
     provenance: dict[str, Any]
-    attributes: dict[str, Any]
+    reference: Reference
     overwrite: bool
 
 
@@ -199,9 +201,7 @@ def _write_grids(grids: Sequence[Path], paths: Sequence[Paths], settings: Config
     summary = {"vectors": 0, "rejected": 0}
     for target, passing in zip(grids, paths, strict=True):
         field = _vectors(settings, settings.grid(), passing)
-        vtkhdf.write_vectors(
-            target, field, provenance=files.provenance, attributes=files.attributes, overwrite=files.overwrite
-        )
+        vtkhdf.write_vectors(target, field, files.reference, provenance=files.provenance, overwrite=files.overwrite)
         summary["vectors"] += field.flag.size
         summary["rejected"] += int(np.count_nonzero(field.flag >= REJECTED))
     return summary

@@ -90,8 +90,8 @@ def _measured(vectors: Path, settings: Config, particles: Path | None, is_simula
         raise InputError(f"{vectors}: holds displacements without a time; correlate again with --dt-s")
     centres = _window_centres_mm(field)
     if particles:
-        reference_z_mm = vtkhdf.read_header(vectors).attributes["reference_z_mm"]
-        return Measured(field, *_truth_of_particles(particles, centres, reference_z_mm))
+        centres = vtkhdf.read_header(vectors).reference.points_to_focal_point(centres)
+        return Measured(field, *_truth_of_particles(particles, centres))
     flow = settings.simulated_flow() if is_simulated else settings.true_flow()
     truth = flow(centres.reshape(-1, 3)).reshape(centres.shape)
     return Measured(field, truth, np.asarray(truth.any(axis=-1)))
@@ -113,12 +113,9 @@ def _window_centres_mm(field: VectorField) -> NDArray[np.float64]:
     return np.stack([x, y, z], axis=-1)
 
 
-def _truth_of_particles(
-    path: Path, centres_mm: NDArray[np.float64], reference_z_mm: float
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Return the true velocities at the window centres, and which of these lie among the particles."""
+def _truth_of_particles(path: Path, centres_mm: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return the true velocities at the window centres, z from the focal point, and which lie among the particles."""
     particles = read_particles(path)
-    centres = centres_mm + np.array([0.0, 0.0, reference_z_mm])
     low, high = particles.positions_mm.min(axis=0), particles.positions_mm.max(axis=0)
-    inside = np.all((centres >= low) & (centres <= high), axis=-1)
-    return truth_at_points(particles.positions_mm, particles.velocities_m_s, centres), inside
+    inside = np.all((centres_mm >= low) & (centres_mm <= high), axis=-1)
+    return truth_at_points(particles.positions_mm, particles.velocities_m_s, centres_mm), inside

@@ -5,8 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files import vtkhdf
@@ -44,7 +42,7 @@ def validate_volume(
     if MOMENTS[frame] and dt_s is None:
         raise ConfigError(f"{config}: correlation.dt_s: is missing, and --frame {frame} needs it")
     moved = MOMENTS[frame] * (dt_s or 0.0) * MM_PER_M * true.velocities_m_s
-    position = true.positions_mm + moved - np.array([0.0, 0.0, found.attributes["reference_z_mm"]])
+    position = found.reference.points_from_focal_point(true.positions_mm + moved)
     camera = settings.camera_model()
     microlens_mm = float(camera.lattice.pitch.mean()) / abs(camera.magnification)
     figures = volume_figures(found.array, found.grid, position, true.brightness, microlens_mm) | {
