@@ -109,6 +109,45 @@ def test_readme_is_short():
     assert len((ROOT / "README.md").read_text().splitlines()) <= 80
 
 
+# What a reader who knows the field searches for, and the command whose help has to say it.
+TERMS = {
+    "particle tracking velocimetry": "track",
+    "iterative particle reconstruction": "reconstruct",
+    "ghost particles": "reconstruct",
+    "volume self-calibration": "refine-calibration",
+    "point-spread function": "build-weights",
+    "calibration target": "calibrate-snapshot",
+    "interrogation windows": "correlate",
+    "multi-pass": "correlate",
+    "false vectors": "correlate",
+    "seeding density": "simulate",
+}
+PRIVATE = re.compile(r"told apart|untold|foretold|glance|\bdoubts\b|jumping", re.IGNORECASE)
+
+
+def help_of(name: str) -> str:
+    """Return a command's whole help on one line."""
+    command = cli.get_command(click.Context(cli), name)
+    assert command is not None
+    return " ".join(command.get_help(click.Context(command, info_name=name)).split())
+
+
+@pytest.mark.parametrize("term", TERMS)
+def test_help_and_documents_use_the_term_of_the_field(term):
+    assert term in help_of(TERMS[term])
+    assert any(term in " ".join(page.read_text(encoding="utf-8").split()) for page in PAGES)
+
+
+@pytest.mark.parametrize("name", cli.list_commands(click.Context(cli)))
+def test_help_uses_plain_words(name):
+    assert not PRIVATE.search(help_of(name))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_pages_use_plain_words(page):
+    assert not PRIVATE.search(page.read_text(encoding="utf-8"))
+
+
 # --- what is longer: the commands themselves
 
 

@@ -15,19 +15,21 @@ from lfpiv_cli.console import Console
 @config_argument
 @click.option("--white", type=FILE, multiple=True, help="White image, uniform light; twice: stopped down and not.")
 @dark_option
-@click.option("--board", type=FILE, multiple=True, help="Snapshot of the dot board; or several, each with its depth.")
-@click.option("--depth-mm", type=float, multiple=True, help="Depth of each board in the fluid, for dlfc.")
+@click.option(
+    "--board", type=FILE, multiple=True, help="Snapshot of the calibration target, a board of dots; or several."
+)
+@click.option("--depth-mm", type=float, multiple=True, help="Depth of each target in the fluid, for dlfc.")
 @output_option("Calibration file to write (.h5).")
 @click.option("--picture", type=FILE, help="Picture of the fitted lattice and board to write (.png).")
 @click.option("--views", type=FILE, help="Picture of views and refocused depths to write (.png).")
 @common_options
 def calibrate_snapshot(config: Path, output: Path, overwrite: bool, console: Console, **chosen: Any) -> dict[str, Any]:
-    """Find the microlenses and the focal plane from a white image and one snapshot of the board.
+    """Find microlenses and focal plane from a white image and one snapshot of a calibration target.
 
     \b
     Example: lfpiv calibrate-snapshot rig.yaml --white white.tif --dark dark.tif --board board.tif \\
                  -o calibration.h5 --picture calibration.png
-    for `build-weights --method dlfc`, with boards moved through the fluid:
+    for `build-weights --method dlfc`, with targets at several depths in the fluid:
              lfpiv calibrate-snapshot rig.yaml --white white.tif --board b1.tif --depth-mm -8 \\
                  --board b2.tif --depth-mm 0 --board b3.tif --depth-mm 8 -o calibration.h5
     """
@@ -43,13 +45,16 @@ def calibrate_snapshot(config: Path, output: Path, overwrite: bool, console: Con
 @click.option("--calibration", type=FILE, required=True, help="From calibrate-snapshot.")
 @dark_option
 @click.option("--background", type=FILE, help="Image without tracers to subtract, in place of the dark one.")
-@output_option("Mended calibration to write (.h5); without it, only report.", required=False)
+@output_option("Corrected calibration to write (.h5); without it, only report.", required=False)
 @click.option("--picture", type=FILE, help="Picture of the particles' depths and the walls to write (.png).")
 @common_options
 def refine_calibration(
     config: Path, images: tuple[Path, ...], calibration: Path, overwrite: bool, console: Console, **chosen: Any
 ) -> dict[str, Any]:
-    """Find the channel's walls by the particles between them, and with them what the calibration got wrong.
+    """Correct a calibration by the tracers of a flow: volume self-calibration.
+
+    The particles end at the channel's walls, which gives the mid plane, and their images say how far the lens images
+    have moved since the white image.
 
     \b
     Example: lfpiv refine-calibration rig.yaml a.tif b.tif --calibration calibration.h5 --dark dark.tif \\

@@ -1,4 +1,4 @@
-"""The command that tells what is in a file."""
+"""The command that describes files."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from lfpiv_cli.console import Console
 
 @click.command("info")
 @click.argument("file", type=FILE)
-@click.option("--picture", type=FILE, help="weights: picture of one voxel's column to write (.png).")
+@click.option("--picture", type=FILE, help="weights: picture of one voxel's pixels to write (.png).")
 @click.option("--voxel", type=int, nargs=3, metavar="IX IY IZ", help="weights: which voxel; default the middle one.")
 @common_options
 def info(file: Path, overwrite: bool, console: Console, **chosen: Any) -> dict[str, Any]:
-    """Tell what is in a file of ours; of weights, draw the pixels that one voxel lights.
+    """Describe a file that lfpiv wrote; of weights, draw the point-spread function of one voxel.
 
     \b
     Example: lfpiv info weights.h5 --picture column.png --voxel 50 40 120

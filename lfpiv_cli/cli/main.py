@@ -39,7 +39,7 @@ class Terminated(BaseException):
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="lfpiv")
 def cli() -> None:
-    """From raw light-field camera images to three-dimensional velocity fields.
+    """From raw light-field camera images to three-dimensional velocity fields (PIV and PTV).
 
     \b
     lfpiv calibrate-snapshot rig.yaml --white white.tif --board board.tif -o calibration.h5

@@ -16,14 +16,18 @@ from lfpiv_cli.reconstruction.registry import SOLVER_NAMES
 @click.command("reconstruct")
 @click.argument("weights", type=FILE)
 @click.argument("images", type=FILE, nargs=-1, required=True)
-@click.option("--solver", type=click.Choice(SOLVER_NAMES), help="Default from the config.")
-@click.option("--iterations", type=click.IntRange(min=1), help="Default from the config.")
-@click.option("--relaxation", type=click.FloatRange(min=0.0, min_open=True, max=2.0), help="Default from the config.")
+@click.option("--solver", type=click.Choice(SOLVER_NAMES), help="Of volumes, or particles; default from the config.")
+@click.option("--iterations", type=click.IntRange(min=1), help="Steps of the solver; default from the config.")
+@click.option(
+    "--relaxation",
+    type=click.FloatRange(min=0.0, min_open=True, max=2.0),
+    help="mu of Eq. 12; default from the config.",
+)
 @click.option("--accelerate/--no-accelerate", default=None, help="Extrapolate between steps; default from the config.")
-@click.option("--start", type=click.Choice(names_in(Start)), help="Default from the config.")
+@click.option("--start", type=click.Choice(names_in(Start)), help="First volume; default from the config.")
 @dark_option
 @click.option("--background", help="Image to subtract, or minimum or mean over the images given, or as minimum:15.")
-@click.option("--mask", type=FILE, help="Image that is black where pixels are to be left out (reflections, bubbles).")
+@click.option("--mask", type=FILE, help="Image that is black where pixels are left out (reflections, bubbles).")
 @pairing_option
 @resume_option
 @click.option("--keep-going", is_flag=True, help="Go on with the next frame when one fails.")
@@ -32,13 +36,16 @@ from lfpiv_cli.reconstruction.registry import SOLVER_NAMES
 def reconstruct(
     weights: Path, images: tuple[Path, ...], output: Path, overwrite: bool, console: Console, **chosen: Any
 ) -> dict[str, Any]:
-    """Reconstruct the volume of tracer particles behind each image, or (--solver particles) the particles themselves.
+    """Reconstruct the volume of tracer particles behind each image (tomographic reconstruction).
 
-    Hot and dead pixels of the dark image are left out. With --pairing, particles are found with the help of the frames
-    beside.
+    With --solver particles it finds the particles themselves by iterative particle reconstruction: each is fitted to
+    the raw image, and ghost particles are removed; with --pairing, neighbouring frames help each other. Hot and dead
+    pixels of the dark image are left out.
 
     \b
     Example: lfpiv reconstruct weights.h5 a.tif b.tif --dark dark.tif -o volumes
+    particles of a pair:
+             lfpiv reconstruct weights.h5 a.tif b.tif --dark dark.tif --solver particles --pairing ab -o particles
     over a long sequence, the background of each frame from the fifteen around it:
              lfpiv reconstruct weights.h5 run.tif --background minimum:15 --mask mask.png -o volumes
     """

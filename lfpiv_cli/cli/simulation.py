@@ -22,6 +22,8 @@ def simulate(
 ) -> dict[str, Any]:
     """Render raw images through the exact optics, ray by ray, with their truth beside them.
 
+    White light, the calibration target, or tracers in the configured flow at the configured seeding density.
+
     \b
     Example: lfpiv simulate particles rig.yaml -o simulated
              lfpiv simulate board rig.yaml --depth-mm -4 --depth-mm 0 --depth-mm 4 -o simulated

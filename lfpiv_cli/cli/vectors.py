@@ -31,7 +31,7 @@ def _window(text: str) -> int | tuple[int, ...]:
 @click.argument("volumes", type=FILE, nargs=-1, required=True)
 @click.option("--config", type=FILE, help="In place of the config carried by the volumes.")
 @dt_option
-@click.option("--windows", callback=parse_windows, help="Window sizes in voxels, coarse to fine, as 32,16.")
+@click.option("--windows", callback=parse_windows, help="Interrogation windows in voxels, coarse to fine, as 32,16.")
 @click.option("--overlap", type=click.FloatRange(min=0.0, max=1.0, max_open=True), help="Of neighbouring windows.")
 @pairing_option
 @click.option("--mask", "mask_volume", type=FILE, help="Volume on the same grid: voxels of 0 are left out.")
@@ -44,9 +44,10 @@ def _window(text: str) -> int | tuple[int, ...]:
 def correlate(
     volumes: tuple[Path, ...], output: Path, overwrite: bool, console: Console, **chosen: Any
 ) -> dict[str, Any]:
-    """Measure the displacement between two volumes by three-dimensional cross-correlation.
+    """Measure the displacements between two volumes by multi-pass three-dimensional cross-correlation.
 
-    More than two volumes need --pairing.
+    From pass to pass interrogation windows get finer and the volumes are deformed by what was found; false vectors are
+    detected by a median test and replaced. More than two volumes need --pairing.
 
     \b
     Example: lfpiv correlate volumes/a.vtkhdf volumes/b.vtkhdf -o vectors.vtkhdf
@@ -66,8 +67,8 @@ def correlate(
 def combine(vectors_a: Path, vectors_b: Path, output: Path, overwrite: bool, console: Console) -> dict[str, Any]:
     """Weight two vector fields on one grid by their uncertainties, those of correlate and of track --grid.
 
-    A vector that has none, or that disagrees with the other and with those around it, is left out; share_a tells the
-    weight of the first file in each component, disagreement how many standard errors the two are apart.
+    A vector that has none, or that disagrees with the other and with those around it, is left out; share_a is the
+    weight of the first file in each component, disagreement how many standard errors lie between the two.
 
     \b
     Example: lfpiv combine vectors.vtkhdf tracks_grid.vtkhdf -o combined.vtkhdf
