@@ -124,4 +124,8 @@ def test_variance_adds_up() -> None:
 
 def test_no_particles_have_no_bound(view: View) -> None:
     slope = slopes(view, np.zeros((0, UNKNOWNS)))
-    assert cramer_rao_bound(slope, np.ones(view.rows * view.columns)).joint.shape == (0, UNKNOWNS, UNKNOWNS)
+    assert cramer_rao_bound(slope, np.ones(view.camera.rows * view.camera.columns)).joint.shape == (
+        0,
+        UNKNOWNS,
+        UNKNOWNS,
+    )

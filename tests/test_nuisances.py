@@ -29,7 +29,7 @@ def view(table2: Camera, water: Media) -> View:
 
 def picture(view: View, particles: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
     """The light of particles with the noise that is stated for it."""
-    image = np.zeros(view.rows * view.columns)
+    image = np.zeros(view.camera.rows * view.camera.columns)
     add_all(view, particles, share_out(view, particles, *DEPTHS), 1.0, image, entry_capacity(view, *DEPTHS))
     return image + rng.normal(0.0, np.sqrt(NOISE.read_counts**2 + NOISE.gain_counts * image))
 

@@ -32,7 +32,7 @@ def view(table2: Camera, water: Media) -> View:
 
 
 def image_of(view: View, particles: NDArray[np.float64]) -> NDArray[np.float64]:
-    image = np.zeros(view.rows * view.columns)
+    image = np.zeros(view.camera.rows * view.camera.columns)
     add_all(view, particles, share_out(view, particles, *DEPTHS), 1.0, image, entry_capacity(view, *DEPTHS))
     return image
 
@@ -67,7 +67,7 @@ def test_spread_is_the_least_possible(view: View, rng: np.random.Generator) -> N
 def test_a_pixel_between_micro_images_counts_once(view: View, rng: np.random.Generator, depth: float) -> None:
     # On the corner of four lenses, where near the focal plane many pixels are lit through two of them.
     particle = np.array([[-0.063 / 0.9995, 0.07, depth, 5e5]])
-    residual = rng.normal(0.0, 50.0, view.rows * view.columns)
+    residual = rng.normal(0.0, 50.0, view.camera.rows * view.camera.columns)
     weight = rng.uniform(0.5, 1.5, residual.size)
     capacity = entry_capacity(view, *DEPTHS)
     pixels, values = np.empty(capacity, np.int32), np.empty((capacity, 4))
@@ -127,7 +127,7 @@ def test_pixels_without_weight_claim_and_see_nothing(view: View) -> None:
     particle = np.array([[0.21, -0.13, 2.3, 2.5e5]])
     clean = image_of(view, particle)
     capacity = entry_capacity(view, *DEPTHS)
-    weight = np.where(np.arange(clean.size) % view.columns < 330, 1.0, 0.0)
+    weight = np.where(np.arange(clean.size) % view.camera.columns < 330, 1.0, 0.0)
     blind = np.where(weight > 0.0, 0.0, -1e6)  # what stands there must not matter
     chi2, share, seen = judge(view, particle, blind, weight, capacity)
     assert chi2[0] == 0.0
@@ -193,7 +193,7 @@ def test_overlapping_particles_are_separated(view: View) -> None:
 
 def test_a_single_particle_is_not_split(view: View) -> None:
     one = np.array([[0.2, 0.1, 2.0, 9e5]])
-    residual = np.zeros(view.rows * view.columns)
+    residual = np.zeros(view.camera.rows * view.camera.columns)
     common = (share_out(view, one, *DEPTHS), residual, np.ones_like(residual), *DEPTHS, 1e5, 1.0)
     limits = (entry_capacity(view, *DEPTHS), footprint_px(view, *DEPTHS))
     partners = split(view, one, np.array([True]), *common, *limits)
@@ -240,7 +240,7 @@ def test_tiles_of_a_group_share_no_pixel(view: View, rng: np.random.Generator) -
     assert sorted(tiles.order.tolist()) == list(range(80))
     assert tiles.start.size > 5
     for group in range(4):
-        lit = np.zeros(view.rows * view.columns)
+        lit = np.zeros(view.camera.rows * view.camera.columns)
         for tile in range(tiles.groups[group], tiles.groups[group + 1]):
             members = particles[tiles.order[tiles.start[tile] : tiles.start[tile + 1]]]
             lit += image_of(view, members) > 0.0
@@ -259,7 +259,7 @@ def test_errors_that_are_alike_widen_a_particles(view: View) -> None:
         slopes.append((image_of(view, particle + step) - image_of(view, particle - step)) / 2.0 / step.max())
     jacobian = np.array(slopes)
     lit = np.flatnonzero(jacobian.any(axis=0))
-    row, column = np.divmod(lit, view.columns)
+    row, column = np.divmod(lit, view.camera.columns)
     distance = np.abs(row[:, np.newaxis] - row) + np.abs(column[:, np.newaxis] - column)
     alike = np.where(distance == 0, 1.0, 0.2 * 0.8**distance)
     whitened = jacobian[:, lit] * np.sqrt(weight[lit])

@@ -40,7 +40,7 @@ def entries(view: View, point: tuple[float, float, float]) -> tuple[NDArray[np.i
 def images(view: View, point: tuple[float, float, float]) -> NDArray[np.float64]:
     """Return light and derivatives as images (pixels, 4)."""
     pixels, values = entries(view, point)
-    result = np.zeros((view.rows * view.columns, 4))
+    result = np.zeros((view.camera.rows * view.camera.columns, 4))
     np.add.at(result, pixels, values)
     return result
 
@@ -99,7 +99,7 @@ def test_each_lens_has_its_own_centre(small: Camera, water: Media) -> None:
     moved = view._replace(centres_mm=view.centres_mm + np.array([0.004, 0.0]))
     place = (0.3, 0.1, 3.0)
     before, after = images(view, place)[:, 0], images(moved, place)[:, 0]
-    columns = np.arange(before.size) % view.columns
+    columns = np.arange(before.size) % view.camera.columns
     shift_px = (after @ columns) / after.sum() - (before @ columns) / before.sum()
     # The light's centre stays (the same rays), moved by the little that the micro-images shift beneath it.
     assert abs(shift_px) < 1.0

@@ -9,12 +9,44 @@ where the sensor's columns follow world y.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lfpiv_cli.names import ColumnAxis
 from lfpiv_cli.optics.microlenses import Lattice
+
+
+class KernelCamera(NamedTuple):
+    """The camera as compiled kernels take it.
+
+    A tuple that holds it cannot go into a parallel loop of numba's, which takes tuples of numbers and arrays, none of
+    tuples: such loops take the parts and put them together again inside.
+
+    Attributes
+    ----------
+    focal_length_mm, image_distance_mm, focus_distance_mm : F_m, s_i and F_m (M - 1)/M of the main lens
+    microlens_focal_length_mm, microlens_distance_mm, bend : f_m, s_mu and 1 - s_mu/f_m of the array
+    distortion_per_mm2 : k1
+    aperture_radius_mm : of the main lens
+    pixel_mm, columns, rows : of the sensor
+    origin_mm, basis_mm : (2,), (2, 2) of the lattice of lens centres
+    """
+
+    focal_length_mm: float
+    image_distance_mm: float
+    focus_distance_mm: float
+    microlens_focal_length_mm: float
+    microlens_distance_mm: float
+    bend: float
+    distortion_per_mm2: float
+    aperture_radius_mm: float
+    pixel_mm: float
+    columns: int
+    rows: int
+    origin_mm: NDArray[np.float64]
+    basis_mm: NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +94,11 @@ class Camera:
         return 0.5 * self.aperture_mm
 
     @property
+    def bend(self) -> float:
+        """What a microlens leaves of a distance from its centre on the way to the sensor, 1 - s_mu/f_m."""
+        return 1.0 - self.microlens_distance_mm / self.microlens_focal_length_mm
+
+    @property
     def micro_image_scale(self) -> float:
         """Ratio of a micro-image's centre to its lens's centre, 1 + s_mu/s_i, both from the axis."""
         return 1.0 + self.microlens_distance_mm / self.image_distance_mm
@@ -70,6 +107,24 @@ class Camera:
     def sensor_centre_px(self) -> NDArray[np.float64]:
         """Where the optical axis meets the sensor: (column, row)."""
         return np.array([(self.columns - 1) / 2, (self.rows - 1) / 2])
+
+    def for_kernels(self) -> KernelCamera:
+        """Return the camera as compiled kernels take it."""
+        return KernelCamera(
+            focal_length_mm=self.focal_length_mm,
+            image_distance_mm=self.image_distance_mm,
+            focus_distance_mm=self.focus_distance_mm,
+            microlens_focal_length_mm=self.microlens_focal_length_mm,
+            microlens_distance_mm=self.microlens_distance_mm,
+            bend=self.bend,
+            distortion_per_mm2=self.distortion_per_mm2,
+            aperture_radius_mm=self.aperture_radius_mm,
+            pixel_mm=self.pixel_mm,
+            columns=self.columns,
+            rows=self.rows,
+            origin_mm=self.lattice.origin,
+            basis_mm=self.lattice.basis,
+        )
 
     def defocus(self, object_distance_mm: ArrayLike) -> NDArray[np.float64]:
         """Return alpha = 1 + s_i/s_o - s_i/F_m, the spread on the array per unit of main-lens position; 0 in focus."""

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from lfpiv_cli.particles.least_squares import UNKNOWNS, add_light, best_light, fit, respond_all
 from lfpiv_cli.particles.response import VALUES
 from lfpiv_cli.particles.tiles import Tiles
-from lfpiv_cli.particles.view import View
+from lfpiv_cli.particles.view import View, view_of
 
 # Starts relative to the particle's depth, mm; its mirrored depth is another.
 OTHER_DEPTHS_MM = np.array([-2.0, -1.5, -1.0, -0.7, -0.4, -0.2, 0.2, 0.4, 0.7, 1.0, 1.5, 2.0])
@@ -42,8 +42,10 @@ def try_other_depths(
     All suspects among the particles (n, 4) are refined; the residual is kept up to date. Returns which have moved.
     """
     moved = np.zeros(particles.shape[0], np.bool_)
+    camera, rest = view.camera[:], view[1:]
     for group in range(4):
         for tile in prange(tiles.groups[group], tiles.groups[group + 1]):
+            whole = view_of(camera, rest)
             counts, place = np.zeros(1, np.int64), np.zeros((0, 0), np.int32)
             pixels, values = np.empty((1, capacity), np.int32), np.empty((1, capacity, VALUES))
             trial, best = np.empty((1, UNKNOWNS)), np.empty((1, UNKNOWNS))
@@ -52,10 +54,10 @@ def try_other_depths(
                 if not suspects[number]:
                     continue
                 best[0] = particles[number]
-                respond_all(view, best, counts, pixels, values)
+                respond_all(whole, best, counts, pixels, values)
                 add_light(pixels[0], values[0], counts[0], best[0, 3], residual)
                 own = fit(
-                    view, best, residual, weight, z_low, z_high, DEPTH_STEPS, np.inf, counts, pixels, values, place
+                    whole, best, residual, weight, z_low, z_high, DEPTH_STEPS, np.inf, counts, pixels, values, place
                 )
                 lowest = own - smallest_gain
                 for k in range(OTHER_DEPTHS_MM.size + 1):
@@ -63,16 +65,27 @@ def try_other_depths(
                     trial[0, 2] = -trial[0, 2] if k == OTHER_DEPTHS_MM.size else trial[0, 2] + OTHER_DEPTHS_MM[k]
                     if not z_low <= trial[0, 2] <= z_high:
                         continue
-                    respond_all(view, trial, counts, pixels, values)
+                    respond_all(whole, trial, counts, pixels, values)
                     trial[0, 3] = best_light(pixels[0], values[0], counts[0], residual, weight)
                     change = fit(
-                        view, trial, residual, weight, z_low, z_high, DEPTH_STEPS, np.inf, counts, pixels, values, place
+                        whole,
+                        trial,
+                        residual,
+                        weight,
+                        z_low,
+                        z_high,
+                        DEPTH_STEPS,
+                        np.inf,
+                        counts,
+                        pixels,
+                        values,
+                        place,
                     )
                     if change < lowest and trial[0, 3] >= smallest_light:
                         lowest = change
                         best[:] = trial
                         moved[number] = True
                 particles[number] = best[0]
-                respond_all(view, best, counts, pixels, values)
+                respond_all(whole, best, counts, pixels, values)
                 add_light(pixels[0], values[0], counts[0], -best[0, 3], residual)
     return moved

@@ -24,7 +24,7 @@ from scipy.spatial import KDTree
 from lfpiv_cli.particles.least_squares import UNKNOWNS
 from lfpiv_cli.particles.noise import Correlation
 from lfpiv_cli.particles.response import VALUES, respond
-from lfpiv_cli.particles.view import View, footprint_radius_mm, on_array_mm
+from lfpiv_cli.particles.view import View, footprint_radius_mm, on_array_mm, view_of
 
 # Neighbours that are left free: with twice as many the errors of 8,300 particles change by a thousandth.
 FREE_NEIGHBOURS = 12
@@ -79,8 +79,8 @@ def joint_covariance(
     """
     slopes = _slopes(view, particles, capacity)
     start, other = _overlapping(view, particles)
-    alone, block = _blocks(slopes, weight, view.columns, start, other)
-    return _covariances(slopes, Ties(start, other, block), alone, weight, correlation, chi2, view.columns)
+    alone, block = _blocks(slopes, weight, view.camera.columns, start, other)
+    return _covariances(slopes, Ties(start, other, block), alone, weight, correlation, chi2, view.camera.columns)
 
 
 def _slopes(view: View, particles: NDArray[np.float64], capacity: int) -> Slopes:
@@ -107,9 +107,11 @@ def _overlapping(view: View, particles: NDArray[np.float64]) -> tuple[NDArray[np
 @njit(cache=True, parallel=True)
 def _count_entries(view: View, particles: NDArray[np.float64], capacity: int) -> NDArray[np.int64]:
     counts = np.empty(particles.shape[0], np.int64)
+    camera, rest = view.camera[:], view[1:]
     for n in prange(particles.shape[0]):
+        whole = view_of(camera, rest)
         pixels, values = np.empty(capacity, np.int32), np.empty((capacity, VALUES))
-        counts[n] = respond(view, particles[n, 0], particles[n, 1], particles[n, 2], pixels, values)
+        counts[n] = respond(whole, particles[n, 0], particles[n, 1], particles[n, 2], pixels, values)
     return counts
 
 
@@ -123,9 +125,11 @@ def _fill_slopes(
     slope: NDArray[np.float32],
 ) -> None:
     """Fill in `pixel` and `slope` of `Slopes`; arrays of a tuple would not be written to from parallel loops."""
+    camera, rest = view.camera[:], view[1:]
     for n in prange(particles.shape[0]):
+        whole = view_of(camera, rest)
         pixels, values = np.empty(capacity, np.int32), np.empty((capacity, VALUES))
-        count = respond(view, particles[n, 0], particles[n, 1], particles[n, 2], pixels, values)
+        count = respond(whole, particles[n, 0], particles[n, 1], particles[n, 2], pixels, values)
         for k in range(count):
             pixel[start[n] + k] = pixels[k]
             for m in range(3):

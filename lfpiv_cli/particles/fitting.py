@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from lfpiv_cli.particles.least_squares import UNKNOWNS, add_light, best_light, fit, respond_all, respond_once
 from lfpiv_cli.particles.response import VALUES, respond
 from lfpiv_cli.particles.tiles import Tiles
-from lfpiv_cli.particles.view import View
+from lfpiv_cli.particles.view import View, view_of
 
 # Candidates are brought into the fit from these depths beside their own, mm.
 START_DEPTHS_MM = np.array([0.0, -0.4, 0.4])
@@ -59,16 +59,18 @@ def refine(
     capacity: int,
 ) -> None:
     """Refine all particles (n, 4) once, in place, and keep the residual up to date."""
+    camera, rest = view.camera[:], view[1:]
     for group in range(4):
         for tile in prange(tiles.groups[group], tiles.groups[group + 1]):
+            whole = view_of(camera, rest)
             counts, place = np.zeros(1, np.int64), np.zeros((0, 0), np.int32)
             pixels, values = np.empty((1, capacity), np.int32), np.empty((1, capacity, VALUES))
             for at in range(tiles.start[tile], tiles.start[tile + 1]):
                 number = tiles.order[at]
                 one = particles[number : number + 1]
-                respond_all(view, one, counts, pixels, values)
+                respond_all(whole, one, counts, pixels, values)
                 add_light(pixels[0], values[0], counts[0], one[0, 3], residual)
-                fit(view, one, residual, weight, z_low, z_high, SWEEP_STEPS, np.inf, counts, pixels, values, place)
+                fit(whole, one, residual, weight, z_low, z_high, SWEEP_STEPS, np.inf, counts, pixels, values, place)
                 add_light(pixels[0], values[0], counts[0], -one[0, 3], residual)
 
 
@@ -87,8 +89,10 @@ def accept(
 ) -> NDArray[np.bool_]:
     """Fit candidates (n, 4) in place, one after the other; return which ones stay, their light off the residual."""
     accepted = np.zeros(candidates.shape[0], np.bool_)
+    camera, rest = view.camera[:], view[1:]
     for group in range(4):
         for tile in prange(tiles.groups[group], tiles.groups[group + 1]):
+            whole = view_of(camera, rest)
             counts, place = np.zeros(1, np.int64), np.zeros((0, 0), np.int32)
             pixels, values = np.empty((1, capacity), np.int32), np.empty((1, capacity, VALUES))
             trial, best = np.empty((1, UNKNOWNS)), np.empty((1, UNKNOWNS))
@@ -98,10 +102,10 @@ def accept(
                 for depth in START_DEPTHS_MM:
                     trial[0] = candidates[number]
                     trial[0, 2] = min(max(trial[0, 2] + depth, z_low), z_high)
-                    respond_all(view, trial, counts, pixels, values)
+                    respond_all(whole, trial, counts, pixels, values)
                     trial[0, 3] = best_light(pixels[0], values[0], counts[0], residual, weight)
                     change = fit(
-                        view,
+                        whole,
                         trial,
                         residual,
                         weight,
@@ -119,7 +123,7 @@ def accept(
                         best[:] = trial
                 if lowest == 0.0 or best[0, 3] < smallest_light:
                     continue
-                respond_all(view, best, counts, pixels, values)
+                respond_all(whole, best, counts, pixels, values)
                 share = claimed_share(pixels[0], values[0], counts[0], best[0, 3], residual, weight)
                 if share >= smallest_share:
                     candidates[number] = best[0]
@@ -138,12 +142,14 @@ def add_all(
     capacity: int,
 ) -> None:
     """Add the light of all particles (n, 4), times `sign`, to an image."""
+    camera, rest = view.camera[:], view[1:]
     for group in range(4):
         for tile in prange(tiles.groups[group], tiles.groups[group + 1]):
+            whole = view_of(camera, rest)
             pixels, values = np.empty(capacity, np.int32), np.empty((capacity, VALUES))
             for at in range(tiles.start[tile], tiles.start[tile + 1]):
                 particle = particles[tiles.order[at]]
-                count = respond(view, particle[0], particle[1], particle[2], pixels, values)
+                count = respond(whole, particle[0], particle[1], particle[2], pixels, values)
                 add_light(pixels, values, count, sign * particle[3], image)
 
 
@@ -161,10 +167,12 @@ def judge(
     nothing.
     """
     chi2, share, seen = np.zeros(len(particles)), np.zeros(len(particles)), np.zeros(len(particles))
+    camera, rest = view.camera[:], view[1:]
     for number in prange(len(particles)):
+        whole = view_of(camera, rest)
         pixels, values = np.empty(capacity, np.int32), np.empty((capacity, VALUES))
         x, y, z, light = particles[number]
-        count = respond_once(view, x, y, z, pixels, values)
+        count = respond_once(whole, x, y, z, pixels, values)
         found = wanted = total = squares = 0.0
         for k in range(count):
             f, r = values[k, 0], residual[pixels[k]]

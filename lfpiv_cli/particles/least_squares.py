@@ -46,14 +46,14 @@ def respond_once(
     entries = respond(view, x, y, z, pixels, values)
     if entries == 0:
         return 0
-    top, bottom, left, right = view.rows, 0, view.columns, 0
+    top, bottom, left, right = view.camera.rows, 0, view.camera.columns, 0
     for k in range(entries):
-        row, column = _row_and_column(pixels[k], view.columns)
+        row, column = _row_and_column(pixels[k], view.camera.columns)
         top, bottom, left, right = min(top, row), max(bottom, row), min(left, column), max(right, column)
     place = np.zeros((bottom - top + 1, right - left + 1), np.int32)
     count = 0
     for k in range(entries):
-        row, column = _row_and_column(pixels[k], view.columns)
+        row, column = _row_and_column(pixels[k], view.camera.columns)
         at = place[row - top, column - left]
         if at > 0:
             for m in range(VALUES):
@@ -144,17 +144,17 @@ def _pair_equations(
     matrix[second, second] = block
     add_light(pixels[0], values[0], counts[0], pair[0, 3], residual)
     # What the first explains is off the second's side already; the first's side still lacks the second's light.
-    top, left = view.rows, view.columns
+    top, left = view.camera.rows, view.camera.columns
     for k in range(counts[0]):
-        row, column = _row_and_column(pixels[0, k], view.columns)
+        row, column = _row_and_column(pixels[0, k], view.camera.columns)
         top, left = min(top, row), min(left, column)
     for k in range(counts[0]):
-        row, column = _row_and_column(pixels[0, k], view.columns)
+        row, column = _row_and_column(pixels[0, k], view.camera.columns)
         place[row - top, column - left] = k + 1
     cross = np.zeros((UNKNOWNS, UNKNOWNS))
     one, two = np.empty(UNKNOWNS), np.empty(UNKNOWNS)
     for k in range(counts[1]):
-        row, column = _row_and_column(pixels[1, k], view.columns)
+        row, column = _row_and_column(pixels[1, k], view.camera.columns)
         row, column = row - top, column - left
         if not (0 <= row < side and 0 <= column < side) or place[row, column] == 0:
             continue
@@ -171,7 +171,7 @@ def _pair_equations(
     matrix[first, second] = cross
     matrix[second, first] = cross.T
     for k in range(counts[0]):
-        row, column = _row_and_column(pixels[0, k], view.columns)
+        row, column = _row_and_column(pixels[0, k], view.camera.columns)
         place[row - top, column - left] = 0
     return change
 

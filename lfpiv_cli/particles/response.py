@@ -63,17 +63,18 @@ def respond(view: View, x: float, y: float, z: float, pixels: NDArray[np.int32],
     pixels : (capacity,) flat pixel numbers, written
     values : (capacity, 4) light and its derivatives by x, y, z, written
     """
-    distance = view.focus_distance_mm + view.depth_ratio * z
-    beta = view.image_distance_mm / distance
-    alpha = 1.0 + beta - view.image_distance_mm / view.focal_length_mm
+    camera = view.camera
+    distance = camera.focus_distance_mm + view.depth_ratio * z
+    beta = camera.image_distance_mm / distance
+    alpha = 1.0 + beta - camera.image_distance_mm / camera.focal_length_mm
     slope = -beta * view.depth_ratio / distance
     x0, y0 = -beta * x, -beta * y
     r2 = x0 * x0 + y0 * y0
-    at_x = x0 * (1.0 + view.distortion_per_mm2 * r2)
-    at_y = y0 * (1.0 + view.distortion_per_mm2 * r2)
-    stretch_x = 1.0 + view.distortion_per_mm2 * (r2 + 2.0 * x0 * x0)
-    stretch_y = 1.0 + view.distortion_per_mm2 * (r2 + 2.0 * y0 * y0)
-    reach = abs(alpha) * view.aperture_radius_mm * max(stretch_x, stretch_y) + beta * view.particle_radius_mm
+    at_x = x0 * (1.0 + camera.distortion_per_mm2 * r2)
+    at_y = y0 * (1.0 + camera.distortion_per_mm2 * r2)
+    stretch_x = 1.0 + camera.distortion_per_mm2 * (r2 + 2.0 * x0 * x0)
+    stretch_y = 1.0 + camera.distortion_per_mm2 * (r2 + 2.0 * y0 * y0)
+    reach = abs(alpha) * camera.aperture_radius_mm * max(stretch_x, stretch_y) + beta * view.particle_radius_mm
     low_i, high_i, low_j, high_j = _lenses(view, at_x, at_y, reach)
     along_x = np.empty((PROFILE_ROWS, LONGEST_PROFILE))
     along_y = np.empty((PROFILE_ROWS, LONGEST_PROFILE))
@@ -86,11 +87,13 @@ def respond(view: View, x: float, y: float, z: float, pixels: NDArray[np.int32],
                 count = _join_cell(view, place, pixels, values, count)
                 continue
             column, columns = _profile(
-                view, x, alpha, beta, slope, at_x, stretch_x, s_x, view.half_x_mm, view.columns, along_x
+                view, x, alpha, beta, slope, at_x, stretch_x, s_x, view.half_x_mm, camera.columns, along_x
             )
             if columns == 0:
                 continue
-            row, rows = _profile(view, y, alpha, beta, slope, at_y, stretch_y, s_y, view.half_y_mm, view.rows, along_y)
+            row, rows = _profile(
+                view, y, alpha, beta, slope, at_y, stretch_y, s_y, view.half_y_mm, camera.rows, along_y
+            )
             if rows > 0:
                 count = _join(
                     view, x, y, alpha, beta, slope, along_x, column, columns, along_y, row, rows, pixels, values, count
@@ -101,8 +104,8 @@ def respond(view: View, x: float, y: float, z: float, pixels: NDArray[np.int32],
 @njit(cache=True)
 def _lenses(view: View, at_x: float, at_y: float, reach: float) -> tuple[int, int, int, int]:
     """Return the ranges of lens indices, first and last along i and j, whose cells the light can reach."""
-    basis = view.inverse_basis
-    dx, dy = at_x - view.origin_mm[0], at_y - view.origin_mm[1]
+    basis, origin = view.inverse_basis, view.camera.origin_mm
+    dx, dy = at_x - origin[0], at_y - origin[1]
     i = dx * basis[0, 0] + dy * basis[1, 0]
     j = dx * basis[0, 1] + dy * basis[1, 1]
     reach_i = reach * (abs(basis[0, 0]) + abs(basis[1, 0]))
@@ -124,17 +127,18 @@ def _lit_pixels(
     A crossing X of the main lens meets the array at `offset` + `gain` X from the lens, within `reach` of it, and the
     sensor at `scale` X + `shift`.
     """
-    low, high = -view.aperture_radius_mm, view.aperture_radius_mm
-    if abs(gain) * view.aperture_radius_mm > 1e-3 * reach:
+    camera = view.camera
+    low, high = -camera.aperture_radius_mm, camera.aperture_radius_mm
+    if abs(gain) * camera.aperture_radius_mm > 1e-3 * reach:
         one, other = (-offset - reach) / gain, (-offset + reach) / gain
         low, high = max(low, min(one, other)), min(high, max(one, other))
-    elif abs(offset) > reach + abs(gain) * view.aperture_radius_mm:
+    elif abs(offset) > reach + abs(gain) * camera.aperture_radius_mm:
         return 0, 0
     if low >= high:
         return 0, 0
     one, other = scale * low + shift, scale * high + shift
-    first = int(np.floor(min(one, other) / view.pixel_mm + 0.5 * pixels))
-    last = int(np.floor(max(one, other) / view.pixel_mm + 0.5 * pixels))
+    first = int(np.floor(min(one, other) / camera.pixel_mm + 0.5 * pixels))
+    last = int(np.floor(max(one, other) / camera.pixel_mm + 0.5 * pixels))
     first, last = max(first, 0), min(last, pixels - 1)
     return first, max(min(last - first + 1, LONGEST_PROFILE), 0)
 
@@ -158,16 +162,17 @@ def _profile(
     `slope` is d alpha/dz = d beta/dz, `at` the array point of the ball's centre seen through the middle of the main
     lens, `stretch` the distortion's local scale: the array point is at + stretch alpha X.
     """
-    tilt = view.microlens_distance_mm / view.image_distance_mm
-    lever = view.bend + tilt
-    scale = view.bend * alpha + tilt * (alpha - 1.0)
+    camera = view.camera
+    tilt = camera.microlens_distance_mm / camera.image_distance_mm
+    lever = camera.bend + tilt
+    scale = camera.bend * alpha + tilt * (alpha - 1.0)
     radius = beta * view.particle_radius_mm
     gain = stretch * alpha
-    shift = (1.0 - view.bend) * s - lever * beta * x
+    shift = (1.0 - camera.bend) * s - lever * beta * x
     first, count = _lit_pixels(view, gain, at - s, half + radius, scale, shift, pixels)
-    width = view.pixel_mm / scale
+    width = camera.pixel_mm / scale
     for k in range(count):
-        middle = ((first + k + 0.5 - 0.5 * pixels) * view.pixel_mm - shift) / scale
+        middle = ((first + k + 0.5 - 0.5 * pixels) * camera.pixel_mm - shift) / scale
         out[:PATCH, k] = 0.0
         out[PATCH, k] = middle
         for node in range(3):
@@ -212,15 +217,16 @@ def _join(
     count: int,
 ) -> int:
     """Write the entries of one lens; return how many there are now."""
-    tilt = view.microlens_distance_mm / view.image_distance_mm
-    lever = view.bend + tilt
-    scale = view.bend * alpha + tilt * (alpha - 1.0)
-    width = view.pixel_mm / scale
-    norm = width * width / (np.pi * view.aperture_radius_mm**2)
+    camera = view.camera
+    tilt = camera.microlens_distance_mm / camera.image_distance_mm
+    lever = camera.bend + tilt
+    scale = camera.bend * alpha + tilt * (alpha - 1.0)
+    width = camera.pixel_mm / scale
+    norm = width * width / (np.pi * camera.aperture_radius_mm**2)
     widen_z = -2.0 * lever * slope / scale
     place_x = lever * beta / scale
-    inside = max(view.aperture_radius_mm - 0.71 * abs(width), 0.0) ** 2
-    outside = (view.aperture_radius_mm + 0.71 * abs(width)) ** 2
+    inside = max(camera.aperture_radius_mm - 0.71 * abs(width), 0.0) ** 2
+    outside = (camera.aperture_radius_mm + 0.71 * abs(width)) ** 2
     for m in range(rows):
         v0, v1 = along_y[MEAN, m], along_y[SLOPE, m]
         v0_y, v1_y, v0_z, v1_z = along_y[MEAN_X, m], along_y[SLOPE_X, m], along_y[MEAN_Z, m], along_y[SLOPE_Z, m]
@@ -247,7 +253,7 @@ def _join(
                 by_z += (share_x * (x - patch_x) + share_y * (y - patch_y)) * lever * slope / scale * h0 * v0
             if light <= 0.0 or count >= pixels.size:
                 continue
-            pixels[count] = (row + m) * view.columns + column + n
+            pixels[count] = (row + m) * camera.columns + column + n
             values[count, 0] = norm * light
             values[count, 1] = norm * by_x
             values[count, 2] = norm * by_y
@@ -272,19 +278,20 @@ def _join_cell(
         distortion's scales there, along x and y
     """
     x, y, alpha, beta, slope, off_x, off_y, stretch_x, stretch_y, s_x, s_y = place
-    tilt = view.microlens_distance_mm / view.image_distance_mm
-    scale = view.bend * alpha + tilt * (alpha - 1.0)
-    lever = (view.bend + tilt) / scale
+    camera = view.camera
+    tilt = camera.microlens_distance_mm / camera.image_distance_mm
+    scale = camera.bend * alpha + tilt * (alpha - 1.0)
+    lever = (camera.bend + tilt) / scale
     gain_x, gain_y = stretch_x * alpha, stretch_y * alpha
-    shift_x = (1.0 - view.bend) * s_x - lever * scale * beta * x
-    shift_y = (1.0 - view.bend) * s_y - lever * scale * beta * y
+    shift_x = (1.0 - camera.bend) * s_x - lever * scale * beta * x
+    shift_y = (1.0 - camera.bend) * s_y - lever * scale * beta * y
     radius = beta * view.particle_radius_mm
-    column, columns = _lit_pixels(view, gain_x, off_x, view.half_x_mm + radius, scale, shift_x, view.columns)
-    row, rows = _lit_pixels(view, gain_y, off_y, view.half_y_mm + radius, scale, shift_y, view.rows)
-    width = abs(view.pixel_mm / scale)
-    norm = width * width / (np.pi * view.aperture_radius_mm**2)
-    inside = max(view.aperture_radius_mm - 0.71 * width, 0.0) ** 2
-    outside = (view.aperture_radius_mm + 0.71 * width) ** 2
+    column, columns = _lit_pixels(view, gain_x, off_x, view.half_x_mm + radius, scale, shift_x, camera.columns)
+    row, rows = _lit_pixels(view, gain_y, off_y, view.half_y_mm + radius, scale, shift_y, camera.rows)
+    width = abs(camera.pixel_mm / scale)
+    norm = width * width / (np.pi * camera.aperture_radius_mm**2)
+    inside = max(camera.aperture_radius_mm - 0.71 * width, 0.0) ** 2
+    outside = (camera.aperture_radius_mm + 0.71 * width) ** 2
     # No ray of a patch further from the lens than this meets its cell.
     furthest = (view.half_x_mm + radius + 0.71 * width * max(abs(gain_x), abs(gain_y))) ** 2
     move_x, move_y = (lever * alpha - 1.0) * beta * stretch_x, (lever * alpha - 1.0) * beta * stretch_y
@@ -298,10 +305,10 @@ def _join_cell(
     low, high = view.cell_table[level], view.cell_table[level + 1]
     half_x, half_y = 0.5 * width * gain_x, 0.5 * width * gain_y
     for m in range(rows):
-        patch_y = ((row + m + 0.5 - 0.5 * view.rows) * view.pixel_mm - shift_y) / scale
+        patch_y = ((row + m + 0.5 - 0.5 * camera.rows) * camera.pixel_mm - shift_y) / scale
         v_z = stretch_y * slope * (patch_y - y) * (1.0 - alpha * lever)
         for n in range(columns):
-            patch_x = ((column + n + 0.5 - 0.5 * view.columns) * view.pixel_mm - shift_x) / scale
+            patch_x = ((column + n + 0.5 - 0.5 * camera.columns) * camera.pixel_mm - shift_x) / scale
             r2 = patch_x * patch_x + patch_y * patch_y
             if r2 >= outside or count >= pixels.size:
                 continue
@@ -327,7 +334,7 @@ def _join_cell(
                 by_z += (share_x * (x - patch_x) + share_y * (y - patch_y)) * lever * slope * part
             if light <= 0.0:
                 continue
-            pixels[count] = (row + m) * view.columns + column + n
+            pixels[count] = (row + m) * camera.columns + column + n
             values[count, 0] = norm * light
             values[count, 1] = norm * by_x
             values[count, 2] = norm * by_y

@@ -21,7 +21,7 @@ from lfpiv_cli.particles.least_squares import (
 )
 from lfpiv_cli.particles.response import VALUES
 from lfpiv_cli.particles.tiles import Tiles
-from lfpiv_cli.particles.view import View
+from lfpiv_cli.particles.view import View, view_of
 
 # Half the distance (x, y, z) of two particles at the start, mm: half a voxel of Table 2 sideways, or along the depth in
 # which a volume shows two as one.
@@ -62,8 +62,10 @@ def split(
     the same shape whose other rows are zero. The residual is kept up to date.
     """
     partners = np.zeros_like(particles)
+    camera, rest = view.camera[:], view[1:]
     for group in range(4):
         for tile in prange(tiles.groups[group], tiles.groups[group + 1]):
+            whole = view_of(camera, rest)
             pixels, values = np.empty((2, capacity), np.int32), np.empty((2, capacity, VALUES))
             counts, place = np.zeros(2, np.int64), np.zeros((box_px, box_px), np.int32)
             matrix, right = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
@@ -73,7 +75,7 @@ def split(
                 if not suspects[number]:
                     continue
                 x, y, z, light = particles[number]
-                count = respond_once(view, x, y, z, pixels[0], values[0])
+                count = respond_once(whole, x, y, z, pixels[0], values[0])
                 add_light(pixels[0], values[0], count, light, residual)
                 single = normal_equations(pixels[0], values[0], count, light, residual, weight, matrix, right)
                 lowest = single - smallest_gain
@@ -86,9 +88,9 @@ def split(
                         pair[m, 1] = y + sign * STARTS_MM[k, 1]
                         pair[m, 2] = min(max(z + sign * STARTS_MM[k, 2], z_low), z_high)
                         pair[m, 3] = 0.5 * light
-                    respond_all(view, pair, counts, pixels, values)
+                    respond_all(whole, pair, counts, pixels, values)
                     change = fit(
-                        view,
+                        whole,
                         pair,
                         residual,
                         weight,
@@ -107,10 +109,10 @@ def split(
                 if found:
                     particles[number] = best[0]
                     partners[number] = best[1]
-                    respond_all(view, best, counts, pixels, values)
+                    respond_all(whole, best, counts, pixels, values)
                     for m in range(2):
                         add_light(pixels[m], values[m], counts[m], -best[m, 3], residual)
                 else:
-                    count = respond_once(view, x, y, z, pixels[0], values[0])
+                    count = respond_once(whole, x, y, z, pixels[0], values[0])
                     add_light(pixels[0], values[0], count, -light, residual)
     return partners

@@ -56,4 +56,4 @@ def tile_side_mm(view: View, z_low_mm: float, z_high_mm: float) -> float:
 
 def footprint_px(view: View, z_low_mm: float, z_high_mm: float) -> int:
     """Return the side of a square of pixels that holds any particle's footprint."""
-    return int(np.ceil(tile_side_mm(view, z_low_mm, z_high_mm) / view.pixel_mm))
+    return int(np.ceil(tile_side_mm(view, z_low_mm, z_high_mm) / view.camera.pixel_mm))

@@ -9,13 +9,14 @@ focal point; lengths in mm about the optical axis.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.calibration.model import Calibration
-from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.camera import Camera, KernelCamera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.particles.cells import cell_shares, hexagon_radius, no_shares
 from lfpiv_cli.particles.rim import rim_table
@@ -29,31 +30,19 @@ class View(NamedTuple):
 
     Attributes
     ----------
-    image_distance_mm, microlens_distance_mm, focal_length_mm : s_i, s_mu, F_m
-    bend : 1 - s_mu/f_m
-    focus_distance_mm, depth_ratio : F_m (M - 1)/M and n_a/n_w (Eqs. 6, 9)
-    distortion_per_mm2 : k1
-    aperture_radius_mm, pixel_mm, columns, rows : of main lens and sensor
+    camera : with the plain lattice of the raw image
+    depth_ratio : n_a/n_w (Eq. 9)
     half_x_mm, half_y_mm : half the rectangle that holds a lens's cell
     cell_reach : how far a cell reaches at most from its lens, in steps of the lattice
     cell_table, cell_side2_mm2, cell_step_mm, cell_ball_mm : of cells that are no rectangles, see `cells.CellShares`
     particle_radius_mm : of the balls
     centres_mm : (nj, ni, 2) lens centres on the array; entry [j, i] is lens (first_i + i, first_j + j)
-    origin_mm, inverse_basis : (2,), (2, 2) of the plain lattice, to find lenses
+    inverse_basis : (2, 2) of the plain lattice, to find lenses
     table, table_step_mm : see `rim`
     """
 
-    image_distance_mm: float
-    microlens_distance_mm: float
-    focal_length_mm: float
-    bend: float
-    focus_distance_mm: float
+    camera: KernelCamera
     depth_ratio: float
-    distortion_per_mm2: float
-    aperture_radius_mm: float
-    pixel_mm: float
-    columns: int
-    rows: int
     half_x_mm: float
     half_y_mm: float
     cell_reach: float
@@ -65,7 +54,6 @@ class View(NamedTuple):
     centres_mm: NDArray[np.float64]
     first_i: int
     first_j: int
-    origin_mm: NDArray[np.float64]
     inverse_basis: NDArray[np.float64]
     table: NDArray[np.float64]
     table_step_mm: float
@@ -86,7 +74,8 @@ def raw_view(camera: Camera, media: Media, particle_radius_mm: float, calibratio
     (low_i, low_j), (high_i, high_j) = span.min(axis=0) - 1, span.max(axis=0) + 1
     indices = np.stack(np.meshgrid(np.arange(low_i, high_i + 1), np.arange(low_j, high_j + 1)), axis=-1)
     centres_px = lattice_px.points(indices) if calibration is None else calibration.fit.centres(indices)
-    lattice = camera.with_micro_images(lattice_px).lattice
+    camera = camera.with_micro_images(lattice_px)
+    lattice = camera.lattice
     radius = max(particle_radius_mm, SMALLEST_RADIUS_MM)
     if lattice.layout == "square":
         half_x, half_y = 0.5 * lattice.pitch
@@ -99,17 +88,8 @@ def raw_view(camera: Camera, media: Media, particle_radius_mm: float, calibratio
         camera.aperture_radius_mm, camera.pixel_mm * camera.image_distance_mm / camera.microlens_distance_mm
     )
     return View(
-        image_distance_mm=camera.image_distance_mm,
-        microlens_distance_mm=camera.microlens_distance_mm,
-        focal_length_mm=camera.focal_length_mm,
-        bend=1.0 - camera.microlens_distance_mm / camera.microlens_focal_length_mm,
-        focus_distance_mm=camera.focus_distance_mm,
+        camera=camera.for_kernels(),
         depth_ratio=media.depth_ratio,
-        distortion_per_mm2=camera.distortion_per_mm2,
-        aperture_radius_mm=camera.aperture_radius_mm,
-        pixel_mm=camera.pixel_mm,
-        columns=camera.columns,
-        rows=camera.rows,
         half_x_mm=float(half_x),
         half_y_mm=float(half_y),
         cell_reach=cell_reach,
@@ -121,34 +101,43 @@ def raw_view(camera: Camera, media: Media, particle_radius_mm: float, calibratio
         centres_mm=np.ascontiguousarray(camera.px_to_mm(centres_px) / camera.micro_image_scale),
         first_i=int(low_i),
         first_j=int(low_j),
-        origin_mm=lattice.origin,
         inverse_basis=np.ascontiguousarray(np.linalg.inv(lattice.basis)),
         table=table,
         table_step_mm=step,
     )
 
 
+@njit(cache=True)
+def view_of(camera: tuple[Any, ...], rest: tuple[Any, ...]) -> View:
+    """Put `view.camera[:]` and `view[1:]` together again, in parallel loops (see `KernelCamera`)."""
+    return View(KernelCamera(*camera), *rest)
+
+
 def on_array_mm(view: View, points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return where the main lens's middle shows points (n, 3 or more) on the array (n, 2), without its distortion."""
-    distance = view.focus_distance_mm + view.depth_ratio * points[:, 2]
-    return -points[:, :2] * (view.image_distance_mm / distance)[:, np.newaxis]
+    return -points[:, :2] * _image_scale(view, points[:, 2])[:, np.newaxis]
 
 
 def footprint_radius_mm(view: View, z_mm: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return how far on the array the light of particles at depths z spreads from their centres."""
-    distance = view.focus_distance_mm + view.depth_ratio * z_mm
-    alpha = 1.0 + view.image_distance_mm / distance - view.image_distance_mm / view.focal_length_mm
-    return np.abs(alpha) * view.aperture_radius_mm + view.image_distance_mm / distance * view.particle_radius_mm
+    camera, beta = view.camera, _image_scale(view, z_mm)
+    alpha = 1.0 + beta - camera.image_distance_mm / camera.focal_length_mm
+    return np.abs(alpha) * camera.aperture_radius_mm + beta * view.particle_radius_mm
+
+
+def _image_scale(view: View, z_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return s_i/s_o at depths z, without the sign of the inversion."""
+    return view.camera.image_distance_mm / (view.camera.focus_distance_mm + view.depth_ratio * z_mm)
 
 
 def entry_capacity(view: View, z_low_mm: float, z_high_mm: float) -> int:
     """Return how many (lens, pixel) entries a particle between two depths can have at most."""
-    per_axis = 0.0
-    patch = view.pixel_mm * view.image_distance_mm / view.microlens_distance_mm
+    camera, per_axis = view.camera, 0.0
+    patch = camera.pixel_mm * camera.image_distance_mm / camera.microlens_distance_mm
     for half in (view.half_x_mm, view.half_y_mm):
         radius = footprint_radius_mm(view, np.linspace(z_low_mm, z_high_mm, 101))
         lenses = np.ceil(radius / half) + 2.0
         # A lens sees the part of the aperture whose light falls into its cell.
-        lit = np.minimum(2.0 * view.aperture_radius_mm, 3.0 * half * 2.0 * view.aperture_radius_mm / radius)
+        lit = np.minimum(2.0 * camera.aperture_radius_mm, 3.0 * half * 2.0 * camera.aperture_radius_mm / radius)
         per_axis = max(per_axis, float(np.max(lenses * (lit / patch + 3.0))))
     return int(per_axis**2) + 1

@@ -73,17 +73,20 @@ class Nuisances:
 
     def applied(self, view: View) -> View:
         """Return the view with these changes."""
-        shift = np.array([self.shift_x_mm, self.shift_y_mm])
-        radius, table, step = view.aperture_radius_mm, view.table, view.table_step_mm
+        camera, shift = view.camera, np.array([self.shift_x_mm, self.shift_y_mm])
+        radius, table, step = camera.aperture_radius_mm, view.table, view.table_step_mm
         if self.aperture_radius_mm != 0.0:
             radius += self.aperture_radius_mm
-            table, step = rim_table(radius, view.pixel_mm * view.image_distance_mm / view.microlens_distance_mm)
-        return view._replace(
-            centres_mm=view.centres_mm + shift,
-            origin_mm=view.origin_mm + shift,
+            table, step = rim_table(radius, camera.pixel_mm * camera.image_distance_mm / camera.microlens_distance_mm)
+        camera = camera._replace(
+            origin_mm=camera.origin_mm + shift,
             aperture_radius_mm=radius,
+            distortion_per_mm2=camera.distortion_per_mm2 + self.distortion_per_mm2,
+        )
+        return view._replace(
+            camera=camera,
+            centres_mm=view.centres_mm + shift,
             particle_radius_mm=view.particle_radius_mm + self.particle_radius_mm,
-            distortion_per_mm2=view.distortion_per_mm2 + self.distortion_per_mm2,
             table=table,
             table_step_mm=step,
         )
@@ -143,7 +146,7 @@ def _model_errors(view: View) -> NDArray[np.float64]:
         [
             2.0 * MODEL_SHARE_OF_PITCH * view.half_x_mm,
             2.0 * MODEL_SHARE_OF_PITCH * view.half_y_mm,
-            MODEL_SHARE_OF_APERTURE * view.aperture_radius_mm,
+            MODEL_SHARE_OF_APERTURE * view.camera.aperture_radius_mm,
             MODEL_SHARE_OF_RADIUS * view.particle_radius_mm,
             MODEL_STRETCH / _corner_mm(view) ** 2,
         ]
@@ -217,13 +220,13 @@ def _freed(own: csc_matrix, column: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _steps(view: View) -> NDArray[np.float64]:
     """Return the steps (5,) of the differences."""
-    shares = SHARE_STEP * np.array([view.aperture_radius_mm, view.particle_radius_mm])
+    shares = SHARE_STEP * np.array([view.camera.aperture_radius_mm, view.particle_radius_mm])
     return np.array([SHIFT_STEP_MM, SHIFT_STEP_MM, *shares, STRETCH_STEP / _corner_mm(view) ** 2])
 
 
 def _corner_mm(view: View) -> float:
     """Return how far the sensor's corner is from the axis."""
-    return 0.5 * view.pixel_mm * float(np.hypot(view.columns, view.rows))
+    return 0.5 * view.camera.pixel_mm * float(np.hypot(view.camera.columns, view.camera.rows))
 
 
 @njit(cache=True)

@@ -59,7 +59,7 @@ def slopes(view: View, particles: NDArray[np.float64]) -> sparse.csc_array:
         rows.append(np.tile(pixels[:count], UNKNOWNS))
         columns.append(np.repeat(UNKNOWNS * number + np.arange(UNKNOWNS), count))
         entries.append((values[:count, [1, 2, 3, 0]] * (light, light, light, 1.0)).T.ravel())
-    shape = (view.rows * view.columns, UNKNOWNS * len(particles))
+    shape = (view.camera.rows * view.camera.columns, UNKNOWNS * len(particles))
     if not rows:
         return sparse.csc_array(shape)
     # A pixel that is lit through two lenses is named twice and added up here.
