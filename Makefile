@@ -3,6 +3,7 @@
 #   make            install into .venv and go from the sample's raw images to velocity vectors and pictures
 #   make flow CONFIG=rig.yaml DATA=images OUT=results A=img_a B=img_b      the same on your own images
 #   make test       quick tests           make test-all   the slow ones too
+#   make test-interpreted   a few tests whose kernels run uncompiled, readable twins in place of vectorised loops
 #   make check      ruff and mypy         make bench      speed as ratios against a stated peer
 #   make docs       the documents, with pictures from the sample, into out/docs/
 #
@@ -23,7 +24,7 @@ B ?= pair_b
 TRUTH ?= $(wildcard $(DATA)/particles.npz)
 
 .DELETE_ON_ERROR:
-.PHONY: flow install test test-all check format docs bench clean
+.PHONY: flow install test test-all test-interpreted check format docs bench clean
 .SECONDARY:
 
 flow: $(OUT)/report/flow.json
@@ -62,6 +63,9 @@ test: $(INSTALLED)
 
 test-all: $(INSTALLED)
 	$(BIN)/python -m pytest -m "slow or not slow"
+
+test-interpreted: $(INSTALLED)
+	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest tests/test_interpreted.py
 
 check: $(INSTALLED)
 	$(BIN)/ruff check .

@@ -1,0 +1,67 @@
+"""Kernels on the smallest arrays that use every loop, compiled in the quick suite and interpreted in its own run.
+
+Interpreted (`NUMBA_DISABLE_JIT=1`, `make test-interpreted`), readable twins stand in place of the vectorised intrinsics,
+and an index outside an array is an error.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from inspect import isfunction
+
+import numpy as np
+import pytest
+from numba import config
+
+from lfpiv_cli.flow.deformation import deform_pair, spline_coefficients
+from lfpiv_cli.flow.maps import map_sums, margins
+from lfpiv_cli.flow.moments import MOMENTS, pair_moments
+from lfpiv_cli.flow.windows import layout_windows
+from lfpiv_cli.grid import Grid
+from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.media import Media
+from lfpiv_cli.optics.microlenses import Lattice
+from lfpiv_cli.simd import combine, splines
+from lfpiv_cli.weights.build import factorise
+from lfpiv_cli.weights.operators import adjoint_reference, forward_reference
+
+
+def test_readable_twins_stand_for_intrinsics_where_nothing_is_compiled() -> None:
+    assert (splines.interpolate is splines.interpolate_reference) == bool(config.DISABLE_JIT)
+    assert isfunction(combine.combine_long) == bool(config.DISABLE_JIT)
+
+
+def test_operators_are_matrix_products(water: Media, table2: Camera, rng: np.random.Generator) -> None:
+    camera = replace(table2, columns=45, rows=40, lattice=Lattice.regular(0.1, origin=(0.01, -0.02)))
+    operator = factorise(camera, water, Grid.centred((2, 1, 3), (0.1, 0.1, 0.3), (0.0, 0.1, 0.0)))
+    volume, image = rng.random(operator.shape, np.float32), rng.random(operator.image_shape, np.float32)
+    np.testing.assert_allclose(operator.forward(volume), forward_reference(operator, volume), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(operator.adjoint(image), adjoint_reference(operator, image), rtol=1e-5, atol=1e-6)
+
+
+def test_a_field_at_rest_deforms_nothing(rng: np.random.Generator) -> None:
+    a, b = rng.random((2, 4, 4, 5), np.float32)
+    rest, at_windows = np.zeros((1, 1, 1, 3)), np.ones((5, 1), np.float32)
+    everywhere = np.zeros((0, 0, 0), np.bool_)
+    to_voxels = (at_windows, at_windows[:4], at_windows[:4])
+    splined = (spline_coefficients(a), spline_coefficients(b))
+    found_a, found_b, valid = deform_pair(*splined, everywhere, rest, to_voxels, (0, 0, 1), (0, 0, 0))
+    assert valid[:, :, 1:].all()
+    # float32, and taps of a weight of 2e-7 are left out
+    np.testing.assert_allclose(found_a[:, :, 1:], a / a.max(), atol=2e-6)
+    np.testing.assert_allclose(found_b[:, :, 1:], b / b.max(), atol=2e-6)
+
+
+def test_maps_and_moments_are_sums_over_a_window(rng: np.random.Generator) -> None:
+    a, b = rng.random((2, 2, 3, 4), np.float32)
+    layout = layout_windows((4, 3, 2), (4, 3, 2), (0.0, 0.0, 0.0))
+    before, after = margins(layout, a.shape, 1)
+    margin = list(zip(before, after, strict=True))
+    padded_a, padded_b = (np.pad(one, margin) for one in (a, b))
+    maps = map_sums(padded_a, padded_b, layout, before, 1).correlation()
+    assert maps[0, 0, 0, 1, 1, 1] == pytest.approx(2.0 * np.sum(a * b) / (2.0 * np.sqrt(np.sum(a**2) * np.sum(b**2))))
+    found = pair_moments(padded_a, padded_b, np.ones(padded_a.shape, np.uint8), layout, before)
+    assert found.shape == (1, 1, 1, MOMENTS)
+    # the last of the ten products among gradient and mean, and the last of those with the difference
+    mean = 0.5 * (a + b)
+    np.testing.assert_allclose(found[0, 0, 0, [9, 13]], [np.sum(mean**2), np.sum(mean * (b - a))], rtol=1e-5)
