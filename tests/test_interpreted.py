@@ -1,6 +1,6 @@
 """Kernels on the smallest arrays that use every loop, compiled in the quick suite and interpreted in its own run.
 
-Interpreted (`NUMBA_DISABLE_JIT=1`, `make test-interpreted`), readable twins stand in place of the vectorised intrinsics,
+Interpreted (`NUMBA_DISABLE_JIT=1`, `make test-interpreted`), readable twins stand in place of the vectorised loops,
 and an index outside an array is an error.
 """
 
