@@ -1,5 +1,8 @@
 """Particles as unknowns: renderings with known tracers, found with a camera calibrated from rendered pictures.
 
+And errors over the Cramer-Rao bound, of the search and the fit alone: a camera that is known exactly, images from the
+response that is fitted.
+
 The camera of Table 2 with an array that is turned, shifted and seen through distortion; tracers of 50 um in water
 behind the channel's wall, by Snell's law, brightness 0.6 to 1.4 or log-normal; the volume of the paper's flow at full
 size.
@@ -11,6 +14,7 @@ import time
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.calibration.model import Calibration, Rig, calibrate
@@ -22,11 +26,13 @@ from lfpiv_cli.particles.refraction import places_by_snell
 from lfpiv_cli.particles.rounds import find_particles
 from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.reconstruction.equations import Normalisers, normalisers
+from lfpiv_cli.robust import MAD_TO_SIGMA
 from lfpiv_cli.synthetic.board import BoardPlacement, render_board
 from lfpiv_cli.synthetic.render import ObjectSpace, render_points, render_white
 from lfpiv_cli.synthetic.scenes import Misalignment, channel_window
 from lfpiv_cli.synthetic.sensor import Readout
-from lfpiv_cli.validation.particles import particle_figures
+from lfpiv_cli.validation.bounds import cramer_rao_bound, expected_image, pixel_variance, slopes
+from lfpiv_cli.validation.particles import match, particle_figures
 from lfpiv_cli.weights.build import default_padding, factorise
 from lfpiv_cli.weights.model import Weights
 
@@ -37,6 +43,13 @@ COUNTS = (300, 1000, 3000, 8300, 16000)
 REALISATIONS = 3
 # One more line: this number with brightness spread so much (standard deviation of the logarithm).
 LOG_NORMAL = (8300, 0.5)
+# Sensor and volume of the images that are held against the bound; their tracers, on a lattice that keeps their light
+# apart and strewn as densely as the paper's 8300.
+BOUND_SHAPE, BOUND_VOLUME_XYZ = (880, 880), (36, 36, 100)
+APART_MM, BOUND_COUNT = 0.8, 830
+# Beyond so many standard errors of the bound it is another tracer, or another depth that explains the light as well:
+# counted, not averaged.
+ASTRAY = 10.0
 # Figures are also given for these distances from the focal plane, mm: light stays within one lens, few, many.
 DISTANCES_MM = ((0.0, 0.5), (0.5, 2.0), (2.0, np.inf))
 WALL_MM, CHANNEL_MM = 5.0, 10.0
@@ -74,6 +87,7 @@ def bench_particles_thrice() -> None:
 
 
 def _print_all(realisations: int) -> None:
+    print_errors_over_bound(BOUND_SHAPE, BOUND_VOLUME_XYZ, BOUND_COUNT, seed=0)
     # One calibration for all: rendering its pictures takes as long as finding a thousand tracers.
     bench = calibrated(SHAPE, VOLUME_XYZ, seed=0)
     for count, spread in (*((count, None) for count in COUNTS), LOG_NORMAL):
@@ -122,6 +136,56 @@ def print_figures(bench: Bench, count: int, seed: int, log_spread: float | None 
         figures = particle_figures(places, true, low, high, VOXEL_MM, sigma, distances)
         text = "  ".join(f"{name} {value:.4f}" for name, value in figures.items())
         print(f"{what}, {seconds:.1f} s, |z| {distances[0]:g} to {distances[1]:g} mm: {text}", flush=True)
+
+
+def print_errors_over_bound(shape: tuple[int, int], volume_xyz: tuple[int, int, int], count: int, seed: int) -> None:
+    """Print the errors of tracers apart from each other, and of `count` strewn over the volume, over the bound."""
+    camera = Camera(-1.0, 100.0, 25.0, 0.8, 0.8, Lattice.regular(0.1), 0.0055, shape[1], shape[0])
+    grid = Grid.centred(volume_xyz, (VOXEL_MM,) * 3, (0.0, 0.0, 0.0))
+    padding = default_padding(camera, WATER, grid)
+    weights = Weights(grid, padding, factorise(camera, WATER, grid.padded(padding)), camera.column_axis, None)
+    sums = normalisers(weights.padded)
+    rng = np.random.default_rng(seed)
+    low, high = (np.array([grid.bounds_mm(axis)[side] for axis in range(3)]) for side in (0, 1))
+    sides = [np.arange(a + 0.5 * APART_MM, b, APART_MM) for a, b in zip(low[:2], high[:2], strict=True)]
+    apart = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
+    apart = apart + rng.uniform(-0.05, 0.05, apart.shape)
+    places = {
+        "apart": np.column_stack([apart, rng.uniform(low[2], high[2], len(apart))]),
+        "strewn": rng.uniform(low, high, (count, 3)),
+    }
+    for name, true in places.items():
+        light = LIGHT_COUNTS * rng.uniform(0.6, 1.4, len(true))
+        view, readout = raw_view(camera, WATER, 0.5 * DIAMETER_MM), Readout()
+        truth = np.column_stack([true, light])
+        slope = slopes(view, truth)
+        expected = expected_image(slope, truth)
+        bound = cramer_rao_bound(slope, pixel_variance(expected, readout))
+        counts = readout.record(expected.reshape(shape), rng).astype(np.float32)
+        image = counts - np.float32(readout.dark_level_counts)
+        found = find_particles(image, view, weights, camera, sums)
+        pairs = match(found.position_mm, true, VOXEL_MM)
+        error = pairs.error_voxel * VOXEL_MM
+        for label, joint in (("neighbours known", False), ("neighbours to be found", True)):
+            over = error / bound.sigma_mm(joint)[pairs.true]
+            figures = errors_over_bound(over)
+            text = "  ".join(f"{key} {value:.3f}" for key, value in figures.items())
+            print(
+                f"{len(true)} tracers {name}, recall {len(pairs.true) / len(true):.4f}, errors over the bound with "
+                f"{label}: {text}",
+                flush=True,
+            )
+
+
+def errors_over_bound(over: NDArray[np.float64]) -> dict[str, float]:
+    """Return rms and robust spread of errors (n, 3) in units of the bound, and the share that is far astray."""
+    figures = {}
+    for name, values in zip("xyz", over.T, strict=True):
+        near = np.abs(values) <= ASTRAY
+        figures[f"rms_{name}"] = float(np.sqrt(np.mean(values[near] ** 2))) if near.any() else float("nan")
+        figures[f"spread_{name}"] = float(MAD_TO_SIGMA * np.median(np.abs(values))) if values.size else float("nan")
+        figures[f"astray_{name}"] = float(np.mean(~near)) if values.size else float("nan")
+    return figures
 
 
 def _calibration(sheet: Camera, real: Camera, rng: np.random.Generator) -> Calibration:
