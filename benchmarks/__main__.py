@@ -1,7 +1,7 @@
 """Run the benchmarks that are named, or all of them: `python -m benchmarks [NAME ...]`.
 
 To add one: a function that takes no arguments, prints its figures, and has a line in `BENCHMARKS`; it lives in a
-function of its own with a size, which the tests call with a tiny one.
+function of its own with a size, which the tests call with a tiny one. `rigs` alone has options of its own.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from benchmarks.calibration import bench_calibration
 from benchmarks.correlation import bench_correlation, bench_correlation_accuracy
 from benchmarks.depth import bench_depth
 from benchmarks.particles import bench_particles, bench_particles_thrice
+from benchmarks.rigs import bench_rigs
 from benchmarks.solvers import bench_solvers
 from benchmarks.weights import bench_weights
 
@@ -23,12 +24,16 @@ BENCHMARKS: dict[str, Callable[[], None]] = {
     "depth": bench_depth,
     "particles": bench_particles,
     "particles-thrice": bench_particles_thrice,
+    "rigs": bench_rigs,
     "solvers": bench_solvers,
     "weights": bench_weights,
 }
 
 
 def main(names: list[str]) -> None:
+    if names[:1] == ["rigs"]:
+        bench_rigs(names[1:])
+        return
     unknown = [name for name in names if name not in BENCHMARKS]
     if unknown:
         sys.exit(f"no benchmark is called {unknown[0]!r}; there are {', '.join(BENCHMARKS)}")

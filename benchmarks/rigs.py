@@ -1,0 +1,292 @@
+"""Other people's rigs: whole experiments on cameras drawn at random, by the program's own commands, against the truth.
+
+    python -m benchmarks rigs [--seed S] [--rigs N] [--only K] [--json FILE] [--without-volumes]
+
+Each is simulated with its camera as it is (white, dark, board or none, a pair of tracers' images, dirt on the sensor),
+then calibrated, reconstructed and measured with its owner's configuration. What came of it is one of
+
+- refused: a sentence before the work starts,
+- failed: a sentence later on, or a crash,
+- warned: a result that is wrong, with a warning,
+- silent: a result that is wrong without one,
+- worked.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import time
+import warnings
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from click.testing import CliRunner
+
+from benchmarks.rig_drawing import DrawnRig, draw
+from benchmarks.rig_judging import Figures, judge_particles, judge_tracks, judge_vectors, truth_of
+from lfpiv_cli.cli import cli
+from lfpiv_cli.errors import LfpivError
+from lfpiv_cli.files.config import load_config
+from lfpiv_cli.files.images import read_image, write_tiff
+from lfpiv_cli.stages.simulate import readout_of, real_camera
+from lfpiv_cli.synthetic.render import render_white
+
+RIGS, SEED = 40, 20261122
+# Samples along each side of a white image's pixel.
+WHITE_SAMPLES = 4
+# Steps that come before the work: what cannot work is to be refused in one of them.
+BEFORE_THE_WORK = ("calibrate-snapshot", "build-weights")
+# What is told of a run and warns of nothing.
+NOTICES = ("were chosen", "columns are made on demand")
+# Standard deviation of a speck's shadow in pixels, and its depth.
+SPECK_PX, SPECK_DEPTH = (0.7, 4.0), (0.1, 0.8)
+# A result is wrong where a slope is off by more (and by more than two of its standard errors), where less than this
+# share of bright tracers is found, where fewer errors lie within 1.96 standard errors, of so many at least, and where
+# less than this share of the tracers found is followed into the second image.
+SMALLEST_TRACKED = 0.5
+WRONG_SLOPE, SMALLEST_RECALL, SMALLEST_COVERAGE, FEWEST = 0.02, 0.5, 0.8, 20
+# Tracers are bright where at least this share of them could be told from noise alone.
+BRIGHT_SHARE = 0.5
+
+
+@dataclass
+class Step:
+    """A command that was run: its exit code, its error, and what it warned of."""
+
+    command: str
+    exit_code: int
+    error: str
+    warnings: list[str]
+    seconds: float
+
+
+@dataclass
+class Outcome:
+    """What came of a rig."""
+
+    number: int
+    name: str
+    wrong_value: str
+    steps: list[Step] = field(default_factory=list)
+    figures: Figures = field(default_factory=dict)
+    faults: list[str] = field(default_factory=list)
+    verdict: str = ""
+    seconds: float = 0.0
+
+    @property
+    def said(self) -> list[str]:
+        """All warnings."""
+        return [text for step in self.steps for text in step.warnings]
+
+    @property
+    def error(self) -> str:
+        """The first step that failed, and its sentence."""
+        failed = [step for step in self.steps if step.exit_code]
+        return f"{failed[0].command} ({failed[0].exit_code}): {failed[0].error}" if failed else ""
+
+
+def bench_rigs(arguments: Sequence[str] = ()) -> None:
+    """Run the experiments and print a row for each and a summary."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks rigs")
+    parser.add_argument("--seed", type=int, default=SEED)
+    parser.add_argument("--rigs", type=int, default=RIGS)
+    parser.add_argument("--only", type=int, action="append", help="number of a rig; repeatable")
+    parser.add_argument("--json", type=Path, help="file for all figures")
+    parser.add_argument("--keep", type=Path, help="folder in which images and results stay")
+    parser.add_argument("--without-volumes", action="store_true", help="only particles, which take less time")
+    chosen = parser.parse_args(arguments)
+    outcomes = []
+    for number in chosen.only or range(chosen.rigs):
+        outcome = run_rig(draw(chosen.seed, number), chosen.keep, not chosen.without_volumes)
+        outcomes.append(outcome)
+        print(row(outcome), flush=True)
+        if chosen.json:
+            chosen.json.write_text(json.dumps([as_tree(each) for each in outcomes], indent=1))
+    print(summary(outcomes))
+
+
+def as_tree(outcome: Outcome) -> dict[str, Any]:
+    """Return an outcome for JSON."""
+    tree = {name: value for name, value in vars(outcome).items() if name != "steps"}
+    return tree | {"steps": [vars(step) for step in outcome.steps], "error": outcome.error}
+
+
+def run_rig(rig: DrawnRig, keep: Path | None = None, volumes: bool = True) -> Outcome:
+    """Return what comes of a rig's experiment."""
+    outcome = Outcome(rig.number, rig.name(), rig.wrong)
+    began = time.perf_counter()
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary) if keep is None else keep / f"rig_{rig.number:03d}"
+        folder.mkdir(parents=True, exist_ok=True)
+        experiment(rig, folder, outcome, volumes)
+    outcome.seconds = time.perf_counter() - began
+    outcome.faults = faults(outcome.figures)
+    outcome.verdict = verdict(outcome)
+    return outcome
+
+
+def experiment(rig: DrawnRig, folder: Path, outcome: Outcome, volumes: bool) -> None:
+    """Simulate, calibrate, measure by particles and by volumes, and judge, as far as the commands lead."""
+    true, told, images = folder / "true.yaml", folder / "told.yaml", folder / "images"
+    true.write_text(yaml.safe_dump(rig.true))
+    told.write_text(yaml.safe_dump(rig.told))
+    photograph_white(true, images)
+    for what in ("board", "particles") if rig.board else ("particles",):
+        step = run_command("simulate", what, true, "-o", images)
+        if step.exit_code:
+            outcome.steps.append(step)
+            return
+    soil(images, rig)
+    truth = truth_of(load_config(true), images)
+
+    def done(*arguments: object) -> bool:
+        outcome.steps.append(run_command(*arguments))
+        return outcome.steps[-1].exit_code == 0
+
+    dark = ("--dark", images / "dark.tif")
+    board = ("--board", images / "board.tif") if rig.board else ()
+    calibration, weights = folder / "calibration.h5", folder / "weights.h5"
+    if not done("calibrate-snapshot", told, "--white", images / "white.tif", *dark, *board, "-o", calibration):
+        return
+    if not done("build-weights", told, "--calibration", calibration, "-o", weights):
+        return
+    pair = (images / "pair_a.tif", images / "pair_b.tif")
+    by_particles = ("--solver", "particles", "--pairing", "ab", "-o", folder / "particles")
+    if done("reconstruct", weights, *pair, *dark, *by_particles):
+        particles = [folder / "particles" / f"pair_{name}.vtkhdf" for name in "ab"]
+        outcome.figures |= judge_particles(rig, truth, particles[0])
+        if done("track", *particles, "--grid", "-o", folder / "tracks.vtkhdf"):
+            outcome.figures |= judge_tracks(truth, folder / "tracks.vtkhdf")
+            outcome.figures |= judge_vectors(truth, folder / "tracks_grid.vtkhdf", "grid")
+    if volumes and done("reconstruct", weights, *pair, *dark, "-o", folder / "volumes"):
+        both = [folder / "volumes" / f"pair_{name}.vtkhdf" for name in "ab"]
+        if done("correlate", *both, "-o", folder / "vectors.vtkhdf"):
+            outcome.figures |= judge_vectors(truth, folder / "vectors.vtkhdf", "volumes")
+
+
+def run_command(*arguments: object) -> Step:
+    """Run a command of the program in this process; return how it ended."""
+    words = [str(word) for word in arguments]
+    began = time.perf_counter()
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        ended = CliRunner().invoke(cli, words)
+    seconds = time.perf_counter() - began
+    code, error = ended.exit_code, ""
+    if isinstance(ended.exception, LfpivError):
+        code, error = ended.exception.exit_code, str(ended.exception)
+    elif ended.exception is not None:
+        error = f"{type(ended.exception).__name__}: {ended.exception}"
+    said = [line for line in ended.stderr.splitlines() if line.startswith("lfpiv:") or "Warning" in line]
+    said = [line for line in said if not any(notice in line for notice in NOTICES)]
+    name = " ".join([words[0], *[word for word in words if word == "particles"]])
+    return Step(name, code, error, said, seconds)
+
+
+def photograph_white(config: Path, images: Path) -> None:
+    """Write a white and a dark image, as `simulate white` does in ten times as long."""
+    settings = load_config(config)
+    camera, readout = real_camera(settings), readout_of(settings)
+    rng = np.random.default_rng([settings.simulation.seed, 0])
+    light = render_white(camera, settings.simulation.peak_counts, WHITE_SAMPLES)
+    images.mkdir(exist_ok=True)
+    write_tiff(images / "white.tif", readout.record(light, rng), overwrite=True)
+    write_tiff(images / "dark.tif", readout.record(np.zeros_like(light), rng), overwrite=True)
+
+
+def soil(images: Path, rig: DrawnRig) -> None:
+    """Cast the shadows of specks on the sensor into all images but the dark one."""
+    rng = np.random.default_rng([rig.true["simulation"]["seed"], 1])
+    sensor, scene = rig.true["camera"]["sensor"], rig.true["simulation"]
+    shape = (sensor["rows"], sensor["columns"])
+    row, column = np.indices(shape)
+    passing = np.ones(shape)
+    for _ in range(rig.dirt):
+        middle, width = rng.random(2) * shape, rng.uniform(*SPECK_PX)
+        far2 = (row - middle[0]) ** 2 + (column - middle[1]) ** 2
+        passing *= 1.0 - rng.uniform(*SPECK_DEPTH) * np.exp(-far2 / (2.0 * width**2))
+    dark = scene["dark_level_counts"]
+    for path in images.glob("*.tif"):
+        if path.name != "dark.tif":
+            shadowed = dark + passing * (read_image(path, shape) - dark)
+            write_tiff(path, np.rint(np.maximum(shadowed, 0.0)).astype(np.uint16), overwrite=True)
+
+
+def faults(figures: Figures) -> list[str]:
+    """Return what is wrong with the particles and their tracks."""
+    wrong = []
+    if figures.get("bright", 0.0) >= BRIGHT_SHARE and figures.get("recall", 1.0) < SMALLEST_RECALL:
+        wrong.append(f"recall {figures['recall']:.2f}")
+    for name in "uvw":
+        slope = figures.get(f"slope_{name}")
+        if slope is not None and abs(slope - 1.0) > WRONG_SLOPE + 2.0 * figures[f"slope_{name}_sigma"]:
+            wrong.append(f"slope {name} {slope:.3f}")
+    judged = figures.get("recall", 0.0) * figures.get("tracers", 0.0)
+    if figures.get("tracks", judged) < SMALLEST_TRACKED * judged:
+        wrong.append(f"{figures['tracks']:.0f} tracks of {judged:.0f} tracers found")
+    for name in "xyz":
+        coverage = figures.get(f"coverage_{name}", 1.0)
+        if judged >= FEWEST and coverage < SMALLEST_COVERAGE:
+            wrong.append(f"coverage {name} {coverage:.2f}")
+    return wrong
+
+
+def verdict(outcome: Outcome) -> str:
+    """Return what came of it, in a word."""
+    failed = [step for step in outcome.steps if step.exit_code]
+    if failed:
+        bug = failed[0].exit_code == 1
+        return "refused" if failed[0].command in BEFORE_THE_WORK and not bug else "failed"
+    if not outcome.faults:
+        return "worked"
+    return "warned" if outcome.said else "silent"
+
+
+def row(outcome: Outcome) -> str:
+    """Return what is printed of a rig."""
+    figures = outcome.figures
+
+    def told(template: str, *names: str) -> str:
+        return " ".join(template.format(figures.get(name, float("nan"))) for name in names)
+
+    lines = [
+        f"{outcome.number:3d} {outcome.verdict:8s} {outcome.seconds:5.0f} s  {outcome.name}",
+        f"      tracers {told('{:.0f}', 'tracers')}, found {told('{:.0f}', 'found')}, "
+        f"recall {told('{:.3f}', 'recall')}, precision {told('{:.3f}', 'precision')}, "
+        f"over the bound, lateral {told('{:.2f}', 'over_x', 'over_y')}, depth {told('{:.2f}', 'over_z')} "
+        f"(astray {told('{:.2f}', 'astray_x', 'astray_z')}), "
+        f"coverage {told('{:.2f}', 'coverage_x', 'coverage_y', 'coverage_z')}",
+        f"      slopes of {told('{:.0f}', 'tracks')} tracks {told('{:.3f}', 'slope_u', 'slope_v', 'slope_w')} "
+        f"(+- {told('{:.3f}', 'slope_u_sigma', 'slope_v_sigma', 'slope_w_sigma')}), of their grid "
+        f"{told('{:.3f}', 'grid_slope_u', 'grid_slope_v', 'grid_slope_w')}, of volumes "
+        f"{told('{:.3f}', 'volumes_slope_u', 'volumes_slope_v', 'volumes_slope_w')}, volumes' coverage "
+        f"{told('{:.2f}', 'volumes_coverage_u', 'volumes_coverage_v', 'volumes_coverage_w')} of "
+        f"{told('{:.2f}', 'volumes_sigma_known')}",
+    ]
+    if outcome.faults:
+        lines.append(f"      wrong: {', '.join(outcome.faults)}")
+    if outcome.error:
+        lines.append(f"      {outcome.error}")
+    lines.extend(f"      {text}" for text in outcome.said)
+    return "\n".join(lines)
+
+
+def summary(outcomes: Sequence[Outcome]) -> str:
+    """Return how many rigs came to what, and which ones were wrong without a word."""
+    count = Counter(outcome.verdict for outcome in outcomes)
+    verdicts = ", ".join(f"{count[name]} {name}" for name in ("worked", "refused", "failed", "warned", "silent"))
+    lines = [f"{len(outcomes)} rigs: {verdicts}"]
+    for name in ("refused", "failed"):
+        lines.extend(f"{name}: rig {each.number}: {each.error}" for each in outcomes if each.verdict == name)
+    for each in outcomes:
+        if each.verdict == "silent":
+            doubt = f" (wrong {each.wrong_value})" if each.wrong_value else ""
+            lines.append(f"silent: rig {each.number}{doubt}: {', '.join(each.faults)}")
+    return "\n".join(lines)
