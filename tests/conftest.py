@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 
@@ -62,6 +65,22 @@ def window() -> Window:
 @pytest.fixture
 def rng() -> np.random.Generator:
     return np.random.default_rng(20260101)
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    threads = numba.get_num_threads()
+    numba.set_num_threads(1)
+    try:
+        yield
+    finally:
+        numba.set_num_threads(threads)
+
+
+@pytest.fixture
+def one_thread() -> Callable[[], AbstractContextManager[None]]:
+    """A context in which kernels run on one thread, for the bits that must not depend on their number."""
+    return _one_thread
 
 
 @pytest.fixture(scope="session")

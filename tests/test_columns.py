@@ -9,7 +9,6 @@ import pytest
 import tifffile
 import yaml
 from click.testing import CliRunner
-from numba import get_num_threads, set_num_threads
 
 from lfpiv_cli import open_volume, open_weights
 from lfpiv_cli.cli import cli
@@ -141,16 +140,12 @@ def test_too_many_columns_are_refused_with_their_size(turned, water, monkeypatch
         operator.restricted(np.ones(operator.image_shape, np.float32))
 
 
-def test_same_bits_for_any_number_of_threads(turned, water, rng):
+def test_same_bits_for_any_number_of_threads(turned, water, rng, one_thread):
     operator = OnDemandOperator(turned, ObjectSpace(water, None, "paraxial"), GRID)
     volume = rng.random(operator.shape, dtype=np.float32)
-    threads = get_num_threads()
-    try:
-        set_num_threads(1)
+    with one_thread():
         image = operator.forward(volume)
         back = operator.adjoint(image)
-    finally:
-        set_num_threads(threads)
     assert np.array_equal(image, operator.forward(volume))
     assert np.array_equal(back, operator.adjoint(image))
 

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import numba
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from lfpiv_cli.errors import ConfigError, InputError
-from lfpiv_cli.flow.correlation import correlate, correlate_ensemble, count_passes
+from lfpiv_cli.flow.correlation import correlate, count_passes
 from lfpiv_cli.flow.deformation import (
     SLACK,
     SPLINE_PAD,
@@ -241,7 +240,7 @@ def test_rigid_shift_is_found_with_its_sign_up_to_the_borders(
 ) -> None:
     shape = (44, 52, 40)
     a, b = moving_pair(rigid(*shift), shape, rng)
-    field = correlate(a, b, unit_grid(shape), [(16, 16, 16)], HALF, None)
+    field = correlate([(a, b)], unit_grid(shape), [(16, 16, 16)], HALF, None)
     assert field.flag.max() == 0
     error = field.displacement_voxel - np.array(shift)
     # A face cuts particles of 8 per window; a corner's window has lost a third of its own.
@@ -259,7 +258,7 @@ def test_linear_shear_is_found_up_to_the_borders(rng: np.random.Generator) -> No
         return moved
 
     a, b = moving_pair(shear, shape, rng)
-    field = correlate(a, b, unit_grid(shape), [(16, 16, 16)], HALF, None)
+    field = correlate([(a, b)], unit_grid(shape), [(16, 16, 16)], HALF, None)
     # The windows at the borders see one side of the shear only, and approach its value pass by pass.
     error = field.displacement_voxel - truth_at(field, shear)
     assert np.all(root_mean_square(error) < 0.06)
@@ -269,7 +268,7 @@ def test_linear_shear_is_found_up_to_the_borders(rng: np.random.Generator) -> No
 def test_elongated_particles_and_windows(rng: np.random.Generator) -> None:
     shape, shift = (40, 40, 48), (1.3, 0.7, 1.5)
     a, b = moving_pair(rigid(*shift), shape, rng, sigma=(1.0, 1.0, 4.0))
-    field = correlate(a, b, unit_grid(shape), [(16, 16, 24)], (0.5, 0.5, 0.75), None)
+    field = correlate([(a, b)], unit_grid(shape), [(16, 16, 24)], (0.5, 0.5, 0.75), None)
     assert field.window_voxel == (16, 16, 24)
     error = root_mean_square(field.displacement_voxel - np.array(shift))
     # The depth is located four times less well at best; by three points of the long peak it was ten times.
@@ -286,7 +285,7 @@ def test_long_particles_do_not_flatten_a_curved_flow(rng: np.random.Generator) -
         return moved
 
     a, b = moving_pair(wave, shape, rng, per_window=40.0, sigma=(1.0, 1.0, 8.0))
-    field = correlate(a, b, unit_grid(shape), [(16, 16, 16)], HALF, None)
+    field = correlate([(a, b)], unit_grid(shape), [(16, 16, 16)], HALF, None)
     truth = truth_at(field, wave)
     inner = (slice(1, -1),) * 3
     slopes = [
@@ -305,7 +304,7 @@ def test_roots_of_intensities_let_dim_particles_count(rng: np.random.Generator) 
     a, b = (faint + np.float32(20.0) * strong for faint, strong in zip(dim, bright, strict=True))
     errors = []
     for exponent in (1.0, 0.5):
-        field = correlate(a, b, unit_grid(shape), [(16, 16, 16)], HALF, None, exponent=exponent)
+        field = correlate([(a, b)], unit_grid(shape), [(16, 16, 16)], HALF, None, exponent=exponent)
         errors.append(np.sqrt(np.nanmean((field.displacement_voxel - np.array(shift)) ** 2)))
     assert errors[1] < 0.7 * errors[0]
 
@@ -324,30 +323,29 @@ def test_any_windows_and_overlap_work(
 ) -> None:
     shape, shift = (40, 44, 36), (1.3, -0.7, 0.4)
     a, b = moving_pair(rigid(*shift), shape, rng)
-    field = correlate(a, b, unit_grid(shape), windows, overlap, 0.5)
+    field = correlate([(a, b)], unit_grid(shape), windows, overlap, 0.5)
     np.testing.assert_allclose(field.displacement_voxel, np.broadcast_to(shift, (*field.flag.shape, 3)), atol=0.03)
 
 
 def test_exchanging_the_volumes_turns_the_vectors_round(rng: np.random.Generator) -> None:
     shape = (40, 40, 40)
     a, b = moving_pair(rigid(1.3, -0.7, 0.4), shape, rng)
-    there, back = (correlate(*pair, unit_grid(shape), [(16, 16, 16)], HALF, None) for pair in ((a, b), (b, a)))
+    there, back = (correlate([pair], unit_grid(shape), [(16, 16, 16)], HALF, None) for pair in ((a, b), (b, a)))
     np.testing.assert_allclose(there.displacement_voxel, -back.displacement_voxel, atol=1e-4)
 
 
 def test_exchanging_axes_exchanges_components(rng: np.random.Generator) -> None:
     a, b = moving_pair(rigid(1.3, -0.7, 0.4), (40, 44, 36), rng)
-    straight = correlate(a, b, unit_grid((40, 44, 36)), [(16, 16, 16)], HALF, None)
-    turned = correlate(
-        np.ascontiguousarray(a.T), np.ascontiguousarray(b.T), unit_grid((36, 44, 40)), [(16, 16, 16)], HALF, None
-    )
+    straight = correlate([(a, b)], unit_grid((40, 44, 36)), [(16, 16, 16)], HALF, None)
+    exchanged = np.ascontiguousarray(a.T), np.ascontiguousarray(b.T)
+    turned = correlate([exchanged], unit_grid((36, 44, 40)), [(16, 16, 16)], HALF, None)
     back = turned.displacement_voxel.transpose(2, 1, 0, 3)[..., ::-1]
     np.testing.assert_allclose(straight.displacement_voxel, back, atol=1e-4)
 
 
 def test_volumes_with_nothing_in_them_are_flagged() -> None:
     empty = np.zeros((24, 24, 24), dtype=np.float32)
-    field = correlate(empty, empty, unit_grid((24, 24, 24)), [(16, 16, 16)], HALF, 1.0)
+    field = correlate([(empty, empty)], unit_grid((24, 24, 24)), [(16, 16, 16)], HALF, 1.0)
     assert np.all(field.flag == REJECTED)
     assert np.all(np.isnan(field.velocity))
     assert np.all(field.correlation == 0.0)
@@ -356,7 +354,7 @@ def test_volumes_with_nothing_in_them_are_flagged() -> None:
 
 def test_constant_volumes_have_finite_or_flagged_vectors() -> None:
     grey = np.full((24, 24, 24), 7.0, dtype=np.float32)
-    field = correlate(grey, grey, unit_grid((24, 24, 24)), [(16, 16, 16)], HALF, 1.0)
+    field = correlate([(grey, grey)], unit_grid((24, 24, 24)), [(16, 16, 16)], HALF, 1.0)
     assert np.all(np.isfinite(field.velocity[field.flag < REJECTED]))
 
 
@@ -365,7 +363,7 @@ def test_half_empty_volume_keeps_its_other_half(rng: np.random.Generator) -> Non
     a, b = moving_pair(rigid(*shift), shape, rng)
     a[:, :, 28:] = 0.0
     b[:, :, 28:] = 0.0
-    field = correlate(a, b, unit_grid(shape), [(16, 16, 16)], HALF, 1e-3)
+    field = correlate([(a, b)], unit_grid(shape), [(16, 16, 16)], HALF, 1e-3)
     full = field.grid.axis_mm(0) < 18.0
     np.testing.assert_allclose(
         field.displacement_voxel[:, :, full],
@@ -382,7 +380,7 @@ def test_masked_windows_are_masked_and_their_neighbours_unharmed(rng: np.random.
     mask = np.ones(a.shape, dtype=np.bool_)
     mask[:, :, 32:] = False
     a[:, :, 32:] = rng.random(a[:, :, 32:].shape)
-    field = correlate(a, b, unit_grid(shape), [(16, 16, 16)], HALF, 1e-3, mask)
+    field = correlate([(a, b)], unit_grid(shape), [(16, 16, 16)], HALF, 1e-3, mask)
     beyond = field.grid.axis_mm(0) > 40.0
     assert np.all(field.flag[:, :, beyond] == MASKED)
     seen = field.flag < REJECTED
@@ -393,41 +391,37 @@ def test_voxels_that_are_not_finite_are_masked(rng: np.random.Generator) -> None
     shape, shift = (40, 40, 40), (1.3, -0.7, 0.4)
     a, b = moving_pair(rigid(*shift), shape, rng)
     a[20, 20, 20] = np.nan
-    field = correlate(a, b, unit_grid(shape), [(16, 16, 16)], HALF, 1e-3)
+    field = correlate([(a, b)], unit_grid(shape), [(16, 16, 16)], HALF, 1e-3)
     np.testing.assert_allclose(field.displacement_voxel, np.broadcast_to(shift, (*field.flag.shape, 3)), atol=CORNER)
 
 
 def test_an_ensemble_finds_what_its_pairs_are_too_sparse_for(rng: np.random.Generator) -> None:
     shape, shift = (40, 40, 40), (1.3, -0.7, 0.4)
     pairs = [moving_pair(rigid(*shift), shape, rng, per_window=1.0) for _ in range(12)]
-    together = correlate_ensemble(iter(pairs), unit_grid(shape), [(16, 16, 16)], HALF, None)
-    single = correlate(*pairs[0], unit_grid(shape), [(16, 16, 16)], HALF, None)
+    together = correlate(iter(pairs), unit_grid(shape), [(16, 16, 16)], HALF, None)
+    single = correlate(pairs[:1], unit_grid(shape), [(16, 16, 16)], HALF, None)
     errors = [np.abs(field.displacement_raw_voxel - np.array(shift)) for field in (together, single)]
     assert np.all(errors[0] < 0.1)
     assert not np.all(errors[1] < 0.5)
     with pytest.raises(InputError):
-        correlate_ensemble([], unit_grid(shape), [(16, 16, 16)], HALF, None)
+        correlate([], unit_grid(shape), [(16, 16, 16)], HALF, None)
 
 
 def test_an_ensemble_of_one_pair_twice_is_that_pair(rng: np.random.Generator) -> None:
     shape = (32, 32, 32)
     a, b = moving_pair(rigid(1.3, -0.7, 0.4), shape, rng)
-    once = correlate(a, b, unit_grid(shape), [(16, 16, 16)], HALF, None)
-    twice = correlate_ensemble([(a, b), (a, b)], unit_grid(shape), [(16, 16, 16)], HALF, None)
+    once = correlate([(a, b)], unit_grid(shape), [(16, 16, 16)], HALF, None)
+    twice = correlate([(a, b), (a, b)], unit_grid(shape), [(16, 16, 16)], HALF, None)
     np.testing.assert_allclose(twice.displacement_voxel, once.displacement_voxel, atol=1e-6)
     np.testing.assert_allclose(twice.correlation, once.correlation, atol=1e-6)
 
 
-def test_threads_do_not_change_a_bit(rng: np.random.Generator) -> None:
+def test_threads_do_not_change_a_bit(rng: np.random.Generator, one_thread) -> None:
     shape = (40, 40, 40)
     a, b = moving_pair(rigid(1.3, -0.7, 0.4), shape, rng)
-    parallel = correlate(a, b, unit_grid(shape), [(16, 16, 16)], HALF, None)
-    threads = numba.get_num_threads()
-    numba.set_num_threads(1)
-    try:
-        serial = correlate(a, b, unit_grid(shape), [(16, 16, 16)], HALF, None)
-    finally:
-        numba.set_num_threads(threads)
+    parallel = correlate([(a, b)], unit_grid(shape), [(16, 16, 16)], HALF, None)
+    with one_thread():
+        serial = correlate([(a, b)], unit_grid(shape), [(16, 16, 16)], HALF, None)
     assert parallel.displacement_voxel.tobytes() == serial.displacement_voxel.tobytes()
     assert parallel.peak_ratio.tobytes() == serial.peak_ratio.tobytes()
 
@@ -436,7 +430,7 @@ def test_progress_counts_every_pass(rng: np.random.Generator) -> None:
     windows = [(16, 16, 16), (8, 8, 8)]
     a, b = moving_pair(rigid(0.5, 0.0, 0.0), (24, 24, 24), rng)
     units: list[int] = []
-    correlate(a, b, unit_grid((24, 24, 24)), windows, HALF, None, progress=units.append)
+    correlate([(a, b)], unit_grid((24, 24, 24)), windows, HALF, None, progress=units.append)
     assert sum(units) == count_passes(windows)
 
 
@@ -449,12 +443,12 @@ def test_progress_counts_every_pass(rng: np.random.Generator) -> None:
         ({"dt_s": 0.0}, ConfigError),
         ({"exponent": 0.0}, ConfigError),
         ({"exponent": 1.5}, ConfigError),
-        ({"b": np.zeros((4, 4, 5), dtype=np.float32)}, InputError),
+        ({"pairs": [(np.zeros((4, 4, 4), np.float32), np.zeros((4, 4, 5), np.float32))]}, InputError),
         ({"mask": np.ones((4, 4, 5), dtype=np.bool_)}, InputError),
     ],
 )
 def test_arguments_that_do_not_belong_together_are_refused(change: dict, error: type[Exception]) -> None:
     empty = np.zeros((4, 4, 4), dtype=np.float32)
-    arguments = {"a": empty, "b": empty, "grid": unit_grid((4, 4, 4)), "windows": [(4, 4, 4)], "overlap": HALF}
+    arguments = {"pairs": [(empty, empty)], "grid": unit_grid((4, 4, 4)), "windows": [(4, 4, 4)], "overlap": HALF}
     with pytest.raises(error):
         correlate(**(arguments | {"dt_s": 1.0} | change))

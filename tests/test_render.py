@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numba
 import numpy as np
 import pytest
 
@@ -94,19 +93,15 @@ def test_a_ball_seen_along_the_axis_has_a_fifth_of_the_squared_radius_per_axis(r
     assert np.mean(points**2, axis=0) == pytest.approx([0.8, 0.8], abs=0.02)
 
 
-def test_same_bits_for_any_number_of_threads_and_any_batch(small, space, rng, monkeypatch):
+def test_same_bits_for_any_number_of_threads_and_any_batch(small, space, rng, monkeypatch, one_thread):
     points = rng.uniform(-0.2, 0.2, (7, 3))
 
     def picture():
         return render_points(small, space, points, 1.0, 0.05, np.random.default_rng(3), rays=500)
 
-    threads = numba.get_num_threads()
     expected = picture()
-    numba.set_num_threads(1)
-    try:
+    with one_thread():
         assert np.array_equal(picture(), expected)
-    finally:
-        numba.set_num_threads(threads)
     monkeypatch.setattr(render, "RAYS_AT_ONCE", 1000)
     assert np.array_equal(picture(), expected)
 

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numba import get_num_threads, set_num_threads
 
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.grid import Grid
@@ -93,16 +92,12 @@ def test_kernels_equal_dense_products(small, water, rng, shape):
     np.testing.assert_allclose(operator.adjoint(image), adjoint_reference(operator, image), rtol=1e-5, atol=1e-6)
 
 
-def test_same_bits_for_any_number_of_threads(small, water, rng):
+def test_same_bits_for_any_number_of_threads(small, water, rng, one_thread):
     operator = factorise(small, water, Grid.centred((9, 8, 7), (0.1, 0.1, 0.5), (0.0, 0.0, 0.0)))
     volume = rng.random(operator.shape, dtype=np.float32)
-    threads = get_num_threads()
-    try:
-        set_num_threads(1)
+    with one_thread():
         image = operator.forward(volume)
         back = operator.adjoint(image)
-    finally:
-        set_num_threads(threads)
     assert np.array_equal(image, operator.forward(volume))
     assert np.array_equal(back, operator.adjoint(image))
 

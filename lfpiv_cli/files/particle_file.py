@@ -23,11 +23,9 @@ from lfpiv_cli.files.hdf5 import (
     member,
     open_h5,
     read_array,
-    read_provenance,
     write_array,
-    write_header,
 )
-from lfpiv_cli.files.vtk import create_vtk_group, read_attributes, write_attributes
+from lfpiv_cli.files.vtk import create_vtk_group, read_root, write_root
 from lfpiv_cli.reference import Reference
 
 PARTICLES_FORMAT = "lfpiv-particles"
@@ -107,8 +105,7 @@ def write_points(
         raise ValueError(f"{format_name} has the arrays {sorted(units)} of {len(position_mm)} rows each")
 
     def fill(file: h5py.File) -> None:
-        write_header(file, format_name, FORMAT_VERSION, provenance)
-        write_attributes(file, reference.attributes() | dict(attributes))
+        write_root(file, format_name, FORMAT_VERSION, reference, attributes, provenance)
         vtk = create_vtk_group(file, "PolyData")
         vtk["Points"] = write_array(file, POSITION, position_mm, "mm")
         vtk["NumberOfPoints"] = np.array([len(position_mm)], dtype=np.int64)
@@ -137,14 +134,13 @@ def read_points(path: Path | str, format_name: str) -> Points:
         size = path.stat().st_size
         position = read_array(member(file, POSITION), size)
         arrays = {name: read_array(member(file, name), size) for name in UNITS[format_name]}
-        attributes, provenance = read_attributes(file), read_provenance(file)
-        reference = Reference.from_attributes(attributes)
+        root = read_root(file)
     if position.ndim != 2 or position.shape[1] != 3:
         raise InputError(f"{path}: its positions have the shape {position.shape}, expected (n, 3)")
     for name, array in (arrays | {POSITION: position}).items():
         if len(array) != len(position) or not np.isfinite(array).all():
             raise InputError(f"{path}: {name} has not one finite value for each of its {len(position)} points")
-    return Points(position.astype(np.float64), arrays, reference, attributes, provenance)
+    return Points(position.astype(np.float64), arrays, root.reference, root.attributes, root.provenance)
 
 
 def symmetric(matrices: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -3,15 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import h5py
 import numpy as np
 
-from lfpiv_cli.files.hdf5 import RESERVED, from_attribute, to_attribute
+from lfpiv_cli.files.hdf5 import RESERVED, from_attribute, read_provenance, to_attribute, write_header
+from lfpiv_cli.reference import Reference
 
 # The version of VTK's layout that ParaView 5.12 reads and later ones still do.
 VTK_VERSION = (2, 0)
+
+
+@dataclass(frozen=True, eq=False)
+class Header:
+    """What a file says about itself besides its arrays: its coordinates' origin, attributes at the root, provenance."""
+
+    reference: Reference
+    attributes: dict[str, Any]
+    provenance: dict[str, Any]
 
 
 def create_vtk_group(file: h5py.File, kind: Literal["ImageData", "PolyData"]) -> h5py.Group:
@@ -23,12 +34,20 @@ def create_vtk_group(file: h5py.File, kind: Literal["ImageData", "PolyData"]) ->
     return vtk
 
 
-def write_attributes(file: h5py.File, attributes: Mapping[str, Any]) -> None:
-    """Write scalars, strings and short numeric arrays at the root.
+def write_root(
+    file: h5py.File,
+    format_name: str,
+    format_version: int,
+    reference: Reference,
+    attributes: Mapping[str, Any],
+    provenance: Mapping[str, Any],
+) -> None:
+    """Write what a file says about itself; its attributes are scalars, strings and short numeric arrays.
 
     What is None is not said, as netCDF knows no empty attribute.
     """
-    for name, value in attributes.items():
+    write_header(file, format_name, format_version, provenance)
+    for name, value in (reference.attributes() | dict(attributes)).items():
         if name in RESERVED:
             raise ValueError(f"{name} is a name that every file uses for itself")
         if isinstance(value, np.ndarray):
@@ -37,10 +56,16 @@ def write_attributes(file: h5py.File, attributes: Mapping[str, Any]) -> None:
             file.attrs[name] = to_attribute(value)
 
 
-def read_attributes(file: h5py.File) -> dict[str, Any]:
-    """Return what the root says besides format, version and provenance."""
-    return {
+def read_root(file: h5py.File) -> Header:
+    """Return what a file says about itself, besides format and version.
+
+    Raises
+    ------
+    KeyError, ValueError : it does not say where its coordinates begin, or how it was made
+    """
+    attributes = {
         name: value.tolist() if isinstance(value, np.ndarray) else from_attribute(name, value)
         for name, value in file.attrs.items()
         if name not in RESERVED
     }
+    return Header(Reference.from_attributes(attributes), attributes, read_provenance(file))

@@ -23,11 +23,9 @@ from lfpiv_cli.files.hdf5 import (
     member,
     open_h5,
     read_array,
-    read_provenance,
     write_array,
-    write_header,
 )
-from lfpiv_cli.files.vtk import create_vtk_group, read_attributes, write_attributes
+from lfpiv_cli.files.vtk import Header, create_vtk_group, read_root, write_root
 from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.reference import Reference
@@ -70,15 +68,6 @@ class Volume:
     provenance: dict[str, Any]
 
 
-@dataclass(frozen=True, eq=False)
-class Header:
-    """What a file says about itself besides its arrays: its coordinates' origin, attributes at the root, provenance."""
-
-    reference: Reference
-    attributes: dict[str, Any]
-    provenance: dict[str, Any]
-
-
 def write_volume(
     path: Path,
     array_zyx: NDArray[np.floating[Any]],
@@ -105,8 +94,7 @@ def write_volume(
         raise ValueError(f"the array's shape is {array_zyx.shape}, the grid's {grid.shape_zyx}")
 
     def fill(file: h5py.File) -> None:
-        write_header(file, VOLUME_FORMAT, FORMAT_VERSION, provenance)
-        write_attributes(file, reference.attributes() | dict(attributes))
+        write_root(file, VOLUME_FORMAT, FORMAT_VERSION, reference, attributes, provenance)
         points = _write_frame(file, grid, with_component=False)
         _write_points(file, points, "intensity", array_zyx.astype(np.float32), "1")
 
@@ -126,12 +114,11 @@ def open_volume(path: Path | str) -> Volume:
         ensure_format(path, file, VOLUME_FORMAT, (FORMAT_VERSION,))
         grid = _read_grid(file)
         array = _read_points(file, "intensity", grid, path.stat().st_size, components=False)
-        attributes, provenance = read_attributes(file), read_provenance(file)
-        reference = Reference.from_attributes(attributes)
+        root = read_root(file)
     bad = int(np.count_nonzero(~np.isfinite(array)))
     if bad:
         raise InputError(f"{path}: {bad} voxels are not finite numbers")
-    return Volume(array.astype(np.float32, copy=False), grid, reference, attributes, provenance)
+    return Volume(array.astype(np.float32, copy=False), grid, root.reference, root.attributes, root.provenance)
 
 
 def write_vectors(
@@ -156,8 +143,7 @@ def write_vectors(
     """
 
     def fill(file: h5py.File) -> None:
-        write_header(file, VECTORS_FORMAT, FORMAT_VERSION, provenance)
-        write_attributes(file, reference.attributes())
+        write_root(file, VECTORS_FORMAT, FORMAT_VERSION, reference, {}, provenance)
         file.attrs["voxel_mm"] = np.asarray(field.voxel_mm, dtype=np.float64)
         file.attrs["window_voxel"] = np.asarray(field.window_voxel, dtype=np.int64)
         file.attrs["flag_meanings"] = np.bytes_(FLAG_MEANINGS)
@@ -219,8 +205,7 @@ def read_header(path: Path | str) -> Header:
     InputError
     """
     with open_h5(Path(path)) as file:
-        attributes = read_attributes(file)
-        return Header(Reference.from_attributes(attributes), attributes, read_provenance(file))
+        return read_root(file)
 
 
 def _reads(read: Callable[[Path], object]) -> Callable[[Path], None]:

@@ -90,8 +90,7 @@ class Measured:
 
 
 def correlate(
-    a: NDArray[np.float32],
-    b: NDArray[np.float32],
+    pairs: Iterable[tuple[NDArray[np.float32], NDArray[np.float32]]],
     grid: Grid,
     windows: Sequence[Triple],
     overlap: tuple[float, float, float],
@@ -100,14 +99,18 @@ def correlate(
     progress: Callable[[int], None] | None = None,
     exponent: float = 1.0,
 ) -> VectorField:
-    """Return the displacements from volume `a` to volume `b`.
+    """Return the displacements from the first to the second volume of a pair, or those that several have in common.
+
+    For a flow that does not change, correlations are summed over the pairs, under one predictor, before a peak is
+    sought: where single pairs hold too few particles, and with an error that falls as the root of their number.
 
     Parameters
     ----------
-    a, b : (z, y, x) intensities on `grid`; voxels that are not finite are masked
+    pairs : volumes (z, y, x), intensities on `grid`; voxels that are not finite are masked. Of each pair only the
+        splines are kept, pairs may be read one by one
     windows : window sizes in voxels along (x, y, z), coarse to fine; the last one gives the vectors
     overlap : share of a window in common with the next one along (x, y, z), 0 <= overlap < 1
-    dt_s : time from `a` to `b`, or None where it is not known
+    dt_s : time from the first to the second volume, or None where it is not known
     mask : (z, y, x) True where the volumes are to be used; None for everywhere
     progress : called with 1 after each of `count_passes(windows)` passes
     exponent : power of the intensities that is correlated, 0 < exponent <= 1, negative ones being zero where it is
@@ -118,33 +121,9 @@ def correlate(
     Raises
     ------
     InputError
-        The volumes or the mask do not have the grid's shape.
+        There is no pair, or the volumes or the mask do not have the grid's shape.
     ConfigError
         No window, one smaller than 2 voxels, an overlap outside 0 to 1, or a time or an exponent out of range.
-    """
-    return correlate_ensemble([(a, b)], grid, windows, overlap, dt_s, mask, progress, exponent)
-
-
-def correlate_ensemble(
-    pairs: Iterable[tuple[NDArray[np.float32], NDArray[np.float32]]],
-    grid: Grid,
-    windows: Sequence[Triple],
-    overlap: tuple[float, float, float],
-    dt_s: float | None,
-    mask: NDArray[np.bool_] | None = None,
-    progress: Callable[[int], None] | None = None,
-    exponent: float = 1.0,
-) -> VectorField:
-    """Return the displacements that several pairs of volumes have in common, for a flow that does not change.
-
-    Correlations are summed over the pairs, under one predictor, before a peak is sought: where single pairs hold too
-    few particles, and with an error that falls as the root of their number. Parameters as of `correlate`; of each pair
-    only the splines are kept, `pairs` may be read one by one.
-
-    Raises
-    ------
-    InputError, ConfigError
-        As `correlate`; also without any pair.
     """
     report = progress or (lambda units: None)
     coarse = coarse_layout(grid.shape_xyz, windows, overlap)

@@ -18,7 +18,8 @@ from lfpiv_cli.files.batch import Target, output_paths, pending, prepare_folder
 from lfpiv_cli.files.config import Config, carried_config, load_config
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.provenance import record
-from lfpiv_cli.flow.correlation import correlate_ensemble, count_passes
+from lfpiv_cli.flow.correlation import correlate as measure
+from lfpiv_cli.flow.correlation import count_passes
 from lfpiv_cli.flow.derived import Derived, derived_fields
 from lfpiv_cli.flow.field import MM_TO_M, REJECTED, VectorField
 from lfpiv_cli.flow.statistics import statistics_of
@@ -146,7 +147,7 @@ def _measure(job: Job, mask: Path | None, console: Console) -> tuple[VectorField
 
     sizes = settings.windows_voxel(grid.spacing_mm)
     with console.progress(count_passes(sizes), "correlate") as advance:
-        field = correlate_ensemble(
+        field = measure(
             volumes(),
             grid,
             sizes,
