@@ -19,7 +19,7 @@ from scipy import ndimage
 
 from benchmarks.timing import interleaved_medians_s
 from benchmarks.volumes import FLOWS, Flow, Seeding, Triple, volume_pair
-from lfpiv_cli.flow.correlation import correlate
+from lfpiv_cli.flow.correlation import CorrelationSettings, correlate
 from lfpiv_cli.flow.field import VALID, VectorField
 from lfpiv_cli.grid import Grid
 
@@ -58,7 +58,7 @@ def accuracy_series(
                     flow = FLOWS[flow_name](shape_xyz)
                     rng = np.random.default_rng(20261121)
                     a, b = volume_pair(flow, shape_xyz, Seeding(count, sigma, noise, lost), rng)
-                    field = correlate([(a, b)], voxel_grid(shape_xyz), windows, HALF, None)
+                    field = correlate([(a, b)], voxel_grid(shape_xyz), CorrelationSettings(windows, HALF))
                     name = f"{shape_name} {count:g} {'noisy' if noise else 'clean'} {flow_name}"
                     results[name] = accuracy(field, flow)
     return results
@@ -95,7 +95,7 @@ def against_openpiv(
     grid = voxel_grid((a.shape[2], a.shape[1], a.shape[0]))
     medians = interleaved_medians_s(
         {
-            "ours": lambda: correlate([(a, b)], grid, windows, HALF, None),
+            "ours": lambda: correlate([(a, b)], grid, CorrelationSettings(windows, HALF)),
             "one_pass": lambda: openpiv_pass(a, b, size),
             "four_passes": lambda: openpiv_passes(a, b, size, passes=4),
         },
@@ -139,7 +139,7 @@ def second_core(a: NDArray[np.float32], b: NDArray[np.float32], windows: Sequenc
 
     def run(threads: int) -> None:
         numba.set_num_threads(threads)
-        correlate([(a, b)], grid, windows, HALF, None)
+        correlate([(a, b)], grid, CorrelationSettings(windows, HALF))
 
     medians = interleaved_medians_s({"one": lambda: run(1), "two": lambda: run(2)}, repeats)
     return medians["one"] / medians["two"]
@@ -151,7 +151,7 @@ def time_and_memory(shape_xyz: Triple, windows: Sequence[Triple]) -> tuple[float
     a, b = volume_pair(FLOWS["ring"](shape_xyz), shape_xyz, Seeding(4.0, LENGTHS["A"]), rng)
     before = memory_bytes("VmRSS", reset_peak=True)
     start = time.perf_counter()
-    correlate([(a, b)], voxel_grid(shape_xyz), windows, HALF, None)
+    correlate([(a, b)], voxel_grid(shape_xyz), CorrelationSettings(windows, HALF))
     seconds = time.perf_counter() - start
     peak = memory_bytes("VmHWM")
     return seconds, None if before is None or peak is None else (peak - before) / (a.nbytes + b.nbytes)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lfpiv_cli.flow.correlation import correlate
+from lfpiv_cli.flow.correlation import CorrelationSettings, correlate
 from lfpiv_cli.flow.field import REJECTED
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
@@ -64,7 +64,9 @@ def response(
     volumes = [solve(case, camera, grid, image) for image in images(case, camera, box_mm)]
     final = [max(4, round(WINDOW_MM / voxel)) for voxel in case.voxel_mm]
     windows = [(2 * final[0], 2 * final[1], 2 * final[2]), (final[0], final[1], final[2])]
-    field = correlate([(volumes[0], volumes[1])], grid, windows, (0.5, 0.5, 0.5), None, exponent=case.exponent)
+    field = correlate(
+        [(volumes[0], volumes[1])], grid, CorrelationSettings(windows, (0.5, 0.5, 0.5), None, case.exponent)
+    )
     inner = (slice(1, -1),) * 3
     vectors = field.displacement_voxel[inner][field.flag[inner] < REJECTED] * np.asarray(case.voxel_mm)
     return vectors.mean(axis=0), vectors.std(axis=0)

@@ -20,7 +20,7 @@ from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.calibration.model import Calibration, Rig, calibrate
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
-from lfpiv_cli.optics.media import Media
+from lfpiv_cli.optics.media import Media, channel_window
 from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.particles.refraction import places_by_snell
 from lfpiv_cli.particles.rounds import find_particles
@@ -29,7 +29,7 @@ from lfpiv_cli.reconstruction.equations import Normalisers, normalisers
 from lfpiv_cli.robust import MAD_TO_SIGMA
 from lfpiv_cli.synthetic.board import BoardPlacement, render_board
 from lfpiv_cli.synthetic.render import ObjectSpace, render_points, render_white
-from lfpiv_cli.synthetic.scenes import Misalignment, channel_window
+from lfpiv_cli.synthetic.scenes import Misalignment
 from lfpiv_cli.synthetic.sensor import Readout
 from lfpiv_cli.validation.bounds import cramer_rao_bound, expected_image, pixel_variance, slopes
 from lfpiv_cli.validation.particles import match, particle_figures
@@ -119,7 +119,7 @@ def print_figures(bench: Bench, count: int, seed: int, log_spread: float | None 
     true = rng.uniform(low - margin, high + margin, (around, 3))
     brightness = rng.uniform(0.6, 1.4, around) if log_spread is None else rng.lognormal(0.0, log_spread, around)
     readout = Readout()
-    window = channel_window(bench.sheet, WATER, CHANNEL_MM, WALL_MM, mid_plane_z_mm=0.0)
+    window = channel_window(bench.sheet.focus_distance_mm, WATER, CHANNEL_MM, WALL_MM, mid_plane_z_mm=0.0)
     space = ObjectSpace(WATER, window, "exact")
     expected = render_points(bench.real, space, true, LIGHT_COUNTS * brightness, DIAMETER_MM, rng)
     image = readout.record(expected, rng).astype(np.float32) - np.float32(readout.dark_level_counts)

@@ -13,7 +13,7 @@ from benchmarks.weights import PAPER_GRID, TABLE2, WATER, sparse_matrix
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.reconstruction.equations import Image, Volume, normalisers
-from lfpiv_cli.reconstruction.solvers import Stopping, reconstruct
+from lfpiv_cli.reconstruction.solvers import SolverSettings, Stopping, reconstruct
 from lfpiv_cli.synthetic.board import BoardPlacement, render_board
 from lfpiv_cli.synthetic.render import ObjectSpace
 from lfpiv_cli.weights.build import factorise
@@ -69,8 +69,8 @@ def against_sparse_matrix(operator: FactorisedOperator, iterations: int, repeats
     sums = normalisers(operator)
     medians = interleaved_medians_s(
         {
-            "factorised": lambda: reconstruct(operator, image, "sart", iterations, sums=sums),
-            "sparse": lambda: reconstruct(explicit, image, "sart", iterations, sums=sums),
+            "factorised": lambda: reconstruct(operator, image, SolverSettings("sart", iterations), sums=sums),
+            "sparse": lambda: reconstruct(explicit, image, SolverSettings("sart", iterations), sums=sums),
         },
         repeats,
     )
@@ -81,10 +81,11 @@ def catching_up(operator: FactorisedOperator, image: Image, iterations: int, mos
     """Return the time of SART, its residual, and with momentum the iterations and the time to the same residual."""
     sums = normalisers(operator)
     began = time.perf_counter()
-    plain = reconstruct(operator, image, "sart", iterations, sums=sums)
+    plain = reconstruct(operator, image, SolverSettings("sart", iterations), sums=sums)
     reached = time.perf_counter()
     limit = float(plain.residual[-1])
-    fast = reconstruct(operator, image, "sart", most, accelerate=True, sums=sums, stopping=Stopping(residual=limit))
+    until = SolverSettings("sart", most, accelerate=True, stopping=Stopping(residual=limit))
+    fast = reconstruct(operator, image, until, sums=sums)
     return {
         "plain_s": reached - began,
         "residual": limit,

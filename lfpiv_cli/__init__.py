@@ -1,24 +1,102 @@
 """lfpiv: from raw light-field camera images to three-dimensional velocity fields.
 
-`open_weights`, `open_volume` and `open_vectors` read the files that the commands write.
+The five steps, arrays in and arrays out::
+
+    import lfpiv_cli as lf
+
+    rig = lf.load_rig("rig.yaml")
+    calibration = lf.calibrate(white, board, rig, dark=dark)
+    weights = lf.build_weights(rig, calibration)
+    a, b = (lf.reconstruct(weights, image, dark=dark) for image in (image_a, image_b))
+    field = lf.correlate(a, b)                     # field.velocity (nz, ny, nx, 3), m/s
+
+or with the particles themselves in place of volumes (particle tracking velocimetry)::
+
+    p, q = (lf.find_particles(weights, image, dark=dark) for image in (image_a, image_b))
+    tracks = lf.track(p, q)                        # tracks.points.position_mm, .arrays["velocity"]
+    field = lf.combine(field, tracks.vectors()[0]).field
+
+Images are (rows, columns) arrays of counts; `read_image` reads one. `open_calibration`, `open_weights`, `open_volume`,
+`open_vectors`, `open_particles` and `open_tracks` read the files that the commands write, and what they return goes
+into the functions above. Volumes and fields are indexed [z, y, x]; points and vectors are (x, y, z) in mm, m/s.
+
+Each command is a function as well, files in and files out, with its options as a dataclass::
+
+    from lfpiv_cli.stages.reconstruct import ReconstructOptions, reconstruct
+
+    reconstruct(Path("weights.h5"), images, Path("volumes"), ReconstructOptions(dark=Path("dark.tif")))
+
+likewise `lfpiv_cli.stages.calibrate`, `.build_weights`, `.correlate`, `.track` and so on. All that can go wrong is an
+`LfpivError` of `lfpiv_cli.errors`, whose message names the place, what was found and what was expected.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from lfpiv_cli.errors import LfpivError
+    from lfpiv_cli.files.vtkhdf import open_vectors, open_volume
+    from lfpiv_cli.files.weights_file import open_weights
+    from lfpiv_cli.flow.combining import combine
+    from lfpiv_cli.interface.calibration import calibrate
+    from lfpiv_cli.interface.particles import find_particles
+    from lfpiv_cli.interface.readers import load_rig, open_calibration, open_particles, open_tracks, read_image
+    from lfpiv_cli.interface.reconstruction import reconstruct
+    from lfpiv_cli.interface.tracks import track
+    from lfpiv_cli.interface.vectors import correlate
+    from lfpiv_cli.interface.weights import build_weights
 
 __version__ = "0.1.0"
-__all__ = ["__version__", "open_vectors", "open_volume", "open_weights"]
+__all__ = [
+    "LfpivError",
+    "__version__",
+    "build_weights",
+    "calibrate",
+    "combine",
+    "correlate",
+    "find_particles",
+    "load_rig",
+    "open_calibration",
+    "open_particles",
+    "open_tracks",
+    "open_vectors",
+    "open_volume",
+    "open_weights",
+    "read_image",
+    "reconstruct",
+    "track",
+]
+
+# Where each name is from: they are imported when they are asked for, so that `lfpiv --help` need not wait for them.
+MODULES = {
+    "LfpivError": "errors",
+    "build_weights": "interface.weights",
+    "calibrate": "interface.calibration",
+    "combine": "flow.combining",
+    "correlate": "interface.vectors",
+    "find_particles": "interface.particles",
+    "load_rig": "interface.readers",
+    "open_calibration": "interface.readers",
+    "open_particles": "interface.readers",
+    "open_tracks": "interface.readers",
+    "open_vectors": "files.vtkhdf",
+    "open_volume": "files.vtkhdf",
+    "open_weights": "files.weights_file",
+    "read_image": "interface.readers",
+    "reconstruct": "interface.reconstruction",
+    "track": "interface.tracks",
+}
 
 
 def __getattr__(name: str) -> Any:
-    """Import the readers when they are asked for, so that `lfpiv --help` need not wait for them."""
-    if name == "open_weights":
-        from lfpiv_cli.files.weights_file import open_weights
+    """Return what is promised, imported when it is asked for."""
+    if name not in MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{MODULES[name]}"), name)
 
-        return open_weights
-    if name in ("open_volume", "open_vectors"):
-        from lfpiv_cli.files import vtkhdf
 
-        return getattr(vtkhdf, name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+def __dir__() -> list[str]:
+    """Return the names that are promised."""
+    return sorted(__all__)

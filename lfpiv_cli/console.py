@@ -29,6 +29,10 @@ class Console:
         if not self.quiet:
             click.echo(text, err=True)
 
+    def warn(self, text: str) -> None:
+        """Print what went otherwise than one would expect, and does not keep the command from going on."""
+        self.say(f"lfpiv: {text}")
+
     def detail(self, text: str) -> None:
         """Print a line for those who asked for more."""
         if self.verbose and not self.quiet:

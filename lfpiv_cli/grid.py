@@ -47,6 +47,11 @@ class Grid:
         """Return the cell centres along axis 0 (x), 1 (y) or 2 (z), in mm."""
         return self.origin_mm[axis] + self.spacing_mm[axis] * np.arange(self.shape_xyz[axis], dtype=np.float64)
 
+    def centres_mm(self) -> NDArray[np.float64]:
+        """Return the cell centres (nz, ny, nx, 3), (x, y, z) in mm."""
+        z, y, x = np.meshgrid(*(self.axis_mm(axis) for axis in (2, 1, 0)), indexing="ij")
+        return np.stack([x, y, z], axis=-1)
+
     def bounds_mm(self, axis: int) -> tuple[float, float]:
         """Return the outer faces of the first and last cell along an axis, in mm."""
         half = 0.5 * self.spacing_mm[axis]

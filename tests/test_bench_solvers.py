@@ -10,7 +10,7 @@ import pytest
 from benchmarks.solvers import SparseOperator, against_sparse_matrix, catching_up
 from benchmarks.weights import sparse_matrix
 from lfpiv_cli.grid import Grid
-from lfpiv_cli.reconstruction.solvers import reconstruct
+from lfpiv_cli.reconstruction.solvers import SolverSettings, reconstruct
 from lfpiv_cli.weights.build import factorise
 
 
@@ -24,7 +24,7 @@ def test_both_weights_give_one_volume(operator, rng):
     matrix = sparse_matrix(operator)
     explicit = SparseOperator(matrix, matrix.T.tocsr(), operator.shape, operator.image_shape)
     image = operator.forward(rng.random(operator.shape, np.float32))
-    volumes = [reconstruct(weights, image, "sart", 5).volume for weights in (operator, explicit)]
+    volumes = [reconstruct(weights, image, SolverSettings("sart", 5)).volume for weights in (operator, explicit)]
     np.testing.assert_allclose(*volumes, rtol=1e-3)
     assert against_sparse_matrix(operator, 1, 1) > 0.0
 

@@ -16,14 +16,13 @@ import tifffile
 
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.optics.camera import Camera
-from lfpiv_cli.optics.media import Media, Window, fluid_path_to_focus
+from lfpiv_cli.optics.media import Media, Window, channel_window, fluid_path_to_focus
 from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.optics.tracing import slopes_equivalent, trace
 from lfpiv_cli.synthetic import board as board_module
 from lfpiv_cli.synthetic.board import BoardPlacement, render_board
 from lfpiv_cli.synthetic.flows import advect, square_duct
 from lfpiv_cli.synthetic.render import ObjectSpace, render_points, render_white
-from lfpiv_cli.synthetic.scenes import channel_window
 
 WATER = Media(1.0, 1.49, 1.33)
 AIR = ObjectSpace(Media())
@@ -192,7 +191,7 @@ def test_the_data_s_window_is_where_the_mid_plane_says(experiment):
     path = fluid_path_to_focus(experiment.window(), camera.focus_distance_mm, WATER)
     mid_plane = experiment.truth["mid_plane_z_mm"]
     assert path + mid_plane == pytest.approx(5.0, abs=1e-9)
-    window = channel_window(camera, WATER, 10.0, experiment.truth["wall_mm"], mid_plane)
+    window = channel_window(camera.focus_distance_mm, WATER, 10.0, experiment.truth["wall_mm"], mid_plane)
     assert window.distance_mm == pytest.approx(experiment.window().distance_mm, abs=1e-9)
 
 

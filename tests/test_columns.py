@@ -225,7 +225,7 @@ def build(path, *options):
 
 def test_a_hexagonal_rig_is_reconstructed_from_columns_on_demand(rig, tmp_path):
     weights = open_weights(build(rig))
-    assert weights.on_demand
+    assert weights.weights.on_demand
     volume = np.zeros(weights.shape, np.float32)
     volume[1, 2, 3] = 1000.0
     image, output = tmp_path / "image.tif", tmp_path / "volume.vtkhdf"
@@ -240,8 +240,8 @@ def test_counted_rays_share_the_file_format(rig):
     small = yaml.safe_dump(RIG | {"weights": {"points": 400, "rays_per_point": 50}})
     rig.write_text(small)
     counted = open_weights(build(rig, "--sampling", "rays"))
-    assert not counted.on_demand
-    assert isinstance(open_weights(build(rig, "--overwrite")).solver_operator, OnDemandOperator)
+    assert not counted.weights.on_demand
+    assert isinstance(open_weights(build(rig, "--overwrite")).weights.solver_operator, OnDemandOperator)
     rows, columns, weights = counted.column(1, 2, 3)
     assert weights.sum() == pytest.approx(1.0, abs=1e-5)
     assert (rows.max(), columns.max()) < counted.image_shape

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lfpiv_cli.errors import ConfigError, InputError
-from lfpiv_cli.flow.correlation import correlate, count_passes
+from lfpiv_cli.flow.correlation import CorrelationSettings, correlate, count_passes
 from lfpiv_cli.flow.deformation import (
     SLACK,
     SPLINE_PAD,
@@ -240,7 +240,7 @@ def test_rigid_shift_is_found_with_its_sign_up_to_the_borders(
 ) -> None:
     shape = (44, 52, 40)
     a, b = moving_pair(rigid(*shift), shape, rng)
-    field = correlate([(a, b)], unit_grid(shape), [(16, 16, 16)], HALF, None)
+    field = correlate([(a, b)], unit_grid(shape), CorrelationSettings([(16, 16, 16)], HALF))
     assert field.flag.max() == 0
     error = field.displacement_voxel - np.array(shift)
     # A face cuts particles of 8 per window; a corner's window has lost a third of its own.
@@ -258,7 +258,7 @@ def test_linear_shear_is_found_up_to_the_borders(rng: np.random.Generator) -> No
         return moved
 
     a, b = moving_pair(shear, shape, rng)
-    field = correlate([(a, b)], unit_grid(shape), [(16, 16, 16)], HALF, None)
+    field = correlate([(a, b)], unit_grid(shape), CorrelationSettings([(16, 16, 16)], HALF))
     # The windows at the borders see one side of the shear only, and approach its value pass by pass.
     error = field.displacement_voxel - truth_at(field, shear)
     assert np.all(root_mean_square(error) < 0.06)
@@ -268,7 +268,7 @@ def test_linear_shear_is_found_up_to_the_borders(rng: np.random.Generator) -> No
 def test_elongated_particles_and_windows(rng: np.random.Generator) -> None:
     shape, shift = (40, 40, 48), (1.3, 0.7, 1.5)
     a, b = moving_pair(rigid(*shift), shape, rng, sigma=(1.0, 1.0, 4.0))
-    field = correlate([(a, b)], unit_grid(shape), [(16, 16, 24)], (0.5, 0.5, 0.75), None)
+    field = correlate([(a, b)], unit_grid(shape), CorrelationSettings([(16, 16, 24)], (0.5, 0.5, 0.75)))
     assert field.window_voxel == (16, 16, 24)
     error = root_mean_square(field.displacement_voxel - np.array(shift))
     # The depth is located four times less well at best; by three points of the long peak it was ten times.
@@ -285,7 +285,7 @@ def test_long_particles_do_not_flatten_a_curved_flow(rng: np.random.Generator) -
         return moved
 
     a, b = moving_pair(wave, shape, rng, per_window=40.0, sigma=(1.0, 1.0, 8.0))
-    field = correlate([(a, b)], unit_grid(shape), [(16, 16, 16)], HALF, None)
+    field = correlate([(a, b)], unit_grid(shape), CorrelationSettings([(16, 16, 16)], HALF))
     truth = truth_at(field, wave)
     inner = (slice(1, -1),) * 3
     slopes = [
@@ -304,7 +304,7 @@ def test_roots_of_intensities_let_dim_particles_count(rng: np.random.Generator) 
     a, b = (faint + np.float32(20.0) * strong for faint, strong in zip(dim, bright, strict=True))
     errors = []
     for exponent in (1.0, 0.5):
-        field = correlate([(a, b)], unit_grid(shape), [(16, 16, 16)], HALF, None, exponent=exponent)
+        field = correlate([(a, b)], unit_grid(shape), CorrelationSettings([(16, 16, 16)], HALF, None, exponent))
         errors.append(np.sqrt(np.nanmean((field.displacement_voxel - np.array(shift)) ** 2)))
     assert errors[1] < 0.7 * errors[0]
 
@@ -323,29 +323,31 @@ def test_any_windows_and_overlap_work(
 ) -> None:
     shape, shift = (40, 44, 36), (1.3, -0.7, 0.4)
     a, b = moving_pair(rigid(*shift), shape, rng)
-    field = correlate([(a, b)], unit_grid(shape), windows, overlap, 0.5)
+    field = correlate([(a, b)], unit_grid(shape), CorrelationSettings(windows, overlap, 0.5))
     np.testing.assert_allclose(field.displacement_voxel, np.broadcast_to(shift, (*field.flag.shape, 3)), atol=0.03)
 
 
 def test_exchanging_the_volumes_turns_the_vectors_round(rng: np.random.Generator) -> None:
     shape = (40, 40, 40)
     a, b = moving_pair(rigid(1.3, -0.7, 0.4), shape, rng)
-    there, back = (correlate([pair], unit_grid(shape), [(16, 16, 16)], HALF, None) for pair in ((a, b), (b, a)))
+    there, back = (
+        correlate([pair], unit_grid(shape), CorrelationSettings([(16, 16, 16)], HALF)) for pair in ((a, b), (b, a))
+    )
     np.testing.assert_allclose(there.displacement_voxel, -back.displacement_voxel, atol=1e-4)
 
 
 def test_exchanging_axes_exchanges_components(rng: np.random.Generator) -> None:
     a, b = moving_pair(rigid(1.3, -0.7, 0.4), (40, 44, 36), rng)
-    straight = correlate([(a, b)], unit_grid((40, 44, 36)), [(16, 16, 16)], HALF, None)
+    straight = correlate([(a, b)], unit_grid((40, 44, 36)), CorrelationSettings([(16, 16, 16)], HALF))
     exchanged = np.ascontiguousarray(a.T), np.ascontiguousarray(b.T)
-    turned = correlate([exchanged], unit_grid((36, 44, 40)), [(16, 16, 16)], HALF, None)
+    turned = correlate([exchanged], unit_grid((36, 44, 40)), CorrelationSettings([(16, 16, 16)], HALF))
     back = turned.displacement_voxel.transpose(2, 1, 0, 3)[..., ::-1]
     np.testing.assert_allclose(straight.displacement_voxel, back, atol=1e-4)
 
 
 def test_volumes_with_nothing_in_them_are_flagged() -> None:
     empty = np.zeros((24, 24, 24), dtype=np.float32)
-    field = correlate([(empty, empty)], unit_grid((24, 24, 24)), [(16, 16, 16)], HALF, 1.0)
+    field = correlate([(empty, empty)], unit_grid((24, 24, 24)), CorrelationSettings([(16, 16, 16)], HALF, 1.0))
     assert np.all(field.flag == REJECTED)
     assert np.all(np.isnan(field.velocity))
     assert np.all(field.correlation == 0.0)
@@ -354,7 +356,7 @@ def test_volumes_with_nothing_in_them_are_flagged() -> None:
 
 def test_constant_volumes_have_finite_or_flagged_vectors() -> None:
     grey = np.full((24, 24, 24), 7.0, dtype=np.float32)
-    field = correlate([(grey, grey)], unit_grid((24, 24, 24)), [(16, 16, 16)], HALF, 1.0)
+    field = correlate([(grey, grey)], unit_grid((24, 24, 24)), CorrelationSettings([(16, 16, 16)], HALF, 1.0))
     assert np.all(np.isfinite(field.velocity[field.flag < REJECTED]))
 
 
@@ -363,7 +365,7 @@ def test_half_empty_volume_keeps_its_other_half(rng: np.random.Generator) -> Non
     a, b = moving_pair(rigid(*shift), shape, rng)
     a[:, :, 28:] = 0.0
     b[:, :, 28:] = 0.0
-    field = correlate([(a, b)], unit_grid(shape), [(16, 16, 16)], HALF, 1e-3)
+    field = correlate([(a, b)], unit_grid(shape), CorrelationSettings([(16, 16, 16)], HALF, 1e-3))
     full = field.grid.axis_mm(0) < 18.0
     np.testing.assert_allclose(
         field.displacement_voxel[:, :, full],
@@ -380,7 +382,9 @@ def test_masked_windows_are_masked_and_their_neighbours_unharmed(rng: np.random.
     mask = np.ones(a.shape, dtype=np.bool_)
     mask[:, :, 32:] = False
     a[:, :, 32:] = rng.random(a[:, :, 32:].shape)
-    field = correlate([(a, b)], unit_grid(shape), [(16, 16, 16)], HALF, 1e-3, mask)
+    field = correlate(
+        [(a, b)], unit_grid(shape), CorrelationSettings(CorrelationSettings([(16, 16, 16)], HALF, 1e-3)), mask=mask
+    )
     beyond = field.grid.axis_mm(0) > 40.0
     assert np.all(field.flag[:, :, beyond] == MASKED)
     seen = field.flag < REJECTED
@@ -391,27 +395,27 @@ def test_voxels_that_are_not_finite_are_masked(rng: np.random.Generator) -> None
     shape, shift = (40, 40, 40), (1.3, -0.7, 0.4)
     a, b = moving_pair(rigid(*shift), shape, rng)
     a[20, 20, 20] = np.nan
-    field = correlate([(a, b)], unit_grid(shape), [(16, 16, 16)], HALF, 1e-3)
+    field = correlate([(a, b)], unit_grid(shape), CorrelationSettings([(16, 16, 16)], HALF, 1e-3))
     np.testing.assert_allclose(field.displacement_voxel, np.broadcast_to(shift, (*field.flag.shape, 3)), atol=CORNER)
 
 
 def test_an_ensemble_finds_what_its_pairs_are_too_sparse_for(rng: np.random.Generator) -> None:
     shape, shift = (40, 40, 40), (1.3, -0.7, 0.4)
     pairs = [moving_pair(rigid(*shift), shape, rng, per_window=1.0) for _ in range(12)]
-    together = correlate(iter(pairs), unit_grid(shape), [(16, 16, 16)], HALF, None)
-    single = correlate(pairs[:1], unit_grid(shape), [(16, 16, 16)], HALF, None)
+    together = correlate(iter(pairs), unit_grid(shape), CorrelationSettings([(16, 16, 16)], HALF))
+    single = correlate(pairs[:1], unit_grid(shape), CorrelationSettings([(16, 16, 16)], HALF))
     errors = [np.abs(field.displacement_raw_voxel - np.array(shift)) for field in (together, single)]
     assert np.all(errors[0] < 0.1)
     assert not np.all(errors[1] < 0.5)
     with pytest.raises(InputError):
-        correlate([], unit_grid(shape), [(16, 16, 16)], HALF, None)
+        correlate([], unit_grid(shape), CorrelationSettings([(16, 16, 16)], HALF))
 
 
 def test_an_ensemble_of_one_pair_twice_is_that_pair(rng: np.random.Generator) -> None:
     shape = (32, 32, 32)
     a, b = moving_pair(rigid(1.3, -0.7, 0.4), shape, rng)
-    once = correlate([(a, b)], unit_grid(shape), [(16, 16, 16)], HALF, None)
-    twice = correlate([(a, b), (a, b)], unit_grid(shape), [(16, 16, 16)], HALF, None)
+    once = correlate([(a, b)], unit_grid(shape), CorrelationSettings([(16, 16, 16)], HALF))
+    twice = correlate([(a, b), (a, b)], unit_grid(shape), CorrelationSettings([(16, 16, 16)], HALF))
     np.testing.assert_allclose(twice.displacement_voxel, once.displacement_voxel, atol=1e-6)
     np.testing.assert_allclose(twice.correlation, once.correlation, atol=1e-6)
 
@@ -419,9 +423,9 @@ def test_an_ensemble_of_one_pair_twice_is_that_pair(rng: np.random.Generator) ->
 def test_threads_do_not_change_a_bit(rng: np.random.Generator, one_thread) -> None:
     shape = (40, 40, 40)
     a, b = moving_pair(rigid(1.3, -0.7, 0.4), shape, rng)
-    parallel = correlate([(a, b)], unit_grid(shape), [(16, 16, 16)], HALF, None)
+    parallel = correlate([(a, b)], unit_grid(shape), CorrelationSettings([(16, 16, 16)], HALF))
     with one_thread():
-        serial = correlate([(a, b)], unit_grid(shape), [(16, 16, 16)], HALF, None)
+        serial = correlate([(a, b)], unit_grid(shape), CorrelationSettings([(16, 16, 16)], HALF))
     assert parallel.displacement_voxel.tobytes() == serial.displacement_voxel.tobytes()
     assert parallel.peak_ratio.tobytes() == serial.peak_ratio.tobytes()
 
@@ -430,7 +434,7 @@ def test_progress_counts_every_pass(rng: np.random.Generator) -> None:
     windows = [(16, 16, 16), (8, 8, 8)]
     a, b = moving_pair(rigid(0.5, 0.0, 0.0), (24, 24, 24), rng)
     units: list[int] = []
-    correlate([(a, b)], unit_grid((24, 24, 24)), windows, HALF, None, progress=units.append)
+    correlate([(a, b)], unit_grid((24, 24, 24)), CorrelationSettings(windows, HALF), progress=units.append)
     assert sum(units) == count_passes(windows)
 
 
@@ -449,6 +453,9 @@ def test_progress_counts_every_pass(rng: np.random.Generator) -> None:
 )
 def test_arguments_that_do_not_belong_together_are_refused(change: dict, error: type[Exception]) -> None:
     empty = np.zeros((4, 4, 4), dtype=np.float32)
-    arguments = {"pairs": [(empty, empty)], "grid": unit_grid((4, 4, 4)), "windows": [(4, 4, 4)], "overlap": HALF}
+    settings = {"windows": [(4, 4, 4)], "overlap": HALF, "dt_s": 1.0, "exponent": 1.0}
+    arguments = {"pairs": [(empty, empty)], "grid": unit_grid((4, 4, 4)), "mask": None}
+    settings |= {name: value for name, value in change.items() if name in settings}
+    arguments |= {name: value for name, value in change.items() if name in arguments}
     with pytest.raises(error):
-        correlate(**(arguments | {"dt_s": 1.0} | change))
+        correlate(**arguments, settings=CorrelationSettings(**settings))

@@ -123,7 +123,7 @@ def test_from_boards_at_depths_to_columns(rig, tmp_path, table2, water, rng):
     columns = []
     for method in ("ert", "dlfc"):
         weights = open_weights(tmp_path / method)
-        assert not weights.on_demand
+        assert not weights.weights.on_demand
         image = np.zeros(weights.image_shape)
         row, column, share = weights.column(2, 1, 3)
         image[row, column] = share

@@ -16,7 +16,7 @@ import lfpiv_cli
 from lfpiv_cli.files.bench import flow_of
 from lfpiv_cli.files.section_types import Section
 from lfpiv_cli.reconstruction.registry import SOLVERS, Solver
-from lfpiv_cli.reconstruction.solvers import reconstruct
+from lfpiv_cli.reconstruction.solvers import SolverSettings, reconstruct
 from lfpiv_cli.reference import Reference
 from lfpiv_cli.synthetic.flows import FLOWS
 
@@ -101,8 +101,8 @@ def halve(problem, volume, projection, relaxation):
 
 def test_a_solver_is_added_by_its_step_and_its_name(monkeypatch):
     monkeypatch.setitem(SOLVERS, "halve", Solver(f"{__name__}:{halve.__name__}"))
-    result = reconstruct(Pixels(), np.array([[4.0, 2.0]], np.float32), "halve", iterations=3)
-    start = reconstruct(Pixels(), np.array([[4.0, 2.0]], np.float32), "halve", iterations=0)
+    result = reconstruct(Pixels(), np.array([[4.0, 2.0]], np.float32), SolverSettings("halve", 3))
+    start = reconstruct(Pixels(), np.array([[4.0, 2.0]], np.float32), SolverSettings("halve", 0))
     np.testing.assert_array_equal(result.volume, start.volume / 8)
     assert result.residual.shape == (4,)
 

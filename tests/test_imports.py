@@ -26,6 +26,7 @@ LAYERS = (
     {"validation"},
     {"files"},
     {"console"},
+    {"interface"},
     {"stages"},
     {"cli"},
     {"__init__", "__main__"},

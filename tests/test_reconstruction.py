@@ -12,7 +12,15 @@ from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.reconstruction import kernels
 from lfpiv_cli.reconstruction.equations import Problem, normalisers
 from lfpiv_cli.reconstruction.registry import SOLVERS
-from lfpiv_cli.reconstruction.solvers import Momentum, Stopping, mart_step, reconstruct, sart_step, smart_step
+from lfpiv_cli.reconstruction.solvers import (
+    Momentum,
+    SolverSettings,
+    Stopping,
+    mart_step,
+    reconstruct,
+    sart_step,
+    smart_step,
+)
 from lfpiv_cli.reconstruction.starts import line_of_sight_start, lit_support
 from lfpiv_cli.weights.build import factorise
 
@@ -75,7 +83,7 @@ def test_true_volume_is_a_fixed_point(optical, rng, solver):
 def test_residual_falls_and_volume_stays_non_negative(optical, rng, solver):
     truth = np.zeros(optical.shape, np.float32)
     truth[rng.integers(0, 6, 8), rng.integers(0, 7, 8), rng.integers(0, 8, 8)] = 100.0
-    result = reconstruct(optical, optical.forward(truth), solver, iterations=12)
+    result = reconstruct(optical, optical.forward(truth), SolverSettings(solver, 12))
     assert np.all(np.diff(result.residual) < 0)
     assert result.residual[-1] < 0.5 * result.residual[0]
     assert result.volume.min() >= 0.0
@@ -113,13 +121,13 @@ def test_excluded_pixels_are_deleted_rows(dense, rng, solver, accelerate):
     excluded = np.array([False, True, False, False, True, False, False, False, False])
     spoilt = np.where(excluded, np.float32(65535.0), image)[np.newaxis]
     fewer = DenseOperator(dense.matrix[~excluded])
-    options = {"solver": solver, "iterations": 12, "accelerate": accelerate}
-    expected = reconstruct(fewer, image[np.newaxis, ~excluded], **options)
+    settings = SolverSettings(solver, 12, accelerate=accelerate)
+    expected = reconstruct(fewer, image[np.newaxis, ~excluded], settings)
     for sums in (
         normalisers(dense, excluded[np.newaxis]),
         normalisers(dense).without(dense, excluded[np.newaxis]),
     ):
-        found = reconstruct(dense, spoilt, **options, sums=sums)
+        found = reconstruct(dense, spoilt, settings, sums=sums)
         np.testing.assert_allclose(found.volume, expected.volume, rtol=1e-4)
         np.testing.assert_allclose(found.residual, expected.residual, rtol=1e-4)
 
@@ -128,9 +136,9 @@ def test_excluded_pixels_are_deleted_rows(dense, rng, solver, accelerate):
 def test_voxels_out_of_the_support_are_deleted_columns(dense, rng, solver):
     image = (dense.matrix @ rng.random(5)).astype(np.float32)[np.newaxis]
     support = np.array([True, False, True, True, False])
-    expected = reconstruct(DenseOperator(dense.matrix[:, support]), image, solver, 12).volume
+    expected = reconstruct(DenseOperator(dense.matrix[:, support]), image, SolverSettings(solver, 12)).volume
     sums = normalisers(dense).within(dense, support.reshape(dense.shape))
-    found = reconstruct(dense, image, solver, 12, sums=sums)
+    found = reconstruct(dense, image, SolverSettings(solver, 12), sums=sums)
     np.testing.assert_allclose(found.volume.ravel()[support], expected.ravel(), rtol=1e-4)
     assert not found.volume.ravel()[~support].any()
     assert found.support_voxels == 3
@@ -158,20 +166,20 @@ def test_line_of_sight_leaves_dark_voxels_out_for_good(optical):
     assert np.unravel_index(start.argmax(), start.shape) == (2, 3, 4)
     assert start.sum() == pytest.approx(100.0, rel=0.05)
     # voxels of the support do not light the whole sensor: the pixels they miss are left out with the others
-    volume = reconstruct(optical, image, "sart", 20, start="line_of_sight").volume
+    volume = reconstruct(optical, image, SolverSettings("sart", 20, start="line_of_sight")).volume
     assert not volume[~support].any()
     assert volume[2, 3, 4] == volume.max()
 
 
 def test_stopping_by_change_and_by_residual(optical, rng):
     image = optical.forward(rng.random(optical.shape, dtype=np.float32))
-    whole = reconstruct(optical, image, "em", 60)
+    whole = reconstruct(optical, image, SolverSettings("em", 60))
     relative = 1.0 - whole.residual[1:] / whole.residual[:-1]
     first = int(np.argmax(relative < 0.02))
-    by_change = reconstruct(optical, image, "em", 60, stopping=Stopping(change=0.02))
+    by_change = reconstruct(optical, image, SolverSettings("em", 60, stopping=Stopping(change=0.02)))
     np.testing.assert_array_equal(by_change.residual, whole.residual[: first + 2])
     limit = float(whole.residual[7])
-    by_residual = reconstruct(optical, image, "em", 60, stopping=Stopping(residual=limit))
+    by_residual = reconstruct(optical, image, SolverSettings("em", 60, stopping=Stopping(residual=limit)))
     np.testing.assert_array_equal(by_residual.residual, whole.residual[:8])
 
 
@@ -179,13 +187,13 @@ def test_pixels_and_voxels_out_of_sight_take_no_part():
     matrix = np.array([[1.0, 0.0, 0.0], [0.5, 0.5, 0.0], [0.0, 0.0, 0.0]])
     image = np.array([[2.0, 3.0, 50.0]], np.float32)  # the third pixel is lit by nothing in the volume
     for solver in SOLVERS:
-        volume = reconstruct(DenseOperator(matrix), image, solver, iterations=400).volume.ravel()
+        volume = reconstruct(DenseOperator(matrix), image, SolverSettings(solver, 400)).volume.ravel()
         np.testing.assert_allclose(volume, [2.0, 4.0, 0.0], rtol=0.02)
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_dark_image_gives_an_empty_volume(optical, solver):
-    result = reconstruct(optical, np.full(optical.image_shape, -3.0, np.float32), solver, iterations=3)
+    result = reconstruct(optical, np.full(optical.image_shape, -3.0, np.float32), SolverSettings(solver, 3))
     assert not result.volume.any()
     assert np.all(np.isfinite(result.residual))
 
@@ -195,8 +203,8 @@ def test_momentum_reaches_the_same_residual_in_fewer_steps(optical, rng, solver)
     truth = np.zeros(optical.shape, np.float32)
     truth[rng.integers(0, 6, 8), rng.integers(0, 7, 8), rng.integers(0, 8, 8)] = 100.0
     image = optical.forward(truth)
-    plain = reconstruct(optical, image, solver, iterations=24)
-    fast = reconstruct(optical, image, solver, iterations=12, accelerate=True)
+    plain = reconstruct(optical, image, SolverSettings(solver, 24))
+    fast = reconstruct(optical, image, SolverSettings(solver, 12, accelerate=True))
     assert fast.residual[-1] < plain.residual[-1]
     assert fast.volume.min() >= 0.0
 

@@ -10,7 +10,7 @@ import pytest
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.grid import Grid
-from lfpiv_cli.optics.media import Media, fluid_path_to_focus
+from lfpiv_cli.optics.media import Media, channel_window, fluid_path_to_focus
 from lfpiv_cli.synthetic.board import BoardPlacement
 from lfpiv_cli.synthetic.flows import rigid_rotation, uniform
 from lfpiv_cli.synthetic.render import ObjectSpace, render_points
@@ -19,7 +19,6 @@ from lfpiv_cli.synthetic.scenes import (
     Misalignment,
     Tracers,
     channel_walls,
-    channel_window,
     simulate_board,
     simulate_particles,
     simulate_white,
@@ -58,7 +57,7 @@ def test_boxes_apart_are_refused():
 
 
 def test_channel_window_is_half_the_width_in_front_of_the_mid_plane(table2, water):
-    window = channel_window(table2, water, 10.0, 5.0, -0.4655)
+    window = channel_window(table2.focus_distance_mm, water, 10.0, 5.0, -0.4655)
     assert fluid_path_to_focus(window, table2.focus_distance_mm, water) - 0.4655 == pytest.approx(5.0)
     # by hand: 200 - 5/1.49 - 5.4655/1.33 = 200 - 3.355705 - 4.109398
     assert window.distance_mm == pytest.approx(192.534897, abs=1e-6)

@@ -39,14 +39,15 @@ from lfpiv_cli.files.yaml_nodes import (
     key_name,
     read_document,
 )
+from lfpiv_cli.flow.correlation import CorrelationSettings
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
-from lfpiv_cli.optics.media import Media, Window
+from lfpiv_cli.optics.media import Media, Window, channel_window
 from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.reconstruction.registry import SOLVERS
+from lfpiv_cli.reconstruction.solvers import SolverSettings, Stopping
 from lfpiv_cli.reference import FOCAL_POINT, Reference
 from lfpiv_cli.synthetic.flows import Flow
-from lfpiv_cli.synthetic.scenes import channel_window
 
 
 @dataclass(frozen=True)
@@ -183,7 +184,7 @@ class Config:
         """Return the window: the channel's wall where its mid plane's depth is given, else the section `window`."""
         if self.channel is not None and mid_plane_z_mm is not None:
             wall = self.channel.width_mm, self.channel.wall_mm
-            return channel_window(self.camera_model(), self.media_model(), *wall, mid_plane_z_mm)
+            return channel_window(self.camera_model().focus_distance_mm, self.media_model(), *wall, mid_plane_z_mm)
         section = self._needed("window", self.sections.window)
         return Window(section.distance_mm, section.thickness_mm)
 
@@ -224,10 +225,28 @@ class Config:
         section: ChannelSection = self._needed("channel", self.channel)
         return section.width_mm
 
+    def solver_settings(self) -> SolverSettings:
+        """Return how volumes are reconstructed."""
+        chosen = self.reconstruction
+        return SolverSettings(
+            chosen.solver,
+            chosen.iterations,
+            chosen.relaxation,
+            chosen.accelerate,
+            chosen.start,
+            Stopping(chosen.stop_change, None, chosen.stop_noise, chosen.photons_per_count),
+        )
+
     def correlation_exponent(self) -> float:
         """Return the power of the intensities that is correlated: the configured one, or the solver's default."""
         solver = SOLVERS.get(self.reconstruction.solver)
         return self.correlation.exponent or (solver.exponent if solver else 1.0)
+
+    def correlation_settings(self, voxel_mm: tuple[float, float, float]) -> CorrelationSettings:
+        """Return how volumes of such voxels are correlated."""
+        return CorrelationSettings(
+            self.windows_voxel(voxel_mm), self.overlap(voxel_mm), self.correlation.dt_s, self.correlation_exponent()
+        )
 
     def simulated_flow(self, reference: Reference = FOCAL_POINT) -> Flow:
         """Return the flow to render, a function of points: z as in the config, or from the focal point as in `grid`."""
@@ -289,7 +308,7 @@ def load_config(path: Path) -> Config:
     return _validated(document, str(path))
 
 
-def carried_config(record: Mapping[str, Any], path: Path) -> Config:
+def carried_config(record: Mapping[str, Any], source: Path | str) -> Config:
     """Return the resolved configuration in the record that one of our files carries.
 
     Raises
@@ -299,7 +318,7 @@ def carried_config(record: Mapping[str, Any], path: Path) -> Config:
     """
     config = record.get("config")
     if not config:
-        raise InputError(f"{path}: carries no config; give one with --config")
+        raise InputError(f"{source}: carries no config; give one with --config")
     return Config.from_resolved(config)
 
 

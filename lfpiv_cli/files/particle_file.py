@@ -143,6 +143,19 @@ def read_points(path: Path | str, format_name: str) -> Points:
     return Points(position.astype(np.float64), arrays, root.reference, root.attributes, root.provenance)
 
 
+def read_tracks(path: Path | str) -> Points:
+    """Read tracks, of two frames or of a sequence.
+
+    Raises
+    ------
+    InputError
+        As `read_points`.
+    """
+    with open_h5(Path(path)) as file:
+        is_sequence = file.attrs.get("format") == TRAJECTORIES_FORMAT.encode()
+    return read_points(path, TRAJECTORIES_FORMAT if is_sequence else TRACKS_FORMAT)
+
+
 def symmetric(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return symmetric matrices (n, 3, 3) as (n, 6): xx, yy, zz, xy, yz, xz."""
     return np.stack([matrices[:, i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))], axis=1)

@@ -15,7 +15,7 @@ had none of these.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +39,7 @@ from lfpiv_cli.weights.axis_cells import AxisOptics, micro_image_cells
 from lfpiv_cli.weights.build import axis_optics
 from lfpiv_cli.weights.columns import ColumnOperator, OnDemandOperator
 from lfpiv_cli.weights.model import Weights, WeightsOperator, behind_transmission
-from lfpiv_cli.weights.operators import BrickOperator, FactorisedOperator
+from lfpiv_cli.weights.operators import BrickOperator, Column, FactorisedOperator
 from lfpiv_cli.weights.quadrature import Columns
 from lfpiv_cli.weights.scene import Source
 
@@ -80,6 +80,45 @@ class WeightsFile:
     provenance: dict[str, Any]
     vignetting: NDArray[np.float64] | None = None
 
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Shape (z, y, x) of the volume."""
+        return self.weights.shape
+
+    @property
+    def image_shape(self) -> tuple[int, int]:
+        """Shape (rows, columns) of the images, raw and prepared."""
+        return self.weights.image_shape
+
+    @property
+    def frame(self) -> str:
+        """`raw` where images are used as they are, `rectified` where `prepare` moves them into the array's frame."""
+        return self.weights.frame
+
+    def prepare(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Take a raw image (rows, columns) to the frame of the weights."""
+        return self.weights.prepare(image)
+
+    def forward(self, volume: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the image (rows, columns) that a volume [z, y, x] gives."""
+        return self.weights.forward(volume)
+
+    def adjoint(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the volume [z, y, x] that an image is spread back to."""
+        return self.weights.adjoint(image)
+
+    def column(self, iz: int, iy: int, ix: int) -> Column:
+        """Return the rows, columns and weights of the pixels that voxel (iz, iy, ix) lights."""
+        return self.weights.column(iz, iy, ix)
+
+    def behind_vignetting(self) -> WeightsFile:
+        """Return the same with the vignetting in the weights, as a file has it once it is read."""
+        if self.vignetting is None:
+            return self
+        surface = vignetting_surface(self.vignetting, self.image_shape)
+        operator = behind_transmission(self.weights.solver_operator, surface)
+        return replace(self, weights=replace(self.weights, solver_operator=operator))
+
 
 def write_weights(path: Path, content: WeightsFile, overwrite: bool) -> None:
     """Write a weights file."""
@@ -107,13 +146,14 @@ def write_weights(path: Path, content: WeightsFile, overwrite: bool) -> None:
     )
 
 
-def read_weights(path: Path) -> WeightsFile:
+def open_weights(path: Path | str) -> WeightsFile:
     """Read a weights file.
 
     Raises
     ------
     InputError : the file is missing, broken, of another format or version, or contradicts itself.
     """
+    path = Path(path)
     tree, provenance = read_tree(path, FORMAT, READABLE_VERSIONS)
     try:
         camera = _camera(tree["camera"])
@@ -126,10 +166,8 @@ def read_weights(path: Path) -> WeightsFile:
         calibration = Calibration.from_tree(tree["calibration"]) if tree.get("calibration") else None
         operator = _operator(tree, camera, grid.padded(padding), calibration)
         vignetting = tree.get("vignetting")
-        if vignetting is not None:
-            if vignetting.ndim != 2 or not np.isfinite(vignetting).all():
-                raise ValueError(f"a vignetting of shape {vignetting.shape}")
-            operator = behind_transmission(operator, vignetting_surface(vignetting, (camera.rows, camera.columns)))
+        if vignetting is not None and (vignetting.ndim != 2 or not np.isfinite(vignetting).all()):
+            raise ValueError(f"a vignetting of shape {vignetting.shape}")
         bend = tree["grid"].get("scene_distortion_per_mm2")
         if bend is not None and (bend.shape != (grid.shape_xyz[2],) or not np.isfinite(bend).all()):
             raise ValueError(f"a distortion of shape {bend.shape} for {grid.shape_xyz[2]} planes")
@@ -137,12 +175,7 @@ def read_weights(path: Path) -> WeightsFile:
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: not a whole weights file: {error}") from error
     weights = Weights(grid, padding, operator, camera.column_axis, calibration, bend)
-    return WeightsFile(weights, camera, reference, provenance, vignetting)
-
-
-def open_weights(path: str | Path) -> Weights:
-    """Return the weights stored in a file: `shape`, `image_shape`, `prepare`, `forward`, `adjoint`, `column`."""
-    return read_weights(Path(path)).weights
+    return WeightsFile(weights, camera, reference, provenance, vignetting).behind_vignetting()
 
 
 def _operator_tree(operator: WeightsOperator) -> dict[str, Any]:

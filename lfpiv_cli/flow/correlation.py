@@ -53,6 +53,27 @@ SMALLEST_VALID_FRACTION = 0.25
 
 
 @dataclass(frozen=True)
+class CorrelationSettings:
+    """How two volumes are correlated.
+
+    Attributes
+    ----------
+    windows : sizes of the interrogation windows in voxels along (x, y, z), coarse to fine; the last gives the vectors
+    overlap : share of a window in common with the next one along (x, y, z), 0 <= overlap < 1
+    dt_s : time from the first volume to the second, or None where it is not known
+    exponent : power of the intensities that is correlated, 0 < exponent <= 1, negative ones being zero where it is
+        below 1. In volumes of a solver that sharpens, as EM does, the brightest particles outweigh all others and are
+        narrower than a voxel: the root lets the others speak and makes peaks wide enough to be located. In volumes with
+        a noisy background it raises that, and harms.
+    """
+
+    windows: Sequence[Triple]
+    overlap: tuple[float, float, float]
+    dt_s: float | None = None
+    exponent: float = 1.0
+
+
+@dataclass(frozen=True)
 class Pass:
     """One pass over the deformed volumes: its windows, how far it looks, and whether its vectors are the result."""
 
@@ -92,12 +113,10 @@ class Measured:
 def correlate(
     pairs: Iterable[tuple[NDArray[np.float32], NDArray[np.float32]]],
     grid: Grid,
-    windows: Sequence[Triple],
-    overlap: tuple[float, float, float],
-    dt_s: float | None,
+    settings: CorrelationSettings,
+    *,
     mask: NDArray[np.bool_] | None = None,
     progress: Callable[[int], None] | None = None,
-    exponent: float = 1.0,
 ) -> VectorField:
     """Return the displacements from the first to the second volume of a pair, or those that several have in common.
 
@@ -108,15 +127,8 @@ def correlate(
     ----------
     pairs : volumes (z, y, x), intensities on `grid`; voxels that are not finite are masked. Of each pair only the
         splines are kept, pairs may be read one by one
-    windows : window sizes in voxels along (x, y, z), coarse to fine; the last one gives the vectors
-    overlap : share of a window in common with the next one along (x, y, z), 0 <= overlap < 1
-    dt_s : time from the first to the second volume, or None where it is not known
     mask : (z, y, x) True where the volumes are to be used; None for everywhere
     progress : called with 1 after each of `count_passes(windows)` passes
-    exponent : power of the intensities that is correlated, 0 < exponent <= 1, negative ones being zero where it is
-        below 1. In volumes of a solver that sharpens, as EM does, the brightest particles outweigh all others and are
-        narrower than a voxel: the root lets the others speak and makes peaks wide enough to be located. In volumes with
-        a noisy background it raises that, and harms.
 
     Raises
     ------
@@ -125,13 +137,14 @@ def correlate(
     ConfigError
         No window, one smaller than 2 voxels, an overlap outside 0 to 1, or a time or an exponent out of range.
     """
+    windows, overlap = settings.windows, settings.overlap
     report = progress or (lambda units: None)
     coarse = coarse_layout(grid.shape_xyz, windows, overlap)
     sums, ready = None, []
     for a, b in pairs:
-        _check(a, b, grid, dt_s, mask, exponent)
+        _check(a, b, grid, mask, settings)
         usable, a, b = _usable_voxels(a, b, mask)
-        a, b = _compressed(a, exponent), _compressed(b, exponent)
+        a, b = _compressed(a, settings.exponent), _compressed(b, settings.exponent)
         found = coarse_sums(a, b, coarse)
         sums = found if sums is None else sums + found
         ready.append(Pair(spline_coefficients(a), spline_coefficients(b), usable, grid.shape_xyz))
@@ -159,7 +172,7 @@ def correlate(
         flag=measured.flag,
         uncertainty_voxel=uncertainty,
         voxel_mm=grid.spacing_mm,
-        dt_s=dt_s,
+        dt_s=settings.dt_s,
         window_voxel=layout.size,
     )
 
@@ -173,14 +186,14 @@ def _check(
     a: NDArray[np.float32],
     b: NDArray[np.float32],
     grid: Grid,
-    dt_s: float | None,
     mask: NDArray[np.bool_] | None,
-    exponent: float,
+    settings: CorrelationSettings,
 ) -> None:
     """Raise where the arguments of `correlate` do not belong together."""
     for name, array in (("first volume", a), ("second volume", b), ("mask", mask)):
         if array is not None and array.shape != grid.shape_zyx:
             raise InputError(f"the {name} has shape {array.shape} (z, y, x); its grid has {grid.shape_zyx}")
+    dt_s, exponent = settings.dt_s, settings.exponent
     if dt_s is not None and not dt_s > 0.0:
         raise ConfigError(f"the time between the volumes is {dt_s} s; it must be positive")
     if not 0.0 < exponent <= 1.0:

@@ -60,6 +60,15 @@ def fluid_path_to_focus(window: Window, focus_distance_mm: float, media: Media) 
     return apparent * media.fluid / media.air
 
 
+def channel_window(
+    focus_distance_mm: float, media: Media, width_mm: float, wall_mm: float, mid_plane_z_mm: float
+) -> Window:
+    """Return the window of a channel whose mid plane lies at a depth, half the width behind the wall (Eq. 6)."""
+    path = 0.5 * width_mm - mid_plane_z_mm
+    distance = focus_distance_mm - path * media.depth_ratio - wall_mm * media.air / media.window
+    return Window(distance, wall_mm)
+
+
 def object_space_matrix(z_mm: float, window: Window, focus_distance_mm: float, media: Media) -> NDArray[np.float64]:
     """Return the 2x2 transfer matrix from a point at depth z to the main lens, paraxial refraction (Eqs. 14, 15)."""
 

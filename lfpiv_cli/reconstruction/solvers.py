@@ -11,7 +11,7 @@ Axes: volumes [z, y, x], images [row, column], float32.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from lfpiv_cli.names import Start
 from lfpiv_cli.reconstruction import kernels
 from lfpiv_cli.reconstruction.equations import Image, Normalisers, Operator, Problem, Volume, normalisers
+from lfpiv_cli.reconstruction.images import noise_residual
 from lfpiv_cli.reconstruction.registry import SOLVERS
 from lfpiv_cli.reconstruction.starts import line_of_sight_start, lit_support, uniform_start
 
@@ -36,11 +37,21 @@ class Stopping:
     Attributes
     ----------
     change : end when an iteration lowers the residual by less than this share of it; None: never
-    residual : end when the relative residual is this small, as what remains is noise; None: never
+    residual : end when the relative residual is this small; None: never
+    noise : end when the residual is this many times that of an image's noise, as what remains is noise; None: never
+    photons_per_count : to know light's own noise; None: only read noise is known
     """
 
     change: float | None = None
     residual: float | None = None
+    noise: float | None = None
+    photons_per_count: float | None = None
+
+    def for_image(self, image: Image) -> Stopping:
+        """Return when to end with an image (rows, columns), its noise told as a residual."""
+        if self.noise is None:
+            return self
+        return replace(self, residual=self.noise * noise_residual(image, self.photons_per_count), noise=None)
 
     def reached(self, residual: NDArray[np.float64]) -> bool:
         """Return whether the residuals (n,) of the iterations so far are the last ones needed."""
@@ -52,6 +63,28 @@ class Stopping:
 
 
 ALL_ITERATIONS = Stopping()
+
+
+@dataclass(frozen=True)
+class SolverSettings:
+    """How to solve.
+
+    Attributes
+    ----------
+    solver : name in `registry.SOLVERS`
+    iterations : at most
+    relaxation : of each step
+    accelerate : step from points extrapolated by `Momentum`, at the cost of three passes over the volume
+    start : `uniform` (the paper), or `line_of_sight`, which also leaves voxels out for good
+    stopping : when to end before all iterations are done
+    """
+
+    solver: str
+    iterations: int
+    relaxation: float = 1.0
+    accelerate: bool = False
+    start: Start = "uniform"
+    stopping: Stopping = ALL_ITERATIONS
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,43 +159,36 @@ def _log_ratio(problem: Problem, projection: Image) -> Image:
 def reconstruct(
     operator: Operator,
     image: Image,
-    solver: str,
-    iterations: int,
-    relaxation: float = 1.0,
-    accelerate: bool = False,
+    settings: SolverSettings,
+    *,
     sums: Normalisers | None = None,
     progress: Callable[[int], None] | None = None,
-    start: Start = "uniform",
-    stopping: Stopping = ALL_ITERATIONS,
 ) -> Reconstruction:
     """Solve for the volume that gives an image.
 
     Parameters
     ----------
     image : (rows, columns) in the weights' frame, dark and background taken off; negative values count as 0
-    solver : name in `registry.SOLVERS`
-    accelerate : step from points extrapolated by `Momentum`, at the cost of three passes over the volume
     sums : `normalisers(operator)`, where several images share it; tells which pixels take part
     progress : called with 1 after each iteration
-    start : `uniform` (the paper), or `line_of_sight`, which also leaves voxels out for good
-    stopping : when to end before all iterations are done
     """
+    stopping = settings.stopping.for_image(image)
     problem = Problem.of(operator, image, sums or normalisers(operator))
-    if start == "line_of_sight":
+    if settings.start == "line_of_sight":
         support = lit_support(operator, problem.image, problem.sums)
         problem = Problem.of(operator, image, problem.sums.within(operator, support))
-    volume = point = line_of_sight_start(problem) if start == "line_of_sight" else uniform_start(problem)
-    step, momentum = SOLVERS[solver].step(), Momentum()
+    volume = point = line_of_sight_start(problem) if settings.start == "line_of_sight" else uniform_start(problem)
+    step, momentum = SOLVERS[settings.solver].step(), Momentum()
     norm = float(np.sqrt(np.sum(np.square(problem.image, dtype=np.float64))))
     residual: list[float] = []
-    for _ in range(iterations):
+    for _ in range(settings.iterations):
         projection = operator.forward(point)
         residual.append(_relative_residual(problem, projection, norm))
         if stopping.reached(np.array(residual)):
             residual.pop()
             break
-        previous, volume = volume, step(problem, point, projection, relaxation)
-        if accelerate:
+        previous, volume = volume, step(problem, point, projection, settings.relaxation)
+        if settings.accelerate:
             momentum, point = momentum.extrapolated(point, previous, volume)
         else:
             point = volume

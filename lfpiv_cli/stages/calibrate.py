@@ -7,11 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lfpiv_cli.calibration.model import calibrate
 from lfpiv_cli.calibration.sheet import image_distance_doubt
 from lfpiv_cli.calibration.white import by_aperture
 from lfpiv_cli.console import CONSOLE, Console
-from lfpiv_cli.errors import UsageError
 from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.calibration_file import write_calibration
@@ -19,6 +17,7 @@ from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.pictures import ensure_drawing, write_picture
 from lfpiv_cli.files.provenance import record as provenance_record
+from lfpiv_cli.interface.calibration import calibration_of, ensure_pictures
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.reconstruction.images import light
 
@@ -55,12 +54,7 @@ def calibrate_snapshot(
     """Find the lattice in white images and the focal plane in a snapshot of the board, or rays in boards at depths."""
     white, board, depth_mm = options.white, options.board, options.depth_mm
     picture, views = options.picture, options.views
-    if not white and not board:
-        raise UsageError("calibrate-snapshot needs a picture: --white, --board or both")
-    if len(depth_mm) != (len(board) if depth_mm else 0) or (len(board) > 1 and not depth_mm):
-        raise UsageError(
-            f"{len(board)} --board and {len(depth_mm)} --depth-mm; give one board alone, or each with its depth"
-        )
+    ensure_pictures(len(white), len(board), len(depth_mm))
     whites, boards = _numbered("white", white), _numbered("board", board)
     inputs = given(config=config, dark=options.dark) | whites | boards
     for target in filter(None, (output, picture, views)):
@@ -70,26 +64,18 @@ def calibrate_snapshot(
     settings = load_config(config)
     shape = settings.image_shape()
     frames = {name: image_files.read_image(path, shape) for name, path in inputs.items() if name != "config"}
-    camera = settings.camera_model() if views or not white else settings.complete_camera()
+    camera = settings.camera_model() if views else settings.complete_camera()
     if not white:
-        console.say(
-            "lfpiv: no white image: the microlenses are believed to lie as the data sheet says, "
+        console.warn(
+            "no white image: the microlenses are believed to lie as the data sheet says, "
             "and the standard errors know nothing of how far that is wrong"
         )
-    calibration = calibrate(
-        [frames[name] for name in whites],
-        frames.get("dark"),
-        frames[next(iter(boards))] if boards and not depth_mm else None,
-        layout=settings.camera.microlenses.layout,
-        sheet_pitch_px=settings.micro_image_pitch_px(),
-        camera=camera,
-        rig=settings.rig() if board else None,
-        depth_boards=[frames[name] for name in boards] if depth_mm else (),
-        depths_mm=depth_mm,
+    calibration = calibration_of(
+        settings, [frames[n] for n in whites], [frames[n] for n in boards], frames.get("dark"), depth_mm
     )
     doubt = None if camera is None else image_distance_doubt(calibration.fit, camera)
     if doubt:
-        console.say(f"lfpiv: {doubt}")
+        console.warn(doubt)
     record = provenance_record("calibrate-snapshot", settings.resolved(), inputs)
     write_calibration(output, calibration, record, overwrite)
     if picture:

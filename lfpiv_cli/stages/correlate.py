@@ -23,7 +23,7 @@ from lfpiv_cli.flow.correlation import count_passes
 from lfpiv_cli.flow.derived import Derived, derived_fields
 from lfpiv_cli.flow.field import MM_TO_M, REJECTED, VectorField
 from lfpiv_cli.flow.statistics import statistics_of
-from lfpiv_cli.grid import Grid
+from lfpiv_cli.interface.vectors import ensure_alike, usable_voxels
 from lfpiv_cli.names import Pairing
 from lfpiv_cli.reference import Reference
 
@@ -136,47 +136,22 @@ def correlate(
 def _measure(job: Job, mask: Path | None, console: Console) -> tuple[VectorField, Reference]:
     """Return the vectors of a job, and the origin of its volumes' coordinates."""
     first = vtkhdf.open_volume(job.pairs[0][0])
-    grid, settings = first.grid, job.settings
+    drawn = None if mask is None else vtkhdf.open_volume(mask)
+    if drawn is not None and drawn.grid != first.grid:
+        raise InputError(f"{mask}: its grid {drawn.grid} differs from that of {job.pairs[0][0]}, {first.grid}")
 
     def volumes() -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
         for pair in job.pairs:
             a, b = (first if path == job.pairs[0][0] else vtkhdf.open_volume(path) for path in pair)
             for path, volume in zip(pair, (a, b), strict=True):
-                _ensure_alike((job.pairs[0][0], path), first, volume)
+                ensure_alike(first, volume, (str(job.pairs[0][0]), str(path)))
             yield a.array, b.array
 
-    sizes = settings.windows_voxel(grid.spacing_mm)
-    with console.progress(count_passes(sizes), "correlate") as advance:
-        field = measure(
-            volumes(),
-            grid,
-            sizes,
-            settings.overlap(grid.spacing_mm),
-            settings.correlation.dt_s,
-            _usable(settings, mask, first, job.pairs[0][0]),
-            progress=advance,
-            exponent=settings.correlation_exponent(),
-        )
+    usable = usable_voxels(job.settings, first.grid, None if drawn is None else drawn.array)
+    settings = job.settings.correlation_settings(first.grid.spacing_mm)
+    with console.progress(count_passes(settings.windows), "correlate") as advance:
+        field = measure(volumes(), first.grid, settings, mask=usable, progress=advance)
     return field, first.reference
-
-
-def _usable(settings: Config, mask: Path | None, volume: vtkhdf.Volume, path: Path) -> NDArray[np.bool_] | None:
-    """Return where the volumes may be used: between the walls and inside the mask; None for everywhere."""
-    usable = None
-    if settings.correlation.mask == "channel":
-        usable = between_walls(volume.grid, settings.channel_width_mm())
-    if mask is not None:
-        drawn = vtkhdf.open_volume(mask)
-        if drawn.grid != volume.grid:
-            raise InputError(f"{mask}: its grid {drawn.grid} differs from that of {path}, {volume.grid}")
-        usable = drawn.array > 0.0 if usable is None else usable & (drawn.array > 0.0)
-    return usable
-
-
-def between_walls(grid: Grid, width_mm: float) -> NDArray[np.bool_]:
-    """Return the voxels (nz, ny, nx) whose centres lie between walls across z, half the width from z = 0."""
-    inside = np.abs(grid.axis_mm(2)) <= 0.5 * width_mm
-    return np.broadcast_to(inside[:, np.newaxis, np.newaxis], grid.shape_zyx).copy()
 
 
 def _arrays_of(derived: Derived) -> Extra:
@@ -226,13 +201,3 @@ def _pairs(volumes: Sequence[Path], pairing: Pairing | None) -> list[tuple[Path,
         )
     step = 1 if pairing == "sequence" else 2
     return [(volumes[k], volumes[k + 1]) for k in range(0, len(volumes) - 1, step)]
-
-
-def _ensure_alike(paths: tuple[Path, Path], first: vtkhdf.Volume, second: vtkhdf.Volume) -> None:
-    """Refuse two volumes that were not made alike."""
-    if first.grid != second.grid:
-        raise InputError(f"{paths[1]}: its grid {second.grid} differs from that of {paths[0]}, {first.grid}")
-    if first.reference.name != second.reference.name:
-        raise InputError(f"{paths[1]}: its coordinates have another origin than those of {paths[0]}")
-    if first.provenance.get("config") != second.provenance.get("config"):
-        raise InputError(f"{paths[1]}: was made with another config than {paths[0]}")

@@ -13,7 +13,7 @@ from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.describe import describe
 from lfpiv_cli.files.pictures import ensure_drawing, write_picture
-from lfpiv_cli.files.weights_file import read_weights
+from lfpiv_cli.files.weights_file import open_weights
 from lfpiv_cli.validation.weights_pictures import column_figure
 
 
@@ -40,7 +40,7 @@ def info(
     ensure_writable(picture, overwrite, [file])
     ensure_drawing()
     found = describe(file)
-    weights = read_weights(file).weights
+    weights = open_weights(file).weights
     nx, ny, nz = weights.grid.shape_xyz
     ix, iy, iz = voxel or (nx // 2, ny // 2, nz // 2)
     if not (0 <= ix < nx and 0 <= iy < ny and 0 <= iz < nz):

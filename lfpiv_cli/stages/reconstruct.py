@@ -19,50 +19,19 @@ from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.batch import Frame, Target, frames_beside, frames_of, output_paths, pending, prepare_folder
 from lfpiv_cli.files.config import Config, carried_config
 from lfpiv_cli.files.inputs import given
+from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, write_points
 from lfpiv_cli.files.provenance import record
-from lfpiv_cli.files.sections import ReconstructionSection
-from lfpiv_cli.files.weights_file import WeightsFile, read_weights
+from lfpiv_cli.files.weights_file import open_weights
+from lfpiv_cli.interface import particles
+from lfpiv_cli.interface.reconstruction import Bench, Progress, bench_of, volume_of
 from lfpiv_cli.names import Pairing, Start
 from lfpiv_cli.particles.search import Particles
-from lfpiv_cli.reconstruction.equations import Normalisers, Operator, normalisers
-from lfpiv_cli.reconstruction.images import (
-    Image,
-    Mask,
-    as_if_lit,
-    defects,
-    filled,
-    noise_residual,
-    saturated,
-    touched,
-)
+from lfpiv_cli.reconstruction.images import Image
 from lfpiv_cli.reconstruction.registry import SolverName
-from lfpiv_cli.reconstruction.solvers import Reconstruction, Stopping
-from lfpiv_cli.reconstruction.solvers import reconstruct as solve
-from lfpiv_cli.stages import particles
 from lfpiv_cli.stages.frames import Background, ahead, reader, sequence_digests, with_those_beside
 
-# Finds the particles of frame `number`.
-Find = Callable[[int, particles.Frame], Particles]
-
-
-@dataclass(frozen=True, eq=False)
-class Bench:
-    """What all frames of a batch share.
-
-    Attributes
-    ----------
-    dark : dark image (rows, columns) or None
-    lasting : raw pixels that are never usable: defects of the dark image, and where the mask is black
-    excluded : pixels in the weights' frame that never take part: off the sensor, or touched by `lasting`
-    sums : of the weights without `excluded`; None where weights are made for each image
-    """
-
-    content: WeightsFile
-    settings: Config
-    dark: Image | None
-    lasting: Mask
-    excluded: Mask
-    sums: Normalisers | None
+# Reads frame `number`: raw, and with dark or background taken off.
+Read = Callable[[int], tuple[Image, Image]]
 
 
 @dataclass(frozen=True)
@@ -120,7 +89,7 @@ def reconstruct(
     beside = None if options.pairing is None else frames_beside(len(frames), options.pairing)
     paths = output_paths(output, [frame.stem for frame in frames])
     prepare_folder(paths)
-    content = read_weights(weights)
+    content = open_weights(weights)
     settings = carried_config(content.provenance, weights).overridden_by("reconstruction", options)
     as_particles = settings.reconstruction.solver == "particles"
     if beside is not None and not as_particles:
@@ -132,9 +101,11 @@ def reconstruct(
     if as_particles:
         content = particles.searchable(content, settings)
         for number in needed:
-            ensure_writable(particles.residual_path(paths[number]), overwrite or options.resume, images)
-    bench = _bench(content, settings, options.dark, options.mask, bool(needed))
-    read = reader(level, frames, content.weights.image_shape, bench.dark)
+            ensure_writable(residual_path(paths[number]), overwrite or options.resume, images)
+    shape = content.image_shape
+    dark, mask = (image_files.read_image(path, shape) if path else None for path in (options.dark, options.mask))
+    bench = bench_of(content, settings, dark, mask, with_sums=bool(needed))
+    read = reader(level, frames, shape, dark)
     steps = particles.STEPS if as_particles else settings.reconstruction.iterations
     outcomes: list[Outcome] = []
     failures: list[str] = []
@@ -143,13 +114,17 @@ def reconstruct(
         find = _finder(bench, read, beside, advance)
         for number, future in ahead(read, needed):
             try:
-                raw, lit = future.result()
-                outcomes.append(_make(bench, targets[number], number, raw, lit, find, overwrite, advance))
+                pictures, target = future.result(), targets[number]
+                if as_particles:
+                    frame = particles.frame_of(bench, *pictures)
+                    outcomes.append(_write_particles(bench, target, frame, find(number, frame), overwrite))
+                else:
+                    outcomes.append(_make_volume(bench, target, pictures, overwrite, advance))
             except InputError as error:
                 if not options.keep_going:
                     raise
                 failures.append(str(error))
-                console.say(f"lfpiv: {error}")
+                console.warn(str(error))
     if failures:
         raise PartialError(f"{len(failures)} of {len(frames)} frames failed, the first because {failures[0]}")
     return {
@@ -187,130 +162,64 @@ def _record_of(path: Path) -> dict[str, Any]:
     return vtkhdf.read_header(path).provenance
 
 
-def _bench(content: WeightsFile, settings: Config, dark: Path | None, mask: Path | None, needed: bool) -> Bench:
-    """Return what all frames share."""
-    weights = content.weights
-    shape = weights.image_shape
-    dark_image = image_files.read_image(dark, shape) if dark else None
-    lasting = np.zeros(shape, np.bool_) if dark_image is None else defects(dark_image)
-    if mask is not None:
-        lasting |= image_files.read_image(mask, shape) == 0.0
-    excluded = touched(lasting, weights.prepare) if lasting.any() else np.zeros(shape, np.bool_)
-    if weights.calibration is not None:
-        excluded |= ~weights.calibration.rectification.inside
-    sums = normalisers(weights.padded, excluded) if needed and not weights.on_demand else None
-    return Bench(content, settings, dark_image, lasting, excluded, sums)
+def residual_path(particles: Path) -> Path:
+    """Return where the residual image of a file of particles goes."""
+    return particles.with_name(f"{particles.stem}_residual.tif")
 
 
-def _make(
-    bench: Bench,
-    target: Target,
-    number: int,
-    raw: Image,
-    lit: Image,
-    find: Find,
-    overwrite: bool,
-    advance: Callable[[int], None],
+def _make_volume(
+    bench: Bench, target: Target, frame: tuple[Image, Image], overwrite: bool, advance: Progress
 ) -> Outcome:
-    """Make and write the particles or the volume of a frame."""
-    if bench.settings.reconstruction.solver == "particles":
-        frame = _particle_frame(bench, raw, lit)
-        residual = particles.write_frame(
-            bench.content, bench.settings, frame, find(number, frame), target.path, target.record, overwrite
-        )
-        return Outcome(residual, int(np.count_nonzero(frame.unusable)))
-    lit, _, excluded = _usable(bench, raw, lit)
-    result = _solved(bench, bench.content.weights.prepare(lit), excluded, advance)
-    outcome = Outcome(float(result.residual[-1]), int(np.count_nonzero(excluded)))
-    _write(target, bench.content, result, outcome.excluded_pixels, overwrite)
-    return outcome
+    """Reconstruct and write the volume of a frame."""
+    volume = volume_of(bench, *frame, target.record, advance)
+    told = volume.attributes
+    vtkhdf.write_volume(
+        target.path,
+        volume.array,
+        volume.grid,
+        volume.reference,
+        provenance=target.record,
+        attributes=told,
+        overwrite=overwrite,
+    )
+    return Outcome(float(told["residual"][-1]), told["excluded_pixels"])
 
 
-def _usable(bench: Bench, raw: Image, lit: Image) -> tuple[Image, Mask, Mask]:
-    """Return a frame with its unusable pixels filled, these, and what takes no part in the weights' frame."""
-    unusable = bench.lasting | saturated(raw, bench.settings.reconstruction.saturation_counts)
-    return filled(lit, unusable), unusable, _excluded(bench, unusable)
-
-
-def _particle_frame(bench: Bench, raw: Image, lit: Image) -> particles.Frame:
-    """Return a frame as particles are sought in it."""
-    lit, unusable, excluded = _usable(bench, raw, lit)
-    return particles.Frame(lit, unusable, _sums_without(bench, bench.content.weights.padded, excluded))
+def _write_particles(
+    bench: Bench, target: Target, frame: particles.Frame, found: Particles, overwrite: bool
+) -> Outcome:
+    """Write the particles found behind a frame and what they leave of it."""
+    points = particles.points_of(bench, frame, found, target.record)
+    left = particles.what_is_left(frame, found)
+    # Made again whenever the particles are: an interrupted batch may have left one without them.
+    image_files.write_tiff(residual_path(target.path), left.astype(np.float32), overwrite=True)
+    write_points(
+        target.path,
+        PARTICLES_FORMAT,
+        points.position_mm,
+        points.arrays,
+        points.reference,
+        provenance=target.record,
+        attributes=points.attributes,
+        overwrite=overwrite,
+    )
+    return Outcome(points.attributes["residual"], points.attributes["excluded_pixels"])
 
 
 def _finder(
-    bench: Bench,
-    read: Callable[[int], tuple[Image, Image]],
-    beside: Sequence[tuple[int, ...]] | None,
-    advance: Callable[[int], None],
-) -> Find:
+    bench: Bench, read: Read, beside: Sequence[tuple[int, ...]] | None, advance: Progress
+) -> Callable[[int, particles.Frame], Particles]:
     """Return the function that finds the particles of a frame, alone or with the first passes of those beside it."""
-    content, settings = bench.content, bench.settings
 
     # A frame needs itself and one at either side, the next one two of these again.
     @lru_cache(maxsize=3)
     def first_pass_of(number: int) -> NDArray[np.float64]:
-        return particles.find_first(content, settings, _particle_frame(bench, *read(number)), advance)
+        return particles.find_first(bench, particles.frame_of(bench, *read(number)), advance)
 
     def find(number: int, frame: particles.Frame) -> Particles:
         if beside is None:
-            return particles.find(content, settings, frame, advance)
+            return particles.find(bench, frame, advance)
         seen = {k: first_pass_of(k) for k in sorted((number, *beside[number]))}
-        return particles.find_beside(content, settings, frame, seen[number], [seen[k] for k in beside[number]])
+        return particles.find_beside(bench, frame, seen[number], [seen[k] for k in beside[number]])
 
     return find
-
-
-def _excluded(bench: Bench, unusable: Mask) -> Mask:
-    """Return which pixels in the weights' frame take no part in a frame whose raw pixels are partly unusable."""
-    too_bright = unusable & ~bench.lasting
-    return bench.excluded | touched(too_bright, bench.content.weights.prepare) if too_bright.any() else bench.excluded
-
-
-def _sums_without(bench: Bench, operator: Operator, excluded: Mask) -> Normalisers:
-    """Return an operator's sums without what a frame excludes: from those that all frames share, if they do."""
-    if bench.sums is None:
-        return normalisers(operator, excluded)
-    return bench.sums if excluded is bench.excluded else bench.sums.without(operator, excluded)
-
-
-def _solved(bench: Bench, image: Image, excluded: Mask, advance: Callable[[int], None]) -> Reconstruction:
-    """Return the reconstruction of an image in the weights' frame."""
-    operator = bench.content.weights.padded
-    if bench.sums is None:
-        operator = operator.for_image(as_if_lit(image, excluded))
-    sums = _sums_without(bench, operator, excluded)
-    chosen = bench.settings.reconstruction
-    return solve(
-        operator,
-        image,
-        chosen.solver,
-        chosen.iterations,
-        chosen.relaxation,
-        chosen.accelerate,
-        sums,
-        advance,
-        chosen.start,
-        Stopping(chosen.stop_change, _noise_limit(chosen, image)),
-    )
-
-
-def _noise_limit(chosen: ReconstructionSection, image: Image) -> float | None:
-    """Return the relative residual at which what remains is noise, None where noise does not end the iterations."""
-    return None if chosen.stop_noise is None else chosen.stop_noise * noise_residual(image, chosen.photons_per_count)
-
-
-def _write(target: Target, content: WeightsFile, result: Reconstruction, excluded: int, overwrite: bool) -> None:
-    vtkhdf.write_volume(
-        target.path,
-        content.weights.to_world(result.volume),
-        content.reference.grid_from_focal_point(content.weights.grid),
-        content.reference,
-        provenance=target.record,
-        attributes={
-            "residual": result.residual,
-            "excluded_pixels": excluded,
-            "support_voxels": result.support_voxels,
-        },
-        overwrite=overwrite,
-    )

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.calibration.model import mid_plane_z_mm
@@ -29,14 +28,10 @@ from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.reference import FOCAL_POINT, Reference
 from lfpiv_cli.synthetic import scenes
 from lfpiv_cli.synthetic.board import BoardPlacement
-from lfpiv_cli.synthetic.flows import MM_PER_M, Flow
 from lfpiv_cli.synthetic.render import RAYS, ObjectSpace
+from lfpiv_cli.synthetic.seeding import seeded_boxes
 from lfpiv_cli.synthetic.sensor import Readout
 from lfpiv_cli.weights.build import blur_radius_mm
-
-# Points along each side of the volume at which the flow is asked for its speed: smooth flows change less than this
-# resolves, and the faster tracer that it misses is one at the rim of a sequence's first or last frame.
-SPEED_POINTS = 21
 
 
 def simulate_white(
@@ -212,29 +207,18 @@ def _tracers(settings: Config, camera: Camera, reference: Reference, dt_s: float
 
     Those that are carried into the volume before a longer sequence ends, or out of it, are there too.
     """
-    scene = settings.simulation
-    volume = settings.grid(reference)
-    margin = blur_radius_mm(camera, settings.media_model(), volume)
-    inside = scenes.Box.around(volume, (0.0, 0.0, 0.0))
-    carried = 0.5 * (scene.frames - 2) * dt_s * _largest_speed_mm_s(settings.simulated_flow(reference), inside)
-    box = inside.wider((margin + carried[0], margin + carried[1], carried[2]))
-    flow = scene.flow
+    scene, flow = settings.simulation, settings.simulation.flow
+    volume, walls = settings.grid(reference), None
     if flow is not None and flow.kind == "square_duct":
         walls = scenes.channel_walls(flow.width_mm, reference.depth_to_focal_point(flow.centre_mm[2]), flow.axis)
-        box, inside = box.within(walls), inside.within(walls)
-    count = round(scene.particles * box.volume_mm3 / inside.volume_mm3)
+    reach = blur_radius_mm(camera, settings.media_model(), volume)
+    carried_s = 0.5 * (scene.frames - 2) * dt_s
+    box, inside = seeded_boxes(volume, reach, settings.simulated_flow(reference), carried_s, walls)
     return scenes.Tracers(
-        count,
+        round(scene.particles * box.volume_mm3 / inside.volume_mm3),
         box,
         scene.particle_diameter_mm,
         scene.particle_counts,
         scene.brightness,
         scene.brightness_log_sigma,
     )
-
-
-def _largest_speed_mm_s(flow: Flow, box: scenes.Box) -> NDArray[np.float64]:
-    """Return the largest speed along each axis (3,) on a lattice of points of a box."""
-    sides = [np.linspace(low, high, SPEED_POINTS) for low, high in zip(box.low_mm, box.high_mm, strict=True)]
-    points = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, 3)
-    return np.asarray(MM_PER_M * np.abs(flow(points)).max(axis=0))

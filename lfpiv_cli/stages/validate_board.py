@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from lfpiv_cli.files.pictures import ensure_drawing, write_picture
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.reconstruction.equations import normalisers
-from lfpiv_cli.reconstruction.solvers import reconstruct
+from lfpiv_cli.reconstruction.solvers import ALL_ITERATIONS, reconstruct
 from lfpiv_cli.stages.simulate import misalignment_of, readout_of
 from lfpiv_cli.synthetic.board import BoardPlacement, dot_centres
 from lfpiv_cli.validation.board import DEPTHS_MM, PAPER, DotFigures, board_figures, measure_dots, place_figures
@@ -137,22 +138,15 @@ def _boards(
     advance: Callable[[int], None],
 ) -> tuple[list[DotFigures], NDArray[np.float32]]:
     """Return what is measured of the boards in pictures at all depths, and the volume of the one in the focal plane."""
-    board, solver = settings.rig().board, settings.reconstruction
+    board = settings.rig().board
+    # all iterations, so that methods and depths can be compared
+    solver = replace(settings.solver_settings(), stopping=ALL_ITERATIONS)
     sums = None if bench.weights.on_demand else normalisers(bench.weights.padded, bench.excluded)
     dots, drawn = [], np.zeros(bench.weights.shape, np.float32)
     for depth, picture in zip(depths_mm, pictures, strict=True):
         operator = bench.weights.padded.for_image(picture)
-        result = reconstruct(
-            operator,
-            picture,
-            solver.solver,
-            solver.iterations,
-            solver.relaxation,
-            solver.accelerate,
-            sums or normalisers(operator, bench.excluded),
-            advance,
-            solver.start,
-        )
+        sums_here = sums or normalisers(operator, bench.excluded)
+        result = reconstruct(operator, picture, solver, sums=sums_here, progress=advance)
         volume = bench.weights.to_world(result.volume)
         centres = dot_centres(board, _placement(settings, depth))[:, :2]
         dots.append(measure_dots(volume, bench.weights.grid, centres, 0.5 * board.spacing_mm))

@@ -20,7 +20,6 @@ from lfpiv_cli.files.particles import read_particles
 from lfpiv_cli.files.pictures import ensure_drawing, write_picture
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.files.sections_simulated import FlowSection
-from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.stages.chain import run_chain
 from lfpiv_cli.validation.channel import Duct
 from lfpiv_cli.validation.flow import limits_missed, truth_at_points
@@ -88,7 +87,7 @@ def _measured(vectors: Path, settings: Config, particles: Path | None, is_simula
     field = vtkhdf.open_vectors(vectors)
     if field.dt_s is None:
         raise InputError(f"{vectors}: holds displacements without a time; correlate again with --dt-s")
-    centres = _window_centres_mm(field)
+    centres = field.grid.centres_mm()
     if particles:
         centres = vtkhdf.read_header(vectors).reference.points_to_focal_point(centres)
         return Measured(field, *_truth_of_particles(particles, centres))
@@ -105,12 +104,6 @@ def _summary(figures: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """Return the figures that are numbers, each with the value of every method."""
     names = _scalars(next(iter(figures.values())))
     return {name: {method: found[name] for method, found in figures.items()} for name in names}
-
-
-def _window_centres_mm(field: VectorField) -> NDArray[np.float64]:
-    """Return the window centres (nz, ny, nx, 3) in the coordinates of the file."""
-    z, y, x = np.meshgrid(*(field.grid.axis_mm(axis) for axis in (2, 1, 0)), indexing="ij")
-    return np.stack([x, y, z], axis=-1)
 
 
 def _truth_of_particles(path: Path, centres_mm: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:

@@ -17,7 +17,6 @@ from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
-from lfpiv_cli.optics.media import Media, Window
 from lfpiv_cli.synthetic.board import BoardPlacement, dot_centres, render_board
 from lfpiv_cli.synthetic.flows import Flow, advect
 from lfpiv_cli.synthetic.render import RAYS, ObjectSpace, render_points, render_white
@@ -149,13 +148,6 @@ def channel_walls(width_mm: float, mid_plane_z_mm: float, axis: str = "x") -> Bo
     low, high = [-np.inf, -np.inf, mid_plane_z_mm - half], [np.inf, np.inf, mid_plane_z_mm + half]
     low[across], high[across] = -half, half
     return Box((low[0], low[1], low[2]), (high[0], high[1], high[2]))
-
-
-def channel_window(camera: Camera, media: Media, width_mm: float, wall_mm: float, mid_plane_z_mm: float) -> Window:
-    """Return the window of a channel whose mid plane lies at a depth, half the width behind the wall (Eq. 6)."""
-    path = 0.5 * width_mm - mid_plane_z_mm
-    distance = camera.focus_distance_mm - path * media.depth_ratio - wall_mm * media.air / media.window
-    return Window(distance, wall_mm)
 
 
 def simulate_white(camera: Camera, level: float, readout: Readout, rng: np.random.Generator) -> SimulatedStill:

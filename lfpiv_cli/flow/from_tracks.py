@@ -1,0 +1,86 @@
+"""Vectors on the grid of the interrogation windows, from the tracks of particles instead of a correlation.
+
+Axes: arrays [z, y, x], components (u, v, w) along (x, y, z) last.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lfpiv_cli.flow.correlation import SMALLEST_VALID_FRACTION
+from lfpiv_cli.flow.field import MASKED, REJECTED, VALID, VectorField
+from lfpiv_cli.flow.masks import share_between_walls
+from lfpiv_cli.flow.windows import Triple, layout_windows
+from lfpiv_cli.grid import Grid
+from lfpiv_cli.tracks.gridding import on_grid
+
+# A vector needs its twelve nearest tracks within this many windows of its centre: in sparse images tracks are further
+# apart than windows, and what a wide fit misses of the flow is in the stated error.
+REACH_WINDOWS = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Paths:
+    """Middles, displacements and standard errors (n, 3), mm, of the tracks that pass from one frame to the next."""
+
+    middle_mm: NDArray[np.float64]
+    displacement_mm: NDArray[np.float64]
+    sigma_mm: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class WindowGrid:
+    """The windows whose centres get vectors.
+
+    Attributes
+    ----------
+    volume : the voxels
+    size : of a window in voxels along x, y, z
+    overlap : share of a window in common with the next one along x, y, z
+    channel_width_mm : between walls across z, beyond which windows are masked; None: nothing is
+    """
+
+    volume: Grid
+    size: Triple
+    overlap: tuple[float, float, float]
+    channel_width_mm: float | None = None
+
+    @property
+    def centres(self) -> Grid:
+        """The windows' centres."""
+        return layout_windows(self.volume.shape_xyz, self.size, self.overlap).grid(self.volume)
+
+    def inside(self) -> NDArray[np.float64]:
+        """Return the share of each window's depth (nz, ny, nx) between the walls; 1 where these mask nothing."""
+        if self.channel_width_mm is None:
+            return np.ones(self.centres.shape_zyx)
+        return share_between_walls(self.centres, self.channel_width_mm, self.size[2] * self.volume.spacing_mm[2])
+
+
+def vectors_from_paths(paths: Paths, windows: WindowGrid, dt_s: float | None) -> VectorField:
+    """Return the vectors at the centres of windows; what only a correlation knows is NaN."""
+    grid, voxel_mm = windows.centres, windows.volume.spacing_mm
+    nodes = grid.centres_mm()
+    reach = REACH_WINDOWS * max(n * d for n, d in zip(windows.size, voxel_mm, strict=True))
+    values, errors = on_grid(paths.middle_mm, paths.displacement_mm, paths.sigma_mm, nodes.reshape(-1, 3), reach)
+    inside = windows.inside()
+    masked = inside < SMALLEST_VALID_FRACTION
+    displacement = np.where(masked[..., np.newaxis], np.nan, values.reshape(nodes.shape) / voxel_mm)
+    found = np.isfinite(displacement).all(axis=-1)
+    unknown = np.full(found.shape, np.nan)
+    return VectorField(
+        grid=grid,
+        displacement_voxel=displacement,
+        displacement_raw_voxel=displacement,
+        correlation=unknown,
+        peak_ratio=unknown,
+        valid_fraction=np.where(found | masked, inside, 0.0),
+        flag=np.where(masked, MASKED, np.where(found, VALID, REJECTED)).astype(np.uint8),
+        uncertainty_voxel=errors.reshape(nodes.shape) / voxel_mm,
+        voxel_mm=voxel_mm,
+        dt_s=dt_s,
+        window_voxel=windows.size,
+    )

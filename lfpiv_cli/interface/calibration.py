@@ -1,0 +1,103 @@
+"""Calibrating from pictures in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lfpiv_cli.calibration import model
+from lfpiv_cli.calibration.model import Calibration
+from lfpiv_cli.errors import UsageError
+from lfpiv_cli.files.config import Config
+
+Pictures = ArrayLike | Sequence[ArrayLike] | None
+
+
+def calibrate(
+    white: Pictures, board: Pictures, rig: Config, *, dark: ArrayLike | None = None, depth_mm: Sequence[float] = ()
+) -> Calibration:
+    """Find the microlenses in a white image and the focal plane in a snapshot of the calibration target.
+
+    Parameters
+    ----------
+    white : (rows, columns) counts
+        Raw image of uniform light, or a sequence of two, one stopped down and one not. None: the microlenses are
+        believed to lie as the data sheet says.
+    board : (rows, columns) counts
+        Raw image of the dot board; or a sequence of boards in the fluid, each with its depth. None: only the
+        microlenses are sought.
+    rig : Config
+        From `load_rig`.
+    dark : (rows, columns) counts, optional
+        Raw image taken with the cap on.
+    depth_mm : sequence of float, optional
+        Depths of several boards in the fluid, mm away from the camera, for weights of the method dlfc.
+
+    Returns
+    -------
+    Calibration
+        Its `summary()` has the figures and their standard errors, units in their names.
+
+    Raises
+    ------
+    UsageError
+        There is no picture, or boards and depths do not belong together.
+    InputError
+        A picture cannot serve; the message says why.
+    ConfigError
+        The rig lacks a section that is needed.
+    """
+    whites, boards = _each(white), _each(board)
+    ensure_pictures(len(whites), len(boards), len(depth_mm))
+    shape = rig.image_shape()
+    for picture in (*whites, *boards, *_each(dark)):
+        if np.shape(picture) != shape:
+            raise UsageError(f"a picture of {np.shape(picture)} pixels; the rig's sensor has {shape} (rows, columns)")
+    return calibration_of(rig, whites, boards, dark, depth_mm)
+
+
+def calibration_of(
+    rig: Config,
+    whites: Sequence[ArrayLike],
+    boards: Sequence[ArrayLike],
+    dark: ArrayLike | None,
+    depth_mm: Sequence[float],
+) -> Calibration:
+    """Return the calibration that pictures of the rig give, all of them (rows, columns)."""
+    return model.calibrate(
+        whites,
+        dark,
+        boards[0] if boards and not len(depth_mm) else None,
+        layout=rig.camera.microlenses.layout,
+        sheet_pitch_px=rig.micro_image_pitch_px(),
+        camera=rig.complete_camera() if whites else rig.camera_model(),
+        rig=rig.rig() if boards else None,
+        depth_boards=boards if len(depth_mm) else (),
+        depths_mm=depth_mm,
+    )
+
+
+def ensure_pictures(whites: int, boards: int, depths: int) -> None:
+    """Refuse numbers of pictures and depths that make no calibration.
+
+    Raises
+    ------
+    UsageError
+    """
+    if not whites and not boards:
+        raise UsageError("calibrate-snapshot needs a picture: --white, --board or both")
+    if depths != (boards if depths else 0) or (boards > 1 and not depths):
+        raise UsageError(f"{boards} --board and {depths} --depth-mm; give one board alone, or each with its depth")
+
+
+def _each(pictures: Pictures) -> list[NDArray[Any]]:
+    """Return one picture or several as a list."""
+    if pictures is None:
+        return []
+    if isinstance(pictures, (list, tuple)) and np.ndim(pictures[0]) > 1:
+        return [np.asarray(picture) for picture in pictures]
+    array = np.asarray(pictures)
+    return [array] if array.ndim == 2 else list(array)

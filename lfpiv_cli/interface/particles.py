@@ -1,0 +1,205 @@
+"""Finding the particles behind an image in memory (iterative particle reconstruction)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lfpiv_cli.errors import ConfigError
+from lfpiv_cli.files.config import Config, carried_config
+from lfpiv_cli.files.particle_file import Points, symmetric
+from lfpiv_cli.files.provenance import record
+from lfpiv_cli.files.weights_file import WeightsFile
+from lfpiv_cli.grid import Grid
+from lfpiv_cli.interface.reconstruction import Bench, as_counts, bench_of, counts
+from lfpiv_cli.optics.object_space import ObjectSpace
+from lfpiv_cli.particles.neighbour_frames import second_pass
+from lfpiv_cli.particles.refraction import places_by_snell
+from lfpiv_cli.particles.rounds import ROUNDS, first_pass
+from lfpiv_cli.particles.search import Particles, Task, result, task_of
+from lfpiv_cli.particles.view import raw_view
+from lfpiv_cli.reconstruction.equations import Normalisers
+from lfpiv_cli.reconstruction.images import Image, Mask, filled, light
+from lfpiv_cli.tracks.tracking import SEARCH_VOXEL
+from lfpiv_cli.weights.build import factorise_bricks
+from lfpiv_cli.weights.columns import OnDemandOperator
+from lfpiv_cli.weights.model import behind_transmission
+
+# Units of progress that `find` and `find_first` report.
+STEPS = sum(settings.iterations + 1 for settings in ROUNDS)
+
+
+def find_particles(
+    weights: WeightsFile,
+    image: NDArray[Any],
+    *,
+    neighbours: Sequence[NDArray[Any]] = (),
+    dark: NDArray[Any] | None = None,
+    background: NDArray[Any] | None = None,
+    mask: NDArray[Any] | None = None,
+    **settings: Any,
+) -> Points:
+    """Find the tracer particles behind an image: where they are, how bright, and how well that is known.
+
+    Parameters
+    ----------
+    weights : WeightsFile
+        From `build_weights` or `open_weights`.
+    image : (rows, columns) counts
+        Raw image.
+    neighbours : sequence of (rows, columns) counts, optional
+        Raw images of the frames before and after, or of the other one of a pair, which help to find what overlaps.
+    dark, background, mask
+        As of `reconstruct`.
+    **settings
+        Keys of the rig's section `reconstruction`, in their place: particle_diameter_mm, saturation_counts.
+
+    Returns
+    -------
+    Points
+        `position_mm` (n, 3), z from the volume's reference, and in `arrays`: `intensity` (n,) counts, `covariance_mm2`
+        (n, 6) as xx, yy, zz, xy, yz, xz, `chi2` (n,) about 1 where all light is explained, `seen` (n,) share of the
+        light that meets the sensor, `flag` (n,) 1 outside the volume.
+
+    Raises
+    ------
+    ConfigError
+        The settings are not possible, rays are fitted (dlfc), or the microlenses do not stand upright.
+    InputError
+        An image has another shape than what the weights were made for.
+    """
+    carried = carried_config(weights.provenance, "the weights")
+    chosen = carried.overridden("reconstruction", **(settings | {"solver": "particles"}))
+    bench = bench_of(searchable(weights, chosen), chosen, counts(dark), counts(mask))
+    level = counts(background)
+    frame, *others = (
+        frame_of(bench, raw, light(raw, bench.dark, level)) for raw in map(as_counts, (image, *neighbours))
+    )
+    if others:
+        own, *beside = (find_first(bench, each) for each in (frame, *others))
+        found = find_beside(bench, frame, own, beside)
+    else:
+        found = find(bench, frame)
+    return points_of(bench, frame, found, record("find_particles", chosen.resolved(), {}))
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """An image and what of it takes part.
+
+    Attributes
+    ----------
+    image : (rows, columns) raw but for dark and background
+    unusable : (rows, columns) pixels that take no part
+    sums : of the padded weights without what these touch
+    """
+
+    image: Image
+    unusable: Mask
+    sums: Normalisers
+
+
+def searchable(content: WeightsFile, settings: Config) -> WeightsFile:
+    """Return weights to look for particles with: where an array is hexagonal, those of bricks for its cells.
+
+    Raises
+    ------
+    ConfigError
+        Rays are fitted, or the array does not stand upright.
+    """
+    if settings.weights.method == "dlfc":
+        raise ConfigError("weights.method: particles are fitted with traced rays; build weights by ert for them")
+    weights, operator = content.weights, content.weights.solver_operator
+    if not isinstance(operator, OnDemandOperator):
+        return content
+    bricks = factorise_bricks(content.camera, settings.media_model(), weights.padded.grid)
+    passing = bricks if operator.transmission is None else behind_transmission(bricks, operator.transmission)
+    return replace(content, weights=replace(weights, solver_operator=passing))
+
+
+def frame_of(bench: Bench, raw: Image, lit: Image) -> Frame:
+    """Return a frame as particles are sought in it."""
+    unusable = bench.unusable(raw)
+    excluded = bench.excluded_with(unusable)
+    return Frame(filled(lit, unusable), unusable, bench.sums_without(bench.content.weights.padded, excluded))
+
+
+def find(bench: Bench, frame: Frame, progress: Callable[[int], None] | None = None) -> Particles:
+    """Return the particles behind an image."""
+    task = _task(bench, frame)
+    return result(task, first_pass(task, progress=progress))
+
+
+def find_first(bench: Bench, frame: Frame, progress: Callable[[int], None] | None = None) -> NDArray[np.float64]:
+    """Return the particles (n, 4) of a frame's first pass, for its own second pass and those of its neighbours."""
+    return first_pass(_task(bench, frame), progress=progress).particles
+
+
+def find_beside(
+    bench: Bench, frame: Frame, own: NDArray[np.float64], neighbours: Sequence[NDArray[np.float64]]
+) -> Particles:
+    """Return the particles behind an image with the help of the first passes of it and of the frames beside it."""
+    task = _task(bench, frame)
+    search_mm = SEARCH_VOXEL * max(bench.content.weights.grid.spacing_mm)
+    return result(task, second_pass(task, own, neighbours, search_mm))
+
+
+def _task(bench: Bench, frame: Frame) -> Task:
+    content, settings = bench.content, bench.settings
+    radius = 0.5 * settings.reconstruction.particle_diameter_mm
+    view = raw_view(content.camera, settings.media_model(), radius, content.weights.calibration)
+    return task_of(frame.image, view, content.weights, content.camera, frame.sums, frame.unusable)
+
+
+def points_of(bench: Bench, frame: Frame, found: Particles, provenance: Mapping[str, Any]) -> Points:
+    """Return the particles found behind an image in the coordinates of files, by Snell's law where it is known."""
+    content = bench.content
+    space = _space(content, bench.settings)
+    places = places_by_snell(found.position_mm, space, content.camera)
+    left = what_is_left(frame, found)
+    norm = float(np.linalg.norm(np.where(frame.unusable, 0.0, frame.image)))
+    return Points(
+        content.reference.points_from_focal_point(places),
+        {
+            "intensity": found.light_counts,
+            "covariance_mm2": symmetric(found.covariance_mm2),
+            "chi2": found.chi2,
+            "seen": found.seen,
+            "flag": _outside(places, content.weights.grid),
+        },
+        content.reference,
+        attributes=content.reference.attributes()
+        | {
+            "refraction": "paraxial" if space.straight else "exact",
+            "residual": float(np.linalg.norm(left)) / norm if norm > 0.0 else 0.0,
+            "residual_rms_counts": float(np.sqrt(np.mean(left[~frame.unusable] ** 2))),
+            "excluded_pixels": int(np.count_nonzero(frame.unusable)),
+            "read_noise_counts": found.noise.read_counts,
+        },
+        provenance=dict(provenance),
+    )
+
+
+def what_is_left(frame: Frame, found: Particles) -> NDArray[np.float64]:
+    """Return what particles leave of an image (rows, columns), counts, 0 where it takes no part."""
+    return np.where(frame.unusable, 0.0, found.residual)
+
+
+def _space(content: WeightsFile, settings: Config) -> ObjectSpace:
+    """Return what lies before the particles: by Snell's law where the window's thickness and place are known."""
+    calibration = content.weights.calibration
+    mid_plane = calibration.mid_plane_z_mm if calibration else None
+    if (settings.channel is None or mid_plane is None) and settings.sections.window is None:
+        return ObjectSpace(settings.media_model(), None, "paraxial")
+    return ObjectSpace(settings.media_model(), settings.window_model(mid_plane), "exact")
+
+
+def _outside(position_mm: NDArray[np.float64], grid: Grid) -> NDArray[np.uint8]:
+    """Return 1 for particles outside the volume, kept because they light it, 0 for those inside."""
+    bounds = np.array([grid.bounds_mm(axis) for axis in range(3)])
+    inside = np.all((position_mm >= bounds[:, 0]) & (position_mm <= bounds[:, 1]), axis=1)
+    return (~inside).astype(np.uint8)

@@ -1,0 +1,169 @@
+"""Reconstructing the volume behind an image in memory; what takes part of an image, and what does not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lfpiv_cli.errors import UsageError
+from lfpiv_cli.files.config import Config, carried_config
+from lfpiv_cli.files.provenance import record
+from lfpiv_cli.files.vtkhdf import Volume
+from lfpiv_cli.files.weights_file import WeightsFile
+from lfpiv_cli.reconstruction.equations import Normalisers, Operator, normalisers
+from lfpiv_cli.reconstruction.images import Image, Mask, as_if_lit, defects, filled, light, saturated, touched
+from lfpiv_cli.reconstruction.solvers import Reconstruction
+from lfpiv_cli.reconstruction.solvers import reconstruct as solve
+
+Progress = Callable[[int], None]
+
+
+def reconstruct(
+    weights: WeightsFile,
+    image: NDArray[Any],
+    *,
+    dark: NDArray[Any] | None = None,
+    background: NDArray[Any] | None = None,
+    mask: NDArray[Any] | None = None,
+    **settings: Any,
+) -> Volume:
+    """Reconstruct the volume of tracer particles behind an image.
+
+    Parameters
+    ----------
+    weights : WeightsFile
+        From `build_weights` or `open_weights`.
+    image : (rows, columns) counts
+        Raw image.
+    dark : (rows, columns) counts, optional
+        Raw image taken with the cap on: is subtracted, and its hot and dead pixels are left out.
+    background : (rows, columns) counts, optional
+        Raw image without tracers, subtracted in place of the dark one.
+    mask : (rows, columns), optional
+        0 where pixels are left out (reflections, bubbles).
+    **settings
+        Keys of the rig's section `reconstruction`, in their place: solver, iterations, relaxation and so on.
+
+    Returns
+    -------
+    Volume
+        `array` (nz, ny, nx) float32, light in counts; `grid`, spacing and origin in mm, z from the volume's reference;
+        `attributes` with the relative `residual` after each iteration.
+
+    Raises
+    ------
+    ConfigError
+        The settings are not possible.
+    UsageError
+        The solver is `particles`, which makes no volume: see `find_particles`.
+    InputError
+        An image has another shape than what the weights were made for, or does not fit into memory.
+    """
+    chosen = carried_config(weights.provenance, "the weights").overridden("reconstruction", **settings)
+    if chosen.reconstruction.solver == "particles":
+        raise UsageError("reconstruct: the solver particles makes no volume; find_particles finds them")
+    bench = bench_of(weights, chosen, counts(dark), counts(mask))
+    raw = as_counts(image)
+    return volume_of(
+        bench, raw, light(raw, bench.dark, counts(background)), record("reconstruct", chosen.resolved(), {})
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Bench:
+    """What all frames of a recording share.
+
+    Attributes
+    ----------
+    dark : dark image (rows, columns) or None
+    lasting : raw pixels that are never usable: defects of the dark image, and where the mask is black
+    excluded : pixels in the weights' frame that never take part: off the sensor, or touched by `lasting`
+    sums : of the weights without `excluded`; None where weights are made for each image
+    """
+
+    content: WeightsFile
+    settings: Config
+    dark: Image | None
+    lasting: Mask
+    excluded: Mask
+    sums: Normalisers | None
+
+    def unusable(self, raw: Image) -> Mask:
+        """Return which pixels of a raw frame take no part."""
+        return np.asarray(self.lasting | saturated(raw, self.settings.reconstruction.saturation_counts))
+
+    def excluded_with(self, unusable: Mask) -> Mask:
+        """Return which pixels in the weights' frame take no part in a frame with unusable raw pixels."""
+        too_bright = unusable & ~self.lasting
+        if not too_bright.any():
+            return self.excluded
+        return self.excluded | touched(too_bright, self.content.weights.prepare)
+
+    def sums_without(self, operator: Operator, excluded: Mask) -> Normalisers:
+        """Return an operator's sums without what a frame excludes: from those that all frames share, if they do."""
+        if self.sums is None:
+            return normalisers(operator, excluded)
+        return self.sums if excluded is self.excluded else self.sums.without(operator, excluded)
+
+
+def bench_of(
+    content: WeightsFile, settings: Config, dark: Image | None, mask: Image | None, with_sums: bool = True
+) -> Bench:
+    """Return what all frames share, given a dark image and a mask (rows, columns) that is 0 where nothing is believed.
+
+    `with_sums` is False where no frame is going to be solved.
+    """
+    weights = content.weights
+    lasting = np.zeros(weights.image_shape, np.bool_) if dark is None else defects(dark)
+    if mask is not None:
+        lasting |= mask == 0.0
+    excluded = touched(lasting, weights.prepare) if lasting.any() else np.zeros(weights.image_shape, np.bool_)
+    if weights.calibration is not None:
+        excluded |= ~weights.calibration.rectification.inside
+    sums = normalisers(weights.padded, excluded) if with_sums and not weights.on_demand else None
+    return Bench(content, settings, dark, lasting, excluded, sums)
+
+
+def volume_of(
+    bench: Bench, raw: Image, lit: Image, provenance: Mapping[str, Any], progress: Progress | None = None
+) -> Volume:
+    """Return the volume behind a raw frame, given also with dark or background taken off (`lit`)."""
+    unusable = bench.unusable(raw)
+    excluded = bench.excluded_with(unusable)
+    content = bench.content
+    result = _solved(bench, content.weights.prepare(filled(lit, unusable)), excluded, progress)
+    return Volume(
+        content.weights.to_world(result.volume),
+        content.reference.grid_from_focal_point(content.weights.grid),
+        content.reference,
+        attributes=content.reference.attributes()
+        | {
+            "residual": result.residual,
+            "excluded_pixels": int(np.count_nonzero(excluded)),
+            "support_voxels": result.support_voxels,
+        },
+        provenance=dict(provenance),
+    )
+
+
+def _solved(bench: Bench, image: Image, excluded: Mask, progress: Progress | None) -> Reconstruction:
+    """Return the reconstruction of an image in the weights' frame."""
+    operator = bench.content.weights.padded
+    if bench.sums is None:
+        operator = operator.for_image(as_if_lit(image, excluded))
+    sums = bench.sums_without(operator, excluded)
+    return solve(operator, image, bench.settings.solver_settings(), sums=sums, progress=progress)
+
+
+def as_counts(image: NDArray[Any]) -> Image:
+    """Return an image as the reader of files has it, float32."""
+    return np.asarray(image, dtype=np.float32)
+
+
+def counts(image: NDArray[Any] | None) -> Image | None:
+    """Return an image as `as_counts`, None where there is none."""
+    return None if image is None else as_counts(image)

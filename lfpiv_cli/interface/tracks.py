@@ -1,0 +1,231 @@
+"""Tracking particles in memory (particle tracking velocimetry)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lfpiv_cli.errors import InputError, UsageError
+from lfpiv_cli.files.config import Config, carried_config
+from lfpiv_cli.files.particle_file import TRACKS_FORMAT, TRAJECTORIES_FORMAT, Points
+from lfpiv_cli.files.provenance import record
+from lfpiv_cli.flow.field import MM_TO_M, VectorField
+from lfpiv_cli.flow.from_tracks import Paths, WindowGrid, vectors_from_paths
+from lfpiv_cli.tracks.sequences import SHORTEST, follow, scatter_in, states_at
+from lfpiv_cli.tracks.tracking import SEARCH_VOXEL, Tracks
+from lfpiv_cli.tracks.tracking import track as match
+
+
+def track(
+    *particles: Points,
+    dt_s: float | None = None,
+    search_voxel: float = SEARCH_VOXEL,
+    shortest: int | None = None,
+) -> Tracked:
+    """Follow particles from one frame to the next, or over a sequence of frames.
+
+    Parameters
+    ----------
+    *particles : Points
+        Of two or more frames in the order of time, from `find_particles` or `open_particles`.
+    dt_s : float, optional
+        Time from one frame to the next, s, in place of the rig's `correlation.dt_s`.
+    search_voxel : float, optional
+        Displacements are sought up to so many voxels along each axis.
+    shortest : int, optional
+        Fewest frames of a track in a sequence of more than two; 3 when not given.
+
+    Returns
+    -------
+    Tracked
+        `points` with `position_mm` (n, 3) and `arrays`: of two frames, for each link, `velocity` and `velocity_sigma`
+        (n, 3) m/s, `displacement_mm` (n, 3), and `particle_a`, `particle_b` (n,) row numbers; of a sequence, for each
+        place of a track, `velocity`, `velocity_sigma`, `track`, `frame` and `particle` (n,). `summary` has the counts;
+        `vectors()` gives the fields on the grid of the interrogation windows, one for each interval.
+
+    Raises
+    ------
+    UsageError
+        Fewer than two frames, or `shortest` with two.
+    InputError
+        The frames were made with different configs, or the time is not known.
+    """
+    ensure_frames(len(particles), shortest)
+    names = [f"frame {number}" for number in range(len(particles))]
+    settings = settings_of(particles, names).overridden("correlation", dt_s=dt_s)
+    chosen = tracking_of(settings, search_voxel, shortest, len(particles), names[0])
+    return tracked(particles, settings, chosen, record("track", settings.resolved() | chosen.told(), {}))
+
+
+@dataclass(frozen=True)
+class Tracking:
+    """How particles are tracked.
+
+    Attributes
+    ----------
+    dt_s : time from one frame to the next
+    search_voxel : displacements are sought up to this along each axis
+    shortest : fewest frames of a track, None where there are only two
+    """
+
+    dt_s: float
+    search_voxel: float
+    shortest: int | None
+
+    def told(self) -> dict[str, Any]:
+        """Return what a record says of it beside the config."""
+        told: dict[str, Any] = {"search_voxel": self.search_voxel}
+        return told if self.shortest is None else told | {"shortest": self.shortest}
+
+
+@dataclass(frozen=True, eq=False)
+class Tracked:
+    """Tracks and what is told of them.
+
+    Attributes
+    ----------
+    points : one for each link of two frames, or for each place of a track in a sequence
+    format_name : of the file that holds such points
+    paths : tracks that pass from each frame to the next
+    summary : counts and figures, units in their names
+    settings : the resolved config
+    """
+
+    points: Points
+    format_name: str
+    paths: Sequence[Paths]
+    summary: dict[str, Any]
+    settings: Config
+
+    def vectors(self) -> list[VectorField]:
+        """Return the field of each interval between frames, on the grid of the interrogation windows."""
+        settings, volume = self.settings, self.settings.grid()
+        windows = WindowGrid(
+            volume,
+            settings.windows_voxel(volume.spacing_mm)[-1],
+            settings.overlap(volume.spacing_mm),
+            settings.channel_width_mm() if settings.correlation.mask == "channel" else None,
+        )
+        return [vectors_from_paths(paths, windows, settings.correlation.dt_s) for paths in self.paths]
+
+
+def ensure_frames(frames: int, shortest: int | None) -> None:
+    """Refuse what makes no tracks.
+
+    Raises
+    ------
+    UsageError
+    """
+    if frames < 2:
+        raise UsageError("track needs the particles of two frames at least")
+    if frames == 2 and shortest is not None:
+        raise UsageError("--shortest is for sequences: two frames make tracks of two")
+
+
+def settings_of(frames: Sequence[Points], names: Sequence[str]) -> Config:
+    """Return the config that all frames were made with.
+
+    Raises
+    ------
+    InputError
+        They were not.
+    """
+    for name, frame in zip(names[1:], frames[1:], strict=True):
+        if frame.provenance.get("config") != frames[0].provenance.get("config"):
+            raise InputError(f"{name}: was made with another config than {names[0]}")
+    return carried_config(frames[0].provenance, names[0])
+
+
+def tracking_of(settings: Config, search_voxel: float, shortest: int | None, frames: int, name: str) -> Tracking:
+    """Return how so many frames are tracked; `name` is the first one's.
+
+    Raises
+    ------
+    InputError
+        The time between frames is not known.
+    """
+    if settings.correlation.dt_s is None:
+        raise InputError(f"{name}: its config has no correlation.dt_s; give --dt-s")
+    fewest = None if frames == 2 else SHORTEST if shortest is None else shortest
+    return Tracking(settings.correlation.dt_s, search_voxel, fewest)
+
+
+def tracked(frames: Sequence[Points], settings: Config, chosen: Tracking, provenance: dict[str, Any]) -> Tracked:
+    """Follow particles from frame to frame."""
+    search_mm = chosen.search_voxel * max(settings.grid().spacing_mm)
+    reference = frames[0].reference
+    told = reference.attributes() | {"dt_s": chosen.dt_s}
+    if chosen.shortest is None:
+        position, arrays, summary, paths = _pair(frames[0], frames[1], search_mm, chosen.dt_s)
+        name = TRACKS_FORMAT
+    else:
+        position, arrays, summary, paths = _sequence(frames, search_mm, chosen.shortest, chosen.dt_s)
+        name = TRAJECTORIES_FORMAT
+    return Tracked(Points(position, arrays, reference, told, provenance), name, paths, summary, settings)
+
+
+Found = tuple[NDArray[np.float64], dict[str, NDArray[Any]], dict[str, Any], list[Paths]]
+
+
+def _pair(first: Points, second: Points, search_mm: float, dt_s: float) -> Found:
+    """Return places, arrays, summary and paths of particles followed from one frame to the next."""
+    found = match(first.position_mm, second.position_mm, search_mm)
+    paths = _paths(first, second, found)
+    arrays = {
+        "velocity": paths.displacement_mm * MM_TO_M / dt_s,
+        "velocity_sigma": paths.sigma_mm * MM_TO_M / dt_s,
+        "displacement_mm": paths.displacement_mm,
+        "particle_a": found.first,
+        "particle_b": found.second,
+    }
+    summary = {
+        "particles_a": len(first.position_mm),
+        "particles_b": len(second.position_mm),
+        "tracks": len(found.first),
+    }
+    return paths.middle_mm, arrays, summary, [paths]
+
+
+def _sequence(frames: Sequence[Points], search_mm: float, shortest: int, dt_s: float) -> Found:
+    """Return places, arrays, summary and paths of particles followed over many frames."""
+    points = [frame.position_mm for frame in frames]
+    sigma = [np.sqrt(frame.arrays["covariance_mm2"][:, :3]) for frame in frames]
+    found = follow(points, sigma, search_mm, shortest)
+    scatter, half = scatter_in(found, points, sigma)
+    rows: list[tuple[NDArray[Any], ...]] = []
+    for number in range(len(frames)):
+        tracks, state = states_at(found, points, sigma, float(number), scatter, half)
+        frame = np.full(len(tracks), number)
+        particle = found.particles(number, tracks)
+        rows.append((state.position_mm, state.velocity, state.velocity_sigma, tracks, frame, particle))
+    position, velocity, error, tracks, frame, particle = (np.concatenate(each) for each in zip(*rows, strict=True))
+    order = np.lexsort((frame, tracks))
+    arrays = {
+        "velocity": velocity[order] * MM_TO_M / dt_s,
+        "velocity_sigma": error[order] * MM_TO_M / dt_s,
+        "track": tracks[order],
+        "frame": frame[order],
+        "particle": particle[order],
+    }
+    between = [states_at(found, points, sigma, number + 0.5, scatter, half)[1] for number in range(len(frames) - 1)]
+    paths = [Paths(state.position_mm, state.velocity, state.velocity_sigma) for state in between]
+    summary = {
+        "frames": len(frames),
+        "particles": sum(len(each) for each in points),
+        "tracked": len(tracks),
+        "tracks": found.count,
+        "noise_over_stated": scatter.noise.tolist(),
+        "acceleration_m_s2": (np.sqrt(scatter.bending) * MM_TO_M / dt_s**2).tolist(),
+    }
+    return position[order], arrays, summary, paths
+
+
+def _paths(first: Points, second: Points, tracks: Tracks) -> Paths:
+    """Return the paths of a pair's tracks."""
+    start, end = first.position_mm[tracks.first], second.position_mm[tracks.second]
+    variance = first.arrays["covariance_mm2"][tracks.first, :3] + second.arrays["covariance_mm2"][tracks.second, :3]
+    return Paths(0.5 * (start + end), end - start, np.sqrt(variance))

@@ -1,0 +1,175 @@
+"""Building weights for a rig in memory."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from lfpiv_cli.calibration.model import Calibration
+from lfpiv_cli.console import Console
+from lfpiv_cli.errors import ConfigError
+from lfpiv_cli.files.config import Config
+from lfpiv_cli.files.provenance import record
+from lfpiv_cli.files.sections import WeightsSection
+from lfpiv_cli.files.weights_file import WeightsFile
+from lfpiv_cli.grid import Grid
+from lfpiv_cli.interface.notices import NOTICES
+from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.object_space import ObjectSpace
+from lfpiv_cli.optics.polynomial_rays import PolynomialRays
+from lfpiv_cli.reference import Reference
+from lfpiv_cli.weights.build import default_padding, scene_distortion
+from lfpiv_cli.weights.columns import ColumnOperator, OnDemandOperator, operator_of, seen_share
+from lfpiv_cli.weights.model import Weights, WeightsOperator
+from lfpiv_cli.weights.operators import FactorisedOperator
+from lfpiv_cli.weights.rays import count_columns
+from lfpiv_cli.weights.scene import Source
+
+# Said where the voxels were left to the program.
+VOXELS_CHOSEN = (
+    "voxels of {:.3g} x {:.3g} x {:.3g} mm were chosen: a third of a microlens wide, because particles lock to "
+    "wider ones and their motion in depth is lost, and six times as deep, as fine as the views tell depths apart"
+)
+# Below this share of its light on the sensor a voxel counts as out of view.
+LEAST_SEEN = 0.01
+# Half an hour on two cores; a core counts about four million rays a second.
+MOST_RAYS = 3e10
+RAYS_PER_CORE_HOUR = 1.5e10
+# Cubic polynomials are good to a third of their range beyond it: the paper's volume reaches a quarter beyond boards.
+FARTHEST_BEYOND = 0.3
+# Some 1,500 pixels of 8 bytes.
+BYTES_PER_COLUMN = 12_000
+
+
+def build_weights(rig: Config, calibration: Calibration | None = None, **settings: Any) -> WeightsFile:
+    """Calculate how every voxel of the rig's volume lights every pixel.
+
+    Parameters
+    ----------
+    rig : Config
+        From `load_rig`.
+    calibration : Calibration, optional
+        From `calibrate` or `open_calibration`; without it the data sheet is believed.
+    **settings
+        Keys of the rig's section `weights`, in their place: method, refraction, sampling and so on.
+
+    Returns
+    -------
+    WeightsFile
+        `shape` (z, y, x) of the volume and `image_shape` (rows, columns); `forward` gives the image of a volume,
+        `adjoint` the volume that an image is spread back to, `column` the pixels that one voxel lights.
+
+    Raises
+    ------
+    ConfigError
+        The rig or the settings are not possible, or need a calibration that is not there.
+    """
+    chosen = rig.overridden("weights", **settings)
+    return weights_of(chosen, calibration, record("build-weights", chosen.resolved(), {}), NOTICES).behind_vignetting()
+
+
+def weights_of(
+    settings: Config, found: Calibration | None, provenance: dict[str, Any], console: Console
+) -> WeightsFile:
+    """Return the weights of the configured volume, for the calibrated camera where there is a calibration."""
+    camera = settings.camera_model()
+    if found:
+        camera = found.camera(camera)
+    reference = _reference(settings, found)
+    grid = settings.grid(reference)
+    if settings.volume.size_mm is not None:
+        console.warn(VOXELS_CHOSEN.format(*grid.spacing_mm))
+    media = settings.media_model()
+    padding = settings.reconstruction.padding_voxel or default_padding(camera, media, grid)
+    source = ray_source(settings, found, grid, console)
+    _judge_view(*seen_share(camera, source, grid), grid, console)
+    operator = make_operator(settings.weights, camera, source, grid.padded(padding), console)
+    traced = isinstance(source, ObjectSpace) and isinstance(operator, FactorisedOperator)
+    bend = scene_distortion(camera, media, grid) if traced else None
+    weights = Weights(grid, padding, operator, camera.column_axis, found, bend)
+    vignetting = found.vignetting() if found else None
+    return WeightsFile(weights, camera, reference, provenance, vignetting)
+
+
+def ray_source(settings: Config, found: Calibration | None, grid: Grid, console: Console) -> Source:
+    """Return how rays are found: traced through the configured object space, or as a calibration fitted them.
+
+    Raises
+    ------
+    ConfigError : fitted rays are asked for and there are none
+    """
+    if settings.weights.method != "dlfc":
+        return settings.object_space(found.mid_plane_z_mm if found else None)
+    if found is None or found.ray_fit is None:
+        raise ConfigError(
+            "weights.method: dlfc needs a --calibration from boards at several depths: calibrate-snapshot with --board "
+            "and --depth-mm, repeated in pairs"
+        )
+    fit = found.ray_fit
+    lateral = fit.reach_mm if settings.camera_model().column_axis == "x" else fit.reach_mm[:, ::-1]
+    for axis, (low, high) in enumerate([*lateral.T, (fit.depths_mm.min(), fit.depths_mm.max())]):
+        beyond = max(low - grid.bounds_mm(axis)[0], grid.bounds_mm(axis)[1] - high)
+        if beyond > FARTHEST_BEYOND * (high - low):
+            console.warn(
+                f"the volume reaches {beyond:.3g} mm beyond the dots along {'xyz'[axis]}, where the fitted rays "
+                "are a guess"
+            )
+    return fit.rays
+
+
+def make_operator(
+    chosen: WeightsSection, camera: Camera, source: Source, grid: Grid, console: Console
+) -> WeightsOperator:
+    """Return the weights of a grid: factorised where the axes separate, else on demand; or counted where asked for.
+
+    Raises
+    ------
+    ConfigError : counting would take too long
+    """
+    if chosen.sampling == "exact" or isinstance(source, PolynomialRays):
+        operator = operator_of(camera, source, grid)
+        if isinstance(operator, OnDemandOperator):
+            console.warn("array or rays do not separate into axes; columns are made on demand, for what is lit")
+        return operator
+    layout = OnDemandOperator(camera, source, grid)
+    voxels = math.prod(layout.shape)
+    rays = voxels * chosen.points * chosen.rays_per_point
+    if rays > MOST_RAYS:
+        raise ConfigError(
+            f"weights.sampling: counting {rays:.3g} rays for {voxels} voxels (padding included) would take about "
+            f"{rays / RAYS_PER_CORE_HOUR:.2g} core hours and {voxels * BYTES_PER_COLUMN / 1e9:.2g} GB; at most "
+            f"{MOST_RAYS:.3g} are counted, use sampling: exact"
+        )
+    centres, rng = layout.centres_mm(np.arange(voxels)), np.random.default_rng(chosen.seed)
+    number = (chosen.points, chosen.rays_per_point)
+    with console.progress(voxels, "count rays") as advance:
+        columns = count_columns(camera, source, centres, layout.sides_mm, rng, *number, advance)
+    return ColumnOperator(layout.shape, layout.image_shape, np.arange(voxels), columns)
+
+
+def _reference(settings: Config, found: Calibration | None) -> Reference:
+    """Return the origin of the volume's coordinates.
+
+    Fitted rays count z from the origin that the boards' depths were told from.
+    """
+    name = settings.volume.reference
+    if name == "focal_point" or settings.weights.method == "dlfc":
+        return Reference(name, 0.0)
+    if found is None or found.mid_plane_z_mm is None:
+        raise ConfigError(
+            "volume.reference: mid_plane needs a calibration with a board, and the section `channel`, to say where the "
+            "mid plane lies"
+        )
+    return Reference(name, found.mid_plane_z_mm)
+
+
+def _judge_view(smallest: float, largest: float, grid: Grid, console: Console) -> None:
+    """Refuse a volume that the sensor does not see and warn of one that it sees in part."""
+    if largest < LEAST_SEEN:
+        bounds = [grid.bounds_mm(axis) for axis in range(3)]
+        spans = ", ".join(f"{axis} {low:.4g} to {high:.4g}" for axis, (low, high) in zip("xyz", bounds, strict=True))
+        raise ConfigError(f"volume: none of it ({spans} mm) lies in the camera's view")
+    if smallest < LEAST_SEEN:
+        console.warn("a part of the volume lies outside the camera's view; nothing will be found there")

@@ -1,0 +1,133 @@
+"""The Python interface: what is promised, and the chain on the sample, which gives what the commands write."""
+
+from __future__ import annotations
+
+import inspect
+import pydoc
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import lfpiv_cli as lf
+from lfpiv_cli.cli import cli
+from lfpiv_cli.errors import ConfigError, InputError, UsageError
+
+ROOT = Path(__file__).parent.parent
+SAMPLE = ROOT / "sample_data"
+# The sample's rig with few and large voxels, and a tracer's share of its particles.
+CONFIG = ROOT / "configs" / "sample.yaml"
+FEW = {"solver": "sart", "iterations": 2}
+
+
+def run(*arguments: object) -> None:
+    cli.main([*(str(argument) for argument in arguments), "-q"], standalone_mode=False)
+
+
+def image(name: str) -> np.ndarray:
+    return lf.read_image(SAMPLE / f"{name}.tif")
+
+
+@pytest.fixture(scope="module")
+def by_commands(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of what the commands write."""
+    out = tmp_path_factory.mktemp("commands")
+    white, dark, board, *pair = (SAMPLE / f"{name}.tif" for name in ("white", "dark", "board", "pair_a", "pair_b"))
+    pictures = ("--white", white, "--dark", dark, "--board", board)
+    run("calibrate-snapshot", CONFIG, *pictures, "-o", out / "calibration.h5")
+    run("build-weights", CONFIG, "--calibration", out / "calibration.h5", "-o", out / "weights.h5")
+    few = ("--solver", "sart", "--iterations", 2)
+    run("reconstruct", out / "weights.h5", *pair, "--dark", dark, *few, "-o", out / "volumes")
+    volumes = [out / "volumes" / f"{path.stem}.vtkhdf" for path in pair]
+    run("correlate", *volumes, "-o", out / "vectors.vtkhdf")
+    run("reconstruct", out / "weights.h5", *pair, "--dark", dark, "--solver", "particles", "-o", out / "particles")
+    particles = [out / "particles" / f"{path.stem}.vtkhdf" for path in pair]
+    run("track", *particles, "--grid", "-o", out / "tracks.vtkhdf")
+    return out
+
+
+def test_calibration_and_weights_are_those_of_the_commands(by_commands: Path) -> None:
+    rig = lf.load_rig(CONFIG)
+    calibration = lf.calibrate(image("white"), image("board"), rig, dark=image("dark"))
+    written = lf.open_calibration(by_commands / "calibration.h5")
+    assert calibration.summary() == written.summary()
+    np.testing.assert_array_equal(calibration.transmission, written.transmission)
+    weights, stored = lf.build_weights(rig, calibration), lf.open_weights(by_commands / "weights.h5")
+    volume = np.random.default_rng(1).random(weights.shape, dtype=np.float32)
+    np.testing.assert_array_equal(weights.forward(volume), stored.forward(volume))
+    assert (weights.reference, weights.reference_z_mm) == (stored.reference, stored.reference_z_mm)
+
+
+def test_volumes_and_vectors_are_those_of_the_commands(by_commands: Path) -> None:
+    weights = lf.open_weights(by_commands / "weights.h5")
+    pair = [lf.reconstruct(weights, image(name), dark=image("dark"), **FEW) for name in ("pair_a", "pair_b")]
+    for volume, name in zip(pair, ("pair_a", "pair_b"), strict=True):
+        written = lf.open_volume(by_commands / "volumes" / f"{name}.vtkhdf")
+        np.testing.assert_array_equal(volume.array, written.array)
+        assert volume.grid == written.grid
+        assert volume.attributes["residual"].tolist() == list(written.attributes["residual"])
+    field, written_field = lf.correlate(*pair), lf.open_vectors(by_commands / "vectors.vtkhdf")
+    np.testing.assert_array_equal(field.velocity, written_field.velocity)
+    np.testing.assert_array_equal(field.uncertainty_voxel, written_field.uncertainty_voxel)
+    # Plain arrays with the settings in the call: the same displacements.
+    rig, arrays = lf.load_rig(CONFIG), [volume.array for volume in pair]
+    settings = rig.resolved()["correlation"] | {"exponent": 1.0}
+    plain = lf.correlate(*arrays, voxel_mm=pair[0].grid.spacing_mm, **settings)
+    np.testing.assert_array_equal(plain.displacement_voxel, written_field.displacement_voxel)
+
+
+def test_particles_and_tracks_are_those_of_the_commands(by_commands: Path) -> None:
+    weights = lf.open_weights(by_commands / "weights.h5")
+    found = [lf.find_particles(weights, image(name), dark=image("dark")) for name in ("pair_a", "pair_b")]
+    for points, name in zip(found, ("pair_a", "pair_b"), strict=True):
+        written = lf.open_particles(by_commands / "particles" / f"{name}.vtkhdf")
+        np.testing.assert_array_equal(points.position_mm, written.position_mm)
+        assert points.attributes == written.attributes
+        for array in written.arrays:
+            np.testing.assert_array_equal(points.arrays[array], written.arrays[array])
+    tracks, written = lf.track(*found), lf.open_tracks(by_commands / "tracks.vtkhdf")
+    np.testing.assert_array_equal(tracks.points.position_mm, written.position_mm)
+    np.testing.assert_array_equal(tracks.points.arrays["velocity"], written.arrays["velocity"])
+    on_grid, written_grid = tracks.vectors()[0], lf.open_vectors(by_commands / "tracks_grid.vtkhdf")
+    np.testing.assert_array_equal(on_grid.velocity, written_grid.velocity)
+    correlated = lf.open_vectors(by_commands / "vectors.vtkhdf")
+    assert lf.combine(correlated, on_grid).field.flag.shape == correlated.flag.shape
+
+
+def test_what_cannot_be_is_refused(by_commands: Path) -> None:
+    weights, rig = lf.open_weights(by_commands / "weights.h5"), lf.load_rig(str(CONFIG))
+    with pytest.raises(ConfigError, match="iteratoins"):
+        lf.reconstruct(weights, image("pair_a"), iteratoins=3)
+    with pytest.raises(UsageError, match="find_particles"):
+        lf.reconstruct(weights, image("pair_a"), solver="particles")
+    with pytest.raises(InputError, match="shape|pixels"):
+        lf.reconstruct(weights, image("pair_a")[:-1])
+    with pytest.raises(UsageError, match="sensor"):
+        lf.calibrate(image("white")[:-1], None, rig)
+    with pytest.raises(UsageError, match="voxel_mm"):
+        lf.correlate(np.zeros((8, 8, 8)), np.zeros((8, 8, 8)))
+    with pytest.raises(UsageError, match="two frames"):
+        lf.track(lf.open_particles(by_commands / "particles" / "pair_a.vtkhdf"))
+
+
+@pytest.mark.parametrize("name", sorted(set(lf.__all__) - {"__version__", "LfpivError"}))
+def test_what_is_promised_is_documented(name: str) -> None:
+    function = getattr(lf, name)
+    words = inspect.getdoc(function) or ""
+    assert words.splitlines()[0].endswith((".", ":", ","))
+    assert "Raises" in words
+    for parameter in inspect.signature(function).parameters.values():
+        assert parameter.annotation is not inspect.Parameter.empty
+
+
+def test_help_names_all_that_is_promised() -> None:
+    words = pydoc.plain(pydoc.render_doc(lf))
+    for name in set(lf.__all__) - {"__version__", "LfpivError"}:
+        assert name in words
+
+
+def test_importing_is_quick() -> None:
+    script = "import sys, lfpiv_cli; print(sorted({'numpy', 'numba', 'h5py', 'scipy'} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", script], capture_output=True, text=True).stdout.strip() == "[]"
