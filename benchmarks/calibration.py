@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.calibration.board_pose import BoardGeometry
-from lfpiv_cli.calibration.model import Calibration, Rig, calibrate
+from lfpiv_cli.calibration.model import Calibration, DataSheet, Photographs, Rig, calibrate
 from lfpiv_cli.errors import LfpivError
 from lfpiv_cli.names import Layout
 from lfpiv_cli.optics.camera import Camera
@@ -168,7 +168,9 @@ def judged(bench: Bench) -> dict[str, float | str]:
     start = time.perf_counter()
     try:
         found = calibrate(
-            [bench.white], bench.dark, bench.picture, camera=bench.sheet, rig=Rig(bench.sheet, WATER, bench.board)
+            Photographs([bench.white], bench.dark, bench.picture),
+            Rig(bench.sheet, WATER, bench.board),
+            DataSheet(camera=bench.sheet),
         )
     except LfpivError as error:
         return {"failure": str(error)}

@@ -17,13 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.calibration.board_pose import BoardGeometry
-from lfpiv_cli.calibration.model import Calibration, Rig, calibrate
+from lfpiv_cli.calibration.model import Calibration, Photographs, Rig, calibrate
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media, channel_window
 from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.particles.refraction import places_by_snell
 from lfpiv_cli.particles.rounds import find_particles
+from lfpiv_cli.particles.search import task_of
 from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.reconstruction.equations import Normalisers, normalisers
 from lfpiv_cli.robust import MAD_TO_SIGMA
@@ -127,7 +128,7 @@ def print_figures(bench: Bench, count: int, seed: int, log_spread: float | None 
     camera = bench.calibration.camera(bench.sheet)
     view = raw_view(camera, WATER, 0.5 * DIAMETER_MM, bench.calibration)
     began = time.perf_counter()
-    found = find_particles(image, view, bench.weights, camera, bench.sums)
+    found = find_particles(task_of(image, view, bench.weights, camera, bench.sums))
     seconds = time.perf_counter() - began
     places = places_by_snell(found.position_mm, space, camera)
     sigma = np.sqrt(np.diagonal(found.covariance_mm2, axis1=1, axis2=2))
@@ -195,4 +196,4 @@ def _calibration(sheet: Camera, real: Camera, rng: np.random.Generator) -> Calib
     placement = BoardPlacement(-0.3, (0.1, -0.1), (0.3, -0.2), 0.0)
     space = ObjectSpace(WATER.in_air(), None, "paraxial")
     board = readout.record(render_board(real, space, BOARD, placement, 28_000.0, rng), rng)
-    return calibrate([white], None, board, rig=Rig(sheet, WATER, BOARD))
+    return calibrate(Photographs([white], board=board), Rig(sheet, WATER, BOARD))

@@ -14,7 +14,16 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose, pose_of_dots
 from lfpiv_cli.calibration.lattice import LatticeFit
-from lfpiv_cli.calibration.model import Calibration, Channel, Rig, advised_move_mm, calibrate, with_mid_plane
+from lfpiv_cli.calibration.model import (
+    Calibration,
+    Channel,
+    DataSheet,
+    Photographs,
+    Rig,
+    advised_move_mm,
+    calibrate,
+    with_mid_plane,
+)
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
@@ -52,7 +61,7 @@ def exact_pose(z_mm: float, magnification: float = -1.0) -> BoardPose:
 
 @pytest.fixture(scope="module")
 def plain() -> Calibration:
-    return calibrate([white_image()])
+    return calibrate(Photographs([white_image()]))
 
 
 @pytest.fixture
@@ -162,7 +171,7 @@ def test_the_camera_takes_the_magnification_only_when_it_differs(plain: Calibrat
 
 def test_a_board_of_another_shape_is_refused(rig: Rig) -> None:
     with pytest.raises(InputError, match=r"\(180, 220\), \(3, 3\)"):
-        calibrate([white_image()], board=np.zeros((3, 3)), rig=rig)
+        calibrate(Photographs([white_image()], board=np.zeros((3, 3))), rig)
 
 
 def test_the_picture_shows_lattice_and_board(plain: Calibration, rig: Rig, tmp_path: Path) -> None:
@@ -187,7 +196,9 @@ def test_experiment(data_folder: Path, table2: Camera, water: Media) -> None:
         cv2.imread(str(folder / f"{name}.tif"), cv2.IMREAD_UNCHANGED).astype(np.uint16)
         for name in ("white", "dark", "board")
     ]
-    calibration = calibrate(pictures[:1], *pictures[1:], camera=table2, rig=Rig(table2, water, BOARD, CHANNEL))
+    calibration = calibrate(
+        Photographs(pictures[:1], *pictures[1:]), Rig(table2, water, BOARD, CHANNEL), DataSheet(camera=table2)
+    )
     pose = calibration.pose
     assert len(pose.indices) == 49
     assert pose.z0_mm == pytest.approx(truth["board_z_mm"], abs=0.01)

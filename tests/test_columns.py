@@ -24,7 +24,7 @@ from lfpiv_cli.weights.columns import OnDemandOperator, operator_of
 from lfpiv_cli.weights.model import Weights
 from lfpiv_cli.weights.operators import FactorisedOperator
 from lfpiv_cli.weights.quadrature import integrate_columns
-from lfpiv_cli.weights.rays import count_columns
+from lfpiv_cli.weights.rays import RayCount, count_columns
 
 GRID = Grid.centred((4, 3, 5), (0.1, 0.12, 0.8), (0.1, -0.1, 0.5))
 
@@ -154,7 +154,9 @@ def test_counted_columns_agree_with_integrated_ones(turned, water, rng):
     grid = Grid.centred((2, 1, 2), (0.1, 0.1, 1.0), (0.0, 0.1, 2.0))
     operator = OnDemandOperator(turned, ObjectSpace(water, None, "paraxial"), grid)
     centres = operator.centres_mm(np.arange(4))
-    counted = count_columns(turned, operator.source, centres, turned.to_image_axes(grid.spacing_mm), rng, 2000, 100)
+    counted = count_columns(
+        turned, operator.source, centres, turned.to_image_axes(grid.spacing_mm), rng, RayCount(2000, 100)
+    )
     for n in range(4):
         exact = operator.columns_of(np.array([n])).image(0, operator.image_shape)
         assert np.abs(counted.image(n, operator.image_shape) - exact).sum() < 0.12  # 2000 points: about 0.07

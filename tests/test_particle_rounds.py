@@ -16,6 +16,7 @@ from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.particles.candidates import explain_rest, find_peaks
 from lfpiv_cli.particles.rounds import find_particles
+from lfpiv_cli.particles.search import task_of
 from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.reconstruction.equations import normalisers
 from lfpiv_cli.synthetic.render import render_points
@@ -43,7 +44,7 @@ def test_particles_are_found_where_they_are(
     expected = render_points(camera, ObjectSpace(water, None, "paraxial"), true, light, 0.05, rng, rays=100_000)
     image = rng.poisson(expected).astype(np.float32) + rng.normal(0.0, 6.0, expected.shape).astype(np.float32)
     weights = weights_of(camera, water, grid)
-    found = find_particles(image, raw_view(camera, water, 0.025), weights, camera, normalisers(weights.padded))
+    found = find_particles(task_of(image, raw_view(camera, water, 0.025), weights, camera, normalisers(weights.padded)))
     scale = np.array([0.05, 0.05, 0.2])
     distance, nearest = KDTree(found.position_mm / scale).query(true / scale)
     matched = distance < 1.0
@@ -74,7 +75,7 @@ def test_pixels_that_are_left_out_do_not_matter(table2: Camera, water: Media, rn
     for reflection in (0.0, 5e4):
         spoilt = np.where(left_out, np.float32(reflection), image)
         view = raw_view(camera, water, 0.025)
-        found.append(find_particles(spoilt, view, weights, camera, sums, excluded=left_out))
+        found.append(find_particles(task_of(spoilt, view, weights, camera, sums, left_out)))
     np.testing.assert_array_equal(found[1].position_mm, found[0].position_mm)
     np.testing.assert_array_equal(found[1].covariance_mm2, found[0].covariance_mm2)
     distance, _ = KDTree(found[0].position_mm / (0.05, 0.05, 0.2)).query(true / (0.05, 0.05, 0.2))
@@ -86,7 +87,7 @@ def test_an_empty_image_has_no_particles(table2: Camera, water: Media) -> None:
     camera = replace(table2, columns=200, rows=200)
     weights = weights_of(camera, water, Grid.centred((6, 6, 4), (0.1, 0.1, 0.1), (0.0, 0.0, 2.0)))
     image = np.zeros((200, 200), np.float32)
-    found = find_particles(image, raw_view(camera, water, 0.025), weights, camera, normalisers(weights.padded))
+    found = find_particles(task_of(image, raw_view(camera, water, 0.025), weights, camera, normalisers(weights.padded)))
     assert found.position_mm.shape == (0, 3)
     np.testing.assert_array_equal(found.residual, image)
 

@@ -15,7 +15,7 @@ from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.optics.polynomial_rays import PolynomialRays, complete_exponents
 from lfpiv_cli.weights.lens_cells import MOST_CORNERS, neighbours, shared_rectangle
 from lfpiv_cli.weights.quadrature import TILES, integrate_columns
-from lfpiv_cli.weights.rays import count_rays, sampling_error
+from lfpiv_cli.weights.rays import RayCount, count_rays, sampling_error
 from lfpiv_cli.weights.scene import aperture_tiles, kernel_scene, on_array, rays_from
 
 VOXEL = (0.1, 0.1, 0.1)
@@ -41,7 +41,7 @@ def test_quadrature_agrees_with_counted_rays_eq_13(
     space = ObjectSpace(water, window, refraction)
     for centre, voxel in [((0.31, -0.22, 3.0), VOXEL), ((-0.2, 0.1, -4.5), (0.05, 0.05, 0.2))]:
         exact = quadrature_image(camera, space, centre, voxel)
-        counted = count_rays(camera, space, centre, voxel, rng, points=100_000, rays_per_point=5)
+        counted = count_rays(camera, space, centre, voxel, rng, RayCount(100_000, 5))
         # A sum over hundreds of pixels stays within some per cent of its mean; the 5 rays of a point add to it.
         assert np.abs(exact - counted).sum() < 1.3 * sampling_error(exact, 500_000)
 
@@ -89,7 +89,7 @@ def test_a_voxel_outside_the_view_has_an_empty_column(water):
 def test_counted_rays_repeat_with_their_seed(water):
     camera = small_camera("square")
     images = [
-        count_rays(camera, ObjectSpace(Media()), (0.1, 0.0, 1.0), VOXEL, np.random.default_rng(3), 50, 40)
+        count_rays(camera, ObjectSpace(Media()), (0.1, 0.0, 1.0), VOXEL, np.random.default_rng(3), RayCount(50, 40))
         for _ in range(2)
     ]
     assert np.array_equal(*images)

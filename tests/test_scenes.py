@@ -17,6 +17,8 @@ from lfpiv_cli.synthetic.render import ObjectSpace, render_points
 from lfpiv_cli.synthetic.scenes import (
     Box,
     Misalignment,
+    Motion,
+    RecordingCamera,
     Tracers,
     channel_walls,
     simulate_board,
@@ -65,7 +67,7 @@ def test_channel_window_is_half_the_width_in_front_of_the_mid_plane(table2, wate
 
 def test_white_image_has_light_dark_and_truth(small, rng):
     camera = Misalignment(0.3, (2.0, -1.0)).apply(small)
-    still = simulate_white(camera, 1000.0, NOISELESS, rng)
+    still = simulate_white(RecordingCamera(camera, NOISELESS), 1000.0, rng)
     assert (still.image.max(), still.dark.min(), still.dark.max()) == (1096, 96, 96)
     assert still.truth["rotation_deg"] == pytest.approx(0.3)
     assert still.truth["pitch_px"] == pytest.approx([18.2545, 18.2545], abs=1e-4)
@@ -73,7 +75,9 @@ def test_white_image_has_light_dark_and_truth(small, rng):
 
 def test_board_s_truth_is_its_placement(small, rng):
     board = BoardGeometry((1, 1), 1.0, 0.2)
-    still = simulate_board(small, AIR, board, BoardPlacement(-0.35, (0.1, 0.05)), 1000.0, NOISELESS, rng)
+    still = simulate_board(
+        RecordingCamera(small, NOISELESS), AIR, board, BoardPlacement(-0.35, (0.1, 0.05)), 1000.0, rng
+    )
     assert still.truth["dots_mm"] == [pytest.approx([0.1, 0.05, -0.35])]
     light = still.image.astype(float) - still.dark
     row, column = np.indices(light.shape)
@@ -89,7 +93,9 @@ def test_frames_lie_evenly_about_the_time_of_the_truth(small, frames):
     tracers = Tracers(5, box, light_counts=1e5)
     velocity = np.array([0.05, -0.02, 0.1])
     rng = np.random.default_rng(4)
-    found = simulate_particles(small, AIR, tracers, uniform(velocity), 2e-3, NOISELESS, rng, frames=frames, rays=20_000)
+    found = simulate_particles(
+        RecordingCamera(small, NOISELESS), AIR, tracers, Motion(uniform(velocity), 2e-3, frames), rng, rays=20_000
+    )
     assert found.velocities_m_s == pytest.approx(np.tile(velocity, (5, 1)))
     # 1 ms: metres per second are mm
     for image, time_ms in zip(found.images, {2: (-1, 1), 3: (-2, 0, 2)}[frames], strict=True):
@@ -102,7 +108,9 @@ def test_frames_lie_evenly_about_the_time_of_the_truth(small, frames):
 def test_tracers_fill_the_box_and_the_brightness(small, rng):
     box = Box((-1.0, -2.0, -3.0), (1.0, 2.0, 4.0))
     tracers = Tracers(2000, box, light_counts=100.0)
-    pair = simulate_particles(small, AIR, tracers, rigid_rotation((0, 0, 5.0)), 1e-3, Readout(), rng, rays=1)
+    pair = simulate_particles(
+        RecordingCamera(small, Readout()), AIR, tracers, Motion(rigid_rotation((0, 0, 5.0)), 1e-3), rng, rays=1
+    )
     for axis in range(3):
         low, high = box.low_mm[axis], box.high_mm[axis]
         assert np.histogram(pair.positions_mm[:, axis], 4, (low, high))[0] == pytest.approx([500] * 4, abs=80)
@@ -121,12 +129,10 @@ def test_brightness_can_be_log_normal(rng):
 def test_a_pair_is_decided_by_its_seed(small):
     pairs = [
         simulate_particles(
-            small,
+            RecordingCamera(small, Readout()),
             AIR,
             Tracers(3, Box((-0.1, -0.1, 0.0), (0.1, 0.1, 1.0))),
-            uniform((0, 0, 0)),
-            1e-3,
-            Readout(),
+            Motion(uniform((0, 0, 0)), 1e-3),
             np.random.default_rng(6),
             rays=100,
         )

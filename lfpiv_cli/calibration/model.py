@@ -207,48 +207,78 @@ class Calibration:
             raise InputError(f"the calibration is not complete ({error}); make it again") from error
 
 
-def calibrate(
-    whites: Sequence[ArrayLike],
-    dark: ArrayLike | None = None,
-    board: ArrayLike | None = None,
-    *,
-    layout: Layout | None = None,
-    sheet_pitch_px: float | None = None,
-    camera: Camera | None = None,
-    rig: Rig | None = None,
-    depth_boards: Sequence[ArrayLike] = (),
-    depths_mm: Sequence[float] = (),
-) -> Calibration:
+@dataclass(frozen=True, eq=False)
+class Photographs:
+    """Raw pictures (rows, columns) to calibrate from.
+
+    Attributes
+    ----------
+    whites : of uniform light: the one with the smallest aperture gives the lattice, the one with the widest the
+        transmission; none: the lattice is that of the data sheet
+    dark : of no light
+    board : of the dot board
+    depth_boards, depths_mm : of the board at several depths, and these, for fitted rays
+    """
+
+    whites: Sequence[ArrayLike] = ()
+    dark: ArrayLike | None = None
+    board: ArrayLike | None = None
+    depth_boards: Sequence[ArrayLike] = ()
+    depths_mm: Sequence[float] = ()
+
+    @property
+    def lit(self) -> list[ArrayLike]:
+        """All but the dark one."""
+        return [*self.whites, *([] if self.board is None else [self.board]), *self.depth_boards]
+
+    def less_dark(self, picture: ArrayLike) -> NDArray[np.float64]:
+        """Return a picture with the dark one taken off."""
+        image = np.asarray(picture, dtype=np.float64)
+        return image if self.dark is None else image - np.asarray(self.dark, dtype=np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class DataSheet:
+    """What a data sheet says of the lens images, to be checked or believed.
+
+    Attributes
+    ----------
+    layout, pitch_px : of the lens images; None: not known
+    camera : whole, for the image distance; needed where there is no white picture
+    """
+
+    layout: Layout | None = None
+    pitch_px: float | None = None
+    camera: Camera | None = None
+
+
+UNKNOWN_SHEET = DataSheet()
+
+
+def calibrate(pictures: Photographs, rig: Rig | None = None, sheet: DataSheet = UNKNOWN_SHEET) -> Calibration:
     """Calibrate from photographs.
 
     Parameters
     ----------
-    whites : (rows, columns) raw pictures of uniform light: the one with the smallest aperture gives the lattice, the
-        one with the widest the transmission; none: the lattice is that of `camera`
-    dark, board : (rows, columns) raw pictures of no light and of the dot board
-    layout, sheet_pitch_px : of the data sheet, to be checked
-    camera : as the data sheet has it, for the image distance; not needed beside whites
     rig : camera, media and board; needed for boards only
-    depth_boards, depths_mm : (rows, columns) raw pictures of the board at several depths, and these, for `ray_fit`
 
     Raises
     ------
     InputError
         when a picture cannot serve; it says why
     """
-    shape = shape_of([*whites, *([] if board is None else [board]), *depth_boards], camera)
+    shape = shape_of(pictures.lit, sheet.camera)
     # One BLAS thread: the same bits on every machine, and small problems gain nothing from more.
     with threadpool_limits(limits=1, user_api="blas"):
-        calibration = lattice_calibration(whites, dark, shape, layout, sheet_pitch_px, camera)
+        calibration = lattice_calibration(pictures, shape, sheet)
         if rig is None:
             return calibration
-        darkness = 0.0 if dark is None else np.asarray(dark, dtype=np.float64)
-        if len(depth_boards):
-            pictures = [np.asarray(each, dtype=np.float64) - darkness for each in depth_boards]
-            calibration = replace(calibration, ray_fit=ray_fit(pictures, depths_mm, calibration, rig))
-        if board is None:
+        if len(pictures.depth_boards):
+            boards = [pictures.less_dark(each) for each in pictures.depth_boards]
+            calibration = replace(calibration, ray_fit=ray_fit(boards, pictures.depths_mm, calibration, rig))
+        if pictures.board is None:
             return calibration
-        pose = board_pose(np.asarray(board, dtype=np.float64) - darkness, calibration, rig)
+        pose = board_pose(pictures.less_dark(pictures.board), calibration, rig)
     return with_mid_plane(replace(calibration, pose=pose), pose, rig)
 
 
@@ -262,26 +292,19 @@ def shape_of(pictures: Sequence[ArrayLike], camera: Camera | None) -> tuple[int,
     return int(shapes[0][0]), int(shapes[0][1])
 
 
-def lattice_calibration(
-    whites: Sequence[ArrayLike],
-    dark: ArrayLike | None,
-    shape: tuple[int, int],
-    layout: Layout | None,
-    sheet_pitch_px: float | None,
-    camera: Camera | None,
-) -> Calibration:
+def lattice_calibration(pictures: Photographs, shape: tuple[int, int], sheet: DataSheet) -> Calibration:
     """Return lattice and transmission from white images, or what the data sheet says where there are none."""
+    whites, dark, camera = pictures.whites, pictures.dark, sheet.camera
     if not whites:
         if camera is None:
             raise InputError("without a white image the lattice needs the whole camera of the data sheet")
         return Calibration(Rectification(sheet_fit(camera), shape))
     order = by_aperture(whites, dark)
-    fit = fit_lattice(whites[order[0]], dark, layout)
-    if sheet_pitch_px is not None:
-        check_pitch(fit, sheet_pitch_px)
+    fit = fit_lattice(whites[order[0]], dark, sheet.layout)
+    if sheet.pitch_px is not None:
+        check_pitch(fit, sheet.pitch_px)
     rectification = Rectification(fit, shape)
-    widest = np.asarray(whites[order[-1]], dtype=np.float64)
-    image = widest if dark is None else widest - np.asarray(dark, dtype=np.float64)
+    image = pictures.less_dark(whites[order[-1]])
     transmission = relative_transmission(rectification.apply(image), rectification.lattice_px)
     distance, sigma = (None, None) if camera is None else image_distance_mm(fit, camera) or (None, None)
     return Calibration(rectification, transmission, image_distance_mm=distance, image_distance_sigma_mm=sigma)

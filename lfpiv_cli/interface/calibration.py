@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lfpiv_cli.calibration import model
-from lfpiv_cli.calibration.model import Calibration
+from lfpiv_cli.calibration.model import Calibration, DataSheet, Photographs
 from lfpiv_cli.errors import UsageError
 from lfpiv_cli.files.config import Config
 
@@ -67,17 +67,16 @@ def calibration_of(
     depth_mm: Sequence[float],
 ) -> Calibration:
     """Return the calibration that pictures of the rig give, all of them (rows, columns)."""
-    return model.calibrate(
-        whites,
-        dark,
-        boards[0] if boards and not len(depth_mm) else None,
-        layout=rig.camera.microlenses.layout,
-        sheet_pitch_px=rig.micro_image_pitch_px(),
-        camera=rig.complete_camera() if whites else rig.camera_model(),
-        rig=rig.rig() if boards else None,
-        depth_boards=boards if len(depth_mm) else (),
-        depths_mm=depth_mm,
+    at_depths = bool(len(depth_mm))
+    sheet = DataSheet(
+        rig.camera.microlenses.layout,
+        rig.micro_image_pitch_px(),
+        rig.complete_camera() if whites else rig.camera_model(),
     )
+    pictures = Photographs(
+        whites, dark, boards[0] if boards and not at_depths else None, boards if at_depths else (), depth_mm
+    )
+    return model.calibrate(pictures, rig.rig() if boards else None, sheet)
 
 
 def ensure_pictures(whites: int, boards: int, depths: int) -> None:

@@ -24,7 +24,7 @@ from lfpiv_cli.weights.build import default_padding, scene_distortion
 from lfpiv_cli.weights.columns import ColumnOperator, OnDemandOperator, operator_of, seen_share
 from lfpiv_cli.weights.model import Weights, WeightsOperator
 from lfpiv_cli.weights.operators import FactorisedOperator
-from lfpiv_cli.weights.rays import count_columns
+from lfpiv_cli.weights.rays import RayCount, count_columns
 from lfpiv_cli.weights.scene import Source
 
 # Said where the voxels were left to the program.
@@ -134,8 +134,8 @@ def make_operator(
             console.warn("array or rays do not separate into axes; columns are made on demand, for what is lit")
         return operator
     layout = OnDemandOperator(camera, source, grid)
-    voxels = math.prod(layout.shape)
-    rays = voxels * chosen.points * chosen.rays_per_point
+    voxels, count = math.prod(layout.shape), RayCount(chosen.points, chosen.rays_per_point)
+    rays = voxels * count.rays
     if rays > MOST_RAYS:
         raise ConfigError(
             f"weights.sampling: counting {rays:.3g} rays for {voxels} voxels (padding included) would take about "
@@ -143,9 +143,8 @@ def make_operator(
             f"{MOST_RAYS:.3g} are counted, use sampling: exact"
         )
     centres, rng = layout.centres_mm(np.arange(voxels)), np.random.default_rng(chosen.seed)
-    number = (chosen.points, chosen.rays_per_point)
     with console.progress(voxels, "count rays") as advance:
-        columns = count_columns(camera, source, centres, layout.sides_mm, rng, *number, advance)
+        columns = count_columns(camera, source, centres, layout.sides_mm, rng, count, advance)
     return ColumnOperator(layout.shape, layout.image_shape, np.arange(voxels), columns)
 
 

@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.particles.candidates import explain_rest, find_peaks, points_in_raw_frame
 from lfpiv_cli.particles.fitting import accept
 from lfpiv_cli.particles.noise import estimate_noise
@@ -33,15 +32,11 @@ from lfpiv_cli.particles.search import (
     prune,
     result,
     sweep,
-    task_of,
     with_measured_noise,
     with_typical_light,
 )
 from lfpiv_cli.particles.suspects import with_depths_corrected, with_overlaps_split
 from lfpiv_cli.particles.tiles import share_out
-from lfpiv_cli.particles.view import View
-from lfpiv_cli.reconstruction.equations import Normalisers
-from lfpiv_cli.weights.model import Weights
 
 
 @dataclass(frozen=True)
@@ -83,26 +78,9 @@ PRUNING_SLACK = 0.3
 
 
 def find_particles(
-    image: NDArray[np.float32],
-    view: View,
-    weights: Weights,
-    camera: Camera,
-    sums: Normalisers,
-    rounds: tuple[Round, ...] = ROUNDS,
-    progress: Callable[[int], None] | None = None,
-    excluded: NDArray[np.bool_] | None = None,
+    task: Task, rounds: tuple[Round, ...] = ROUNDS, progress: Callable[[int], None] | None = None
 ) -> Particles:
-    """Return the particles that explain a raw image.
-
-    Parameters
-    ----------
-    image : (rows, columns) raw, dark and background taken off, counts
-    weights, sums : of the volume in which particles are looked for, and their `normalisers` on the padded grid
-    camera : says which world axis the columns follow
-    progress : called with 1 after each iteration and each round
-    excluded : (rows, columns) raw pixels that take no part; `sums` must leave out what they touch; default: none
-    """
-    task = task_of(image, view, weights, camera, sums, excluded)
+    """Return the particles that explain a raw image; `progress` is called with 1 after each iteration and round."""
     return result(task, first_pass(task, rounds, progress))
 
 

@@ -112,9 +112,17 @@ def task_of(
     weights: Weights,
     camera: Camera,
     sums: Normalisers,
-    excluded: NDArray[np.bool_] | None,
+    excluded: NDArray[np.bool_] | None = None,
 ) -> Task:
-    """Return the task that an image sets; see `rounds.find_particles`."""
+    """Return the task that an image sets.
+
+    Parameters
+    ----------
+    image : (rows, columns) raw, dark and background taken off, counts
+    weights, sums : of the volume in which particles are looked for, and their `normalisers` on the padded grid
+    camera : says which world axis the columns follow
+    excluded : (rows, columns) raw pixels that take no part; `sums` must leave out what they touch; None: none
+    """
     low, high = weights.grid.bounds_mm(2)
     return Task(
         view,

@@ -23,7 +23,7 @@ from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.particles.refraction import places_by_snell
 from lfpiv_cli.particles.rounds import ROUNDS, find_particles
-from lfpiv_cli.particles.search import Particles
+from lfpiv_cli.particles.search import Particles, task_of
 from lfpiv_cli.particles.view import View, raw_view
 from lfpiv_cli.reconstruction.equations import normalisers
 from lfpiv_cli.self_calibration.nuisances import Nuisances, fit_nuisances
@@ -137,14 +137,28 @@ class Refinement:
         }
 
 
+@dataclass(frozen=True)
+class ChannelFlow:
+    """What is known of a flow between a channel's walls.
+
+    Attributes
+    ----------
+    volume : says where particles are looked for laterally, and how fine
+    width_mm : of the channel
+    particle_diameter_mm : of the tracers
+    """
+
+    volume: Grid
+    width_mm: float
+    particle_diameter_mm: float
+
+
 def refine_calibration(
     images: Sequence[NDArray[np.float32]],
     calibration: Calibration,
     sheet: Camera,
     space: ObjectSpace,
-    volume: Grid,
-    width_mm: float,
-    particle_diameter_mm: float,
+    flow: ChannelFlow,
     progress: Callable[[int], None] | None = None,
 ) -> Refinement:
     """Find the particles of images and the channel's walls by them.
@@ -154,8 +168,6 @@ def refine_calibration(
     images : (rows, columns) raw, dark and background taken off, counts
     sheet : camera as the data sheet has it
     space : what lies before the particles, by the calibration
-    volume : says where particles are looked for laterally, and how fine
-    width_mm : of the channel
 
     Raises
     ------
@@ -166,16 +178,16 @@ def refine_calibration(
     """
     camera = calibration.camera(sheet)
     media = space.media
-    view = raw_view(camera, media, 0.5 * particle_diameter_mm, calibration)
+    view = raw_view(camera, media, 0.5 * flow.particle_diameter_mm, calibration)
     expected = 0.0 if calibration.mid_plane_z_mm is None else calibration.mid_plane_z_mm
-    grid = _deep_grid(volume, expected, width_mm)
+    grid = _deep_grid(flow.volume, expected, flow.width_mm)
     padding = default_padding(camera, media, grid)
     operator = factorise(camera, media, grid.padded(padding))
     weights = Weights(grid, padding, operator, camera.column_axis, calibration)
     sums = normalisers(weights.padded)
 
     def search(image: NDArray[np.float32], seen: View) -> Particles:
-        return find_particles(image, seen, weights, camera, sums, REFINING_ROUNDS, progress=progress)
+        return find_particles(task_of(image, seen, weights, camera, sums), REFINING_ROUNDS, progress)
 
     first = search(images[0], view)
     refuse_few(len(first.position_mm))
@@ -191,7 +203,7 @@ def refine_calibration(
     known = np.isfinite(variance) & (variance > 0.0)
     position, sigma = places_by_snell(position[known], space, camera), np.sqrt(variance[known])
     return Refinement(
-        walls=find_walls(position, sigma, grid.bounds_mm(2), width_mm, len(images)),
+        walls=find_walls(position, sigma, grid.bounds_mm(2), flow.width_mm, len(images)),
         nuisances=fit.found,
         nuisances_sigma=fit.sigma,
         position_mm=position,
@@ -200,8 +212,8 @@ def refine_calibration(
         expected_z_mm=expected,
         expected_sigma_mm=calibration.mid_plane_z_sigma_mm,
         common_depth_mm=_common_depth_mm(camera, media),
-        width_mm=width_mm,
-        particle_diameter_mm=particle_diameter_mm,
+        width_mm=flow.width_mm,
+        particle_diameter_mm=flow.particle_diameter_mm,
         camera=camera,
     )
 

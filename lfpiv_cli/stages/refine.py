@@ -19,7 +19,7 @@ from lfpiv_cli.files.pictures import ensure_drawing, write_picture
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.reconstruction.images import light
-from lfpiv_cli.self_calibration.refinement import STEPS
+from lfpiv_cli.self_calibration.refinement import STEPS, ChannelFlow
 from lfpiv_cli.self_calibration.refinement import refine_calibration as refine
 
 
@@ -75,9 +75,7 @@ def refine_calibration(
             before,
             settings.camera_model(),
             ObjectSpace(settings.media_model(), window, "exact"),
-            settings.grid(),
-            settings.channel.width_mm,
-            settings.reconstruction.particle_diameter_mm,
+            ChannelFlow(settings.grid(), settings.channel.width_mm, settings.reconstruction.particle_diameter_mm),
             advance,
         )
     if output:

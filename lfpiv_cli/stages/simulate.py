@@ -39,9 +39,7 @@ def simulate_white(
 ) -> dict[str, Any]:
     """Render a white image and a dark one."""
     settings, paths = _begin(config, output, ("white.tif", "dark.tif", "white.json"), overwrite)
-    still = scenes.simulate_white(
-        real_camera(settings), settings.simulation.peak_counts, readout_of(settings), _generator(settings, 0)
-    )
+    still = scenes.simulate_white(_recording(settings), settings.simulation.peak_counts, _generator(settings, 0))
     write_tiff(paths["white.tif"], still.image, overwrite)
     write_tiff(paths["dark.tif"], still.dark, overwrite)
     return _write_truth(paths["white.json"], "simulate white", still.truth, settings, config, overwrite)
@@ -93,18 +91,15 @@ def simulate_particles(
     scene = settings.simulation
     if settings.correlation.dt_s is None:
         raise ConfigError(f"{config}: correlation.dt_s: is missing, and images of a flow need it")
-    camera, reference = real_camera(settings), simulated_reference(settings)
-    tracers = _tracers(settings, camera, reference, settings.correlation.dt_s)
+    reference = simulated_reference(settings)
+    tracers = _tracers(settings, real_camera(settings), reference, settings.correlation.dt_s)
     with console.progress(scene.frames * tracers.count, "simulate") as advance:
         found = scenes.simulate_particles(
-            camera,
+            _recording(settings),
             _flow_space(settings, reference),
             tracers,
-            settings.simulated_flow(reference),
-            settings.correlation.dt_s,
-            readout_of(settings),
+            scenes.Motion(settings.simulated_flow(reference), settings.correlation.dt_s, scene.frames),
             _generator(settings, 2),
-            frames=scene.frames,
             rays=scene.rays or RAYS,
             progress=advance,
         )
@@ -131,6 +126,10 @@ def real_camera(settings: Config) -> Camera:
     return misalignment_of(settings).apply(settings.camera_model())
 
 
+def _recording(settings: Config) -> scenes.RecordingCamera:
+    return scenes.RecordingCamera(real_camera(settings), readout_of(settings))
+
+
 def misalignment_of(settings: Config) -> scenes.Misalignment:
     """Return how the simulated camera departs from its data sheet."""
     scene = settings.simulation
@@ -155,8 +154,7 @@ def _board_still(
 ) -> scenes.SimulatedStill:
     scene = settings.simulation
     placement = BoardPlacement(z_mm, scene.board_offset_mm, scene.board_tilt_deg, scene.board_rotation_deg)
-    camera, readout = real_camera(settings), readout_of(settings)
-    return scenes.simulate_board(camera, space, board, placement, scene.peak_counts, readout, rng)
+    return scenes.simulate_board(_recording(settings), space, board, placement, scene.peak_counts, rng)
 
 
 def _begin(config: Path, output: Path, names: tuple[str, ...], overwrite: bool) -> tuple[Config, dict[str, Path]]:

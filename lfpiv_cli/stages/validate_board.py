@@ -24,7 +24,7 @@ from lfpiv_cli.reconstruction.solvers import ALL_ITERATIONS, reconstruct
 from lfpiv_cli.stages.simulate import misalignment_of, readout_of
 from lfpiv_cli.synthetic.board import BoardPlacement, dot_centres
 from lfpiv_cli.validation.board import DEPTHS_MM, PAPER, DotFigures, board_figures, measure_dots, place_figures
-from lfpiv_cli.validation.board_bench import BoardBench, ideal_bench, recorded_bench
+from lfpiv_cli.validation.board_bench import BoardBench, Reality, ideal_bench, recorded_bench
 from lfpiv_cli.validation.board_pictures import board_figure
 
 # Two make a step in depth, a third the polynomials of fitted rays.
@@ -100,16 +100,8 @@ def _bench(settings: Config, half: str) -> BoardBench:
     if half == "ideal":
         return ideal_bench(rig, grid, scene.peak_counts, rng)
     true = ObjectSpace(rig.media, settings.window_model(), scene.refraction)
-    return recorded_bench(
-        rig,
-        settings.object_space(),
-        true,
-        misalignment_of(settings),
-        readout_of(settings),
-        grid,
-        scene.peak_counts,
-        rng,
-    )
+    reality = Reality(misalignment_of(settings), readout_of(settings), true)
+    return recorded_bench(rig, settings.object_space(), reality, grid, scene.peak_counts, rng)
 
 
 def _discs(

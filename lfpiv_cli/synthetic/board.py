@@ -6,7 +6,6 @@ y), tilted, and moved to its place, in this order, as a rigid plate.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -76,7 +75,6 @@ def render_board(
     placement: BoardPlacement,
     level: float,
     rng: np.random.Generator,
-    progress: Callable[[int], None] | None = None,
     shown: ArrayLike | None = None,
 ) -> NDArray[np.float64]:
     """Render bright dots on dark ground, or dark dots on ground that fills the view.
@@ -84,7 +82,6 @@ def render_board(
     Parameters
     ----------
     level : expected counts of a pixel that sees only what is bright, as in a white image
-    progress : called with the number of points done
     shown : (n,) bool, which dots there are, the first index along x running fastest; default: all
 
     Returns
@@ -99,7 +96,7 @@ def render_board(
     area = 0.25 * np.pi * board.dot_diameter_mm**2 / POINTS_PER_DOT
     light = area * light_per_area(camera, space.media, points[:, 2], level)
     size = board.dot_diameter_mm / np.sqrt(POINTS_PER_DOT)
-    dots = render_points(camera, space, points, light, size, rng, rays=RAYS_PER_POINT, progress=progress)
+    dots = render_points(camera, space, points, light, size, rng, rays=RAYS_PER_POINT)
     if board.polarity == "bright":
         return dots
     # the rays' noise may ask for more than there is

@@ -113,6 +113,31 @@ class Tracers:
 
 
 @dataclass(frozen=True, eq=False)
+class RecordingCamera:
+    """A camera with the sensor that records what it sees."""
+
+    optics: Camera
+    readout: Readout
+
+    def dark_frame(self, rng: np.random.Generator) -> NDArray[np.uint16]:
+        """Return an image recorded without light."""
+        return self.readout.record(np.zeros((self.optics.rows, self.optics.columns)), rng)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """How tracers move while they are recorded: a flow, the time between frames, and how many there are."""
+
+    flow: Flow
+    dt_s: float
+    frames: int = 2
+
+    def times_s(self) -> list[float]:
+        """Return when the frames are taken, counted from the middle of the sequence."""
+        return [(number - 0.5 * (self.frames - 1)) * self.dt_s for number in range(self.frames)]
+
+
+@dataclass(frozen=True, eq=False)
 class SimulatedStill:
     """An image, uint16, a dark frame of the same sensor, and the truth."""
 
@@ -150,79 +175,70 @@ def channel_walls(width_mm: float, mid_plane_z_mm: float, axis: str = "x") -> Bo
     return Box((low[0], low[1], low[2]), (high[0], high[1], high[2]))
 
 
-def simulate_white(camera: Camera, level: float, readout: Readout, rng: np.random.Generator) -> SimulatedStill:
+def simulate_white(camera: RecordingCamera, level: float, rng: np.random.Generator) -> SimulatedStill:
     """Simulate an image of uniform light, `level` expected counts where a pixel sees nothing but the aperture."""
-    image = readout.record(render_white(camera, level), rng)
-    return SimulatedStill(image, dark_frame(camera, readout, rng), camera_truth(camera))
+    image = camera.readout.record(render_white(camera.optics, level), rng)
+    return SimulatedStill(image, camera.dark_frame(rng), camera_truth(camera.optics))
 
 
 def simulate_board(
-    camera: Camera,
+    camera: RecordingCamera,
     space: ObjectSpace,
     board: BoardGeometry,
     placement: BoardPlacement,
     level: float,
-    readout: Readout,
     rng: np.random.Generator,
 ) -> SimulatedStill:
     """Simulate an image of a board, `level` expected counts in a pixel that sees only what is bright."""
-    image = readout.record(render_board(camera, space, board, placement, level, rng), rng)
+    image = camera.readout.record(render_board(camera.optics, space, board, placement, level, rng), rng)
     truth = {
-        **camera_truth(camera),
+        **camera_truth(camera.optics),
         "board_z_mm": placement.z_mm,
         "tilt_deg": list(placement.tilt_deg),
         "offset_mm": list(placement.offset_mm),
         "board_rotation_deg": placement.rotation_deg,
         "dots_mm": dot_centres(board, placement).tolist(),
     }
-    return SimulatedStill(image, dark_frame(camera, readout, rng), truth)
+    return SimulatedStill(image, camera.dark_frame(rng), truth)
 
 
 def simulate_particles(
-    camera: Camera,
+    camera: RecordingCamera,
     space: ObjectSpace,
     tracers: Tracers,
-    flow: Flow,
-    dt_s: float,
-    readout: Readout,
+    motion: Motion,
     rng: np.random.Generator,
     *,
-    frames: int = 2,
     rays: int = RAYS,
     progress: Callable[[int], None] | None = None,
 ) -> SimulatedFrames:
-    """Simulate images of tracers, dt apart, half of them before the time of the truth's positions and half after.
+    """Simulate images of tracers, half of them before the time of the truth's positions and half after.
 
     `progress` is called with the number of tracers rendered, n for each frame.
     """
     positions = rng.uniform(tracers.box.low_mm, tracers.box.high_mm, (tracers.count, 3))
     brightness = tracers.draw_brightness(rng)
     images = []
-    for number in range(frames):
+    for time_s in motion.times_s():
         expected = render_points(
-            camera,
+            camera.optics,
             space,
-            advect(flow, positions, (number - 0.5 * (frames - 1)) * dt_s),
+            advect(motion.flow, positions, time_s),
             tracers.light_counts * brightness,
             tracers.diameter_mm,
             rng,
             rays=rays,
             progress=progress,
         )
-        images.append(readout.record(expected, rng))
+        images.append(camera.readout.record(expected, rng))
     truth = {
-        **camera_truth(camera),
-        "dt_s": dt_s,
+        **camera_truth(camera.optics),
+        "dt_s": motion.dt_s,
         "particles": tracers.count,
         "window_distance_mm": None if space.window is None else space.window.distance_mm,
     }
-    dark = dark_frame(camera, readout, rng)
-    return SimulatedFrames(tuple(images), dark, positions, flow(positions), brightness, truth)
-
-
-def dark_frame(camera: Camera, readout: Readout, rng: np.random.Generator) -> NDArray[np.uint16]:
-    """Return an image recorded without light."""
-    return readout.record(np.zeros((camera.rows, camera.columns)), rng)
+    dark = camera.dark_frame(rng)
+    return SimulatedFrames(tuple(images), dark, positions, motion.flow(positions), brightness, truth)
 
 
 def camera_truth(camera: Camera) -> dict[str, Any]:

@@ -14,12 +14,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lfpiv_cli.calibration.dlfc import fit_rays
-from lfpiv_cli.calibration.model import Rig, calibrate
+from lfpiv_cli.calibration.model import Photographs, Rig, calibrate
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.reconstruction.images import Image, Mask, light
 from lfpiv_cli.synthetic.board import BoardPlacement, render_board
-from lfpiv_cli.synthetic.scenes import Misalignment, dark_frame, simulate_board, simulate_white
+from lfpiv_cli.synthetic.scenes import Misalignment, RecordingCamera, simulate_board, simulate_white
 from lfpiv_cli.synthetic.sensor import Readout
 from lfpiv_cli.weights.build import factorise_through, scene_distortion
 from lfpiv_cli.weights.columns import operator_of
@@ -64,38 +64,47 @@ def ideal_bench(rig: Rig, grid: Grid, level: float, rng: np.random.Generator) ->
     return BoardBench(rig, weights, picture, np.zeros(weights.image_shape, np.bool_))
 
 
+@dataclass(frozen=True)
+class Reality:
+    """How a real bench is other than its data sheets say.
+
+    Attributes
+    ----------
+    misalignment : of the camera
+    readout : of its sensor, with noise
+    space : what lies before the lens
+    """
+
+    misalignment: Misalignment
+    readout: Readout
+    space: ObjectSpace
+
+
 def recorded_bench(
-    rig: Rig,
-    assumed: ObjectSpace,
-    true: ObjectSpace,
-    misalignment: Misalignment,
-    readout: Readout,
-    grid: Grid,
-    level: float,
-    rng: np.random.Generator,
+    rig: Rig, assumed: ObjectSpace, reality: Reality, grid: Grid, level: float, rng: np.random.Generator
 ) -> BoardBench:
     """Return a camera that departs from its data sheet, calibrated from pictures that it took.
 
     Parameters
     ----------
     rig : as the data sheets have it
-    assumed, true : what lies before the lens, for the weights and for the pictures
+    assumed : what is taken to lie before the lens, for the weights
     level : expected counts in a pixel that sees only what is bright
     """
-    real = misalignment.apply(rig.camera)
-    dark = dark_frame(real, readout, rng)
-    white = simulate_white(real, level, readout, rng).image
+    real = RecordingCamera(reality.misalignment.apply(rig.camera), reality.readout)
+    dark = real.dark_frame(rng)
+    white = simulate_white(real, level, rng).image
     board = replace(rig.board, medium="air")
     air = ObjectSpace(rig.media.in_air(), None, "paraxial")
-    snapshot = simulate_board(real, air, board, BoardPlacement(CALIBRATION_BOARD_Z_MM), level, readout, rng).image
-    calibration = calibrate([white], dark, snapshot, rig=replace(rig, board=board))
+    snapshot = simulate_board(real, air, board, BoardPlacement(CALIBRATION_BOARD_Z_MM), level, rng).image
+    calibration = calibrate(Photographs([white], dark, snapshot), replace(rig, board=board))
     camera = calibration.camera(rig.camera)
     bend = scene_distortion(camera, rig.media, grid)
     operator = factorise_through(camera, assumed, grid)
     weights = Weights(grid, (0, 0, 0), operator, camera.column_axis, calibration, bend)
 
     def picture(placement: BoardPlacement) -> Image:
-        recorded = simulate_board(real, true, rig.board, placement, level, readout, rng).image
+        recorded = simulate_board(real, reality.space, rig.board, placement, level, rng).image
         return weights.prepare(light(recorded.astype(np.float32), dark.astype(np.float32)))
 
     return BoardBench(replace(rig, camera=camera), weights, picture, ~calibration.rectification.inside)

@@ -23,7 +23,7 @@ from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.weights.build import factorise_through
 from lfpiv_cli.weights.columns import seen_share
 from lfpiv_cli.weights.quadrature import REFERENCE_DEPTH_NODES, REFERENCE_TILES, integrate_columns
-from lfpiv_cli.weights.rays import POINTS, RAYS_PER_POINT, count_rays, sampling_error
+from lfpiv_cli.weights.rays import PAPERS_COUNT, RayCount, count_rays, sampling_error
 
 # The voxels p1 to p5 of the equivalent-ray-tracing paper (its Table 1), x, y and depth, mm.
 TABLE1_MM = ((1.0, 0.0, 4.0), (1.5, 0.0, 2.0), (2.0, 0.0, 0.0), (2.5, 0.0, -2.0), (3.0, 0.0, -4.0))
@@ -139,11 +139,11 @@ def make_columns(
         images["ray_count"] = count_rays(camera, paraxial, point, sides, rng)
         if rays:
             per_point = min(RAYS_PER_POINT_LONG, int(rays))
-            number = (int(rays) // per_point, per_point)
-            images["long_count"] = count_rays(camera, paraxial, point, sides, rng, *number)
+            number = RayCount(int(rays) // per_point, per_point)
+            images["long_count"] = count_rays(camera, paraxial, point, sides, rng, number)
             if space.window is not None:
                 direct = replace(space, refraction="exact", method="drt")
-                images["long_count_exact"] = count_rays(camera, direct, point, sides, rng, *number)
+                images["long_count_exact"] = count_rays(camera, direct, point, sides, rng, number)
         columns.append(Column((centre[0], centre[1], centre[2]), _cut(images)))
         if progress:
             progress(1)
@@ -160,7 +160,7 @@ def weights_figures(columns: list[Column], long_count: NDArray[np.int64]) -> dic
                 entry[name] = compare_columns(column.images[reference], column.images[image])
         converged = column.images["ert"]
         entry["pixels"] = int(np.count_nonzero(converged))
-        entry["independent_rays_l1"] = sampling_error(converged, int(rays) or POINTS * RAYS_PER_POINT)
+        entry["independent_rays_l1"] = sampling_error(converged, int(rays) or PAPERS_COUNT.rays)
         voxels.append(entry)
     return {name: _summary([v[name] for v in voxels if name in v]) for name in COMPARISONS} | {"voxels": voxels}
 

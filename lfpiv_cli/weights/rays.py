@@ -11,6 +11,7 @@ Axes: image axes (x along the columns), mm, z away from the camera from the nomi
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numba import njit, prange
@@ -21,9 +22,6 @@ from lfpiv_cli.optics.object_space import ObjectSpace, slope_ratio
 from lfpiv_cli.optics.tracing import kernel_distances, trace_ray
 from lfpiv_cli.weights.quadrature import Columns
 
-# The paper's numbers.
-POINTS = 500
-RAYS_PER_POINT = 10_000
 # Points are counted in this many parts side by side, each into an image of its own.
 PARTS = 8
 
@@ -35,36 +33,49 @@ MIX_B = np.uint64(0x94D049BB133111EB)
 TO_UNIT = 2.0**-53
 
 
+@dataclass(frozen=True)
+class RayCount:
+    """How many rays are counted: from each of some random points of a voxel; by default the paper's numbers."""
+
+    points: int = 500
+    rays_per_point: int = 10_000
+
+    @property
+    def rays(self) -> int:
+        """All rays of a voxel."""
+        return self.points * self.rays_per_point
+
+
+PAPERS_COUNT = RayCount()
+
+
 def count_rays(
     camera: Camera,
     space: ObjectSpace,
     centre_mm: ArrayLike,
     voxel_mm: ArrayLike,
     rng: np.random.Generator,
-    points: int = POINTS,
-    rays_per_point: int = RAYS_PER_POINT,
+    count: RayCount = PAPERS_COUNT,
 ) -> NDArray[np.float64]:
     """Return the image (rows, columns) of the shares of a voxel's rays that strike each pixel.
 
     Parameters
     ----------
     centre_mm, voxel_mm : (3,) its centre and its sides, image axes
-    points : random points of the voxel
-    rays_per_point : rays from each
 
     Raises
     ------
     ConfigError : a voxel in front of the fluid, or no window where one is needed
     """
     centre, sides = np.asarray(centre_mm, dtype=np.float64), np.asarray(voxel_mm, dtype=np.float64)
-    starts = centre + (rng.random((points, 3)) - 0.5) * sides
-    seeds = rng.integers(0, 2**64, points, dtype=np.uint64)
+    starts = centre + (rng.random((count.points, 3)) - 0.5) * sides
+    seeds = rng.integers(0, 2**64, count.points, dtype=np.uint64)
     reach = camera.aperture_radius_mm + float(np.hypot(*(np.abs(centre[:2]) + sides[:2])))
     nodes, factors = space.slope_polynomials(camera, starts[:, 2], reach)
     counts = _count(
         starts,
         seeds,
-        rays_per_point,
+        count.rays_per_point,
         nodes,
         factors,
         kernel_distances(camera),
@@ -75,7 +86,7 @@ def count_rays(
         camera.pixel_mm,
         (camera.rows, camera.columns),
     )
-    return counts.sum(axis=0) / (points * rays_per_point)
+    return counts.sum(axis=0) / count.rays
 
 
 def count_columns(
@@ -84,14 +95,13 @@ def count_columns(
     centres_mm: NDArray[np.float64],
     voxel_mm: ArrayLike,
     rng: np.random.Generator,
-    points: int = POINTS,
-    rays_per_point: int = RAYS_PER_POINT,
+    count: RayCount = PAPERS_COUNT,
     progress: Callable[[int], None] | None = None,
 ) -> Columns:
     """Return the counted columns of voxels at `centres_mm` (n, 3); the other arguments are those of `count_rays`."""
     start, pixels, shares = [0], [], []
     for centre in centres_mm:
-        image = count_rays(camera, space, centre, voxel_mm, rng, points, rays_per_point).ravel()
+        image = count_rays(camera, space, centre, voxel_mm, rng, count).ravel()
         lit = np.flatnonzero(image)
         pixels.append(lit.astype(np.int32))
         shares.append(image[lit].astype(np.float32))
