@@ -10,8 +10,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from lfpiv_cli.calibration import model
 from lfpiv_cli.calibration.model import Calibration, DataSheet, Photographs
+from lfpiv_cli.calibration.sheet import image_distance_doubt
+from lfpiv_cli.console import Console
 from lfpiv_cli.errors import UsageError
 from lfpiv_cli.files.config import Config
+from lfpiv_cli.interface.notices import NOTICES
+
+NO_WHITE_IMAGE = (
+    "no white image: the microlenses are believed to lie as the data sheet says, and the standard errors know nothing "
+    "of how far that is wrong"
+)
 
 Pictures = ArrayLike | Sequence[ArrayLike] | None
 
@@ -54,29 +62,32 @@ def calibrate(
     ensure_pictures(len(whites), len(boards), len(depth_mm))
     shape = rig.image_shape()
     for picture in (*whites, *boards, *_each(dark)):
-        if np.shape(picture) != shape:
-            raise UsageError(f"a picture of {np.shape(picture)} pixels; the rig's sensor has {shape} (rows, columns)")
-    return calibration_of(rig, whites, boards, dark, depth_mm)
+        if picture.shape != shape:
+            raise UsageError(f"a picture of {picture.shape} pixels; the rig's sensor has {shape} (rows, columns)")
+    return calibration_of(rig, photographs(whites, boards, dark, depth_mm), NOTICES)
 
 
-def calibration_of(
-    rig: Config,
-    whites: Sequence[ArrayLike],
-    boards: Sequence[ArrayLike],
-    dark: ArrayLike | None,
-    depth_mm: Sequence[float],
-) -> Calibration:
-    """Return the calibration that pictures of the rig give, all of them (rows, columns)."""
-    at_depths = bool(len(depth_mm))
-    sheet = DataSheet(
-        rig.camera.microlenses.layout,
-        rig.micro_image_pitch_px(),
-        rig.complete_camera() if whites else rig.camera_model(),
-    )
-    pictures = Photographs(
-        whites, dark, boards[0] if boards and not at_depths else None, boards if at_depths else (), depth_mm
-    )
-    return model.calibrate(pictures, rig.rig() if boards else None, sheet)
+def photographs(
+    whites: Sequence[ArrayLike], boards: Sequence[ArrayLike], dark: ArrayLike | None, depth_mm: Sequence[float]
+) -> Photographs:
+    """Return pictures (rows, columns) as they are calibrated from: one board alone, or several at depths."""
+    if len(depth_mm):
+        return Photographs(whites, dark, None, boards, depth_mm)
+    return Photographs(whites, dark, boards[0] if boards else None)
+
+
+def calibration_of(rig: Config, pictures: Photographs, console: Console) -> Calibration:
+    """Return the calibration that pictures of the rig give; what speaks against it is warned of."""
+    camera = rig.complete_camera() if pictures.whites else rig.camera_model()
+    if not pictures.whites:
+        console.warn(NO_WHITE_IMAGE)
+    sheet = DataSheet(rig.camera.microlenses.layout, rig.micro_image_pitch_px(), camera)
+    has_board = pictures.board is not None or len(pictures.depth_boards) > 0
+    found = model.calibrate(pictures, rig.rig() if has_board else None, sheet)
+    doubt = None if camera is None else image_distance_doubt(found.fit, camera)
+    if doubt:
+        console.warn(doubt)
+    return found
 
 
 def ensure_pictures(whites: int, boards: int, depths: int) -> None:

@@ -6,7 +6,7 @@ import warnings
 
 from lfpiv_cli.console import Console
 
-# From `Notices.warn` through the function that tells and the one of the interface to who called that.
+# From `Notices.warn` through the function that warns and the one of the interface to who called that.
 CALLER = 4
 
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lfpiv_cli.calibration.sheet import image_distance_doubt
 from lfpiv_cli.calibration.white import by_aperture
 from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.files import images as image_files
@@ -17,7 +16,7 @@ from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.pictures import ensure_drawing, write_picture
 from lfpiv_cli.files.provenance import record as provenance_record
-from lfpiv_cli.interface.calibration import calibration_of, ensure_pictures
+from lfpiv_cli.interface.calibration import calibration_of, ensure_pictures, photographs
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.reconstruction.images import light
 
@@ -64,18 +63,11 @@ def calibrate_snapshot(
     settings = load_config(config)
     shape = settings.image_shape()
     frames = {name: image_files.read_image(path, shape) for name, path in inputs.items() if name != "config"}
-    camera = settings.camera_model() if views else settings.complete_camera()
-    if not white:
-        console.warn(
-            "no white image: the microlenses are believed to lie as the data sheet says, "
-            "and the standard errors know nothing of how far that is wrong"
-        )
-    calibration = calibration_of(
-        settings, [frames[n] for n in whites], [frames[n] for n in boards], frames.get("dark"), depth_mm
+    camera = settings.camera_model() if views else None
+    pictures = photographs(
+        [frames[name] for name in whites], [frames[name] for name in boards], frames.get("dark"), depth_mm
     )
-    doubt = None if camera is None else image_distance_doubt(calibration.fit, camera)
-    if doubt:
-        console.warn(doubt)
+    calibration = calibration_of(settings, pictures, console)
     record = provenance_record("calibrate-snapshot", settings.resolved(), inputs)
     write_calibration(output, calibration, record, overwrite)
     if picture:
@@ -84,7 +76,7 @@ def calibrate_snapshot(
         shown = [frames[name] for name in whites] or [frames["board"]]
         sharpest = shown[by_aperture(shown, frames.get("dark"))[0]]
         write_picture(picture, calibration_figure(calibration, sharpest, frames.get("board")), overwrite)
-    if views and camera is not None:
+    if views and camera:
         from lfpiv_cli.calibration.views_picture import views_figure
 
         medium = settings.media_model() if board and settings.board.medium == "fluid" else Media()
