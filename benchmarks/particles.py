@@ -164,7 +164,7 @@ def print_errors_over_bound(shape: tuple[int, int], volume_xyz: tuple[int, int, 
         bound = cramer_rao_bound(slope, pixel_variance(expected, readout))
         counts = readout.record(expected.reshape(shape), rng).astype(np.float32)
         image = counts - np.float32(readout.dark_level_counts)
-        found = find_particles(image, view, weights, camera, sums)
+        found = find_particles(task_of(image, view, weights, camera, sums))
         pairs = match(found.position_mm, true, VOXEL_MM)
         error = pairs.error_voxel * VOXEL_MM
         for label, joint in (("neighbours known", False), ("neighbours to be found", True)):

@@ -15,7 +15,7 @@ from lfpiv_cli.files.particle_file import Points, symmetric
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.files.weights_file import WeightsFile
 from lfpiv_cli.grid import Grid
-from lfpiv_cli.interface.reconstruction import Bench, as_counts, bench_of, counts
+from lfpiv_cli.interface.reconstruction import Bench, bench_of, given_picture, picture_for
 from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.particles.neighbour_frames import second_pass
 from lfpiv_cli.particles.refraction import places_by_snell
@@ -74,11 +74,10 @@ def find_particles(
     """
     carried = carried_config(weights.provenance, "the weights")
     chosen = carried.overridden("reconstruction", **(settings | {"solver": "particles"}))
-    bench = bench_of(searchable(weights, chosen), chosen, counts(dark), counts(mask))
-    level = counts(background)
-    frame, *others = (
-        frame_of(bench, raw, light(raw, bench.dark, level)) for raw in map(as_counts, (image, *neighbours))
-    )
+    bench = bench_of(searchable(weights, chosen), chosen, given_picture(weights, dark), given_picture(weights, mask))
+    level = given_picture(weights, background)
+    raws = [picture_for(weights, each) for each in (image, *neighbours)]
+    frame, *others = (frame_of(bench, raw, light(raw, bench.dark, level)) for raw in raws)
     if others:
         own, *beside = (find_first(bench, each) for each in (frame, *others))
         found = find_beside(bench, frame, own, beside)

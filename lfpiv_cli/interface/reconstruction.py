@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lfpiv_cli.errors import UsageError
+from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files.config import Config, carried_config
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.files.vtkhdf import Volume
@@ -66,11 +66,10 @@ def reconstruct(
     chosen = carried_config(weights.provenance, "the weights").overridden("reconstruction", **settings)
     if chosen.reconstruction.solver == "particles":
         raise UsageError("reconstruct: the solver particles makes no volume; find_particles finds them")
-    bench = bench_of(weights, chosen, counts(dark), counts(mask))
-    raw = as_counts(image)
-    return volume_of(
-        bench, raw, light(raw, bench.dark, counts(background)), record("reconstruct", chosen.resolved(), {})
-    )
+    bench = bench_of(weights, chosen, given_picture(weights, dark), given_picture(weights, mask))
+    raw = picture_for(weights, image)
+    lit = light(raw, bench.dark, given_picture(weights, background))
+    return volume_of(bench, raw, lit, record("reconstruct", chosen.resolved(), {}))
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,11 +158,19 @@ def _solved(bench: Bench, image: Image, excluded: Mask, progress: Progress | Non
     return solve(operator, image, bench.settings.solver_settings(), sums=sums, progress=progress)
 
 
-def as_counts(image: NDArray[Any]) -> Image:
-    """Return an image as the reader of files has it, float32."""
-    return np.asarray(image, dtype=np.float32)
+def picture_for(weights: WeightsFile, picture: NDArray[Any]) -> Image:
+    """Return a picture as the reader of files has it, float32.
+
+    Raises
+    ------
+    InputError
+        Its shape is not that of the images that the weights were made for.
+    """
+    if np.shape(picture) != weights.image_shape:
+        raise InputError(f"a picture of {np.shape(picture)} pixels does not fit weights made for {weights.image_shape}")
+    return np.asarray(picture, dtype=np.float32)
 
 
-def counts(image: NDArray[Any] | None) -> Image | None:
-    """Return an image as `as_counts`, None where there is none."""
-    return None if image is None else as_counts(image)
+def given_picture(weights: WeightsFile, picture: NDArray[Any] | None) -> Image | None:
+    """Return a picture as `picture_for` does, None where there is none."""
+    return None if picture is None else picture_for(weights, picture)
