@@ -12,8 +12,7 @@ from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.microlenses import Lattice
-from lfpiv_cli.reconstruction.equations import normalisers
-from lfpiv_cli.reconstruction.solvers import reconstruct
+from lfpiv_cli.reconstruction.solvers import SolverSettings, reconstruct
 from lfpiv_cli.synthetic.render import ObjectSpace, render_points
 from lfpiv_cli.synthetic.sensor import Readout
 from lfpiv_cli.weights.build import default_padding, factorise
@@ -92,9 +91,7 @@ def solve(case: Case, camera: Camera, grid: Grid, image: np.ndarray) -> np.ndarr
     """Return the volume of an image, the padding cut off."""
     padding = default_padding(camera, WATER, grid)
     operator = factorise(camera, WATER, grid.padded(padding))
-    result = reconstruct(
-        operator, image, case.solver, case.iterations, accelerate=case.accelerate, sums=normalisers(operator)
-    )
+    result = reconstruct(operator, image, SolverSettings(case.solver, case.iterations, accelerate=case.accelerate))
     nx, ny, nz = grid.shape_xyz
     px, py, pz = padding
     return np.ascontiguousarray(result.volume[pz : pz + nz, py : py + ny, px : px + nx])

@@ -382,9 +382,7 @@ def test_masked_windows_are_masked_and_their_neighbours_unharmed(rng: np.random.
     mask = np.ones(a.shape, dtype=np.bool_)
     mask[:, :, 32:] = False
     a[:, :, 32:] = rng.random(a[:, :, 32:].shape)
-    field = correlate(
-        [(a, b)], unit_grid(shape), CorrelationSettings(CorrelationSettings([(16, 16, 16)], HALF, 1e-3)), mask=mask
-    )
+    field = correlate([(a, b)], unit_grid(shape), CorrelationSettings([(16, 16, 16)], HALF, 1e-3), mask=mask)
     beyond = field.grid.axis_mm(0) > 40.0
     assert np.all(field.flag[:, :, beyond] == MASKED)
     seen = field.flag < REJECTED
