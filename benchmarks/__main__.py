@@ -14,6 +14,7 @@ from benchmarks.correlation import bench_correlation, bench_correlation_accuracy
 from benchmarks.depth import bench_depth
 from benchmarks.particles import bench_particles, bench_particles_thrice
 from benchmarks.rigs import bench_rigs
+from benchmarks.simd import bench_simd
 from benchmarks.solvers import bench_solvers
 from benchmarks.weights import bench_weights
 
@@ -25,6 +26,7 @@ BENCHMARKS: dict[str, Callable[[], None]] = {
     "particles": bench_particles,
     "particles-thrice": bench_particles_thrice,
     "rigs": bench_rigs,
+    "simd": bench_simd,
     "solvers": bench_solvers,
     "weights": bench_weights,
 }
