@@ -14,6 +14,7 @@ import re
 import shutil
 import subprocess
 import sys
+import typing
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -127,22 +128,17 @@ def code_block(code: list[str]) -> Iterator[str]:
 
 
 def interface() -> Iterator[str]:
-    """Yield what the package promises to Python, as directives: functions first, then classes, then the rest."""
-    functions, classes = [], []
-    for name in lfpiv_cli.__all__:
-        thing = getattr(lfpiv_cli, name)
-        if inspect.isclass(thing):
-            classes.append(name)
-        elif callable(thing):
-            functions.append(name)
+    """Yield what the package promises to Python, as directives: its functions, its classes, and what those return."""
+    promised = [getattr(lfpiv_cli, name) for name in lfpiv_cli.__all__]
+    functions = [thing for thing in promised if inspect.isfunction(thing)]
+    classes = [thing for thing in promised if inspect.isclass(thing)]
+    returned = {typing.get_type_hints(function)["return"] for function in functions}
+    ours = {thing for thing in returned if inspect.isclass(thing) and thing.__module__.startswith("lfpiv_cli.")}
     yield "```{eval-rst}"
-    for name in functions:
-        yield f".. autofunction:: lfpiv_cli.{name}"
-        yield ""
-    for name in classes:
-        yield f".. autoclass:: lfpiv_cli.{name}"
-        yield "   :members:"
-        yield ""
+    for function in functions:
+        yield f".. autofunction:: lfpiv_cli.{function.__name__}\n"
+    for thing in [*classes, *sorted(ours, key=lambda thing: thing.__name__)]:
+        yield f".. autoclass:: {thing.__module__}.{thing.__qualname__}\n   :members:\n"
     yield "```"
 
 
