@@ -106,6 +106,13 @@ def test_every_file_that_is_named_exists(page):
         assert (ROOT / place).exists(), place
 
 
+def test_architecture_names_every_part_of_the_package():
+    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8").split("## Walks", 1)[0]
+    package = ROOT / "lfpiv_cli"
+    parts = {path.stem for path in package.glob("*.py")} | {path.parent.name for path in package.glob("*/__init__.py")}
+    assert {part for part in parts if f"`{part}`" not in page} == {"__init__", "__main__"}
+
+
 def test_readme_is_short():
     assert len((ROOT / "README.md").read_text().splitlines()) <= 80
 
