@@ -75,6 +75,54 @@ def test_track_writes_tracks_and_vectors(pair: tuple[Path, Path], tmp_path: Path
     assert field.uncertainty_voxel is not None
 
 
+def frames_of(counts: list[int], folder: Path, rng: np.random.Generator) -> list[Path]:
+    """Write frames with so many particles each, all of which move by one voxel."""
+    start = rng.uniform((-1.5, -1.1, -2.0), (1.5, 1.1, 2.0), (max(counts), 3))
+    paths = [folder / f"frame_{number}.vtkhdf" for number in range(len(counts))]
+    for number, (path, count) in enumerate(zip(paths, counts, strict=True)):
+        write_frame(path, start[:count] + (0.1 * number, 0.0, 0.0))
+    return paths
+
+
+@pytest.mark.parametrize(
+    ("counts", "said", "tracks"),
+    [
+        ([3, 3], "3 particles at most", 3),
+        ([40, 40], "", 40),
+        ([40, 2], "holds 2 particles, another frame 40", 2),
+        ([5, 5, 5], "5 particles at most", 5),
+        ([40, 40, 40, 0], "no particles in", 40),
+    ],
+)
+def test_few_particles_are_tracked_and_said(
+    counts: list[int], said: str, tracks: int, tmp_path: Path, rng: np.random.Generator, capsys
+) -> None:
+    paths = frames_of(counts, tmp_path, rng)
+    run("track", *paths, "-o", tmp_path / "tracks.vtkhdf")
+    told = capsys.readouterr().err
+    assert said in told
+    assert ("lfpiv:" in told) == bool(said)
+    run("track", *paths, "-o", tmp_path / "tracks.vtkhdf", "--json", "--overwrite")
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["tracks"] == tracks
+    # Forty tracks of three places show no noise: a parabola takes them all.
+    assert summary.get("noise_over_stated") is None
+
+
+def test_no_tracks_are_said(tmp_path: Path, rng: np.random.Generator, capsys) -> None:
+    paths = frames_of([9, 9], tmp_path, rng)
+    write_frame(paths[1], rng.uniform(8.0, 9.0, (9, 3)))
+    run("track", *paths, "-o", tmp_path / "tracks.vtkhdf")
+    assert "lfpiv: no tracks" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("counts", [[40, 0], [0, 0], [0, 40, 0]])
+def test_nothing_to_track_is_an_error(counts: list[int], tmp_path: Path, rng: np.random.Generator) -> None:
+    with pytest.raises(InputError, match="no particles; tracks need some in two frames"):
+        run("track", *frames_of(counts, tmp_path, rng), "-o", tmp_path / "tracks.vtkhdf")
+    assert not (tmp_path / "tracks.vtkhdf").exists()
+
+
 def test_vectors_beyond_the_walls_are_masked(tmp_path: Path, rng: np.random.Generator) -> None:
     start = rng.uniform((-1.5, -1.1, -2.0), (1.5, 1.1, 2.0), (300, 3))
     resolved = load_config(CONFIG).resolved()

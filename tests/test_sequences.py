@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from lfpiv_cli.scale import Scale
 from lfpiv_cli.synthetic.flows import advect, rigid_rotation
 from lfpiv_cli.tracks.in_time import Scatter, fit_in_time, scatter_of
 from lfpiv_cli.tracks.sequences import NO_TRACK, Trajectories, follow, scatter_in, states_at
@@ -16,6 +17,8 @@ from lfpiv_cli.tracks.tracking import Forecast, track
 BOX_MM, DT_S = 4.0, 0.002
 NOISE_MM = np.array([0.003, 0.003, 0.02])
 FRAMES = 6
+# Table 2's camera.
+SCALE = Scale(0.1, 1.064)
 # Up to 0.26 mm a frame, where particles are 0.5 mm apart.
 FLOW = rigid_rotation((0.0, 20.0, 0.0), (2.0, 2.0, 2.0), (0.05, 0.0, 0.06))
 
@@ -35,7 +38,7 @@ class Recorded:
         return [np.broadcast_to(self.noise_mm, points.shape).copy() for points in self.points]
 
     def follow(self, frames: int, shortest: int) -> Trajectories:
-        return follow(self.points[:frames], self.sigma[:frames], 0.4, shortest)
+        return follow(self.points[:frames], self.sigma[:frames], 0.4, shortest, SCALE)
 
 
 def record(rng: np.random.Generator, ghosts: float, noise: float) -> Recorded:
@@ -80,7 +83,7 @@ def error_over_sigma(recorded: Recorded, found: Trajectories, frames: int) -> ND
 
 
 def test_errors_fall_with_the_number_of_frames_and_are_stated(recorded: Recorded, followed: Trajectories) -> None:
-    pair = track(recorded.points[0], recorded.points[1], 0.4)
+    pair = track(recorded.points[0], recorded.points[1], 0.4, SCALE)
     moved = recorded.points[1][pair.second] - recorded.points[0][pair.first]
     middle = 0.5 * (recorded.true_mm[0][pair.first] + recorded.true_mm[1][pair.second])
     spread = [np.median(np.abs(moved - FLOW(middle) * DT_S * 1e3), axis=0)]
@@ -99,7 +102,7 @@ def test_errors_fall_with_the_number_of_frames_and_are_stated(recorded: Recorded
 def test_ghosts_fall_with_the_length_of_tracks() -> None:
     """As many ghosts as particles, which are known so badly that a ghost is often where one is expected."""
     crowd = record(np.random.default_rng(6), ghosts=1.0, noise=2.0)
-    pair = track(crowd.points[0], crowd.points[1], 0.4)
+    pair = track(crowd.points[0], crowd.points[1], 0.4, SCALE)
     of_pair = np.mean((crowd.true_number[0][pair.first] < 0) | (crowd.true_number[1][pair.second] < 0))
     found = crowd.follow(5, 2)
     labels, truth = np.concatenate(found.labels), np.concatenate(crowd.true_number[:5])
@@ -136,7 +139,7 @@ def test_tracks_are_of_one_particle_each(recorded: Recorded, followed: Trajector
 
 def test_frames_of_nothing_give_no_tracks() -> None:
     empty = [np.zeros((0, 3))] * 4
-    found = follow(empty, empty, 0.4, 3)
+    found = follow(empty, empty, 0.4, 3, SCALE)
     assert found.count == 0
     assert states_at(found, empty, empty, 1.5, *scatter_in(found, empty, empty))[0].size == 0
 
@@ -176,7 +179,7 @@ def test_a_track_s_own_past_goes_before_its_neighbours(rng: np.random.Generator)
     noise = rng.normal(0.0, NOISE_MM, start.shape)
     forecast = Forecast(moved + noise, np.broadcast_to(NOISE_MM, start.shape))
     for prediction, least, most in ((forecast, 0.95, 1.0), (None, 0.0, 0.5)):
-        links = track(start, start + moved, 0.4, prediction)
+        links = track(start, start + moved, 0.4, SCALE, prediction)
         assert least * 400 <= np.sum(links.first == links.second) <= most * 400
 
 
@@ -193,3 +196,21 @@ def test_velocities_take_fewer_frames_where_parabolas_do_not_follow(
         points.append(centre + circle + rng.normal(0.0, NOISE_MM, centre.shape))
     sigma = [np.broadcast_to(NOISE_MM, centre.shape)] * 7
     assert scatter_in(Trajectories((np.arange(300),) * 7, 300), points, sigma)[1] == half_frames
+
+
+@pytest.mark.parametrize("count", [1, 2, 5, 12])
+def test_few_particles_are_followed_through_a_frame_that_lost_one(count: int, rng: np.random.Generator) -> None:
+    start = np.concatenate([np.array([[2.0, 2.0, 2.0]]), rng.uniform(0.5, BOX_MM - 0.5, (count - 1, 3))])
+    points = [advect(FLOW, start, number * DT_S) + rng.normal(0.0, NOISE_MM, start.shape) for number in range(FRAMES)]
+    # Nobody but a ghost takes the place of the first one in the fourth frame.
+    points[3] = np.concatenate([points[3][1:], [[0.1, 0.1, 0.1]]])
+    sigma = [np.broadcast_to(NOISE_MM, each.shape) for each in points]
+    found = follow(points, sigma, 0.4, 3, SCALE)
+    assert found.count == count
+    for number, labels in enumerate(found.labels):
+        whole = np.roll(labels, 1) if number == 3 else labels
+        np.testing.assert_array_equal(whole, [NO_TRACK, *range(1, count)] if number == 3 else range(count))
+    # Neither noise nor bending is known of so few.
+    scatter, _ = scatter_in(found, points, sigma)
+    assert not scatter.noise_known
+    assert not scatter.bending_known

@@ -14,7 +14,9 @@ from lfpiv_cli.console import Console
 @click.command("track")
 @click.argument("particles", type=FILE, nargs=-1, required=True)
 @dt_option
-@click.option("--search", "search_voxel", type=POSITIVE, help="Largest displacement, voxels.")
+@click.option(
+    "--search", "search_voxel", type=POSITIVE, help="Largest displacement, voxels; six microlenses when not given."
+)
 @click.option(
     "--shortest",
     type=click.IntRange(min=2),

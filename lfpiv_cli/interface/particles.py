@@ -24,7 +24,7 @@ from lfpiv_cli.particles.search import Particles, Task, result, task_of
 from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.reconstruction.equations import Normalisers
 from lfpiv_cli.reconstruction.images import Image, Mask, filled, light
-from lfpiv_cli.tracks.tracking import SEARCH_VOXEL
+from lfpiv_cli.tracks.tracking import SEARCH_LENSES
 from lfpiv_cli.weights.build import factorise_bricks
 from lfpiv_cli.weights.columns import OnDemandOperator
 from lfpiv_cli.weights.model import behind_transmission
@@ -143,8 +143,8 @@ def find_beside(
 ) -> Particles:
     """Return the particles behind an image with the help of the first passes of it and of the frames beside it."""
     task = _task(bench, frame)
-    search_mm = SEARCH_VOXEL * max(bench.content.weights.grid.spacing_mm)
-    return result(task, second_pass(task, own, neighbours, search_mm))
+    scale = bench.content.camera.scale(bench.settings.media_model())
+    return result(task, second_pass(task, own, neighbours, SEARCH_LENSES * scale.lens_mm, scale))
 
 
 def _task(bench: Bench, frame: Frame) -> Task:

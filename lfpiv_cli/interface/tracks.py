@@ -9,21 +9,29 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.console import Console
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files.config import Config, carried_config
 from lfpiv_cli.files.particle_file import TRACKS_FORMAT, TRAJECTORIES_FORMAT, Points
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.flow.field import MM_TO_M, VectorField
 from lfpiv_cli.flow.from_tracks import Paths, WindowGrid, vectors_from_paths
+from lfpiv_cli.interface.notices import NOTICES
+from lfpiv_cli.scale import Scale
 from lfpiv_cli.tracks.sequences import SHORTEST, follow, scatter_in, states_at
-from lfpiv_cli.tracks.tracking import SEARCH_VOXEL, Tracks
+from lfpiv_cli.tracks.tracking import FEWEST_OF_FIT, SEARCH_LENSES, Tracks
 from lfpiv_cli.tracks.tracking import track as match
+
+# A frame with less than this share of the fullest one's particles leaves most of those without a partner.
+ONE_SIDED = 0.5
+# With fewer particles than this no local linear fit tells which links are wrong.
+FEW = FEWEST_OF_FIT + 2
 
 
 def track(
     *particles: Points,
     dt_s: float | None = None,
-    search_voxel: float = SEARCH_VOXEL,
+    search_voxel: float | None = None,
     shortest: int | None = None,
 ) -> Tracked:
     """Follow particles from one frame to the next, or over a sequence of frames.
@@ -35,7 +43,7 @@ def track(
     dt_s : float, optional
         Time from one frame to the next, s, in place of the rig's `correlation.dt_s`.
     search_voxel : float, optional
-        Displacements are sought up to so many voxels along each axis.
+        Displacements are sought up to so many voxels along each axis; six microlenses in the scene when not given.
     shortest : int, optional
         Fewest frames of a track in a sequence of more than two; 3 when not given.
 
@@ -52,13 +60,17 @@ def track(
     UsageError
         Fewer than two frames, or `shortest` with two.
     InputError
-        The frames were made with different configs, or the time is not known.
+        The frames were made with different configs, the time is not known, or all but one are empty.
     """
     ensure_frames(len(particles), shortest)
     names = [f"frame {number}" for number in range(len(particles))]
     settings = settings_of(particles, names).overridden("correlation", dt_s=dt_s)
+    counts = [len(each.position_mm) for each in particles]
+    ensure_particles(counts, names)
     chosen = tracking_of(settings, search_voxel, shortest, len(particles), names[0])
-    return tracked(particles, settings, chosen, record("track", settings.resolved() | chosen.told(), {}))
+    found = tracked(particles, settings, chosen, record("track", settings.resolved() | chosen.told(), {}))
+    warn_of_few(counts, names, found, NOTICES)
+    return found
 
 
 @dataclass(frozen=True)
@@ -68,17 +80,19 @@ class Tracking:
     Attributes
     ----------
     dt_s : time from one frame to the next
-    search_voxel : displacements are sought up to this along each axis
+    search_mm : displacements are sought up to this along each axis
     shortest : fewest frames of a track, None where there are only two
+    scale : of the camera
     """
 
     dt_s: float
-    search_voxel: float
+    search_mm: float
     shortest: int | None
+    scale: Scale
 
     def told(self) -> dict[str, Any]:
         """Return what a record says of it beside the config."""
-        told: dict[str, Any] = {"search_voxel": self.search_voxel}
+        told: dict[str, Any] = {"search_mm": self.search_mm}
         return told if self.shortest is None else told | {"shortest": self.shortest}
 
 
@@ -126,6 +140,38 @@ def ensure_frames(frames: int, shortest: int | None) -> None:
         raise UsageError("--shortest is for sequences: two frames make tracks of two")
 
 
+def ensure_particles(counts: Sequence[int], names: Sequence[str]) -> None:
+    """Refuse frames of which not even two hold particles.
+
+    Raises
+    ------
+    InputError
+    """
+    if np.count_nonzero(counts) < 2:
+        empty = [name for name, count in zip(names, counts, strict=True) if not count]
+        raise InputError(f"{', '.join(empty)}: no particles; tracks need some in two frames at least")
+
+
+def warn_of_few(counts: Sequence[int], names: Sequence[str], found: Tracked, console: Console) -> None:
+    """Say which frames hold few particles or none, and whether any could be followed."""
+    fullest, doubts = max(counts), []
+    empty = [name for name, count in zip(names, counts, strict=True) if not count]
+    if empty:
+        doubts.append(f"no particles in {', '.join(empty)}: no track passes there")
+    doubts += [
+        f"{name} holds {count} particles, another frame {fullest}, most of which have no partner: compare exposure, "
+        "mask and background of the images"
+        for name, count in zip(names, counts, strict=True)
+        if 0 < count < ONE_SIDED * fullest
+    ]
+    if fullest < FEW:
+        doubts.append(f"{fullest} particles at most in a frame: below {FEW} neighbours do not tell wrong links")
+    if not found.summary["tracks"]:
+        doubts.append("no tracks: check the order of the frames and how far particles are sought (--search)")
+    for doubt in doubts:
+        console.warn(doubt)
+
+
 def settings_of(frames: Sequence[Points], names: Sequence[str]) -> Config:
     """Return the config that all frames were made with.
 
@@ -140,7 +186,7 @@ def settings_of(frames: Sequence[Points], names: Sequence[str]) -> Config:
     return carried_config(frames[0].provenance, names[0])
 
 
-def tracking_of(settings: Config, search_voxel: float, shortest: int | None, frames: int, name: str) -> Tracking:
+def tracking_of(settings: Config, search_voxel: float | None, shortest: int | None, frames: int, name: str) -> Tracking:
     """Return how so many frames are tracked; `name` is the first one's.
 
     Raises
@@ -151,19 +197,22 @@ def tracking_of(settings: Config, search_voxel: float, shortest: int | None, fra
     if settings.correlation.dt_s is None:
         raise InputError(f"{name}: its config has no correlation.dt_s; give --dt-s")
     fewest = None if frames == 2 else SHORTEST if shortest is None else shortest
-    return Tracking(settings.correlation.dt_s, search_voxel, fewest)
+    scale = settings.camera_model().scale(settings.media_model())
+    search_mm = SEARCH_LENSES * scale.lens_mm
+    if search_voxel is not None:
+        search_mm = search_voxel * max(settings.grid().spacing_mm)
+    return Tracking(settings.correlation.dt_s, search_mm, fewest, scale)
 
 
 def tracked(frames: Sequence[Points], settings: Config, chosen: Tracking, provenance: dict[str, Any]) -> Tracked:
     """Follow particles from frame to frame."""
-    search_mm = chosen.search_voxel * max(settings.grid().spacing_mm)
     reference = frames[0].reference
     told = reference.attributes() | {"dt_s": chosen.dt_s}
     if chosen.shortest is None:
-        position, arrays, summary, paths = _pair(frames[0], frames[1], search_mm, chosen.dt_s)
+        position, arrays, summary, paths = _pair(frames[0], frames[1], chosen)
         name = TRACKS_FORMAT
     else:
-        position, arrays, summary, paths = _sequence(frames, search_mm, chosen.shortest, chosen.dt_s)
+        position, arrays, summary, paths = _sequence(frames, chosen, chosen.shortest)
         name = TRAJECTORIES_FORMAT
     return Tracked(Points(position, arrays, reference, told, provenance), name, paths, summary, settings)
 
@@ -171,13 +220,13 @@ def tracked(frames: Sequence[Points], settings: Config, chosen: Tracking, proven
 Found = tuple[NDArray[np.float64], dict[str, NDArray[Any]], dict[str, Any], list[Paths]]
 
 
-def _pair(first: Points, second: Points, search_mm: float, dt_s: float) -> Found:
+def _pair(first: Points, second: Points, chosen: Tracking) -> Found:
     """Return places, arrays, summary and paths of particles followed from one frame to the next."""
-    found = match(first.position_mm, second.position_mm, search_mm)
+    found = match(first.position_mm, second.position_mm, chosen.search_mm, chosen.scale)
     paths = _paths(first, second, found)
     arrays = {
-        "velocity": paths.displacement_mm * MM_TO_M / dt_s,
-        "velocity_sigma": paths.sigma_mm * MM_TO_M / dt_s,
+        "velocity": paths.displacement_mm * MM_TO_M / chosen.dt_s,
+        "velocity_sigma": paths.sigma_mm * MM_TO_M / chosen.dt_s,
         "displacement_mm": paths.displacement_mm,
         "particle_a": found.first,
         "particle_b": found.second,
@@ -190,11 +239,11 @@ def _pair(first: Points, second: Points, search_mm: float, dt_s: float) -> Found
     return paths.middle_mm, arrays, summary, [paths]
 
 
-def _sequence(frames: Sequence[Points], search_mm: float, shortest: int, dt_s: float) -> Found:
+def _sequence(frames: Sequence[Points], chosen: Tracking, shortest: int) -> Found:
     """Return places, arrays, summary and paths of particles followed over many frames."""
     points = [frame.position_mm for frame in frames]
     sigma = [np.sqrt(frame.arrays["covariance_mm2"][:, :3]) for frame in frames]
-    found = follow(points, sigma, search_mm, shortest)
+    found = follow(points, sigma, chosen.search_mm, shortest, chosen.scale)
     scatter, half = scatter_in(found, points, sigma)
     rows: list[tuple[NDArray[Any], ...]] = []
     for number in range(len(frames)):
@@ -205,21 +254,22 @@ def _sequence(frames: Sequence[Points], search_mm: float, shortest: int, dt_s: f
     position, velocity, error, tracks, frame, particle = (np.concatenate(each) for each in zip(*rows, strict=True))
     order = np.lexsort((frame, tracks))
     arrays = {
-        "velocity": velocity[order] * MM_TO_M / dt_s,
-        "velocity_sigma": error[order] * MM_TO_M / dt_s,
+        "velocity": velocity[order] * MM_TO_M / chosen.dt_s,
+        "velocity_sigma": error[order] * MM_TO_M / chosen.dt_s,
         "track": tracks[order],
         "frame": frame[order],
         "particle": particle[order],
     }
     between = [states_at(found, points, sigma, number + 0.5, scatter, half)[1] for number in range(len(frames) - 1)]
     paths = [Paths(state.position_mm, state.velocity, state.velocity_sigma) for state in between]
+    acceleration = np.sqrt(scatter.bending) * MM_TO_M / chosen.dt_s**2
     summary = {
         "frames": len(frames),
         "particles": sum(len(each) for each in points),
         "tracked": len(tracks),
         "tracks": found.count,
-        "noise_over_stated": scatter.noise.tolist(),
-        "acceleration_m_s2": (np.sqrt(scatter.bending) * MM_TO_M / dt_s**2).tolist(),
+        "noise_over_stated": scatter.noise.tolist() if scatter.noise_known else None,
+        "acceleration_m_s2": acceleration.tolist() if scatter.bending_known else None,
     }
     return position[order], arrays, summary, paths
 

@@ -15,7 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lfpiv_cli.names import ColumnAxis
+from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.microlenses import Lattice
+from lfpiv_cli.scale import Scale
 
 
 class KernelCamera(NamedTuple):
@@ -107,6 +109,11 @@ class Camera:
     def sensor_centre_px(self) -> NDArray[np.float64]:
         """Where the optical axis meets the sensor: (column, row)."""
         return np.array([(self.columns - 1) / 2, (self.rows - 1) / 2])
+
+    def scale(self, media: Media) -> Scale:
+        """Return the camera's lengths in the scene."""
+        pitch, f_number = float(self.lattice.pitch.mean()), self.image_distance_mm / self.aperture_mm
+        return Scale(pitch / abs(self.magnification), pitch * f_number / self.magnification**2 / media.depth_ratio)
 
     def for_kernels(self) -> KernelCamera:
         """Return the camera as compiled kernels take it."""

@@ -31,6 +31,7 @@ from lfpiv_cli.particles.search import (
     with_measured_noise,
     with_typical_light,
 )
+from lfpiv_cli.scale import Scale
 from lfpiv_cli.tracks.tracking import expected_displacement, track
 
 # A particle without a partner this near to where one is expected is that one, at another depth: near the focal plane
@@ -45,7 +46,7 @@ CLAIMED_SHARE = 0.6
 
 
 def second_pass(
-    task: Task, own: NDArray[np.float64], neighbours: Sequence[NDArray[np.float64]], search_mm: float
+    task: Task, own: NDArray[np.float64], neighbours: Sequence[NDArray[np.float64]], search_mm: float, scale: Scale
 ) -> State:
     """Return what is found with the help of neighbour frames.
 
@@ -54,10 +55,11 @@ def second_pass(
     task : the image
     own, neighbours : (n, 4) what first passes found in it and in the frames beside it
     search_mm : largest displacement along each axis
+    scale : of the camera
     """
     state = with_typical_light(task, rebuilt(task, blank(task), own))
     state = with_measured_noise(task, replace(state, noise=estimate_noise(task.image, state.typical_light)))
-    state = rebuilt(task, state, np.concatenate([own, _missing_particles(task, own, neighbours, search_mm)]))
+    state = rebuilt(task, state, np.concatenate([own, _missing_particles(task, own, neighbours, search_mm, scale)]))
     for sweeps, unexplained in REFINING:
         sweep(task, state, unexplained, sweeps)
     state = prune(task, merge(task, state), CLAIMED_SHARE, LAST_UNEXPLAINED)
@@ -65,12 +67,12 @@ def second_pass(
 
 
 def _missing_particles(
-    task: Task, own: NDArray[np.float64], neighbours: Sequence[NDArray[np.float64]], search_mm: float
+    task: Task, own: NDArray[np.float64], neighbours: Sequence[NDArray[np.float64]], search_mm: float, scale: Scale
 ) -> NDArray[np.float64]:
     """Return the neighbours' particles (m, 4) that are missing here, where they are expected."""
     missing = np.zeros((0, 4))
     for other in neighbours:
-        expected, partnerless = _without_partner(own, other, search_mm)
+        expected, partnerless = _without_partner(own, other, search_mm, scale)
         known = np.concatenate([own[partnerless, :3], missing[:, :3]])
         seen = (expected[:, 2] >= task.depths_mm[0]) & (expected[:, 2] <= task.depths_mm[1])
         seen &= ~_same(expected[:, :3], known)
@@ -88,12 +90,12 @@ def _same(points: NDArray[np.float64], known: NDArray[np.float64]) -> NDArray[np
 
 
 def _without_partner(
-    own: NDArray[np.float64], other: NDArray[np.float64], search_mm: float
+    own: NDArray[np.float64], other: NDArray[np.float64], search_mm: float, scale: Scale
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Return another frame's particles (m, 4) that were not tracked, where they are expected here, and which own ones
     were not.
     """
-    tracks = track(other[:, :3], own[:, :3], search_mm)
+    tracks = track(other[:, :3], own[:, :3], search_mm, scale)
     alone, partnerless = np.ones(len(other), np.bool_), np.ones(len(own), np.bool_)
     alone[tracks.first] = partnerless[tracks.second] = False
     if not len(tracks.first):
@@ -101,5 +103,5 @@ def _without_partner(
     displacement = np.full((len(other), 3), np.nan)
     displacement[tracks.first] = own[tracks.second, :3] - other[tracks.first, :3]
     expected = other.copy()
-    expected[:, :3] += expected_displacement(other[:, :3], displacement, None)
+    expected[:, :3] += expected_displacement(other[:, :3], displacement, scale, None)
     return expected[alone], partnerless

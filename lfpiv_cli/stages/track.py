@@ -15,8 +15,15 @@ from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, read_points, write_points
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.flow.field import REJECTED
-from lfpiv_cli.interface.tracks import Tracked, ensure_frames, settings_of, tracked, tracking_of
-from lfpiv_cli.tracks.tracking import SEARCH_VOXEL
+from lfpiv_cli.interface.tracks import (
+    Tracked,
+    ensure_frames,
+    ensure_particles,
+    settings_of,
+    tracked,
+    tracking_of,
+    warn_of_few,
+)
 
 ROLES_OF_TWO = ["particles_a", "particles_b"]
 
@@ -28,13 +35,13 @@ class TrackOptions:
     Attributes
     ----------
     dt_s : time from one frame to the next, in place of the config's
-    search_voxel : displacements are sought up to this along each axis
+    search_voxel : displacements are sought up to this along each axis, six microlenses in the scene where None
     shortest : fewest frames of a track in a sequence, three where None
     grid : vectors on the grid of the correlation windows, too
     """
 
     dt_s: float | None = None
-    search_voxel: float = SEARCH_VOXEL
+    search_voxel: float | None = None
     shortest: int | None = None
     grid: bool = False
 
@@ -58,9 +65,12 @@ def track_particles(
         ensure_writable(target, overwrite, inputs.values())
     frames, names = [read_points(path, PARTICLES_FORMAT) for path in particles], [str(path) for path in particles]
     settings = settings_of(frames, names).overridden_by("correlation", options)
+    counts = [len(frame.position_mm) for frame in frames]
+    ensure_particles(counts, names)
     chosen = tracking_of(settings, options.search_voxel, options.shortest, len(frames), names[0])
     provenance = record("track", settings.resolved() | chosen.told(), inputs)
     found = tracked(frames, settings, chosen, provenance)
+    warn_of_few(counts, names, found, console)
     write_points(
         output,
         found.format_name,

@@ -49,10 +49,13 @@ class Scatter:
     ----------
     noise : (3,) how large errors of places are over the stated ones
     bending : (3,) variance of the second derivatives, mm^2 per frame^4
+    noise_known, bending_known : whether tracks are enough to tell them, or else errors as stated and straight tracks
     """
 
     noise: NDArray[np.float64]
     bending: NDArray[np.float64]
+    noise_known: bool = False
+    bending_known: bool = False
 
     @classmethod
     def unknown(cls) -> Scatter:
@@ -84,13 +87,15 @@ def scatter_of(position_mm: NDArray[np.float64], sigma_mm: NDArray[np.float64], 
     position, sigma, freedom = position_mm[bent], sigma_mm[bent], count[bent] - TERMS
     solution, covariance = _parabola(position, sigma, time, np.full(3, np.inf))
     noise2: NDArray[np.float64] = np.ones(3)
-    if np.count_nonzero(freedom) >= FEWEST_TRACKS:
+    noise_known = np.count_nonzero(freedom) >= FEWEST_TRACKS
+    if noise_known:
         left = position - np.einsum("mi,nai->nma", _terms(time), solution)
         squares = np.nansum((left / sigma) ** 2, axis=1)[freedom > 0]
         noise2 = np.median(squares / chi2.median(freedom[freedom > 0])[:, np.newaxis], axis=0)
     variance = noise2 * covariance[..., 2, 2]
     spread = MAD_TO_SIGMA * np.median(np.abs(solution[..., 2]) / np.sqrt(variance), axis=0)
-    return Scatter(np.sqrt(noise2), np.maximum(spread**2 - 1.0, 0.0) * np.median(variance, axis=0))
+    bending = np.maximum(spread**2 - 1.0, 0.0) * np.median(variance, axis=0)
+    return Scatter(np.sqrt(noise2), bending, noise_known=bool(noise_known), bending_known=True)
 
 
 def _terms(time: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -15,8 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.scale import Scale
 from lfpiv_cli.tracks.in_time import Scatter, State, fit_in_time, scatter_of
-from lfpiv_cli.tracks.tracking import FIT_TRACKS, Forecast, expected_displacement, gate_mm, mutual, track
+from lfpiv_cli.tracks.tracking import Forecast, expected_displacement, gate_mm, mutual, track
 
 # A forecast takes a track's last four places: enough for a parabola and to see its noise.
 PAST_FRAMES = 4
@@ -52,22 +53,23 @@ class Trajectories:
         return np.asarray(place[tracks])
 
 
-def follow(points: Frames, sigma_mm: Frames, search_mm: float, shortest: int) -> Trajectories:
+def follow(points: Frames, sigma_mm: Frames, search_mm: float, shortest: int, scale: Scale) -> Trajectories:
     """Follow particles through frames; tracks of fewer than `shortest` places are dropped.
 
     Parameters
     ----------
     points, sigma_mm : for each frame (n, 3) places and their standard errors, mm
     search_mm : largest displacement along each axis from the first frame to the second
+    scale : of the camera
     """
     found = Trajectories(tuple(np.full(len(frame), NO_TRACK) for frame in points), 0)
     scatter = Scatter.unknown()
     for number in range(len(points) - 1):
         forecast = _forecast(found, points, sigma_mm, number, 1, scatter)
-        links = track(points[number], points[number + 1], search_mm, forecast)
+        links = track(points[number], points[number + 1], search_mm, scale, forecast)
         found = _linked(found, number, links.first, number + 1, links.second)
         if number:
-            found = _linked(found, *_bridges(found, points, sigma_mm, number, scatter))
+            found = _linked(found, *_bridges(found, points, sigma_mm, number, scatter, search_mm, scale))
         window = _frames_before(number + 2, PAST_FRAMES)
         position, sigma = _places(found, points, sigma_mm, window, np.arange(found.count))
         scatter = scatter_of(position, sigma, np.arange(len(window), dtype=np.float64))
@@ -157,7 +159,13 @@ def _linked(
 
 
 def _bridges(
-    found: Trajectories, points: Frames, sigma_mm: Frames, lost_in: int, scatter: Scatter
+    found: Trajectories,
+    points: Frames,
+    sigma_mm: Frames,
+    lost_in: int,
+    scatter: Scatter,
+    search_mm: float,
+    scale: Scale,
 ) -> tuple[int, NDArray[np.int64], int, NDArray[np.int64]]:
     """Return links over a frame in which a track has no particle: frames and particles of both ends."""
     start, end = lost_in - 1, lost_in + 1
@@ -167,17 +175,17 @@ def _bridges(
     through = later >= 0
     none = np.zeros(0, dtype=np.int64)
     forecast = _forecast(found, points, sigma_mm, start, 2, scatter)
-    if forecast is None or np.count_nonzero(through) < FIT_TRACKS:
+    if forecast is None:
         return start, none, end, none
     displacement = np.full(points[start].shape, np.nan)
     displacement[through] = points[end][later[through]] - points[start][through]
-    expected = expected_displacement(points[start], displacement, forecast)
+    expected = expected_displacement(points[start], displacement, scale, forecast)
     lost = np.flatnonzero((labels != NO_TRACK) & (found.particles(lost_in, labels) < 0))
     free = np.flatnonzero(found.labels[end] == NO_TRACK)
     if not lost.size or not free.size:
         return start, none, end, none
-    gate = gate_mm(displacement - expected)
-    first, second = mutual((points[start] + expected)[lost], points[end][free], gate)
+    gate = gate_mm(displacement - expected, search_mm, scale)
+    first, second = mutual((points[start] + expected)[lost], points[end][free], gate, scale)
     return start, lost[first], end, free[second]
 
 
