@@ -32,6 +32,8 @@ myst_enable_extensions = ["dollarmath", "deflist", "colon_fence"]
 myst_heading_anchors = 3
 # Two dashes begin an option; they are no dash.
 smartquotes_action = "qe"
+# Names in docstrings are code.
+default_role = "literal"
 numpydoc_show_class_members = False
 autodoc_typehints = "none"
 
