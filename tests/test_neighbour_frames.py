@@ -17,8 +17,7 @@ from lfpiv_cli.optics.media import Media
 from lfpiv_cli.particles.fitting import add_all
 from lfpiv_cli.particles.neighbour_frames import second_pass
 from lfpiv_cli.particles.search import Task, task_of
-from lfpiv_cli.particles.tiles import share_out
-from lfpiv_cli.particles.view import entry_capacity, raw_view
+from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.reconstruction.equations import normalisers
 from lfpiv_cli.scale import Scale
 from lfpiv_cli.weights.build import default_padding, factorise
@@ -35,7 +34,7 @@ def task_with(table2: Camera, water: Media, true: NDArray[np.float64], rng: np.r
     weights = Weights(grid, padding, factorise(camera, water, grid.padded(padding)), camera.column_axis)
     view, depths = raw_view(camera, water, 0.025), grid.bounds_mm(2)
     image = np.zeros(camera.rows * camera.columns)
-    add_all(view, true, share_out(view, true, *depths), 1.0, image, entry_capacity(view, *depths))
+    add_all(view, true, 1.0, image, depths)
     image += rng.normal(0.0, 6.0, image.size)
     shaped = image.reshape(camera.rows, camera.columns).astype(np.float32)
     return task_of(shaped, view, weights, camera, normalisers(weights.padded), None)

@@ -12,8 +12,7 @@ from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.particles.fitting import add_all
 from lfpiv_cli.particles.noise import Noise
-from lfpiv_cli.particles.tiles import share_out
-from lfpiv_cli.particles.view import View, entry_capacity, raw_view
+from lfpiv_cli.particles.view import View, raw_view
 from lfpiv_cli.self_calibration.nuisances import Nuisances, fit_nuisances
 
 DEPTHS = (-4.0, 4.0)
@@ -30,7 +29,7 @@ def view(table2: Camera, water: Media) -> View:
 def picture(view: View, particles: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
     """The light of particles with the noise that is stated for it."""
     image = np.zeros(view.camera.rows * view.camera.columns)
-    add_all(view, particles, share_out(view, particles, *DEPTHS), 1.0, image, entry_capacity(view, *DEPTHS))
+    add_all(view, particles, 1.0, image, DEPTHS)
     return image + rng.normal(0.0, np.sqrt(NOISE.read_counts**2 + NOISE.gain_counts * image))
 
 

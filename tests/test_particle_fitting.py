@@ -16,10 +16,10 @@ from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.particles.alternative_depths import try_other_depths
 from lfpiv_cli.particles.covariance import joint_covariance
 from lfpiv_cli.particles.fitting import accept, add_all, claimed_share, judge, refine
-from lfpiv_cli.particles.least_squares import normal_equations, respond_once
+from lfpiv_cli.particles.least_squares import Observation, normal_equations, observation_of, respond_once
 from lfpiv_cli.particles.noise import WHITE, Correlation, Noise, error_correlation, measured_noise
 from lfpiv_cli.particles.splitting import split
-from lfpiv_cli.particles.tiles import footprint_px, share_out
+from lfpiv_cli.particles.tiles import groups_of_tiles
 from lfpiv_cli.particles.view import View, entry_capacity, raw_view
 
 DEPTHS = (-4.0, 4.0)
@@ -33,8 +33,17 @@ def view(table2: Camera, water: Media) -> View:
 
 def image_of(view: View, particles: NDArray[np.float64]) -> NDArray[np.float64]:
     image = np.zeros(view.camera.rows * view.camera.columns)
-    add_all(view, particles, share_out(view, particles, *DEPTHS), 1.0, image, entry_capacity(view, *DEPTHS))
+    add_all(view, particles, 1.0, image, DEPTHS)
     return image
+
+
+def observed(view: View, residual: NDArray[np.float64], weight: NDArray[np.float64]) -> Observation:
+    return observation_of(view, residual, weight, DEPTHS)
+
+
+def blind(view: View, weight: NDArray[np.float64]) -> Observation:
+    """Pixels of these weights, what is left of them of no interest."""
+    return observed(view, np.zeros_like(weight), weight)
 
 
 def scattered(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
@@ -46,14 +55,13 @@ def test_spread_is_the_least_possible(view: View, rng: np.random.Generator) -> N
     particle = np.array([[0.21, -0.13, 2.3, 2.5e5]])
     clean = image_of(view, particle)
     weight = 1.0 / (clean + 36.0)
-    capacity = entry_capacity(view, *DEPTHS)
-    sigma = np.sqrt(np.diagonal(joint_covariance(view, particle, weight, WHITE, np.ones(len(particle)), capacity)[0]))
+    sigma = np.sqrt(np.diagonal(joint_covariance(blind(view, weight), particle, WHITE, np.ones(1))[0]))
     errors = []
     for _ in range(60):
         start = particle + rng.normal(0.0, (0.01, 0.01, 0.1, 1e4))
         residual = clean + rng.normal(0.0, 1.0, clean.size) / np.sqrt(weight) - image_of(view, start)
         for _ in range(3):
-            refine(view, start, share_out(view, start, *DEPTHS), residual, weight, *DEPTHS, capacity)
+            refine(observed(view, residual, weight), start)
         errors.append((start - particle)[0])
     # Of 60 fits the spread is known to 9 %; four standard errors are allowed. No bias beyond its own error.
     assert np.std(errors, axis=0) == pytest.approx(sigma, rel=0.37)
@@ -73,7 +81,7 @@ def test_a_pixel_between_micro_images_counts_once(view: View, rng: np.random.Gen
     pixels, values = np.empty(capacity, np.int32), np.empty((capacity, 4))
     count = respond_once(view, *particle[0, :3], pixels, values)
     assert np.unique(pixels[:count]).size == count
-    change = normal_equations(pixels, values, count, 5e5, residual, weight, np.empty((4, 4)), np.empty(4))
+    change = normal_equations(pixels[:count], values[:count], 5e5, residual, weight, np.empty((4, 4)), np.empty(4))
     direct = np.sum(weight * ((residual - image_of(view, particle)) ** 2 - residual**2))
     assert change == pytest.approx(direct, rel=1e-9)
 
@@ -85,8 +93,7 @@ def test_neighbours_are_found_without_noise(view: View, rng: np.random.Generator
     residual = image - image_of(view, found)
     before = np.sum(residual**2)
     for _ in range(15):
-        tiles = share_out(view, found, *DEPTHS)
-        refine(view, found, tiles, residual, np.ones_like(image), *DEPTHS, entry_capacity(view, *DEPTHS))
+        refine(observed(view, residual, np.ones_like(image)), found)
     # Block coordinates creep where two particles all but coincide, so the last per cent takes long.
     assert np.sum(residual**2) < 0.03 * before
     np.testing.assert_allclose(residual, image - image_of(view, found), atol=1e-6)
@@ -98,17 +105,7 @@ def test_a_ghost_is_not_accepted(view: View, rng: np.random.Generator) -> None:
     residual = image_of(view, particles)
     ghost = np.array([[1.0, 1.0, 0.0, 5e5]]) * np.sign(-particles[:1])
     candidates = np.concatenate([particles + (0.01, 0.01, 0.1, 0.0), ghost])
-    taken = accept(
-        view,
-        candidates,
-        share_out(view, candidates, *DEPTHS),
-        residual,
-        np.ones_like(residual),
-        *DEPTHS,
-        1e5,
-        0.8,
-        entry_capacity(view, *DEPTHS),
-    )
+    taken = accept(observed(view, residual, np.ones_like(residual)), candidates, 1e5, 0.8)
     assert taken.tolist() == [True, True, False]
     np.testing.assert_allclose(candidates[:2, :3], particles[:, :3], atol=2e-3)
 
@@ -117,19 +114,18 @@ def test_a_claim_is_worth_the_light_that_is_there() -> None:
     pixels, values = np.arange(10, dtype=np.int32), np.full((10, 4), 0.1)
     residual = np.full(10, 100.0)
     weight = np.ones_like(residual)
-    assert claimed_share(pixels, values, 10, 1000.0, residual, weight) == 1.0
+    assert claimed_share(pixels, values, 1000.0, residual, weight, 0.0) == 1.0
     residual[:4] = -50.0
-    assert claimed_share(pixels, values, 10, 1000.0, residual, weight) == pytest.approx(0.6)
-    assert claimed_share(pixels, values, 10, 2000.0, residual, weight) == pytest.approx(0.6 * 100.0 / 140.0)
+    assert claimed_share(pixels, values, 1000.0, residual, weight, 0.0) == pytest.approx(0.6)
+    assert claimed_share(pixels, values, 2000.0, residual, weight, 0.0) == pytest.approx(0.6 * 100.0 / 140.0)
 
 
 def test_pixels_without_weight_claim_and_see_nothing(view: View) -> None:
     particle = np.array([[0.21, -0.13, 2.3, 2.5e5]])
     clean = image_of(view, particle)
-    capacity = entry_capacity(view, *DEPTHS)
     weight = np.where(np.arange(clean.size) % view.camera.columns < 330, 1.0, 0.0)
-    blind = np.where(weight > 0.0, 0.0, -1e6)  # what stands there must not matter
-    chi2, share, seen = judge(view, particle, blind, weight, capacity)
+    residual = np.where(weight > 0.0, 0.0, -1e6)  # what stands there must not matter
+    chi2, share, seen = judge(observed(view, residual, weight), particle)
     assert chi2[0] == 0.0
     assert share[0] == 1.0
     assert seen[0] == pytest.approx(clean[weight > 0.0].sum() / 2.5e5)
@@ -142,8 +138,7 @@ def test_neighbours_that_are_free_widen_the_errors(view: View) -> None:
     )
     clean = image_of(view, particles)
     weight = 1.0 / (clean + 36.0)
-    capacity = entry_capacity(view, *DEPTHS)
-    found = joint_covariance(view, particles, weight, WHITE, np.ones(len(particles)), capacity)
+    found = joint_covariance(blind(view, weight), particles, WHITE, np.ones(len(particles)))
     slopes = []
     for number, unknown in np.ndindex(particles.shape):
         step = np.zeros_like(particles)
@@ -154,7 +149,7 @@ def test_neighbours_that_are_free_widen_the_errors(view: View) -> None:
     for number in range(4):
         part = slice(4 * number, 4 * number + 4)
         np.testing.assert_allclose(np.sqrt(np.diag(found[number])), np.sqrt(np.diag(whole[part, part])), rtol=2e-3)
-    alone = joint_covariance(view, particles[[0]], weight, WHITE, np.ones(len(particles[[0]])), capacity)
+    alone = joint_covariance(blind(view, weight), particles[[0]], WHITE, np.ones(1))
     assert found[0, 2, 2] > 1.1 * alone[0, 2, 2]
 
 
@@ -162,7 +157,7 @@ def test_particles_that_nearly_coincide_have_errors(view: View) -> None:
     # Near the focal plane many pixels are lit through two lenses, and count once all the same.
     particles = np.array([[0.2295, 0.0436, 0.1066, 5e5], [0.2168, 0.0374, 0.1087, 5e5]])
     weight = 1.0 / (image_of(view, particles) + 36.0)
-    found = joint_covariance(view, particles, weight, WHITE, np.ones(len(particles)), entry_capacity(view, *DEPTHS))
+    found = joint_covariance(blind(view, weight), particles, WHITE, np.ones(len(particles)))
     assert np.all(np.diagonal(found, axis1=1, axis2=2) > 0.0)
 
 
@@ -171,19 +166,7 @@ def test_overlapping_particles_are_separated(view: View) -> None:
     image = image_of(view, pair)
     one = np.array([[0.225, 0.09, 2.1, 9e5]])
     residual = image - image_of(view, one)
-    partners = split(
-        view,
-        one,
-        np.array([True]),
-        share_out(view, one, *DEPTHS),
-        residual,
-        1.0 / (image + 36.0),
-        *DEPTHS,
-        1e5,
-        100.0,
-        entry_capacity(view, *DEPTHS),
-        footprint_px(view, *DEPTHS),
-    )
+    partners = split(observed(view, residual, 1.0 / (image + 36.0)), one, np.array([True]), 1e5, 100.0)
     found = np.concatenate([one, partners])
     found = found[np.argsort(found[:, 0])]
     np.testing.assert_allclose(found[:, :2], pair[:, :2], atol=1e-3)
@@ -194,9 +177,7 @@ def test_overlapping_particles_are_separated(view: View) -> None:
 def test_a_single_particle_is_not_split(view: View) -> None:
     one = np.array([[0.2, 0.1, 2.0, 9e5]])
     residual = np.zeros(view.camera.rows * view.camera.columns)
-    common = (share_out(view, one, *DEPTHS), residual, np.ones_like(residual), *DEPTHS, 1e5, 1.0)
-    limits = (entry_capacity(view, *DEPTHS), footprint_px(view, *DEPTHS))
-    partners = split(view, one, np.array([True]), *common, *limits)
+    partners = split(observed(view, residual, np.ones_like(residual)), one, np.array([True]), 1e5, 1.0)
     assert not partners.any()
     np.testing.assert_allclose(residual, 0.0, atol=1e-9)
 
@@ -208,8 +189,8 @@ def test_a_particle_at_a_wrong_depth_finds_its_own(view: View, wrong: float) -> 
     found = true.copy()
     found[0, 2] = wrong
     residual = image - image_of(view, found)
-    common = (share_out(view, found, *DEPTHS), residual, 1.0 / (image + 36.0), *DEPTHS, 1e5, 10.0)
-    moved = try_other_depths(view, found, np.array([True, True]), *common, entry_capacity(view, *DEPTHS))
+    observation = observed(view, residual, 1.0 / (image + 36.0))
+    moved = try_other_depths(observation, found, np.array([True, True]), 1e5, 10.0)
     assert moved.tolist() == [True, False]
     np.testing.assert_allclose(found[:, :3], true[:, :3], atol=2e-3)
     np.testing.assert_allclose(residual, image - image_of(view, found), atol=1e-6)
@@ -225,8 +206,7 @@ def test_result_does_not_depend_on_threads(view: View, rng: np.random.Generator)
         numba.set_num_threads(count)
         found = start.copy()
         residual = image - image_of(view, found)
-        tiles = share_out(view, found, *DEPTHS)
-        refine(view, found, tiles, residual, np.ones_like(image), *DEPTHS, entry_capacity(view, *DEPTHS))
+        refine(observed(view, residual, np.ones_like(image)), found)
         results.append((found, residual))
     numba.set_num_threads(threads)
     for found, residual in results[1:]:
@@ -236,22 +216,22 @@ def test_result_does_not_depend_on_threads(view: View, rng: np.random.Generator)
 
 def test_tiles_of_a_group_share_no_pixel(view: View, rng: np.random.Generator) -> None:
     particles = scattered(80, rng)
-    tiles = share_out(view, particles, *DEPTHS)
-    assert sorted(tiles.order.tolist()) == list(range(80))
-    assert tiles.start.size > 5
-    for group in range(4):
+    groups = groups_of_tiles(view, particles, DEPTHS)
+    tiles = [numbers for group in groups for numbers in group]
+    assert sorted(np.concatenate(tiles).tolist()) == list(range(80))
+    assert len(tiles) > 4
+    assert len(groups) == 4
+    for group in groups:
         lit = np.zeros(view.camera.rows * view.camera.columns)
-        for tile in range(tiles.groups[group], tiles.groups[group + 1]):
-            members = particles[tiles.order[tiles.start[tile] : tiles.start[tile + 1]]]
-            lit += image_of(view, members) > 0.0
+        for numbers in group:
+            lit += image_of(view, particles[numbers]) > 0.0
         assert lit.max() <= 1.0
 
 
 def test_errors_that_are_alike_widen_a_particles(view: View) -> None:
     particle = np.array([[0.20, 0.10, 1.5, 5e5]])
     weight = 1.0 / (image_of(view, particle) + 36.0)
-    capacity = entry_capacity(view, *DEPTHS)
-    found = joint_covariance(view, particle, weight, Correlation(0.2, 0.8), np.ones(1), capacity)[0]
+    found = joint_covariance(blind(view, weight), particle, Correlation(0.2, 0.8), np.ones(1))[0]
     slopes = []
     for unknown in range(4):
         step = np.zeros_like(particle)
@@ -266,7 +246,7 @@ def test_errors_that_are_alike_widen_a_particles(view: View) -> None:
     moved_by = np.linalg.inv(whitened @ whitened.T) @ whitened
     np.testing.assert_allclose(np.diag(found), np.diag(moved_by @ alike @ moved_by.T), rtol=5e-3)
     # What chi-squared exceeds 1 by is alike throughout.
-    worse = joint_covariance(view, particle, weight, Correlation(0.2, 0.8), np.array([1.5]), capacity)[0]
+    worse = joint_covariance(blind(view, weight), particle, Correlation(0.2, 0.8), np.array([1.5]))[0]
     law = alike + 0.5 * 0.8**distance
     np.testing.assert_allclose(np.diag(worse), np.diag(moved_by @ law @ moved_by.T), rtol=5e-3)
     assert found[2, 2] > 1.5 * np.linalg.inv(whitened @ whitened.T)[2, 2]

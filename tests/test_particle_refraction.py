@@ -11,9 +11,9 @@ from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media, Window, exact_lateral_mm
 from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.particles.fitting import add_all, refine
+from lfpiv_cli.particles.least_squares import observation_of
 from lfpiv_cli.particles.refraction import paraxial_shift, places_by_snell
-from lfpiv_cli.particles.tiles import share_out
-from lfpiv_cli.particles.view import entry_capacity, raw_view
+from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.synthetic.render import render_points
 
 DEPTHS = (-4.5, 4.5)
@@ -34,12 +34,11 @@ def test_fits_to_refracted_rays_are_set_right(
     true = np.array([(-1.2, 0.3, 2.5), (0.4, -0.8, 3.1), (1.5, 0.6, -2.2), (-0.3, 1.1, -3.0), (1.6, 0.0, 1.2)])
     image = render_points(camera, space, true, np.full(5, 4e5), 0.05, rng, rays=100_000).ravel()
     view = raw_view(camera, water, 0.025)
-    found, capacity = np.column_stack([true, np.full(5, 4e5)]), entry_capacity(view, *DEPTHS)
-    tiles = share_out(view, found, *DEPTHS)
+    found = np.column_stack([true, np.full(5, 4e5)])
     residual = image.copy()
-    add_all(view, found, tiles, -1.0, residual, capacity)
+    add_all(view, found, -1.0, residual, DEPTHS)
     for _ in range(5):
-        refine(view, found, tiles, residual, 1.0 / (image + 36.0), *DEPTHS, capacity)
+        refine(observation_of(view, residual, 1.0 / (image + 36.0), DEPTHS), found)
     error = places_by_snell(found[:, :3], space, camera) - true
     # Where on the lens a fit looks most depends on which lenses a particle's rim meets: a third of the whole shift.
     assert np.abs(error[:, 2]).max() < within_mm

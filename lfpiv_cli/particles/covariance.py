@@ -17,17 +17,20 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from lfpiv_cli.particles.least_squares import UNKNOWNS
+from lfpiv_cli.particles.least_squares import UNKNOWNS, Observation
 from lfpiv_cli.particles.noise import Correlation
-from lfpiv_cli.particles.response import VALUES, respond
-from lfpiv_cli.particles.view import View, footprint_radius_mm, on_array_mm, view_of
+from lfpiv_cli.particles.response import entries_of
+from lfpiv_cli.particles.view import View, footprint_radius_mm, on_array_mm
+from lfpiv_cli.threads import blocks, in_threads
 
 # Neighbours that are left free: with twice as many the errors of 8,300 particles change by a thousandth.
 FREE_NEIGHBOURS = 12
+# Particles that one thread takes at a time.
+BLOCK = 64
 
 
 class Slopes(NamedTuple):
@@ -38,61 +41,97 @@ class Slopes(NamedTuple):
     start : (n + 1,) where each particle's entries begin
     pixel : flat numbers
     slope : (entries, 4) change of the pixel by x, y, z and light
+    columns : of the image
     """
 
     start: NDArray[np.int64]
     pixel: NDArray[np.int32]
     slope: NDArray[np.float32]
+    columns: int
 
 
-class Ties(NamedTuple):
+class Neighbours(NamedTuple):
     """Which particles share pixels, each pair named once for either.
 
     Attributes
     ----------
     start, other : (n + 1,) and (2 pairs,), the neighbours of each, ascending
-    block : (2 pairs, 4, 4) the normal matrix's block of particle and neighbour
     """
 
     start: NDArray[np.int64]
     other: NDArray[np.int64]
+
+
+class Equations(NamedTuple):
+    """The normal matrix of all particles together, block by block.
+
+    Attributes
+    ----------
+    slopes, neighbours : see there
+    weight : (pixels,) 1/variance
+    alone : (n, 4, 4) the blocks of single particles
+    block : (2 pairs, 4, 4) those of particles and their neighbours
+    inverses : (n, 4, 4) of `alone`
+    """
+
+    slopes: Slopes
+    neighbours: Neighbours
+    weight: NDArray[np.float64]
+    alone: NDArray[np.float64]
     block: NDArray[np.float64]
+    inverses: NDArray[np.float64]
 
 
 def joint_covariance(
-    view: View,
-    particles: NDArray[np.float64],
-    weight: NDArray[np.float64],
-    correlation: Correlation,
-    chi2: NDArray[np.float64],
-    capacity: int,
+    observation: Observation, particles: NDArray[np.float64], correlation: Correlation, chi2: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return the covariance (n, 4, 4) of each particle with its neighbours free.
 
     Parameters
     ----------
     particles : (n, 4)
-    weight : (rows * columns,) 1/variance of the pixels
-    correlation : of their errors, and how it falls with distance for errors that are alike
+    correlation : of the pixels' errors, and how it falls with distance for errors that are alike
     chi2 : (n,) local chi-squared, 1 where the weights say all
-    capacity : entries that a particle can have at most
     """
-    slopes = _slopes(view, particles, capacity)
-    start, other = _overlapping(view, particles)
-    alone, block = _blocks(slopes, weight, view.camera.columns, start, other)
-    return _covariances(slopes, Ties(start, other, block), alone, weight, correlation, chi2, view.camera.columns)
+    equations = _equations(observation, particles)
+    result = np.empty_like(equations.alone)
+    in_threads(
+        lambda part: _covariances(equations, correlation, chi2, part.start, result[part]),
+        blocks(len(particles), BLOCK),
+    )
+    return result
+
+
+def _equations(observation: Observation, particles: NDArray[np.float64]) -> Equations:
+    """Return the normal matrix of all particles."""
+    slopes = _slopes(observation.optics, particles, observation.capacity)
+    neighbours = _overlapping(observation.optics, particles)
+    alone = np.zeros((len(particles), UNKNOWNS, UNKNOWNS))
+    block = np.zeros((neighbours.other.size, UNKNOWNS, UNKNOWNS))
+    in_threads(
+        lambda part: _fill_blocks(slopes, neighbours, observation.weight, part.start, alone[part], block),
+        blocks(len(particles), BLOCK),
+    )
+    return Equations(slopes, neighbours, observation.weight, alone, block, np.asarray(np.linalg.inv(alone), np.float64))
 
 
 def _slopes(view: View, particles: NDArray[np.float64], capacity: int) -> Slopes:
-    counts = _count_entries(view, particles, capacity)
-    start = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-    pixel, slope = np.empty(start[-1], np.int32), np.empty((start[-1], UNKNOWNS), np.float32)
-    _fill_slopes(view, particles, capacity, start, pixel, slope)
-    return Slopes(start, pixel, slope)
+    """Return what each particle's unknowns do to the pixels."""
+
+    def of(part: slice) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]:
+        counts, pixels, values = entries_of(view, particles[part], capacity)
+        slope = np.empty(values.shape, np.float32)
+        slope[:, :3] = np.repeat(particles[part, 3], counts)[:, np.newaxis] * values[:, 1:]
+        slope[:, 3] = values[:, 0]
+        return counts, pixels, slope
+
+    parts = in_threads(of, blocks(len(particles), BLOCK))
+    counts, pixel, slope = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    return Slopes(np.concatenate([[0], np.cumsum(counts)]), pixel, slope, view.camera.columns)
 
 
-def _overlapping(view: View, particles: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the particles whose footprints may overlap: where each one's neighbours begin, and their numbers."""
+def _overlapping(view: View, particles: NDArray[np.float64]) -> Neighbours:
+    """Return the particles whose footprints may overlap."""
     on_array = on_array_mm(view, particles)
     # Light that touches a lens's cell spreads over it.
     reach = footprint_radius_mm(view, particles[:, 2]) + 2.0 * max(view.half_x_mm, view.half_y_mm)
@@ -101,140 +140,139 @@ def _overlapping(view: View, particles: NDArray[np.float64]) -> tuple[NDArray[np
     pairs = np.concatenate([np.stack([first, second]), np.stack([second, first])], axis=1)[:, np.tile(near, 2)]
     pairs = pairs[:, np.lexsort(pairs[::-1])]
     start = np.searchsorted(pairs[0], np.arange(len(particles) + 1))
-    return start.astype(np.int64), pairs[1].astype(np.int64)
+    return Neighbours(start.astype(np.int64), pairs[1].astype(np.int64))
 
 
-@njit(cache=True, parallel=True)
-def _count_entries(view: View, particles: NDArray[np.float64], capacity: int) -> NDArray[np.int64]:
-    counts = np.empty(particles.shape[0], np.int64)
-    camera, rest = view.camera[:], view[1:]
-    for n in prange(particles.shape[0]):
-        whole = view_of(camera, rest)
-        pixels, values = np.empty(capacity, np.int32), np.empty((capacity, VALUES))
-        counts[n] = respond(whole, particles[n, 0], particles[n, 1], particles[n, 2], pixels, values)
-    return counts
+@njit(cache=True)
+def _rectangle(slopes: Slopes, n: int) -> tuple[int, int, int, int]:
+    """Return first row, first column, rows and columns of the rectangle of pixels that a particle lights."""
+    begin, end = slopes.start[n], slopes.start[n + 1]
+    if begin == end:
+        return 0, 0, 0, 0
+    top = bottom = slopes.pixel[begin] // slopes.columns
+    left = right = slopes.pixel[begin] % slopes.columns
+    for k in range(begin, end):
+        row, column = slopes.pixel[k] // slopes.columns, slopes.pixel[k] % slopes.columns
+        top, bottom, left, right = min(top, row), max(bottom, row), min(left, column), max(right, column)
+    return top, left, bottom - top + 1, right - left + 1
 
 
-@njit(cache=True, parallel=True)
-def _fill_slopes(
-    view: View,
-    particles: NDArray[np.float64],
-    capacity: int,
-    start: NDArray[np.int64],
-    pixel: NDArray[np.int32],
-    slope: NDArray[np.float32],
+@njit(cache=True, nogil=True)
+def _fill_blocks(
+    slopes: Slopes,
+    neighbours: Neighbours,
+    weight: NDArray[np.float64],
+    first: int,
+    alone: NDArray[np.float64],
+    block: NDArray[np.float64],
 ) -> None:
-    """Fill in `pixel` and `slope` of `Slopes`; arrays of a tuple would not be written to from parallel loops."""
-    camera, rest = view.camera[:], view[1:]
-    for n in prange(particles.shape[0]):
-        whole = view_of(camera, rest)
-        pixels, values = np.empty(capacity, np.int32), np.empty((capacity, VALUES))
-        count = respond(whole, particles[n, 0], particles[n, 1], particles[n, 2], pixels, values)
-        for k in range(count):
-            pixel[start[n] + k] = pixels[k]
-            for m in range(3):
-                slope[start[n] + k, m] = particles[n, 3] * values[k, 1 + m]
-            slope[start[n] + k, 3] = values[k, 0]
-
-
-@njit(cache=True, parallel=True)
-def _blocks(
-    slopes: Slopes, weight: NDArray[np.float64], columns: int, start: NDArray[np.int64], other: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return J_n^T W J_n (n, 4, 4) of every particle, and J_n^T W J_m (pairs, 4, 4) with each of its neighbours m.
+    """Fill J_n^T W J_n (n, 4, 4) of the particles from `first` on, and J_n^T W J_m of each of their neighbours m.
 
     Both from whole pixels: a pixel that two lenses light has one error, and with two it would be less than its
     neighbours' blocks ask for.
     """
-    alone = np.zeros((start.size - 1, UNKNOWNS, UNKNOWNS))
-    blocks = np.zeros((other.size, UNKNOWNS, UNKNOWNS))
-    for n in prange(start.size - 1):
-        begin, end = slopes.start[n], slopes.start[n + 1]
-        if begin == end:
-            continue
-        row, column = slopes.pixel[begin:end] // columns, slopes.pixel[begin:end] % columns
-        top, left = row.min(), column.min()
-        own = np.zeros((row.max() - top + 1, column.max() - left + 1, UNKNOWNS))
-        for k in range(end - begin):
-            own[row[k] - top, column[k] - left] += weight[slopes.pixel[begin + k]] * slopes.slope[begin + k]
-        _add_products(slopes, n, own, top, left, columns, alone[n])
-        for at in range(start[n], start[n + 1]):
-            _add_products(slopes, other[at], own, top, left, columns, blocks[at])
-    return alone, blocks
+    for k in range(alone.shape[0]):
+        n = first + k
+        top, left, rows, columns = _rectangle(slopes, n)
+        own = np.zeros((rows, columns, UNKNOWNS))
+        for entry in range(slopes.start[n], slopes.start[n + 1]):
+            pixel = slopes.pixel[entry]
+            row, column = pixel // slopes.columns - top, pixel % slopes.columns - left
+            for a in range(UNKNOWNS):
+                own[row, column, a] += weight[pixel] * slopes.slope[entry, a]
+        _add_products(slopes, n, own, top, left, alone[k])
+        for at in range(neighbours.start[n], neighbours.start[n + 1]):
+            _add_products(slopes, neighbours.other[at], own, top, left, block[at])
 
 
 @njit(cache=True)
 def _add_products(
-    slopes: Slopes, m: int, own: NDArray[np.float64], top: int, left: int, columns: int, block: NDArray[np.float64]
+    slopes: Slopes, m: int, own: NDArray[np.float64], top: int, left: int, block: NDArray[np.float64]
 ) -> None:
     """Add own^T J_m to a block (4, 4), with `own` on a rectangle of pixels."""
     for k in range(slopes.start[m], slopes.start[m + 1]):
-        i, j = slopes.pixel[k] // columns - top, slopes.pixel[k] % columns - left
+        i, j = slopes.pixel[k] // slopes.columns - top, slopes.pixel[k] % slopes.columns - left
         if 0 <= i < own.shape[0] and 0 <= j < own.shape[1]:
             for a in range(UNKNOWNS):
                 for b in range(UNKNOWNS):
                     block[a, b] += own[i, j, a] * slopes.slope[k, b]
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, nogil=True)
 def _covariances(
-    slopes: Slopes,
-    ties: Ties,
-    matrices: NDArray[np.float64],
-    weight: NDArray[np.float64],
-    correlation: Correlation,
-    chi2: NDArray[np.float64],
-    columns: int,
-) -> NDArray[np.float64]:
-    """Return each particle's part of the inverse of the normal matrix of itself and its strongest neighbours."""
-    inverses = np.empty_like(matrices)
-    for n in prange(matrices.shape[0]):
-        inverses[n] = np.linalg.inv(matrices[n])
-    result = inverses.copy()
-    for n in prange(matrices.shape[0]):
-        members = _strongest(ties, inverses, n)
-        whole = _normal_matrix(ties, matrices, members)
+    equations: Equations, correlation: Correlation, chi2: NDArray[np.float64], first: int, result: NDArray[np.float64]
+) -> None:
+    """Fill in the covariances of the particles from `first` on.
+
+    Each is the particle's part of the inverse of the normal matrix of itself and its strongest neighbours.
+    """
+    for k in range(result.shape[0]):
+        n = first + k
+        members = _strongest(equations, n)
+        whole = _normal_matrix(equations, members)
         # Millimetres beside counts: inverted with a diagonal of ones.
         scale = 1.0 / np.sqrt(np.diag(whole))
-        inverse = np.linalg.inv(whole * scale * scale.reshape(-1, 1)) * scale * scale.reshape(-1, 1)
+        _rescale(whole, scale)
+        inverse = np.linalg.inv(whole)
+        _rescale(inverse, scale)
         excess = max(chi2[n] - 1.0, 0.0)
-        result[n] = (1.0 + excess) * inverse[:UNKNOWNS, :UNKNOWNS]
+        for a in range(UNKNOWNS):
+            for b in range(UNKNOWNS):
+                result[k, a, b] = (1.0 + excess) * inverse[a, b]
         if correlation.share + excess > 0.0:
-            moved_by = _moved_by(slopes, members, inverse, weight, columns)
-            result[n] += (correlation.share + excess) * _excess(moved_by, correlation.decay)
-    return result
+            moved_by = _moved_by(equations, members, inverse)
+            _add_excess(moved_by, correlation.decay, correlation.share + excess, result[k])
 
 
 @njit(cache=True)
-def _strongest(ties: Ties, inverses: NDArray[np.float64], n: int) -> NDArray[np.int64]:
+def _rescale(matrix: NDArray[np.float64], scale: NDArray[np.float64]) -> None:
+    """Multiply rows and columns of a matrix by the scales of its unknowns."""
+    for i in range(scale.size):
+        for j in range(scale.size):
+            matrix[i, j] = matrix[i, j] * scale[j] * scale[i]
+
+
+@njit(cache=True)
+def _strongest(equations: Equations, n: int) -> NDArray[np.int64]:
     """Return a particle's number and those of the neighbours that it is tied to most."""
-    begin, end = ties.start[n], ties.start[n + 1]
+    begin, end = equations.neighbours.start[n], equations.neighbours.start[n + 1]
     strength = np.zeros(end - begin)
     for k in range(end - begin):
-        block = ties.block[begin + k]
-        strength[k] = np.trace(inverses[n] @ block @ inverses[ties.other[begin + k]] @ block.T)
+        block = equations.block[begin + k]
+        strength[k] = _tie(equations.inverses[n], block, equations.inverses[equations.neighbours.other[begin + k]])
     chosen = np.argsort(-strength)[:FREE_NEIGHBOURS]
     members = np.empty(chosen.size + 1, np.int64)
     members[0] = n
     for k in range(chosen.size):
-        members[k + 1] = ties.other[begin + chosen[k]]
+        members[k + 1] = equations.neighbours.other[begin + chosen[k]]
     return members
 
 
 @njit(cache=True)
-def _moved_by(
-    slopes: Slopes, members: NDArray[np.int64], inverse: NDArray[np.float64], weight: NDArray[np.float64], columns: int
-) -> NDArray[np.float64]:
+def _tie(one: NDArray[np.float64], block: NDArray[np.float64], other: NDArray[np.float64]) -> float:
+    """Return trace(A B C B^T) of matrices (4, 4)."""
+    trace = 0.0
+    for a in range(UNKNOWNS):
+        for d in range(UNKNOWNS):
+            left = right = 0.0
+            for b in range(UNKNOWNS):
+                left += one[a, b] * block[b, d]
+                right += other[d, b] * block[a, b]
+            trace += left * right
+    return trace
+
+
+@njit(cache=True)
+def _moved_by(equations: Equations, members: NDArray[np.int64], inverse: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return K (4, rows, columns) of the first member on the rectangle that it lights, its neighbours free."""
-    begin, end = slopes.start[members[0]], slopes.start[members[0] + 1]
-    row, column = slopes.pixel[begin:end] // columns, slopes.pixel[begin:end] % columns
-    top, left = row.min(), column.min()
-    moved_by = np.zeros((UNKNOWNS, row.max() - top + 1, column.max() - left + 1))
+    slopes = equations.slopes
+    top, left, rows, columns = _rectangle(slopes, members[0])
+    moved_by = np.zeros((UNKNOWNS, rows, columns))
     for m in range(members.size):
         for k in range(slopes.start[members[m]], slopes.start[members[m] + 1]):
-            i, j = slopes.pixel[k] // columns - top, slopes.pixel[k] % columns - left
-            if 0 <= i < moved_by.shape[1] and 0 <= j < moved_by.shape[2]:
-                root = np.sqrt(weight[slopes.pixel[k]])
+            i, j = slopes.pixel[k] // slopes.columns - top, slopes.pixel[k] % slopes.columns - left
+            if 0 <= i < rows and 0 <= j < columns:
+                root = np.sqrt(equations.weight[slopes.pixel[k]])
                 for a in range(UNKNOWNS):
                     for b in range(UNKNOWNS):
                         moved_by[a, i, j] += inverse[a, UNKNOWNS * m + b] * slopes.slope[k, b] * root
@@ -242,46 +280,56 @@ def _moved_by(
 
 
 @njit(cache=True)
-def _excess(moved_by: NDArray[np.float64], decay: float) -> NDArray[np.float64]:
-    """Return K (R - 1) K^T (4, 4) for errors whose correlation falls by `decay` from pixel to pixel along each axis."""
-    excess = np.empty((UNKNOWNS, UNKNOWNS))
+def _add_excess(moved_by: NDArray[np.float64], decay: float, factor: float, result: NDArray[np.float64]) -> None:
+    """Add factor K (R - 1) K^T (4, 4) for errors whose correlation falls by `decay` from pixel to pixel."""
+    _, rows, columns = moved_by.shape
     for b in range(UNKNOWNS):
-        others = _correlated(_correlated(moved_by[b], decay).T, decay).T - moved_by[b]
+        alike = _correlated(_correlated(moved_by[b], decay), decay)
         for a in range(UNKNOWNS):
-            excess[a, b] = np.sum(moved_by[a] * others)
-    return excess
+            total = 0.0
+            for i in range(rows):
+                for j in range(columns):
+                    total += moved_by[a, i, j] * (alike[i, j] - moved_by[b, i, j])
+            result[a, b] += factor * total
 
 
 @njit(cache=True)
 def _correlated(values: NDArray[np.float64], decay: float) -> NDArray[np.float64]:
-    """Return sum_k decay^|j - k| values[i, k], by one pass each way."""
-    result = np.empty_like(values)
-    for i in range(values.shape[0]):
+    """Return sum_k decay^|j - k| values[i, k] in row j and column i, by one pass each way."""
+    rows, columns = values.shape
+    result = np.empty((columns, rows))
+    for i in range(rows):
         carried = 0.0
-        for j in range(values.shape[1]):
+        for j in range(columns):
             carried = carried * decay + values[i, j]
-            result[i, j] = carried
+            result[j, i] = carried
         carried = 0.0
-        for j in range(values.shape[1] - 1, -1, -1):
+        for j in range(columns - 1, -1, -1):
             carried *= decay
-            result[i, j] += carried
+            result[j, i] += carried
             carried += values[i, j]
     return result
 
 
 @njit(cache=True)
-def _normal_matrix(ties: Ties, matrices: NDArray[np.float64], members: NDArray[np.int64]) -> NDArray[np.float64]:
+def _normal_matrix(equations: Equations, members: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return the normal matrix of some particles together."""
+    neighbours = equations.neighbours
     size = UNKNOWNS * members.size
     whole = np.zeros((size, size))
     for a in range(members.size):
-        at_a = UNKNOWNS * a
-        whole[at_a : at_a + UNKNOWNS, at_a : at_a + UNKNOWNS] = matrices[members[a]]
-        others = ties.other[ties.start[members[a]] : ties.start[members[a] + 1]]
-        for b in range(members.size):
-            place = np.searchsorted(others, members[b])
-            if place < others.size and others[place] == members[b]:
-                at_b = UNKNOWNS * b
-                block = ties.block[ties.start[members[a]] + place]
-                whole[at_a : at_a + UNKNOWNS, at_b : at_b + UNKNOWNS] = block
+        n = members[a]
+        _put(whole, a, a, equations.alone[n])
+        for at in range(neighbours.start[n], neighbours.start[n + 1]):
+            for b in range(members.size):
+                if neighbours.other[at] == members[b]:
+                    _put(whole, a, b, equations.block[at])
     return whole
+
+
+@njit(cache=True)
+def _put(whole: NDArray[np.float64], a: int, b: int, block: NDArray[np.float64]) -> None:
+    """Put the block (4, 4) of two particles into the matrix of some."""
+    for i in range(UNKNOWNS):
+        for j in range(UNKNOWNS):
+            whole[UNKNOWNS * a + i, UNKNOWNS * b + j] = block[i, j]

@@ -8,13 +8,24 @@ Axes: image axes, mm; light in counts; residual and weights as flat images. A pa
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
-from lfpiv_cli.particles.least_squares import UNKNOWNS, add_light, best_light, fit, respond_all, respond_once
+from lfpiv_cli.particles.least_squares import (
+    UNKNOWNS,
+    Observation,
+    Responses,
+    add_light,
+    best_light,
+    fit,
+    lit_by,
+    respond_all,
+    room_for,
+)
 from lfpiv_cli.particles.response import VALUES, respond
-from lfpiv_cli.particles.tiles import Tiles
-from lfpiv_cli.particles.view import View, view_of
+from lfpiv_cli.particles.tiles import over_tiles
+from lfpiv_cli.particles.view import View, entry_capacity
+from lfpiv_cli.threads import blocks, in_threads
 
 # Candidates are brought into the fit from these depths beside their own, mm.
 START_DEPTHS_MM = np.array([0.0, -0.4, 0.4])
@@ -23,167 +34,223 @@ CANDIDATE_STEPS = 12
 SWEEP_STEPS = 4
 # A particle claims its light where at least this share of it is found (the rest may be noise and neighbours).
 CLAIM = 0.7
+# Particles that one thread judges at a time.
+BLOCK = 64
 
 
 @njit(cache=True)
 def claimed_share(
     pixels: NDArray[np.int32],
     values: NDArray[np.float64],
-    count: int,
     light: float,
     residual: NDArray[np.float64],
     weight: NDArray[np.float64],
+    own: float,
 ) -> float:
     """Return the share of the light that a particle would claim which is there: sum min(r+, c I f) / sum c I f.
 
-    Pixels without weight do not count.
+    Pixels without weight do not count. `own` is the particle's light that the residual lacks already.
     """
     found = wanted = 0.0
-    for k in range(count):
+    for k in range(pixels.size):
         if weight[pixels[k]] > 0.0:
             claim = CLAIM * light * values[k, 0]
             wanted += claim
-            found += min(max(residual[pixels[k]], 0.0), claim)
+            found += min(max(residual[pixels[k]] + own * values[k, 0], 0.0), claim)
     return found / wanted if wanted > 0.0 else 0.0
 
 
-@njit(cache=True, parallel=True)
-def refine(
-    view: View,
-    particles: NDArray[np.float64],
-    tiles: Tiles,
-    residual: NDArray[np.float64],
-    weight: NDArray[np.float64],
-    z_low: float,
-    z_high: float,
-    capacity: int,
-) -> None:
+def refine(observation: Observation, particles: NDArray[np.float64]) -> None:
     """Refine all particles (n, 4) once, in place, and keep the residual up to date."""
-    camera, rest = view.camera[:], view[1:]
-    for group in range(4):
-        for tile in prange(tiles.groups[group], tiles.groups[group + 1]):
-            whole = view_of(camera, rest)
-            counts, place = np.zeros(1, np.int64), np.zeros((0, 0), np.int32)
-            pixels, values = np.empty((1, capacity), np.int32), np.empty((1, capacity, VALUES))
-            for at in range(tiles.start[tile], tiles.start[tile + 1]):
-                number = tiles.order[at]
-                one = particles[number : number + 1]
-                respond_all(whole, one, counts, pixels, values)
-                add_light(pixels[0], values[0], counts[0], one[0, 3], residual)
-                fit(whole, one, residual, weight, z_low, z_high, SWEEP_STEPS, np.inf, counts, pixels, values, place)
-                add_light(pixels[0], values[0], counts[0], -one[0, 3], residual)
+    fit_again(observation, particles, np.ones(len(particles), np.bool_), SWEEP_STEPS)
 
 
-@njit(cache=True, parallel=True)
+def fit_again(
+    observation: Observation,
+    particles: NDArray[np.float64],
+    chosen: NDArray[np.bool_],
+    steps: int,
+    depths_mm: NDArray[np.float64] | None = None,
+    least: tuple[float, float] = (0.0, 0.0),
+) -> NDArray[np.bool_]:
+    """Fit the chosen ones of particles (n, 4) in place, from where they are and from other depths.
+
+    The residual is kept up to date. Returns which particles have been moved to another depth.
+
+    Parameters
+    ----------
+    depths_mm : (n, k) where else to begin, NaN for nowhere; default: nowhere
+    least : what another depth must gain in chi-squared, and the light that a particle must have there
+    """
+    depths = np.empty((len(particles), 0)) if depths_mm is None else depths_mm
+    moved = np.zeros(len(particles), np.bool_)
+
+    def work(numbers: NDArray[np.int64]) -> None:
+        _fit_again(observation, particles, numbers[chosen[numbers]], steps, depths, least, moved)
+
+    over_tiles(work, observation.optics, particles, observation.depths_mm)
+    return moved
+
+
+@njit(cache=True, nogil=True)
+def _fit_again(
+    observation: Observation,
+    particles: NDArray[np.float64],
+    numbers: NDArray[np.int64],
+    steps: int,
+    depths: NDArray[np.float64],
+    least: tuple[float, float],
+    moved: NDArray[np.bool_],
+) -> None:
+    """Do the work of `fit_again` for the particles of a tile."""
+    view, residual = observation.optics, observation.residual
+    responses = room_for(1, observation.capacity, 0)
+    trial, best = np.empty((1, UNKNOWNS)), np.empty((1, UNKNOWNS))
+    for number in numbers:
+        best[0] = particles[number]
+        respond_all(view, best, responses)
+        pixels, values = lit_by(responses, 0)
+        add_light(pixels, values, best[0, 3], residual)
+        lowest = fit(observation, best, responses, steps, np.inf) - least[0]
+        for depth in depths[number]:
+            if np.isnan(depth):
+                continue
+            change = _fit_from(observation, particles[number], depth, trial, responses, steps)
+            if change < lowest and trial[0, 3] >= least[1]:
+                lowest = change
+                best[:] = trial
+                moved[number] = True
+        particles[number] = best[0]
+        if depths.shape[1] > 0:
+            respond_all(view, best, responses)
+        pixels, values = lit_by(responses, 0)
+        add_light(pixels, values, -best[0, 3], residual)
+
+
+@njit(cache=True)
+def _fit_from(
+    observation: Observation,
+    particle: NDArray[np.float64],
+    depth: float,
+    trial: NDArray[np.float64],
+    responses: Responses,
+    steps: int,
+) -> float:
+    """Fit `trial` (1, 4), a particle with the best light at another depth; return what it adds to chi-squared."""
+    trial[0] = particle
+    trial[0, 2] = depth
+    respond_all(observation.optics, trial, responses)
+    pixels, values = lit_by(responses, 0)
+    trial[0, 3] = best_light(pixels, values, observation.residual, observation.weight)
+    return fit(observation, trial, responses, steps, np.inf)
+
+
 def accept(
-    view: View,
-    candidates: NDArray[np.float64],
-    tiles: Tiles,
-    residual: NDArray[np.float64],
-    weight: NDArray[np.float64],
-    z_low: float,
-    z_high: float,
-    smallest_light: float,
-    smallest_share: float,
-    capacity: int,
+    observation: Observation, candidates: NDArray[np.float64], smallest_light: float, smallest_share: float
 ) -> NDArray[np.bool_]:
     """Fit candidates (n, 4) in place, one after the other; return which ones stay, their light off the residual."""
-    accepted = np.zeros(candidates.shape[0], np.bool_)
-    camera, rest = view.camera[:], view[1:]
-    for group in range(4):
-        for tile in prange(tiles.groups[group], tiles.groups[group + 1]):
-            whole = view_of(camera, rest)
-            counts, place = np.zeros(1, np.int64), np.zeros((0, 0), np.int32)
-            pixels, values = np.empty((1, capacity), np.int32), np.empty((1, capacity, VALUES))
-            trial, best = np.empty((1, UNKNOWNS)), np.empty((1, UNKNOWNS))
-            for at in range(tiles.start[tile], tiles.start[tile + 1]):
-                number = tiles.order[at]
-                lowest = 0.0
-                for depth in START_DEPTHS_MM:
-                    trial[0] = candidates[number]
-                    trial[0, 2] = min(max(trial[0, 2] + depth, z_low), z_high)
-                    respond_all(whole, trial, counts, pixels, values)
-                    trial[0, 3] = best_light(pixels[0], values[0], counts[0], residual, weight)
-                    change = fit(
-                        whole,
-                        trial,
-                        residual,
-                        weight,
-                        z_low,
-                        z_high,
-                        CANDIDATE_STEPS,
-                        np.inf,
-                        counts,
-                        pixels,
-                        values,
-                        place,
-                    )
-                    if change < lowest:
-                        lowest = change
-                        best[:] = trial
-                if lowest == 0.0 or best[0, 3] < smallest_light:
-                    continue
-                respond_all(whole, best, counts, pixels, values)
-                share = claimed_share(pixels[0], values[0], counts[0], best[0, 3], residual, weight)
-                if share >= smallest_share:
-                    candidates[number] = best[0]
-                    accepted[number] = True
-                    add_light(pixels[0], values[0], counts[0], -best[0, 3], residual)
+    accepted = np.zeros(len(candidates), np.bool_)
+
+    def work(numbers: NDArray[np.int64]) -> None:
+        _accept(observation, candidates, numbers, CANDIDATE_STEPS, (smallest_light, smallest_share), accepted)
+
+    over_tiles(work, observation.optics, candidates, observation.depths_mm)
     return accepted
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, nogil=True)
+def _accept(
+    observation: Observation,
+    candidates: NDArray[np.float64],
+    numbers: NDArray[np.int64],
+    steps: int,
+    least: tuple[float, float],
+    accepted: NDArray[np.bool_],
+) -> None:
+    """Do the work of `accept` for the candidates of a tile; `least` are the light and the share that one must have."""
+    residual, weight = observation.residual, observation.weight
+    responses = room_for(1, observation.capacity, 0)
+    trial, best = np.empty((1, UNKNOWNS)), np.empty((1, UNKNOWNS))
+    for number in numbers:
+        lowest = 0.0
+        for offset in START_DEPTHS_MM:
+            depth = min(max(candidates[number, 2] + offset, observation.low_mm), observation.high_mm)
+            change = _fit_from(observation, candidates[number], depth, trial, responses, steps)
+            if change < lowest:
+                lowest = change
+                best[:] = trial
+        if lowest == 0.0 or best[0, 3] < least[0]:
+            continue
+        respond_all(observation.optics, best, responses)
+        pixels, values = lit_by(responses, 0)
+        if claimed_share(pixels, values, best[0, 3], residual, weight, 0.0) >= least[1]:
+            candidates[number] = best[0]
+            accepted[number] = True
+            add_light(pixels, values, -best[0, 3], residual)
+
+
 def add_all(
+    view: View, particles: NDArray[np.float64], sign: float, image: NDArray[np.float64], depths_mm: tuple[float, float]
+) -> None:
+    """Add the light of all particles (n, 4) between two depths, times `sign`, to an image."""
+    capacity = entry_capacity(view, *depths_mm)
+    over_tiles(lambda numbers: _add_all(view, particles, numbers, sign, image, capacity), view, particles, depths_mm)
+
+
+@njit(cache=True, nogil=True)
+def _add_all(
     view: View,
     particles: NDArray[np.float64],
-    tiles: Tiles,
+    numbers: NDArray[np.int64],
     sign: float,
     image: NDArray[np.float64],
     capacity: int,
 ) -> None:
-    """Add the light of all particles (n, 4), times `sign`, to an image."""
-    camera, rest = view.camera[:], view[1:]
-    for group in range(4):
-        for tile in prange(tiles.groups[group], tiles.groups[group + 1]):
-            whole = view_of(camera, rest)
-            pixels, values = np.empty(capacity, np.int32), np.empty((capacity, VALUES))
-            for at in range(tiles.start[tile], tiles.start[tile + 1]):
-                particle = particles[tiles.order[at]]
-                count = respond(whole, particle[0], particle[1], particle[2], pixels, values)
-                add_light(pixels, values, count, sign * particle[3], image)
+    """Do the work of `add_all` for the particles of a tile."""
+    pixels, values = np.empty(capacity, np.int32), np.empty((capacity, VALUES))
+    for number in numbers:
+        x, y, z, light = particles[number]
+        count = respond(view, x, y, z, pixels, values)
+        add_light(pixels[:count], values[:count], sign * light, image)
 
 
-@njit(cache=True, parallel=True)
 def judge(
-    view: View,
-    particles: NDArray[np.float64],
-    residual: NDArray[np.float64],
-    weight: NDArray[np.float64],
-    capacity: int,
+    observation: Observation, particles: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return local chi-squared, claimed share and share of the light that is seen of each particle.
 
     Local chi-squared is the mean of w r^2 over the particle's light; 1 for a perfect model. Pixels without weight see
     nothing.
     """
-    chi2, share, seen = np.zeros(len(particles)), np.zeros(len(particles)), np.zeros(len(particles))
-    camera, rest = view.camera[:], view[1:]
-    for number in prange(len(particles)):
-        whole = view_of(camera, rest)
-        pixels, values = np.empty(capacity, np.int32), np.empty((capacity, VALUES))
-        x, y, z, light = particles[number]
-        count = respond_once(whole, x, y, z, pixels, values)
-        found = wanted = total = squares = 0.0
-        for k in range(count):
-            f, r = values[k, 0], residual[pixels[k]]
-            if weight[pixels[k]] == 0.0:
-                continue
-            total += f
-            squares += f * weight[pixels[k]] * r * r
-            wanted += CLAIM * light * f
-            found += min(max(r + light * f, 0.0), CLAIM * light * f)
+    chi2, share, seen = (np.zeros(len(particles)) for _ in range(3))
+    in_threads(
+        lambda part: _judge(observation, particles[part], chi2[part], share[part], seen[part]),
+        blocks(len(particles), BLOCK),
+    )
+    return chi2, share, seen
+
+
+@njit(cache=True, nogil=True)
+def _judge(
+    observation: Observation,
+    particles: NDArray[np.float64],
+    chi2: NDArray[np.float64],
+    share: NDArray[np.float64],
+    seen: NDArray[np.float64],
+) -> None:
+    """Do the work of `judge` for some particles."""
+    residual, weight = observation.residual, observation.weight
+    responses = room_for(1, observation.capacity, 0)
+    for number in range(particles.shape[0]):
+        respond_all(observation.optics, particles[number : number + 1], responses)
+        pixels, values = lit_by(responses, 0)
+        total = squares = 0.0
+        for k in range(pixels.size):
+            f, w = values[k, 0], weight[pixels[k]]
+            if w > 0.0:
+                total += f
+                squares += f * w * residual[pixels[k]] * residual[pixels[k]]
         if total > 0.0:
             chi2[number], seen[number] = squares / total, total
-        if wanted > 0.0:
-            share[number] = found / wanted
-    return chi2, share, seen
+        light = particles[number, 3]
+        share[number] = claimed_share(pixels, values, light, residual, weight, light)

@@ -12,13 +12,15 @@ Axes: image axes, mm; light in counts; residual and weights as flat images. A pa
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.particles.response import VALUES, respond
 from lfpiv_cli.particles.tiles import LARGEST_MOVE_MM
-from lfpiv_cli.particles.view import View
+from lfpiv_cli.particles.view import View, entry_capacity
 
 UNKNOWNS = 4
 # Damping relative to the diagonal: its start, and the factors after a step that failed or helped.
@@ -31,6 +33,67 @@ SMALLEST_GAIN = 0.01
 LONGEST_DEPTH_STEP_MM = 0.5
 # A fit that may be given up early is judged after so many steps.
 EARLY_STEPS = 4
+
+
+class Observation(NamedTuple):
+    """What particles are fitted to.
+
+    Attributes
+    ----------
+    optics : how particles are seen (numba reserves the name `view`)
+    residual : (pixels,) what the particles leave of the image; kernels keep it up to date
+    weight : (pixels,) 1/variance
+    low_mm, high_mm : depths between which particles stay
+    capacity : entries that a particle can have at most
+    """
+
+    optics: View
+    residual: NDArray[np.float64]
+    weight: NDArray[np.float64]
+    low_mm: float
+    high_mm: float
+    capacity: int
+
+    @property
+    def depths_mm(self) -> tuple[float, float]:
+        """Between which particles stay."""
+        return self.low_mm, self.high_mm
+
+
+def observation_of(
+    view: View, residual: NDArray[np.float64], weight: NDArray[np.float64], depths_mm: tuple[float, float]
+) -> Observation:
+    """Return the observation of particles between two depths."""
+    return Observation(view, residual, weight, *depths_mm, entry_capacity(view, *depths_mm))
+
+
+class Responses(NamedTuple):
+    """Responses of one particle or two that are fitted together.
+
+    Attributes
+    ----------
+    counts, pixels, values : (k,), (k, capacity), (k, capacity, 4) as `respond_once` writes them
+    place : (side, side) zeros, as wide as a footprint where there are two; serves to find common pixels
+    """
+
+    counts: NDArray[np.int64]
+    pixels: NDArray[np.int32]
+    values: NDArray[np.float64]
+    place: NDArray[np.int32]
+
+
+@njit(cache=True)
+def room_for(members: int, capacity: int, side: int) -> Responses:
+    """Return room for the responses of so many particles."""
+    pixels, values = np.empty((members, capacity), np.int32), np.empty((members, capacity, VALUES))
+    return Responses(np.zeros(members, np.int64), pixels, values, np.zeros((side, side), np.int32))
+
+
+@njit(cache=True)
+def lit_by(responses: Responses, member: int) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+    """Return the pixels (n,) that a particle lights, and their values (n, 4)."""
+    count = responses.counts[member]
+    return responses.pixels[member][:count], responses.values[member][:count]
 
 
 @njit(cache=True)
@@ -79,7 +142,6 @@ def _row_and_column(pixel: int, columns: int) -> tuple[int, int]:
 def normal_equations(
     pixels: NDArray[np.int32],
     values: NDArray[np.float64],
-    count: int,
     light: float,
     residual: NDArray[np.float64],
     weight: NDArray[np.float64],
@@ -90,7 +152,7 @@ def normal_equations(
     matrix[:] = 0.0
     right[:] = 0.0
     change = 0.0
-    for k in range(count):
+    for k in range(pixels.size):
         at = pixels[k]
         w = weight[at]
         f, r = light * values[k, 0], residual[at]
@@ -119,59 +181,57 @@ def normal_equations(
 
 @njit(cache=True)
 def _pair_equations(
-    view: View,
+    observation: Observation,
     pair: NDArray[np.float64],
-    residual: NDArray[np.float64],
-    weight: NDArray[np.float64],
-    counts: NDArray[np.int64],
-    pixels: NDArray[np.int32],
-    values: NDArray[np.float64],
-    place: NDArray[np.int32],
+    responses: Responses,
     matrix: NDArray[np.float64],
     right: NDArray[np.float64],
 ) -> float:
     """Fill the normal equations (8, 8) of two particles (2, 4); return what they add to chi-squared together.
 
-    `place` (side, side) is zero and serves to find common pixels; it is zero again on return.
+    The place of the responses is zero again on return.
     """
-    side = place.shape[0]
+    columns, residual, weight = observation.optics.camera.columns, observation.residual, observation.weight
     first, second = slice(0, UNKNOWNS), slice(UNKNOWNS, 2 * UNKNOWNS)
     block = np.empty((UNKNOWNS, UNKNOWNS))
-    change = normal_equations(pixels[0], values[0], counts[0], pair[0, 3], residual, weight, block, right[first])
+    pixels_1, values_1 = lit_by(responses, 0)
+    pixels_2, values_2 = lit_by(responses, 1)
+    change = normal_equations(pixels_1, values_1, pair[0, 3], residual, weight, block, right[first])
     matrix[first, first] = block
-    add_light(pixels[0], values[0], counts[0], -pair[0, 3], residual)
-    change += normal_equations(pixels[1], values[1], counts[1], pair[1, 3], residual, weight, block, right[second])
+    add_light(pixels_1, values_1, -pair[0, 3], residual)
+    change += normal_equations(pixels_2, values_2, pair[1, 3], residual, weight, block, right[second])
     matrix[second, second] = block
-    add_light(pixels[0], values[0], counts[0], pair[0, 3], residual)
+    add_light(pixels_1, values_1, pair[0, 3], residual)
     # What the first explains is off the second's side already; the first's side still lacks the second's light.
-    top, left = view.camera.rows, view.camera.columns
-    for k in range(counts[0]):
-        row, column = _row_and_column(pixels[0, k], view.camera.columns)
+    place, side = responses.place, responses.place.shape[0]
+    top, left = observation.optics.camera.rows, columns
+    for pixel in pixels_1:
+        row, column = _row_and_column(pixel, columns)
         top, left = min(top, row), min(left, column)
-    for k in range(counts[0]):
-        row, column = _row_and_column(pixels[0, k], view.camera.columns)
+    for k in range(pixels_1.size):
+        row, column = _row_and_column(pixels_1[k], columns)
         place[row - top, column - left] = k + 1
     cross = np.zeros((UNKNOWNS, UNKNOWNS))
     one, two = np.empty(UNKNOWNS), np.empty(UNKNOWNS)
-    for k in range(counts[1]):
-        row, column = _row_and_column(pixels[1, k], view.camera.columns)
+    for k in range(pixels_2.size):
+        row, column = _row_and_column(pixels_2[k], columns)
         row, column = row - top, column - left
         if not (0 <= row < side and 0 <= column < side) or place[row, column] == 0:
             continue
         at = place[row, column] - 1
-        w = weight[pixels[1, k]]
+        w = weight[pixels_2[k]]
         for i in range(3):
-            one[i] = pair[0, 3] * values[0, at, i + 1]
-            two[i] = pair[1, 3] * values[1, k, i + 1]
-        one[3], two[3] = values[0, at, 0], values[1, k, 0]
+            one[i] = pair[0, 3] * values_1[at, i + 1]
+            two[i] = pair[1, 3] * values_2[k, i + 1]
+        one[3], two[3] = values_1[at, 0], values_2[k, 0]
         for i in range(UNKNOWNS):
-            right[i] -= w * one[i] * pair[1, 3] * values[1, k, 0]
+            right[i] -= w * one[i] * pair[1, 3] * values_2[k, 0]
             for j in range(UNKNOWNS):
                 cross[i, j] += w * one[i] * two[j]
     matrix[first, second] = cross
     matrix[second, first] = cross.T
-    for k in range(counts[0]):
-        row, column = _row_and_column(pixels[0, k], view.camera.columns)
+    for pixel in pixels_1:
+        row, column = _row_and_column(pixel, columns)
         place[row - top, column - left] = 0
     return change
 
@@ -211,18 +271,7 @@ def solve_damped(
 
 @njit(cache=True)
 def fit(
-    view: View,
-    members: NDArray[np.float64],
-    residual: NDArray[np.float64],
-    weight: NDArray[np.float64],
-    z_low: float,
-    z_high: float,
-    steps: int,
-    promising: float,
-    counts: NDArray[np.int64],
-    pixels: NDArray[np.int32],
-    values: NDArray[np.float64],
-    place: NDArray[np.int32],
+    observation: Observation, members: NDArray[np.float64], responses: Responses, steps: int, promising: float
 ) -> float:
     """Improve one particle or two (k, 4) in place; return what they add to chi-squared (below 0 where they help).
 
@@ -230,15 +279,14 @@ def fit(
 
     Parameters
     ----------
+    responses : of the particles, on entry as on return
     promising : given up early where this is not undercut after a few steps
-    counts, pixels, values : (k,), (k, capacity), (k, capacity, 4) their responses, on entry as on return
-    place : (side, side) zeros, as wide as a footprint, where there are two
     """
     n = UNKNOWNS * members.shape[0]
     matrix, trial_matrix = np.empty((n, n)), np.empty((n, n))
     right, trial_right = np.empty(n), np.empty(n)
     step, trial, begin = np.zeros(n), np.empty_like(members), members.copy()
-    change = _equations(view, members, residual, weight, counts, pixels, values, place, matrix, right)
+    change = _equations(observation, members, responses, matrix, right)
     damping, last_failed = DAMPING, False
     for number in range(steps):
         if number == EARLY_STEPS and change > promising:
@@ -250,11 +298,9 @@ def fit(
             predicted += step[i] * right[i]
         if predicted < SMALLEST_GAIN:
             break
-        _move(members, begin, step, z_low, z_high, trial)
-        respond_all(view, trial, counts, pixels, values)
-        trial_change = _equations(
-            view, trial, residual, weight, counts, pixels, values, place, trial_matrix, trial_right
-        )
+        _move(members, begin, step, observation.low_mm, observation.high_mm, trial)
+        respond_all(observation.optics, trial, responses)
+        trial_change = _equations(observation, trial, responses, trial_matrix, trial_right)
         last_failed = not trial_change < change
         if last_failed:
             damping *= DAMPING_UP
@@ -265,26 +311,23 @@ def fit(
         if gain < SMALLEST_GAIN:
             break
     if last_failed:
-        respond_all(view, members, counts, pixels, values)
+        respond_all(observation.optics, members, responses)
     return change
 
 
 @njit(cache=True)
 def _equations(
-    view: View,
+    observation: Observation,
     members: NDArray[np.float64],
-    residual: NDArray[np.float64],
-    weight: NDArray[np.float64],
-    counts: NDArray[np.int64],
-    pixels: NDArray[np.int32],
-    values: NDArray[np.float64],
-    place: NDArray[np.int32],
+    responses: Responses,
     matrix: NDArray[np.float64],
     right: NDArray[np.float64],
 ) -> float:
-    if members.shape[0] == 1:
-        return normal_equations(pixels[0], values[0], counts[0], members[0, 3], residual, weight, matrix, right)
-    return _pair_equations(view, members, residual, weight, counts, pixels, values, place, matrix, right)
+    """Fill the normal equations of one particle or two; return what they add to chi-squared."""
+    if members.shape[0] == 2:
+        return _pair_equations(observation, members, responses, matrix, right)
+    pixels, values = lit_by(responses, 0)
+    return normal_equations(pixels, values, members[0, 3], observation.residual, observation.weight, matrix, right)
 
 
 @njit(cache=True)
@@ -308,29 +351,23 @@ def _move(
 
 
 @njit(cache=True)
-def respond_all(
-    view: View,
-    members: NDArray[np.float64],
-    counts: NDArray[np.int64],
-    pixels: NDArray[np.int32],
-    values: NDArray[np.float64],
-) -> None:
-    """Write the responses of particles (k, 4): their numbers of pixels (k,), these (k, capacity) and their values."""
+def respond_all(view: View, members: NDArray[np.float64], responses: Responses) -> None:
+    """Write the responses of one particle or two (k, 4)."""
     for m in range(members.shape[0]):
-        counts[m] = respond_once(view, members[m, 0], members[m, 1], members[m, 2], pixels[m], values[m])
+        x, y, z = members[m, 0], members[m, 1], members[m, 2]
+        responses.counts[m] = respond_once(view, x, y, z, responses.pixels[m], responses.values[m])
 
 
 @njit(cache=True)
 def best_light(
     pixels: NDArray[np.int32],
     values: NDArray[np.float64],
-    count: int,
     residual: NDArray[np.float64],
     weight: NDArray[np.float64],
 ) -> float:
     """Return the light, at least 0, that a particle at this place gets by weighted least squares."""
     top = bottom = 0.0
-    for k in range(count):
+    for k in range(pixels.size):
         w = weight[pixels[k]]
         top += w * values[k, 0] * residual[pixels[k]]
         bottom += w * values[k, 0] ** 2
@@ -338,9 +375,7 @@ def best_light(
 
 
 @njit(cache=True)
-def add_light(
-    pixels: NDArray[np.int32], values: NDArray[np.float64], count: int, light: float, image: NDArray[np.float64]
-) -> None:
+def add_light(pixels: NDArray[np.int32], values: NDArray[np.float64], light: float, image: NDArray[np.float64]) -> None:
     """Add light times the response to an image."""
-    for k in range(count):
+    for k in range(pixels.size):
         image[pixels[k]] += light * values[k, 0]

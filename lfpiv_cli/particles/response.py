@@ -17,6 +17,8 @@ can have two.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -35,6 +37,49 @@ PROFILE_ROWS = 7
 LONGEST_PROFILE = 96
 # Columns of the entries' values: light, and its derivatives by x, y and z.
 VALUES = 4
+
+
+class Projection(NamedTuple):
+    """How the main lens shows one particle on the array.
+
+    Attributes
+    ----------
+    x, y : the particle's centre
+    alpha, beta, slope : see above, and d alpha/dz = d beta/dz
+    at_x, at_y : where the middle of the main lens shows the centre
+    stretch_x, stretch_y : the distortion's local scale: array points are at + stretch alpha X
+    scale, lever : x_s changes by `scale` with X, by -`lever` with beta x
+    """
+
+    x: float
+    y: float
+    alpha: float
+    beta: float
+    slope: float
+    at_x: float
+    at_y: float
+    stretch_x: float
+    stretch_y: float
+    scale: float
+    lever: float
+
+
+class Axis(NamedTuple):
+    """One axis of a projection and of a lens: its part of `Projection`, half the cell and the sensor's pixels."""
+
+    x: float
+    at: float
+    stretch: float
+    half: float
+    pixels: int
+
+
+class Profile(NamedTuple):
+    """What one lens shows along one axis: the first pixel, their number and their values (PROFILE_ROWS, number)."""
+
+    first: int
+    number: int
+    values: NDArray[np.float64]
 
 
 @njit(cache=True)
@@ -64,18 +109,10 @@ def respond(view: View, x: float, y: float, z: float, pixels: NDArray[np.int32],
     values : (capacity, 4) light and its derivatives by x, y, z, written
     """
     camera = view.camera
-    distance = camera.focus_distance_mm + view.depth_ratio * z
-    beta = camera.image_distance_mm / distance
-    alpha = 1.0 + beta - camera.image_distance_mm / camera.focal_length_mm
-    slope = -beta * view.depth_ratio / distance
-    x0, y0 = -beta * x, -beta * y
-    r2 = x0 * x0 + y0 * y0
-    at_x = x0 * (1.0 + camera.distortion_per_mm2 * r2)
-    at_y = y0 * (1.0 + camera.distortion_per_mm2 * r2)
-    stretch_x = 1.0 + camera.distortion_per_mm2 * (r2 + 2.0 * x0 * x0)
-    stretch_y = 1.0 + camera.distortion_per_mm2 * (r2 + 2.0 * y0 * y0)
-    reach = abs(alpha) * camera.aperture_radius_mm * max(stretch_x, stretch_y) + beta * view.particle_radius_mm
-    low_i, high_i, low_j, high_j = _lenses(view, at_x, at_y, reach)
+    projection = _project(view, x, y, z)
+    low_i, high_i, low_j, high_j = _lenses(view, projection)
+    axis_x = Axis(x, projection.at_x, projection.stretch_x, view.half_x_mm, camera.columns)
+    axis_y = Axis(y, projection.at_y, projection.stretch_y, view.half_y_mm, camera.rows)
     along_x = np.empty((PROFILE_ROWS, LONGEST_PROFILE))
     along_y = np.empty((PROFILE_ROWS, LONGEST_PROFILE))
     count = 0
@@ -83,29 +120,50 @@ def respond(view: View, x: float, y: float, z: float, pixels: NDArray[np.int32],
         for i in range(low_i, high_i + 1):
             s_x, s_y = view.centres_mm[j, i]
             if view.cell_table.shape[0] > 0:
-                place = (x, y, alpha, beta, slope, at_x - s_x, at_y - s_y, stretch_x, stretch_y, s_x, s_y)
-                count = _join_cell(view, place, pixels, values, count)
+                count += _join_cell(view, projection, (s_x, s_y), pixels[count:], values[count:])
                 continue
-            column, columns = _profile(
-                view, x, alpha, beta, slope, at_x, stretch_x, s_x, view.half_x_mm, camera.columns, along_x
-            )
-            if columns == 0:
+            across = _profile(view, projection, axis_x, s_x, along_x)
+            if across.number == 0:
                 continue
-            row, rows = _profile(
-                view, y, alpha, beta, slope, at_y, stretch_y, s_y, view.half_y_mm, camera.rows, along_y
-            )
-            if rows > 0:
-                count = _join(
-                    view, x, y, alpha, beta, slope, along_x, column, columns, along_y, row, rows, pixels, values, count
-                )
+            down = _profile(view, projection, axis_y, s_y, along_y)
+            if down.number > 0:
+                count += _join(view, projection, across, down, pixels[count:], values[count:])
     return count
 
 
 @njit(cache=True)
-def _lenses(view: View, at_x: float, at_y: float, reach: float) -> tuple[int, int, int, int]:
+def _project(view: View, x: float, y: float, z: float) -> Projection:
+    """Return how the main lens shows a particle."""
+    camera = view.camera
+    distance = camera.focus_distance_mm + view.depth_ratio * z
+    beta = camera.image_distance_mm / distance
+    alpha = 1.0 + beta - camera.image_distance_mm / camera.focal_length_mm
+    x0, y0 = -beta * x, -beta * y
+    r2 = x0 * x0 + y0 * y0
+    tilt = camera.microlens_distance_mm / camera.image_distance_mm
+    return Projection(
+        x,
+        y,
+        alpha,
+        beta,
+        -beta * view.depth_ratio / distance,
+        x0 * (1.0 + camera.distortion_per_mm2 * r2),
+        y0 * (1.0 + camera.distortion_per_mm2 * r2),
+        1.0 + camera.distortion_per_mm2 * (r2 + 2.0 * x0 * x0),
+        1.0 + camera.distortion_per_mm2 * (r2 + 2.0 * y0 * y0),
+        camera.bend * alpha + tilt * (alpha - 1.0),
+        camera.bend + tilt,
+    )
+
+
+@njit(cache=True)
+def _lenses(view: View, projection: Projection) -> tuple[int, int, int, int]:
     """Return the ranges of lens indices, first and last along i and j, whose cells the light can reach."""
-    basis, origin = view.inverse_basis, view.camera.origin_mm
-    dx, dy = at_x - origin[0], at_y - origin[1]
+    camera = view.camera
+    widest = max(projection.stretch_x, projection.stretch_y)
+    reach = abs(projection.alpha) * camera.aperture_radius_mm * widest + projection.beta * view.particle_radius_mm
+    basis = view.inverse_basis
+    dx, dy = projection.at_x - camera.origin_mm[0], projection.at_y - camera.origin_mm[1]
     i = dx * basis[0, 0] + dy * basis[1, 0]
     j = dx * basis[0, 1] + dy * basis[1, 1]
     reach_i = reach * (abs(basis[0, 0]) + abs(basis[1, 0]))
@@ -144,28 +202,12 @@ def _lit_pixels(
 
 
 @njit(cache=True)
-def _profile(
-    view: View,
-    x: float,
-    alpha: float,
-    beta: float,
-    slope: float,
-    at: float,
-    stretch: float,
-    s: float,
-    half: float,
-    pixels: int,
-    out: NDArray[np.float64],
-) -> tuple[int, int]:
-    """Fill the profile of one lens along one axis; return its first pixel and their number.
-
-    `slope` is d alpha/dz = d beta/dz, `at` the array point of the ball's centre seen through the middle of the main
-    lens, `stretch` the distortion's local scale: the array point is at + stretch alpha X.
-    """
+def _profile(view: View, projection: Projection, axis: Axis, s: float, out: NDArray[np.float64]) -> Profile:
+    """Fill the profile of the lens at s along one axis, and return it."""
     camera = view.camera
-    tilt = camera.microlens_distance_mm / camera.image_distance_mm
-    lever = camera.bend + tilt
-    scale = camera.bend * alpha + tilt * (alpha - 1.0)
+    alpha, beta, slope = projection.alpha, projection.beta, projection.slope
+    scale, lever = projection.scale, projection.lever
+    x, at, stretch, half, pixels = axis
     radius = beta * view.particle_radius_mm
     gain = stretch * alpha
     shift = (1.0 - camera.bend) * s - lever * beta * x
@@ -195,32 +237,25 @@ def _profile(
             out[SLOPE_X, k] += 3.0 * weight * xi * by_u * u_x
             out[MEAN_Z, k] += weight * by_z
             out[SLOPE_Z, k] += 3.0 * weight * xi * by_z
-    return first, count
+    return Profile(first, count, out)
 
 
 @njit(cache=True)
 def _join(
     view: View,
-    x: float,
-    y: float,
-    alpha: float,
-    beta: float,
-    slope: float,
-    along_x: NDArray[np.float64],
-    column: int,
-    columns: int,
-    along_y: NDArray[np.float64],
-    row: int,
-    rows: int,
+    projection: Projection,
+    across: Profile,
+    down: Profile,
     pixels: NDArray[np.int32],
     values: NDArray[np.float64],
-    count: int,
 ) -> int:
-    """Write the entries of one lens; return how many there are now."""
+    """Write the entries of one lens; return their number."""
     camera = view.camera
-    tilt = camera.microlens_distance_mm / camera.image_distance_mm
-    lever = camera.bend + tilt
-    scale = camera.bend * alpha + tilt * (alpha - 1.0)
+    count = 0
+    x, y, beta, slope = projection.x, projection.y, projection.beta, projection.slope
+    scale, lever = projection.scale, projection.lever
+    column, columns, along_x = across
+    row, rows, along_y = down
     width = camera.pixel_mm / scale
     norm = width * width / (np.pi * camera.aperture_radius_mm**2)
     widen_z = -2.0 * lever * slope / scale
@@ -265,23 +300,18 @@ def _join(
 @njit(cache=True)
 def _join_cell(
     view: View,
-    place: tuple[float, ...],
+    projection: Projection,
+    lens: tuple[float, float],
     pixels: NDArray[np.int32],
     values: NDArray[np.float64],
-    count: int,
 ) -> int:
-    """Write the entries of one lens whose cell is no rectangle; return how many there are now.
-
-    Parameters
-    ----------
-    place : x, y, alpha, beta, slope as in `_join`; where the ball's centre meets the array from the lens, and the
-        distortion's scales there, along x and y
-    """
-    x, y, alpha, beta, slope, off_x, off_y, stretch_x, stretch_y, s_x, s_y = place
+    """Write the entries of one lens whose cell is no rectangle; return their number."""
     camera = view.camera
-    tilt = camera.microlens_distance_mm / camera.image_distance_mm
-    scale = camera.bend * alpha + tilt * (alpha - 1.0)
-    lever = (camera.bend + tilt) / scale
+    count = 0
+    x, y, alpha, beta, slope, at_x, at_y, stretch_x, stretch_y, scale, whole_lever = projection
+    s_x, s_y = lens
+    off_x, off_y = at_x - s_x, at_y - s_y
+    lever = whole_lever / scale
     gain_x, gain_y = stretch_x * alpha, stretch_y * alpha
     shift_x = (1.0 - camera.bend) * s_x - lever * scale * beta * x
     shift_y = (1.0 - camera.bend) * s_y - lever * scale * beta * y
@@ -341,3 +371,25 @@ def _join_cell(
             values[count, 3] = norm * (by_z - 2.0 * lever * slope * light)
             count += 1
     return count
+
+
+@njit(cache=True, nogil=True)
+def entries_of(
+    view: View, particles: NDArray[np.float64], capacity: int
+) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float64]]:
+    """Return the entries of particles (n, 3 or more) of unit light, one particle after another.
+
+    Returns
+    -------
+    counts : (n,) entries of each
+    pixels, values : as `respond` writes them
+    """
+    counts = np.zeros(particles.shape[0], np.int64)
+    pixels = np.empty(particles.shape[0] * capacity, np.int32)
+    values = np.empty((particles.shape[0] * capacity, VALUES))
+    end = 0
+    for n in range(particles.shape[0]):
+        x, y, z = particles[n, 0], particles[n, 1], particles[n, 2]
+        counts[n] = respond(view, x, y, z, pixels[end : end + capacity], values[end : end + capacity])
+        end += counts[n]
+    return counts, pixels[:end].copy(), values[:end].copy()

@@ -28,7 +28,7 @@ from lfpiv_cli.particles.search import (
     Task,
     blank,
     merge,
-    pixel_weight,
+    observed,
     prune,
     result,
     sweep,
@@ -36,7 +36,6 @@ from lfpiv_cli.particles.search import (
     with_typical_light,
 )
 from lfpiv_cli.particles.suspects import with_depths_corrected, with_overlaps_split
-from lfpiv_cli.particles.tiles import share_out
 
 
 @dataclass(frozen=True)
@@ -143,15 +142,6 @@ def _candidates(
 
 def _accept(task: Task, state: State, candidates: NDArray[np.float64], settings: Round) -> State:
     """Return the state with those candidates that hold."""
-    accepted = accept(
-        task.view,
-        candidates,
-        share_out(task.view, candidates, *task.depths_mm),
-        state.residual,
-        pixel_weight(task, state, settings.unexplained),
-        *task.depths_mm,
-        SMALLEST_LIGHT * state.typical_light,
-        settings.claimed_share,
-        task.capacity,
-    )
+    observation = observed(task, state, settings.unexplained)
+    accepted = accept(observation, candidates, SMALLEST_LIGHT * state.typical_light, settings.claimed_share)
     return replace(state, particles=np.concatenate([state.particles, candidates[accepted]]))

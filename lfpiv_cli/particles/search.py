@@ -15,9 +15,9 @@ from scipy.spatial import KDTree
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.particles.covariance import joint_covariance
 from lfpiv_cli.particles.fitting import add_all, judge, refine
+from lfpiv_cli.particles.least_squares import Observation, observation_of
 from lfpiv_cli.particles.noise import Noise, error_correlation, estimate_noise, measured_noise
-from lfpiv_cli.particles.tiles import share_out
-from lfpiv_cli.particles.view import View, entry_capacity
+from lfpiv_cli.particles.view import View
 from lfpiv_cli.reconstruction.equations import Normalisers
 from lfpiv_cli.weights.model import Weights
 
@@ -79,11 +79,6 @@ class Task:
     prepared: NDArray[np.float32]
     depths_mm: tuple[float, float]
 
-    @property
-    def capacity(self) -> int:
-        """Entries that a particle can have at most."""
-        return entry_capacity(self.view, *self.depths_mm)
-
 
 @dataclass(frozen=True, eq=False)
 class State:
@@ -142,17 +137,16 @@ def blank(task: Task) -> State:
     return State(np.zeros((0, 4)), task.image.copy(), 0.0, estimate_noise(task.image, 0.0), none, none)
 
 
-def pixel_weight(task: Task, state: State, unexplained: float) -> NDArray[np.float64]:
-    """Return the weight of each pixel, zero where it is not usable; light above the model counts for less."""
-    return np.where(task.usable, state.noise.weights(task.image - state.residual, state.residual, unexplained), 0.0)
+def observed(task: Task, state: State, unexplained: float) -> Observation:
+    """Return what particles are fitted to: pixels that are not usable weigh nothing, light above the model less."""
+    weight = state.noise.weights(task.image - state.residual, state.residual, unexplained)
+    return observation_of(task.view, state.residual, np.where(task.usable, weight, 0.0), task.depths_mm)
 
 
 def sweep(task: Task, state: State, unexplained: float, sweeps: int) -> None:
     """Refine all particles in place, the residual along with them."""
     for _ in range(sweeps):
-        tiles = share_out(task.view, state.particles, *task.depths_mm)
-        weight = pixel_weight(task, state, unexplained)
-        refine(task.view, state.particles, tiles, state.residual, weight, *task.depths_mm, task.capacity)
+        refine(observed(task, state, unexplained), state.particles)
 
 
 def merge(task: Task, state: State) -> State:
@@ -170,8 +164,7 @@ def merge(task: Task, state: State) -> State:
 
 def prune(task: Task, state: State, claimed_share: float, unexplained: float) -> State:
     """Return the state without particles that are too faint, hardly seen, or do not find their light."""
-    weight = pixel_weight(task, state, unexplained)
-    _, share, seen = judge(task.view, state.particles, state.residual, weight, task.capacity)
+    _, share, seen = judge(observed(task, state, unexplained), state.particles)
     keep = (state.particles[:, 3] > SMALLEST_LIGHT * state.typical_light) & (seen > SMALLEST_SEEN)
     keep &= share > claimed_share
     return rebuilt(task, state, state.particles[keep])
@@ -180,8 +173,7 @@ def prune(task: Task, state: State, claimed_share: float, unexplained: float) ->
 def rebuilt(task: Task, state: State, particles: NDArray[np.float64]) -> State:
     """Return the state with other particles, its residual computed from the image."""
     residual = task.image.copy()
-    tiles = share_out(task.view, particles, *task.depths_mm)
-    add_all(task.view, particles, tiles, -1.0, residual, task.capacity)
+    add_all(task.view, particles, -1.0, residual, task.depths_mm)
     return replace(state, particles=particles, residual=residual)
 
 
@@ -189,8 +181,7 @@ def with_typical_light(task: Task, state: State) -> State:
     """Return the state with the median light of the better fitting half, which holds fewer merged particles."""
     if not len(state.particles):
         return state
-    weight = pixel_weight(task, state, LAST_UNEXPLAINED)
-    chi2, *_ = judge(task.view, state.particles, state.residual, weight, task.capacity)
+    chi2, *_ = judge(observed(task, state, LAST_UNEXPLAINED), state.particles)
     typical = float(np.median(state.particles[chi2 <= np.median(chi2), 3]))
     return replace(state, typical_light=typical, noise=estimate_noise(task.image, typical))
 
@@ -205,11 +196,12 @@ def result(task: Task, state: State) -> Particles:
     shape = task.prepared.shape
     order = np.argsort(-state.particles[:, 3], kind="stable")
     particles = state.particles[order]
-    weight = pixel_weight(task, state, 0.0)
-    chi2, _, seen = judge(task.view, particles, state.residual, weight, task.capacity)
-    model, left, trust = (values.reshape(shape) for values in (task.image - state.residual, state.residual, weight))
+    observation = observed(task, state, 0.0)
+    chi2, _, seen = judge(observation, particles)
+    images = (task.image - state.residual, state.residual, observation.weight)
+    model, left, trust = (values.reshape(shape) for values in images)
     correlation = error_correlation(model, left, trust, state.noise)
-    covariance = joint_covariance(task.view, particles, weight, correlation, chi2, task.capacity)
+    covariance = joint_covariance(observation, particles, correlation, chi2)
     to_world = task.camera.to_image_axes(np.eye(3))
     return Particles(
         position_mm=task.camera.to_image_axes(particles[:, :3]),

@@ -8,20 +8,20 @@ Axes: image axes, mm; light in counts; residual and weights as flat images. A pa
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.particles.least_squares import (
     UNKNOWNS,
+    Observation,
     add_light,
     fit,
+    lit_by,
     normal_equations,
     respond_all,
-    respond_once,
+    room_for,
 )
-from lfpiv_cli.particles.response import VALUES
-from lfpiv_cli.particles.tiles import Tiles
-from lfpiv_cli.particles.view import View, view_of
+from lfpiv_cli.particles.tiles import footprint_px, over_tiles
 
 # Half the distance (x, y, z) of two particles at the start, mm: half a voxel of Table 2 sideways, or along the depth in
 # which a volume shows two as one.
@@ -41,20 +41,12 @@ PAIR_STEPS = 12
 EARLY_GAIN = 0.25
 
 
-@njit(cache=True, parallel=True)
 def split(
-    view: View,
+    observation: Observation,
     particles: NDArray[np.float64],
     suspects: NDArray[np.bool_],
-    tiles: Tiles,
-    residual: NDArray[np.float64],
-    weight: NDArray[np.float64],
-    z_low: float,
-    z_high: float,
     smallest_light: float,
     smallest_gain: float,
-    capacity: int,
-    box_px: int,
 ) -> NDArray[np.float64]:
     """Replace suspects by two particles where that lowers chi-squared by `smallest_gain`.
 
@@ -62,57 +54,62 @@ def split(
     the same shape whose other rows are zero. The residual is kept up to date.
     """
     partners = np.zeros_like(particles)
-    camera, rest = view.camera[:], view[1:]
-    for group in range(4):
-        for tile in prange(tiles.groups[group], tiles.groups[group + 1]):
-            whole = view_of(camera, rest)
-            pixels, values = np.empty((2, capacity), np.int32), np.empty((2, capacity, VALUES))
-            counts, place = np.zeros(2, np.int64), np.zeros((box_px, box_px), np.int32)
-            matrix, right = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
-            pair, best = np.empty((2, UNKNOWNS)), np.empty((2, UNKNOWNS))
-            for at in range(tiles.start[tile], tiles.start[tile + 1]):
-                number = tiles.order[at]
-                if not suspects[number]:
-                    continue
-                x, y, z, light = particles[number]
-                count = respond_once(whole, x, y, z, pixels[0], values[0])
-                add_light(pixels[0], values[0], count, light, residual)
-                single = normal_equations(pixels[0], values[0], count, light, residual, weight, matrix, right)
-                lowest = single - smallest_gain
-                promising = single - EARLY_GAIN * smallest_gain
-                found = False
-                for k in range(STARTS_MM.shape[0]):
-                    for m in range(2):
-                        sign = 1.0 - 2.0 * m
-                        pair[m, 0] = x + sign * STARTS_MM[k, 0]
-                        pair[m, 1] = y + sign * STARTS_MM[k, 1]
-                        pair[m, 2] = min(max(z + sign * STARTS_MM[k, 2], z_low), z_high)
-                        pair[m, 3] = 0.5 * light
-                    respond_all(whole, pair, counts, pixels, values)
-                    change = fit(
-                        whole,
-                        pair,
-                        residual,
-                        weight,
-                        z_low,
-                        z_high,
-                        PAIR_STEPS,
-                        promising,
-                        counts,
-                        pixels,
-                        values,
-                        place,
-                    )
-                    if change < lowest and min(pair[0, 3], pair[1, 3]) >= smallest_light:
-                        lowest, found = change, True
-                        best[:] = pair
-                if found:
-                    particles[number] = best[0]
-                    partners[number] = best[1]
-                    respond_all(whole, best, counts, pixels, values)
-                    for m in range(2):
-                        add_light(pixels[m], values[m], counts[m], -best[m, 3], residual)
-                else:
-                    count = respond_once(whole, x, y, z, pixels[0], values[0])
-                    add_light(pixels[0], values[0], count, -light, residual)
+    side = footprint_px(observation.optics, *observation.depths_mm)
+
+    def work(numbers: NDArray[np.int64]) -> None:
+        least = (smallest_gain, smallest_light)
+        _split(observation, particles, numbers[suspects[numbers]], side, PAIR_STEPS, least, partners)
+
+    over_tiles(work, observation.optics, particles, observation.depths_mm)
     return partners
+
+
+@njit(cache=True, nogil=True)
+def _split(
+    observation: Observation,
+    particles: NDArray[np.float64],
+    numbers: NDArray[np.int64],
+    side: int,
+    steps: int,
+    least: tuple[float, float],
+    partners: NDArray[np.float64],
+) -> None:
+    """Do the work of `split` for suspects of a tile; `least` is what two must gain, and the light of each."""
+    view, residual = observation.optics, observation.residual
+    responses = room_for(2, observation.capacity, side)
+    matrix, right = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
+    pair, best = np.empty((2, UNKNOWNS)), np.empty((2, UNKNOWNS))
+    for number in numbers:
+        one = particles[number : number + 1]
+        light = one[0, 3]
+        respond_all(view, one, responses)
+        pixels, values = lit_by(responses, 0)
+        add_light(pixels, values, light, residual)
+        single = normal_equations(pixels, values, light, residual, observation.weight, matrix, right)
+        lowest = single - least[0]
+        promising = single - EARLY_GAIN * least[0]
+        found = False
+        for offset in STARTS_MM:
+            for m in range(2):
+                sign = 1.0 - 2.0 * m
+                pair[m, 0] = one[0, 0] + sign * offset[0]
+                pair[m, 1] = one[0, 1] + sign * offset[1]
+                depth = one[0, 2] + sign * offset[2]
+                pair[m, 2] = min(max(depth, observation.low_mm), observation.high_mm)
+                pair[m, 3] = 0.5 * light
+            respond_all(view, pair, responses)
+            change = fit(observation, pair, responses, steps, promising)
+            if change < lowest and min(pair[0, 3], pair[1, 3]) >= least[1]:
+                lowest, found = change, True
+                best[:] = pair
+        if found:
+            particles[number] = best[0]
+            partners[number] = best[1]
+            respond_all(view, best, responses)
+            for m in range(2):
+                pixels, values = lit_by(responses, m)
+                add_light(pixels, values, -best[m, 3], residual)
+        else:
+            respond_all(view, one, responses)
+            pixels, values = lit_by(responses, 0)
+            add_light(pixels, values, -light, residual)

@@ -13,9 +13,8 @@ from scipy.spatial import KDTree
 
 from lfpiv_cli.particles.alternative_depths import try_other_depths
 from lfpiv_cli.particles.fitting import judge
-from lfpiv_cli.particles.search import SMALLEST_LIGHT, State, Task, pixel_weight
+from lfpiv_cli.particles.search import SMALLEST_LIGHT, State, Task, observed
 from lfpiv_cli.particles.splitting import split
-from lfpiv_cli.particles.tiles import footprint_px, share_out
 from lfpiv_cli.particles.view import footprint_radius_mm
 
 # A good particle's chi-squared is the one at this percentile; particles that fit worse by this factor are
@@ -32,49 +31,28 @@ CHANGED = np.array([0.005, 0.005, 0.05, 0.05, 0.2])
 
 def with_depths_corrected(task: Task, state: State, unexplained: float) -> State:
     """Return the state with particles moved to depths that explain the light better, the residual in place."""
-    weight = pixel_weight(task, state, unexplained)
-    chi2, *_ = judge(task.view, state.particles, state.residual, weight, task.capacity)
+    observation = observed(task, state, unexplained)
+    chi2, *_ = judge(observation, state.particles)
     good = _good(chi2)
     # Light that stays within about one lens fits well at many depths.
     near_focus = footprint_radius_mm(task.view, state.particles[:, 2]) < 2.0 * task.view.half_x_mm
     signature = _signature(state.particles, chi2)
     suspects = (near_focus | (chi2 > SUSPECT_CHI2 * good)) & ~_among(state.unmoved, signature)
-    moved = try_other_depths(
-        task.view,
-        state.particles,
-        suspects,
-        share_out(task.view, state.particles, *task.depths_mm),
-        state.residual,
-        weight,
-        *task.depths_mm,
-        SMALLEST_LIGHT * state.typical_light,
-        DEPTH_GAIN * good,
-        task.capacity,
-    )
+    light = SMALLEST_LIGHT * state.typical_light
+    moved = try_other_depths(observation, state.particles, suspects, light, DEPTH_GAIN * good)
     return replace(state, unmoved=np.concatenate([state.unmoved, signature[suspects & ~moved]]))
 
 
 def with_overlaps_split(task: Task, state: State, unexplained: float, thorough: bool) -> State:
     """Return the state with overlapping particles separated; `thorough`: also those of usual brightness."""
-    weight = pixel_weight(task, state, unexplained)
-    chi2, *_ = judge(task.view, state.particles, state.residual, weight, task.capacity)
+    observation = observed(task, state, unexplained)
+    chi2, *_ = judge(observation, state.particles)
     good = _good(chi2)
     bright = state.particles[:, 3] > (ENOUGH_FOR_TWO if thorough else BRIGHT) * state.typical_light
     signature = _signature(state.particles, chi2)
     suspects = bright & (chi2 > SUSPECT_CHI2 * good) & ~_among(state.unsplit, signature)
-    partners = split(
-        task.view,
-        state.particles,
-        suspects,
-        share_out(task.view, state.particles, *task.depths_mm),
-        state.residual,
-        weight,
-        *task.depths_mm,
-        SMALLEST_LIGHT * state.typical_light,
-        SPLIT_GAIN * good,
-        task.capacity,
-        footprint_px(task.view, *task.depths_mm),
-    )
+    light = SMALLEST_LIGHT * state.typical_light
+    partners = split(observation, state.particles, suspects, light, SPLIT_GAIN * good)
     found = partners[:, 3] > 0.0
     return replace(
         state,

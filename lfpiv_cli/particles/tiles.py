@@ -7,44 +7,45 @@ can be worked on at once; within a tile particles follow each other.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.particles.view import View, footprint_radius_mm, on_array_mm
+from lfpiv_cli.threads import in_threads
 
 # How far a particle may be moved within one sweep, on the array: footprints must not grow into other tiles.
 LARGEST_MOVE_MM = 0.15
 
 
-class Tiles(NamedTuple):
-    """Particles by tile.
+def over_tiles(
+    work: Callable[[NDArray[np.int64]], None], view: View, points: NDArray[np.float64], depths_mm: tuple[float, float]
+) -> None:
+    """Call work(numbers) with the particles of each tile, in their order, on all threads: one group after another.
 
-    Attributes
+    Parameters
     ----------
-    order : (n,) particle numbers, tile by tile, in the order given within each
-    start : (tiles + 1,) where each tile begins in `order`
-    groups : (5,) where each of the four groups of tiles begins
+    points : (n, 3 or more), image axes
+    depths_mm : between which particles stay
     """
-
-    order: NDArray[np.int64]
-    start: NDArray[np.int64]
-    groups: NDArray[np.int64]
+    for tiles in groups_of_tiles(view, points, depths_mm):
+        in_threads(work, tiles)
 
 
-def share_out(view: View, points: NDArray[np.float64], z_low_mm: float, z_high_mm: float) -> Tiles:
-    """Return the tiles of particles (n, 3 or more), image axes, whose depths stay between two limits."""
-    side = tile_side_mm(view, z_low_mm, z_high_mm)
-    tile = np.floor(on_array_mm(view, points) / side).astype(np.int64)
+def groups_of_tiles(
+    view: View, points: NDArray[np.float64], depths_mm: tuple[float, float]
+) -> list[list[NDArray[np.int64]]]:
+    """Return the numbers of the particles of each tile, for the four groups of tiles."""
+    tile = np.floor(on_array_mm(view, points) / tile_side_mm(view, *depths_mm)).astype(np.int64)
     group = tile[:, 0] % 2 + 2 * (tile[:, 1] % 2)
-    order = np.lexsort((np.arange(len(points)), tile[:, 0], tile[:, 1], group))
-    keys = np.column_stack([group, tile])[order]
-    begins = np.ones(len(points), dtype=bool)
-    begins[1:] = np.any(keys[1:] != keys[:-1], axis=1)
-    start = np.flatnonzero(begins)
-    groups = np.searchsorted(keys[start, 0], np.arange(5))
-    return Tiles(order, np.append(start, len(points)).astype(np.int64), groups.astype(np.int64))
+    groups = []
+    for number in range(4):
+        members = np.flatnonzero(group == number)
+        members = members[np.lexsort((members, tile[members, 0], tile[members, 1]))]
+        ends = np.flatnonzero(np.any(np.diff(tile[members], axis=0) != 0, axis=1)) + 1
+        groups.append([numbers for numbers in np.split(members, ends) if numbers.size])
+    return groups
 
 
 def tile_side_mm(view: View, z_low_mm: float, z_high_mm: float) -> float:

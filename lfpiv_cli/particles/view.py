@@ -9,10 +9,9 @@ focal point; lengths in mm about the optical axis.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.calibration.model import Calibration
@@ -105,12 +104,6 @@ def raw_view(camera: Camera, media: Media, particle_radius_mm: float, calibratio
         table=table,
         table_step_mm=step,
     )
-
-
-@njit(cache=True)
-def view_of(camera: tuple[Any, ...], rest: tuple[Any, ...]) -> View:
-    """Put `view.camera[:]` and `view[1:]` together again, in parallel loops (see `KernelCamera`)."""
-    return View(KernelCamera(*camera), *rest)
 
 
 def on_array_mm(view: View, points: NDArray[np.float64]) -> NDArray[np.float64]:

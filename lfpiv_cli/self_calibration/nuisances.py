@@ -20,12 +20,12 @@ from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import lsqr
 
 from lfpiv_cli.particles.fitting import add_all, refine
-from lfpiv_cli.particles.least_squares import UNKNOWNS
+from lfpiv_cli.particles.least_squares import UNKNOWNS, observation_of
 from lfpiv_cli.particles.noise import Noise
-from lfpiv_cli.particles.response import VALUES, respond
+from lfpiv_cli.particles.response import entries_of
 from lfpiv_cli.particles.rim import rim_table
-from lfpiv_cli.particles.tiles import share_out
 from lfpiv_cli.particles.view import View, entry_capacity
+from lfpiv_cli.threads import blocks, in_threads
 
 # A round with this many sweeps over the particles leaves a sixth of an error, four leave 1e-3 of it. They end earlier
 # when a step is within what the optics model gets wrong.
@@ -40,6 +40,8 @@ SHIFT_STEP_MM, SHARE_STEP, STRETCH_STEP = 2.5e-4, 0.004, 1e-4
 # What the optics model itself gets wrong: on an image traced ray by ray by another program, true to 4e-5 of the pitch,
 # aperture, radius and distortion came out 0.05 %, 0.7 % and 8e-5 (of stretch at the corner) off.
 MODEL_SHARE_OF_PITCH, MODEL_SHARE_OF_APERTURE, MODEL_SHARE_OF_RADIUS, MODEL_STRETCH = 1e-4, 6e-4, 0.01, 1.5e-4
+# Particles whose columns are made at a time.
+BLOCK = 64
 # Noise about zero is no light: pixels count as lit above this many standard deviations of the read noise.
 LIT_SIGMAS = 5.0
 
@@ -162,10 +164,9 @@ def _refined(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Refine particles in place; return what they leave of the image, and the weights of its pixels."""
     residual = image - _light(view, particles, image.size, depths_mm)
-    capacity = entry_capacity(view, *depths_mm)
     for _ in range(SWEEPS):
         weight = noise.weights(image - residual, residual, UNEXPLAINED)
-        refine(view, particles, share_out(view, particles, *depths_mm), residual, weight, *depths_mm, capacity)
+        refine(observation_of(view, residual, weight, depths_mm), particles)
     return residual, noise.weights(image - residual, residual, UNEXPLAINED)
 
 
@@ -174,8 +175,7 @@ def _light(
 ) -> NDArray[np.float64]:
     """Return the light (pixels,) of all particles."""
     image = np.zeros(pixels)
-    tiles = share_out(view, particles, *depths_mm)
-    add_all(view, particles, tiles, 1.0, image, entry_capacity(view, *depths_mm))
+    add_all(view, particles, 1.0, image, depths_mm)
     return image
 
 
@@ -188,8 +188,7 @@ def _gauss_newton(
     depths_mm: tuple[float, float],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the next step of the camera's unknowns and their standard errors, (5,) each."""
-    values, rows, starts = _columns(view, particles, root_weight, entry_capacity(view, *depths_mm))
-    own = csc_matrix((values, rows, starts), shape=(residual.size, UNKNOWNS * len(particles)))
+    own = _columns(view, particles, root_weight, entry_capacity(view, *depths_mm))
     unit = _steps(view)
     free = []
     for step in np.diag(unit):
@@ -229,26 +228,38 @@ def _corner_mm(view: View) -> float:
     return 0.5 * view.camera.pixel_mm * float(np.hypot(view.camera.columns, view.camera.rows))
 
 
-@njit(cache=True)
-def _columns(
-    view: View, particles: NDArray[np.float64], root_weight: NDArray[np.float64], capacity: int
-) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.int64]]:
+def _columns(view: View, particles: NDArray[np.float64], root_weight: NDArray[np.float64], capacity: int) -> csc_matrix:
     """Return the weighted derivatives by x, y, z and light of each particle, scaled to length 1, as sparse columns."""
-    pixels, values = np.empty(capacity, np.int32), np.empty((capacity, VALUES))
-    starts = np.zeros(UNKNOWNS * len(particles) + 1, np.int64)
-    for n in range(len(particles)):
-        count = respond(view, particles[n, 0], particles[n, 1], particles[n, 2], pixels, values)
+
+    def of(part: slice) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]:
+        counts, pixels, values = entries_of(view, particles[part], capacity)
+        return counts, *_scaled(counts, pixels, values, root_weight)
+
+    parts = in_threads(of, blocks(len(particles), BLOCK))
+    counts, rows, data = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    starts = np.concatenate([[0], np.cumsum(np.repeat(counts, UNKNOWNS))])
+    return csc_matrix((data, rows, starts), shape=(root_weight.size, UNKNOWNS * len(particles)))
+
+
+@njit(cache=True, nogil=True)
+def _scaled(
+    counts: NDArray[np.int64],
+    pixels: NDArray[np.int32],
+    values: NDArray[np.float64],
+    root_weight: NDArray[np.float64],
+) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+    """Return rows and values of the columns of some particles, from their entries."""
+    data, rows = np.empty(UNKNOWNS * pixels.size, np.float32), np.empty(UNKNOWNS * pixels.size, np.int32)
+    begin = at = 0
+    for count in counts:
         for k in range(UNKNOWNS):
-            starts[UNKNOWNS * n + k + 1] = starts[UNKNOWNS * n + k] + count
-    data, rows = np.empty(starts[-1], np.float32), np.empty(starts[-1], np.int32)
-    for n in range(len(particles)):
-        count = respond(view, particles[n, 0], particles[n, 1], particles[n, 2], pixels, values)
-        for k in range(UNKNOWNS):
-            start, length2 = starts[UNKNOWNS * n + k], 0.0
-            for entry in range(count):
+            length2 = 0.0
+            for entry in range(begin, begin + count):
                 length2 += (root_weight[pixels[entry]] * values[entry, k]) ** 2
             scale = 1.0 / np.sqrt(length2) if length2 > 0.0 else 0.0
-            for entry in range(count):
-                rows[start + entry] = pixels[entry]
-                data[start + entry] = scale * root_weight[pixels[entry]] * values[entry, k]
-    return data, rows, starts
+            for entry in range(begin, begin + count):
+                rows[at] = pixels[entry]
+                data[at] = scale * root_weight[pixels[entry]] * values[entry, k]
+                at += 1
+        begin += count
+    return rows, data
