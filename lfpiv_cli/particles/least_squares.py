@@ -315,7 +315,8 @@ def fit(
     return change
 
 
-@njit(cache=True)
+# Inlined: one function less to compile all of the response into.
+@njit(cache=True, inline="always")
 def _equations(
     observation: Observation,
     members: NDArray[np.float64],
