@@ -23,7 +23,7 @@ from lfpiv_cli.scale import Scale
 # light spreads by one lens (1.064 mm).
 # Standard error of a depth beside that of a lateral place, in D/L: 4 in Table 2.
 DEPTH_RATIO = 4.0 / 10.64
-# Displacements are sought up to this along each axis unless told otherwise, in L.
+# Displacements are sought up to this along each axis by default, in L.
 SEARCH_LENSES = 6.0
 NEIGHBOURS = 14
 # How far two displacements of neighbours may differ to count as alike, first and after a fit, laterally, in L.

@@ -1,0 +1,20 @@
+"""Work shared out to threads: every item once, in order, and no error lost."""
+
+from __future__ import annotations
+
+import pytest
+
+from lfpiv_cli.threads import blocks, in_threads
+
+
+@pytest.mark.parametrize(
+    ("count", "expected"), [(0, [(0, 0)]), (1, [(0, 1)]), (4, [(0, 2), (2, 4)]), (5, [(0, 2), (2, 4), (4, 5)])]
+)
+def test_blocks_hold_every_item_once(count: int, expected: list[tuple[int, int]]) -> None:
+    assert [(block.start, block.stop) for block in blocks(count, 2)] == expected
+
+
+def test_results_are_in_order_and_errors_come_through() -> None:
+    assert in_threads(lambda k: 10 // k, [1, 2, 5]) == [10, 5, 2]
+    with pytest.raises(ZeroDivisionError):
+        in_threads(lambda k: 10 // k, [1, 0, 5])
