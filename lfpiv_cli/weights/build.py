@@ -106,7 +106,7 @@ def _factorised(
 def traced_bending(space: ObjectSpace, camera: Camera, grid: Grid, axes: tuple[int, int]) -> list[Bending]:
     """Return how rays are bent along the columns and along the rows, which follow world `axes`."""
     depths = depth_nodes(grid.axis_mm(2), grid.spacing_mm[2])
-    if camera.focus_distance_mm + space.media.depth_ratio * depths.min() <= 0.0:
+    if equivalent_object_distance(depths.min(), camera.focus_distance_mm, space.media) <= 0.0:
         raise ConfigError(
             f"volume: its nearest point lies {grid.bounds_mm(2)[0]:.4g} mm from the focal point, behind the main lens"
         )
