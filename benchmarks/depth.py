@@ -13,7 +13,7 @@ from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.reconstruction.solvers import SolverSettings, reconstruct
-from lfpiv_cli.synthetic.render import ObjectSpace, render_points
+from lfpiv_cli.synthetic.render import Balls, ObjectSpace, render_points
 from lfpiv_cli.synthetic.sensor import Readout
 from lfpiv_cli.weights.build import default_padding, factorise
 
@@ -82,7 +82,7 @@ def images(case: Case, camera: Camera, box_mm: tuple[float, float, float]) -> li
     pair = []
     for sign in (-0.5, 0.5):
         points = (middle + sign * move + half) % (2.0 * half) - half
-        expected = render_points(camera, ObjectSpace(WATER, None, "paraxial"), points, light, 0.05, rng)
+        expected = render_points(camera, ObjectSpace(WATER, None, "paraxial"), Balls(points, light, 0.05), rng)
         pair.append(readout.record(expected, rng).astype(np.float32) - np.float32(DARK_COUNTS))
     return pair
 

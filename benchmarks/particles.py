@@ -29,7 +29,7 @@ from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.reconstruction.equations import Normalisers, normalisers
 from lfpiv_cli.robust import MAD_TO_SIGMA
 from lfpiv_cli.synthetic.board import BoardPlacement, render_board
-from lfpiv_cli.synthetic.render import ObjectSpace, render_points, render_white
+from lfpiv_cli.synthetic.render import Balls, ObjectSpace, render_points, render_white
 from lfpiv_cli.synthetic.scenes import Misalignment
 from lfpiv_cli.synthetic.sensor import Readout
 from lfpiv_cli.validation.bounds import cramer_rao_bound, expected_image, pixel_variance, slopes
@@ -122,7 +122,7 @@ def print_figures(bench: Bench, count: int, seed: int, log_spread: float | None 
     readout = Readout()
     window = channel_window(bench.sheet.focus_distance_mm, WATER, CHANNEL_MM, WALL_MM, mid_plane_z_mm=0.0)
     space = ObjectSpace(WATER, window, "exact")
-    expected = render_points(bench.real, space, true, LIGHT_COUNTS * brightness, DIAMETER_MM, rng)
+    expected = render_points(bench.real, space, Balls(true, LIGHT_COUNTS * brightness, DIAMETER_MM), rng)
     image = readout.record(expected, rng).astype(np.float32) - np.float32(readout.dark_level_counts)
 
     camera = bench.calibration.camera(bench.sheet)

@@ -21,7 +21,7 @@ Tree = dict[str, Any]
 
 MAGNIFICATION = (0.1, 6.0)
 F_NUMBER = (2.8, 16.0)
-# Towards the array; beyond, light spreads more by diffraction than pixels tell apart.
+# Towards the array; beyond, light spreads more by diffraction than pixels resolve.
 LARGEST_WORKING_F_NUMBER = 25.0
 FOCAL_LENGTHS_MM = (25.0, 35.0, 50.0, 60.0, 85.0, 100.0, 105.0, 180.0)
 PITCH_PX = (8.0, 40.0)

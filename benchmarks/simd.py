@@ -25,7 +25,7 @@ def bench_simd() -> None:
 
 
 def gains(calls: int, repeats: int, names: Sequence[str] = ()) -> dict[str, float]:
-    """Return the time of each twin over that of its intrinsic, in a compiled loop; of all of them, or of those named."""
+    """Return the time of each twin over that of its intrinsic, in a compiled loop; of all, or of those named."""
     found = {}
     rivals_of = _rivals()
     for name in names or rivals_of:

@@ -22,7 +22,7 @@ from lfpiv_cli.optics.tracing import slopes_equivalent, trace
 from lfpiv_cli.synthetic import board as board_module
 from lfpiv_cli.synthetic.board import BoardPlacement, render_board
 from lfpiv_cli.synthetic.flows import advect, square_duct
-from lfpiv_cli.synthetic.render import ObjectSpace, render_points, render_white
+from lfpiv_cli.synthetic.render import Balls, ObjectSpace, render_points, render_white
 
 WATER = Media(1.0, 1.49, 1.33)
 AIR = ObjectSpace(Media())
@@ -174,7 +174,7 @@ def likeness(experiment, name, camera=None, places=None, refraction="exact"):
         np.abs(places[:, 1] - (y0 + y1) / 2) < (y1 - y0) / 2 + REACH_MM
     )
     space = ObjectSpace(WATER, experiment.window(), refraction)
-    picture = render_points(camera, space, places[near], 1.0, TRACER_MM, np.random.default_rng(1), rays=RAYS)
+    picture = render_points(camera, space, Balls(places[near], 1.0, TRACER_MM), np.random.default_rng(1), rays=RAYS)
     (c0, r0), (c1, r1) = np.rint(camera.mm_to_px([(-x1, -y1), (-x0, -y0)])).astype(int)
     part = (slice(r0, r1), slice(c0, c1))
     return np.corrcoef(picture[part].ravel(), experiment.images[name][part].ravel())[0, 1]
@@ -315,6 +315,8 @@ def test_the_whole_pair_is_the_data_s(experiment):
     space = ObjectSpace(WATER, experiment.window())
     for direction, same, other in ((-0.5, "pair_a", "pair_b"), (0.5, "pair_b", "pair_a")):
         places = experiment.frame_a(direction)
-        picture = render_points(experiment.camera(), space, places, 1.0, TRACER_MM, np.random.default_rng(1)).ravel()
+        picture = render_points(
+            experiment.camera(), space, Balls(places, 1.0, TRACER_MM), np.random.default_rng(1)
+        ).ravel()
         assert np.corrcoef(picture, experiment.images[same].ravel())[0, 1] > 0.965
         assert np.corrcoef(picture, experiment.images[other].ravel())[0, 1] < 0.3

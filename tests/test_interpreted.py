@@ -18,12 +18,22 @@ from lfpiv_cli.flow.maps import map_sums, margins
 from lfpiv_cli.flow.moments import MOMENTS, pair_moments
 from lfpiv_cli.flow.windows import layout_windows
 from lfpiv_cli.grid import Grid
+from lfpiv_cli.names import Layout
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.microlenses import Lattice
+from lfpiv_cli.optics.object_space import ObjectSpace
+from lfpiv_cli.particles.fitting import add_all
+from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.simd import combine, splines
+from lfpiv_cli.synthetic.render import Balls, render_points
 from lfpiv_cli.weights.build import factorise
 from lfpiv_cli.weights.operators import adjoint_reference, forward_reference
+from lfpiv_cli.weights.quadrature import integrate_columns
+from lfpiv_cli.weights.rays import RayCount, count_rays, sampling_error
+
+# Off the axis and out of focus: a point's light goes through several lenses.
+PLACE_MM, POINT_MM = (0.02, -0.01, 1.8), (1e-3, 1e-3, 1e-3)
 
 
 def test_readable_twins_stand_for_intrinsics_where_nothing_is_compiled() -> None:
@@ -65,3 +75,32 @@ def test_maps_and_moments_are_sums_over_a_window(rng: np.random.Generator) -> No
     # the last of the ten products among gradient and mean, and the last of those with the difference
     mean = 0.5 * (a + b)
     np.testing.assert_allclose(found[0, 0, 0, [9, 13]], [np.sum(mean**2), np.sum(mean * (b - a))], rtol=1e-5)
+
+
+@pytest.fixture
+def coarse(table2: Camera) -> Camera:
+    """Micro-images of 4.5 pixels, 20 lenses."""
+    return replace(table2, columns=20, rows=20, pixel_mm=0.022)
+
+
+@pytest.mark.parametrize("layout", ["square", "hexagonal"])
+def test_columns_are_what_rays_make(water: Media, coarse: Camera, rng: np.random.Generator, layout: Layout) -> None:
+    camera, space = replace(coarse, lattice=Lattice.regular(0.1, layout)), ObjectSpace(water, None, "paraxial")
+    column = integrate_columns(camera, space, [PLACE_MM], POINT_MM, 12, 1).image(0, (20, 20))
+    assert column.sum() == pytest.approx(1.0, abs=1e-5)
+    rendered = render_points(camera, space, Balls(PLACE_MM, 1.0, 0.0), rng, rays=1000)
+    with np.errstate(over="ignore"):  # the random numbers' counter is to overflow
+        counted = count_rays(camera, space, PLACE_MM, POINT_MM, rng, RayCount(2, 500))
+    # 1,000 rays over some 50 pixels, evenly spread and random ones
+    assert np.abs(rendered - column).sum() < 0.12
+    assert np.abs(counted - column).sum() < 1.3 * sampling_error(column, 1000)
+
+
+def test_particles_are_balls_as_rays_make_them(water: Media, coarse: Camera, rng: np.random.Generator) -> None:
+    view, particles = raw_view(coarse, water, 0.025), np.array([(*PLACE_MM, 1.0)])
+    image = np.zeros(400)
+    add_all(view, particles, 1.0, image, (1.0, 2.0))
+    space = ObjectSpace(water, None, "paraxial")
+    rendered = render_points(coarse, space, Balls(PLACE_MM, 1.0, 0.05), rng, rays=4000).ravel()
+    # 4,000 rays over some 50 pixels
+    assert np.abs(image - rendered).sum() < 0.06

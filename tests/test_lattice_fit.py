@@ -87,7 +87,7 @@ def test_spectrum_of_hexagons_turns_to_the_columns(angle_deg: float) -> None:
 
 @pytest.mark.parametrize("radius_per_pitch", [0.2, 0.45])
 @pytest.mark.parametrize(("pitch", "angle_deg"), [(6.1, 2.7), (10.3, -41.0), (23.0, 0.4), (60.0, -2.0)])
-def test_untold_lattices_stopped_down_or_at_working_aperture(
+def test_lattices_are_found_stopped_down_or_at_working_aperture(
     layout: str, pitch: float, angle_deg: float, radius_per_pitch: float, rng: np.random.Generator
 ) -> None:
     side = (480, 520) if pitch > 20.0 else (240, 280)

@@ -14,7 +14,7 @@ from lfpiv_cli.particles.fitting import add_all, refine
 from lfpiv_cli.particles.least_squares import observation_of
 from lfpiv_cli.particles.refraction import paraxial_shift, places_by_snell
 from lfpiv_cli.particles.view import raw_view
-from lfpiv_cli.synthetic.render import render_points
+from lfpiv_cli.synthetic.render import Balls, render_points
 
 DEPTHS = (-4.5, 4.5)
 
@@ -32,7 +32,7 @@ def test_fits_to_refracted_rays_are_set_right(
     camera = replace(table2, columns=900, rows=600)
     space = behind(camera, water, fluid_mm, 5.0)
     true = np.array([(-1.2, 0.3, 2.5), (0.4, -0.8, 3.1), (1.5, 0.6, -2.2), (-0.3, 1.1, -3.0), (1.6, 0.0, 1.2)])
-    image = render_points(camera, space, true, np.full(5, 4e5), 0.05, rng, rays=100_000).ravel()
+    image = render_points(camera, space, Balls(true, np.full(5, 4e5), 0.05), rng, rays=100_000).ravel()
     view = raw_view(camera, water, 0.025)
     found = np.column_stack([true, np.full(5, 4e5)])
     residual = image.copy()

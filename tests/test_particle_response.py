@@ -15,7 +15,7 @@ from lfpiv_cli.particles.cells import cell_shares, level_at, share_at
 from lfpiv_cli.particles.response import respond
 from lfpiv_cli.particles.rim import covered_share, rim_table
 from lfpiv_cli.particles.view import View, entry_capacity, raw_view
-from lfpiv_cli.synthetic.render import ObjectSpace, render_points
+from lfpiv_cli.synthetic.render import Balls, ObjectSpace, render_points
 
 RADIUS_MM = 0.025
 # In, near and out of focus, on both sides, off the axis; light goes through 1 to 50 lenses.
@@ -51,7 +51,9 @@ def test_response_is_what_rays_make(small: Camera, water: Media, place: tuple[fl
     response = images(view, place)
     rays = 1_000_000
     space = ObjectSpace(water, None, "paraxial")
-    traced = render_points(small, space, [place], 1.0, 2 * RADIUS_MM, np.random.default_rng(1), rays=rays).ravel()
+    traced = render_points(
+        small, space, Balls([place], 1.0, 2 * RADIUS_MM), np.random.default_rng(1), rays=rays
+    ).ravel()
     assert response[:, 0].sum() == pytest.approx(1.0, abs=1e-3)
     # The rays' own noise is 0.8 sqrt(f/n) a pixel, summed over the pixels; the model may add half of a per cent.
     noise = 0.8 * np.sqrt(traced / rays).sum()

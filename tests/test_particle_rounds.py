@@ -19,7 +19,7 @@ from lfpiv_cli.particles.rounds import find_particles
 from lfpiv_cli.particles.search import task_of
 from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.reconstruction.equations import normalisers
-from lfpiv_cli.synthetic.render import render_points
+from lfpiv_cli.synthetic.render import Balls, render_points
 from lfpiv_cli.weights.build import default_padding, factorise, factorise_bricks
 from lfpiv_cli.weights.model import Weights
 
@@ -41,7 +41,7 @@ def test_particles_are_found_where_they_are(
     low, high = (np.array([grid.bounds_mm(axis)[side] for axis in range(3)]) for side in (0, 1))
     true = rng.uniform(low, high, (30, 3))
     light = rng.uniform(3e5, 6e5, 30)
-    expected = render_points(camera, ObjectSpace(water, None, "paraxial"), true, light, 0.05, rng, rays=100_000)
+    expected = render_points(camera, ObjectSpace(water, None, "paraxial"), Balls(true, light, 0.05), rng, rays=100_000)
     image = rng.poisson(expected).astype(np.float32) + rng.normal(0.0, 6.0, expected.shape).astype(np.float32)
     weights = weights_of(camera, water, grid)
     found = find_particles(task_of(image, raw_view(camera, water, 0.025), weights, camera, normalisers(weights.padded)))
@@ -65,7 +65,7 @@ def test_pixels_that_are_left_out_do_not_matter(table2: Camera, water: Media, rn
     grid = Grid.centred((14, 11, 10), (0.1, 0.1, 0.1), (0.0, 0.0, 1.9))
     true = rng.uniform(*(np.array([grid.bounds_mm(axis)[side] for axis in range(3)]) for side in (0, 1)), (12, 3))
     space = ObjectSpace(water, None, "paraxial")
-    image = render_points(camera, space, true, np.full(12, 4e5), 0.05, rng, rays=50_000).astype(np.float32)
+    image = render_points(camera, space, Balls(true, np.full(12, 4e5), 0.05), rng, rays=50_000).astype(np.float32)
     image += rng.normal(0.0, 6.0, image.shape).astype(np.float32)
     left_out = np.zeros(image.shape, np.bool_)
     left_out[100:140, 150:200] = True

@@ -12,7 +12,7 @@ from lfpiv_cli.optics.media import Media, Window, fluid_path_to_focus
 from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.optics.tracing import disc_points, exact_slope, slopes_equivalent, slopes_exact, trace
 from lfpiv_cli.synthetic import render
-from lfpiv_cli.synthetic.render import ObjectSpace, render_points, render_white, slope_polynomial, slope_ratio
+from lfpiv_cli.synthetic.render import Balls, ObjectSpace, render_points, render_white, slope_polynomial, slope_ratio
 
 
 @pytest.fixture
@@ -39,7 +39,7 @@ def image_of(camera, sensor_mm, weights):
 def test_renderer_equals_the_readable_tracer(small, space, rng):
     points = np.array([[0.05, -0.1, 3.0], [-0.2, 0.1, -4.0]])
     light, rays, diameter = np.array([1.0, 3.0]), 400, 0.05
-    found = render_points(small, space, points, light, diameter, np.random.default_rng(5), rays=rays)
+    found = render_points(small, space, Balls(points, light, diameter), np.random.default_rng(5), rays=rays)
 
     expected = np.zeros_like(found)
     for point, brightness, shift in zip(points, light, np.random.default_rng(5).random((2, 4)), strict=True):
@@ -59,20 +59,20 @@ def test_renderer_equals_the_readable_tracer(small, space, rng):
 
 def test_column_axis_is_applied_once(small, space, rng):
     point = np.array([[0.2, -0.05, 2.0]])
-    along_x = render_points(small, space, point, 1.0, 0.05, np.random.default_rng(1), rays=100)
+    along_x = render_points(small, space, Balls(point, 1.0, 0.05), np.random.default_rng(1), rays=100)
     turned = replace(small, column_axis="y")
-    along_y = render_points(turned, space, point[:, [1, 0, 2]], 1.0, 0.05, np.random.default_rng(1), rays=100)
+    along_y = render_points(turned, space, Balls(point[:, [1, 0, 2]], 1.0, 0.05), np.random.default_rng(1), rays=100)
     assert np.array_equal(along_x, along_y)
 
 
 def test_light_off_the_sensor_is_lost(small, space, rng):
     inside, beyond = np.array([[0.0, 0.0, 1.0]]), np.array([[3.0, 0.0, 1.0]])
-    assert render_points(small, space, inside, 7.0, 0.0, rng, rays=1000).sum() == pytest.approx(7.0)
-    assert render_points(small, space, beyond, 7.0, 0.0, rng, rays=1000).sum() == 0.0
+    assert render_points(small, space, Balls(inside, 7.0, 0.0), rng, rays=1000).sum() == pytest.approx(7.0)
+    assert render_points(small, space, Balls(beyond, 7.0, 0.0), rng, rays=1000).sum() == 0.0
 
 
 def test_no_points_give_a_dark_image(small, space, rng):
-    assert render_points(small, space, np.empty((0, 3)), 1.0, 0.05, rng).sum() == 0.0
+    assert render_points(small, space, Balls(np.empty((0, 3)), 1.0, 0.05), rng).sum() == 0.0
 
 
 def test_slope_polynomial_against_exact_snell():
@@ -97,7 +97,7 @@ def test_same_bits_for_any_number_of_threads_and_any_batch(small, space, rng, mo
     points = rng.uniform(-0.2, 0.2, (7, 3))
 
     def picture():
-        return render_points(small, space, points, 1.0, 0.05, np.random.default_rng(3), rays=500)
+        return render_points(small, space, Balls(points, 1.0, 0.05), np.random.default_rng(3), rays=500)
 
     expected = picture()
     with one_thread():
@@ -109,20 +109,20 @@ def test_same_bits_for_any_number_of_threads_and_any_batch(small, space, rng, mo
 def test_progress_counts_the_points(small, space, rng, monkeypatch):
     monkeypatch.setattr(render, "RAYS_AT_ONCE", 20)
     done = []
-    render_points(small, space, np.zeros((5, 3)), 1.0, 0.05, rng, rays=10, progress=done.append)
+    render_points(small, space, Balls(np.zeros((5, 3)), 1.0, 0.05), rng, rays=10, progress=done.append)
     assert done == [2, 2, 1]
 
 
 def test_exact_refraction_needs_a_window(small, water, rng):
     with pytest.raises(ConfigError, match=r"1\.33 needs a window"):
-        render_points(small, ObjectSpace(water, None, "exact"), np.zeros((1, 3)), 1.0, 0.05, rng)
+        render_points(small, ObjectSpace(water, None, "exact"), Balls(np.zeros((1, 3)), 1.0, 0.05), rng)
 
 
 def test_a_point_in_front_of_the_fluid_is_refused(small, water, rng):
     window = Window(195.0, 1.0)
     path = fluid_path_to_focus(window, small.focus_distance_mm, water)
     with pytest.raises(ConfigError, match="in front of the fluid"):
-        render_points(small, ObjectSpace(water, window), np.array([[0, 0, -path - 0.5]]), 1.0, 0.05, rng)
+        render_points(small, ObjectSpace(water, window), Balls(np.array([[0, 0, -path - 0.5]]), 1.0, 0.05), rng)
 
 
 @pytest.mark.parametrize("microlens_distance", [0.8, 0.7])

@@ -13,7 +13,7 @@ from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.media import Media, channel_window, fluid_path_to_focus
 from lfpiv_cli.synthetic.board import BoardPlacement
 from lfpiv_cli.synthetic.flows import rigid_rotation, uniform
-from lfpiv_cli.synthetic.render import ObjectSpace, render_points
+from lfpiv_cli.synthetic.render import Balls, ObjectSpace, render_points
 from lfpiv_cli.synthetic.scenes import (
     Box,
     Misalignment,
@@ -100,7 +100,7 @@ def test_frames_lie_evenly_about_the_time_of_the_truth(small, frames):
     # 1 ms: metres per second are mm
     for image, time_ms in zip(found.images, {2: (-1, 1), 3: (-2, 0, 2)}[frames], strict=True):
         places, light = found.positions_mm + time_ms * velocity, 1e5 * found.brightness
-        expected = render_points(small, AIR, places, light, 0.05, np.random.default_rng(9), rays=20_000)
+        expected = render_points(small, AIR, Balls(places, light, 0.05), np.random.default_rng(9), rays=20_000)
         # two sets of rays of the same tracers
         assert np.corrcoef(image.ravel(), expected.ravel())[0, 1] > 0.97
 

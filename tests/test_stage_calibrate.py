@@ -52,7 +52,7 @@ def square() -> Lattice:
     return Lattice.regular(14.2, "square", np.deg2rad(0.7), (117.3, 98.4))
 
 
-def test_layout_is_found_untold_and_checked_when_told(tmp_path: Path) -> None:
+def test_layout_is_found_and_checked_when_given(tmp_path: Path) -> None:
     hexagons = Lattice.regular(14.2, "hexagonal", np.deg2rad(0.7), (117.3, 98.4))
     picture = white(tmp_path / "w.tif", hexagons, 5.5)
     assert calibrated(tmp_path, config(tmp_path), [picture])["layout"] == "hexagonal"

@@ -12,7 +12,6 @@ from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.optics.tracing import (
     disc_points,
     exact_slope,
-    kernel_distances,
     slopes_direct,
     slopes_equivalent,
     slopes_exact,
@@ -182,8 +181,7 @@ def test_kernel_traces_as_its_twin(camera, water, rng):
     points, lens = scene(rng, camera)
     slopes = slopes_equivalent(points, lens, camera, water)
     expected = trace(camera, lens, slopes).sensor_mm
-    place = (kernel_distances(camera), camera.distortion_per_mm2, camera.lattice.origin, camera.lattice.basis)
-    found = np.array([trace_ray(*x, *s, *place) for x, s in zip(lens, slopes, strict=True)])
+    found = np.array([trace_ray(camera.for_kernels(), *x, *s) for x, s in zip(lens, slopes, strict=True)])
     assert found == pytest.approx(expected, abs=1e-12)
 
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 # A dot whose place or depth is this many robust deviations off the common board is dirt.
 OUTLIER_SIGMAS = 6.0
-# Terms of which one is this close to a sum of the others, each scaled to 1, cannot be told apart.
+# Terms of which one is this close to a sum of the others, each scaled to 1, cannot be separated.
 LEAST_RANK = 1e-6
 # Six numbers place the board sideways, a seventh is the distortion; with fewer dots than these it has little check.
 FEWEST_DOTS_FOR_DISTORTION = 12

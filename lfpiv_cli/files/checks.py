@@ -15,7 +15,7 @@ from lfpiv_cli.files.bench import (
 from lfpiv_cli.files.sections import Sections
 from lfpiv_cli.files.sections_simulated import SimulationSection
 from lfpiv_cli.files.yaml_nodes import KeyPath
-from lfpiv_cli.optics.media import Window, fluid_path_to_focus
+from lfpiv_cli.optics.media import Window, equivalent_object_distance, fluid_path_to_focus
 from lfpiv_cli.reference import FOCAL_POINT
 
 Found = Iterator[tuple[KeyPath, str]]
@@ -150,7 +150,7 @@ def _object_space(sections: Sections) -> Found:
         return
     camera, media = camera_of(section), media_of(sections.media)
     nearest = grid_of(volume, section, FOCAL_POINT).bounds_mm(2)[0]
-    distance = camera.focus_distance_mm + media.depth_ratio * nearest
+    distance = float(equivalent_object_distance(nearest, camera.focus_distance_mm, media))
     if distance <= 0.0:
         yield (
             ("volume",),

@@ -9,6 +9,7 @@ paper.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -44,6 +45,13 @@ class Window:
 
     distance_mm: float
     thickness_mm: float
+
+
+class Layers(NamedTuple):
+    """Plane layers, from the lens on: their thicknesses (n,), mm, and refractive indices (n,)."""
+
+    thicknesses_mm: NDArray[np.float64]
+    indices: NDArray[np.float64]
 
 
 def equivalent_object_distance(z_mm: ArrayLike, focus_distance_mm: float, media: Media) -> NDArray[np.float64]:

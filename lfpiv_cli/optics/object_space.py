@@ -19,6 +19,7 @@ from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.names import Refraction, TracedMethod
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import (
+    Layers,
     Media,
     Window,
     equivalent_object_distance,
@@ -70,8 +71,8 @@ class ObjectSpace:
         matrices = [object_space_matrix(z, window, camera.focus_distance_mm, self.media) for z in depths.ravel()]
         return np.array([matrix[0, 1] / matrix[1, 1] for matrix in matrices]).reshape(depths.shape)
 
-    def layers(self, camera: Camera) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the thicknesses from the lens to the focal point, mm, and their indices; the last one grows with z.
+    def layers(self, camera: Camera) -> Layers:
+        """Return the layers from the lens to the focal point; the last one grows with z.
 
         Paraxial rays and rays in air are straight in one layer, the equivalent one.
 
@@ -81,7 +82,7 @@ class ObjectSpace:
         """
         media = self.media
         if self.straight:
-            return np.array([camera.focus_distance_mm]), np.array([media.air])
+            return Layers(np.array([camera.focus_distance_mm]), np.array([media.air]))
         if self.window is None:
             raise ConfigError(f"exact refraction into a fluid of index {media.fluid} needs a window, none was given")
         path = fluid_path_to_focus(self.window, camera.focus_distance_mm, media)
@@ -90,7 +91,17 @@ class ObjectSpace:
             air = self.window.distance_mm
         else:  # what window and fluid, the only ones that aberrate, leave of the equivalent distance
             air = camera.focus_distance_mm - wall * media.air / media.window - path * media.depth_ratio
-        return np.array([air, wall, path]), np.array([media.air, media.window, media.fluid])
+        return Layers(np.array([air, wall, path]), np.array([media.air, media.window, media.fluid]))
+
+    def last_layers_mm(self, camera: Camera, z_mm: ArrayLike) -> NDArray[np.float64]:
+        """Return how thick the last of `layers` is in front of points at depth z; not above 0 in front of the fluid.
+
+        Raises
+        ------
+        ConfigError : exact refraction in a fluid without a window
+        """
+        growth = self.media.depth_ratio if self.straight else 1.0
+        return self.layers(camera).thicknesses_mm[-1] + growth * np.asarray(z_mm, dtype=np.float64)
 
     def slope_polynomials(
         self, camera: Camera, z_mm: ArrayLike, reach_mm: float
@@ -110,22 +121,22 @@ class ObjectSpace:
             nodes, factors = np.zeros((2, depths.size, SLOPE_NODES))
             factors[:, 0] = 1.0 / self.distance(camera, depths)
             return nodes, factors
-        thicknesses, indices = self.layers(camera)
-        if thicknesses[-1] + depths.min() <= 0.0:
+        last_layers = self.last_layers_mm(camera, depths)
+        if last_layers.min() <= 0.0:
             raise ConfigError(f"a point at z = {depths.min():g} mm lies in front of the fluid")
-        return _polynomials_at(depths, reach_mm, thicknesses, indices)
+        return _polynomials_at(last_layers, reach_mm, self.layers(camera))
 
 
 @njit(cache=True)
 def _polynomials_at(
-    depths: NDArray[np.float64], reach_mm: float, thicknesses: NDArray[np.float64], indices: NDArray[np.float64]
+    last_layers_mm: NDArray[np.float64], reach_mm: float, layers: Layers
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return nodes and factors for points at several depths."""
-    nodes, factors = np.empty((depths.size, SLOPE_NODES)), np.empty((depths.size, SLOPE_NODES))
-    layers = thicknesses.copy()
-    for k in range(depths.size):
-        layers[-1] = thicknesses[-1] + depths[k]
-        nodes[k], factors[k] = slope_polynomial(reach_mm, layers, indices)
+    """Return nodes and factors for points behind as much of the last layer as given."""
+    nodes, factors = np.empty((last_layers_mm.size, SLOPE_NODES)), np.empty((last_layers_mm.size, SLOPE_NODES))
+    thicknesses = layers.thicknesses_mm.copy()
+    for k in range(last_layers_mm.size):
+        thicknesses[-1] = last_layers_mm[k]
+        nodes[k], factors[k] = slope_polynomial(reach_mm, thicknesses, layers.indices)
     return nodes, factors
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.camera import Camera, KernelCamera
 from lfpiv_cli.optics.media import (
     Media,
     Window,
@@ -114,42 +114,35 @@ def trace(camera: Camera, lens: ArrayLike, slopes: ArrayLike) -> Hits:
 
 @njit(cache=True)
 def trace_ray(
-    lens_x: float,
-    lens_y: float,
-    slope_x: float,
-    slope_y: float,
-    distances: tuple[float, float, float, float],
-    distortion: float,
-    origin: NDArray[np.float64],
-    basis: NDArray[np.float64],
+    camera: KernelCamera, lens_x: float, lens_y: float, slope_x: float, slope_y: float
 ) -> tuple[float, float]:
-    """Return where one ray strikes the sensor, mm: `trace` for kernels.
-
-    `distances` holds F_m, s_i, f_m and s_mu; `origin` and `basis` the lattice on the array.
-    """
-    focal_length, image_distance, microlens_focal_length, microlens_distance = distances
-    behind_x = slope_x - lens_x / focal_length
-    behind_y = slope_y - lens_y / focal_length
-    x = lens_x + image_distance * behind_x
-    y = lens_y + image_distance * behind_y
-    stretch = 1.0 + distortion * (x * x + y * y)
+    """Return where one ray strikes the sensor, mm: `trace` for kernels."""
+    behind_x = slope_x - lens_x / camera.focal_length_mm
+    behind_y = slope_y - lens_y / camera.focal_length_mm
+    x = lens_x + camera.image_distance_mm * behind_x
+    y = lens_y + camera.image_distance_mm * behind_y
+    stretch = 1.0 + camera.distortion_per_mm2 * (x * x + y * y)
     x *= stretch
     y *= stretch
-    centre_x, centre_y = nearest_point(x, y, origin, basis)
-    return (
-        x + microlens_distance * (behind_x - (x - centre_x) / microlens_focal_length),
-        y + microlens_distance * (behind_y - (y - centre_y) / microlens_focal_length),
-    )
+    centre_x, centre_y = nearest_point(x, y, camera.origin_mm, camera.basis_mm)
+    return behind_microlens(camera, x, centre_x, behind_x), behind_microlens(camera, y, centre_y, behind_y)
 
 
-def kernel_distances(camera: Camera) -> tuple[float, float, float, float]:
-    """Return the lengths that `trace_ray` takes."""
-    return (
-        camera.focal_length_mm,
-        camera.image_distance_mm,
-        camera.microlens_focal_length_mm,
-        camera.microlens_distance_mm,
-    )
+@njit(cache=True)
+def behind_microlens(camera: KernelCamera, place: float, centre: float, slope: float) -> float:
+    """Return one coordinate on the sensor of a ray that meets the array at `place` under the microlens at `centre`.
+
+    The last part of Eq. 1; `slope` is the ray's between main lens and array.
+    """
+    return place + camera.microlens_distance_mm * (slope - (place - centre) / camera.microlens_focal_length_mm)
+
+
+@njit(cache=True)
+def struck_pixel(camera: KernelCamera, x: float, y: float) -> int:
+    """Return the flat number of the pixel at a place on the sensor, mm; -1 off the sensor."""
+    column = int(np.floor(x / camera.pixel_mm + 0.5 * camera.columns))
+    row = int(np.floor(y / camera.pixel_mm + 0.5 * camera.rows))
+    return row * camera.columns + column if 0 <= column < camera.columns and 0 <= row < camera.rows else -1
 
 
 def disc_points(count: int, radius: float, rng: np.random.Generator) -> NDArray[np.float64]:

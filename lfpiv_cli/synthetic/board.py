@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
-from lfpiv_cli.synthetic.render import ObjectSpace, render_points, render_white
+from lfpiv_cli.synthetic.render import Balls, ObjectSpace, render_points, render_white
 
 # A dot is made of this many points in a sunflower's order, small balls that close the gaps between them: 0.2 mm dots of
 # 0.0125 mm points, an eighth of a microlens.
@@ -96,7 +96,7 @@ def render_board(
     area = 0.25 * np.pi * board.dot_diameter_mm**2 / POINTS_PER_DOT
     light = area * light_per_area(camera, space.media, points[:, 2], level)
     size = board.dot_diameter_mm / np.sqrt(POINTS_PER_DOT)
-    dots = render_points(camera, space, points, light, size, rng, rays=RAYS_PER_POINT)
+    dots = render_points(camera, space, Balls(points, light, size), rng, rays=RAYS_PER_POINT)
     if board.polarity == "bright":
         return dots
     # the rays' noise may ask for more than there is

@@ -11,16 +11,18 @@ order of the points: the same bits for any number of threads.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numba import njit, prange
 from numpy.typing import ArrayLike, NDArray
 
 from lfpiv_cli.errors import ConfigError
-from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.camera import Camera, KernelCamera
+from lfpiv_cli.optics.media import Layers
 from lfpiv_cli.optics.microlenses import nearest_point
 from lfpiv_cli.optics.object_space import ObjectSpace, slope_polynomial, slope_ratio
-from lfpiv_cli.optics.tracing import kernel_distances, trace_ray
+from lfpiv_cli.optics.tracing import struck_pixel, trace_ray
 
 # Additive recurrence in four dimensions (aperture and ball): powers of the inverse of the root of x^5 = x + 1, whose
 # multiples fill the unit cube more evenly than random points do.
@@ -38,26 +40,37 @@ RAYS = 40_000
 WHITE_SAMPLES_PER_SIDE = 8
 
 
+@dataclass(frozen=True, eq=False)
+class Balls:
+    """Small balls that glow evenly and send light through the whole aperture: tracers.
+
+    Attributes
+    ----------
+    points_mm : (n, 3) centres, world axes
+    light : (n,) or one number, expected counts of each that pass the aperture; those that miss the sensor are lost
+    diameter_mm : of all, 0 for points; their depth does not count
+    """
+
+    points_mm: ArrayLike
+    light: ArrayLike
+    diameter_mm: float
+
+
 def render_points(
     camera: Camera,
     space: ObjectSpace,
-    points_mm: ArrayLike,
-    light: ArrayLike,
-    diameter_mm: float,
+    balls: Balls,
     rng: np.random.Generator,
     *,
     rays: int = RAYS,
     progress: Callable[[int], None] | None = None,
 ) -> NDArray[np.float64]:
-    """Render small glowing balls that send light evenly through the aperture: tracers.
+    """Render small glowing balls.
 
     Parameters
     ----------
-    points_mm : (n, 3) centres, world axes
-    light : (n,) expected counts of each that pass the aperture; those that miss the sensor are lost
-    diameter_mm : their diameter, 0 for points; the balls glow evenly, their depth does not count
-    rays : rays per point
-    progress : called with the number of points done
+    rays : rays per ball
+    progress : called with the number of balls done
 
     Returns
     -------
@@ -65,34 +78,21 @@ def render_points(
 
     Raises
     ------
-    ConfigError : a point in front of the fluid, or no window for exact refraction
+    ConfigError : a ball in front of the fluid, or no window for exact refraction
     """
-    points = camera.to_image_axes(points_mm).reshape(-1, 3)
-    weights = np.broadcast_to(np.asarray(light, dtype=np.float64), len(points)) / rays
-    thicknesses, indices = space.layers(camera)
-    last_layers = thicknesses[-1] + (space.media.depth_ratio if len(indices) == 1 else 1.0) * points[:, 2]
+    points = camera.to_image_axes(balls.points_mm).reshape(-1, 3)
+    weights = np.broadcast_to(np.asarray(balls.light, dtype=np.float64), len(points)) / rays
+    last_layers = space.last_layers_mm(camera, points[:, 2])
     _check_depths(points, last_layers)
     shifts = rng.random((len(points), 4))
 
     image = np.zeros((camera.rows, camera.columns))
+    layers, seen = space.layers(camera), camera.for_kernels()
     batch = max(RAYS_AT_ONCE // rays, 1)
     for start in range(0, len(points), batch):
         part = slice(start, start + batch)
         pixels = _trace_points(
-            points[part],
-            last_layers[part],
-            shifts[part],
-            rays,
-            0.5 * diameter_mm,
-            camera.aperture_radius_mm,
-            thicknesses,
-            indices,
-            kernel_distances(camera),
-            camera.distortion_per_mm2,
-            camera.lattice.origin,
-            camera.lattice.basis,
-            camera.pixel_mm,
-            (camera.rows, camera.columns),
+            points[part], last_layers[part], shifts[part], rays, 0.5 * balls.diameter_mm, layers, seen
         )
         _add_light(image.ravel(), pixels, weights[part])
         if progress is not None:
@@ -114,35 +114,25 @@ def _trace_points(
     shifts: NDArray[np.float64],
     rays: int,
     ball_radius: float,
-    aperture_radius: float,
-    thicknesses: NDArray[np.float64],
-    indices: NDArray[np.float64],
-    distances: tuple[float, float, float, float],
-    distortion: float,
-    origin: NDArray[np.float64],
-    basis: NDArray[np.float64],
-    pixel: float,
-    shape: tuple[int, int],
+    layers: Layers,
+    camera: KernelCamera,
 ) -> NDArray[np.int32]:
     """Return the flat pixel number that each ray of each point strikes, (n, rays), -1 off the sensor."""
-    rows, columns = shape
+    aperture_radius = camera.aperture_radius_mm
     pixels = np.empty((len(points), rays), dtype=np.int32)
     for i in prange(len(points)):
-        layers = thicknesses.copy()
-        layers[-1] = last_layers[i]
+        thicknesses = layers.thicknesses_mm.copy()
+        thicknesses[-1] = last_layers[i]
         reach = aperture_radius + ball_radius + np.sqrt(points[i, 0] ** 2 + points[i, 1] ** 2)
-        nodes, factors = slope_polynomial(reach, layers, indices)
+        nodes, factors = slope_polynomial(reach, thicknesses, layers.indices)
         for k in range(rays):
             lens_x, lens_y = _on_disc(aperture_radius, shifts[i, 0] + k * SEQUENCE[0], shifts[i, 1] + k * SEQUENCE[1])
             ball_x, ball_y = _in_ball(ball_radius, shifts[i, 2] + k * SEQUENCE[2], shifts[i, 3] + k * SEQUENCE[3])
             dx = lens_x - points[i, 0] - ball_x
             dy = lens_y - points[i, 1] - ball_y
             ratio = slope_ratio(dx * dx + dy * dy, nodes, factors)
-            x, y = trace_ray(lens_x, lens_y, ratio * dx, ratio * dy, distances, distortion, origin, basis)
-            column = int(np.floor(x / pixel + 0.5 * columns))
-            row = int(np.floor(y / pixel + 0.5 * rows))
-            inside = 0 <= column < columns and 0 <= row < rows
-            pixels[i, k] = row * columns + column if inside else -1
+            x, y = trace_ray(camera, lens_x, lens_y, ratio * dx, ratio * dy)
+            pixels[i, k] = struck_pixel(camera, x, y)
     return pixels
 
 
@@ -194,38 +184,25 @@ def render_white(camera: Camera, level: float, samples_per_side: int = WHITE_SAM
     # the sequence's mean is not the lens's centre: it would move the micro-images by 0.002 px
     offsets = offsets - offsets.mean(axis=0)
     centres = camera.micro_image_lattice_px()
-    return _backtrack_white(
-        positions,
-        offsets,
-        kernel_distances(camera),
-        camera.aperture_radius_mm,
-        camera.pixel_mm,
-        centres.origin,
-        centres.basis,
-        camera.columns,
-        camera.rows,
-    ) * (level / samples)
+    lit = _backtrack_white(positions, offsets, camera.for_kernels(), centres.origin, centres.basis)
+    return lit * (level / samples)
 
 
 @njit(cache=True, parallel=True)
 def _backtrack_white(
     positions_px: NDArray[np.float64],
     offsets: NDArray[np.float64],
-    distances: tuple[float, float, float, float],
-    aperture_radius: float,
-    pixel: float,
+    camera: KernelCamera,
     origin_px: NDArray[np.float64],
     basis_px: NDArray[np.float64],
-    columns: int,
-    rows: int,
 ) -> NDArray[np.int64]:
     """Return how many of each pixel's samples come from the aperture, summed over the lenses."""
-    _, image_distance, microlens_focal_length, microlens_distance = distances
+    rows, columns, pixel, straight = camera.rows, camera.columns, camera.pixel_mm, camera.bend
+    aperture_radius = camera.aperture_radius_mm
     lit = np.zeros((rows, columns), dtype=np.int64)
     # Eq. 1 for a ray that meets the array q beside the centre s_u of a lens, solved for X:
     # x_s = s_u + q (1 - s_mu/f_m) + s_mu (s_u + q - X)/s_i
-    lever = image_distance / microlens_distance
-    straight = 1.0 - microlens_distance / microlens_focal_length
+    lever = camera.image_distance_mm / camera.microlens_distance_mm
     for row in prange(rows):
         for column in range(columns):
             near_x, near_y = nearest_point(float(column), float(row), origin_px, basis_px)

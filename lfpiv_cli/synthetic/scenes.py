@@ -19,7 +19,7 @@ from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.synthetic.board import BoardPlacement, dot_centres, render_board
 from lfpiv_cli.synthetic.flows import Flow, advect
-from lfpiv_cli.synthetic.render import RAYS, ObjectSpace, render_points, render_white
+from lfpiv_cli.synthetic.render import RAYS, Balls, ObjectSpace, render_points, render_white
 from lfpiv_cli.synthetic.sensor import Readout
 
 Triple = tuple[float, float, float]
@@ -223,9 +223,7 @@ def simulate_particles(
         expected = render_points(
             camera.optics,
             space,
-            advect(motion.flow, positions, time_s),
-            tracers.light_counts * brightness,
-            tracers.diameter_mm,
+            Balls(advect(motion.flow, positions, time_s), tracers.light_counts * brightness, tracers.diameter_mm),
             rng,
             rays=rays,
             progress=progress,

@@ -9,35 +9,32 @@ Axes: one image axis at a time (columns or rows), in mm about the optical axis.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from lfpiv_cli.optics.camera import KernelCamera
 
 # Width given to a patch that lies outside the aperture, in radii: small beside the patch of a whole pixel (a tenth).
 SMALLEST_PATCH = 1e-3
 
 
-@dataclass(frozen=True)
-class AxisOptics:
-    """One axis of the camera.
+class AxisOptics(NamedTuple):
+    """One axis of the camera; its square aperture is as wide as the round one.
 
     Attributes
     ----------
-    image_distance_mm, microlens_distance_mm, microlens_focal_length_mm : s_i, s_mu, f_m
-    aperture_radius_mm : half the side of the square aperture
+    camera : what both axes share
     lens_origin_mm, lens_pitch_mm : a lens centre on the array and the pitch along this axis
     lens_width_mm : what of the pitch a lens takes in, half of it to either side
-    pixel_mm, pixels : pixel pitch and count
+    pixels : of the sensor along this axis
     """
 
-    image_distance_mm: float
-    microlens_distance_mm: float
-    microlens_focal_length_mm: float
-    aperture_radius_mm: float
+    camera: KernelCamera
     lens_origin_mm: float
     lens_pitch_mm: float
     lens_width_mm: float
-    pixel_mm: float
     pixels: int
 
 
@@ -62,16 +59,16 @@ class Cells:
 
 def micro_image_cells(optics: AxisOptics) -> Cells:
     """Return the cells of all lenses whose micro-image meets the sensor."""
-    tilt = optics.microlens_distance_mm / optics.image_distance_mm
-    bend = 1.0 - optics.microlens_distance_mm / optics.microlens_focal_length_mm
-    reach = tilt * optics.aperture_radius_mm + (tilt + abs(bend)) * 0.5 * optics.lens_width_mm
-    half = 0.5 * optics.pixels * optics.pixel_mm
+    camera = optics.camera
+    tilt = camera.microlens_distance_mm / camera.image_distance_mm
+    reach = tilt * camera.aperture_radius_mm + (tilt + abs(camera.bend)) * 0.5 * optics.lens_width_mm
+    half = 0.5 * optics.pixels * camera.pixel_mm
     edge = np.array([-half - reach, half + reach]) / (1.0 + tilt)
     first, last = np.rint((edge - optics.lens_origin_mm) / optics.lens_pitch_mm).astype(int)
     number = np.arange(first, last + 1)
     lens = optics.lens_origin_mm + number * optics.lens_pitch_mm
-    low = np.floor((lens * (1.0 + tilt) - reach + half) / optics.pixel_mm).astype(int).clip(0, optics.pixels)
-    high = np.floor((lens * (1.0 + tilt) + reach + half) / optics.pixel_mm).astype(int).clip(-1, optics.pixels - 1)
+    low = np.floor((lens * (1.0 + tilt) - reach + half) / camera.pixel_mm).astype(int).clip(0, optics.pixels)
+    high = np.floor((lens * (1.0 + tilt) + reach + half) / camera.pixel_mm).astype(int).clip(-1, optics.pixels - 1)
     counts = np.maximum(high - low + 1, 0)
     start = np.concatenate([[0], np.cumsum(counts)])
     owner = np.repeat(np.arange(lens.size), counts)
@@ -81,10 +78,11 @@ def micro_image_cells(optics: AxisOptics) -> Cells:
 
 def _patches(optics: AxisOptics, lens_mm: NDArray[np.float64], pixel: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return the intervals of the main lens that pixels see through lenses' centres, shape (cells, 2)."""
-    magnify = optics.image_distance_mm / optics.microlens_distance_mm
-    edges = (pixel[:, np.newaxis] + np.array([1, 0]) - 0.5 * optics.pixels) * optics.pixel_mm
+    camera = optics.camera
+    magnify = camera.image_distance_mm / camera.microlens_distance_mm
+    edges = (pixel[:, np.newaxis] + np.array([1, 0]) - 0.5 * optics.pixels) * camera.pixel_mm
     patch = lens_mm[:, np.newaxis] - (edges - lens_mm[:, np.newaxis]) * magnify
-    radius = optics.aperture_radius_mm
+    radius = camera.aperture_radius_mm
     patch = np.clip(patch, -radius, radius)
     # A cell that only rays away from the lens's centre reach sees the very edge of the aperture.
     sliver = SMALLEST_PATCH * radius

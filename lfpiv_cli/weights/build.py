@@ -106,7 +106,7 @@ def _factorised(
 def traced_bending(space: ObjectSpace, camera: Camera, grid: Grid, axes: tuple[int, int]) -> list[Bending]:
     """Return how rays are bent along the columns and along the rows, which follow world `axes`."""
     depths = depth_nodes(grid.axis_mm(2), grid.spacing_mm[2])
-    if camera.focus_distance_mm + space.media.depth_ratio * depths.min() <= 0.0:
+    if equivalent_object_distance(depths.min(), camera.focus_distance_mm, space.media) <= 0.0:
         raise ConfigError(
             f"volume: its nearest point lies {grid.bounds_mm(2)[0]:.4g} mm from the focal point, behind the main lens"
         )
@@ -117,7 +117,7 @@ def traced_bending(space: ObjectSpace, camera: Camera, grid: Grid, axes: tuple[i
     strips = 1 if space.straight else STRIPS
 
     beside = [float(np.mean(grid.axis_mm(other) ** 2)) for other in axes[::-1]]
-    return [Bending(nodes, factors, camera.focal_length_mm, each, strips) for each in beside]
+    return [Bending(nodes, factors, each, strips) for each in beside]
 
 
 def fitted_bending(rays: PolynomialRays, camera: Camera, grid: Grid, axis: int) -> FittedBending:
@@ -195,14 +195,10 @@ def axis_optics(camera: Camera, widths_mm: tuple[float, float] | None = None) ->
     widths = widths_mm or (float(basis[0, 0]), float(basis[1, 1]))
     first, second = (
         AxisOptics(
-            image_distance_mm=camera.image_distance_mm,
-            microlens_distance_mm=camera.microlens_distance_mm,
-            microlens_focal_length_mm=camera.microlens_focal_length_mm,
-            aperture_radius_mm=camera.aperture_radius_mm,
+            camera=camera.for_kernels(),
             lens_origin_mm=float(camera.lattice.origin[axis]),
             lens_pitch_mm=float(basis[axis, axis]),
             lens_width_mm=widths[axis],
-            pixel_mm=camera.pixel_mm,
             pixels=int(pixels[axis]),
         )
         for axis in (0, 1)

@@ -21,11 +21,12 @@ from lfpiv_cli.grid import Grid
 from lfpiv_cli.neighbourhoods import with_neighbours
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.microlenses import nearest_point
+from lfpiv_cli.optics.tracing import struck_pixel
 from lfpiv_cli.robust import BRIGHTEST_PERCENTILE, LIT_SHARE
 from lfpiv_cli.weights.build import factorise_through, separates
 from lfpiv_cli.weights.operators import Column, FactorisedOperator
 from lfpiv_cli.weights.quadrature import DEPTH_NODES, TILES, Columns, integrate_columns
-from lfpiv_cli.weights.scene import Scene, Source, kernel_scene, on_array, on_sensor, rays_from
+from lfpiv_cli.weights.scene import Scene, Source, kernel_scene, on_array, on_sensor, rays_from, scene_of
 
 # Columns may take this much memory: two thirds of a machine with 24 GiB, the rest is for volumes and images.
 LARGEST_BYTES = 16 * 2**30
@@ -169,7 +170,7 @@ class OnDemandOperator:
         for first in range(0, result.size, VOXELS_AT_ONCE * 16):
             part = np.arange(first, min(first + VOXELS_AT_ONCE * 16, result.size))
             scene = kernel_scene(self.camera, self.source, self.centres_mm(part), self.sides_mm, SIGHT_TILES, 1)
-            result[part] = _seen_share(scene, near) >= SEEN_SHARE
+            result[part] = _seen_share(scene, near.ravel()) >= SEEN_SHARE
         return result
 
     @cached_property
@@ -251,24 +252,34 @@ def _gather(
 
 @njit(cache=True, parallel=True)
 def _seen_share(scene: Scene, lit: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return the share of each voxel's lines of sight, among those that meet the sensor, that end on lit pixels."""
-    pixel = scene.pixel_mm
+    """Return the share of each voxel's lines of sight, among those that meet the sensor, that end on lit pixels.
+
+    `lit` is flat.
+    """
+    camera, rest = scene.camera[:], scene[1:]
     seen = np.zeros(scene.plane.size)
     for n in prange(scene.plane.size):
-        total, found = 0.0, 0.0
-        point = scene.centres_mm[n]
-        rays = rays_from(scene, point, scene.plane[n], 0)
-        for t in range(scene.tile_share.size):
-            crossing = scene.tile_mm[t]
-            x, y = on_array(scene, point, rays, crossing[0], crossing[1])
-            distorted = 1.0 + scene.distortion_per_mm2 * (x * x + y * y)
-            m_x, m_y = x * distorted, y * distorted
-            centre_x, centre_y = nearest_point(m_x, m_y, scene.origin_mm, scene.basis_mm)
-            x = on_sensor(scene, x, crossing[0], m_x, centre_x)
-            y = on_sensor(scene, y, crossing[1], m_y, centre_y)
-            column, row = int(np.floor(x / pixel + 0.5 * scene.columns)), int(np.floor(y / pixel + 0.5 * scene.rows))
-            if 0 <= column < scene.columns and 0 <= row < scene.rows:
-                total += scene.tile_share[t]
-                found += scene.tile_share[t] * lit[row, column]
-        seen[n] = found / total if total > 0.0 else 0.0
+        whole = scene_of(camera, rest)
+        seen[n] = _lit_share(whole, whole.centres_mm[n], whole.plane[n], lit)
     return seen
+
+
+@njit(cache=True)
+def _lit_share(scene: Scene, point: NDArray[np.float64], plane: int, lit: NDArray[np.bool_]) -> float:
+    """Return the share of the lines of sight from a point, among those that meet the sensor, that end on lit pixels."""
+    camera, total, found = scene.camera, 0.0, 0.0
+    middle = scene.depth_share.size // 2
+    rays = rays_from(scene, point, plane, middle)
+    for t in range(scene.tile_share.size):
+        crossing = scene.tile_mm[t]
+        x, y = on_array(scene, point, rays, crossing[0], crossing[1])
+        distorted = 1.0 + camera.distortion_per_mm2 * (x * x + y * y)
+        m_x, m_y = x * distorted, y * distorted
+        centre_x, centre_y = nearest_point(m_x, m_y, camera.origin_mm, camera.basis_mm)
+        x = on_sensor(camera, x, crossing[0], m_x, centre_x)
+        y = on_sensor(camera, y, crossing[1], m_y, centre_y)
+        pixel = struck_pixel(camera, x, y)
+        if pixel >= 0:
+            total += scene.tile_share[t]
+            found += scene.tile_share[t] * lit[pixel]
+    return found / total if total > 0.0 else 0.0

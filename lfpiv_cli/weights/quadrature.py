@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.weights.lens_cells import MOST_CORNERS, shared_rectangle
-from lfpiv_cli.weights.scene import Scene, Source, kernel_scene, on_array, on_sensor, rays_from
+from lfpiv_cli.weights.scene import Scene, Source, kernel_scene, on_array, on_sensor, rays_from, scene_of
 
 # Tiles across the aperture: with 32 a tile is seen as half a pixel of Table 2's camera and columns are off by 0.01 to
 # 0.02 in L1 (0.04 at 11 mm from focus), with 64 by 0.003 to 0.005, with 256 by 0.0002 (0.0008).
@@ -132,99 +132,119 @@ def _half_face(scene: Scene, point: NDArray[np.float64], plane: int, node: int) 
 
 @njit(cache=True, parallel=True)
 def _boxes(scene: Scene) -> NDArray[np.int64]:
-    """Return the part of the sensor that each voxel can light: (n, 4) first row and column, and those after the last.
+    """Return the part of the sensor that each voxel can light: (n, 4) first row and column, and those behind."""
+    camera, rest = scene.camera[:], scene[1:]
+    boxes = np.empty((scene.plane.size, 4), np.int64)
+    for n in prange(scene.plane.size):
+        whole = scene_of(camera, rest)
+        _set_box(whole, whole.centres_mm[n], whole.plane[n], boxes[n])
+    return boxes
+
+
+@njit(cache=True)
+def _set_box(scene: Scene, centre: NDArray[np.float64], plane: int, box: NDArray[np.int64]) -> None:
+    """Set the box (4,) of a voxel.
 
     Found from the rays through the rim: light under a lens stays within the aperture's image about its centre.
     """
-    boxes = np.empty((scene.plane.size, 4), np.int64)
-    radius, cell, pixel = scene.aperture_radius_mm, scene.cell_radius_mm, scene.pixel_mm
-    tilt = scene.microlens_distance_mm / scene.image_distance_mm
-    for n in prange(scene.plane.size):
-        low, high = np.full(2, np.inf), np.full(2, -np.inf)
-        for k in range(scene.depth_share.size):
-            point = scene.centres_mm[n].copy()
-            point[2] = scene.depth_mm[scene.plane[n], k]
-            rays = rays_from(scene, point, scene.plane[n], k)
-            half = _half_face(scene, point, scene.plane[n], k)
-            for m in range(RIM_RAYS):
-                angle = 2.0 * np.pi * m / RIM_RAYS
-                x, y = on_array(scene, point, rays, radius * np.cos(angle), radius * np.sin(angle))
-                distorted = 1.0 + scene.distortion_per_mm2 * (x * x + y * y)
-                low[0], high[0] = min(low[0], x * distorted - half[0]), max(high[0], x * distorted + half[0])
-                low[1], high[1] = min(low[1], y * distorted - half[1]), max(high[1], y * distorted + half[1])
-        # One pixel more than the geometry asks for covers rays between those followed, and the distortion's bend.
-        spread = abs(1.0 + tilt - scene.microlens_distance_mm / scene.microlens_focal_length_mm)
-        beyond = tilt * radius + spread * cell + pixel
-        for axis in range(2):
-            size = scene.columns if axis == 0 else scene.rows
-            first = int(np.floor(((low[axis] - cell) * (1.0 + tilt) - beyond) / pixel + 0.5 * size))
-            last = int(np.floor(((high[axis] + cell) * (1.0 + tilt) + beyond) / pixel + 0.5 * size)) + 1
-            boxes[n, 1 - axis] = min(max(first, 0), size)
-            boxes[n, 3 - axis] = min(max(last, 0), size)
-    return boxes
+    camera = scene.camera
+    radius, cell, pixel = camera.aperture_radius_mm, scene.cell_radius_mm, camera.pixel_mm
+    tilt = camera.microlens_distance_mm / camera.image_distance_mm
+    low, high = np.full(2, np.inf), np.full(2, -np.inf)
+    point = centre.copy()
+    for k in range(scene.depth_share.size):
+        point[2] = scene.depth_mm[plane, k]
+        rays = rays_from(scene, point, plane, k)
+        half = _half_face(scene, point, plane, k)
+        for m in range(RIM_RAYS):
+            angle = 2.0 * np.pi * m / RIM_RAYS
+            x, y = on_array(scene, point, rays, radius * np.cos(angle), radius * np.sin(angle))
+            distorted = 1.0 + camera.distortion_per_mm2 * (x * x + y * y)
+            low[0], high[0] = min(low[0], x * distorted - half[0]), max(high[0], x * distorted + half[0])
+            low[1], high[1] = min(low[1], y * distorted - half[1]), max(high[1], y * distorted + half[1])
+    # One pixel more than the geometry asks for covers rays between those followed, and the distortion's bend.
+    spread = abs(1.0 + tilt - camera.microlens_distance_mm / camera.microlens_focal_length_mm)
+    beyond = tilt * radius + spread * cell + pixel
+    for axis in range(2):
+        size = camera.columns if axis == 0 else camera.rows
+        first = int(np.floor(((low[axis] - cell) * (1.0 + tilt) - beyond) / pixel + 0.5 * size))
+        last = int(np.floor(((high[axis] + cell) * (1.0 + tilt) + beyond) / pixel + 0.5 * size)) + 1
+        box[1 - axis] = min(max(first, 0), size)
+        box[3 - axis] = min(max(last, 0), size)
 
 
 @njit(cache=True, parallel=True)
 def _fill(scene: Scene, boxes: NDArray[np.int64], first: int, pictures: NDArray[np.float64]) -> None:
     """Add up the light of the voxels from `first` on in `pictures` (voxels, rows, columns of their boxes)."""
+    camera, rest = scene.camera[:], scene[1:]
     for n in prange(pictures.shape[0]):
-        voxel = first + n
-        plane = scene.plane[voxel]
-        work = np.empty((2, MOST_CORNERS, 2))
-        lines = np.empty((2, MOST_PIXELS))
-        for k in range(scene.depth_share.size):
-            point = scene.centres_mm[voxel].copy()
-            point[2] = scene.depth_mm[plane, k]
-            rays = rays_from(scene, point, plane, k)
-            half = _half_face(scene, point, plane, k)
-            for t in range(scene.tile_share.size):
-                place = on_array(scene, point, rays, scene.tile_mm[t, 0], scene.tile_mm[t, 1])
-                light = scene.tile_share[t] * scene.depth_share[k]
-                _add_tile(scene, place, half, scene.tile_mm[t], light, boxes[voxel], work, lines, pictures[n])
+        _fill_picture(scene_of(camera, rest), first + n, boxes[first + n], pictures[n])
+
+
+@njit(cache=True)
+def _fill_picture(scene: Scene, voxel: int, box: NDArray[np.int64], picture: NDArray[np.float64]) -> None:
+    """Add up the light of a voxel in a picture of its box."""
+    plane, point = scene.plane[voxel], scene.centres_mm[voxel].copy()
+    work = np.empty((2, MOST_CORNERS, 2))
+    lines = np.empty((2, MOST_PIXELS))
+    for k in range(scene.depth_share.size):
+        point[2] = scene.depth_mm[plane, k]
+        rays = rays_from(scene, point, plane, k)
+        half = _half_face(scene, point, plane, k)
+        for t in range(scene.tile_share.size):
+            x, y = on_array(scene, point, rays, scene.tile_mm[t, 0], scene.tile_mm[t, 1])
+            tile = (scene.tile_mm[t, 0], scene.tile_mm[t, 1], scene.tile_share[t] * scene.depth_share[k])
+            _add_tile(scene, (x, y, half[0], half[1]), tile, box, work, lines, picture)
 
 
 @njit(cache=True)
 def _add_tile(
     scene: Scene,
-    place: tuple[float, float],
-    half: tuple[float, float],
-    middle: NDArray[np.float64],
-    light: float,
+    face: tuple[float, float, float, float],
+    tile: tuple[float, float, float],
     box: NDArray[np.int64],
     work: NDArray[np.float64],
     lines: NDArray[np.float64],
     picture: NDArray[np.float64],
 ) -> None:
-    """Add the light that a voxel's face sends through one tile, seen as a rectangle about `place` on the array."""
-    x, y = place
-    origin, basis, cell = scene.origin_mm, scene.basis_mm, scene.cell_radius_mm
-    s_i, f_m, s_mu = scene.image_distance_mm, scene.microlens_focal_length_mm, scene.microlens_distance_mm
-    distorted = 1.0 + scene.distortion_per_mm2 * (x * x + y * y)
+    """Add the light that a voxel's face sends through one tile.
+
+    Parameters
+    ----------
+    face : the middle and half the sides of the rectangle as which the face is seen on the array
+    tile : its middle on the main lens, and the share of the voxel's light that passes it
+    work, lines : scratch
+    """
+    camera, cell = scene.camera, scene.cell_radius_mm
+    x, y, half_x, half_y = face
+    origin, basis = camera.origin_mm, camera.basis_mm
+    s_i, f_m, s_mu = camera.image_distance_mm, camera.microlens_focal_length_mm, camera.microlens_distance_mm
+    distorted = 1.0 + camera.distortion_per_mm2 * (x * x + y * y)
     array_x, array_y = x * distorted, y * distorted
-    low, high = (array_x - half[0], array_y - half[1]), (array_x + half[0], array_y + half[1])
-    spread = abs(1.0 + s_mu / s_i - s_mu / f_m) / scene.pixel_mm
-    width = scene.tile_side_mm * s_mu / s_i / scene.pixel_mm
+    low, high = (array_x - half_x, array_y - half_y), (array_x + half_x, array_y + half_y)
+    spread = abs(1.0 + s_mu / s_i - s_mu / f_m) / camera.pixel_mm
+    width = scene.tile_side_mm * s_mu / s_i / camera.pixel_mm
     determinant = basis[0, 0] * basis[1, 1] - basis[0, 1] * basis[1, 0]
     dx, dy = array_x - origin[0], array_y - origin[1]
     i0 = np.rint((dx * basis[1, 1] - dy * basis[1, 0]) / determinant)
     j0 = np.rint((dy * basis[0, 0] - dx * basis[0, 1]) / determinant)
-    reach_i = int(np.ceil((abs(half[0] * basis[1, 1]) + abs(half[1] * basis[1, 0])) / abs(determinant) + 0.5))
-    reach_j = int(np.ceil((abs(half[1] * basis[0, 0]) + abs(half[0] * basis[0, 1])) / abs(determinant) + 0.5))
+    reach_i = int(np.ceil((abs(half_x * basis[1, 1]) + abs(half_y * basis[1, 0])) / abs(determinant) + 0.5))
+    reach_j = int(np.ceil((abs(half_y * basis[0, 0]) + abs(half_x * basis[0, 1])) / abs(determinant) + 0.5))
     for i in range(-reach_i, reach_i + 1):
         for j in range(-reach_j, reach_j + 1):
             centre_x = origin[0] + (i0 + i) * basis[0, 0] + (j0 + j) * basis[1, 0]
             centre_y = origin[1] + (i0 + i) * basis[0, 1] + (j0 + j) * basis[1, 1]
-            if abs(array_x - centre_x) >= half[0] + cell or abs(array_y - centre_y) >= half[1] + cell:
+            if abs(array_x - centre_x) >= half_x + cell or abs(array_y - centre_y) >= half_y + cell:
                 continue
             area, m_x, m_y, wide, tall = shared_rectangle(low, high, centre_x, centre_y, scene.neighbours_mm, work)
             if area <= 0.0:
                 continue
-            sensor_x = on_sensor(scene, x + m_x - array_x, middle[0], m_x, centre_x)
-            sensor_y = on_sensor(scene, y + m_y - array_y, middle[1], m_y, centre_y)
+            sensor_x = on_sensor(camera, x + m_x - array_x, tile[0], m_x, centre_x)
+            sensor_y = on_sensor(camera, y + m_y - array_y, tile[1], m_y, centre_y)
             # In pixels from the sensor's corner.
-            column = sensor_x / scene.pixel_mm + 0.5 * scene.columns
-            row = sensor_y / scene.pixel_mm + 0.5 * scene.rows
-            share = light * area / (4.0 * half[0] * half[1])
+            column = sensor_x / camera.pixel_mm + 0.5 * camera.columns
+            row = sensor_y / camera.pixel_mm + 0.5 * camera.rows
+            share = tile[2] * area / (4.0 * half_x * half_y)
             first_column, columns = _line(column, width, spread * wide, box[1], box[3], lines[0])
             first_row, rows = _line(row, width, spread * tall, box[0], box[2], lines[1])
             for r in range(rows):

@@ -17,9 +17,9 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import ArrayLike, NDArray
 
-from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.camera import Camera, KernelCamera
 from lfpiv_cli.optics.object_space import ObjectSpace, slope_ratio
-from lfpiv_cli.optics.tracing import kernel_distances, trace_ray
+from lfpiv_cli.optics.tracing import struck_pixel, trace_ray
 from lfpiv_cli.weights.quadrature import Columns
 
 # Points are counted in this many parts side by side, each into an image of its own.
@@ -72,21 +72,8 @@ def count_rays(
     seeds = rng.integers(0, 2**64, count.points, dtype=np.uint64)
     reach = camera.aperture_radius_mm + float(np.hypot(*(np.abs(centre[:2]) + sides[:2])))
     nodes, factors = space.slope_polynomials(camera, starts[:, 2], reach)
-    counts = _count(
-        starts,
-        seeds,
-        count.rays_per_point,
-        nodes,
-        factors,
-        kernel_distances(camera),
-        camera.distortion_per_mm2,
-        camera.lattice.origin,
-        camera.lattice.basis,
-        camera.aperture_radius_mm,
-        camera.pixel_mm,
-        (camera.rows, camera.columns),
-    )
-    return counts.sum(axis=0) / count.rays
+    counts = _count(starts, seeds, count.rays_per_point, nodes, factors, camera.for_kernels())
+    return counts.sum(axis=0).reshape(camera.rows, camera.columns) / count.rays
 
 
 def count_columns(
@@ -134,17 +121,11 @@ def _count(
     rays: int,
     nodes: NDArray[np.float64],
     factors: NDArray[np.float64],
-    distances: tuple[float, float, float, float],
-    distortion: float,
-    origin: NDArray[np.float64],
-    basis: NDArray[np.float64],
-    radius: float,
-    pixel: float,
-    shape: tuple[int, int],
+    camera: KernelCamera,
 ) -> NDArray[np.int64]:
-    """Return the rays that strike each pixel, (parts, rows, columns)."""
-    rows, columns = shape
-    counts = np.zeros((PARTS, rows, columns), np.int64)
+    """Return the rays that strike each pixel, (parts, rows * columns)."""
+    radius = camera.aperture_radius_mm
+    counts = np.zeros((PARTS, camera.rows * camera.columns), np.int64)
     for part in prange(PARTS):
         for n in range(part, starts.shape[0], PARTS):
             state = seeds[n]
@@ -156,9 +137,8 @@ def _count(
                 lens_x, lens_y = r * np.cos(angle), r * np.sin(angle)
                 dx, dy = lens_x - starts[n, 0], lens_y - starts[n, 1]
                 ratio = slope_ratio(dx * dx + dy * dy, nodes[n], factors[n])
-                x, y = trace_ray(lens_x, lens_y, ratio * dx, ratio * dy, distances, distortion, origin, basis)
-                column = int(np.floor(x / pixel + 0.5 * columns))
-                row = int(np.floor(y / pixel + 0.5 * rows))
-                if 0 <= column < columns and 0 <= row < rows:
-                    counts[part, row, column] += 1
+                x, y = trace_ray(camera, lens_x, lens_y, ratio * dx, ratio * dy)
+                pixel = struck_pixel(camera, x, y)
+                if pixel >= 0:
+                    counts[part, pixel] += 1
     return counts

@@ -8,15 +8,16 @@ Axes: everything here is in image axes (x along the columns), mm, z away from th
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.camera import Camera, KernelCamera
 from lfpiv_cli.optics.object_space import SLOPE_NODES, ObjectSpace, slope_ratio
 from lfpiv_cli.optics.polynomial_rays import PolynomialRays
+from lfpiv_cli.optics.tracing import behind_microlens
 from lfpiv_cli.weights.aperture import disc_area_below
 from lfpiv_cli.weights.lens_cells import cell_radius, neighbours
 
@@ -41,6 +42,7 @@ class Scene(NamedTuple):
 
     Attributes
     ----------
+    camera : without the distortion where rays are fitted, as it is in the polynomial
     centres_mm, sides_mm : (n, 3) of the voxels, (3,)
     plane : (n,) which depths are a voxel's
     depth_mm, depth_share : (planes, nodes) and (nodes,), the depths along a voxel and the share of light from each
@@ -48,13 +50,10 @@ class Scene(NamedTuple):
     scale_mm, exponents, coefficients_mm : of `PolynomialRays` where they are fitted; no exponents where traced
     degree : of the polynomial
     tile_mm, tile_share, tile_side_mm : of `Tiles`
-    focal_length_mm, image_distance_mm, microlens_focal_length_mm, microlens_distance_mm, distortion_per_mm2, pixel_mm,
-    aperture_radius_mm : of the camera; the distortion is 0 where rays are fitted, as it is in the polynomial
-    cell_radius_mm : of a microlens's region
-    origin_mm, basis_mm, neighbours_mm : of the lattice, (2,), (2, 2) and (k, 2)
-    rows, columns : of the sensor
+    cell_radius_mm, neighbours_mm : of a microlens's region, and (k, 2) the steps to the lenses around
     """
 
+    camera: KernelCamera
     centres_mm: NDArray[np.float64]
     sides_mm: NDArray[np.float64]
     plane: NDArray[np.int64]
@@ -68,19 +67,8 @@ class Scene(NamedTuple):
     tile_mm: NDArray[np.float64]
     tile_share: NDArray[np.float64]
     tile_side_mm: float
-    focal_length_mm: float
-    image_distance_mm: float
-    microlens_focal_length_mm: float
-    microlens_distance_mm: float
-    distortion_per_mm2: float
-    pixel_mm: float
-    aperture_radius_mm: float
     cell_radius_mm: float
-    origin_mm: NDArray[np.float64]
-    basis_mm: NDArray[np.float64]
     neighbours_mm: NDArray[np.float64]
-    rows: int
-    columns: int
 
 
 def aperture_tiles(radius_mm: float, per_side: int) -> Tiles:
@@ -121,15 +109,14 @@ def kernel_scene(
     z = depth[:, np.newaxis] + 0.5 * sides[2] * place
     slopes = np.zeros((*z.shape, 2, SLOPE_NODES))
     fitted = PolynomialRays(np.ones(5), np.zeros((0, 5), np.int64), np.zeros((0, 2)))
-    distortion = 0.0
+    seen = camera.for_kernels()
     if isinstance(source, ObjectSpace):
         reach = camera.aperture_radius_mm + float(np.hypot(*(np.abs(centres[:, :2]) + sides[:2]).max(axis=0)))
         slopes = np.stack(source.slope_polynomials(camera, z.ravel(), reach), axis=1).reshape(slopes.shape)
-        distortion = camera.distortion_per_mm2
     else:
-        fitted = source
-    lattice = camera.lattice
+        fitted, seen = source, seen._replace(distortion_per_mm2=0.0)
     return Scene(
+        camera=seen,
         centres_mm=centres,
         sides_mm=sides,
         plane=plane.astype(np.int64),
@@ -143,20 +130,15 @@ def kernel_scene(
         tile_mm=tiles.middle_mm,
         tile_share=tiles.share,
         tile_side_mm=tiles.side_mm,
-        focal_length_mm=camera.focal_length_mm,
-        image_distance_mm=camera.image_distance_mm,
-        microlens_focal_length_mm=camera.microlens_focal_length_mm,
-        microlens_distance_mm=camera.microlens_distance_mm,
-        distortion_per_mm2=distortion,
-        pixel_mm=camera.pixel_mm,
-        aperture_radius_mm=camera.aperture_radius_mm,
-        cell_radius_mm=cell_radius(lattice),
-        origin_mm=lattice.origin,
-        basis_mm=lattice.basis,
-        neighbours_mm=neighbours(lattice),
-        rows=camera.rows,
-        columns=camera.columns,
+        cell_radius_mm=cell_radius(camera.lattice),
+        neighbours_mm=neighbours(camera.lattice),
     )
+
+
+@njit(cache=True)
+def scene_of(camera: tuple[Any, ...], rest: tuple[Any, ...]) -> Scene:
+    """Put `scene.camera[:]` and `scene[1:]` together again inside a parallel loop (see `KernelCamera`)."""
+    return Scene(KernelCamera(*camera), *rest)
 
 
 @njit(cache=True)
@@ -168,7 +150,9 @@ def rays_from(scene: Scene, point: NDArray[np.float64], plane: int, node: int) -
     """
     if scene.exponents.shape[0] == 0:
         rays = np.empty((2, 1, SLOPE_NODES))
-        rays[:, 0] = scene.slopes[plane, node]
+        for table in range(2):
+            for k in range(SLOPE_NODES):
+                rays[table, 0, k] = scene.slopes[plane, node, table, k]
         return rays
     rays = np.zeros((2, scene.degree + 1, scene.degree + 1))
     for k in range(scene.exponents.shape[0]):
@@ -189,8 +173,8 @@ def on_array(
     if scene.exponents.shape[0] == 0:
         dx, dy = lens_x - point[0], lens_y - point[1]
         ratio = slope_ratio(dx * dx + dy * dy, rays[0, 0], rays[1, 0])
-        bent_x, bent_y = ratio * dx - lens_x / scene.focal_length_mm, ratio * dy - lens_y / scene.focal_length_mm
-        return lens_x + scene.image_distance_mm * bent_x, lens_y + scene.image_distance_mm * bent_y
+        f_m, s_i = scene.camera.focal_length_mm, scene.camera.image_distance_mm
+        return lens_x + s_i * (ratio * dx - lens_x / f_m), lens_y + s_i * (ratio * dy - lens_y / f_m)
     across, down = lens_x / scene.scale_mm[3], lens_y / scene.scale_mm[4]
     x, y = 0.0, 0.0
     for a in range(scene.degree, -1, -1):
@@ -203,11 +187,10 @@ def on_array(
     return x, y
 
 
-@njit(cache=True, inline="always")
-def on_sensor(scene: Scene, ideal: float, crossing: float, place: float, centre: float) -> float:
+@njit(cache=True)
+def on_sensor(camera: KernelCamera, ideal: float, crossing: float, place: float, centre: float) -> float:
     """Return one coordinate on the sensor of a ray that meets the array at `place` under the microlens at `centre`.
 
-    Eq. 1 behind the array; `ideal` is where the ray would meet it without the main lens's distortion.
+    `ideal` is where the ray from `crossing` of the main lens would meet it without the main lens's distortion.
     """
-    behind = (ideal - crossing) / scene.image_distance_mm - (place - centre) / scene.microlens_focal_length_mm
-    return place + scene.microlens_distance_mm * behind
+    return behind_microlens(camera, place, centre, (ideal - crossing) / camera.image_distance_mm)
