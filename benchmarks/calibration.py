@@ -1,4 +1,4 @@
-"""The calibration on random benches: rendered white image and board, calibrated without the data sheet, held against the truth.
+"""The calibration on random benches: rendered white image and board, calibrated from pictures alone, held to the truth.
 
 Square and hexagonal arrays, pitches of 10 to 30 px, rotations within 3 degrees, sensors of 8 to 16 bits, boards between
 -8 and 8 mm tilted by up to 3 degrees, of either polarity, with dots missing, dots too many and glare. Most sensors are

@@ -1,4 +1,4 @@
-"""The pitch and direction of a lens lattice, read from the spectrum of a white image: a first guess that needs no data sheet.
+"""The pitch and direction of a lens lattice, from the spectrum of a white image: a guess that needs no data sheet.
 
 Axes: vectors are (column, row); frequencies in cycles per pixel.
 """
