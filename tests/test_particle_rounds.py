@@ -15,7 +15,7 @@ from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.particles.candidates import explain_rest, find_peaks
-from lfpiv_cli.particles.rounds import find_particles
+from lfpiv_cli.particles.rounds import find_particles, first_typical_light
 from lfpiv_cli.particles.search import task_of
 from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.reconstruction.equations import normalisers
@@ -106,3 +106,24 @@ def test_what_is_explained_gives_no_candidate(table2: Camera, water: Media) -> N
     np.testing.assert_allclose(index[0], (7 + px, 7 + py, 2 + pz), atol=0.3)
     assert light[0] > 0.8e5
     assert np.all(light[np.abs(index - (2 + px, 2 + py, 2 + pz)).max(axis=1) < 2.0] < 0.05e5)
+
+
+def test_typical_light_is_not_the_noise_s() -> None:
+    noise = np.linspace(0.5, 9.0, 400)
+    assert first_typical_light(noise, 1.0) == 0.0
+    assert first_typical_light(np.zeros(0), 1.0) == 0.0
+    # One tracer, which the volume shows as a bright peak and two faint ones beside it.
+    assert first_typical_light(np.append(noise, [5000.0, 900.0, 300.0]), 1.0) == 5000.0
+    many = np.linspace(500.0, 1500.0, 101)
+    assert first_typical_light(np.append(noise[:20], many), 1.0) == pytest.approx(1380.0, abs=5.0)
+
+
+def test_peaks_have_light() -> None:
+    """Behind a bright plane, running sums leave traces of it where there is none."""
+    volume = np.zeros((12, 7, 7), np.float32)
+    volume[2:5, 3, 3] = 1e5, 0.1, 3e4
+    with np.errstate(all="raise"):
+        centres, light = find_peaks(volume)
+    assert np.all(light > 0.0)
+    assert np.isfinite(centres).all()
+    assert len(light) == 1

@@ -9,12 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.console import Console
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files.config import Config, carried_config
 from lfpiv_cli.files.particle_file import Points, symmetric
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.files.weights_file import WeightsFile
 from lfpiv_cli.grid import Grid
+from lfpiv_cli.interface.notices import NOTICES
 from lfpiv_cli.interface.reconstruction import Bench, bench_of, given_picture, picture_for
 from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.particles.neighbour_frames import second_pass
@@ -29,6 +31,8 @@ from lfpiv_cli.weights.build import factorise_bricks
 from lfpiv_cli.weights.columns import OnDemandOperator
 from lfpiv_cli.weights.model import behind_transmission
 
+# More than this share of an image's light, its noise taken off, is too much to leave unexplained.
+LARGEST_UNEXPLAINED = 0.5
 # Units of progress that `find` and `find_first` report.
 STEPS = sum(settings.iterations + 1 for settings in ROUNDS)
 
@@ -83,7 +87,9 @@ def find_particles(
         found = find_beside(bench, frame, own, beside)
     else:
         found = find(bench, frame)
-    return points_of(bench, frame, found, record("find_particles", chosen.resolved(), {}))
+    points = points_of(bench, frame, found, record("find_particles", chosen.resolved(), {}))
+    warn_of_unexplained(points, "the image", NOTICES)
+    return points
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,6 +187,21 @@ def points_of(bench: Bench, frame: Frame, found: Particles, provenance: Mapping[
         },
         provenance=dict(provenance),
     )
+
+
+def warn_of_unexplained(points: Points, name: str, console: Console) -> None:
+    """Say where no particles were found, or where they leave more of the image's light than noise makes."""
+    told = points.attributes
+    noise_share = min(told["read_noise_counts"] / max(told["residual_rms_counts"], told["read_noise_counts"]), 1.0)
+    unexplained = told["residual"] * float(np.sqrt(1.0 - noise_share**2))
+    count = len(points.position_mm)
+    if not count and unexplained <= LARGEST_UNEXPLAINED:
+        console.warn(f"{name}: no particles found: nothing stands out of the noise; check exposure, --dark and --mask")
+    elif unexplained > LARGEST_UNEXPLAINED:
+        console.warn(
+            f"{name}: {count or 'no'} particles found, and {unexplained:.0%} of the light is not explained by them: "
+            "check the calibration (refine-calibration), particle_diameter_mm, --dark, --background and the volume"
+        )
 
 
 def what_is_left(frame: Frame, found: Particles) -> NDArray[np.float64]:

@@ -57,6 +57,8 @@ def find_peaks(volume: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArra
     """Return the peaks of a volume, brightest first: fractional indices (n, 3) as (x, y, z), and their light (n,)."""
     height = ndimage.uniform_filter(volume, PEAK_SUM, mode="constant")
     peak = (height == ndimage.maximum_filter(height, PEAK_BOX, mode="constant")) & (height > 0.0)
+    # Running sums leave traces of bright planes in dark ones behind them: a peak must have light of its own.
+    peak &= ndimage.maximum_filter(volume, PEAK_SUM, mode="constant") > 0.0
     at = np.argwhere(peak)
     light, centres = _light_and_centres(volume, at)
     order = np.lexsort((at[:, 2], at[:, 1], at[:, 0], -light))

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.particles.candidates import explain_rest, find_peaks, points_in_raw_frame
 from lfpiv_cli.particles.fitting import accept
-from lfpiv_cli.particles.noise import estimate_noise
+from lfpiv_cli.particles.noise import Noise, estimate_noise
 from lfpiv_cli.particles.search import (
     LAST_SWEEPS,
     LAST_UNEXPLAINED,
@@ -36,6 +36,7 @@ from lfpiv_cli.particles.search import (
     with_typical_light,
 )
 from lfpiv_cli.particles.suspects import with_depths_corrected, with_overlaps_split
+from lfpiv_cli.particles.view import View
 
 
 @dataclass(frozen=True)
@@ -68,8 +69,12 @@ ROUNDS = (
 
 # Sweeps of refinement after candidates and after splitting.
 SWEEPS, SWEEPS_AFTER_SPLIT = 4, 2
-# Before any particle is known, its light is taken from the peaks: one in ten is brighter than a typical particle.
+# Before any particle is known, its light is taken from the peaks: one in ten is brighter than a typical particle. Where
+# not even so many stand out of the noise, as with few tracers, most peaks are noise: then one in ten of those that do.
 FIRST_TYPICAL_PERCENTILE = 90.0
+# A peak stands out that is brighter than noise makes a particle's light by this factor. Peaks are the largest of many
+# thousands, and gather noise from more pixels than a particle lights.
+STANDING_OUT = 20.0
 # Share of a typical particle's light that a peak must have to be tried.
 CANDIDATE_LIGHT = 0.1
 # A particle stays while it finds this much less of its light than a candidate had to.
@@ -110,13 +115,39 @@ def _one_round(task: Task, state: State, settings: Round, progress: Callable[[in
     candidates, light = _candidates(task, state, settings.iterations, progress)
     typical = state.typical_light
     if typical == 0.0:
-        typical = float(np.percentile(light, FIRST_TYPICAL_PERCENTILE)) if light.size else 0.0
-    candidates = candidates[light > CANDIDATE_LIGHT * typical]
+        typical = first_typical_light(light, noise_of_light(task.view, estimate_noise(task.image, 0.0)))
+    candidates = candidates[light > CANDIDATE_LIGHT * typical] if typical > 0.0 else candidates[:0]
     state = replace(state, typical_light=typical, noise=estimate_noise(task.image, typical))
     state = _accept(task, state, candidates, settings)
     sweep(task, state, settings.unexplained, SWEEPS)
     state = with_typical_light(task, state)
     return with_typical_light(task, with_suspects_checked(task, state, settings))
+
+
+def first_typical_light(light: NDArray[np.float64], noise_counts: float) -> float:
+    """Return the light of a typical particle as far as peaks tell; 0 where none stands out of the noise.
+
+    Parameters
+    ----------
+    light : (n,) of the peaks, counts
+    noise_counts : standard error of a particle's light by the image's noise
+    """
+    standing_out = light > STANDING_OUT * noise_counts
+    if not standing_out.any():
+        return 0.0
+    if np.count_nonzero(standing_out) < (1.0 - 0.01 * FIRST_TYPICAL_PERCENTILE) * len(light):
+        return float(np.percentile(light[standing_out], FIRST_TYPICAL_PERCENTILE, method="higher"))
+    return float(np.percentile(light, FIRST_TYPICAL_PERCENTILE))
+
+
+def noise_of_light(view: View, noise: Noise) -> float:
+    """Return the standard error of a lone particle's light by read noise.
+
+    However many lenses its light reaches, together they show the aperture once: about as many pixels are lit as a lens
+    has.
+    """
+    pixels = 4.0 * view.half_x_mm * view.half_y_mm / view.camera.pixel_mm**2
+    return float(noise.read_counts * np.sqrt(pixels))
 
 
 def with_suspects_checked(task: Task, state: State, settings: Round) -> State:

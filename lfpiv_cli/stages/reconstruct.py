@@ -36,10 +36,11 @@ Read = Callable[[int], tuple[Image, Image]]
 
 @dataclass(frozen=True)
 class Outcome:
-    """What is told of a frame: its relative residual, and how many of its pixels took no part."""
+    """What is told of a frame: its relative residual, the number of pixels that took no part, and of particles."""
 
     residual: float
     excluded_pixels: int
+    particles: int | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,7 +118,7 @@ def reconstruct(
                 pictures, target = future.result(), targets[number]
                 if as_particles:
                     frame = particles.frame_of(bench, *pictures)
-                    outcomes.append(_write_particles(bench, target, frame, find(number, frame), overwrite))
+                    outcomes.append(_write_particles(bench, target, frame, find(number, frame), overwrite, console))
                 else:
                     outcomes.append(_make_volume(bench, target, pictures, overwrite, advance))
             except InputError as error:
@@ -127,6 +128,8 @@ def reconstruct(
                 console.warn(str(error))
     if failures:
         raise PartialError(f"{len(failures)} of {len(frames)} frames failed, the first because {failures[0]}")
+    found = [outcome.particles for outcome in outcomes if outcome.particles is not None]
+    counts = {"particles": sum(found), "particles_fewest": min(found)} if found else {}
     return {
         "frames": len(frames),
         "reconstructed": len(outcomes),
@@ -135,7 +138,7 @@ def reconstruct(
         "iterations": None if as_particles else settings.reconstruction.iterations,
         "residual": max((outcome.residual for outcome in outcomes), default=None),
         "excluded_pixels": max((outcome.excluded_pixels for outcome in outcomes), default=None),
-    }
+    } | counts
 
 
 def _targets(
@@ -186,7 +189,7 @@ def _make_volume(
 
 
 def _write_particles(
-    bench: Bench, target: Target, frame: particles.Frame, found: Particles, overwrite: bool
+    bench: Bench, target: Target, frame: particles.Frame, found: Particles, overwrite: bool, console: Console
 ) -> Outcome:
     """Write the particles found behind a frame and what they leave of it."""
     points = particles.points_of(bench, frame, found, target.record)
@@ -203,7 +206,8 @@ def _write_particles(
         attributes=points.attributes,
         overwrite=overwrite,
     )
-    return Outcome(points.attributes["residual"], points.attributes["excluded_pixels"])
+    particles.warn_of_unexplained(points, str(target.path), console)
+    return Outcome(points.attributes["residual"], points.attributes["excluded_pixels"], len(points.position_mm))
 
 
 def _finder(
