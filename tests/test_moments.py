@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from benchmarks.volumes import Seeding, volume_pair
 from lfpiv_cli.flow.maps import margins
-from lfpiv_cli.flow.moments import CELLS_PER_WINDOW, cells_of, gauss_newton, pair_moments
+from lfpiv_cli.flow.moments import cells_of, gauss_newton, pair_moments
 from lfpiv_cli.flow.windows import WindowLayout, layout_windows
 
 HALF = (0.5, 0.5, 0.5)
@@ -104,8 +104,28 @@ def test_windows_that_overhang_have_an_uncertainty_of_their_own(rng: np.random.G
     assert 1.0 < np.median(deviation[[0, -1]]) / inside < 2.5
 
 
-def test_a_window_of_sixteen_has_four_cells_an_axis() -> None:
-    cells = cells_of(layout_windows(SHAPE, (16, 16, 16), HALF))
-    assert cells.per_window == (CELLS_PER_WINDOW,) * 3
-    assert cells.size == (4, 4, 4)
-    assert cells.hop == (2, 2, 2)
+@pytest.mark.parametrize(
+    ("size", "step", "per_window", "hop"), [(16, 8, 4, 2), (12, 6, 4, 2), (10, 5, 4, 2), (31, 16, 4, 4), (3, 3, 3, 3)]
+)
+def test_cells_make_up_each_window(size: int, step: int, per_window: int, hop: int) -> None:
+    cells = cells_of(WindowLayout((size, 8, 8), (step, 4, 4), (3, 1, 1), (0, 0, 0)))
+    assert (cells.per_window[2], cells.hop[2]) == (per_window, hop)
+    for window in range(3):
+        voxels = np.concatenate(
+            [
+                cells.start[2][cell] + np.arange(cells.size[2][cell])
+                for cell in range(window * hop, window * hop + per_window)
+            ]
+        )
+        np.testing.assert_array_equal(voxels, window * step + np.arange(size))
+
+
+@pytest.mark.parametrize("size", [(10, 10, 10), (12, 12, 12), (14, 14, 14), (18, 18, 18), (31, 31, 5), (24, 24, 4)])
+def test_windows_of_any_size_have_an_uncertainty(size: tuple[int, int, int], rng: np.random.Generator) -> None:
+    a, _ = shifted(rng, (1.0, 1.0, 1.0), shift=(0.0, 0.0, 0.0))
+    pair = [a + (0.05 * rng.standard_normal(a.shape)).astype(np.float32) for _ in range(2)]
+    found, stated = steps(pair[0], pair[1], layout_windows(SHAPE, size, HALF))
+    assert np.isfinite(stated).all()
+    # Some twenty windows of the largest size, half of each in the next one: the spread is known to a fifth.
+    ratio = np.sqrt(np.mean(np.square(stated)) / np.mean(np.square(found)))
+    assert 0.6 < ratio < 1.5

@@ -11,19 +11,20 @@ whatever the reason. Axes: cells and windows are ordered (z, y, x); vectors hold
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from math import gcd
 
 import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from lfpiv_cli.flow.maps import SMALLEST_BLOCK, Blocks
+from lfpiv_cli.flow.maps import SMALLEST_BLOCK
 from lfpiv_cli.flow.windows import Triple, WindowLayout
 from lfpiv_cli.simd.block_sums import MOMENTS
 from lfpiv_cli.simd.block_sums import moments as lane_moments
 from lfpiv_cli.simd.vectors import LANES
 
-# Cells along an axis of a window: groups enough for a variance, each as large as a particle image.
+# Cells along an axis of a window, at least, where it has as many voxels: groups enough for a variance.
 CELLS_PER_WINDOW = 4
 # Three components and the gain. Moments are those of their derivatives, and those of these with B - A.
 UNKNOWNS = 4
@@ -37,22 +38,46 @@ FEWEST_GROUPS = 3
 SMALLEST_PIVOT = 1e-6
 
 
-def cells_of(layout: WindowLayout) -> Blocks:
-    """Return the cells that make up the windows, axis by axis; one a window where windows share no common length."""
+Starts = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """How the windows of one layout are made of cells, along (z, y, x).
+
+    Cell k along an axis covers `size[k]` voxels from `start[k]` on, counted from the first window's first voxel; window
+    k is the sum of cells k hop ... k hop + per_window - 1.
+    """
+
+    start: Starts
+    size: Starts
+    per_window: Triple
+    hop: Triple
+
+
+def cells_of(layout: WindowLayout) -> Cells:
+    """Return the cells that make up the windows, axis by axis."""
     axes = [_cells_along(layout.size[axis], layout.step[axis], layout.count[axis]) for axis in (2, 1, 0)]
-    size, stride, count, per_window, hop = ((a[0], a[1], a[2]) for a in zip(*axes, strict=True))
-    return Blocks((layout.first[2], layout.first[1], layout.first[0]), size, stride, count, per_window, hop)
+    start, size, per_window, hop = ((a[0], a[1], a[2]) for a in zip(*axes, strict=True))
+    return Cells(start, size, per_window, hop)
 
 
-def _cells_along(size: int, step: int, count: int) -> tuple[int, int, int, int, int]:
-    """Return size, stride, count, cells per window and hop along one axis."""
-    cell = gcd(size, step)
-    if cell < SMALLEST_BLOCK or step > size:
-        return size, step, count, 1, 1
-    while cell % 2 == 0 and cell >= 2 * SMALLEST_BLOCK and size < CELLS_PER_WINDOW * cell:
-        cell //= 2
-    hop, per_window = step // cell, size // cell
-    return cell, cell, (count - 1) * hop + per_window, per_window, hop
+def _cells_along(size: int, step: int, count: int) -> tuple[NDArray[np.int64], NDArray[np.int64], int, int]:
+    """Return the starts and sizes of the cells, the cells per window and the hop along one axis.
+
+    Windows share cells of their step's and size's common divisor, or parts of these; where it is small, each window has
+    cells of its own.
+    """
+    shared = gcd(size, step)
+    if shared < SMALLEST_BLOCK or step > size:
+        first, length = step * np.arange(count), size
+    else:
+        first, length = shared * np.arange(((count - 1) * step + size) // shared), shared
+    parts = min(length, -(-CELLS_PER_WINDOW * length // size))
+    edges = np.arange(parts + 1) * length // parts
+    start = (first[:, np.newaxis] + edges[:-1]).ravel()
+    per_window = parts * (size // length)
+    return start, np.tile(np.diff(edges), first.size), per_window, parts * step // length if length < size else parts
 
 
 def pair_moments(
@@ -67,8 +92,8 @@ def pair_moments(
     before : the margins before the volume, (z, y, x)
     """
     cells = cells_of(layout)
-    first = (cells.first[0] + before[0], cells.first[1] + before[1], cells.first[2] + before[2])
-    return cell_moments(a, b, valid, first, cells.size, cells.stride, cells.count)
+    first = (layout.first[2] + before[0], layout.first[1] + before[1], layout.first[0] + before[2])
+    return cell_moments(a, b, valid, first, cells.start, cells.size)
 
 
 def gauss_newton(
@@ -87,16 +112,16 @@ def gauss_newton(
     cells = cells_of(layout)
     groups = [
         _cells_a_group(per_window, length, sigma)
-        for per_window, length, sigma in zip(cells.per_window, cells.size, particle_sigma[::-1], strict=True)
+        for per_window, length, sigma in zip(cells.per_window, layout.size[::-1], particle_sigma[::-1], strict=True)
     ]
     grouped = (groups[0], groups[1], groups[2])
     return solve_windows(moments, layout.count_zyx, cells.per_window, cells.hop, grouped)
 
 
 def _cells_a_group(per_window: int, length: int, sigma: float) -> int:
-    """Return the fewest cells, a divisor of those of a window, that are `GROUP_SIGMAS` long; or all of them."""
+    """Return the fewest cells, a divisor of those of a window of `length`, that are `GROUP_SIGMAS` long; or all."""
     for cells in range(1, per_window):
-        if per_window % cells == 0 and cells * length >= GROUP_SIGMAS * sigma:
+        if per_window % cells == 0 and cells * length >= GROUP_SIGMAS * sigma * per_window:
             return cells
     return per_window
 
@@ -107,34 +132,34 @@ def cell_moments(
     b: NDArray[np.float32],
     valid: NDArray[np.uint8],
     first: Triple,
-    size: Triple,
-    stride: Triple,
-    count: Triple,
+    start: Starts,
+    size: Starts,
 ) -> NDArray[np.float64]:
-    """Return the moments of every cell, (cells z, y, x, MOMENTS).
+    """Return the moments of every cell, (cells z, y, x, MOMENTS), of windows that begin at the voxel `first`.
 
     The upper triangle of the products of (dM/dx, dM/dy, dM/dz, M), row by row, then those of each with B - A. Voxels
     with a neighbour that is not valid are left out: their gradient would be that of the rim.
     """
+    count = (start[0].size, start[1].size, start[2].size)
     found = np.empty((count[0], count[1], count[2], MOMENTS))
     row, plane = a.shape[2], a.shape[1] * a.shape[2]
     flat_a, flat_b, flat_valid = a.reshape(a.size), b.reshape(b.size), valid.reshape(valid.size)
-    length = max(LANES, (count[2] - 1) * stride[2] + size[2])
+    length = max(LANES, start[2][-1] + size[2][-1])
     for job in prange(count[0] * count[1]):
         cz, cy = job // count[1], job % count[1]
-        begin = (first[0] + cz * stride[0]) * plane + (first[1] + cy * stride[1]) * row + first[2]
+        begin = (first[0] + start[0][cz]) * plane + (first[1] + start[1][cy]) * row + first[2]
         # Summed over the planes and rows of the cells first, many columns at once; float32 serves for so few.
         columns = np.empty((MOMENTS, length), dtype=np.float32)
         flat = columns.reshape(columns.size)
-        for start in range(0, length, LANES):
+        for lane in range(0, length, LANES):
             # The last lanes begin early enough to end with the others.
-            x = min(start, length - LANES)
+            x = min(lane, length - LANES)
             places = (begin + x, plane, row)
-            lane_moments(flat, (x, length), flat_a, flat_b, flat_valid, places, (size[0], size[1]))
+            lane_moments(flat, (x, length), flat_a, flat_b, flat_valid, places, (size[0][cz], size[1][cy]))
         for cx in range(count[2]):
             for moment in range(MOMENTS):
                 total = 0.0
-                for x in range(cx * stride[2], cx * stride[2] + size[2]):
+                for x in range(start[2][cx], start[2][cx] + size[2][cx]):
                     total += columns[moment, x]
                 found[cz, cy, cx, moment] = total
     return found
