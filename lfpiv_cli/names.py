@@ -8,10 +8,11 @@ from __future__ import annotations
 
 from typing import Any, Literal, get_args
 
-# The microlens array, and the board: what it stands in, and its dots beside its ground.
+# The microlens array, and the calibration target: what is on it, what it stands in, and its dots beside its ground.
 Layout = Literal["square", "hexagonal"]
+Pattern = Literal["dots", "chessboard", "charuco"]
 Medium = Literal["air", "fluid"]
-Polarity = Literal["bright", "dark"]
+Polarity = Literal["auto", "bright", "dark"]
 
 # The world axis that the sensor's columns follow.
 ColumnAxis = Literal["x", "y"]

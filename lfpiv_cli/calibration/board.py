@@ -1,4 +1,4 @@
-"""From one picture of a dot board to where the focal plane is, how the board is tilted, and the magnification.
+"""From one picture of a calibration target to where the focal plane is, how the board is tilted, and the magnification.
 
 Axes: the picture is rectified and its microlenses stand upright; the pose is given in world axes, those of the raw
 sensor: x, y lateral, z away from the camera from the focal plane, in the medium the board stands in.
@@ -6,24 +6,28 @@ sensor: x, y lateral, z away from the camera from the focal plane, in the medium
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose, on_the_grid, pose_of_dots
+from lfpiv_cli.calibration.corners import first_corners
 from lfpiv_cli.calibration.dot_model import (
-    DiscFit,
     checked_disc_radius,
     fit_disc,
-    lens_crossings,
-    pixel_rays,
-    scene_points,
 )
+from lfpiv_cli.calibration.measured_points import MeasuredPoints, measured_points
+from lfpiv_cli.calibration.near_pixels import pixels_near
 from lfpiv_cli.calibration.rectification import turned
 from lfpiv_cli.calibration.refocusing import Refocusing
+from lfpiv_cli.calibration.shape_fit import ShapeFit
 from lfpiv_cli.calibration.spots import find_spots
+from lfpiv_cli.calibration.target_kinds import another_kind
 from lfpiv_cli.errors import InputError
+from lfpiv_cli.names import Pattern
 from lfpiv_cli.neighbourhoods import opened
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
@@ -44,14 +48,6 @@ HALF_WIDTH = 0.6
 # Pixels that see the plane of the dots within this many microlenses of a dot's rim, but not half-way to the next dot,
 # belong to its fit.
 MARGIN_LENSES = 2.5
-# Pixels at the rim of a micro-image are lit in part, by light that does not come from where their middle sees, and
-# rectification mixes neighbours; a pixel is used when the main lens's rim is more than half its patch's diagonal and a
-# pixel away. Without that pixel depths are 0.2 % too large.
-RIM_PER_PATCH = np.sqrt(0.5) + 1.0
-# Fewer pixels than these are a dot at the sensor's edge: five unknowns need several times as many.
-FEWEST_PIXELS = 50
-# More pixels than these make a dot's fit slower and hardly better: the model's own errors are larger than their noise.
-MOST_PIXELS = 10_000
 # What is wider than this share of the dots' distance in the refocused picture is light on the board, not a dot.
 DOT_PER_SPACING = 0.5
 # Magnification and distortion enter the place of each dot; one repetition with the measured ones leaves the square of
@@ -59,6 +55,19 @@ DOT_PER_SPACING = 0.5
 LENS_ROUNDS = 2
 # Below this a change of scale at the board's corner moves nothing by a micrometre over a board of 10 mm.
 SCALE_TOLERANCE = 1e-4
+
+
+class Look(Protocol):
+    """A picture of a target and the points in it, roughly; `medium` is what the target stands in."""
+
+    @property
+    def medium(self) -> Media: ...
+
+    def moved(self, scale: float, depth_mm: float) -> Look:
+        """Return the look with its points nearer the axis by a scale, at another depth."""
+
+    def measured(self, camera: Camera, board: BoardGeometry) -> MeasuredPoints:
+        """Measure the points."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,15 +91,18 @@ class FirstLook:
     start_mm: NDArray[np.float64]
     depth_mm: float
 
-    def fits(
-        self, camera: Camera, board: BoardGeometry, start_mm: NDArray[np.float64], depth_mm: float
-    ) -> list[DiscFit | None]:
-        """Fit a disc to each dot from a first guess of all."""
+    def moved(self, scale: float, depth_mm: float) -> FirstLook:
+        """Return the look with its dots nearer the axis by a scale, at another depth."""
+        return replace(self, start_mm=self.start_mm / scale, depth_mm=depth_mm)
+
+    def measured(self, camera: Camera, board: BoardGeometry) -> MeasuredPoints:
+        """Fit a disc to each dot."""
         scene = (self.signal, self.passed, camera, board, self.medium)
-        return [fit_one_dot(*scene, (x, y, depth_mm), self.radius_mm) for x, y in start_mm]
+        fits = [fit_one_dot(*scene, (x, y, self.depth_mm), self.radius_mm) for x, y in self.start_mm]
+        return measured_points([fit if fit is not None and fit.brightness > 0.0 else None for fit in fits])
 
 
-def first_look(
+def first_dots_look(
     image: NDArray[np.float32],
     camera: Camera,
     board: BoardGeometry,
@@ -129,14 +141,22 @@ def locate_board(
     InputError
         when too few dots are found to make a board
     """
-    look = first_look(image, camera, board, media, transmission)
-    start, depth = look.start_mm, look.depth_mm
+    try:
+        return _pose(LOOKS[board.pattern](image, camera, board, media, transmission), camera, board, rotation_rad)
+    except InputError as error:
+        if named := another_kind(image, camera, board, transmission):
+            raise InputError(f"{named}; correct the section board") from error
+        raise
+
+
+def _pose(look: Look, camera: Camera, board: BoardGeometry, rotation_rad: float) -> BoardPose:
+    """Return the pose of a target, again with the magnification and the distortion that the first one tells."""
     micro_images = camera.micro_image_lattice_px()
     for _ in range(LENS_ROUNDS):
-        fits = look.fits(camera, board, start, depth)
-        places, sigmas = world_places(fits, camera, rotation_rad)
+        found = look.measured(camera, board)
+        places, sigmas = world_places(found, camera, rotation_rad)
         array = array_places(places, camera, look.medium)
-        pose = pose_of_dots(places, sigmas, array, camera, board)
+        pose = pose_of_dots(places, sigmas, array, camera, board, found.numbers)
         ratio = pose.magnification / camera.magnification
         bend = pose.distortion_per_mm2 - camera.distortion_per_mm2
         if max(abs(ratio - 1.0), abs(bend) * float(np.sum(array**2, axis=1).max())) < SCALE_TOLERANCE:
@@ -144,7 +164,7 @@ def locate_board(
         camera = replace(
             camera, magnification=pose.magnification, distortion_per_mm2=pose.distortion_per_mm2
         ).with_micro_images(micro_images)
-        start, depth = start / ratio, pose.z0_mm
+        look = look.moved(ratio, pose.z0_mm)
     return pose
 
 
@@ -155,8 +175,8 @@ def dots_in_world(
 
     Parameters and errors are those of `locate_board`, which believes in the spacing and asks what the camera is.
     """
-    look = first_look(image, camera, board, media)
-    places, _ = world_places(look.fits(camera, board, look.start_mm, look.depth_mm), camera, rotation_rad)
+    found = first_dots_look(image, camera, board, media).measured(camera, board)
+    places, _ = world_places(found, camera, rotation_rad)
     kept, index = on_the_grid(places, board)
     dots = np.full((board.dots[1], board.dots[0], 3), np.nan)
     dots[index[:, 1], index[:, 0]] = places[kept]
@@ -164,12 +184,10 @@ def dots_in_world(
 
 
 def world_places(
-    fits: list[DiscFit | None], camera: Camera, rotation_rad: float
+    found: MeasuredPoints, camera: Camera, rotation_rad: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return places and standard errors (n, 3) of the fitted dots, turned back to the raw sensor's axes."""
-    good = [fit for fit in fits if fit is not None and fit.converged and fit.brightness > 0.0]
-    places = np.array([fit.position_mm for fit in good]).reshape(-1, 3)
-    sigmas = np.sqrt(np.array([np.diag(fit.covariance_mm2) for fit in good])).reshape(-1, 3)
+    """Return places and standard errors (n, 3) of the measured points, turned back to the raw sensor's axes."""
+    places, sigmas = found.places_mm, found.sigmas_mm
     return camera.to_image_axes(turned(places, rotation_rad)), camera.to_image_axes(sigmas)
 
 
@@ -181,11 +199,18 @@ def array_places(places_mm: NDArray[np.float64], camera: Camera, media: Media) -
 
 
 def dot_signal(image: NDArray[np.float32], passed: NDArray[np.float32], board: BoardGeometry) -> NDArray[np.float64]:
-    """Return the picture with the dots bright on a dim ground; dark dots are what the lit board lacks of full light."""
+    """Return the picture with the dots bright on a dim ground; dark dots are what the lit board lacks of full light.
+
+    Dots cover the smaller part of a board: where the polarity is not known, most of the picture is the board.
+    """
     if board.polarity == "bright":
         return image.astype(np.float64)
     usable = passed > 0.0
-    level = np.median(image[usable] / passed[usable])
+    light = image[usable] / passed[usable]
+    level = np.median(light)
+    dim, bright = np.percentile(light, [100.0 - BRIGHTEST_PERCENTILE, BRIGHTEST_PERCENTILE])
+    if board.polarity == "auto" and level - dim < bright - level:
+        return image.astype(np.float64)
     return np.asarray(level * passed - image, dtype=np.float64)
 
 
@@ -232,29 +257,22 @@ def fit_one_dot(
     media: Media,
     start_mm: tuple[float, float, float],
     radius_mm: float,
-) -> DiscFit | None:
+) -> ShapeFit | None:
     """Fit a disc to the pixels that see the surroundings of its first guess, in image axes; None off the sensor."""
-    x, y, z = start_mm
-    distance = float(equivalent_object_distance(z, camera.focus_distance_mm, media))
+    distance = float(equivalent_object_distance(start_mm[2], camera.focus_distance_mm, media))
     forward = camera.image_distance_mm / distance
     pitch = float(camera.lattice.pitch.max())
     reach = min(0.5 * board.spacing_mm, radius_mm + MARGIN_LENSES * pitch / forward)
-    blur = abs(float(camera.defocus(distance))) * camera.aperture_radius_mm
-    half = (forward * reach + blur + pitch) / camera.pixel_mm
-    middle = camera.mm_to_px(-forward * np.array([x, y]))
-    low = np.maximum(np.floor(middle - half), 0).astype(np.int64)
-    high = np.minimum(np.ceil(middle + half) + 1, [camera.columns, camera.rows]).astype(np.int64)
-    row, column = (axis.ravel() for axis in np.mgrid[low[1] : high[1], low[0] : high[0]])
-    rays = pixel_rays(camera, column, row)
-    near = np.hypot(*(scene_points(rays, camera, media, z) - (x, y)).T) <= reach
-    rim = RIM_PER_PATCH * camera.pixel_mm * camera.image_distance_mm / camera.microlens_distance_mm
-    through = np.hypot(*lens_crossings(rays, camera).T) <= camera.aperture_radius_mm - rim
-    kept = np.nonzero(near & through & (passed[row, column] > 0.0))[0]
-    if len(kept) < FEWEST_PIXELS:
+    near = pixels_near((signal, passed), camera, media, start_mm, reach)
+    if near is None:
         return None
-    kept = kept[:: -(-len(kept) // MOST_PIXELS)]
-    chosen = replace(rays, place_mm=rays.place_mm[kept], lens_mm=rays.lens_mm[kept], ideal_mm=rays.ideal_mm[kept])
-    light = passed[row, column][kept].astype(np.float64)
-    return fit_disc(
-        signal[row, column][kept], light, chosen, np.array(start_mm, dtype=np.float64), radius_mm, camera, media
-    )
+    start = np.array(start_mm, dtype=np.float64)
+    return fit_disc(near.signal, near.passed, near.rays, start, radius_mm, camera, media)
+
+
+# How the points of each pattern are found, by `board.pattern`.
+LOOKS: dict[Pattern, Callable[..., Look]] = {
+    "dots": first_dots_look,
+    "chessboard": first_corners,
+    "charuco": first_corners,
+}

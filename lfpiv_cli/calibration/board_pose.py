@@ -6,7 +6,7 @@ board stands in. Lengths in mm.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,11 +15,17 @@ from numpy.typing import NDArray
 from lfpiv_cli.calibration.board_fit import FlatFit, bent_fit, flat_fit, outliers
 from lfpiv_cli.calibration.spots import first_of_each
 from lfpiv_cli.errors import InputError
-from lfpiv_cli.names import Medium, Polarity
+from lfpiv_cli.names import Medium, Pattern, Polarity
 from lfpiv_cli.optics.camera import Camera
 
 # The plane, the spacing and their errors need more than their own unknowns.
 FEWEST_DOTS = 6
+# Bright spots of any picture fit a part of a grid by chance; a board shows most of its dots. The corners of a ChArUco
+# board are known each by itself, so that a part of it will do.
+LEAST_SHARE = 0.5
+# Dots of a board lie within a few thousandths of the spacing from its grid, other things anywhere within the tolerance
+# below: a fifth of the spacing, root mean square.
+LARGEST_SCATTER = 0.08
 # Dots off the common board are left out; without them others may turn out to be off, and a third look settles it.
 OUTLIER_ROUNDS = 3
 # What all dots have in common does not show in their scatter. On rendered boards it was 1 to 10 um of depth, two
@@ -42,15 +48,18 @@ STARTS = 8
 
 @dataclass(frozen=True)
 class BoardGeometry:
-    """A flat board with a square grid of round dots.
+    """A flat calibration target with a square grid of points: round dots, or the inner corners of a chessboard.
 
     Attributes
     ----------
-    dots : number of dots along x and y
-    spacing_mm, dot_diameter_mm : of the dots
+    dots : number of dots or inner corners along x and y, the squares less one
+    spacing_mm : of the dots or corners, the side of a square
+    dot_diameter_mm : of the dots
     thickness_mm : of the board, t_b of Eq. 21
     polarity : whether the dots are brighter or darker than the board
     medium : what is in front of it
+    pattern : what is on it
+    marker_mm, dictionary : of a ChArUco board: the side of its markers and OpenCV's name of their dictionary
     """
 
     dots: tuple[int, int]
@@ -59,6 +68,14 @@ class BoardGeometry:
     thickness_mm: float = 0.0
     polarity: Polarity = "bright"
     medium: Medium = "air"
+    pattern: Pattern = "dots"
+    marker_mm: float = 0.0
+    dictionary: str = "DICT_4X4_50"
+
+    @property
+    def points(self) -> str:
+        """What its points are called."""
+        return "dots" if self.pattern == "dots" else "corners"
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +116,11 @@ class BoardPose:
     k1_sigma_per_mm2: float | None = None
 
     @property
+    def dots_found(self) -> int:
+        """How many dots or corners the pose rests on."""
+        return len(self.indices)
+
+    @property
     def distortion_per_mm2(self) -> float:
         """The distortion to reckon with: k1 where it is more than chance, else 0."""
         if self.k1_per_mm2 is None or self.k1_sigma_per_mm2 is None:
@@ -112,21 +134,28 @@ def pose_of_dots(
     array_mm: NDArray[np.float64],
     camera: Camera,
     board: BoardGeometry,
+    numbers: NDArray[np.int64] | None = None,
 ) -> BoardPose:
-    """Fit a flat regular board to dots.
+    """Fit a flat regular board to dots or corners.
 
     Parameters
     ----------
     dots_mm, sigma_mm : (n, 3) places of dots, world axes, in any order, and their standard errors
     array_mm : (n, 2) where an ideal main lens would show them on the microlens array, image axes
     camera : that these places were computed with
+    numbers : (n, 2) which point of the board each is, the board turned in any way; default: not known
 
     Raises
     ------
     InputError
-        when fewer than six dots lie on a common grid
+        when too few dots lie on a common grid, or they scatter about it
     """
-    kept, indices = on_the_grid(dots_mm, board)
+    if numbers is None:
+        kept, indices = on_the_grid(dots_mm, board)
+    else:
+        indices, board = upright_numbers(numbers, dots_mm[:, :2], board)
+        kept = np.arange(len(indices))
+        refuse_few(len(kept), board)
     radius = np.hypot(array_mm[:, 0], array_mm[:, 1])
     for _ in range(OUTLIER_ROUNDS):
         bent = bent_fit(dots_mm[kept], indices, radius[kept], board)
@@ -136,6 +165,7 @@ def pose_of_dots(
         kept, indices = kept[good], indices[good]
         refuse_few(len(kept), board)
     bent = bent_fit(dots_mm[kept], indices, radius[kept], board)
+    refuse_scattered(bent.residual_mm, board)
     k1, k1_sigma = total_distortion(bent, camera)
     proven = k1 is not None and k1_sigma is not None and abs(k1) > DISTORTION_SIGMAS * k1_sigma
     fit = bent if proven else flat_fit(dots_mm[kept], indices, board)
@@ -223,11 +253,38 @@ def numbered_dots(
 
 def refuse_few(count: int, board: BoardGeometry) -> None:
     """Raise when too few dots are left."""
-    if count < FEWEST_DOTS:
+    across, down = board.dots
+    share = 0.0 if board.pattern == "charuco" else LEAST_SHARE
+    needed = max(FEWEST_DOTS, int(np.ceil(share * across * down)))
+    if count < needed:
         raise InputError(
-            f"only {count} of the board's {board.dots[0]} x {board.dots[1]} dots were found, {board.spacing_mm:g} mm "
-            f"apart, at least {FEWEST_DOTS} are needed; check board.spacing_mm, the exposure and the focus"
+            f"only {count} of the board's {across} x {down} {board.points} were found, {board.spacing_mm:g} mm apart, "
+            f"at least {needed} are needed; check the section board, the exposure and the focus"
         )
+
+
+def refuse_scattered(residual_mm: NDArray[np.float64], board: BoardGeometry) -> None:
+    """Raise when what was found lies about a grid and not on it."""
+    scatter = float(np.sqrt(np.mean(np.sum(residual_mm[:, :2] ** 2, axis=1))))
+    if scatter > LARGEST_SCATTER * board.spacing_mm:
+        raise InputError(
+            f"what was found lies {scatter:.3g} mm rms off a grid of {board.spacing_mm:g} mm, at most "
+            f"{LARGEST_SCATTER * board.spacing_mm:.3g} mm is a board's; check board.spacing_mm and that the picture "
+            "shows the board"
+        )
+
+
+def upright_numbers(
+    numbers: NDArray[np.int64], lateral_mm: NDArray[np.float64], board: BoardGeometry
+) -> tuple[NDArray[np.int64], BoardGeometry]:
+    """Return numbers (n, 2) of a board's points that grow with x and y, and the board as it is then seen."""
+    terms = np.column_stack([np.ones(len(numbers)), numbers])
+    along = np.linalg.lstsq(terms, lateral_mm, rcond=None)[0][1:]
+    if abs(along[0, 0]) + abs(along[1, 1]) < abs(along[0, 1]) + abs(along[1, 0]):
+        numbers, along = numbers[:, ::-1], along[::-1]
+        board = replace(board, dots=board.dots[::-1])
+    last = np.array(board.dots) - 1
+    return np.where(np.diag(along) < 0.0, last - numbers, numbers), board
 
 
 def rows_direction(lateral: NDArray[np.float64], start: int, spacing_mm: float) -> NDArray[np.float64]:

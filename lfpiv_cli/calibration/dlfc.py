@@ -20,10 +20,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from lfpiv_cli.calibration.board import RIM_PER_PATCH, candidate_depths, dot_signal, first_dots
+from lfpiv_cli.calibration.board import candidate_depths, dot_signal, first_dots
 from lfpiv_cli.calibration.board_pose import BoardGeometry, on_the_grid
+from lfpiv_cli.calibration.near_pixels import RIM_PER_PATCH
 from lfpiv_cli.calibration.rectification import turn_matrix
-from lfpiv_cli.calibration.views import lens_table, sub_aperture_view
+from lfpiv_cli.calibration.views import lens_table, sub_aperture_view, view_crossings
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
@@ -127,6 +128,8 @@ def fit_rays(
     ------
     InputError : fewer than three different depths or lines of dots, or a board whose dots are not found
     """
+    if board.pattern != "dots":
+        raise InputError(f"polynomials are fitted to boards of dots, and board.pattern is {board.pattern}")
     depths = np.asarray(depths_mm, dtype=np.float64)
     different = np.unique(depths).size
     if different <= SMALLEST_DEGREE:
@@ -246,14 +249,6 @@ def sightings_of(seen: SeenBoard, camera: Camera, board: BoardGeometry, media: M
     clear = heights > CONTRAST_SHARE * np.nanmedian(heights)
     view_of, dot = np.nonzero(clear & np.isfinite(found).all(axis=-1))
     return Sightings(dot, crossings[view_of], found[view_of, dot])
-
-
-def view_crossings(radius_mm: float, step_mm: float) -> NDArray[np.float64]:
-    """Return points (n, 2) of the main lens, a square grid about its middle."""
-    count = int(radius_mm / step_mm)
-    line = step_mm * np.arange(-count, count + 1)
-    points = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
-    return points[np.hypot(points[:, 0], points[:, 1]) <= radius_mm]
 
 
 @njit(cache=True)

@@ -8,12 +8,14 @@ share of this polygon that the disc covers, exactly, times what the pixel passes
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from lfpiv_cli.calibration.shape_fit import ShapeFit, SharesAndSlopes, fit_shape
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
@@ -23,11 +25,6 @@ from lfpiv_cli.optics.microlenses import Lattice, nearest_point
 # radius in the scene, else at 3 x 3 places, which leaves a tenth of the spread out.
 SHARP_SHARE = 0.2
 BLURRED_SAMPLES = 3
-# Gauss-Newton starts within the disc and settles in about five rounds, to a hundredth of what noise leaves; a step
-# that raises the misfit is halved.
-FIT_ROUNDS = 20
-FIT_HALVINGS = 6
-FIT_TOLERANCE_PER_RADIUS = 1e-4
 # Undoing r' = r (1 + k1 r^2) by repetition: each round gains a factor 3 k1 r^2, below 0.01 for usable lenses.
 UNDISTORT_ROUNDS = 6
 
@@ -46,41 +43,6 @@ class PixelRays:
     place_mm: NDArray[np.float64]
     lens_mm: NDArray[np.float64]
     ideal_mm: NDArray[np.float64]
-
-
-@dataclass(frozen=True, eq=False)
-class DiscFit:
-    """A disc fitted to pixels.
-
-    Attributes
-    ----------
-    position_mm : (3,) x, y in image axes, z in the medium
-    covariance_mm2 : (3, 3) of the position
-    brightness, background : light of the disc and around it, in the image's unit at full transmission
-    rms : root mean square misfit, in the image's unit
-    converged : the steps became small before the rounds were used up
-    """
-
-    position_mm: NDArray[np.float64]
-    covariance_mm2: NDArray[np.float64]
-    brightness: float
-    background: float
-    rms: float
-    converged: bool
-
-
-@dataclass(frozen=True, eq=False)
-class LinearFit:
-    """Brightness and background (levels) that explain pixels best for a disc at a given place.
-
-    `design` (n, 7) is what the disc's moves along x, y, z and a unit of each level put on the pixels, `residual` (n,)
-    what is left, `misfit` its square.
-    """
-
-    design: NDArray[np.float64]
-    levels: NDArray[np.float64]
-    residual: NDArray[np.float64]
-    misfit: float
 
 
 def pixel_rays(camera: Camera, column: NDArray[np.int64], row: NDArray[np.int64]) -> PixelRays:
@@ -138,10 +100,33 @@ def lens_cell(lattice: Lattice) -> NDArray[np.float64]:
 
 def disc_shares(
     rays: PixelRays, position_mm: NDArray[np.float64], radius_mm: float, camera: Camera, media: Media
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> SharesAndSlopes:
     """Return for each pixel the share (n,) of the scene it sees at depth z that a disc there covers, and its slopes.
 
     `position_mm` is (x, y, z) in image axes; the slopes (n, 3) are the share's derivatives by it, per mm.
+    """
+
+    def covered(middle: NDArray[np.float64], cell: NDArray[np.float64], width: float) -> SharesAndSlopes:
+        samples = 1 if width < SHARP_SHARE * radius_mm else BLURRED_SAMPLES
+        return covered_shares(middle, cell, radius_mm, width, samples)
+
+    return scene_shares(rays, position_mm, camera, media, covered)
+
+
+def scene_shares(
+    rays: PixelRays,
+    position_mm: NDArray[np.float64],
+    camera: Camera,
+    media: Media,
+    covered: Callable[[NDArray[np.float64], NDArray[np.float64], float], SharesAndSlopes],
+) -> SharesAndSlopes:
+    """Return the shares (n,) of what pixels see in the plane of `position_mm` that a shape there covers, and slopes.
+
+    Parameters
+    ----------
+    covered : gives the shares for the middles (n, 2) of what is seen, about the position, the corners of a microlens as
+        seen there (k, 2), and the width of a pixel; and their slopes (n, 4) by the middle's x and y, the logarithm of
+        the microlens's size, and the width
     """
     distance = float(equivalent_object_distance(position_mm[2], camera.focus_distance_mm, media))
     back = distance / camera.image_distance_mm
@@ -159,8 +144,7 @@ def disc_shares(
     middle = spread * crossings - back * rays.ideal_mm - position_mm[:2]
     middle_z = spread_z * crossings - back_z * rays.ideal_mm
     width = abs(spread) * pixel
-    samples = 1 if width < SHARP_SHARE * radius_mm else BLURRED_SAMPLES
-    shares, slopes = covered_shares(middle, lens_cell(camera.lattice) * cell_scale, radius_mm, width, samples)
+    shares, slopes = covered(middle, lens_cell(camera.lattice) * cell_scale, width)
     by_z = (
         slopes[:, 0] * middle_z[:, 0] + slopes[:, 1] * middle_z[:, 1] + slopes[:, 2] * cell_z + slopes[:, 3] * width_z
     )
@@ -276,8 +260,8 @@ def fit_disc(
     radius_mm: float,
     camera: Camera,
     media: Media,
-) -> DiscFit:
-    """Fit a disc of known radius to pixels by least squares: x, y, z, brightness and a sloping background are free.
+) -> ShapeFit:
+    """Fit a disc of known radius to pixels by least squares.
 
     Parameters
     ----------
@@ -285,45 +269,17 @@ def fit_disc(
     start_mm : (3,) first guess, in image axes, within about the radius
     """
 
-    slopes = (scene_points(rays, camera, media, float(start_mm[2])) - start_mm[:2]) / radius_mm
-    ground = passed[:, np.newaxis] * np.column_stack([np.ones(len(passed)), slopes])
-    # Columns of like size: a move of this much in depth changes the light as much as one of a radius sideways.
-    deep = radius_mm * camera.focus_distance_mm / (camera.aperture_radius_mm * media.depth_ratio)
-    unit = np.array([radius_mm, radius_mm, deep])
+    def shares_at(position: NDArray[np.float64]) -> SharesAndSlopes:
+        return disc_shares(rays, position, radius_mm, camera, media)
 
-    def linear_fit(position: NDArray[np.float64]) -> LinearFit:
-        shares, moves = disc_shares(rays, position, radius_mm, camera, media)
-        design = np.column_stack([passed * shares, ground])
-        levels = solved(design, signal)
-        residual = signal - design @ levels
-        full = np.column_stack([levels[0] * passed[:, np.newaxis] * moves * unit, design])
-        return LinearFit(full, levels, residual, float(residual @ residual))
-
-    position = np.asarray(start_mm, dtype=np.float64)
-    best = linear_fit(position)
-    converged = False
-    for _ in range(FIT_ROUNDS):
-        move = solved(best.design, best.residual)[:3] * unit
-        for _ in range(FIT_HALVINGS):
-            trial = linear_fit(position + move)
-            if trial.misfit <= best.misfit:
-                break
-            move = 0.5 * move
-        converged = bool(np.all(np.abs(move) <= FIT_TOLERANCE_PER_RADIUS * unit))
-        if trial.misfit > best.misfit:
-            break
-        position, best = position + move, trial
-        if converged:
-            break
-    variance = best.misfit / max(1, signal.size - best.design.shape[1])
-    covariance = np.linalg.pinv(best.design.T @ best.design)[:3, :3] * variance * np.outer(unit, unit)
-    rms = float(np.sqrt(best.misfit / signal.size))
-    return DiscFit(position, covariance, float(best.levels[0]), float(best.levels[1]), rms, converged)
+    beside = scene_points(rays, camera, media, float(start_mm[2])) - start_mm[:2]
+    return fit_shape(signal, passed, beside, start_mm, fit_steps(radius_mm, camera, media), shares_at)
 
 
-def solved(design: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the coefficients of the design's columns that explain the values best."""
-    return np.asarray(np.linalg.lstsq(design, values, rcond=None)[0], dtype=np.float64)
+def fit_steps(size_mm: float, camera: Camera, media: Media) -> NDArray[np.float64]:
+    """Return moves (3,) that change a shape's light alike: its size sideways, and what moves the rim's rays as far."""
+    deep = size_mm * camera.focus_distance_mm / (camera.aperture_radius_mm * media.depth_ratio)
+    return np.array([size_mm, size_mm, deep])
 
 
 def checked_disc_radius(radius_mm: float, camera: Camera) -> float:

@@ -151,6 +151,7 @@ class Calibration:
             "image_distance_mm_sigma": self.image_distance_sigma_mm,
             "k1_per_mm2": pose.k1_per_mm2 if pose else None,
             "k1_per_mm2_sigma": pose.k1_sigma_per_mm2 if pose else None,
+            "dots_found": pose.dots_found if pose else None,
             "board_z_mm": pose.z0_mm if pose else None,
             "board_z_mm_sigma": pose.z0_sigma_mm if pose else None,
             "tilt_deg": pose.tilt_deg.tolist() if pose else None,

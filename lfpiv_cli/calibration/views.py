@@ -48,6 +48,14 @@ def view_places_px(camera: Camera, crossing_mm: ArrayLike) -> NDArray[np.float64
     return camera.mm_to_px(lens + camera.microlens_distance_mm * step)
 
 
+def view_crossings(radius_mm: float, step_mm: float) -> NDArray[np.float64]:
+    """Return points (n, 2) of the main lens, a square grid about its middle."""
+    count = int(radius_mm / step_mm)
+    line = step_mm * np.arange(-count, count + 1)
+    points = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+    return points[np.hypot(points[:, 0], points[:, 1]) <= radius_mm]
+
+
 def sub_aperture_view(image: ArrayLike, camera: Camera, crossing_mm: ArrayLike) -> NDArray[np.float64]:
     """Return the view (lens rows, lens columns) from the point (X, Y) of the main lens, linearly interpolated.
 

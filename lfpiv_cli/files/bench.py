@@ -107,14 +107,20 @@ def media_of(section: MediaSection) -> Media:
 
 
 def board_of(section: BoardSection) -> BoardGeometry:
-    """Return the board."""
+    """Return the board; a chessboard's points are the corners between its squares."""
+    points = section.dots if section.squares is None else (section.squares[0] - 1, section.squares[1] - 1)
+    if points is None:
+        raise ValueError("board.dots or board.squares is missing")
     return BoardGeometry(
-        dots=section.dots,
+        dots=points,
         spacing_mm=section.spacing_mm,
-        dot_diameter_mm=section.dot_diameter_mm,
+        dot_diameter_mm=section.dot_diameter_mm or 0.0,
         thickness_mm=section.thickness_mm,
         polarity=section.polarity,
         medium=section.medium,
+        pattern=section.pattern,
+        marker_mm=section.marker_mm or 0.0,
+        dictionary=section.dictionary,
     )
 
 

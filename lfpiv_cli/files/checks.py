@@ -20,6 +20,12 @@ from lfpiv_cli.reference import FOCAL_POINT
 
 Found = Iterator[tuple[KeyPath, str]]
 
+# What the board of each pattern needs besides its spacing; the other keys here are not for it.
+BOARD_KEYS = {
+    "dots": ("dots", "dot_diameter_mm"),
+    "chessboard": ("squares",),
+    "charuco": ("squares", "marker_mm"),
+}
 # Data sheets give three or four digits.
 AGREEMENT = 1e-3
 
@@ -28,6 +34,7 @@ def contradictions(sections: Sections) -> Found:
     """Yield the place and the sentence of everything that cannot be."""
     yield from _lens(sections)
     yield from _volume(sections)
+    yield from _board(sections)
     yield from _scene(sections)
     yield from _processing(sections)
     yield from _rays(sections)
@@ -88,14 +95,25 @@ def _volume(sections: Sections) -> Found:
         yield (*place, "reference"), "is mid_plane, which needs the section channel"
 
 
+def _board(sections: Sections) -> Found:
+    """Yield what a board's pattern lacks or does not have, and dots or markers that are too large."""
+    board = sections.board
+    if board is None:
+        return
+    has = BOARD_KEYS[board.pattern]
+    for name in dict.fromkeys(key for keys in BOARD_KEYS.values() for key in keys):
+        given = getattr(board, name) is not None
+        if given != (name in has):
+            yield ("board", name), f"is {'not for' if given else 'missing for'} pattern {board.pattern}"
+    for name in ("dot_diameter_mm", "marker_mm"):
+        size = getattr(board, name)
+        if size is not None and size >= board.spacing_mm:
+            yield ("board", name), f"is {size:g}, expected less than the spacing of {board.spacing_mm:g}"
+
+
 def _scene(sections: Sections) -> Found:
-    """Yield dots that overlap, and a wall that is not the window."""
+    """Yield a wall that is not the window, and a board's place in the fluid that is in air."""
     board, window, channel = sections.board, sections.window, sections.channel
-    if board is not None and board.dot_diameter_mm >= board.spacing_mm:
-        yield (
-            ("board", "dot_diameter_mm"),
-            f"is {board.dot_diameter_mm:g}, expected less than the spacing of {board.spacing_mm:g}",
-        )
     in_fluid = board is not None and board.medium == "fluid"
     if channel is not None and channel.board_from_mid_plane_mm is not None and not in_fluid:
         yield ("channel", "board_from_mid_plane_mm"), "is for a board in the fluid; one in air stands on the outer wall"

@@ -24,7 +24,18 @@ from lfpiv_cli.files.section_types import (
     Windows,
 )
 from lfpiv_cli.files.sections_simulated import SimulationSection, ValidationSection
-from lfpiv_cli.names import ColumnAxis, Layout, Medium, Method, Polarity, ReferenceName, Refraction, Sampling, Start
+from lfpiv_cli.names import (
+    ColumnAxis,
+    Layout,
+    Medium,
+    Method,
+    Pattern,
+    Polarity,
+    ReferenceName,
+    Refraction,
+    Sampling,
+    Start,
+)
 from lfpiv_cli.reconstruction.registry import SolverName
 
 
@@ -107,19 +118,29 @@ class VolumeSection(Section):
     reference: ReferenceName = "focal_point"
 
 
-class BoardSection(Section):
-    """The calibration board: dots along x and y, their spacing and diameter, the board's thickness t_b.
+# OpenCV's names of the dictionaries of ArUco markers.
+DICTIONARIES = r"^DICT_((4X4|5X5|6X6|7X7)_(50|100|250|1000)|ARUCO_ORIGINAL)$"
 
-    medium: what the board stands in, air or fluid. polarity: whether the dots are brighter than the board (bright) or
-    darker (dark).
+
+class BoardSection(Section):
+    """The calibration target: what is on it, how many, how far apart, and its thickness t_b.
+
+    pattern: round dots, of dot_diameter_mm, as many along x and y as `dots` has; or a chessboard or a charuco board of
+    `squares` along x and y, whose side is spacing_mm. marker_mm, dictionary: side of a ChArUco board's markers, and
+    OpenCV's name of their dictionary. medium: what the board stands in, air or fluid. polarity: whether the dots are
+    brighter (bright) or darker (dark) than the board, or as the picture shows them (auto).
     """
 
-    dots: tuple[Annotated[int, Field(ge=2)], Annotated[int, Field(ge=2)]]
+    pattern: Pattern = "dots"
+    dots: tuple[Annotated[int, Field(ge=2)], Annotated[int, Field(ge=2)]] | None = None
+    squares: tuple[Annotated[int, Field(ge=3)], Annotated[int, Field(ge=3)]] | None = None
     spacing_mm: Positive
-    dot_diameter_mm: Positive
+    dot_diameter_mm: Positive | None = None
+    marker_mm: Positive | None = None
+    dictionary: Annotated[str, Field(pattern=DICTIONARIES)] = "DICT_4X4_50"
     thickness_mm: NotNegative = 0.0
     medium: Medium = "air"
-    polarity: Polarity = "bright"
+    polarity: Polarity = "auto"
 
 
 class ChannelSection(Section):

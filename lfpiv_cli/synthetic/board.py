@@ -1,4 +1,4 @@
-"""Expected images of a board with round dots.
+"""Expected images of calibration targets: round dots, or what is printed on a plate.
 
 Axes: world axes, z away from the camera from the nominal focal point. The board is turned in its plane (from x towards
 y), tilted, and moved to its place, in this order, as a rigid plate.
@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
+from lfpiv_cli.synthetic.printed import printed_plate, render_plate
 from lfpiv_cli.synthetic.render import Balls, ObjectSpace, render_points, render_white
 
 # A dot is made of this many points in a sunflower's order, small balls that close the gaps between them: 0.2 mm dots of
@@ -77,7 +78,7 @@ def render_board(
     rng: np.random.Generator,
     shown: ArrayLike | None = None,
 ) -> NDArray[np.float64]:
-    """Render bright dots on dark ground, or dark dots on ground that fills the view.
+    """Render bright dots on dark ground, dark dots on ground that fills the view, or a lit print.
 
     Parameters
     ----------
@@ -88,6 +89,9 @@ def render_board(
     -------
     (rows, columns) float64, expected counts
     """
+    if board.pattern != "dots":
+        steps = placement.to_world([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+        return render_plate(camera, space, printed_plate(camera, board, steps), level)
     plate = _plate_centres(board)
     if shown is not None:
         plate = plate[np.asarray(shown, dtype=bool)]
@@ -97,7 +101,7 @@ def render_board(
     light = area * light_per_area(camera, space.media, points[:, 2], level)
     size = board.dot_diameter_mm / np.sqrt(POINTS_PER_DOT)
     dots = render_points(camera, space, Balls(points, light, size), rng, rays=RAYS_PER_POINT)
-    if board.polarity == "bright":
+    if board.polarity != "dark":
         return dots
     # the rays' noise may ask for more than there is
     return np.maximum(render_white(camera, level) - dots, 0.0)

@@ -1,0 +1,233 @@
+"""Chessboards and ChArUco boards, rendered and found again; targets that the config does not name."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lfpiv_cli.calibration.board import dot_signal, locate_board
+from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose, pose_of_dots, upright_numbers
+from lfpiv_cli.calibration.corner_model import corner_shares, quadrant_shares
+from lfpiv_cli.calibration.dot_model import lens_cell, pixel_rays
+from lfpiv_cli.calibration.target_kinds import another_kind
+from lfpiv_cli.errors import InputError
+from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.media import Media, Window
+from lfpiv_cli.optics.microlenses import Lattice
+from lfpiv_cli.optics.object_space import ObjectSpace
+from lfpiv_cli.optics.tracing import slopes_exact
+from lfpiv_cli.synthetic.board import BoardPlacement, render_board
+from lfpiv_cli.synthetic.printed import _on_plate, _rays_to, printed_plate
+from lfpiv_cli.synthetic.render import Balls, render_points, render_white
+
+CHESS = BoardGeometry((4, 3), 0.8, 0.0, pattern="chessboard")
+CHARUCO = BoardGeometry((4, 3), 1.6, 0.0, pattern="charuco", marker_mm=1.2)
+DOTS = BoardGeometry((5, 4), 0.8, 0.3)
+PAPERS = Camera(-1.0, 100.0, 25.0, 0.8, 0.8, Lattice.regular(0.1), 0.0055, 2352, 1768)
+AIR = ObjectSpace(Media())
+LEVEL = 10_000.0
+
+
+def small(camera: Camera, columns: int = 600, rows: int = 448) -> Camera:
+    """The paper's optics in front of coarse pixels, nine to a microlens: 66 x 49 lenses."""
+    return replace(camera, pixel_mm=0.011, columns=columns, rows=rows)
+
+
+def large(camera: Camera) -> Camera:
+    """The same with more of them, which markers need: 75 x 62 lenses."""
+    return small(camera, 680, 560)
+
+
+def picture(camera: Camera, board: BoardGeometry, placement: BoardPlacement) -> NDArray[np.float32]:
+    return render_board(camera, AIR, board, placement, LEVEL, np.random.default_rng(5)).astype(np.float32)
+
+
+@cache
+def at_one_mm(board: BoardGeometry) -> NDArray[np.float32]:
+    return picture(large(PAPERS) if board.pattern == "charuco" else small(PAPERS), board, BoardPlacement(1.0))
+
+
+def agrees(pose: BoardPose, placement: BoardPlacement) -> None:
+    """Within four of its own standard errors, and these are small."""
+    assert pose.z0_sigma_mm < 0.03
+    assert pose.z0_mm == pytest.approx(placement.z_mm, abs=4 * pose.z0_sigma_mm)
+    np.testing.assert_array_less(np.abs(pose.tilt_deg - placement.tilt_deg), 4 * pose.tilt_sigma_deg)
+    np.testing.assert_allclose(pose.offset_mm, placement.offset_mm, atol=2e-3)
+    assert pose.magnification == pytest.approx(-1.0, abs=4 * pose.magnification_sigma + 1e-4)
+    assert pose.rotation_deg == pytest.approx(placement.rotation_deg, abs=4 * pose.rotation_sigma_deg + 0.02)
+
+
+@pytest.mark.parametrize(("z_mm", "tilt_deg"), [(-3.0, (0.0, 0.0)), (4.0, (0.0, 0.0)), (7.0, (3.0, -2.0))])
+def test_a_chessboard_is_found_in_both_layouts(camera: Camera, z_mm: float, tilt_deg: tuple[float, float]) -> None:
+    placement = BoardPlacement(z_mm, (0.07, -0.04), tilt_deg, 1.5)
+    pose = locate_board(picture(small(camera), CHESS, placement), small(camera), CHESS, Media())
+    assert pose.dots_found == 12
+    agrees(pose, placement)
+
+
+def test_a_chessboard_in_focus_and_a_quarter_turn(table2: Camera) -> None:
+    """Turned, the longer side stands along y."""
+    camera = replace(small(table2, 448, 600), column_axis="y")
+    board = replace(CHESS, dots=(3, 4))
+    placement = BoardPlacement(0.0, (0.07, -0.04), rotation_deg=1.5)
+    pose = locate_board(picture(camera, board, placement), camera, CHESS, Media())
+    assert pose.z0_mm == pytest.approx(0.0, abs=4 * pose.z0_sigma_mm)
+    np.testing.assert_allclose(pose.offset_mm, placement.offset_mm, atol=2e-3)
+    assert pose.indices.max(axis=0).tolist() == [2, 3]
+
+
+def test_magnification_is_measured(table2: Camera) -> None:
+    true = replace(small(table2), magnification=-1.01)
+    sheet = replace(true, magnification=-1.0).with_micro_images(true.micro_image_lattice_px())
+    pose = locate_board(picture(true, CHESS, BoardPlacement(3.0)), sheet, CHESS, Media())
+    assert pose.magnification == pytest.approx(-1.01, abs=4 * pose.magnification_sigma + 1e-4)
+    assert pose.z0_mm == pytest.approx(3.0, abs=4 * pose.z0_sigma_mm)
+
+
+def test_a_charuco_board_may_reach_beyond_the_view(table2: Camera) -> None:
+    """The markers tell which corners are seen, so that the board's middle is known."""
+    camera, placement = large(table2), BoardPlacement(2.0, (1.3, -0.1), rotation_deg=-1.0)
+    pose = locate_board(picture(camera, CHARUCO, placement), camera, CHARUCO, Media())
+    assert 6 <= pose.dots_found < 12
+    agrees(pose, placement)
+
+
+def test_numbers_grow_with_x_and_y_however_the_board_is_turned() -> None:
+    numbers = np.array([[0, 0], [3, 0], [0, 2], [3, 2]])
+    for turn, expected in ((np.diag([-1.0, -1.0]), [3, 2]), (np.array([[0.0, 1.0], [-1.0, 0.0]]), [2, 0])):
+        found, board = upright_numbers(numbers, numbers @ turn, CHESS)
+        assert found[0].tolist() == expected
+        assert board.dots == ((4, 3) if expected == [3, 2] else (3, 4))
+
+
+@pytest.mark.parametrize(
+    ("shown", "said", "sentence"),
+    [
+        (CHESS, DOTS, "looks like a chessboard of 5 x 4 squares; board.pattern says dots"),
+        (DOTS, CHESS, "looks like a board of 20 bright dots; board.pattern says chessboard"),
+        (
+            CHESS,
+            replace(CHESS, dots=(5, 4)),
+            "looks like a chessboard of 5 x 4 squares; the config says a chessboard of 6",
+        ),
+        (
+            CHESS,
+            replace(CHARUCO, spacing_mm=0.8, marker_mm=0.6),
+            "a chessboard of 5 x 4 squares; board.pattern says charuco",
+        ),
+        (
+            replace(CHARUCO, dots=(3, 2)),
+            DOTS,
+            "looks like a ChArUco board with markers of 4X4; board.pattern says dots",
+        ),
+    ],
+)
+def test_a_target_of_another_kind_is_named(
+    table2: Camera, shown: BoardGeometry, said: BoardGeometry, sentence: str
+) -> None:
+    camera = large(table2) if shown.pattern == "charuco" else small(table2)
+    with pytest.raises(InputError, match=sentence):
+        locate_board(at_one_mm(shown), camera, said, Media())
+
+
+def test_squares_of_few_microlenses_are_refused(table2: Camera) -> None:
+    camera = small(table2)
+    with pytest.raises(InputError, match="squares are 4 microlenses wide"):
+        locate_board(
+            np.zeros((camera.rows, camera.columns), np.float32), camera, replace(CHESS, spacing_mm=0.4), Media()
+        )
+
+
+def test_most_dots_of_a_board_must_be_found(table2: Camera) -> None:
+    board = BoardGeometry((9, 9), 1.0, 0.2)
+    i, j = np.divmod(np.arange(81), 9)
+    dots = np.column_stack([i - 4.0, j - 4.0, np.full(81, 2.0)])
+    assert pose_of_dots(dots[:41], np.full((41, 3), 1e-3), -dots[:41, :2], table2, board).dots_found == 41
+    with pytest.raises(InputError, match="only 40 of the board's 9 x 9 dots were found.* at least 41 are needed"):
+        pose_of_dots(dots[:40], np.full((40, 3), 1e-3), -dots[:40, :2], table2, board)
+
+
+def test_particles_are_no_board(table2: Camera, rng: np.random.Generator) -> None:
+    """Many tracers fill a grid of any spacing, and lie anywhere about its points."""
+    board = BoardGeometry((9, 9), 1.0, 0.2)
+    tracers = rng.uniform(-5.0, 5.0, (2000, 3))
+    with pytest.raises(InputError, match="mm rms off a grid of 1 mm"):
+        pose_of_dots(tracers, np.full(tracers.shape, 1e-3), -tracers[:, :2], table2, board)
+
+
+def test_particles_are_called_nothing(table2: Camera, rng: np.random.Generator) -> None:
+    """Nor is white light: OpenCV alone finds three by three corners in both."""
+    camera = small(table2)
+    points = np.column_stack([rng.uniform(-3.0, 3.0, 300), rng.uniform(-2.5, 2.5, 300), rng.uniform(-3.0, 3.0, 300)])
+    tracers = render_points(camera, AIR, Balls(points, 1e4, 0.05), rng, rays=500)
+    for image in (tracers, render_white(camera, LEVEL)):
+        assert another_kind(image.astype(np.float32), camera, DOTS) is None
+        assert another_kind(image.astype(np.float32), camera, CHESS) is None
+
+
+def test_auto_sees_whether_dots_are_bright_or_dark(rng: np.random.Generator) -> None:
+    """Dots cover the smaller part of what micro-images show."""
+    passed = np.where(rng.random((60, 80)) < 0.7, 0.8, 0.0).astype(np.float32)
+    on_dots = rng.random(passed.shape) < 0.1
+    for polarity, ground, dot in (("bright", 50.0, 900.0), ("dark", 900.0, 50.0)):
+        image = (np.where(on_dots, dot, ground) * passed + rng.normal(0.0, 5.0, passed.shape)).astype(np.float32)
+        found = dot_signal(image, passed, replace(DOTS, polarity="auto"))
+        np.testing.assert_array_equal(found, dot_signal(image, passed, replace(DOTS, polarity=polarity)))
+
+
+def test_rays_to_the_plate_are_those_that_the_tracer_follows(camera: Camera, rng: np.random.Generator) -> None:
+    """Back through window and water to a tilted plate, and from there forward again."""
+    camera, media, window = replace(small(camera), distortion_per_mm2=2e-5), Media(1.0, 1.49, 1.33), Window(98.0, 2.0)
+    placement = BoardPlacement(1.5, (0.1, -0.2), (12.0, -7.0), 20.0)
+    steps = placement.to_world([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    plate = printed_plate(camera, CHESS, steps)
+    crossing, slope = _rays_to(rng.uniform(0, 440, (50, 2)), np.array([0.02, -0.03]), camera)
+    on_plate = _on_plate(crossing, slope, camera, ObjectSpace(media, window), plate)
+    points = placement.to_world(on_plate)
+    np.testing.assert_allclose(slopes_exact(points, crossing, camera, media, window), slope, atol=1e-8)
+
+
+@pytest.mark.parametrize("z_mm", [0.4, -6.0])
+def test_slopes_of_the_corners_shares_are_their_differences(camera: Camera, water: Media, z_mm: float) -> None:
+    # The sensor stands off the microlenses' focus, so that all of the cell's scale counts.
+    camera = replace(small(camera), microlens_distance_mm=1.03 * camera.microlens_distance_mm)
+    row, column = (axis.ravel() for axis in np.mgrid[200:250:3, 280:330:3])
+    rays, place = pixel_rays(camera, column, row), np.array([0.013, -0.021, z_mm])
+    edges = np.array([[0.79, 0.03], [-0.05, 0.8]])
+    _, slopes = corner_shares(rays, place, edges, camera, water)
+    for axis in range(3):
+        step = np.zeros(3)
+        step[axis] = 1e-5
+        ahead, behind = (corner_shares(rays, place + sign * step, edges, camera, water)[0] for sign in (1, -1))
+        off = np.abs((ahead - behind) / 2e-5 - slopes[:, axis])
+        assert np.abs(slopes[:, axis]).max() > 0.02
+        # an edge that passes through a cell's corner within the step makes a kink; there are few
+        assert np.percentile(off, 98) < 1e-4 * np.abs(slopes[:, axis]).max()
+
+
+def test_quadrants_share_what_a_fine_grid_counts(layout: str) -> None:
+    lattice = Lattice.regular(1.0, layout)
+    line = np.linspace(-0.7, 0.7, 701)
+    points = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+    own = points[(lattice.nearest(points) == 0).all(axis=-1)]
+    edges = np.array([[2.0, 0.3], [-0.2, 2.1]])
+    middles = np.array([[0.0, 0.0], [0.1, -0.2], [0.3, 0.05], [-0.4, 0.4], [2.0, 1.0], [-2.0, 1.0]])
+    shares, _ = quadrant_shares(middles, lens_cell(lattice), np.linalg.inv(edges), 0.0, 1)
+    counted = [np.mean(np.prod((own + middle) @ np.linalg.inv(edges), axis=1) > 0.0) for middle in middles]
+    np.testing.assert_allclose(shares, counted, atol=3e-3)
+    np.testing.assert_allclose(shares[4:], [1.0, 0.0], atol=1e-12)
+
+
+def test_a_white_plate_is_a_white_image(camera: Camera) -> None:
+    """Where the plate's margin fills the view there is nothing but the aperture."""
+    camera = small(camera, 90, 90)
+    board = BoardGeometry((2, 2), 40.0, 0.0, pattern="chessboard")
+    image = picture(camera, board, BoardPlacement(1.0, (80.0, 0.0)))
+    white = render_white(camera, LEVEL)
+    # A sixteenth of a pixel's rays is the step; between touching micro-images some come from the neighbour.
+    assert np.mean(np.abs(image - white)[white > 0.999 * LEVEL] > 0.0) < 0.02
+    assert image.sum() == pytest.approx(white.sum(), rel=0.01)
