@@ -7,11 +7,13 @@ which a point's light spreads by one lens.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 
-@dataclass(frozen=True)
-class Scale:
+class Scale(NamedTuple):
     """A camera's lengths in the scene. Table 2's: 0.1 mm and 1.064 mm.
 
     Attributes
@@ -28,3 +30,7 @@ class Scale:
     def depth_ratio(self) -> float:
         """Depth over lateral length, 10.64 in Table 2."""
         return self.depth_mm / self.lens_mm
+
+    def box_mm(self, lenses: float, depths: float) -> NDArray[np.float64]:
+        """Return lengths (3,) along x, y and z: so many microlenses laterally, so many depths of one lens."""
+        return np.array([lenses * self.lens_mm, lenses * self.lens_mm, depths * self.depth_mm])

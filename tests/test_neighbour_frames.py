@@ -19,7 +19,6 @@ from lfpiv_cli.particles.neighbour_frames import second_pass
 from lfpiv_cli.particles.search import Task, task_of
 from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.reconstruction.equations import normalisers
-from lfpiv_cli.scale import Scale
 from lfpiv_cli.weights.build import default_padding, factorise
 from lfpiv_cli.weights.model import Weights
 
@@ -54,13 +53,13 @@ def test_what_a_neighbour_found_is_found(table2: Camera, water: Media, rng: np.r
     own = np.concatenate([own, [[*(0.5 * (true[0] + true[1]))[:3], true[0, 3] + true[1, 3]]]])
     ghosts = rng.uniform((-0.9, -0.7, 1.2, 4e5), (0.9, 0.7, 2.6, 6e5), (3, 4))
     before = np.concatenate([true, ghosts]) - MOVED_MM
-    alone = second_pass(task, own, [], 0.6, Scale(0.1, 1.064)).particles
+    alone = second_pass(task, own, [], 0.6).particles
     assert not found(alone, true)[2]
-    beside = second_pass(task, own, [before], 0.6, Scale(0.1, 1.064)).particles
+    beside = second_pass(task, own, [before], 0.6).particles
     assert found(beside, true).all()
     assert len(beside) == len(true)
     # Two neighbours that know the same name it once.
-    both = second_pass(task, own, [before, np.concatenate([true, ghosts]) + MOVED_MM], 0.6, Scale(0.1, 1.064)).particles
+    both = second_pass(task, own, [before, np.concatenate([true, ghosts]) + MOVED_MM], 0.6).particles
     assert found(both, true).all()
     assert len(both) == len(true)
 

@@ -14,11 +14,13 @@ from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.optics.object_space import ObjectSpace
-from lfpiv_cli.particles.candidates import explain_rest, find_peaks
-from lfpiv_cli.particles.rounds import find_particles, first_typical_light
+from lfpiv_cli.particles.candidates import boxes_of, explain_rest, find_peaks
+from lfpiv_cli.particles.fitting import add_all
+from lfpiv_cli.particles.rounds import ROUNDS, find_particles, first_pass, first_typical_light
 from lfpiv_cli.particles.search import task_of
 from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.reconstruction.equations import normalisers
+from lfpiv_cli.scale import Scale
 from lfpiv_cli.synthetic.render import Balls, render_points
 from lfpiv_cli.weights.build import default_padding, factorise, factorise_bricks
 from lfpiv_cli.weights.model import Weights
@@ -58,6 +60,41 @@ def test_particles_are_found_where_they_are(
     # The rays' own noise adds to the sensor's; a factor of two either way is what 27 particles can hold to.
     assert np.all(np.median(np.abs(error / sigma), axis=0) < 2.0 * 0.6745)
     assert np.all(np.median(np.abs(error / sigma), axis=0) > 0.5 * 0.6745)
+
+
+def scaled(camera: Camera, factor: float) -> Camera:
+    """Return the camera with all lengths multiplied."""
+    return replace(
+        camera,
+        focal_length_mm=factor * camera.focal_length_mm,
+        aperture_mm=factor * camera.aperture_mm,
+        microlens_focal_length_mm=factor * camera.microlens_focal_length_mm,
+        microlens_distance_mm=factor * camera.microlens_distance_mm,
+        lattice=camera.lattice.scaled(factor),
+        pixel_mm=factor * camera.pixel_mm,
+    )
+
+
+def test_the_same_image_in_a_larger_world_shows_the_same(
+    table2: Camera, water: Media, rng: np.random.Generator
+) -> None:
+    camera = replace(table2, columns=200, rows=180)
+    # Some overlap, some lie near the focal plane: candidates, splitting, other depths and merging all take part.
+    true = rng.uniform((-0.4, -0.35, -0.6, 3e5), (0.4, 0.35, 1.3, 6e5), (12, 4))
+    image = np.zeros(camera.rows * camera.columns)
+    add_all(raw_view(camera, water, 0.025), true, 1.0, image, (-1.0, 2.0))
+    image = (image + rng.normal(0.0, 6.0, image.size)).reshape(camera.rows, camera.columns).astype(np.float32)
+    found = []
+    for factor in (1.0, 3.0, 0.2):
+        larger = scaled(camera, factor)
+        spacing = factor * 0.1
+        weights = weights_of(larger, water, Grid.centred((8, 7, 19), (spacing,) * 3, (0.0, 0.0, factor * 0.35)))
+        view = raw_view(larger, water, factor * 0.025)
+        state = first_pass(task_of(image, view, weights, larger, normalisers(weights.padded)), ROUNDS[2:4])
+        found.append(state.particles / (factor, factor, factor, 1.0))
+    assert len(found[0]) > 8
+    for others in found[1:]:
+        np.testing.assert_allclose(others, found[0], rtol=1e-6, atol=1e-6)
 
 
 def test_pixels_that_are_left_out_do_not_matter(table2: Camera, water: Media, rng: np.random.Generator) -> None:
@@ -101,7 +138,7 @@ def test_what_is_explained_gives_no_candidate(table2: Camera, water: Media) -> N
     one[2, 2, 2] = 1e5
     image, background = weights.forward(volume), weights.forward(one)
     rest = explain_rest(weights, image, background, normalisers(weights.padded), 10)
-    index, light = find_peaks(rest)
+    index, light = find_peaks(rest, boxes_of(camera.scale(water), weights.grid.spacing_mm))
     px, py, pz = weights.padding_xyz
     np.testing.assert_allclose(index[0], (7 + px, 7 + py, 2 + pz), atol=0.3)
     assert light[0] > 0.8e5
@@ -123,7 +160,7 @@ def test_peaks_have_light() -> None:
     volume = np.zeros((12, 7, 7), np.float32)
     volume[2:5, 3, 3] = 1e5, 0.1, 3e4
     with np.errstate(all="raise"):
-        centres, light = find_peaks(volume)
+        centres, light = find_peaks(volume, boxes_of(Scale(0.1, 1.064), (0.1, 0.1, 0.1)))
     assert np.all(light > 0.0)
     assert np.isfinite(centres).all()
     assert len(light) == 1

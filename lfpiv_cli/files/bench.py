@@ -23,6 +23,7 @@ from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.reference import Reference
+from lfpiv_cli.scale import Scale
 from lfpiv_cli.synthetic.flows import FLOWS, Flow
 
 UM_TO_MM = 1e-3
@@ -31,9 +32,10 @@ DEFAULT_WINDOWS = ((32, 32, 32), (16, 16, 16))
 SMALLEST_WINDOW = 4
 # Voxels as wide as a microlens lock depth to the array's grid and swallow its velocity: of 0.6 mm EM volumes give 0.22
 # with them. With half of one laterally and two along the axis they give nine tenths, with a third 0.98 to 1.02 and a
-# third less spread; a quarter gains no more.
+# third less spread; a quarter gains no more. Along the axis the depth over which light spreads by one lens counts: two
+# microlenses of Table 2 are 0.2 mm of 1.064 mm.
 LATERAL_VOXELS_PER_MICROLENS = 3.0
-DEPTH_VOXELS_PER_MICROLENS = 0.5
+VOXELS_PER_DEPTH = 1.064 / 0.2
 
 Triple = tuple[int, int, int]
 Lengths = tuple[float, float, float]
@@ -129,29 +131,27 @@ def channel_of(section: ChannelSection) -> Channel:
     return Channel(section.width_mm, section.wall_mm, section.camera_move_mm, section.board_from_mid_plane_mm)
 
 
-def grid_of(section: VolumeSection, camera: CameraSection | None, reference: Reference) -> Grid:
+def grid_of(section: VolumeSection, scale: Scale | None, reference: Reference) -> Grid:
     """Return the volume's grid, z from the focal point, where the section counts z from a reference.
 
-    `camera` is needed only where the section leaves the voxels to the program.
+    The camera's `scale` is needed only where the section leaves the voxels to the program.
     """
     shape, voxel = section.shape_xyz, section.voxel_mm
     if shape is None or voxel is None:
-        if section.size_mm is None or camera is None:
+        if section.size_mm is None or scale is None:
             raise ValueError("neither shape_xyz and voxel_mm nor size_mm with a camera")
-        shape, voxel = choose_voxels(camera, section.size_mm)
+        shape, voxel = choose_voxels(scale, section.size_mm)
     x, y, z = section.centre_mm
     return Grid.centred(shape, voxel, (x, y, reference.depth_to_focal_point(z)))
 
 
-def choose_voxels(camera: CameraSection, size_mm: Lengths) -> tuple[Triple, Lengths]:
+def choose_voxels(scale: Scale, size_mm: Lengths) -> tuple[Triple, Lengths]:
     """Return the number and size of the voxels that fill `size_mm` and serve the velocity best.
 
-    They are near a third of a microlens laterally and two in depth, as it appears in the scene, and divide the size.
+    They are near a third of a microlens laterally, as it appears in the scene, and a fifth of the depth over which
+    light spreads by one lens, and divide the size.
     """
-    if camera.main_lens is None:
-        raise ValueError("camera.main_lens is missing")
-    microlens = camera.microlenses.pitch_mm / abs(camera.main_lens.magnification)
-    lateral, depth = microlens / LATERAL_VOXELS_PER_MICROLENS, microlens / DEPTH_VOXELS_PER_MICROLENS
+    lateral, depth = scale.lens_mm / LATERAL_VOXELS_PER_MICROLENS, scale.depth_mm / VOXELS_PER_DEPTH
     counts = [max(1, round(size / target)) for size, target in zip(size_mm, (lateral, lateral, depth), strict=True)]
     voxel = [size / count for size, count in zip(size_mm, counts, strict=True)]
     return (counts[0], counts[1], counts[2]), (voxel[0], voxel[1], voxel[2])

@@ -87,8 +87,8 @@ def _volume(sections: Sections) -> Found:
         for name in ("shape_xyz", "voxel_mm"):
             if getattr(volume, name) is not None:
                 yield (*place, name), "contradicts size_mm, which leaves the voxels to the program"
-        if sections.camera is None or sections.camera.main_lens is None:
-            yield (*place, "size_mm"), "needs camera.main_lens to choose the voxels"
+        if sections.camera is None or missing_for_camera(sections.camera) is not None or sections.media is None:
+            yield (*place, "size_mm"), "needs the sections media and camera, with all of its main lens, for the voxels"
     elif volume.shape_xyz is None or volume.voxel_mm is None:
         yield place, "needs shape_xyz and voxel_mm, or size_mm"
     if volume.reference == "mid_plane" and sections.channel is None:
@@ -167,7 +167,7 @@ def _object_space(sections: Sections) -> Found:
     if volume.size_mm is None and (volume.shape_xyz is None or volume.voxel_mm is None):
         return
     camera, media = camera_of(section), media_of(sections.media)
-    nearest = grid_of(volume, section, FOCAL_POINT).bounds_mm(2)[0]
+    nearest = grid_of(volume, camera.scale(media), FOCAL_POINT).bounds_mm(2)[0]
     distance = float(equivalent_object_distance(nearest, camera.focus_distance_mm, media))
     if distance <= 0.0:
         yield (

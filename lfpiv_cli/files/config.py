@@ -205,7 +205,9 @@ class Config:
 
     def grid(self, reference: Reference = FOCAL_POINT) -> Grid:
         """Return the volume's grid: z as in the config, or from the focal point where its reference is given."""
-        return bench.grid_of(self.volume, self.sections.camera, reference)
+        chosen = self.volume.size_mm is not None
+        scale = self.camera_model().scale(self.media_model()) if chosen else None
+        return bench.grid_of(self.volume, scale, reference)
 
     def rig(self) -> Rig:
         """Return what must be known to read the picture of a board."""

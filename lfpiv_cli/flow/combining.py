@@ -34,8 +34,8 @@ SPREAD_SHARE, SPREAD_SIGMAS = 0.9, 1.645
 FEWEST_DIFFERENCES = 30
 # No vector is known better than this.
 SMALLEST_SIGMA_VOXEL = 1e-6
-# Positions that should be the same differ by the rounding of sums: far less than this, in mm.
-SAME_PLACE_MM = 1e-6
+# Positions that should be the same differ by the rounding of sums: far less than this share of a voxel.
+SAME_PLACE_VOXEL = 1e-5
 
 # How far a vector can be relied on: measured with an uncertainty, with none to be had, only replaced, not there.
 WEIGHED, UNWEIGHED, FILLED, NONE = 3, 2, 1, 0
@@ -117,7 +117,7 @@ def _ensure_alike(first: VectorField, second: VectorField) -> None:
         ),
         strict=True,
     )
-    if exact[0] != exact[1] or np.abs(lengths[0] - lengths[1]).max() > SAME_PLACE_MM:
+    if exact[0] != exact[1] or np.abs(lengths[0] - lengths[1]).max() > SAME_PLACE_VOXEL * min(first.voxel_mm):
         told = [f"{field.grid}, voxels of {field.voxel_mm} mm, {field.dt_s} s" for field in (first, second)]
         raise InputError(f"the two vector fields differ in grid, voxels or time: {told[0]} and {told[1]}")
 

@@ -149,8 +149,7 @@ def find_beside(
 ) -> Particles:
     """Return the particles behind an image with the help of the first passes of it and of the frames beside it."""
     task = _task(bench, frame)
-    scale = bench.content.camera.scale(bench.settings.media_model())
-    return result(task, second_pass(task, own, neighbours, SEARCH_LENSES * scale.lens_mm, scale))
+    return result(task, second_pass(task, own, neighbours, SEARCH_LENSES * task.view.scale.lens_mm))
 
 
 def _task(bench: Bench, frame: Frame) -> Task:

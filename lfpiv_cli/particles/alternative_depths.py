@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from lfpiv_cli.particles.fitting import fit_again
 from lfpiv_cli.particles.least_squares import Observation
 
-# Starts relative to the particle's depth, mm; its mirrored depth is another.
-OTHER_DEPTHS_MM = np.array([-2.0, -1.5, -1.0, -0.7, -0.4, -0.2, 0.2, 0.4, 0.7, 1.0, 1.5, 2.0])
+# Starts relative to the particle's depth, in depths over which light spreads by one lens (Table 2: 0.2 to 2 mm); its
+# mirrored depth is another.
+OTHER_DEPTHS = np.array([-2.0, -1.5, -1.0, -0.7, -0.4, -0.2, 0.2, 0.4, 0.7, 1.0, 1.5, 2.0]) / 1.064
 STEPS = 8
 
 
@@ -32,6 +33,6 @@ def try_other_depths(
     All suspects among the particles (n, 4) are refined; the residual is kept up to date. Returns which have moved.
     """
     depth = particles[:, 2:3]
-    starts = np.concatenate([depth + OTHER_DEPTHS_MM, -depth], axis=1)
+    starts = np.concatenate([depth + OTHER_DEPTHS * observation.optics.scale.depth_mm, -depth], axis=1)
     starts[(starts < observation.low_mm) | (starts > observation.high_mm)] = np.nan
     return fit_again(observation, particles, suspects, STEPS, starts, (smallest_gain, smallest_light))

@@ -27,8 +27,9 @@ from lfpiv_cli.particles.tiles import over_tiles
 from lfpiv_cli.particles.view import View, entry_capacity
 from lfpiv_cli.threads import blocks, in_threads
 
-# Candidates are brought into the fit from these depths beside their own, mm.
-START_DEPTHS_MM = np.array([0.0, -0.4, 0.4])
+# Candidates are brought into the fit from these depths beside their own, in depths over which light spreads by one lens
+# (Table 2: 0.4 mm).
+START_DEPTHS = np.array([0.0, -0.4, 0.4]) / 1.064
 # Steps for a candidate, for a particle in a sweep.
 CANDIDATE_STEPS = 12
 SWEEP_STEPS = 4
@@ -174,8 +175,9 @@ def _accept(
     trial, best = np.empty((1, UNKNOWNS)), np.empty((1, UNKNOWNS))
     for number in numbers:
         lowest = 0.0
-        for offset in START_DEPTHS_MM:
-            depth = min(max(candidates[number, 2] + offset, observation.low_mm), observation.high_mm)
+        for offset in START_DEPTHS:
+            depth = candidates[number, 2] + offset * observation.optics.scale.depth_mm
+            depth = min(max(depth, observation.low_mm), observation.high_mm)
             change = _fit_from(observation, candidates[number], depth, trial, responses, steps)
             if change < lowest:
                 lowest = change

@@ -19,7 +19,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.particles.response import VALUES, respond
-from lfpiv_cli.particles.tiles import LARGEST_MOVE_MM
+from lfpiv_cli.particles.tiles import LARGEST_MOVE_LENSES
 from lfpiv_cli.particles.view import View, entry_capacity
 
 UNKNOWNS = 4
@@ -29,8 +29,9 @@ DAMPING_UP = 10.0
 DAMPING_DOWN = 0.2
 # A step that lowers chi-squared by less ends the fit: a hundredth of what one standard error costs.
 SMALLEST_GAIN = 0.01
-# Longest step in depth, mm: further away the response is another one and its slope says nothing.
-LONGEST_DEPTH_STEP_MM = 0.5
+# Longest step in depth, in depths over which light spreads by one lens (Table 2: 0.5 mm): further away the response is
+# another one and its slope says nothing.
+LONGEST_STEP_DEPTHS = 0.5 / 1.064
 # A fit that may be given up early is judged after so many steps.
 EARLY_STEPS = 4
 
@@ -298,7 +299,7 @@ def fit(
             predicted += step[i] * right[i]
         if predicted < SMALLEST_GAIN:
             break
-        _move(members, begin, step, observation.low_mm, observation.high_mm, trial)
+        _move(observation, members, begin, step, trial)
         respond_all(observation.optics, trial, responses)
         trial_change = _equations(observation, trial, responses, trial_matrix, trial_right)
         last_failed = not trial_change < change
@@ -333,21 +334,22 @@ def _equations(
 
 @njit(cache=True)
 def _move(
+    observation: Observation,
     members: NDArray[np.float64],
     begin: NDArray[np.float64],
     step: NDArray[np.float64],
-    z_low: float,
-    z_high: float,
     trial: NDArray[np.float64],
 ) -> None:
     """Fill `trial` (k, 4) with particles moved by a step, within what a sweep and a linear model allow."""
+    scale = observation.optics.scale
+    furthest, deepest = LARGEST_MOVE_LENSES * scale.lens_mm, LONGEST_STEP_DEPTHS * scale.depth_mm
     for m in range(members.shape[0]):
         for i in range(UNKNOWNS):
             trial[m, i] = members[m, i] + step[m * UNKNOWNS + i]
         for i in range(2):
-            trial[m, i] = min(max(trial[m, i], begin[m, i] - LARGEST_MOVE_MM), begin[m, i] + LARGEST_MOVE_MM)
-        low, high = members[m, 2] - LONGEST_DEPTH_STEP_MM, members[m, 2] + LONGEST_DEPTH_STEP_MM
-        trial[m, 2] = min(max(trial[m, 2], low, z_low), high, z_high)
+            trial[m, i] = min(max(trial[m, i], begin[m, i] - furthest), begin[m, i] + furthest)
+        low, high = members[m, 2] - deepest, members[m, 2] + deepest
+        trial[m, 2] = min(max(trial[m, 2], low, observation.low_mm), high, observation.high_mm)
         trial[m, 3] = max(trial[m, 3], 0.0)
 
 

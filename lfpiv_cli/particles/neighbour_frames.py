@@ -35,8 +35,8 @@ from lfpiv_cli.scale import Scale
 from lfpiv_cli.tracks.tracking import expected_displacement, track
 
 # A particle without a partner this near to where one is expected is that one, at another depth: near the focal plane
-# depths may be wrong by a millimetre.
-SAME_MM = np.array([0.05, 0.05, 1.25])
+# depths may be wrong by as much as lets light spread by one lens. In microlenses and in such depths (Table 2: 1.25 mm).
+SAME_LENSES, SAME_DEPTHS = 0.5, 1.25 / 1.064
 # Added particles begin with this share of the light that they have in their own frame: some of it is others' for now.
 FIRST_SHARE = 0.5
 # Sweeps in which they are refined, and how little unexplained light counts then: first as in early rounds, then as at
@@ -46,7 +46,7 @@ CLAIMED_SHARE = 0.6
 
 
 def second_pass(
-    task: Task, own: NDArray[np.float64], neighbours: Sequence[NDArray[np.float64]], search_mm: float, scale: Scale
+    task: Task, own: NDArray[np.float64], neighbours: Sequence[NDArray[np.float64]], search_mm: float
 ) -> State:
     """Return what is found with the help of neighbour frames.
 
@@ -55,11 +55,10 @@ def second_pass(
     task : the image
     own, neighbours : (n, 4) what first passes found in it and in the frames beside it
     search_mm : largest displacement along each axis
-    scale : of the camera
     """
     state = with_typical_light(task, rebuilt(task, blank(task), own))
     state = with_measured_noise(task, replace(state, noise=estimate_noise(task.image, state.typical_light)))
-    state = rebuilt(task, state, np.concatenate([own, _missing_particles(task, own, neighbours, search_mm, scale)]))
+    state = rebuilt(task, state, np.concatenate([own, _missing_particles(task, own, neighbours, search_mm)]))
     for sweeps, unexplained in REFINING:
         sweep(task, state, unexplained, sweeps)
     state = prune(task, merge(task, state), CLAIMED_SHARE, LAST_UNEXPLAINED)
@@ -67,25 +66,26 @@ def second_pass(
 
 
 def _missing_particles(
-    task: Task, own: NDArray[np.float64], neighbours: Sequence[NDArray[np.float64]], search_mm: float, scale: Scale
+    task: Task, own: NDArray[np.float64], neighbours: Sequence[NDArray[np.float64]], search_mm: float
 ) -> NDArray[np.float64]:
     """Return the neighbours' particles (m, 4) that are missing here, where they are expected."""
-    missing = np.zeros((0, 4))
+    scale, missing = task.view.scale, np.zeros((0, 4))
+    same = scale.box_mm(SAME_LENSES, SAME_DEPTHS)
     for other in neighbours:
         expected, partnerless = _without_partner(own, other, search_mm, scale)
         known = np.concatenate([own[partnerless, :3], missing[:, :3]])
         seen = (expected[:, 2] >= task.depths_mm[0]) & (expected[:, 2] <= task.depths_mm[1])
-        seen &= ~_same(expected[:, :3], known)
+        seen &= ~_same(expected[:, :3] / same, known / same)
         missing = np.concatenate([missing, expected[seen]])
     return missing * (1.0, 1.0, 1.0, FIRST_SHARE)
 
 
 def _same(points: NDArray[np.float64], known: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which points (n, 3) are known ones (m, 3): near and each other's nearest."""
+    """Return which points (n, 3) are known ones (m, 3): within 1 and each other's nearest."""
     if not len(points) or not len(known):
         return np.zeros(len(points), np.bool_)
-    distance, to = KDTree(known / SAME_MM).query(points / SAME_MM)
-    _, back = KDTree(points / SAME_MM).query(known / SAME_MM)
+    distance, to = KDTree(known).query(points)
+    _, back = KDTree(points).query(known)
     return np.asarray((distance <= 1.0) & (back[to] == np.arange(len(points))))
 
 

@@ -21,8 +21,8 @@ from lfpiv_cli.optics.object_space import ObjectSpace, slope_ratio
 RINGS, RAYS_PER_RING = 8, 8
 # The shift changes by some 1e-3 of what a point moves: twice leaves a millionth of it.
 REPEATS = 2
-# Points in the window are shifted like those this far behind its face, mm.
-SHALLOWEST_MM = 1e-6
+# Points in the window are shifted like those this far behind its face, in depths over which light spreads by one lens.
+SHALLOWEST_DEPTHS = 1e-6
 
 
 def places_by_snell(points_mm: NDArray[np.float64], space: ObjectSpace, camera: Camera) -> NDArray[np.float64]:
@@ -44,7 +44,8 @@ def paraxial_shift(points_mm: NDArray[np.float64], space: ObjectSpace, camera: C
     if space.straight or not len(points_mm):
         return np.zeros_like(points_mm)
     in_fluid = points_mm.copy()
-    in_fluid[:, 2] = np.maximum(points_mm[:, 2], SHALLOWEST_MM - space.layers(camera)[0][-1])
+    shallowest = SHALLOWEST_DEPTHS * camera.scale(space.media).depth_mm
+    in_fluid[:, 2] = np.maximum(points_mm[:, 2], shallowest - space.layers(camera)[0][-1])
     lens = _rays_on_lens(camera.aperture_radius_mm)
     reach = camera.aperture_radius_mm + float(np.linalg.norm(in_fluid[:, :2], axis=1).max())
     nodes, factors = space.slope_polynomials(camera, in_fluid[:, 2], reach)

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lfpiv_cli.particles.candidates import explain_rest, find_peaks, points_in_raw_frame
+from lfpiv_cli.particles.candidates import boxes_of, explain_rest, find_peaks, points_in_raw_frame
 from lfpiv_cli.particles.fitting import accept
 from lfpiv_cli.particles.noise import Noise, estimate_noise
 from lfpiv_cli.particles.search import (
@@ -166,7 +166,7 @@ def _candidates(
     model = (task.image - state.residual).reshape(task.prepared.shape).astype(np.float32)
     background = task.weights.prepare(model)
     volume = explain_rest(task.weights, task.prepared, background, task.sums, iterations, progress)
-    index, light = find_peaks(volume)
+    index, light = find_peaks(volume, boxes_of(task.view.scale, task.weights.grid.spacing_mm))
     points = task.camera.to_image_axes(points_in_raw_frame(task.weights, index))
     return np.column_stack([points, light]), light
 

@@ -27,10 +27,12 @@ LAST_SWEEPS, LAST_UNEXPLAINED = 4, 0.02
 SMALLEST_LIGHT = 0.3
 # A particle stays while at least this much of it meets the sensor.
 SMALLEST_SEEN = 0.1
+# Lengths are in the camera's own units (`scale`): microlenses laterally, depths over which light spreads by one lens
+# (Table 2: 0.04, 0.25 and 0.3 mm).
 # Two particles this close, laterally and in depth, are one.
-MERGE_MM = np.array([0.04, 0.04, 0.25])
+MERGE_LENSES, MERGE_DEPTHS = 0.4, 0.25 / 1.064
 # Particles this far in front of and behind the volume are kept: they light it.
-DEPTH_MARGIN_MM = 0.3
+MARGIN_DEPTHS = 0.3 / 1.064
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,6 +121,7 @@ def task_of(
     excluded : (rows, columns) raw pixels that take no part; `sums` must leave out what they touch; None: none
     """
     low, high = weights.grid.bounds_mm(2)
+    margin = MARGIN_DEPTHS * view.scale.depth_mm
     return Task(
         view,
         weights,
@@ -127,7 +130,7 @@ def task_of(
         np.ascontiguousarray(image, dtype=np.float64).ravel(),
         np.ones(image.size, np.bool_) if excluded is None else ~excluded.ravel(),
         weights.prepare(image.astype(np.float32)),
-        (low - DEPTH_MARGIN_MM, high + DEPTH_MARGIN_MM),
+        (low - margin, high + margin),
     )
 
 
@@ -152,7 +155,8 @@ def sweep(task: Task, state: State, unexplained: float, sweeps: int) -> None:
 def merge(task: Task, state: State) -> State:
     """Return the state with particles that have become one added up, and its residual computed anew."""
     particles = state.particles.copy()
-    pairs = KDTree(particles[:, :3] / MERGE_MM).query_pairs(1.0, output_type="ndarray")
+    merging = task.view.scale.box_mm(MERGE_LENSES, MERGE_DEPTHS)
+    pairs = KDTree(particles[:, :3] / merging).query_pairs(1.0, output_type="ndarray")
     merged = np.zeros(len(particles), dtype=bool)
     for a, b in pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]:
         if not (merged[a] or merged[b]):

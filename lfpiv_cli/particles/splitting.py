@@ -23,17 +23,17 @@ from lfpiv_cli.particles.least_squares import (
 )
 from lfpiv_cli.particles.tiles import footprint_px, over_tiles
 
-# Half the distance (x, y, z) of two particles at the start, mm: half a voxel of Table 2 sideways, or along the depth in
-# which a volume shows two as one.
-STARTS_MM = np.array(
+# Half the distance (x, y, z) of two particles at the start: sideways in microlenses, or along the depth in which a
+# volume shows two as one, in depths over which light spreads by one lens (Table 2: 0.2, 0.5 and 1 mm).
+STARTS = np.array(
     [
-        (0.03, 0.0, 0.0),
-        (0.0, 0.03, 0.0),
-        (0.02, 0.02, 0.0),
-        (0.02, -0.02, 0.0),
-        (0.0, 0.0, 0.2),
-        (0.0, 0.0, 0.5),
-        (0.0, 0.0, 1.0),
+        (0.3, 0.0, 0.0),
+        (0.0, 0.3, 0.0),
+        (0.2, 0.2, 0.0),
+        (0.2, -0.2, 0.0),
+        (0.0, 0.0, 0.2 / 1.064),
+        (0.0, 0.0, 0.5 / 1.064),
+        (0.0, 0.0, 1.0 / 1.064),
     ]
 )
 PAIR_STEPS = 12
@@ -75,7 +75,7 @@ def _split(
     partners: NDArray[np.float64],
 ) -> None:
     """Do the work of `split` for suspects of a tile; `least` is what two must gain, and the light of each."""
-    view, residual = observation.optics, observation.residual
+    view, residual, scale = observation.optics, observation.residual, observation.optics.scale
     responses = room_for(2, observation.capacity, side)
     matrix, right = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
     pair, best = np.empty((2, UNKNOWNS)), np.empty((2, UNKNOWNS))
@@ -89,12 +89,12 @@ def _split(
         lowest = single - least[0]
         promising = single - EARLY_GAIN * least[0]
         found = False
-        for offset in STARTS_MM:
+        for offset in STARTS:
             for m in range(2):
                 sign = 1.0 - 2.0 * m
-                pair[m, 0] = one[0, 0] + sign * offset[0]
-                pair[m, 1] = one[0, 1] + sign * offset[1]
-                depth = one[0, 2] + sign * offset[2]
+                pair[m, 0] = one[0, 0] + sign * offset[0] * scale.lens_mm
+                pair[m, 1] = one[0, 1] + sign * offset[1] * scale.lens_mm
+                depth = one[0, 2] + sign * offset[2] * scale.depth_mm
                 pair[m, 2] = min(max(depth, observation.low_mm), observation.high_mm)
                 pair[m, 3] = 0.5 * light
             respond_all(view, pair, responses)

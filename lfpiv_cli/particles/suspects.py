@@ -16,6 +16,7 @@ from lfpiv_cli.particles.fitting import judge
 from lfpiv_cli.particles.search import SMALLEST_LIGHT, State, Task, observed
 from lfpiv_cli.particles.splitting import split
 from lfpiv_cli.particles.view import footprint_radius_mm
+from lfpiv_cli.scale import Scale
 
 # A good particle's chi-squared is the one at this percentile; particles that fit worse by this factor are
 # suspects.
@@ -24,9 +25,10 @@ GOOD_PERCENTILE, SUSPECT_CHI2 = 20.0, 1.5
 BRIGHT, ENOUGH_FOR_TWO = 1.2, 2.0 * SMALLEST_LIGHT
 # What chi-squared must fall by, in units of a good particle's, where one becomes two, and where it changes its depth.
 SPLIT_GAIN, DEPTH_GAIN = 40.0, 10.0
-# A particle that could not be split or moved is not tried again until it has changed by this much: mm laterally, mm in
-# depth, and by these shares in light and in chi-squared.
-CHANGED = np.array([0.005, 0.005, 0.05, 0.05, 0.2])
+# A particle that could not be split or moved is not tried again until it has changed by this much: laterally in
+# microlenses, in depths over which light spreads by one lens (Table 2: 0.05 mm), and by these shares in light and in
+# chi-squared.
+CHANGED_LENSES, CHANGED_DEPTHS, CHANGED_SHARES = 0.05, 0.05 / 1.064, (0.05, 0.2)
 
 
 def with_depths_corrected(task: Task, state: State, unexplained: float) -> State:
@@ -36,7 +38,7 @@ def with_depths_corrected(task: Task, state: State, unexplained: float) -> State
     good = _good(chi2)
     # Light that stays within about one lens fits well at many depths.
     near_focus = footprint_radius_mm(task.view, state.particles[:, 2]) < 2.0 * task.view.half_x_mm
-    signature = _signature(state.particles, chi2)
+    signature = _signature(task.view.scale, state.particles, chi2)
     suspects = (near_focus | (chi2 > SUSPECT_CHI2 * good)) & ~_among(state.unmoved, signature)
     light = SMALLEST_LIGHT * state.typical_light
     moved = try_other_depths(observation, state.particles, suspects, light, DEPTH_GAIN * good)
@@ -49,7 +51,7 @@ def with_overlaps_split(task: Task, state: State, unexplained: float, thorough: 
     chi2, *_ = judge(observation, state.particles)
     good = _good(chi2)
     bright = state.particles[:, 3] > (ENOUGH_FOR_TWO if thorough else BRIGHT) * state.typical_light
-    signature = _signature(state.particles, chi2)
+    signature = _signature(task.view.scale, state.particles, chi2)
     suspects = bright & (chi2 > SUSPECT_CHI2 * good) & ~_among(state.unsplit, signature)
     light = SMALLEST_LIGHT * state.typical_light
     partners = split(observation, state.particles, suspects, light, SPLIT_GAIN * good)
@@ -66,13 +68,11 @@ def _good(chi2: NDArray[np.float64]) -> float:
     return max(float(np.percentile(chi2, GOOD_PERCENTILE)), 1.0) if chi2.size else 1.0
 
 
-def _signature(particles: NDArray[np.float64], chi2: NDArray[np.float64]) -> NDArray[np.float64]:
+def _signature(scale: Scale, particles: NDArray[np.float64], chi2: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return (n, 5) numbers that differ by 1 where a particle has changed enough to be tried again."""
     tiny = np.finfo(np.float64).tiny
-    return (
-        np.column_stack([particles[:, :3], np.log(np.maximum(np.column_stack([particles[:, 3], chi2]), tiny))])
-        / CHANGED
-    )
+    shares = np.log(np.maximum(np.column_stack([particles[:, 3], chi2]), tiny)) / CHANGED_SHARES
+    return np.column_stack([particles[:, :3] / scale.box_mm(CHANGED_LENSES, CHANGED_DEPTHS), shares])
 
 
 def _among(tried: NDArray[np.float64], signature: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -12,11 +12,11 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from lfpiv_cli.particles.view import View, footprint_radius_mm, on_array_mm
+from lfpiv_cli.particles.view import View, footprint_radius_mm, lens_on_array_mm, on_array_mm
 from lfpiv_cli.threads import in_threads
 
-# How far a particle may be moved within one sweep, on the array: footprints must not grow into other tiles.
-LARGEST_MOVE_MM = 0.15
+# How far a particle may be moved within one sweep, in microlenses: footprints must not grow into other tiles.
+LARGEST_MOVE_LENSES = 1.5
 
 
 def over_tiles(
@@ -52,7 +52,8 @@ def tile_side_mm(view: View, z_low_mm: float, z_high_mm: float) -> float:
     """Return the side of a tile, on the array: two footprints of particles that move in one sweep."""
     widest = float(footprint_radius_mm(view, np.linspace(z_low_mm, z_high_mm, 11)).max())
     # Light that touches a lens's cell lands within its micro-image: two cells to each side.
-    return 2.0 * (widest + 4.0 * max(view.half_x_mm, view.half_y_mm) + LARGEST_MOVE_MM)
+    move = LARGEST_MOVE_LENSES * lens_on_array_mm(view)
+    return 2.0 * (widest + 4.0 * max(view.half_x_mm, view.half_y_mm) + move)
 
 
 def footprint_px(view: View, z_low_mm: float, z_high_mm: float) -> int:

@@ -19,9 +19,10 @@ from lfpiv_cli.optics.camera import Camera, KernelCamera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.particles.cells import cell_shares, hexagon_radius, no_shares
 from lfpiv_cli.particles.rim import rim_table
+from lfpiv_cli.scale import Scale
 
 # Particles that are smaller are taken as this large, so that profiles have slopes: a thousandth of a lens.
-SMALLEST_RADIUS_MM = 1e-4
+SMALLEST_RADIUS_LENSES = 1e-3
 
 
 class View(NamedTuple):
@@ -30,6 +31,7 @@ class View(NamedTuple):
     Attributes
     ----------
     camera : with the plain lattice of the raw image
+    scale : its lengths in the scene
     depth_ratio : n_a/n_w (Eq. 9)
     half_x_mm, half_y_mm : half the rectangle that holds a lens's cell
     cell_reach : how far a cell reaches at most from its lens, in steps of the lattice
@@ -41,6 +43,7 @@ class View(NamedTuple):
     """
 
     camera: KernelCamera
+    scale: Scale
     depth_ratio: float
     half_x_mm: float
     half_y_mm: float
@@ -75,7 +78,8 @@ def raw_view(camera: Camera, media: Media, particle_radius_mm: float, calibratio
     centres_px = lattice_px.points(indices) if calibration is None else calibration.fit.centres(indices)
     camera = camera.with_micro_images(lattice_px)
     lattice = camera.lattice
-    radius = max(particle_radius_mm, SMALLEST_RADIUS_MM)
+    scale = camera.scale(media)
+    radius = max(particle_radius_mm, SMALLEST_RADIUS_LENSES * scale.lens_mm)
     if lattice.layout == "square":
         half_x, half_y = 0.5 * lattice.pitch
         cell_reach, shares = 0.5, no_shares()
@@ -88,6 +92,7 @@ def raw_view(camera: Camera, media: Media, particle_radius_mm: float, calibratio
     )
     return View(
         camera=camera.for_kernels(),
+        scale=scale,
         depth_ratio=media.depth_ratio,
         half_x_mm=float(half_x),
         half_y_mm=float(half_y),
@@ -109,6 +114,11 @@ def raw_view(camera: Camera, media: Media, particle_radius_mm: float, calibratio
 def on_array_mm(view: View, points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return where the main lens's middle shows points (n, 3 or more) on the array (n, 2), without its distortion."""
     return -points[:, :2] * _image_scale(view, points[:, 2])[:, np.newaxis]
+
+
+def lens_on_array_mm(view: View) -> float:
+    """Return the mean pitch of the microlenses on the array, for lengths counted in them."""
+    return view.scale.lens_mm * view.camera.image_distance_mm / view.camera.focus_distance_mm
 
 
 def footprint_radius_mm(view: View, z_mm: NDArray[np.float64]) -> NDArray[np.float64]:

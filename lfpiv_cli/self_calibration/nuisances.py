@@ -34,9 +34,9 @@ ROUNDS, SWEEPS = 4, 3
 UNEXPLAINED = 0.02
 # Least squares: the columns are good to a thousandth after some forty steps.
 LEAST_SQUARES_STEPS, LEAST_SQUARES_TOLERANCE = 50, 1e-4
-# Differences: shift in mm (a twentieth of a small pixel), shares of aperture and particle radius, and distortion in
-# stretch at the sensor's corner.
-SHIFT_STEP_MM, SHARE_STEP, STRETCH_STEP = 2.5e-4, 0.004, 1e-4
+# Differences: shift as a share of the pitch, shares of aperture and particle radius, and distortion in stretch at the
+# sensor's corner.
+SHIFT_STEP, SHARE_STEP, STRETCH_STEP = 2.5e-3, 0.004, 1e-4
 # What the optics model itself gets wrong: on an image traced ray by ray by another program, true to 4e-5 of the pitch,
 # aperture, radius and distortion came out 0.05 %, 0.7 % and 8e-5 (of stretch at the corner) off.
 MODEL_SHARE_OF_PITCH, MODEL_SHARE_OF_APERTURE, MODEL_SHARE_OF_RADIUS, MODEL_STRETCH = 1e-4, 6e-4, 0.01, 1.5e-4
@@ -220,7 +220,8 @@ def _freed(own: csc_matrix, column: NDArray[np.float64]) -> NDArray[np.float64]:
 def _steps(view: View) -> NDArray[np.float64]:
     """Return the steps (5,) of the differences."""
     shares = SHARE_STEP * np.array([view.camera.aperture_radius_mm, view.particle_radius_mm])
-    return np.array([SHIFT_STEP_MM, SHIFT_STEP_MM, *shares, STRETCH_STEP / _corner_mm(view) ** 2])
+    shift = 2.0 * SHIFT_STEP * np.array([view.half_x_mm, view.half_y_mm])
+    return np.array([*shift, *shares, STRETCH_STEP / _corner_mm(view) ** 2])
 
 
 def _corner_mm(view: View) -> float:

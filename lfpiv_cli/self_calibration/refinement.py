@@ -37,8 +37,9 @@ REFINING_ROUNDS = ROUNDS[:3]
 STEPS = sum(settings.iterations + 1 for settings in REFINING_ROUNDS)
 # Particles are looked for this share of the channel's width beyond the walls on each side.
 MARGIN_PER_WIDTH = 0.15
-# Candidates' depths need planes only this many lateral voxels apart; the fit finds the rest.
-DEPTH_PER_LATERAL = 2.0
+# Candidates' depths need planes only this far apart, in depths over which light spreads by one lens (Table 2: 0.2 mm);
+# the fit finds the rest.
+PLANES_APART = 0.2 / 1.064
 # What all particles' depths have in common (the lens's rim, best focus of refracted rays) was 1 to 3 um on an image
 # traced through 5 mm of acrylic and up to 10 mm of water: this share of the depth over which the main lens's rim moves
 # a point by a microlens, with room for as much again.
@@ -180,7 +181,7 @@ def refine_calibration(
     media = space.media
     view = raw_view(camera, media, 0.5 * flow.particle_diameter_mm, calibration)
     expected = 0.0 if calibration.mid_plane_z_mm is None else calibration.mid_plane_z_mm
-    grid = _deep_grid(flow.volume, expected, flow.width_mm)
+    grid = _deep_grid(flow.volume, expected, flow.width_mm, PLANES_APART * view.scale.depth_mm)
     padding = default_padding(camera, media, grid)
     operator = factorise(camera, media, grid.padded(padding))
     weights = Weights(grid, padding, operator, camera.column_axis, calibration)
@@ -225,10 +226,9 @@ def _common_depth_mm(camera: Camera, media: Media) -> float:
     return COMMON_SHARE_OF_LENS_DEPTH * lens_depth
 
 
-def _deep_grid(volume: Grid, middle_mm: float, width_mm: float) -> Grid:
-    """Return a grid as wide as the volume and deeper than the channel."""
+def _deep_grid(volume: Grid, middle_mm: float, width_mm: float, deep: float) -> Grid:
+    """Return a grid as wide as the volume and deeper than the channel, of planes `deep` mm apart."""
     shape, spacing = volume.shape_xyz, volume.spacing_mm
-    deep = DEPTH_PER_LATERAL * max(spacing[:2])
     count = int(np.ceil(width_mm * (1.0 + 2.0 * MARGIN_PER_WIDTH) / deep))
     x, y = (0.5 * sum(volume.bounds_mm(axis)) for axis in (0, 1))
     return Grid.centred((shape[0], shape[1], count), (spacing[0], spacing[1], deep), (x, y, middle_mm))

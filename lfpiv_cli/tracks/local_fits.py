@@ -24,8 +24,9 @@ TUKEY = 4.685
 TUKEY_VARIANCE = 0.827
 # A share of the mean of the diagonal that keeps the equations of tracks in one plane solvable.
 RIDGE = 1e-10
-# No particle is known better than this; guards against a standard error of zero, and a fit that leaves nothing.
-SMALLEST_SIGMA_MM = 1e-6
+# No particle is known better than this share of the distance of those around it; guards against a standard error of
+# zero, and a fit that leaves nothing.
+SMALLEST_SIGMA_SHARE = 1e-6
 SMALLEST_SPREAD = 1e-12
 
 
@@ -58,11 +59,11 @@ def fit_around(
     values, sigma : (m, k, 3) their displacements and stated standard errors, mm
     """
     distance = np.linalg.norm(offset_mm, axis=2)
-    radius = np.maximum(distance[:, -1:], SMALLEST_SIGMA_MM)
+    radius = np.where(distance[:, -1:] > 0.0, distance[:, -1:], 1.0)
     terms = _terms(offset_mm / radius[..., np.newaxis], degree)
     kernel = np.exp(-0.5 * (distance / (KERNEL_WIDTH * radius)) ** 2)
     each = [
-        _fit_component(terms, values[..., axis], np.maximum(sigma[..., axis], SMALLEST_SIGMA_MM), kernel)
+        _fit_component(terms, values[..., axis], np.maximum(sigma[..., axis], SMALLEST_SIGMA_SHARE * radius), kernel)
         for axis in range(3)
     ]
     value, weights, scatter2 = (np.stack(parts, axis=1) for parts in zip(*each, strict=True))

@@ -15,7 +15,7 @@ from scipy.spatial import KDTree
 
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.grid import Grid
-from lfpiv_cli.particles.candidates import find_peaks
+from lfpiv_cli.particles.candidates import Boxes, find_peaks
 from lfpiv_cli.validation.board import elongation_mm
 from lfpiv_cli.validation.particles import DEPTH_VOXEL, LATERAL_VOXEL, match
 
@@ -25,6 +25,8 @@ DEPTH_TO_LATERAL = DEPTH_VOXEL / LATERAL_VOXEL
 REACH = 4.3
 # Peaks with less light than this share of a typical particle's are noise to any later step.
 FAINTEST = 0.2
+# A peak is the highest of its neighbouring voxels, three planes taken together; its light lies within two of them.
+BOXES = Boxes(sum=(3, 1, 1), peak=(3, 3, 3), light=(5, 3, 3))
 
 
 def volume_figures(
@@ -63,7 +65,7 @@ def volume_figures(
         "q_gaussian": normalised_correlation(volume, known_volume(grid, position_mm, brightness, sigma)),
         "q_box": normalised_correlation(volume, shared_among_voxels(grid, position_mm, brightness)),
     }
-    index, light = find_peaks(volume)
+    index, light = find_peaks(volume, BOXES)
     typical = np.median(light[: int(inside.sum())]) if light.size else 0.0
     index = index[light > FAINTEST * typical]
     pairs = match(grid.voxel_to_mm(index), position_mm, microlens_mm / LATERAL_VOXEL)
