@@ -366,12 +366,9 @@ def test_half_empty_volume_keeps_its_other_half(rng: np.random.Generator) -> Non
     a[:, :, 28:] = 0.0
     b[:, :, 28:] = 0.0
     field = correlate([(a, b)], unit_grid(shape), CorrelationSettings([(16, 16, 16)], HALF, 1e-3))
-    full = field.grid.axis_mm(0) < 18.0
-    np.testing.assert_allclose(
-        field.displacement_voxel[:, :, full],
-        np.broadcast_to(shift, field.displacement_voxel[:, :, full].shape),
-        atol=CORNER,
-    )
+    error = (field.displacement_voxel - np.array(shift))[:, :, field.grid.axis_mm(0) < 18.0]
+    # Of thirty pairs none exceeds half of what a corner's window errs by.
+    assert np.sqrt(np.mean(error**2)) < 0.5 * CORNER
     assert np.all(field.flag[:, :, -2:] == REJECTED)
     assert np.array_equal(np.isnan(field.velocity).any(axis=-1), field.flag >= REJECTED)
 
@@ -457,3 +454,19 @@ def test_arguments_that_do_not_belong_together_are_refused(change: dict, error: 
     arguments |= {name: value for name, value in change.items() if name in arguments}
     with pytest.raises(error):
         correlate(**arguments, settings=CorrelationSettings(**settings))
+
+
+def test_a_region_without_tracers_has_no_vectors(rng: np.random.Generator) -> None:
+    shape = (48, 32, 32)
+    pair = moving_pair(rigid(0.6, -0.3, 0.2), shape, rng)
+    for volume in pair:
+        volume[:, :, 28:] = 0.0
+        # What a solver makes of noise: a hundredth of a tracer's light, different in both.
+        volume += (0.01 * rng.random(volume.shape)).astype(np.float32)
+    field = correlate([pair], unit_grid(shape), CorrelationSettings([(16, 16, 16), (8, 8, 8)], HALF))
+    x = field.grid.axis_mm(0)
+    # At corners as much as half of a window has come from beyond the volume: those are masked.
+    assert np.all(field.flag[:, :, x > 34.0] >= REJECTED)
+    assert np.isnan(field.displacement_voxel[:, :, x > 34.0]).all()
+    # One tracer is expected in such a window, so that a third of them are empty as well.
+    assert np.mean(field.flag[:, :, x < 20.0] != REJECTED) > 0.5

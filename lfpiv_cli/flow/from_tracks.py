@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from lfpiv_cli.flow.correlation import SMALLEST_VALID_FRACTION
 from lfpiv_cli.flow.field import MASKED, REJECTED, VALID, VectorField
@@ -20,6 +21,11 @@ from lfpiv_cli.tracks.gridding import on_grid
 # A vector needs its twelve nearest tracks within this many windows of its centre: in sparse images tracks are further
 # apart than windows, and what a wide fit misses of the flow is in the stated error.
 REACH_WINDOWS = 2.0
+# A vector lies in a region without tracers where so many tracks would be expected nearer than the nearest one is: by
+# chance alone one vector in ten thousand would.
+EXPECTED_TRACKS = 9.2
+# The density at a track is that of the box which reaches its sixth neighbour.
+DENSITY_NEIGHBOURS = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +75,7 @@ def vectors_from_paths(paths: Paths, windows: WindowGrid, dt_s: float | None) ->
     inside = windows.inside()
     masked = inside < SMALLEST_VALID_FRACTION
     displacement = np.where(masked[..., np.newaxis], np.nan, values.reshape(nodes.shape) / voxel_mm)
+    displacement[without_tracks(paths.middle_mm, nodes.reshape(-1, 3), windows).reshape(masked.shape)] = np.nan
     found = np.isfinite(displacement).all(axis=-1)
     unknown = np.full(found.shape, np.nan)
     return VectorField(
@@ -84,3 +91,33 @@ def vectors_from_paths(paths: Paths, windows: WindowGrid, dt_s: float | None) ->
         dt_s=dt_s,
         window_voxel=windows.size,
     )
+
+
+def without_tracks(
+    middle_mm: NDArray[np.float64], nodes_mm: NDArray[np.float64], windows: WindowGrid
+) -> NDArray[np.bool_]:
+    """Return which nodes (m,) lie in a region without tracks, where tracks elsewhere are as dense as they are.
+
+    A fit to the nearest tracks would only extend what the flow does beside the region. Nearness is counted in boxes of
+    the windows' proportions, as far as these lie in the volume and between the walls.
+    """
+    if len(middle_mm) <= DENSITY_NEIGHBOURS:
+        return np.ones(len(nodes_mm), dtype=np.bool_)
+    low, high = np.array([windows.volume.bounds_mm(axis) for axis in range(3)]).T
+    if windows.channel_width_mm is not None:
+        low[2], high[2] = max(low[2], -0.5 * windows.channel_width_mm), min(high[2], 0.5 * windows.channel_width_mm)
+    side_mm = np.array(windows.size) * windows.volume.spacing_mm
+
+    def volume_around(points_mm: NDArray[np.float64], reach: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the volume, mm^3, of boxes that reach so many windows far to each side."""
+        half = reach[:, np.newaxis] * side_mm
+        sides = np.minimum(points_mm + half, high) - np.maximum(points_mm - half, low)
+        return np.asarray(np.prod(np.maximum(sides, 0.0), axis=1))
+
+    tree = KDTree(middle_mm / side_mm)
+    # Its own place is each track's nearest.
+    sixth = tree.query(middle_mm / side_mm, k=[DENSITY_NEIGHBOURS + 1], p=np.inf)[0][:, 0]
+    around = volume_around(middle_mm, sixth)
+    density = np.median(DENSITY_NEIGHBOURS / around[around > 0.0])
+    nearest = tree.query(nodes_mm / side_mm, p=np.inf)[0]
+    return np.asarray(density * volume_around(nodes_mm, nearest) > EXPECTED_TRACKS)

@@ -30,6 +30,9 @@ SMALLEST_BLOCK = 4
 # A window whose energy is below this share of the brightest one's is empty: what the splines carry into empty space
 # reaches amplitudes of 1e-5.
 SMALLEST_ENERGY = 1e-9
+# A window whose amplitude is below this share of the typical one holds no tracers: one of two hundred would reach it.
+# What noise, ghosts and the tails of long particles leave in a region without tracers stays below.
+SMALLEST_AMPLITUDE = 0.07
 
 
 @dataclass(frozen=True)
@@ -107,14 +110,33 @@ class MapSums:
             self.blocks,
         )
 
+    def amplitude(self) -> NDArray[np.float64]:
+        """Return the root of the sum of squares over each window where it stands, the mean of both volumes' in logs."""
+        middle = self.energies_a.shape[1] // 2
+        energy_a, energy_b = (e[:, middle, :, middle, :, middle] for e in (self.energies_a, self.energies_b))
+        return np.asarray((energy_a.astype(np.float64) * energy_b).transpose(0, 2, 1) ** 0.25)
+
     def correlation(self) -> NDArray[np.float64]:
-        """Return R, (nz, ny, nx, 2r + 1, 2r + 1, 2r + 1), zero where a window holds nothing."""
+        """Return R, (nz, ny, nx, 2r + 1, 2r + 1, 2r + 1), zero where a window holds no tracers."""
         # The brackets of R hold two windows each.
         brightest = 4.0 * float(np.max(self.energies_a)) * float(np.max(self.energies_b))
         per_window, hop = self.blocks.per_window[:2], self.blocks.hop[:2]
-        return normalise(
+        maps = normalise(
             self.products, self.energies_a, self.energies_b, per_window, hop, SMALLEST_ENERGY**2 * brightest
         )
+        maps[without_tracers(self.amplitude())] = 0.0
+        return maps
+
+
+def without_tracers(amplitude: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which windows of these amplitudes hold no tracers, the others being what most of the light comes from.
+
+    The typical amplitude is that from which on windows make up half of the sum of all: neither a few windows with a
+    reflection in them nor many dark ones move it far.
+    """
+    falling = np.sort(amplitude, axis=None)[::-1]
+    typical = falling[np.searchsorted(np.cumsum(falling), 0.5 * falling.sum())]
+    return np.asarray(amplitude < SMALLEST_AMPLITUDE * typical)
 
 
 def map_sums(

@@ -69,8 +69,9 @@ def validate_vectors(
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     """Return the validated displacements and their flags.
 
-    An outlier takes its second peak if that one fits; otherwise it, and a window without a peak, takes the value that
-    its neighbours predict if enough of them are sound; otherwise it is rejected. Rejected and masked vectors are NaN.
+    An outlier takes its second peak if that one fits; otherwise the value that its neighbours predict if enough of them
+    are sound; otherwise it is rejected, as is a window without a peak: it holds no tracers, and what neighbours predict
+    for it would look measured. Rejected and masked vectors are NaN.
 
     Parameters
     ----------
@@ -98,7 +99,7 @@ def validate_vectors(
         fits = np.all(np.abs(raw - predicted) <= limit, axis=-1)
         flag[judged] = np.where(fits[judged], VALID, REJECTED)
     rescued = judged & (flag == REJECTED) & np.all(np.abs(second - predicted) <= limit, axis=-1)
-    replaced = (flag == REJECTED) & ~rescued & (share >= NEEDED_SHARE)
+    replaced = judged & (flag == REJECTED) & ~rescued
     flag[rescued] = SECOND_PEAK
     flag[replaced] = REPLACED
     displacement[rescued] = second[rescued]
