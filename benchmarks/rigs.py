@@ -43,8 +43,6 @@ RIGS, SEED = 40, 20261122
 WHITE_SAMPLES = 4
 # Steps that come before the work: what cannot work is to be refused in one of them.
 BEFORE_THE_WORK = ("calibrate-snapshot", "build-weights")
-# What is told of a run and warns of nothing.
-NOTICES = ("were chosen", "columns are made on demand")
 # Standard deviation of a speck's shadow in pixels, and its depth.
 SPECK_PX, SPECK_DEPTH = (0.7, 4.0), (0.1, 0.8)
 # A result is wrong where a slope is off by more (and by more than two of its standard errors), where less than this
@@ -185,7 +183,6 @@ def run_command(*arguments: object) -> Step:
     elif ended.exception is not None:
         error = f"{type(ended.exception).__name__}: {ended.exception}"
     said = [line for line in ended.stderr.splitlines() if line.startswith("lfpiv:") or "Warning" in line]
-    said = [line for line in said if not any(notice in line for notice in NOTICES)]
     name = " ".join([words[0], *[word for word in words if word == "particles"]])
     return Step(name, code, error, said, seconds)
 

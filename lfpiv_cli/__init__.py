@@ -27,7 +27,8 @@ Each command is a function as well, files in and files out, with its options as 
     reconstruct(Path("weights.h5"), images, Path("volumes"), ReconstructOptions(dark=Path("dark.tif")))
 
 likewise `lfpiv_cli.stages.calibrate`, `.build_weights`, `.correlate`, `.track` and so on. All that can go wrong is an
-`LfpivError` of `lfpiv_cli.errors`, whose message names the place, what was found and what was expected.
+`LfpivError` of `lfpiv_cli.errors`, whose message names the place, what was found and what was expected; what speaks
+against a result is an `LfpivWarning`.
 """
 
 from __future__ import annotations
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
     from lfpiv_cli.files.weights_file import open_weights
     from lfpiv_cli.flow.combining import combine
     from lfpiv_cli.interface.calibration import calibrate
+    from lfpiv_cli.interface.notices import LfpivWarning
     from lfpiv_cli.interface.particles import find_particles
     from lfpiv_cli.interface.readers import load_rig, open_calibration, open_particles, open_tracks, read_image
     from lfpiv_cli.interface.reconstruction import reconstruct
@@ -51,6 +53,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 __all__ = [
     "LfpivError",
+    "LfpivWarning",
     "__version__",
     "build_weights",
     "calibrate",
@@ -72,6 +75,7 @@ __all__ = [
 # Where each name is from: they are imported when they are asked for, so that `lfpiv --help` need not wait for them.
 MODULES = {
     "LfpivError": "errors",
+    "LfpivWarning": "interface.notices",
     "build_weights": "interface.weights",
     "calibrate": "interface.calibration",
     "combine": "flow.combining",

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 import click
+
+from lfpiv_cli.notice import Notice
 
 
 @dataclass(frozen=True)
@@ -19,24 +21,32 @@ class Console:
     ----------
     verbose : say more
     quiet : say nothing but errors
+    only_warnings : say nothing but errors and warnings: the summary goes elsewhere
+    warned : where it is given, all warnings are added to it
     """
 
     verbose: bool = False
     quiet: bool = False
+    only_warnings: bool = False
+    warned: list[Notice] | None = None
 
     def say(self, text: str) -> None:
         """Print a line that everybody should see."""
-        if not self.quiet:
+        if not self._silent:
             click.echo(text, err=True)
 
-    def warn(self, text: str) -> None:
-        """Print what went otherwise than one would expect, and does not keep the command from going on."""
-        self.say(f"lfpiv: {text}")
+    def warn(self, notices: Iterable[Notice]) -> None:
+        """Print what speaks against a result and does not keep the command from going on, a line each."""
+        for notice in notices:
+            if self.warned is not None:
+                self.warned.append(notice)
+            if not self.quiet:
+                click.echo(f"lfpiv: warning: {notice}", err=True)
 
     def detail(self, text: str) -> None:
         """Print a line for those who asked for more."""
-        if self.verbose and not self.quiet:
-            click.echo(text, err=True)
+        if self.verbose:
+            self.say(text)
 
     def summary(self, figures: dict[str, Any]) -> None:
         """Print the figures of a command, one a line."""
@@ -46,13 +56,18 @@ class Console:
     @contextmanager
     def progress(self, total: int, label: str) -> Iterator[Callable[[int], None]]:
         """Show a progress bar on a terminal and nothing elsewhere; yields the function that advances it."""
-        if self.quiet or not sys.stderr.isatty():
+        if self._silent or not sys.stderr.isatty():
             yield lambda _steps: None
             return
         from tqdm import tqdm
 
         with tqdm(total=total, desc=label, file=sys.stderr, leave=False) as bar:
             yield lambda steps: bar.update(steps) and None
+
+    @property
+    def _silent(self) -> bool:
+        """True where only errors, or these and warnings, are printed."""
+        return self.quiet or self.only_warnings
 
 
 # For those who call a stage from Python and say nothing of it.

@@ -123,7 +123,7 @@ def test_what_cannot_be_is_refused(by_commands: Path) -> None:
         lf.track(lf.open_particles(by_commands / "particles" / "pair_a.vtkhdf"))
 
 
-@pytest.mark.parametrize("name", sorted(set(lf.__all__) - {"__version__", "LfpivError"}))
+@pytest.mark.parametrize("name", sorted(set(lf.__all__) - {"__version__", "LfpivError", "LfpivWarning"}))
 def test_what_is_promised_is_documented(name: str) -> None:
     function = getattr(lf, name)
     words = inspect.getdoc(function) or ""
@@ -135,7 +135,7 @@ def test_what_is_promised_is_documented(name: str) -> None:
 
 def test_help_names_all_that_is_promised() -> None:
     words = pydoc.plain(pydoc.render_doc(lf))
-    for name in set(lf.__all__) - {"__version__", "LfpivError"}:
+    for name in set(lf.__all__) - {"__version__", "LfpivError", "LfpivWarning"}:
         assert name in words
 
 

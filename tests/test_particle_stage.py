@@ -91,7 +91,7 @@ def frames_of(counts: list[int], folder: Path, rng: np.random.Generator) -> list
         ([40, 40], "", 40),
         ([40, 2], "holds 2 particles, another frame 40", 2),
         ([5, 5, 5], "5 particles at most", 5),
-        ([40, 40, 40, 0], "no particles in", 40),
+        ([40, 40, 40, 0], "there are no particles in it", 40),
     ],
 )
 def test_few_particles_are_tracked_and_said(
@@ -113,7 +113,7 @@ def test_no_tracks_are_said(tmp_path: Path, rng: np.random.Generator, capsys) ->
     paths = frames_of([9, 9], tmp_path, rng)
     write_frame(paths[1], rng.uniform(8.0, 9.0, (9, 3)))
     run("track", *paths, "-o", tmp_path / "tracks.vtkhdf")
-    assert "lfpiv: no tracks" in capsys.readouterr().err
+    assert "[no-tracks]" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("counts", [[40, 0], [0, 0], [0, 40, 0]])

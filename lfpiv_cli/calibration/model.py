@@ -19,8 +19,14 @@ from lfpiv_cli.calibration.dlfc import RayFit, fit_rays
 from lfpiv_cli.calibration.lattice import LatticeFit, fit_lattice
 from lfpiv_cli.calibration.rectification import Rectification
 from lfpiv_cli.calibration.sheet import check_pitch, image_distance_mm, sheet_fit
-from lfpiv_cli.calibration.transmission import fit_vignetting, relative_transmission
+from lfpiv_cli.calibration.transmission import (
+    NARROWEST_LENS_IMAGE,
+    fit_vignetting,
+    lens_image_width,
+    relative_transmission,
+)
 from lfpiv_cli.calibration.white import by_aperture
+from lfpiv_cli.calibration.white_checks import check_residual
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.names import Layout
 from lfpiv_cli.optics.camera import Camera
@@ -304,9 +310,11 @@ def lattice_calibration(pictures: Photographs, shape: tuple[int, int], sheet: Da
     fit = fit_lattice(whites[order[0]], dark, sheet.layout)
     if sheet.pitch_px is not None:
         check_pitch(fit, sheet.pitch_px)
+    check_residual(fit)
     rectification = Rectification(fit, shape)
-    image = pictures.less_dark(whites[order[-1]])
-    transmission = relative_transmission(rectification.apply(image), rectification.lattice_px)
+    image, lattice_px = rectification.apply(pictures.less_dark(whites[order[-1]])), rectification.lattice_px
+    narrow = lens_image_width(image, lattice_px) < NARROWEST_LENS_IMAGE
+    transmission = None if narrow else relative_transmission(image, lattice_px)
     distance, sigma = (None, None) if camera is None else image_distance_mm(fit, camera) or (None, None)
     return Calibration(rectification, transmission, image_distance_mm=distance, image_distance_sigma_mm=sigma)
 

@@ -1,4 +1,4 @@
-"""The data sheet beside the measured lattice: do the pitches agree, and what image distance does their ratio tell?
+"""The data sheet beside itself and the measured lattice: do f-numbers and pitches agree, and what image distance is it?
 
 The lens images are projected from the exit pupil: their pitch is that of the lenses times 1 + s_mu/s_i.
 """
@@ -8,7 +8,8 @@ from __future__ import annotations
 import numpy as np
 
 from lfpiv_cli.calibration.lattice import EXPONENTS, LatticeFit
-from lfpiv_cli.errors import InputError
+from lfpiv_cli.errors import ConfigError, InputError
+from lfpiv_cli.notice import Notice
 from lfpiv_cli.optics.camera import Camera
 
 # A lattice further from the data sheet than this is another camera, a binned sensor or a slip in the sheet: the
@@ -18,6 +19,10 @@ LARGEST_DIFFERENCE = 0.05
 # this are no contradiction.
 IMAGE_DISTANCE_TOLERANCE = 0.1
 IMAGE_DISTANCE_SIGMAS = 3.0
+# Between the f-numbers of main lens and microlenses, towards the array. Lens images a quarter wider or narrower than
+# their pitch lose or waste two fifths of the light; of three times as wide or narrow ones nine overlap, or a ninth of
+# the pixels is lit.
+LARGE_F_RATIO, LARGEST_F_RATIO = 1.25, 3.0
 
 
 def check_pitch(fit: LatticeFit, sheet_pitch_px: float) -> None:
@@ -62,28 +67,89 @@ def image_distance_mm(fit: LatticeFit, camera: Camera) -> tuple[float, float] | 
 
     None where the lens images are not further apart than the lenses, within their error: the ratio then tells nothing.
     """
-    sheet_mm = float(np.sqrt(abs(np.linalg.det(camera.lattice.basis))))
-    measured_mm = float(np.sqrt(abs(np.linalg.det(fit.lattice_px.basis)))) * camera.pixel_mm
-    sigma = float(np.hypot(*fit.pitch_sigma_px)) / 2.0 / float(fit.lattice_px.pitch.mean())
-    excess = measured_mm / sheet_mm - 1.0
+    excess, sigma = _excess(fit, camera)
     if not np.isfinite(sigma) or excess <= IMAGE_DISTANCE_SIGMAS * sigma:
         return None
     distance = camera.microlens_distance_mm / excess
     return distance, distance * sigma / excess
 
 
-def image_distance_doubt(fit: LatticeFit, camera: Camera) -> str | None:
-    """Return a sentence when the pitch of the lens images contradicts the data sheet's image distance, else None."""
-    found = image_distance_mm(fit, camera)
+def image_distance_notices(fit: LatticeFit, camera: Camera) -> list[Notice]:
+    """Return what speaks for another image distance than the data sheet's: the pitch of the lens images.
+
+    Lens images as far apart as the lenses tell no distance: behind a lens that is telecentric towards the array they
+    are, and a pitch given in whole pixels is often theirs.
+    """
     sheet = camera.image_distance_mm
+    excess, sigma = _excess(fit, camera)
+    expected = camera.micro_image_scale - 1.0
+    if not np.isfinite(sigma) or abs(excess) <= max(IMAGE_DISTANCE_SIGMAS * sigma, IMAGE_DISTANCE_TOLERANCE * expected):
+        return []
+    found = image_distance_mm(fit, camera)
     if found is not None:
         difference = abs(found[0] - sheet)
         if difference <= max(IMAGE_DISTANCE_TOLERANCE * sheet, IMAGE_DISTANCE_SIGMAS * found[1]):
-            return None
-    elif fit.lenses == 0:
-        return None
+            return []
     told = "no image distance" if found is None else f"an image distance of {found[0]:.4g} mm"
-    return (
-        f"the pitch of the lens images tells {told}, the data sheet {sheet:.4g} mm; one of microlenses.pitch_mm, "
-        "sensor.pixel_um, sensor.microlens_distance_mm and main_lens is off"
-    )
+    return [
+        Notice(
+            "image-distance",
+            "camera.main_lens",
+            f"the pitch of the lens images tells {told}, the data sheet {sheet:.4g} mm",
+            "correct what is off of microlenses.pitch_mm, sensor.pixel_um, sensor.microlens_distance_mm and main_lens",
+            None if found is None else found[0],
+            f"{sheet:.4g} mm",
+        )
+    ]
+
+
+def check_f_numbers(camera: Camera) -> None:
+    """Refuse a main lens and microlenses whose f-numbers are so different that lens images are no use.
+
+    Raises
+    ------
+    ConfigError
+    """
+    if _ratio(camera) > LARGEST_F_RATIO:
+        raise ConfigError(
+            f"camera.main_lens.aperture_mm: {_f_numbers(camera)}; at most a factor of {LARGEST_F_RATIO:g} may be "
+            "between them; check the apertures, the focal lengths and microlens_distance_mm"
+        )
+
+
+def f_number_notices(camera: Camera) -> list[Notice]:
+    """Return what speaks against the f-numbers of main lens and microlenses."""
+    if _ratio(camera) <= LARGE_F_RATIO:
+        return []
+    turned = "stop the lens down" if camera.lens_image_width > 1.0 else "open it"
+    return [
+        Notice(
+            "f-numbers",
+            "camera.main_lens.aperture_mm",
+            _f_numbers(camera),
+            f"correct the aperture (f_number is F_m / p_m), or {turned} until lens images just touch",
+            _ratio(camera),
+            f"at most {LARGE_F_RATIO:g}",
+        )
+    ]
+
+
+def _ratio(camera: Camera) -> float:
+    """Return the factor between the two f-numbers, 1 where they match."""
+    return max(camera.lens_image_width, 1.0 / camera.lens_image_width)
+
+
+def _f_numbers(camera: Camera) -> str:
+    """Return what becomes of lens images by the f-numbers, in words."""
+    width, main = camera.lens_image_width, camera.image_distance_mm / camera.aperture_mm
+    what = f"overlap, {width:.2f} of their pitch wide" if width > 1.0 else f"fill only {width:.2f} of their pitch"
+    numbers = f"the main lens is f/{main:.3g} towards the array and the microlenses are f/{main * width:.3g}"
+    return f"{numbers}: lens images {what}"
+
+
+def _excess(fit: LatticeFit, camera: Camera) -> tuple[float, float]:
+    """Return by what share lens images are further apart than lenses, and its standard error."""
+    sheet_mm = float(np.sqrt(abs(np.linalg.det(camera.lattice.basis))))
+    measured_mm = float(np.sqrt(abs(np.linalg.det(fit.lattice_px.basis)))) * camera.pixel_mm
+    sigma = float(np.hypot(*fit.pitch_sigma_px)) / 2.0 / float(fit.lattice_px.pitch.mean())
+    return measured_mm / sheet_mm - 1.0, sigma

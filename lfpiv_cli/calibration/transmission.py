@@ -17,6 +17,9 @@ MIDDLE_SIDE_PX = 512
 # fitted to the medians of this many blocks along each side, which dust and dead pixels do not move.
 VIGNETTING_DEGREE = 4
 VIGNETTING_BLOCKS = 24
+# In narrower lens images, shares of the pitch, the middles reach the dark around: a quarter of the pitch on either side
+# and a pixel's blur.
+NARROWEST_LENS_IMAGE = 0.6
 # A block of fewer usable middles says nothing.
 FEWEST_MIDDLES = 20
 
@@ -35,14 +38,25 @@ def relative_transmission(white: NDArray[np.float32], lattice_px: Lattice) -> ND
 
 def centre_level(white: NDArray[np.float32], lattice_px: Lattice) -> float:
     """Return the median brightness of the middles of the lens images around the sensor's centre."""
-    rows, columns = white.shape
-    top, left = max(0, (rows - MIDDLE_SIDE_PX) // 2), max(0, (columns - MIDDLE_SIDE_PX) // 2)
-    part = white[top : top + MIDDLE_SIDE_PX, left : left + MIDDLE_SIDE_PX]
-    row, column = np.indices(part.shape)
-    place = np.stack([column + left, row + top], axis=-1).astype(np.float64)
-    offset = place - lattice_px.points(lattice_px.nearest(place))
+    part, place, index = _middle_part(white, lattice_px)
+    offset = place - lattice_px.points(index)
     middle = np.hypot(offset[..., 0], offset[..., 1]) <= MIDDLE_PER_PITCH * lattice_px.pitch.min()
     return float(np.median(part[middle]))
+
+
+def lens_image_width(white: NDArray[np.float32], lattice_px: Lattice) -> float:
+    """Return how wide lens images are over their pitch, around the sensor's centre: the diameter of a disc as large.
+
+    As large as what is at least half as bright as the brightest pixel of a lens image, in the middle one of them all.
+    """
+    part, place, index = _middle_part(white, lattice_px)
+    lens = index - index.min(axis=(0, 1))
+    brightest = np.full(lens.max(axis=(0, 1)) + 1, -np.inf)
+    np.maximum.at(brightest, (lens[..., 0], lens[..., 1]), part)
+    area = float(np.mean(part > 0.5 * np.median(brightest[np.isfinite(brightest)]))) * abs(
+        float(np.linalg.det(lattice_px.basis))
+    )
+    return float(np.sqrt(4.0 / np.pi * area) / lattice_px.pitch.mean())
 
 
 def fit_vignetting(transmission: NDArray[np.float32], lattice_px: Lattice) -> NDArray[np.float64] | None:
@@ -79,6 +93,18 @@ def vignetting_surface(coefficients: NDArray[np.float64], shape: tuple[int, int]
     y, x = ((np.arange(n) - n / 2.0) / (n / 2.0) for n in shape)
     surface = np.polynomial.polynomial.polygrid2d(y, x, coefficients)
     return np.clip(surface, TRANSMISSION_FLOOR, 1.0 / TRANSMISSION_FLOOR).astype(np.float32)
+
+
+def _middle_part(
+    white: NDArray[np.float32], lattice_px: Lattice
+) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.int64]]:
+    """Return the square around the sensor's centre, its pixels' places (..., 2) as (column, row), and their lenses."""
+    rows, columns = white.shape
+    top, left = max(0, (rows - MIDDLE_SIDE_PX) // 2), max(0, (columns - MIDDLE_SIDE_PX) // 2)
+    part = white[top : top + MIDDLE_SIDE_PX, left : left + MIDDLE_SIDE_PX]
+    row, column = np.indices(part.shape)
+    place = np.stack([column + left, row + top], axis=-1).astype(np.float64)
+    return part, place, lattice_px.nearest(place)
 
 
 def _block_levels(

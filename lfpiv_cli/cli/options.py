@@ -43,15 +43,19 @@ def common_options(command: Callable[..., dict[str, Any]]) -> Callable[..., None
 
     @click.option("--overwrite", is_flag=True, help="Replace outputs that exist.")
     @click.option("--threads", type=click.IntRange(min=1), help="Threads to use; all cores when not given.")
-    @click.option("--json", "as_json", is_flag=True, help="Print one JSON object to stdout and nothing else.")
+    @click.option(
+        "--json", "as_json", is_flag=True, help="Print one JSON object to stdout, and only warnings to stderr."
+    )
     @click.option("-v", "--verbose", is_flag=True, help="Say more on stderr.")
     @click.option("-q", "--quiet", is_flag=True, help="Say nothing on stderr but errors.")
     @click.option("--debug", is_flag=True, expose_value=False, help="Show the traceback of an error.")
     @wraps(command)
     def run(threads: int | None, as_json: bool, verbose: bool, quiet: bool, **arguments: Any) -> None:
         from lfpiv_cli.console import Console
+        from lfpiv_cli.notice import Notice
 
-        console = Console(verbose=verbose, quiet=quiet or as_json)
+        warned: list[Notice] = []
+        console = Console(verbose=verbose, quiet=quiet, only_warnings=as_json, warned=warned)
         if threads is not None:
             from lfpiv_cli.threads import use_threads
 
@@ -63,7 +67,8 @@ def common_options(command: Callable[..., dict[str, Any]]) -> Callable[..., None
         except LimitMissedError as error:
             missed, summary = error, error.figures
         if as_json:
-            click.echo(json.dumps(summary, allow_nan=False, sort_keys=True))
+            told = summary | {"warnings": [notice.record() for notice in warned]}
+            click.echo(json.dumps(told, allow_nan=False, sort_keys=True))
         else:
             console.summary(summary)
         if missed:

@@ -10,6 +10,7 @@ from typing import Any
 from lfpiv_cli.errors import InputError, OutputExistsError, UsageError
 from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.images import count_pages
+from lfpiv_cli.files.provenance import without_warnings
 from lfpiv_cli.names import Pairing
 
 VTKHDF_SUFFIX = ".vtkhdf"
@@ -106,7 +107,7 @@ def pending(
 
 def _made_alike(target: Target, read_record: Callable[[Path], Mapping[str, Any]]) -> bool:
     try:
-        return read_record(target.path) == target.record
+        return without_warnings(read_record(target.path)) == target.record
     except InputError:
         return False
 

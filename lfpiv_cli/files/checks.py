@@ -28,11 +28,14 @@ BOARD_KEYS = {
 }
 # Data sheets give three or four digits.
 AGREEMENT = 1e-3
+# Three pixels tell the middle of a lens image from its rims; the widest lens images in use are some 100 px wide.
+FEWEST_PIXELS_A_LENS, MOST_PIXELS_A_LENS = 3.0, 1000.0
 
 
 def contradictions(sections: Sections) -> Found:
     """Yield the place and the sentence of everything that cannot be."""
     yield from _lens(sections)
+    yield from _sensor(sections)
     yield from _volume(sections)
     yield from _board(sections)
     yield from _scene(sections)
@@ -75,6 +78,20 @@ def _lens(sections: Sections) -> Found:
                 ("camera", "microlenses", "f_number"),
                 f"is {microlenses.f_number:g}, but focal_length_mm / pitch_mm is {expected:g}",
             )
+
+
+def _sensor(sections: Sections) -> Found:
+    """Yield pixels so large or so small that lens images cannot be told: most often a slip in the unit."""
+    if sections.camera is None:
+        return
+    sensor, pitch_mm = sections.camera.sensor, sections.camera.microlenses.pitch_mm
+    pitch_px = pitch_mm * 1e3 / sensor.pixel_um
+    if not FEWEST_PIXELS_A_LENS <= pitch_px <= MOST_PIXELS_A_LENS:
+        yield (
+            ("camera", "sensor", "pixel_um"),
+            f"is {sensor.pixel_um:g}: lens images would be {pitch_px:.4g} px apart (pitch_mm is {pitch_mm:g}), "
+            f"expected {FEWEST_PIXELS_A_LENS:g} to {MOST_PIXELS_A_LENS:g}: pixels in um, the pitch in mm",
+        )
 
 
 def _volume(sections: Sections) -> Found:

@@ -10,6 +10,7 @@ import h5py
 
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.files.hdf5 import from_attribute, member, open_h5, read_provenance
+from lfpiv_cli.files.provenance import recorded_warnings
 
 # Attributes that are told in words of their own or are of no interest to a person.
 SILENT = ("format", "format_version", "provenance")
@@ -47,6 +48,9 @@ def _made(record: dict[str, Any]) -> dict[str, Any]:
         "program_version": record.get("version"),
         "inputs": inputs,
     }
+    warnings = recorded_warnings(record)
+    if warnings:
+        made["warnings_recorded"] = warnings
     weights = (record.get("config") or {}).get("weights")
     if weights:
         made |= {name: weights.get(name) for name in ("method", "refraction", "sampling")}

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import platform
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
@@ -20,6 +20,7 @@ from lfpiv_cli.errors import InputError
 from lfpiv_cli.files.atomic import without_nan
 from lfpiv_cli.files.hdf5 import open_h5, read_provenance
 from lfpiv_cli.files.inputs import ensure_regular_file, reason
+from lfpiv_cli.notice import Notice
 
 # Files whose hash is remembered: those that a batch has in common are few.
 FILES_REMEMBERED = 64
@@ -66,6 +67,27 @@ def record(command: str, config: Mapping[str, Any] | None, inputs: Mapping[str, 
         "inputs": named,
         "made_from": dict(sorted(made_from.items())),
     }
+
+
+def with_warnings(made: Mapping[str, Any], notices: Iterable[Notice]) -> dict[str, Any]:
+    """Return a record with what was warned of when the result was made; as it is where there was nothing."""
+    warnings = [without_nan(notice.record()) for notice in notices]
+    return dict(made) | ({"warnings": warnings} if warnings else {})
+
+
+def without_warnings(made: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a record as it stood before the work: what it was made of and how."""
+    return {name: value for name, value in made.items() if name != "warnings"}
+
+
+def recorded_warnings(made: Mapping[str, Any]) -> list[str]:
+    """Return what was warned of when a result was made, and before that when its inputs were, each with the command."""
+    records = [*made.get("made_from", {}).values(), made]
+    return [
+        f"{each['command']}: {warning['about']}: {warning['text']}; {warning['remedy']} [{warning['code']}]"
+        for each in records
+        for warning in each.get("warnings", ())
+    ]
 
 
 def sha256(path: Path) -> str:

@@ -10,15 +10,21 @@ from numpy.typing import ArrayLike, NDArray
 
 from lfpiv_cli.calibration import model
 from lfpiv_cli.calibration.model import Calibration, DataSheet, Photographs
-from lfpiv_cli.calibration.sheet import image_distance_doubt
-from lfpiv_cli.console import Console
+from lfpiv_cli.calibration.sheet import check_f_numbers, f_number_notices, image_distance_notices
+from lfpiv_cli.calibration.transmission import lens_image_width
+from lfpiv_cli.calibration.white import by_aperture
+from lfpiv_cli.calibration.white_checks import white_notices
 from lfpiv_cli.errors import UsageError
 from lfpiv_cli.files.config import Config
-from lfpiv_cli.interface.notices import NOTICES
+from lfpiv_cli.interface.notices import warn_of
+from lfpiv_cli.notice import Notice
 
-NO_WHITE_IMAGE = (
-    "no white image: the microlenses are believed to lie as the data sheet says, and the standard errors know nothing "
-    "of how far that is wrong"
+NO_WHITE_IMAGE = Notice(
+    "no-white-image",
+    "--white",
+    "there is none: the microlenses are believed to lie as the data sheet says, and the standard errors know nothing "
+    "of how far that is wrong",
+    "give a white image, of uniform light",
 )
 
 Pictures = ArrayLike | Sequence[ArrayLike] | None
@@ -64,7 +70,10 @@ def calibrate(
     for picture in (*whites, *boards, *_each(dark)):
         if picture.shape != shape:
             raise UsageError(f"a picture of {picture.shape} pixels; the rig's sensor has {shape} (rows, columns)")
-    return calibration_of(rig, photographs(whites, boards, dark, depth_mm), NOTICES)
+    pictures = photographs(whites, boards, dark, depth_mm)
+    found = calibration_of(rig, pictures)
+    warn_of(calibration_notices(rig, pictures, found))
+    return found
 
 
 def photographs(
@@ -76,18 +85,27 @@ def photographs(
     return Photographs(whites, dark, boards[0] if boards else None)
 
 
-def calibration_of(rig: Config, pictures: Photographs, console: Console) -> Calibration:
-    """Return the calibration that pictures of the rig give; what speaks against it is warned of."""
+def calibration_of(rig: Config, pictures: Photographs) -> Calibration:
+    """Return the calibration that pictures of the rig give."""
     camera = rig.complete_camera() if pictures.whites else rig.camera_model()
-    if not pictures.whites:
-        console.warn(NO_WHITE_IMAGE)
+    if camera is not None:
+        check_f_numbers(camera)
     sheet = DataSheet(rig.camera.microlenses.layout, rig.micro_image_pitch_px(), camera)
     has_board = pictures.board is not None or len(pictures.depth_boards) > 0
-    found = model.calibrate(pictures, rig.rig() if has_board else None, sheet)
-    doubt = None if camera is None else image_distance_doubt(found.fit, camera)
-    if doubt:
-        console.warn(doubt)
-    return found
+    return model.calibrate(pictures, rig.rig() if has_board else None, sheet)
+
+
+def calibration_notices(rig: Config, pictures: Photographs, found: Calibration) -> list[Notice]:
+    """Return what speaks against a calibration and the pictures that it is from."""
+    camera = rig.complete_camera()
+    notices = [] if camera is None else f_number_notices(camera)
+    if not pictures.whites:
+        return [*notices, NO_WHITE_IMAGE]
+    order = by_aperture(pictures.whites, pictures.dark)
+    first, widest = (pictures.less_dark(pictures.whites[order[place]]) for place in (0, -1))
+    width = lens_image_width(found.rectification.apply(widest), found.rectification.lattice_px)
+    notices += white_notices(first, found.fit, width, None if camera is None else camera.lens_image_width)
+    return notices if camera is None else notices + image_distance_notices(found.fit, camera)
 
 
 def ensure_pictures(whites: int, boards: int, depths: int) -> None:

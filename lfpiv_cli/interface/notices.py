@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterable
 
 from lfpiv_cli.console import Console
+from lfpiv_cli.notice import Notice
 
-# From `Notices.warn` through the function that warns and the one of the interface to who called that.
-CALLER = 4
-
-
-class Notices(Console):
-    """A console whose warnings are Python's."""
-
-    def warn(self, text: str) -> None:
-        """Warn of what went otherwise than one would expect."""
-        warnings.warn(text, stacklevel=CALLER)
+# From `warn_of` through the function of the interface to who called that.
+CALLER = 3
+SILENT = Console(quiet=True)
 
 
-NOTICES = Notices(quiet=True)
+class LfpivWarning(UserWarning):
+    """What speaks against a result; `notice` has its code, what it is about, figure, expectation and remedy."""
+
+    def __init__(self, notice: Notice) -> None:
+        super().__init__(str(notice))
+        self.notice = notice
+
+
+def warn_of(notices: Iterable[Notice]) -> None:
+    """Give each notice as a Python warning; to be called by a function of the interface itself."""
+    for notice in notices:
+        warnings.warn(LfpivWarning(notice), stacklevel=CALLER)

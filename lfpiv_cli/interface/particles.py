@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lfpiv_cli.console import Console
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files.config import Config, carried_config
 from lfpiv_cli.files.particle_file import Points, symmetric
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.files.weights_file import WeightsFile
 from lfpiv_cli.grid import Grid
-from lfpiv_cli.interface.notices import NOTICES
+from lfpiv_cli.interface.notices import warn_of
 from lfpiv_cli.interface.reconstruction import Bench, bench_of, given_picture, picture_for
+from lfpiv_cli.notice import Notice
 from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.particles.neighbour_frames import second_pass
 from lfpiv_cli.particles.refraction import places_by_snell
@@ -88,7 +88,7 @@ def find_particles(
     else:
         found = find(bench, frame)
     points = points_of(bench, frame, found, record("find_particles", chosen.resolved(), {}))
-    warn_of_unexplained(points, "the image", NOTICES)
+    warn_of(light_notices(points, "the image"))
     return points
 
 
@@ -188,19 +188,28 @@ def points_of(bench: Bench, frame: Frame, found: Particles, provenance: Mapping[
     )
 
 
-def warn_of_unexplained(points: Points, name: str, console: Console) -> None:
-    """Say where no particles were found, or where they leave more of the image's light than noise makes."""
-    told = points.attributes
-    noise_share = min(told["read_noise_counts"] / max(told["residual_rms_counts"], told["read_noise_counts"]), 1.0)
-    unexplained = told["residual"] * float(np.sqrt(1.0 - noise_share**2))
+def light_notices(points: Points, name: str) -> list[Notice]:
+    """Return where no particles were found, or where they leave more of the image's light than noise makes."""
+    measured = points.attributes
+    noise_share = measured["read_noise_counts"] / max(measured["residual_rms_counts"], measured["read_noise_counts"])
+    unexplained = measured["residual"] * float(np.sqrt(1.0 - min(noise_share, 1.0) ** 2))
     count = len(points.position_mm)
-    if not count and unexplained <= LARGEST_UNEXPLAINED:
-        console.warn(f"{name}: no particles found: nothing stands out of the noise; check exposure, --dark and --mask")
-    elif unexplained > LARGEST_UNEXPLAINED:
-        console.warn(
-            f"{name}: {count or 'no'} particles found, and {unexplained:.0%} of the light is not explained by them: "
-            "check the calibration (refine-calibration), particle_diameter_mm, --dark, --background and the volume"
-        )
+    if unexplained > LARGEST_UNEXPLAINED:
+        return [
+            Notice(
+                "light-unexplained",
+                name,
+                f"{count or 'no'} particles found, and {unexplained:.0%} of the light is not explained by them, at "
+                f"most {LARGEST_UNEXPLAINED:.0%} of a good image's",
+                "check the calibration (refine-calibration), particle_diameter_mm, --dark, --background and the volume",
+                unexplained,
+                f"at most {LARGEST_UNEXPLAINED:g}",
+            )
+        ]
+    if count:
+        return []
+    text = "no particles found: nothing stands out of the noise"
+    return [Notice("no-particles", name, text, "check exposure, --dark and --mask", 0.0, "some")]
 
 
 def what_is_left(frame: Frame, found: Particles) -> NDArray[np.float64]:

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lfpiv_cli.console import Console
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files.config import Config, carried_config
 from lfpiv_cli.files.particle_file import TRACKS_FORMAT, TRAJECTORIES_FORMAT, Points
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.flow.field import MM_TO_M, VectorField
 from lfpiv_cli.flow.from_tracks import Paths, WindowGrid, vectors_from_paths
-from lfpiv_cli.interface.notices import NOTICES
+from lfpiv_cli.interface.notices import warn_of
+from lfpiv_cli.notice import Notice
 from lfpiv_cli.scale import Scale
 from lfpiv_cli.tracks.sequences import SHORTEST, follow, scatter_in, states_at
 from lfpiv_cli.tracks.tracking import FEWEST_OF_FIT, SEARCH_LENSES, Tracks
@@ -69,7 +69,7 @@ def track(
     ensure_particles(counts, names)
     chosen = tracking_of(settings, search_voxel, shortest, len(particles), names[0])
     found = tracked(particles, settings, chosen, record("track", settings.resolved() | chosen.told(), {}))
-    warn_of_few(counts, names, found, NOTICES)
+    warn_of(few_notices(counts, names, found))
     return found
 
 
@@ -152,24 +152,56 @@ def ensure_particles(counts: Sequence[int], names: Sequence[str]) -> None:
         raise InputError(f"{', '.join(empty)}: no particles; tracks need some in two frames at least")
 
 
-def warn_of_few(counts: Sequence[int], names: Sequence[str], found: Tracked, console: Console) -> None:
-    """Say which frames hold few particles or none, and whether any could be followed."""
-    fullest, doubts = max(counts), []
-    empty = [name for name, count in zip(names, counts, strict=True) if not count]
-    if empty:
-        doubts.append(f"no particles in {', '.join(empty)}: no track passes there")
-    doubts += [
-        f"{name} holds {count} particles, another frame {fullest}, most of which have no partner: compare exposure, "
-        "mask and background of the images"
-        for name, count in zip(names, counts, strict=True)
+def few_notices(counts: Sequence[int], names: Sequence[str], found: Tracked) -> list[Notice]:
+    """Return which frames hold few particles or none, and whether any could be followed."""
+    fullest, named = max(counts), list(zip(names, counts, strict=True))
+    notices = [
+        Notice(
+            "frame-without-particles",
+            name,
+            "there are no particles in it: no track passes there",
+            "compare exposure, mask and background of the images, or leave the frame out",
+            0.0,
+            "some",
+        )
+        for name, count in named
+        if not count
+    ]
+    notices += [
+        Notice(
+            "frame-with-few-particles",
+            name,
+            f"holds {count} particles, another frame {fullest}, most of which have no partner",
+            "compare exposure, mask and background of the images",
+            float(count),
+            f"at least {ONE_SIDED * fullest:g}",
+        )
+        for name, count in named
         if 0 < count < ONE_SIDED * fullest
     ]
     if fullest < FEW:
-        doubts.append(f"{fullest} particles at most in a frame: below {FEW} neighbours do not tell wrong links")
+        notices.append(
+            Notice(
+                "few-particles",
+                names[0],
+                f"{fullest} particles at most in a frame: below {FEW} neighbours do not tell wrong links",
+                "judge the links by themselves, or find more particles",
+                float(fullest),
+                f"at least {FEW}",
+            )
+        )
     if not found.summary["tracks"]:
-        doubts.append("no tracks: check the order of the frames and how far particles are sought (--search)")
-    for doubt in doubts:
-        console.warn(doubt)
+        notices.append(
+            Notice(
+                "no-tracks",
+                names[0],
+                "no tracks were found from it to the next frame",
+                "check the order of the frames and how far particles are sought (--search)",
+                0.0,
+                "some",
+            )
+        )
+    return notices
 
 
 def settings_of(frames: Sequence[Points], names: Sequence[str]) -> Config:

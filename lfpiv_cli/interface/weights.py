@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,9 @@ from lfpiv_cli.files.provenance import record
 from lfpiv_cli.files.sections import WeightsSection
 from lfpiv_cli.files.weights_file import WeightsFile
 from lfpiv_cli.grid import Grid
-from lfpiv_cli.interface.notices import NOTICES
+from lfpiv_cli.interface.notices import SILENT, warn_of
+from lfpiv_cli.interface.weights_checks import check_rig, rig_notices
+from lfpiv_cli.notice import Notice
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.optics.polynomial_rays import PolynomialRays
@@ -27,11 +30,12 @@ from lfpiv_cli.weights.operators import FactorisedOperator
 from lfpiv_cli.weights.rays import RayCount, count_columns
 from lfpiv_cli.weights.scene import Source
 
-# Said where the voxels were left to the program.
+# Told where the voxels were left to the program, and where the axes do not separate.
 VOXELS_CHOSEN = (
     "voxels of {:.3g} x {:.3g} x {:.3g} mm were chosen: a third of a microlens wide, because particles lock to "
     "wider ones and their motion in depth is lost, and six times as deep, as fine as the views tell depths apart"
 )
+ON_DEMAND = "array or rays do not separate into axes; columns are made on demand, for what is lit"
 # Below this share of its light on the sensor a voxel counts as out of view.
 LEAST_SEEN = 0.01
 # Half an hour on two cores; a core counts about four million rays a second.
@@ -67,33 +71,74 @@ def build_weights(rig: Config, calibration: Calibration | None = None, **setting
         The rig or the settings are not possible, or need a calibration that is not there.
     """
     chosen = rig.overridden("weights", **settings)
-    return weights_of(chosen, calibration, record("build-weights", chosen.resolved(), {}), NOTICES).behind_vignetting()
+    plan = plan_of(chosen, calibration)
+    found = weights_of(plan, record("build-weights", chosen.resolved(), {}), SILENT)
+    warn_of(plan.notices)
+    return found.behind_vignetting()
 
 
-def weights_of(
-    settings: Config, found: Calibration | None, provenance: dict[str, Any], console: Console
-) -> WeightsFile:
-    """Return the weights of the configured volume, for the calibrated camera where there is a calibration."""
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """Weights that are to be made.
+
+    Attributes
+    ----------
+    settings, found : the config, and the calibration or None
+    camera : calibrated, in the frame that the weights work in
+    reference, grid : the origin of the volume's coordinates, and the volume, z from the focal point
+    padding : voxels (x, y, z) solved for beyond each side of it
+    source : how rays are found
+    notices : what speaks against the weights
+    """
+
+    settings: Config
+    found: Calibration | None
+    camera: Camera
+    reference: Reference
+    grid: Grid
+    padding: tuple[int, int, int]
+    source: Source
+    notices: list[Notice]
+
+
+def plan_of(settings: Config, found: Calibration | None) -> Plan:
+    """Return what is to be made for the configured volume, for the calibrated camera where there is a calibration.
+
+    Raises
+    ------
+    ConfigError, InputError
+        Rig and settings are not possible, or need another calibration.
+    """
+    check_rig(settings, found)
     camera = settings.camera_model()
     if found:
         camera = found.camera(camera)
     reference = _reference(settings, found)
     grid = settings.grid(reference)
+    padding = settings.reconstruction.padding_voxel or default_padding(camera, settings.media_model(), grid)
+    source = ray_source(settings, found)
+    notices = [
+        *rig_notices(settings, found, camera, source, grid),
+        *_view_notices(*seen_share(camera, source, grid), grid),
+        *_reach_notices(settings, found, grid),
+    ]
+    return Plan(settings, found, camera, reference, grid, padding, source, notices)
+
+
+def weights_of(plan: Plan, provenance: dict[str, Any], console: Console) -> WeightsFile:
+    """Return the weights of a plan."""
+    settings, camera, grid, found = plan.settings, plan.camera, plan.grid, plan.found
     if settings.volume.size_mm is not None:
-        console.warn(VOXELS_CHOSEN.format(*grid.spacing_mm))
-    media = settings.media_model()
-    padding = settings.reconstruction.padding_voxel or default_padding(camera, media, grid)
-    source = ray_source(settings, found, grid, console)
-    _judge_view(*seen_share(camera, source, grid), grid, console)
-    operator = make_operator(settings.weights, camera, source, grid.padded(padding), console)
-    traced = isinstance(source, ObjectSpace) and isinstance(operator, FactorisedOperator)
-    bend = scene_distortion(camera, media, grid) if traced else None
-    weights = Weights(grid, padding, operator, camera.column_axis, found, bend)
+        console.say(VOXELS_CHOSEN.format(*grid.spacing_mm))
+    operator = make_operator(settings.weights, camera, plan.source, grid.padded(plan.padding), console)
+    traced = isinstance(plan.source, ObjectSpace) and isinstance(operator, FactorisedOperator)
+    bend = scene_distortion(camera, settings.media_model(), grid) if traced else None
+    weights = Weights(grid, plan.padding, operator, camera.column_axis, found, bend)
     vignetting = found.vignetting() if found else None
-    return WeightsFile(weights, camera, reference, provenance, vignetting)
+    return WeightsFile(weights, camera, plan.reference, provenance, vignetting)
 
 
-def ray_source(settings: Config, found: Calibration | None, grid: Grid, console: Console) -> Source:
+def ray_source(settings: Config, found: Calibration | None) -> Source:
     """Return how rays are found: traced through the configured object space, or as a calibration fitted them.
 
     Raises
@@ -107,16 +152,33 @@ def ray_source(settings: Config, found: Calibration | None, grid: Grid, console:
             "weights.method: dlfc needs a --calibration from boards at several depths: calibrate-snapshot with --board "
             "and --depth-mm, repeated in pairs"
         )
-    fit = found.ray_fit
+    return found.ray_fit.rays
+
+
+def _reach_notices(settings: Config, found: Calibration | None, grid: Grid) -> list[Notice]:
+    """Return where a volume reaches far beyond the boards that its rays were fitted to."""
+    if settings.weights.method != "dlfc" or found is None or found.ray_fit is None:
+        return []
+    fit, notices = found.ray_fit, []
     lateral = fit.reach_mm if settings.camera_model().column_axis == "x" else fit.reach_mm[:, ::-1]
     for axis, (low, high) in enumerate([*lateral.T, (fit.depths_mm.min(), fit.depths_mm.max())]):
-        beyond = max(low - grid.bounds_mm(axis)[0], grid.bounds_mm(axis)[1] - high)
-        if beyond > FARTHEST_BEYOND * (high - low):
-            console.warn(
-                f"the volume reaches {beyond:.3g} mm beyond the dots along {'xyz'[axis]}, where the fitted rays "
-                "are a guess"
+        beyond, most = (
+            max(low - grid.bounds_mm(axis)[0], grid.bounds_mm(axis)[1] - high),
+            FARTHEST_BEYOND * (high - low),
+        )
+        if beyond > most:
+            notices.append(
+                Notice(
+                    "beyond-boards",
+                    "volume",
+                    f"reaches {beyond:.3g} mm beyond the dots along {'xyz'[axis]}, at most {most:.3g} mm without harm: "
+                    "the fitted rays are a guess there",
+                    "a smaller volume, or boards that reach further",
+                    float(beyond),
+                    f"at most {most:.3g} mm",
+                )
             )
-    return fit.rays
+    return notices
 
 
 def make_operator(
@@ -131,7 +193,7 @@ def make_operator(
     if chosen.sampling == "exact" or isinstance(source, PolynomialRays):
         operator = operator_of(camera, source, grid)
         if isinstance(operator, OnDemandOperator):
-            console.warn("array or rays do not separate into axes; columns are made on demand, for what is lit")
+            console.say(ON_DEMAND)
         return operator
     layout = OnDemandOperator(camera, source, grid)
     voxels, count = math.prod(layout.shape), RayCount(chosen.points, chosen.rays_per_point)
@@ -164,11 +226,26 @@ def _reference(settings: Config, found: Calibration | None) -> Reference:
     return Reference(name, found.mid_plane_z_mm)
 
 
-def _judge_view(smallest: float, largest: float, grid: Grid, console: Console) -> None:
-    """Refuse a volume that the sensor does not see and warn of one that it sees in part."""
+def _view_notices(smallest: float, largest: float, grid: Grid) -> list[Notice]:
+    """Return whether the sensor sees a volume only in part, by the shares of its voxels' light that it sees.
+
+    Raises
+    ------
+    ConfigError : the sensor sees none of it
+    """
     if largest < LEAST_SEEN:
         bounds = [grid.bounds_mm(axis) for axis in range(3)]
         spans = ", ".join(f"{axis} {low:.4g} to {high:.4g}" for axis, (low, high) in zip("xyz", bounds, strict=True))
         raise ConfigError(f"volume: none of it ({spans} mm) lies in the camera's view")
-    if smallest < LEAST_SEEN:
-        console.warn("a part of the volume lies outside the camera's view; nothing will be found there")
+    if smallest >= LEAST_SEEN:
+        return []
+    return [
+        Notice(
+            "volume-out-of-view",
+            "volume",
+            "a part of it lies outside the camera's view, where nothing will be found",
+            "a smaller volume, or another centre_mm",
+            float(smallest),
+            f"at least {LEAST_SEEN:g} of each voxel's light on the sensor",
+        )
+    ]

@@ -106,6 +106,11 @@ class Camera:
         return 1.0 + self.microlens_distance_mm / self.image_distance_mm
 
     @property
+    def lens_image_width(self) -> float:
+        """Diameter of a lens image over the pitch of the lenses: how the two f-numbers compare, 1 where they match."""
+        return self.microlens_distance_mm / self.image_distance_mm * self.aperture_mm / float(self.lattice.pitch.mean())
+
+    @property
     def sensor_centre_px(self) -> NDArray[np.float64]:
         """Where the optical axis meets the sensor: (column, row)."""
         return np.array([(self.columns - 1) / 2, (self.rows - 1) / 2])

@@ -11,9 +11,9 @@ from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.calibration_file import read_calibration
 from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.inputs import given
-from lfpiv_cli.files.provenance import record
+from lfpiv_cli.files.provenance import record, with_warnings
 from lfpiv_cli.files.weights_file import write_weights
-from lfpiv_cli.interface.weights import weights_of
+from lfpiv_cli.interface.weights import plan_of, weights_of
 from lfpiv_cli.names import Method, Refraction, Sampling
 
 
@@ -49,8 +49,10 @@ def build_weights(
     ensure_writable(output, overwrite, inputs.values())
     settings = load_config(config).overridden_by("weights", options)
     found = read_calibration(options.calibration) if options.calibration else None
-    provenance = record("build-weights", settings.resolved(), inputs)
-    content = weights_of(settings, found, provenance, console)
+    plan = plan_of(settings, found)
+    console.warn(plan.notices)
+    provenance = with_warnings(record("build-weights", settings.resolved(), inputs), plan.notices)
+    content = weights_of(plan, provenance, console)
     write_weights(output, content, overwrite)
     weights = content.weights
     return {

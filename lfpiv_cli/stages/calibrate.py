@@ -16,7 +16,8 @@ from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.pictures import ensure_drawing, write_picture
 from lfpiv_cli.files.provenance import record as provenance_record
-from lfpiv_cli.interface.calibration import calibration_of, ensure_pictures, photographs
+from lfpiv_cli.files.provenance import with_warnings
+from lfpiv_cli.interface.calibration import calibration_notices, calibration_of, ensure_pictures, photographs
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.reconstruction.images import light
 
@@ -67,8 +68,10 @@ def calibrate_snapshot(
     pictures = photographs(
         [frames[name] for name in whites], [frames[name] for name in boards], frames.get("dark"), depth_mm
     )
-    calibration = calibration_of(settings, pictures, console)
-    record = provenance_record("calibrate-snapshot", settings.resolved(), inputs)
+    calibration = calibration_of(settings, pictures)
+    notices = calibration_notices(settings, pictures, calibration)
+    console.warn(notices)
+    record = with_warnings(provenance_record("calibrate-snapshot", settings.resolved(), inputs), notices)
     write_calibration(output, calibration, record, overwrite)
     if picture:
         from lfpiv_cli.calibration.picture import calibration_figure

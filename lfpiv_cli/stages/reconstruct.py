@@ -20,11 +20,12 @@ from lfpiv_cli.files.batch import Frame, Target, frames_beside, frames_of, outpu
 from lfpiv_cli.files.config import Config, carried_config
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, write_points
-from lfpiv_cli.files.provenance import record
+from lfpiv_cli.files.provenance import record, with_warnings
 from lfpiv_cli.files.weights_file import open_weights
 from lfpiv_cli.interface import particles
 from lfpiv_cli.interface.reconstruction import Bench, Progress, bench_of, volume_of
 from lfpiv_cli.names import Pairing, Start
+from lfpiv_cli.notice import Notice
 from lfpiv_cli.particles.search import Particles
 from lfpiv_cli.reconstruction.images import Image
 from lfpiv_cli.reconstruction.registry import SolverName
@@ -125,7 +126,7 @@ def reconstruct(
                 if not options.keep_going:
                     raise
                 failures.append(str(error))
-                console.warn(str(error))
+                console.warn([Notice("frame-failed", frames[number].stem, str(error), "leave it out, or mend it")])
     if failures:
         raise PartialError(f"{len(failures)} of {len(frames)} frames failed, the first because {failures[0]}")
     found = [outcome.particles for outcome in outcomes if outcome.particles is not None]
@@ -193,6 +194,8 @@ def _write_particles(
 ) -> Outcome:
     """Write the particles found behind a frame and what they leave of it."""
     points = particles.points_of(bench, frame, found, target.record)
+    notices = particles.light_notices(points, target.path.name)
+    console.warn(notices)
     left = particles.what_is_left(frame, found)
     # Made again whenever the particles are: an interrupted batch may have left one without them.
     image_files.write_tiff(residual_path(target.path), left.astype(np.float32), overwrite=True)
@@ -202,11 +205,10 @@ def _write_particles(
         points.position_mm,
         points.arrays,
         points.reference,
-        provenance=target.record,
+        provenance=with_warnings(target.record, notices),
         attributes=points.attributes,
         overwrite=overwrite,
     )
-    particles.warn_of_unexplained(points, str(target.path), console)
     return Outcome(points.attributes["residual"], points.attributes["excluded_pixels"], len(points.position_mm))
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,16 +13,16 @@ from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, read_points, write_points
-from lfpiv_cli.files.provenance import record
+from lfpiv_cli.files.provenance import record, with_warnings
 from lfpiv_cli.flow.field import REJECTED
 from lfpiv_cli.interface.tracks import (
     Tracked,
     ensure_frames,
     ensure_particles,
+    few_notices,
     settings_of,
     tracked,
     tracking_of,
-    warn_of_few,
 )
 
 ROLES_OF_TWO = ["particles_a", "particles_b"]
@@ -68,9 +68,10 @@ def track_particles(
     counts = [len(frame.position_mm) for frame in frames]
     ensure_particles(counts, names)
     chosen = tracking_of(settings, options.search_voxel, options.shortest, len(frames), names[0])
-    provenance = record("track", settings.resolved() | chosen.told(), inputs)
-    found = tracked(frames, settings, chosen, provenance)
-    warn_of_few(counts, names, found, console)
+    found = tracked(frames, settings, chosen, record("track", settings.resolved() | chosen.told(), inputs))
+    notices = few_notices(counts, [path.name for path in particles], found)
+    console.warn(notices)
+    provenance = with_warnings(found.points.provenance, notices)
     write_points(
         output,
         found.format_name,
@@ -81,7 +82,7 @@ def track_particles(
         attributes=found.points.attributes,
         overwrite=overwrite,
     )
-    return found.summary | _write_grids(grids, found, overwrite)
+    return found.summary | _write_grids(grids, found, provenance, overwrite)
 
 
 def grid_paths(output: Path, intervals: int) -> list[Path]:
@@ -94,15 +95,15 @@ def _roles(frames: int) -> list[str]:
     return ROLES_OF_TWO if frames == 2 else [f"particles_{number:04d}" for number in range(frames)]
 
 
-def _write_grids(grids: Sequence[Path], found: Tracked, overwrite: bool) -> dict[str, Any]:
+def _write_grids(
+    grids: Sequence[Path], found: Tracked, provenance: Mapping[str, Any], overwrite: bool
+) -> dict[str, Any]:
     """Write the vectors of each interval; return how many there are."""
     if not grids:
         return {}
     summary = {"vectors": 0, "rejected": 0}
     for target, field in zip(grids, found.vectors(), strict=True):
-        vtkhdf.write_vectors(
-            target, field, found.points.reference, provenance=found.points.provenance, overwrite=overwrite
-        )
+        vtkhdf.write_vectors(target, field, found.points.reference, provenance=provenance, overwrite=overwrite)
         summary["vectors"] += field.flag.size
         summary["rejected"] += int(np.count_nonzero(field.flag >= REJECTED))
     return summary

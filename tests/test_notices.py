@@ -1,0 +1,276 @@
+"""Warnings: their one form, on the terminal, in JSON, in files and in Python; and planted faults that must be told."""
+
+from __future__ import annotations
+
+import json
+import re
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import lfpiv_cli as lf
+from lfpiv_cli.calibration.sheet import check_f_numbers, f_number_notices, image_distance_notices, sheet_fit
+from lfpiv_cli.calibration.transmission import lens_image_width
+from lfpiv_cli.calibration.white_checks import check_residual, residual_share
+from lfpiv_cli.cli import cli
+from lfpiv_cli.console import Console
+from lfpiv_cli.errors import ConfigError, InputError
+from lfpiv_cli.files.batch import Target, pending
+from lfpiv_cli.files.calibration_file import read_calibration
+from lfpiv_cli.files.config import Config, load_config
+from lfpiv_cli.files.images import write_tiff
+from lfpiv_cli.files.provenance import earlier_record, with_warnings
+from lfpiv_cli.interface.weights import plan_of
+from lfpiv_cli.notice import Notice
+from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.media import Media, Window
+from lfpiv_cli.optics.microlenses import Lattice
+from lfpiv_cli.optics.paraxial import refraction_error_mm, sine_error_mm
+
+ROOT = Path(__file__).parent.parent
+SHAPE = (200, 240)
+PITCH_PX = 14.2
+RIG = """
+camera:
+  microlenses: {pitch_mm: 0.071, f_number: 8}
+  sensor:      {pixel_um: 5.0, columns: 240, rows: 200}
+"""
+NOTICE = Notice("no-tracks", "a.vtkhdf", "no tracks", "look", 0.0, "some")
+
+
+def white(
+    radius_px: float = 6.5, jitter_px: float = 0.0, unevenness: float = 0.0, lit: float = 1.0
+) -> NDArray[np.uint16]:
+    """Return a white image of discs whose places and brightness differ at random, on a share of the columns."""
+    lattice = Lattice.regular(PITCH_PX, "square", np.deg2rad(0.7), (117.3, 98.4))
+    row, column = np.indices(SHAPE)
+    place = np.stack([column, row], axis=-1).astype(float)
+    index = lattice.nearest(place)
+    lens = index - index.min(axis=(0, 1))
+    rng = np.random.default_rng(3)
+    moved = rng.normal(0.0, jitter_px, (*lens.max(axis=(0, 1)) + 1, 2))
+    brightness = np.clip(rng.normal(1.0, unevenness, moved.shape[:2]), 0.3, 2.0)
+    distance = np.linalg.norm(place - lattice.points(index) - moved[lens[..., 0], lens[..., 1]], axis=-1)
+    disc = np.clip(radius_px + 0.5 - distance, 0.0, 1.0) * (np.abs(column - 120) < 0.5 * lit * SHAPE[1])
+    image = 200.0 + 2e4 * brightness[lens[..., 0], lens[..., 1]] * disc
+    return (image + rng.normal(0.0, 50.0, SHAPE)).astype(np.uint16)
+
+
+def rig_in(folder: Path) -> Path:
+    (folder / "rig.yaml").write_text(RIG)
+    return folder / "rig.yaml"
+
+
+def codes(picture: NDArray[np.uint16], folder: Path) -> list[str]:
+    """Return the codes of what is warned of a white image, from Python."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        lf.calibrate(picture, None, lf.load_rig(rig_in(folder)))
+    assert all(each.filename == __file__ for each in caught)
+    return [each.message.notice.code for each in caught if isinstance(each.message, lf.LfpivWarning)]
+
+
+def test_documents_list_all_codes() -> None:
+    made = set()
+    for path in (ROOT / "lfpiv_cli").rglob("*.py"):
+        made |= set(re.findall(r'\bNotice\(\s*"([^"]*)"', path.read_text(encoding="utf-8")))
+    page = (ROOT / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
+    listed = re.findall(r"^\| `([a-z-]+)` \|", page.split("## Warnings")[1].split("\n## ")[0], re.MULTILINE)
+    assert sorted(listed) == sorted(made)
+
+
+def test_a_warning_is_on_the_terminal_in_json_and_in_the_file(tmp_path: Path, capsys) -> None:
+    write_tiff(tmp_path / "white.tif", white(radius_px=2.5), overwrite=False)
+    output = tmp_path / "c.h5"
+    command = ["calibrate-snapshot", rig_in(tmp_path), "--white", tmp_path / "white.tif", "-o", output, "--overwrite"]
+
+    def told(*options: str) -> Any:
+        cli.main([*(str(word) for word in command), *options], standalone_mode=False)
+        return capsys.readouterr()
+
+    printed = told("--json")
+    (warning,) = json.loads(printed.out)["warnings"]
+    assert set(warning) == {"code", "about", "text", "remedy", "measured", "expected"}
+    assert warning["code"] == "white-stopped-down"
+    assert warning["measured"] == pytest.approx(5.0 / PITCH_PX, rel=0.1)
+    line = f"lfpiv: warning: {warning['about']}: {warning['text']}; {warning['remedy']} [white-stopped-down]\n"
+    assert printed.err == line
+    assert line in told().err
+    assert told("-q").err == ""
+    record = earlier_record(output)
+    assert record is not None
+    assert record["warnings"] == [warning]
+    assert read_calibration(output).transmission is None
+    cli.main(["info", str(output), "--json"], standalone_mode=False)
+    (recorded,) = json.loads(capsys.readouterr().out)["warnings_recorded"]
+    assert recorded == f"calibrate-snapshot: {line.removeprefix('lfpiv: warning: ').strip()}"
+
+
+def test_a_result_that_was_warned_of_is_not_made_again(tmp_path: Path) -> None:
+    target = Target(tmp_path / "a.vtkhdf", {"command": "track"})
+    target.path.touch()
+    made = with_warnings(target.record, [NOTICE])
+    assert made["warnings"] == [NOTICE.record()]
+    assert with_warnings(target.record, []) == target.record
+    assert pending([target], [], False, True, lambda path: made) == []
+
+
+def test_a_console_collects_what_it_warns_of(capsys) -> None:
+    warned: list[Notice] = []
+    Console(quiet=True, warned=warned).warn([NOTICE])
+    assert warned == [NOTICE]
+    assert capsys.readouterr().err == ""
+    Console(only_warnings=True).warn([NOTICE])
+    Console(only_warnings=True, verbose=True).detail("more")
+    assert capsys.readouterr().err == "lfpiv: warning: a.vtkhdf: no tracks; look [no-tracks]\n"
+
+
+@pytest.mark.parametrize(
+    ("fault", "code"),
+    [
+        ({}, None),
+        ({"radius_px": 4.6}, None),
+        ({"radius_px": 2.5}, "white-stopped-down"),
+        ({"jitter_px": 0.03 * PITCH_PX}, "lattice-residual"),
+        ({"unevenness": 0.15}, "white-not-uniform"),
+        ({"lit": 0.4}, "lattice-incomplete"),
+    ],
+)
+def test_faults_of_a_white_image_are_told(fault: dict[str, float], code: str | None, tmp_path: Path) -> None:
+    assert codes(white(**fault), tmp_path) == ([] if code is None else [code])
+
+
+def test_what_is_no_lattice_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="off a lattice by .* not a white image"):
+        codes(white(jitter_px=0.09 * PITCH_PX), tmp_path)
+
+
+def test_width_of_lens_images() -> None:
+    lattice = Lattice.regular(PITCH_PX, "square", np.deg2rad(0.7), (117.3, 98.4))
+    for radius in (2.5, 4.0, 6.0):
+        # a disc's rim is a pixel wide, half of it beyond the radius
+        found = lens_image_width(white(radius).astype(np.float32) - 200.0, lattice)
+        assert found == pytest.approx(2.0 * radius / PITCH_PX, rel=0.03)
+
+
+def test_residual_that_is_refused_is_that_of_the_chosen_model(table2: Camera) -> None:
+    fit = replace(sheet_fit(table2), residual_px=np.full(2, 0.1), residual_affine_px=np.full(2, 2.0))
+    check_residual(replace(fit, cubic_used=True))
+    assert residual_share(fit) == pytest.approx(2.0 / fit.lattice_px.pitch[0])
+    with pytest.raises(InputError):
+        check_residual(fit)
+
+
+def fit_of(camera: Camera, stretch: float) -> Any:
+    """Return the sheet's lattice with another pitch, as one that was measured."""
+    fit = sheet_fit(camera)
+    lattice = replace(fit.lattice_px, basis=fit.lattice_px.basis * stretch)
+    return replace(fit, lattice_px=lattice, indices=np.zeros((100, 2), int), pitch_sigma_px=np.full(2, 1e-5))
+
+
+def test_lens_images_as_far_apart_as_the_lenses_say_nothing_is_off(table2: Camera) -> None:
+    # telecentric towards the array: no excess of the pitch
+    assert image_distance_notices(fit_of(table2, 1.0 / table2.micro_image_scale), table2) == []
+    assert image_distance_notices(fit_of(table2, 1.0), table2) == []
+    for stretch in (1.002, 0.99):
+        (notice,) = image_distance_notices(fit_of(table2, stretch), table2)
+        assert notice.code == "image-distance"
+
+
+def test_f_numbers_that_do_not_match(table2: Camera) -> None:
+    assert table2.lens_image_width == pytest.approx(1.0)
+    for factor, told in ((0.85, 0), (1.2, 0), (1.67, 1), (0.6, 1)):
+        camera = replace(table2, aperture_mm=factor * table2.aperture_mm)
+        check_f_numbers(camera)
+        assert len(f_number_notices(camera)) == told
+    for factor in (3.1, 0.3):
+        with pytest.raises(ConfigError, match="aperture_mm: the main lens is f/"):
+            check_f_numbers(replace(table2, aperture_mm=factor * table2.aperture_mm))
+
+
+def rig_of(folder: Path, *changes: tuple[str, str]) -> Config:
+    """Return the sample's rig, z from the focal point, with pieces of its text replaced."""
+    text = (ROOT / "configs" / "sample.yaml").read_text().replace("reference: mid_plane", "reference: focal_point")
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    (folder / "rig.yaml").write_text(text)
+    return load_config(folder / "rig.yaml")
+
+
+def test_the_sample_rig_is_fine(tmp_path: Path) -> None:
+    assert plan_of(rig_of(tmp_path), None).notices == []
+
+
+def test_pixels_of_another_unit_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"camera.sensor.pixel_um: is 0.0055: lens images would be .* px apart"):
+        rig_of(tmp_path, ("pixel_um: 5.5", "pixel_um: 0.0055"))
+    with pytest.raises(ConfigError, match="camera.sensor.pixel_um"):
+        rig_of(tmp_path, ("pixel_um: 5.5", "pixel_um: 55"))
+
+
+def test_weights_want_the_pitch_of_the_calibration(tmp_path: Path) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", lf.LfpivWarning)
+        calibration = lf.calibrate(white(), None, lf.load_rig(rig_in(tmp_path)))
+    with pytest.raises(InputError, match=r"14.2 px apart and 18.25 px by the data sheet"):
+        plan_of(rig_of(tmp_path), calibration)
+
+
+PAPERS_WINDOW = "{distance_mm: 98.0, thickness_mm: 2.0}"
+
+
+@pytest.mark.parametrize(
+    ("changes", "code"),
+    [
+        ([("aperture_mm: 25.0", "aperture_mm: 41.0")], "f-numbers"),
+        ([("shape_xyz: [30, 22, 40]", "shape_xyz: [60, 22, 40]")], "volume-out-of-view"),
+        # through 134 mm of water
+        ([("channel: {width_mm: 4.0, wall_mm: 2.0}", f"window: {PAPERS_WINDOW}")], "paraxial-refraction"),
+    ],
+)
+def test_faults_of_a_rig_are_told(changes: list[tuple[str, str]], code: str, tmp_path: Path) -> None:
+    (notice,) = plan_of(rig_of(tmp_path, *changes), None).notices
+    assert notice.code == code
+
+
+OBJECTIVE = """
+camera:
+  main_lens:   {magnification: -20.0, focal_length_mm: 10.0, aperture_mm: APERTURE}
+  microlenses: {f_number: F_NUMBER, pitch_mm: 0.1}
+  sensor:      {pixel_um: 5.5, columns: 600, rows: 448}
+media:   {air: 1.0, window: 1.0, fluid: 1.0}
+volume:  {shape_xyz: [10, 10, 10], voxel_mm: [0.005, 0.005, 0.01]}
+"""
+
+
+@pytest.mark.parametrize(("na", "told"), [(0.1, []), (0.4, ["paraxial-lens"]), (0.8, None)])
+def test_microscope_objectives(na: float, told: list[str] | None, tmp_path: Path) -> None:
+    aperture = 2.0 * 10.5 * np.tan(np.arcsin(na))
+    rig = OBJECTIVE.replace("APERTURE", f"{aperture:.4f}").replace("F_NUMBER", f"{210.0 / aperture:.4f}")
+    (tmp_path / "rig.yaml").write_text(rig)
+    if told is None:
+        with pytest.raises(ConfigError, match=r"NA 0\.80.* at most 1 may be"):
+            plan_of(load_config(tmp_path / "rig.yaml"), None)
+    else:
+        assert [each.code for each in plan_of(load_config(tmp_path / "rig.yaml"), None).notices] == told
+
+
+def test_refraction_error_is_the_papers_aberration(table2: Camera, water: Media, window: Window) -> None:
+    # 0.085 mm of apparent depth at the edge of an f/4 lens through 134 mm of water, under the rim's slope
+    error = refraction_error_mm(table2, water, window, np.zeros(1))
+    assert error == pytest.approx(0.085 * 12.5 / 200.0, rel=0.05)
+    assert refraction_error_mm(table2, Media(), None, np.array([-1.0, 0.0, 5.0])) < 1e-12
+    # not known what is before the fluid: less than with it
+    assert 0.0 < refraction_error_mm(table2, water, None, np.array([-5.0, 0.0])) < error
+
+
+def test_sine_error_is_that_of_two_rays(table2: Camera) -> None:
+    tangent = 12.5 / 200.0
+    sine = np.sin(np.arctan(tangent))
+    assert sine_error_mm(table2, Media(), np.array([-3.0, 2.0])) == pytest.approx(3.0 * (tangent - sine))
