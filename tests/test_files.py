@@ -513,16 +513,42 @@ def test_png(tmp_path: Path, bits: int) -> None:
     assert refused(lambda: read_image(path), "check sum")
 
 
-@pytest.mark.parametrize("kind", ["rgb", "palette", "miniswhite"])
+GREY = FRAMES[0].astype(np.uint8)
+# As other programs save a grey image: its channel three times, together or apart, an opaque one beside, or a palette.
+IN_COLOUR = {
+    "rgb": (np.stack([GREY] * 3, axis=-1), {"photometric": "rgb"}),
+    "apart": (np.stack([GREY] * 3), {"photometric": "rgb", "planarconfig": "separate"}),
+    "16 bits": (np.stack([FRAMES[0]] * 3, axis=-1), {"photometric": "rgb"}),
+    "opaque": (np.stack([GREY] * 3 + [np.full_like(GREY, 255)], axis=-1), {"photometric": "rgb", "extrasamples": [2]}),
+    "palette": (GREY, {"photometric": "palette", "colormap": np.tile(np.arange(256) * 257, (3, 1)).astype(np.uint16)}),
+}
+
+
+@pytest.mark.parametrize("kind", IN_COLOUR)
+def test_grey_saved_as_colour_is_read(tmp_path: Path, kind: str) -> None:
+    image, options = IN_COLOUR[kind]
+    tifffile.imwrite(tmp_path / "t.tif", image, **options)
+    grey = FRAMES[0] if kind == "16 bits" else GREY
+    np.testing.assert_array_equal(read_image(tmp_path / "t.tif", (40, 50)), grey)
+    if kind in ("rgb", "16 bits", "opaque"):
+        (tmp_path / "t.png").write_bytes(imagecodecs.png_encode(image))
+        np.testing.assert_array_equal(read_image(tmp_path / "t.png", (40, 50)), grey)
+
+
+@pytest.mark.parametrize("kind", ["rgb", "apart", "opaque", "palette", "miniswhite"])
 def test_colour_is_refused_with_a_hint(tmp_path: Path, kind: str) -> None:
-    image = FRAMES[0].astype(np.uint8)
-    options = {"colormap": np.zeros((3, 256), np.uint16)} if kind == "palette" else {}
-    if kind == "rgb":
-        image = np.stack([image] * 3, axis=-1)
-        (tmp_path / "t.png").write_bytes(cv2.imencode(".png", image)[1].tobytes())
+    image, options = IN_COLOUR.get(kind, (GREY, {"photometric": kind}))
+    if kind == "palette":
+        options = options | {"colormap": options["colormap"] // np.array([[1], [1], [2]], np.uint16)}
+    elif kind != "miniswhite":
+        image = image.copy()
+        # one pixel's blue, or how transparent it is
+        image[(2, 5, 7) if kind == "apart" else (5, 7, -1)] ^= 1
+    tifffile.imwrite(tmp_path / "t.tif", image, **options)
+    assert refused(lambda: read_image(tmp_path / "t.tif"), "save the sensor's raw image as greyscale")
+    if kind in ("rgb", "opaque"):
+        (tmp_path / "t.png").write_bytes(imagecodecs.png_encode(image))
         assert refused(lambda: read_image(tmp_path / "t.png"), "save the sensor's raw image as greyscale")
-    tifffile.imwrite(tmp_path / "t.tif", image, photometric=kind, **options)
-    assert refused(lambda: read_image(tmp_path / "t.tif"), kind.upper(), "save the sensor's raw image as greyscale")
 
 
 def test_another_size_is_refused_with_both(tmp_path: Path) -> None:

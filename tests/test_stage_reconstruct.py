@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -140,3 +141,40 @@ def test_iterations_end_where_the_config_says(tmp_path, stop, done):
     weights = build(tmp_path, ("iterations: 16", f"iterations: 6, {stop}"))
     run("reconstruct", weights, SAMPLE / "pair_a.tif", "--dark", SAMPLE / "dark.tif", "-o", tmp_path / "a.vtkhdf")
     assert len(open_volume(tmp_path / "a.vtkhdf").attributes["residual"]) == done + 1
+
+
+@pytest.mark.parametrize(("counts", "said"), [(0, "one value everywhere \\(0\\)"), (65535, "one value everywhere")])
+def test_a_frame_that_shows_nothing_is_refused(weights, frame, counts, said, tmp_path):
+    tifffile.imwrite(tmp_path / "nothing.tif", np.full_like(frame, counts))
+    with pytest.raises(InputError, match=f"nothing: the image has {said}"):
+        volume_of(weights, tmp_path / "nothing.tif", tmp_path / "v.vtkhdf")
+    assert not (tmp_path / "v.vtkhdf").exists()
+
+
+def test_a_frame_without_a_usable_pixel_is_refused(weights, frame, tmp_path):
+    mask = np.zeros(frame.shape, np.uint8)
+    tifffile.imwrite(tmp_path / "mask.tif", mask)
+    with pytest.raises(InputError, match="mask and dark image leave out all pixels"):
+        volume_of(weights, SAMPLE / "pair_a.tif", tmp_path / "v.vtkhdf", "--mask", tmp_path / "mask.tif")
+    # what the mask leaves is saturated
+    mask[:50] = 255
+    frame[:50] = 65535
+    tifffile.imwrite(tmp_path / "mask.tif", mask)
+    tifffile.imwrite(tmp_path / "a.tif", frame)
+    with pytest.raises(InputError, match="a: all pixels are saturated or left out"):
+        volume_of(weights, tmp_path / "a.tif", tmp_path / "v.vtkhdf", "--mask", tmp_path / "mask.tif")
+
+
+@pytest.mark.parametrize("fault", ["none", "noise", "noise less dark", "saturated"])
+def test_a_frame_of_noise_or_half_saturated_is_told(weights, frame, fault, tmp_path, rng, capsys):
+    dark = read_image(SAMPLE / "dark.tif")
+    if fault.startswith("noise"):
+        frame = np.rint(dark + rng.normal(0.0, 4.0, dark.shape)).astype(np.uint16)
+    elif fault == "saturated":
+        frame[:45] = 65535
+    tifffile.imwrite(tmp_path / "a.tif", frame)
+    options = () if fault == "noise" else ("--dark", SAMPLE / "dark.tif")
+    volume_of(weights, tmp_path / "a.tif", tmp_path / "v.vtkhdf", *options, "--json")
+    told = [each["code"] for each in json.loads(capsys.readouterr().out)["warnings"]]
+    assert told == {"none": [], "saturated": ["frame-saturated"]}.get(fault, ["frame-dark"])
+    assert [each["code"] for each in open_volume(tmp_path / "v.vtkhdf").provenance.get("warnings", [])] == told

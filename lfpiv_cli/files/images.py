@@ -1,6 +1,6 @@
 """Raw images in, images out: greyscale TIFF and PNG, refused rather than guessed where anything is odd.
 
-Images are float32 arrays `[row, column]` in counts.
+Images are float32 arrays `[row, column]` in counts. Colour is read where its channels are all the same.
 """
 
 from __future__ import annotations
@@ -28,9 +28,15 @@ Image = NDArray[np.float32]
 
 TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 PNG_START = b"\x89PNG\r\n\x1a\n"
-# Photometric interpretation of a greyscale TIFF whose zeros are black.
-BLACK_IS_ZERO = 1
-PNG_GREY = 0
+# Photometric interpretations: of a greyscale TIFF whose zeros are black, and of colours.
+BLACK_IS_ZERO, RGB, PALETTE = 1, 2, 3
+# Samples of a pixel by a PNG's colour type, once decoded: grey, colour, palette, and with transparency.
+PNG_SAMPLES = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}
+# TIFF's palettes hold 16-bit colours for indices of 8 bits.
+PALETTE_SHIFT = 8
+# Numbers of samples of which the last is the transparency, and how a TIFF says that its channels lie apart.
+TRANSPARENT_SAMPLES = (2, 4)
+SEPARATE = 2
 # The largest sensor sold has 151 million pixels; a header that declares more is wrong or hostile.
 MOST_PIXELS = 160_000_000
 # Without a sensor size to compare with, a header may declare this much whatever the file's size ...
@@ -165,13 +171,14 @@ def _decode_page(tiff: tifffile.TiffFile, number: int, shape: tuple[int, int] | 
     page = tiff.pages[number]
     if not isinstance(page, tifffile.TiffPage):
         raise InputError(f"page {number} cannot be decoded")
-    if page.samplesperpixel != 1 or page.photometric != BLACK_IS_ZERO or page.colormap is not None:
+    if page.photometric not in (BLACK_IS_ZERO, RGB, PALETTE) or (page.photometric == PALETTE) != _has_palette(page):
         kind = getattr(page.photometric, "name", page.photometric)
         raise InputError(f"page {number} is {kind} with {page.samplesperpixel} samples per pixel: {GREY_HINT}")
     if page.dtype is None or page.dtype.kind not in "uif":
         raise InputError(f"page {number} has {page.bitspersample} bits per pixel of an unknown kind")
     size = tiff.filehandle.size
-    _ensure_size(f"page {number}", (page.imagelength, page.imagewidth), page.dtype.itemsize, shape, size)
+    pixel_bytes = page.dtype.itemsize * page.samplesperpixel
+    _ensure_size(f"page {number}", (page.imagelength, page.imagewidth), pixel_bytes, shape, size)
     segments = math.prod(page.chunked)
     if not len(page.dataoffsets) == len(page.databytecounts) == segments:
         raise InputError(f"page {number} has {len(page.dataoffsets)} of its {segments} strips or tiles: {CUT}")
@@ -179,9 +186,39 @@ def _decode_page(tiff: tifffile.TiffFile, number: int, shape: tuple[int, int] | 
         if length == 0 or place + length > size:
             raise InputError(f"the data of page {number} ends at byte {place + length} of {size}: {CUT}")
     array = page.asarray(maxworkers=1)
-    if array.shape != (page.imagelength, page.imagewidth):
+    if page.samplesperpixel > 1 and page.planarconfig == SEPARATE:
+        array = np.moveaxis(array, 0, -1)
+    if array.shape[:2] != (page.imagelength, page.imagewidth):
         raise InputError(f"page {number} decodes to {array.shape}, it declares {page.imagelength, page.imagewidth}")
-    return _as_counts(array)
+    if page.colormap is not None:
+        array = np.moveaxis(page.colormap[:, array] >> PALETTE_SHIFT, 0, -1)
+    return _as_counts(_one_channel(array, f"page {number}"))
+
+
+def _has_palette(page: tifffile.TiffPage) -> bool:
+    """Return whether a page holds indices of 8 bits into colours."""
+    return page.colormap is not None and page.samplesperpixel == 1 and page.dtype == np.uint8
+
+
+def _one_channel(array: NDArray[Any], what: str) -> NDArray[Any]:
+    """Return the channel that all channels of an image (rows, columns[, samples]) are alike.
+
+    A last one of two or four is how transparent pixels are; it must be the same everywhere.
+
+    Raises
+    ------
+    InputError
+    """
+    if array.ndim == 2:
+        return array
+    samples = array.shape[2]
+    colours = array[..., : samples - (samples in TRANSPARENT_SAMPLES)]
+    first = np.broadcast_to(colours[..., :1], colours.shape)
+    if not np.array_equal(colours, first, equal_nan=colours.dtype.kind == "f"):
+        raise InputError(f"{what} is in colour, its {colours.shape[2]} channels differ: {GREY_HINT}")
+    if samples in TRANSPARENT_SAMPLES and np.ptp(array[..., -1]) != 0:
+        raise InputError(f"{what} has pixels of different transparency: {GREY_HINT}")
+    return array[..., 0]
 
 
 def _read_png(path: Path, shape: tuple[int, int] | None) -> Image:
@@ -189,13 +226,13 @@ def _read_png(path: Path, shape: tuple[int, int] | None) -> Image:
     try:
         content = path.read_bytes()
         columns, rows, bits, colour = _png_header(content)
-        if colour != PNG_GREY:
+        if colour not in PNG_SAMPLES:
             raise InputError(f"is a PNG of colour type {colour}: {GREY_HINT}")
-        _ensure_size("the image", (rows, columns), 1 if bits <= 8 else 2, shape, len(content))
+        _ensure_size("the image", (rows, columns), PNG_SAMPLES[colour] * (1 if bits <= 8 else 2), shape, len(content))
         array = imagecodecs.png_decode(content)
-        if array.shape != (rows, columns):
+        if array.shape[:2] != (rows, columns):
             raise InputError(f"decodes to {array.shape}, it declares {rows, columns}")
-        return _as_counts(array)
+        return _as_counts(_one_channel(array, "the image"))
     except LfpivError as error:
         raise type(error)(f"{path}: {error}") from error
     except Exception as error:  # as in _open_tiff

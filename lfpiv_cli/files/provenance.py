@@ -70,8 +70,8 @@ def record(command: str, config: Mapping[str, Any] | None, inputs: Mapping[str, 
 
 
 def with_warnings(made: Mapping[str, Any], notices: Iterable[Notice]) -> dict[str, Any]:
-    """Return a record with what was warned of when the result was made; as it is where there was nothing."""
-    warnings = [without_nan(notice.record()) for notice in notices]
+    """Return a record with what, besides what it holds, was warned of when the result was made."""
+    warnings = [*made.get("warnings", ()), *(without_nan(notice.record()) for notice in notices)]
     return dict(made) | ({"warnings": warnings} if warnings else {})
 
 

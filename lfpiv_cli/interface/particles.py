@@ -16,7 +16,13 @@ from lfpiv_cli.files.provenance import record
 from lfpiv_cli.files.weights_file import WeightsFile
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.interface.notices import warn_of
-from lfpiv_cli.interface.reconstruction import Bench, bench_of, given_picture, picture_for
+from lfpiv_cli.interface.reconstruction import (
+    Bench,
+    bench_of,
+    given_picture,
+    judged_frame,
+    picture_for,
+)
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.particles.neighbour_frames import second_pass
@@ -81,6 +87,7 @@ def find_particles(
     bench = bench_of(searchable(weights, chosen), chosen, given_picture(weights, dark), given_picture(weights, mask))
     level = given_picture(weights, background)
     raws = [picture_for(weights, each) for each in (image, *neighbours)]
+    notices = judged_frame(bench, raws[0], light(raws[0], bench.dark, level), "the image")
     frame, *others = (frame_of(bench, raw, light(raw, bench.dark, level)) for raw in raws)
     if others:
         own, *beside = (find_first(bench, each) for each in (frame, *others))
@@ -88,7 +95,7 @@ def find_particles(
     else:
         found = find(bench, frame)
     points = points_of(bench, frame, found, record("find_particles", chosen.resolved(), {}))
-    warn_of(light_notices(points, "the image"))
+    warn_of([*notices, *light_notices(points, "the image")])
     return points
 
 

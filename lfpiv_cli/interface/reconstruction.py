@@ -14,12 +14,20 @@ from lfpiv_cli.files.config import Config, carried_config
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.files.vtkhdf import Volume
 from lfpiv_cli.files.weights_file import WeightsFile
+from lfpiv_cli.interface.notices import warn_of
+from lfpiv_cli.notice import Notice
 from lfpiv_cli.reconstruction.equations import Normalisers, Operator, normalisers
 from lfpiv_cli.reconstruction.images import Image, Mask, as_if_lit, defects, filled, light, saturated, touched
 from lfpiv_cli.reconstruction.solvers import Reconstruction
 from lfpiv_cli.reconstruction.solvers import reconstruct as solve
+from lfpiv_cli.robust import HALF_NORMAL_MEDIAN, MAD_TO_SIGMA
 
 Progress = Callable[[int], None]
+
+# A share of an image that reflections do not reach.
+LARGEST_SATURATED = 0.05
+# The brightest of some millions of pixels stands 5.2 standard deviations out of normal noise.
+NOISE_SIGMAS = 6.0
 
 
 def reconstruct(
@@ -69,6 +77,7 @@ def reconstruct(
     bench = bench_of(weights, chosen, given_picture(weights, dark), given_picture(weights, mask))
     raw = picture_for(weights, image)
     lit = light(raw, bench.dark, given_picture(weights, background))
+    warn_of(judged_frame(bench, raw, lit, "the image"))
     return volume_of(bench, raw, lit, record("reconstruct", chosen.resolved(), {}))
 
 
@@ -115,11 +124,18 @@ def bench_of(
     """Return what all frames share, given a dark image and a mask (rows, columns) that is 0 where nothing is believed.
 
     `with_sums` is False where no frame is going to be solved.
+
+    Raises
+    ------
+    InputError
+        No pixel is left.
     """
     weights = content.weights
     lasting = np.zeros(weights.image_shape, np.bool_) if dark is None else defects(dark)
     if mask is not None:
         lasting |= mask == 0.0
+    if lasting.all():
+        raise InputError("mask and dark image leave out all pixels; a mask is black only where nothing is believed")
     excluded = touched(lasting, weights.prepare) if lasting.any() else np.zeros(weights.image_shape, np.bool_)
     if weights.calibration is not None:
         excluded |= ~weights.calibration.rectification.inside
@@ -147,6 +163,56 @@ def volume_of(
         },
         provenance=dict(provenance),
     )
+
+
+def judged_frame(bench: Bench, raw: Image, lit: Image, name: str) -> list[Notice]:
+    """Return what speaks against a raw frame, given also with dark or background taken off (`lit`).
+
+    Raises
+    ------
+    InputError
+        It shows nothing at all: no pixel is usable, or it has one value everywhere.
+    """
+    if raw.min() == raw.max():
+        raise InputError(f"{name}: the image has one value everywhere ({raw.flat[0]:g}); it shows no particles")
+    unusable = bench.unusable(raw)
+    if unusable.all():
+        raise InputError(f"{name}: all pixels are saturated or left out; there is nothing to reconstruct from")
+    saturated_share, notices = float(np.mean(unusable & ~bench.lasting)), []
+    if saturated_share > LARGEST_SATURATED:
+        notices.append(
+            Notice(
+                "frame-saturated",
+                name,
+                f"{saturated_share:.0%} of its pixels are saturated and left out, at most {LARGEST_SATURATED:.0%} of a "
+                "good image's",
+                "less light or a shorter exposure; or correct reconstruction.saturation_counts",
+                saturated_share,
+                f"at most {LARGEST_SATURATED:g}",
+            )
+        )
+    used = lit[~unusable]
+    brightest, noise = float(used.max() - np.median(used)), _noise(used)
+    if brightest <= NOISE_SIGMAS * noise:
+        notices.append(
+            Notice(
+                "frame-dark",
+                name,
+                f"its brightest pixel is {brightest:.3g} counts above the others, with a noise of {noise:.3g}: no more "
+                "than noise makes",
+                "check light, exposure and the order of the frames",
+                brightest,
+                f"above {NOISE_SIGMAS * noise:.3g}",
+            )
+        )
+    return notices
+
+
+def _noise(counts: NDArray[np.float32]) -> float:
+    """Return at most the standard deviation of an image's noise: by what lies below 0, or around the median."""
+    noise = MAD_TO_SIGMA * float(np.median(np.abs(counts - np.median(counts))))
+    below = counts[counts < 0.0]
+    return min(noise, float(np.median(-below)) / HALF_NORMAL_MEDIAN) if below.size else noise
 
 
 def _solved(bench: Bench, image: Image, excluded: Mask, progress: Progress | None) -> Reconstruction:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, write_points
 from lfpiv_cli.files.provenance import record, with_warnings
 from lfpiv_cli.files.weights_file import open_weights
 from lfpiv_cli.interface import particles
-from lfpiv_cli.interface.reconstruction import Bench, Progress, bench_of, volume_of
+from lfpiv_cli.interface.reconstruction import Bench, Progress, bench_of, judged_frame, volume_of
 from lfpiv_cli.names import Pairing, Start
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.particles.search import Particles
@@ -117,6 +117,9 @@ def reconstruct(
         for number, future in ahead(read, needed):
             try:
                 pictures, target = future.result(), targets[number]
+                notices = judged_frame(bench, *pictures, frames[number].stem)
+                console.warn(notices)
+                target = replace(target, record=with_warnings(target.record, notices))
                 if as_particles:
                     frame = particles.frame_of(bench, *pictures)
                     outcomes.append(_write_particles(bench, target, frame, find(number, frame), overwrite, console))
