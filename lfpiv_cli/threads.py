@@ -9,6 +9,9 @@ from typing import TypeVar
 import cv2
 import numba
 
+# More than one, for pieces of work that do not take equally long; the threads wait for the last part.
+PARTS_A_THREAD = 4
+
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -24,8 +27,21 @@ def in_threads(work: Callable[[Item], Result], items: Iterable[Item]) -> list[Re
 
     Takes less than half the time of a parallel loop of numba's to compile, and tuples of arrays can be written to.
     """
-    with ThreadPoolExecutor(numba.get_num_threads()) as pool:
-        return list(pool.map(work, items))
+    pieces = list(items)
+    threads = min(numba.get_num_threads(), len(pieces))
+    if threads < 2:
+        return [work(piece) for piece in pieces]
+    with ThreadPoolExecutor(threads) as pool:
+        return list(pool.map(work, pieces))
+
+
+def share_out(kernel: Callable[..., None], count: int, *arguments: object) -> None:
+    """Have `kernel(part, *arguments)` do `count` pieces of work, a part (first, end) of them at a time on each thread.
+
+    The kernel is compiled with `nogil`; what it does for one piece may not depend on another.
+    """
+    size = -(-count // (PARTS_A_THREAD * numba.get_num_threads()))
+    in_threads(lambda part: kernel((part.start, part.stop), *arguments), blocks(count, max(size, 1)))
 
 
 def blocks(count: int, size: int) -> list[slice]:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.errors import ConfigError
@@ -18,6 +18,7 @@ from lfpiv_cli.flow.maps import MapSums, map_sums, margins
 from lfpiv_cli.flow.outliers import expected_noise, fill_field, validate_vectors
 from lfpiv_cli.flow.peaks import ELONGATED_WIDTH, absolute, find_peaks, typical_width, undiluted
 from lfpiv_cli.flow.windows import Triple, WindowLayout, layout_windows
+from lfpiv_cli.threads import share_out
 
 # The coarse pass: windows twice the final ones at least (and those that come first), binned to about 16 cells, with
 # shifts of up to 4 cells. That is a quarter of the window, beyond which too few particles are in both volumes.
@@ -94,17 +95,17 @@ def bin_volume(volume: NDArray[np.float32], coarse: CoarseLayout, before: Triple
     padded = tuple(m + n + k for m, n, k in zip(before, coarse.cells_zyx, after, strict=True))
     sums = np.zeros(padded, dtype=np.float32)
     inside = tuple(slice(m, m + n) for m, n in zip(before, coarse.cells_zyx, strict=True))
-    sum_bins(volume, coarse.bins[::-1], sums[inside])
+    share_out(sum_bins, coarse.cells_zyx[0], volume, coarse.bins[::-1], sums[inside])
     largest = float(max(np.max(sums), -np.min(sums)))
     if largest > 0.0:
         sums *= np.float32(1.0 / largest)
     return sums
 
 
-@njit(cache=True, parallel=True)
-def sum_bins(volume: NDArray[np.float32], bins: Triple, sums: NDArray[np.float32]) -> None:
-    """Write sums over bins of `bins` voxels along (z, y, x)."""
-    for cell_z in prange(sums.shape[0]):
+@njit(cache=True, nogil=True)
+def sum_bins(part: tuple[int, int], volume: NDArray[np.float32], bins: Triple, sums: NDArray[np.float32]) -> None:
+    """Write sums over bins of `bins` voxels along (z, y, x), planes `part` of them."""
+    for cell_z in range(part[0], part[1]):
         line = np.empty(volume.shape[2])
         for cell_y in range(sums.shape[1]):
             line[:] = 0.0

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
@@ -26,6 +26,7 @@ from lfpiv_cli.simd.splines import (
     range_reference,
     spline_weights,
 )
+from lfpiv_cli.threads import share_out
 
 # Sources lie between the first and the last voxel's centre: the four taps of a cubic B-spline reach one coefficient
 # beyond these, and a fifth of weight zero another.
@@ -63,8 +64,9 @@ def spline_coefficients(volume: NDArray[np.float32]) -> Spline:
     flat = np.zeros(int(np.prod(padded)) + 2 * SLACK, dtype=np.float32)
     inside = (slice(SPLINE_PAD, -SPLINE_PAD),) * 3
     coefficients = flat[SLACK:-SLACK].reshape(padded)
-    filter_planes(volume, np.float32(1.0 / largest if largest > 0.0 else 1.0), coefficients[inside])
-    filter_depth(coefficients[inside])
+    scale = np.float32(1.0 / largest if largest > 0.0 else 1.0)
+    share_out(filter_planes, volume.shape[0], volume, scale, coefficients[inside])
+    share_out(filter_depth, volume.shape[1], coefficients[inside])
     for axis in range(3):
         moved = np.moveaxis(coefficients, axis, 0)
         first, last = moved[SPLINE_PAD], moved[-SPLINE_PAD - 1]
@@ -100,23 +102,28 @@ def filter_lines(lines: NDArray[np.float32], factors: NDArray[np.float32]) -> No
             here[x] -= factor * after[x]
 
 
-@njit(cache=True, parallel=True)
-def filter_planes(volume: NDArray[np.float32], scale: np.float32, coefficients: NDArray[np.float32]) -> None:
-    """Write the B-spline coefficients along x and y of a volume times `scale`."""
+@njit(cache=True, nogil=True)
+def filter_planes(
+    part: tuple[int, int], volume: NDArray[np.float32], scale: np.float32, coefficients: NDArray[np.float32]
+) -> None:
+    """Write the B-spline coefficients along x and y of a volume times `scale`, planes `part` of them."""
     along_y, along_x = pivots(volume.shape[1]), pivots(volume.shape[2])
-    for z in prange(volume.shape[0]):
+    for z in range(part[0], part[1]):
         plane = volume[z] * scale
         filter_lines(plane, along_y)
         turned = plane.T.copy()
         filter_lines(turned, along_x)
-        coefficients[z] = turned.T
+        # Element by element: an assignment of whole arrays takes seconds to compile, for the words of its error.
+        for y in range(plane.shape[0]):
+            for x in range(plane.shape[1]):
+                coefficients[z, y, x] = turned[x, y]
 
 
-@njit(cache=True, parallel=True)
-def filter_depth(volume: NDArray[np.float32]) -> None:
-    """Replace samples by B-spline coefficients along z, in place."""
+@njit(cache=True, nogil=True)
+def filter_depth(part: tuple[int, int], volume: NDArray[np.float32]) -> None:
+    """Replace samples by B-spline coefficients along z, rows `part` of each plane, in place."""
     factors = pivots(volume.shape[0])
-    for y in prange(volume.shape[1]):
+    for y in range(part[0], part[1]):
         filter_lines(volume[:, y], factors)
 
 
@@ -181,35 +188,34 @@ def deform_pair(
     valid = np.zeros(padded, dtype=np.uint8)
     half = np.ascontiguousarray(0.5 * predictor.transpose(0, 3, 1, 2), dtype=np.float32)
     along_x, along_y, along_z = to_voxels
-    across = np.ascontiguousarray(along_x.T)
-    deform_planes(
-        a.flat, b.flat, a.shape_zyx, mask, half, across, along_y, along_z, before, deformed_a, deformed_b, valid
-    )
+    matrices = (np.ascontiguousarray(along_x.T), along_y, along_z)
+    out = (deformed_a, deformed_b, valid)
+    share_out(deform_planes, a.shape_zyx[0], (a.flat, b.flat), mask, half, matrices, before, out)
     return deformed_a, deformed_b, valid
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, nogil=True)
 def deform_planes(
-    flat_a: NDArray[np.float32],
-    flat_b: NDArray[np.float32],
-    shape: Triple,
+    part: tuple[int, int],
+    flat: tuple[NDArray[np.float32], NDArray[np.float32]],
     mask: NDArray[np.bool_],
     half: NDArray[np.float32],
-    along_x: NDArray[np.float32],
-    along_y: NDArray[np.float32],
-    along_z: NDArray[np.float32],
+    to_voxels: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]],
     before: Triple,
-    deformed_a: NDArray[np.float32],
-    deformed_b: NDArray[np.float32],
-    valid: NDArray[np.uint8],
+    out: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]],
 ) -> None:
-    """Deform all planes by half displacements (nz, 3, ny, nx) that the matrices carry to the voxels.
+    """Deform planes `part` by half displacements (nz, 3, ny, nx) that the matrices carry to the voxels.
 
-    `along_x` is (nx, voxels), the others (voxels, windows).
+    The matrix along x is (windows, voxels), those along y and z are (voxels, windows). `out` takes both volumes and
+    where they are valid, all with a margin `before` them.
     """
+    flat_a, flat_b = flat
+    along_x, along_y, along_z = to_voxels
+    deformed_a, deformed_b, valid = out
+    shape = (along_z.shape[0], along_y.shape[0], along_x.shape[1])
     row = shape[2] + 2 * SPLINE_PAD
     plane = row * (shape[1] + 2 * SPLINE_PAD)
-    for z in prange(shape[0]):
+    for z in range(part[0], part[1]):
         half_here = expand_plane(half, along_z[z], along_y, along_x)
         moved = np.empty((3, shape[2] + NEIGHBOURS), dtype=np.float32)
         flat_moved = moved.reshape(moved.size)
@@ -224,7 +230,8 @@ def deform_planes(
             if mask.size:
                 mask_row(mask, moved, z, y, seen)
             begin = SLACK + (z + SPLINE_PAD) * plane + (y + SPLINE_PAD) * row + SPLINE_PAD
-            x = 0
+            # Not plain 0, nor a plain width below: for these numba would compile what they go to once more.
+            x = np.int64(0)
             while x < shape[2]:
                 width, taps = gather_taps(flat_moved, moved.shape[1], x, weights)
                 places = (begin + x, plane, row)
@@ -263,7 +270,7 @@ def gather_taps(
     These are the lowest along z, y, x and how many follow along each. As many neighbours as `MOST_TAPS` serve: where
     displacements differ too much for all, fewer are taken at once. `moved` is `length` long an axis.
     """
-    width = NEIGHBOURS
+    width = np.int64(NEIGHBOURS)
     low_x, taps_x = taps_of(moved, x, width)
     low_y, taps_y = taps_of(moved, length + x, width)
     low_z, taps_z = taps_of(moved, 2 * length + x, width)

@@ -18,12 +18,13 @@ from dataclasses import dataclass
 from math import gcd
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.flow.windows import Triple, WindowLayout
 from lfpiv_cli.simd.block_sums import FEW_SHIFTS, MANY_SHIFTS, products
 from lfpiv_cli.simd.vectors import LANES
+from lfpiv_cli.threads import share_out
 
 # Blocks narrower than this cost more in sums of sums than the products they save.
 SMALLEST_BLOCK = 4
@@ -157,7 +158,9 @@ def map_sums(
     return MapSums(products, energies_a, energies_b, blocks)
 
 
-def energies_of(volume: NDArray, layout: WindowLayout, before: Triple, radius: int = 0) -> NDArray[np.float32]:
+def energies_of(
+    volume: NDArray[np.float32], layout: WindowLayout, before: Triple, radius: int = 0
+) -> NDArray[np.float32]:
     """Return the sums of squares over all windows at all shifts along each axis, of `window_energies`."""
     size, step, count, low = (triple[::-1] for triple in (layout.size, layout.step, layout.count, layout.first))
     first = (low[0] + before[0], low[1] + before[1], low[2] + before[2])
@@ -166,14 +169,13 @@ def energies_of(volume: NDArray, layout: WindowLayout, before: Triple, radius: i
 
 def valid_shares(valid: NDArray[np.uint8], layout: WindowLayout, before: Triple) -> NDArray[np.float64]:
     """Return the share of each window's voxels that are valid, (nz, ny, nx), from their flags 0 or 1."""
-    # The squares of 0 and 1 are themselves.
-    seen = energies_of(valid, layout, before)[:, 0, :, 0, :, 0].transpose(0, 2, 1)
+    # The squares of 0 and 1 are themselves; float32, for which the sums are compiled anyway.
+    seen = energies_of(valid.astype(np.float32), layout, before)[:, 0, :, 0, :, 0].transpose(0, 2, 1)
     return seen / np.prod(layout.size, dtype=np.float64)
 
 
-@njit(cache=True, parallel=True)
 def window_energies(
-    volume: NDArray, first: Triple, size: Triple, step: Triple, count: Triple, radius: int
+    volume: NDArray[np.float32], first: Triple, size: Triple, step: Triple, count: Triple, radius: int
 ) -> NDArray[np.float32]:
     """Return the sums of squares over shifted windows: (windows z, shifts z, windows x, shifts x, windows y, shifts y).
 
@@ -182,10 +184,29 @@ def window_energies(
     """
     shifts = 2 * radius + 1
     nz, ny, nx = count
-    lowest = first[0] - radius
     planes = (nz - 1) * step[0] + size[0] + 2 * radius
     lateral = np.empty((planes, nx * shifts, ny * shifts), dtype=np.float32)
-    for z in prange(planes):
+    share_out(sum_laterally, planes, volume, first, size, step, radius, lateral)
+    rows = lateral.reshape(planes, nx * shifts * ny * shifts)
+    found = np.empty((nz, shifts, rows.shape[1]), dtype=np.float32)
+    share_out(sum_planes, nz, rows, size[0], step[0], radius, found)
+    return found.reshape(nz, shifts, nx, shifts, ny, shifts)
+
+
+@njit(cache=True, nogil=True)
+def sum_laterally(
+    part: tuple[int, int],
+    volume: NDArray[np.float32],
+    first: Triple,
+    size: Triple,
+    step: Triple,
+    radius: int,
+    lateral: NDArray[np.float32],
+) -> None:
+    """Write the sums of squares over the rows and columns of windows, planes `part` of (z, columns, rows)."""
+    shifts, lowest = 2 * radius + 1, first[0] - radius
+    nx, ny = lateral.shape[1] // shifts, lateral.shape[2] // shifts
+    for z in range(part[0], part[1]):
         squares = np.empty(volume.shape[1:], dtype=np.float32)
         for y in range(volume.shape[1]):
             square_row(volume[lowest + z, y], squares[y])
@@ -195,11 +216,15 @@ def window_energies(
         turned = along_y.T.copy()
         for k in range(nx):
             sum_rows(turned, first[2] + k * step[2], size[2], radius, lateral[z, k * shifts : (k + 1) * shifts])
-    rows = lateral.reshape(planes, nx * shifts * ny * shifts)
-    found = np.empty((nz, shifts, rows.shape[1]), dtype=np.float32)
-    for k in prange(nz):
-        sum_rows(rows, k * step[0] + radius, size[0], radius, found[k])
-    return found.reshape(nz, shifts, nx, shifts, ny, shifts)
+
+
+@njit(cache=True, nogil=True)
+def sum_planes(
+    part: tuple[int, int], planes: NDArray[np.float32], size: int, step: int, radius: int, sums: NDArray[np.float32]
+) -> None:
+    """Write the sums of flat planes (z, n) over the windows `part` of (windows z, shifts z, n)."""
+    for k in range(part[0], part[1]):
+        sum_rows(planes, k * step + radius, size, radius, sums[k])
 
 
 @njit(cache=True)
@@ -238,7 +263,9 @@ def sum_rows(rows: NDArray[np.float32], first: int, size: int, radius: int, sums
     for shift in range(2 * radius, -1, -1):
         target = sums[shift]
         if shift > 0:
-            target[:] = shared
+            # Element by element: an assignment of whole arrays takes seconds to compile, for the words of its error.
+            for i in range(shared.size):
+                target[i] = shared[i]
         for row in range(lowest + shift, min(begin, lowest + shift + size)):
             add_row(target, rows[row])
         for row in range(end, lowest + shift + size):
@@ -253,13 +280,12 @@ def write_sum(target: NDArray[np.float32], one: NDArray[np.float32], other: NDAr
 
 
 @njit(cache=True)
-def square_row(row: NDArray, squares: NDArray[np.float32]) -> None:
+def square_row(row: NDArray[np.float32], squares: NDArray[np.float32]) -> None:
     """Write the squares of a row."""
     for x in range(row.size):
-        squares[x] = np.float32(row[x]) * np.float32(row[x])
+        squares[x] = row[x] * row[x]
 
 
-@njit(cache=True, parallel=True)
 def normalise(
     products: NDArray[np.float64],
     energies_a: NDArray[np.float32],
@@ -270,10 +296,27 @@ def normalise(
 ) -> NDArray[np.float64]:
     """Return R from the members of `MapSums`; zero where the product of the energies is `least` or less."""
     nz, shifts, nx, _, ny, _ = energies_a.shape
-    radius, last = shifts // 2, shifts - 1
     blocks = products.reshape(products.shape[0], products.shape[1], nx, shifts**3)
-    maps = np.zeros((nz, ny, nx, shifts**3))
-    for job in prange(nz * ny):
+    maps = np.empty((nz, ny, nx, shifts**3))
+    share_out(write_maps, nz * ny, blocks, (energies_a, energies_b), per_window, hop, least, maps)
+    return maps.reshape(nz, ny, nx, shifts, shifts, shifts)
+
+
+@njit(cache=True, nogil=True)
+def write_maps(
+    part: tuple[int, int],
+    blocks: NDArray[np.float64],
+    energies: tuple[NDArray[np.float32], NDArray[np.float32]],
+    per_window: tuple[int, int],
+    hop: tuple[int, int],
+    least: float,
+    maps: NDArray[np.float64],
+) -> None:
+    """Write R of the rows of windows `part`, each flat: (nz, ny, nx, shifts cubed), as are the blocks."""
+    energies_a, energies_b = energies
+    shifts, (ny, nx) = energies_a.shape[1], maps.shape[1:3]
+    radius, last = shifts // 2, shifts - 1
+    for job in range(part[0], part[1]):
         kz, ky = job // ny, job % ny
         scale = np.empty(shifts**3)
         for kx in range(nx):
@@ -288,6 +331,7 @@ def normalise(
                         scale[at] = (whole_a + moved_a) * (whole_b + energies_b[kz, sz, kx, sx, ky, sy])
                         at += 1
             window = maps[kz, ky, kx]
+            window[:] = 0.0
             for bz in range(kz * hop[0], kz * hop[0] + per_window[0]):
                 for by in range(ky * hop[1], ky * hop[1] + per_window[1]):
                     block = blocks[bz, by, kx]
@@ -295,7 +339,6 @@ def normalise(
                         window[at] += block[at]
             for at in range(shifts**3):
                 window[at] *= 1.0 / np.sqrt(scale[at]) if scale[at] > least else 0.0
-    return maps.reshape(nz, ny, nx, shifts, shifts, shifts)
 
 
 @njit(cache=True)
@@ -305,7 +348,6 @@ def add_row(target: NDArray[np.float32], row: NDArray[np.float32]) -> None:
         target[i] += row[i]
 
 
-@njit(cache=True, parallel=True)
 def block_products(
     a: NDArray[np.float32],
     b: NDArray[np.float32],
@@ -321,12 +363,29 @@ def block_products(
     once, and only then over the columns of each window. These sums are float32: the maps are wanted to 1e-5.
     """
     shifts = 2 * radius + 1
+    found = np.empty((*count, shifts, shifts, shifts))
+    share_out(sum_products, count[0] * count[1], (a, b), first, size, stride, found)
+    return found
+
+
+@njit(cache=True, nogil=True)
+def sum_products(
+    part: tuple[int, int],
+    pair: tuple[NDArray[np.float32], NDArray[np.float32]],
+    first: Triple,
+    size: Triple,
+    stride: Triple,
+    found: NDArray[np.float64],
+) -> None:
+    """Write the sums of `block_products` for the rows of blocks `part`."""
+    a, b = pair
+    count, shifts = found.shape[:3], found.shape[3]
+    radius = shifts // 2
     row, plane = a.shape[2], a.shape[1] * a.shape[2]
     flat_a, flat_b = a.reshape(a.size), b.reshape(b.size)
-    found = np.empty((count[0], count[1], count[2], shifts, shifts, shifts))
     length = max(LANES, (count[2] - 1) * stride[2] + size[2])
     together = MANY_SHIFTS if shifts >= MANY_SHIFTS else FEW_SHIFTS
-    for job in prange(count[0] * count[1]):
+    for job in range(part[0], part[1]):
         bz, by = job // count[1], job % count[1]
         begin = (first[0] + bz * stride[0]) * plane + (first[1] + by * stride[1]) * row + first[2]
         room = np.empty((3, shifts**3 * length), dtype=np.float32)
@@ -349,4 +408,3 @@ def block_products(
             window = found[bz, by, kx].reshape(lines.shape[0])
             for shift in range(window.size):
                 window[shift] = lines[shift, kx * stride[2]]
-    return found

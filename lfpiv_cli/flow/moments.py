@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from math import gcd
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.flow.maps import SMALLEST_BLOCK
@@ -23,6 +23,7 @@ from lfpiv_cli.flow.windows import Triple, WindowLayout
 from lfpiv_cli.simd.block_sums import MOMENTS
 from lfpiv_cli.simd.block_sums import moments as lane_moments
 from lfpiv_cli.simd.vectors import LANES
+from lfpiv_cli.threads import share_out
 
 # Cells along an axis of a window, at least, where it has as many voxels: groups enough for a variance.
 CELLS_PER_WINDOW = 4
@@ -93,7 +94,10 @@ def pair_moments(
     """
     cells = cells_of(layout)
     first = (layout.first[2] + before[0], layout.first[1] + before[1], layout.first[0] + before[2])
-    return cell_moments(a, b, valid, first, cells.start, cells.size)
+    count = tuple(starts.size for starts in cells.start)
+    found = np.empty((*count, MOMENTS))
+    share_out(sum_cells, count[0] * count[1], (a, b), valid, first, cells.start, cells.size, found)
+    return found
 
 
 def gauss_newton(
@@ -115,7 +119,10 @@ def gauss_newton(
         for per_window, length, sigma in zip(cells.per_window, layout.size[::-1], particle_sigma[::-1], strict=True)
     ]
     grouped = (groups[0], groups[1], groups[2])
-    return solve_windows(moments, layout.count_zyx, cells.per_window, cells.hop, grouped)
+    count = layout.count_zyx
+    step, deviation = np.full((2, *count, 3), np.nan)
+    share_out(solve_windows, count[0] * count[1], moments, cells.per_window, cells.hop, grouped, step, deviation)
+    return step, deviation
 
 
 def _cells_a_group(per_window: int, length: int, sigma: float) -> int:
@@ -126,26 +133,27 @@ def _cells_a_group(per_window: int, length: int, sigma: float) -> int:
     return per_window
 
 
-@njit(cache=True, parallel=True)
-def cell_moments(
-    a: NDArray[np.float32],
-    b: NDArray[np.float32],
+@njit(cache=True, nogil=True)
+def sum_cells(
+    part: tuple[int, int],
+    pair: tuple[NDArray[np.float32], NDArray[np.float32]],
     valid: NDArray[np.uint8],
     first: Triple,
     start: Starts,
     size: Starts,
-) -> NDArray[np.float64]:
-    """Return the moments of every cell, (cells z, y, x, MOMENTS), of windows that begin at the voxel `first`.
+    found: NDArray[np.float64],
+) -> None:
+    """Write the moments of cells, rows `part` of (cells z, y, x, MOMENTS), of windows that begin at the voxel `first`.
 
     The upper triangle of the products of (dM/dx, dM/dy, dM/dz, M), row by row, then those of each with B - A. Voxels
     with a neighbour that is not valid are left out: their gradient would be that of the rim.
     """
-    count = (start[0].size, start[1].size, start[2].size)
-    found = np.empty((count[0], count[1], count[2], MOMENTS))
+    a, b = pair
+    count = found.shape[:3]
     row, plane = a.shape[2], a.shape[1] * a.shape[2]
     flat_a, flat_b, flat_valid = a.reshape(a.size), b.reshape(b.size), valid.reshape(valid.size)
     length = max(LANES, start[2][-1] + size[2][-1])
-    for job in prange(count[0] * count[1]):
+    for job in range(part[0], part[1]):
         cz, cy = job // count[1], job % count[1]
         begin = (first[0] + start[0][cz]) * plane + (first[1] + start[1][cy]) * row + first[2]
         # Summed over the planes and rows of the cells first, many columns at once; float32 serves for so few.
@@ -162,7 +170,6 @@ def cell_moments(
                 for x in range(start[2][cx], start[2][cx] + size[2][cx]):
                     total += columns[moment, x]
                 found[cz, cy, cx, moment] = total
-    return found
 
 
 @njit(cache=True)
@@ -202,18 +209,24 @@ def invert(matrix: NDArray[np.float64], inverse: NDArray[np.float64]) -> bool:
     return True
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, nogil=True)
 def solve_windows(
-    moments: NDArray[np.float64], count: Triple, per_window: Triple, hop: Triple, grouped: Triple
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return step and standard deviation of every window, (nz, ny, nx, 3) each, from the moments of its cells.
+    part: tuple[int, int],
+    moments: NDArray[np.float64],
+    per_window: Triple,
+    hop: Triple,
+    grouped: Triple,
+    step: NDArray[np.float64],
+    deviation: NDArray[np.float64],
+) -> None:
+    """Write step and standard deviation of windows, rows `part` of (nz, ny, nx, 3), from the moments of their cells.
 
-    `grouped` is how many cells along (z, y, x) make one group of the sandwich estimator.
+    `grouped` is how many cells along (z, y, x) make one group of the sandwich estimator. Windows that their moments do
+    not determine are left as they are.
     """
-    step = np.full((count[0], count[1], count[2], 3), np.nan)
-    deviation = np.full((count[0], count[1], count[2], 3), np.nan)
+    count = step.shape[:3]
     groups = (per_window[0] // grouped[0], per_window[1] // grouped[1], per_window[2] // grouped[2])
-    for job in prange(count[0] * count[1]):
+    for job in range(part[0], part[1]):
         kz, ky = job // count[1], job % count[1]
         matrix, vector = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
         inverse, solution = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
@@ -241,7 +254,6 @@ def solve_windows(
             for i in range(3):
                 step[kz, ky, kx, i] = -solution[i]
             write_deviation(sums, inverse, solution, deviation[kz, ky, kx])
-    return step, deviation
 
 
 @njit(cache=True)

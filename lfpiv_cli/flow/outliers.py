@@ -9,12 +9,13 @@ Fields are (nz, ny, nx, 3); neighbours are the up to 26 around a vector.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 
 from lfpiv_cli.flow.field import MASKED, REJECTED, REPLACED, SECOND_PEAK, VALID
 from lfpiv_cli.flow.peaks import typical_width
+from lfpiv_cli.threads import share_out
 
 # Measurement noise that the test takes for granted, in voxels for particle images of 1 voxel standard deviation; it
 # grows with their width. A smaller one flags clean vectors where the neighbours happen to agree.
@@ -209,7 +210,6 @@ def gather(
         share[lane] = used / possible if used else 0.0
 
 
-@njit(cache=True, parallel=True)
 def predict(
     field: NDArray[np.float64], usable: NDArray[np.bool_], counted: NDArray[np.bool_], wanted: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
@@ -229,9 +229,26 @@ def predict(
     share : (n,) usable neighbours over counted neighbours
     """
     tiles = -(-wanted.size // LANES)
-    predicted, spread = np.zeros((tiles, 3, LANES)), np.zeros((tiles, 3, LANES))
+    predicted, spread = np.zeros((2, tiles, 3, LANES))
     share = np.zeros((tiles, LANES))
-    for tile in prange(tiles):
+    share_out(predict_tiles, tiles, field, usable, counted, wanted, (predicted, spread, share))
+    by_vector = (predicted.transpose(0, 2, 1).reshape(-1, 3), spread.transpose(0, 2, 1).reshape(-1, 3))
+    n = wanted.size
+    return by_vector[0][:n], by_vector[1][:n], share.reshape(-1)[:n]
+
+
+@njit(cache=True, nogil=True)
+def predict_tiles(
+    part: tuple[int, int],
+    field: NDArray[np.float64],
+    usable: NDArray[np.bool_],
+    counted: NDArray[np.bool_],
+    wanted: NDArray[np.int64],
+    out: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
+) -> None:
+    """Write what `predict` returns for tiles `part` of `LANES` wanted vectors each, (tiles, 3, LANES); see there."""
+    predicted, spread, share = out
+    for tile in range(part[0], part[1]):
         cubes = np.empty((3, NEIGHBOURHOOD, LANES))
         rows, slopes = np.empty((NEIGHBOURHOOD, LANES)), np.empty((3, LANES))
         gather(field, usable, counted, wanted[tile * LANES : (tile + 1) * LANES], cubes, share[tile])
@@ -250,9 +267,6 @@ def predict(
                 for lane in range(LANES):
                     rows[place, lane] = abs(values[place, lane] - middle[lane])
             medians(rows, spread[tile, component])
-    by_vector = (predicted.transpose(0, 2, 1).copy(), spread.transpose(0, 2, 1).copy())
-    n = wanted.size
-    return by_vector[0].reshape(-1, 3)[:n], by_vector[1].reshape(-1, 3)[:n], share.reshape(tiles * LANES)[:n]
 
 
 def _around(chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -9,8 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
+
+from lfpiv_cli.threads import share_out
 
 # A ratio beyond this says only that there is no second peak; it keeps the stored numbers finite.
 LARGEST_PEAK_RATIO = 100.0
@@ -49,8 +51,11 @@ def find_peaks(maps: NDArray[np.float64]) -> Peaks:
     """Return the peaks of maps of shape (nz, ny, nx, 2r + 1, 2r + 1, 2r + 1)."""
     windows, shifts = maps.shape[:3], maps.shape[3]
     flat = np.ascontiguousarray(maps).reshape(-1, shifts, shifts, shifts)
-    offset, second_offset, width, scalars = peaks_of(flat)
-    height, second_height, beyond = (scalars[:, i].reshape(windows) for i in range(3))
+    count = flat.shape[0]
+    offset, second_offset, heights = np.zeros((3, count, 3))
+    width = np.full((count, 3), np.nan)
+    share_out(write_peaks, count, flat, offset, second_offset, width, heights)
+    height, second_height, beyond = (heights[:, i].reshape(windows) for i in range(3))
     rival = np.where(second_height > 0.0, second_height, beyond)
     ratio = np.full(windows, LARGEST_PEAK_RATIO)
     np.divide(height, rival, out=ratio, where=rival > 0.0)
@@ -147,23 +152,25 @@ def is_local_maximum(shifts: NDArray[np.float64], iz: int, iy: int, ix: int) -> 
     return True
 
 
-@njit(cache=True, parallel=True)
-def peaks_of(
+@njit(cache=True, nogil=True)
+def write_peaks(
+    part: tuple[int, int],
     maps: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return for each map (n, s, s, s): offset (n, 3), second offset (n, 3), width (n, 3), and heights (n, 3).
+    offset: NDArray[np.float64],
+    second_offset: NDArray[np.float64],
+    width: NDArray[np.float64],
+    heights: NDArray[np.float64],
+) -> None:
+    """Write for maps `part` of (n, s, s, s): offset (n, 3), second offset (n, 3), width (n, 3), and heights (n, 3).
 
     The heights are those of the peak, of the second local maximum, and of the highest node that is no neighbour of the
-    peak.
+    peak. Where there is no peak nothing is written; the heights are zero before.
     """
-    count, size = maps.shape[0], maps.shape[1]
-    offset = np.zeros((count, 3))
-    second_offset = np.zeros((count, 3))
-    width = np.full((count, 3), np.nan)
-    heights = np.zeros((count, 3))
-    for n in prange(count):
+    size = maps.shape[1]
+    for n in range(part[0], part[1]):
         shifts = maps[n]
-        best = (0, 0, 0)
+        # Not plain numbers: for these numba would compile `fit_peak` once more.
+        best = (np.int64(0), np.int64(0), np.int64(0))
         for iz in range(size):
             for iy in range(size):
                 for ix in range(size):
@@ -175,7 +182,7 @@ def peaks_of(
         x, y, z, width_x, width_y, width_z = fit_peak(shifts, best[0], best[1], best[2])
         offset[n, 0], offset[n, 1], offset[n, 2] = x, y, z
         width[n, 0], width[n, 1], width[n, 2] = width_x, width_y, width_z
-        second = (-1, -1, -1)
+        second = (np.int64(-1), np.int64(-1), np.int64(-1))
         for iz in range(size):
             for iy in range(size):
                 for ix in range(size):
@@ -190,4 +197,3 @@ def peaks_of(
         if second[0] >= 0:
             x, y, z, _, _, _ = fit_peak(shifts, second[0], second[1], second[2])
             second_offset[n, 0], second_offset[n, 1], second_offset[n, 2] = x, y, z
-    return offset, second_offset, width, heights
