@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
@@ -19,6 +19,7 @@ from lfpiv_cli.calibration.lattice import EXPONENTS, LatticeFit
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.names import ColumnAxis
 from lfpiv_cli.optics.microlenses import Lattice, nearest_point
+from lfpiv_cli.threads import share_out
 
 EXPONENT_ARRAY = np.array(EXPONENTS, dtype=np.int64)
 
@@ -58,15 +59,11 @@ class Rectification:
 
         Float32 holds these few pixels to 1e-6 px at half the memory.
         """
-        return sampling_shift(
-            self.image_shape[0],
-            self.image_shape[1],
-            self.lattice_px.origin,
-            self.lattice_px.basis,
-            self.fit.coefficients_px,
-            EXPONENT_ARRAY,
-            turn_matrix(self.rotation_rad),
-        )
+        shift = np.empty((*self.image_shape, 2), dtype=np.float32)
+        upright, turn = self.lattice_px, turn_matrix(self.rotation_rad)
+        model = (self.fit.coefficients_px, EXPONENT_ARRAY)
+        share_out(write_shift, self.image_shape[0], upright.origin, upright.basis, model, turn, shift)
+        return shift
 
     @cached_property
     def inside(self) -> NDArray[np.bool_]:
@@ -112,23 +109,23 @@ def turned(points: ArrayLike, angle_rad: float) -> NDArray[np.float64]:
     return result
 
 
-@njit(cache=True, parallel=True)
-def sampling_shift(
-    rows: int,
-    columns: int,
+@njit(cache=True, nogil=True)
+def write_shift(
+    part: tuple[int, int],
     origin: NDArray[np.float64],
     basis: NDArray[np.float64],
-    coefficients: NDArray[np.float64],
-    exponents: NDArray[np.int64],
+    model: tuple[NDArray[np.float64], NDArray[np.int64]],
     turn: NDArray[np.float64],
-) -> NDArray[np.float32]:
-    """Return for each rectified pixel its raw place less its own (rows, columns, 2).
+    shift: NDArray[np.float32],
+) -> None:
+    """Write for each rectified pixel of rows `part` its raw place less its own (rows, columns, 2).
 
-    The offset from its lens in the upright lattice is turned and added to the lens's modelled centre in the raw image.
+    The offset from its lens in the upright lattice is turned and added to the lens's centre in the raw image, of a
+    model with coefficients and exponents.
     """
-    shift = np.empty((rows, columns, 2), dtype=np.float32)
-    for row in prange(rows):
-        for column in range(columns):
+    coefficients, exponents = model
+    for row in range(part[0], part[1]):
+        for column in range(shift.shape[1]):
             lens_x, lens_y = nearest_point(float(column), float(row), origin, basis)
             j = np.rint((lens_y - origin[1]) / basis[1, 1])
             i = np.rint((lens_x - origin[0] - j * basis[1, 0]) / basis[0, 0])
@@ -140,7 +137,6 @@ def sampling_shift(
                 y += coefficients[k, 1] * term
             shift[row, column, 0] = x - column
             shift[row, column, 1] = y - row
-    return shift
 
 
 @njit(cache=True)
@@ -165,14 +161,26 @@ def mirrored(index: int, size: int) -> int:
     return index
 
 
-@njit(cache=True, parallel=True)
 def sample_spline(
     coefficients: NDArray[np.float64], shift: NDArray[np.float32], inside: NDArray[np.bool_]
 ) -> NDArray[np.float32]:
     """Return a cubic spline at each pixel's place plus its shift, 0 where not inside."""
+    image = np.zeros(coefficients.shape, dtype=np.float32)
+    share_out(sample_rows, coefficients.shape[0], coefficients, shift, inside, image)
+    return image
+
+
+@njit(cache=True, nogil=True)
+def sample_rows(
+    part: tuple[int, int],
+    coefficients: NDArray[np.float64],
+    shift: NDArray[np.float32],
+    inside: NDArray[np.bool_],
+    image: NDArray[np.float32],
+) -> None:
+    """Write rows `part` of what `sample_spline` returns, where inside."""
     rows, columns = coefficients.shape
-    image = np.zeros((rows, columns), dtype=np.float32)
-    for row in prange(rows):
+    for row in range(part[0], part[1]):
         for column in range(columns):
             if inside[row, column]:
                 x = column + np.float64(shift[row, column, 0])
@@ -184,9 +192,8 @@ def sample_spline(
                 total = 0.0
                 for m in range(4):
                     line = coefficients[mirrored(top + m - 1, rows)]
-                    part = 0.0
+                    across_line = 0.0
                     for n in range(4):
-                        part += across[n] * line[mirrored(left + n - 1, columns)]
-                    total += down[m] * part
+                        across_line += across[n] * line[mirrored(left + n - 1, columns)]
+                    total += down[m] * across_line
                 image[row, column] = total
-    return image

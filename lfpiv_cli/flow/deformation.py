@@ -230,13 +230,12 @@ def deform_planes(
             if mask.size:
                 mask_row(mask, moved, z, y, seen)
             begin = SLACK + (z + SPLINE_PAD) * plane + (y + SPLINE_PAD) * row + SPLINE_PAD
-            # Not plain 0, nor a plain width below: for these numba would compile what they go to once more.
-            x = np.int64(0)
-            while x < shape[2]:
+            at = begin
+            while at < begin + shape[2]:
+                x = at - begin
                 width, taps = gather_taps(flat_moved, moved.shape[1], x, weights)
-                places = (begin + x, plane, row)
-                interpolate(flat_lines, (x, lines.shape[1]), flat_a, flat_b, places, weights, taps)
-                x += width
+                interpolate(flat_lines, (x, lines.shape[1]), flat_a, flat_b, (at, plane, row), weights, taps)
+                at += width
             copy_seen(lines[0], seen, deformed_a[target][here])
             copy_seen(lines[1], seen, deformed_b[target][here])
 
@@ -270,15 +269,14 @@ def gather_taps(
     These are the lowest along z, y, x and how many follow along each. As many neighbours as `MOST_TAPS` serve: where
     displacements differ too much for all, fewer are taken at once. `moved` is `length` long an axis.
     """
-    width = np.int64(NEIGHBOURS)
-    low_x, taps_x = taps_of(moved, x, width)
-    low_y, taps_y = taps_of(moved, length + x, width)
-    low_z, taps_z = taps_of(moved, 2 * length + x, width)
-    while max(taps_x, taps_y, taps_z) > MOST_TAPS:
+    width = 2 * NEIGHBOURS
+    while True:
         width //= 2
         low_x, taps_x = taps_of(moved, x, width)
         low_y, taps_y = taps_of(moved, length + x, width)
         low_z, taps_z = taps_of(moved, 2 * length + x, width)
+        if max(taps_x, taps_y, taps_z) <= MOST_TAPS:
+            break
     spline_weights(weights, 0, moved, 2 * length + x, low_z, taps_z)
     spline_weights(weights, taps_z * NEIGHBOURS, moved, length + x, low_y, taps_y)
     spline_weights(weights, (taps_z + taps_y) * NEIGHBOURS, moved, x, low_x, taps_x)

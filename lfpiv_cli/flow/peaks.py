@@ -169,31 +169,32 @@ def write_peaks(
     size = maps.shape[1]
     for n in range(part[0], part[1]):
         shifts = maps[n]
-        # Not plain numbers: for these numba would compile `fit_peak` once more.
-        best = (np.int64(0), np.int64(0), np.int64(0))
+        # Nodes by their place in memory: numba would compile `fit_peak` once more for indices that begin as constants.
+        best = 0
         for iz in range(size):
             for iy in range(size):
                 for ix in range(size):
                     if shifts[iz, iy, ix] > heights[n, 0]:
                         heights[n, 0] = shifts[iz, iy, ix]
-                        best = (iz, iy, ix)
+                        best = (iz * size + iy) * size + ix
         if heights[n, 0] <= 0.0:
             continue
-        x, y, z, width_x, width_y, width_z = fit_peak(shifts, best[0], best[1], best[2])
+        best_z, best_y, best_x = best // (size * size), best // size % size, best % size
+        x, y, z, width_x, width_y, width_z = fit_peak(shifts, best_z, best_y, best_x)
         offset[n, 0], offset[n, 1], offset[n, 2] = x, y, z
         width[n, 0], width[n, 1], width[n, 2] = width_x, width_y, width_z
-        second = (np.int64(-1), np.int64(-1), np.int64(-1))
+        second = -1
         for iz in range(size):
             for iy in range(size):
                 for ix in range(size):
                     value = shifts[iz, iy, ix]
-                    near = abs(iz - best[0]) <= 1 and abs(iy - best[1]) <= 1 and abs(ix - best[2]) <= 1
+                    near = abs(iz - best_z) <= 1 and abs(iy - best_y) <= 1 and abs(ix - best_x) <= 1
                     if near:
                         continue
                     heights[n, 2] = max(heights[n, 2], value)
                     if value > heights[n, 1] and is_local_maximum(shifts, iz, iy, ix):
                         heights[n, 1] = value
-                        second = (iz, iy, ix)
-        if second[0] >= 0:
-            x, y, z, _, _, _ = fit_peak(shifts, second[0], second[1], second[2])
+                        second = (iz * size + iy) * size + ix
+        if second >= 0:
+            x, y, z, _, _, _ = fit_peak(shifts, second // (size * size), second // size % size, second % size)
             second_offset[n, 0], second_offset[n, 1], second_offset[n, 2] = x, y, z

@@ -23,9 +23,6 @@ from lfpiv_cli.scale import Scale
 class KernelCamera(NamedTuple):
     """The camera as compiled kernels take it.
 
-    A tuple that holds it cannot go into a parallel loop of numba's, which takes tuples of numbers and arrays, none of
-    tuples: such loops take the parts and put them together again inside.
-
     Attributes
     ----------
     focal_length_mm, image_distance_mm, focus_distance_mm : F_m, s_i and F_m (M - 1)/M of the main lens

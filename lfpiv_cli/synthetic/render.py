@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from lfpiv_cli.errors import ConfigError
@@ -23,6 +23,7 @@ from lfpiv_cli.optics.media import Layers
 from lfpiv_cli.optics.microlenses import nearest_point
 from lfpiv_cli.optics.object_space import ObjectSpace, slope_polynomial, slope_ratio
 from lfpiv_cli.optics.tracing import struck_pixel, trace_ray
+from lfpiv_cli.threads import share_out
 
 # Additive recurrence in four dimensions (aperture and ball): powers of the inverse of the root of x^5 = x + 1, whose
 # multiples fill the unit cube more evenly than random points do.
@@ -91,9 +92,9 @@ def render_points(
     batch = max(RAYS_AT_ONCE // rays, 1)
     for start in range(0, len(points), batch):
         part = slice(start, start + batch)
-        pixels = _trace_points(
-            points[part], last_layers[part], shifts[part], rays, 0.5 * balls.diameter_mm, layers, seen
-        )
+        placed = (points[part], last_layers[part], shifts[part])
+        pixels = np.empty((len(points[part]), rays), dtype=np.int32)
+        share_out(_trace_points, len(pixels), placed, 0.5 * balls.diameter_mm, layers, seen, pixels)
         _add_light(image.ravel(), pixels, weights[part])
         if progress is not None:
             progress(len(pixels))
@@ -107,25 +108,27 @@ def _check_depths(points: NDArray[np.float64], last_layers_mm: NDArray[np.float6
         raise ConfigError(f"a point at z = {nearest:g} mm lies {-last_layers_mm.min():g} mm in front of the fluid")
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, nogil=True)
 def _trace_points(
-    points: NDArray[np.float64],
-    last_layers: NDArray[np.float64],
-    shifts: NDArray[np.float64],
-    rays: int,
+    part: tuple[int, int],
+    placed: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
     ball_radius: float,
     layers: Layers,
     camera: KernelCamera,
-) -> NDArray[np.int32]:
-    """Return the flat pixel number that each ray of each point strikes, (n, rays), -1 off the sensor."""
+    pixels: NDArray[np.int32],
+) -> None:
+    """Write the flat pixel number that each ray of the points `part` strikes, (n, rays), -1 off the sensor.
+
+    `placed` holds all points, their last layers' thicknesses and the shifts of their rays.
+    """
+    points, last_layers, shifts = placed
     aperture_radius = camera.aperture_radius_mm
-    pixels = np.empty((len(points), rays), dtype=np.int32)
-    for i in prange(len(points)):
+    for i in range(part[0], part[1]):
         thicknesses = layers.thicknesses_mm.copy()
         thicknesses[-1] = last_layers[i]
         reach = aperture_radius + ball_radius + np.sqrt(points[i, 0] ** 2 + points[i, 1] ** 2)
         nodes, factors = slope_polynomial(reach, thicknesses, layers.indices)
-        for k in range(rays):
+        for k in range(pixels.shape[1]):
             lens_x, lens_y = _on_disc(aperture_radius, shifts[i, 0] + k * SEQUENCE[0], shifts[i, 1] + k * SEQUENCE[1])
             ball_x, ball_y = _in_ball(ball_radius, shifts[i, 2] + k * SEQUENCE[2], shifts[i, 3] + k * SEQUENCE[3])
             dx = lens_x - points[i, 0] - ball_x
@@ -133,7 +136,6 @@ def _trace_points(
             ratio = slope_ratio(dx * dx + dy * dy, nodes, factors)
             x, y = trace_ray(camera, lens_x, lens_y, ratio * dx, ratio * dy)
             pixels[i, k] = struck_pixel(camera, x, y)
-    return pixels
 
 
 @njit(cache=True)
@@ -184,26 +186,30 @@ def render_white(camera: Camera, level: float, samples_per_side: int = WHITE_SAM
     # the sequence's mean is not the lens's centre: it would move the micro-images by 0.002 px
     offsets = offsets - offsets.mean(axis=0)
     centres = camera.micro_image_lattice_px()
-    lit = _backtrack_white(positions, offsets, camera.for_kernels(), centres.origin, centres.basis)
-    return lit * (level / samples)
+    lit = np.empty((camera.rows, camera.columns), dtype=np.int64)
+    share_out(
+        _backtrack_white, camera.rows, positions, offsets, camera.for_kernels(), centres.origin, centres.basis, lit
+    )
+    return lit * np.float64(level / samples)
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, nogil=True)
 def _backtrack_white(
+    part: tuple[int, int],
     positions_px: NDArray[np.float64],
     offsets: NDArray[np.float64],
     camera: KernelCamera,
     origin_px: NDArray[np.float64],
     basis_px: NDArray[np.float64],
-) -> NDArray[np.int64]:
-    """Return how many of each pixel's samples come from the aperture, summed over the lenses."""
-    rows, columns, pixel, straight = camera.rows, camera.columns, camera.pixel_mm, camera.bend
+    lit: NDArray[np.int64],
+) -> None:
+    """Write how many samples of each pixel, rows `part`, come from the aperture, summed over the lenses."""
+    columns, pixel, straight = camera.columns, camera.pixel_mm, camera.bend
     aperture_radius = camera.aperture_radius_mm
-    lit = np.zeros((rows, columns), dtype=np.int64)
     # Eq. 1 for a ray that meets the array q beside the centre s_u of a lens, solved for X:
     # x_s = s_u + q (1 - s_mu/f_m) + s_mu (s_u + q - X)/s_i
     lever = camera.image_distance_mm / camera.microlens_distance_mm
-    for row in prange(rows):
+    for row in range(part[0], part[1]):
         for column in range(columns):
             near_x, near_y = nearest_point(float(column), float(row), origin_px, basis_px)
             count = 0
@@ -220,4 +226,3 @@ def _backtrack_white(
                         if x * x + y * y <= aperture_radius * aperture_radius:
                             count += 1
             lit[row, column] = count
-    return lit

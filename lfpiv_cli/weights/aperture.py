@@ -10,9 +10,10 @@ Axes: patches are intervals of X (columns) and Y (rows) on the main lens, in mm 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
+from lfpiv_cli.threads import share_out
 from lfpiv_cli.weights.axis_cells import Cells
 
 DISC_SHARE_OF_SQUARE = np.pi / 4.0
@@ -20,7 +21,9 @@ DISC_SHARE_OF_SQUARE = np.pi / 4.0
 
 def aperture_mask(columns: Cells, rows: Cells, radius_mm: float) -> NDArray[np.float32]:
     """Return C (row cells, column cells): the share of each cell's patch inside the disc, over the square's share."""
-    return _mask(columns.patch_mm, rows.patch_mm, radius_mm)
+    mask = np.empty((len(rows.patch_mm), len(columns.patch_mm)), np.float32)
+    share_out(_write_mask, len(mask), columns.patch_mm, rows.patch_mm, radius_mm, mask)
+    return mask
 
 
 @njit(cache=True)
@@ -53,10 +56,16 @@ def disc_area_below(x: float, y: float, radius: float) -> float:
     return area
 
 
-@njit(cache=True, parallel=True)
-def _mask(columns: NDArray[np.float64], rows: NDArray[np.float64], radius: float) -> NDArray[np.float32]:
-    mask = np.zeros((rows.shape[0], columns.shape[0]), np.float32)
-    for r in prange(rows.shape[0]):
+@njit(cache=True, nogil=True)
+def _write_mask(
+    part: tuple[int, int],
+    columns: NDArray[np.float64],
+    rows: NDArray[np.float64],
+    radius: float,
+    mask: NDArray[np.float32],
+) -> None:
+    """Write rows `part` of `aperture_mask`, from the patches (n, 2) of columns and rows."""
+    for r in range(part[0], part[1]):
         y0, y1 = rows[r]
         for c in range(columns.shape[0]):
             x0, x1 = columns[c]
@@ -67,4 +76,3 @@ def _mask(columns: NDArray[np.float64], rows: NDArray[np.float64], radius: float
                 + disc_area_below(x0, y0, radius)
             )
             mask[r, c] = max(inside, 0.0) / ((x1 - x0) * (y1 - y0)) / DISC_SHARE_OF_SQUARE
-    return mask

@@ -17,14 +17,14 @@ Axes: one image axis at a time (columns or rows), in mm about the optical axis; 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
-from lfpiv_cli.optics.camera import KernelCamera
 from lfpiv_cli.optics.object_space import slope_ratio
+from lfpiv_cli.threads import share_out
 from lfpiv_cli.weights.axis_cells import AxisOptics, Cells, micro_image_cells
 from lfpiv_cli.weights.polygons import cut, polygon_area, set_rectangle
 
@@ -170,10 +170,11 @@ def axis_weights(
         strips=bending.strips,
     )
     counts = np.zeros(planes * centres_mm.size, np.int64)
-    _integrate(scene, np.zeros(0, np.int64), counts, np.zeros(0, np.int32), np.zeros(0, np.float32))
+    nothing = (np.zeros(0, np.int64), counts, np.zeros(0, np.int32), np.zeros(0, np.float32))
+    share_out(_integrate, planes, scene, *nothing)
     start = np.concatenate([[0], np.cumsum(counts)])
     cell, share = np.empty(start[-1], np.int32), np.empty(start[-1], np.float32)
-    _integrate(scene, start, counts, cell, share)
+    share_out(_integrate, planes, scene, start, counts, cell, share)
     return AxisWeights(planes, centres_mm.size, optics.pixels, cells, start, cell, share)
 
 
@@ -183,24 +184,23 @@ def depth_nodes(z_mm: NDArray[np.float64], depth_mm: float) -> NDArray[np.float6
     return z_mm[:, np.newaxis] + 0.5 * depth_mm * nodes
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, nogil=True)
 def _integrate(
+    part: tuple[int, int],
     scene: AxisScene,
     start: NDArray[np.int64],
     counts: NDArray[np.int64],
     cell: NDArray[np.int32],
     share: NDArray[np.float32],
 ) -> None:
-    """Fill `counts` (when `start` is empty) or `cell` and `share`, one plane after the other."""
-    camera, lenses, rest = scene.optics.camera[:], scene.optics[1:], scene[1:]
+    """Fill `counts` (when `start` is empty) or `cell` and `share`, one plane of `part` after the other."""
     voxels = scene.centres_mm.size
-    for plane in prange(scene.fitted_mm.shape[0]):
-        whole = _scene_of(camera, lenses, rest)
-        shares = np.zeros(whole.cell_pixel.size)
-        work = np.empty((4, MOST_CORNERS, 2))
+    shares = np.zeros(scene.cell_pixel.size)
+    work = np.empty((4, MOST_CORNERS, 2))
+    for plane in range(part[0], part[1]):
         for k in range(voxels):
             row = plane * voxels + k
-            begin, end = _voxel_shares(whole, row, work, shares)
+            begin, end = _voxel_shares(scene, row, work, shares)
             found = 0
             for at in range(begin, end):
                 if shares[at] > SMALLEST_SHARE:
@@ -210,12 +210,6 @@ def _integrate(
                     found += 1
                 shares[at] = 0.0
             counts[row] = found
-
-
-@njit(cache=True)
-def _scene_of(camera: tuple[Any, ...], lenses: tuple[Any, ...], rest: tuple[Any, ...]) -> AxisScene:
-    """Put a scene together again inside a parallel loop (see `KernelCamera`)."""
-    return AxisScene(AxisOptics(KernelCamera(*camera), *lenses), *rest)
 
 
 @njit(cache=True)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.errors import InputError
@@ -23,10 +23,11 @@ from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.microlenses import nearest_point
 from lfpiv_cli.optics.tracing import struck_pixel
 from lfpiv_cli.robust import BRIGHTEST_PERCENTILE, LIT_SHARE
+from lfpiv_cli.threads import share_out
 from lfpiv_cli.weights.build import factorise_through, separates
 from lfpiv_cli.weights.operators import Column, FactorisedOperator
 from lfpiv_cli.weights.quadrature import DEPTH_NODES, TILES, Columns, integrate_columns
-from lfpiv_cli.weights.scene import Scene, Source, kernel_scene, on_array, on_sensor, rays_from, scene_of
+from lfpiv_cli.weights.scene import Scene, Source, kernel_scene, on_array, on_sensor, rays_from
 
 # Columns may take this much memory: two thirds of a machine with 24 GiB, the rest is for volumes and images.
 LARGEST_BYTES = 16 * 2**30
@@ -170,7 +171,9 @@ class OnDemandOperator:
         for first in range(0, result.size, VOXELS_AT_ONCE * 16):
             part = np.arange(first, min(first + VOXELS_AT_ONCE * 16, result.size))
             scene = kernel_scene(self.camera, self.source, self.centres_mm(part), self.sides_mm, SIGHT_TILES, 1)
-            result[part] = _seen_share(scene, near.ravel()) >= SEEN_SHARE
+            seen = np.empty(part.size)
+            share_out(_seen_shares, part.size, scene, near.ravel(), seen)
+            result[part] = seen >= SEEN_SHARE
         return result
 
     @cached_property
@@ -214,7 +217,6 @@ def _as_column(columns: Columns, at: int, width: int) -> Column:
     return row, column, columns.share[part]
 
 
-@njit(cache=True, parallel=True)
 def _add_columns(
     light: NDArray[np.float32],
     start: NDArray[np.int64],
@@ -224,44 +226,62 @@ def _add_columns(
 ) -> NDArray[np.float32]:
     """Return the flat image of the voxels' light."""
     images = np.zeros((PARTS, pixels), np.float32)
+    share_out(_add_parts, PARTS, light, start, pixel, share, images)
+    return np.asarray(images.sum(axis=0))
+
+
+@njit(cache=True, nogil=True)
+def _add_parts(
+    parts: tuple[int, int],
+    light: NDArray[np.float32],
+    start: NDArray[np.int64],
+    pixel: NDArray[np.int32],
+    share: NDArray[np.float32],
+    images: NDArray[np.float32],
+) -> None:
+    """Add the light of each of `parts` of the voxels to an image of its own, (PARTS, pixels)."""
     size = -(-light.size // PARTS)
-    for part in prange(PARTS):
+    for part in range(parts[0], parts[1]):
         for n in range(part * size, min((part + 1) * size, light.size)):
             if light[n] != 0.0:
                 for at in range(start[n], start[n + 1]):
                     images[part, pixel[at]] += light[n] * share[at]
-    total = np.empty(pixels, np.float32)
-    for k in prange(pixels):
-        total[k] = images[:, k].sum()
-    return total
 
 
-@njit(cache=True, parallel=True)
 def _gather(
     image: NDArray[np.float32], start: NDArray[np.int64], pixel: NDArray[np.int32], share: NDArray[np.float32]
 ) -> NDArray[np.float32]:
     """Return for each voxel the sum of its weights times the pixels."""
     values = np.empty(start.size - 1, np.float32)
-    for n in prange(start.size - 1):
+    share_out(_gather_part, values.size, image, start, pixel, share, values)
+    return values
+
+
+@njit(cache=True, nogil=True)
+def _gather_part(
+    part: tuple[int, int],
+    image: NDArray[np.float32],
+    start: NDArray[np.int64],
+    pixel: NDArray[np.int32],
+    share: NDArray[np.float32],
+    values: NDArray[np.float32],
+) -> None:
+    """Write what `_gather` returns for voxels `part`."""
+    for n in range(part[0], part[1]):
         total = np.float32(0.0)
         for at in range(start[n], start[n + 1]):
             total += share[at] * image[pixel[at]]
         values[n] = total
-    return values
 
 
-@njit(cache=True, parallel=True)
-def _seen_share(scene: Scene, lit: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return the share of each voxel's lines of sight, among those that meet the sensor, that end on lit pixels.
+@njit(cache=True, nogil=True)
+def _seen_shares(part: tuple[int, int], scene: Scene, lit: NDArray[np.bool_], seen: NDArray[np.float64]) -> None:
+    """Write the shares (n,) of the lines of sight, among those that meet the sensor, that end on lit pixels.
 
-    `lit` is flat.
+    Those of voxels `part`; `lit` is flat.
     """
-    camera, rest = scene.camera[:], scene[1:]
-    seen = np.zeros(scene.plane.size)
-    for n in prange(scene.plane.size):
-        whole = scene_of(camera, rest)
-        seen[n] = _lit_share(whole, whole.centres_mm[n], whole.plane[n], lit)
-    return seen
+    for n in range(part[0], part[1]):
+        seen[n] = _lit_share(scene, scene.centres_mm[n], scene.plane[n], lit)
 
 
 @njit(cache=True)

@@ -13,12 +13,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.threads import share_out
 from lfpiv_cli.weights.lens_cells import MOST_CORNERS, shared_rectangle
-from lfpiv_cli.weights.scene import Scene, Source, kernel_scene, on_array, on_sensor, rays_from, scene_of
+from lfpiv_cli.weights.scene import Scene, Source, kernel_scene, on_array, on_sensor, rays_from
 
 # Tiles across the aperture: with 32 a tile is seen as half a pixel of Table 2's camera and columns are off by 0.01 to
 # 0.02 in L1 (0.04 at 11 mm from focus), with 64 by 0.003 to 0.005, with 256 by 0.0002 (0.0008).
@@ -91,13 +92,14 @@ def integrate_columns(
     centres = np.ascontiguousarray(centres_mm, dtype=np.float64).reshape(-1, 3)
     sides = np.asarray(voxel_mm, dtype=np.float64)
     scene = kernel_scene(camera, source, centres, sides, tiles, depth_nodes)
-    boxes = _boxes(scene)
+    boxes = np.empty((len(centres), 4), np.int64)
+    share_out(_set_boxes, len(centres), scene, boxes)
     pixels, shares, counts = [], [], []
     first = 0
     while first < len(centres):
         last = _block_end(boxes, first)
         pictures = np.zeros((last - first, *(boxes[first:last, 2:] - boxes[first:last, :2]).max(axis=0)))
-        _fill(scene, boxes, first, pictures)
+        share_out(_fill, len(pictures), scene, boxes, first, pictures)
         voxel, row, column = np.nonzero(pictures > SMALLEST_SHARE)
         shares.append(pictures[voxel, row, column].astype(np.float32))
         pixels.append((row + boxes[first + voxel, 0]) * camera.columns + column + boxes[first + voxel, 1])
@@ -130,15 +132,11 @@ def _half_face(scene: Scene, point: NDArray[np.float64], plane: int, node: int) 
     return 0.5 * abs(ends[0, 1] - ends[0, 0]), 0.5 * abs(ends[1, 1] - ends[1, 0])
 
 
-@njit(cache=True, parallel=True)
-def _boxes(scene: Scene) -> NDArray[np.int64]:
-    """Return the part of the sensor that each voxel can light: (n, 4) first row and column, and those behind."""
-    camera, rest = scene.camera[:], scene[1:]
-    boxes = np.empty((scene.plane.size, 4), np.int64)
-    for n in prange(scene.plane.size):
-        whole = scene_of(camera, rest)
-        _set_box(whole, whole.centres_mm[n], whole.plane[n], boxes[n])
-    return boxes
+@njit(cache=True, nogil=True)
+def _set_boxes(part: tuple[int, int], scene: Scene, boxes: NDArray[np.int64]) -> None:
+    """Set what of the sensor voxels `part` can light: (n, 4) first row and column, and those behind."""
+    for n in range(part[0], part[1]):
+        _set_box(scene, scene.centres_mm[n], scene.plane[n], boxes[n])
 
 
 @njit(cache=True)
@@ -173,12 +171,13 @@ def _set_box(scene: Scene, centre: NDArray[np.float64], plane: int, box: NDArray
         box[3 - axis] = min(max(last, 0), size)
 
 
-@njit(cache=True, parallel=True)
-def _fill(scene: Scene, boxes: NDArray[np.int64], first: int, pictures: NDArray[np.float64]) -> None:
-    """Add up the light of the voxels from `first` on in `pictures` (voxels, rows, columns of their boxes)."""
-    camera, rest = scene.camera[:], scene[1:]
-    for n in prange(pictures.shape[0]):
-        _fill_picture(scene_of(camera, rest), first + n, boxes[first + n], pictures[n])
+@njit(cache=True, nogil=True)
+def _fill(
+    part: tuple[int, int], scene: Scene, boxes: NDArray[np.int64], first: int, pictures: NDArray[np.float64]
+) -> None:
+    """Add up the light of the voxels from `first` on in pictures `part` of (voxels, rows, columns of their boxes)."""
+    for n in range(part[0], part[1]):
+        _fill_picture(scene, first + n, boxes[first + n], pictures[n])
 
 
 @njit(cache=True)

@@ -14,12 +14,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from lfpiv_cli.optics.camera import Camera, KernelCamera
 from lfpiv_cli.optics.object_space import ObjectSpace, slope_ratio
 from lfpiv_cli.optics.tracing import struck_pixel, trace_ray
+from lfpiv_cli.threads import share_out
 from lfpiv_cli.weights.quadrature import Columns
 
 # Points are counted in this many parts side by side, each into an image of its own.
@@ -72,7 +73,9 @@ def count_rays(
     seeds = rng.integers(0, 2**64, count.points, dtype=np.uint64)
     reach = camera.aperture_radius_mm + float(np.hypot(*(np.abs(centre[:2]) + sides[:2])))
     nodes, factors = space.slope_polynomials(camera, starts[:, 2], reach)
-    counts = _count(starts, seeds, count.rays_per_point, nodes, factors, camera.for_kernels())
+    counts = np.zeros((PARTS, camera.rows * camera.columns), np.int64)
+    rays = (starts, seeds, count.rays_per_point)
+    share_out(_count, PARTS, rays, nodes, factors, camera.for_kernels(), counts)
     return counts.sum(axis=0).reshape(camera.rows, camera.columns) / count.rays
 
 
@@ -114,22 +117,25 @@ def unit_random(state: np.uint64) -> float:
     return float(z >> np.uint64(11)) * TO_UNIT
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, nogil=True)
 def _count(
-    starts: NDArray[np.float64],
-    seeds: NDArray[np.uint64],
-    rays: int,
+    parts: tuple[int, int],
+    rays: tuple[NDArray[np.float64], NDArray[np.uint64], int],
     nodes: NDArray[np.float64],
     factors: NDArray[np.float64],
     camera: KernelCamera,
-) -> NDArray[np.int64]:
-    """Return the rays that strike each pixel, (parts, rows * columns)."""
+    counts: NDArray[np.int64],
+) -> None:
+    """Add up the rays that strike each pixel, `parts` of (parts, rows * columns).
+
+    `rays` holds the points that they start from, a seed for each, and how many each sends.
+    """
+    starts, seeds, rays_each = rays
     radius = camera.aperture_radius_mm
-    counts = np.zeros((PARTS, camera.rows * camera.columns), np.int64)
-    for part in prange(PARTS):
+    for part in range(parts[0], parts[1]):
         for n in range(part, starts.shape[0], PARTS):
             state = seeds[n]
-            for _ in range(rays):
+            for _ in range(rays_each):
                 state += STEP
                 r = radius * np.sqrt(unit_random(state))
                 state += STEP
@@ -141,4 +147,3 @@ def _count(
                 pixel = struck_pixel(camera, x, y)
                 if pixel >= 0:
                     counts[part, pixel] += 1
-    return counts

@@ -8,7 +8,7 @@ Axes: everything here is in image axes (x along the columns), mm, z away from th
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -133,12 +133,6 @@ def kernel_scene(
         cell_radius_mm=cell_radius(camera.lattice),
         neighbours_mm=neighbours(camera.lattice),
     )
-
-
-@njit(cache=True)
-def scene_of(camera: tuple[Any, ...], rest: tuple[Any, ...]) -> Scene:
-    """Put `scene.camera[:]` and `scene[1:]` together again inside a parallel loop (see `KernelCamera`)."""
-    return Scene(KernelCamera(*camera), *rest)
 
 
 @njit(cache=True)
