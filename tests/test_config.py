@@ -44,10 +44,11 @@ def write(tmp_path: Path):
 
 def refusal(path: Path) -> str:
     """Return the message with which a config is refused."""
-    start = time.perf_counter()
+    # Of this thread's work, whatever else the machine is busy with.
+    start = time.thread_time()
     with pytest.raises(ConfigError) as caught:
         load_config(path)
-    assert time.perf_counter() - start < 1.0
+    assert time.thread_time() - start < 1.0
     return str(caught.value)
 
 
