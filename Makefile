@@ -12,6 +12,8 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
+# What the commands need, and what the tests, checks and documents need beside it: two thirds of all.
+CORE := $(VENV)/core
 INSTALLED := $(VENV)/installed
 LFPIV := $(BIN)/lfpiv
 
@@ -31,28 +33,34 @@ flow: $(OUT)/report/flow.json
 
 install: $(INSTALLED)
 
-$(INSTALLED): requirements.lock pyproject.toml
+# Python compiles what it imports; pip would compile all.
+PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile
+
+$(CORE): requirements.lock pyproject.toml
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.lock
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --editable .
+	$(PIP_INSTALL) --constraint requirements.lock --editable ".[plot]"
 	@touch $@
 
-$(OUT)/calibration.h5: $(CONFIG) $(DATA)/white.tif $(DATA)/dark.tif $(DATA)/board.tif | $(INSTALLED)
+$(INSTALLED): $(CORE)
+	$(PIP_INSTALL) --requirement requirements.lock
+	@touch $@
+
+$(OUT)/calibration.h5: $(CONFIG) $(DATA)/white.tif $(DATA)/dark.tif $(DATA)/board.tif | $(CORE)
 	@mkdir -p $(@D)
 	$(LFPIV) calibrate-snapshot $(CONFIG) --white $(DATA)/white.tif --dark $(DATA)/dark.tif --board $(DATA)/board.tif \
 	    --output $(OUT)/calibration.h5 --picture $(OUT)/calibration.png --overwrite
 
-$(OUT)/weights.h5: $(CONFIG) $(OUT)/calibration.h5 | $(INSTALLED)
+$(OUT)/weights.h5: $(CONFIG) $(OUT)/calibration.h5 | $(CORE)
 	$(LFPIV) build-weights $(CONFIG) --calibration $(OUT)/calibration.h5 --output $@ --overwrite
 
-$(OUT)/volumes/%.vtkhdf: $(DATA)/%.tif $(OUT)/weights.h5 $(DATA)/dark.tif | $(INSTALLED)
+$(OUT)/volumes/%.vtkhdf: $(DATA)/%.tif $(OUT)/weights.h5 $(DATA)/dark.tif | $(CORE)
 	@mkdir -p $(@D)
 	$(LFPIV) reconstruct $(OUT)/weights.h5 $< --dark $(DATA)/dark.tif --output $@ --overwrite
 
-$(OUT)/vectors.vtkhdf: $(OUT)/volumes/$(A).vtkhdf $(OUT)/volumes/$(B).vtkhdf | $(INSTALLED)
+$(OUT)/vectors.vtkhdf: $(OUT)/volumes/$(A).vtkhdf $(OUT)/volumes/$(B).vtkhdf | $(CORE)
 	$(LFPIV) correlate $^ --output $@ --overwrite
 
-$(OUT)/report/flow.json: $(CONFIG) $(OUT)/vectors.vtkhdf $(TRUTH) | $(INSTALLED)
+$(OUT)/report/flow.json: $(CONFIG) $(OUT)/vectors.vtkhdf $(TRUTH) | $(CORE)
 	@mkdir -p $(@D)
 	$(LFPIV) validate flow $(CONFIG) --vectors $(OUT)/vectors.vtkhdf $(if $(TRUTH),--particles $(TRUTH)) \
 	    --output $(@D) --overwrite
