@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from lfpiv_cli.threads import blocks, in_threads
+from lfpiv_cli.threads import blocks, in_threads, share_out
 
 
 @pytest.mark.parametrize(
@@ -18,3 +20,14 @@ def test_results_are_in_order_and_errors_come_through() -> None:
     assert in_threads(lambda k: 10 // k, [1, 2, 5]) == [10, 5, 2]
     with pytest.raises(ZeroDivisionError):
         in_threads(lambda k: 10 // k, [1, 0, 5])
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 100])
+def test_every_piece_of_work_is_shared_out_once(count: int) -> None:
+    done = np.zeros(count)
+
+    def work(part: tuple[int, int], much: float, onto: NDArray[np.float64]) -> None:
+        onto[part[0] : part[1]] += much
+
+    share_out(work, count, 2.0, done)
+    assert done.tolist() == [2.0] * count
