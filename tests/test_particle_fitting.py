@@ -15,7 +15,7 @@ from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.particles.alternative_depths import try_other_depths
 from lfpiv_cli.particles.covariance import joint_covariance
-from lfpiv_cli.particles.fitting import accept, add_all, claimed_share, judge, refine
+from lfpiv_cli.particles.fitting import Least, accept, add_all, claimed_share, judge, refine
 from lfpiv_cli.particles.least_squares import Observation, normal_equations, observation_of, respond_once
 from lfpiv_cli.particles.noise import WHITE, Correlation, Noise, error_correlation, measured_noise
 from lfpiv_cli.particles.splitting import split
@@ -105,7 +105,7 @@ def test_a_ghost_is_not_accepted(view: View, rng: np.random.Generator) -> None:
     residual = image_of(view, particles)
     ghost = np.array([[1.0, 1.0, 0.0, 5e5]]) * np.sign(-particles[:1])
     candidates = np.concatenate([particles + (0.01, 0.01, 0.1, 0.0), ghost])
-    taken = accept(observed(view, residual, np.ones_like(residual)), candidates, 1e5, 0.8)
+    taken = accept(observed(view, residual, np.ones_like(residual)), candidates, Least(1e5, 0.8, 0.1))
     assert taken.tolist() == [True, True, False]
     np.testing.assert_allclose(candidates[:2, :3], particles[:, :3], atol=2e-3)
 
@@ -281,3 +281,16 @@ def test_noise_is_what_a_fit_leaves(rng: np.random.Generator) -> None:
     assert found.model_error == pytest.approx(0.05, rel=0.2)
     few = measured_noise(model[:100], residual[:100], usable[:100], Noise(6.0, 2.0))
     assert few == Noise(6.0, 2.0)
+
+
+def test_what_hardly_meets_the_sensor_is_no_particle(view: View) -> None:
+    candidate = np.array([[2.02, 0.3, 2.0, 1e6]])
+    residual = image_of(view, candidate)
+    weight = np.full_like(residual, 1.0 / 36.0)
+    *_, seen = judge(observed(view, residual, weight), candidate)
+    assert 0.0 < seen[0] < 0.1
+    taken = [
+        accept(observed(view, residual.copy(), weight), candidate.copy(), Least(1e5, 0.5, least)).tolist()
+        for least in (0.0, 0.1)
+    ]
+    assert taken == [[True], [False]]

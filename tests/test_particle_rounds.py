@@ -97,6 +97,23 @@ def test_the_same_image_in_a_larger_world_shows_the_same(
         np.testing.assert_allclose(others, found[0], rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_single_tracer_is_found_in_a_volume_that_is_partly_out_of_view(
+    table2: Camera, water: Media, seed: int
+) -> None:
+    """Where a voxel is hardly seen, noise is explained by more light than any tracer has."""
+    rng = np.random.default_rng(seed)
+    camera = replace(table2, columns=160, rows=160)
+    weights = weights_of(camera, water, Grid.centred((24, 24, 7), (0.1, 0.1, 0.1), (0.0, 0.0, 1.9)))
+    true, view = np.array([[0.05, -0.1, 1.8, 5e5]]), raw_view(camera, water, 0.025)
+    image = np.zeros(camera.rows * camera.columns)
+    add_all(view, true, 1.0, image, (1.0, 3.0))
+    image = rng.poisson(0.5 * image) / 0.5 + rng.normal(0.0, 6.0, image.size)
+    image = np.rint(image).reshape(camera.rows, camera.columns).astype(np.float32)
+    state = first_pass(task_of(image, view, weights, camera, normalisers(weights.padded)), ROUNDS[:1])
+    np.testing.assert_allclose(state.particles, true, rtol=0.02, atol=2e-3)
+
+
 def test_pixels_that_are_left_out_do_not_matter(table2: Camera, water: Media, rng: np.random.Generator) -> None:
     camera = replace(table2, columns=360, rows=300)
     grid = Grid.centred((14, 11, 10), (0.1, 0.1, 0.1), (0.0, 0.0, 1.9))

@@ -7,6 +7,8 @@ Axes: image axes, mm; light in counts; residual and weights as flat images. A pa
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -59,6 +61,16 @@ def claimed_share(
             wanted += claim
             found += min(max(residual[pixels[k]] + own * values[k, 0], 0.0), claim)
     return found / wanted if wanted > 0.0 else 0.0
+
+
+@njit(cache=True)
+def seen_share(pixels: NDArray[np.int32], values: NDArray[np.float64], weight: NDArray[np.float64]) -> float:
+    """Return the share of a particle's light that meets pixels with weight."""
+    seen = 0.0
+    for k in range(pixels.size):
+        if weight[pixels[k]] > 0.0:
+            seen += values[k, 0]
+    return seen
 
 
 def refine(observation: Observation, particles: NDArray[np.float64]) -> None:
@@ -147,14 +159,20 @@ def _fit_from(
     return fit(observation, trial, responses, steps, np.inf)
 
 
-def accept(
-    observation: Observation, candidates: NDArray[np.float64], smallest_light: float, smallest_share: float
-) -> NDArray[np.bool_]:
+class Least(NamedTuple):
+    """What a candidate must have: light, the share of it that is found, and the share of it that meets the sensor."""
+
+    light: float
+    found: float
+    seen: float
+
+
+def accept(observation: Observation, candidates: NDArray[np.float64], least: Least) -> NDArray[np.bool_]:
     """Fit candidates (n, 4) in place, one after the other; return which ones stay, their light off the residual."""
     accepted = np.zeros(len(candidates), np.bool_)
 
     def work(numbers: NDArray[np.int64]) -> None:
-        _accept(observation, candidates, numbers, CANDIDATE_STEPS, (smallest_light, smallest_share), accepted)
+        _accept(observation, candidates, numbers, CANDIDATE_STEPS, least, accepted)
 
     over_tiles(work, observation.optics, candidates, observation.depths_mm)
     return accepted
@@ -166,10 +184,10 @@ def _accept(
     candidates: NDArray[np.float64],
     numbers: NDArray[np.int64],
     steps: int,
-    least: tuple[float, float],
+    least: Least,
     accepted: NDArray[np.bool_],
 ) -> None:
-    """Do the work of `accept` for the candidates of a tile; `least` are the light and the share that one must have."""
+    """Do the work of `accept` for the candidates of a tile."""
     residual, weight = observation.residual, observation.weight
     responses = room_for(1, observation.capacity, 0)
     trial, best = np.empty((1, UNKNOWNS)), np.empty((1, UNKNOWNS))
@@ -182,11 +200,13 @@ def _accept(
             if change < lowest:
                 lowest = change
                 best[:] = trial
-        if lowest == 0.0 or best[0, 3] < least[0]:
+        if lowest == 0.0 or best[0, 3] < least.light:
             continue
         respond_all(observation.optics, best, responses)
         pixels, values = lit_by(responses, 0)
-        if claimed_share(pixels, values, best[0, 3], residual, weight, 0.0) >= least[1]:
+        if seen_share(pixels, values, weight) <= least.seen:
+            continue
+        if claimed_share(pixels, values, best[0, 3], residual, weight, 0.0) >= least.found:
             candidates[number] = best[0]
             accepted[number] = True
             add_light(pixels, values, -best[0, 3], residual)

@@ -17,12 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.particles.candidates import boxes_of, explain_rest, find_peaks, points_in_raw_frame
-from lfpiv_cli.particles.fitting import accept
+from lfpiv_cli.particles.fitting import Least, accept, judge
 from lfpiv_cli.particles.noise import Noise, estimate_noise
 from lfpiv_cli.particles.search import (
     LAST_SWEEPS,
     LAST_UNEXPLAINED,
     SMALLEST_LIGHT,
+    SMALLEST_SEEN,
     Particles,
     State,
     Task,
@@ -115,7 +116,10 @@ def _one_round(task: Task, state: State, settings: Round, progress: Callable[[in
     candidates, light = _candidates(task, state, settings.iterations, progress)
     typical = state.typical_light
     if typical == 0.0:
-        typical = first_typical_light(light, noise_of_light(task.view, estimate_noise(task.image, 0.0)))
+        # Where hardly any light meets the sensor, at the volume's rim, noise becomes peaks brighter than tracers.
+        *_, seen = judge(observed(task, state, LAST_UNEXPLAINED), candidates)
+        noise = noise_of_light(task.view, estimate_noise(task.image, 0.0))
+        typical = first_typical_light(light[seen > SMALLEST_SEEN], noise)
     candidates = candidates[light > CANDIDATE_LIGHT * typical] if typical > 0.0 else candidates[:0]
     state = replace(state, typical_light=typical, noise=estimate_noise(task.image, typical))
     state = _accept(task, state, candidates, settings)
@@ -174,5 +178,6 @@ def _candidates(
 def _accept(task: Task, state: State, candidates: NDArray[np.float64], settings: Round) -> State:
     """Return the state with those candidates that hold."""
     observation = observed(task, state, settings.unexplained)
-    accepted = accept(observation, candidates, SMALLEST_LIGHT * state.typical_light, settings.claimed_share)
+    least = Least(SMALLEST_LIGHT * state.typical_light, settings.claimed_share, SMALLEST_SEEN)
+    accepted = accept(observation, candidates, least)
     return replace(state, particles=np.concatenate([state.particles, candidates[accepted]]))

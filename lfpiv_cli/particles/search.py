@@ -182,11 +182,13 @@ def rebuilt(task: Task, state: State, particles: NDArray[np.float64]) -> State:
 
 
 def with_typical_light(task: Task, state: State) -> State:
-    """Return the state with the median light of the better fitting half, which holds fewer merged particles."""
-    if not len(state.particles):
-        return state
-    chi2, *_ = judge(observed(task, state, LAST_UNEXPLAINED), state.particles)
-    typical = float(np.median(state.particles[chi2 <= np.median(chi2), 3]))
+    """Return the state with the median light of the better fitting half, which holds fewer merged particles.
+
+    Those that are hardly seen fit anything; where there are no others, the typical light is not known: 0.
+    """
+    chi2, _, seen = judge(observed(task, state, LAST_UNEXPLAINED), state.particles)
+    light, chi2 = state.particles[seen > SMALLEST_SEEN, 3], chi2[seen > SMALLEST_SEEN]
+    typical = float(np.median(light[chi2 <= np.median(chi2)])) if light.size else 0.0
     return replace(state, typical_light=typical, noise=estimate_noise(task.image, typical))
 
 
