@@ -14,9 +14,10 @@ from lfpiv_cli.calibration.lattice import LatticeFit, fit_lattice
 from lfpiv_cli.calibration.rectification import (
     EXPONENT_ARRAY,
     Rectification,
+    sample_rows,
     sample_spline,
-    sampling_shift,
     turn_matrix,
+    write_shift,
 )
 from lfpiv_cli.calibration.transmission import relative_transmission
 from lfpiv_cli.calibration.views import lens_table, sub_aperture_view
@@ -109,15 +110,15 @@ def test_compiled_kernels_equal_their_python(rng: np.random.Generator) -> None:
     rectification = Rectification(known_fit(turned_lattice("hexagonal")), (14, 17))
     fit, upright = rectification.fit, rectification.lattice_px
     turn = turn_matrix(rectification.rotation_rad)
-    python = getattr(sampling_shift, "py_func", sampling_shift)
-    plain = python(14, 17, upright.origin, upright.basis, fit.coefficients_px, EXPONENT_ARRAY, turn)
+    plain, sampled = np.empty((14, 17, 2), np.float32), np.zeros((14, 17), np.float32)
+    python = getattr(write_shift, "py_func", write_shift)
+    python((0, 14), upright.origin, upright.basis, (fit.coefficients_px, EXPONENT_ARRAY), turn, plain)
     np.testing.assert_allclose(rectification.shift_px, plain, atol=1e-6)
     coefficients = rng.random((14, 17))
-    np.testing.assert_allclose(
-        sample_spline(coefficients, plain, rectification.inside),
-        getattr(sample_spline, "py_func", sample_spline)(coefficients, plain, rectification.inside),
-        rtol=1e-6,
-    )
+    python = getattr(sample_rows, "py_func", sample_rows)
+    python((0, 14), coefficients, plain, rectification.inside, sampled)
+    assert np.any(sampled)
+    np.testing.assert_allclose(sample_spline(coefficients, plain, rectification.inside), sampled, rtol=1e-6)
 
 
 @pytest.mark.parametrize("column_axis", ["x", "y"])
