@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lfpiv_cli.console import Console
-from lfpiv_cli.errors import InputError, UsageError
+from lfpiv_cli.errors import ConfigError, InputError, UsageError
 from lfpiv_cli.files.calibration_file import read_calibration
 from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.stages.calibrate import CalibrateOptions, calibrate_snapshot
@@ -83,6 +84,26 @@ def test_another_pitch_than_the_data_sheets_is_refused(tmp_path: Path, square: L
 def test_no_picture_is_a_slip_of_the_command(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="--white, --board or both"):
         calibrated(tmp_path, config(tmp_path), [])
+
+
+def test_a_known_focus_needs_no_board(tmp_path: Path, square: Lattice) -> None:
+    """The mid plane is where it is told to be; a board measures it."""
+    rig, picture = config(tmp_path), white(tmp_path / "w.tif", square, 5.5)
+    options = CalibrateOptions(white=[picture], depth_mm=[-0.35])
+    with pytest.raises(ConfigError, match="section `channel` is missing"):
+        calibrate_snapshot(rig, tmp_path / "c.h5", options, console=QUIET)
+    rig.write_text(rig.read_text() + "channel: {width_mm: 4.0, wall_mm: 2.0}\n")
+    figures = calibrate_snapshot(rig, tmp_path / "c.h5", options, console=QUIET)
+    assert (figures["mid_plane_z_mm"], figures["mid_plane_z_mm_sigma"], figures["mid_plane_given"]) == (
+        -0.35,
+        None,
+        True,
+    )
+    assert read_calibration(tmp_path / "c.h5").summary() == figures
+    with pytest.raises(UsageError, match="0 --board and 2 --depth-mm"):
+        calibrate_snapshot(rig, tmp_path / "d.h5", replace(options, depth_mm=[0.0, 1.0]), console=QUIET)
+    with pytest.raises(UsageError, match="a depth of nan mm"):
+        calibrate_snapshot(rig, tmp_path / "d.h5", replace(options, depth_mm=[np.nan]), console=QUIET)
 
 
 def test_a_whole_camera_tells_its_image_distance_and_shows_views(tmp_path: Path, square: Lattice) -> None:

@@ -88,6 +88,7 @@ class Calibration:
     pose : of the board, or None
     camera_move_mm : d_m of Eq. 21, or None
     mid_plane_z_mm, mid_plane_z_sigma_mm : depth of the channel's mid plane in the fluid, or None
+    mid_plane_given : that depth was told and not measured, its uncertainty is not known
     image_distance_mm, image_distance_sigma_mm : s_i by the pitch of the lens images, a check of the data sheet, or None
     ray_fit : polynomials of rays from boards at several depths, in the rectified frame, or None
     """
@@ -101,6 +102,7 @@ class Calibration:
     image_distance_mm: float | None = None
     image_distance_sigma_mm: float | None = None
     ray_fit: RayFit | None = None
+    mid_plane_given: bool = False
 
     @property
     def fit(self) -> LatticeFit:
@@ -169,6 +171,7 @@ class Calibration:
             "camera_move_mm": self.camera_move_mm,
             "mid_plane_z_mm": self.mid_plane_z_mm,
             "mid_plane_z_mm_sigma": self.mid_plane_z_sigma_mm,
+            "mid_plane_given": None if self.mid_plane_z_mm is None else self.mid_plane_given,
             "dlfc_depths_mm": rays.depths_mm.tolist() if rays else None,
             "dlfc_degree": rays.rays.degree if rays else None,
             "dlfc_sightings": rays.sightings if rays else None,
@@ -187,6 +190,7 @@ class Calibration:
             "transmission": self.transmission,
             "board": {field.name: getattr(pose, field.name) for field in fields(BoardPose)} if pose else None,
             "dlfc": self.ray_fit.to_tree() if self.ray_fit else None,
+            "mid_plane_given": 1 if self.mid_plane_given else None,
         } | {name: getattr(self, name) for name in CARRIED}
 
     @classmethod
@@ -208,6 +212,7 @@ class Calibration:
                 tree.get("transmission"),
                 BoardPose(**tree["board"]) if tree.get("board") else None,
                 ray_fit=RayFit.from_tree(tree["dlfc"]) if tree.get("dlfc") else None,
+                mid_plane_given=bool(tree.get("mid_plane_given")),
                 **{name: tree.get(name) for name in CARRIED},
             )
         except (KeyError, TypeError, ValueError) as error:
@@ -216,15 +221,16 @@ class Calibration:
 
 @dataclass(frozen=True, eq=False)
 class Photographs:
-    """Raw pictures (rows, columns) to calibrate from.
+    """Raw pictures (rows, columns) to calibrate from, and what is known of the scene.
 
     Attributes
     ----------
     whites : of uniform light: the one with the smallest aperture gives the lattice, the one with the widest the
         transmission; none: the lattice is that of the data sheet
     dark : of no light
-    board : of the dot board
+    board : of the calibration target
     depth_boards, depths_mm : of the board at several depths, and these, for fitted rays
+    mid_plane_z_mm : depth of the channel's mid plane in the fluid where it is known without a board
     """
 
     whites: Sequence[ArrayLike] = ()
@@ -232,6 +238,7 @@ class Photographs:
     board: ArrayLike | None = None
     depth_boards: Sequence[ArrayLike] = ()
     depths_mm: Sequence[float] = ()
+    mid_plane_z_mm: float | None = None
 
     @property
     def lit(self) -> list[ArrayLike]:
@@ -278,6 +285,8 @@ def calibrate(pictures: Photographs, rig: Rig | None = None, sheet: DataSheet = 
     # One BLAS thread: the same bits on every machine, and small problems gain nothing from more.
     with threadpool_limits(limits=1, user_api="blas"):
         calibration = lattice_calibration(pictures, shape, sheet)
+        if pictures.mid_plane_z_mm is not None:
+            calibration = replace(calibration, mid_plane_z_mm=pictures.mid_plane_z_mm, mid_plane_given=True)
         if rig is None:
             return calibration
         if len(pictures.depth_boards):

@@ -16,9 +16,17 @@ from lfpiv_cli.console import Console
 @click.option("--white", type=FILE, multiple=True, help="White image, uniform light; twice: stopped down and not.")
 @dark_option
 @click.option(
-    "--board", type=FILE, multiple=True, help="Snapshot of the calibration target, a board of dots; or several."
+    "--board",
+    type=FILE,
+    multiple=True,
+    help="Snapshot of the calibration target: dots, a chessboard or a ChArUco board; or several.",
 )
-@click.option("--depth-mm", type=float, multiple=True, help="Depth of each target in the fluid, for dlfc.")
+@click.option(
+    "--depth-mm",
+    type=float,
+    multiple=True,
+    help="Depth of each target in the fluid, for dlfc; without a target, of the channel's mid plane.",
+)
 @output_option("Calibration file to write (.h5).")
 @click.option("--picture", type=FILE, help="Picture of the fitted lattice and board to write (.png).")
 @click.option("--views", type=FILE, help="Picture of views and refocused depths to write (.png).")
@@ -32,6 +40,8 @@ def calibrate_snapshot(config: Path, output: Path, overwrite: bool, console: Con
     for `build-weights --method dlfc`, with targets at several depths in the fluid:
              lfpiv calibrate-snapshot rig.yaml --white white.tif --board b1.tif --depth-mm -8 \\
                  --board b2.tif --depth-mm 0 --board b3.tif --depth-mm 8 -o calibration.h5
+    without a target, with a camera known to be focused on the channel's mid plane:
+             lfpiv calibrate-snapshot rig.yaml --white white.tif --depth-mm 0 -o calibration.h5
     """
     from lfpiv_cli.stages import calibrate as stage
 

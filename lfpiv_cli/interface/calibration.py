@@ -14,7 +14,7 @@ from lfpiv_cli.calibration.sheet import check_f_numbers, f_number_notices, image
 from lfpiv_cli.calibration.transmission import lens_image_width
 from lfpiv_cli.calibration.white import by_aperture
 from lfpiv_cli.calibration.white_checks import white_notices
-from lfpiv_cli.errors import UsageError
+from lfpiv_cli.errors import ConfigError, UsageError
 from lfpiv_cli.files.config import Config
 from lfpiv_cli.interface.notices import warn_of
 from lfpiv_cli.notice import Notice
@@ -41,14 +41,15 @@ def calibrate(
         Raw image of uniform light, or a sequence of two, one stopped down and one not. None: the microlenses are
         believed to lie as the data sheet says.
     board : (rows, columns) counts
-        Raw image of the dot board; or a sequence of boards in the fluid, each with its depth. None: only the
+        Raw image of the calibration target; or a sequence of boards in the fluid, each with its depth. None: only the
         microlenses are sought.
     rig : Config
         From `load_rig`.
     dark : (rows, columns) counts, optional
         Raw image taken with the cap on.
     depth_mm : sequence of float, optional
-        Depths of several boards in the fluid, mm away from the camera, for weights of the method dlfc.
+        Depths of several boards in the fluid, mm away from the camera from the focal plane, for weights of the method
+        dlfc. Without a board: the one depth of the channel's mid plane, for a camera whose focus is known.
 
     Returns
     -------
@@ -79,7 +80,9 @@ def calibrate(
 def photographs(
     whites: Sequence[ArrayLike], boards: Sequence[ArrayLike], dark: ArrayLike | None, depth_mm: Sequence[float]
 ) -> Photographs:
-    """Return pictures (rows, columns) as they are calibrated from: one board alone, or several at depths."""
+    """Return pictures (rows, columns) as they are calibrated from: one board alone, several at depths, or a depth."""
+    if len(depth_mm) and not boards:
+        return Photographs(whites, dark, mid_plane_z_mm=depth_mm[0])
     if len(depth_mm):
         return Photographs(whites, dark, None, boards, depth_mm)
     return Photographs(whites, dark, boards[0] if boards else None)
@@ -87,6 +90,8 @@ def photographs(
 
 def calibration_of(rig: Config, pictures: Photographs) -> Calibration:
     """Return the calibration that pictures of the rig give."""
+    if pictures.mid_plane_z_mm is not None:
+        _check_mid_plane(pictures.mid_plane_z_mm, rig)
     camera = rig.complete_camera() if pictures.whites else rig.camera_model()
     if camera is not None:
         check_f_numbers(camera)
@@ -108,6 +113,14 @@ def calibration_notices(rig: Config, pictures: Photographs, found: Calibration) 
     return notices if camera is None else notices + image_distance_notices(found.fit, camera)
 
 
+def _check_mid_plane(z_mm: float, rig: Config) -> None:
+    """Refuse a mid plane that is told where there is no channel, or no depth."""
+    if not np.isfinite(z_mm):
+        raise UsageError(f"a depth of {z_mm:g} mm, expected a number")
+    if rig.channel is None:
+        raise ConfigError("a depth without a board is the mid plane's of a channel; the section `channel` is missing")
+
+
 def ensure_pictures(whites: int, boards: int, depths: int) -> None:
     """Refuse numbers of pictures and depths that make no calibration.
 
@@ -117,8 +130,11 @@ def ensure_pictures(whites: int, boards: int, depths: int) -> None:
     """
     if not whites and not boards:
         raise UsageError("calibrate-snapshot needs a picture: --white, --board or both")
-    if depths != (boards if depths else 0) or (boards > 1 and not depths):
-        raise UsageError(f"{boards} --board and {depths} --depth-mm; give one board alone, or each with its depth")
+    if depths not in (0, max(boards, 1)) or (boards > 1 and not depths):
+        raise UsageError(
+            f"{boards} --board and {depths} --depth-mm; give one board alone, or each with its depth, or without a "
+            "board the depth of the channel's mid plane"
+        )
 
 
 def _each(pictures: Pictures) -> list[NDArray[Any]]:

@@ -220,8 +220,8 @@ def _reference(settings: Config, found: Calibration | None) -> Reference:
         return Reference(name, 0.0)
     if found is None or found.mid_plane_z_mm is None:
         raise ConfigError(
-            "volume.reference: mid_plane needs a calibration with a board, and the section `channel`, to say where the "
-            "mid plane lies"
+            "volume.reference: mid_plane needs a calibration with a board or with --depth-mm, and the section channel: "
+            "they say where the mid plane lies"
         )
     return Reference(name, found.mid_plane_z_mm)
 

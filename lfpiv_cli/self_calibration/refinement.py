@@ -57,7 +57,7 @@ class Refinement:
     position_mm : (n, 3) of the particles, all images together
     depths_mm : between which they were looked for
     frames : number of images
-    expected_z_mm, expected_sigma_mm : depth of the mid plane before, and its standard error where it was known
+    expected_z_mm, expected_sigma_mm : depth of the mid plane before and its standard error, None where not known
     common_depth_mm : standard error that all depths share
     width_mm, particle_diameter_mm : true width of the channel, diameter of the particles before
     camera : that the particles were found with
@@ -69,7 +69,7 @@ class Refinement:
     position_mm: NDArray[np.float64]
     depths_mm: tuple[float, float]
     frames: int
-    expected_z_mm: float
+    expected_z_mm: float | None
     expected_sigma_mm: float | None
     common_depth_mm: float
     width_mm: float
@@ -103,6 +103,7 @@ class Refinement:
             rectification=replace(calibration.rectification, fit=calibration.fit.shifted(self.shift_px)),
             mid_plane_z_mm=self.walls.middle_mm,
             mid_plane_z_sigma_mm=self.middle_sigma_mm,
+            mid_plane_given=False,
         )
 
     def summary(self) -> dict[str, Any]:
@@ -110,15 +111,17 @@ class Refinement:
         walls, change, error, camera = self.walls, self.nuisances, self.nuisances_sigma, self.camera
         half_span = np.sqrt(np.var(self.position_mm[:, :2], axis=0))
         slope_sigma = np.hypot(walls.slope_sigma, self.common_depth_mm / half_span)
-        scale, before = walls.width_mm / self.width_mm, self.expected_sigma_mm
+        scale, before, before_sigma = walls.width_mm / self.width_mm, self.expected_z_mm, self.expected_sigma_mm
         return {
             "frames": self.frames,
             "particles": len(self.position_mm),
             "mid_plane_z_mm": walls.middle_mm,
             "mid_plane_z_mm_sigma": self.middle_sigma_mm,
-            "mid_plane_z_mm_before": self.expected_z_mm if before is not None else None,
-            "mid_plane_correction_mm": walls.middle_mm - self.expected_z_mm if before is not None else None,
-            "mid_plane_correction_mm_sigma": np.hypot(self.middle_sigma_mm, before) if before is not None else None,
+            "mid_plane_z_mm_before": before,
+            "mid_plane_correction_mm": None if before is None else walls.middle_mm - before,
+            "mid_plane_correction_mm_sigma": (
+                None if before_sigma is None else np.hypot(self.middle_sigma_mm, before_sigma)
+            ),
             "wall_tilt_deg": np.rad2deg(np.arctan(walls.slope)).tolist(),
             "wall_tilt_deg_sigma": np.rad2deg(slope_sigma / (1.0 + walls.slope**2)).tolist(),
             "apparent_width_mm": walls.width_mm,
@@ -210,7 +213,7 @@ def refine_calibration(
         position_mm=position,
         depths_mm=grid.bounds_mm(2),
         frames=len(images),
-        expected_z_mm=expected,
+        expected_z_mm=calibration.mid_plane_z_mm,
         expected_sigma_mm=calibration.mid_plane_z_sigma_mm,
         common_depth_mm=_common_depth_mm(camera, media),
         width_mm=flow.width_mm,

@@ -33,7 +33,7 @@ def walls_figure(refinement: Refinement) -> Figure:
     (whole, across), (near, far) = figure.subplots(2, 2)
     limits = (0.5 * searched * np.array([-1.0, 1.0])).tolist()
     _draw_depths(whole, refinement, depth, (limits[0], limits[1]), BARS)
-    expected = refinement.expected_z_mm - walls.middle_mm
+    expected = (refinement.expected_z_mm or 0.0) - walls.middle_mm
     for side in (-1.0, 1.0):
         before = expected + side * 0.5 * refinement.width_mm
         whole.axvline(before, color="0.5", linestyle=":", label="walls before" if side < 0.0 else None)

@@ -30,8 +30,9 @@ class CalibrateOptions:
     ----------
     white : images of uniform light, one stopped down and one not where there are two
     dark : image taken with the cap on
-    board : snapshot of the dot board; or several, each with its depth
-    depth_mm : depths of the boards in the fluid, for fitted rays; empty for a single snapshot
+    board : snapshot of the calibration target; or several, each with its depth
+    depth_mm : depths of the boards in the fluid, for fitted rays; empty for a single snapshot; without a board the one
+        of the channel's mid plane
     picture, views : pictures to write: lattice and board; views and refocused depths
     """
 
