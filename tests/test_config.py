@@ -129,6 +129,9 @@ def test_all_errors_come_in_one_run_in_the_order_of_the_file(write) -> None:
     [
         ("window: {distance_mm: 250.0, thickness_mm: 2.0}", "window's far face"),
         ("board: {dots: [7, 7], spacing_mm: 0.2, dot_diameter_mm: 0.2}", "less than the spacing of 0.2"),
+        ("board: {spacing_mm: 0.2, dot_diameter_mm: 0.1}", "dots: is missing for pattern dots"),
+        ("board: {pattern: chessboard, squares: [5, 4], marker_mm: 0.1, spacing_mm: 1}", "not for pattern chessboard"),
+        ("board: {pattern: chessboard, squares: [5, 3], spacing_mm: 1}", "squares: is (5, 3), expected 4 or more"),
         ("correlation: {windows: [16, 32]}", "expected coarse to fine"),
         ("correlation: {windows: [16], window_mm: 1.6}", "contradicts window_mm"),
         ("channel: {width_mm: 9, wall_mm: 2, board_from_mid_plane_mm: 1}", "is for a board in the fluid"),

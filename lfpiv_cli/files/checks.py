@@ -26,6 +26,8 @@ BOARD_KEYS = {
     "chessboard": ("squares",),
     "charuco": ("squares", "marker_mm"),
 }
+# OpenCV finds three by three inner corners and more.
+FEWEST_SQUARES = 4
 # Data sheets give three or four digits.
 AGREEMENT = 1e-3
 # Three pixels tell the middle of a lens image from its rims; the widest lens images in use are some 100 px wide.
@@ -122,6 +124,8 @@ def _board(sections: Sections) -> Found:
         given = getattr(board, name) is not None
         if given != (name in has):
             yield ("board", name), f"is {'not for' if given else 'missing for'} pattern {board.pattern}"
+    if board.pattern == "chessboard" and min(board.squares or (FEWEST_SQUARES,)) < FEWEST_SQUARES:
+        yield ("board", "squares"), f"is {board.squares}, expected {FEWEST_SQUARES} or more along each side"
     for name in ("dot_diameter_mm", "marker_mm"):
         size = getattr(board, name)
         if size is not None and size >= board.spacing_mm:
