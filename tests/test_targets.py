@@ -13,8 +13,9 @@ from lfpiv_cli.calibration.board import dot_signal, locate_board
 from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose, pose_of_dots, upright_numbers
 from lfpiv_cli.calibration.corner_model import corner_shares, quadrant_shares
 from lfpiv_cli.calibration.dot_model import lens_cell, pixel_rays
-from lfpiv_cli.calibration.target_kinds import another_kind
+from lfpiv_cli.calibration.target_kinds import another_kind, sentence
 from lfpiv_cli.errors import InputError
+from lfpiv_cli.names import Polarity
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media, Window
 from lfpiv_cli.optics.microlenses import Lattice
@@ -105,7 +106,7 @@ def test_numbers_grow_with_x_and_y_however_the_board_is_turned() -> None:
 
 
 @pytest.mark.parametrize(
-    ("shown", "said", "sentence"),
+    ("shown", "said", "expected"),
     [
         (CHESS, DOTS, "looks like a chessboard of 5 x 4 squares; board.pattern says dots"),
         (DOTS, CHESS, "looks like a board of 20 bright dots; board.pattern says chessboard"),
@@ -127,10 +128,10 @@ def test_numbers_grow_with_x_and_y_however_the_board_is_turned() -> None:
     ],
 )
 def test_a_target_of_another_kind_is_named(
-    table2: Camera, shown: BoardGeometry, said: BoardGeometry, sentence: str
+    table2: Camera, shown: BoardGeometry, said: BoardGeometry, expected: str
 ) -> None:
     camera = large(table2) if shown.pattern == "charuco" else small(table2)
-    with pytest.raises(InputError, match=sentence):
+    with pytest.raises(InputError, match=expected):
         locate_board(at_one_mm(shown), camera, said, Media())
 
 
@@ -157,6 +158,47 @@ def test_particles_are_no_board(table2: Camera, rng: np.random.Generator) -> Non
     tracers = rng.uniform(-5.0, 5.0, (2000, 3))
     with pytest.raises(InputError, match="mm rms off a grid of 1 mm"):
         pose_of_dots(tracers, np.full(tracers.shape, 1e-3), -tracers[:, :2], table2, board)
+
+
+def test_few_tracers_are_no_small_board(table2: Camera, rng: np.random.Generator) -> None:
+    """Half of a board of 4 x 3 is soon found among tracers, near enough to a grid of which six numbers are free."""
+    for _ in range(40):
+        tracers = rng.uniform(-1.0, 1.0, (25, 3)) * (1.6, 1.2, 0.8)
+        with pytest.raises(InputError):
+            pose_of_dots(tracers, np.full(tracers.shape, 1e-3), -tracers[:, :2], table2, replace(DOTS, dots=(4, 3)))
+
+
+def test_a_board_is_flat(table2: Camera, rng: np.random.Generator) -> None:
+    i, j = np.divmod(np.arange(20), 5)
+    dots = np.column_stack([0.8 * (j - 2.0), 0.8 * (i - 1.5), 2.0 + rng.normal(0.0, 0.5, 20)])
+    with pytest.raises(InputError, match=r"lies 0\.\d+ mm rms in front of and behind one plane, at most 0\.16 mm"):
+        pose_of_dots(dots, np.full(dots.shape, 1e-3), -dots[:, :2], table2, DOTS)
+
+
+@pytest.mark.parametrize(
+    ("polarity", "diameters_mm"), [("bright", ()), ("dark", ()), ("bright", (0.5,)), ("dark", (0.5, 0.3))]
+)
+def test_an_origin_may_be_missing_larger_or_a_ring(
+    table2: Camera, polarity: Polarity, diameters_mm: tuple[float, ...]
+) -> None:
+    """One dot is not like the others: left out, of another diameter, or one less a smaller one."""
+    camera, placement = small(table2), BoardPlacement(2.0, (0.07, -0.04), (1.0, -0.5), 1.5)
+    others, rng = np.arange(20) != 7, np.random.default_rng(5)
+    image = render_board(camera, AIR, DOTS, placement, LEVEL, rng, others)
+    for diameter, sign in zip(diameters_mm, (1.0, -1.0), strict=False):
+        mark = replace(DOTS, dot_diameter_mm=diameter)
+        image += sign * render_board(camera, AIR, mark, placement, LEVEL, rng, ~others)
+    if polarity == "dark":
+        image = np.maximum(render_white(camera, LEVEL) - image, 0.0)
+    pose = locate_board(image.astype(np.float32), camera, replace(DOTS, polarity="auto"), Media())
+    assert pose.dots_found == 19
+    agrees(pose, placement)
+
+
+def test_a_charuco_board_is_not_called_dots() -> None:
+    """Out of focus its markers are dark, round and even."""
+    assert sentence("a board of 9 dark dots", "dots", CHARUCO) is None
+    assert sentence("a board of 9 dark dots", "dots", CHESS) is not None
 
 
 def test_particles_are_called_nothing(table2: Camera, rng: np.random.Generator) -> None:

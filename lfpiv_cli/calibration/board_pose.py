@@ -23,9 +23,11 @@ FEWEST_DOTS = 6
 # Bright spots of any picture fit a part of a grid by chance; a board shows most of its dots. The corners of a ChArUco
 # board are known each by itself, so that a part of it will do.
 LEAST_SHARE = 0.5
-# Dots of a board lie within a few thousandths of the spacing from its grid, other things anywhere within the tolerance
-# below: a fifth of the spacing, root mean square.
-LARGEST_SCATTER = 0.08
+# Dots of a board lie within a few thousandths of the spacing from its grid and of the depth over which light spreads by
+# one microlens from its plane. Other things lie anywhere within the tolerance below, a fifth of the spacing root mean
+# square, and spread in depth as the scene does; of few of them some are near a grid by chance.
+LARGEST_SCATTER = 0.05
+LARGEST_SCATTER_OF_LENS_DEPTH = 0.1
 # Dots off the common board are left out; without them others may turn out to be off, and a third look settles it.
 OUTLIER_ROUNDS = 3
 # What all dots have in common does not show in their scatter. On rendered boards it was 1 to 10 um of depth, two
@@ -165,7 +167,7 @@ def pose_of_dots(
         kept, indices = kept[good], indices[good]
         refuse_few(len(kept), board)
     bent = bent_fit(dots_mm[kept], indices, radius[kept], board)
-    refuse_scattered(bent.residual_mm, board)
+    refuse_scattered(bent, board, camera)
     k1, k1_sigma = total_distortion(bent, camera)
     proven = k1 is not None and k1_sigma is not None and abs(k1) > DISTORTION_SIGMAS * k1_sigma
     fit = bent if proven else flat_fit(dots_mm[kept], indices, board)
@@ -184,10 +186,15 @@ def pose_of_dots(
 
 def common_errors_mm(camera: Camera) -> tuple[float, float]:
     """Return the standard errors of place and depth that all dots share."""
-    lens = float(camera.lattice.pitch.max()) / abs(camera.magnification)
-    lens_depth = lens / camera.aperture_radius_mm * camera.focus_distance_mm
+    lens, lens_depth = lens_in_scene_mm(camera)
     coarse = max(1.0, COARSE_LENS_PX * camera.pixel_mm / float(camera.lattice.pitch.min())) ** 2
     return COMMON_SHARE_OF_LENS * lens, COMMON_SHARE_OF_LENS_DEPTH * coarse * lens_depth
+
+
+def lens_in_scene_mm(camera: Camera) -> tuple[float, float]:
+    """Return a microlens's width in the focal plane, and the depth over which the rim's rays move by it."""
+    lens = float(camera.lattice.pitch.max()) / abs(camera.magnification)
+    return lens, lens / camera.aperture_radius_mm * camera.focus_distance_mm
 
 
 def total_distortion(bent: FlatFit, camera: Camera) -> tuple[float | None, float | None]:
@@ -263,14 +270,25 @@ def refuse_few(count: int, board: BoardGeometry) -> None:
         )
 
 
-def refuse_scattered(residual_mm: NDArray[np.float64], board: BoardGeometry) -> None:
-    """Raise when what was found lies about a grid and not on it."""
-    scatter = float(np.sqrt(np.mean(np.sum(residual_mm[:, :2] ** 2, axis=1))))
-    if scatter > LARGEST_SCATTER * board.spacing_mm:
+def refuse_scattered(fit: FlatFit, board: BoardGeometry, camera: Camera) -> None:
+    """Raise when what was found lies about a grid and not on it, or in front of and behind its plane.
+
+    The scatter is that of one point, by the misfit and how many numbers were fitted.
+    """
+    freedom = 2 * len(fit.residual_mm) - (6 if fit.k1_per_mm2 is None else 7)
+    sideways = float(np.sqrt(2.0 * np.sum(fit.residual_mm[:, :2] ** 2) / max(1, freedom)))
+    if sideways > LARGEST_SCATTER * board.spacing_mm:
         raise InputError(
-            f"what was found lies {scatter:.3g} mm rms off a grid of {board.spacing_mm:g} mm, at most "
+            f"what was found lies {sideways:.3g} mm rms off a grid of {board.spacing_mm:g} mm, at most "
             f"{LARGEST_SCATTER * board.spacing_mm:.3g} mm is a board's; check board.spacing_mm and that the picture "
             "shows the board"
+        )
+    deep = float(np.sqrt(np.sum(fit.residual_mm[:, 2] ** 2) / max(1, len(fit.residual_mm) - 3)))
+    flat = LARGEST_SCATTER_OF_LENS_DEPTH * lens_in_scene_mm(camera)[1]
+    if deep > flat:
+        raise InputError(
+            f"what was found lies {deep:.3g} mm rms in front of and behind one plane, at most {flat:.3g} mm is a "
+            "board's; check the section board and that the picture shows the board"
         )
 
 

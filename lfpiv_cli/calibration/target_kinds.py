@@ -34,11 +34,15 @@ def another_kind(
     picture, _ = enlarged_view(evenly_lit(image, passed), camera)
     for pattern, look in LOOKS_LIKE.items():
         if (found := look(picture)) is not None:
-            return None if found == described(board) else _sentence(found, pattern, board)
+            return None if found == described(board) else sentence(found, pattern, board)
     return None
 
 
-def _sentence(found: str, pattern: str, board: BoardGeometry) -> str | None:
+def sentence(found: str, pattern: str, board: BoardGeometry) -> str | None:
+    """Return what to say of a target that was found where the config has another; None where that is not certain."""
+    if pattern == "dots" and board.pattern == "charuco":
+        # its own markers are even and round once they are out of focus
+        return None
     if pattern != board.pattern:
         return f"this looks like {found}; board.pattern says {board.pattern}"
     if pattern == "chessboard":
