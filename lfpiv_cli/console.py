@@ -22,7 +22,7 @@ class Console:
     verbose : say more
     quiet : say nothing but errors
     only_warnings : say nothing but errors and warnings: the summary goes elsewhere
-    warned : where it is given, all warnings are added to it
+    warned : where it is given, all warnings are added to it, and none is printed twice
     """
 
     verbose: bool = False
@@ -39,6 +39,8 @@ class Console:
         """Print what speaks against a result and does not keep the command from going on, a line each."""
         for notice in notices:
             if self.warned is not None:
+                if notice in self.warned:
+                    continue
                 self.warned.append(notice)
             if not self.quiet:
                 click.echo(f"lfpiv: warning: {notice}", err=True)

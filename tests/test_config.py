@@ -285,6 +285,14 @@ def test_windows_in_millimetres_are_the_final_ones(write) -> None:
     )
 
 
+def test_windows_are_cubes_by_default_as_far_as_long_voxels_allow(write) -> None:
+    config = load_config(write("correlation: {dt_s: 0.001}\n"))
+    assert config.windows_voxel((0.1, 0.1, 0.1)) == ((32, 32, 32), (16, 16, 16))
+    assert config.windows_voxel((0.1, 0.1, 0.15)) == ((32, 32, 22), (16, 16, 11))
+    # as the program chooses voxels: 16 of them would be 8 mm deep
+    assert config.windows_voxel((0.083, 0.083, 0.5)) == ((32, 32, 16), (16, 16, 8))
+
+
 @pytest.mark.parametrize("voxel_mm", np.linspace(0.04, 0.22, 37))
 def test_windows_in_millimetres_always_give_the_paper_s_number(write, voxel_mm: float) -> None:
     config = load_config(write("correlation: {window_mm: 1.6}\n"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -15,9 +16,10 @@ from lfpiv_cli.cli import cli
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.provenance import record
-from lfpiv_cli.files.vtkhdf import write_volume
+from lfpiv_cli.files.vtkhdf import read_header, write_volume
 from lfpiv_cli.flow.field import MASKED
 from lfpiv_cli.grid import Grid
+from lfpiv_cli.interface.vectors_checks import Quality, calibration_notices, field_notices, quality_of_all
 from lfpiv_cli.reference import Reference
 
 CONFIG = Path(__file__).parent.parent / "configs" / "sample.yaml"
@@ -102,3 +104,78 @@ def test_a_mean_needs_pairs_of_their_own(volumes: list[Path], tmp_path: Path) ->
     for extra in ((*volumes[:2],), (*volumes[:4], "--pairing", "ab", "--ensemble")):
         with pytest.raises(UsageError, match="--mean"):
             run("correlate", *extra, "--mean", tmp_path / "m.vtkhdf", "-o", tmp_path / "v.vtkhdf")
+
+
+def told(capsys, *arguments: object) -> tuple[dict, list[str]]:
+    """Run correlate; return its summary and the codes of what it warns of."""
+    capsys.readouterr()
+    run("correlate", *arguments, "--json", "--overwrite")
+    summary = json.loads(capsys.readouterr().out)
+    return summary, [each["code"] for each in summary["warnings"]]
+
+
+def moved(folder: Path, shape: tuple[int, int, int], spacing: tuple[float, float, float], tracers: float) -> list[Path]:
+    """Write a pair of volumes in which so many tracers a window of 12 voxels move by SHIFT."""
+    seeding = Seeding(tracers, (1.0,) * 3)
+    arrays = volume_pair(lambda points: np.tile(SHIFT, (len(points), 1)), shape, seeding, np.random.default_rng(5))
+    made_by = record("test", load_config(CONFIG).resolved(), {})
+    grid = Grid.centred(shape, spacing, (0.0, 0.0, 0.0))
+    paths = [folder / "a.vtkhdf", folder / "b.vtkhdf"]
+    for path, array in zip(paths, arrays, strict=True):
+        write_volume(path, array, grid, REFERENCE, provenance=made_by, attributes={}, overwrite=False)
+    return paths
+
+
+def test_the_summary_says_how_good_the_vectors_are(volumes: list[Path], tmp_path: Path, capsys) -> None:
+    summary, codes = told(capsys, *volumes[:4], "--pairing", "ab", "-o", tmp_path)
+    fields = [open_vectors(tmp_path / f"a{number}.vtkhdf") for number in range(2)]
+    assert codes == []
+    assert summary["vectors"] == sum(field.flag.size for field in fields)
+    sigma = [field.uncertainty_voxel for field in fields]
+    known = [np.isfinite(each).all(axis=-1) & (field.flag < 3) for each, field in zip(sigma, fields, strict=True)]
+    medians = [np.median(each[here], axis=0) for each, here in zip(sigma, known, strict=True)]
+    np.testing.assert_allclose(summary["uncertainty_voxel_median"], np.median(medians, axis=0))
+    finite = sum(np.count_nonzero(field.flag < 3) for field in fields)
+    assert summary["without_uncertainty_share"] == pytest.approx(1.0 - sum(each.sum() for each in known) / finite)
+    in_doubt = sum(np.count_nonzero((field.flag > 0) & (field.flag < 4)) for field in fields)
+    assert summary["in_doubt_share"] == pytest.approx(in_doubt / summary["vectors"])
+
+
+def test_windows_that_do_not_fit_are_told(tmp_path: Path, capsys) -> None:
+    pair = moved(tmp_path, (40, 40, 20), (0.1, 0.1, 0.4), 40.0)
+    output = ("-o", tmp_path / "v.vtkhdf")
+    assert told(capsys, *pair, "--windows", "32,16", *output)[1] == ["windows-too-large"]
+    assert told(capsys, *pair, "--windows", "32x32x16,16x16x8", *output)[1] == []
+
+
+def test_few_tracers_are_told(tmp_path: Path, capsys) -> None:
+    pair = moved(tmp_path, SHAPE, (0.1,) * 3, 1.0)
+    summary, codes = told(capsys, *pair, "-o", tmp_path / "v.vtkhdf")
+    assert "few-tracers" in codes
+    assert open_vectors(tmp_path / "v.vtkhdf").flag.size == summary["vectors"]
+    assert [each["code"] for each in read_header(tmp_path / "v.vtkhdf").provenance["warnings"]] == codes
+
+
+def made_with(calibration: str, weights: str = "w") -> dict:
+    return {
+        "inputs": {"weights": {"sha256": weights}},
+        "made_from": {weights: {"inputs": {"calibration": {"sha256": calibration}} if calibration else {}}},
+    }
+
+
+def test_volumes_of_different_calibrations_are_told() -> None:
+    assert calibration_notices({"a": made_with("1"), "b": made_with("1", "x"), "c": {}}) == []
+    assert calibration_notices({"a": {}, "b": {}}) == []
+    for other in (made_with("2"), made_with("", "x")):
+        (notice,) = calibration_notices({"a": made_with("1"), "b": other})
+        assert notice.code == "other-calibration"
+        assert notice.about == "b"
+
+
+def test_vectors_without_an_uncertainty_or_in_doubt_are_told() -> None:
+    good = Quality(100, 90, 9, 85, 8, np.ones((1, 3)))
+    assert list(field_notices(good, "v")) == []
+    assert [each.code for each in field_notices(replace(good, without=60), "v")] == ["no-uncertainty"]
+    assert [each.code for each in field_notices(replace(good, in_doubt=60), "v")] == ["vectors-in-doubt"]
+    nothing = quality_of_all([]).summary()
+    assert nothing == {"uncertainty_voxel_median": None, "without_uncertainty_share": None, "in_doubt_share": None}

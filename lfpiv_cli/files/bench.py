@@ -27,8 +27,11 @@ from lfpiv_cli.scale import Scale
 from lfpiv_cli.synthetic.flows import FLOWS, Flow
 
 UM_TO_MM = 1e-3
-# The paper's final window, and one that a displacement of a quarter of its side (8 voxels) does not leave.
-DEFAULT_WINDOWS = ((32, 32, 32), (16, 16, 16))
+# Of the paper's final window along the axis with the smallest voxels; the coarse one is twice as large: a displacement
+# of a quarter of its side does not leave it.
+DEFAULT_WINDOW = 16
+# Along an axis with longer voxels, where particle images are long: two of them fit.
+SMALLEST_DEFAULT_WINDOW = 8
 SMALLEST_WINDOW = 4
 # Voxels as wide as a microlens lock depth to the array's grid and swallow its velocity: of 0.6 mm EM volumes give 0.22
 # with them. With half of one laterally and two along the axis they give nine tenths, with a third 0.98 to 1.02 and a
@@ -158,14 +161,17 @@ def choose_voxels(scale: Scale, size_mm: Lengths) -> tuple[Triple, Lengths]:
 
 
 def windows_of(section: CorrelationSection, voxel_mm: Lengths) -> tuple[Triple, ...]:
-    """Return the correlation windows in voxels, coarse to fine; `window_mm` is the final one of two."""
+    """Return the correlation windows in voxels, coarse to fine; `window_mm` is the final one of two.
+
+    By default they are as long along all axes, as far as voxels of different sides allow.
+    """
     if section.windows is not None:
         return section.windows
-    if section.window_mm is None:
-        return DEFAULT_WINDOWS
-    final = [
-        max(SMALLEST_WINDOW, round(length / voxel)) for length, voxel in zip(section.window_mm, voxel_mm, strict=True)
-    ]
+    lengths, smallest = section.window_mm, SMALLEST_WINDOW
+    if lengths is None:
+        side = DEFAULT_WINDOW * min(voxel_mm)
+        lengths, smallest = (side, side, side), SMALLEST_DEFAULT_WINDOW
+    final = [max(smallest, round(length / voxel)) for length, voxel in zip(lengths, voxel_mm, strict=True)]
     return (2 * final[0], 2 * final[1], 2 * final[2]), (final[0], final[1], final[2])
 
 

@@ -90,6 +90,16 @@ def recorded_warnings(made: Mapping[str, Any]) -> list[str]:
     ]
 
 
+def calibrated_with(made: Mapping[str, Any]) -> str | None:
+    """Return the SHA-256 of the calibration that a volume's or particles' weights are of, or of weights without one.
+
+    None where the record does not say.
+    """
+    weights = made.get("inputs", {}).get("weights", {}).get("sha256")
+    earlier = made.get("made_from", {}).get(weights, {}).get("inputs", {})
+    return str(earlier["calibration"]["sha256"]) if "calibration" in earlier else weights
+
+
 def sha256(path: Path) -> str:
     """Return the SHA-256 of a file, in hexadecimal digits."""
     size = ensure_regular_file(path)

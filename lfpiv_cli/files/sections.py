@@ -205,6 +205,8 @@ class ReconstructionSection(Section):
 class CorrelationSection(Section):
     """The correlation windows, coarse to fine, in voxels (numbers or [x, y, z]), or the final one as window_mm.
 
+    Default: 32 and 16 voxels, fewer where voxels are longer along an axis, but not below 16 and 8.
+
     overlap: of neighbouring windows, a number or [x, y, z]. dt_s: time between the volumes of a pair.
     mask: channel leaves out what lies beyond the channel's walls across the depth (needs reference: mid_plane).
     exponent: power of the intensities that is correlated (default: 0.5 for volumes of the solvers em, smart and mart;

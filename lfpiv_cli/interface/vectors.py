@@ -14,6 +14,8 @@ from lfpiv_cli.flow import correlation
 from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.flow.masks import between_walls
 from lfpiv_cli.grid import Grid
+from lfpiv_cli.interface.notices import warn_of
+from lfpiv_cli.interface.vectors_checks import field_notices, quality_of, window_notices
 from lfpiv_cli.reference import FOCAL_POINT
 
 
@@ -59,12 +61,11 @@ def correlate(
     config = first.provenance.get("config")
     carried = carried_config(first.provenance, "the volume") if config else Config.from_resolved({})
     chosen = carried.overridden("correlation", **settings)
-    return correlation.correlate(
-        [(first.array, second.array)],
-        first.grid,
-        chosen.correlation_settings(first.grid.spacing_mm),
-        mask=usable_voxels(chosen, first.grid, mask),
-    )
+    windows = chosen.correlation_settings(first.grid.spacing_mm)
+    usable = usable_voxels(chosen, first.grid, mask)
+    field = correlation.correlate([(first.array, second.array)], first.grid, windows, mask=usable)
+    warn_of([*window_notices(first, windows, "the first volume"), *field_notices(quality_of(field), "the field")])
+    return field
 
 
 def usable_voxels(settings: Config, grid: Grid, mask: NDArray[Any] | None) -> NDArray[np.bool_] | None:

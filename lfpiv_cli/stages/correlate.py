@@ -17,14 +17,22 @@ from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.batch import Target, output_paths, pending, prepare_folder
 from lfpiv_cli.files.config import Config, carried_config, load_config
 from lfpiv_cli.files.inputs import given
-from lfpiv_cli.files.provenance import record
+from lfpiv_cli.files.provenance import record, with_warnings
 from lfpiv_cli.flow.correlation import correlate as measure
 from lfpiv_cli.flow.correlation import count_passes
 from lfpiv_cli.flow.derived import Derived, derived_fields
 from lfpiv_cli.flow.field import MM_TO_M, REJECTED, VectorField
 from lfpiv_cli.flow.statistics import statistics_of
 from lfpiv_cli.interface.vectors import ensure_alike, usable_voxels
+from lfpiv_cli.interface.vectors_checks import (
+    calibration_notices,
+    field_notices,
+    quality_of,
+    quality_of_all,
+    window_notices,
+)
 from lfpiv_cli.names import Pairing
+from lfpiv_cli.notice import Notice
 from lfpiv_cli.reference import Reference
 
 Extra = dict[str, tuple[NDArray[Any], str]]
@@ -109,23 +117,28 @@ def correlate(
     ]
     if mean is not None:
         ensure_writable(mean, overwrite, [*volumes, *common.values()])
-    summary: dict[str, Any] = {"pairs": len(pairs), "vectors": 0, "rejected": 0}
-    divergence = []
+    divergence, qualities, rejected = [], [], 0
     for number in pending(targets, [*volumes, *common.values()], overwrite, options.resume, _record_of):
-        field, reference = _measure(jobs[number], options.mask_volume, console)
+        field, reference, notices = _measure(jobs[number], options.mask_volume, console)
+        quality = quality_of(field)
+        notices += field_notices(quality, targets[number].path.name)
+        console.warn(notices)
         told_more = derived_fields(field) if derived else None
         vtkhdf.write_vectors(
             targets[number].path,
             field,
             reference,
-            provenance=targets[number].record,
+            provenance=with_warnings(targets[number].record, notices),
             overwrite=overwrite,
             extra=_arrays_of(told_more) if told_more else None,
         )
-        summary["rejected"] += int(np.count_nonzero(field.flag >= REJECTED))
-        summary["vectors"] += field.flag.size
+        qualities.append(quality)
+        rejected += int(np.count_nonzero(field.flag >= REJECTED))
         if told_more and told_more.divergence_rms is not None:
             divergence.append(told_more.divergence_rms)
+    found = quality_of_all(qualities)
+    summary: dict[str, Any] = {"pairs": len(pairs), "vectors": found.vectors, "rejected": rejected}
+    summary |= found.summary()
     if divergence:
         summary["divergence_rms_per_s"] = float(np.mean(divergence))
     if mean is not None:
@@ -133,8 +146,8 @@ def correlate(
     return summary
 
 
-def _measure(job: Job, mask: Path | None, console: Console) -> tuple[VectorField, Reference]:
-    """Return the vectors of a job, and the origin of its volumes' coordinates."""
+def _measure(job: Job, mask: Path | None, console: Console) -> tuple[VectorField, Reference, list[Notice]]:
+    """Return the vectors of a job, the origin of its volumes' coordinates, and what speaks against its windows."""
     first = vtkhdf.open_volume(job.pairs[0][0])
     drawn = None if mask is None else vtkhdf.open_volume(mask)
     if drawn is not None and drawn.grid != first.grid:
@@ -149,9 +162,11 @@ def _measure(job: Job, mask: Path | None, console: Console) -> tuple[VectorField
 
     usable = usable_voxels(job.settings, first.grid, None if drawn is None else drawn.array)
     settings = job.settings.correlation_settings(first.grid.spacing_mm)
+    records = {f"{role} {path.name}": vtkhdf.read_header(path).provenance for role, path in job.inputs().items()}
+    notices = [*calibration_notices(records), *window_notices(first, settings, job.pairs[0][0].name)]
     with console.progress(count_passes(settings.windows), "correlate") as advance:
         field = measure(volumes(), first.grid, settings, mask=usable, progress=advance)
-    return field, first.reference
+    return field, first.reference, notices
 
 
 def _arrays_of(derived: Derived) -> Extra:

@@ -24,6 +24,7 @@ from lfpiv_cli.interface.tracks import (
     tracked,
     tracking_of,
 )
+from lfpiv_cli.interface.vectors_checks import calibration_notices, field_notices, quality_of, quality_of_all
 
 ROLES_OF_TWO = ["particles_a", "particles_b"]
 
@@ -69,7 +70,11 @@ def track_particles(
     ensure_particles(counts, names)
     chosen = tracking_of(settings, options.search_voxel, options.shortest, len(frames), names[0])
     found = tracked(frames, settings, chosen, record("track", settings.resolved() | chosen.told(), inputs))
-    notices = few_notices(counts, [path.name for path in particles], found)
+    short = [path.name for path in particles]
+    records = {
+        f"{role} {path.name}": frame.provenance for (role, path), frame in zip(inputs.items(), frames, strict=True)
+    }
+    notices = [*calibration_notices(records), *few_notices(counts, short, found)]
     console.warn(notices)
     provenance = with_warnings(found.points.provenance, notices)
     write_points(
@@ -82,7 +87,7 @@ def track_particles(
         attributes=found.points.attributes,
         overwrite=overwrite,
     )
-    return found.summary | _write_grids(grids, found, provenance, overwrite)
+    return found.summary | _sigmas(found) | _write_grids(grids, found, provenance, overwrite, console)
 
 
 def grid_paths(output: Path, intervals: int) -> list[Path]:
@@ -95,15 +100,30 @@ def _roles(frames: int) -> list[str]:
     return ROLES_OF_TWO if frames == 2 else [f"particles_{number:04d}" for number in range(frames)]
 
 
+def _sigmas(found: Tracked) -> dict[str, Any]:
+    """Return the median of the tracks' standard deviations, and the share of those without one."""
+    sigma = found.points.arrays["velocity_sigma"]
+    known = np.isfinite(sigma).all(axis=1)
+    return {
+        "velocity_sigma_m_s_median": np.median(sigma[known], axis=0).tolist() if known.any() else None,
+        "tracks_without_uncertainty_share": float(np.mean(~known)) if len(known) else None,
+    }
+
+
 def _write_grids(
-    grids: Sequence[Path], found: Tracked, provenance: Mapping[str, Any], overwrite: bool
+    grids: Sequence[Path], found: Tracked, provenance: Mapping[str, Any], overwrite: bool, console: Console
 ) -> dict[str, Any]:
-    """Write the vectors of each interval; return how many there are."""
+    """Write the vectors of each interval; return how many there are and how good."""
     if not grids:
         return {}
-    summary = {"vectors": 0, "rejected": 0}
+    qualities, rejected = [], 0
     for target, field in zip(grids, found.vectors(), strict=True):
-        vtkhdf.write_vectors(target, field, found.points.reference, provenance=provenance, overwrite=overwrite)
-        summary["vectors"] += field.flag.size
-        summary["rejected"] += int(np.count_nonzero(field.flag >= REJECTED))
-    return summary
+        quality = quality_of(field)
+        notices = list(field_notices(quality, target.name))
+        console.warn(notices)
+        made = with_warnings(provenance, notices)
+        vtkhdf.write_vectors(target, field, found.points.reference, provenance=made, overwrite=overwrite)
+        qualities.append(quality)
+        rejected += int(np.count_nonzero(field.flag >= REJECTED))
+    all_of_them = quality_of_all(qualities)
+    return {"vectors": all_of_them.vectors, "rejected": rejected} | all_of_them.summary()
