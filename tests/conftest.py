@@ -34,7 +34,7 @@ def layout(request: pytest.FixtureRequest) -> str:
     return request.param
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def table2() -> Camera:
     """The paper's camera."""
     return TABLE2
@@ -51,7 +51,7 @@ def media(request: pytest.FixtureRequest) -> Media:
     return Media() if request.param == "air" else Media(1.0, 1.49, 1.33)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def water() -> Media:
     return Media(1.0, 1.49, 1.33)
 

@@ -22,11 +22,17 @@ RADIUS_MM = 0.025
 PLACES = [(0.31, -0.2, 3.0), (0.53, 0.21, 0.02), (-0.62, 0.4, 0.4), (0.2, 0.3, -4.0)]
 
 
-@pytest.fixture(params=["square", "hexagonal"])
+@pytest.fixture(scope="module", params=["square", "hexagonal"])
 def small(table2: Camera, request: pytest.FixtureRequest) -> Camera:
     """The paper's camera with a small sensor and an array that is turned, shifted and seen through distortion."""
     lattice = Lattice.regular(0.1, request.param, np.deg2rad(0.12), (0.013, -0.02))
     return replace(table2, lattice=lattice, columns=400, rows=360, distortion_per_mm2=2e-4)
+
+
+@pytest.fixture(scope="module")
+def view(small: Camera, water: Media) -> View:
+    """What the small camera sees: its tables for hexagons take longer than the tests."""
+    return raw_view(small, water, RADIUS_MM)
 
 
 def entries(view: View, point: tuple[float, float, float]) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
@@ -46,8 +52,7 @@ def images(view: View, point: tuple[float, float, float]) -> NDArray[np.float64]
 
 
 @pytest.mark.parametrize("place", PLACES)
-def test_response_is_what_rays_make(small: Camera, water: Media, place: tuple[float, float, float]) -> None:
-    view = raw_view(small, water, RADIUS_MM)
+def test_response_is_what_rays_make(small: Camera, view: View, water: Media, place: tuple[float, float, float]) -> None:
     response = images(view, place)
     rays = 1_000_000
     space = ObjectSpace(water, None, "paraxial")
@@ -72,9 +77,8 @@ def test_response_is_what_rays_make(small: Camera, water: Media, place: tuple[fl
 @pytest.mark.parametrize("place", PLACES)
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_derivatives_are_finite_differences(
-    small: Camera, water: Media, place: tuple[float, float, float], axis: int
+    small: Camera, view: View, place: tuple[float, float, float], axis: int
 ) -> None:
-    view = raw_view(small, water, RADIUS_MM)
     hexagonal = small.lattice.layout == "hexagonal"
     # Smaller steps would see where entries of the hexagons' table meet.
     step = np.zeros(3)
@@ -88,17 +92,15 @@ def test_derivatives_are_finite_differences(
     assert np.abs(analytic - difference).sum() < share * np.abs(difference).sum() + 0.005
 
 
-def test_distortion_moves_the_light(small: Camera, water: Media) -> None:
+def test_distortion_moves_the_light(view: View) -> None:
     place = (0.6, -0.5, 2.0)
-    view = raw_view(small, water, RADIUS_MM)
     straight = view._replace(camera=view.camera._replace(distortion_per_mm2=0.0))
     with_it, without = (images(v, place)[:, 0] for v in (view, straight))
     # k1 r^3 = 1e-4 mm of a lens of 0.1 mm: about 2e-3 of the light changes lenses.
     assert 1e-4 < np.abs(with_it - without).sum() < 1e-2
 
 
-def test_each_lens_has_its_own_centre(small: Camera, water: Media) -> None:
-    view = raw_view(small, water, RADIUS_MM)
+def test_each_lens_has_its_own_centre(view: View) -> None:
     moved = view._replace(centres_mm=view.centres_mm + np.array([0.004, 0.0]))
     place = (0.3, 0.1, 3.0)
     before, after = images(view, place)[:, 0], images(moved, place)[:, 0]
