@@ -63,11 +63,16 @@ def _rivals() -> dict[str, tuple[Any, Any, tuple[Any, ...]]]:
     found = {}
     for name, lines, length, intrinsic in (
         ("combine_long", combine.GROUP, combine.TILE, combine.combine_long),
-        ("combine_short", combine.ROWS, LANES, combine.combine_short),
+        ("combine_line", 1, combine.TILE, combine.combine_line),
+        ("combine_vector", 1, LANES, combine.combine_vector),
     ):
         twin = _with_shape((lines, length))
-        arguments: tuple[Any, ...] = (out, (0, length, 1), a, line, (0, 0, line.size), b, (0, lines, 1))
+        arguments: tuple[Any, ...] = (out, (0, length, 1), a, line, (0, length, 0, line.size), b, (0, lines, 1))
         found[name] = (intrinsic, twin, arguments)
+    arguments = (out, (0, combine.TILE), a, line, (0, 80, 0, 3), b, 0)
+    found["combine_turned"] = (combine.combine_turned, njit(combine.combine_turned_reference), arguments)
+    arguments = (out, (0, combine.TILE), a, (0, combine.TILE))
+    found["turn"] = (combine.turn, njit(combine.turn_reference), arguments)
     for shifts in (block_sums.FEW_SHIFTS, block_sums.MANY_SHIFTS):
         arguments = (out, (0, LANES), a, b, place, (4, 8), (-2, shifts))
         found[f"products of {shifts} shifts"] = (block_sums.products, njit(block_sums.products_reference), arguments)

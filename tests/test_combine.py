@@ -10,7 +10,18 @@ from benchmarks.simd import gains
 from benchmarks.weights import against_sparse_matrix, share_of_matrix_product_rate
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.simd.combine import GROUP, ROWS, TILE, combine_long, combine_reference, combine_short
+from lfpiv_cli.simd.combine import (
+    GROUP,
+    TILE,
+    combine_line,
+    combine_long,
+    combine_reference,
+    combine_turned,
+    combine_turned_reference,
+    combine_vector,
+    turn,
+    turn_reference,
+)
 from lfpiv_cli.simd.vectors import LANES, lanes_of
 from lfpiv_cli.weights.build import factorise
 
@@ -21,25 +32,64 @@ def long_lines(out, to, source, line, terms, share, shares):
 
 
 @njit
-def short_lines(out, to, source, line, terms, share, shares):
-    combine_short(out, to, source, line, terms, share, shares)
+def one_line(out, to, source, line, terms, share, shares):
+    combine_line(out, to, source, line, terms, share, shares)
+
+
+@njit
+def one_vector(out, to, source, line, terms, share, shares):
+    combine_vector(out, to, source, line, terms, share, shares)
+
+
+@njit
+def turned_lines(out, to, source, line, terms, share, share_at):
+    combine_turned(out, to, source, line, terms, share, share_at)
+
+
+@njit
+def turned_square(out, to, source, lines):
+    turn(out, to, source, lines)
 
 
 @pytest.mark.parametrize("onto", [0, 3])
 @pytest.mark.parametrize("count", [0, 1, 7])
-@pytest.mark.parametrize(("compiled", "shape"), [(long_lines, (GROUP, TILE)), (short_lines, (ROWS, LANES))])
-@pytest.mark.parametrize(("term_step", "line_step"), [(ROWS, 1), (1, 11)])
+@pytest.mark.parametrize(
+    ("compiled", "shape"), [(long_lines, (GROUP, TILE)), (one_line, (1, TILE)), (one_vector, (1, LANES))]
+)
+@pytest.mark.parametrize(("term_step", "line_step"), [(GROUP, 1), (1, 11)])
 def test_combine_equals_its_reference(rng, compiled, shape, onto, count, term_step, line_step):
     source = rng.standard_normal(12 * TILE, np.float32)
     share = rng.standard_normal(100, np.float32)
     line = rng.integers(0, 10, 9).astype(np.int32)
-    start = rng.standard_normal(ROWS * (TILE + 3) * GROUP, np.float32)
+    start = rng.standard_normal((TILE + 3) * GROUP + 5, np.float32)
     expected, found = start.copy(), start.copy()
-    places = ((5, shape[1] + 3, onto), source, line, (TILE, 2, count), share, (4, term_step, line_step))
+    places = ((5, shape[1] + 3, onto), source, line, (TILE, TILE - 3, 2, count), share, (4, term_step, line_step))
     combine_reference(shape, expected, *places)
     compiled(found, *places)
     # a fused multiply-add rounds once where the twin rounds twice
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("count", [0, 1, 3])
+def test_combine_turned_equals_its_reference(rng, count):
+    step = LANES + 3
+    source, share = rng.standard_normal(12 * step, np.float32), rng.standard_normal(4 * LANES, np.float32)
+    line = rng.integers(0, 8, LANES + 2).astype(np.int32)
+    expected, found = rng.standard_normal((2, step * LANES), np.float32)
+    found[:] = expected
+    places = ((2, step), source, line, (1, step, 2, count), share, LANES)
+    combine_turned_reference(expected, *places)
+    turned_lines(found, *places)
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_turn_equals_its_reference(rng):
+    step = LANES + 3
+    source, expected = rng.standard_normal((2, step * LANES), np.float32)
+    found = expected.copy()
+    turn_reference(expected, (2, step), source, (1, step))
+    turned_square(found, (2, step), source, (1, step))
+    np.testing.assert_array_equal(found, expected)
 
 
 def test_lanes_are_those_of_the_processor():

@@ -81,6 +81,11 @@ def splat(builder: ir.IRBuilder, value: Any) -> Any:
     return builder.shuffle_vector(one, undefined, ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES))
 
 
+def shuffle(builder: ir.IRBuilder, a: Any, b: Any, lanes: Sequence[int]) -> Any:
+    """Return a vector of lanes of two others, those of the second counted from `LANES` on."""
+    return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(ir.IntType(32), LANES), list(lanes)))
+
+
 def call(builder: ir.IRBuilder, name: str, *vectors: Any) -> Any:
     """Return what one of LLVM's functions of whole vectors gives."""
     kind = ir.FunctionType(VECTOR, [VECTOR] * len(vectors))

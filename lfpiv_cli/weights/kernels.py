@@ -2,12 +2,14 @@
 
 Every step is one form, some lines as sums of many (`simd.combine`). The lit column cells are cut into tiles, and a tile
 goes through both steps, along the columns and along the rows, some planes at a time, while these are in the cache.
+Registers hold neighbouring cells of the columns in the sums over the rows, and neighbouring voxels of the rows in the
+sums over the columns: so neither has terms that are zero; what is between them is turned.
 Each output element is one sum in a fixed order, so the result does not depend on the number of threads, nor on how many
 numbers a register holds.
 
 Arrays: float32. `height` and `width` count the voxels along the sensor's rows and columns, the height filled up to a
-multiple of `ROWS`; `by_cell` is (tiles, row lines, TILE). The steps along one axis have their tables: `RowTerms` and
-`ColumnBlocks`.
+multiple of `LANES`; `by_cell` is (tiles, row lines, TILE). The steps along one axis have their tables: `Terms` along
+the rows, `CellBlocks` and `VoxelSums` along the columns.
 """
 
 from __future__ import annotations
@@ -18,7 +20,16 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from lfpiv_cli.simd.combine import GROUP, ROWS, TILE, VECTORS, combine_long, combine_short
+from lfpiv_cli.simd.combine import (
+    GROUP,
+    TILE,
+    VECTORS,
+    combine_line,
+    combine_long,
+    combine_turned,
+    combine_vector,
+    turn,
+)
 from lfpiv_cli.simd.vectors import LANES
 
 Floats = NDArray[np.float32]
@@ -31,14 +42,14 @@ PLANES_FORWARD, PLANES_BACK = 8, 16
 CACHE_LINE = 16
 
 
-class RowTerms(NamedTuple):
-    """Sums along the rows, two lines each.
+class Terms(NamedTuple):
+    """Sums of lines, some of them sharing their terms.
 
     Attributes
     ----------
     start : (sums + 1,) int64, the first term of each sum
     line : (terms,) int32, the line that each term takes
-    share : (terms, GROUP) float32, its share in either line
+    share : (terms, sums that share it) float32, its share in each
     """
 
     start: NDArray[np.int64]
@@ -46,18 +57,50 @@ class RowTerms(NamedTuple):
     share: NDArray[np.float32]
 
 
-class ColumnBlocks(NamedTuple):
-    """The weights along the columns as dense blocks of `LANES` columns, cells or voxels.
+class CellBlocks(NamedTuple):
+    """The weights along the columns for `LANES` cells at once: as many neighbouring voxels for each.
 
     Attributes
     ----------
     start : (blocks + 1,) int64, the first row of each block
-    first : (blocks, 2) int32, the first voxel of each block, and its first cell in the tile
-    share : (rows, LANES) float32
+    voxel : (blocks * LANES,) int32, the first voxel of each cell
+    share : (rows, LANES) float32, row by row that of the next voxel
     """
 
     start: NDArray[np.int64]
-    first: NDArray[np.int32]
+    voxel: NDArray[np.int32]
+    share: NDArray[np.float32]
+
+
+class LitRows(NamedTuple):
+    """The lit row cells in the order of their pixels.
+
+    Attributes
+    ----------
+    start : (rows + 1,) int64, the first cell of each pixel
+    cell : (lit cells,) int64
+    line : (lit cells,) int64, the line of `by_cell` that each has
+    """
+
+    start: Index
+    cell: Index
+    line: Index
+
+
+class VoxelSums(NamedTuple):
+    """The weights along the columns for the voxels that a tile of cells lights in a plane, its lines being cells.
+
+    Attributes
+    ----------
+    owned : (tiles * planes + 1,) int64, the first sum of each tile and plane
+    voxel : (tiles * planes,) int32, the voxel of this sum; the others follow one by one
+    start, line, share : of `Terms`, one share a term
+    """
+
+    owned: NDArray[np.int64]
+    voxel: NDArray[np.int32]
+    start: NDArray[np.int64]
+    line: NDArray[np.int32]
     share: NDArray[np.float32]
 
 
@@ -70,139 +113,147 @@ def room_for(size: int) -> Floats:
 
 
 @njit(cache=True, parallel=True)
-def turned(volume: Floats) -> Floats:
-    """Return a volume (planes, height, width) as (planes, width, height), the height filled up with zeros."""
-    planes, height, width = volume.shape
-    found = np.zeros((planes, width, -(-height // ROWS) * ROWS), np.float32)
-    for plane in prange(planes):
-        for j in range(height):
-            for x in range(width):
-                found[plane, x, j] = volume[plane, j, x]
+def turned(volume: Floats, shape: tuple[int, int]) -> Floats:
+    """Return a volume (planes, rows, columns) as (planes, columns, rows), cut or filled up with zeros to `shape`."""
+    found = np.zeros((volume.shape[0], shape[0], shape[1]), np.float32)
+    columns, rows = min(shape[0], volume.shape[2]), min(shape[1], volume.shape[1])
+    for plane in prange(volume.shape[0]):
+        for column in range(columns):
+            for row in range(rows):
+                found[plane, column, row] = volume[plane, row, column]
     return found
 
 
 @njit(cache=True, parallel=True)
-def project(volume: Floats, columns: ColumnBlocks, rows: RowTerms, tiles: int) -> Floats:
+def project(volume: Floats, columns: CellBlocks, rows: Terms, tiles: int) -> Floats:
     """Return sum_z B_z V_z A_z^T by cells of a volume (planes, width, filled height).
 
-    Block (plane * tiles + tile) * VECTORS + v of `columns` has a row of `LANES` cells for each voxel. Sum g of each
-    `PLANES_FORWARD` planes in `rows` gives lines g * GROUP on of `by_cell`; its terms are lines plane * height + voxel,
-    planes counted from the first of these.
+    Block (tile * planes + plane) * VECTORS + v of `columns` has the cells of vector v. Sum g of each `PLANES_FORWARD`
+    planes in `rows` gives lines g * GROUP on of `by_cell`; its terms are lines plane * height + voxel, planes counted
+    from the first of these.
     """
     planes, width, height = volume.shape
     chunks = -(-planes // PLANES_FORWARD)
     sums = (rows.start.size - 1) // chunks
     flat_cell, flat_volume = room_for(tiles * GROUP * sums * TILE), volume.reshape(-1)
-    block_start, block_first, block_share = columns.start, columns.first, columns.share.reshape(-1)
+    block_start, block_voxel, block_share = columns.start, columns.voxel, columns.share.reshape(-1)
     start, line, share = rows.start, rows.line, rows.share.reshape(-1)
-    in_turn = np.arange(width + 1).astype(np.int32)
     for tile in prange(tiles):
         lines = room_for(PLANES_FORWARD * height * TILE)
+        lit_chunks = 0
         for chunk in range(chunks):
             first = chunk * PLANES_FORWARD
-            for plane in range(first, min(first + PLANES_FORWARD, planes)):
+            last = min(first + PLANES_FORWARD, planes)
+            if block_start[(tile * planes + first) * VECTORS] == block_start[(tile * planes + last) * VECTORS]:
+                continue
+            for plane in range(first, last):
                 for v in range(VECTORS):
-                    block = (plane * tiles + tile) * VECTORS + v
-                    terms = (block_start[block] * LANES, 0, block_start[block + 1] - block_start[block])
-                    to, voxels = (plane - first) * height * TILE + v * LANES, plane * width + block_first[block, 0]
-                    for j in range(0, height, ROWS):
-                        shares = (voxels * height + j, height, 1)
-                        combine_short(lines, (to + j * TILE, TILE, 0), block_share, in_turn, terms, flat_volume, shares)
+                    block = (tile * planes + plane) * VECTORS + v
+                    count = block_start[block + 1] - block_start[block]
+                    for y in range(0, height, LANES):
+                        to = (((plane - first) * height + y) * TILE + v * LANES, TILE)
+                        terms = (plane * width * height + y, height, block * LANES, count)
+                        shares = block_start[block] * LANES
+                        combine_turned(lines, to, flat_volume, block_voxel, terms, block_share, shares)
             for g in range(sums):
                 at = chunk * sums + g
                 to = (tile * sums + g) * GROUP * TILE
-                terms = (0, start[at], start[at + 1] - start[at])
-                combine_long(flat_cell, (to, TILE, chunk), lines, line, terms, share, (start[at] * GROUP, GROUP, 1))
+                terms = (0, TILE, start[at], start[at + 1] - start[at])
+                combine_long(
+                    flat_cell, (to, TILE, lit_chunks), lines, line, terms, share, (start[at] * GROUP, GROUP, 1)
+                )
+            lit_chunks += 1
+        if lit_chunks == 0:
+            flat_cell[tile * sums * GROUP * TILE : (tile + 1) * sums * GROUP * TILE] = 0.0
     return flat_cell.reshape(tiles, GROUP * sums, TILE)
 
 
 @njit(cache=True, parallel=True)
-def back_project(
-    by_cell: Floats, shape: tuple[int, int, int], rows: RowTerms, columns: ColumnBlocks, owned: Index
-) -> Floats:
-    """Return B_z^T I A_z as a volume of `shape` (planes, filled height, width of at least `LANES`).
+def back_project(by_cell: Floats, shape: tuple[int, int, int], rows: Terms, columns: VoxelSums, threads: int) -> Floats:
+    """Return B_z^T I A_z as a volume of `shape` (planes, width, filled height).
 
     Each `PLANES_BACK` planes have for each voxel PLANES_BACK / GROUP sums in `rows`, whose terms are lines of
-    `by_cell`. Block b of `columns` has a row of `LANES` voxels for each cell; plane * tiles + tile owns blocks
-    owned[...] to owned[... + 1].
+    `by_cell`. Tile * planes + plane owns sums in `columns`.
     """
-    planes, height, width = shape
+    planes, width, height = shape
     tiles, size = by_cell.shape[0], by_cell.shape[1] * TILE
-    volume = np.zeros(shape, np.float32)
+    volume = np.zeros((planes, width, height), np.float32)
     flat_cell, flat_volume = by_cell.reshape(-1), volume.reshape(-1)
-    block_start, block_first, block_share = columns.start, columns.first, columns.share.reshape(-1)
     start, line, share = rows.start, rows.line, rows.share.reshape(-1)
-    in_turn = np.arange(TILE).astype(np.int32)
-    pairs = PLANES_BACK // GROUP
-    for chunk in prange(-(-planes // PLANES_BACK)):
-        first = chunk * PLANES_BACK
-        lines = room_for(PLANES_BACK * height * TILE)
+    pairs, chunks = PLANES_BACK // GROUP, -(-planes // PLANES_BACK)
+    # A thread takes a tile through all of its planes, so that the cells come into its cache once.
+    for thread in prange(threads):
+        lines, cells = room_for(PLANES_BACK * height * TILE), room_for(TILE * height)
         for tile in range(tiles):
-            # One voxel through all planes: these see the same cells, which stay in the fastest cache.
-            for voxel in range(height):
-                for pair in range(pairs):
-                    at = (chunk * height + voxel) * pairs + pair
-                    to = ((pair * GROUP * height + voxel) * TILE, height * TILE, 0)
-                    terms = (tile * size, start[at], start[at + 1] - start[at])
-                    combine_long(lines, to, flat_cell, line, terms, share, (start[at] * GROUP, GROUP, 1))
-            for plane in range(first, min(first + PLANES_BACK, planes)):
-                for b in range(owned[plane * tiles + tile], owned[plane * tiles + tile + 1]):
-                    terms = (block_start[b] * LANES, 0, block_start[b + 1] - block_start[b])
-                    to, cells = plane * height * width + block_first[b, 0], (plane - first) * height * TILE
-                    for j in range(0, height, ROWS):
-                        shares = (cells + j * TILE + block_first[b, 1], 1, TILE)
-                        onto = (to + j * width, width, 1)
-                        combine_short(flat_volume, onto, block_share, in_turn, terms, lines, shares)
+            for chunk in range(thread * chunks // threads, (thread + 1) * chunks // threads):
+                first = chunk * PLANES_BACK
+                last = min(first + PLANES_BACK, planes)
+                if columns.owned[tile * planes + first] == columns.owned[tile * planes + last]:
+                    continue
+                # One voxel through all planes: these see the same cells, which stay in the fastest cache.
+                for voxel in range(height):
+                    for pair in range(pairs):
+                        at = (chunk * height + voxel) * pairs + pair
+                        to = ((pair * GROUP * height + voxel) * TILE, height * TILE, 0)
+                        terms = (tile * size, TILE, start[at], start[at + 1] - start[at])
+                        combine_long(lines, to, flat_cell, line, terms, share, (start[at] * GROUP, GROUP, 1))
+                for plane in range(first, last):
+                    for y in range(0, height, LANES):
+                        for v in range(0, TILE, LANES):
+                            source = (((plane - first) * height + y) * TILE + v, TILE)
+                            turn(cells, (v * height + y, height), lines, source)
+                    owner = tile * planes + plane
+                    to_voxel = (plane * width + columns.voxel[owner]) * height
+                    _add_voxels(flat_volume, to_voxel, cells, height, columns, owner)
     return volume
 
 
-@njit(cache=True, parallel=True)
-def fold(
-    by_cell: Floats,
-    mask: Floats,
-    columns: tuple[int, int],
-    column_pixel: NDArray[np.int32],
-    row_cell: Index,
-    row_line: Index,
-    row_start: Index,
-    image: Floats,
-) -> None:
-    """Add to an image (rows, columns): C times the light of each lit cell, added up by pixel.
+@njit(cache=True)
+def _add_voxels(volume: Floats, at: int, cells: Floats, height: int, columns: VoxelSums, owner: int) -> None:
+    """Add to lines of `height` voxels, from place `at` in the flat volume on, the sums over cells that `owner` has."""
+    start, line, share = columns.start, columns.line, columns.share.reshape(-1)
+    whole = height // TILE * TILE
+    for n in range(columns.owned[owner], columns.owned[owner + 1]):
+        first, count = start[n], start[n + 1] - start[n]
+        for y in range(0, whole, TILE):
+            combine_line(volume, (at + y, 0, 1), cells, line, (y, height, first, count), share, (first, 1, 0))
+        for y in range(whole, height, LANES):
+            combine_vector(volume, (at + y, 0, 1), cells, line, (y, height, first, count), share, (first, 1, 0))
+        at += height
 
-    `columns` bounds the lit column cells. `row_cell` holds the lit row cells in the order of their pixels, `row_line`
-    their lines, `row_start` (rows + 1,) where each pixel's begin.
+
+@njit(cache=True, parallel=True)
+def fold(by_cell: Floats, mask: Floats, runs: Index, rows: LitRows, shape: tuple[int, int]) -> Floats:
+    """Return the image (rows, columns) of `shape`: C times the light of each lit cell, added up by pixel.
+
+    `runs` (runs, 4) are neighbouring column cells of a tile, and of a lens: the first one's number among all cells and
+    among the lit, its pixel, and how many they are.
     """
-    for row in prange(row_start.size - 1):
+    image = np.empty(shape, np.float32)
+    for row in prange(shape[0]):
         target = image[row]
-        for at in range(row_start[row], row_start[row + 1]):
-            weight, line = mask[row_cell[at]], row_line[at]
-            for tile in range(by_cell.shape[0]):
-                source = by_cell[tile, line]
-                first = columns[0] + tile * TILE
-                for k in range(min(TILE, columns[1] - first)):
-                    target[column_pixel[first + k]] += weight[first + k] * source[k]
+        target[:] = 0.0
+        for at in range(rows.start[row], rows.start[row + 1]):
+            weight, line = mask[rows.cell[at]], rows.line[at]
+            for run in range(runs.shape[0]):
+                cell, lit, pixel, count = runs[run]
+                source, k = by_cell[lit // TILE, line], lit % TILE
+                for n in range(count):
+                    target[pixel + n] += weight[cell + n] * source[k + n]
+    return image
 
 
 @njit(cache=True, parallel=True)
-def unfold(
-    image: Floats,
-    mask: Floats,
-    rows: tuple[int, int],
-    columns: tuple[int, int],
-    row_pixel: NDArray[np.int32],
-    column_pixel: NDArray[np.int32],
-) -> Floats:
-    """Return C times the pixel that each lit cell belongs to, (tiles, lit row cells, TILE)."""
-    tiles = -(-(columns[1] - columns[0]) // TILE)
-    lines = rows[1] - rows[0]
+def unfold(image: Floats, mask: Floats, runs: Index, rows: tuple[int, int], row_pixel: NDArray[np.int32]) -> Floats:
+    """Return C times the pixel that each lit cell belongs to, (tiles, lit row cells, TILE); `runs` as in `fold`."""
+    tiles, lines = -(-runs[:, 3].sum() // TILE), rows[1] - rows[0]
     by_cell = room_for(tiles * lines * TILE).reshape(tiles, lines, TILE)
     for line in prange(lines):
         source, weight = image[row_pixel[rows[0] + line]], mask[rows[0] + line]
-        for tile in range(tiles):
-            target = by_cell[tile, line]
-            first = columns[0] + tile * TILE
-            lit = min(TILE, columns[1] - first)
-            for k in range(lit):
-                target[k] = weight[first + k] * source[column_pixel[first + k]]
-            target[lit:] = 0.0
+        by_cell[tiles - 1 :, line] = 0.0
+        for run in range(runs.shape[0]):
+            cell, lit, pixel, count = runs[run]
+            target, k = by_cell[lit // TILE, line], lit % TILE
+            for n in range(count):
+                target[k + n] = weight[cell + n] * source[pixel + n]
     return by_cell

@@ -18,13 +18,15 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numba import get_num_threads
 from numpy.typing import NDArray
 
-from lfpiv_cli.simd.combine import GROUP, ROWS, TILE
+from lfpiv_cli.simd.combine import GROUP, TILE
 from lfpiv_cli.simd.vectors import LANES
 from lfpiv_cli.weights import kernels
 from lfpiv_cli.weights.axis import AxisWeights
-from lfpiv_cli.weights.kernels import PLANES_BACK, PLANES_FORWARD, ColumnBlocks, RowTerms
+from lfpiv_cli.weights.axis_cells import Cells
+from lfpiv_cli.weights.kernels import PLANES_BACK, PLANES_FORWARD, CellBlocks, LitRows, Terms, VoxelSums
 
 # Pixel rows, pixel columns and weights of one voxel.
 Column = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]
@@ -58,19 +60,18 @@ class FactorisedOperator:
         """Return the image (rows, columns) of a volume [plane, row voxel, column voxel]."""
         first, last = self._lit_columns
         tiles = _filled(last - first, TILE) // TILE
-        by_cell = kernels.project(kernels.turned(volume), self._columns_forward, self._rows_forward, tiles)
-        image = np.zeros(self.image_shape, np.float32)
-        kernels.fold(by_cell, self.mask, self._lit_columns, self.columns.cells.pixel, *self._lines_of_rows, image)
-        return image
+        _, height, width = self.shape
+        turned = kernels.turned(volume, (width, _filled(height, LANES)))
+        by_cell = kernels.project(turned, self._columns_forward, self._rows_forward, tiles)
+        return kernels.fold(by_cell, self.mask, self._runs, self._lines_of_rows, self.image_shape)
 
     def adjoint(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the volume [plane, row voxel, column voxel] that an image is spread back to."""
-        row_pixel, column_pixel = self.rows.cells.pixel, self.columns.cells.pixel
-        by_cell = kernels.unfold(image, self.mask, self._lit_rows, self._lit_columns, row_pixel, column_pixel)
+        by_cell = kernels.unfold(image, self.mask, self._runs, self._lit_rows, self.rows.cells.pixel)
         planes, height, width = self.shape
-        filled = (planes, _filled(height, ROWS), max(width, LANES))
-        volume = kernels.back_project(by_cell, filled, self._rows_back, *self._columns_back)
-        return np.ascontiguousarray(volume[:, :height, :width])
+        turned = (planes, width, _filled(height, LANES))
+        volume = kernels.back_project(by_cell, turned, self._rows_back, self._columns_back, get_num_threads())
+        return kernels.turned(volume, (height, width))
 
     def column(self, plane: int, row_voxel: int, column_voxel: int) -> Column:
         """Return the rows, columns (int64) and weights (float32) of the pixels that one voxel lights."""
@@ -95,28 +96,31 @@ class FactorisedOperator:
         return _range(self.columns.cell)
 
     @cached_property
-    def _lines_of_rows(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-        """Lit row cells in the order of their pixels, their lines in the sum, and where each pixel's begin."""
+    def _runs(self) -> NDArray[np.int64]:
+        return runs_of_cells(self.columns.cells, *self._lit_columns)
+
+    @cached_property
+    def _lines_of_rows(self) -> LitRows:
         first, last = self._lit_rows
         pixel = self.rows.cells.pixel[first:last]
         order = np.argsort(pixel, kind="stable")
         start = np.searchsorted(pixel[order], np.arange(self.rows.pixels + 1)).astype(np.int64)
-        return first + order, lens_lines(self.rows, first, last)[order], start
+        return LitRows(start, first + order, lens_lines(self.rows, first, last)[order])
 
     @cached_property
-    def _columns_forward(self) -> ColumnBlocks:
+    def _columns_forward(self) -> CellBlocks:
         return blocks_of_cells(self.columns, *self._lit_columns)
 
     @cached_property
-    def _columns_back(self) -> tuple[ColumnBlocks, NDArray[np.int64]]:
-        return blocks_of_voxels(self.columns, *self._lit_columns)
+    def _columns_back(self) -> VoxelSums:
+        return sums_of_voxels(self.columns, *self._lit_columns)
 
     @cached_property
-    def _rows_forward(self) -> RowTerms:
+    def _rows_forward(self) -> Terms:
         return row_terms_of_cells(self.rows, *self._lit_rows)
 
     @cached_property
-    def _rows_back(self) -> RowTerms:
+    def _rows_back(self) -> Terms:
         return row_terms_of_voxels(self.rows, self._lit_rows[0])
 
 
@@ -178,48 +182,41 @@ def adjoint_reference(operator: FactorisedOperator, image: NDArray[np.float32]) 
     return np.stack([operator.rows.matrix(k).T @ by_cell @ operator.columns.matrix(k) for k in planes])
 
 
-def blocks_of_cells(columns: AxisWeights, first: int, last: int) -> ColumnBlocks:
-    """Return the columns' weights as blocks of `LANES` lit cells (from `first` to `last`), a row for each voxel."""
+def runs_of_cells(cells: Cells, first: int, last: int) -> NDArray[np.int64]:
+    """Return the runs (runs, 4) of lit cells (from `first` to `last`) that share a tile and a lens; see `fold`."""
+    cell = np.arange(first, last)
+    begins = np.isin(cell, cells.start) | ((cell - first) % TILE == 0)
+    begin = cell[begins]
+    return np.stack([begin, begin - first, cells.pixel[begin], np.diff(begin, append=last)], axis=1).astype(np.int64)
+
+
+def blocks_of_cells(columns: AxisWeights, first: int, last: int) -> CellBlocks:
+    """Return the columns' weights as blocks of `LANES` lit cells (from `first` to `last`), each with its voxels."""
     pieces = _filled(last - first, TILE) // LANES
     plane, voxel = np.divmod(_line_of(columns), columns.voxels)
-    piece, cell = np.divmod(columns.cell.astype(np.int64) - first, LANES)
-    blocks = columns.planes * pieces
-    return _dense(plane * pieces + piece, voxel, cell, columns.share, blocks)
+    tile, cell = np.divmod(columns.cell.astype(np.int64) - first, TILE)
+    at = (tile * columns.planes + plane) * TILE + cell
+    low, span = _spans(at, voxel, columns.planes * pieces * LANES)
+    most = span.reshape(-1, LANES).max(axis=1)
+    start = np.concatenate([[0], np.cumsum(most)]).astype(np.int64)
+    block, lane = np.divmod(at, LANES)
+    low = np.minimum(low, columns.voxels - np.repeat(most, LANES))
+    share = np.zeros((start[-1], LANES), np.float32)
+    share[start[block] + voxel - low[at], lane] = columns.share
+    return CellBlocks(start, low.astype(np.int32), share)
 
 
-def blocks_of_voxels(columns: AxisWeights, first: int, last: int) -> tuple[ColumnBlocks, NDArray[np.int64]]:
-    """Return the columns' weights as blocks of `LANES` voxels, a row for each cell of a tile, and which a tile owns.
-
-    The blocks of a tile of lit cells (from `first` to `last`) begin with its lowest voxel, or so that they end with the
-    row of voxels.
-    """
+def sums_of_voxels(columns: AxisWeights, first: int, last: int) -> VoxelSums:
+    """Return the columns' weights as sums over the cells of each tile of lit cells (from `first` to `last`)."""
     tiles = _filled(last - first, TILE) // TILE
     plane, voxel = np.divmod(_line_of(columns), columns.voxels)
     tile, cell = np.divmod(columns.cell.astype(np.int64) - first, TILE)
-    owner = plane * tiles + tile
+    owner = tile * columns.planes + plane
     low, span = _spans(owner, voxel, columns.planes * tiles)
-    owned = np.concatenate([[0], np.cumsum(_filled(span, LANES) // LANES)]).astype(np.int64)
-    number = (voxel - low[owner]) // LANES
-    begin = np.minimum(low[owner] + LANES * number, max(columns.voxels - LANES, 0))
-    block = owned[owner] + number
-    by_cell = _dense(block, cell, voxel - begin, columns.share, int(owned[-1]))
-    by_cell.first[block, 0] = begin
-    return by_cell, owned
-
-
-def _dense(
-    block: NDArray[np.int64],
-    row: NDArray[np.int64],
-    lane: NDArray[np.int64],
-    share: NDArray[np.float32],
-    blocks: int,
-) -> ColumnBlocks:
-    """Gather shares into blocks of the rows between their lowest and their highest."""
-    low, span = _spans(block, row, blocks)
-    start = np.concatenate([[0], np.cumsum(span)]).astype(np.int64)
-    dense = np.zeros((start[-1], LANES), np.float32)
-    dense[start[block] + row - low[block], lane] = share
-    return ColumnBlocks(start, np.stack([low, low], axis=1).astype(np.int32), dense)
+    owned = np.concatenate([[0], np.cumsum(span)]).astype(np.int64)
+    number = owned[owner] + voxel - low[owner]
+    terms = _pack(number, cell, np.zeros_like(cell), columns.share, (int(owned[-1]), 1))
+    return VoxelSums(owned, low.astype(np.int32), *terms)
 
 
 def _spans(
@@ -243,7 +240,7 @@ def lens_lines(rows: AxisWeights, first: int, last: int) -> NDArray[np.int64]:
     return start[which] + cell - begin
 
 
-def row_terms_of_cells(rows: AxisWeights, first: int, last: int) -> RowTerms:
+def row_terms_of_cells(rows: AxisWeights, first: int, last: int) -> Terms:
     """Return, for each `GROUP` row cells of a lens, the lines of the volume that reach any of them, and the shares.
 
     `first` and `last` bound the lit cells; a line is plane * filled height + voxel, with the planes of each
@@ -254,18 +251,18 @@ def row_terms_of_cells(rows: AxisWeights, first: int, last: int) -> RowTerms:
     groups = int(line_of_cell[-1]) // GROUP + 1
     plane, voxel = np.divmod(_line_of(rows), rows.voxels)
     chunk, plane = np.divmod(plane, PLANES_FORWARD)
-    line = plane * _filled(rows.voxels, ROWS) + voxel
-    return _pack(chunk * groups + group, line, member, rows.share, _chunks(rows, PLANES_FORWARD) * groups)
+    line = plane * _filled(rows.voxels, LANES) + voxel
+    return _pack(chunk * groups + group, line, member, rows.share, (_chunks(rows, PLANES_FORWARD) * groups, GROUP))
 
 
-def row_terms_of_voxels(rows: AxisWeights, first: int) -> RowTerms:
+def row_terms_of_voxels(rows: AxisWeights, first: int) -> Terms:
     """Return, for each voxel of each `GROUP` planes, the lit row cells it reaches (from `first` on) and the shares."""
     plane, voxel = np.divmod(_line_of(rows), rows.voxels)
     chunk, plane = np.divmod(plane, PLANES_BACK)
-    height, pairs = _filled(rows.voxels, ROWS), PLANES_BACK // GROUP
+    height, pairs = _filled(rows.voxels, LANES), PLANES_BACK // GROUP
     cell = rows.cell.astype(np.int64) - first
     group = (chunk * height + voxel) * pairs + plane // GROUP
-    return _pack(group, cell, plane % GROUP, rows.share, _chunks(rows, PLANES_BACK) * height * pairs)
+    return _pack(group, cell, plane % GROUP, rows.share, (_chunks(rows, PLANES_BACK) * height * pairs, GROUP))
 
 
 def _pack(
@@ -273,15 +270,15 @@ def _pack(
     line: NDArray[np.int64],
     member: NDArray[np.int64],
     share: NDArray[np.float32],
-    groups: int,
-) -> RowTerms:
-    """Gather the shares of each (group, line) into one term of `GROUP` members."""
+    shape: tuple[int, int],
+) -> Terms:
+    """Gather the shares of each (group, line) into one term; `shape` counts groups and the members of each."""
     lines = int(line.max(initial=0)) + 1
     keys, term = np.unique(group * lines + line, return_inverse=True)
-    start = np.searchsorted(keys, lines * np.arange(groups + 1)).astype(np.int64)
-    packed = np.zeros((keys.size, GROUP), np.float32)
+    start = np.searchsorted(keys, lines * np.arange(shape[0] + 1)).astype(np.int64)
+    packed = np.zeros((keys.size, shape[1]), np.float32)
     packed[term, member] = share
-    return RowTerms(start, (keys % lines).astype(np.int32), packed)
+    return Terms(start, (keys % lines).astype(np.int32), packed)
 
 
 def _chunks(axis: AxisWeights, planes: int) -> int:
