@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter, shift
 
 from benchmarks.volumes import Seeding, volume_pair
 from lfpiv_cli.flow.maps import margins
@@ -19,17 +20,17 @@ ROUND = np.ones(3)
 def steps(
     a: NDArray[np.float32], b: NDArray[np.float32], layout: WindowLayout, sigma: NDArray[np.float64] = ROUND
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Gauss-Newton steps of two volumes that are valid everywhere."""
+    """Gauss-Newton steps of two volumes that are valid everywhere, and their standard deviations."""
     before, after = margins(layout, a.shape, 1)
     margin = list(zip(before, after, strict=True))
     padded = (np.pad(volume, margin) for volume in (a, b, np.ones(a.shape, np.uint8)))
-    return gauss_newton(pair_moments(*padded, layout, before), layout, sigma)
+    return gauss_newton(pair_moments(*padded, layout, before), layout, sigma)[:2]
 
 
 def shifted(
-    rng: np.random.Generator, sigma: tuple[float, float, float], noise: float = 0.0, shift: tuple = (0.1, -0.2, 0.3)
+    rng: np.random.Generator, sigma: tuple[float, float, float], noise: float = 0.0, moved: tuple = (0.1, -0.2, 0.3)
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    return volume_pair(lambda points: np.tile(shift, (len(points), 1)), SHAPE, Seeding(12.0, sigma, noise), rng)
+    return volume_pair(lambda points: np.tile(moved, (len(points), 1)), SHAPE, Seeding(12.0, sigma, noise), rng)
 
 
 @pytest.mark.parametrize(("size", "overlap"), [((16, 16, 16), HALF), ((12, 16, 9), (0.5, 0.25, 0.3))])
@@ -67,7 +68,7 @@ def test_uncertainty_is_the_spread_of_the_steps(rng: np.random.Generator) -> Non
     layout = layout_windows(SHAPE, (16, 16, 16), (0.0, 0.0, 0.0))
     found, stated = [], []
     for _ in range(8):
-        a, _ = shifted(rng, (1.0, 1.0, 1.0), shift=(0.0, 0.0, 0.0))
+        a, _ = shifted(rng, (1.0, 1.0, 1.0), moved=(0.0, 0.0, 0.0))
         pair = [a + (0.05 * rng.standard_normal(a.shape)).astype(np.float32) for _ in range(2)]
         step, deviation = steps(pair[0], pair[1], layout)
         found.append(step)
@@ -97,7 +98,7 @@ def test_windows_that_overhang_have_an_uncertainty_of_their_own(rng: np.random.G
     # As where particles move 4 voxels in depth: of the outermost windows half is left.
     valid[:2] = valid[-2:] = 0
     padded = (np.pad(volume, margin) for volume in (a, b, valid))
-    _, deviation = gauss_newton(pair_moments(*padded, layout, before), layout, ROUND)
+    _, deviation, _ = gauss_newton(pair_moments(*padded, layout, before), layout, ROUND)
     assert np.isfinite(deviation).all()
     inside = np.median(deviation[1:-1])
     # Half the voxels, and some of the particles cut: a root of two more, or a little beyond.
@@ -122,10 +123,32 @@ def test_cells_make_up_each_window(size: int, step: int, per_window: int, hop: i
 
 @pytest.mark.parametrize("size", [(10, 10, 10), (12, 12, 12), (14, 14, 14), (18, 18, 18), (31, 31, 5), (24, 24, 4)])
 def test_windows_of_any_size_have_an_uncertainty(size: tuple[int, int, int], rng: np.random.Generator) -> None:
-    a, _ = shifted(rng, (1.0, 1.0, 1.0), shift=(0.0, 0.0, 0.0))
+    a, _ = shifted(rng, (1.0, 1.0, 1.0), moved=(0.0, 0.0, 0.0))
     pair = [a + (0.05 * rng.standard_normal(a.shape)).astype(np.float32) for _ in range(2)]
     found, stated = steps(pair[0], pair[1], layout_windows(SHAPE, size, HALF))
     assert np.isfinite(stated).all()
     # Some twenty windows of the largest size, half of each in the next one: the spread is known to a fifth.
     ratio = np.sqrt(np.mean(np.square(stated)) / np.mean(np.square(found)))
     assert 0.6 < ratio < 1.5
+
+
+def test_steps_respond_to_a_predictor_by_the_slopes_that_the_volumes_share(rng: np.random.Generator) -> None:
+    """Volumes with noise of their own, correlated over two voxels as that of a solver is, against a moved predictor."""
+    a, b = shifted(rng, (1.0, 1.0, 4.0), moved=(0.0, 0.0, 0.0))
+    noisy = [v + gaussian_filter(rng.standard_normal(v.shape), (2.0, 1.0, 1.0)).astype(np.float32) for v in (a, b)]
+    layout = layout_windows(SHAPE, (16, 16, 16), HALF)
+    before, after = margins(layout, a.shape, 1)
+    margin = list(zip(before, after, strict=True))
+
+    def solved(moved_by: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        moved = [
+            shift(v, (sign * 0.5 * moved_by, 0, 0), mode="nearest") for v, sign in zip(noisy, (1, -1), strict=True)
+        ]
+        padded = (np.pad(v, margin) for v in (*moved, np.ones(a.shape, np.uint8)))
+        step, _, response = gauss_newton(pair_moments(*padded, layout, before), layout, np.array([1.0, 1.0, 4.0]))
+        return step[1:-1, 1:-1, 1:-1, 2], response[1:-1, 1:-1, 1:-1, 2]
+
+    step, response = solved(0.0)
+    moved_step, _ = solved(0.4)
+    assert 0.3 < np.median(response) < 0.8
+    np.testing.assert_allclose(np.median((step - moved_step) / 0.4), np.median(response), rtol=0.15)

@@ -272,7 +272,8 @@ def _refine(pairs: Sequence[Pair], predictor: NDArray[np.float64], step: Pass, i
     width = undiluted(typical_width(peaks.width))
     rest = uncertainty = np.full(peaks.offset.shape, np.nan)
     if moments_of[0] is not None:
-        rest, uncertainty = gauss_newton(reduce(add, moments_of), layout, width / np.sqrt(2.0))
+        rest, deviation, response = gauss_newton(reduce(add, moments_of), layout, width / np.sqrt(2.0))
+        uncertainty = deviation / response
     raw, second = absolute(_with_steps(peaks, rest, width), predictor)
     masked = valid_fraction < SMALLEST_VALID_FRACTION
     displacement, flag = validate_vectors(raw, second, peaks.found, masked, expected_noise(peaks.width))

@@ -6,7 +6,11 @@ windows from these. Along a particle image that is long and smooth this is far l
 peak, where neighbouring shifts hardly differ; along a short one the peak is more robust against lost particles.
 
 The uncertainty is that of the sandwich estimator: how much the groups of cells in a window disagree on the solution,
-whatever the reason. Axes: cells and windows are ordered (z, y, x); vectors hold (u, v, w) along (x, y, z).
+whatever the reason. Where the volumes differ, a step is too short: a predictor that is moved by one changes it only by
+the response sum(dA/dx dB/dx) / sum(dM/dx dM/dx), as differences have slopes as well. Passes make up for that, and what
+they converge to errs by as much more than one step.
+
+Axes: cells and windows are ordered (z, y, x); vectors hold (u, v, w) along (x, y, z).
 """
 
 from __future__ import annotations
@@ -29,6 +33,7 @@ from lfpiv_cli.threads import share_out
 CELLS_PER_WINDOW = 4
 # Three components and the gain. Moments are those of their derivatives, and those of these with B - A.
 UNKNOWNS = 4
+PRODUCTS = UNKNOWNS * (UNKNOWNS + 1) // 2
 # A group is at least this many standard deviations of a particle image long: smaller ones share their particles, and
 # the spread of what they say is then too small.
 GROUP_SIGMAS = 2.0
@@ -37,6 +42,8 @@ GROUP_SIGMAS = 2.0
 FEWEST_GROUPS = 3
 # A pivot below this share of its diagonal element is rounding: the window does not determine that unknown.
 SMALLEST_PIVOT = 1e-6
+# With a smaller response the volumes' slopes have next to nothing in common: errors stated are then large enough.
+SMALLEST_RESPONSE = 0.25
 
 
 Starts = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]
@@ -102,8 +109,8 @@ def pair_moments(
 
 def gauss_newton(
     moments: NDArray[np.float64], layout: WindowLayout, particle_sigma: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the rest displacements and their standard deviations, (nz, ny, nx, 3) each.
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return the rest displacements, their standard deviations and the response to a predictor, (nz, ny, nx, 3) each.
 
     NaN where a window does not determine them, and for the standard deviation where its groups are too few.
 
@@ -120,9 +127,9 @@ def gauss_newton(
     ]
     grouped = (groups[0], groups[1], groups[2])
     count = layout.count_zyx
-    step, deviation = np.full((2, *count, 3), np.nan)
-    share_out(solve_windows, count[0] * count[1], moments, cells.per_window, cells.hop, grouped, step, deviation)
-    return step, deviation
+    solved = np.full((3, *count, 3), np.nan)
+    share_out(solve_windows, count[0] * count[1], moments, cells.per_window, cells.hop, grouped, solved)
+    return solved[0], solved[1], solved[2]
 
 
 def _cells_a_group(per_window: int, length: int, sigma: float) -> int:
@@ -145,8 +152,9 @@ def sum_cells(
 ) -> None:
     """Write the moments of cells, rows `part` of (cells z, y, x, MOMENTS), of windows that begin at the voxel `first`.
 
-    The upper triangle of the products of (dM/dx, dM/dy, dM/dz, M), row by row, then those of each with B - A. Voxels
-    with a neighbour that is not valid are left out: their gradient would be that of the rim.
+    The upper triangle of the products of (dM/dx, dM/dy, dM/dz, M), row by row, those of each with B - A, and the
+    squares of the slopes of (B - A) / 2. Voxels with a neighbour that is not valid are left out: their gradient would
+    be that of the rim.
     """
     a, b = pair
     count = found.shape[:3]
@@ -181,7 +189,7 @@ def unpack(moments: NDArray[np.float64], matrix: NDArray[np.float64], vector: ND
             matrix[i, j] = moments[place]
             matrix[j, i] = moments[place]
             place += 1
-        vector[i] = moments[MOMENTS - UNKNOWNS + i]
+        vector[i] = moments[PRODUCTS + i]
 
 
 @njit(cache=True)
@@ -216,15 +224,15 @@ def solve_windows(
     per_window: Triple,
     hop: Triple,
     grouped: Triple,
-    step: NDArray[np.float64],
-    deviation: NDArray[np.float64],
+    solved: NDArray[np.float64],
 ) -> None:
-    """Write step and standard deviation of windows, rows `part` of (nz, ny, nx, 3), from the moments of their cells.
+    """Write step, deviation and response of windows, rows `part` of (3, nz, ny, nx, 3), from their cells' moments.
 
     `grouped` is how many cells along (z, y, x) make one group of the sandwich estimator. Windows that their moments do
     not determine are left as they are.
     """
-    count = step.shape[:3]
+    count = solved.shape[1:4]
+    step, deviation, response = solved[0], solved[1], solved[2]
     groups = (per_window[0] // grouped[0], per_window[1] // grouped[1], per_window[2] // grouped[2])
     for job in range(part[0], part[1]):
         kz, ky = job // count[1], job % count[1]
@@ -254,6 +262,9 @@ def solve_windows(
             for i in range(3):
                 step[kz, ky, kx, i] = -solution[i]
             write_deviation(sums, inverse, solution, deviation[kz, ky, kx])
+            for i in range(3):
+                common = 1.0 - total[PRODUCTS + UNKNOWNS + i] / matrix[i, i]
+                response[kz, ky, kx, i] = max(common, SMALLEST_RESPONSE)
 
 
 @njit(cache=True)

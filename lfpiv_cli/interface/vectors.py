@@ -12,11 +12,13 @@ from lfpiv_cli.files.config import Config, carried_config
 from lfpiv_cli.files.vtkhdf import Volume
 from lfpiv_cli.flow import correlation
 from lfpiv_cli.flow.field import VectorField
+from lfpiv_cli.flow.locking import with_locking
 from lfpiv_cli.flow.masks import between_walls
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.interface.notices import warn_of
 from lfpiv_cli.interface.vectors_checks import field_notices, quality_of, window_notices
 from lfpiv_cli.reference import FOCAL_POINT
+from lfpiv_cli.scale import Scale
 
 
 def correlate(
@@ -64,8 +66,16 @@ def correlate(
     windows = chosen.correlation_settings(first.grid.spacing_mm)
     usable = usable_voxels(chosen, first.grid, mask)
     field = correlation.correlate([(first.array, second.array)], first.grid, windows, mask=usable)
+    if config:
+        # Of light that no camera recorded nothing is known.
+        field = with_locking(field, first.reference, scale_of(chosen))
     warn_of([*window_notices(first, windows, "the first volume"), *field_notices(quality_of(field), "the field")])
     return field
+
+
+def scale_of(settings: Config) -> Scale:
+    """Return the lengths in the scene of the camera that volumes were made of."""
+    return settings.camera_model().scale(settings.media_model())
 
 
 def usable_voxels(settings: Config, grid: Grid, mask: NDArray[Any] | None) -> NDArray[np.bool_] | None:

@@ -36,8 +36,9 @@ Floats = NDArray[np.float32]
 
 # Shifts along x that share their loads: with five of them all sums of a radius of 2 stay in registers.
 FEW_SHIFTS, MANY_SHIFTS = 3, 5
-# Products of three derivatives, a mean and a difference: ten among the first four, and four with the difference.
-MOMENTS = 14
+# Products of three derivatives, a mean and a difference: ten among the first four, four with the difference, and the
+# squares of the difference's three derivatives.
+MOMENTS = 17
 
 
 def products_reference(
@@ -122,7 +123,8 @@ def moments_reference(
     """Sum products of gradient, mean and difference over planes and rows: the readable twin of `moments`.
 
     Of the mean M = (a + b) / 2 and its central differences, q = (dM/dx, dM/dy, dM/dz, M), and of r = b - a: the upper
-    triangle of the products q q, row by row, then q r. Voxels with a neighbour that is not valid are left out.
+    triangle of the products q q, row by row, then q r, then the squares of (dr/dx, dr/dy, dr/dz) / 2. Voxels with a
+    neighbour that is not valid are left out.
 
     Parameters
     ----------
@@ -131,7 +133,8 @@ def moments_reference(
     extent : planes, rows
     """
     at, plane, row = places
-    q, r, kept = np.empty((4, LANES), np.float32), np.empty(LANES, np.float32), np.empty(LANES, np.float32)
+    q, slope = np.empty((4, LANES), np.float32), np.empty((3, LANES), np.float32)
+    r, kept = np.empty(LANES, np.float32), np.empty(LANES, np.float32)
     sums = np.zeros((MOMENTS, LANES), np.float32)
     for z in range(extent[0]):
         for y in range(extent[1]):
@@ -140,7 +143,7 @@ def moments_reference(
             _strike_out(valid[here : here + LANES], kept)
             for axis, step in enumerate((1, row, plane)):
                 before, after = slice(here - step, here - step + LANES), slice(here + step, here + step + LANES)
-                _write_slopes(a[before], a[after], b[before], b[after], q[axis])
+                _write_slopes(a[before], a[after], b[before], b[after], q[axis], slope[axis])
                 _strike_out(valid[before], kept)
                 _strike_out(valid[after], kept)
             a_here, b_here = a[here : here + LANES], b[here : here + LANES]
@@ -156,15 +159,22 @@ def moments_reference(
             for i in range(4):
                 for lane in range(LANES):
                     sums[m + i, lane] += q[i, lane] * r[lane]
+            m += 4
+            for i in range(3):
+                for lane in range(LANES):
+                    sums[m + i, lane] += kept[lane] * slope[i, lane] * slope[i, lane]
     for m in range(MOMENTS):
         out[to[0] + m * to[1] : to[0] + m * to[1] + LANES] = sums[m]
 
 
 @njit(cache=True)
-def _write_slopes(a_before: Floats, a_after: Floats, b_before: Floats, b_after: Floats, slope: Floats) -> None:
-    """Write the central differences of the mean of a and b."""
-    for lane in range(slope.size):
-        slope[lane] = np.float32(0.25) * ((a_after[lane] + b_after[lane]) - (a_before[lane] + b_before[lane]))
+def _write_slopes(
+    a_before: Floats, a_after: Floats, b_before: Floats, b_after: Floats, of_mean: Floats, of_difference: Floats
+) -> None:
+    """Write the central differences of the mean of a and b, and of half their difference."""
+    for lane in range(of_mean.size):
+        of_mean[lane] = np.float32(0.25) * ((a_after[lane] + b_after[lane]) - (a_before[lane] + b_before[lane]))
+        of_difference[lane] = np.float32(0.25) * ((b_after[lane] - a_after[lane]) - (b_before[lane] - a_before[lane]))
 
 
 @njit(cache=True)
@@ -191,26 +201,34 @@ def _generate_moments(context: Any, builder: ir.IRBuilder, signature: Any, argum
     planes, rows = cgutils.unpack_tuple(builder, arguments[6], 2)
     sums = registers(builder, [ZERO] * MOMENTS)
 
-    def total(place: Any) -> Any:
-        return builder.fadd(load(builder, a, place), load(builder, b, place))
+    def both(place: Any) -> tuple[Any, Any]:
+        one, other = load(builder, a, place), load(builder, b, place)
+        return builder.fadd(one, other), builder.fsub(other, one)
 
     with cgutils.for_range(builder, planes) as z:
         begin = builder.add(at, builder.mul(z.index, plane))
         with cgutils.for_range(builder, rows) as y:
             here = builder.add(begin, builder.mul(y.index, row))
             kept = load(builder, valid, here, FLAGS)
-            known = []
+            known: list[Any] = []
+            slopes: list[Any] = []
             for step in (index(1), row, plane):
                 before, after = builder.sub(here, step), builder.add(here, step)
                 for place in (before, after):
                     kept = builder.and_(kept, load(builder, valid, place, FLAGS))
-                known.append(builder.fmul(constant(0.25), builder.fsub(total(after), total(before))))
-            known.append(builder.fmul(constant(0.5), total(here)))
-            rest = builder.fsub(load(builder, b, here), load(builder, a, here))
+                quarters = (
+                    builder.fmul(constant(0.25), builder.fsub(one, other))
+                    for one, other in zip(both(after), both(before), strict=True)
+                )
+                for found, slope in zip((known, slopes), quarters, strict=True):
+                    found.append(slope)
+            total, rest = both(here)
+            known.append(builder.fmul(constant(0.5), total))
             kept = builder.uitofp(kept, VECTOR)
-            known = [builder.fmul(kept, one) for one in known]
+            known, slopes = ([builder.fmul(kept, one) for one in each] for each in (known, slopes))
             pairs = [(one, other) for i, one in enumerate(known) for other in known[i:]]
-            for slot, (one, other) in zip(sums, pairs + [(one, rest) for one in known], strict=True):
+            pairs += [(one, rest) for one in known] + [(one, one) for one in slopes]
+            for slot, (one, other) in zip(sums, pairs, strict=True):
                 add_product(builder, slot, one, other)
     for m, slot in enumerate(sums):
         store(builder, builder.load(slot), out, builder.add(out_at, builder.mul(out_step, index(m))))

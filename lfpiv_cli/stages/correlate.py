@@ -22,8 +22,9 @@ from lfpiv_cli.flow.correlation import correlate as measure
 from lfpiv_cli.flow.correlation import count_passes
 from lfpiv_cli.flow.derived import Derived, derived_fields
 from lfpiv_cli.flow.field import MM_TO_M, REJECTED, VectorField
+from lfpiv_cli.flow.locking import with_locking
 from lfpiv_cli.flow.statistics import statistics_of
-from lfpiv_cli.interface.vectors import ensure_alike, usable_voxels
+from lfpiv_cli.interface.vectors import ensure_alike, scale_of, usable_voxels
 from lfpiv_cli.interface.vectors_checks import (
     calibration_notices,
     field_notices,
@@ -166,6 +167,7 @@ def _measure(job: Job, mask: Path | None, console: Console) -> tuple[VectorField
     notices = [*calibration_notices(records), *window_notices(first, settings, job.pairs[0][0].name)]
     with console.progress(count_passes(settings.windows), "correlate") as advance:
         field = measure(volumes(), first.grid, settings, mask=usable, progress=advance)
+    field = with_locking(field, first.reference, scale_of(job.settings))
     return field, first.reference, notices
 
 
