@@ -25,12 +25,15 @@ from lfpiv_cli.files.calibration_file import read_calibration
 from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.images import write_tiff
 from lfpiv_cli.files.provenance import earlier_record, with_warnings
+from lfpiv_cli.files.weights_file import open_weights
 from lfpiv_cli.interface.weights import plan_of
+from lfpiv_cli.interface.weights_cost import cost_notices, cost_of
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media, Window
 from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.optics.paraxial import refraction_error_mm, sine_error_mm
+from lfpiv_cli.weights.operators import FactorisedOperator
 
 ROOT = Path(__file__).parent.parent
 SHAPE = (200, 240)
@@ -274,3 +277,43 @@ def test_sine_error_is_that_of_two_rays(table2: Camera) -> None:
     tangent = 12.5 / 200.0
     sine = np.sin(np.arctan(tangent))
     assert sine_error_mm(table2, Media(), np.array([-3.0, 2.0])) == pytest.approx(3.0 * (tangent - sine))
+
+
+def test_work_is_estimated_before_it_begins(tmp_path: Path, capsys) -> None:
+    rig_of(tmp_path)
+    command = ["build-weights", str(tmp_path / "rig.yaml"), "-o", str(tmp_path / "w.h5"), "--json"]
+    cli.main([*command, "--dry-run"], standalone_mode=False)
+    estimated = json.loads(capsys.readouterr().out)
+    assert not (tmp_path / "w.h5").exists()
+    assert estimated["warnings"] == []
+    cli.main(command, standalone_mode=False)
+    made = json.loads(capsys.readouterr().out)
+    weights = open_weights(tmp_path / "w.h5").weights.solver_operator
+    assert isinstance(weights, FactorisedOperator)
+    held = sum(each.cell.nbytes + each.share.nbytes for each in (weights.columns, weights.rows))
+    assert estimated["estimated_weights_bytes"] == pytest.approx(held + 4 * 600 * 448, rel=0.5)
+    for name in ("voxels_xyz", "padding_xyz", "method"):
+        assert estimated[name] == made[name]
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ([], []),
+        ([("layout: square", "layout: hexagonal")], []),
+        ([("shape_xyz: [30, 22, 40], voxel_mm: 0.1", "shape_xyz: [1500, 1100, 400], voxel_mm: 0.002")], ["heavy-work"]),
+    ],
+)
+def test_heavy_work_is_told(changes: list[tuple[str, str]], told: list[str], tmp_path: Path) -> None:
+    plan = plan_of(rig_of(tmp_path, *changes), None)
+    cost = cost_of(plan.settings, plan.camera, plan.source, plan.grid.padded(plan.padding))
+    assert [each.code for each in cost_notices(cost)] == told
+
+
+def test_columns_on_demand_cost_more_than_factors(tmp_path: Path) -> None:
+    square, hexagonal = (
+        plan_of(rig_of(tmp_path, *changes), None) for changes in ([], [("layout: square", "layout: hexagonal")])
+    )
+    costs = [cost_of(each.settings, each.camera, each.source, each.grid) for each in (square, hexagonal)]
+    assert costs[1].image_core_s > 10.0 * costs[0].image_core_s
+    assert costs[1].weights_core_s == costs[1].weights_bytes == 0.0

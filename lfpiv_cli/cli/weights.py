@@ -20,6 +20,7 @@ from lfpiv_cli.names import Method, Refraction, Sampling, names_in
 )
 @click.option("--refraction", type=click.Choice(names_in(Refraction)), help="Snell's law; default from the config.")
 @click.option("--sampling", type=click.Choice(names_in(Sampling)), help="Integrals or rays; default from the config.")
+@click.option("--dry-run", is_flag=True, help="Check everything and estimate time and memory; write nothing.")
 @output_option("Weights file to write (.h5).")
 @common_options
 def build_weights(config: Path, output: Path, overwrite: bool, console: Console, **chosen: Any) -> dict[str, Any]:
@@ -27,6 +28,7 @@ def build_weights(config: Path, output: Path, overwrite: bool, console: Console,
 
     \b
     Example: lfpiv build-weights rig.yaml --calibration calibration.h5 -o weights.h5
+             lfpiv build-weights rig.yaml --calibration calibration.h5 -o weights.h5 --dry-run
     """
     from lfpiv_cli.stages import build_weights as stage
 

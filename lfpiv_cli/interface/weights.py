@@ -18,6 +18,7 @@ from lfpiv_cli.files.weights_file import WeightsFile
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.interface.notices import SILENT, warn_of
 from lfpiv_cli.interface.weights_checks import check_rig, rig_notices
+from lfpiv_cli.interface.weights_cost import check_rays
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.object_space import ObjectSpace
@@ -38,13 +39,8 @@ VOXELS_CHOSEN = (
 ON_DEMAND = "array or rays do not separate into axes; columns are made on demand, for what is lit"
 # Below this share of its light on the sensor a voxel counts as out of view.
 LEAST_SEEN = 0.01
-# Half an hour on two cores; a core counts about four million rays a second.
-MOST_RAYS = 3e10
-RAYS_PER_CORE_HOUR = 1.5e10
 # Cubic polynomials are good to a third of their range beyond it: the paper's volume reaches a quarter beyond boards.
 FARTHEST_BEYOND = 0.3
-# Some 1,500 pixels of 8 bytes.
-BYTES_PER_COLUMN = 12_000
 
 
 def build_weights(rig: Config, calibration: Calibration | None = None, **settings: Any) -> WeightsFile:
@@ -117,6 +113,7 @@ def plan_of(settings: Config, found: Calibration | None) -> Plan:
     grid = settings.grid(reference)
     padding = settings.reconstruction.padding_voxel or default_padding(camera, settings.media_model(), grid)
     source = ray_source(settings, found)
+    check_rays(settings, source, grid.padded(padding))
     notices = [
         *rig_notices(settings, found, camera, source, grid),
         *_view_notices(*seen_share(camera, source, grid), grid),
@@ -184,12 +181,7 @@ def _reach_notices(settings: Config, found: Calibration | None, grid: Grid) -> l
 def make_operator(
     chosen: WeightsSection, camera: Camera, source: Source, grid: Grid, console: Console
 ) -> WeightsOperator:
-    """Return the weights of a grid: factorised where the axes separate, else on demand; or counted where asked for.
-
-    Raises
-    ------
-    ConfigError : counting would take too long
-    """
+    """Return the weights of a grid: factorised where the axes separate, else on demand; or counted where asked for."""
     if chosen.sampling == "exact" or isinstance(source, PolynomialRays):
         operator = operator_of(camera, source, grid)
         if isinstance(operator, OnDemandOperator):
@@ -197,13 +189,6 @@ def make_operator(
         return operator
     layout = OnDemandOperator(camera, source, grid)
     voxels, count = math.prod(layout.shape), RayCount(chosen.points, chosen.rays_per_point)
-    rays = voxels * count.rays
-    if rays > MOST_RAYS:
-        raise ConfigError(
-            f"weights.sampling: counting {rays:.3g} rays for {voxels} voxels (padding included) would take about "
-            f"{rays / RAYS_PER_CORE_HOUR:.2g} core hours and {voxels * BYTES_PER_COLUMN / 1e9:.2g} GB; at most "
-            f"{MOST_RAYS:.3g} are counted, use sampling: exact"
-        )
     centres, rng = layout.centres_mm(np.arange(voxels)), np.random.default_rng(chosen.seed)
     with console.progress(voxels, "count rays") as advance:
         columns = count_columns(camera, source, centres, layout.sides_mm, rng, count, advance)

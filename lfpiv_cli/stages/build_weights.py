@@ -14,6 +14,7 @@ from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.provenance import record, with_warnings
 from lfpiv_cli.files.weights_file import write_weights
 from lfpiv_cli.interface.weights import plan_of, weights_of
+from lfpiv_cli.interface.weights_cost import cost_notices, cost_of
 from lfpiv_cli.names import Method, Refraction, Sampling
 
 
@@ -25,12 +26,14 @@ class BuildWeightsOptions:
     ----------
     calibration : file of `calibrate_snapshot`; None: the data sheet is believed
     method, refraction, sampling : in place of the config's, see its section `weights`
+    dry_run : check everything and estimate the work, make nothing
     """
 
     calibration: Path | None = None
     method: Method | None = None
     refraction: Refraction | None = None
     sampling: Sampling | None = None
+    dry_run: bool = False
 
 
 NO_OPTIONS = BuildWeightsOptions()
@@ -44,24 +47,29 @@ def build_weights(
     overwrite: bool = False,
     console: Console = CONSOLE,
 ) -> dict[str, Any]:
-    """Calculate the weights of the configured volume, for the calibrated camera where there is a calibration."""
+    """Calculate the weights of the configured volume, for the calibrated camera where there is a calibration.
+
+    What speaks against the work's size is no fault of the result, and not kept with it.
+    """
     inputs = given(config=config, calibration=options.calibration)
     ensure_writable(output, overwrite, inputs.values())
     settings = load_config(config).overridden_by("weights", options)
     found = read_calibration(options.calibration) if options.calibration else None
     plan = plan_of(settings, found)
-    console.warn(plan.notices)
+    cost = cost_of(settings, plan.camera, plan.source, plan.grid.padded(plan.padding))
+    console.warn([*plan.notices, *cost_notices(cost)])
+    summary = {
+        "voxels_xyz": list(plan.grid.shape_xyz),
+        "voxel_mm": list(plan.grid.spacing_mm),
+        "padding_xyz": list(plan.padding),
+        **plan.reference.attributes(),
+        "method": settings.weights.method,
+        "refraction": settings.weights.refraction,
+    }
+    if options.dry_run:
+        return summary | cost.summary()
+    console.detail(f"about {cost.weights_core_s:.2g} s of a core and {cost.weights_bytes / 1e9:.2g} GB")
     provenance = with_warnings(record("build-weights", settings.resolved(), inputs), plan.notices)
     content = weights_of(plan, provenance, console)
     write_weights(output, content, overwrite)
-    weights = content.weights
-    return {
-        "voxels_xyz": list(weights.grid.shape_xyz),
-        "voxel_mm": list(weights.grid.spacing_mm),
-        "padding_xyz": list(weights.padding_xyz),
-        **content.reference.attributes(),
-        "frame": weights.frame,
-        "method": settings.weights.method,
-        "refraction": settings.weights.refraction,
-        "file_bytes": output.stat().st_size,
-    }
+    return summary | {"frame": content.weights.frame, "file_bytes": output.stat().st_size}

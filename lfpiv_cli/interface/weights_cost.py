@@ -1,0 +1,121 @@
+"""What weights and a volume made with them will cost, estimated before the work: right to a factor of two or three."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+
+from lfpiv_cli.errors import ConfigError
+from lfpiv_cli.files.config import Config
+from lfpiv_cli.grid import Grid
+from lfpiv_cli.notice import Notice
+from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.polynomial_rays import PolynomialRays
+from lfpiv_cli.weights.build import separates
+from lfpiv_cli.weights.columns import LARGEST_BYTES
+from lfpiv_cli.weights.rays import RayCount
+from lfpiv_cli.weights.scene import Source
+
+# Measured on one core. A voxel's factors along an axis have 2 to 2.6 entries for each pixel of a lens image; they take
+# 8 bytes and 1.2 us each, the aperture's mask 0.3 us a pixel of the sensor. A projection makes 5e9 multiplications a
+# second, one for each entry along the rows and pixel along the columns. A column takes some 8 ms and 1,500 pixels of 8
+# bytes. A core counts some four million rays a second.
+ENTRIES_PER_PIXEL = 2.5
+ENTRY_BYTES, ENTRY_S, MASK_PIXEL_S = 8, 1.2e-6, 3e-7
+MULTIPLICATIONS_PER_S = 5e9
+COLUMN_S, COLUMN_BYTES = 8e-3, 12_000
+RAYS_PER_CORE_HOUR = 1.5e10
+# Half an hour on two cores.
+MOST_RAYS = 3e10
+# Volumes and images of float32 that a solver holds.
+VOLUMES_HELD, IMAGES_HELD, FLOAT_BYTES = 8, 12, 4
+# More than this is worth a word before it begins.
+LONG_S, MUCH_BYTES = 600.0, 8e9
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Bytes in memory or in the file, and seconds of one core.
+
+    Attributes
+    ----------
+    voxels : of the volume and its padding
+    weights_bytes, weights_core_s : of making the weights
+    image_bytes, image_core_s : of one volume by the configured solver, at most where columns are made on demand
+    """
+
+    voxels: int
+    weights_bytes: float
+    weights_core_s: float
+    image_bytes: float
+    image_core_s: float
+
+    def summary(self) -> dict[str, float]:
+        """Return the figures, named as estimates."""
+        return {f"estimated_{name}": value for name, value in asdict(self).items()}
+
+
+def cost_of(settings: Config, camera: Camera, source: Source, grid: Grid) -> Cost:
+    """Return what the weights of a grid, padding included, and a volume on it will cost."""
+    columns, rows, planes = grid.shape_xyz if camera.column_axis == "x" else (grid.shape_xyz[1], *grid.shape_xyz[::2])
+    voxels, pixels = math.prod(grid.shape_xyz), camera.columns * camera.rows
+    held = FLOAT_BYTES * (VOLUMES_HELD * voxels + IMAGES_HELD * pixels)
+    projections = 2 * settings.reconstruction.iterations
+    rays = _rays(settings, source, grid)
+    if rays or not separates(camera, source, grid):
+        kept = min(voxels * COLUMN_BYTES, LARGEST_BYTES)
+        solving = projections * voxels * COLUMN_BYTES / ENTRY_BYTES / MULTIPLICATIONS_PER_S
+        weights_bytes, making = (kept, 0.0) if rays else (0.0, voxels * COLUMN_S)
+        return Cost(voxels, weights_bytes, 3600.0 * rays / RAYS_PER_CORE_HOUR, held + kept, making + solving)
+    entries = ENTRIES_PER_PIXEL * float(camera.micro_image_lattice_px().pitch.mean())
+    both_axes, pixel_bytes = planes * (columns + rows) * entries, FLOAT_BYTES * pixels
+    products = planes * rows * entries * (columns + camera.columns)
+    return Cost(
+        voxels,
+        both_axes * ENTRY_BYTES + pixel_bytes,
+        both_axes * ENTRY_S + pixels * MASK_PIXEL_S,
+        held + both_axes * ENTRY_BYTES + pixel_bytes,
+        projections * products / MULTIPLICATIONS_PER_S,
+    )
+
+
+def check_rays(settings: Config, source: Source, grid: Grid) -> None:
+    """Refuse to count more rays for a grid, padding included, than there is time for.
+
+    Raises
+    ------
+    ConfigError
+    """
+    rays, voxels = _rays(settings, source, grid), math.prod(grid.shape_xyz)
+    if rays > MOST_RAYS:
+        raise ConfigError(
+            f"weights.sampling: counting {rays:.3g} rays for {voxels} voxels (padding included) would take about "
+            f"{rays / RAYS_PER_CORE_HOUR:.2g} core hours and {voxels * COLUMN_BYTES / 1e9:.2g} GB; at most "
+            f"{MOST_RAYS:.3g} are counted, use sampling: exact"
+        )
+
+
+def _rays(settings: Config, source: Source, grid: Grid) -> int:
+    """Return how many rays are to be counted for a grid, 0 where weights are integrals."""
+    chosen = settings.weights
+    if chosen.sampling == "exact" or isinstance(source, PolynomialRays):
+        return 0
+    return math.prod(grid.shape_xyz) * RayCount(chosen.points, chosen.rays_per_point).rays
+
+
+def cost_notices(cost: Cost) -> list[Notice]:
+    """Return whether making the weights, or holding what a volume needs, is more than one would expect."""
+    most = max(cost.weights_bytes, cost.image_bytes)
+    if cost.weights_core_s <= LONG_S and most <= MUCH_BYTES:
+        return []
+    return [
+        Notice(
+            "heavy-work",
+            "volume",
+            f"weights of {cost.voxels:.3g} voxels will take about {cost.weights_core_s / 60.0:.2g} minutes of a core, "
+            f"and a volume of one image up to {most / 1e9:.2g} GB and {cost.image_core_s / 60.0:.2g} minutes of a core",
+            "a smaller volume or larger voxels; --dry-run tells what others will take",
+            max(cost.weights_core_s / LONG_S, most / MUCH_BYTES),
+            f"at most {LONG_S / 60.0:g} minutes for the weights and {MUCH_BYTES / 1e9:g} GB",
+        )
+    ]
