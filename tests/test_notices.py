@@ -210,6 +210,11 @@ def test_the_sample_rig_is_fine(tmp_path: Path) -> None:
     assert plan_of(rig_of(tmp_path), None).notices == []
 
 
+def test_a_rim_may_lie_out_of_view(tmp_path: Path) -> None:
+    # the sensor sees 3.3 mm
+    assert plan_of(rig_of(tmp_path, ("shape_xyz: [30, 22, 40]", "shape_xyz: [35, 22, 40]")), None).notices == []
+
+
 def test_pixels_of_another_unit_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"camera.sensor.pixel_um: is 0.0055: lens images would be .* px apart"):
         rig_of(tmp_path, ("pixel_um: 5.5", "pixel_um: 0.0055"))

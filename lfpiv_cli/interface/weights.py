@@ -39,6 +39,8 @@ VOXELS_CHOSEN = (
 ON_DEMAND = "array or rays do not separate into axes; columns are made on demand, for what is lit"
 # Below this share of its light on the sensor a voxel counts as out of view.
 LEAST_SEEN = 0.01
+# Of the volume's length, at either end: the paper's volume is 0.06 mm longer than its sensor sees.
+RIM_SHARE = 0.01
 # Cubic polynomials are good to a third of their range beyond it: the paper's volume reaches a quarter beyond boards.
 FARTHEST_BEYOND = 0.3
 
@@ -116,7 +118,7 @@ def plan_of(settings: Config, found: Calibration | None) -> Plan:
     check_rays(settings, source, grid.padded(padding))
     notices = [
         *rig_notices(settings, found, camera, source, grid),
-        *_view_notices(*seen_share(camera, source, grid), grid),
+        *_view_notices(*seen_share(camera, source, _without_rim(grid)), grid),
         *_reach_notices(settings, found, grid),
     ]
     return Plan(settings, found, camera, reference, grid, padding, source, notices)
@@ -209,6 +211,12 @@ def _reference(settings: Config, found: Calibration | None) -> Reference:
             "they say where the mid plane lies"
         )
     return Reference(name, found.mid_plane_z_mm)
+
+
+def _without_rim(grid: Grid) -> Grid:
+    """Return a grid without what may lie out of view without a word."""
+    x, y, z = (-math.ceil(RIM_SHARE * n) if n > 2 else 0 for n in grid.shape_xyz)
+    return grid.padded((x, y, z))
 
 
 def _view_notices(smallest: float, largest: float, grid: Grid) -> list[Notice]:
