@@ -105,7 +105,7 @@ def test_a_ghost_is_not_accepted(view: View, rng: np.random.Generator) -> None:
     residual = image_of(view, particles)
     ghost = np.array([[1.0, 1.0, 0.0, 5e5]]) * np.sign(-particles[:1])
     candidates = np.concatenate([particles + (0.01, 0.01, 0.1, 0.0), ghost])
-    taken = accept(observed(view, residual, np.ones_like(residual)), candidates, Least(1e5, 0.8, 0.1))
+    taken = accept(observed(view, residual, np.ones_like(residual)), candidates, Least(1e5, 0.8, 0.1, 50.0))
     assert taken.tolist() == [True, True, False]
     np.testing.assert_allclose(candidates[:2, :3], particles[:, :3], atol=2e-3)
 
@@ -290,7 +290,7 @@ def test_what_hardly_meets_the_sensor_is_no_particle(view: View) -> None:
     *_, seen = judge(observed(view, residual, weight), candidate)
     assert 0.0 < seen[0] < 0.1
     taken = [
-        accept(observed(view, residual.copy(), weight), candidate.copy(), Least(1e5, 0.5, least)).tolist()
+        accept(observed(view, residual.copy(), weight), candidate.copy(), Least(1e5, 0.5, least, 50.0)).tolist()
         for least in (0.0, 0.1)
     ]
     assert taken == [[True], [False]]

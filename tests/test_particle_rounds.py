@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from lfpiv_cli.grid import Grid
@@ -114,6 +116,54 @@ def test_a_single_tracer_is_found_in_a_volume_that_is_partly_out_of_view(
     np.testing.assert_allclose(state.particles, true, rtol=0.02, atol=2e-3)
 
 
+def without_noise(light: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
+    return light
+
+
+def with_noise(light: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
+    return rng.poisson(0.5 * light) / 0.5 + rng.normal(0.0, 6.0, light.shape)
+
+
+def thresholded(light: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
+    noisy = with_noise(light, rng)
+    return np.where(noisy < 25.0, 0.0, noisy)
+
+
+@pytest.mark.parametrize(
+    ("counts", "recorded"),
+    [
+        (0.0, with_noise),  # nothing but noise
+        (3e3, with_noise),  # as bright as the noise of a pixel
+        (5e4, thresholded),
+        (5e5, without_noise),
+        (2e7, with_noise),
+    ],
+)
+def test_any_brightness_will_do(
+    table2: Camera,
+    water: Media,
+    rng: np.random.Generator,
+    counts: float,
+    recorded: Callable[[NDArray[np.float64], np.random.Generator], NDArray[np.float64]],
+) -> None:
+    camera = replace(table2, columns=240, rows=240)
+    weights = weights_of(camera, water, Grid.centred((12, 12, 12), (0.1, 0.1, 0.1), (0.0, 0.0, 1.9)))
+    view, axis = raw_view(camera, water, 0.025), np.array([-0.42, 0.0, 0.42])
+    true = np.stack(np.meshgrid(axis, axis, [1.9], [counts], indexing="ij"), axis=-1).reshape(-1, 4)
+    true[:, :3] += rng.uniform((-0.05, -0.05, -0.3), (0.05, 0.05, 0.3), (9, 3))
+    light = np.zeros(camera.rows * camera.columns)
+    add_all(view, true, 1.0, light, (1.0, 3.0))
+    image = np.rint(recorded(light, rng)).reshape(camera.rows, camera.columns).astype(np.float32)
+    found = find_particles(task_of(image, view, weights, camera, normalisers(weights.padded)), ROUNDS[::5])
+    if counts == 0.0:
+        assert not len(found.position_mm)
+        return
+    assert len(found.position_mm) == len(true)
+    distance, nearest = KDTree(true[:, :3] / (0.03, 0.03, 0.3)).query(found.position_mm / (0.03, 0.03, 0.3))
+    assert np.all(distance < 1.0)
+    assert len(np.unique(nearest)) == len(true)
+
+
 def test_pixels_that_are_left_out_do_not_matter(table2: Camera, water: Media, rng: np.random.Generator) -> None:
     camera = replace(table2, columns=360, rows=300)
     grid = Grid.centred((14, 11, 10), (0.1, 0.1, 0.1), (0.0, 0.0, 1.9))
@@ -164,7 +214,8 @@ def test_what_is_explained_gives_no_candidate(table2: Camera, water: Media) -> N
 
 def test_typical_light_is_not_the_noise_s() -> None:
     noise = np.linspace(0.5, 9.0, 400)
-    assert first_typical_light(noise, 1.0) == 0.0
+    # Where nothing stands out all peaks are tried, and none is accepted that noise makes.
+    assert first_typical_light(noise, 1.0) == np.percentile(noise, 90.0)
     assert first_typical_light(np.zeros(0), 1.0) == 0.0
     # One tracer, which the volume shows as a bright peak and two faint ones beside it.
     assert first_typical_light(np.append(noise, [5000.0, 900.0, 300.0]), 1.0) == 5000.0

@@ -160,11 +160,19 @@ def _fit_from(
 
 
 class Least(NamedTuple):
-    """What a candidate must have: light, the share of it that is found, and the share of it that meets the sensor."""
+    """What a candidate must have.
+
+    Attributes
+    ----------
+    light : counts
+    found, seen : shares of it that are found in the image, and that meet the sensor
+    gain : by which it lowers chi-squared
+    """
 
     light: float
     found: float
     seen: float
+    gain: float
 
 
 def accept(observation: Observation, candidates: NDArray[np.float64], least: Least) -> NDArray[np.bool_]:
@@ -200,7 +208,7 @@ def _accept(
             if change < lowest:
                 lowest = change
                 best[:] = trial
-        if lowest == 0.0 or best[0, 3] < least.light:
+        if lowest > -least.gain or lowest == 0.0 or best[0, 3] < least.light:
             continue
         respond_all(observation.optics, best, responses)
         pixels, values = lit_by(responses, 0)

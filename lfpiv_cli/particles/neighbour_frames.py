@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from lfpiv_cli.particles.noise import estimate_noise
 from lfpiv_cli.particles.rounds import ROUNDS, finished, with_suspects_checked
 from lfpiv_cli.particles.search import (
     LAST_UNEXPLAINED,
@@ -25,6 +24,7 @@ from lfpiv_cli.particles.search import (
     Task,
     blank,
     merge,
+    noise_with,
     prune,
     rebuilt,
     sweep,
@@ -57,7 +57,7 @@ def second_pass(
     search_mm : largest displacement along each axis
     """
     state = with_typical_light(task, rebuilt(task, blank(task), own))
-    state = with_measured_noise(task, replace(state, noise=estimate_noise(task.image, state.typical_light)))
+    state = with_measured_noise(task, replace(state, noise=noise_with(task, state.typical_light)))
     state = rebuilt(task, state, np.concatenate([own, _missing_particles(task, own, neighbours, search_mm)]))
     for sweeps, unexplained in REFINING:
         sweep(task, state, unexplained, sweeps)

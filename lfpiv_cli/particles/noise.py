@@ -22,6 +22,9 @@ MODEL_ERROR = 0.03
 PHOTONS_PER_PARTICLE = 2.5e5
 # Rounding to whole counts alone makes this standard deviation.
 ROUNDING_COUNTS = 0.29
+# While particles are sought, dark pixels are not trusted beyond this share of what a typical particle's pixels hold: a
+# candidate a third of a microlens off lights dark pixels, and must not go out for it in an image with hardly any noise.
+LEAST_SHARE_OF_LIT = 0.003
 # Pixels are lit above this many standard deviations of the read noise; what lies further than so many from the model is
 # light that was not found, not an error's usual size.
 LIT_SIGMAS, USUAL_SIGMAS = 3.0, 3.5
@@ -114,11 +117,27 @@ def measured_noise(
     return Noise(noise.read_counts, float(gain), float(np.sqrt(error2)))
 
 
-def estimate_noise(image: NDArray[np.float64], typical_light: float) -> Noise:
-    """Return the noise of a dark-subtracted image whose particles have a typical light in counts.
+def estimate_noise(image: NDArray[np.float64], typical_light: float, lens_pixels: float) -> Noise:
+    """Return the noise of a dark-subtracted image to seek particles with.
 
-    Read noise is the spread below zero, where no light hides it.
+    Parameters
+    ----------
+    typical_light : of a particle, counts; 0 where it is not known
+    lens_pixels : pixels of a micro-image, over about as many of which a particle's light is spread
+    """
+    least = LEAST_SHARE_OF_LIT * typical_light / lens_pixels
+    return Noise(max(read_noise(image), least), typical_light / PHOTONS_PER_PARTICLE)
+
+
+def read_noise(image: NDArray[np.float64]) -> float:
+    """Return the read noise of a dark-subtracted image: its spread below zero, where no light hides it.
+
+    Where pixels below a threshold were set to zero, as by who removes noise, most are zero and the faintest of the
+    others shows the threshold: up to there zero says nothing.
     """
     below = image[image < 0.0]
     read = float(np.median(-below)) / HALF_NORMAL_MEDIAN if below.size else 0.0
-    return Noise(max(read, ROUNDING_COUNTS), typical_light / PHOTONS_PER_PARTICLE)
+    lit = image[image > 0.0]
+    if 0 < lit.size < np.count_nonzero(image == 0.0):
+        read = max(read, (float(lit.min()) - 0.5) / np.sqrt(3.0))
+    return max(read, ROUNDING_COUNTS)

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.particles.candidates import boxes_of, explain_rest, find_peaks, points_in_raw_frame
 from lfpiv_cli.particles.fitting import Least, accept, judge
-from lfpiv_cli.particles.noise import Noise, estimate_noise
 from lfpiv_cli.particles.search import (
     LAST_SWEEPS,
     LAST_UNEXPLAINED,
@@ -29,6 +28,7 @@ from lfpiv_cli.particles.search import (
     Task,
     blank,
     merge,
+    noise_with,
     observed,
     prune,
     result,
@@ -37,7 +37,7 @@ from lfpiv_cli.particles.search import (
     with_typical_light,
 )
 from lfpiv_cli.particles.suspects import with_depths_corrected, with_overlaps_split
-from lfpiv_cli.particles.view import View
+from lfpiv_cli.particles.view import lens_pixels
 
 
 @dataclass(frozen=True)
@@ -78,6 +78,8 @@ FIRST_TYPICAL_PERCENTILE = 90.0
 STANDING_OUT = 20.0
 # Share of a typical particle's light that a peak must have to be tried.
 CANDIDATE_LIGHT = 0.1
+# What a candidate must lower chi-squared by: among thousands of places noise alone gives some 30.
+CANDIDATE_GAIN = 50.0
 # A particle stays while it finds this much less of its light than a candidate had to.
 PRUNING_SLACK = 0.3
 
@@ -118,10 +120,10 @@ def _one_round(task: Task, state: State, settings: Round, progress: Callable[[in
     if typical == 0.0:
         # Where hardly any light meets the sensor, at the volume's rim, noise becomes peaks brighter than tracers.
         *_, seen = judge(observed(task, state, LAST_UNEXPLAINED), candidates)
-        noise = noise_of_light(task.view, estimate_noise(task.image, 0.0))
+        noise = state.noise.read_counts * np.sqrt(lens_pixels(task.view))
         typical = first_typical_light(light[seen > SMALLEST_SEEN], noise)
     candidates = candidates[light > CANDIDATE_LIGHT * typical] if typical > 0.0 else candidates[:0]
-    state = replace(state, typical_light=typical, noise=estimate_noise(task.image, typical))
+    state = replace(state, typical_light=typical, noise=noise_with(task, typical))
     state = _accept(task, state, candidates, settings)
     sweep(task, state, settings.unexplained, SWEEPS)
     state = with_typical_light(task, state)
@@ -129,29 +131,21 @@ def _one_round(task: Task, state: State, settings: Round, progress: Callable[[in
 
 
 def first_typical_light(light: NDArray[np.float64], noise_counts: float) -> float:
-    """Return the light of a typical particle as far as peaks tell; 0 where none stands out of the noise.
+    """Return the light of a typical particle as far as peaks tell; 0 where there are none.
+
+    Where none stands out of the noise all may be noise, and the fit will tell.
 
     Parameters
     ----------
     light : (n,) of the peaks, counts
-    noise_counts : standard error of a particle's light by the image's noise
+    noise_counts : standard error of a lone particle's light by read noise
     """
-    standing_out = light > STANDING_OUT * noise_counts
-    if not standing_out.any():
+    if not light.size:
         return 0.0
-    if np.count_nonzero(standing_out) < (1.0 - 0.01 * FIRST_TYPICAL_PERCENTILE) * len(light):
+    standing_out = light > STANDING_OUT * noise_counts
+    if standing_out.any() and np.count_nonzero(standing_out) < (1.0 - 0.01 * FIRST_TYPICAL_PERCENTILE) * len(light):
         return float(np.percentile(light[standing_out], FIRST_TYPICAL_PERCENTILE, method="higher"))
     return float(np.percentile(light, FIRST_TYPICAL_PERCENTILE))
-
-
-def noise_of_light(view: View, noise: Noise) -> float:
-    """Return the standard error of a lone particle's light by read noise.
-
-    However many lenses its light reaches, together they show the aperture once: about as many pixels are lit as a lens
-    has.
-    """
-    pixels = 4.0 * view.half_x_mm * view.half_y_mm / view.camera.pixel_mm**2
-    return float(noise.read_counts * np.sqrt(pixels))
 
 
 def with_suspects_checked(task: Task, state: State, settings: Round) -> State:
@@ -178,6 +172,7 @@ def _candidates(
 def _accept(task: Task, state: State, candidates: NDArray[np.float64], settings: Round) -> State:
     """Return the state with those candidates that hold."""
     observation = observed(task, state, settings.unexplained)
-    least = Least(SMALLEST_LIGHT * state.typical_light, settings.claimed_share, SMALLEST_SEEN)
+    light = SMALLEST_LIGHT * state.typical_light
+    least = Least(light, settings.claimed_share, SMALLEST_SEEN, CANDIDATE_GAIN)
     accepted = accept(observation, candidates, least)
     return replace(state, particles=np.concatenate([state.particles, candidates[accepted]]))

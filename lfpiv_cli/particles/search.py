@@ -16,8 +16,8 @@ from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.particles.covariance import joint_covariance
 from lfpiv_cli.particles.fitting import add_all, judge, refine
 from lfpiv_cli.particles.least_squares import Observation, observation_of
-from lfpiv_cli.particles.noise import Noise, error_correlation, estimate_noise, measured_noise
-from lfpiv_cli.particles.view import View
+from lfpiv_cli.particles.noise import Noise, error_correlation, estimate_noise, measured_noise, read_noise
+from lfpiv_cli.particles.view import View, lens_pixels
 from lfpiv_cli.reconstruction.equations import Normalisers
 from lfpiv_cli.weights.model import Weights
 
@@ -137,7 +137,12 @@ def task_of(
 def blank(task: Task) -> State:
     """Return the state in which nothing has been found."""
     none = np.zeros((0, 5))
-    return State(np.zeros((0, 4)), task.image.copy(), 0.0, estimate_noise(task.image, 0.0), none, none)
+    return State(np.zeros((0, 4)), task.image.copy(), 0.0, noise_with(task, 0.0), none, none)
+
+
+def noise_with(task: Task, typical_light: float) -> Noise:
+    """Return the noise to seek particles with."""
+    return estimate_noise(task.image, typical_light, lens_pixels(task.view))
 
 
 def observed(task: Task, state: State, unexplained: float) -> Observation:
@@ -189,12 +194,13 @@ def with_typical_light(task: Task, state: State) -> State:
     chi2, _, seen = judge(observed(task, state, LAST_UNEXPLAINED), state.particles)
     light, chi2 = state.particles[seen > SMALLEST_SEEN, 3], chi2[seen > SMALLEST_SEEN]
     typical = float(np.median(light[chi2 <= np.median(chi2)])) if light.size else 0.0
-    return replace(state, typical_light=typical, noise=estimate_noise(task.image, typical))
+    return replace(state, typical_light=typical, noise=noise_with(task, typical))
 
 
 def with_measured_noise(task: Task, state: State) -> State:
     """Return the state with the noise that its particles leave of the image."""
-    return replace(state, noise=measured_noise(task.image - state.residual, state.residual, task.usable, state.noise))
+    assumed = replace(state.noise, read_counts=read_noise(task.image))
+    return replace(state, noise=measured_noise(task.image - state.residual, state.residual, task.usable, assumed))
 
 
 def result(task: Task, state: State) -> Particles:

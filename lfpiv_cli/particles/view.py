@@ -121,6 +121,14 @@ def lens_on_array_mm(view: View) -> float:
     return view.scale.lens_mm * view.camera.image_distance_mm / view.camera.focus_distance_mm
 
 
+def lens_pixels(view: View) -> float:
+    """Return the pixels of a lens's cell.
+
+    However many lenses a particle's light reaches, together they show the aperture once: about as many pixels are lit.
+    """
+    return 4.0 * view.half_x_mm * view.half_y_mm / view.camera.pixel_mm**2
+
+
 def footprint_radius_mm(view: View, z_mm: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return how far on the array the light of particles at depths z spreads from their centres."""
     camera, beta = view.camera, _image_scale(view, z_mm)
