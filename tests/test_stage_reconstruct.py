@@ -146,7 +146,7 @@ def test_iterations_end_where_the_config_says(tmp_path, stop, done):
 @pytest.mark.parametrize(("counts", "said"), [(0, "one value everywhere \\(0\\)"), (65535, "one value everywhere")])
 def test_a_frame_that_shows_nothing_is_refused(weights, frame, counts, said, tmp_path):
     tifffile.imwrite(tmp_path / "nothing.tif", np.full_like(frame, counts))
-    with pytest.raises(InputError, match=f"nothing: the image has {said}"):
+    with pytest.raises(InputError, match=f"nothing.tif: has {said}"):
         volume_of(weights, tmp_path / "nothing.tif", tmp_path / "v.vtkhdf")
     assert not (tmp_path / "v.vtkhdf").exists()
 
@@ -161,7 +161,7 @@ def test_a_frame_without_a_usable_pixel_is_refused(weights, frame, tmp_path):
     frame[:50] = 65535
     tifffile.imwrite(tmp_path / "mask.tif", mask)
     tifffile.imwrite(tmp_path / "a.tif", frame)
-    with pytest.raises(InputError, match="a: all pixels are saturated or left out"):
+    with pytest.raises(InputError, match="a.tif: all pixels are saturated or left out"):
         volume_of(weights, tmp_path / "a.tif", tmp_path / "v.vtkhdf", "--mask", tmp_path / "mask.tif")
 
 

@@ -17,10 +17,12 @@ from lfpiv_cli.files.weights_file import WeightsFile
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.interface.notices import warn_of
 from lfpiv_cli.interface.reconstruction import (
+    IMAGE,
     Bench,
     bench_of,
+    check_frame,
+    frame_notices,
     given_picture,
-    judged_frame,
     picture_for,
 )
 from lfpiv_cli.notice import Notice
@@ -87,7 +89,8 @@ def find_particles(
     bench = bench_of(searchable(weights, chosen), chosen, given_picture(weights, dark), given_picture(weights, mask))
     level = given_picture(weights, background)
     raws = [picture_for(weights, each) for each in (image, *neighbours)]
-    notices = judged_frame(bench, raws[0], light(raws[0], bench.dark, level), "the image")
+    check_frame(bench, raws[0], IMAGE)
+    notices = frame_notices(bench, raws[0], light(raws[0], bench.dark, level), IMAGE)
     frame, *others = (frame_of(bench, raw, light(raw, bench.dark, level)) for raw in raws)
     if others:
         own, *beside = (find_first(bench, each) for each in (frame, *others))
@@ -95,7 +98,7 @@ def find_particles(
     else:
         found = find(bench, frame)
     points = points_of(bench, frame, found, record("find_particles", chosen.resolved(), {}))
-    warn_of([*notices, *light_notices(points, "the image")])
+    warn_of([*notices, *light_notices(points, IMAGE)])
     return points
 
 

@@ -28,6 +28,8 @@ Progress = Callable[[int], None]
 LARGEST_SATURATED = 0.05
 # The brightest of some millions of pixels stands 5.2 standard deviations out of normal noise.
 NOISE_SIGMAS = 6.0
+# The name of one in memory.
+IMAGE = "the image"
 
 
 def reconstruct(
@@ -77,7 +79,8 @@ def reconstruct(
     bench = bench_of(weights, chosen, given_picture(weights, dark), given_picture(weights, mask))
     raw = picture_for(weights, image)
     lit = light(raw, bench.dark, given_picture(weights, background))
-    warn_of(judged_frame(bench, raw, lit, "the image"))
+    check_frame(bench, raw, IMAGE)
+    warn_of(frame_notices(bench, raw, lit, IMAGE))
     return volume_of(bench, raw, lit, record("reconstruct", chosen.resolved(), {}))
 
 
@@ -165,19 +168,22 @@ def volume_of(
     )
 
 
-def judged_frame(bench: Bench, raw: Image, lit: Image, name: str) -> list[Notice]:
-    """Return what speaks against a raw frame, given also with dark or background taken off (`lit`).
+def check_frame(bench: Bench, raw: Image, place: str) -> None:
+    """Refuse a raw frame that shows nothing at all: no pixel is usable, or it has one value everywhere.
 
     Raises
     ------
     InputError
-        It shows nothing at all: no pixel is usable, or it has one value everywhere.
     """
     if raw.min() == raw.max():
-        raise InputError(f"{name}: the image has one value everywhere ({raw.flat[0]:g}); it shows no particles")
+        raise InputError(f"{place}: has one value everywhere ({raw.flat[0]:g}); it shows no particles")
+    if bench.unusable(raw).all():
+        raise InputError(f"{place}: all pixels are saturated or left out; there is nothing to reconstruct from")
+
+
+def frame_notices(bench: Bench, raw: Image, lit: Image, name: str) -> list[Notice]:
+    """Return what speaks against a raw frame, given also with dark or background taken off (`lit`)."""
     unusable = bench.unusable(raw)
-    if unusable.all():
-        raise InputError(f"{name}: all pixels are saturated or left out; there is nothing to reconstruct from")
     saturated_share, notices = float(np.mean(unusable & ~bench.lasting)), []
     if saturated_share > LARGEST_SATURATED:
         notices.append(

@@ -121,7 +121,7 @@ def window_notices(volume: Volume, settings: CorrelationSettings, name: str) -> 
             "windows-too-large",
             WINDOWS,
             f"the final windows are {size[fewest]} voxels ({length:.3g} mm) along {axis}, where the volume has "
-            f"{shape[fewest]}: {layout.count[fewest]} vectors along that axis",
+            f"{shape[fewest]}: vectors along that axis: {layout.count[fewest]}",
             f"windows as [x, y, z] with fewer voxels along {axis}, or window_mm",
             float(layout.count[fewest]),
             f"at least {FEWEST_ALONG_AXIS} vectors",

@@ -23,7 +23,7 @@ from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, write_points
 from lfpiv_cli.files.provenance import record, with_warnings
 from lfpiv_cli.files.weights_file import open_weights
 from lfpiv_cli.interface import particles
-from lfpiv_cli.interface.reconstruction import Bench, Progress, bench_of, judged_frame, volume_of
+from lfpiv_cli.interface.reconstruction import Bench, Progress, bench_of, check_frame, frame_notices, volume_of
 from lfpiv_cli.names import Pairing, Start
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.particles.search import Particles
@@ -117,7 +117,8 @@ def reconstruct(
         for number, future in ahead(read, needed):
             try:
                 pictures, target = future.result(), targets[number]
-                notices = judged_frame(bench, *pictures, frames[number].stem)
+                check_frame(bench, pictures[0], str(frames[number].path))
+                notices = frame_notices(bench, *pictures, frames[number].stem)
                 console.warn(notices)
                 target = replace(target, record=with_warnings(target.record, notices))
                 if as_particles:
