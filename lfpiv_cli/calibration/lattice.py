@@ -119,7 +119,7 @@ def fit_lattice(
     basis, seen = lattice_vectors(image)
     if layout is not None and seen != layout:
         raise InputError(
-            f"the white image shows a {seen} array, and microlenses.layout is {layout}; correct it, or is it no white image?"
+            f"the white image shows a {seen} array, and microlenses.layout is {layout}; correct it, or is it not white?"
         )
     points = find_spots(image, float(np.mean(np.hypot(basis[:, 0], basis[:, 1]))))
     centre = (np.array(image.shape[::-1]) - 1.0) / 2.0
