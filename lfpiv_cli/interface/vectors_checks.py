@@ -101,7 +101,7 @@ def field_notices(quality: Quality, name: str) -> Iterator[Notice]:
         yield Notice(
             "vectors-in-doubt",
             name,
-            f"{share:.0%} of the vectors are not what the highest peak gave: rejected, replaced or of a second peak",
+            f"{share:.0%} of the vectors are rejected, replaced or of a second peak",
             "larger correlation.windows, a shorter time between the images, more tracers; or leave out where there are "
             "none (--mask)",
             share,

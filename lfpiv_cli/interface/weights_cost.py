@@ -79,6 +79,14 @@ def cost_of(settings: Config, camera: Camera, source: Source, grid: Grid) -> Cos
     )
 
 
+def on_demand_told(voxels: int) -> str:
+    """Return what volumes will take whose columns are made on demand, in words."""
+    return (
+        f"columns are made on demand: up to {voxels * COLUMN_S / 60.0:.2g} minutes of a core for each image, where all "
+        f"{voxels:.3g} voxels can be lit"
+    )
+
+
 def check_rays(settings: Config, source: Source, grid: Grid) -> None:
     """Refuse to count more rays for a grid, padding included, than there is time for.
 

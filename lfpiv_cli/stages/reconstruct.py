@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -24,6 +25,7 @@ from lfpiv_cli.files.provenance import record, with_warnings
 from lfpiv_cli.files.weights_file import open_weights
 from lfpiv_cli.interface import particles
 from lfpiv_cli.interface.reconstruction import Bench, Progress, bench_of, check_frame, frame_notices, volume_of
+from lfpiv_cli.interface.weights_cost import on_demand_told
 from lfpiv_cli.names import Pairing, Start
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.particles.search import Particles
@@ -104,6 +106,8 @@ def reconstruct(
         content = particles.searchable(content, settings)
         for number in needed:
             ensure_writable(residual_path(paths[number]), overwrite or options.resume, images)
+    elif content.weights.on_demand and needed:
+        console.say(on_demand_told(math.prod(content.weights.padded.shape)))
     shape = content.image_shape
     dark, mask = (image_files.read_image(path, shape) if path else None for path in (options.dark, options.mask))
     bench = bench_of(content, settings, dark, mask, with_sums=bool(needed))
