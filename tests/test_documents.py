@@ -12,6 +12,7 @@ import re
 import shlex
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import click
@@ -221,16 +222,7 @@ def write_third_frame(folder: Path) -> None:
     last = read_points(particles / "b.vtkhdf", PARTICLES_FORMAT)
     moved = last.position_mm.copy()
     moved[:, 0] += DT_S * (1e3 * 0.12 + 30.0 * moved[:, 2])
-    write_points(
-        particles / "frame_2.vtkhdf",
-        PARTICLES_FORMAT,
-        moved,
-        last.arrays,
-        last.reference,
-        provenance=last.provenance,
-        attributes=last.attributes,
-        overwrite=False,
-    )
+    write_points(particles / "frame_2.vtkhdf", PARTICLES_FORMAT, replace(last, position_mm=moved), overwrite=False)
 
 
 def chain_of(page: Path) -> list[str]:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lfpiv_cli.errors import InputError
-from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, read_points, symmetric, write_points
+from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, Points, read_points, symmetric, write_points
 from lfpiv_cli.reference import Reference
 
 REFERENCE = Reference("mid_plane", -0.4)
@@ -26,9 +26,7 @@ def path(tmp_path: Path, rng: np.random.Generator) -> Path:
         "flag": np.zeros(5, np.uint8),
     }
     position = np.arange(15.0).reshape(5, 3)
-    write_points(
-        target, PARTICLES_FORMAT, position, arrays, REFERENCE, provenance={"a": 1}, attributes={}, overwrite=False
-    )
+    write_points(target, PARTICLES_FORMAT, Points(position, arrays, REFERENCE, {}, {"a": 1}), overwrite=False)
     return target
 
 
@@ -58,16 +56,8 @@ def test_an_empty_set_is_a_set(tmp_path: Path) -> None:
     target = tmp_path / "tracks.vtkhdf"
     vectors = {name: np.zeros((0, 3)) for name in ("velocity", "velocity_sigma", "displacement_mm")}
     numbers = {name: np.zeros(0, np.int64) for name in ("particle_a", "particle_b")}
-    write_points(
-        target,
-        TRACKS_FORMAT,
-        np.zeros((0, 3)),
-        vectors | numbers,
-        REFERENCE,
-        provenance={},
-        attributes={},
-        overwrite=False,
-    )
+    empty = Points(np.zeros((0, 3)), vectors | numbers, REFERENCE, {}, {})
+    write_points(target, TRACKS_FORMAT, empty, overwrite=False)
     assert read_points(target, TRACKS_FORMAT).position_mm.shape == (0, 3)
 
 

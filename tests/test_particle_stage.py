@@ -19,6 +19,7 @@ from lfpiv_cli.files.particle_file import (
     PARTICLES_FORMAT,
     TRACKS_FORMAT,
     TRAJECTORIES_FORMAT,
+    Points,
     read_points,
     write_points,
 )
@@ -39,16 +40,9 @@ def write_frame(path: Path, position_mm: np.ndarray, **changes: object) -> None:
     covariance = np.tile([1e-6, 1e-6, 1e-4, 0.0, 0.0, 0.0], (n, 1))
     arrays = {"intensity": np.ones(n), "covariance_mm2": covariance, "chi2": np.ones(n), "seen": np.ones(n)}
     resolved = load_config(CONFIG).resolved() | changes
-    write_points(
-        path,
-        PARTICLES_FORMAT,
-        position_mm,
-        arrays | {"flag": np.zeros(n, np.uint8)},
-        Reference("mid_plane", 0.5),
-        provenance={"config": resolved},
-        attributes={},
-        overwrite=True,
-    )
+    arrays["flag"] = np.zeros(n, np.uint8)
+    points = Points(position_mm, arrays, Reference("mid_plane", 0.5), {}, {"config": resolved})
+    write_points(path, PARTICLES_FORMAT, points, overwrite=True)
 
 
 @pytest.fixture

@@ -7,7 +7,6 @@ attribute `units`) and are linked under `/VTKHDF`, so that readers of HDF5 and o
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -81,31 +80,19 @@ class Points:
     provenance: dict[str, Any]
 
 
-def write_points(
-    path: Path,
-    format_name: str,
-    position_mm: NDArray[np.float64],
-    arrays: Mapping[str, NDArray[Any]],
-    reference: Reference,
-    *,
-    provenance: Mapping[str, Any],
-    attributes: Mapping[str, Any],
-    overwrite: bool,
-) -> None:
-    """Write points; `arrays` holds all that the format has, each with as many rows as there are points.
-
-    Their z counts from the reference.
+def write_points(path: Path, format_name: str, points: Points, *, overwrite: bool) -> None:
+    """Write points; their arrays are all that the format has, each with as many rows as there are points.
 
     Raises
     ------
     OutputExistsError, OutputError
     """
-    units = UNITS[format_name]
+    units, position_mm, arrays = UNITS[format_name], points.position_mm, points.arrays
     if set(arrays) != set(units) or any(len(array) != len(position_mm) for array in arrays.values()):
         raise ValueError(f"{format_name} has the arrays {sorted(units)} of {len(position_mm)} rows each")
 
     def fill(file: h5py.File) -> None:
-        write_root(file, format_name, FORMAT_VERSION, reference, attributes, provenance)
+        write_root(file, format_name, FORMAT_VERSION, points.reference, points.attributes, points.provenance)
         vtk = create_vtk_group(file, "PolyData")
         vtk["Points"] = write_array(file, POSITION, position_mm, "mm")
         vtk["NumberOfPoints"] = np.array([len(position_mm)], dtype=np.int64)

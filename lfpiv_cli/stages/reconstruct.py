@@ -207,16 +207,8 @@ def _write_particles(
     left = particles.what_is_left(frame, found)
     # Made again whenever the particles are: an interrupted batch may have left one without them.
     image_files.write_tiff(residual_path(target.path), left.astype(np.float32), overwrite=True)
-    write_points(
-        target.path,
-        PARTICLES_FORMAT,
-        points.position_mm,
-        points.arrays,
-        points.reference,
-        provenance=with_warnings(target.record, notices),
-        attributes=points.attributes,
-        overwrite=overwrite,
-    )
+    told = replace(points, provenance=with_warnings(target.record, notices))
+    write_points(target.path, PARTICLES_FORMAT, told, overwrite=overwrite)
     return Outcome(points.attributes["residual"], points.attributes["excluded_pixels"], len(points.position_mm))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -77,16 +77,7 @@ def track_particles(
     notices = [*calibration_notices(records), *few_notices(counts, short, found)]
     console.warn(notices)
     provenance = with_warnings(found.points.provenance, notices)
-    write_points(
-        output,
-        found.format_name,
-        found.points.position_mm,
-        found.points.arrays,
-        found.points.reference,
-        provenance=provenance,
-        attributes=found.points.attributes,
-        overwrite=overwrite,
-    )
+    write_points(output, found.format_name, replace(found.points, provenance=provenance), overwrite=overwrite)
     return found.summary | _sigmas(found) | _write_grids(grids, found, provenance, overwrite, console)
 
 
