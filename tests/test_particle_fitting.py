@@ -279,6 +279,12 @@ def test_noise_is_what_a_fit_leaves(rng: np.random.Generator) -> None:
     assert found.read_counts == 6.0
     assert found.gain_counts == pytest.approx(5.0, rel=0.2)
     assert found.model_error == pytest.approx(0.05, rel=0.2)
+    # One tracer's pixels tell the noise of all their light to a third.
+    single = measured_noise(model[:400], residual[:400], usable[:400], Noise(6.0, 2.0))
+    dim, bright = (np.full(1, counts) for counts in (300.0, 1500.0))
+    for counts in (dim, bright):
+        expected, measured = (each.weights(counts, np.zeros(1), 0.0) for each in (true, single))
+        assert measured == pytest.approx(expected, rel=0.5)
     few = measured_noise(model[:100], residual[:100], usable[:100], Noise(6.0, 2.0))
     assert few == Noise(6.0, 2.0)
 

@@ -30,8 +30,9 @@ LEAST_SHARE_OF_LIT = 0.003
 LIT_SIGMAS, USUAL_SIGMAS = 3.0, 3.5
 # Distances in pixels at which errors are compared: from where white noise has ended to within a micro-image.
 LAGS_PX = range(1, 9)
-# Lit pixels are sorted by brightness into so many classes, of at least so many pixels, to see how their errors grow.
-CLASSES, SMALLEST_CLASS = 32, 100
+# Lit pixels are sorted by brightness into so many classes, of at least so many pixels, to see how their errors grow. A
+# single tracer lights enough for the fewest classes that tell light's own noise from the model's error.
+CLASSES, FEWEST_CLASSES, SMALLEST_CLASS = 32, 3, 100
 
 
 @dataclass(frozen=True)
@@ -103,10 +104,11 @@ def measured_noise(
     noise : taken for the read noise, and as it is where too little is lit
     """
     lit = usable & (model > LIT_SIGMAS * noise.read_counts)
-    if np.count_nonzero(lit) < CLASSES * SMALLEST_CLASS:
+    number = min(CLASSES, int(np.count_nonzero(lit)) // SMALLEST_CLASS)
+    if number < FEWEST_CLASSES:
         return noise
     order = np.argsort(model[lit], kind="stable")
-    classes = np.array_split(order, CLASSES)
+    classes = np.array_split(order, number)
     brightness = np.array([np.mean(model[lit][members]) for members in classes])
     variance = np.array([np.median(residual[lit][members] ** 2) for members in classes]) / HALF_NORMAL_MEDIAN**2
     if not np.all(variance > 0.0):
