@@ -136,7 +136,11 @@ def test_from_boards_at_depths_to_columns(rig, tmp_path, table2, water, rng):
     ("arguments", "code", "message"),
     [
         (["calibrate-snapshot", "{rig}", "--board", "a.tif", "--board", "b.tif", "-o", "c.h5"], 2, "with its depth"),
-        (["calibrate-snapshot", "{rig}", "--white", "a.tif", "--depth-mm", "1", "-o", "c.h5"], 2, "0 --board and 1"),
+        (
+            ["calibrate-snapshot", "{rig}", "--white", "a.tif", "--depth-mm", "1", "--depth-mm", "2", "-o", "c.h5"],
+            2,
+            "0 --board and 2",
+        ),
         (["build-weights", "{rig}", "--method", "dlfc", "-o", "w.h5"], 3, "boards at several depths"),
         (
             ["build-weights", "{rig}", "--method", "dlfc", "--refraction", "exact", "-o", "w.h5"],
