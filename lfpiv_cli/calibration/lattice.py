@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import stats
+from scipy.special import fdtrc
 
 from lfpiv_cli.calibration.spectrum import lattice_vectors
 from lfpiv_cli.calibration.spots import find_spots, index_spots
@@ -233,7 +233,8 @@ def cubic_is_significant(terms: NDArray[np.float64], points: NDArray[np.float64]
     if squares[1] == 0.0:
         return True
     ratio = (squares[0] - squares[1]) / more / (squares[1] / rest)
-    return bool(stats.f.sf(ratio, more, rest) < CUBIC_CHANCE)
+    # The chance of so large a ratio; scipy.stats has it, too, and takes a second to import.
+    return bool(fdtrc(more, rest, ratio) < CUBIC_CHANCE)
 
 
 def coefficient_sigmas(

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
-from scipy.stats import chi2
+from scipy.special import chdtr, gammaincinv
 
 from lfpiv_cli.tracks.local_fits import LocalFits, fit_around
 
@@ -169,7 +169,7 @@ def _excess(
     """Return by how much the mean square of differences (m, 3), over nodes that go together, exceeds their noise."""
     dropped = int(TRIMMED * together.shape[1])
     kept = np.sort((difference**2)[together], axis=1)[:, : together.shape[1] - dropped].mean(axis=1)
-    # What the mean of the kept ones is of that of all, if the differences are normal.
+    # What the mean of the kept ones is of that of all, if the differences are normal: chi-squared up to its quantile.
     share = 1.0 - dropped / together.shape[1]
-    kept_share = float(chi2.cdf(chi2.ppf(share, 1), 3)) / share
+    kept_share = float(chdtr(3, 2.0 * gammaincinv(0.5, share))) / share
     return np.asarray(np.maximum(kept / kept_share - noise2[together].mean(axis=1), 0.0))

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from lfpiv_cli.robust import MAD_TO_SIGMA
 
@@ -91,7 +91,9 @@ def scatter_of(position_mm: NDArray[np.float64], sigma_mm: NDArray[np.float64], 
     if noise_known:
         left = position - np.einsum("mi,nai->nma", _terms(time), solution)
         squares = np.nansum((left / sigma) ** 2, axis=1)[freedom > 0]
-        noise2 = np.median(squares / chi2.median(freedom[freedom > 0])[:, np.newaxis], axis=0)
+        # The median of chi-squared.
+        median = 2.0 * gammaincinv(0.5 * freedom[freedom > 0], 0.5)
+        noise2 = np.median(squares / median[:, np.newaxis], axis=0)
     variance = noise2 * covariance[..., 2, 2]
     spread = MAD_TO_SIGMA * np.median(np.abs(solution[..., 2]) / np.sqrt(variance), axis=0)
     bending = np.maximum(spread**2 - 1.0, 0.0) * np.median(variance, axis=0)
