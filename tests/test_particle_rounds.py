@@ -19,7 +19,7 @@ from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.particles.candidates import boxes_of, explain_rest, find_peaks
 from lfpiv_cli.particles.fitting import add_all
 from lfpiv_cli.particles.rounds import ROUNDS, find_particles, first_pass, first_typical_light
-from lfpiv_cli.particles.search import task_of
+from lfpiv_cli.particles.search import noise_with, task_of
 from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.reconstruction.equations import normalisers
 from lfpiv_cli.scale import Scale
@@ -185,6 +185,16 @@ def test_pixels_that_are_left_out_do_not_matter(table2: Camera, water: Media, rn
     distance, _ = KDTree(found[0].position_mm / (0.05, 0.05, 0.2)).query(true / (0.05, 0.05, 0.2))
     assert np.sum(distance < 1.0) >= 10
     assert len(found[0].position_mm) <= 13
+
+
+def test_photons_count_as_the_camera_has_them(table2: Camera, water: Media, rng: np.random.Generator) -> None:
+    camera = replace(table2, columns=120, rows=120)
+    weights = weights_of(camera, water, Grid.centred((4, 4, 3), (0.1, 0.1, 0.1), (0.0, 0.0, 1.9)))
+    image = rng.normal(0.0, 6.0, (120, 120)).astype(np.float32)
+    given = image, raw_view(camera, water, 0.025), weights, camera, normalisers(weights.padded)
+    assert noise_with(task_of(*given, photons_per_count=0.25), 5e5).gain_counts == 4.0
+    # 2.5e5 photons a particle where they are not known.
+    assert noise_with(task_of(*given), 5e5).gain_counts == 2.0
 
 
 def test_an_empty_image_has_no_particles(table2: Camera, water: Media) -> None:

@@ -179,7 +179,7 @@ class ReconstructionSection(Section):
     start: uniform (as the paper), or line_of_sight, which also leaves out for good what no light can have come from.
     stop_change: end when an iteration lowers the residual by less than this share of it (default: never).
     stop_noise: end when the residual is this many times the image's noise (default: never): read noise and, with
-    photons_per_count, light's own.
+    photons_per_count, light's own; the solver `particles` begins with it.
     saturation_counts: pixels as bright as this are left out (default: those at the end of 8 to 16 bits).
     particle_diameter_mm: of the tracers; only the solver `particles` reads it.
     accelerate: step from points extrapolated by Nesterov's momentum; a quarter of the iterations will do.

@@ -68,7 +68,8 @@ def find_particles(
     dark, background, mask
         As of `reconstruct`.
     **settings
-        Keys of the rig's section `reconstruction`, in their place: particle_diameter_mm, saturation_counts.
+        Keys of the rig's section `reconstruction`, in their place: particle_diameter_mm, saturation_counts,
+        photons_per_count.
 
     Returns
     -------
@@ -166,7 +167,8 @@ def _task(bench: Bench, frame: Frame) -> Task:
     content, settings = bench.content, bench.settings
     radius = 0.5 * settings.reconstruction.particle_diameter_mm
     view = raw_view(content.camera, settings.media_model(), radius, content.weights.calibration)
-    return task_of(frame.image, view, content.weights, content.camera, frame.sums, frame.unusable)
+    photons = settings.reconstruction.photons_per_count
+    return task_of(frame.image, view, content.weights, content.camera, frame.sums, frame.unusable, photons)
 
 
 def points_of(bench: Bench, frame: Frame, found: Particles, provenance: Mapping[str, Any]) -> Points:

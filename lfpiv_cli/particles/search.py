@@ -70,6 +70,7 @@ class Task:
     usable : (rows * columns,) which pixels take part
     prepared : (rows, columns) the same in the weights' frame
     depths_mm : between which particles may lie
+    photons_per_count : of the camera; None: not known
     """
 
     view: View
@@ -80,6 +81,7 @@ class Task:
     usable: NDArray[np.bool_]
     prepared: NDArray[np.float32]
     depths_mm: tuple[float, float]
+    photons_per_count: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +112,7 @@ def task_of(
     camera: Camera,
     sums: Normalisers,
     excluded: NDArray[np.bool_] | None = None,
+    photons_per_count: float | None = None,
 ) -> Task:
     """Return the task that an image sets.
 
@@ -119,6 +122,7 @@ def task_of(
     weights, sums : of the volume in which particles are looked for, and their `normalisers` on the padded grid
     camera : says which world axis the columns follow
     excluded : (rows, columns) raw pixels that take no part; `sums` must leave out what they touch; None: none
+    photons_per_count : of the camera; None: taken from how bright particles are, until the fit shows it
     """
     low, high = weights.grid.bounds_mm(2)
     margin = MARGIN_DEPTHS * view.scale.depth_mm
@@ -131,6 +135,7 @@ def task_of(
         np.ones(image.size, np.bool_) if excluded is None else ~excluded.ravel(),
         weights.prepare(image.astype(np.float32)),
         (low - margin, high + margin),
+        photons_per_count,
     )
 
 
@@ -142,7 +147,8 @@ def blank(task: Task) -> State:
 
 def noise_with(task: Task, typical_light: float) -> Noise:
     """Return the noise to seek particles with."""
-    return estimate_noise(task.image, typical_light, lens_pixels(task.view))
+    noise = estimate_noise(task.image, typical_light, lens_pixels(task.view))
+    return noise if task.photons_per_count is None else replace(noise, gain_counts=1.0 / task.photons_per_count)
 
 
 def observed(task: Task, state: State, unexplained: float) -> Observation:
