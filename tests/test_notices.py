@@ -14,7 +14,14 @@ import pytest
 from numpy.typing import NDArray
 
 import lfpiv_cli as lf
-from lfpiv_cli.calibration.sheet import check_f_numbers, f_number_notices, image_distance_notices, sheet_fit
+from lfpiv_cli.calibration.sheet import (
+    board_notices,
+    check_f_numbers,
+    f_number_notices,
+    image_distance_notices,
+    magnification_notices,
+    sheet_fit,
+)
 from lfpiv_cli.calibration.transmission import lens_image_width
 from lfpiv_cli.calibration.white_checks import check_residual, residual_share
 from lfpiv_cli.cli import cli
@@ -322,3 +329,11 @@ def test_columns_on_demand_cost_more_than_factors(tmp_path: Path) -> None:
     costs = [cost_of(each.settings, each.camera, each.source, each.grid) for each in (square, hexagonal)]
     assert costs[1].image_core_s > 10.0 * costs[0].image_core_s
     assert costs[1].weights_core_s == costs[1].weights_bytes == 0.0
+
+
+def test_a_board_in_part_or_of_another_size_is_told(table2: Camera) -> None:
+    assert board_notices(19, (5, 4)) == []
+    assert [each.code for each in board_notices(20, (7, 5))] == ["board-incomplete"]
+    assert magnification_notices(-1.04, table2) == []
+    # Dots 0.5 mm apart that are said to be 0.6.
+    assert [each.code for each in magnification_notices(-0.836, table2)] == ["magnification"]

@@ -9,6 +9,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from benchmarks.volumes import Seeding, volume_pair
 from lfpiv_cli import open_vectors
@@ -17,9 +18,10 @@ from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.files.vtkhdf import read_header, write_volume
+from lfpiv_cli.flow.correlation import CorrelationSettings, correlate
 from lfpiv_cli.flow.field import MASKED
 from lfpiv_cli.grid import Grid
-from lfpiv_cli.interface.vectors_checks import Quality, calibration_notices, field_notices, quality_of_all
+from lfpiv_cli.interface.vectors_checks import Quality, calibration_notices, field_notices, pair_notices, quality_of_all
 from lfpiv_cli.reference import Reference
 
 CONFIG = Path(__file__).parent.parent / "configs" / "sample.yaml"
@@ -170,6 +172,22 @@ def test_volumes_of_different_calibrations_are_told() -> None:
         (notice,) = calibration_notices({"a": made_with("1"), "b": other})
         assert notice.code == "other-calibration"
         assert notice.about == "b"
+
+
+def test_volumes_that_are_no_pair_are_told(rng: np.random.Generator) -> None:
+    shape = (24, 24, 24)
+    grid, settings = (
+        Grid.centred(shape, (0.1, 0.1, 0.1), (0.0, 0.0, 0.0)),
+        CorrelationSettings([(12, 12, 12)], (0.5,) * 3),
+    )
+    one, other = (gaussian_filter((rng.random(shape) < 0.01).astype(np.float32), 1.0) for _ in range(2))
+    for pair, codes in (
+        ((one, one), ["volumes-alike"]),
+        ((one, np.roll(one, 1, axis=2)), []),
+        ((one, other), ["volumes-unlike"]),
+    ):
+        field = correlate([pair], grid, settings)
+        assert [each.code for each in pair_notices(field, "v")] == codes
 
 
 def test_vectors_without_an_uncertainty_or_in_doubt_are_told() -> None:

@@ -19,6 +19,10 @@ LARGEST_DIFFERENCE = 0.05
 # this are no contradiction.
 IMAGE_DISTANCE_TOLERANCE = 0.1
 IMAGE_DISTANCE_SIGMAS = 3.0
+# A lens is focused by hand; a board of another spacing, or in another medium, is off by a tenth or more.
+MAGNIFICATION_TOLERANCE = 0.05
+# Share of a board's points that are found without a word: an origin may be left out, some may lie in dirt.
+FEWEST_POINTS = 0.8
 # Between the f-numbers of main lens and microlenses, towards the array. Lens images a quarter wider or narrower than
 # their pitch lose or waste two fifths of the light; of three times as wide or narrow ones nine overlap, or a ninth of
 # the pixels is lit.
@@ -99,6 +103,40 @@ def image_distance_notices(fit: LatticeFit, camera: Camera) -> list[Notice]:
             "correct what is off of microlenses.pitch_mm, sensor.pixel_um, sensor.microlens_distance_mm and main_lens",
             None if found is None else found[0],
             f"{sheet:.4g} mm",
+        )
+    ]
+
+
+def magnification_notices(measured: float, camera: Camera) -> list[Notice]:
+    """Return what speaks against the magnification that a board shows: the data sheet's."""
+    sheet = camera.magnification
+    if abs(measured / sheet - 1.0) <= MAGNIFICATION_TOLERANCE:
+        return []
+    return [
+        Notice(
+            "magnification",
+            "board.spacing_mm",
+            f"the board shows a magnification of {measured:.4g}, the data sheet {sheet:.4g}",
+            "correct what is off of board.spacing_mm, board.medium and main_lens.magnification",
+            measured,
+            f"{sheet:.4g} within {MAGNIFICATION_TOLERANCE:.0%}",
+        )
+    ]
+
+
+def board_notices(found: int, dots: tuple[int, int]) -> list[Notice]:
+    """Return what speaks against a board of which only a part was found: which part it is, its dots do not tell."""
+    count = dots[0] * dots[1]
+    if found >= FEWEST_POINTS * count:
+        return []
+    return [
+        Notice(
+            "board-incomplete",
+            "board.dots",
+            f"{found} of the board's {dots[0]} x {dots[1]} points were found: where its middle lies is a guess",
+            "correct board.dots, or bring all of the board into view",
+            float(found),
+            f"{count}",
         )
     ]
 

@@ -10,7 +10,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from lfpiv_cli.calibration import model
 from lfpiv_cli.calibration.model import Calibration, DataSheet, Photographs
-from lfpiv_cli.calibration.sheet import check_f_numbers, f_number_notices, image_distance_notices
+from lfpiv_cli.calibration.sheet import (
+    board_notices,
+    check_f_numbers,
+    f_number_notices,
+    image_distance_notices,
+    magnification_notices,
+)
 from lfpiv_cli.calibration.transmission import lens_image_width
 from lfpiv_cli.calibration.white import by_aperture
 from lfpiv_cli.calibration.white_checks import white_notices
@@ -104,6 +110,10 @@ def calibration_notices(rig: Config, pictures: Photographs, found: Calibration) 
     """Return what speaks against a calibration and the pictures that it is from."""
     camera = rig.complete_camera()
     notices = [] if camera is None else f_number_notices(camera)
+    if found.pose is not None and rig.board.dots is not None and rig.board.pattern != "charuco":
+        notices += board_notices(found.pose.dots_found, rig.board.dots)
+    if found.pose is not None and camera is not None:
+        notices += magnification_notices(found.pose.magnification, camera)
     if not pictures.whites:
         return [*notices, NO_WHITE_IMAGE]
     order = by_aperture(pictures.whites, pictures.dark)

@@ -16,7 +16,7 @@ from lfpiv_cli.flow.locking import with_locking
 from lfpiv_cli.flow.masks import between_walls
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.interface.notices import warn_of
-from lfpiv_cli.interface.vectors_checks import field_notices, quality_of, window_notices
+from lfpiv_cli.interface.vectors_checks import field_notices, pair_notices, quality_of, window_notices
 from lfpiv_cli.reference import FOCAL_POINT
 from lfpiv_cli.scale import Scale
 
@@ -69,7 +69,8 @@ def correlate(
     if config:
         # Of light that no camera recorded nothing is known.
         field = with_locking(field, first.reference, scale_of(chosen))
-    warn_of([*window_notices(first, windows, "the first volume"), *field_notices(quality_of(field), "the field")])
+    against_field = [*field_notices(quality_of(field), "the field"), *pair_notices(field, "the field")]
+    warn_of([*window_notices(first, windows, "the first volume"), *against_field])
     return field
 
 

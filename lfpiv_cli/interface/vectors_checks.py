@@ -27,6 +27,10 @@ FEWEST_TRACERS = 3.0
 TRACER_SHARE = 0.05
 # Of the vectors.
 MOST_WITHOUT, MOST_IN_DOUBT = 0.5, 0.5
+# Voxels: volumes that have no tracers in common leave more than this sideways, poor ones of a pair a quarter of it.
+LARGEST_MEDIAN_SIGMA = 0.5
+# Only a volume and itself correlate so well and lie so still: two images of the same tracers have different noise.
+SAME_CORRELATION, STILL_VOXEL = 0.9999, 1e-3
 WINDOWS = "correlation.windows"
 
 
@@ -106,6 +110,32 @@ def field_notices(quality: Quality, name: str) -> Iterator[Notice]:
             "none (--mask)",
             share,
             f"at most {MOST_IN_DOUBT:g}",
+        )
+
+
+def pair_notices(field: VectorField, name: str) -> Iterator[Notice]:
+    """Yield what speaks against the two images that one field of vectors is of."""
+    finite = field.flag < REJECTED
+    correlation = float(np.median(field.correlation[finite])) if finite.any() else 0.0
+    if correlation > SAME_CORRELATION and np.abs(field.displacement_voxel[finite]).max() < STILL_VOXEL:
+        yield Notice(
+            "volumes-alike",
+            name,
+            "both volumes are one and the same: nothing has moved, and no noise differs",
+            "check that the two images of the pair are two",
+            correlation,
+            f"at most {SAME_CORRELATION:g}",
+        )
+    largest = float(quality_of(field).sigma[0, :2].max())
+    if largest > LARGEST_MEDIAN_SIGMA:
+        yield Notice(
+            "volumes-unlike",
+            name,
+            f"half of the vectors have an uncertainty above {largest:.2g} voxels sideways: the volumes have few "
+            "tracers in common",
+            "check that both images are of one pair, and the time between them; larger windows, more tracers",
+            largest,
+            f"at most {LARGEST_MEDIAN_SIGMA:g}",
         )
 
 

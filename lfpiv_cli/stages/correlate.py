@@ -28,6 +28,7 @@ from lfpiv_cli.interface.vectors import ensure_alike, scale_of, usable_voxels
 from lfpiv_cli.interface.vectors_checks import (
     calibration_notices,
     field_notices,
+    pair_notices,
     quality_of,
     quality_of_all,
     window_notices,
@@ -122,7 +123,8 @@ def correlate(
     for number in pending(targets, [*volumes, *common.values()], overwrite, options.resume, _record_of):
         field, reference, notices = _measure(jobs[number], options.mask_volume, console)
         quality = quality_of(field)
-        notices += field_notices(quality, targets[number].path.name)
+        name = targets[number].path.name
+        notices += [*field_notices(quality, name), *pair_notices(field, name)]
         console.warn(notices)
         told_more = derived_fields(field) if derived else None
         vtkhdf.write_vectors(
