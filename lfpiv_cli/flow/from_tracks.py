@@ -22,8 +22,8 @@ from lfpiv_cli.tracks.gridding import on_grid
 # apart than windows, and what a wide fit misses of the flow is in the stated error.
 REACH_WINDOWS = 2.0
 # A vector lies in a region without tracers where so many tracks would be expected nearer than the nearest one is: by
-# chance alone one vector in ten thousand would.
-EXPECTED_TRACKS = 9.2
+# chance alone one vector in a million would; where half of the tracers are found, one in a thousand.
+EXPECTED_TRACKS = 14.0
 # The density at a track is that of the box which reaches its sixth neighbour.
 DENSITY_NEIGHBOURS = 6
 

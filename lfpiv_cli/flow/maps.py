@@ -22,6 +22,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.flow.windows import Triple, WindowLayout
+from lfpiv_cli.robust import of_half_the_sum
 from lfpiv_cli.simd.block_sums import FEW_SHIFTS, MANY_SHIFTS, products
 from lfpiv_cli.simd.vectors import LANES
 from lfpiv_cli.threads import share_out
@@ -130,14 +131,8 @@ class MapSums:
 
 
 def without_tracers(amplitude: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which windows of these amplitudes hold no tracers, the others being what most of the light comes from.
-
-    The typical amplitude is that from which on windows make up half of the sum of all: neither a few windows with a
-    reflection in them nor many dark ones move it far.
-    """
-    falling = np.sort(amplitude, axis=None)[::-1]
-    typical = falling[np.searchsorted(np.cumsum(falling), 0.5 * falling.sum())]
-    return np.asarray(amplitude < SMALLEST_AMPLITUDE * typical)
+    """Return which windows of these amplitudes hold no tracers, the others being what most of the light comes from."""
+    return np.asarray(amplitude < SMALLEST_AMPLITUDE * of_half_the_sum(amplitude))
 
 
 def map_sums(

@@ -16,15 +16,15 @@ from lfpiv_cli.flow.correlation import CorrelationSettings
 from lfpiv_cli.flow.field import MASKED, REJECTED, VALID, VectorField
 from lfpiv_cli.flow.windows import WindowLayout, layout_windows
 from lfpiv_cli.notice import Notice
-from lfpiv_cli.robust import BRIGHTEST_PERCENTILE
+from lfpiv_cli.robust import of_half_the_sum
 
 # Two vectors along an axis show no profile, and each is half about the volume's face.
 FEWEST_ALONG_AXIS = 3
 # Below five tracers a window the share of false vectors rises steeply; peaks of a volume are fewer than tracers where
 # these are dense, and more where ghosts stand between them: a third of those of the sample's windows.
 FEWEST_TRACERS = 3.0
-# A voxel brighter than those around it and than this share of the brightest is a tracer.
-TRACER_SHARE = 0.05
+# A voxel brighter than those around it and than this share of those that most of the light comes from is a tracer.
+TRACER_SHARE = 0.1
 # Of the vectors.
 MOST_WITHOUT, MOST_IN_DOUBT = 0.5, 0.5
 # Voxels: volumes that have no tracers in common leave more than this sideways, poor ones of a pair a quarter of it.
@@ -174,7 +174,7 @@ def tracers_per_window(volume: NDArray[np.float32], layout: WindowLayout) -> flo
     peaks = (volume == maximum_filter(volume, 3)) & (volume > 0.0)
     if not peaks.any():
         return 0.0
-    peaks &= volume > TRACER_SHARE * np.percentile(volume[peaks], BRIGHTEST_PERCENTILE)
+    peaks &= volume > TRACER_SHARE * of_half_the_sum(volume[peaks])
     sums = np.zeros(tuple(n + 1 for n in volume.shape))
     sums[1:, 1:, 1:] = peaks.cumsum(0).cumsum(1).cumsum(2)
     for axis, direction in enumerate((2, 1, 0)):
