@@ -20,8 +20,17 @@ from lfpiv_cli.files.provenance import record
 from lfpiv_cli.files.vtkhdf import read_header, write_volume
 from lfpiv_cli.flow.correlation import CorrelationSettings, correlate
 from lfpiv_cli.flow.field import MASKED
+from lfpiv_cli.flow.windows import WindowLayout, layout_windows
 from lfpiv_cli.grid import Grid
-from lfpiv_cli.interface.vectors_checks import Quality, calibration_notices, field_notices, pair_notices, quality_of_all
+from lfpiv_cli.interface.vectors_checks import (
+    Quality,
+    calibration_notices,
+    field_notices,
+    pair_notices,
+    quality_of,
+    quality_of_all,
+    tracers_per_window,
+)
 from lfpiv_cli.reference import Reference
 
 CONFIG = Path(__file__).parent.parent / "configs" / "sample.yaml"
@@ -174,6 +183,15 @@ def test_volumes_of_different_calibrations_are_told() -> None:
         assert notice.about == "b"
 
 
+def test_tracers_are_counted_in_windows_that_overhang() -> None:
+    volume = np.zeros((10, 10, 10), np.float32)
+    volume[1::3, 1::3, 1::3] = 1.0
+    # Along each axis they lie at 1, 4 and 7; the window in the middle holds two of these.
+    assert tracers_per_window(volume, layout_windows((10, 10, 10), (6, 6, 6), (0.0, 0.0, 0.0))) == 8.0
+    # The first windows hold two, the last ones one: 8, three times 4, three times 2, and 1.
+    assert tracers_per_window(volume, WindowLayout((6, 6, 6), (6, 6, 6), (2, 2, 2), (-1, -1, -1))) == 3.0
+
+
 def test_volumes_that_are_no_pair_are_told(rng: np.random.Generator) -> None:
     shape = (24, 24, 24)
     grid, settings = (
@@ -187,7 +205,7 @@ def test_volumes_that_are_no_pair_are_told(rng: np.random.Generator) -> None:
         ((one, other), ["volumes-unlike"]),
     ):
         field = correlate([pair], grid, settings)
-        assert [each.code for each in pair_notices(field, "v")] == codes
+        assert [each.code for each in pair_notices(field, quality_of(field), "v")] == codes
 
 
 def test_vectors_without_an_uncertainty_or_in_doubt_are_told() -> None:

@@ -30,7 +30,7 @@ def with_locking(field: VectorField, reference: Reference, scale: Scale) -> Vect
     """Return vectors from volumes with locking in the uncertainty of their lateral components."""
     if field.uncertainty_voxel is None:
         return field
-    z_mm = field.grid.axis_mm(2) + reference.z_mm
+    z_mm = np.array([reference.depth_to_focal_point(z) for z in field.grid.axis_mm(2)])
     error_mm = np.zeros((len(z_mm), 1, 1, 3))
     error_mm[..., :2] = locking_mm(z_mm, scale)[:, np.newaxis, np.newaxis, np.newaxis]
     return replace(field, uncertainty_voxel=np.hypot(field.uncertainty_voxel, error_mm / field.voxel_mm))

@@ -78,14 +78,13 @@ def _cells_along(size: int, step: int, count: int) -> tuple[NDArray[np.int64], N
     """
     shared = gcd(size, step)
     if shared < SMALLEST_BLOCK or step > size:
-        first, length = step * np.arange(count), size
+        first, length, hop = step * np.arange(count), size, 1
     else:
-        first, length = shared * np.arange(((count - 1) * step + size) // shared), shared
+        first, length, hop = shared * np.arange(((count - 1) * step + size) // shared), shared, step // shared
     parts = min(length, -(-CELLS_PER_WINDOW * length // size))
     edges = np.arange(parts + 1) * length // parts
     start = (first[:, np.newaxis] + edges[:-1]).ravel()
-    per_window = parts * (size // length)
-    return start, np.tile(np.diff(edges), first.size), per_window, parts * step // length if length < size else parts
+    return start, np.tile(np.diff(edges), first.size), parts * (size // length), parts * hop
 
 
 def pair_moments(

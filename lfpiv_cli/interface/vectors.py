@@ -69,7 +69,8 @@ def correlate(
     if config:
         # Of light that no camera recorded nothing is known.
         field = with_locking(field, first.reference, scale_of(chosen))
-    against_field = [*field_notices(quality_of(field), "the field"), *pair_notices(field, "the field")]
+    quality, name = quality_of(field), "the field"
+    against_field = [*field_notices(quality, name), *pair_notices(field, quality, name)]
     warn_of([*window_notices(first, windows, "the first volume"), *against_field])
     return field
 

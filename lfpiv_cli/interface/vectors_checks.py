@@ -14,6 +14,7 @@ from lfpiv_cli.files.provenance import calibrated_with
 from lfpiv_cli.files.vtkhdf import Volume
 from lfpiv_cli.flow.correlation import CorrelationSettings
 from lfpiv_cli.flow.field import MASKED, REJECTED, VALID, VectorField
+from lfpiv_cli.flow.maps import margins, valid_shares
 from lfpiv_cli.flow.windows import WindowLayout, layout_windows
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.robust import of_half_the_sum
@@ -113,7 +114,7 @@ def field_notices(quality: Quality, name: str) -> Iterator[Notice]:
         )
 
 
-def pair_notices(field: VectorField, name: str) -> Iterator[Notice]:
+def pair_notices(field: VectorField, quality: Quality, name: str) -> Iterator[Notice]:
     """Yield what speaks against the two images that one field of vectors is of."""
     finite = field.flag < REJECTED
     correlation = float(np.median(field.correlation[finite])) if finite.any() else 0.0
@@ -126,7 +127,7 @@ def pair_notices(field: VectorField, name: str) -> Iterator[Notice]:
             correlation,
             f"at most {SAME_CORRELATION:g}",
         )
-    largest = float(quality_of(field).sigma[0, :2].max())
+    largest = float(quality.sigma[0, :2].max())
     if largest > LARGEST_MEDIAN_SIGMA:
         yield Notice(
             "volumes-unlike",
@@ -175,13 +176,9 @@ def tracers_per_window(volume: NDArray[np.float32], layout: WindowLayout) -> flo
     if not peaks.any():
         return 0.0
     peaks &= volume > TRACER_SHARE * of_half_the_sum(volume[peaks])
-    sums = np.zeros(tuple(n + 1 for n in volume.shape))
-    sums[1:, 1:, 1:] = peaks.cumsum(0).cumsum(1).cumsum(2)
-    for axis, direction in enumerate((2, 1, 0)):
-        first = layout.first[direction] + layout.step[direction] * np.arange(layout.count[direction])
-        low, high = (np.clip(edge, 0, volume.shape[axis]) for edge in (first, first + layout.size[direction]))
-        sums = sums.take(high, axis) - sums.take(low, axis)
-    return float(np.median(sums))
+    before, after = margins(layout, (volume.shape[0], volume.shape[1], volume.shape[2]), 0)
+    padded = np.pad(peaks.astype(np.uint8), list(zip(before, after, strict=True)))
+    return float(np.median(valid_shares(padded, layout, before)) * np.prod(layout.size))
 
 
 def calibration_notices(records: Mapping[str, Mapping[str, Any]]) -> list[Notice]:

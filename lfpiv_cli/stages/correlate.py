@@ -124,7 +124,7 @@ def correlate(
         field, reference, notices = _measure(jobs[number], options.mask_volume, console)
         quality = quality_of(field)
         name = targets[number].path.name
-        notices += [*field_notices(quality, name), *pair_notices(field, name)]
+        notices += [*field_notices(quality, name), *pair_notices(field, quality, name)]
         console.warn(notices)
         told_more = derived_fields(field) if derived else None
         vtkhdf.write_vectors(
