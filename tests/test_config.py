@@ -160,6 +160,22 @@ def test_contradictions_are_named(write, addition: str, words: str) -> None:
             "aperture_mm: 25.0, image_distance_mm: 210",
             "focal_length_mm (1 - magnification) is 200",
         ),
+        (
+            "aperture_mm: 25.0",
+            "aperture_mm: 25.0, image_distance_mm: 200, pupil_ratio: 1.3",
+            "focal_length_mm (1.3 - magnification) is 230",
+        ),
+        (
+            "aperture_mm: 25.0",
+            "aperture_mm: 25.0, image_distance_mm: 200, image_distance: infinite",
+            "main_lens.image_distance_mm: is 200, but image_distance is infinite",
+        ),
+        (
+            "aperture_mm: 25.0",
+            "aperture_mm: 25.0, pupil_ratio: 2, image_distance: infinite",
+            "main_lens.pupil_ratio: is 2, but image_distance is infinite",
+        ),
+        ("focal_length_mm: 100.0, aperture_mm", "image_distance: infinite, aperture_mm", "needs focal_length_mm"),
         ("aperture_mm: 25.0", "f_number: null", "needs aperture_mm or f_number"),
         ("pitch_mm: 0.1", "pitch_mm: 0.1, f_number: 4.0", "focal_length_mm / pitch_mm is 8"),
         ("shape_xyz: [8, 6, 4]", "size_mm: [1, 1, 1]", "contradicts size_mm"),
@@ -257,6 +273,19 @@ def test_lengths_follow_from_f_numbers_and_the_image_distance(write) -> None:
     camera = load_config(write(text.replace("{focal_length_mm: 0.8", "{f_number: 8"))).camera_model()
     assert (camera.focal_length_mm, camera.aperture_mm) == (100.0, 25.0)
     assert camera.microlens_distance_mm == camera.microlens_focal_length_mm == pytest.approx(0.8)
+
+
+def test_pupils_make_the_thin_lens_that_stands_for_the_real_one(write, table2) -> None:
+    """With P = 1.25 the array lies 100 (1.25 + 1) mm behind the exit pupil, the focus 180 mm before the entrance."""
+    for told in ("focal_length_mm: 100, pupil_ratio: 1.25", "image_distance_mm: 225, pupil_ratio: 1.25"):
+        camera = load_config(write(RIG.replace("focal_length_mm: 100.0", told))).camera_model()
+        assert camera.focus_distance_mm == pytest.approx(180.0)
+        assert camera.micro_image_lattice_px().pitch * 5.5 == pytest.approx(100.0 * (1.0 + 0.8 / 225.0))
+        assert camera.aperture_mm == 25.0
+    telecentric = RIG.replace("focal_length_mm: 100.0", "focal_length_mm: 100, image_distance: infinite")
+    camera = load_config(write(telecentric)).camera_model()
+    assert camera.focus_distance_mm == pytest.approx(100.0)
+    assert camera.micro_image_lattice_px().pitch * 5.5 == pytest.approx(100.0)
 
 
 def test_grid_is_centred_and_moved(write) -> None:

@@ -40,6 +40,7 @@ from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media, Window
 from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.optics.paraxial import refraction_error_mm, sine_error_mm
+from lfpiv_cli.optics.pupils import thin_lens
 from lfpiv_cli.weights.operators import FactorisedOperator
 
 ROOT = Path(__file__).parent.parent
@@ -190,6 +191,17 @@ def test_lens_images_as_far_apart_as_the_lenses_say_nothing_is_off(table2: Camer
     for stretch in (1.002, 0.99):
         (notice,) = image_distance_notices(fit_of(table2, stretch), table2)
         assert notice.code == "image-distance"
+
+
+def test_image_distance_is_that_of_the_exit_pupil(table2: Camera) -> None:
+    for entrance_over_exit in (1.25, 0.5, 0.0):
+        camera = thin_lens(table2, entrance_over_exit)
+        assert image_distance_notices(fit_of(camera, 1.0), camera) == []
+        (notice,) = image_distance_notices(fit_of(camera, 1.002), camera)
+        told = 100.0 * (1.0 / entrance_over_exit + 1.0) if entrance_over_exit else np.inf
+        assert notice.expected == ("an infinite one" if entrance_over_exit == 0.0 else f"{told:.4g} mm")
+        excess = 1.002 * (1.0 + 0.8 / told) - 1.0
+        assert notice.measured == pytest.approx(0.8 / excess)
 
 
 def test_f_numbers_that_do_not_match(table2: Camera) -> None:

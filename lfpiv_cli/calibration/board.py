@@ -31,6 +31,7 @@ from lfpiv_cli.names import Pattern
 from lfpiv_cli.neighbourhoods import opened
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
+from lfpiv_cli.optics.pupils import refocused
 from lfpiv_cli.robust import BRIGHTEST_PERCENTILE
 
 # A pixel shows a dot when it is brighter than this share of the brightest thousandth of the picture.
@@ -161,9 +162,8 @@ def _pose(look: Look, camera: Camera, board: BoardGeometry, rotation_rad: float)
         bend = pose.distortion_per_mm2 - camera.distortion_per_mm2
         if max(abs(ratio - 1.0), abs(bend) * float(np.sum(array**2, axis=1).max())) < SCALE_TOLERANCE:
             break
-        camera = replace(
-            camera, magnification=pose.magnification, distortion_per_mm2=pose.distortion_per_mm2
-        ).with_micro_images(micro_images)
+        camera = replace(refocused(camera, pose.magnification), distortion_per_mm2=pose.distortion_per_mm2)
+        camera = camera.with_micro_images(micro_images)
         look = look.moved(ratio, pose.z0_mm)
     return pose
 

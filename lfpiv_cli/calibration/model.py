@@ -32,6 +32,7 @@ from lfpiv_cli.names import Layout
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.microlenses import Lattice
+from lfpiv_cli.optics.pupils import refocused
 
 # A measured magnification replaces the data sheet's when it differs by more standard errors than chance explains.
 MAGNIFICATION_SIGMAS = 3.0
@@ -130,7 +131,7 @@ class Calibration:
         if self.pose is not None:
             difference = abs(self.pose.magnification - camera.magnification)
             if difference > MAGNIFICATION_SIGMAS * self.pose.magnification_sigma:
-                camera = replace(camera, magnification=self.pose.magnification)
+                camera = refocused(camera, self.pose.magnification)
             camera = replace(camera, distortion_per_mm2=self.pose.distortion_per_mm2)
         return camera.with_micro_images(self.rectification.lattice_px)
 

@@ -1,6 +1,7 @@
 """The data sheet beside itself and the measured lattice: do f-numbers and pitches agree, and what image distance is it?
 
-The lens images are projected from the exit pupil: their pitch is that of the lenses times 1 + s_mu/s_i.
+The lens images are projected from the exit pupil: their pitch is that of the lenses times 1 + s_mu/s_i, s_i from that
+pupil to the array.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from lfpiv_cli.calibration.lattice import EXPONENTS, LatticeFit
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.pupils import real_lens
 
 # A lattice further from the data sheet than this is another camera, a binned sensor or a slip in the sheet: the
 # projection itself makes up to 4 % where the main lens is not known.
@@ -74,7 +76,7 @@ def image_distance_mm(fit: LatticeFit, camera: Camera) -> tuple[float, float] | 
     excess, sigma = _excess(fit, camera)
     if not np.isfinite(sigma) or excess <= IMAGE_DISTANCE_SIGMAS * sigma:
         return None
-    distance = camera.microlens_distance_mm / excess
+    distance = real_lens(camera).microlens_distance_mm / excess
     return distance, distance * sigma / excess
 
 
@@ -84,25 +86,27 @@ def image_distance_notices(fit: LatticeFit, camera: Camera) -> list[Notice]:
     Lens images as far apart as the lenses tell no distance: behind a lens that is telecentric towards the array they
     are, and a pitch given in whole pixels is often theirs.
     """
-    sheet = camera.image_distance_mm
     excess, sigma = _excess(fit, camera)
-    expected = camera.micro_image_scale - 1.0
-    if not np.isfinite(sigma) or abs(excess) <= max(IMAGE_DISTANCE_SIGMAS * sigma, IMAGE_DISTANCE_TOLERANCE * expected):
+    thin = camera.micro_image_scale - 1.0
+    if not np.isfinite(sigma) or abs(excess) <= max(IMAGE_DISTANCE_SIGMAS * sigma, IMAGE_DISTANCE_TOLERANCE * thin):
         return []
-    found = image_distance_mm(fit, camera)
-    if found is not None:
+    found, telecentric = image_distance_mm(fit, camera), camera.entrance_over_exit == 0.0
+    sheet = float("inf") if telecentric else camera.image_distance_mm / camera.entrance_over_exit
+    if found is not None and not telecentric:
         difference = abs(found[0] - sheet)
         if difference <= max(IMAGE_DISTANCE_TOLERANCE * sheet, IMAGE_DISTANCE_SIGMAS * found[1]):
             return []
     told = "no image distance" if found is None else f"an image distance of {found[0]:.4g} mm"
+    expected = "an infinite one" if telecentric else f"{sheet:.4g} mm"
     return [
         Notice(
             "image-distance",
             "camera.main_lens",
-            f"the pitch of the lens images tells {told}, the data sheet {sheet:.4g} mm",
-            "correct what is off of microlenses.pitch_mm, sensor.pixel_um, sensor.microlens_distance_mm and main_lens",
+            f"the pitch of the lens images tells {told}, the data sheet {expected}",
+            "correct what is off of microlenses.pitch_mm, sensor.pixel_um, sensor.microlens_distance_mm and main_lens "
+            "(its pupil_ratio too)",
             None if found is None else found[0],
-            f"{sheet:.4g} mm",
+            expected,
         )
     ]
 
@@ -188,6 +192,6 @@ def _f_numbers(camera: Camera) -> str:
 def _excess(fit: LatticeFit, camera: Camera) -> tuple[float, float]:
     """Return by what share lens images are further apart than lenses, and its standard error."""
     sheet_mm = float(np.sqrt(abs(np.linalg.det(camera.lattice.basis))))
-    measured_mm = float(np.sqrt(abs(np.linalg.det(fit.lattice_px.basis)))) * camera.pixel_mm
+    measured_mm = float(np.sqrt(abs(np.linalg.det(fit.lattice_px.basis)))) * real_lens(camera).pixel_mm
     sigma = float(np.hypot(*fit.pitch_sigma_px)) / 2.0 / float(fit.lattice_px.pitch.mean())
     return measured_mm / sheet_mm - 1.0, sigma

@@ -22,6 +22,7 @@ from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.microlenses import Lattice
+from lfpiv_cli.optics.pupils import thin_lens
 from lfpiv_cli.reference import Reference
 from lfpiv_cli.scale import Scale
 from lfpiv_cli.synthetic.flows import FLOWS, Flow
@@ -45,10 +46,15 @@ Lengths = tuple[float, float, float]
 
 
 def focal_length_mm(lens: MainLens) -> float | None:
-    """Return F_m, given or from S_i = F_m (1 - M)."""
+    """Return F_m, given or from S_i = F_m (P - M)."""
     if lens.focal_length_mm is not None or lens.image_distance_mm is None:
         return lens.focal_length_mm
-    return lens.image_distance_mm / (1.0 - lens.magnification)
+    return lens.image_distance_mm / (lens.pupil_ratio - lens.magnification)
+
+
+def entrance_over_exit(lens: MainLens) -> float:
+    """Return 1/P, 0 of a lens that is telecentric towards the array."""
+    return 0.0 if lens.image_distance == "infinite" else 1.0 / lens.pupil_ratio
 
 
 def aperture_mm(lens: MainLens) -> float | None:
@@ -79,13 +85,13 @@ def missing_for_camera(section: CameraSection) -> str | None:
 
 
 def camera_of(section: CameraSection) -> Camera:
-    """Return the camera of a section that lacks nothing, a lens centre on the axis."""
+    """Return the camera of a section that lacks nothing, a lens centre on the axis, its thin lens for the real one."""
     lens, microlenses, sensor = section.main_lens, section.microlenses, section.sensor
     missing = missing_for_camera(section)
     if lens is None or missing is not None:
         raise ValueError(f"camera.{missing} is missing")
     microlens_focal_length = microlens_focal_length_mm(microlenses)
-    return Camera(
+    real = Camera(
         magnification=lens.magnification,
         focal_length_mm=focal_length_mm(lens) or 0.0,
         aperture_mm=aperture_mm(lens) or 0.0,
@@ -97,6 +103,7 @@ def camera_of(section: CameraSection) -> Camera:
         rows=sensor.rows,
         column_axis=sensor.column_axis,
     )
+    return thin_lens(real, entrance_over_exit(lens))
 
 
 def micro_image_pitch_px(section: CameraSection) -> float:

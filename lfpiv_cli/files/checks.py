@@ -12,7 +12,7 @@ from lfpiv_cli.files.bench import (
     media_of,
     missing_for_camera,
 )
-from lfpiv_cli.files.sections import Sections
+from lfpiv_cli.files.sections import MainLens, Sections
 from lfpiv_cli.files.sections_simulated import SimulationSection
 from lfpiv_cli.files.yaml_nodes import KeyPath
 from lfpiv_cli.optics.media import Window, equivalent_object_distance, fluid_path_to_focus
@@ -51,21 +51,24 @@ def _disagree(first: float, second: float) -> bool:
 
 
 def _lens(sections: Sections) -> Found:
-    """Yield what is given twice and differs: S_i = F_m (1 - M) and the f-numbers."""
+    """Yield what is given twice and differs: S_i = F_m (P - M) and the f-numbers."""
     if sections.camera is None:
         return
     lens, microlenses = sections.camera.main_lens, sections.camera.microlenses
     if lens is not None:
         place = ("camera", "main_lens")
         focal_length = focal_length_mm(lens)
-        if focal_length is None:
+        if lens.image_distance is not None:
+            yield from _telecentric(lens)
+        elif focal_length is None:
             yield place, "needs focal_length_mm or image_distance_mm"
         elif lens.image_distance_mm is not None:
-            expected = focal_length * (1.0 - lens.magnification)
+            expected = focal_length * (lens.pupil_ratio - lens.magnification)
             if _disagree(lens.image_distance_mm, expected):
                 yield (
                     (*place, "image_distance_mm"),
-                    f"is {lens.image_distance_mm:g}, but focal_length_mm (1 - magnification) is {expected:g}",
+                    f"is {lens.image_distance_mm:g}, but focal_length_mm ({lens.pupil_ratio:g} - magnification) is "
+                    f"{expected:g}",
                 )
         if lens.aperture_mm is None and lens.f_number is None:
             yield place, "needs aperture_mm or f_number"
@@ -80,6 +83,17 @@ def _lens(sections: Sections) -> Found:
                 ("camera", "microlenses", "f_number"),
                 f"is {microlenses.f_number:g}, but focal_length_mm / pitch_mm is {expected:g}",
             )
+
+
+def _telecentric(lens: MainLens) -> Found:
+    """Yield what a lens whose exit pupil is infinitely far away cannot have, and the focal length where it lacks."""
+    place = ("camera", "main_lens")
+    if lens.focal_length_mm is None:
+        yield place, "needs focal_length_mm, which an infinite image distance does not tell"
+    if lens.image_distance_mm is not None:
+        yield (*place, "image_distance_mm"), f"is {lens.image_distance_mm:g}, but image_distance is infinite"
+    if lens.pupil_ratio != 1.0:
+        yield (*place, "pupil_ratio"), f"is {lens.pupil_ratio:g}, but image_distance is infinite and so is the ratio"
 
 
 def _sensor(sections: Sections) -> Found:

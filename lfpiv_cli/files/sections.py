@@ -42,13 +42,17 @@ from lfpiv_cli.reconstruction.registry import SolverName
 class MainLens(Section):
     """The main lens: M and two of its lengths; what is given twice must agree.
 
-    magnification: M, negative, as the image is inverted. focal_length_mm: F_m; or image_distance_mm: S_i = F_m (1 - M).
-    aperture_mm: the diameter p_m; or f_number: F_m / p_m.
+    magnification: M, negative, as the image is inverted. focal_length_mm: F_m; or image_distance_mm: S_i = F_m (P - M),
+    from the exit pupil to the array. pupil_ratio: P, diameter of the exit over that of the entrance pupil;
+    image_distance: infinite in its place, of a lens that is telecentric towards the array.
+    aperture_mm: the diameter p_m of the entrance pupil; or f_number: F_m / p_m.
     """
 
     magnification: Annotated[float, Field(lt=0.0)]
     focal_length_mm: Positive | None = None
     image_distance_mm: Positive | None = None
+    image_distance: Literal["infinite"] | None = None
+    pupil_ratio: Positive = 1.0
     aperture_mm: Positive | None = None
     f_number: Positive | None = None
 
@@ -98,7 +102,7 @@ class MediaSection(Section):
 
 
 class WindowSection(Section):
-    """The window: distance d1 from the main lens and thickness d2. Only exact refraction reads it."""
+    """The window: distance d1 from the main lens's entrance pupil and thickness d2. Only exact refraction reads it."""
 
     distance_mm: Positive
     thickness_mm: NotNegative

@@ -58,6 +58,7 @@ CAMERA_SCALARS = (
     "rows",
     "column_axis",
     "distortion_per_mm2",
+    "entrance_over_exit",
 )
 
 
@@ -267,7 +268,8 @@ def _axis_weights(tree: dict[str, Any], planes: int, voxels: int, optics: AxisOp
 
 def _camera(tree: dict[str, Any]) -> Camera:
     lattice = Lattice(tree["lattice_origin_mm"], tree["lattice_basis_mm"], tree["layout"])
-    return Camera(lattice=lattice, **{name: tree[name] for name in CAMERA_SCALARS})
+    known = {"entrance_over_exit": 1.0} | tree  # files from before pupils have thin lenses
+    return Camera(lattice=lattice, **{name: known[name] for name in CAMERA_SCALARS})
 
 
 def _triple(values: Any, kind: type) -> tuple[Any, Any, Any]:

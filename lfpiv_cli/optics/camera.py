@@ -50,7 +50,7 @@ class KernelCamera(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """Everything between the scene and the pixels.
+    """Everything between the scene and the pixels, with a thin main lens; see `pupils` for one that is not thin.
 
     Attributes
     ----------
@@ -63,6 +63,7 @@ class Camera:
     columns, rows : sensor size in pixels
     column_axis : world axis that the sensor's columns follow
     distortion_per_mm2 : k1 of r' = r (1 + k1 r^2), about the axis, on where rays meet the array
+    entrance_over_exit : 1/P of the lens that the thin one stands for, see `pupils`; nothing here needs it
     """
 
     magnification: float
@@ -76,6 +77,7 @@ class Camera:
     rows: int
     column_axis: ColumnAxis = "x"
     distortion_per_mm2: float = 0.0
+    entrance_over_exit: float = 1.0
 
     @property
     def image_distance_mm(self) -> float:

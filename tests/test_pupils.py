@@ -1,0 +1,153 @@
+"""Main lenses with pupils against rays traced through two lenses and a stop between them, surface by surface."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.media import Media, Window
+from lfpiv_cli.optics.microlenses import Lattice
+from lfpiv_cli.optics.pupils import real_lens, refocused, thin_lens
+from lfpiv_cli.optics.tracing import slopes_equivalent, slopes_exact, trace
+
+F_1, F_2 = 150.0, 150.0
+# From the front lens to the object in focus, mm.
+TO_FOCUS = 340.0
+S_MU, F_MU, PIXEL, PITCH = 0.8, 0.75, 0.0055, 0.1
+WATER = Media(1.0, 1.49, 1.33)
+
+
+@dataclass(frozen=True)
+class TwoLenses:
+    """Thin lenses of F_1 and F_2 in air and a stop between them, at `before` and `behind` it; an array and a sensor."""
+
+    before: float
+    behind: float
+
+    @property
+    def focal_length(self) -> float:
+        return F_1 * F_2 / (F_1 + F_2 - self.before - self.behind)
+
+    @property
+    def entrance_per_stop(self) -> float:
+        return F_1 / (F_1 - self.before)
+
+    @property
+    def entrance_behind_front(self) -> float:
+        """Place of the stop's picture in the front lens."""
+        return self.before * self.entrance_per_stop
+
+    @property
+    def entrance_over_exit(self) -> float:
+        return self.entrance_per_stop * (F_2 - self.behind) / F_2
+
+    def image(self) -> tuple[float, float]:
+        """Return how far behind the rear lens the object in focus is shown, and how large."""
+        first = 1.0 / (1.0 / F_1 - 1.0 / TO_FOCUS)
+        second_object = self.before + self.behind - first
+        second = 1.0 / (1.0 / F_2 - 1.0 / second_object)
+        return second, (first / TO_FOCUS) * (second / second_object)
+
+    def from_stop(self, stop, slope):
+        """Return where rays through the stop meet the array, and their slopes there."""
+        x = stop + self.behind * slope
+        slope = slope - x / F_2
+        return x + self.image()[0] * slope, slope
+
+    def to_stop(self, points, depth, stop):
+        """Return the slopes at the stop of rays from points, `depth` behind the focus in air, through the stop."""
+        distance = TO_FOCUS + depth
+        # at the stop: (x + distance s) (1 - before/F_1) + before s
+        slope = (stop - points * (1.0 - self.before / F_1)) / (distance * (1.0 - self.before / F_1) + self.before)
+        return slope - (points + distance * slope) / F_1
+
+    def pixels(self, stop, slope, lattice):
+        """Return where rays end on the sensor, in pixels from the axis, and on the array in mm."""
+        array, behind = self.from_stop(stop, slope)
+        centre = lattice.points(lattice.nearest(array))
+        return (array + S_MU * (behind - (array - centre) / F_MU)) / PIXEL, array
+
+    def camera(self) -> Camera:
+        """Return what a data sheet says of it."""
+        lattice = Lattice.regular(PITCH, "hexagonal", 0.02, (0.03, -0.02))
+        magnification = self.image()[1]
+        real = Camera(magnification, self.focal_length, 25.0, F_MU, S_MU, lattice, PIXEL, 1000, 800)
+        return thin_lens(real, self.entrance_over_exit)
+
+
+# P = 0.8, 1.3, and the stop in the rear lens's focus: telecentric towards the array.
+LENSES = {
+    "0.8": TwoLenses(38.0, 10.0),
+    "1.3": TwoLenses(10.0, 150.0 - 140.0 / 1.3),
+    "telecentric": TwoLenses(10.0, 150.0),
+}
+
+
+@pytest.fixture(params=list(LENSES))
+def lenses(request: pytest.FixtureRequest) -> TwoLenses:
+    return LENSES[request.param]
+
+
+def test_the_lenses_are_what_they_are_called():
+    ratios = [each.entrance_over_exit for each in LENSES.values()]
+    assert ratios == pytest.approx([1.0 / 0.8, 1.0 / 1.3, 0.0], abs=1e-12)
+
+
+def test_points_in_air_light_the_pixels_that_two_lenses_and_a_stop_make_them_light(lenses, rng):
+    camera, air = lenses.camera(), Media()
+    points = rng.uniform((-6.0, -5.0, -20.0), (6.0, 5.0, 20.0), (400, 3))
+    stop = rng.uniform(-8.0, 8.0, (400, 2))
+    told, array = lenses.pixels(stop, lenses.to_stop(points[:, :2], points[:, 2:], stop), camera.lattice)
+    entrance = stop * lenses.entrance_per_stop
+    hits = trace(camera, entrance, slopes_equivalent(points, entrance, camera, air))
+    np.testing.assert_allclose(hits.array_mm, array, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(hits.sensor_mm / camera.pixel_mm, told, rtol=0, atol=1e-8)
+
+
+def test_points_in_water_are_seen_by_snell_from_the_entrance_pupil(lenses, rng):
+    """Rays are followed from the stop outwards: through the front lens, to the window, by Snell's law into water."""
+    camera = lenses.camera()
+    stop, slope = rng.uniform(-8.0, 8.0, 100), rng.uniform(-0.06, 0.06, 100)
+    front = stop - lenses.before * slope
+    outward = slope + front / F_1
+    to_window, glass, depth = 250.0, 3.0, rng.uniform(5.0, 40.0, 100)
+    sine = outward / np.hypot(1.0, outward)
+    fluid = (sine / 1.33) / np.sqrt(1.0 - (sine / 1.33) ** 2)
+    wall = (sine / 1.49) / np.sqrt(1.0 - (sine / 1.49) ** 2)
+    x = front - to_window * outward - glass * wall - depth * fluid
+    in_focus = (TO_FOCUS - to_window - glass / 1.49) * 1.33
+    points = np.stack([x, np.zeros(100), depth - in_focus], axis=1)
+    window = Window(to_window + lenses.entrance_behind_front, glass)
+    entrance = np.stack([stop * lenses.entrance_per_stop, np.zeros(100)], axis=1)
+    hits = trace(camera, entrance, slopes_exact(points, entrance, camera, WATER, window))
+    flat = np.zeros((100, 1))
+    told, _ = lenses.pixels(
+        np.hstack([stop[:, np.newaxis], flat]), np.hstack([slope[:, np.newaxis], flat]), camera.lattice
+    )
+    np.testing.assert_allclose(hits.sensor_mm / camera.pixel_mm, told, rtol=0, atol=1e-8)
+
+
+def test_lens_images_are_projected_from_the_exit_pupil(lenses):
+    """Their pitch is p_l (1 + s_mu/s_i); behind a telecentric lens it is that of the lenses, to the last pixel."""
+    camera = lenses.camera()
+    exit_pupil = lenses.image()[0] + (lenses.behind * F_2 / (F_2 - lenses.behind) if lenses.behind < F_2 else np.inf)
+    expected = PITCH * (1.0 + S_MU / exit_pupil) / PIXEL
+    np.testing.assert_allclose(camera.micro_image_lattice_px().pitch, expected, rtol=1e-12)
+
+
+def test_a_thin_lens_stands_for_itself_bit_for_bit(camera):
+    told = replace(camera, magnification=-0.7, focal_length_mm=98.7)
+    for same in (thin_lens(told, 1.0), real_lens(told), refocused(told, -0.7)):
+        assert (same.focal_length_mm, same.microlens_distance_mm, same.pixel_mm) == (98.7, 0.8, 0.0055)
+    assert refocused(told, -0.9).image_distance_mm == replace(told, magnification=-0.9).image_distance_mm
+
+
+@pytest.mark.parametrize("entrance_over_exit", [1.25, 0.6, 0.0])
+def test_refocused_is_the_same_lens_at_another_magnification(camera, entrance_over_exit):
+    seen = refocused(thin_lens(camera, entrance_over_exit), -0.8)
+    told = thin_lens(replace(camera, magnification=-0.8), entrance_over_exit)
+    for name in ("magnification", "focal_length_mm", "microlens_distance_mm", "pixel_mm", "entrance_over_exit"):
+        assert getattr(seen, name) == pytest.approx(getattr(told, name), rel=1e-14)
