@@ -26,6 +26,8 @@ LARGE_RESIDUAL, LARGEST_RESIDUAL = 0.02, 0.06
 FEWEST_FOUND = 0.5
 # Nine in ten lens images of a white image differ less from the median of those around.
 LARGEST_DIFFERENCE, DIFFERENCE_PERCENTILE, NEIGHBOURS = 0.08, 90.0, 4
+# Of the brightest lens image: darker ones count as this bright, which is nothing.
+DARKEST = 1e-9
 # What the data sheet says of the lens images' width is believed to this factor.
 WIDTH_TOLERANCE = 1.25
 
@@ -114,7 +116,7 @@ def neighbours_difference(white: NDArray[np.float64], fit: LatticeFit) -> float:
     brightness = level[rows, columns]
     _, nearest = KDTree(fit.centres_px).query(fit.centres_px, NEIGHBOURS + 1)
     around = np.median(brightness[nearest[:, 1:]], axis=1)
-    relative = np.abs(brightness - around) / np.maximum(around, np.finfo(np.float64).tiny)
+    relative = np.abs(brightness - around) / np.maximum(around, DARKEST * max(float(np.abs(brightness).max()), DARKEST))
     return float(np.percentile(relative, DIFFERENCE_PERCENTILE))
 
 

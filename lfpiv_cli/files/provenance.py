@@ -90,6 +90,16 @@ def recorded_warnings(made: Mapping[str, Any]) -> list[str]:
     ]
 
 
+def also_used_as(made: Mapping[str, Any], role: str) -> str | None:
+    """Return as what the input of a role was given besides, to this command or to one before; None if to none."""
+    digest = made["inputs"][role]["sha256"]
+    for each in (made, *made["made_from"].values()):
+        for name, given in each["inputs"].items():
+            if given["sha256"] == digest and (each is not made or name != role):
+                return f"{name} of {each['command'].split()[0]}"
+    return None
+
+
 def calibrated_with(made: Mapping[str, Any]) -> str | None:
     """Return the SHA-256 of the calibration that a volume's or particles' weights are of, or of weights without one.
 

@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lfpiv_cli.calibration import model
+from lfpiv_cli.calibration.lens_light import LensImages
+from lfpiv_cli.calibration.light_checks import dark_notices, position_notices
 from lfpiv_cli.calibration.model import Calibration, DataSheet, Photographs
 from lfpiv_cli.calibration.sheet import (
     board_notices,
@@ -32,6 +34,8 @@ NO_WHITE_IMAGE = Notice(
     "of how far that is wrong",
     "give a white image, of uniform light",
 )
+
+MOVED_SINCE_WHITE = "take white image and board one after the other, with the camera as it is"
 
 Pictures = ArrayLike | Sequence[ArrayLike] | None
 
@@ -114,6 +118,7 @@ def calibration_notices(rig: Config, pictures: Photographs, found: Calibration) 
         notices += board_notices(found.pose.dots_found, rig.board.dots)
     if found.pose is not None and camera is not None:
         notices += magnification_notices(found.pose.magnification, camera)
+    notices += light_notices(rig, pictures, found)
     if not pictures.whites:
         return [*notices, NO_WHITE_IMAGE]
     order = by_aperture(pictures.whites, pictures.dark)
@@ -121,6 +126,21 @@ def calibration_notices(rig: Config, pictures: Photographs, found: Calibration) 
     width = lens_image_width(found.rectification.apply(widest), found.rectification.lattice_px)
     notices += white_notices(first, found.fit, width, None if camera is None else camera.lens_image_width)
     return notices if camera is None else notices + image_distance_notices(found.fit, camera)
+
+
+def light_notices(rig: Config, pictures: Photographs, found: Calibration) -> list[Notice]:
+    """Return what the light of boards and of the dark image says against the lens images that were found."""
+    camera = rig.complete_camera()
+    boards = [*([] if pictures.board is None else [pictures.board]), *pictures.depth_boards]
+    if found.transmission is None and camera is None:
+        return []
+    width = 1.0 if camera is None else camera.lens_image_width
+    images = LensImages.of(found.rectification, found.transmission, width)
+    notices = [] if pictures.dark is None else dark_notices(images, np.asarray(pictures.dark, dtype=np.float64))
+    for number, board in enumerate(boards, 1):
+        name = "board image" if len(boards) == 1 else f"board image {number}"
+        notices += position_notices(images, pictures.less_dark(board), name, MOVED_SINCE_WHITE)
+    return notices
 
 
 def _check_mid_plane(z_mm: float, rig: Config) -> None:

@@ -9,6 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.calibration.lens_light import LensImages
+from lfpiv_cli.calibration.light_checks import level_notices, position_notices, uniform_notices
+from lfpiv_cli.calibration.rectification import Rectification
+from lfpiv_cli.calibration.sheet import sheet_fit
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files.config import Config, carried_config
 from lfpiv_cli.files.provenance import record
@@ -30,6 +34,9 @@ LARGEST_SATURATED = 0.05
 NOISE_SIGMAS = 6.0
 # The name of one in memory.
 IMAGE = "the image"
+MOVED_SINCE_CALIBRATION = (
+    "calibrate with a white image of the camera as it is, or refine-calibration, which finds the shift"
+)
 
 
 def reconstruct(
@@ -94,6 +101,7 @@ class Bench:
     lasting : raw pixels that are never usable: defects of the dark image, and where the mask is black
     excluded : pixels in the weights' frame that never take part: off the sensor, or touched by `lasting`
     sums : of the weights without `excluded`; None where weights are made for each image
+    lens_images : what the light of frames is held against
     """
 
     content: WeightsFile
@@ -102,6 +110,7 @@ class Bench:
     lasting: Mask
     excluded: Mask
     sums: Normalisers | None
+    lens_images: LensImages
 
     def unusable(self, raw: Image) -> Mask:
         """Return which pixels of a raw frame take no part."""
@@ -143,7 +152,15 @@ def bench_of(
     if weights.calibration is not None:
         excluded |= ~weights.calibration.rectification.inside
     sums = normalisers(weights.padded, excluded) if with_sums and not weights.on_demand else None
-    return Bench(content, settings, dark, lasting, excluded, sums)
+    return Bench(content, settings, dark, lasting, excluded, sums, _lens_images(content))
+
+
+def _lens_images(content: WeightsFile) -> LensImages:
+    """Return the lens images that weights were made for: calibrated, or the data sheet's."""
+    found, camera = content.weights.calibration, content.camera
+    if found is None:
+        return LensImages.of(Rectification(sheet_fit(camera), content.image_shape), None, camera.lens_image_width)
+    return LensImages.of(found.rectification, found.transmission, camera.lens_image_width)
 
 
 def volume_of(
@@ -211,7 +228,14 @@ def frame_notices(bench: Bench, raw: Image, lit: Image, name: str) -> list[Notic
                 f"above {NOISE_SIGMAS * noise:.3g}",
             )
         )
-    return notices
+    return [*notices, *_light_notices(bench, np.where(unusable, np.float32(np.nan), lit), name)]
+
+
+def _light_notices(bench: Bench, lit: Image, name: str) -> list[Notice]:
+    """Return what the light of a frame, its unusable pixels NaN, says against it and the calibration."""
+    images, calibration = bench.lens_images, bench.content.weights.calibration
+    notices = [] if calibration is None else list(uniform_notices(images, calibration.fit, lit, name))
+    return [*notices, *level_notices(images, lit, name), *position_notices(images, lit, name, MOVED_SINCE_CALIBRATION)]
 
 
 def _noise(counts: NDArray[np.float32]) -> float:

@@ -21,7 +21,7 @@ from lfpiv_cli.files.batch import Frame, Target, frames_beside, frames_of, outpu
 from lfpiv_cli.files.config import Config, carried_config
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, write_points
-from lfpiv_cli.files.provenance import record, with_warnings
+from lfpiv_cli.files.provenance import also_used_as, record, with_warnings
 from lfpiv_cli.files.weights_file import open_weights
 from lfpiv_cli.interface import particles
 from lfpiv_cli.interface.reconstruction import Bench, Progress, bench_of, check_frame, frame_notices, volume_of
@@ -122,7 +122,8 @@ def reconstruct(
             try:
                 pictures, target = future.result(), targets[number]
                 check_frame(bench, pictures[0], str(frames[number].path))
-                notices = frame_notices(bench, *pictures, frames[number].stem)
+                stem = frames[number].stem
+                notices = _file_notices(target.record, stem) + frame_notices(bench, *pictures, stem)
                 console.warn(notices)
                 target = replace(target, record=with_warnings(target.record, notices))
                 if as_particles:
@@ -168,6 +169,15 @@ def _targets(
         )
         for path, frame, words in zip(paths, frames, made_of, strict=True)
     ]
+
+
+def _file_notices(made: Mapping[str, Any], name: str) -> list[Notice]:
+    """Return what is said of a frame whose file was given as something else, too."""
+    other = also_used_as(made, "image")
+    if other is None:
+        return []
+    text = f"the file is also the {other}: it shows no tracers"
+    return [Notice("frame-given-before", name, text, "leave it out of the images, or correct the other")]
 
 
 def _record_of(path: Path) -> dict[str, Any]:

@@ -1,0 +1,357 @@
+"""Whether a picture's light lies on the calibrated lens images, and how far beside them.
+
+A tracer, or any other small thing, lights the main lens's aperture evenly, through however many microlenses: folded
+onto one cell of the lattice, all light of a picture shows the lens image of uniform light. Its rims tell how far the
+lens images have moved, modulo the lattice. Things may be brighter to one side and stand before an even background: the
+folded light may be a lens image times a linear function, plus a constant.
+
+Parts of the picture err on their own, and how they differ tells how well the result is known: a picture of too few
+tracers says so by its standard error.
+
+Axes: (column, row) in pixels; parts row by row.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from lfpiv_cli.calibration.lattice import LatticeFit
+from lfpiv_cli.calibration.rectification import Rectification
+from lfpiv_cli.optics.microlenses import Lattice
+from lfpiv_cli.threads import share_out
+
+# Parts of a picture along each side.
+PARTS = 6
+# Bins along a cell's side: about one a pixel, as pixels sample it; more than these would tell no more.
+FEWEST_BINS, MOST_BINS = 6, 24
+# Light is what stands out of the background by so many standard deviations of its noise.
+LIGHT_SIGMAS = 3.0
+# Of a normal distribution these percentiles lie one and two standard deviations below its middle. So many pixels tell
+# them to a per cent.
+ONE_BELOW, TWO_BELOW, ENOUGH = 15.87, 2.275, 60_000
+# Of noise alone this share of a standard deviation stands above three of them, on average; light is ten times of it.
+NOISE_LIGHT, TIMES_NOISE = 3.8e-4, 10.0
+# Gauss-Newton from the best of the bins settles to a thousandth of a pixel.
+ROUNDS = 2
+# Pixels that get no more than this share of what a lens image's brightest ones do lie between lens images.
+DARK_SHARE = 0.02
+# Of a tracer's light: how unevenly at least it fills its lens images, so that no part outweighs all others.
+UNEVENNESS = 0.1
+# With fewer parts that tell of the shift its error is not known; with these it may grow along the sides. It is told
+# where a part tells this share of what the best one does.
+FEWEST_PARTS, PARTS_FOR_SLOPES, WELL_LIT = 3.0, 10.0, 0.3
+
+
+class Cells(NamedTuple):
+    """The lens images of a picture, for kernels.
+
+    Attributes
+    ----------
+    off : (nj, ni, 2) how far their centres are off the plain lattice, in shares of its basis; entry [j, i] is lens
+        (first_i + i, first_j + j)
+    origin_px, inverse_basis : (2,), (2, 2) of the plain lattice
+    """
+
+    off: NDArray[np.float64]
+    first_i: int
+    first_j: int
+    origin_px: NDArray[np.float64]
+    inverse_basis: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, lattice_px: Lattice, shape: tuple[int, int], fit: LatticeFit | None = None) -> Cells:
+        """Return the cells of a picture (rows, columns) on a plain lattice, or on the one that was fitted."""
+        corners = [(column, row) for column in (0, shape[1] - 1) for row in (0, shape[0] - 1)]
+        found = np.rint(lattice_px.coordinates(corners)).astype(np.int64)
+        (low_i, low_j), (high_i, high_j) = found.min(axis=0) - 1, found.max(axis=0) + 1
+        indices = np.stack(np.meshgrid(np.arange(low_i, high_i + 1), np.arange(low_j, high_j + 1)), axis=-1)
+        off = np.zeros(indices.shape) if fit is None else lattice_px.coordinates(fit.centres(indices)) - indices
+        inverse = np.ascontiguousarray(np.linalg.inv(lattice_px.basis))
+        return cls(np.ascontiguousarray(off), int(low_i), int(low_j), lattice_px.origin, inverse)
+
+
+class Place(NamedTuple):
+    """How far beside its lens images the light lies somewhere, (2,) pixels, and the standard error along that."""
+
+    shift_px: NDArray[np.float64]
+    sigma_px: float
+
+
+class Beside(NamedTuple):
+    """Where a picture's light lies.
+
+    Attributes
+    ----------
+    places : in the middles of parts that are well lit
+    following, following_sigma : share of the light that follows the lens images, 1 of a good picture
+    lit : whether there is more light than noise makes
+    """
+
+    places: tuple[Place, ...]
+    following: float
+    following_sigma: float
+    lit: bool
+
+
+@dataclass(frozen=True, eq=False)
+class LensImages:
+    """What pictures are held against.
+
+    Attributes
+    ----------
+    lattice_px : plain lattice of raw pictures
+    cells : their lens images
+    area : (parts, bins, bins) pixels that fall into each bin
+    pattern : (parts, bins, bins) uniform light on a cell, entry [v, u] at shares u, v of the basis from a lens image's
+        centre
+    between : some pixels between the lens images, by their number in a picture that is read row by row
+    """
+
+    lattice_px: Lattice
+    cells: Cells
+    area: NDArray[np.float64]
+    pattern: NDArray[np.float64]
+    between: NDArray[np.int64]
+
+    @classmethod
+    def of(
+        cls, rectification: Rectification, transmission: NDArray[np.float32] | None, lens_image_width: float
+    ) -> LensImages:
+        """Return the lens images of a calibration: by its transmission, or discs of a width in pitches without one."""
+        lattice, shape = rectification.fit.lattice_px, rectification.image_shape
+        cells = Cells.of(lattice, shape, rectification.fit)
+        bins = int(np.clip(np.rint(lattice.pitch.mean()), FEWEST_BINS, MOST_BINS))
+        if transmission is None:
+            pattern = np.repeat(_discs(lattice, bins, lens_image_width)[np.newaxis], PARTS**2, axis=0)
+        else:
+            upright, inside = Cells.of(rectification.lattice_px, shape), rectification.inside
+            light, lit = (folded(np.where(inside, each, 0.0), 0.0, upright, bins) for each in (transmission, 1.0))
+            pattern = _over(light, lit)
+        area = folded(np.ones(shape), 0.0, cells, bins)
+        return cls(lattice, cells, area, pattern, _between(cells, shape, pattern.sum(axis=0)))
+
+    def beside(self, picture: NDArray[np.floating]) -> Beside:
+        """Return where the light of a raw picture (rows, columns) less its dark image lies; unusable pixels are NaN."""
+        middle, noise = self.background(picture)
+        light = folded(picture, middle + LIGHT_SIGMAS * noise, self.cells, self.pattern.shape[-1])
+        light = _over(light, self.area)
+        system, shift = self._settled(light, _nearest_bin(light, self.pattern, self.lattice_px))
+        if system.alike >= PARTS_FOR_SLOPES:
+            system, shift = self._settled(light, np.concatenate([shift, np.zeros(4)]))
+        following, sigma = system.following(light)
+        lit = float(light.mean()) > TIMES_NOISE * NOISE_LIGHT * noise
+        return Beside(_places(shift, system), following, sigma, lit)
+
+    def background(self, picture: NDArray[np.floating]) -> tuple[float, float]:
+        """Return level and noise of a picture's background: what darker pixels between lens images vary about."""
+        between = picture.ravel()[self.between]
+        between = between[np.isfinite(between)]
+        if not between.size:
+            return 0.0, 0.0
+        two, one = np.percentile(between, [TWO_BELOW, ONE_BELOW])
+        return float(2.0 * one - two), float(one - two)
+
+    def _settled(self, light: NDArray[np.float64], unknowns: NDArray[np.float64]) -> tuple[System, NDArray[np.float64]]:
+        """Return the last normal equations, and the unknowns by Gauss-Newton from first values of them."""
+        for _ in range(ROUNDS):
+            system = _system(light, self.pattern, self.lattice_px, unknowns)
+            unknowns = unknowns + system.step
+        return system, unknowns
+
+
+def folded(picture: NDArray[np.floating], level: float, cells: Cells, bins: int) -> NDArray[np.float64]:
+    """Return the light above a level on one cell (parts, bins, bins), summed over each part of a picture.
+
+    Pixels that are not numbers have none.
+    """
+    # Beyond the last bin comes the first one again; rounding may reach one further.
+    total = np.zeros((PARTS**2, bins + 2, bins + 2))
+    share_out(fold_strips, PARTS, np.ascontiguousarray(picture, dtype=np.float32), level, cells, total)
+    total[:, :2] += total[:, bins:]
+    total[:, :, :2] += total[:, :, bins:]
+    return total[:, :bins, :bins]
+
+
+@njit(cache=True, nogil=True)
+def fold_strips(
+    strips: tuple[int, int], picture: NDArray[np.float32], level: float, cells: Cells, total: NDArray[np.float64]
+) -> None:
+    """Add the light of strips of parts to `total`; a pixel's is shared by the four bins around it."""
+    (rows, columns), bins = picture.shape, total.shape[1] - 2
+    inverse = cells.inverse_basis
+    for row in range(-(-strips[0] * rows // PARTS), -(-strips[1] * rows // PARTS)):
+        y = row - cells.origin_px[1]
+        for part in range(PARTS):
+            here = total[(row * PARTS // rows) * PARTS + part]
+            for column in range(-(-part * columns // PARTS), -(-(part + 1) * columns // PARTS)):
+                light = picture[row, column] - level
+                if not light > 0.0:
+                    continue
+                x = column - cells.origin_px[0]
+                u = x * inverse[0, 0] + y * inverse[1, 0]
+                v = x * inverse[0, 1] + y * inverse[1, 1]
+                i, j = int(np.rint(u)) - cells.first_i, int(np.rint(v)) - cells.first_j
+                u, v = u - cells.off[j, i, 0], v - cells.off[j, i, 1]
+                right, down = (u - np.floor(u)) * bins, (v - np.floor(v)) * bins
+                left, top = int(right), int(down)
+                right, down = right - left, down - top
+                here[top, left] += light * (1.0 - right) * (1.0 - down)
+                here[top, left + 1] += light * right * (1.0 - down)
+                here[top + 1, left] += light * (1.0 - right) * down
+                here[top + 1, left + 1] += light * right * down
+
+
+class System(NamedTuple):
+    """Normal equations of where the light lies: unknowns are a shift, and perhaps how it grows along each side.
+
+    Attributes
+    ----------
+    matrix, pull : (parts, k, k), (parts, k) what each part adds, in inverse variances; k is 2 or 6
+    amount : (parts,) light that follows the lens images
+    """
+
+    matrix: NDArray[np.float64]
+    pull: NDArray[np.float64]
+    amount: NDArray[np.float64]
+
+    @property
+    def inverse(self) -> NDArray[np.float64]:
+        """(k, k) of the sum of all parts."""
+        return np.asarray(np.linalg.inv(self.matrix.sum(axis=0)))
+
+    @property
+    def step(self) -> NDArray[np.float64]:
+        """(k,) towards the solution."""
+        return np.asarray(self.inverse @ self.pull.sum(axis=0))
+
+    @property
+    def told(self) -> NDArray[np.float64]:
+        """(parts,) how much each part tells of the shift."""
+        return np.asarray(np.trace(self.matrix[:, :2, :2], axis1=1, axis2=2))
+
+    @property
+    def alike(self) -> float:
+        """How many parts that tell as much as each other would tell what they do."""
+        return float(self.told.sum() ** 2 / np.sum(self.told**2))
+
+    @property
+    def covariance(self) -> NDArray[np.float64]:
+        """(k, k) by how parts differ (the sandwich estimate), and bins; of no use where too few parts tell."""
+        few = 0.5 * self.pull.shape[1] + 1.0
+        freedom = self.alike / max(self.alike - few, 1.0)
+        apart = self.inverse @ (self.pull.T @ self.pull) @ self.inverse
+        return np.asarray(freedom * (apart + self.inverse))
+
+    def following(self, light: NDArray[np.float64]) -> tuple[float, float]:
+        """Return the share of all light that follows the lens images, and its standard error by how parts differ."""
+        level = light.mean(axis=(1, 2))
+        total = max(float(level.sum()), np.finfo(np.float64).tiny)
+        share = float(self.amount.sum()) / total
+        return share, float(np.sqrt(np.sum((self.amount - share * level) ** 2))) / total
+
+
+def _system(
+    light: NDArray[np.float64], pattern: NDArray[np.float64], lattice: Lattice, unknowns: NDArray[np.float64]
+) -> System:
+    """Return the normal equations about the shift that `unknowns` (2,) or (6,) tell."""
+    parts, bins = len(light), light.shape[-1]
+    inverse = np.linalg.inv(lattice.basis)
+    lever = _levers(_middles())[..., : len(unknowns)]
+    moved, slope = _moved(pattern, lever @ unknowns @ inverse)
+    across = (_cell(bins) @ lattice.basis - unknowns[:2]) / lattice.pitch.mean()
+    cell = Lattice(np.zeros(2), lattice.basis / lattice.pitch.mean(), lattice.layout)
+    across -= cell.points(cell.nearest(across))
+    free = np.stack([moved, moved * across[..., 0], moved * across[..., 1], np.ones_like(moved)], axis=-1)
+    kept, upper = np.linalg.qr(free.reshape(parts, -1, 4))
+    seen = light.reshape(parts, -1, 1)
+    factor = np.linalg.solve(upper, np.swapaxes(kept, 1, 2) @ seen)[:, 0]
+    amount = factor[:, 0] * moved.mean(axis=(1, 2))
+    design = np.maximum(factor, 0.0)[:, :1, np.newaxis] * (slope.reshape(parts, -1, 2) @ inverse.T)
+    rest, design = (each - kept @ (np.swapaxes(kept, 1, 2) @ each) for each in (seen, design))
+    variance = np.sum(rest[..., 0] ** 2, axis=1) / (bins**2 - 4) + (UNEVENNESS * amount) ** 2
+    weight = 1.0 / np.maximum(variance, np.finfo(np.float64).tiny)[:, np.newaxis, np.newaxis]
+    design = design @ lever
+    matrix = weight * (np.swapaxes(design, 1, 2) @ design)
+    # nothing is known beyond half a pitch: parts without light leave the rest as it is
+    matrix += np.eye(len(unknowns)) / (parts * (0.5 * float(lattice.pitch.mean())) ** 2)
+    pull = (weight * (np.swapaxes(design, 1, 2) @ rest))[..., 0]
+    return System(matrix, pull, amount)
+
+
+def _moved(pattern: NDArray[np.float64], shift: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the pattern moved by a shift (parts, 2) in cells, and its slopes (parts, bins, bins, 2) with the shift."""
+    bins = pattern.shape[-1]
+    frequency = np.fft.fftfreq(bins, 1.0 / bins)
+    below = np.abs(frequency) < 0.5 * bins
+    wave = -2j * np.pi * np.stack(np.meshgrid(frequency, frequency), axis=-1)
+    turn = np.exp(wave @ shift[:, np.newaxis, :, np.newaxis])[..., 0]
+    spectrum = np.fft.fft2(pattern) * np.outer(below, below) * turn
+    slope = [np.fft.ifft2(spectrum * wave[..., axis]).real for axis in range(2)]
+    return np.fft.ifft2(spectrum).real, np.stack(slope, axis=-1)
+
+
+def _nearest_bin(light: NDArray[np.float64], pattern: NDArray[np.float64], lattice: Lattice) -> NDArray[np.float64]:
+    """Return the shift (2,) in pixels, to a bin, by which the pattern correlates best with the light."""
+    spectra = (np.fft.fft2(each.sum(axis=0) - each.sum(axis=0).mean()) for each in (light, pattern))
+    first, second = spectra
+    alike = np.fft.ifft2(first * np.conj(second)).real
+    row, column = np.unravel_index(int(np.argmax(alike)), alike.shape)
+    share = np.array([column, row]) / len(alike)
+    return np.asarray((share - np.rint(share)) @ lattice.basis)
+
+
+def _places(unknowns: NDArray[np.float64], system: System) -> tuple[Place, ...]:
+    """Return shifts in the middles of parts that tell of them, with the standard errors along them."""
+    places, covariance, known = [], system.covariance, system.alike > FEWEST_PARTS
+    for lever in _levers(_middles()[system.told >= WELL_LIT * system.told.max()])[..., : len(unknowns)]:
+        shift, spread = lever @ unknowns, lever @ covariance @ lever.T
+        along = shift / max(float(np.hypot(*shift)), np.finfo(np.float64).tiny)
+        places.append(Place(shift, float(np.sqrt(along @ spread @ along)) if known else np.inf))
+    return tuple(places)
+
+
+def _levers(places: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the matrices (n, 2, 6) from the unknowns to the shift at places (n, 2), from -1 to 1 along each side."""
+    terms = np.column_stack([np.ones(len(places)), places])
+    return np.asarray(np.einsum("nk,ab->nakb", terms, np.eye(2)).reshape(len(places), 2, 6))
+
+
+def _middles() -> NDArray[np.float64]:
+    """Return the middles (parts, 2) of the parts, from -1 to 1 along each side."""
+    side = (2.0 * np.arange(PARTS) + 1.0) / PARTS - 1.0
+    return np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+
+
+def _cell(bins: int) -> NDArray[np.float64]:
+    """Return the places (bins, bins, 2) of the bins in shares of the basis."""
+    share = np.arange(bins) / bins
+    return np.stack(np.meshgrid(share, share), axis=-1)
+
+
+def _discs(lattice: Lattice, bins: int, width: float) -> NDArray[np.float64]:
+    """Return discs of a width in pitches on the cell (bins, bins), a pixel's rim soft."""
+    place, radius = _cell(bins), 0.5 * width * float(lattice.pitch.mean())
+    steps = range(-2, 4)
+    distances = (np.linalg.norm((place - (i, j)) @ lattice.basis, axis=-1) for i in steps for j in steps)
+    return np.asarray(sum(np.clip(radius + 0.5 - distance, 0.0, 1.0) for distance in distances))
+
+
+def _between(cells: Cells, shape: tuple[int, int], pattern: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the numbers of pixels, of enough all over a picture, that uniform light leaves dark; of all if none is."""
+    number = np.arange(0, shape[0] * shape[1], shape[0] * shape[1] // ENOUGH + 1)
+    place = np.column_stack([number % shape[1], number // shape[1]]) - cells.origin_px
+    share = place @ cells.inverse_basis
+    i, j = np.rint(share).astype(np.int64).T
+    share = share - cells.off[j - cells.first_j, i - cells.first_i]
+    column, row = np.rint(len(pattern) * share).astype(np.int64).T % len(pattern)
+    return np.asarray(number[pattern[row, column] <= max(DARK_SHARE * pattern.max(), pattern.min())])
+
+
+def _over(light: NDArray[np.float64], area: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the mean light (parts, bins, bins) of pixels, 0 in bins without any."""
+    return np.asarray(light / np.where(area > 0.0, area, 1.0))

@@ -1,0 +1,183 @@
+"""Lens images that have moved since the calibration, told by a picture's light; and what else that light tells."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lfpiv_cli.calibration.lattice import lattice_through
+from lfpiv_cli.calibration.lens_light import PARTS, Cells, LensImages, folded
+from lfpiv_cli.calibration.light_checks import dark_notices, level_notices, position_notices, uniform_notices
+from lfpiv_cli.calibration.rectification import Rectification
+from lfpiv_cli.calibration.sheet import sheet_fit
+from lfpiv_cli.files.provenance import also_used_as
+from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.microlenses import Lattice
+
+SHAPE = (170, 200)
+PITCH_PX, RADIUS_PX = 10.3, 4.9
+NOISE = 2.0
+
+
+@pytest.fixture
+def lattice(layout: str) -> Lattice:
+    return Lattice.regular(PITCH_PX, layout, np.deg2rad(0.6), (98.7, 84.2))
+
+
+@pytest.fixture
+def images(lattice: Lattice, table2: Camera) -> LensImages:
+    camera = replace(table2, columns=SHAPE[1], rows=SHAPE[0]).with_micro_images(lattice)
+    return LensImages.of(Rectification(sheet_fit(camera), SHAPE), None, 2.0 * RADIUS_PX / PITCH_PX)
+
+
+def uniform(lattice: Lattice, shift_px: Sequence[float] = (0.0, 0.0)) -> NDArray[np.float64]:
+    """Return uniform light on lens images that have moved."""
+    place = places() - np.array(shift_px)
+    distance = np.linalg.norm(place - lattice.points(lattice.nearest(place)), axis=-1)
+    return np.clip(RADIUS_PX + 0.5 - distance, 0.0, 1.0)
+
+
+def tracers(
+    lattice: Lattice, shift_px: Sequence[float] = (0.0, 0.0), *, share: float = 0.3, tilt: float = 0.0, seed: int = 0
+) -> NDArray[np.float64]:
+    """Return light that is bright behind a share of the lenses, more to the right of each, and noise."""
+    rng = np.random.default_rng(seed)
+    lens = lattice.nearest(places() - np.array(shift_px)) - lattice.nearest(places()).min(axis=(0, 1)) + 2
+    brightness = rng.exponential(1000.0, lens.max(axis=(0, 1)) + 1)
+    brightness *= rng.random(brightness.shape) < share
+    across = (places() - np.array(shift_px) - lattice.points(lattice.nearest(places() - np.array(shift_px))))[..., 0]
+    lit = uniform(lattice, shift_px) * brightness[lens[..., 0], lens[..., 1]] * (1.0 + tilt * across / RADIUS_PX)
+    return lit + rng.normal(0.0, NOISE, SHAPE)
+
+
+def places() -> NDArray[np.float64]:
+    row, column = np.indices(SHAPE)
+    return np.stack([column, row], axis=-1).astype(float)
+
+
+def codes(images: LensImages, picture: NDArray[np.float64]) -> list[str]:
+    return [notice.code for notice in position_notices(images, picture, "a", "b")]
+
+
+def test_folding_is_a_histogram(lattice: Lattice, rng: np.random.Generator) -> None:
+    picture, bins = rng.normal(1.0, 1.0, SHAPE), 8
+    picture[3, 5] = np.nan
+    expected = np.zeros((PARTS**2, bins, bins))
+    for row in range(SHAPE[0]):
+        for column in range(SHAPE[1]):
+            light = picture[row, column].astype(np.float32) - 0.5
+            u, v = lattice.coordinates((column, row)) * bins
+            part = row * PARTS // SHAPE[0] * PARTS + column * PARTS // SHAPE[1]
+            for m in (int(np.floor(v)), int(np.floor(v)) + 1):
+                for n in (int(np.floor(u)), int(np.floor(u)) + 1):
+                    if light > 0.0:
+                        expected[part, m % bins, n % bins] += light * (1.0 - abs(v - m)) * (1.0 - abs(u - n))
+    cells = Cells.of(lattice, SHAPE)
+    np.testing.assert_allclose(folded(picture, 0.5, cells, bins), expected, rtol=1e-6, atol=1e-6)
+
+
+def test_folding_follows_a_lattice_that_is_bent(lattice: Lattice, table2: Camera) -> None:
+    indices = np.stack(np.meshgrid(np.arange(-12, 13), np.arange(-12, 13)), axis=-1).reshape(-1, 2)
+    bent = lattice.points(indices)
+    bent = bent + 1e-6 * (bent - 90.0) ** 3
+    inside = np.all((bent > 0) & (bent < SHAPE[::-1]), axis=1)
+    fit = lattice_through(indices[inside], bent[inside], np.array([99.5, 84.5]), lattice.layout)
+    assert fit.cubic_used
+    dots = np.zeros(SHAPE)
+    column, row = np.rint(bent[inside]).astype(int).T
+    dots[row, column] = 1.0
+    bins = 10
+    light = folded(dots, 0.0, Cells.of(fit.lattice_px, SHAPE, fit), bins).sum(axis=0)
+    middle = light[np.ix_([-1, 0, 1], [-1, 0, 1])].sum()
+    assert middle > 0.99 * light.sum()
+
+
+@pytest.mark.parametrize("shift", [(0.0, 0.0), (0.3, 0.0), (-2.4, 3.1)])
+@pytest.mark.parametrize("tilt", [0.0, 0.4])
+def test_shift_is_found_within_its_error(
+    images: LensImages, lattice: Lattice, shift: tuple[float, float], tilt: float
+) -> None:
+    found = images.beside(tracers(lattice, shift, tilt=tilt))
+    assert found.lit
+    assert found.following == pytest.approx(1.0, abs=0.25)
+    for place in found.places:
+        assert place.sigma_px < 0.08
+        assert np.hypot(*(place.shift_px - shift)) < max(5.0 * place.sigma_px, 0.05)
+    assert codes(images, tracers(lattice, shift, tilt=tilt)) == (["lens-images-moved"] if any(shift) else [])
+
+
+def test_stated_errors_are_those_made(images: LensImages, lattice: Lattice) -> None:
+    relative = []
+    for seed in range(12):
+        place = images.beside(tracers(lattice, share=0.15, seed=seed)).places[0]
+        relative.append(place.shift_px / place.sigma_px)
+    # of two components with the larger one's error, and errors that are rather too large
+    assert 0.2 < np.sqrt(np.mean(np.square(relative))) < 1.3
+
+
+def test_a_lattice_that_has_turned_is_told(images: LensImages, lattice: Lattice) -> None:
+    turned = Lattice.regular(PITCH_PX, lattice.layout, np.deg2rad(1.0), lattice.origin)
+    assert codes(images, tracers(turned)) == ["lens-images-moved"]
+
+
+def test_too_little_light_tells_nothing(images: LensImages, lattice: Lattice, rng: np.random.Generator) -> None:
+    assert codes(images, rng.normal(0.0, NOISE, SHAPE)) == []
+    # a tracer behind one lens, in the middle of one of the parts
+    one = tracers(lattice, (3.0, 0.0), share=0.0)
+    one[92:106, 110:124] += 500.0 * uniform(lattice, (3.0, 0.0))[92:106, 110:124]
+    assert not np.isfinite(images.beside(one).places[0].sigma_px)
+    assert codes(images, one) == []
+    # bright pixels
+    assert codes(images, rng.normal(0.0, NOISE, SHAPE) + 500.0 * (rng.random(SHAPE) < 1e-3)) == []
+
+
+def test_light_of_another_camera_is_told(images: LensImages, lattice: Lattice) -> None:
+    other = Lattice.regular(1.21 * PITCH_PX, lattice.layout, 0.1, (95.0, 80.0))
+    assert codes(images, tracers(other)) == ["light-off-lens-images"]
+
+
+@pytest.mark.parametrize(
+    ("offset", "told"), [(0.0, []), (2.0 * NOISE, []), (60.0, ["dark-level"]), (-60.0, ["dark-level"])]
+)
+def test_offset_between_lens_images_is_told(
+    images: LensImages, lattice: Lattice, offset: float, told: list[str]
+) -> None:
+    picture = tracers(lattice, share=0.1) + offset
+    assert [notice.code for notice in level_notices(images, picture, "a")] == told
+
+
+def test_uniform_light_is_no_frame(images: LensImages, lattice: Lattice, table2: Camera) -> None:
+    camera = replace(table2, columns=SHAPE[1], rows=SHAPE[0]).with_micro_images(lattice)
+    indices = np.unique(lattice.nearest(places()).reshape(-1, 2), axis=0)
+    centres = lattice.points(indices)
+    whole = np.all((centres > RADIUS_PX) & (centres < np.array(SHAPE[::-1]) - RADIUS_PX), axis=1)
+    fit = replace(sheet_fit(camera), indices=indices[whole], centres_px=centres[whole])
+    noise = tracers(lattice, share=0.0)
+    told = [notice.code for notice in uniform_notices(images, fit, 1000.0 * uniform(lattice) + noise, "a")]
+    assert told == ["frame-uniform"]
+    for share in (0.1, 0.9):
+        assert not list(uniform_notices(images, fit, tracers(lattice, share=share), "a"))
+    assert not list(uniform_notices(images, sheet_fit(camera), 1000.0 * uniform(lattice) + noise, "a"))
+
+
+def test_dark_image_with_the_light_on_is_told(images: LensImages, lattice: Lattice, rng: np.random.Generator) -> None:
+    dark = 100.0 + rng.normal(0.0, NOISE, SHAPE)
+    dark[rng.random(SHAPE) < 1e-3] += 500.0
+    assert not dark_notices(images, dark)
+    assert [notice.code for notice in dark_notices(images, dark + 30.0 * uniform(lattice))] == ["dark-lit"]
+
+
+def test_a_picture_that_was_given_before_is_known() -> None:
+    before = {"command": "calibrate-snapshot", "inputs": {"white": {"sha256": "w"}, "board": {"sha256": "b"}}}
+
+    def made(image: str) -> dict[str, object]:
+        given = {"image": {"sha256": image}, "dark": {"sha256": "d"}}
+        return {"command": "reconstruct page 0", "inputs": given, "made_from": {"c": before}}
+
+    assert also_used_as(made("b"), "image") == "board of calibrate-snapshot"
+    assert also_used_as(made("d"), "image") == "dark of reconstruct"
+    assert also_used_as(made("a"), "image") is None
