@@ -6,17 +6,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+import yaml
 
+import lfpiv_cli as lf
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media, Window
 from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.optics.pupils import real_lens, refocused, thin_lens
-from lfpiv_cli.optics.tracing import slopes_equivalent, slopes_exact, trace
+from lfpiv_cli.optics.tracing import disc_points, slopes_equivalent, slopes_exact, trace
 
 F_1, F_2 = 150.0, 150.0
 # From the front lens to the object in focus, mm.
-TO_FOCUS = 340.0
-S_MU, F_MU, PIXEL, PITCH = 0.8, 0.75, 0.0055, 0.1
+TO_FOCUS = 200.0
+S_MU, F_MU, PIXEL, PITCH = 0.8, 0.75, 0.01, 0.1
 WATER = Media(1.0, 1.49, 1.33)
 
 
@@ -113,7 +115,7 @@ def test_points_in_water_are_seen_by_snell_from_the_entrance_pupil(lenses, rng):
     stop, slope = rng.uniform(-8.0, 8.0, 100), rng.uniform(-0.06, 0.06, 100)
     front = stop - lenses.before * slope
     outward = slope + front / F_1
-    to_window, glass, depth = 250.0, 3.0, rng.uniform(5.0, 40.0, 100)
+    to_window, glass, depth = 150.0, 3.0, rng.uniform(5.0, 40.0, 100)
     sine = outward / np.hypot(1.0, outward)
     fluid = (sine / 1.33) / np.sqrt(1.0 - (sine / 1.33) ** 2)
     wall = (sine / 1.49) / np.sqrt(1.0 - (sine / 1.49) ** 2)
@@ -151,3 +153,92 @@ def test_refocused_is_the_same_lens_at_another_magnification(camera, entrance_ov
     told = thin_lens(replace(camera, magnification=-0.8), entrance_over_exit)
     for name in ("magnification", "focal_length_mm", "microlens_distance_mm", "pixel_mm", "entrance_over_exit"):
         assert getattr(seen, name) == pytest.approx(getattr(told, name), rel=1e-14)
+
+
+COLUMNS, ROWS, STOP_RADIUS = 210, 180, 8.0
+SPACING, DOTS, DOT_MM, BOARD_Z = 0.7, (4, 3), 0.3, 0.3
+TRACER_MM = 0.05
+
+
+def photograph(lenses, stop, slope) -> np.ndarray:
+    """Return the rays that each pixel gets behind an array that is turned and shifted, as a picture (rows, columns)."""
+    lattice = Lattice.regular(PITCH, "square", 0.004, (0.013, -0.021))
+    array, behind = lenses.from_stop(stop, slope)
+    centre = lattice.points(np.rint(lattice.coordinates(array)))
+    sensor = array + S_MU * (behind - (array - centre) / F_MU)
+    column, row = np.floor(sensor / PIXEL + 0.5 * np.array([COLUMNS, ROWS])).astype(int).T
+    seen = (column >= 0) & (column < COLUMNS) & (row >= 0) & (row < ROWS)
+    return np.bincount(row[seen] * COLUMNS + column[seen], minlength=ROWS * COLUMNS).reshape(ROWS, COLUMNS)
+
+
+def picture_of(lenses, points, rays, rng) -> np.ndarray:
+    """Return the picture of points (n, 3) that shine alike, some rays each."""
+    points = np.repeat(points, rays, axis=0)
+    stop = disc_points(len(points), STOP_RADIUS, rng)
+    return photograph(lenses, stop, lenses.to_stop(points[:, :2], points[:, 2:], stop))
+
+
+def white_picture(lenses, rng) -> np.ndarray:
+    """Return the picture of uniform light: rays from everywhere in the stop to everywhere on the array."""
+    stop, reach = disc_points(3_000_000, STOP_RADIUS, rng), 0.55 * PIXEL * np.array([COLUMNS, ROWS])
+    array, to_array = rng.uniform(-reach, reach, stop.shape), lenses.image()[0]
+    left = 1.0 - to_array / F_2
+    return photograph(lenses, stop, (array - stop * left) / (lenses.behind * left + to_array))
+
+
+def data_sheet(lenses, folder):
+    """Return the rig as its owner would describe it."""
+    q = lenses.entrance_over_exit
+    ratio = {"pupil_ratio": 1.0 / q} if q > 1e-9 else {"image_distance": "infinite"}
+    size = [round(0.75 * side * PIXEL / abs(lenses.image()[1]), 2) for side in (COLUMNS, ROWS)]
+    told = {
+        "camera": {
+            "main_lens": {
+                "magnification": lenses.image()[1],
+                "focal_length_mm": lenses.focal_length,
+                "aperture_mm": 2.0 * STOP_RADIUS * lenses.entrance_per_stop,
+                **ratio,
+            },
+            "microlenses": {"pitch_mm": PITCH, "focal_length_mm": F_MU},
+            "sensor": {
+                "pixel_um": 1e3 * PIXEL,
+                "columns": COLUMNS,
+                "rows": ROWS,
+                "microlens_distance_mm": S_MU,
+            },
+        },
+        "media": {},
+        "board": {"dots": list(DOTS), "spacing_mm": SPACING, "dot_diameter_mm": DOT_MM, "polarity": "bright"},
+        "volume": {"size_mm": [*size, 10.0]},
+        "reconstruction": {"particle_diameter_mm": TRACER_MM},
+    }
+    path = folder / "rig.yaml"
+    path.write_text(yaml.safe_dump(told))
+    return lf.load_rig(path)
+
+
+@pytest.mark.parametrize("name", [pytest.param("1.3", marks=pytest.mark.slow), "telecentric"])
+def test_tracers_are_found_where_they_are_behind_two_lenses_and_a_stop(name, tmp_path, rng):
+    """The whole experiment, white picture, board and tracers, in pictures that the program had no part in."""
+    lenses = LENSES[name]
+    rig = data_sheet(lenses, tmp_path)
+    columns, rows = np.indices(DOTS).reshape(2, -1) - 0.5 * (np.array(DOTS)[:, np.newaxis] - 1.0)
+    dots = np.repeat(SPACING * np.stack([columns, rows], axis=1), 300, axis=0)
+    dots += disc_points(len(dots), 0.5 * DOT_MM, rng)
+    board = picture_of(lenses, np.column_stack([dots, np.full(len(dots), BOARD_Z)]), 200, rng)
+    calibration = lf.calibrate(white_picture(lenses, rng), board, rig)
+    assert calibration.pose.z0_mm == pytest.approx(BOARD_Z, abs=0.1)
+    # Apart from each other, so that none hides another, at depths from -4.5 to 4.5 mm.
+    places = np.stack([0.65 * columns, 0.65 * rows, rng.permutation(np.linspace(-4.5, 4.5, columns.size))], axis=1)
+    places[:, :2] += rng.uniform(-0.1, 0.1, (columns.size, 2))
+    ball = rng.normal(size=(400, 3))
+    ball *= 0.5 * TRACER_MM * rng.random((400, 1)) ** (1 / 3) / np.linalg.norm(ball, axis=1, keepdims=True)
+    tracers = picture_of(lenses, (places[:, np.newaxis] + ball).reshape(-1, 3), 100, rng)
+    found = lf.find_particles(lf.build_weights(rig, calibration), tracers).position_mm
+    near = [np.argmin(np.linalg.norm((found - place) * (1.0, 1.0, 0.1), axis=1)) for place in places]
+    slope = [np.polyfit(places[:, axis], found[near, axis], 1)[0] for axis in range(3)]
+    error = np.sqrt(np.mean((found[near] - places) ** 2, axis=0))
+    assert slope == pytest.approx([1.0, 1.0, 1.0], abs=0.01)
+    # A hundredth of a microlens, as wide as 0.15 mm here, and of the depth over which light spreads by one: 1.6 mm.
+    assert error[:2].max() < 0.0025
+    assert error[2] < 0.05
