@@ -37,10 +37,10 @@ LENS = Camera(-1.0, 100.0, 25.0, 0.8, 0.8, Lattice.regular(0.1), 0.0055, SHAPE[1
 MEASURED = [
     "lenses pitch_px rotation_deg origin_px residual_px k1_per_mm2 board_z_mm tilt_deg offset_mm magnification",
     "camera_move_mm mid_plane_z_mm layout distortion_model residual_affine_px image_distance_mm",
-    "dots_found mid_plane_given dlfc_depths_mm dlfc_degree dlfc_sightings dlfc_residual_mm",
+    "dots_found mid_plane_given dlfc_depths_mm dlfc_degree dlfc_sightings dlfc_residual_mm dlfc_entrance_pupil_mm",
 ]
 UNCERTAIN = "pitch_px rotation_deg origin_px k1_per_mm2 board_z_mm tilt_deg offset_mm magnification mid_plane_z_mm"
-UNCERTAIN += " image_distance_mm"
+UNCERTAIN += " image_distance_mm dlfc_entrance_pupil_mm"
 
 
 def white_image() -> NDArray[np.float64]:

@@ -13,10 +13,13 @@ from click.testing import CliRunner
 from lfpiv_cli import open_weights
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.calibration.dlfc import SeenBoard, aligned, fit_rays
+from lfpiv_cli.calibration.entrance_pupil import entrance_pupil_mm, shown
+from lfpiv_cli.calibration.sheet import entrance_pupil_notices
 from lfpiv_cli.cli import cli
 from lfpiv_cli.errors import InputError, LfpivError
 from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.optics.object_space import ObjectSpace
+from lfpiv_cli.optics.pupils import thin_lens
 from lfpiv_cli.optics.tracing import disc_points, slopes_equivalent, trace
 from lfpiv_cli.synthetic import board as synthetic_board
 from lfpiv_cli.synthetic.board import BoardPlacement, render_board
@@ -58,6 +61,49 @@ def test_fitted_rays_meet_the_array_where_traced_ones_do_eq_1(camera, water, rng
     # leave 0.6. The distortion moves rays by up to 2 um, the board's turn by 20.
     error = fit.rays.on_array(points, lens) - truth
     assert np.sqrt(np.mean(error**2)) < 0.9e-3
+
+
+def test_boards_at_several_depths_show_the_entrance_pupil_and_rays_are_fitted_behind_it(table2, water, rng):
+    """A lens of P = 1.3, told as a thin one: its entrance pupil is 100 (1/1.3 + 1) = 176.9 mm away, not 200."""
+    told = replace(small(table2), aperture_mm=22.0)
+    seen_by = thin_lens(told, 1.0 / 1.3)
+    images = pictures(seen_by, water, rng, [BoardPlacement(z, (0.05, -0.03)) for z in DEPTHS])
+    told = told.with_micro_images(seen_by.micro_image_lattice_px())  # as a white image has it
+    fit = fit_rays(images, DEPTHS, told, BOARD, water)
+    assert 0.3 < fit.entrance_pupil_sigma_mm < 1.5
+    assert fit.entrance_pupil_mm == pytest.approx(100.0 / 1.3 + 100.0, abs=2.0 * fit.entrance_pupil_sigma_mm)
+    camera = fit.behind_its_pupil(told)
+    assert camera.focus_distance_mm == pytest.approx(fit.entrance_pupil_mm, rel=1e-12)
+    assert fit.behind_its_pupil(camera) is camera
+    points = rng.uniform((-0.8, -0.5, -4.0), (0.8, 0.5, 5.0), (500, 3))
+    lens = disc_points(500, 10.0, rng)
+    truth = trace(seen_by, lens, slopes_equivalent(points, lens, seen_by, water)).array_mm
+    # The crossings of the thin lens are an eighth too far out: rays were off by 7 um.
+    error = fit.rays.on_array(points, lens) - truth
+    assert np.sqrt(np.mean(error**2)) < 0.9e-3
+    (notice,) = entrance_pupil_notices(fit.entrance_pupil_mm, fit.entrance_pupil_sigma_mm, told)
+    assert "pupil_ratio (1.3 if all else is right)" in notice.remedy
+
+
+@pytest.mark.parametrize("entrance_over_exit", [1.25, 1.0, 0.6, 0.0])
+def test_the_entrance_pupil_follows_from_how_boards_shrink(table2, rng, entrance_over_exit):
+    camera = thin_lens(replace(table2, magnification=-0.6), entrance_over_exit)
+    plate = rng.uniform(-2.0, 2.0, (9, 2))
+    dot, crossing = np.repeat(np.arange(9), 20), rng.uniform(-9.0, 9.0, (180, 2))
+    boards = []
+    for z in (-4.0, -1.5, 2.0, 6.0):
+        distance = camera.focus_distance_mm + (z + 0.7) / 1.33  # depths count from anywhere
+        turned = np.stack([plate[:, 0] - 0.01 * plate[:, 1], plate[:, 1] + 0.01 * plate[:, 0]], axis=1) / np.hypot(
+            1, 0.01
+        )
+        forward = camera.image_distance_mm / distance
+        array = camera.defocus(distance) * crossing - forward * (turned + (0.3, -0.2))[dot]
+        boards.append(shown(z, plate, dot, 1.1 * crossing, array))
+    found, sigma = entrance_pupil_mm(boards, 1.0 / 1.33)
+    assert found == pytest.approx(100.0 * (entrance_over_exit + 1.0 / 0.6), rel=1e-9)
+    assert 0.0 < sigma < 0.01 * found
+    assert entrance_pupil_mm(boards[:2], 1.0 / 1.33) is None
+    assert entrance_pupil_mm([replace(each, z_mm=-each.z_mm) for each in boards], 1.0 / 1.33) is None
 
 
 def test_three_depths_give_degree_two_and_two_are_refused(table2, water, rng):

@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from lfpiv_cli.calibration.board import candidate_depths, dot_signal, first_dots
 from lfpiv_cli.calibration.board_pose import BoardGeometry, on_the_grid
+from lfpiv_cli.calibration.entrance_pupil import entrance_pupil_mm, shown
 from lfpiv_cli.calibration.near_pixels import RIM_PER_PATCH
 from lfpiv_cli.calibration.rectification import turn_matrix
 from lfpiv_cli.calibration.views import lens_table, sub_aperture_view, view_crossings
@@ -29,6 +30,7 @@ from lfpiv_cli.errors import InputError
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
 from lfpiv_cli.optics.polynomial_rays import LARGEST_DEGREE, PolynomialRays, complete_exponents, polynomial_terms
+from lfpiv_cli.optics.pupils import with_entrance_pupil
 from lfpiv_cli.robust import MAD_TO_SIGMA
 
 # A polynomial of degree k needs k + 1 depths, and as many rows and columns of dots.
@@ -42,6 +44,9 @@ CONTRAST_SHARE = 0.3
 # Sightings off the polynomials by this many robust deviations are strays; what is left is looked at once more.
 OUTLIER_SIGMAS = 6.0
 FIT_ROUNDS = 3
+# The place of the entrance pupil that boards show replaces the data sheet's when it differs by more standard errors
+# than chance explains.
+ENTRANCE_PUPIL_SIGMAS = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +60,8 @@ class RayFit:
     reach_mm : (2, 2) lowest and highest x and y of the dots
     sightings : dots times views that the fit rests on
     residual_mm : (boards, 2) root mean square misfit on the array, along columns and rows
+    entrance_pupil_mm, entrance_pupil_sigma_mm : how far the main lens's entrance pupil lies from the focal plane, in
+        air, or None
     """
 
     rays: PolynomialRays
@@ -62,6 +69,8 @@ class RayFit:
     reach_mm: NDArray[np.float64]
     sightings: int
     residual_mm: NDArray[np.float64]
+    entrance_pupil_mm: float | None = None
+    entrance_pupil_sigma_mm: float | None = None
 
     def to_tree(self) -> dict[str, Any]:
         """Return everything as a nested dict of arrays and numbers."""
@@ -76,6 +85,13 @@ class RayFit:
         KeyError, ValueError : something is missing or cannot be
         """
         return cls(**(dict(tree) | {"rays": PolynomialRays.from_tree(tree["rays"])}))
+
+    def behind_its_pupil(self, camera: Camera) -> Camera:
+        """Return a camera with the entrance pupil where the boards show it, if that is another place than it has."""
+        found, sigma = self.entrance_pupil_mm, self.entrance_pupil_sigma_mm
+        if found is None or sigma is None or abs(found - camera.focus_distance_mm) <= ENTRANCE_PUPIL_SIGMAS * sigma:
+            return camera
+        return with_entrance_pupil(camera, found)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,6 +133,9 @@ def fit_rays(
 ) -> RayFit:
     """Fit the polynomials to pictures of a board at several depths.
 
+    They count where rays cross the main lens as the camera does. Where the boards show its entrance pupil elsewhere
+    they are fitted once more, with the camera that `RayFit.behind_its_pupil` gives.
+
     Parameters
     ----------
     images : (rows, columns) each, rectified, less the dark frame
@@ -130,6 +149,25 @@ def fit_rays(
     """
     if board.pattern != "dots":
         raise InputError(f"polynomials are fitted to boards of dots, and board.pattern is {board.pattern}")
+    first = _fit_as_seen_by(camera, images, depths_mm, board, media, transmission)
+    better = first.behind_its_pupil(camera)
+    if better is camera:
+        return first
+    better = better.with_micro_images(camera.micro_image_lattice_px())
+    again = _fit_as_seen_by(better, images, depths_mm, board, media, transmission)
+    pupil = {name: getattr(first, name) for name in ("entrance_pupil_mm", "entrance_pupil_sigma_mm")}
+    return replace(again, **pupil)
+
+
+def _fit_as_seen_by(
+    camera: Camera,
+    images: Sequence[ArrayLike],
+    depths_mm: Sequence[float],
+    board: BoardGeometry,
+    media: Media,
+    transmission: NDArray[np.float32] | None,
+) -> RayFit:
+    """Fit the polynomials with a camera believed as it is; parameters and errors are those of `fit_rays`."""
     depths = np.asarray(depths_mm, dtype=np.float64)
     different = np.unique(depths).size
     if different <= SMALLEST_DEGREE:
@@ -159,7 +197,23 @@ def fit_rays(
     reach = np.stack([start[used, :2].min(axis=0), start[used, :2].max(axis=0)])
     number = np.repeat(np.arange(len(seen)), [len(each.dot) for each in seen])
     rms = [np.sqrt(np.mean(residual[used & (number == k)] ** 2, axis=0)) for k in range(len(seen))]
-    return RayFit(rays, depths, reach, int(used.sum()), np.array(rms))
+    views = [alone_in_its_lens(each, camera) for each in seen]
+    sizes = [
+        shown(one.z_mm, _plate(one.index, board), each.dot, each.crossing_mm, each.array_mm)
+        for one, each in zip(boards, views, strict=True)
+        if len(each.dot)
+    ]
+    pupil = entrance_pupil_mm(sizes, media.depth_ratio) or (None, None)
+    return RayFit(rays, depths, reach, int(used.sum()), np.array(rms), *pupil)
+
+
+def alone_in_its_lens(sightings: Sightings, camera: Camera) -> Sightings:
+    """Return the sightings in views that no neighbouring lens's image reaches, where the aperture is a little wide."""
+    step = camera.pixel_mm * camera.image_distance_mm / camera.microlens_distance_mm
+    next_image = float(camera.lattice.pitch.min()) / camera.pixel_mm * step
+    clear = next_image - camera.aperture_radius_mm - RIM_PER_PATCH * step
+    kept = np.hypot(*sightings.crossing_mm.T) <= clear
+    return Sightings(sightings.dot[kept], sightings.crossing_mm[kept], sightings.array_mm[kept])
 
 
 def seen_board(

@@ -116,7 +116,7 @@ class Calibration:
         return self.rectification.image_shape
 
     def camera(self, camera: Camera) -> Camera:
-        """Return the data sheet's camera with the measured lattice, rectified, magnification and distortion.
+        """Return the data sheet's camera with the measured lattice, rectified, magnification, distortion and pupils.
 
         Raises
         ------
@@ -133,6 +133,8 @@ class Calibration:
             if difference > MAGNIFICATION_SIGMAS * self.pose.magnification_sigma:
                 camera = refocused(camera, self.pose.magnification)
             camera = replace(camera, distortion_per_mm2=self.pose.distortion_per_mm2)
+        if self.ray_fit is not None:
+            camera = self.ray_fit.behind_its_pupil(camera)
         return camera.with_micro_images(self.rectification.lattice_px)
 
     def vignetting(self) -> NDArray[np.float64] | None:
@@ -173,6 +175,8 @@ class Calibration:
             "mid_plane_z_mm": self.mid_plane_z_mm,
             "mid_plane_z_mm_sigma": self.mid_plane_z_sigma_mm,
             "mid_plane_given": None if self.mid_plane_z_mm is None else self.mid_plane_given,
+            "dlfc_entrance_pupil_mm": rays.entrance_pupil_mm if rays else None,
+            "dlfc_entrance_pupil_mm_sigma": rays.entrance_pupil_sigma_mm if rays else None,
             "dlfc_depths_mm": rays.depths_mm.tolist() if rays else None,
             "dlfc_degree": rays.rays.degree if rays else None,
             "dlfc_sightings": rays.sightings if rays else None,

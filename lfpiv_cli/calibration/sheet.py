@@ -12,7 +12,7 @@ from lfpiv_cli.calibration.lattice import EXPONENTS, LatticeFit
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.optics.camera import Camera
-from lfpiv_cli.optics.pupils import real_lens
+from lfpiv_cli.optics.pupils import real_lens, with_entrance_pupil
 
 # A lattice further from the data sheet than this is another camera, a binned sensor or a slip in the sheet: the
 # projection itself makes up to 4 % where the main lens is not known.
@@ -21,6 +21,8 @@ LARGEST_DIFFERENCE = 0.05
 # this are no contradiction.
 IMAGE_DISTANCE_TOLERANCE = 0.1
 IMAGE_DISTANCE_SIGMAS = 3.0
+# Focal lengths are named to a few per cent.
+ENTRANCE_PUPIL_TOLERANCE = 0.03
 # A lens is focused by hand; a board of another spacing, or in another medium, is off by a tenth or more.
 MAGNIFICATION_TOLERANCE = 0.05
 # Share of a board's points that are found without a word: an origin may be left out, some may lie in dirt.
@@ -124,6 +126,28 @@ def magnification_notices(measured: float, camera: Camera) -> list[Notice]:
             "correct what is off of board.spacing_mm, board.medium and main_lens.magnification",
             measured,
             f"{sheet:.4g} within {MAGNIFICATION_TOLERANCE:.0%}",
+        )
+    ]
+
+
+def entrance_pupil_notices(found_mm: float | None, sigma_mm: float | None, camera: Camera) -> list[Notice]:
+    """Return what speaks against the place of the entrance pupil that boards at several depths show."""
+    sheet = camera.focus_distance_mm
+    if found_mm is None or sigma_mm is None:
+        return []
+    if abs(found_mm - sheet) <= max(IMAGE_DISTANCE_SIGMAS * sigma_mm, ENTRANCE_PUPIL_TOLERANCE * sheet):
+        return []
+    inverse = with_entrance_pupil(camera, found_mm).entrance_over_exit
+    ratio = f"{1.0 / inverse:.3g}" if inverse > 0.0 else "image_distance: infinite"
+    return [
+        Notice(
+            "entrance-pupil",
+            "camera.main_lens.pupil_ratio",
+            f"the boards show the entrance pupil {found_mm:.4g} mm from the focal plane, the data sheet {sheet:.4g} mm",
+            "correct what is off of main_lens.focal_length_mm, media.fluid, the boards' depths and pupil_ratio "
+            f"({ratio} if all else is right)",
+            found_mm,
+            f"{sheet:.4g} mm within {ENTRANCE_PUPIL_TOLERANCE:.0%}",
         )
     ]
 

@@ -15,6 +15,7 @@ from lfpiv_cli.calibration.model import Calibration, DataSheet, Photographs
 from lfpiv_cli.calibration.sheet import (
     board_notices,
     check_f_numbers,
+    entrance_pupil_notices,
     f_number_notices,
     image_distance_notices,
     magnification_notices,
@@ -118,6 +119,9 @@ def calibration_notices(rig: Config, pictures: Photographs, found: Calibration) 
         notices += board_notices(found.pose.dots_found, rig.board.dots)
     if found.pose is not None and camera is not None:
         notices += magnification_notices(found.pose.magnification, camera)
+    if found.ray_fit is not None and camera is not None:
+        rays = found.ray_fit
+        notices += entrance_pupil_notices(rays.entrance_pupil_mm, rays.entrance_pupil_sigma_mm, camera)
     notices += light_notices(rig, pictures, found)
     if not pictures.whites:
         return [*notices, NO_WHITE_IMAGE]

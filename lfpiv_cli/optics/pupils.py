@@ -62,6 +62,12 @@ def real_lens(thin: Camera) -> Camera:
     )
 
 
+def with_entrance_pupil(camera: Camera, distance_mm: float) -> Camera:
+    """Return the camera with its entrance pupil so far from the focal plane's equivalent in air: F_m (1/P - 1/M)."""
+    real = real_lens(camera)
+    return thin_lens(real, distance_mm / real.focal_length_mm + 1.0 / real.magnification)
+
+
 def refocused(camera: Camera, magnification: float) -> Camera:
     """Return the camera with the same lens at another magnification."""
     return thin_lens(replace(real_lens(camera), magnification=magnification), camera.entrance_over_exit)
