@@ -162,6 +162,16 @@ def test_dots_that_gaps_cut_off_belong_to_the_board(table2: Camera) -> None:
     np.testing.assert_allclose(pose.offset_mm, (0.1, 0.0), atol=0.02)
 
 
+def test_a_turned_board_is_refused(table2: Camera) -> None:
+    board = BoardGeometry((5, 4), 1.0, 0.2)
+    # a dot is lost, and a stray one lies where the next column would be
+    dots = np.vstack([dot_places(board, 2.0, (0.1, 0.0), (1.0, 0.0))[1:], [[3.1, 0.5, 2.0]]])
+    sigma, array = np.full(dots.shape, 1e-3), -dots[:, :2]
+    assert len(pose_of_dots(dots, sigma, array, table2, board).indices) == 19
+    with pytest.raises(InputError, match="19 of the dots .* 5 x 4 along x and y, and 16 .* 4 x 5; correct board.dots"):
+        pose_of_dots(dots, sigma, array, table2, replace(board, dots=(4, 5)))
+
+
 def test_a_dot_off_the_plane_does_not_move_the_board(table2: Camera, rng: np.random.Generator) -> None:
     board = BoardGeometry((7, 7), 1.0, 0.2)
     dots = dot_places(board, 3.0, (0.4, -0.2), (0.5, -0.5)) + rng.normal(0.0, 1e-3, (49, 3))

@@ -225,8 +225,8 @@ def on_the_grid(dots_mm: NDArray[np.float64], board: BoardGeometry) -> tuple[NDA
             best, numbers = on_grid, found
     kept = np.nonzero(best)[0]
     indices = numbers[kept]
-    corner = best_window(indices, lateral[kept], board)
-    within = ((indices >= corner) & (indices < corner + np.array(board.dots))).all(axis=1)
+    corner, within = best_window(indices, lateral[kept], board)
+    refuse_turned(int(within.sum()), indices, lateral[kept], board)
     refuse_few(int(within.sum()), board)
     return kept[within], indices[within] - corner
 
@@ -318,8 +318,12 @@ def rows_direction(lateral: NDArray[np.float64], start: int, spacing_mm: float) 
     return spacing_mm * np.array([[cosine, sine], [-sine, cosine]])
 
 
-def best_window(indices: NDArray[np.int64], lateral: NDArray[np.float64], board: BoardGeometry) -> NDArray[np.int64]:
-    """Return the first index (2,) of the window of the board's size that holds most dots; of equals, the most central.
+def best_window(
+    indices: NDArray[np.int64], lateral: NDArray[np.float64], board: BoardGeometry
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Return the first index (2,) of the window of the board's size that holds most dots, and which (n,) these are.
+
+    Of windows that hold as many it is the most central one.
 
     Central means the dots' mean index nearest the window's middle: lost rows are shared between the two sides.
     """
@@ -333,7 +337,23 @@ def best_window(indices: NDArray[np.int64], lateral: NDArray[np.float64], board:
             off = float(np.hypot(*(corner + (size - 1) / 2.0 - indices.mean(axis=0))))
             if (count, -off) > best_rank:
                 best, best_rank = corner, (count, -off)
-    return best
+    return best, ((indices >= best) & (indices < best + size)).all(axis=1)
+
+
+def refuse_turned(count: int, indices: NDArray[np.int64], lateral: NDArray[np.float64], board: BoardGeometry) -> None:
+    """Raise where the dots are those of the board turned by 90 degrees, of which it holds `count` as it is told.
+
+    Outside of a board that is told as it is lie strays, and not most of a row as long as its shorter side.
+    """
+    across, down = board.dots
+    if across == down:
+        return
+    _, turned = best_window(indices, lateral, replace(board, dots=(down, across)))
+    if turned.sum() - count > 0.5 * min(across, down):
+        raise InputError(
+            f"{turned.sum()} of the dots are those of a board of {down} x {across} along x and y, and {count} those of "
+            f"one of {across} x {down}; correct board.dots, or camera.sensor.column_axis"
+        )
 
 
 def lengths_and_angles(fit: FlatFit, magnification: float, common_mm: float, common_depth_mm: float) -> dict[str, Any]:
