@@ -20,6 +20,7 @@ from lfpiv_cli.calibration.sheet import (
     f_number_notices,
     image_distance_notices,
     magnification_notices,
+    points_notices,
     sheet_fit,
 )
 from lfpiv_cli.calibration.transmission import lens_image_width
@@ -31,8 +32,10 @@ from lfpiv_cli.files.batch import Target, pending
 from lfpiv_cli.files.calibration_file import read_calibration
 from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.images import write_tiff
+from lfpiv_cli.files.particle_file import Points
 from lfpiv_cli.files.provenance import earlier_record, with_warnings
 from lfpiv_cli.files.weights_file import open_weights
+from lfpiv_cli.interface.tracks import still_notices
 from lfpiv_cli.interface.weights import plan_of
 from lfpiv_cli.interface.weights_cost import cost_notices, cost_of
 from lfpiv_cli.notice import Notice
@@ -41,6 +44,7 @@ from lfpiv_cli.optics.media import Media, Window
 from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.optics.paraxial import refraction_error_mm, sine_error_mm
 from lfpiv_cli.optics.pupils import thin_lens
+from lfpiv_cli.reference import Reference
 from lfpiv_cli.weights.operators import FactorisedOperator
 
 ROOT = Path(__file__).parent.parent
@@ -341,6 +345,23 @@ def test_columns_on_demand_cost_more_than_factors(tmp_path: Path) -> None:
     costs = [cost_of(each.settings, each.camera, each.source, each.grid) for each in (square, hexagonal)]
     assert costs[1].image_core_s > 10.0 * costs[0].image_core_s
     assert costs[1].weights_core_s == costs[1].weights_bytes == 0.0
+
+
+def test_one_image_twice_is_told_of_its_tracks() -> None:
+    def tracks(velocity: float) -> Points:
+        arrays = {"velocity": np.full((5, 3), velocity), "velocity_sigma": np.full((5, 3), 1e-3)}
+        arrays["velocity_sigma"][0] = np.nan
+        return Points(np.zeros((5, 3)), arrays, Reference("focal_point", 0.0), attributes={}, provenance={})
+
+    assert [notice.code for notice in still_notices(tracks(1e-6), "a")] == ["frames-alike"]
+    assert still_notices(tracks(1e-3), "a") == []
+
+
+def test_few_points_of_a_board_are_told() -> None:
+    assert points_notices(9) == []
+    (told,) = points_notices(6)
+    assert told.code == "board-few-points"
+    assert told.measured == 6.0
 
 
 def test_a_board_in_part_or_of_another_size_is_told(table2: Camera) -> None:

@@ -27,6 +27,9 @@ ENTRANCE_PUPIL_TOLERANCE = 0.03
 MAGNIFICATION_TOLERANCE = 0.05
 # Share of a board's points that are found without a word: an origin may be left out, some may lie in dirt.
 FEWEST_POINTS = 0.8
+# The standard errors of a board's place are from how its points scatter about it; of six, a third of the true error was
+# stated of the magnification.
+ENOUGH_POINTS = 9
 # Between the f-numbers of main lens and microlenses, towards the array. Lens images a quarter wider or narrower than
 # their pitch lose or waste two fifths of the light; of three times as wide or narrow ones nine overlap, or a ninth of
 # the pixels is lit.
@@ -165,6 +168,23 @@ def board_notices(found: int, dots: tuple[int, int]) -> list[Notice]:
             "correct board.dots, or bring all of the board into view",
             float(found),
             f"{count}",
+        )
+    ]
+
+
+def points_notices(found: int) -> list[Notice]:
+    """Return what speaks against so few points of a board: nobody knows how well they tell where it is."""
+    if found >= ENOUGH_POINTS:
+        return []
+    return [
+        Notice(
+            "board-few-points",
+            "board",
+            f"{found} of its points were found, at least {ENOUGH_POINTS} are needed to see how well they agree: the "
+            "stated errors may be three times too small",
+            "bring more of the board into view, or take one with smaller squares",
+            float(found),
+            f"at least {ENOUGH_POINTS}",
         )
     ]
 

@@ -19,6 +19,7 @@ from lfpiv_cli.calibration.sheet import (
     f_number_notices,
     image_distance_notices,
     magnification_notices,
+    points_notices,
 )
 from lfpiv_cli.calibration.transmission import lens_image_width
 from lfpiv_cli.calibration.white import by_aperture
@@ -117,6 +118,8 @@ def calibration_notices(rig: Config, pictures: Photographs, found: Calibration) 
     notices = [] if camera is None else f_number_notices(camera)
     if found.pose is not None and rig.board.dots is not None and rig.board.pattern != "charuco":
         notices += board_notices(found.pose.dots_found, rig.board.dots)
+    if found.pose is not None:
+        notices += points_notices(found.pose.dots_found)
     if found.pose is not None and camera is not None:
         notices += magnification_notices(found.pose.magnification, camera)
     if found.ray_fit is not None and camera is not None:

@@ -26,6 +26,8 @@ from lfpiv_cli.tracks.tracking import track as match
 ONE_SIDED = 0.5
 # With fewer particles than this no local linear fit tells which links are wrong.
 FEW = FEWEST_OF_FIT + 2
+# Displacements of still particles differ from 0 by .67 standard errors in the middle, by chance.
+STILL_SIGMAS = 0.05
 
 
 def track(
@@ -201,7 +203,26 @@ def few_notices(counts: Sequence[int], names: Sequence[str], found: Tracked) -> 
                 "some",
             )
         )
-    return notices
+    return notices + still_notices(found.points, names[0])
+
+
+def still_notices(tracks: Points, name: str) -> list[Notice]:
+    """Return what is said where nothing moves, not even by the errors of the particles' places: of one image twice."""
+    velocity, sigma = tracks.arrays["velocity"], tracks.arrays["velocity_sigma"]
+    known = sigma > 0.0
+    moved = float(np.median(np.abs(velocity[known]) / sigma[known])) if known.any() else STILL_SIGMAS
+    if moved >= STILL_SIGMAS:
+        return []
+    return [
+        Notice(
+            "frames-alike",
+            name,
+            "nothing moves from it to the next frame, not even by chance: both are one and the same image",
+            "check that the images are two",
+            moved,
+            f"above {STILL_SIGMAS:g} standard errors",
+        )
+    ]
 
 
 def settings_of(frames: Sequence[Points], names: Sequence[str]) -> Config:
