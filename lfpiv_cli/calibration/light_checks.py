@@ -29,9 +29,9 @@ LEAST_FOLLOWING = 0.7
 LEAST_CERTAIN_FOLLOWING = 0.3
 # Of what stands out of a dark image's noise, hot pixels, most lies on the lens images where these are seen in it.
 LEAST_DARK_FOLLOWING = 0.5
-# Between lens images it is dark: at most this share of the mean light, or so many standard deviations of the noise, by
-# which a background that is the minimum over a hundred images lies below it.
-LARGEST_OFFSET_SHARE, LARGEST_OFFSET_SIGMAS = 0.2, 3.0
+# Between lens images it is dark, but for what is spread there: a share of the mean light that uniform light does not
+# reach, and the noise, by three standard deviations of which the minimum over a hundred images lies below it.
+LARGEST_OFFSET_SHARE, LARGEST_OFFSET_SIGMAS = 0.1, 3.0
 # So many pixels between the lens images tell how bright it is there.
 FEWEST_BETWEEN = 200
 
@@ -91,7 +91,8 @@ def level_notices(images: LensImages, picture: NDArray[np.floating], name: str) 
         return []
     level = float(np.median(between))
     noise = MAD_TO_SIGMA * float(np.median(np.abs(between - level)))
-    largest = max(LARGEST_OFFSET_SIGMAS * noise, LARGEST_OFFSET_SHARE * abs(float(np.nanmean(picture))))
+    spread = LARGEST_OFFSET_SHARE * abs(float(np.nanmean(picture))) if level > 0.0 else 0.0
+    largest = max(LARGEST_OFFSET_SIGMAS * noise, spread)
     if abs(level) <= largest:
         return []
     return [
