@@ -1,7 +1,7 @@
 """Run the benchmarks that are named, or all of them: `python -m benchmarks [NAME ...]`.
 
 To add one: a function that takes no arguments, prints its figures, and has a line in `BENCHMARKS`; it lives in a
-function of its own with a size, which the tests call with a tiny one. `rigs` alone has options of its own.
+function of its own with a size, which the tests call with a tiny one. `rigs` and `faults` have options of their own.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from collections.abc import Callable
 from benchmarks.calibration import bench_calibration
 from benchmarks.correlation import bench_correlation, bench_correlation_accuracy
 from benchmarks.depth import bench_depth
+from benchmarks.faults import bench_faults
 from benchmarks.particles import bench_particles, bench_particles_thrice
 from benchmarks.rigs import bench_rigs
 from benchmarks.simd import bench_simd
@@ -23,6 +24,7 @@ BENCHMARKS: dict[str, Callable[[], None]] = {
     "correlation": bench_correlation,
     "correlation-accuracy": bench_correlation_accuracy,
     "depth": bench_depth,
+    "faults": bench_faults,
     "particles": bench_particles,
     "particles-thrice": bench_particles_thrice,
     "rigs": bench_rigs,
@@ -33,9 +35,10 @@ BENCHMARKS: dict[str, Callable[[], None]] = {
 
 
 def main(names: list[str]) -> None:
-    if names[:1] == ["rigs"]:
-        bench_rigs(names[1:])
-        return
+    for name, bench in (("rigs", bench_rigs), ("faults", bench_faults)):
+        if names[:1] == [name]:
+            bench(names[1:])
+            return
     unknown = [name for name in names if name not in BENCHMARKS]
     if unknown:
         sys.exit(f"no benchmark is called {unknown[0]!r}; there are {', '.join(BENCHMARKS)}")
