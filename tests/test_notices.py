@@ -206,6 +206,7 @@ def test_image_distance_is_that_of_the_exit_pupil(table2: Camera) -> None:
         assert notice.expected == ("an infinite one" if entrance_over_exit == 0.0 else f"{told:.4g} mm")
         excess = 1.002 * (1.0 + 0.8 / told) - 1.0
         assert notice.measured == pytest.approx(0.8 / excess)
+        assert f"(pupil_ratio {0.8 / excess / 100.0 - 1.0:.3g} if all else is right)" in notice.remedy
 
 
 def test_f_numbers_that_do_not_match(table2: Camera) -> None:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import h5py
 import numpy as np
 import pytest
 import yaml
 
 import lfpiv_cli as lf
+from lfpiv_cli.cli import cli
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media, Window
 from lfpiv_cli.optics.microlenses import Lattice
@@ -153,6 +155,30 @@ def test_refocused_is_the_same_lens_at_another_magnification(camera, entrance_ov
     told = thin_lens(replace(camera, magnification=-0.8), entrance_over_exit)
     for name in ("magnification", "focal_length_mm", "microlens_distance_mm", "pixel_mm", "entrance_over_exit"):
         assert getattr(seen, name) == pytest.approx(getattr(told, name), rel=1e-14)
+
+
+RIG = {
+    "camera": {
+        "main_lens": {"magnification": -1.0, "focal_length_mm": 100.0, "aperture_mm": 20.0, "pupil_ratio": 1.6},
+        "microlenses": {"pitch_mm": 0.1, "focal_length_mm": 0.8},
+        "sensor": {"pixel_um": 10.0, "columns": 60, "rows": 50},
+    },
+    "media": {},
+    "volume": {"shape_xyz": [4, 3, 2], "voxel_mm": 0.1},
+    "reconstruction": {"padding_voxel": [0, 0, 0]},
+}
+
+
+def test_weights_files_know_the_lens_and_those_without_pupils_are_read(tmp_path):
+    config, output = tmp_path / "rig.yaml", tmp_path / "weights.h5"
+    config.write_text(yaml.safe_dump(RIG))
+    cli.main(["build-weights", str(config), "-o", str(output)], standalone_mode=False)
+    made, read = lf.load_rig(config).camera_model(), lf.open_weights(output).camera
+    for name in ("focal_length_mm", "microlens_distance_mm", "pixel_mm", "entrance_over_exit"):
+        assert getattr(read, name) == getattr(made, name)
+    with h5py.File(output, "r+") as file:
+        del file["camera"].attrs["entrance_over_exit"]
+    assert lf.open_weights(output).camera.entrance_over_exit == 1.0
 
 
 COLUMNS, ROWS, STOP_RADIUS = 210, 180, 8.0

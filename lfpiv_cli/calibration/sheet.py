@@ -102,14 +102,15 @@ def image_distance_notices(fit: LatticeFit, camera: Camera) -> list[Notice]:
         if difference <= max(IMAGE_DISTANCE_TOLERANCE * sheet, IMAGE_DISTANCE_SIGMAS * found[1]):
             return []
     told = "no image distance" if found is None else f"an image distance of {found[0]:.4g} mm"
+    ratio = None if found is None else found[0] / real_lens(camera).focal_length_mm + camera.magnification
     expected = "an infinite one" if telecentric else f"{sheet:.4g} mm"
     return [
         Notice(
             "image-distance",
             "camera.main_lens",
             f"the pitch of the lens images tells {told}, the data sheet {expected}",
-            "correct what is off of microlenses.pitch_mm, sensor.pixel_um, sensor.microlens_distance_mm and main_lens "
-            "(its pupil_ratio too)",
+            "correct what is off of microlenses.pitch_mm, sensor.pixel_um, sensor.microlens_distance_mm and main_lens"
+            + (f" (pupil_ratio {ratio:.3g} if all else is right)" if ratio is not None and ratio > 0.0 else ""),
             None if found is None else found[0],
             expected,
         )
