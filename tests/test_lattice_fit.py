@@ -59,6 +59,16 @@ def test_pitch_rotation_and_origin_are_found(layout: str, rng: np.random.Generat
     assert np.all(fit.residual_px < 0.05)
 
 
+@pytest.mark.parametrize("pitch", [8.0, 10.0])
+def test_whole_pixels_between_lens_images_are_no_distortion(pitch: float, rng: np.random.Generator) -> None:
+    """As behind a telecentric lens: the centroids' own error within a pixel changes slowly from lens to lens."""
+    truth = tilted("square", pitch, 0.3)
+    fit = fit_lattice(white_image(truth, rng, 0.48))
+    assert not fit.cubic_used
+    found = fit.centres(fit.indices)
+    assert np.abs(found - truth.points(truth.nearest(found))).max() < 0.03  # a cubic is 0.1 px off
+
+
 def test_index_zero_is_the_lens_nearest_the_middle(layout: str, rng: np.random.Generator) -> None:
     fit = fit_lattice(white_image(tilted(layout), rng), layout=layout)
     middle = (np.array(SHAPE[::-1]) - 1) / 2

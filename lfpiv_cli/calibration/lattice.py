@@ -217,16 +217,22 @@ def weighted_rms(residual: NDArray[np.float64], weights: NDArray[np.float64]) ->
 
 
 def cubic_is_significant(terms: NDArray[np.float64], points: NDArray[np.float64], weights: NDArray[np.float64]) -> bool:
-    """Tell by an F-test whether the seven further coefficients per axis do enough, and more than chance."""
+    """Tell by an F-test whether the seven further coefficients per axis do enough, and more than chance.
+
+    What a centroid's place within its pixel explains is the pixels' own error: behind a telecentric lens, where lens
+    images may be whole pixels apart, it changes so slowly over the image that a cubic follows it.
+    """
     kept = weights > 0.0
     scale = np.abs(terms).max(axis=0)
+    phase = 2.0 * np.pi * points
+    beat = np.concatenate([np.sin(phase), np.cos(phase)], axis=1)
     squares = []
     for count in (3, terms.shape[1]):
-        design = (terms / scale)[kept, :count]
+        design = np.concatenate([(terms / scale)[:, :count], beat], axis=1)[kept]
         residual = points[kept] - design @ np.linalg.lstsq(design, points[kept], rcond=None)[0]
         squares.append(float(np.sum(residual**2)))
     more = 2 * (terms.shape[1] - 3)
-    rest = 2 * (int(kept.sum()) - terms.shape[1])
+    rest = 2 * (int(kept.sum()) - terms.shape[1] - beat.shape[1])
     explained = (squares[0] - squares[1]) / (2 * int(kept.sum()))
     if squares[1] >= (1.0 - CUBIC_GAIN) * squares[0] or explained < CUBIC_LEAST_PX**2:
         return False
