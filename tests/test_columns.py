@@ -135,6 +135,14 @@ def test_lines_of_sight_keep_what_is_lit_and_leave_most_out(turned, water):
     np.testing.assert_allclose(restricted.forward(volume), operator.forward(volume), atol=1e-7)
 
 
+def test_a_dark_image_has_no_columns(turned, water):
+    operator = OnDemandOperator(turned, ObjectSpace(water, None, "paraxial"), GRID)
+    dark = np.zeros(operator.image_shape, np.float32)
+    restricted = operator.restricted(dark)
+    assert restricted.voxel.size == 0
+    assert not restricted.adjoint(dark + 1.0).any()
+
+
 def test_too_many_columns_are_refused_with_their_size(turned, water, monkeypatch):
     operator = OnDemandOperator(turned, ObjectSpace(water, None, "paraxial"), GRID)
     monkeypatch.setattr(columns_module, "LARGEST_BYTES", 1000)

@@ -142,6 +142,8 @@ class OnDemandOperator:
 
     def columns_of(self, voxel: NDArray[np.int64]) -> Columns:
         """Return the columns of voxels given by their flat indices."""
+        if not voxel.size:
+            return Columns(np.zeros(1, np.int64), np.zeros(0, np.int32), np.zeros(0, np.float32))
         centres = self.centres_mm(voxel)
         columns = integrate_columns(self.camera, self.source, centres, self.sides_mm, TILES, DEPTH_NODES)
         return columns if self.transmission is None else columns.dimmed(self.transmission)
