@@ -135,6 +135,14 @@ def test_too_little_light_tells_nothing(images: LensImages, lattice: Lattice, rn
     assert codes(images, rng.normal(0.0, NOISE, SHAPE) + 500.0 * (rng.random(SHAPE) < 1e-3)) == []
 
 
+def test_rounding_is_no_light(images: LensImages, lattice: Lattice, rng: np.random.Generator) -> None:
+    """A few counts of light, of a sensor whose noise is less than one count."""
+    faint = 0.02 * tracers(lattice, share=0.1) + rng.normal(0.0, 0.5, SHAPE)
+    assert images.background(np.rint(faint))[1] == pytest.approx(0.8, abs=0.2)
+    assert images.beside(np.rint(faint)).following > 0.7
+    assert codes(images, np.rint(faint)) == []
+
+
 def test_light_of_another_camera_is_told(images: LensImages, lattice: Lattice) -> None:
     other = Lattice.regular(1.21 * PITCH_PX, lattice.layout, 0.1, (95.0, 80.0))
     assert codes(images, tracers(other)) == ["light-off-lens-images"]

@@ -34,6 +34,8 @@ LIGHT_SIGMAS = 3.0
 # Of a normal distribution these percentiles lie one and two standard deviations below its middle. So many pixels tell
 # them to a per cent.
 ONE_BELOW, TWO_BELOW, ENOUGH = 15.87, 2.275, 60_000
+# Multiples of the golden section lie evenly between whole numbers, however many.
+GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 # Of noise alone this share of a standard deviation stands above three of them, on average; light is ten times of it.
 NOISE_LIGHT, TIMES_NOISE = 3.8e-4, 10.0
 # Gauss-Newton from the best of the bins settles to a thousandth of a pixel.
@@ -153,7 +155,11 @@ class LensImages:
         between = between[np.isfinite(between)]
         if not between.size:
             return 0.0, 0.0
-        two, one = np.percentile(between, [TWO_BELOW, ONE_BELOW])
+        # Whole counts are spread evenly over what was rounded: of little noise percentiles are steps.
+        values = np.unique(between)
+        step = float(np.diff(values).min()) if values.size > 1 else 0.0
+        rounded = step * ((GOLDEN * np.arange(between.size)) % 1.0 - 0.5)
+        two, one = np.percentile(between + rounded, [TWO_BELOW, ONE_BELOW])
         return float(2.0 * one - two), float(one - two)
 
     def _settled(self, light: NDArray[np.float64], unknowns: NDArray[np.float64]) -> tuple[System, NDArray[np.float64]]:

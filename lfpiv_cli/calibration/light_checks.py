@@ -31,7 +31,7 @@ LEAST_CERTAIN_FOLLOWING = 0.3
 LEAST_DARK_FOLLOWING = 0.5
 # Between lens images it is dark, but for what is spread there: a share of the mean light that uniform light does not
 # reach, and the noise, by three standard deviations of which the minimum over a hundred images lies below it.
-LARGEST_OFFSET_SHARE, LARGEST_OFFSET_SIGMAS = 0.1, 3.0
+LARGEST_OFFSET_SHARE, LARGEST_OFFSET_SIGMAS = 0.05, 3.0
 # So many pixels between the lens images tell how bright it is there.
 FEWEST_BETWEEN = 200
 
