@@ -185,7 +185,7 @@ class ReconstructionSection(Section):
     stop_noise: end when the residual is this many times the image's noise (default: never): read noise and, with
     photons_per_count, light's own; the solver `particles` begins with it.
     saturation_counts: pixels as bright as this are left out (default: those at the end of 8 to 16 bits).
-    particle_diameter_mm: of the tracers; only the solver `particles` reads it.
+    particle_diameter_mm: of the tracers (default: by their images); only the solver `particles` reads it.
     accelerate: step from points extrapolated by Nesterov's momentum; a quarter of the iterations will do.
     padding_voxel: voxels [x, y, z] solved for beyond each side of the volume and cropped on writing (default: derived
     from how far light spreads).
@@ -197,7 +197,7 @@ class ReconstructionSection(Section):
     stop_noise: Positive | None = None
     photons_per_count: Positive | None = None
     saturation_counts: Positive | None = None
-    particle_diameter_mm: Positive = 0.05
+    particle_diameter_mm: Positive | None = None
     iterations: Annotated[int, Field(ge=1, le=100_000)] = 24
     relaxation: Annotated[float, Field(gt=0.0, le=2.0)] = 1.0
     accelerate: bool = True

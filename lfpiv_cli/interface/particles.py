@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,7 @@ from lfpiv_cli.interface.reconstruction import (
 )
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.optics.object_space import ObjectSpace
+from lfpiv_cli.particles.diameter import LIMIT_SIGMAS, UNKNOWN_LENSES, diameter_by
 from lfpiv_cli.particles.neighbour_frames import second_pass
 from lfpiv_cli.particles.refraction import places_by_snell
 from lfpiv_cli.particles.rounds import ROUNDS, first_pass
@@ -41,6 +43,10 @@ from lfpiv_cli.weights.model import behind_transmission
 
 # More than this share of an image's light, its noise taken off, is too much to leave unexplained.
 LARGEST_UNEXPLAINED = 0.5
+# Frames that are looked at for the tracers' diameter, if the first do not hold enough.
+LOOKED_AT = 5
+# Beyond so many standard errors a given diameter contradicts the images.
+CONTRADICTING_SIGMAS = 4.0
 # Units of progress that `find` and `find_first` report.
 STEPS = sum(settings.iterations + 1 for settings in ROUNDS)
 
@@ -93,13 +99,14 @@ def find_particles(
     check_frame(bench, raws[0], IMAGE)
     notices = frame_notices(bench, raws[0], light(raws[0], bench.dark, level), IMAGE)
     frame, *others = (frame_of(bench, raw, light(raw, bench.dark, level)) for raw in raws)
+    bench, size = sized(bench, (frame, *others))
     if others:
         own, *beside = (find_first(bench, each) for each in (frame, *others))
         found = find_beside(bench, frame, own, beside)
     else:
         found = find(bench, frame)
-    points = points_of(bench, frame, found, record("find_particles", chosen.resolved(), {}))
-    warn_of([*notices, *light_notices(points, IMAGE)])
+    points = points_of(bench, frame, found, size, record("find_particles", chosen.resolved(), {}))
+    warn_of([*notices, *size_notices(chosen, size), *light_notices(points, IMAGE)])
     return points
 
 
@@ -144,6 +151,76 @@ def frame_of(bench: Bench, raw: Image, lit: Image) -> Frame:
     return Frame(filled(lit, unusable), unusable, bench.sums_without(bench.content.weights.padded, excluded))
 
 
+@dataclass(frozen=True)
+class TracerSize:
+    """The tracers' diameter.
+
+    Attributes
+    ----------
+    diameter_mm : that they are fitted with
+    measured_mm, sigma_mm : by their images, and its standard error; None where no image shows it
+    resolved : whether more than an upper limit is known by the images
+    """
+
+    diameter_mm: float
+    measured_mm: float | None = None
+    sigma_mm: float | None = None
+    resolved: bool = False
+
+    @property
+    def at_most_mm(self) -> float | None:
+        """What it is not above, by the images."""
+        if self.measured_mm is None or self.sigma_mm is None:
+            return None
+        return self.measured_mm + LIMIT_SIGMAS * self.sigma_mm
+
+    def attributes(self) -> dict[str, float]:
+        """Return what files say of it: its standard error where it is by the images."""
+        told = {"particle_diameter_mm": self.diameter_mm}
+        if self.sigma_mm is not None and self.diameter_mm == self.measured_mm:
+            told["particle_diameter_sigma_mm"] = self.sigma_mm
+        return told
+
+    def summary(self) -> dict[str, float | None]:
+        """Return what is told of it; None where it is not known."""
+        return {
+            "particle_diameter_mm": self.diameter_mm,
+            "particle_diameter_measured_mm": self.measured_mm,
+            "particle_diameter_sigma_mm": self.sigma_mm,
+        }
+
+
+def sized(bench: Bench, frames: Iterable[Frame]) -> tuple[Bench, TracerSize]:
+    """Return the bench with the tracers' diameter, from the first of its frames where it is not given."""
+    given, lens_mm = bench.settings.reconstruction.particle_diameter_mm, _lens_mm(bench)
+    found = diameter_by(_task(bench, frame) for frame in islice(frames, LOOKED_AT))
+    if found is None:
+        size = TracerSize(given or UNKNOWN_LENSES * lens_mm)
+    else:
+        measured = lens_mm * found.lenses
+        size = TracerSize(given or measured, measured, lens_mm * found.sigma_lenses, found.resolved)
+    settings = bench.settings.overridden("reconstruction", particle_diameter_mm=size.diameter_mm)
+    return replace(bench, settings=settings), size
+
+
+def size_notices(settings: Config, size: TracerSize) -> list[Notice]:
+    """Return where the given diameter contradicts the images, or where they do not tell it."""
+    given, key = settings.reconstruction.particle_diameter_mm, "reconstruction.particle_diameter_mm"
+    if size.measured_mm is None or size.sigma_mm is None:
+        if given is not None:
+            return []
+        text = f"no image shows the tracers' size; {size.diameter_mm:.3g} mm is taken, half a microlens in the scene"
+        return [Notice("particle-diameter-unknown", key, text, "give it", None, "bright tracers")]
+    if given is not None and abs(given - size.measured_mm) > CONTRADICTING_SIGMAS * size.sigma_mm:
+        text = f"{given:g} mm, but by the images it is {size.measured_mm:.3g} ± {size.sigma_mm:.2g} mm"
+        remedy = "leave it out, and it is taken from the images; or check calibration and focus"
+        return [Notice("particle-diameter", key, text, remedy, given, f"{size.measured_mm:.3g} mm")]
+    if given is None and not size.resolved:
+        text = f"tracers are smaller than the images show: at most {size.at_most_mm:.2g} mm"
+        return [Notice("particle-diameter-limit", key, text, "give it, if it is known", size.at_most_mm, None)]
+    return []
+
+
 def find(bench: Bench, frame: Frame, progress: Callable[[int], None] | None = None) -> Particles:
     """Return the particles behind an image."""
     task = _task(bench, frame)
@@ -163,15 +240,19 @@ def find_beside(
     return result(task, second_pass(task, own, neighbours, SEARCH_LENSES * task.view.scale.lens_mm))
 
 
+def _lens_mm(bench: Bench) -> float:
+    return bench.content.camera.scale(bench.settings.media_model()).lens_mm
+
+
 def _task(bench: Bench, frame: Frame) -> Task:
     content, settings = bench.content, bench.settings
-    radius = 0.5 * settings.reconstruction.particle_diameter_mm
+    radius = 0.5 * (settings.reconstruction.particle_diameter_mm or UNKNOWN_LENSES * _lens_mm(bench))
     view = raw_view(content.camera, settings.media_model(), radius, content.weights.calibration)
     photons = settings.reconstruction.photons_per_count
     return task_of(frame.image, view, content.weights, content.camera, frame.sums, frame.unusable, photons)
 
 
-def points_of(bench: Bench, frame: Frame, found: Particles, provenance: Mapping[str, Any]) -> Points:
+def points_of(bench: Bench, frame: Frame, found: Particles, size: TracerSize, provenance: Mapping[str, Any]) -> Points:
     """Return the particles found behind an image in the coordinates of files, by Snell's law where it is known."""
     content = bench.content
     space = _space(content, bench.settings)
@@ -195,7 +276,8 @@ def points_of(bench: Bench, frame: Frame, found: Particles, provenance: Mapping[
             "residual_rms_counts": float(np.sqrt(np.mean(left[~frame.unusable] ** 2))),
             "excluded_pixels": int(np.count_nonzero(frame.unusable)),
             "read_noise_counts": found.noise.read_counts,
-        },
+        }
+        | size.attributes(),
         provenance=dict(provenance),
     )
 

@@ -61,9 +61,14 @@ def hexagon_radius(lattice: Lattice) -> float:
     return float(lattice.pitch.max()) / np.sqrt(3.0)
 
 
+def smallest_ball_mm(lattice: Lattice) -> float:
+    """Return the radius on the array of the smallest balls that have a table of their own."""
+    return SMALLEST_SHARE_OF_PITCH * float(lattice.pitch.min())
+
+
 def cell_shares(lattice: Lattice, radius_mm: float) -> CellShares:
     """Return the shares for the cells of a hexagonal lattice and a ball whose image has about this radius."""
-    radius = max(radius_mm, SMALLEST_SHARE_OF_PITCH * float(lattice.pitch.min()))
+    radius = max(radius_mm, smallest_ball_mm(lattice))
     step, pitch = radius / ENTRIES_PER_RADIUS, float(lattice.pitch.max())
     levels = max(int(np.ceil(np.log(pitch / (FIRST_SIDE * radius)) / np.log(NEXT_SIDE))), 0)
     sides = np.array([0.0, *(FIRST_SIDE * radius * NEXT_SIDE**level for level in range(levels)), pitch])

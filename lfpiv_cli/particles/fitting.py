@@ -128,7 +128,7 @@ def _fit_again(
         for depth in depths[number]:
             if np.isnan(depth):
                 continue
-            change = _fit_from(observation, particles[number], depth, trial, responses, steps)
+            change = fit_from(observation, particles[number], depth, trial, responses, steps)
             if change < lowest and trial[0, 3] >= least[1]:
                 lowest = change
                 best[:] = trial
@@ -142,7 +142,7 @@ def _fit_again(
 
 # Inlined: one function less to compile the whole fit into.
 @njit(cache=True, inline="always")
-def _fit_from(
+def fit_from(
     observation: Observation,
     particle: NDArray[np.float64],
     depth: float,
@@ -204,7 +204,7 @@ def _accept(
         for offset in START_DEPTHS:
             depth = candidates[number, 2] + offset * observation.optics.scale.depth_mm
             depth = min(max(depth, observation.low_mm), observation.high_mm)
-            change = _fit_from(observation, candidates[number], depth, trial, responses, steps)
+            change = fit_from(observation, candidates[number], depth, trial, responses, steps)
             if change < lowest:
                 lowest = change
                 best[:] = trial

@@ -115,7 +115,22 @@ def pruned(task: Task, state: State, settings: Round) -> State:
 
 def _one_round(task: Task, state: State, settings: Round, progress: Callable[[int], None] | None) -> State:
     """Return the state after one round."""
-    candidates, light = _candidates(task, state, settings.iterations, progress)
+    candidates, light = candidates_of(task, state, settings.iterations, progress)
+    return explained(task, *with_candidates(task, state, candidates, light), settings)
+
+
+def explained(task: Task, state: State, candidates: NDArray[np.float64], settings: Round) -> State:
+    """Return the state with what of the candidates holds, refined and checked."""
+    state = accepted(task, state, candidates, settings)
+    sweep(task, state, settings.unexplained, SWEEPS)
+    state = with_typical_light(task, state)
+    return with_typical_light(task, with_suspects_checked(task, state, settings))
+
+
+def with_candidates(
+    task: Task, state: State, candidates: NDArray[np.float64], light: NDArray[np.float64]
+) -> tuple[State, NDArray[np.float64]]:
+    """Return the state with its typical light, by candidates where no particle is known, and those to be tried."""
     typical = state.typical_light
     if typical == 0.0:
         # Where hardly any light meets the sensor, at the volume's rim, noise becomes peaks brighter than tracers.
@@ -123,11 +138,7 @@ def _one_round(task: Task, state: State, settings: Round, progress: Callable[[in
         noise = state.noise.read_counts * np.sqrt(lens_pixels(task.view))
         typical = first_typical_light(light[seen > SMALLEST_SEEN], noise)
     candidates = candidates[light > CANDIDATE_LIGHT * typical] if typical > 0.0 else candidates[:0]
-    state = replace(state, typical_light=typical, noise=noise_with(task, typical))
-    state = _accept(task, state, candidates, settings)
-    sweep(task, state, settings.unexplained, SWEEPS)
-    state = with_typical_light(task, state)
-    return with_typical_light(task, with_suspects_checked(task, state, settings))
+    return replace(state, typical_light=typical, noise=noise_with(task, typical)), candidates
 
 
 def first_typical_light(light: NDArray[np.float64], noise_counts: float) -> float:
@@ -157,7 +168,7 @@ def with_suspects_checked(task: Task, state: State, settings: Round) -> State:
     return pruned(task, merge(task, state), settings)
 
 
-def _candidates(
+def candidates_of(
     task: Task, state: State, iterations: int, progress: Callable[[int], None] | None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return candidates (n, 4), brightest first, and their light (n,)."""
@@ -169,10 +180,10 @@ def _candidates(
     return np.column_stack([points, light]), light
 
 
-def _accept(task: Task, state: State, candidates: NDArray[np.float64], settings: Round) -> State:
+def accepted(task: Task, state: State, candidates: NDArray[np.float64], settings: Round) -> State:
     """Return the state with those candidates that hold."""
     observation = observed(task, state, settings.unexplained)
     light = SMALLEST_LIGHT * state.typical_light
     least = Least(light, settings.claimed_share, SMALLEST_SEEN, CANDIDATE_GAIN)
-    accepted = accept(observation, candidates, least)
-    return replace(state, particles=np.concatenate([state.particles, candidates[accepted]]))
+    stay = accept(observation, candidates, least)
+    return replace(state, particles=np.concatenate([state.particles, candidates[stay]]))

@@ -17,12 +17,15 @@ from numpy.typing import NDArray
 from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.optics.camera import Camera, KernelCamera
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.particles.cells import cell_shares, hexagon_radius, no_shares
+from lfpiv_cli.optics.microlenses import Lattice
+from lfpiv_cli.particles.cells import cell_shares, hexagon_radius, no_shares, smallest_ball_mm
 from lfpiv_cli.particles.rim import rim_table
 from lfpiv_cli.scale import Scale
 
 # Particles that are smaller are taken as this large, so that profiles have slopes: a thousandth of a lens.
 SMALLEST_RADIUS_LENSES = 1e-3
+# Tables of hexagonal cells serve balls that differ from theirs by this factor: only their blur's variance is changed.
+SAME_TABLE = 1.6
 
 
 class View(NamedTuple):
@@ -108,6 +111,26 @@ def raw_view(camera: Camera, media: Media, particle_radius_mm: float, calibratio
         inverse_basis=np.ascontiguousarray(np.linalg.inv(lattice.basis)),
         table=table,
         table_step_mm=step,
+    )
+
+
+def with_radius(view: View, particle_radius_mm: float) -> View:
+    """Return the view of balls of another size."""
+    view = view._replace(particle_radius_mm=max(particle_radius_mm, SMALLEST_RADIUS_LENSES * view.scale.lens_mm))
+    if view.cell_table.shape[0] == 0:
+        return view
+    basis = np.asarray(np.linalg.inv(view.inverse_basis), np.float64)
+    lattice = Lattice(view.camera.origin_mm, basis, "hexagonal")
+    radius = view.particle_radius_mm * view.camera.image_distance_mm / view.camera.focus_distance_mm
+    smallest = smallest_ball_mm(lattice)
+    if max(radius, smallest) / SAME_TABLE <= view.cell_ball_mm <= max(radius, smallest) * SAME_TABLE:
+        return view
+    shares = cell_shares(lattice, radius)
+    return view._replace(
+        cell_table=shares.table,
+        cell_side2_mm2=shares.side2_mm2,
+        cell_step_mm=shares.step_mm,
+        cell_ball_mm=shares.radius_mm,
     )
 
 

@@ -21,6 +21,7 @@ from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.object_space import ObjectSpace
+from lfpiv_cli.particles.diameter import UNKNOWN_LENSES, diameter_by
 from lfpiv_cli.particles.refraction import places_by_snell
 from lfpiv_cli.particles.rounds import ROUNDS, find_particles
 from lfpiv_cli.particles.search import Particles, task_of
@@ -149,12 +150,12 @@ class ChannelFlow:
     ----------
     volume : says where particles are looked for laterally, and how fine
     width_mm : of the channel
-    particle_diameter_mm : of the tracers
+    particle_diameter_mm : of the tracers; None: by their images
     """
 
     volume: Grid
     width_mm: float
-    particle_diameter_mm: float
+    particle_diameter_mm: float | None
 
 
 def refine_calibration(
@@ -182,7 +183,8 @@ def refine_calibration(
     """
     camera = calibration.camera(sheet)
     media = space.media
-    view = raw_view(camera, media, 0.5 * flow.particle_diameter_mm, calibration)
+    given, lens_mm = flow.particle_diameter_mm, camera.scale(media).lens_mm
+    view = raw_view(camera, media, 0.5 * (given or UNKNOWN_LENSES * lens_mm), calibration)
     expected = 0.0 if calibration.mid_plane_z_mm is None else calibration.mid_plane_z_mm
     grid = _deep_grid(flow.volume, expected, flow.width_mm, PLANES_APART * view.scale.depth_mm)
     padding = default_padding(camera, media, grid)
@@ -193,6 +195,8 @@ def refine_calibration(
     def search(image: NDArray[np.float32], seen: View) -> Particles:
         return find_particles(task_of(image, seen, weights, camera, sums), REFINING_ROUNDS, progress)
 
+    if given is None and (measured := diameter_by([task_of(images[0], view, weights, camera, sums)])):
+        view = raw_view(camera, media, 0.5 * lens_mm * measured.lenses, calibration)
     first = search(images[0], view)
     refuse_few(len(first.position_mm))
     rows = np.column_stack([camera.to_image_axes(first.position_mm), first.light_counts])
@@ -217,7 +221,7 @@ def refine_calibration(
         expected_sigma_mm=calibration.mid_plane_z_sigma_mm,
         common_depth_mm=_common_depth_mm(camera, media),
         width_mm=flow.width_mm,
-        particle_diameter_mm=flow.particle_diameter_mm,
+        particle_diameter_mm=2.0 * view.particle_radius_mm,
         camera=camera,
     )
 

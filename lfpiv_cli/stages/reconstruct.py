@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -116,6 +116,12 @@ def reconstruct(
     outcomes: list[Outcome] = []
     failures: list[str] = []
     looked_at = needed if beside is None else {k for number in needed for k in (number, *beside[number])}
+    size = None
+    if as_particles and needed:
+        bench, size = particles.sized(bench, _frames(bench, read, len(frames)))
+        said = particles.size_notices(settings, size)
+        console.warn(said)
+        targets = [replace(target, record=with_warnings(target.record, said)) for target in targets]
     with console.progress(len(looked_at) * steps, "reconstruct") as advance:
         find = _finder(bench, read, beside, advance)
         for number, future in ahead(read, needed):
@@ -126,9 +132,11 @@ def reconstruct(
                 notices = _file_notices(target.record, stem) + frame_notices(bench, *pictures, stem)
                 console.warn(notices)
                 target = replace(target, record=with_warnings(target.record, notices))
-                if as_particles:
+                if size is not None:
                     frame = particles.frame_of(bench, *pictures)
-                    outcomes.append(_write_particles(bench, target, frame, find(number, frame), overwrite, console))
+                    outcomes.append(
+                        _write_particles(bench, target, (frame, find(number, frame), size), overwrite, console)
+                    )
                 else:
                     outcomes.append(_make_volume(bench, target, pictures, overwrite, advance))
             except InputError as error:
@@ -140,15 +148,29 @@ def reconstruct(
         raise PartialError(f"{len(failures)} of {len(frames)} frames failed, the first because {failures[0]}")
     found = [outcome.particles for outcome in outcomes if outcome.particles is not None]
     counts = {"particles": sum(found), "particles_fewest": min(found)} if found else {}
-    return {
-        "frames": len(frames),
-        "reconstructed": len(outcomes),
-        "skipped": len(frames) - len(needed),
-        "solver": settings.reconstruction.solver,
-        "iterations": None if as_particles else settings.reconstruction.iterations,
-        "residual": max((outcome.residual for outcome in outcomes), default=None),
-        "excluded_pixels": max((outcome.excluded_pixels for outcome in outcomes), default=None),
-    } | counts
+    return (
+        {
+            "frames": len(frames),
+            "reconstructed": len(outcomes),
+            "skipped": len(frames) - len(needed),
+            "solver": settings.reconstruction.solver,
+            "iterations": None if as_particles else settings.reconstruction.iterations,
+            "residual": max((outcome.residual for outcome in outcomes), default=None),
+            "excluded_pixels": max((outcome.excluded_pixels for outcome in outcomes), default=None),
+        }
+        | counts
+        | (size.summary() if size else {})
+    )
+
+
+def _frames(bench: Bench, read: Read, number: int) -> Iterator[particles.Frame]:
+    """Yield the frames that can be read."""
+    for k in range(number):
+        try:
+            pictures = read(k)
+        except InputError:
+            continue  # it is told where its turn comes
+        yield particles.frame_of(bench, *pictures)
 
 
 def _targets(
@@ -208,10 +230,15 @@ def _make_volume(
 
 
 def _write_particles(
-    bench: Bench, target: Target, frame: particles.Frame, found: Particles, overwrite: bool, console: Console
+    bench: Bench,
+    target: Target,
+    made: tuple[particles.Frame, Particles, particles.TracerSize],
+    overwrite: bool,
+    console: Console,
 ) -> Outcome:
     """Write the particles found behind a frame and what they leave of it."""
-    points = particles.points_of(bench, frame, found, target.record)
+    frame, found, size = made
+    points = particles.points_of(bench, frame, found, size, target.record)
     notices = particles.light_notices(points, target.path.name)
     console.warn(notices)
     left = particles.what_is_left(frame, found)

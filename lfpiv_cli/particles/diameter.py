@@ -1,0 +1,360 @@
+"""The tracers' diameter by the images of single ones.
+
+Bright tracers whose light lies apart are fitted in x, y, z and light with balls of several sizes. The size on which
+most agree is refined with the light around them taken off, as two rounds of the search find it. How well a tracer's
+light is explained is nearly quadratic in the square of the diameter, which is what blurs an image: the vertex and
+curvature are the tracer's squared diameter and its standard error. Their median is taken, so that a few that are two,
+or larger than the others, do not matter.
+
+Axes: see `search`. Diameters in this module are in microlenses as the scene shows them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from lfpiv_cli.particles.fitting import fit_from, judge
+from lfpiv_cli.particles.least_squares import (
+    UNKNOWNS,
+    Observation,
+    add_light,
+    lit_by,
+    observation_of,
+    respond_all,
+    room_for,
+)
+from lfpiv_cli.particles.rounds import (
+    CANDIDATE_GAIN,
+    ROUNDS,
+    SWEEPS_AFTER_SPLIT,
+    accepted,
+    candidates_of,
+    explained,
+    with_candidates,
+)
+from lfpiv_cli.particles.search import (
+    LAST_UNEXPLAINED,
+    State,
+    Task,
+    blank,
+    noise_with,
+    observed,
+    rebuilt,
+    sweep,
+    with_typical_light,
+)
+from lfpiv_cli.particles.tiles import over_tiles
+from lfpiv_cli.particles.view import footprint_radius_mm, on_array_mm, with_radius
+from lfpiv_cli.robust import MAD_TO_SIGMA, of_half_the_sum
+
+# Sizes that are tried first, in microlenses: each about twice the one before, from what no camera resolves on.
+FIRST_DIAMETERS = (0.06, 0.12, 0.25, 0.5, 0.9, 1.5, 2.4, 3.8)
+# Then sizes that are these shares apart, and so many microlenses at least: with the light of the first candidates taken
+# off, and with all that two rounds find.
+WIDE, NARROW, SMALLEST_STEP = (0.25, 0.1), (0.06, 0.04, 0.03), 0.03
+# So many candidates around the middle of all are enough, and all others only take time.
+MOST_CANDIDATES = 400
+# Parabolas are believed up to so many times as far from the middle as sizes were tried.
+FURTHEST = 2.0
+# Tracers that are fitted with all sizes. A candidate's light lies apart where it is most of the light around it.
+MOST_TRACERS = 40
+# What else is within so many microlenses around a tracer's light counts as around it.
+AROUND_LENSES = 2.0
+# Candidates have at least this share of a typical tracer's light, and of it so much meets the sensor.
+BRIGHT, WELL_SEEN = 0.3, 0.9
+# The rounds of the search. A wrong size finds less of its light, so that less is asked for.
+SEARCH = tuple(replace(settings, claimed_share=ROUNDS[-1].claimed_share) for settings in ROUNDS[:2])
+# Starts of the first fits beside a candidate's own depth, in depths over which light spreads by one lens.
+START_DEPTHS = (0.0, -0.4, 0.4)
+STEPS = 12
+# What calibration and model get wrong of a diameter: a share of it, and microlenses.
+MODEL_SHARE, MODEL_LENSES = 0.01, 0.025
+# Of a diameter that is below so many of its standard errors only an upper limit is known.
+LIMIT_SIGMAS = 3.0
+# Tracers that are enough, and where there are none, the diameter that is taken.
+ENOUGH, UNKNOWN_LENSES = 10, 0.5
+# Standard error of a median over that of a mean.
+MEDIAN_TO_MEAN = 1.25
+
+
+class Sizes(NamedTuple):
+    """What single tracers show.
+
+    Attributes
+    ----------
+    square : (n,) squared diameters in microlenses, below 0 where noise makes an image sharper than a point's
+    sigma : (n,) their standard errors
+    """
+
+    square: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+
+
+NO_SIZES = Sizes(np.zeros(0), np.zeros(0))
+
+
+@dataclass(frozen=True)
+class Diameter:
+    """The tracers' diameter.
+
+    Attributes
+    ----------
+    lenses, sigma_lenses : in microlenses as the scene shows them, and its standard error
+    tracers : by how many
+    """
+
+    lenses: float
+    sigma_lenses: float
+    tracers: int
+
+    @property
+    def resolved(self) -> bool:
+        """Whether it is more than an upper limit."""
+        return self.lenses > LIMIT_SIGMAS * self.sigma_lenses
+
+
+def diameter_by(tasks: Iterable[Task]) -> Diameter | None:
+    """Return the diameter that the tracers of the first images show, of as many as are needed; None without tracers."""
+    frames: list[Sizes] = []
+    for task in tasks:
+        frames.append(measured_sizes(task))
+        if sum(sizes.square.size for sizes in frames) >= ENOUGH:
+            break
+    return diameter_of(frames)
+
+
+def diameter_of(frames: Sequence[Sizes]) -> Diameter | None:
+    """Return the diameter that the tracers of some frames show together; None where there are none."""
+    square, sigma = (np.concatenate(parts) for parts in zip(*frames, strict=True)) if frames else (np.zeros(0),) * 2
+    if not square.size:
+        return None
+    middle, error = _middle(Sizes(square, sigma))
+    diameter = float(np.sqrt(max(middle, 0.0)))
+    # From squares to diameters, also where the diameter is 0: half of how far up the square may be.
+    spread = float(np.sqrt(max(middle, 0.0) + LIMIT_SIGMAS * error)) - diameter
+    model = np.hypot(MODEL_SHARE * diameter, MODEL_LENSES)
+    return Diameter(diameter, float(np.hypot(spread / LIMIT_SIGMAS, model)), int(square.size))
+
+
+def measured_sizes(task: Task) -> Sizes:
+    """Return what the tracers of an image show of their sizes; `task` may be of any size."""
+    candidates, light = candidates_of(task, blank(task), SEARCH[0].iterations, None)
+    region = _middle_region(candidates)
+    candidates = candidates[region.holds(candidates)]
+    state = _with_light(task, blank(task), candidates)
+    diameter, apart = _first_diameter(task, state, _apart(task, state, candidates))
+    if not len(apart):
+        return NO_SIZES
+    candidates = np.concatenate([apart, candidates])
+    for share in WIDE:
+        task = _of_diameter(task, diameter)
+        found = accepted(task, _begun(task, state), candidates.copy(), SEARCH[0])
+        diameter, _ = _tried(task, found, _steps(diameter, share), SEARCH[0].unexplained)
+    task = _of_diameter(task, diameter)
+    found = explained(task, _begun(task, state), candidates.copy(), SEARCH[0])
+    more, light = candidates_of(task, found, SEARCH[1].iterations, None)
+    inside = region.holds(more)
+    found = explained(task, *with_candidates(task, found, more[inside], light[inside]), SEARCH[1])
+    for share in NARROW:
+        diameters = _steps(diameter, share)
+        diameter, losses = _tried(task, found, diameters, LAST_UNEXPLAINED)
+    return _vertices(np.square(diameters), losses)
+
+
+def _begun(task: Task, state: State) -> State:
+    """Return the state without particles, with a residual of its own, which is worked on in place."""
+    return rebuilt(task, state, state.particles[:0])
+
+
+def _with_light(task: Task, state: State, candidates: NDArray[np.float64]) -> State:
+    """Return the state with the light that most of the candidates' comes from as typical."""
+    *_, seen = judge(observed(task, state, LAST_UNEXPLAINED), candidates)
+    light = candidates[seen > WELL_SEEN, 3]
+    typical = of_half_the_sum(light) if light.size else 0.0
+    return replace(state, typical_light=typical, noise=noise_with(task, typical))
+
+
+class Region(NamedTuple):
+    """The part of the image that is looked at, about a point (x, y), mm in image axes."""
+
+    middle_mm: NDArray[np.float64]
+    radius_mm: float
+
+    def holds(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return which points (n, 2 or more) lie in it."""
+        return np.asarray(np.linalg.norm(points[:, :2] - self.middle_mm, axis=1) <= self.radius_mm)
+
+
+def _middle_region(candidates: NDArray[np.float64]) -> Region:
+    """Return the region around the middle of all candidates that holds enough of them."""
+    if not len(candidates):
+        return Region(np.zeros(2), 0.0)
+    middle = np.median(candidates[:, :2], axis=0)
+    distances = np.sort(np.linalg.norm(candidates[:, :2] - middle, axis=1))
+    return Region(middle, float(distances[min(MOST_CANDIDATES, len(distances)) - 1]))
+
+
+def _steps(diameter: float, share: float) -> NDArray[np.float64]:
+    """Return diameters (m,) around one, a share of it apart."""
+    step = max(share * diameter, SMALLEST_STEP)
+    return max(diameter, 2.0 * step) + step * np.arange(-2.0, 3.0)
+
+
+def _common(diameters: NDArray[np.float64], losses: NDArray[np.float64]) -> float:
+    """Return the diameter that most tracers agree on, by what each loses (m, n) with each; without any, the middle one.
+
+    Losses count by their logarithms, so that a tracer that is two or has another size loses little more the more wrong
+    it is.
+    """
+    if not losses.size:
+        return float(diameters[len(diameters) // 2])
+    return float(diameters[np.argmin(np.sum(np.log1p(losses), axis=1))])
+
+
+def _middle(sizes: Sizes) -> tuple[float, float]:
+    """Return a weighted median and its standard error, from the scatter or from what each one states."""
+    scatter = MAD_TO_SIGMA * float(np.median(np.abs(sizes.square - np.median(sizes.square))))
+    weight = 1.0 / (sizes.sigma**2 + scatter**2)
+    order = np.argsort(sizes.square, kind="stable")
+    below = np.cumsum(weight[order]) - 0.5 * weight[order]
+    middle = float(np.interp(0.5 * weight.sum(), below, sizes.square[order]))
+    scattered = MEDIAN_TO_MEAN * scatter / np.sqrt(sizes.square.size)
+    return middle, float(max(scattered, 1.0 / np.sqrt(np.sum(1.0 / sizes.sigma**2))))
+
+
+def _of_diameter(task: Task, diameter: float) -> Task:
+    """Return the task with tracers of a diameter."""
+    return replace(task, view=with_radius(task.view, 0.5 * diameter * task.view.scale.lens_mm))
+
+
+def _apart(task: Task, state: State, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return bright candidates (n, 4), those first whose light is most of what is around them."""
+    *_, seen = judge(observed(task, state, 0.0), candidates)
+    bright = candidates[(candidates[:, 3] > BRIGHT * state.typical_light) & (seen > WELL_SEEN)]
+    share = bright[:, 3] / np.maximum(_light_around(task, bright), bright[:, 3])
+    return bright[np.argsort(-share, kind="stable")[:MOST_TRACERS]]
+
+
+def _light_around(task: Task, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the light (n,) in squares of the image that hold the light of points and what is around it."""
+    view, camera = task.view, task.view.camera
+    size = np.array([camera.columns, camera.rows])
+    image = np.where(task.usable, task.image, 0.0).reshape(camera.rows, camera.columns)
+    sums = np.pad(image.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
+    reach = footprint_radius_mm(view, points[:, 2]) + 2.0 * AROUND_LENSES * max(view.half_x_mm, view.half_y_mm)
+    middle, reach = on_array_mm(view, points) / camera.pixel_mm + 0.5 * size, reach[:, np.newaxis] / camera.pixel_mm
+    left, top = np.clip(np.rint(middle - reach), 0, size).astype(np.int64).T
+    right, bottom = np.clip(np.rint(middle + reach), 0, size).astype(np.int64).T
+    return np.asarray(sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left])
+
+
+def _first_diameter(task: Task, state: State, apart: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+    """Return the one of the first sizes that candidates fitted alone agree on, and these as fitted, without noise."""
+    # The image in place of a model that is not known yet; nothing has been taken off it.
+    weight = state.noise.weights(task.image, np.zeros_like(task.image), 0.0)
+    weight, image = np.where(task.usable, weight, 0.0), task.image.copy()
+    tracers = apart * (1.0, 1.0, 1.0, 0.0)
+    starts = apart[:, 2:3] + np.array(START_DEPTHS) * task.view.scale.depth_mm
+    fits = []
+    for diameter in FIRST_DIAMETERS:
+        task = _of_diameter(task, diameter)
+        observation = observation_of(task.view, image, weight, task.depths_mm)
+        fits.append(_fitted(observation, observation, tracers, starts))
+    change = np.stack([each for each, _ in fits])
+    real = change.min(axis=0) < -CANDIDATE_GAIN
+    diameter = _common(np.array(FIRST_DIAMETERS), (change - change.min(axis=0))[:, real])
+    return diameter, fits[FIRST_DIAMETERS.index(diameter)][1][real]
+
+
+def _tried(
+    task: Task, state: State, diameters: NDArray[np.float64], unexplained: float
+) -> tuple[float, NDArray[np.float64]]:
+    """Return the diameter that bright tracers agree on, and what they lose with each that is tried, (m, n).
+
+    The losses are in chi-squared, in units of what is left of a tracer's own, at least 1.
+    """
+    task = _of_diameter(task, diameters[len(diameters) // 2])
+    state = rebuilt(task, state, state.particles)
+    sweep(task, state, unexplained, SWEEPS_AFTER_SPLIT)
+    state = with_typical_light(task, state)
+    observation = observed(task, state, unexplained)
+    chi2, _, seen = judge(observation, state.particles)
+    bright = (state.particles[:, 3] > BRIGHT * state.typical_light) & (seen > WELL_SEEN)
+    good = np.flatnonzero(bright)[np.argsort(chi2[bright], kind="stable")[:MOST_TRACERS]]
+    tracers, change = state.particles[good], np.zeros((len(diameters), good.size))
+    for number, diameter in enumerate(diameters):
+        sized = observed(_of_diameter(task, diameter), state, unexplained)._replace(residual=observation.residual)
+        change[number], _ = _fitted(observation, sized, tracers, tracers[:, 2:3])
+    losses = (change - change.min(axis=0)) / np.maximum(chi2[good], 1.0)
+    return _common(diameters, losses), losses
+
+
+def _vertices(square: NDArray[np.float64], losses: NDArray[np.float64]) -> Sizes:
+    """Return the squares where parabolas through losses (m, n) are lowest, and how far from there they rise by 1.
+
+    Tracers whose parabola opens downwards, or is lowest far from all squares (m,) that were tried, are left out.
+    """
+    middle, half = 0.5 * (square[0] + square[-1]), 0.5 * (square[-1] - square[0])
+    if not losses.size:
+        return NO_SIZES
+    curvature, slope, _ = np.polyfit((square - middle) / half, losses, 2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        vertex = -0.5 * slope / curvature
+        sigma = 1.0 / np.sqrt(curvature)
+    near = (curvature > 0.0) & (np.abs(vertex) < FURTHEST)
+    return Sizes(middle + half * vertex[near], half * sigma[near])
+
+
+def _fitted(
+    observation: Observation, sized: Observation, tracers: NDArray[np.float64], depths_mm: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return what each tracer adds to chi-squared when it is fitted with another size, (n,), and the fits (n, 4).
+
+    Parameters
+    ----------
+    observation : whose residual lacks the tracers' light, of the size that they have there; in place again on return
+    sized : the same with the other size
+    tracers : (n, 4) where fits begin
+    depths_mm : (n, k) their depths
+    """
+    change, fitted = np.zeros(len(tracers)), tracers.copy()
+
+    def work(numbers: NDArray[np.int64]) -> None:
+        _fit_each(observation, sized, tracers, numbers, depths_mm, change, fitted)
+
+    larger = max(observation.optics, sized.optics, key=lambda view: view.particle_radius_mm)
+    over_tiles(work, larger, tracers, observation.depths_mm)
+    return change, fitted
+
+
+@njit(cache=True, nogil=True)
+def _fit_each(
+    observation: Observation,
+    sized: Observation,
+    tracers: NDArray[np.float64],
+    numbers: NDArray[np.int64],
+    depths_mm: NDArray[np.float64],
+    change: NDArray[np.float64],
+    fitted: NDArray[np.float64],
+) -> None:
+    """Do the work of `_fitted` for the tracers of a tile."""
+    residual = observation.residual
+    own, responses = room_for(1, observation.capacity, 0), room_for(1, sized.capacity, 0)
+    trial = np.empty((1, UNKNOWNS))
+    for number in numbers:
+        respond_all(observation.optics, tracers[number : number + 1], own)
+        pixels, values = lit_by(own, 0)
+        add_light(pixels, values, tracers[number, 3], residual)
+        for depth in depths_mm[number]:
+            depth = min(max(depth, sized.low_mm), sized.high_mm)
+            gained = fit_from(sized, tracers[number], depth, trial, responses, STEPS)
+            if gained < change[number]:
+                change[number] = gained
+                fitted[number] = trial[0]
+        add_light(pixels, values, -tracers[number, 3], residual)
