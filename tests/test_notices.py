@@ -35,7 +35,7 @@ from lfpiv_cli.files.images import write_tiff
 from lfpiv_cli.files.particle_file import Points
 from lfpiv_cli.files.provenance import earlier_record, with_warnings
 from lfpiv_cli.files.weights_file import open_weights
-from lfpiv_cli.interface.tracks import still_notices
+from lfpiv_cli.interface.tracks import Tracked, few_notices, still_notices
 from lfpiv_cli.interface.weights import plan_of
 from lfpiv_cli.interface.weights_cost import cost_notices, cost_of
 from lfpiv_cli.notice import Notice
@@ -348,14 +348,23 @@ def test_columns_on_demand_cost_more_than_factors(tmp_path: Path) -> None:
     assert costs[1].weights_core_s == costs[1].weights_bytes == 0.0
 
 
-def test_one_image_twice_is_told_of_its_tracks() -> None:
-    def tracks(velocity: float) -> Points:
-        arrays = {"velocity": np.full((5, 3), velocity), "velocity_sigma": np.full((5, 3), 1e-3)}
-        arrays["velocity_sigma"][0] = np.nan
-        return Points(np.zeros((5, 3)), arrays, Reference("focal_point", 0.0), attributes={}, provenance={})
+def tracks(velocity: float) -> Points:
+    arrays = {"velocity": np.full((5, 3), velocity), "velocity_sigma": np.full((5, 3), 1e-3)}
+    arrays["velocity_sigma"][0] = np.nan
+    return Points(np.zeros((5, 3)), arrays, Reference("focal_point", 0.0), attributes={}, provenance={})
 
+
+def test_one_image_twice_is_told_of_its_tracks() -> None:
     assert [notice.code for notice in still_notices(tracks(1e-6), "a")] == ["frames-alike"]
     assert still_notices(tracks(1e-3), "a") == []
+
+
+@pytest.mark.parametrize(
+    ("counts", "linked", "told"), [((60, 50), 40, []), ((60, 50), 20, ["few-links"]), ((5, 5), 2, ["few-particles"])]
+)
+def test_few_links_are_told_where_particles_are_many(counts: tuple[int, int], linked: int, told: list[str]) -> None:
+    found = Tracked(tracks(1e-3), "", [], {"tracks": linked}, load_config(ROOT / "configs" / "sample.yaml"))
+    assert [notice.code for notice in few_notices(counts, ("a", "b"), found)] == told
 
 
 def test_few_points_of_a_board_are_told() -> None:

@@ -26,7 +26,9 @@ from lfpiv_cli.tracks.tracking import track as match
 ONE_SIDED = 0.5
 # With fewer particles than this no local linear fit tells which links are wrong.
 FEW = FEWEST_OF_FIT + 2
-# Displacements of still particles differ from 0 by .67 standard errors in the middle, by chance.
+# Of good pairs four in five particles or more are linked; of unrelated images chance links three in ten.
+LEAST_LINKED = 0.5
+# Displacements of still particles differ from 0 by a standard error along one axis or another, by chance.
 STILL_SIGMAS = 0.05
 
 
@@ -192,7 +194,19 @@ def few_notices(counts: Sequence[int], names: Sequence[str], found: Tracked) -> 
                 f"at least {FEW}",
             )
         )
-    if not found.summary["tracks"]:
+    linked, fewest = found.summary["tracks"], min(counts)
+    if len(counts) == 2 and fewest >= FEW and 0 < linked < LEAST_LINKED * fewest:
+        notices.append(
+            Notice(
+                "few-links",
+                names[0],
+                f"{linked} of {fewest} particles have a partner in the other frame, as many as in unrelated images",
+                "check that both images are of one pair, the time between them, and how far is sought (--search)",
+                linked / fewest,
+                f"at least {LEAST_LINKED:g}",
+            )
+        )
+    if not linked:
         notices.append(
             Notice(
                 "no-tracks",
@@ -209,8 +223,8 @@ def few_notices(counts: Sequence[int], names: Sequence[str], found: Tracked) -> 
 def still_notices(tracks: Points, name: str) -> list[Notice]:
     """Return what is said where nothing moves, not even by the errors of the particles' places: of one image twice."""
     velocity, sigma = tracks.arrays["velocity"], tracks.arrays["velocity_sigma"]
-    known = sigma > 0.0
-    moved = float(np.median(np.abs(velocity[known]) / sigma[known])) if known.any() else STILL_SIGMAS
+    known = (sigma > 0.0).all(axis=1)
+    moved = float(np.median((np.abs(velocity[known]) / sigma[known]).max(axis=1))) if known.any() else STILL_SIGMAS
     if moved >= STILL_SIGMAS:
         return []
     return [
