@@ -18,6 +18,7 @@ from lfpiv_cli.calibration.dot_model import (
     pixel_rays,
     undistorted,
 )
+from lfpiv_cli.calibration.refocusing import Refocusing
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
@@ -160,6 +161,14 @@ def test_dots_that_gaps_cut_off_belong_to_the_board(table2: Camera) -> None:
     pose = pose_of_dots(kept, np.full(kept.shape, 1e-3), -kept[:, :2], table2, board)
     assert len(pose.indices) >= 16
     np.testing.assert_allclose(pose.offset_mm, (0.1, 0.0), atol=0.02)
+
+
+def test_a_plane_that_no_ray_meets_in_view_is_dark(table2: Camera) -> None:
+    pixels = (np.array([200, 210]), np.array([230, 240]))
+    planes = Refocusing.of(small(table2), Media(), pixels, 3, 0.01)
+    (picture,) = planes.pictures(-100.0, (np.ones(2),), 1.0)
+    assert picture.dtype == np.float64
+    assert not picture.any()
 
 
 def test_a_turned_board_is_refused(table2: Camera) -> None:

@@ -80,5 +80,6 @@ class Refocusing:
         seen = self.through & ((place >= 0) & (place < self.shape)).all(axis=1)
         flat = np.ravel_multi_index(tuple(place[seen].T), self.shape)
         length = self.shape[0] * self.shape[1]
-        sums = [np.bincount(flat, values[seen], minlength=length).reshape(self.shape) for values in light]
-        return [ndimage.gaussian_filter(each, smoothing) for each in sums]
+        # bincount makes whole numbers of no light at all
+        sums = [np.bincount(flat, values[seen], minlength=length).astype(np.float64) for values in light]
+        return [ndimage.gaussian_filter(each.reshape(self.shape), smoothing) for each in sums]
