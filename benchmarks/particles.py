@@ -22,7 +22,6 @@ from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media, channel_window
 from lfpiv_cli.optics.microlenses import Lattice
-from lfpiv_cli.particles.refraction import places_by_snell
 from lfpiv_cli.particles.rounds import find_particles
 from lfpiv_cli.particles.search import task_of
 from lfpiv_cli.particles.view import raw_view
@@ -126,15 +125,14 @@ def print_figures(bench: Bench, count: int, seed: int, log_spread: float | None 
     image = readout.record(expected, rng).astype(np.float32) - np.float32(readout.dark_level_counts)
 
     camera = bench.calibration.camera(bench.sheet)
-    view = raw_view(camera, WATER, 0.5 * DIAMETER_MM, bench.calibration)
+    view = raw_view(camera, WATER, 0.5 * DIAMETER_MM, bench.calibration, space)
     began = time.perf_counter()
     found = find_particles(task_of(image, view, bench.weights, camera, bench.sums))
     seconds = time.perf_counter() - began
-    places = places_by_snell(found.position_mm, space, camera)
     sigma = np.sqrt(np.diagonal(found.covariance_mm2, axis1=1, axis2=2))
     what = f"{count} particles" if log_spread is None else f"{count} particles of log-normal brightness {log_spread:g}"
     for distances in ((0.0, np.inf), *DISTANCES_MM):
-        figures = particle_figures(places, true, low, high, VOXEL_MM, sigma, distances)
+        figures = particle_figures(found.position_mm, true, low, high, VOXEL_MM, sigma, distances)
         text = "  ".join(f"{name} {value:.4f}" for name, value in figures.items())
         print(f"{what}, {seconds:.1f} s, |z| {distances[0]:g} to {distances[1]:g} mm: {text}", flush=True)
 

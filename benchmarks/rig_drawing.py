@@ -11,6 +11,7 @@ spreads by one microlens, n p N/M^2 with N the lens's f-number towards the array
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -133,9 +134,11 @@ def _drawn(rng: np.random.Generator, number: int, lenses: tuple[int, int] | None
     }
     if board:
         true["board"] = _board(rng, lens_mm, field)
+    flow, deepest_mm = _flow(rng, lens_mm, depth_mm, size)
     if fluid != "air":
-        _place_behind_a_wall(true, depth, wall, to_focus, board)
-    scene = _scene(rng, true, density, lens_mm, depth_mm, depth, field)
+        # No tracer meets a wall between the images, half of the way before and half after.
+        _place_behind_a_wall(true, depth + deepest_mm, wall, to_focus, board)
+    scene = {"flow": flow} | _scene(rng, true, density, lens_mm, depth_mm, field)
     told, wrong = _told(rng, true)
     return DrawnRig(
         number,
@@ -193,15 +196,14 @@ def _board(rng: np.random.Generator, lens_mm: float, field: NDArray[np.float64])
 
 
 def _place_behind_a_wall(true: Tree, depth: float, wall: float, to_focus: float, board: bool) -> None:
-    """Put the volume into a channel that a board tells the place of, or behind a window at a known distance."""
+    """Put the fluid's `depth` into a channel that a board tells the place of, or behind a window at a known place."""
     if board:
         true["channel"] = {"width_mm": round(depth, 4), "wall_mm": round(wall, 4)}
         true["volume"]["reference"] = "mid_plane"
         return
     media = true["media"]
     distance = to_focus - 0.5 * depth / media["fluid"] - wall / media["window"]
-    # A little nearer, so that the volume's face lies within the fluid.
-    true["window"] = {"distance_mm": round(distance - 0.01 * depth, 4), "thickness_mm": round(wall, 4)}
+    true["window"] = {"distance_mm": round(distance, 4), "thickness_mm": round(wall, 4)}
 
 
 def _scene(
@@ -210,10 +212,9 @@ def _scene(
     density: float,
     lens_mm: float,
     depth_mm: float,
-    depth: float,
     field: NDArray[np.float64],
 ) -> Tree:
-    """Return the section `simulation`: tracers, their flow, the sensor, and how the camera departs from its sheet."""
+    """Return the section `simulation` but for the flow: tracers, sensor, how the camera departs from its sheet."""
     array, sensor = true["camera"]["microlenses"], true["camera"]["sensor"]
     pitch_px = array["pitch_mm"] / sensor["pixel_um"] * 1e3
     bits = int(rng.choice(BITS))
@@ -226,7 +227,6 @@ def _scene(
     lenses = FILLED**2 * np.prod(field) / lens_mm**2 / cell
     particles = max(1, round(density * float(lenses)))
     return {
-        "flow": _flow(rng, lens_mm, depth_mm, depth),
         "particles": particles,
         "rays": round(float(np.clip(ALL_RAYS / particles, *RAYS))),
         "particle_diameter_mm": true["reconstruction"]["particle_diameter_mm"],
@@ -245,17 +245,23 @@ def _scene(
     }
 
 
-def _flow(rng: np.random.Generator, lens_mm: float, depth_mm: float, depth: float) -> Tree:
-    """Return a shear, or a rotation about y, either with a velocity in depth: some microlenses between the images."""
+def _flow(rng: np.random.Generator, lens_mm: float, depth_mm: float, size_mm: Sequence[float]) -> tuple[Tree, float]:
+    """Return a shear, or a rotation about y, either with a velocity in depth, and the longest move in depth.
+
+    Tracers move by some microlenses between the images; `size_mm` is the volume's.
+    """
     per_s = 1e-3 / DT_S
     at_face = rng.uniform(0.5, 2.5) * lens_mm * rng.choice([-1.0, 1.0])
     in_depth = min(rng.uniform(0.05, 0.3) * depth_mm, 6.0 * lens_mm) * rng.choice([-1.0, 1.0])
     along = rng.uniform(-1.0, 1.0, 2) * lens_mm
     velocity = [round(float(v) * per_s, 6) for v in (*along, in_depth)]
-    rate = round(float(at_face / (0.5 * depth) / DT_S), 6)
+    a_turn = at_face / (0.5 * size_mm[2])
+    rate = round(float(a_turn / DT_S), 6)
     if rng.random() < 0.5:
-        return {"kind": "shear", "along": "x", "across": "z", "rate_per_s": rate, "velocity_m_s": velocity}
-    return {"kind": "rigid_rotation", "angular_velocity_rad_s": [0.0, rate, 0.0], "velocity_m_s": velocity}
+        shear = {"kind": "shear", "along": "x", "across": "z", "rate_per_s": rate, "velocity_m_s": velocity}
+        return shear, float(abs(in_depth))
+    rotation = {"kind": "rigid_rotation", "angular_velocity_rad_s": [0.0, rate, 0.0], "velocity_m_s": velocity}
+    return rotation, float(abs(in_depth) + 0.5 * abs(a_turn) * size_mm[0])
 
 
 def _told(rng: np.random.Generator, true: Tree) -> tuple[Tree, str]:

@@ -25,30 +25,30 @@ def behind(camera: Camera, media: Media, fluid_mm: float, wall_mm: float) -> Obj
     return ObjectSpace(media, Window(distance, wall_mm), "exact")
 
 
-@pytest.mark.parametrize(("fluid_mm", "within_mm"), [(5.0, 0.0045), (100.0, 0.025)])
-def test_fits_to_refracted_rays_are_set_right(
-    table2: Camera, water: Media, rng: np.random.Generator, fluid_mm: float, within_mm: float
+@pytest.mark.parametrize("fluid_mm", [5.0, 100.0])
+def test_particles_are_fitted_with_refracted_rays(
+    table2: Camera, water: Media, rng: np.random.Generator, fluid_mm: float
 ) -> None:
     camera = replace(table2, columns=900, rows=600)
     space = behind(camera, water, fluid_mm, 5.0)
     true = np.array([(-1.2, 0.3, 2.5), (0.4, -0.8, 3.1), (1.5, 0.6, -2.2), (-0.3, 1.1, -3.0), (1.6, 0.0, 1.2)])
     image = render_points(camera, space, Balls(true, np.full(5, 4e5), 0.05), rng, rays=100_000).ravel()
-    view = raw_view(camera, water, 0.025)
+    view = raw_view(camera, water, 0.025, space=space)
     found = np.column_stack([true, np.full(5, 4e5)])
     residual = image.copy()
     add_all(view, found, -1.0, residual, DEPTHS)
     for _ in range(5):
         refine(observation_of(view, residual, 1.0 / (image + 36.0), DEPTHS), found)
-    error = places_by_snell(found[:, :3], space, camera) - true
-    # Where on the lens a fit looks most depends on which lenses a particle's rim meets: a third of the whole shift.
-    assert np.abs(error[:, 2]).max() < within_mm
-    assert abs(np.mean(error[:, 2])) < 0.35 * abs(np.mean(found[:, 2] - true[:, 2]))
+    error = found[:, :3] - true
+    # What the noise of so many rays moves a depth by; straight rays put the particles up to 0.1 mm too near.
+    assert np.abs(error[:, 2]).max() < 0.003
     assert np.abs(error[:, :2]).max() < 3e-4
 
 
 def test_shift_is_that_of_the_best_focus(table2: Camera, water: Media) -> None:
     space = behind(table2, water, 60.0, 5.0)
-    shift = paraxial_shift(np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]]), space, table2)
+    view = raw_view(table2, water, 0.025, space=space)
+    shift = paraxial_shift(np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]]), view)
     # On the axis a ray at height h seems to come from nearer by c h^2; by least squares over a disc that is 2/3 c R^2.
     for z, found in zip((-1.0, 1.0), shift, strict=True):
         layers, indices = space.layers(table2)
@@ -63,8 +63,8 @@ def test_shift_is_that_of_the_best_focus(table2: Camera, water: Media) -> None:
 
 def test_air_shifts_nothing_and_the_wall_does(table2: Camera, water: Media) -> None:
     points = np.array([[1.0, -2.0, -5.3], [0.5, 0.5, 2.0]])
-    in_air = ObjectSpace(water.in_air())
-    np.testing.assert_array_equal(places_by_snell(points, in_air, table2), points)
+    in_air = raw_view(table2, water.in_air(), 0.025, space=ObjectSpace(water.in_air()))
+    np.testing.assert_allclose(places_by_snell(points, in_air), points, rtol=1e-12)
     # A point in the window has the window's own shift, not an error.
-    shift = paraxial_shift(points, behind(table2, water, 5.0, 5.0), table2)
+    shift = paraxial_shift(points, raw_view(table2, water, 0.025, space=behind(table2, water, 5.0, 5.0)))
     assert np.all(shift[:, 2] < -0.002)

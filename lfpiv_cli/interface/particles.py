@@ -30,7 +30,6 @@ from lfpiv_cli.notice import Notice
 from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.particles.diameter import LIMIT_SIGMAS, UNKNOWN_LENSES, diameter_by
 from lfpiv_cli.particles.neighbour_frames import second_pass
-from lfpiv_cli.particles.refraction import places_by_snell
 from lfpiv_cli.particles.rounds import ROUNDS, first_pass
 from lfpiv_cli.particles.search import Particles, Task, result, task_of
 from lfpiv_cli.particles.view import raw_view
@@ -247,7 +246,8 @@ def _lens_mm(bench: Bench) -> float:
 def _task(bench: Bench, frame: Frame) -> Task:
     content, settings = bench.content, bench.settings
     radius = 0.5 * (settings.reconstruction.particle_diameter_mm or UNKNOWN_LENSES * _lens_mm(bench))
-    view = raw_view(content.camera, settings.media_model(), radius, content.weights.calibration)
+    space = _space(content, settings)
+    view = raw_view(content.camera, settings.media_model(), radius, content.weights.calibration, space)
     photons = settings.reconstruction.photons_per_count
     return task_of(frame.image, view, content.weights, content.camera, frame.sums, frame.unusable, photons)
 
@@ -256,17 +256,16 @@ def points_of(bench: Bench, frame: Frame, found: Particles, size: TracerSize, pr
     """Return the particles found behind an image in the coordinates of files, by Snell's law where it is known."""
     content = bench.content
     space = _space(content, bench.settings)
-    places = places_by_snell(found.position_mm, space, content.camera)
     left = what_is_left(frame, found)
     norm = float(np.linalg.norm(np.where(frame.unusable, 0.0, frame.image)))
     return Points(
-        content.reference.points_from_focal_point(places),
+        content.reference.points_from_focal_point(found.position_mm),
         {
             "intensity": found.light_counts,
             "covariance_mm2": symmetric(found.covariance_mm2),
             "chi2": found.chi2,
             "seen": found.seen,
-            "flag": _outside(places, content.weights.grid),
+            "flag": _outside(found.position_mm, content.weights.grid),
         },
         content.reference,
         attributes=content.reference.attributes()

@@ -1,81 +1,110 @@
-"""Where particles are by Snell's law, from where paraxial rays have them.
+"""Particles by Snell's law.
 
-Particles are fitted with paraxial rays, which all come from one point. Behind plane faces those through the rim of the
-main lens come from nearer by: some 6 um behind 5 mm of acrylic and 5 mm of water at f/4, a tenth of a millimetre behind
-10 cm of water. What a fit returns is the point whose rays are closest to the real ones, by least squares over the main
-lens: its distance from the slopes along the lens, its lateral place from their mean (Eqs. 4, 6, 9).
+Behind plane faces rays do not all come from one point: those through the rim of the main lens come from nearer by,
+some 6 um behind 5 mm of acrylic and 5 mm of water at f/4, a tenth of a millimetre behind 10 cm of water. Particles are
+fitted with straight rays from the point that is closest to all of them (a cubic's slopes over a disc have their
+least-squares line where it spreads to sqrt(2/3) of the radius), and with what the real rays differ from those
+(`bend_of`, `displaced`).
+
+The same point is where a volume, which comes from paraxial rays, has the particle; `places_by_snell` turns such places
+into true ones.
 
 Axes: world or image axes, z away from the camera from the nominal focal point; lengths in mm.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from lfpiv_cli.optics.camera import Camera
-from lfpiv_cli.optics.object_space import ObjectSpace, slope_ratio
+from lfpiv_cli.optics.object_space import slope_polynomial, slope_ratio
+from lfpiv_cli.particles.view import View
 
-# Rings of equal area and rays on each: the slope is a cubic in the place on the lens, its moments are right to 0.4 %.
-RINGS, RAYS_PER_RING = 8, 8
 # The shift changes by some 1e-3 of what a point moves: twice leaves a millionth of it.
 REPEATS = 2
 # Points in the window are shifted like those this far behind its face, in depths over which light spreads by one lens.
 SHALLOWEST_DEPTHS = 1e-6
 
 
-def places_by_snell(points_mm: NDArray[np.float64], space: ObjectSpace, camera: Camera) -> NDArray[np.float64]:
-    """Return the points (n, 3) that paraxial rays see at the given ones, mm."""
-    places = points_mm
-    for _ in range(REPEATS):
-        places = points_mm - paraxial_shift(places, space, camera)
-    return places
+class Bend(NamedTuple):
+    """Rays from a particle, and the straight ones from a point in air that stand for them.
 
-
-def paraxial_shift(points_mm: NDArray[np.float64], space: ObjectSpace, camera: Camera) -> NDArray[np.float64]:
-    """Return how far (n, 3) from their places points are seen by who takes rays for paraxial, mm.
-
-    Raises
-    ------
-    ConfigError
-        Refraction is exact and the thickness of the window unknown.
+    Attributes
+    ----------
+    x, y : the particle's lateral place
+    nodes, factors : of its rays' slopes, see `object_space.slope_ratio`; empty where these rays are straight
+    seen_x, seen_y, distance : the point in air, and its distance from the lens
     """
-    if space.straight or not len(points_mm):
-        return np.zeros_like(points_mm)
-    in_fluid = points_mm.copy()
-    shallowest = SHALLOWEST_DEPTHS * camera.scale(space.media).depth_mm
-    in_fluid[:, 2] = np.maximum(points_mm[:, 2], shallowest - space.layers(camera)[0][-1])
-    lens = _rays_on_lens(camera.aperture_radius_mm)
-    reach = camera.aperture_radius_mm + float(np.linalg.norm(in_fluid[:, :2], axis=1).max())
-    nodes, factors = space.slope_polynomials(camera, in_fluid[:, 2], reach)
-    seen = _seen_at(in_fluid, lens, nodes, factors)
-    seen[:, 2] = (seen[:, 2] - camera.focus_distance_mm) / space.media.depth_ratio
-    return seen - in_fluid
 
-
-def _rays_on_lens(radius_mm: float) -> NDArray[np.float64]:
-    """Return points (m, 2) that stand for equal areas of the main lens, mm; their mean is zero."""
-    radius = radius_mm * np.sqrt((np.arange(RINGS) + 0.5) / RINGS)
-    angle = 2.0 * np.pi * np.arange(RAYS_PER_RING) / RAYS_PER_RING
-    return np.stack([np.outer(radius, f(angle)).ravel() for f in (np.cos, np.sin)], axis=1)
+    x: float
+    y: float
+    nodes: NDArray[np.float64]
+    factors: NDArray[np.float64]
+    seen_x: float
+    seen_y: float
+    distance: float
 
 
 @njit(cache=True)
-def _seen_at(
-    points: NDArray[np.float64], lens: NDArray[np.float64], nodes: NDArray[np.float64], factors: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return the points in air, (x, y, distance from the lens), whose rays have most nearly the slopes of the real."""
-    seen = np.empty_like(points)
-    for n in range(points.shape[0]):
-        mean_x = mean_y = along = spread = 0.0
-        for x, y in lens:
-            dx, dy = x - points[n, 0], y - points[n, 1]
-            ratio = slope_ratio(dx * dx + dy * dy, nodes[n], factors[n])
-            mean_x += ratio * dx / lens.shape[0]
-            mean_y += ratio * dy / lens.shape[0]
-            along += ratio * (dx * x + dy * y)
-            spread += x * x + y * y
-        distance = spread / along
-        seen[n] = -mean_x * distance, -mean_y * distance, distance
-    return seen
+def bend_of(view: View, x: float, y: float, z: float) -> Bend:
+    """Return the rays of a particle, image axes.
+
+    The point in air has their slopes in the middle of the lens, and at sqrt(2/3) of its radius.
+    """
+    camera = view.camera
+    if view.layers.indices.size < 2:
+        none = np.empty(0)
+        return Bend(x, y, none, none, x, y, camera.focus_distance_mm + view.depth_ratio * z)
+    thicknesses = view.layers.thicknesses_mm.copy()
+    thicknesses[-1] = max(thicknesses[-1] + z, SHALLOWEST_DEPTHS * view.scale.depth_mm)
+    lateral2, radius = x * x + y * y, camera.aperture_radius_mm
+    nodes, factors = slope_polynomial(radius + np.sqrt(lateral2), thicknesses, view.layers.indices)
+    distance = 1.0 / slope_ratio(lateral2 + radius * radius / 1.5, nodes, factors)
+    middle = distance * slope_ratio(lateral2, nodes, factors)
+    return Bend(x, y, nodes, factors, middle * x, middle * y, distance)
+
+
+@njit(cache=True)
+def displaced(bend: Bend, at_x: float, at_y: float) -> tuple[float, float]:
+    """Return by how much the real ray's slope (x, y) exceeds the straight one's where they cross the main lens."""
+    if bend.nodes.size == 0:
+        return 0.0, 0.0
+    dx, dy = at_x - bend.x, at_y - bend.y
+    ratio = slope_ratio(dx * dx + dy * dy, bend.nodes, bend.factors)
+    return ratio * dx - (at_x - bend.seen_x) / bend.distance, ratio * dy - (at_y - bend.seen_y) / bend.distance
+
+
+@njit(cache=True)
+def largest_displacement(bend: Bend, radius: float) -> float:
+    """Return a bound of what `displaced` returns on a main lens of that radius."""
+    if bend.nodes.size == 0:
+        return 0.0
+    reach = radius + np.sqrt(bend.x * bend.x + bend.y * bend.y)
+    middle = slope_ratio(0.0, bend.nodes, bend.factors)
+    return abs(slope_ratio(reach * reach, bend.nodes, bend.factors) - middle) * reach
+
+
+def places_by_snell(points_mm: NDArray[np.float64], view: View) -> NDArray[np.float64]:
+    """Return the points (n, 3) that paraxial rays see at the given ones, mm."""
+    places = points_mm
+    for _ in range(REPEATS):
+        places = points_mm - paraxial_shift(places, view)
+    return places
+
+
+@njit(cache=True)
+def paraxial_shift(points_mm: NDArray[np.float64], view: View) -> NDArray[np.float64]:
+    """Return how far (n, 3) from their places points are seen by who takes rays for paraxial, mm."""
+    shift = np.empty_like(points_mm)
+    shallowest = SHALLOWEST_DEPTHS * view.scale.depth_mm - view.layers.thicknesses_mm[-1]
+    for n in range(points_mm.shape[0]):
+        x, y, z = points_mm[n, 0], points_mm[n, 1], points_mm[n, 2]
+        if view.layers.indices.size > 1:
+            z = max(z, shallowest)
+        bend = bend_of(view, x, y, z)
+        depth = (bend.distance - view.camera.focus_distance_mm) / view.depth_ratio
+        shift[n] = bend.seen_x - x, bend.seen_y - y, depth - z
+    return shift

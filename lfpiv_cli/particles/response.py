@@ -11,6 +11,10 @@ of P over the patch come from a three-point Gauss rule, and the two axes are joi
 first moments (`rim`). In a hexagonal cell P does not separate; it is taken from a table of its means over
 patches (`cells`).
 
+Faces between media bend the rays (`refraction`). What that moves x_m by in the middle of a lens's patches moves the
+lens's profiles; what it moves x_m by more in each patch enters by the profiles' slopes. On the sensor rays stay where
+they were: what moves x_m by a pixel moves x_s by s_mu/s_i of it.
+
 Axes: image axes, mm; see `view`. An *entry* is the meeting of a pixel with one lens; a pixel between two micro-images
 can have two.
 """
@@ -24,6 +28,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.particles.cells import level_at, share_at
+from lfpiv_cli.particles.refraction import Bend, bend_of, displaced, largest_displacement
 from lfpiv_cli.particles.rim import covered_share
 from lfpiv_cli.particles.view import View
 
@@ -82,6 +87,15 @@ class Profile(NamedTuple):
     values: NDArray[np.float64]
 
 
+class Lens(NamedTuple):
+    """What one lens shows along both axes, and what its profiles were moved by on the array for bent rays."""
+
+    across: Profile
+    down: Profile
+    bent_x: float
+    bent_y: float
+
+
 @njit(cache=True)
 def ball_share(t: float) -> float:
     """Return the share of a ball of radius 1 that lies below t along one axis."""
@@ -109,10 +123,9 @@ def respond(view: View, x: float, y: float, z: float, pixels: NDArray[np.int32],
     values : (capacity, 4) light and its derivatives by x, y, z, written
     """
     camera = view.camera
-    projection = _project(view, x, y, z)
-    low_i, high_i, low_j, high_j = _lenses(view, projection)
-    axis_x = Axis(x, projection.at_x, projection.stretch_x, view.half_x_mm, camera.columns)
-    axis_y = Axis(y, projection.at_y, projection.stretch_y, view.half_y_mm, camera.rows)
+    bend = bend_of(view, x, y, z)
+    projection = _project(view, bend)
+    low_i, high_i, low_j, high_j = _lenses(view, projection, bend)
     along_x = np.empty((PROFILE_ROWS, LONGEST_PROFILE))
     along_y = np.empty((PROFILE_ROWS, LONGEST_PROFILE))
     count = 0
@@ -120,22 +133,26 @@ def respond(view: View, x: float, y: float, z: float, pixels: NDArray[np.int32],
         for i in range(low_i, high_i + 1):
             s_x, s_y = view.centres_mm[j, i]
             if view.cell_table.shape[0] > 0:
-                count += _join_cell(view, projection, (s_x, s_y), pixels[count:], values[count:])
+                count += _join_cell(view, projection, bend, (s_x, s_y), pixels[count:], values[count:])
                 continue
+            bent_x, bent_y = _bent_at(view, projection, bend, s_x, s_y)
+            axis_x = Axis(projection.x, projection.at_x + bent_x, projection.stretch_x, view.half_x_mm, camera.columns)
             across = _profile(view, projection, axis_x, s_x, along_x)
             if across.number == 0:
                 continue
+            axis_y = Axis(projection.y, projection.at_y + bent_y, projection.stretch_y, view.half_y_mm, camera.rows)
             down = _profile(view, projection, axis_y, s_y, along_y)
             if down.number > 0:
-                count += _join(view, projection, across, down, pixels[count:], values[count:])
+                lens = Lens(across, down, bent_x, bent_y)
+                count += _join(view, projection, bend, lens, pixels[count:], values[count:])
     return count
 
 
 @njit(cache=True)
-def _project(view: View, x: float, y: float, z: float) -> Projection:
+def _project(view: View, bend: Bend) -> Projection:
     """Return how the main lens shows a particle."""
     camera = view.camera
-    distance = camera.focus_distance_mm + view.depth_ratio * z
+    x, y, distance = bend.seen_x, bend.seen_y, bend.distance
     beta = camera.image_distance_mm / distance
     alpha = 1.0 + beta - camera.image_distance_mm / camera.focal_length_mm
     x0, y0 = -beta * x, -beta * y
@@ -157,11 +174,40 @@ def _project(view: View, x: float, y: float, z: float) -> Projection:
 
 
 @njit(cache=True)
-def _lenses(view: View, projection: Projection) -> tuple[int, int, int, int]:
+def _bent_at(view: View, projection: Projection, bend: Bend, s_x: float, s_y: float) -> tuple[float, float]:
+    """Return what bent rays are moved by (x, y) on the array in the middle of the patches of the lens at s."""
+    if bend.nodes.size == 0:
+        return 0.0, 0.0
+    radius, ball = view.camera.aperture_radius_mm, projection.beta * view.particle_radius_mm
+    gain_x, gain_y = projection.stretch_x * projection.alpha, projection.stretch_y * projection.alpha
+    at_x = _middle_of_part(gain_x, projection.at_x - s_x, view.half_x_mm + ball, radius)
+    at_y = _middle_of_part(gain_y, projection.at_y - s_y, view.half_y_mm + ball, radius)
+    slope_x, slope_y = displaced(bend, at_x, at_y)
+    distance = view.camera.image_distance_mm
+    return projection.stretch_x * distance * slope_x, projection.stretch_y * distance * slope_y
+
+
+@njit(cache=True)
+def _middle_of_part(gain: float, offset: float, reach: float, radius: float) -> float:
+    """Return the middle of where `offset` + `gain` X is within `reach` of 0, for X in -radius to radius.
+
+    Where it nowhere is, the rim that is nearest.
+    """
+    if abs(gain) * radius <= 1e-3 * reach:
+        return 0.0
+    one, other = (-offset - reach) / gain, (-offset + reach) / gain
+    low = min(max(min(one, other), -radius), radius)
+    return 0.5 * (low + min(max(max(one, other), -radius), radius))
+
+
+@njit(cache=True)
+def _lenses(view: View, projection: Projection, bend: Bend) -> tuple[int, int, int, int]:
     """Return the ranges of lens indices, first and last along i and j, whose cells the light can reach."""
     camera = view.camera
     widest = max(projection.stretch_x, projection.stretch_y)
-    reach = abs(projection.alpha) * camera.aperture_radius_mm * widest + projection.beta * view.particle_radius_mm
+    bent = camera.image_distance_mm * largest_displacement(bend, camera.aperture_radius_mm)
+    spread = abs(projection.alpha) * camera.aperture_radius_mm + bent
+    reach = spread * widest + projection.beta * view.particle_radius_mm
     basis = view.inverse_basis
     dx, dy = projection.at_x - camera.origin_mm[0], projection.at_y - camera.origin_mm[1]
     i = dx * basis[0, 0] + dy * basis[1, 0]
@@ -244,8 +290,8 @@ def _profile(view: View, projection: Projection, axis: Axis, s: float, out: NDAr
 def _join(
     view: View,
     projection: Projection,
-    across: Profile,
-    down: Profile,
+    bend: Bend,
+    lens: Lens,
     pixels: NDArray[np.int32],
     values: NDArray[np.float64],
 ) -> int:
@@ -254,12 +300,15 @@ def _join(
     count = 0
     x, y, beta, slope = projection.x, projection.y, projection.beta, projection.slope
     scale, lever = projection.scale, projection.lever
-    column, columns, along_x = across
-    row, rows, along_y = down
+    column, columns, along_x = lens.across
+    row, rows, along_y = lens.down
     width = camera.pixel_mm / scale
     norm = width * width / (np.pi * camera.aperture_radius_mm**2)
     widen_z = -2.0 * lever * slope / scale
     place_x = lever * beta / scale
+    # What a profile changes by with x, over what the array point does.
+    per_x = 1.0 / (projection.stretch_x * (projection.alpha * place_x - beta))
+    per_y = 1.0 / (projection.stretch_y * (projection.alpha * place_x - beta))
     inside = max(camera.aperture_radius_mm - 0.71 * abs(width), 0.0) ** 2
     outside = (camera.aperture_radius_mm + 0.71 * abs(width)) ** 2
     for m in range(rows):
@@ -286,6 +335,11 @@ def _join(
                 by_z = share * (h0_z * v0 + h0 * v0_z)
                 by_z += mean_x * (h1_z * v0 + h1 * v0_z) + mean_y * (h0_z * v1 + h0 * v1_z)
                 by_z += (share_x * (x - patch_x) + share_y * (y - patch_y)) * lever * slope / scale * h0 * v0
+            if bend.nodes.size > 0:
+                slope_x, slope_y = displaced(bend, patch_x, patch_y)
+                more_x = projection.stretch_x * camera.image_distance_mm * slope_x - lens.bent_x
+                more_y = projection.stretch_y * camera.image_distance_mm * slope_y - lens.bent_y
+                light += by_x * per_x * more_x + by_y * per_y * more_y
             if light <= 0.0 or count >= pixels.size:
                 continue
             pixels[count] = (row + m) * camera.columns + column + n
@@ -301,6 +355,7 @@ def _join(
 def _join_cell(
     view: View,
     projection: Projection,
+    bend: Bend,
     lens: tuple[float, float],
     pixels: NDArray[np.int32],
     values: NDArray[np.float64],
@@ -342,7 +397,9 @@ def _join_cell(
             r2 = patch_x * patch_x + patch_y * patch_y
             if r2 >= outside or count >= pixels.size:
                 continue
-            u, v = off_x + gain_x * patch_x, off_y + gain_y * patch_y
+            slope_x, slope_y = displaced(bend, patch_x, patch_y)
+            u = off_x + gain_x * patch_x + stretch_x * camera.image_distance_mm * slope_x
+            v = off_y + gain_y * patch_y + stretch_y * camera.image_distance_mm * slope_y
             if u * u + v * v >= furthest:
                 continue
             part, by_u, by_v, by_uu, by_uv, by_vv = share_at(u, v, low, high, blend, view.cell_step_mm)

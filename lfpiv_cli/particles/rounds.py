@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.particles.candidates import boxes_of, explain_rest, find_peaks, points_in_raw_frame
 from lfpiv_cli.particles.fitting import Least, accept, judge
+from lfpiv_cli.particles.refraction import places_by_snell
 from lfpiv_cli.particles.search import (
     LAST_SWEEPS,
     LAST_UNEXPLAINED,
@@ -177,6 +178,7 @@ def candidates_of(
     volume = explain_rest(task.weights, task.prepared, background, task.sums, iterations, progress)
     index, light = find_peaks(volume, boxes_of(task.view.scale, task.weights.grid.spacing_mm))
     points = task.camera.to_image_axes(points_in_raw_frame(task.weights, index))
+    points = places_by_snell(points, task.view)
     return np.column_stack([points, light]), light
 
 

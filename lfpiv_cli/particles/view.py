@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.optics.camera import Camera, KernelCamera
-from lfpiv_cli.optics.media import Media
+from lfpiv_cli.optics.media import Layers, Media
 from lfpiv_cli.optics.microlenses import Lattice
+from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.particles.cells import cell_shares, hexagon_radius, no_shares, smallest_ball_mm
 from lfpiv_cli.particles.rim import rim_table
 from lfpiv_cli.scale import Scale
@@ -36,6 +37,7 @@ class View(NamedTuple):
     camera : with the plain lattice of the raw image
     scale : its lengths in the scene
     depth_ratio : n_a/n_w (Eq. 9)
+    layers : from the lens to the focal point, of plane faces that bend rays by Snell's law; one where rays are straight
     half_x_mm, half_y_mm : half the rectangle that holds a lens's cell
     cell_reach : how far a cell reaches at most from its lens, in steps of the lattice
     cell_table, cell_side2_mm2, cell_step_mm, cell_ball_mm : of cells that are no rectangles, see `cells.CellShares`
@@ -48,6 +50,7 @@ class View(NamedTuple):
     camera: KernelCamera
     scale: Scale
     depth_ratio: float
+    layers: Layers
     half_x_mm: float
     half_y_mm: float
     cell_reach: float
@@ -64,13 +67,20 @@ class View(NamedTuple):
     table_step_mm: float
 
 
-def raw_view(camera: Camera, media: Media, particle_radius_mm: float, calibration: Calibration | None = None) -> View:
+def raw_view(
+    camera: Camera,
+    media: Media,
+    particle_radius_mm: float,
+    calibration: Calibration | None = None,
+    space: ObjectSpace | None = None,
+) -> View:
     """Return the view of a camera on the raw image.
 
     Parameters
     ----------
     camera : as the weights have it; its lattice is used where there is no calibration
     calibration : gives the measured centres of the lens images
+    space : what bends rays; None: they are straight from the equivalent points
     """
     lattice_px = camera.micro_image_lattice_px() if calibration is None else calibration.fit.lattice_px
     # One lens more than the sensor's corners: micro-images reach over its edge.
@@ -97,6 +107,7 @@ def raw_view(camera: Camera, media: Media, particle_radius_mm: float, calibratio
         camera=camera.for_kernels(),
         scale=scale,
         depth_ratio=media.depth_ratio,
+        layers=(space or ObjectSpace(media, refraction="paraxial")).layers(camera),
         half_x_mm=float(half_x),
         half_y_mm=float(half_y),
         cell_reach=cell_reach,

@@ -209,7 +209,8 @@ def refine_calibration(
     variance = np.concatenate([each.covariance_mm2[:, 2, 2] for each in found])
     # A particle that hardly lights the sensor may have no depth that can be determined.
     known = np.isfinite(variance) & (variance > 0.0)
-    position, sigma = places_by_snell(position[known], space, camera), np.sqrt(variance[known])
+    behind_walls = view._replace(layers=space.layers(camera))
+    position, sigma = places_by_snell(position[known], behind_walls), np.sqrt(variance[known])
     return Refinement(
         walls=find_walls(position, sigma, grid.bounds_mm(2), flow.width_mm, len(images)),
         nuisances=fit.found,
