@@ -35,11 +35,14 @@ from lfpiv_cli.particles.view import View
 # Three-point Gauss-Legendre on (-1, 1): exact for the cubic profile wherever it has no kink within the patch.
 GAUSS_AT = np.sqrt(0.6)
 GAUSS_WEIGHT = (5.0 / 18.0, 8.0 / 18.0, 5.0 / 18.0)
-# Rows of a profile: mean and slope of P, their derivatives by x and by z.
-MEAN, SLOPE, MEAN_X, SLOPE_X, MEAN_Z, SLOPE_Z, PATCH = range(7)
-PROFILE_ROWS = 7
+# Rows of a profile: mean and slope of P, their derivatives by x and by z, the patch's middle, and how far from the
+# ball's middle the part of it is that is seen, times P.
+MEAN, SLOPE, MEAN_X, SLOPE_X, MEAN_Z, SLOPE_Z, PATCH, AWAY = range(8)
+PROFILE_ROWS = 8
 # Pixels that one micro-image may span.
 LONGEST_PROFILE = 96
+# Of a ball; what sees less sees nothing.
+SMALLEST_SHARE = 1e-9
 # Columns of the entries' values: light, and its derivatives by x, y and z.
 VALUES = 4
 
@@ -54,6 +57,7 @@ class Projection(NamedTuple):
     at_x, at_y : where the middle of the main lens shows the centre
     stretch_x, stretch_y : the distortion's local scale: array points are at + stretch alpha X
     scale, lever : x_s changes by `scale` with X, by -`lever` with beta x
+    radius, growth : the ball's on the array as a pixel sees it, and its relative change with z
     """
 
     x: float
@@ -67,6 +71,8 @@ class Projection(NamedTuple):
     stretch_y: float
     scale: float
     lever: float
+    radius: float
+    growth: float
 
 
 class Axis(NamedTuple):
@@ -110,6 +116,13 @@ def ball_share(t: float) -> float:
 def ball_density(t: float) -> float:
     """Return the derivative of `ball_share`."""
     return 0.75 * (1.0 - t * t) if -1.0 < t < 1.0 else 0.0
+
+
+@njit(cache=True)
+def ball_moment(t: float) -> float:
+    """Return the integral of t `ball_density` up to t, but for a constant."""
+    t2 = min(t * t, 1.0)
+    return 0.1875 * t2 * (2.0 - t2)
 
 
 @njit(cache=True)
@@ -158,18 +171,24 @@ def _project(view: View, bend: Bend) -> Projection:
     x0, y0 = -beta * x, -beta * y
     r2 = x0 * x0 + y0 * y0
     tilt = camera.microlens_distance_mm / camera.image_distance_mm
+    scale, lever = camera.bend * alpha + tilt * (alpha - 1.0), camera.bend + tilt
+    slope = -beta * view.depth_ratio / distance
+    # Of rays that strike one place, those from one side of the ball crossed the main lens elsewhere than the others.
+    radius = abs(1.0 - alpha * lever / scale) * beta * view.particle_radius_mm
     return Projection(
         x,
         y,
         alpha,
         beta,
-        -beta * view.depth_ratio / distance,
+        slope,
         x0 * (1.0 + camera.distortion_per_mm2 * r2),
         y0 * (1.0 + camera.distortion_per_mm2 * r2),
         1.0 + camera.distortion_per_mm2 * (r2 + 2.0 * x0 * x0),
         1.0 + camera.distortion_per_mm2 * (r2 + 2.0 * y0 * y0),
-        camera.bend * alpha + tilt * (alpha - 1.0),
-        camera.bend + tilt,
+        scale,
+        lever,
+        radius,
+        slope * (1.0 / beta - lever / scale),
     )
 
 
@@ -178,7 +197,7 @@ def _bent_at(view: View, projection: Projection, bend: Bend, s_x: float, s_y: fl
     """Return what bent rays are moved by (x, y) on the array in the middle of the patches of the lens at s."""
     if bend.nodes.size == 0:
         return 0.0, 0.0
-    radius, ball = view.camera.aperture_radius_mm, projection.beta * view.particle_radius_mm
+    radius, ball = view.camera.aperture_radius_mm, projection.radius
     gain_x, gain_y = projection.stretch_x * projection.alpha, projection.stretch_y * projection.alpha
     at_x = _middle_of_part(gain_x, projection.at_x - s_x, view.half_x_mm + ball, radius)
     at_y = _middle_of_part(gain_y, projection.at_y - s_y, view.half_y_mm + ball, radius)
@@ -207,7 +226,7 @@ def _lenses(view: View, projection: Projection, bend: Bend) -> tuple[int, int, i
     widest = max(projection.stretch_x, projection.stretch_y)
     bent = camera.image_distance_mm * largest_displacement(bend, camera.aperture_radius_mm)
     spread = abs(projection.alpha) * camera.aperture_radius_mm + bent
-    reach = spread * widest + projection.beta * view.particle_radius_mm
+    reach = spread * widest + projection.radius
     basis = view.inverse_basis
     dx, dy = projection.at_x - camera.origin_mm[0], projection.at_y - camera.origin_mm[1]
     i = dx * basis[0, 0] + dy * basis[1, 0]
@@ -254,14 +273,14 @@ def _profile(view: View, projection: Projection, axis: Axis, s: float, out: NDAr
     alpha, beta, slope = projection.alpha, projection.beta, projection.slope
     scale, lever = projection.scale, projection.lever
     x, at, stretch, half, pixels = axis
-    radius = beta * view.particle_radius_mm
+    radius, growth = projection.radius, projection.growth
     gain = stretch * alpha
     shift = (1.0 - camera.bend) * s - lever * beta * x
     first, count = _lit_pixels(view, gain, at - s, half + radius, scale, shift, pixels)
     width = camera.pixel_mm / scale
     for k in range(count):
         middle = ((first + k + 0.5 - 0.5 * pixels) * camera.pixel_mm - shift) / scale
-        out[:PATCH, k] = 0.0
+        out[:, k] = 0.0
         out[PATCH, k] = middle
         for node in range(3):
             xi = (node - 1) * GAUSS_AT
@@ -275,7 +294,7 @@ def _profile(view: View, projection: Projection, axis: Axis, s: float, out: NDAr
             share = ball_share(upper) - ball_share(lower)
             dense_upper, dense_lower = ball_density(upper), ball_density(lower)
             by_u = (dense_upper - dense_lower) / radius
-            by_z = by_u * u_z - (dense_upper * upper - dense_lower * lower) * slope / beta
+            by_z = by_u * u_z - (dense_upper * upper - dense_lower * lower) * growth
             weight = GAUSS_WEIGHT[node]
             out[MEAN, k] += weight * share
             out[SLOPE, k] += 3.0 * weight * xi * share
@@ -283,6 +302,7 @@ def _profile(view: View, projection: Projection, axis: Axis, s: float, out: NDAr
             out[SLOPE_X, k] += 3.0 * weight * xi * by_u * u_x
             out[MEAN_Z, k] += weight * by_z
             out[SLOPE_Z, k] += 3.0 * weight * xi * by_z
+            out[AWAY, k] += weight * (ball_moment(upper) - ball_moment(lower))
     return Profile(first, count, out)
 
 
@@ -306,6 +326,7 @@ def _join(
     norm = width * width / (np.pi * camera.aperture_radius_mm**2)
     widen_z = -2.0 * lever * slope / scale
     place_x = lever * beta / scale
+    away = place_x * view.particle_radius_mm
     # What a profile changes by with x, over what the array point does.
     per_x = 1.0 / (projection.stretch_x * (projection.alpha * place_x - beta))
     per_y = 1.0 / (projection.stretch_y * (projection.alpha * place_x - beta))
@@ -326,8 +347,11 @@ def _join(
                 by_z = h0_z * v0 + h0 * v0_z
             else:
                 h1, h1_x, h1_z = along_x[SLOPE, n], along_x[SLOPE_X, n], along_x[SLOPE_Z, n]
+                # Light from one side of the ball crossed the main lens elsewhere than light from its middle.
+                rim_x = patch_x + away * along_x[AWAY, n] / max(h0, SMALLEST_SHARE)
+                rim_y = patch_y + away * along_y[AWAY, m] / max(v0, SMALLEST_SHARE)
                 share, mean_x, mean_y, share_x, share_y = covered_share(
-                    patch_x, patch_y, view.table, view.table_step_mm
+                    rim_x, rim_y, abs(width), camera.aperture_radius_mm, view.table, view.table_step_mm
                 )
                 light = share * h0 * v0 + mean_x * h1 * v0 + mean_y * h0 * v1
                 by_x = share * h0_x * v0 + mean_x * h1_x * v0 + mean_y * h0_x * v1 + share_x * place_x * h0 * v0
@@ -363,14 +387,13 @@ def _join_cell(
     """Write the entries of one lens whose cell is no rectangle; return their number."""
     camera = view.camera
     count = 0
-    x, y, alpha, beta, slope, at_x, at_y, stretch_x, stretch_y, scale, whole_lever = projection
+    x, y, alpha, beta, slope, at_x, at_y, stretch_x, stretch_y, scale, whole_lever, radius, growth = projection
     s_x, s_y = lens
     off_x, off_y = at_x - s_x, at_y - s_y
     lever = whole_lever / scale
     gain_x, gain_y = stretch_x * alpha, stretch_y * alpha
     shift_x = (1.0 - camera.bend) * s_x - lever * scale * beta * x
     shift_y = (1.0 - camera.bend) * s_y - lever * scale * beta * y
-    radius = beta * view.particle_radius_mm
     column, columns = _lit_pixels(view, gain_x, off_x, view.half_x_mm + radius, scale, shift_x, camera.columns)
     row, rows = _lit_pixels(view, gain_y, off_y, view.half_y_mm + radius, scale, shift_y, camera.rows)
     width = abs(camera.pixel_mm / scale)
@@ -384,9 +407,11 @@ def _join_cell(
     stretch = 0.5 * (stretch_x + stretch_y)
     side = stretch * abs(alpha) * width
     side_z = stretch * slope * width * (np.sign(alpha) - abs(alpha) * lever)
-    level, blend = level_at(side, view.cell_side2_mm2)
-    wider = 0.1 * (radius * radius - view.cell_ball_mm**2)
-    wider_z = 0.2 * radius * view.particle_radius_mm * slope + side * side_z / 12.0
+    more = 0.2 * (radius * radius - view.cell_ball_mm**2)
+    whole_side = np.sqrt(max(side * side + 12.0 * more, 0.0))
+    level, blend = level_at(whole_side, view.cell_side2_mm2)
+    wider = 0.5 * (more - (whole_side * whole_side - side * side) / 12.0)
+    wider_z = 0.2 * radius * radius * growth + side * side_z / 12.0
     low, high = view.cell_table[level], view.cell_table[level + 1]
     half_x, half_y = 0.5 * width * gain_x, 0.5 * width * gain_y
     for m in range(rows):
@@ -409,8 +434,17 @@ def _join_cell(
             by_x, by_y = by_u * move_x, by_v * move_y
             light = part
             if r2 > inside:
+                # As in `_join`; the moment of what is seen of the ball is a fifth of the slope of P, nearly, its
+                # middle no further away than the ball's edge.
+                moment = 0.2 * radius
+                away = -lever * beta * view.particle_radius_mm * moment / max(part, moment * np.hypot(by_u, by_v), 1e-9)
                 share, mean_x, mean_y, share_x, share_y = covered_share(
-                    patch_x, patch_y, view.table, view.table_step_mm
+                    patch_x + away * by_u,
+                    patch_y + away * by_v,
+                    width,
+                    camera.aperture_radius_mm,
+                    view.table,
+                    view.table_step_mm,
                 )
                 lean_x, lean_y = mean_x * half_x, mean_y * half_y
                 light = share * part + lean_x * by_u + lean_y * by_v
