@@ -164,7 +164,7 @@ def test_hexagonal_cells_share_out_all_light() -> None:
     i, j = np.meshgrid(np.arange(-4, 5), np.arange(-4, 5))
     lenses = lattice.points(np.stack([i.ravel(), j.ravel()], axis=1))
     for side in (0.0, 0.02, 0.07, 0.1):
-        level, blend = level_at(side, side2)
+        level, blend = level_at(side * side, side2)
         for place in np.random.default_rng(4).uniform(-0.1, 0.1, (20, 2)):
             shares = [share_at(*(place - lens), table[level], table[level + 1], blend, step) for lens in lenses]
             # Second-order terms between entries leave a quarter of (1/16)^3, chords 1e-4 of each of three cells.

@@ -24,10 +24,15 @@ FINER = 4
 # Sides of the patches: none, then from this share of the ball's radius on, each longer by this factor, up to the pitch
 # of the lenses. Shares are almost linear in the side's square. Beyond, two pixels see more than two lenses apart.
 FIRST_SIDE, NEXT_SIDE = 0.5, 1.35
+# Where particles are far from focus their balls are seen up to so much smaller than in it. Blur makes a ball larger,
+# nothing makes it smaller: the first table is that of a smaller one, by what its square lacks.
+SMALLER_BALL = 0.85
 # Balls whose images are smaller than this share of the pitch are taken as this large: their shares are almost steps.
 SMALLEST_SHARE_OF_PITCH = 1.0 / 16.0
 # Chords into which a ball is cut; Gauss's rule on them is right to 1e-4 where an edge ends within the ball.
 CHORDS = 96
+# Of a ball of radius 1 along an axis; a patch of side 1 has 1/12.
+BALL_VARIANCE = 0.2
 # Columns of the table: the share, its first and its second derivatives.
 SHARE, BY_U, BY_V, BY_UU, BY_UV, BY_VV = range(6)
 COLUMNS = 6
@@ -38,9 +43,9 @@ class CellShares(NamedTuple):
 
     Attributes
     ----------
-    table : (sides, n, n, 6), index [side, v, u] of the ball's centre, the middle entry the lens's; empty for cells
+    table : (levels, n, n, 6), index [level, v, u] of the ball's centre, the middle entry the lens's; empty for cells
         that are rectangles
-    side2_mm2 : (sides,) the patches' sides squared
+    side2_mm2 : (levels,) the patches' sides squared, below 0 for the smaller ball: 12 times the variance that it lacks
     step_mm : distance of entries
     radius_mm : the ball's radius on the array
     """
@@ -70,21 +75,25 @@ def cell_shares(lattice: Lattice, radius_mm: float) -> CellShares:
     """Return the shares for the cells of a hexagonal lattice and a ball whose image has about this radius."""
     radius = max(radius_mm, smallest_ball_mm(lattice))
     step, pitch = radius / ENTRIES_PER_RADIUS, float(lattice.pitch.max())
-    levels = max(int(np.ceil(np.log(pitch / (FIRST_SIDE * radius)) / np.log(NEXT_SIDE))), 0)
-    sides = np.array([0.0, *(FIRST_SIDE * radius * NEXT_SIDE**level for level in range(levels)), pitch])
+    steps = max(int(np.ceil(np.log(pitch / (FIRST_SIDE * radius)) / np.log(NEXT_SIDE))), 0)
+    sides = np.array([0.0, *(FIRST_SIDE * radius * NEXT_SIDE**n for n in range(steps)), pitch])
     count = int(np.ceil((hexagon_radius(lattice) + 1.5 * radius + 0.75 * pitch) / step))
     axis = step * np.arange(-count, count + 1, dtype=np.float64)
     fine = step / FINER * np.arange(-count * FINER, count * FINER + 1, dtype=np.float64)
-    share = _share(lattice, fine, radius)
-    by_v, by_u = np.gradient(share, fine[1] - fine[0])
-    by_uv, by_uu = np.gradient(by_u, fine[1] - fine[0])
-    by_vv = np.gradient(by_v, fine[1] - fine[0], axis=0)
-    table = np.zeros((sides.size, axis.size, axis.size, COLUMNS))
-    for level, side in enumerate(sides):
-        mean = _mean_over(axis, fine, side)
-        for column, values in enumerate((share, by_u, by_v, by_uu, by_uv, by_vv)):
-            table[level, ..., column] = mean @ values @ mean.T
-    return CellShares(table, sides**2, step, radius)
+    smaller, usual = (_with_derivatives(_share(lattice, fine, r), fine) for r in (SMALLER_BALL * radius, radius))
+    means = [_mean_over(axis, fine, side) for side in sides]
+    levels = [(means[0], smaller), *((mean, usual) for mean in means)]
+    table = np.stack([np.stack([mean @ values @ mean.T for values in ball], axis=-1) for mean, ball in levels])
+    lacking = 12.0 * BALL_VARIANCE * (1.0 - SMALLER_BALL**2) * radius**2
+    return CellShares(table, np.array([-lacking, *sides**2]), step, radius)
+
+
+def _with_derivatives(share: NDArray[np.float64], axis_mm: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """Return the columns of the table for shares on an axis."""
+    step = axis_mm[1] - axis_mm[0]
+    by_v, by_u = np.gradient(share, step)
+    by_uv, by_uu = np.gradient(by_u, step)
+    return [share, by_u, by_v, by_uu, by_uv, np.gradient(by_v, step, axis=0)]
 
 
 def _mean_over(axis: NDArray[np.float64], fine: NDArray[np.float64], side: float) -> NDArray[np.float64]:
@@ -133,10 +142,10 @@ def _below(t: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 @njit(cache=True)
-def level_at(side_mm: float, side2_mm2: NDArray[np.float64]) -> tuple[int, float]:
-    """Return the table's level below a patch's side and the share of the next one."""
+def level_at(square_mm2: float, side2_mm2: NDArray[np.float64]) -> tuple[int, float]:
+    """Return the table's level below a patch's side squared and the share of the next one."""
     level = 0
-    square = min(side_mm * side_mm, side2_mm2[-1])
+    square = min(max(square_mm2, side2_mm2[0]), side2_mm2[-1])
     while level < side2_mm2.size - 2 and side2_mm2[level + 1] < square:
         level += 1
     return level, (square - side2_mm2[level]) / (side2_mm2[level + 1] - side2_mm2[level])

@@ -27,7 +27,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from lfpiv_cli.particles.cells import level_at, share_at
+from lfpiv_cli.particles.cells import BALL_VARIANCE, level_at, share_at
 from lfpiv_cli.particles.refraction import Bend, bend_of, displaced, largest_displacement
 from lfpiv_cli.particles.rim import covered_share
 from lfpiv_cli.particles.view import View
@@ -407,11 +407,10 @@ def _join_cell(
     stretch = 0.5 * (stretch_x + stretch_y)
     side = stretch * abs(alpha) * width
     side_z = stretch * slope * width * (np.sign(alpha) - abs(alpha) * lever)
-    more = 0.2 * (radius * radius - view.cell_ball_mm**2)
-    whole_side = np.sqrt(max(side * side + 12.0 * more, 0.0))
-    level, blend = level_at(whole_side, view.cell_side2_mm2)
-    wider = 0.5 * (more - (whole_side * whole_side - side * side) / 12.0)
-    wider_z = 0.2 * radius * radius * growth + side * side_z / 12.0
+    square = side * side + 12.0 * BALL_VARIANCE * (radius * radius - view.cell_ball_mm**2)
+    level, blend = level_at(square, view.cell_side2_mm2)
+    wider = 0.5 / 12.0 * min(square - view.cell_side2_mm2[0], 0.0)
+    wider_z = BALL_VARIANCE * radius * radius * growth + side * side_z / 12.0
     low, high = view.cell_table[level], view.cell_table[level + 1]
     half_x, half_y = 0.5 * width * gain_x, 0.5 * width * gain_y
     for m in range(rows):
@@ -436,7 +435,7 @@ def _join_cell(
             if r2 > inside:
                 # As in `_join`; the moment of what is seen of the ball is a fifth of the slope of P, nearly, its
                 # middle no further away than the ball's edge.
-                moment = 0.2 * radius
+                moment = BALL_VARIANCE * radius
                 away = -lever * beta * view.particle_radius_mm * moment / max(part, moment * np.hypot(by_u, by_v), 1e-9)
                 share, mean_x, mean_y, share_x, share_y = covered_share(
                     patch_x + away * by_u,
