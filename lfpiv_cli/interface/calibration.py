@@ -37,6 +37,13 @@ NO_WHITE_IMAGE = Notice(
     "give a white image, of uniform light",
 )
 
+NO_BOARD = Notice(
+    "no-board",
+    "--board",
+    "there is none: magnification and focus are believed as the data sheet has them, and all lengths with them",
+    "give a picture of a calibration board; of one at several depths, to see the depth scale too",
+)
+
 MOVED_SINCE_WHITE = "take white image and board one after the other, with the camera as it is"
 
 Pictures = ArrayLike | Sequence[ArrayLike] | None
@@ -125,6 +132,8 @@ def calibration_notices(rig: Config, pictures: Photographs, found: Calibration) 
     if found.ray_fit is not None and camera is not None:
         rays = found.ray_fit
         notices += entrance_pupil_notices(rays.entrance_pupil_mm, rays.entrance_pupil_sigma_mm, camera)
+    if camera is not None and found.pose is None and found.ray_fit is None:
+        notices.append(NO_BOARD)
     notices += light_notices(rig, pictures, found)
     if not pictures.whites:
         return [*notices, NO_WHITE_IMAGE]

@@ -42,6 +42,8 @@ from lfpiv_cli.weights.model import behind_transmission
 
 # More than this share of an image's light, its noise taken off, is too much to leave unexplained.
 LARGEST_UNEXPLAINED = 0.5
+# Above so many particles for each microlens their stated errors cover less than four fifths.
+LARGEST_CROWD = 1.5
 # Frames that are looked at for the tracers' diameter, if the first do not hold enough.
 LOOKED_AT = 5
 # Beyond so many standard errors a given diameter contradicts the images.
@@ -256,6 +258,7 @@ def points_of(bench: Bench, frame: Frame, found: Particles, size: TracerSize, pr
     """Return the particles found behind an image in the coordinates of files, by Snell's law where it is known."""
     content = bench.content
     space = _space(content, bench.settings)
+    outside = _outside(found.position_mm, content.weights.grid)
     left = what_is_left(frame, found)
     norm = float(np.linalg.norm(np.where(frame.unusable, 0.0, frame.image)))
     return Points(
@@ -265,7 +268,7 @@ def points_of(bench: Bench, frame: Frame, found: Particles, size: TracerSize, pr
             "covariance_mm2": symmetric(found.covariance_mm2),
             "chi2": found.chi2,
             "seen": found.seen,
-            "flag": _outside(found.position_mm, content.weights.grid),
+            "flag": outside,
         },
         content.reference,
         attributes=content.reference.attributes()
@@ -275,6 +278,7 @@ def points_of(bench: Bench, frame: Frame, found: Particles, size: TracerSize, pr
             "residual_rms_counts": float(np.sqrt(np.mean(left[~frame.unusable] ** 2))),
             "excluded_pixels": int(np.count_nonzero(frame.unusable)),
             "read_noise_counts": found.noise.read_counts,
+            "particles_per_lens": float(np.count_nonzero(outside == 0)) / _lenses_before(bench),
         }
         | size.attributes(),
         provenance=dict(provenance),
@@ -282,7 +286,7 @@ def points_of(bench: Bench, frame: Frame, found: Particles, size: TracerSize, pr
 
 
 def light_notices(points: Points, name: str) -> list[Notice]:
-    """Return where no particles were found, or where they leave more of the image's light than noise makes."""
+    """Return where none were found, where they crowd, or leave more of the image's light than noise makes."""
     measured = points.attributes
     noise_share = measured["read_noise_counts"] / max(measured["residual_rms_counts"], measured["read_noise_counts"])
     unexplained = measured["residual"] * float(np.sqrt(1.0 - min(noise_share, 1.0) ** 2))
@@ -297,6 +301,19 @@ def light_notices(points: Points, name: str) -> list[Notice]:
                 "check the calibration (refine-calibration), particle_diameter_mm, --dark, --background and the volume",
                 unexplained,
                 f"at most {LARGEST_UNEXPLAINED:g}",
+            )
+        ]
+    crowd = measured["particles_per_lens"]
+    if crowd > LARGEST_CROWD:
+        return [
+            Notice(
+                "particles-crowded",
+                name,
+                f"{crowd:.2g} particles for each microlens, at most {LARGEST_CROWD:g}: beyond, neighbours are taken "
+                "for one another, and standard errors do not know of it",
+                "fewer tracers, or volumes and their correlation",
+                crowd,
+                f"at most {LARGEST_CROWD:g}",
             )
         ]
     if count:
@@ -317,6 +334,14 @@ def _space(content: WeightsFile, settings: Config) -> ObjectSpace:
     if (settings.channel is None or mid_plane is None) and settings.sections.window is None:
         return ObjectSpace(settings.media_model(), None, "paraxial")
     return ObjectSpace(settings.media_model(), settings.window_model(mid_plane), "exact")
+
+
+def _lenses_before(bench: Bench) -> float:
+    """Return how many microlenses the volume fills as the scene shows them."""
+    camera, grid = bench.content.camera, bench.content.weights.grid
+    (low_x, high_x), (low_y, high_y) = (grid.bounds_mm(axis) for axis in (0, 1))
+    lens_mm2 = abs(float(np.linalg.det(camera.lattice.basis))) / camera.magnification**2
+    return (high_x - low_x) * (high_y - low_y) / lens_mm2
 
 
 def _outside(position_mm: NDArray[np.float64], grid: Grid) -> NDArray[np.uint8]:
