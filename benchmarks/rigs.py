@@ -243,7 +243,9 @@ def verdict(outcome: Outcome) -> str:
         return "refused" if failed[0].command in BEFORE_THE_WORK and not bug else "failed"
     if not outcome.faults:
         return "worked"
-    return "warned" if outcome.said else "silent"
+    # That the data sheet is believed tells of nothing but a wrong data sheet.
+    told = [text for text in outcome.said if outcome.wrong_value or "[no-board]" not in text]
+    return "warned" if told else "silent"
 
 
 def row(outcome: Outcome) -> str:
