@@ -42,8 +42,8 @@ from lfpiv_cli.weights.model import behind_transmission
 
 # More than this share of an image's light, its noise taken off, is too much to leave unexplained.
 LARGEST_UNEXPLAINED = 0.5
-# Above so many particles for each microlens their stated errors cover less than four fifths.
-LARGEST_CROWD = 1.5
+# At so many found for each microlens, fewer than there are, stated errors begin to cover less than four fifths.
+LARGEST_CROWD = 1.3
 # Frames that are looked at for the tracers' diameter, if the first do not hold enough.
 LOOKED_AT = 5
 # Beyond so many standard errors a given diameter contradicts the images.
@@ -309,7 +309,7 @@ def light_notices(points: Points, name: str) -> list[Notice]:
             Notice(
                 "particles-crowded",
                 name,
-                f"{crowd:.2g} particles for each microlens, at most {LARGEST_CROWD:g}: beyond, neighbours are taken "
+                f"{crowd:.3g} particles for each microlens, at most {LARGEST_CROWD:g}: beyond, neighbours are taken "
                 "for one another, and standard errors do not know of it",
                 "fewer tracers, or volumes and their correlation",
                 crowd,
