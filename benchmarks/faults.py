@@ -33,8 +33,16 @@ from lfpiv_cli.files.images import read_image, write_tiff
 SEED, RIGS, GOOD = 20261122, 2, 10
 # Microlenses along the sensor's sides: fewer than `rigs` has, as pictures are only looked at.
 LENSES = (34, 26)
-# Advice on what a good rig measures, which says nothing against its pictures.
-ADVICE = {"few-tracers", "no-uncertainty", "windows-too-large", "volume-out-of-view", "heavy-work", "few-particles"}
+# Advice on what a good rig measures or believes, which says nothing against its pictures.
+ADVICE = {
+    "few-tracers",
+    "no-uncertainty",
+    "windows-too-large",
+    "volume-out-of-view",
+    "heavy-work",
+    "few-particles",
+    "no-board",
+}
 # Tracers for each microlens that are enough for lens images to be seen by their light, and that leave some dark.
 DENSITY = (0.05, 1.0)
 
