@@ -64,7 +64,7 @@ def test_shift_is_that_of_the_best_focus(table2: Camera, water: Media) -> None:
 def test_air_shifts_nothing_and_the_wall_does(table2: Camera, water: Media) -> None:
     points = np.array([[1.0, -2.0, -5.3], [0.5, 0.5, 2.0]])
     in_air = raw_view(table2, water.in_air(), 0.025, space=ObjectSpace(water.in_air()))
-    np.testing.assert_allclose(places_by_snell(points, in_air), points, rtol=1e-12)
+    np.testing.assert_array_equal(places_by_snell(points, in_air), points)
     # A point in the window has the window's own shift, not an error.
     shift = paraxial_shift(points, raw_view(table2, water, 0.025, space=behind(table2, water, 5.0, 5.0)))
     assert np.all(shift[:, 2] < -0.002)

@@ -236,7 +236,7 @@ def _f_numbers(camera: Camera) -> str:
 
 def _excess(fit: LatticeFit, camera: Camera) -> tuple[float, float]:
     """Return by what share lens images are further apart than lenses, and its standard error."""
-    sheet_mm = float(np.sqrt(abs(np.linalg.det(camera.lattice.basis))))
-    measured_mm = float(np.sqrt(abs(np.linalg.det(fit.lattice_px.basis)))) * real_lens(camera).pixel_mm
+    sheet_mm = float(np.sqrt(camera.lattice.cell_area))
+    measured_mm = float(np.sqrt(fit.lattice_px.cell_area)) * real_lens(camera).pixel_mm
     sigma = float(np.hypot(*fit.pitch_sigma_px)) / 2.0 / float(fit.lattice_px.pitch.mean())
     return measured_mm / sheet_mm - 1.0, sigma

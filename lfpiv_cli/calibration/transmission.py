@@ -53,9 +53,8 @@ def lens_image_width(white: NDArray[np.float32], lattice_px: Lattice) -> float:
     lens = index - index.min(axis=(0, 1))
     brightest = np.full(lens.max(axis=(0, 1)) + 1, -np.inf)
     np.maximum.at(brightest, (lens[..., 0], lens[..., 1]), part)
-    area = float(np.mean(part > 0.5 * np.median(brightest[np.isfinite(brightest)]))) * abs(
-        float(np.linalg.det(lattice_px.basis))
-    )
+    lit = float(np.mean(part > 0.5 * np.median(brightest[np.isfinite(brightest)])))
+    area = lit * lattice_px.cell_area
     return float(np.sqrt(4.0 / np.pi * area) / lattice_px.pitch.mean())
 
 

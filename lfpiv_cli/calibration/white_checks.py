@@ -81,7 +81,7 @@ def _of_lattice(fit: LatticeFit, pixels: int) -> Iterator[Notice]:
             share,
             f"at most {LARGE_RESIDUAL:g}",
         )
-    found = fit.lenses * abs(float(np.linalg.det(fit.lattice_px.basis))) / pixels
+    found = fit.lenses * fit.lattice_px.cell_area / pixels
     if found < FEWEST_FOUND:
         yield Notice(
             "lattice-incomplete",

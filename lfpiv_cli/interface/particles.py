@@ -340,8 +340,7 @@ def _lenses_before(bench: Bench) -> float:
     """Return how many microlenses the volume fills as the scene shows them."""
     camera, grid = bench.content.camera, bench.content.weights.grid
     (low_x, high_x), (low_y, high_y) = (grid.bounds_mm(axis) for axis in (0, 1))
-    lens_mm2 = abs(float(np.linalg.det(camera.lattice.basis))) / camera.magnification**2
-    return (high_x - low_x) * (high_y - low_y) / lens_mm2
+    return (high_x - low_x) * (high_y - low_y) * camera.magnification**2 / camera.lattice.cell_area
 
 
 def _outside(position_mm: NDArray[np.float64], grid: Grid) -> NDArray[np.uint8]:

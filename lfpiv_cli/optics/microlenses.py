@@ -53,6 +53,11 @@ class Lattice:
         """Lengths of the two basis vectors, shape (2,)."""
         return np.hypot(self.basis[:, 0], self.basis[:, 1])
 
+    @property
+    def cell_area(self) -> float:
+        """Area of the plane for each point."""
+        return abs(float(np.linalg.det(self.basis)))
+
     def points(self, indices: ArrayLike) -> NDArray[np.float64]:
         """Return the positions of lattice points, indices of shape (..., 2)."""
         return self.origin + np.asarray(indices, dtype=np.float64) @ self.basis

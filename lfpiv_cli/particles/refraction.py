@@ -49,6 +49,12 @@ class Bend(NamedTuple):
 
 
 @njit(cache=True)
+def _in_fluid(view: View, z: float) -> float:
+    """Return a depth, or that just behind the window where it lies in front of the fluid."""
+    return max(z, SHALLOWEST_DEPTHS * view.scale.depth_mm - view.layers.thicknesses_mm[-1])
+
+
+@njit(cache=True)
 def bend_of(view: View, x: float, y: float, z: float) -> Bend:
     """Return the rays of a particle, image axes.
 
@@ -59,7 +65,7 @@ def bend_of(view: View, x: float, y: float, z: float) -> Bend:
         none = np.empty(0)
         return Bend(x, y, none, none, x, y, camera.focus_distance_mm + view.depth_ratio * z)
     thicknesses = view.layers.thicknesses_mm.copy()
-    thicknesses[-1] = max(thicknesses[-1] + z, SHALLOWEST_DEPTHS * view.scale.depth_mm)
+    thicknesses[-1] += _in_fluid(view, z)
     lateral2, radius = x * x + y * y, camera.aperture_radius_mm
     nodes, factors = slope_polynomial(radius + np.sqrt(lateral2), thicknesses, view.layers.indices)
     distance = 1.0 / slope_ratio(lateral2 + radius * radius / 1.5, nodes, factors)
@@ -98,12 +104,11 @@ def places_by_snell(points_mm: NDArray[np.float64], view: View) -> NDArray[np.fl
 @njit(cache=True)
 def paraxial_shift(points_mm: NDArray[np.float64], view: View) -> NDArray[np.float64]:
     """Return how far (n, 3) from their places points are seen by who takes rays for paraxial, mm."""
-    shift = np.empty_like(points_mm)
-    shallowest = SHALLOWEST_DEPTHS * view.scale.depth_mm - view.layers.thicknesses_mm[-1]
+    shift = np.zeros_like(points_mm)
+    if view.layers.indices.size < 2:
+        return shift
     for n in range(points_mm.shape[0]):
-        x, y, z = points_mm[n, 0], points_mm[n, 1], points_mm[n, 2]
-        if view.layers.indices.size > 1:
-            z = max(z, shallowest)
+        x, y, z = points_mm[n, 0], points_mm[n, 1], _in_fluid(view, points_mm[n, 2])
         bend = bend_of(view, x, y, z)
         depth = (bend.distance - view.camera.focus_distance_mm) / view.depth_ratio
         shift[n] = bend.seen_x - x, bend.seen_y - y, depth - z

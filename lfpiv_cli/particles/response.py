@@ -208,15 +208,23 @@ def _bent_at(view: View, projection: Projection, bend: Bend, s_x: float, s_y: fl
 
 @njit(cache=True)
 def _middle_of_part(gain: float, offset: float, reach: float, radius: float) -> float:
-    """Return the middle of where `offset` + `gain` X is within `reach` of 0, for X in -radius to radius.
+    """Return the middle of `_part_of_lens`; where there is none, a place on the main lens all the same."""
+    low, high = _part_of_lens(gain, offset, reach, radius)
+    return min(max(0.5 * (low + high), -radius), radius)
 
-    Where it nowhere is, the rim that is nearest.
+
+@njit(cache=True)
+def _part_of_lens(gain: float, offset: float, reach: float, radius: float) -> tuple[float, float]:
+    """Return between which X of -radius to radius `offset` + `gain` X is within `reach` of 0.
+
+    The first is not below the second where it nowhere is.
     """
-    if abs(gain) * radius <= 1e-3 * reach:
-        return 0.0
-    one, other = (-offset - reach) / gain, (-offset + reach) / gain
-    low = min(max(min(one, other), -radius), radius)
-    return 0.5 * (low + min(max(max(one, other), -radius), radius))
+    if abs(gain) * radius > 1e-3 * reach:
+        one, other = (-offset - reach) / gain, (-offset + reach) / gain
+        return max(-radius, min(one, other)), min(radius, max(one, other))
+    if abs(offset) > reach + abs(gain) * radius:
+        return 0.0, 0.0
+    return -radius, radius
 
 
 @njit(cache=True)
@@ -251,12 +259,7 @@ def _lit_pixels(
     sensor at `scale` X + `shift`.
     """
     camera = view.camera
-    low, high = -camera.aperture_radius_mm, camera.aperture_radius_mm
-    if abs(gain) * camera.aperture_radius_mm > 1e-3 * reach:
-        one, other = (-offset - reach) / gain, (-offset + reach) / gain
-        low, high = max(low, min(one, other)), min(high, max(one, other))
-    elif abs(offset) > reach + abs(gain) * camera.aperture_radius_mm:
-        return 0, 0
+    low, high = _part_of_lens(gain, offset, reach, camera.aperture_radius_mm)
     if low >= high:
         return 0, 0
     one, other = scale * low + shift, scale * high + shift

@@ -116,8 +116,7 @@ def light_per_area(camera: Camera, media: Media, z_mm: ArrayLike, level: float) 
     distance = equivalent_object_distance(z_mm, camera.focus_distance_mm, media)
     micro_image_radius = camera.aperture_radius_mm * camera.microlens_distance_mm / camera.image_distance_mm
     per_lens = level * np.pi * micro_image_radius**2 / camera.pixel_mm**2
-    cell = abs(float(np.linalg.det(camera.lattice.basis)))
-    return per_lens / cell * (camera.image_distance_mm / distance) ** 2
+    return per_lens / camera.lattice.cell_area * (camera.image_distance_mm / distance) ** 2
 
 
 def _sunflower(count: int, radius: float) -> NDArray[np.float64]:
