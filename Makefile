@@ -38,7 +38,7 @@ PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check 
 
 $(CORE): requirements.lock pyproject.toml
 	$(PYTHON) -m venv $(VENV)
-	$(PIP_INSTALL) --constraint requirements.lock --editable ".[plot]"
+	$(PIP_INSTALL) --constraint requirements.lock --editable ".[report]"
 	@touch $@
 
 $(INSTALLED): $(CORE)

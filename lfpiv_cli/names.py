@@ -37,6 +37,22 @@ BoardMethod = Literal["ert", "dlfc", "discs"]
 BoardImages = Literal["ideal", "recorded", "both"]
 Moment = Literal["a", "middle", "b"]
 
+# The parts of the report on the paper in their order, and how large they are computed: for a test, within ten minutes,
+# or as the paper did.
+PaperPart = Literal[
+    "table1",
+    "table2",
+    "table3",
+    "table3-experiment",
+    "focal-plane",
+    "table4",
+    "bubbles",
+    "discussion",
+    "sensitivities",
+    "faults",
+]
+Size = Literal["tiny", "quick", "full"]
+
 
 def names_in(kind: Any) -> tuple[str, ...]:
     """Return the names of one of the kinds above, in their order."""

@@ -28,6 +28,7 @@ LAYERS = (
     {"console"},
     {"interface"},
     {"stages"},
+    {"paper"},
     {"cli"},
     {"__init__", "__main__"},
 )

@@ -17,7 +17,7 @@ from lfpiv_cli.cli import cli
 from lfpiv_cli.files.section_types import Section
 from lfpiv_cli.files.sections import CorrelationSection, Sections
 from lfpiv_cli.files.sections_simulated import FlowSection
-from lfpiv_cli.names import BoardMethod, Method, Moment, Pairing, Refraction, Sampling, Start, names_in
+from lfpiv_cli.names import BoardMethod, Method, Moment, PaperPart, Pairing, Refraction, Sampling, Start, names_in
 from lfpiv_cli.reconstruction.registry import PARTICLES, SOLVER_NAMES, SOLVERS
 from lfpiv_cli.synthetic.flows import FLOWS
 
@@ -35,6 +35,7 @@ OPTIONS = {
     ("reconstruct", "pairing"): names_in(Pairing),
     ("correlate", "pairing"): names_in(Pairing),
     ("validate", "frame"): names_in(Moment),
+    ("validate", "only"): names_in(PaperPart),
 }
 # Names that are no words of plain English: where two of them stand side by side in a text, it lists names.
 LISTED = [SOLVER_NAMES, names_in(Method), names_in(BoardMethod), tuple(FLOWS)]

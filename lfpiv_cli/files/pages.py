@@ -1,0 +1,104 @@
+"""A report for people: one HTML page that holds its pictures, prints and needs no network, and the same as Markdown.
+
+The layout is that of the templates beside this module; Jinja2, which fills them, is an optional extra.
+"""
+
+from __future__ import annotations
+
+import base64
+from dataclasses import dataclass
+from pathlib import Path
+
+from lfpiv_cli.errors import UsageError
+from lfpiv_cli.files.atomic import write_atomically
+from lfpiv_cli.files.inputs import ensure_regular_file
+
+TEMPLATES = Path(__file__).with_name("templates")
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of text; cells that are verdicts (met, missed, unknown) are coloured."""
+
+    caption: str
+    head: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A PNG file and what it shows."""
+
+    path: Path
+    caption: str
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of a page; `anchor` is its name in links, `commands` are what a person types to make its figures."""
+
+    title: str
+    anchor: str
+    text: tuple[str, ...] = ()
+    tables: tuple[Table, ...] = ()
+    pictures: tuple[Picture, ...] = ()
+    commands: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Page:
+    """A page: its first words and tables, its sections, and the line at its foot."""
+
+    title: str
+    text: tuple[str, ...]
+    tables: tuple[Table, ...]
+    sections: tuple[Section, ...]
+    foot: str
+
+
+def ensure_pages() -> None:
+    """Refuse pages, before anything is computed, where Jinja2 is not installed."""
+    try:
+        import jinja2  # noqa: F401
+    except ImportError as error:
+        raise UsageError('reports need Jinja2: pip install "lfpiv[report]"') from error
+
+
+def write_pages(page: Page, html: Path, markdown: Path, overwrite: bool) -> None:
+    """Write a page as HTML with its pictures inside, and as Markdown that links to them.
+
+    Raises
+    ------
+    InputError : a picture cannot be read
+    """
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    places = Environment(
+        loader=FileSystemLoader(TEMPLATES),
+        autoescape=lambda name: name is not None and name.endswith(".html"),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    places.filters |= {
+        "data_uri": _data_uri,
+        "cell": lambda text: text.replace("|", "\\|"),
+        "relative": lambda path: path.relative_to(markdown.parent).as_posix(),
+    }
+    for target in (html, markdown):
+        text = places.get_template(f"page{target.suffix}").render(page=page)
+        _write_text(target, text, overwrite)
+
+
+def _data_uri(path: Path) -> str:
+    """Return a PNG file as an address that holds the picture itself."""
+    ensure_regular_file(path)
+    return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode("ascii")
+
+
+def _write_text(target: Path, text: str, overwrite: bool) -> None:
+    def write(temporary: Path) -> None:
+        temporary.write_bytes(text.encode("utf-8"))
+
+    write_atomically(target, write, overwrite=overwrite)

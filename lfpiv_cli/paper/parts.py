@@ -1,0 +1,164 @@
+"""What a part of the report is given and what it returns."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
+
+import yaml
+
+from lfpiv_cli.console import Console
+from lfpiv_cli.errors import InputError
+from lfpiv_cli.files.atomic import write_atomically, write_json
+from lfpiv_cli.files.inputs import ensure_regular_file, reason
+from lfpiv_cli.files.pages import Table
+from lfpiv_cli.names import Size
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Value = TypeVar("Value")
+Verdict = Literal["met", "missed", "unknown"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """One quantity: the paper's values, ours, and what ours are held to.
+
+    Attributes
+    ----------
+    quantity : in words, with its unit
+    source : the table or figure of the paper
+    limit, sense : what `judged` is held to, by default the paper's own value by equivalent ray tracing
+    paper_dlfc, paper_ert : the paper's, by volumetric calibration and by equivalent ray tracing; None: it has none
+    dlfc, ert : ours as the paper did it (SART, 200 iterations, 0.1 mm voxels); None: not measured
+    best : ours at its best
+    judged : which of ours the verdict is of
+    reason : why ours as the paper did it falls short of the paper's, where it does
+    """
+
+    quantity: str
+    source: str
+    limit: float
+    sense: Literal["at most", "at least"] = "at most"
+    paper_dlfc: float | None = None
+    paper_ert: float | None = None
+    dlfc: float | None = None
+    ert: float | None = None
+    best: float | None = None
+    judged: Literal["dlfc", "ert", "best"] = "best"
+    reason: str = ""
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether the judged value meets the limit; unknown where there is none."""
+        value = getattr(self, self.judged)
+        if value is None or value != value:
+            return "unknown"
+        return "met" if (value <= self.limit if self.sense == "at most" else value >= self.limit) else "missed"
+
+
+@dataclass(frozen=True, eq=False)
+class Drawing:
+    """A picture that is to be written, `name` in lower case without spaces; the caption names the paper's figure."""
+
+    name: str
+    caption: str
+    figure: Figure
+
+
+@dataclass(frozen=True, eq=False)
+class Findings:
+    """What a part has found.
+
+    Attributes
+    ----------
+    text : paragraphs: what was done, at which size, and what to read from it
+    commands : what a person types in the report's folder to make the same figures
+    seeds : of the random numbers
+    """
+
+    rows: tuple[Row, ...] = ()
+    drawings: tuple[Drawing, ...] = ()
+    tables: tuple[Table, ...] = ()
+    text: tuple[str, ...] = ()
+    commands: tuple[str, ...] = ()
+    seeds: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class Work:
+    """Where and how large a part works.
+
+    Attributes
+    ----------
+    folder : of the part alone, below that of the report
+    made : what a kept result must have been made with to be used again
+    resume : use what is kept
+    """
+
+    folder: Path
+    size: Size
+    console: Console
+    made: Mapping[str, Any]
+    resume: bool = False
+
+    def by_size(self, tiny: Value, quick: Value, full: Value) -> Value:
+        """Return the value for the size."""
+        return {"tiny": tiny, "quick": quick, "full": full}[self.size]
+
+    def config(self, name: str, sections: Mapping[str, Any]) -> Path:
+        """Write a config of the part's own and return its path."""
+        path = self.folder / f"{name}.yaml"
+        text = yaml.safe_dump(dict(sections), sort_keys=False, default_flow_style=None, width=110)
+        write_atomically(path, lambda target: _write_bytes(target, text), overwrite=True)
+        return path
+
+    def step(self, name: str, make: Callable[[], Mapping[str, Any]]) -> dict[str, Any]:
+        """Return what `make` gives, as JSON has it; kept, so that interrupted work goes on from there."""
+        path = self.folder / f"{name}.json"
+        return kept(path, self.made, self.resume, make)
+
+
+def kept(path: Path, made: Mapping[str, Any], resume: bool, make: Callable[[], Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the result in a file that was made alike, or make it and write the file."""
+    if resume and path.exists():
+        found = read_json(path)
+        if found.get("made") == made:
+            return dict(found["result"])
+    write_json(path, {"result": make(), "made": made}, overwrite=True)
+    return dict(read_json(path)["result"])
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Return the object in a JSON file of ours.
+
+    Raises
+    ------
+    InputError : it is missing or not such a file
+    """
+    ensure_regular_file(path)
+    try:
+        value = json.loads(path.read_bytes())
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: is not a JSON file: {reason(error)}") from error
+    if not isinstance(value, dict):
+        raise InputError(f"{path}: holds no JSON object")
+    return value
+
+
+def plain(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Return rows as plain data, each with its verdict."""
+    return [asdict(row) | {"verdict": row.verdict} for row in rows]
+
+
+def rows_of(values: Sequence[Mapping[str, Any]]) -> tuple[Row, ...]:
+    """Return the rows that plain data hold."""
+    return tuple(Row(**{name: value for name, value in each.items() if name != "verdict"}) for each in values)
+
+
+def _write_bytes(target: Path, text: str) -> None:
+    target.write_bytes(text.encode("utf-8"))

@@ -1,0 +1,29 @@
+"""The parts of the report, in the order in which they are made and shown; a new one is a line here and in `names`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from lfpiv_cli.names import PaperPart
+from lfpiv_cli.paper.focal_plane import focal_plane
+from lfpiv_cli.paper.parts import Findings, Work
+from lfpiv_cli.paper.table1 import table1
+from lfpiv_cli.paper.table2 import table2
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part: what makes it, what of the paper it covers, and how long it takes on two cores, quick and full."""
+
+    find: Callable[[Work], Findings]
+    title: str
+    quick_minutes: float
+    full_minutes: float
+
+
+PARTS: dict[PaperPart, Part] = {
+    "table1": Part(table1, "Weights of single voxels (Table 1, Figs. 5 and 6)", 0.5, 4.0),
+    "table2": Part(table2, "The camera (Table 2)", 0.01, 0.01),
+    "focal-plane": Part(focal_plane, "The focal plane from one snapshot (Eq. 21)", 0.5, 3.0),
+}
