@@ -17,7 +17,7 @@ from lfpiv_cli.cli import cli
 from lfpiv_cli.files.section_types import Section
 from lfpiv_cli.files.sections import CorrelationSection, Sections
 from lfpiv_cli.files.sections_simulated import FlowSection
-from lfpiv_cli.names import BoardMethod, Method, Moment, PaperPart, Pairing, Refraction, Sampling, Start, names_in
+from lfpiv_cli.names import BoardMethod, Method, Moment, Pairing, PaperPart, Refraction, Sampling, Start, names_in
 from lfpiv_cli.reconstruction.registry import PARTICLES, SOLVER_NAMES, SOLVERS
 from lfpiv_cli.synthetic.flows import FLOWS
 
