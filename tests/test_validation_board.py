@@ -12,7 +12,8 @@ import pytest
 from lfpiv_cli.cli import cli
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.grid import Grid
-from lfpiv_cli.validation.board import board_figures, elongation_mm, gaussian_centre_mm, measure_dots
+from lfpiv_cli.validation.board import board_figures, elongation_mm, measure_dots
+from lfpiv_cli.validation.board_depths import DEPTH_DEFINITIONS, gaussian_centre_mm
 
 CONFIG = Path(__file__).parent.parent / "configs" / "table2.yaml"
 GRID = Grid.centred((30, 20, 60), (0.1, 0.1, 0.1), (0.0, 0.0, 0.0))
@@ -42,12 +43,39 @@ def test_gaussian_centre_between_samples():
     assert gaussian_centre_mm(z, 5.0 * np.exp(-0.5 * ((z - 0.137) / 0.7) ** 2)) == pytest.approx(0.137, abs=1e-6)
 
 
+def test_every_definition_finds_the_middle_of_an_even_dot():
+    z = np.linspace(-3.0, 3.0, 61)
+    profile = 5.0 * np.exp(-0.5 * ((z - 0.137) / 0.7) ** 2)
+    for name, definition in DEPTH_DEFINITIONS.items():
+        # masses above a threshold err by a part of a sample
+        assert definition.depth_mm(z, profile) == pytest.approx(0.137, abs=0.015), name
+
+
+def test_definitions_differ_for_a_dot_with_a_tail():
+    z = np.linspace(-3.0, 3.0, 61)
+    profile = np.exp(-0.5 * (z / 0.3) ** 2) + 0.6 * np.exp(-0.5 * ((z - 0.8) / 0.5) ** 2)
+    depths = {name: definition.depth_mm(z, profile) for name, definition in DEPTH_DEFINITIONS.items()}
+    assert depths["three_point"] < 0.1 < depths["gaussian_peak"] < depths["gaussian"]
+    assert depths["middle"] > depths["mass"] > 0.3
+
+
+@pytest.mark.parametrize("lit", [slice(30, 31), slice(0, 1), slice(60, 61), slice(0, 61)])
+def test_definitions_of_profiles_without_a_width(lit, recwarn):
+    z = np.linspace(-3.0, 3.0, 61)
+    profile = np.zeros(61)
+    profile[lit] = 1.0
+    for name, definition in DEPTH_DEFINITIONS.items():
+        assert z[lit].min() - 0.05 <= definition.depth_mm(z, profile) <= z[lit].max() + 0.05, name
+    assert not recwarn.list
+
+
 def test_figures_of_boards_eqs_17_to_20():
     # true steps of 1 mm measured as 1.1 mm: depth error 10 %; spacing 1.02 mm: lateral error 2 %
     dots = [measure_dots(board(1.1 * z, spacing=1.02), GRID, CENTRES, 0.5) for z in (-1.0, 0.0, 1.0)]
     figures = board_figures(dots, (-1.0, 0.0, 1.0), (3, 2), 1.0)
     assert figures["depth_error"] == pytest.approx(0.10, abs=1e-4)
     assert figures["depth_error_mass"] == pytest.approx(0.10, abs=0.02)
+    assert figures["depth_definitions"]["gaussian"] == pytest.approx({"error": 0.1, "shortest": 1.1, "longest": 1.1})
     assert figures["lateral_error"] == pytest.approx(0.02, abs=0.002)
     assert figures["elongation_mm"] == pytest.approx(np.sqrt(2), abs=0.01)
     assert figures["elongation_sigma_mm"] == pytest.approx(0.0, abs=0.01)

@@ -6,16 +6,16 @@ else is measured.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import curve_fit
 
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.grid import Grid
+from lfpiv_cli.validation.board_depths import DEPTH_DEFINITIONS, THE_PAPERS, width_ends_mm
 
 # The paper's boards: seventeen depths, a millimetre apart.
 DEPTHS_MM = tuple(float(z) for z in range(-8, 9))
@@ -36,15 +36,28 @@ class DotFigures:
     Attributes
     ----------
     elongation_mm : depth over which the in-plane maximum exceeds 1/e of its peak, interpolated
-    depth_mm : centre of a Gaussian through the depth profile of the in-plane sum
-    mass_depth_mm : centre of mass of that profile where it exceeds 1/e of its peak
+    depth_mm : by each definition of `DEPTH_DEFINITIONS`
     lateral_mm : (n, 2) centre of mass in the plane
     """
 
     elongation_mm: NDArray[np.float64]
-    depth_mm: NDArray[np.float64]
-    mass_depth_mm: NDArray[np.float64]
+    depth_mm: dict[str, NDArray[np.float64]]
     lateral_mm: NDArray[np.float64]
+
+    def to_plain(self) -> dict[str, Any]:
+        """Return the figures as lists of numbers."""
+        depths = {name: each.tolist() for name, each in self.depth_mm.items()}
+        return {
+            "elongation_mm": self.elongation_mm.tolist(),
+            "depth_mm": depths,
+            "lateral_mm": self.lateral_mm.tolist(),
+        }
+
+    @classmethod
+    def from_plain(cls, values: Mapping[str, Any]) -> DotFigures:
+        """Return the figures that lists of numbers hold."""
+        depths = {name: np.array(each) for name, each in values["depth_mm"].items()}
+        return cls(np.array(values["elongation_mm"]), depths, np.array(values["lateral_mm"]))
 
 
 def measure_dots(
@@ -56,14 +69,16 @@ def measure_dots(
     ------
     InputError : a dot's column lies outside the volume or holds no light.
     """
-    rows = [_measure_dot(volume, grid, centre, reach_mm) for centre in centres_mm]
-    values = np.array(rows)
-    return DotFigures(values[:, 0], values[:, 1], values[:, 2], values[:, 3:])
+    elongations, depths, lateral = zip(
+        *(_measure_dot(volume, grid, centre, reach_mm) for centre in centres_mm), strict=True
+    )
+    by_definition = {name: np.array([each[name] for each in depths]) for name in DEPTH_DEFINITIONS}
+    return DotFigures(np.array(elongations), by_definition, np.array(lateral))
 
 
 def _measure_dot(
     volume: NDArray[np.float32], grid: Grid, centre: NDArray[np.float64], reach_mm: float
-) -> tuple[float, float, float, float, float]:
+) -> tuple[float, dict[str, float], tuple[float, float]]:
     x, y, z = (grid.axis_mm(axis) for axis in range(3))
     column = np.ix_(np.arange(z.size), np.abs(y - centre[1]) < reach_mm, np.abs(x - centre[0]) < reach_mm)
     part = volume[column].astype(np.float64)
@@ -71,49 +86,18 @@ def _measure_dot(
         raise InputError(
             f"no light was reconstructed within {reach_mm} mm of the dot at {centre[0]:.3g}, {centre[1]:.3g}"
         )
-    profile = part.sum(axis=(1, 2))
-    plane = part[profile > profile.max() / np.e].sum(axis=0)
+    profiles = {"sum": part.sum(axis=(1, 2)), "maximum": part.max(axis=(1, 2))}
+    plane = part[profiles["sum"] > profiles["sum"].max() / np.e].sum(axis=0)
     own_x, own_y = x[np.abs(x - centre[0]) < reach_mm], y[np.abs(y - centre[1]) < reach_mm]
-    lateral = plane.sum(axis=0) @ own_x / plane.sum(), plane.sum(axis=1) @ own_y / plane.sum()
-    high = profile > profile.max() / np.e
-    mass = float(profile[high] @ z[high] / profile[high].sum())
-    return elongation_mm(z, part.max(axis=(1, 2))), gaussian_centre_mm(z, profile), mass, *lateral
+    lateral = float(plane.sum(axis=0) @ own_x / plane.sum()), float(plane.sum(axis=1) @ own_y / plane.sum())
+    depths = {name: each.depth_mm(z, profiles[each.profile]) for name, each in DEPTH_DEFINITIONS.items()}
+    return elongation_mm(z, profiles["maximum"]), depths, lateral
 
 
 def elongation_mm(z_mm: NDArray[np.float64], height: NDArray[np.float64], peak: int | None = None) -> float:
-    """Return the depth over which a profile around a peak, by default its highest, exceeds 1/e of it.
-
-    Between samples the profile is taken as linear.
-    """
-    peak = int(np.argmax(height)) if peak is None else peak
-    limit = height[peak] / np.e
-    ends = []
-    for step in (-1, 1):
-        at = peak
-        while 0 <= at + step < z_mm.size and height[at + step] > limit:
-            at += step
-        beyond = at + step
-        if 0 <= beyond < z_mm.size:
-            share = (height[at] - limit) / (height[at] - height[beyond])
-            ends.append(z_mm[at] + share * (z_mm[beyond] - z_mm[at]))
-        else:
-            ends.append(z_mm[at])
-    return float(ends[1] - ends[0])
-
-
-def gaussian_centre_mm(z_mm: NDArray[np.float64], profile: NDArray[np.float64]) -> float:
-    """Return the centre of the least-squares Gaussian through a profile, its peak where no fit is found."""
-    peak = int(np.argmax(profile))
-    width = max(elongation_mm(z_mm, profile) / (2.0 * np.sqrt(2.0)), float(z_mm[1] - z_mm[0]))
-
-    def gaussian(z: NDArray[np.float64], height: float, centre: float, sigma: float) -> NDArray[np.float64]:
-        return height * np.exp(-0.5 * ((z - centre) / sigma) ** 2)
-
-    try:
-        fitted, _ = curve_fit(gaussian, z_mm, profile, p0=(profile[peak], z_mm[peak], width))
-    except RuntimeError:
-        return float(z_mm[peak])
-    return float(fitted[1])
+    """Return the depth over which a profile around a peak, by default its highest, exceeds 1/e of it."""
+    near, far = width_ends_mm(z_mm, height, peak)
+    return far - near
 
 
 def board_figures(
@@ -131,16 +115,20 @@ def board_figures(
     -------
     dict
         `elongation_mm` and `elongation_sigma_mm` (Eqs. 17, 18, averaged over the depths), `lateral_error` (Eq. 19) and
-        `depth_error` (Eq. 20, averaged over the steps; `depth_error_mass` by centres of mass), and `by_depth`.
+        `depth_error` (Eq. 20, averaged over the steps; `depth_error_mass` by centres of mass), and `by_depth`. Of each
+        of the `depth_definitions`: `error`, and `shortest` and `longest` step over the true one.
     """
     lateral = [each.lateral_mm[:, 0].reshape(shape[1], shape[0]) for each in dots]
-    places = place_figures(lateral, [each.depth_mm for each in dots], depths_mm, spacing_mm)
-    mass = np.array([each.mass_depth_mm.mean() for each in dots])
-    steps = np.diff(depths_mm)
+    places = place_figures(lateral, [each.depth_mm[THE_PAPERS] for each in dots], depths_mm, spacing_mm)
+    mass = np.array([each.depth_mm["mass"].mean() for each in dots])
     return places | {
         "elongation_mm": float(np.mean([each.elongation_mm.mean() for each in dots])),
         "elongation_sigma_mm": float(np.mean([each.elongation_mm.std() for each in dots])),
-        "depth_error_mass": float(np.mean(np.abs(np.diff(mass) - steps) / steps)),
+        "depth_error_mass": depth_error(mass, depths_mm),
+        "depth_definitions": {
+            name: _steps(np.array([each.depth_mm[name].mean() for each in dots]), depths_mm)
+            for name in DEPTH_DEFINITIONS
+        },
         "by_depth": places["by_depth"]
         | {
             "elongation_mm": [float(each.elongation_mm.mean()) for each in dots],
@@ -165,9 +153,22 @@ def place_figures(
     """
     spacing = [float(np.nanmean(np.diff(each, axis=1))) for each in x_mm]
     centre = [float(np.nanmean(each)) for each in depth_mm]
-    steps = np.diff(depths_mm)
     return {
         "lateral_error": float(np.mean(np.abs(np.array(spacing) - spacing_mm)) / spacing_mm),
-        "depth_error": float(np.mean(np.abs(np.diff(centre) - steps) / steps)),
+        "depth_error": depth_error(centre, depths_mm),
         "by_depth": {"depth_mm": list(depths_mm), "spacing_mm": spacing, "centre_mm": centre},
+    }
+
+
+def depth_error(centre_mm: Sequence[float] | NDArray[np.float64], depths_mm: Sequence[float]) -> float:
+    """Return Eq. 20 averaged over the steps between neighbouring depths."""
+    return float(np.mean(np.abs(np.diff(centre_mm) / np.diff(depths_mm) - 1.0)))
+
+
+def _steps(centre_mm: NDArray[np.float64], depths_mm: Sequence[float]) -> dict[str, float]:
+    steps = np.diff(centre_mm) / np.diff(depths_mm)
+    return {
+        "error": depth_error(centre_mm, depths_mm),
+        "shortest": float(steps.min()),
+        "longest": float(steps.max()),
     }
