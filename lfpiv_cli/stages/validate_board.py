@@ -20,12 +20,14 @@ from lfpiv_cli.files.pictures import ensure_drawing, write_picture
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.reconstruction.equations import normalisers
-from lfpiv_cli.reconstruction.solvers import ALL_ITERATIONS, reconstruct
+from lfpiv_cli.reconstruction.solvers import ALL_ITERATIONS, Reconstruction, reconstruct
 from lfpiv_cli.stages.simulate import misalignment_of, readout_of
 from lfpiv_cli.synthetic.board import BoardPlacement, dot_centres
 from lfpiv_cli.validation.board import DEPTHS_MM, PAPER, DotFigures, board_figures, measure_dots, place_figures
 from lfpiv_cli.validation.board_bench import BoardBench, Reality, ideal_bench, recorded_bench
 from lfpiv_cli.validation.board_pictures import board_figure
+
+BoardSolver = Callable[[NDArray[np.float32], Callable[[int], None]], Reconstruction]
 
 # Two make a step in depth, a third the polynomials of fitted rays.
 FEWEST_DEPTHS = 3
@@ -54,8 +56,8 @@ def validate_board(
     steps = len(halves) * (len(solved) * settings.reconstruction.iterations + len(chosen.methods) - len(solved))
     with console.progress(steps * len(depths), "boards") as advance:
         for half in halves:
-            bench = _bench(settings, half)
-            pictures = [bench.picture(_placement(settings, depth)) for depth in depths]
+            bench = bench_of(settings, half)
+            pictures = [bench.picture(placement_of(settings, depth)) for depth in depths]
             for method in chosen.methods:
                 if method == "discs":
                     figures[half][method] = _discs(bench, pictures, depths, advance)
@@ -88,12 +90,13 @@ def _depths(settings: Config, config: Path) -> tuple[float, ...]:
     return depths
 
 
-def _placement(settings: Config, depth_mm: float) -> BoardPlacement:
+def placement_of(settings: Config, depth_mm: float) -> BoardPlacement:
+    """Return where the simulated board stands at a depth."""
     scene = settings.simulation
     return BoardPlacement(depth_mm, scene.board_offset_mm, scene.board_tilt_deg, scene.board_rotation_deg)
 
 
-def _bench(settings: Config, half: str) -> BoardBench:
+def bench_of(settings: Config, half: str) -> BoardBench:
     """Return the camera before which the boards of a half of Table 3 are held."""
     scene = settings.simulation
     rig, grid, rng = settings.rig(), settings.grid(), np.random.default_rng(scene.seed)
@@ -131,17 +134,30 @@ def _boards(
 ) -> tuple[list[DotFigures], NDArray[np.float32]]:
     """Return what is measured of the boards in pictures at all depths, and the volume of the one in the focal plane."""
     board = settings.rig().board
-    # all iterations, so that methods and depths can be compared
-    solver = replace(settings.solver_settings(), stopping=ALL_ITERATIONS)
-    sums = None if bench.weights.on_demand else normalisers(bench.weights.padded, bench.excluded)
+    solve = board_solver(bench, settings)
     dots, drawn = [], np.zeros(bench.weights.shape, np.float32)
     for depth, picture in zip(depths_mm, pictures, strict=True):
-        operator = bench.weights.padded.for_image(picture)
-        sums_here = sums or normalisers(operator, bench.excluded)
-        result = reconstruct(operator, picture, solver, sums=sums_here, progress=advance)
+        result = solve(picture, advance)
         volume = bench.weights.to_world(result.volume)
-        centres = dot_centres(board, _placement(settings, depth))[:, :2]
+        centres = dot_centres(board, placement_of(settings, depth))[:, :2]
         dots.append(measure_dots(volume, bench.weights.grid, centres, 0.5 * board.spacing_mm))
         drawn = volume if depth == 0.0 else drawn
         console.detail(f"board at {depth:+.0f} mm: residual {result.residual[-1]:.3f}")
     return dots, drawn
+
+
+def board_solver(bench: BoardBench, settings: Config) -> BoardSolver:
+    """Return what reconstructs a picture of the bench with the configured solver and calls back at each iteration.
+
+    The volume is in the solver's axes. All iterations are made, so that methods and depths can be compared.
+    """
+    solver = replace(settings.solver_settings(), stopping=ALL_ITERATIONS)
+    sums = None if bench.weights.on_demand else normalisers(bench.weights.padded, bench.excluded)
+
+    def solve(picture: NDArray[np.float32], advance: Callable[[int], None]) -> Reconstruction:
+        operator = bench.weights.padded.for_image(picture)
+        return reconstruct(
+            operator, picture, solver, sums=sums or normalisers(operator, bench.excluded), progress=advance
+        )
+
+    return solve

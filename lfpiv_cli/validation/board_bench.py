@@ -46,6 +46,14 @@ class BoardBench:
     picture: Callable[[BoardPlacement], Image]
     excluded: Mask
 
+    def with_voxels(self, grid: Grid, assumed: ObjectSpace) -> BoardBench:
+        """Return the bench with weights of equivalent points on another grid."""
+        camera = self.rig.camera
+        bend = None if self.weights.calibration is None else scene_distortion(camera, self.rig.media, grid)
+        operator = factorise_through(camera, assumed, grid)
+        weights = replace(self.weights, grid=grid, solver_operator=operator, scene_distortion_per_mm2=bend)
+        return replace(self, weights=weights)
+
     def with_fitted_rays(self, pictures: Sequence[Image], depths_mm: Sequence[float]) -> BoardBench:
         """Return the bench with weights of rays fitted to pictures of its board at depths."""
         rays = fit_rays(pictures, depths_mm, self.rig.camera, self.rig.board, self.rig.media).rays
