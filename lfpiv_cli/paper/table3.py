@@ -84,7 +84,7 @@ SMALL: dict[str, dict[str, Any]] = {
         "camera": {"sensor": {"columns": 760, "rows": 760}},
         "board": {"dots": [3, 3]},
         "paper": {"volume": {"shape_xyz": [32, 32, 100]}, "reconstruction": {"iterations": 60}},
-        "best": {"volume": {"shape_xyz": [96, 96, 50]}, "reconstruction": {"iterations": 15}},
+        "best": {"volume": {"shape_xyz": [96, 96, 50]}, "reconstruction": {"iterations": 30}},
     },
     "full": {},
 }
