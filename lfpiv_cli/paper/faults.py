@@ -1,0 +1,302 @@
+"""Mistakes that are planted in an otherwise good measurement, and the figures that give them away.
+
+A pair of images of tracers that stand apart, in a flow with all three components, is measured: particles of both
+images, joined to tracks. Middles of tracks are held against true places, their displacements against true ones. Each
+figure may be off by `LIMIT_SIGMAS` standard errors of a measurement without a mistake, made with other tracers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from lfpiv_cli.errors import LimitMissedError
+from lfpiv_cli.files.pages import Table
+from lfpiv_cli.optics.media import Media
+from lfpiv_cli.paper.parts import Drawing, Findings, Row, Work
+from lfpiv_cli.paper.small_rig import (
+    GATE_MM,
+    HALF_DEPTH_MM,
+    HALF_WIDTH_MM,
+    WATER,
+    Case,
+    Figures,
+    Points,
+    aimed,
+    lattice_shifted,
+    lattice_turned,
+    rig,
+    search_of,
+    sheet,
+    strewn_apart,
+)
+from lfpiv_cli.paper.small_scenes import displacement, tracks_between
+from lfpiv_cli.synthetic.sensor import Readout
+from lfpiv_cli.validation.fault_pictures import faults_figure
+from lfpiv_cli.validation.particles import Matches
+from lfpiv_cli.validation.place_errors import fit_errors, pairs_of
+from lfpiv_cli.validation.tracer_bench import Image, photograph
+
+SEED_OF_LIMITS, SEED = 100, 1
+# Of some fifteen figures of a good measurement one is off by five standard errors once in a hundred thousand times.
+LIMIT_SIGMAS = 5.0
+WRONG_INDEX = 1.30
+SHIFT_PX, TURN_DEG = 0.5, 0.02
+COMPONENTS = ("u", "v", "w")
+
+# Figures of each mistake in the table.
+WORST = 3
+
+Pair = tuple[Image, Image]
+
+
+@dataclass(frozen=True)
+class Words:
+    """What a figure is called, and in which unit it is shown."""
+
+    text: str
+    factor: float
+    unit: str
+
+    def shown(self, value: float, signed: bool = True) -> str:
+        """Return a value with its unit."""
+        number = f"{self.factor * value:+.3g}" if signed and value < 0.0 else f"{self.factor * value:.3g}"
+        return f"{number} {self.unit}"
+
+
+WORDS = {
+    **{f"offset_{name}": Words(f"offset in {name}", 1e3, "um") for name in "xyz"},
+    **{f"stretch_{name}": Words(f"error of the scale of {name}", 100.0, "%") for name in "xyz"},
+    **{f"slant_{name}": Words(f"slant of {name} over depth", 1e3, "um/mm") for name in "xy"},
+    "turn": Words("turn about the axis", float(np.rad2deg(1.0)), "deg"),
+    "twist": Words("growth of the turn in depth", float(np.rad2deg(1.0)), "deg/mm"),
+    **{f"spread_{name}": Words(f"spread of {name}", 1e3, "um") for name in "xyz"},
+    **{f"slope_{name}": Words(f"error of the slope of {name}", 100.0, "%") for name in COMPONENTS},
+}
+
+
+@dataclass(frozen=True)
+class Limit:
+    """Between which values a figure may lie: about a centre, or only not above."""
+
+    centre: float
+    half_width: float
+    only_above: bool
+
+    def over(self, value: float) -> float:
+        """Return how far a value lies from the centre, over what is allowed; infinite for what is not known."""
+        off = value - self.centre
+        off = max(off, 0.0) if self.only_above else abs(off)
+        return float(off / self.half_width) if np.isfinite(off) else float("inf")
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A mistake: what is believed of the rig, what is done to the pair of images, and what to the places found."""
+
+    name: str
+    case: Callable[[], Case]
+    images: Callable[[Pair], Pair] = lambda pair: pair
+    signs: tuple[float, float, float] = (1.0, 1.0, 1.0)
+
+
+def good() -> Case:
+    """Return the rig as it is."""
+    known = rig(sheet())
+    return Case(known, known)
+
+
+def index_believed() -> Case:
+    """Return water whose index is believed to be another, before a wall and behind a move that are known."""
+    return aimed(rig(sheet()), rig(sheet(), Media(WATER.air, WATER.window, WRONG_INDEX)))
+
+
+NONE = Fault("none", good)
+FAULTS = (
+    Fault("index 1.30 for 1.33", index_believed),
+    Fault("z of the wrong sign", good, signs=(1.0, 1.0, -1.0)),
+    Fault("images half a pixel off", partial(lattice_shifted, SHIFT_PX)),
+    Fault("lattice turned by 0.02 degrees", partial(lattice_turned, TURN_DEG)),
+    Fault("column axis mirrored", good, lambda pair: (pair[0][:, ::-1].copy(), pair[1][:, ::-1].copy())),
+    Fault("pair swapped", good, lambda pair: (pair[1], pair[0])),
+)
+
+
+def faults(work: Work) -> Findings:
+    """Plant each mistake and tell which figures miss their limits."""
+    known = {seed: work.step(f"none_{seed}", partial(measured, NONE, seed)) for seed in (SEED_OF_LIMITS, SEED)}
+    limits, good_figures = limits_of(known[SEED_OF_LIMITS]), known[SEED]
+    planted = work.by_size(FAULTS[-1:], FAULTS, FAULTS)
+    figures = {each.name: work.step(file_name(each), partial(measured, each, SEED)) for each in planted}
+    over = {name: over_limits(each, limits) for name, each in {"no mistake": good_figures, **figures}.items()}
+    return Findings(
+        rows=fault_rows(figures, good_figures, limits),
+        drawings=(
+            Drawing(
+                "faults",
+                "How far each figure of a measurement is off, over its limit, without a mistake and with a planted "
+                "one. Numbers above 1 miss it.",
+                faults_figure(over, {name: words.text for name, words in WORDS.items()}),
+            ),
+        ),
+        tables=(fault_table(figures, good_figures, limits),),
+        text=text_of(len(planted)),
+        commands=("lfpiv validate paper -o . --only faults --overwrite",),
+        seeds=(SEED_OF_LIMITS, SEED),
+    )
+
+
+def file_name(fault: Fault) -> str:
+    """Return a mistake's name for its step."""
+    return fault.name.replace(" ", "_").replace(".", "")
+
+
+def measured(fault: Fault, seed: int) -> Figures:
+    """Return the figures of a measurement with a mistake, `name` and `name_sigma`."""
+    rng = np.random.default_rng([seed, 5])
+    case = fault.case()
+    tracers = strewn_apart(rng, (-HALF_DEPTH_MM, HALF_DEPTH_MM), HALF_WIDTH_MM)
+    moves = displacement(tracers.position_mm)
+    first, second = (photograph(case.true, tracers.moved(sign * moves), Readout(), rng) for sign in (-0.5, 0.5))
+    search, signs = search_of(case), np.array(fault.signs)
+    found = [search.particles(image) * signs for image in fault.images((first, second))]
+    middle, moved = tracks_between(found[0], found[1], case.believed)
+    return place_and_velocity_figures(middle, moved, tracers.position_mm, moves)
+
+
+def place_and_velocity_figures(middle: Points, moved: Points, true_places: Points, true_moves: Points) -> Figures:
+    """Return figures of tracks against the truth, and standard errors.
+
+    Which track is which tracer is told by the signs of the axes that pair most of them.
+    """
+    mirrorings = (1.0 - 2.0 * np.array(signs) for signs in np.ndindex(2, 2, 2))
+    pairs = max((pairs_of(middle * signs, true_places, GATE_MM) for signs in mirrorings), key=closeness)
+    places, moves = middle[pairs.found], moved[pairs.found]
+    true, expected = true_places[pairs.true], true_moves[pairs.true]
+    fitted = fit_errors(true, places - true)
+    figures, sigma = fitted.figures(), fitted.standard_errors()
+    for axis, name in enumerate(COMPONENTS):
+        power = np.sum(expected[:, axis] ** 2)
+        slope = np.sum(moves[:, axis] * expected[:, axis]) / power
+        left = moves[:, axis] - slope * expected[:, axis]
+        figures[f"slope_{name}"] = float(slope - 1.0)
+        sigma[f"slope_{name}"] = float(np.sqrt(np.mean(left**2) / power))
+    return figures | {f"{name}_sigma": value for name, value in sigma.items()}
+
+
+def closeness(pairs: Matches) -> tuple[int, float]:
+    """Return by how much pairs are to be preferred: many, then near in depth."""
+    return len(pairs.found), -float(np.sum(np.abs(pairs.error_voxel)))
+
+
+def limits_of(good_figures: Figures) -> dict[str, Limit]:
+    """Return the limits that a good measurement's standard errors give: about 0, of spreads above their own."""
+    sigma = {name.removesuffix("_sigma"): value for name, value in good_figures.items() if name.endswith("_sigma")}
+    spreads = {name for name in sigma if name.startswith("spread")}
+    return {
+        name: Limit(good_figures[name] if name in spreads else 0.0, LIMIT_SIGMAS * value, name in spreads)
+        for name, value in sigma.items()
+    }
+
+
+def over_limits(figures: Figures, limits: Mapping[str, Limit]) -> dict[str, float]:
+    """Return how far figures are off, over their limits: missed above 1."""
+    return {name: limit.over(figures[name]) for name, limit in limits.items()}
+
+
+def missed_limits(figures: Figures, limits: Mapping[str, Limit]) -> list[str]:
+    """Return the figures that miss their limits, the worst first."""
+    over = over_limits(figures, limits)
+    return sorted((name for name, value in over.items() if not value <= 1.0), key=lambda name: -over[name])
+
+
+def ensure_within(figures: Figures, limits: Mapping[str, Limit]) -> None:
+    """Refuse a measurement of which a figure misses its limit.
+
+    Raises
+    ------
+    LimitMissedError
+    """
+    missed = missed_limits(figures, limits)
+    if missed:
+        raise LimitMissedError("; ".join(told(name, figures, limits) for name in missed), figures)
+
+
+def told(name: str, figures: Figures, limits: Mapping[str, Limit]) -> str:
+    """Return a figure with its value and its limit."""
+    return f"{WORDS[name].text} is {WORDS[name].shown(figures[name])}, allowed {allowed(name, limits)}"
+
+
+def allowed(name: str, limits: Mapping[str, Limit]) -> str:
+    """Return the limit of a figure in words."""
+    limit, words = limits[name], WORDS[name]
+    if limit.only_above:
+        return f"up to {words.shown(limit.centre + limit.half_width)}"
+    return f"\N{PLUS-MINUS SIGN}{words.shown(limit.half_width, signed=False)}"
+
+
+def said_to(figures: Figures, limits: Mapping[str, Limit]) -> str:
+    """Return what a validation with these limits says to a measurement; empty where it says nothing."""
+    try:
+        ensure_within(figures, limits)
+    except LimitMissedError as error:
+        return str(error)
+    return ""
+
+
+def fault_rows(figures: Mapping[str, Figures], good_figures: Figures, limits: Mapping[str, Limit]) -> tuple[Row, ...]:
+    """Return how many mistakes are found, with what gives each away, and how many figures alarm without one."""
+    said = {name: said_to(each, limits) for name, each in figures.items()}
+    return (
+        Row(
+            quantity="planted mistakes on which validation fails",
+            source="planted mistakes",
+            limit=float(len(figures)),
+            sense="at least",
+            best=float(sum(bool(text) for text in said.values())),
+            reason=" ".join(
+                f"{name}: {text.split(';')[0] or 'no figure misses its limit'}." for name, text in said.items()
+            ),
+        ),
+        Row(
+            quantity="figures that miss their limit without a mistake",
+            source="planted mistakes",
+            limit=0.0,
+            best=float(len(missed_limits(good_figures, limits))),
+            reason=said_to(good_figures, limits),
+        ),
+    )
+
+
+def fault_table(figures: Mapping[str, Figures], good_figures: Figures, limits: Mapping[str, Limit]) -> Table:
+    """Return the figures that give each mistake away, the three worst, and a line for no mistake."""
+    rows = [
+        (fault, WORDS[name].text, WORDS[name].shown(each[name]), allowed(name, limits), "missed")
+        for fault, each in figures.items()
+        for name in missed_limits(each, limits)[:WORST]
+    ]
+    over = over_limits(good_figures, limits)
+    worst = max(over, key=lambda name: over[name])
+    verdict = "met" if over[worst] <= 1.0 else "missed"
+    none = ("no mistake", WORDS[worst].text, WORDS[worst].shown(good_figures[worst]), allowed(worst, limits), verdict)
+    head = ("mistake", "figure", "value", "limit", "verdict")
+    return Table("What gives planted mistakes away, the worst three figures of each", head, (none, *rows))
+
+
+def text_of(planted: int) -> tuple[str, ...]:
+    """Return what was done."""
+    return (
+        f"{planted} mistakes are planted, each in a measurement that is good otherwise: a pair of images of some tens "
+        "of tracers that stand apart, taken by a corner of the paper's camera before its channel, with noise and "
+        "Snell's law. Particles of both images are found and joined to tracks. What the tracks say is held against "
+        "the truth: a map is fitted from true to measured places (offsets, scales, slants of the lateral axes over "
+        "depth, turn about the axis and its growth in depth, and what scatters about it), and a slope for each "
+        "velocity component.",
+        f"The limits are {LIMIT_SIGMAS:g} standard errors of the same figures in a good measurement of other tracers; "
+        "of spreads, above their value there. A validation fails, as `lfpiv validate` does with exit code 8, where a "
+        "figure misses its limit. A swapped pair leaves all places as they are, as they are those of the middle of the "
+        "pair: velocities alone tell.",
+    )

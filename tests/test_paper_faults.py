@@ -1,0 +1,138 @@
+"""Planted mistakes: limits that a good measurement sets, and the figures that miss them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lfpiv_cli.errors import LimitMissedError
+from lfpiv_cli.paper import small_rig
+from lfpiv_cli.paper.faults import (
+    FAULTS,
+    LIMIT_SIGMAS,
+    NONE,
+    WORDS,
+    Limit,
+    allowed,
+    ensure_within,
+    fault_rows,
+    fault_table,
+    limits_of,
+    missed_limits,
+    place_and_velocity_figures,
+    said_to,
+)
+from lfpiv_cli.paper.small_scenes import displacement
+
+Points = NDArray[np.float64]
+# Of places and displacements, x, y and z, mm.
+SIGMA_MM = np.array([1e-4, 1e-4, 3e-3])
+
+
+def tracks(seed: int, change: Any = lambda middle, moved: (middle, moved)) -> dict[str, float]:
+    """Figures of tracks with noise, changed by a mistake."""
+    rng = np.random.default_rng(seed)
+    true = small_rig.strewn_apart(rng, (-4.0, 4.0), small_rig.HALF_WIDTH_MM).position_mm
+    moves = displacement(true)
+    middle, moved = (values + rng.normal(0.0, SIGMA_MM, true.shape) for values in (true, moves))
+    return place_and_velocity_figures(*change(middle, moved), true, moves)
+
+
+LIMITS = limits_of(tracks(100))
+SIGNS = np.array([1.0, 1.0, -1.0])
+
+
+def test_a_good_measurement_is_within_its_limits():
+    for seed in range(20):
+        ensure_within(tracks(seed), LIMITS)
+
+
+@pytest.mark.parametrize(
+    ("change", "given_away"),
+    [
+        (lambda middle, moved: (middle, -moved), {"slope_u", "slope_v", "slope_w"}),
+        (lambda middle, moved: (middle * SIGNS, moved * SIGNS), {"stretch_z", "slope_w"}),
+        (lambda middle, moved: (middle * [-1, 1, 1], moved * [-1, 1, 1]), {"stretch_x", "slope_u"}),
+        (lambda middle, moved: (middle + [2e-3, 0, 0], moved), {"offset_x"}),
+        (lambda middle, moved: (middle * [1, 1, 1.02], moved * [1, 1, 1.02]), {"stretch_z", "slope_w"}),
+        (lambda middle, moved: (middle + 3e-3 * middle[:, 2:] * [0, 1, 0], moved), {"slant_y"}),
+    ],
+    ids=["pair swapped", "z of the wrong sign", "columns mirrored", "offset", "index", "slant"],
+)
+def test_figures_give_a_mistake_away(change: Any, given_away: set[str]):
+    figures = tracks(1, change)
+    assert set(missed_limits(figures, LIMITS)) == given_away
+    with pytest.raises(LimitMissedError) as caught:
+        ensure_within(figures, LIMITS)
+    assert caught.value.exit_code == 8
+    assert all(WORDS[name].text in str(caught.value) for name in given_away)
+
+
+def test_the_worst_figure_is_named_first():
+    figures = tracks(1, lambda middle, moved: (middle + [1e-3, 4e-3, 0.0], moved))
+    assert missed_limits(figures, LIMITS) == ["offset_y", "offset_x"]
+
+
+def test_more_spread_is_a_miss_and_less_is_not():
+    limit = LIMITS["spread_z"]
+    assert limit.centre == pytest.approx(SIGMA_MM[2], rel=0.3)
+    assert limit.over(0.0) == 0.0
+    assert limit.over(limit.centre + 2.0 * limit.half_width) == pytest.approx(2.0)
+    assert LIMITS["offset_x"].over(-2.0 * LIMITS["offset_x"].half_width) == pytest.approx(2.0)
+
+
+def test_what_is_not_known_is_a_miss():
+    assert Limit(0.0, 1.0, False).over(float("nan")) == np.inf
+    figures = tracks(1) | {"stretch_z": float("nan")}
+    assert missed_limits(figures, LIMITS) == ["stretch_z"]
+
+
+def test_limits_are_standard_errors():
+    figures = tracks(100)
+    assert LIMITS["offset_z"].half_width == pytest.approx(LIMIT_SIGMAS * figures["offset_z_sigma"])
+    assert set(LIMITS) == set(WORDS)
+    assert allowed("offset_z", {"offset_z": Limit(0.0, 2e-3, False)}) == "\N{PLUS-MINUS SIGN}2 um"
+    assert allowed("spread_z", {"spread_z": Limit(1e-3, 2e-3, True)}) == "up to 3 um"
+
+
+def test_rows_count_mistakes_found_and_false_alarms():
+    good = tracks(1)
+    swapped = tracks(1, lambda middle, moved: (middle, -moved))
+    found, alarms = fault_rows({"pair swapped": swapped}, good, LIMITS)
+    assert (found.best, found.limit, found.verdict) == (1.0, 1.0, "met")
+    assert "slope of u is -200 %" in found.reason
+    assert (alarms.best, alarms.verdict) == (0.0, "met")
+    missed, wrong = fault_rows({"pair swapped": good}, swapped, LIMITS)
+    assert (missed.best, missed.verdict, wrong.verdict) == (0.0, "missed", "missed")
+    assert "no figure misses its limit" in missed.reason
+    table = fault_table({"pair swapped": swapped}, good, LIMITS)
+    assert [row[0] for row in table.rows] == ["no mistake", *["pair swapped"] * 3]
+    assert [row[-1] for row in table.rows] == ["met", *["missed"] * 3]
+    assert said_to(good, LIMITS) == ""
+
+
+def test_the_planted_mistakes_are_those_that_are_told():
+    assert [fault.name for fault in FAULTS] == [
+        "index 1.30 for 1.33",
+        "z of the wrong sign",
+        "images half a pixel off",
+        "lattice turned by 0.02 degrees",
+        "column axis mirrored",
+        "pair swapped",
+    ]
+    first, second = np.arange(6.0).reshape(2, 3), np.ones((2, 3))
+    assert NONE.images((first, second)) == (first, second)
+    mirrored = FAULTS[4].images((first, second))[0]
+    assert np.array_equal(mirrored, first[:, ::-1])
+    assert FAULTS[5].images((first, second)) == (second, first)
+    assert FAULTS[0].case().believed.media.fluid == 1.30
+
+
+def test_a_mirrored_image_fits_the_lattice():
+    # it is its own mirror image about the sensor's middle, so that nothing but signs tells
+    lattice = small_rig.sheet().micro_image_lattice_px()
+    middle = small_rig.sheet().sensor_centre_px
+    assert lattice.origin == pytest.approx(middle)
