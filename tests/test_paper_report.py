@@ -220,7 +220,7 @@ def test_the_command_line(arguments: list[str], words: str, tmp_path) -> None:
     assert words in result.output
 
 
-@pytest.mark.parametrize("name", ["table1", "table2", "focal-plane"])
+@pytest.mark.parametrize("name", ["table1", "table2", "focal-plane", "sensitivities", "faults"])
 def test_parts_at_a_tiny_size(name: PaperPart, tmp_path) -> None:
     chosen = PaperOptions(only=(name,), size="tiny")
     summary = validate_paper(tmp_path, chosen, console=QUIET)
