@@ -27,6 +27,10 @@ Method = Literal[TracedMethod, "dlfc"]
 Refraction = Literal["paraxial", "exact"]
 Sampling = Literal["exact", "rays"]
 
+# The wall of a channel that simulated bubbles stick to: across the depth the nearest or farthest one, across the other
+# axis that of its low or high end.
+BubbleWall = Literal["near", "far", "low", "high"]
+
 # What a solver starts from, and which frames belong together.
 Start = Literal["uniform", "line_of_sight"]
 Pairing = Literal["ab", "sequence"]

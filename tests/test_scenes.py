@@ -90,11 +90,11 @@ def test_board_s_truth_is_its_placement(small, rng):
 def test_frames_lie_evenly_about_the_time_of_the_truth(small, frames):
     """Each frame is the truth's tracers carried back or forth: rendered again from the truth alone."""
     box = Box((-0.2, -0.2, -1.0), (0.2, 0.2, 1.0))
-    tracers = Tracers(5, box, light_counts=1e5)
+    tracers = Tracers(5, box, light_counts=1e5, rays=20_000)
     velocity = np.array([0.05, -0.02, 0.1])
     rng = np.random.default_rng(4)
     found = simulate_particles(
-        RecordingCamera(small, NOISELESS), AIR, tracers, Motion(uniform(velocity), 2e-3, frames), rng, rays=20_000
+        RecordingCamera(small, NOISELESS), AIR, tracers, Motion(uniform(velocity), 2e-3, frames), rng
     )
     assert found.velocities_m_s == pytest.approx(np.tile(velocity, (5, 1)))
     # 1 ms: metres per second are mm
@@ -107,9 +107,9 @@ def test_frames_lie_evenly_about_the_time_of_the_truth(small, frames):
 
 def test_tracers_fill_the_box_and_the_brightness(small, rng):
     box = Box((-1.0, -2.0, -3.0), (1.0, 2.0, 4.0))
-    tracers = Tracers(2000, box, light_counts=100.0)
+    tracers = Tracers(2000, box, light_counts=100.0, rays=1)
     pair = simulate_particles(
-        RecordingCamera(small, Readout()), AIR, tracers, Motion(rigid_rotation((0, 0, 5.0)), 1e-3), rng, rays=1
+        RecordingCamera(small, Readout()), AIR, tracers, Motion(rigid_rotation((0, 0, 5.0)), 1e-3), rng
     )
     for axis in range(3):
         low, high = box.low_mm[axis], box.high_mm[axis]
@@ -131,10 +131,9 @@ def test_a_pair_is_decided_by_its_seed(small):
         simulate_particles(
             RecordingCamera(small, Readout()),
             AIR,
-            Tracers(3, Box((-0.1, -0.1, 0.0), (0.1, 0.1, 1.0))),
+            Tracers(3, Box((-0.1, -0.1, 0.0), (0.1, 0.1, 1.0)), rays=100),
             Motion(uniform((0, 0, 0)), 1e-3),
             np.random.default_rng(6),
-            rays=100,
         )
         for _ in range(2)
     ]

@@ -27,7 +27,11 @@ from lfpiv_cli.reconstruction.registry import SOLVER_NAMES
 @click.option("--start", type=click.Choice(names_in(Start)), help="First volume; default from the config.")
 @dark_option
 @click.option("--background", help="Image to subtract, or minimum or mean over the images given, or as minimum:15.")
-@click.option("--mask", type=FILE, help="Image that is black where pixels are left out (reflections, bubbles).")
+@click.option(
+    "--mask",
+    help="Image that is black where pixels are left out (reflections, bubbles), or still: where light stands still in "
+    "the images given, brighter than what moves.",
+)
 @pairing_option
 @resume_option
 @click.option("--keep-going", is_flag=True, help="Go on with the next frame when one fails.")

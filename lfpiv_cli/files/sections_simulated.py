@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from lfpiv_cli.files.section_types import (
+    MOST_BUBBLES,
     MOST_FRAMES,
     MOST_PARTICLES,
     Angle,
@@ -17,7 +18,7 @@ from lfpiv_cli.files.section_types import (
     Share,
     Vector,
 )
-from lfpiv_cli.names import BoardImages, BoardMethod, FlowMethod, Refraction
+from lfpiv_cli.names import BoardImages, BoardMethod, BubbleWall, FlowMethod, Refraction
 
 
 class SquareDuct(Section):
@@ -82,6 +83,9 @@ class SimulationSection(Section):
     brightness (range of each particle's light relative to particle_counts) or brightness_log_sigma (log-normal instead,
     of median 1), particle_counts (counts of a whole particle of brightness 1), mid_plane_z_mm (where the origin of a
     mid_plane volume lies behind the focal point; by default where Eq. 21 puts it for the board at board_z_mm).
+    Bubbles that stick to a wall of a square duct: bubbles (their number), bubble_diameter_mm (range), bubble_counts (of
+    a pixel that sees only the middle of one), bubble_wall (near or far across the depth, low or high across the other
+    axis).
     Board: board_z_mm, board_tilt_deg, board_offset_mm, board_rotation_deg.
     Camera as it really is: rotation_deg of the array (from the columns towards the rows), shift_px (columns, rows) and
     distortion_per_mm2.
@@ -98,6 +102,10 @@ class SimulationSection(Section):
     brightness_log_sigma: NotNegative | None = None
     particle_counts: Positive = 500_000.0
     mid_plane_z_mm: float | None = None
+    bubbles: Annotated[int, Field(ge=0, le=MOST_BUBBLES)] = 0
+    bubble_diameter_mm: tuple[Positive, Positive] = (0.3, 0.8)
+    bubble_counts: Positive = 200_000.0
+    bubble_wall: BubbleWall = "high"
     board_z_mm: float = 0.0
     board_tilt_deg: tuple[Angle, Angle] = (0.0, 0.0)
     board_offset_mm: Pair = (0.0, 0.0)

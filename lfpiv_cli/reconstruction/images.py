@@ -24,6 +24,15 @@ FULL_SCALES = (255.0, 1023.0, 4095.0, 16383.0, 65472.0, 65520.0, 65532.0, 65535.
 # A hot or dead pixel stands out of its neighbours in the dark image, above or below, by this many standard deviations
 # of such differences: of four million pixels of mere noise none does.
 DEFECT_SIGMAS = 8.0
+# Still light is this many times as bright as what the frames differ by in all but a thousandth of the pixels: of a pair
+# of the paper's channel without bubbles, whose tracers hardly move beside the walls, no pixel is from 1.5 times on. A
+# bubble is many times as bright.
+STILL_RATIO = 1.5
+DIFFERENT_PERCENTILE = 99.9
+# Its rim fades below that within so many pixels.
+STILL_MARGIN_PX = 2
+# Of more than this share of the pixels, tracers that do not move have been taken for bubbles.
+LARGEST_STILL = 0.3
 # Resampling: a pixel with more than this share of its light from unusable ones is unusable, too.
 TOUCHED_SHARE = 0.1
 
@@ -89,6 +98,28 @@ def _over_sequence(
     if result is None or count < 2:
         raise InputError(f"a background over a sequence needs at least two images, found {count}")
     return result, count
+
+
+def still_light(images: Iterable[Image]) -> Mask:
+    """Return which pixels (rows, columns) of a sequence hold light that does not move and outshines all that does.
+
+    Bubbles on a wall, reflections: in every image they are brighter than what the images differ by.
+
+    Raises
+    ------
+    InputError : there are fewer than two images, they differ in shape, or hardly at all in what they show.
+    """
+    lowest, highest = _over_sequence((np.stack([image, -image]) for image in images), np.fmin)[0] * [[[1.0]], [[-1.0]]]
+    moving = np.percentile(highest - lowest, DIFFERENT_PERCENTILE)
+    dark = np.median(lowest)
+    still = lowest - dark > STILL_RATIO * moving
+    if np.mean(still) > LARGEST_STILL:
+        raise InputError(
+            f"{np.mean(still):.0%} of the light stands still, at most {LARGEST_STILL:.0%} can be left out: the images "
+            "hardly differ"
+        )
+    side = 2 * STILL_MARGIN_PX + 1
+    return np.asarray(cv2.dilate(still.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
 
 
 def saturated(image: Image, level_counts: float | None = None) -> Mask:

@@ -16,8 +16,10 @@ from numpy.typing import NDArray
 from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files.batch import Frame
 from lfpiv_cli.files.provenance import sha256
-from lfpiv_cli.reconstruction.images import Image, light, mean_background, minimum_background
+from lfpiv_cli.reconstruction.images import Image, light, mean_background, minimum_background, still_light
 
+# In place of a mask's file: what does not move in the frames is left out.
+STILL = "still"
 BACKGROUNDS = {"minimum": minimum_background, "mean": mean_background}
 
 
@@ -79,6 +81,16 @@ def reader(
     return read
 
 
+def mask_of(given: str | Path | None, frames: Sequence[Frame], shape: tuple[int, int]) -> Image | None:
+    """Return the mask, 0 where pixels are left out: of a file, or of what does not move in the frames (`still`)."""
+    if given is None:
+        return None
+    if given != STILL:
+        return image_files.read_image(Path(given), shape)
+    still = still_light(image_files.read_page(frame.path, frame.page, shape) for frame in frames)
+    return np.where(still, np.float32(0.0), np.float32(1.0))
+
+
 def ahead(
     read: Callable[[int], tuple[Image, Image]], numbers: Sequence[int]
 ) -> Iterator[tuple[int, Future[tuple[Image, Image]]]]:
@@ -91,16 +103,21 @@ def ahead(
             yield number, current
 
 
-def sequence_digests(level: Background, frames: Sequence[Frame]) -> list[str]:
-    """Return for each frame which other frames its background is made from, as words for its record."""
-    if level.kind is None:
-        return [""] * len(frames)
+def sequence_digests(level: Background, frames: Sequence[Frame], mask: str | Path | None = None) -> list[str]:
+    """Return for each frame which other frames its background and mask are made from, as words for its record."""
+    words = [""] * len(frames)
+    if level.kind is None and mask != STILL:
+        return words
     pages = [f"{sha256(frame.path)} {frame.page}\n" for frame in frames]
-    words = []
-    for number in range(len(frames)):
-        numbers = level.around(number, len(frames))
+
+    def over(numbers: range) -> str:
         digest = hashlib.sha256("".join(pages[k] for k in numbers).encode()).hexdigest()
-        words.append(f", background: {level.kind} over {len(numbers)} frames, SHA-256 {digest}")
+        return f"over {len(numbers)} frames, SHA-256 {digest}"
+
+    if level.kind is not None:
+        words = [f", background: {level.kind} {over(level.around(k, len(frames)))}" for k in range(len(frames))]
+    if mask == STILL:
+        words = [f"{word}, mask: {STILL} {over(range(len(frames)))}" for word in words]
     return words
 
 

@@ -31,7 +31,7 @@ from lfpiv_cli.notice import Notice
 from lfpiv_cli.particles.search import Particles
 from lfpiv_cli.reconstruction.images import Image
 from lfpiv_cli.reconstruction.registry import SolverName
-from lfpiv_cli.stages.frames import Background, ahead, reader, sequence_digests, with_those_beside
+from lfpiv_cli.stages.frames import STILL, Background, ahead, mask_of, reader, sequence_digests, with_those_beside
 
 # Reads frame `number`: raw, and with dark or background taken off.
 Read = Callable[[int], tuple[Image, Image]]
@@ -55,7 +55,7 @@ class ReconstructOptions:
     solver, iterations, relaxation, accelerate, start : in place of the config's, see its section `reconstruction`
     dark : image taken with the cap on; its hot and dead pixels are left out
     background : image to subtract, or `minimum` or `mean` over the images, or as `minimum:15`
-    mask : image that is black where pixels are left out
+    mask : image that is black where pixels are left out, or `still`: where bright light does not move in the images
     pairing : `ab` or `sequence`: find particles with the help of the frames beside
     resume : skip what is complete and made from the same inputs
     keep_going : go on with the next frame when one fails
@@ -68,7 +68,7 @@ class ReconstructOptions:
     start: Start | None = None
     dark: Path | None = None
     background: str | None = None
-    mask: Path | None = None
+    mask: str | Path | None = None
     pairing: Pairing | None = None
     resume: bool = False
     keep_going: bool = False
@@ -88,7 +88,8 @@ def reconstruct(
 ) -> dict[str, Any]:
     """Reconstruct the volume behind each image, or find its particles."""
     level = Background.parse(options.background)
-    common = given(weights=weights, dark=options.dark, background=level.path, mask=options.mask)
+    mask_file = None if options.mask is None or options.mask == STILL else Path(options.mask)
+    common = given(weights=weights, dark=options.dark, background=level.path, mask=mask_file)
     frames = frames_of(images)
     beside = None if options.pairing is None else frames_beside(len(frames), options.pairing)
     paths = output_paths(output, [frame.stem for frame in frames])
@@ -100,7 +101,10 @@ def reconstruct(
         raise UsageError(
             f"--pairing: {settings.reconstruction.solver} takes each frame alone; --solver particles does not"
         )
-    targets = _targets(paths, frames, level, settings, common, beside)
+    made_of = sequence_digests(level, frames, options.mask)
+    if beside is not None:
+        made_of = with_those_beside(made_of, frames, beside)
+    targets = _targets(paths, frames, made_of, settings, common)
     needed = pending(targets, [*common.values(), *images], overwrite, options.resume, _record_of)
     if as_particles:
         content = particles.searchable(content, settings)
@@ -109,7 +113,8 @@ def reconstruct(
     elif content.weights.on_demand and needed:
         console.say(on_demand_told(math.prod(content.weights.padded.shape)))
     shape = content.image_shape
-    dark, mask = (image_files.read_image(path, shape) if path else None for path in (options.dark, options.mask))
+    dark = image_files.read_image(options.dark, shape) if options.dark else None
+    mask = mask_of(options.mask, frames, shape)
     bench = bench_of(content, settings, dark, mask, with_sums=bool(needed))
     read = reader(level, frames, shape, dark)
     steps = particles.STEPS if as_particles else settings.reconstruction.iterations
@@ -176,15 +181,11 @@ def _frames(bench: Bench, read: Read, number: int) -> Iterator[particles.Frame]:
 def _targets(
     paths: Sequence[Path],
     frames: Sequence[Frame],
-    level: Background,
+    made_of: Sequence[str],
     settings: Config,
     common: Mapping[str, Path],
-    beside: Sequence[tuple[int, ...]] | None,
 ) -> list[Target]:
-    """Return where each frame's result goes and the record that it will carry."""
-    made_of = sequence_digests(level, frames)
-    if beside is not None:
-        made_of = with_those_beside(made_of, frames, beside)
+    """Return where each frame's result goes and the record that it will carry, with words of other frames."""
     return [
         Target(
             path, record(f"reconstruct page {frame.page}{words}", settings.resolved(), {**common, "image": frame.path})

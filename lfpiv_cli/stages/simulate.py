@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.calibration.model import mid_plane_z_mm
@@ -28,6 +29,7 @@ from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.reference import FOCAL_POINT, Reference
 from lfpiv_cli.synthetic import scenes
 from lfpiv_cli.synthetic.board import BoardPlacement
+from lfpiv_cli.synthetic.bubbles import Bubbles, bubbles_at_wall, render_bubbles
 from lfpiv_cli.synthetic.render import RAYS, ObjectSpace
 from lfpiv_cli.synthetic.seeding import seeded_boxes
 from lfpiv_cli.synthetic.sensor import Readout
@@ -92,21 +94,28 @@ def simulate_particles(
     if settings.correlation.dt_s is None:
         raise ConfigError(f"{config}: correlation.dt_s: is missing, and images of a flow need it")
     reference = simulated_reference(settings)
-    tracers = _tracers(settings, real_camera(settings), reference, settings.correlation.dt_s)
+    camera, space = _recording(settings), _flow_space(settings, reference)
+    tracers = _tracers(settings, camera.optics, reference, settings.correlation.dt_s)
+    bubbles = _bubbles(settings, tracers.box, reference)
+    still: NDArray[np.float64] | float = 0.0
+    if bubbles is not None:
+        still = render_bubbles(camera.optics, space, bubbles, scene.bubble_counts, _generator(settings, 5))
     with console.progress(scene.frames * tracers.count, "simulate") as advance:
         found = scenes.simulate_particles(
-            _recording(settings),
-            _flow_space(settings, reference),
+            camera,
+            space,
             tracers,
             scenes.Motion(settings.simulated_flow(reference), settings.correlation.dt_s, scene.frames),
             _generator(settings, 2),
-            rays=scene.rays or RAYS,
+            still=still,
             progress=advance,
         )
     for name, image in zip(images, found.images, strict=True):
         write_tiff(paths[name], image, overwrite)
     write_particles(paths["particles.npz"], found.positions_mm, found.velocities_m_s, found.brightness, overwrite)
     truth = found.truth | {"reference_z_mm": reference.z_mm}
+    if bubbles is not None:
+        truth["bubbles_mm"] = bubbles.truth()
     return _write_truth(paths["particles.json"], "simulate particles", truth, settings, config, overwrite)
 
 
@@ -205,13 +214,11 @@ def _tracers(settings: Config, camera: Camera, reference: Reference, dt_s: float
 
     Those that are carried into the volume before a longer sequence ends, or out of it, are there too.
     """
-    scene, flow = settings.simulation, settings.simulation.flow
-    volume, walls = settings.grid(reference), None
-    if flow is not None and flow.kind == "square_duct":
-        walls = scenes.channel_walls(flow.width_mm, reference.depth_to_focal_point(flow.centre_mm[2]), flow.axis)
+    scene, volume = settings.simulation, settings.grid(reference)
     reach = blur_radius_mm(camera, settings.media_model(), volume)
     carried_s = 0.5 * (scene.frames - 2) * dt_s
-    box, inside = seeded_boxes(volume, reach, settings.simulated_flow(reference), carried_s, walls)
+    flow, walls = settings.simulated_flow(reference), _walls(settings, reference)
+    box, inside = seeded_boxes(volume, reach, flow, carried_s, walls)
     return scenes.Tracers(
         round(scene.particles * box.volume_mm3 / inside.volume_mm3),
         box,
@@ -219,4 +226,30 @@ def _tracers(settings: Config, camera: Camera, reference: Reference, dt_s: float
         scene.particle_counts,
         scene.brightness,
         scene.brightness_log_sigma,
+        scene.rays or RAYS,
+    )
+
+
+def _walls(settings: Config, reference: Reference) -> scenes.Box | None:
+    """Return the inside of the channel that the flow runs through, None where it is another flow."""
+    flow = settings.simulation.flow
+    if flow is None or flow.kind != "square_duct":
+        return None
+    return scenes.channel_walls(flow.width_mm, reference.depth_to_focal_point(flow.centre_mm[2]), flow.axis)
+
+
+def _bubbles(settings: Config, seen: scenes.Box, reference: Reference) -> Bubbles | None:
+    """Return the bubbles at the channel's wall, None where there are none.
+
+    Raises
+    ------
+    ConfigError : there is no channel that they could stick to
+    """
+    scene, walls = settings.simulation, _walls(settings, reference)
+    if scene.bubbles == 0:
+        return None
+    if walls is None:
+        raise ConfigError("simulation.bubbles: bubbles stick to a channel's wall; simulation.flow is no square_duct")
+    return bubbles_at_wall(
+        scene.bubbles, scene.bubble_diameter_mm, scene.bubble_wall, seen, walls, _generator(settings, 4)
     )

@@ -95,7 +95,7 @@ def render_board(
     plate = _plate_centres(board)
     if shown is not None:
         plate = plate[np.asarray(shown, dtype=bool)]
-    inside = _sunflower(POINTS_PER_DOT, 0.5 * board.dot_diameter_mm)
+    inside = sunflower(POINTS_PER_DOT, 0.5 * board.dot_diameter_mm)
     points = placement.to_world(plate[:, np.newaxis, :] + inside).reshape(-1, 3)
     area = 0.25 * np.pi * board.dot_diameter_mm**2 / POINTS_PER_DOT
     light = area * light_per_area(camera, space.media, points[:, 2], level)
@@ -119,7 +119,7 @@ def light_per_area(camera: Camera, media: Media, z_mm: ArrayLike, level: float) 
     return per_lens / camera.lattice.cell_area * (camera.image_distance_mm / distance) ** 2
 
 
-def _sunflower(count: int, radius: float) -> NDArray[np.float64]:
+def sunflower(count: int, radius: float) -> NDArray[np.float64]:
     """Return points that fill a disc evenly, (count, 2), their mean at its centre: the order alone is off by 0.2 %."""
     k = np.arange(count)
     r = radius * np.sqrt((k + 0.5) / count)

@@ -96,6 +96,7 @@ class Tracers:
     light_counts : expected counts of a tracer of brightness 1 that pass the aperture
     brightness : brightness is evenly spread between these two
     brightness_log_sigma : log-normal instead, of median 1, with this standard deviation of the logarithm
+    rays : traced of each
     """
 
     count: int
@@ -104,6 +105,7 @@ class Tracers:
     light_counts: float = 6.0e5
     brightness: tuple[float, float] = (0.6, 1.4)
     brightness_log_sigma: float | None = None
+    rays: int = RAYS
 
     def draw_brightness(self, rng: np.random.Generator) -> NDArray[np.float64]:
         """Return the brightness (count,) of each tracer."""
@@ -209,12 +211,15 @@ def simulate_particles(
     motion: Motion,
     rng: np.random.Generator,
     *,
-    rays: int = RAYS,
+    still: NDArray[np.float64] | float = 0.0,
     progress: Callable[[int], None] | None = None,
 ) -> SimulatedFrames:
     """Simulate images of tracers, half of them before the time of the truth's positions and half after.
 
-    `progress` is called with the number of tracers rendered, n for each frame.
+    Parameters
+    ----------
+    still : expected counts (rows, columns) of light that does not move, in all frames
+    progress : called with the number of tracers rendered, n for each frame
     """
     positions = rng.uniform(tracers.box.low_mm, tracers.box.high_mm, (tracers.count, 3))
     brightness = tracers.draw_brightness(rng)
@@ -225,10 +230,10 @@ def simulate_particles(
             space,
             Balls(advect(motion.flow, positions, time_s), tracers.light_counts * brightness, tracers.diameter_mm),
             rng,
-            rays=rays,
+            rays=tracers.rays,
             progress=progress,
         )
-        images.append(camera.readout.record(expected, rng))
+        images.append(camera.readout.record(expected + still, rng))
     truth = {
         **camera_truth(camera.optics),
         "dt_s": motion.dt_s,

@@ -1,0 +1,159 @@
+"""Bubbles on a channel's wall: where they are, what images show of them, and how a mask finds them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+import yaml
+
+from lfpiv_cli import open_volume
+from lfpiv_cli.cli import cli
+from lfpiv_cli.errors import ConfigError, InputError
+from lfpiv_cli.files.images import read_image
+from lfpiv_cli.optics.media import Media
+from lfpiv_cli.paper.channel import TINY, channel_sections
+from lfpiv_cli.paper.parts import read_json
+from lfpiv_cli.reconstruction.images import LARGEST_STILL, STILL_MARGIN_PX, still_light
+from lfpiv_cli.synthetic.bubbles import Bubbles, bubbles_at_wall, render_bubbles
+from lfpiv_cli.synthetic.render import ObjectSpace
+from lfpiv_cli.synthetic.scenes import Box, channel_walls
+
+AIR = ObjectSpace(Media())
+
+
+@pytest.mark.parametrize("axis", ["x", "y"])
+@pytest.mark.parametrize(
+    ("wall", "is_deep", "sign"), [("near", True, -1), ("far", True, 1), ("low", False, -1), ("high", False, 1)]
+)
+def test_bubbles_touch_their_wall_and_stay_in_the_channel(rng, axis, wall, is_deep, sign):
+    walls = channel_walls(4.0, -0.3, axis)
+    seen = Box((-1.0, -2.0, -2.3), (1.0, 2.0, 1.7)) if axis == "x" else Box((-2.0, -1.0, -2.3), (2.0, 1.0, 1.7))
+    found = bubbles_at_wall(50, (0.2, 0.6), wall, seen, walls, rng)
+    across, middle = (2, -0.3) if is_deep else ({"x": 1, "y": 0}[axis], 0.0)
+    reach = sign * (found.centres_mm[:, across] - middle) + 0.5 * found.diameters_mm
+    assert reach == pytest.approx(np.full(50, 2.0))
+    radii = 0.5 * found.diameters_mm[:, np.newaxis]
+    assert (found.centres_mm - radii >= np.array(walls.low_mm) - 1e-9).all()
+    assert (found.centres_mm + radii <= np.array(walls.high_mm) + 1e-9).all()
+    assert found.diameters_mm.min() < 0.25
+    assert found.diameters_mm.max() > 0.55
+    with pytest.raises(ConfigError, match="do not fit"):
+        bubbles_at_wall(5, (4.1, 4.2), wall, seen, walls, rng)
+
+
+def test_a_bubble_gives_its_level_in_the_middle_and_fades_to_its_rim(camera, rng):
+    small = replace(camera, columns=220, rows=180)
+    bubble = Bubbles(np.array([[0.1, -0.05, 0.0]]), np.array([0.6]))
+    image = render_bubbles(small, AIR, bubble, 1000.0, rng)
+    # in focus a micro-image has the light of its lens's place: 1 - r^2/R^2 of the level in the middle of it
+    rows, columns = np.indices(image.shape)
+    x, y = np.moveaxis(small.px_to_mm(np.stack([columns, rows], axis=-1).astype(float)), -1, 0)
+    r = np.hypot(x + 0.1, y - 0.05)
+    lit = image[r < 0.05]
+    assert np.percentile(lit, 90) == pytest.approx(1000.0, rel=0.1)
+    assert image[r > 0.42].max() == 0.0
+    # of a paraboloid half of what fills the disc
+    lenses = 0.5 * np.pi * 0.3**2 / small.lattice.cell_area
+    assert image.sum() == pytest.approx(lenses * _lens_pixels(small) * 1000.0, rel=0.02)
+
+
+def _lens_pixels(camera):
+    radius_mm = camera.aperture_radius_mm * camera.microlens_distance_mm / camera.image_distance_mm
+    return np.pi * radius_mm**2 / camera.pixel_mm**2
+
+
+def simulated(folder: Path, name: str, **simulation: object) -> Path:
+    sections = channel_sections(TINY, simulation={"particles": 20, "rays": 500})
+    sections["simulation"] |= simulation
+    config = folder / f"{name}.yaml"
+    config.write_text(yaml.safe_dump(sections))
+    cli.main(["simulate", "particles", str(config), "-o", str(folder / name)], standalone_mode=False)
+    return folder / name
+
+
+def test_both_frames_show_the_same_bubbles_beside_the_same_tracers(tmp_path):
+    noiseless = {"photons_per_count": None, "read_noise_counts": 0.0}
+    plain = simulated(tmp_path, "plain", **noiseless)
+    bubbly = simulated(tmp_path, "bubbly", **noiseless, bubbles=3, bubble_counts=9000.0, bubble_diameter_mm=[0.3, 0.4])
+    difference = [
+        read_image(bubbly / f"pair_{k}.tif").astype(float) - read_image(plain / f"pair_{k}.tif") for k in "ab"
+    ]
+    # counts are rounded
+    np.testing.assert_allclose(*difference, atol=1.0)
+    assert difference[0].max() > 8000.0
+    told = read_json(bubbly / "particles.json")["bubbles_mm"]
+    assert np.shape(told) == (3, 4)
+    assert np.array(told)[:, 1] + 0.5 * np.array(told)[:, 3] == pytest.approx(np.full(3, 0.8))
+    assert "bubbles_mm" not in read_json(plain / "particles.json")
+
+
+def test_bubbles_need_a_channel(tmp_path):
+    sections = channel_sections(TINY, simulation={"bubbles": 1})
+    sections["simulation"]["flow"] = {"kind": "uniform", "velocity_m_s": [0.1, 0.0, 0.0]}
+    (tmp_path / "rig.yaml").write_text(yaml.safe_dump(sections))
+    with pytest.raises(ConfigError, match=r"simulation.bubbles: .* no square_duct"):
+        cli.main(
+            ["simulate", "particles", str(tmp_path / "rig.yaml"), "-o", str(tmp_path / "x")], standalone_mode=False
+        )
+
+
+def frames(rng, bright: float) -> tuple[list[np.ndarray], np.ndarray]:
+    """Return two frames of moved spots with noise and one bright thing that rests, and where that is."""
+    spots = (rng.random((120, 120)) < 0.01) * 900.0
+    rest = np.zeros((120, 120))
+    rest[40:60, 70:95] = bright
+    still = [np.roll(spots, 6 * k, axis=1) + rest + rng.normal(96.0, 6.0, rest.shape) for k in range(2)]
+    return [image.astype(np.float32) for image in still], rest > 0.0
+
+
+def test_still_light_is_what_rests_and_outshines_what_moves(rng):
+    images, rest = frames(rng, 20_000.0)
+    side = 2 * STILL_MARGIN_PX + 1
+    expected = cv2.dilate(rest.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
+    np.testing.assert_array_equal(still_light(images), expected)
+    # what moves is not believed to rest, nor is what rests but is no brighter
+    assert not still_light(frames(rng, 0.0)[0]).any()
+    assert not still_light(frames(rng, 500.0)[0]).any()
+
+
+def test_frames_that_hardly_differ_show_no_bubbles(rng):
+    image = (96.0 + 5000.0 * (rng.random((50, 50)) < 1.3 * LARGEST_STILL)).astype(np.float32)
+    with pytest.raises(InputError, match="hardly differ"):
+        still_light([image, image + 1.0])
+    with pytest.raises(InputError, match="at least two"):
+        still_light([image])
+
+
+def test_a_mask_of_what_is_still_is_that_of_its_image(tmp_path):
+    root = Path(__file__).parent.parent
+    text = (root / "configs" / "sample.yaml").read_text()
+    for old, new in (("[30, 22, 40]", "[16, 12, 20]"), ("reference: mid_plane", "reference: focal_point")):
+        assert old in text
+        text = text.replace(old, new)
+    (tmp_path / "rig.yaml").write_text(text)
+
+    def run(*words: object) -> None:
+        cli.main([str(word) for word in words], standalone_mode=False)
+
+    run("build-weights", tmp_path / "rig.yaml", "-o", tmp_path / "weights.h5")
+    pair = []
+    for name in "ab":
+        image = read_image(root / "sample_data" / f"pair_{name}.tif").astype(np.uint16)
+        image[180:230, 250:320] = 50_000
+        tifffile.imwrite(tmp_path / f"{name}.tif", image)
+        pair.append(image.astype(np.float32))
+    tifffile.imwrite(tmp_path / "mask.tif", np.where(still_light(pair), 0, 255).astype(np.uint8))
+    images = [tmp_path / f"{name}.tif" for name in "ab"]
+    common = ("reconstruct", tmp_path / "weights.h5", *images, "--iterations", 2)
+    for name, mask in (("still", "still"), ("file", tmp_path / "mask.tif")):
+        (tmp_path / name).mkdir()
+        run(*common, "--mask", mask, "-o", tmp_path / name)
+    found, given = (open_volume(tmp_path / name / "a.vtkhdf") for name in ("still", "file"))
+    np.testing.assert_array_equal(found.array, given.array)
+    assert found.attributes["excluded_pixels"] == (50 + 2 * STILL_MARGIN_PX) * (70 + 2 * STILL_MARGIN_PX)
+    assert "mask: still over 2 frames, SHA-256" in found.provenance["command"]
