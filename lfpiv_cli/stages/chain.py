@@ -23,29 +23,49 @@ def run_chain(config: Path, output: Path, *, overwrite: bool = False, console: C
     From raw images with all imperfections on, which every method gets alike, through the same stages and files as
     recorded ones; of a longer sequence, the first two.
     """
-    settings, images = load_config(config), output / "images"
-    methods = settings.flow_methods()
+    images = output / "images"
+    simulate_images(config, images, overwrite=overwrite, console=console)
+    return measure_images(config, images, output, overwrite=overwrite, console=console)
+
+
+def simulate_images(config: Path, images: Path, *, overwrite: bool = False, console: Console = CONSOLE) -> None:
+    """Simulate all images of the config's experiment, boards at several depths where its weights need them."""
+    settings = load_config(config)
     common: dict[str, Any] = {"overwrite": overwrite, "console": console}
     simulate.simulate_white(config, images, **common)
     simulate.simulate_particles(config, images, **common)
+    if settings.weights.method == "dlfc":
+        simulate.simulate_boards(config, images, board_depths(settings), **common)
+    else:
+        simulate.simulate_board(config, images, **common)
+
+
+def measure_images(
+    config: Path, images: Path, output: Path, *, overwrite: bool = False, console: Console = CONSOLE
+) -> dict[str, Path]:
+    """Measure the flow in images that `simulate_images` made, calibration included; return the vectors by method."""
+    settings = load_config(config)
+    common: dict[str, Any] = {"overwrite": overwrite, "console": console}
     weights = _weights(config, settings, images, output, common)
     pair = [images / name for name in simulate.frame_names(settings.simulation.frames)[:2]]
     makers = {"volumes": _by_volumes, "particles": _by_particles}
-    return {name: makers[name](weights, pair, output, common) for name in methods}
+    return {name: makers[name](weights, pair, output, common) for name in settings.flow_methods()}
+
+
+def board_depths(settings: Config) -> list[float]:
+    """Return the depths of the boards that rays are fitted to, from the origin of the volume's coordinates."""
+    low, high = settings.grid().bounds_mm(2)
+    margin = DLFC_MARGIN * (high - low)
+    return [float(depth) for depth in np.linspace(low + margin, high - margin, DLFC_BOARDS).round(2)]
 
 
 def _weights(config: Path, settings: Config, images: Path, output: Path, common: dict[str, Any]) -> Path:
-    """Simulate the boards, calibrate and build the weights; return their file."""
+    """Calibrate and build the weights; return their file."""
     calibration, weights = output / "calibration.h5", output / "weights.h5"
     boards, depths = [images / "board.tif"], []
     if settings.weights.method == "dlfc":
-        low, high = settings.grid().bounds_mm(2)
-        margin = DLFC_MARGIN * (high - low)
-        depths = np.linspace(low + margin, high - margin, DLFC_BOARDS).round(2).tolist()
+        depths = board_depths(settings)
         boards = [images / simulate.board_at(depth) for depth in depths]
-        simulate.simulate_boards(config, images, depths, **common)
-    else:
-        simulate.simulate_board(config, images, **common)
     pictures = calibrate.CalibrateOptions(
         white=[images / "white.tif"], dark=images / "dark.tif", board=boards, depth_mm=depths
     )

@@ -51,7 +51,7 @@ def validate_flow(
     ensure_drawing()
     made = {"measured": vectors} if vectors else run_chain(config, output, overwrite=overwrite, console=console)
     inputs = given(config=config, particles=particles) | (given(vectors=vectors) if vectors else made)
-    methods = {name: _measured(path, settings, particles, is_simulated) for name, path in made.items()}
+    methods = {name: measured_of(path, settings, particles, is_simulated) for name, path in made.items()}
     figures = {name: measured.figures(duct) for name, measured in methods.items()}
     limits = settings.validation.limits.model_dump()
     missed = [
@@ -82,7 +82,7 @@ def duct_of(flow: FlowSection | None) -> Duct | None:
     return Duct(flow.width_mm, flow.centre_mm, flow.axis)
 
 
-def _measured(vectors: Path, settings: Config, particles: Path | None, is_simulated: bool) -> Measured:
+def measured_of(vectors: Path, settings: Config, particles: Path | None, is_simulated: bool) -> Measured:
     """Return vectors with the true flow at their places."""
     field = vtkhdf.open_vectors(vectors)
     if field.dt_s is None:

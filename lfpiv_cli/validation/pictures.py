@@ -71,7 +71,7 @@ def slices_figure(methods: Mapping[str, Measured], duct: Duct) -> Figure:
         for panel, share in zip(row, PAPER_SLICES[name], strict=True):
             position = duct.position_mm(axis, share)
             for (label, values), style in zip(curves.items(), STYLES, strict=False):
-                profile = _profile_at(values[..., main], grid.axis_mm(axis), position, axis, main)
+                profile = profile_at(values[..., main], grid.axis_mm(axis), position, axis, main)
                 panel.plot(grid.axis_mm(other), profile, style, markersize=4, label=label)
             rows = {method: table[f"{name} {share}"] for method, table in tables.items()}
             told = [_told(method, errors["ours_percent"]) for method, errors in rows.items()]
@@ -89,20 +89,29 @@ def _told(method: str, percent: float | None) -> str:
     return f"{method} unknown" if percent is None else f"{method} {percent:.2f} %"
 
 
-def _profile_at(
+def profile_at(
     values: NDArray[np.float64], places: NDArray[np.float64], position: float, axis: int, along: int
 ) -> NDArray[np.float64]:
     """Return a slice across one axis (0 for x) of values [z, y, x], interpolated, and its mean along another."""
+    # what is left of [z, y, x] once the first axis is taken
+    left = [k for k in (2, 1, 0) if k != axis].index(along)
+    between = slice_at(values, places, position, axis)
+    known = np.isfinite(between)
+    count = known.sum(axis=left)
+    profile = np.full(count.shape, np.nan)
+    np.divide(np.where(known, between, 0.0).sum(axis=left), count, out=profile, where=count > 0)
+    return profile
+
+
+def slice_at(
+    values: NDArray[np.float64], places: NDArray[np.float64], position: float, axis: int
+) -> NDArray[np.float64]:
+    """Return a slice across one axis (0 for x) of values [z, y, x], interpolated between planes at `places`."""
     at = float(np.clip(np.interp(position, places, np.arange(places.size)), 0, places.size - 1))
     low = min(int(at), max(0, places.size - 2))
     high = min(low + 1, places.size - 1)
-    planes = np.moveaxis(values, (2 - axis, 2 - along), (0, 1))
-    known = np.isfinite(planes[low]) & np.isfinite(planes[high])
-    between = np.where(known, (1.0 - (at - low)) * planes[low] + (at - low) * planes[high], 0.0)
-    count = known.sum(axis=0)
-    profile = np.full(count.shape, np.nan)
-    np.divide(between.sum(axis=0), count, out=profile, where=count > 0)
-    return profile
+    planes = np.moveaxis(values, 2 - axis, 0)
+    return np.asarray((1.0 - (at - low)) * planes[low] + (at - low) * planes[high])
 
 
 def _mid_plane(values: NDArray) -> NDArray:
