@@ -13,11 +13,13 @@ import yaml
 
 from lfpiv_cli import open_volume
 from lfpiv_cli.cli import cli
+from lfpiv_cli.console import Console
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.files.images import read_image
 from lfpiv_cli.optics.media import Media
+from lfpiv_cli.paper.bubbles import _rows, bubbles
 from lfpiv_cli.paper.channel import TINY, channel_sections
-from lfpiv_cli.paper.parts import read_json
+from lfpiv_cli.paper.parts import Work, read_json
 from lfpiv_cli.reconstruction.images import LARGEST_STILL, STILL_MARGIN_PX, still_light
 from lfpiv_cli.synthetic.bubbles import Bubbles, bubbles_at_wall, render_bubbles
 from lfpiv_cli.synthetic.render import ObjectSpace
@@ -157,3 +159,25 @@ def test_a_mask_of_what_is_still_is_that_of_its_image(tmp_path):
     np.testing.assert_array_equal(found.array, given.array)
     assert found.attributes["excluded_pixels"] == (50 + 2 * STILL_MARGIN_PX) * (70 + 2 * STILL_MARGIN_PX)
     assert "mask: still over 2 frames, SHA-256" in found.provenance["command"]
+
+
+def test_the_part_measures_beside_bubbles_in_all_ways(tmp_path):
+    found = bubbles(Work(tmp_path, "tiny", Console(only_warnings=True), {}))
+    kept = {path.stem: read_json(path)["result"] for path in tmp_path.glob("*_figures.json")}
+    assert set(kept) == {f"{name}_figures" for name in ("clean", "paper", "bubbles", "background", "mask")}
+    clean, masked = kept["clean_figures"], kept["mask_figures"]
+    error, share = found.rows
+    assert error.limit == pytest.approx(100.0 * (abs(clean["mean_error"]) + 2.0 * clean["mean_sigma"]))
+    assert error.best == pytest.approx(100.0 * abs(masked["mean_error"]))
+    assert share.limit == pytest.approx(100.0 * (clean["within_25"] - 2.0 * clean["within_sigma"]))
+    # the mask leaves out what is saturated in any case, and the rims
+    assert masked["excluded_pixels"] > kept["bubbles_figures"]["excluded_pixels"] > clean["excluded_pixels"]
+    assert [drawing.name for drawing in found.drawings] == ["raw", "vectors", "profile"]
+
+
+def test_bubbles_that_a_mask_does_not_make_good_miss_the_limit():
+    figures = {"mean_error": -0.02, "mean_sigma": 0.01, "within_25": 0.9, "within_sigma": 0.02}
+    found = {"clean": figures, "mask": figures, "paper": figures | {"mean_error": -0.4, "within_25": 0.4}}
+    assert [row.verdict for row in _rows(found)] == ["met", "met"]
+    assert [row.verdict for row in _rows(found | {"mask": found["paper"]})] == ["missed", "missed"]
+    assert [row.ert for row in _rows(found)] == pytest.approx([40.0, 40.0])

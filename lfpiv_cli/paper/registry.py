@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from lfpiv_cli.names import PaperPart
+from lfpiv_cli.paper.bubbles import bubbles
 from lfpiv_cli.paper.faults import faults
 from lfpiv_cli.paper.focal_plane import focal_plane
 from lfpiv_cli.paper.parts import Findings, Work
@@ -13,6 +14,7 @@ from lfpiv_cli.paper.sensitivities import sensitivities
 from lfpiv_cli.paper.table1 import table1
 from lfpiv_cli.paper.table2 import table2
 from lfpiv_cli.paper.table3 import table3, table3_experiment
+from lfpiv_cli.paper.table4 import table4
 
 
 @dataclass(frozen=True)
@@ -36,6 +38,8 @@ PARTS: dict[PaperPart, Part] = {
         45.0,
     ),
     "focal-plane": Part(focal_plane, "The focal plane from one snapshot (Eq. 21)", 0.5, 3.0),
+    "table4": Part(table4, "The laminar channel flow (Section 4.2, Figs. 14-16 and 18, Table 4)", 2.0, 30.0),
+    "bubbles": Part(bubbles, "Bubbles on the wall (Fig. 17)", 0.75, 6.0),
     "sensitivities": Part(sensitivities, "What matters, and how much", 1.5, 12.0),
     "faults": Part(faults, "Planted mistakes", 0.7, 0.7),
 }

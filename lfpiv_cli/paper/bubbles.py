@@ -1,0 +1,223 @@
+"""Bubbles on the channel's wall (Fig. 17): what they do to the velocities beside them, and what a mask makes good."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lfpiv_cli.console import Console
+from lfpiv_cli.files.config import load_config
+from lfpiv_cli.files.images import read_image
+from lfpiv_cli.files.pages import Table
+from lfpiv_cli.paper.channel import SEED, TINY, ChannelSize, as_paper, at_best, channel_sections
+from lfpiv_cli.paper.parts import Drawing, Findings, Row, Work
+from lfpiv_cli.reconstruction.images import still_light
+from lfpiv_cli.stages.build_weights import BuildWeightsOptions, build_weights
+from lfpiv_cli.stages.calibrate import CalibrateOptions, calibrate_snapshot
+from lfpiv_cli.stages.correlate import correlate
+from lfpiv_cli.stages.reconstruct import ReconstructOptions, reconstruct
+from lfpiv_cli.stages.simulate import frame_names, simulate_board, simulate_particles, simulate_white
+from lfpiv_cli.stages.validate_flow import duct_of, measured_of
+from lfpiv_cli.validation.bubble_pictures import plane_figure, raw_figure, wall_profile_figure
+from lfpiv_cli.validation.channel import Duct
+from lfpiv_cli.validation.methods import Measured
+from lfpiv_cli.validation.near_wall import PAPERS_WALL, near_wall
+
+FULL = ChannelSize(10.0, 5.0, 900, 1768, 0.1, (32, 16), 200, (5, 7))
+QUICK = ChannelSize(5.0, 3.0, 600, 900, 0.1, (16,), 60, (4, 5))
+# What the mask leaves must measure as well as a channel without bubbles, but for so many standard errors of chance.
+CHANCE_SIGMAS = 2.0
+# The side of the piece of the raw image that is shown, in pixels.
+SHOWN_PX = 500
+
+
+@dataclass(frozen=True)
+class Case:
+    """One way to measure: of which images, what is left out or taken off, and by which solver."""
+
+    words: str
+    images: str
+    options: Mapping[str, Any]
+
+
+def _cases(size: ChannelSize) -> dict[str, Case]:
+    return {
+        "clean": Case("without bubbles", "clean", {}),
+        "paper": Case("bubbles, SART", "bubbles", as_paper(size)),
+        "bubbles": Case("bubbles", "bubbles", {}),
+        "background": Case("bubbles, background taken off", "bubbles", {"background": "minimum"}),
+        "mask": Case("bubbles, mask", "bubbles", {"mask": "still"}),
+    }
+
+
+# What the pictures show.
+SHOWN = ("clean", "bubbles", "background", "mask")
+
+
+def bubbles(work: Work) -> Findings:
+    """Measure a channel with bubbles on a wall, with and without a mask, and the same without them."""
+    size = work.by_size(TINY, QUICK, FULL)
+    diameters = work.by_size([0.3, 0.4], [0.6, 1.2], [0.6, 1.6])
+    config = work.config("clean", channel_sections(size, reconstruction=at_best(size)))
+    count = work.by_size(3, 5, 8)
+    simulation = {"bubbles": count, "bubble_diameter_mm": diameters}
+    with_bubbles = work.config("bubbles", channel_sections(size, reconstruction=at_best(size), simulation=simulation))
+    work.step("images", partial(_simulated, config, with_bubbles, work))
+    cases = _cases(size)
+    found = {name: work.step(f"{name}_figures", partial(_measured, name, case, work)) for name, case in cases.items()}
+    duct = _duct(config)
+    methods = {cases[name].words: _read(work, name) for name in SHOWN}
+    return Findings(
+        rows=_rows(found),
+        drawings=_drawings(work, methods, duct),
+        tables=(_table(cases, found),),
+        text=_text(size, diameters, count),
+        commands=(
+            "lfpiv simulate particles work/bubbles/bubbles.yaml -o bubbles-images",
+            "lfpiv reconstruct work/bubbles/weights.h5 bubbles-images/pair_a.tif bubbles-images/pair_b.tif "
+            "--dark work/bubbles/still/dark.tif --mask still -o bubbles-volumes",
+            "lfpiv correlate bubbles-volumes/pair_a.vtkhdf bubbles-volumes/pair_b.vtkhdf -o bubbles.vtkhdf",
+            "lfpiv validate flow work/bubbles/bubbles.yaml --vectors bubbles.vtkhdf -o bubbles-report",
+        ),
+        seeds=(SEED,),
+    )
+
+
+def _duct(config: Path) -> Duct:
+    duct = duct_of(load_config(config).simulation.flow)
+    assert duct is not None  # the sections of the channel have one
+    return duct
+
+
+def _simulated(clean: Path, with_bubbles: Path, work: Work) -> dict[str, Any]:
+    """Simulate the same tracers without and with bubbles, calibrate and build the weights of both."""
+    common: dict[str, Any] = {"overwrite": True, "console": work.console}
+    still = work.folder / "still"
+    simulate_white(clean, still, **common)
+    simulate_board(clean, still, **common)
+    for config in (clean, with_bubbles):
+        simulate_particles(config, work.folder / config.stem, **common)
+    calibration = work.folder / "calibration.h5"
+    pictures = CalibrateOptions(white=[still / "white.tif"], dark=still / "dark.tif", board=[still / "board.tif"])
+    calibrate_snapshot(clean, calibration, pictures, **common)
+    build_weights(clean, work.folder / "weights.h5", BuildWeightsOptions(calibration=calibration), **common)
+    return {"images": ["clean", "bubbles"]}
+
+
+def _measured(name: str, case: Case, work: Work) -> dict[str, Any]:
+    """Measure the flow in one way and return its figures near the wall."""
+    folder, quiet = work.folder / f"measured_{name}", Console(only_warnings=True)
+    folder.mkdir(exist_ok=True)
+    pair = [work.folder / case.images / image for image in frame_names(2)]
+    options = ReconstructOptions(dark=work.folder / "still" / "dark.tif", **case.options)
+    told = reconstruct(work.folder / "weights.h5", pair, folder, options, overwrite=True, console=quiet)
+    volumes = [folder / f"{image.stem}.vtkhdf" for image in pair]
+    correlate(volumes, _vectors(work, name), overwrite=True, console=quiet)
+    figures = asdict(near_wall(_read(work, name), _duct(work.folder / "clean.yaml")))
+    return figures | {"excluded_pixels": told["excluded_pixels"]}
+
+
+def _vectors(work: Work, name: str) -> Path:
+    return work.folder / f"{name}.vtkhdf"
+
+
+def _read(work: Work, name: str) -> Measured:
+    """Return vectors with the true flow."""
+    return measured_of(_vectors(work, name), load_config(work.folder / "clean.yaml"), None, is_simulated=True)
+
+
+def _rows(found: Mapping[str, Mapping[str, Any]]) -> tuple[Row, ...]:
+    clean = found["clean"]
+    where = f"at x/D > {PAPERS_WALL:g}"
+    return (
+        Row(
+            quantity=f"mean velocity error {where} beside bubbles (%)",
+            source="Figs. 16, 17",
+            limit=100.0 * (abs(clean["mean_error"]) + CHANCE_SIGMAS * clean["mean_sigma"]),
+            ert=100.0 * abs(found["paper"]["mean_error"]),
+            best=100.0 * abs(found["mask"]["mean_error"]),
+            reason="without the mask bubbles hide the tracers and stand still, as the paper says of its own",
+        ),
+        Row(
+            quantity=f"vectors within 25 % {where} beside bubbles (%)",
+            source="Figs. 16, 17",
+            limit=100.0 * (clean["within_25"] - CHANCE_SIGMAS * clean["within_sigma"]),
+            sense="at least",
+            ert=100.0 * found["paper"]["within_25"],
+            best=100.0 * found["mask"]["within_25"],
+        ),
+    )
+
+
+def _table(cases: Mapping[str, Case], found: Mapping[str, Mapping[str, Any]]) -> Table:
+    rows = tuple(
+        (
+            case.words,
+            f"{100.0 * found[name]['mean_error']:+.1f} ± {100.0 * found[name]['mean_sigma']:.1f}",
+            f"{100.0 * found[name]['within_25']:.0f} ± {100.0 * found[name]['within_sigma']:.0f}",
+            f"{found[name]['excluded_pixels']}",
+        )
+        for name, case in cases.items()
+    )
+    return Table(
+        f"The {found['clean']['windows']} windows at x/D > {PAPERS_WALL:g}, with one standard error of chance",
+        ("measured", "mean velocity error (%)", "vectors within 25 % (%)", "pixels left out"),
+        rows,
+    )
+
+
+def _drawings(work: Work, methods: Mapping[str, Measured], duct: Duct) -> tuple[Drawing, ...]:
+    pair = [read_image(work.folder / "bubbles" / name) for name in frame_names(2)]
+    mask = still_light(pair)
+    shown = _piece(mask)
+    without = methods[_cases(TINY)["bubbles"].words]
+    main = "xyz".index(duct.axis)
+    error = np.where(without.inside, np.abs(without.field.velocity - without.truth)[..., main], 0.0)
+    plane = int(np.argmax(np.nan_to_num(error).sum(axis=(1, 2))))
+    depth = float((without.field.grid.axis_mm(2)[plane] - duct.position_mm(2, 0.0)) / duct.width_mm)
+    return (
+        Drawing(
+            "raw",
+            "A piece of a raw image with bubbles on the wall (after Fig. 17), and what the mask leaves out: pixels "
+            "that are in both images brighter than anything that moves.",
+            raw_figure(pair[0][shown], mask[shown]),
+        ),
+        Drawing(
+            "vectors",
+            f"Vectors and errors in the plane at z/D = {depth:.2f}, in which the bubbles spoil most; beyond the dashed "
+            f"line, x/D = {PAPERS_WALL:g}, the paper's velocities are too small.",
+            plane_figure(methods, duct, plane),
+        ),
+        Drawing(
+            "profile",
+            "Means over flow and depth of the velocity along the flow (after Fig. 16a), and their errors; grey is "
+            "where the paper's velocities are too small.",
+            wall_profile_figure(methods, duct),
+        ),
+    )
+
+
+def _piece(mask: np.ndarray) -> tuple[slice, slice]:
+    """Return the piece of an image around the pixels that a mask leaves out, or its first corner."""
+    rows, columns = np.nonzero(mask)
+    middle = (np.median(rows), np.median(columns)) if rows.size else (0.0, 0.0)
+    starts = [int(np.clip(m - SHOWN_PX / 2, 0, max(n - SHOWN_PX, 0))) for m, n in zip(middle, mask.shape, strict=True)]
+    return slice(starts[0], starts[0] + SHOWN_PX), slice(starts[1], starts[1] + SHOWN_PX)
+
+
+def _text(size: ChannelSize, diameters: list[float], count: int) -> tuple[str, ...]:
+    return (
+        f"A short piece of the channel ({size.told()}) with {count} bubbles of {diameters[0]:g} to {diameters[1]:g} mm "
+        "on the wall at the high end of x/D: bright discs with a saturated core that do not move between the two "
+        "images. Saturated pixels are left out in any case; what spoils the velocities is the bright rim, which light "
+        "gives to voxels all along its line of sight and which stands still. `lfpiv reconstruct --mask still` finds "
+        "such pixels from the images alone, here the two of the pair, without knowing where the bubbles are; "
+        "`--background minimum` takes off what both images have in common.",
+        "Left out are pixels that in all images are brighter than what the images differ by nearly everywhere. The "
+        "limits are those of the same tracers without bubbles, less two standard errors of chance.",
+    )
