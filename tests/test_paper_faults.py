@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import yaml
+from click.testing import CliRunner
 from numpy.typing import NDArray
 
+from lfpiv_cli.cli import cli
 from lfpiv_cli.errors import LimitMissedError
+from lfpiv_cli.files.vtkhdf import write_vectors
+from lfpiv_cli.flow.field import VALID, VectorField
+from lfpiv_cli.grid import Grid
 from lfpiv_cli.paper import small_rig
 from lfpiv_cli.paper.faults import (
     FAULTS,
@@ -25,7 +32,9 @@ from lfpiv_cli.paper.faults import (
     place_and_velocity_figures,
     said_to,
 )
+from lfpiv_cli.paper.rig import sections
 from lfpiv_cli.paper.small_scenes import displacement
+from lfpiv_cli.reference import FOCAL_POINT
 
 Points = NDArray[np.float64]
 # Of places and displacements, x, y and z, mm.
@@ -136,3 +145,31 @@ def test_a_mirrored_image_fits_the_lattice():
     lattice = small_rig.sheet().micro_image_lattice_px()
     middle = small_rig.sheet().sensor_centre_px
     assert lattice.origin == pytest.approx(middle)
+
+
+def vectors_of_a_shear(turned: tuple[float, float, float]) -> VectorField:
+    """Vectors of u = 0.1 m/s + z 20/s, w = 0.05 m/s, their components with signs."""
+    grid = Grid.centred((4, 4, 5), (0.8, 0.8, 0.8), (0.0, 0.0, 0.0))
+    z = grid.centres_mm()[..., 2]
+    velocity = np.stack([0.1 + 0.02 * z, 0.0 * z, 0.0 * z + 0.05], axis=-1) * turned
+    moved = velocity * 1000.0 * 0.001 / 0.1
+    ones, flag = np.ones(z.shape), np.full(z.shape, VALID, np.uint8)
+    return VectorField(grid, moved, moved, ones, ones, ones, flag, None, (0.1, 0.1, 0.1), 0.001, (16, 16, 16))
+
+
+@pytest.mark.parametrize(
+    ("signs", "exit_code"),
+    [((1.0, 1.0, 1.0), 0), ((-1.0, -1.0, -1.0), 8), ((-1.0, 1.0, 1.0), 8), ((1.0, 1.0, -1.0), 8)],
+    ids=["no mistake", "pair swapped", "column axis mirrored", "z of the wrong sign"],
+)
+def test_validate_flow_fails_on_velocities_of_the_wrong_sign(
+    signs: tuple[float, float, float], exit_code: int, tmp_path: Path
+):
+    flow = {"kind": "shear", "along": "x", "across": "z", "rate_per_s": 20.0, "velocity_m_s": [0.1, 0.0, 0.05]}
+    limits = {"streamwise_mean_error": 0.05, "within_25_percent_vector": 0.9}
+    config, vectors = tmp_path / "rig.yaml", tmp_path / "vectors.vtkhdf"
+    config.write_text(yaml.safe_dump(sections(validation={"flow": flow, "limits": limits})))
+    write_vectors(vectors, vectors_of_a_shear(signs), FOCAL_POINT, provenance={}, overwrite=False)
+    ended = CliRunner().invoke(cli, ["validate", "flow", str(config), "--vectors", str(vectors), "-o", str(tmp_path)])
+    told = ended.exception.exit_code if isinstance(ended.exception, LimitMissedError) else ended.exit_code
+    assert told == exit_code, ended.output
