@@ -13,7 +13,16 @@ from lfpiv_cli.optics.media import equivalent_object_distance
 from lfpiv_cli.paper import small_rig, small_scenes
 from lfpiv_cli.paper.influences import Influence
 from lfpiv_cli.paper.scatter import DISTANCE, F_NUMBERS, NOISE, PAPER_PER_LENS, SEEDING
-from lfpiv_cli.paper.sensitivities import INFLUENCES, Measured, care, crowding, drawing_of, rows_of, table_of
+from lfpiv_cli.paper.sensitivities import (
+    INFLUENCES,
+    Measured,
+    bound_rows,
+    care,
+    crowding,
+    drawing_of,
+    rows_of,
+    table_of,
+)
 from lfpiv_cli.paper.small_rig import CHANNEL, WATER, Case
 from lfpiv_cli.paper.wrong_numbers import FOCUS, INDEX, LEVER, SHIFT, WALL
 from lfpiv_cli.validation.place_errors import TERMS, fit_errors, pairs_of, straight_line
@@ -164,8 +173,16 @@ def test_tracers_that_are_strewn_are_as_many_as_asked_for_a_microlens():
 @pytest.mark.parametrize("influence", [INDEX, FOCUS, WALL, SHIFT])
 def test_rows_are_met_by_theory_and_missed_beside_it(influence: Influence):
     assert [row.verdict for row in rows_of(by_theory(influence))] == ["met"] * len(rows_of(by_theory(influence)))
-    assert {row.verdict for row in rows_of(by_theory(influence, 1.1))} == {"missed"}
+    assert {row.verdict for row in rows_of(by_theory(influence, 1.2))} == {"missed"}
     assert {row.verdict for row in rows_of(by_theory(influence, -1.0))} == {"missed"}
+
+
+@pytest.mark.parametrize(("spread", "verdict"), [(1.4e-2, "met"), (1.6e-2, "missed"), (np.nan, "unknown")])
+def test_scatter_is_held_against_its_bound(spread: float, verdict: str):
+    curves = curves_of(NOISE, {})
+    curves.figures["bound_z"][:], curves.figures["spread_z"][:] = 1e-2, spread
+    assert [row.verdict for row in bound_rows(Measured(NOISE, curves))] == [verdict]
+    assert bound_rows(by_theory(INDEX)) == ()
 
 
 def test_a_sensitivity_that_is_not_known_has_no_verdict():
@@ -191,7 +208,7 @@ def test_what_harms_most_comes_first():
     assert "calliper" not in care([by_theory(known), *found[:1], *found[2:]])[0]
 
 
-@pytest.mark.parametrize(("recall", "told"), [((0.97, 0.95, 0.6), "from 1.5 on"), ((1.0, 1.0, 1.0), "all")])
+@pytest.mark.parametrize(("recall", "told"), [((0.97, 0.95, 0.6), "from 1.2 on"), ((1.0, 1.0, 1.0), "at none")])
 def test_from_where_tracers_crowd(recall: tuple[float, ...], told: str):
     curves = curves_of(SEEDING, {})
     curves.figures["recall"][:] = np.array(recall)[:, np.newaxis]  # type: ignore[index]

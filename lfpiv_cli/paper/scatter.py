@@ -48,6 +48,10 @@ F_NUMBERS = Influence(
     "of water at f/4, less as the square of the f-number and in proportion to the fluid.",
 )
 
+# Read noise over light at which scatter is told and held against its bound: the fit knows neither noise nor light, and
+# tracers overlap.
+FAINT, LARGEST_OVER_BOUND = 0.1, 1.5
+
 NOISE = Influence(
     name="noise",
     label="read noise over the light of a lit pixel",
@@ -56,16 +60,20 @@ NOISE = Influence(
     panels=(
         Panel(
             "spread of depth (um)",
-            (Series("spread_z", "measured", 1e3, True), Series("bound_z", "Cramer-Rao bound (median)", 1e3)),
+            (Series("spread_z", "measured", 1e3), Series("bound_z", "Cramer-Rao bound (median)", 1e3)),
         ),
         Panel(
             "spread of x (um)",
-            (Series("spread_x", "measured", 1e3, True), Series("bound_x", "Cramer-Rao bound (median)", 1e3)),
+            (Series("spread_x", "measured", 1e3), Series("bound_x", "Cramer-Rao bound (median)", 1e3)),
         ),
     ),
     sensitivities=(
-        Sensitivity("spread_z", "spread of depth", "um per per cent", 10.0, 0.1, "a tenth: faint tracers"),
-        Sensitivity("spread_x", "spread of lateral places", "um per per cent", 10.0, 0.1, "a tenth: faint tracers"),
+        Sensitivity(
+            "spread_z", "spread of depth where noise is a tenth", "um", 1e3, 1.0, "a tenth: faint tracers", at=FAINT
+        ),
+        Sensitivity(
+            "spread_x", "spread of x where noise is a tenth", "um", 1e3, 1.0, "a tenth: faint tracers", at=FAINT
+        ),
     ),
     advice="Give tracers light: where read noise is a tenth of what a lit pixel holds, depths scatter by "
     "{error}, and a velocity by that, times 1.4, over the time between the images.",
@@ -101,7 +109,7 @@ DISTANCE = Influence(
 SEEDING = Influence(
     name="seeding",
     label="tracers for each microlens",
-    values=((0.1, 0.3), (0.1, 0.67, 1.5), (0.1, 0.25, 0.67, 1.2, 2.0, 4.0)),
+    values=((0.1, 0.3), (0.1, 0.67, 1.2), (0.1, 0.25, 0.67, 1.2, 2.0, 4.0)),
     measure=small_scenes.crowded,
     panels=(
         Panel(

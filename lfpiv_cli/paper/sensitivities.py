@@ -11,12 +11,23 @@ import numpy as np
 from lfpiv_cli.files.pages import Table
 from lfpiv_cli.paper.influences import Influence, Sensitivity
 from lfpiv_cli.paper.parts import Drawing, Findings, Row, Work
-from lfpiv_cli.paper.scatter import DISTANCE, F_NUMBERS, NOISE, PAPER_PER_LENS, PAPER_PER_PIXEL, SEEDING
+from lfpiv_cli.paper.scatter import (
+    DISTANCE,
+    F_NUMBERS,
+    FAINT,
+    LARGEST_OVER_BOUND,
+    NOISE,
+    PAPER_PER_LENS,
+    PAPER_PER_PIXEL,
+    SEEDING,
+)
 from lfpiv_cli.paper.wrong_numbers import FOCUS, INDEX, SHIFT, TURN, WALL
 from lfpiv_cli.validation.place_errors import Line, straight_line
 from lfpiv_cli.validation.sensitivity_pictures import Curves, influence_figure
 
 INFLUENCES = (SEEDING, F_NUMBERS, FOCUS, WALL, INDEX, SHIFT, TURN, NOISE, DISTANCE)
+# Tracers crowd where fewer than this share is found.
+SEEN_SHARE = 0.9
 # The sentences on what to take care of.
 SENTENCES = 3
 # Of the influences at the tiny size, which only tries the code.
@@ -38,8 +49,12 @@ class Measured:
         """Return a sensitivity as the slope is, or the value at the stated place."""
         if of.at is None:
             return self.line(of).slope
-        nearest = int(np.argmin(np.abs(self.curves.values - of.at)))
-        return float(self.curves.median(of.figure)[nearest])
+        return self.at(of.figure, of.at)
+
+    def at(self, figure: str, value: float) -> float:
+        """Return the median of a figure at the nearest value of the influence."""
+        nearest = int(np.argmin(np.abs(self.curves.values - value)))
+        return float(self.curves.median(figure)[nearest])
 
     def error_mm(self, of: Sensitivity) -> float:
         """Return the error of places that typically follows."""
@@ -51,7 +66,8 @@ class Measured:
 
     def told(self, of: Sensitivity) -> str:
         """Return a sensitivity with its unit."""
-        return f"{of.text}: {of.factor * self.value(of):.3g} {of.unit}"
+        place = f", {of.reach_text}" if of.at is not None and of.reach_text != "everywhere" else ""
+        return f"{of.text}{place}: {of.factor * self.value(of):.3g} {of.unit}"
 
 
 def sensitivities(work: Work) -> Findings:
@@ -59,7 +75,7 @@ def sensitivities(work: Work) -> Findings:
     chosen = [each for each in INFLUENCES if work.size != "tiny" or each.name in TINY]
     found = [measured(work, each) for each in chosen]
     return Findings(
-        rows=tuple(row for each in found for row in rows_of(each)),
+        rows=tuple(row for each in found for row in (*rows_of(each), *bound_rows(each))),
         drawings=tuple(drawing_of(each) for each in found),
         tables=(table_of(found),),
         text=(*setting(work), *care(found), *(crowding(each) for each in found if each.influence is SEEDING)),
@@ -108,6 +124,22 @@ def rows_of(found: Measured) -> tuple[Row, ...]:
         )
         for each in found.influence.sensitivities
         if each.expected is not None
+    )
+
+
+def bound_rows(found: Measured) -> tuple[Row, ...]:
+    """Return the row of scatter by noise, which no measurement without bias can have below its bound."""
+    if found.influence is not NOISE:
+        return ()
+    spread, bound = (found.at(f"{figure}_z", FAINT) for figure in ("spread", "bound"))
+    return (
+        Row(
+            quantity="noise: spread of depth over the Cramer-Rao bound",
+            source="bound by theory",
+            limit=LARGEST_OVER_BOUND,
+            best=spread / bound,
+            reason=f"read noise a tenth of the light of a lit pixel: {1e3 * spread:.3g} um, bound {1e3 * bound:.3g} um",
+        ),
     )
 
 
@@ -174,13 +206,18 @@ def setting(work: Work) -> tuple[str, ...]:
 
 
 def crowding(found: Measured) -> str:
-    """Return the paper's seeding in tracers for each microlens, and from where on particles begin to fail."""
+    """Return the paper's seeding in tracers for each microlens, and where errors begin to rise."""
     values, recall = found.curves.values, found.curves.median("recall")
-    beyond = values[recall < 0.9]
-    told = f"from {beyond[0]:g} on fewer than nine in ten are found" if beyond.size else "nine in ten are found at all"
+    beyond = values[recall < SEEN_SHARE]
+    told = f"from {beyond[0]:g} on" if beyond.size else "at none"
+    rms = {name: found.at(f"{name}_rms_w", PAPER_PER_LENS) for name in ("tracks", "volumes")}
+    few, many = (found.at("tracks_rms_w", value) for value in (values[0], values[-1]))
     return (
         f"The paper seeds {PAPER_PER_PIXEL:g} tracers for each pixel, which are {PAPER_PER_LENS:.2f} for each "
-        f"microlens, over 10 mm of depth. Of tracers for each microlens, {told} of those tried; a particle's "
-        "displacement in depth is then lost to neighbours that are taken for it, and volumes, which smear each tracer "
-        "over millimetres of depth, have the depth component wrong at any seeding."
+        f"microlens, over the 10 mm of its channel. There {found.at('recall', PAPER_PER_LENS):.0%} of the tracers are "
+        f"found, and a displacement in depth is wrong by {rms['tracks']:.2g} mm rms by particles and by "
+        f"{rms['volumes']:.2g} mm by volumes. Of the seedings tried, fewer than {SEEN_SHARE:.0%} are found {told}: "
+        "neighbours are taken for one another, and the error of a particle's displacement in depth rises from "
+        f"{few:.2g} mm at {values[0]:g} for each microlens to {many:.2g} mm at {values[-1]:g}. That of volumes is not "
+        "one of neighbours: light is smeared over millimetres of depth at any seeding."
     )

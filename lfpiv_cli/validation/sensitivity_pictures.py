@@ -82,6 +82,7 @@ def influence_figure(
     notes : what is written into the first and the second panel; empty: nothing
     """
     from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator, NullFormatter
 
     figure = Figure(figsize=(9.0, 3.6), layout="constrained")
     for axes, panel, note in zip(figure.subplots(1, 2), panels, notes, strict=True):
@@ -92,6 +93,9 @@ def influence_figure(
         axes.tick_params(labelsize=8)
         if panel.logarithmic:
             axes.set_yscale("log")
+            axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            axes.yaxis.set_major_formatter("{x:g}")
+            axes.yaxis.set_minor_formatter(NullFormatter())
         if panel.at_least:
             low, high = axes.get_ylim()
             axes.set_ylim(min(low, -panel.at_least), max(high, panel.at_least))
@@ -109,10 +113,11 @@ def _draw(axes: Axes, curves: Curves, series: Series, number: int, line: Line | 
     """Draw a series: medians, the range over realisations, and its straight line or the points joined."""
     colour, mark, dash = COLOURS[number], MARKS[number], DASHES[number]
     middle, table = series.factor * curves.median(series.figure), series.factor * curves.figures[series.figure]
-    is_line = series.fitted and line is not None
+    is_line = series.fitted and line is not None and np.isfinite(line.slope)
     axes.plot(curves.values, middle, mark, color=colour, ls="" if is_line else dash, ms=5, label=series.label)
     if table.shape[1] > 1:
         axes.vlines(curves.values, table.min(axis=1), table.max(axis=1), color=colour, lw=1.5)
     if is_line and line is not None:
-        x = np.linspace(curves.values.min(), curves.values.max(), 50)
+        known = curves.values[np.isfinite(middle)]
+        x = np.linspace(known.min(), known.max(), 50)
         axes.plot(x, series.factor * (line.offset + line.slope * x**series.power), ls=dash, color=colour, lw=1.2)
