@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from lfpiv_cli.names import PaperPart
 from lfpiv_cli.paper.bubbles import bubbles
+from lfpiv_cli.paper.discussion import discussion
 from lfpiv_cli.paper.faults import faults
 from lfpiv_cli.paper.focal_plane import focal_plane
 from lfpiv_cli.paper.parts import Findings, Work
@@ -40,6 +41,7 @@ PARTS: dict[PaperPart, Part] = {
     "focal-plane": Part(focal_plane, "The focal plane from one snapshot (Eq. 21)", 0.5, 3.0),
     "table4": Part(table4, "The laminar channel flow (Section 4.2, Figs. 14-16 and 18, Table 4)", 2.0, 30.0),
     "bubbles": Part(bubbles, "Bubbles on the wall (Fig. 17)", 0.75, 6.0),
+    "discussion": Part(discussion, "Depth resolution and seeding (the paper's discussion)", 0.2, 2.0),
     "sensitivities": Part(sensitivities, "What matters, and how much", 1.5, 12.0),
     "faults": Part(faults, "Planted mistakes", 0.7, 0.7),
 }
