@@ -92,7 +92,7 @@ def test_where_the_steps_err():
     errors = np.where(np.abs(depth[:-1] + 0.5) < 2.0, -0.07, 0.01)
     told = table3._where_steps(depth, errors)
     # four steps of 7 %, four of 1 %
-    assert told.startswith("88 % of it are of the 4 steps within 2 mm")
+    assert told.startswith("88 % of it comes from the 4 steps within 2 mm")
     assert told.endswith("1.00 %")
 
 

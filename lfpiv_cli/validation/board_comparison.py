@@ -28,6 +28,8 @@ STYLES: tuple[dict[str, Any], ...] = (
 BAND = {"color": "#BBBBBB", "alpha": 0.5, "linewidth": 0.0}
 # Of a board in three dimensions voxels are shown that are brighter than this share of the brightest: 1/e, as for e_z.
 SHOWN_SHARE = float(1.0 / np.e)
+# A board is shown in this many times the depth that its dots reach.
+SHOWN_DEPTHS = 2.0
 # Numbers kept of pictures: as many as a printed page shows.
 DECIMALS = 3
 
@@ -75,16 +77,19 @@ def views_figure(views: Mapping[str, BoardView]) -> Figure:
 
     figure = Figure(figsize=(11.0, 3.7 * len(views)), layout="constrained")
     drawn = None
+    # as much of the depth for each as shows the longest dots and their surroundings
+    reach = SHOWN_DEPTHS * max(float(np.abs(view.bright_mm[:, 2]).max()) for view in views.values())
     for row, (label, view) in enumerate(views.items()):
         x, y, z = ((low, high) for low, high in view.bounds_mm)
         front, side = (figure.add_subplot(len(views), 3, 3 * row + column) for column in (1, 2))
         drawn = front.imshow(view.front, origin="lower", extent=(*x, *y), cmap="viridis", vmin=0.0, vmax=1.0)
         front.set(title=f"{label}: maximum along z", xlabel="x (mm)", ylabel="y (mm)")
         side.imshow(view.side, origin="lower", extent=(*x, *z), cmap="viridis", vmin=0.0, vmax=1.0, aspect="auto")
-        side.set(title=f"{label}: maximum along y", xlabel="x (mm)", ylabel="z (mm)")
+        side.set(title=f"{label}: maximum along y", xlabel="x (mm)", ylabel="z (mm)", ylim=(-reach, reach))
         space: Any = figure.add_subplot(len(views), 3, 3 * row + 3, projection="3d")
         space.scatter(*view.bright_mm.T, c=view.bright_mm[:, 2], cmap="viridis", s=1.5, linewidths=0.0, rasterized=True)
         space.set(title=f"{label}: brighter than 1/e", xlabel="x (mm)", ylabel="y (mm)", zlabel="z (mm)")
+        space.set(zlim=(-reach, reach))
         space.set_box_aspect((1.0, 1.0, 1.2), zoom=0.85)
         _tidy(space)
     if drawn is not None:
