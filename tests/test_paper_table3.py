@@ -115,9 +115,10 @@ def test_pictures_show_all_methods_with_units(found):
             for axes in drawing.figure.axes:
                 labels = axes.get_xlabel() + axes.get_ylabel()
                 assert "mm" in labels or "intensity" in labels, (name, drawing.name, labels)
-        for axes in drawn["places"].figure.axes:
-            shown = {text.get_text() for text in axes.get_legend().get_texts()}
-            assert {"DLFC", "ERT", "best"} <= shown
+        legends = [*drawn["places"].figure.legends, *(each.get_legend() for each in drawn["elongation"].figure.axes)]
+        assert len(legends) == 3
+        for legend in legends:
+            assert {"DLFC", "ERT", "best"} <= {text.get_text() for text in legend.get_texts()}
 
 
 def test_steps_are_drawn_over_the_true_ones():

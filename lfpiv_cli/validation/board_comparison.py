@@ -121,6 +121,8 @@ def elongation_figure(
     length.set(title="mean over the dots", ylabel="elongation $e_z$ (mm)", ylim=(0.0, None))
     spread.set(title="standard deviation over the dots", ylabel=r"$\sigma$ (mm)", ylim=(0.0, None))
     _finish(length, spread)
+    for panel in (length, spread):
+        panel.legend(fontsize=8)
     return figure
 
 
@@ -142,7 +144,7 @@ def location_figure(
     lateral.axhline(spacing_mm, color="black", linewidth=0.8, label="true")
     depth.axhline(1.0, color="black", linewidth=0.8, label="true")
     if paper_steps_mm is not None:
-        depth.axhspan(*paper_steps_mm, label="paper: {:g} to {:g} mm".format(*paper_steps_mm), **BAND)
+        depth.axhspan(*paper_steps_mm, label="paper: separations of {:g} to {:g} mm".format(*paper_steps_mm), **BAND)
     for (label, figures), style in zip(methods.items(), STYLES, strict=False):
         table = figures["by_depth"]
         at, spacing = np.array(table["depth_mm"]), np.array(table["spacing_mm"])
@@ -158,6 +160,8 @@ def location_figure(
     lateral_error.set(title=r"lateral error $\delta_x$", ylabel="%", ylim=(0.0, None))
     depth_error.set(title=r"depth error $\delta_z$", ylabel="%", ylim=(0.0, None))
     _finish(lateral, depth, lateral_error, depth_error)
+    # below the panels: in them it would hide the largest errors
+    figure.legend(*depth.get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=8)
     return figure
 
 
@@ -186,7 +190,6 @@ def _finish(*panels: Axes) -> None:
     for panel in panels:
         panel.set_xlabel("z (mm)")
         panel.grid(alpha=0.3)
-        panel.legend(fontsize=8)
 
 
 def _tidy(space: Any) -> None:
