@@ -17,7 +17,7 @@ from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import Refraction
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media, channel_window
-from lfpiv_cli.particles.rounds import find_particles
+from lfpiv_cli.particles.rounds import ROUNDS, Round, find_particles
 from lfpiv_cli.particles.search import task_of
 from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.reconstruction.equations import normalisers
@@ -101,6 +101,7 @@ class Search:
     size_mm: tuple[float, float, float]
     diameter_mm: float = 0.05
     search_voxel_mm: tuple[float, float, float] = SEARCH_VOXEL_MM
+    rounds: tuple[Round, ...] = ROUNDS
 
     @cached_property
     def _weights(self) -> Weights:
@@ -113,7 +114,7 @@ class Search:
         """Return the places (n, 3) of the particles behind an image, those a little outside the box as well."""
         rig, weights = self.rig, self._weights
         view = raw_view(rig.camera, rig.media, 0.5 * self.diameter_mm, None, rig.space)
-        found = find_particles(task_of(image, view, weights, rig.camera, normalisers(weights.padded)))
+        found = find_particles(task_of(image, view, weights, rig.camera, normalisers(weights.padded)), self.rounds)
         return rig.reference.points_from_focal_point(found.position_mm)
 
     def volume(
