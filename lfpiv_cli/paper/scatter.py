@@ -141,7 +141,7 @@ SEEDING = Influence(
             1e3,
             1.0,
             "the paper's seeding",
-            reach_text="0.67 tracers for each microlens",
+            reach_text="at 0.67 a microlens",
             at=0.67,
         ),
         Sensitivity(
@@ -151,7 +151,7 @@ SEEDING = Influence(
             1e3,
             1.0,
             "the paper's seeding",
-            reach_text="0.67 tracers for each microlens",
+            reach_text="at 0.67 a microlens",
             at=0.67,
         ),
     ),

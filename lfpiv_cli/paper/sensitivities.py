@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -28,6 +29,8 @@ from lfpiv_cli.validation.sensitivity_pictures import Curves, influence_figure
 INFLUENCES = (SEEDING, F_NUMBERS, FOCUS, WALL, INDEX, SHIFT, TURN, NOISE, DISTANCE)
 # Tracers crowd where fewer than this share is found.
 SEEN_SHARE = 0.9
+# Letters of a line above a panel.
+NOTE_WIDTH = 64
 # The sentences on what to take care of.
 SENTENCES = 3
 # Of the influences at the tiny size, which only tries the code.
@@ -79,14 +82,8 @@ def sensitivities(work: Work) -> Findings:
         drawings=tuple(drawing_of(each) for each in found),
         tables=(table_of(found),),
         text=(*setting(work), *care(found), *(crowding(each) for each in found if each.influence is SEEDING)),
-        commands=(f"lfpiv validate paper -o . --only sensitivities{size_option(work)} --overwrite",),
         seeds=tuple(range(1, 1 + max(realisations(work, each) for each in chosen))),
     )
-
-
-def size_option(work: Work) -> str:
-    """Return the option that asks for a size."""
-    return work.by_size(" --quick", " --quick", "")
 
 
 def realisations(work: Work, influence: Influence) -> int:
@@ -120,7 +117,6 @@ def rows_of(found: Measured) -> tuple[Row, ...]:
             source="sensitivity by theory",
             limit=100.0 * each.tolerance,
             best=100.0 * abs(found.value(each) / each.expected - 1.0),
-            reason=f"{found.told(each)}, by theory {each.factor * each.expected:.3g}",
         )
         for each in found.influence.sensitivities
         if each.expected is not None
@@ -134,11 +130,10 @@ def bound_rows(found: Measured) -> tuple[Row, ...]:
     spread, bound = (found.at(f"{figure}_z", FAINT) for figure in ("spread", "bound"))
     return (
         Row(
-            quantity="noise: spread of depth over the Cramer-Rao bound",
+            quantity="noise a tenth of the light: spread of depth over the Cramer-Rao bound",
             source="bound by theory",
             limit=LARGEST_OVER_BOUND,
             best=spread / bound,
-            reason=f"read noise a tenth of the light of a lit pixel: {1e3 * spread:.3g} um, bound {1e3 * bound:.3g} um",
         ),
     )
 
@@ -148,7 +143,12 @@ def drawing_of(found: Measured) -> Drawing:
     influence = found.influence
     lines = {each.figure: found.line(each) for each in influence.sensitivities if each.at is None}
     shown = [{series.figure for series in panel.series} for panel in influence.panels]
-    notes = ["\n".join(found.told(each) for each in influence.sensitivities if each.figure in names) for names in shown]
+    notes = [
+        "\n".join(
+            textwrap.fill(found.told(each), NOTE_WIDTH) for each in influence.sensitivities if each.figure in names
+        )
+        for names in shown
+    ]
     bars = " Medians; bars: all realisations." if found.curves.values.size and influence.repeats > 1 else ""
     return Drawing(
         influence.name,
@@ -165,12 +165,22 @@ def table_of(found: Sequence[Measured]) -> Table:
     each.sort(key=lambda pair: -np.nan_to_num(pair[0].error_mm(pair[1])))
     return Table(
         "Sensitivities, by the error of places that typically follows",
-        ("influence", "of what", "sensitivity", "unit", "typical uncertainty", "resulting error (mm)", "where"),
+        (
+            "influence",
+            "of what",
+            "sensitivity",
+            "by theory",
+            "unit",
+            "typical uncertainty",
+            "resulting error (mm)",
+            "where",
+        ),
         tuple(
             (
                 one.influence.name,
                 of.text,
                 f"{of.factor * one.value(of):.3g}",
+                "" if of.expected is None else f"{of.factor * of.expected:.3g}",
                 of.unit,
                 of.typical_text,
                 f"{one.error_mm(of):.2g}",
@@ -211,6 +221,8 @@ def crowding(found: Measured) -> str:
     beyond = values[recall < SEEN_SHARE]
     told = f"from {beyond[0]:g} on" if beyond.size else "at none"
     rms = {name: found.at(f"{name}_rms_w", PAPER_PER_LENS) for name in ("tracks", "volumes")}
+    better = values[found.curves.median("tracks_rms_w") > found.curves.median("volumes_rms_w")]
+    turned = f", and from {better[0]:g} on volumes do better" if better.size else ""
     few, many = (found.at("tracks_rms_w", value) for value in (values[0], values[-1]))
     return (
         f"The paper seeds {PAPER_PER_PIXEL:g} tracers for each pixel, which are {PAPER_PER_LENS:.2f} for each "
@@ -218,6 +230,6 @@ def crowding(found: Measured) -> str:
         f"found, and a displacement in depth is wrong by {rms['tracks']:.2g} mm rms by particles and by "
         f"{rms['volumes']:.2g} mm by volumes. Of the seedings tried, fewer than {SEEN_SHARE:.0%} are found {told}: "
         "neighbours are taken for one another, and the error of a particle's displacement in depth rises from "
-        f"{few:.2g} mm at {values[0]:g} for each microlens to {many:.2g} mm at {values[-1]:g}. That of volumes is not "
-        "one of neighbours: light is smeared over millimetres of depth at any seeding."
+        f"{few:.2g} mm at {values[0]:g} for each microlens to {many:.2g} mm at {values[-1]:g}{turned}. That of volumes "
+        "is not one of neighbours: light is smeared over millimetres of depth at any seeding."
     )

@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00")
 MARKS, DASHES = ("o", "s", "^", "D", "v"), ("-", "--", "-.", ":", (0, (5, 1, 1, 1)))
 
+# Names of so many curves find room among them.
+ROOM = 3
+
 
 @dataclass(frozen=True)
 class Series:
@@ -84,7 +87,7 @@ def influence_figure(
     from matplotlib.figure import Figure
     from matplotlib.ticker import LogLocator, NullFormatter
 
-    figure = Figure(figsize=(9.0, 3.6), layout="constrained")
+    figure = Figure(figsize=(9.0, 3.8), layout="constrained")
     for axes, panel, note in zip(figure.subplots(1, 2), panels, notes, strict=True):
         for number, series in enumerate(panel.series):
             _draw(axes, curves, series, number, lines.get(series.figure))
@@ -105,7 +108,10 @@ def influence_figure(
             axes.minorticks_off()
         axes.grid(alpha=0.3)
         axes.set_title(note, fontsize=8, loc="left")
-        axes.legend(fontsize=8)
+        if len(panel.series) > ROOM:
+            axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.17), ncols=2)
+        else:
+            axes.legend(fontsize=8)
     return figure
 
 
