@@ -6,6 +6,7 @@ took more than a little from an unusable one is left out of the equations. Image
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 
 import cv2
@@ -29,8 +30,6 @@ DEFECT_SIGMAS = 8.0
 # bubble is many times as bright.
 STILL_RATIO = 1.5
 DIFFERENT_PERCENTILE = 99.9
-# Its rim fades below that within so many pixels.
-STILL_MARGIN_PX = 2
 # Of more than this share of the pixels, tracers that do not move have been taken for bubbles.
 LARGEST_STILL = 0.3
 # Resampling: a pixel with more than this share of its light from unusable ones is unusable, too.
@@ -100,10 +99,15 @@ def _over_sequence(
     return result, count
 
 
-def still_light(images: Iterable[Image]) -> Mask:
+def still_light(images: Iterable[Image], margin_px: float) -> Mask:
     """Return which pixels (rows, columns) of a sequence hold light that does not move and outshines all that does.
 
     Bubbles on a wall, reflections: in every image they are brighter than what the images differ by.
+
+    Parameters
+    ----------
+    margin_px : how far beside such pixels others are left out as well: from one lens to the next, as a lens that sees
+        only the dim rim of a bubble has an image that is no brighter than tracers
 
     Raises
     ------
@@ -118,7 +122,7 @@ def still_light(images: Iterable[Image]) -> Mask:
             f"{np.mean(still):.0%} of the light stands still, at most {LARGEST_STILL:.0%} can be left out: the images "
             "hardly differ"
         )
-    side = 2 * STILL_MARGIN_PX + 1
+    side = 2 * math.ceil(margin_px) + 1
     return np.asarray(cv2.dilate(still.astype(np.uint8), np.ones((side, side), np.uint8)) > 0)
 
 

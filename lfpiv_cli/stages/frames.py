@@ -81,13 +81,14 @@ def reader(
     return read
 
 
-def mask_of(given: str | Path | None, frames: Sequence[Frame], shape: tuple[int, int]) -> Image | None:
+def mask_of(given: str | Path | None, frames: Sequence[Frame], shape: tuple[int, int], pitch_px: float) -> Image | None:
     """Return the mask, 0 where pixels are left out: of a file, or of what does not move in the frames (`still`)."""
     if given is None:
         return None
     if given != STILL:
         return image_files.read_image(Path(given), shape)
-    still = still_light(image_files.read_page(frame.path, frame.page, shape) for frame in frames)
+    images = (image_files.read_page(frame.path, frame.page, shape) for frame in frames)
+    still = still_light(images, pitch_px)
     return np.where(still, np.float32(0.0), np.float32(1.0))
 
 

@@ -114,7 +114,8 @@ def reconstruct(
         console.say(on_demand_told(math.prod(content.weights.padded.shape)))
     shape = content.image_shape
     dark = image_files.read_image(options.dark, shape) if options.dark else None
-    mask = mask_of(options.mask, frames, shape)
+    pitch_px = float(content.camera.micro_image_lattice_px().pitch.max())
+    mask = mask_of(options.mask, frames, shape, pitch_px)
     bench = bench_of(content, settings, dark, mask, with_sums=bool(needed))
     read = reader(level, frames, shape, dark)
     steps = particles.STEPS if as_particles else settings.reconstruction.iterations
