@@ -31,12 +31,12 @@ class Part:
 PARTS: dict[PaperPart, Part] = {
     "table1": Part(table1, "Weights of single voxels (Table 1, Figs. 5 and 6)", 0.5, 4.0),
     "table2": Part(table2, "The camera (Table 2)", 0.01, 0.01),
-    "table3": Part(table3, "Boards, an ideal camera (Table 3, numerical; Figs. 8 to 11)", 1.0, 45.0),
+    "table3": Part(table3, "Boards, an ideal camera (Table 3, numerical; Figs. 8 to 11)", 0.8, 20.0),
     "table3-experiment": Part(
         table3_experiment,
         "Boards, a camera as real ones are, simulated (Table 3, experiment; Figs. 12 and 13)",
-        1.3,
-        45.0,
+        0.8,
+        22.0,
     ),
     "focal-plane": Part(focal_plane, "The focal plane from one snapshot (Eq. 21)", 0.5, 3.0),
     "table4": Part(table4, "The laminar channel flow (Section 4.2, Figs. 14-16 and 18, Table 4)", 2.0, 30.0),
