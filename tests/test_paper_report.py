@@ -220,6 +220,16 @@ def test_the_command_line(arguments: list[str], words: str, tmp_path) -> None:
     assert words in result.output
 
 
+@pytest.mark.slow
+def test_the_quick_report(tmp_path) -> None:
+    summary = validate_paper(tmp_path, PaperOptions(size="quick"), console=QUIET)
+    assert summary["parts"] == len(PARTS)
+    assert summary["met"] == summary["rows"]
+    page = Page((tmp_path / "index.html").read_text(encoding="utf-8"))
+    assert len(page.loads) > 20
+    assert all(each.startswith("data:image/png;base64,") for each in page.loads)
+
+
 @pytest.mark.parametrize("name", ["table1", "table2", "focal-plane", "sensitivities", "faults"])
 def test_parts_at_a_tiny_size(name: PaperPart, tmp_path) -> None:
     chosen = PaperOptions(only=(name,), size="tiny")
