@@ -257,7 +257,8 @@ def _measured(work: Work, boards: _Boards, method: str) -> list[dict[str, Any]]:
 def _row(boards: _Boards, measure: str, figures: Figures) -> Row:
     half, spacing_mm = boards.half, boards.board.spacing_mm
     quantity, scale = QUANTITIES[measure]
-    paper = {method: scale * PAPER[half, method][measure] for method in ("dlfc", "ert")}
+    # rounded: 100 x 0.056 is not 5.6
+    paper = {method: round(scale * PAPER[half, method][measure], 9) for method in ("dlfc", "ert")}
     ours = {method: scale * each[measure] for method, each in figures.items()}
     return Row(
         quantity=quantity,
