@@ -42,6 +42,6 @@ PARTS: dict[PaperPart, Part] = {
     "table4": Part(table4, "The laminar channel flow (Section 4.2, Figs. 14-16 and 18, Table 4)", 2.0, 30.0),
     "bubbles": Part(bubbles, "Bubbles on the wall (Fig. 17)", 0.75, 6.0),
     "discussion": Part(discussion, "Depth resolution and seeding (the paper's discussion)", 0.2, 2.0),
-    "sensitivities": Part(sensitivities, "What matters, and how much", 1.5, 12.0),
-    "faults": Part(faults, "Planted mistakes", 0.7, 0.7),
+    "sensitivities": Part(sensitivities, "What matters, and how much", 2.0, 8.0),
+    "faults": Part(faults, "Planted mistakes", 0.3, 0.3),
 }
