@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-STYLES = (("#0072B2", "o"), ("#D55E00", "s"), ("#009E73", "^"), ("#CC79A7", "v"))
+STYLES = (("#0072B2", "o"), ("#D55E00", "s"), ("#009E73", "^"), ("#CC79A7", "v"), ("#E69F00", "D"))
 
 
 def raw_figure(image: NDArray[np.float32], mask: NDArray[np.bool_]) -> Figure:
@@ -29,7 +29,7 @@ def raw_figure(image: NDArray[np.float32], mask: NDArray[np.bool_]) -> Figure:
     figure = Figure(figsize=(10.0, 10.0 * 0.5 * image.shape[0] / image.shape[1] + 1.0), layout="constrained")
     highest = float(np.percentile(image[~mask], 99.9)) if not mask.all() else float(image.max())
     for axes, title in zip(figure.subplots(1, 2), ("raw image", "left out by the mask"), strict=True):
-        shown = axes.imshow(np.sqrt(np.clip(image, 0.0, highest)), cmap="gray", interpolation="nearest")
+        shown = axes.imshow(np.sqrt(np.clip(image, 0.0, highest)), cmap="gray", vmin=0.0, interpolation="nearest")
         axes.set(xlabel="column (px)", ylabel="row (px)", title=title)
     axes.imshow(np.where(mask, 1.0, np.nan), cmap="autumn", alpha=0.6, interpolation="nearest")
     bar = figure.colorbar(shown, ax=figure.axes, shrink=0.8, label="counts, root scale")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lfpiv_cli.validation.channel import Duct
 from lfpiv_cli.validation.flow import TOLERANCE, compare, relative_errors
@@ -33,12 +34,16 @@ class NearWall:
     mean_sigma: float
 
 
-def near_wall(measured: Measured, duct: Duct, beyond: float = PAPERS_WALL) -> NearWall:
-    """Return the figures of a duct's windows near the wall at the high end of its lateral axis."""
+def beside_wall(measured: Measured, duct: Duct, beyond: float = PAPERS_WALL) -> NDArray[np.bool_]:
+    """Return which windows (nz, ny, nx) lie beyond a share of the width, of those that are judged."""
     axis = duct.across["x/D"]
     places = measured.field.grid.centres_mm()[..., axis]
-    chosen = measured.inside & (places > duct.position_mm(axis, beyond))
-    pairs = compare(measured.field, measured.truth, chosen)
+    return np.asarray(measured.inside & (places > duct.position_mm(axis, beyond)))
+
+
+def near_wall(measured: Measured, duct: Duct, beyond: float = PAPERS_WALL) -> NearWall:
+    """Return the figures of a duct's windows near the wall at the high end of its lateral axis."""
+    pairs = compare(measured.field, measured.truth, beside_wall(measured, duct, beyond))
     streamwise, _ = relative_errors(pairs)
     # a duct's flow has a direction
     assert streamwise is not None
