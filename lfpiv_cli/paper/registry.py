@@ -39,9 +39,9 @@ PARTS: dict[PaperPart, Part] = {
         22.0,
     ),
     "focal-plane": Part(focal_plane, "The focal plane from one snapshot (Eq. 21)", 0.5, 3.0),
-    "table4": Part(table4, "The laminar channel flow (Section 4.2, Figs. 14-16 and 18, Table 4)", 2.0, 30.0),
-    "bubbles": Part(bubbles, "Bubbles on the wall (Fig. 17)", 0.75, 6.0),
-    "discussion": Part(discussion, "Depth resolution and seeding (the paper's discussion)", 0.2, 2.0),
+    "table4": Part(table4, "The laminar channel flow (Section 4.2, Figs. 14-16 and 18, Table 4)", 1.2, 15.0),
+    "bubbles": Part(bubbles, "Bubbles on the wall (Fig. 17)", 0.5, 2.5),
+    "discussion": Part(discussion, "Depth resolution and seeding (the paper's discussion)", 0.1, 0.5),
     "sensitivities": Part(sensitivities, "What matters, and how much", 2.0, 8.0),
     "faults": Part(faults, "Planted mistakes", 0.3, 0.3),
 }

@@ -29,6 +29,8 @@ VOXEL_MM = 0.1
 # Room for a reconstructed point before and behind it, mm: half of the paper's longest dots and as much again.
 ROOM_MM = 4.0
 POINT_VOXELS = 5
+# A median of so many is right to a sixth of their spread.
+FEWEST_TRACERS = 40
 
 
 def geometric_depth_mm(camera: Camera, media: Media) -> float:
@@ -64,13 +66,16 @@ def smallest_errors_crowded_mm(
     scale = camera.scale(media)
     side = np.array([camera.columns, camera.rows]) * camera.pixel_mm * scale.lens_mm / float(camera.lattice.pitch[0])
     count = max(round(per_lens * float(np.prod(side)) / scale.lens_mm**2), 1)
-    places = rng.uniform([*(-0.5 * side), -deepest_mm], [*(0.5 * side), deepest_mm], (count, 3))
-    particles = np.column_stack([places, np.full(count, LIGHT_COUNTS)])
-    slope = slopes(view, particles)
-    bound = cramer_rao_bound(slope, pixel_variance(expected_image(slope, particles), readout))
-    # whose light lies on the sensor
-    inner = np.all(np.abs(places[:, :2]) < 0.25 * side, axis=1)
-    return np.asarray(np.median(bound.sigma_mm(joint=True)[inner if inner.any() else slice(None)], axis=0))
+    errors: list[NDArray[np.float64]] = []
+    while len(errors) < FEWEST_TRACERS:
+        places = rng.uniform([*(-0.5 * side), -deepest_mm], [*(0.5 * side), deepest_mm], (count, 3))
+        particles = np.column_stack([places, np.full(count, LIGHT_COUNTS)])
+        slope = slopes(view, particles)
+        bound = cramer_rao_bound(slope, pixel_variance(expected_image(slope, particles), readout))
+        # whose light lies on the sensor
+        inner = np.all(np.abs(places[:, :2]) < 0.25 * side, axis=1)
+        errors.extend(bound.sigma_mm(joint=True)[inner])
+    return np.asarray(np.median(errors, axis=0))
 
 
 def elongations_mm(
