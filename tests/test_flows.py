@@ -7,7 +7,16 @@ import pytest
 from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 
-from lfpiv_cli.synthetic.flows import FLOWS, advect, rigid_rotation, shear, square_duct, taylor_green, uniform
+from lfpiv_cli.synthetic.flows import (
+    FLOWS,
+    advect,
+    random_modes,
+    rigid_rotation,
+    shear,
+    square_duct,
+    taylor_green,
+    uniform,
+)
 
 WIDTH = 10.0
 MEAN = 0.1082
@@ -19,6 +28,7 @@ EXAMPLES = {
     "taylor_green": taylor_green(0.05, 8.0, CENTRE),
     "shear": shear(4.0, "z", "x", CENTRE),
     "uniform": uniform((0.1, -0.02, 0.03)),
+    "random_modes": random_modes(0.05, shortest_mm=8.0, centre_mm=CENTRE),
 }
 
 
@@ -133,3 +143,31 @@ def test_duct_line_mean_by_quadrature():
     flow = square_duct(2.0, 1.0)
     line = lambda z: quad(lambda y: flow(np.array([[0.0, y, z]]))[0, 0], 0, 1, epsabs=1e-7)[0]  # noqa: E731
     assert quad(line, 0, 1, epsabs=1e-6)[0] == pytest.approx(1.0, abs=1e-5)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_random_modes_have_their_rms_and_a_kolmogorov_spectrum(seed, rng):
+    points = rng.uniform(-2000.0, 2000.0, (20000, 3))
+    flow = random_modes(0.05, seed=seed, velocity_m_s=(0.1, 0.0, 0.0))
+    velocity = flow(points) - (0.1, 0.0, 0.0)
+    # 200 modes in random directions: components share the energy within a tenth, and the sum is exact but for sampling
+    assert np.sqrt(np.mean(velocity**2)) == pytest.approx(0.05, rel=0.02)
+    np.testing.assert_allclose(velocity.std(axis=0), 0.05, rtol=0.2)
+    # the structure function of E(k) ~ k^(-5/3) between the longest and the shortest wave, by quadrature
+    step = rng.normal(size=points.shape)
+    step /= np.linalg.norm(step, axis=1, keepdims=True)
+    low, high = 2.0 * np.pi / 20.0, 2.0 * np.pi / 0.7
+    for distance in (0.3, 1.0, 3.0):
+        found = np.mean(np.sum((flow(points + distance * step) - flow(points)) ** 2, axis=1))
+        lost = quad(lambda k, r=distance: k ** (-5 / 3) * np.sin(k * r) / (k * r), low, high)[0]
+        energy = quad(lambda k: k ** (-5 / 3), low, high)[0]
+        assert found == pytest.approx(6.0 * 0.05**2 * (1.0 - lost / energy), rel=0.3)
+
+
+def test_random_modes_are_those_of_their_seed(rng):
+    points = rng.uniform(-5.0, 5.0, (10, 3))
+    first, again, other = (random_modes(0.05, seed=seed)(points) for seed in (4, 4, 5))
+    np.testing.assert_array_equal(first, again)
+    assert not np.allclose(first, other)
+    moved = random_modes(0.05, seed=4, centre_mm=(1.0, 2.0, 3.0))(points + (1.0, 2.0, 3.0))
+    np.testing.assert_allclose(moved, first, atol=1e-12)

@@ -20,6 +20,9 @@ from lfpiv_cli.files.section_types import (
 )
 from lfpiv_cli.names import BoardImages, BoardMethod, BubbleWall, FlowMethod, Refraction
 
+# Each point is carried by all of them: of more, a frame of many tracers takes gigabytes.
+MOST_MODES = 2000
+
 
 class SquareDuct(Section):
     """Fully developed laminar flow along axis (x or y) through a square duct of width_mm.
@@ -72,7 +75,25 @@ class Uniform(Section):
     velocity_m_s: Vector
 
 
-FlowSection = Annotated[SquareDuct | RigidRotation | TaylorGreen | Shear | Uniform, Field(discriminator="kind")]
+class RandomModes(Section):
+    """A frozen picture of turbulence: so many solenoidal modes of random direction and phase, plus velocity_m_s.
+
+    Wavelengths from longest_mm to shortest_mm, a -5/3 spectrum; rms_m_s: of each component; seed: of the modes.
+    """
+
+    kind: Literal["random_modes"]
+    rms_m_s: NotNegative
+    longest_mm: Positive = 20.0
+    shortest_mm: Positive = 0.7
+    modes: Annotated[int, Field(ge=1, le=MOST_MODES)] = 200
+    seed: Annotated[int, Field(ge=0)] = 0
+    centre_mm: Vector = (0.0, 0.0, 0.0)
+    velocity_m_s: Vector = (0.0, 0.0, 0.0)
+
+
+FlowSection = Annotated[
+    SquareDuct | RigidRotation | TaylorGreen | Shear | Uniform | RandomModes, Field(discriminator="kind")
+]
 
 
 class SimulationSection(Section):

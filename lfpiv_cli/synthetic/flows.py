@@ -148,12 +148,48 @@ def uniform(velocity_m_s: Sequence[float]) -> Flow:
     return flow
 
 
+def random_modes(
+    rms_m_s: float,
+    longest_mm: float = 20.0,
+    shortest_mm: float = 0.7,
+    modes: int = 200,
+    seed: int = 0,
+    centre_mm: Sequence[float] = ORIGIN,
+    velocity_m_s: Sequence[float] = ORIGIN,
+) -> Flow:
+    """Return a frozen picture of turbulence: solenoidal waves in random directions, plus a uniform velocity.
+
+    Wave numbers are evenly spread in their logarithm and energies follow Kolmogorov's spectrum, E(k) ~ k^(-5/3);
+    `rms_m_s` is that of each component, over all space and all seeds.
+    """
+    rng = np.random.default_rng(seed)
+    wave = 2.0 * np.pi * np.exp(rng.uniform(-np.log(longest_mm), -np.log(shortest_mm), modes))
+    direction, other = _unit(rng.normal(size=(modes, 3))), rng.normal(size=(modes, 3))
+    polarisation = _unit(np.cross(direction, other))
+    phase = rng.uniform(0.0, 2.0 * np.pi, modes)
+    # the energy of an interval of ln k is k E(k); a wave of amplitude a has a^2 / 2, over three components
+    amplitude = wave ** (-1.0 / 3.0)
+    amplitude *= rms_m_s * np.sqrt(6.0 / np.sum(amplitude**2))
+
+    def flow(points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        relative = points_mm - np.asarray(centre_mm, dtype=np.float64)
+        waves = np.cos(relative @ (wave[:, np.newaxis] * direction).T + phase)
+        return waves @ (amplitude[:, np.newaxis] * polarisation) + np.asarray(velocity_m_s, dtype=np.float64)
+
+    return flow
+
+
+def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
 FLOWS: dict[str, Callable[..., Flow]] = {
     "square_duct": square_duct,
     "rigid_rotation": rigid_rotation,
     "taylor_green": taylor_green,
     "shear": shear,
     "uniform": uniform,
+    "random_modes": random_modes,
 }
 
 
