@@ -56,7 +56,8 @@ def test_an_empty_set_is_a_set(tmp_path: Path) -> None:
     target = tmp_path / "tracks.vtkhdf"
     vectors = {name: np.zeros((0, 3)) for name in ("velocity", "velocity_sigma", "displacement_mm")}
     numbers = {name: np.zeros(0, np.int64) for name in ("particle_a", "particle_b")}
-    empty = Points(np.zeros((0, 3)), vectors | numbers, REFERENCE, {}, {})
+    probability = {"link_probability": np.zeros(0)}
+    empty = Points(np.zeros((0, 3)), vectors | numbers | probability, REFERENCE, {}, {})
     write_points(target, TRACKS_FORMAT, empty, overwrite=False)
     assert read_points(target, TRACKS_FORMAT).position_mm.shape == (0, 3)
 

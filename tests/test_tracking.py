@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.scale import Scale
 from lfpiv_cli.synthetic.flows import taylor_green
+from lfpiv_cli.tracks.candidates import Seen
 from lfpiv_cli.tracks.gridding import on_grid
-from lfpiv_cli.tracks.tracking import track, vote
+from lfpiv_cli.tracks.tracking import track
 
 BOX_MM = np.array([4.0, 4.0, 4.0])
 # Table 2's camera.
@@ -35,30 +36,21 @@ def frames(rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.fl
 def test_particles_are_followed_further_than_their_distance(
     frames: tuple[NDArray[np.float64], NDArray[np.float64]],
 ) -> None:
-    tracks = track(*frames, 0.6, SCALE)
+    tracks = track(*map(Seen, frames), 0.6, SCALE)
     right = (tracks.first == tracks.second) & (tracks.first < 450)
     assert right.sum() > 0.9 * 450
     assert right.mean() > 0.98
     assert np.unique(tracks.second).size == tracks.second.size
 
 
-def test_neighbours_vote_for_the_right_displacement(
-    frames: tuple[NDArray[np.float64], NDArray[np.float64]],
-) -> None:
-    chosen = vote(*frames, 0.6, SCALE)[:450]
-    right = np.all(np.abs(chosen - moved(frames[0][:450])) < (0.02, 0.02, 0.1), axis=1)
-    # Each has some fourteen particles within reach: chance would find one in fourteen.
-    assert right.mean() > 0.7
-
-
 def test_frames_without_common_particles_give_few_tracks(rng: np.random.Generator) -> None:
-    first, second = rng.uniform(0.0, BOX_MM, (2, 300, 3))
+    first, second = (Seen(points) for points in rng.uniform(0.0, BOX_MM, (2, 300, 3)))
     assert len(track(first, second, 0.3, SCALE).first) < 60
 
 
 def test_no_particles_give_no_track() -> None:
-    assert track(np.zeros((0, 3)), np.zeros((3, 3)), 0.5, SCALE).first.size == 0
-    assert track(np.zeros((3, 3)), np.zeros((0, 3)), 0.5, SCALE).first.size == 0
+    assert track(Seen(np.zeros((0, 3))), Seen(np.zeros((3, 3))), 0.5, SCALE).first.size == 0
+    assert track(Seen(np.zeros((3, 3))), Seen(np.zeros((0, 3))), 0.5, SCALE).first.size == 0
 
 
 @pytest.mark.parametrize("count", [1, 2, 5, 12, 27])
@@ -69,7 +61,8 @@ def test_few_particles_are_followed_among_ghosts(count: int, rng: np.random.Gene
         both = rng.uniform(0.0, BOX_MM, (count, 3))
         start, end = (each + rng.normal(0.0, NOISE_MM, each.shape) for each in (both, both + moved(both)))
         alone = rng.uniform(0.0, BOX_MM, (2, ghosts, 3))
-        links = track(np.concatenate([start, alone[0]]), np.concatenate([end, alone[1]]), 0.6, SCALE)
+        frames = np.concatenate([start, alone[0]]), np.concatenate([end, alone[1]])
+        links = track(*map(Seen, frames), 0.6, SCALE)
         right += np.count_nonzero((links.first == links.second) & (links.first < count))
         linked += len(links.first)
     # A ghost has another within reach in one frame of forty for each particle there.
@@ -84,11 +77,11 @@ def test_a_world_of_another_size_has_the_same_links(
 ) -> None:
     some = slice(max(0, 448 - count), 452)
     first, second = frames[0][some], frames[1][some]
-    here = track(first, second, 0.6, SCALE)
-    there = track(factor * first, factor * second, factor * 0.6, Scale(factor * 0.1, factor * 1.064))
+    here = track(Seen(first), Seen(second), 0.6, SCALE)
+    there = track(Seen(factor * first), Seen(factor * second), factor * 0.6, Scale(factor * 0.1, factor * 1.064))
     np.testing.assert_array_equal(there.first, here.first)
     np.testing.assert_array_equal(there.second, here.second)
-    np.testing.assert_allclose(there.residual_mm, factor * here.residual_mm, atol=factor * 1e-9)
+    np.testing.assert_allclose(there.probability, here.probability, atol=1e-9)
 
 
 def test_grid_takes_a_quadratic_flow_exactly(rng: np.random.Generator) -> None:

@@ -49,6 +49,7 @@ UNITS = {
         "displacement_mm": "mm",
         "particle_a": "1",
         "particle_b": "1",
+        "link_probability": "1",
     },
     # Rows are ordered by track, then by frame.
     TRAJECTORIES_FORMAT: {
@@ -57,8 +58,11 @@ UNITS = {
         "track": "1",
         "frame": "1",
         "particle": "1",
+        "link_probability": "1",
     },
 }
+# Arrays in which NaN stands for what is not known.
+MAY_BE_UNKNOWN = {"link_probability"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +129,8 @@ def read_points(path: Path | str, format_name: str) -> Points:
     if position.ndim != 2 or position.shape[1] != 3:
         raise InputError(f"{path}: its positions have the shape {position.shape}, expected (n, 3)")
     for name, array in (arrays | {POSITION: position}).items():
-        if len(array) != len(position) or not np.isfinite(array).all():
+        known = array[~np.isnan(array)] if name in MAY_BE_UNKNOWN else array
+        if len(array) != len(position) or not np.isfinite(known).all():
             raise InputError(f"{path}: {name} has not one finite value for each of its {len(position)} points")
     return Points(position.astype(np.float64), arrays, root.reference, root.attributes, root.provenance)
 

@@ -18,8 +18,9 @@ from lfpiv_cli.flow.from_tracks import Paths, WindowGrid, vectors_from_paths
 from lfpiv_cli.interface.notices import warn_of
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.scale import Scale
+from lfpiv_cli.tracks.candidates import Seen
 from lfpiv_cli.tracks.sequences import SHORTEST, follow, scatter_in, states_at
-from lfpiv_cli.tracks.tracking import FEWEST_OF_FIT, SEARCH_LENSES, Tracks
+from lfpiv_cli.tracks.tracking import FEWEST_OF_FIT, SEARCH_LENSES, Tracks, wrong_link_variance
 from lfpiv_cli.tracks.tracking import track as match
 
 # A frame with less than this share of the fullest one's particles leaves most of those without a partner.
@@ -55,8 +56,9 @@ def track(
     -------
     Tracked
         `points` with `position_mm` (n, 3) and `arrays`: of two frames, for each link, `velocity` and `velocity_sigma`
-        (n, 3) m/s, `displacement_mm` (n, 3), and `particle_a`, `particle_b` (n,) row numbers; of a sequence, for each
-        place of a track, `velocity`, `velocity_sigma`, `track`, `frame` and `particle` (n,). `summary` has the counts;
+        (n, 3) m/s, `displacement_mm` (n, 3), `particle_a`, `particle_b` (n,) row numbers and `link_probability` (n,);
+        of a sequence, for each place of a track, `velocity`, `velocity_sigma`, `track`, `frame`, `particle` and the
+        `link_probability` (n,) by which the track has come there, NaN where it begins. `summary` has the counts;
         `vectors()` gives the fields on the grid of the interrogation windows, one for each interval.
 
     Raises
@@ -289,36 +291,40 @@ Found = tuple[NDArray[np.float64], dict[str, NDArray[Any]], dict[str, Any], list
 
 def _pair(first: Points, second: Points, chosen: Tracking) -> Found:
     """Return places, arrays, summary and paths of particles followed from one frame to the next."""
-    found = match(first.position_mm, second.position_mm, chosen.search_mm, chosen.scale)
-    paths = _paths(first, second, found)
+    found = match(_seen(first), _seen(second), chosen.search_mm, chosen.scale)
+    paths = _paths(first, second, found, chosen.scale)
     arrays = {
         "velocity": paths.displacement_mm * MM_TO_M / chosen.dt_s,
         "velocity_sigma": paths.sigma_mm * MM_TO_M / chosen.dt_s,
         "displacement_mm": paths.displacement_mm,
         "particle_a": found.first,
         "particle_b": found.second,
+        "link_probability": found.probability,
     }
     summary = {
         "particles_a": len(first.position_mm),
         "particles_b": len(second.position_mm),
         "tracks": len(found.first),
+        "expected_wrong_links": float(np.sum(1.0 - found.probability)),
     }
     return paths.middle_mm, arrays, summary, [paths]
 
 
 def _sequence(frames: Sequence[Points], chosen: Tracking, shortest: int) -> Found:
     """Return places, arrays, summary and paths of particles followed over many frames."""
-    points = [frame.position_mm for frame in frames]
-    sigma = [np.sqrt(frame.arrays["covariance_mm2"][:, :3]) for frame in frames]
-    found = follow(points, sigma, chosen.search_mm, shortest, chosen.scale)
-    scatter, half = scatter_in(found, points, sigma)
+    seen = [_seen(frame) for frame in frames]
+    found = follow(seen, chosen.search_mm, shortest, chosen.scale)
+    scatter, half = scatter_in(found, seen)
     rows: list[tuple[NDArray[Any], ...]] = []
     for number in range(len(frames)):
-        tracks, state = states_at(found, points, sigma, float(number), scatter, half)
+        tracks, state = states_at(found, seen, float(number), scatter, half)
         frame = np.full(len(tracks), number)
         particle = found.particles(number, tracks)
-        rows.append((state.position_mm, state.velocity, state.velocity_sigma, tracks, frame, particle))
-    position, velocity, error, tracks, frame, particle = (np.concatenate(each) for each in zip(*rows, strict=True))
+        probability = found.probability[number][particle]
+        rows.append((state.position_mm, state.velocity, state.velocity_sigma, tracks, frame, particle, probability))
+    position, velocity, error, tracks, frame, particle, probability = (
+        np.concatenate(each) for each in zip(*rows, strict=True)
+    )
     order = np.lexsort((frame, tracks))
     arrays = {
         "velocity": velocity[order] * MM_TO_M / chosen.dt_s,
@@ -326,23 +332,30 @@ def _sequence(frames: Sequence[Points], chosen: Tracking, shortest: int) -> Foun
         "track": tracks[order],
         "frame": frame[order],
         "particle": particle[order],
+        "link_probability": probability[order],
     }
-    between = [states_at(found, points, sigma, number + 0.5, scatter, half)[1] for number in range(len(frames) - 1)]
+    between = [states_at(found, seen, number + 0.5, scatter, half)[1] for number in range(len(frames) - 1)]
     paths = [Paths(state.position_mm, state.velocity, state.velocity_sigma) for state in between]
     acceleration = np.sqrt(scatter.bending) * MM_TO_M / chosen.dt_s**2
     summary = {
         "frames": len(frames),
-        "particles": sum(len(each) for each in points),
+        "particles": sum(len(each) for each in seen),
         "tracked": len(tracks),
         "tracks": found.count,
+        "expected_wrong_links": float(np.nansum(1.0 - probability)),
         "noise_over_stated": scatter.noise.tolist() if scatter.noise_known else None,
         "acceleration_m_s2": acceleration.tolist() if scatter.bending_known else None,
     }
     return position[order], arrays, summary, paths
 
 
-def _paths(first: Points, second: Points, tracks: Tracks) -> Paths:
+def _seen(frame: Points) -> Seen:
+    return Seen(frame.position_mm, frame.arrays["covariance_mm2"], frame.arrays["intensity"])
+
+
+def _paths(first: Points, second: Points, tracks: Tracks, scale: Scale) -> Paths:
     """Return the paths of a pair's tracks."""
     start, end = first.position_mm[tracks.first], second.position_mm[tracks.second]
     variance = first.arrays["covariance_mm2"][tracks.first, :3] + second.arrays["covariance_mm2"][tracks.second, :3]
+    variance = variance + wrong_link_variance(tracks.probability, scale)
     return Paths(0.5 * (start + end), end - start, np.sqrt(variance))

@@ -36,6 +36,7 @@ from lfpiv_cli.particles.view import lens_pixels, raw_view
 from lfpiv_cli.reconstruction.solvers import SolverSettings
 from lfpiv_cli.robust import MAD_TO_SIGMA
 from lfpiv_cli.synthetic.sensor import Readout
+from lfpiv_cli.tracks.candidates import Seen
 from lfpiv_cli.tracks.tracking import track
 from lfpiv_cli.validation.bounds import cramer_rao_bound, expected_image, pixel_variance, slopes
 from lfpiv_cli.validation.particles import match, particle_figures
@@ -150,7 +151,7 @@ def displacement(points_mm: Points) -> Points:
 
 def tracks_between(first: Points, second: Points, known: Rig) -> tuple[Points, Points]:
     """Return the middles (n, 3) of a pair's tracks and their displacements (n, 3)."""
-    tracks = track(first, second, SEARCH_MM, known.camera.scale(known.media))
+    tracks = track(Seen(first), Seen(second), SEARCH_MM, known.camera.scale(known.media))
     a, b = first[tracks.first], second[tracks.second]
     return 0.5 * (a + b), b - a
 

@@ -32,7 +32,8 @@ from lfpiv_cli.particles.search import (
     with_typical_light,
 )
 from lfpiv_cli.scale import Scale
-from lfpiv_cli.tracks.tracking import expected_displacement, track
+from lfpiv_cli.tracks.candidates import Seen
+from lfpiv_cli.tracks.tracking import expected_of, known_of, track
 
 # A particle without a partner this near to where one is expected is that one, at another depth: near the focal plane
 # depths may be wrong by as much as lets light spread by one lens. In microlenses and in such depths (Table 2: 1.25 mm).
@@ -95,13 +96,13 @@ def _without_partner(
     """Return another frame's particles (m, 4) that were not tracked, where they are expected here, and which own ones
     were not.
     """
-    tracks = track(other[:, :3], own[:, :3], search_mm, scale)
+    there, here = (Seen(each[:, :3], light=each[:, 3]) for each in (other, own))
+    tracks = track(there, here, search_mm, scale)
     alone, partnerless = np.ones(len(other), np.bool_), np.ones(len(own), np.bool_)
     alone[tracks.first] = partnerless[tracks.second] = False
     if not len(tracks.first):
         return np.zeros((0, 4)), partnerless
-    displacement = np.full((len(other), 3), np.nan)
-    displacement[tracks.first] = own[tracks.second, :3] - other[tracks.first, :3]
+    known = known_of(there, here, tracks.first, tracks.second, scale)
     expected = other.copy()
-    expected[:, :3] += expected_displacement(other[:, :3], displacement, scale, None)
+    expected[:, :3] += expected_of(there.position_mm, known, search_mm, scale).displacement_mm
     return expected[alone], partnerless

@@ -1,9 +1,10 @@
-"""Two-frame particle tracking velocimetry (PTV) without a predictor: which particle of one frame is which of the next.
+"""Two-frame particle tracking velocimetry (PTV): which particle of one frame is which of the next, and how surely.
 
-Neighbours move alike: a displacement that takes a particle to one of the next frame takes many of its neighbours to
-others there. The displacement with most votes starts the match; then each particle is sought where a local linear fit
-through its neighbours' displacements expects it, and matches that deviate from such a fit are dropped. In a sequence,
-what a particle's own past forecasts takes the place of the votes, and joins what its neighbours let expect.
+Neighbours move alike, more or less, and a tracer's light hardly changes. The first guess is voted for by neighbours;
+then each particle's displacement is expected from those of its neighbours, with the uncertainty that the flow's own
+structure function gives, and each pair within reach is weighed by its place and its light against chance. A particle
+has one partner at most; the probability of each link follows, and links that are more likely than not are kept. In a
+sequence, what a particle's own past forecasts joins what its neighbours let expect.
 
 Axes: points (n, 3) in mm. Depth is known worse than the lateral place, so distances in depth count for less.
 """
@@ -14,10 +15,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from lfpiv_cli.robust import MAD_TO_SIGMA
 from lfpiv_cli.scale import Scale
+from lfpiv_cli.tracks.association import marginals
+from lfpiv_cli.tracks.candidates import Candidates, Seen, candidates_of
+from lfpiv_cli.tracks.kriging import kriged, structure_of
+from lfpiv_cli.tracks.votes import votes
 
 # Lengths are in the camera's own units: L, a microlens in the scene (Table 2: 0.1 mm), and D, the depth over which
 # light spreads by one lens (1.064 mm).
@@ -25,33 +29,68 @@ from lfpiv_cli.scale import Scale
 DEPTH_RATIO = 4.0 / 10.64
 # Displacements are sought up to this along each axis by default, in L.
 SEARCH_LENSES = 6.0
-NEIGHBOURS = 14
-# How far two displacements of neighbours may differ to count as alike, first and after a fit, laterally, in L.
-ALIKE_LENSES = 0.4
-# A local linear fit through as many tracks as seven for each of its unknowns, or through all others where these are
-# fewer; with fewer than this its four unknowns are noise, and neighbours let expect their mean.
-FIT_TRACKS = 28
+# Around a forecast, particles are sought up to so many of its standard errors and no less than this, in L.
+FORECAST_SIGMAS, FORECAST_LENSES = 6.0, 1.2
+# No displacement is expected better than this, laterally, in L: fits have errors that they do not know of.
+SMALLEST_SIGMA_LENSES = 0.02
+# With fewer links than this their differences do not show how unlike displacements are; a share of the search, over the
+# root of their number, is added to what they let expect.
 FEWEST_OF_FIT = 6
-ROUNDS = 4
-# A match stays within so many robust standard deviations of the fit around it.
-OUTLIER_SIGMAS = 5.0
-# The spread below which no match is dropped, in L: particles are not known better.
-SMALLEST_SPREAD_LENSES = 0.04
+FEW_SHARE = 0.5
+ROUNDS = 6
+# A tenth of all displacements is off by three times as much as expected.
+TAIL_SHARE, TAIL_WIDTH = 0.1, 3.0
+# How many particles have a partner, at first and within which limits.
+PARTNERED, LEAST_PARTNERED, MOST_PARTNERED = 0.9, 0.02, 0.98
+# Residuals may be smaller than expected, not by more than this.
+SMALLEST_FACTOR = 0.5
+# Pairs further off than so many standard errors are none.
+FURTHEST_SIGMAS = 12.0
+# A link that is wrong although it was kept is off by as much, laterally, in L: the partner was near what was expected.
+WRONG_LENSES = 0.3
+# A link is kept that is more likely than all its alternatives together.
+LEAST_PROBABILITY = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """Matches of two frames.
+    """Links of two frames.
 
     Attributes
     ----------
     first, second : (n,) numbers of the particles in the two frames
-    residual_mm : (n, 3) displacement less that of the fit around it
+    probability : (n,) of the links, from the alternatives
     """
 
     first: NDArray[np.int64]
     second: NDArray[np.int64]
-    residual_mm: NDArray[np.float64]
+    probability: NDArray[np.float64]
+
+
+NO_TRACKS = Tracks(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """Displacements that are known of some of the particles.
+
+    Attributes
+    ----------
+    number : (k,) of the particles
+    displacement_mm, variance_mm2 : (k, 3)
+    """
+
+    number: NDArray[np.int64]
+    displacement_mm: NDArray[np.float64]
+    variance_mm2: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Expected:
+    """Displacements (n, 3) that are expected of particles, and the variances (n, 3) of what is missed, mm, mm^2."""
+
+    displacement_mm: NDArray[np.float64]
+    variance_mm2: NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,185 +101,170 @@ class Forecast:
     sigma_mm: NDArray[np.float64]
 
 
-def track(
-    points_a: NDArray[np.float64],
-    points_b: NDArray[np.float64],
-    search_mm: float,
-    scale: Scale,
-    forecast: Forecast | None = None,
-) -> Tracks:
-    """Match two frames' particles, whose displacements are at most `search_mm` along each axis unless forecast.
+def track(first: Seen, second: Seen, search_mm: float, scale: Scale, forecast: Forecast | None = None) -> Tracks:
+    """Link two frames' particles, whose displacements are at most `search_mm` along each axis unless forecast.
 
-    Any number of particles will do. One or two that have nobody to vote for them are matched with their nearest.
+    Any number of particles will do; one alone is linked where there is one candidate.
     """
-    none = np.zeros(0, dtype=np.int64)
-    tracks = Tracks(none, none, np.zeros((0, 3)))
-    if not len(points_a) or not len(points_b):
-        return tracks
-    displacement = _first_guess(points_a, points_b, search_mm, scale, forecast)
+    if not len(first) or not len(second):
+        return NO_TRACKS
+    candidates = candidates_of(first, second, *_sought(first, search_mm, scale, forecast))
+    density = density_per_mm3(first, second, search_mm)
+    score = votes(first.position_mm, candidates, density, scale, of_equal_errors(scale))
+    links, share = _exclusive(candidates, score + _log_near(candidates, search_mm, forecast)), PARTNERED
+    probability = np.zeros(len(candidates.first))
     for _ in range(ROUNDS):
-        if not np.isfinite(displacement[:, 0]).any():
-            return Tracks(none, none, np.zeros((0, 3)))
-        expected = expected_displacement(points_a, displacement, scale, forecast)
-        gate = gate_mm(displacement - expected, search_mm, scale)
-        first, second = mutual(points_a + expected, points_b, gate, scale)
-        displacement = np.full(points_a.shape, np.nan)
-        displacement[first] = points_b[second] - points_a[first]
-        if not len(first):
-            return Tracks(none, none, np.zeros((0, 3)))
-        residual = (displacement - expected_displacement(points_a, displacement, scale, forecast))[first]
-        outlier = _outliers(residual, scale)
-        displacement[first[outlier]] = np.nan
-        tracks = Tracks(first[~outlier], second[~outlier], residual[~outlier])
-    return tracks
+        known = known_of(first, second, candidates.first[links], candidates.second[links], scale)
+        expected = expected_of(first.position_mm, known, search_mm, scale, forecast)
+        expected = _calibrated(expected, known)
+        probability = probability_of(candidates, expected, first, second, share, density)
+        share = float(np.clip(probability.sum() / len(first), LEAST_PARTNERED, MOST_PARTNERED))
+        before, links = links, np.flatnonzero(probability > LEAST_PROBABILITY)
+        if np.array_equal(before, links):
+            break
+    return Tracks(candidates.first[links], candidates.second[links], probability[links])
 
 
-def _first_guess(
-    points_a: NDArray[np.float64],
-    points_b: NDArray[np.float64],
+def link_some(
+    first: tuple[Seen, NDArray[np.bool_]],
+    second: tuple[Seen, NDArray[np.bool_]],
+    known: Known,
     search_mm: float,
     scale: Scale,
-    forecast: Forecast | None,
-) -> NDArray[np.float64]:
-    """Return the displacements (n, 3) to begin with: forecast ones where these suffice, voted ones besides."""
-    if forecast is None:
-        return vote(points_a, points_b, search_mm, scale)
-    if np.count_nonzero(np.isfinite(forecast.sigma_mm[:, 0])) >= FIT_TRACKS:
-        return forecast.displacement_mm
-    voted = vote(points_a, points_b, search_mm, scale)
-    return np.where(np.isfinite(forecast.displacement_mm), forecast.displacement_mm, voted)
+    forecast: Forecast,
+) -> Tracks:
+    """Link those particles of two frames that are chosen (n,), where the displacements of others are known already."""
+    (start, some), (end, free) = first, second
+    candidates = candidates_of(start, end, *_sought(start, search_mm, scale, forecast))
+    candidates = candidates.part(some[candidates.first] & free[candidates.second])
+    expected = _calibrated(expected_of(start.position_mm, known, search_mm, scale, forecast), known)
+    density = density_per_mm3(start, end, search_mm)
+    probability = probability_of(candidates, expected, start, end, PARTNERED, density)
+    links = np.flatnonzero(probability > LEAST_PROBABILITY)
+    return Tracks(candidates.first[links], candidates.second[links], probability[links])
 
 
-def vote(
-    points_a: NDArray[np.float64], points_b: NDArray[np.float64], search_mm: float, scale: Scale
-) -> NDArray[np.float64]:
-    """Return for each particle of the first frame the displacement (n, 3) that most neighbours share; NaN for none.
+def known_of(
+    first: Seen, second: Seen, at_first: NDArray[np.int64], at_second: NDArray[np.int64], scale: Scale
+) -> Known:
+    """Return the displacements of linked particles."""
+    noise = first.covariance()[at_first, :3] + second.covariance()[at_second, :3]
+    smallest = (SMALLEST_SIGMA_LENSES * scale.lens_mm * of_equal_errors(scale)) ** 2
+    return Known(at_first, second.position_mm[at_second] - first.position_mm[at_first], noise + smallest)
 
-    Of displacements that nobody shares it is the shortest.
+
+def expected_of(
+    points: NDArray[np.float64], known: Known, search_mm: float, scale: Scale, forecast: Forecast | None = None
+) -> Expected:
+    """Return what the known displacements of the neighbours, and a particle's own past, let expect at points (n, 3).
+
+    A particle's own displacement takes no part in what is expected of it. The variance includes that of the place.
+    Where nothing is known, any displacement within the search is expected.
     """
-    equal = _of_equal_errors(scale)
-    alike = ALIKE_LENSES * scale.lens_mm
-    tree = KDTree(points_b / equal)
-    count = min(NEIGHBOURS + 1, len(points_a))
-    _, neighbours = KDTree(points_a).query(points_a, k=np.arange(1, count + 1))
-    chosen = KDTree(points_b).query_ball_point(points_a, search_mm, p=np.inf, return_sorted=True)
-    owner = np.repeat(np.arange(len(points_a)), [len(c) for c in chosen])
-    target = np.array([k for c in chosen for k in c], dtype=np.int64)
-    result = np.full(points_a.shape, np.nan)
-    if not target.size:
-        return result
-    candidate = points_b[target] - points_a[owner]
-    votes = np.zeros(len(owner))
-    for k in range(1, count):
-        at = (points_a[neighbours[owner, k]] + candidate) / equal
-        distance, _ = tree.query(at, distance_upper_bound=3.0 * alike)
-        votes += np.exp(-0.5 * (distance / alike) ** 2)
-    order = np.lexsort((np.linalg.norm(candidate / equal, axis=1), -votes, owner))
-    best = order[np.unique(owner[order], return_index=True)[1]]
-    result[owner[best]] = candidate[best]
-    return result
+    count = len(known.number)
+    value, variance = np.zeros(points.shape), np.full(points.shape, search_mm**2 / 3.0)
+    if count > 1:
+        own = np.full(len(points), -1)
+        own[known.number] = np.arange(count)
+        at = points[known.number]
+        structure = structure_of(at, known.displacement_mm, known.variance_mm2)
+        value, variance = kriged(points, own, at, known.displacement_mm, known.variance_mm2, structure)
+        if count < FEWEST_OF_FIT:
+            variance = variance + (FEW_SHARE * search_mm) ** 2 / count
+        # The place where a displacement ends is known as badly as the places of the neighbours' are.
+        variance = variance + np.median(known.variance_mm2, axis=0) + 0.5 * structure.nugget
+    if forecast is None:
+        return Expected(value, variance)
+    smallest = (SMALLEST_SIGMA_LENSES * scale.lens_mm * of_equal_errors(scale)) ** 2
+    past2 = forecast.sigma_mm**2 + smallest
+    weight = variance / (variance + past2)
+    has_past = np.isfinite(weight) & np.isfinite(forecast.displacement_mm)
+    return Expected(
+        np.where(has_past, value + weight * (forecast.displacement_mm - value), value),
+        np.where(has_past, weight * past2, variance),
+    )
 
 
-def _of_equal_errors(scale: Scale) -> NDArray[np.float64]:
+def probability_of(
+    candidates: Candidates, expected: Expected, first: Seen, second: Seen, share: float, density: float
+) -> NDArray[np.float64]:
+    """Return the probability (c,) that pairs are one particle.
+
+    Parameters
+    ----------
+    share : of the particles that have a partner
+    density : of the second frame's particles, per mm^3
+    """
+    covariance = first.covariance()[candidates.first] + second.covariance()[candidates.second]
+    matrix = covariance[:, [0, 3, 5, 3, 1, 4, 5, 4, 2]].reshape(-1, 3, 3).copy()
+    matrix[:, [0, 1, 2], [0, 1, 2]] += expected.variance_mm2[candidates.first]
+    off = candidates.displacement_mm - expected.displacement_mm[candidates.first]
+    near = np.flatnonzero(np.sum(off**2 / np.diagonal(matrix, axis1=1, axis2=2), axis=1) < FURTHEST_SIGMAS**2)
+    distance2 = np.einsum("ci,cij,cj->c", off[near], np.linalg.inv(matrix[near]), off[near])
+    height = 1.0 / np.sqrt((2.0 * np.pi) ** 3 * np.linalg.det(matrix[near]))
+    likely = height * (
+        (1.0 - TAIL_SHARE) * np.exp(-0.5 * distance2)
+        + TAIL_SHARE * np.exp(-0.5 * distance2 / TAIL_WIDTH**2) / TAIL_WIDTH**3
+    )
+    odds = share / (1.0 - share) * likely * candidates.light_ratio[near] / density
+    probability = np.zeros(len(off))
+    probability[near] = marginals(candidates.first[near], candidates.second[near], odds, (len(first), len(second)))
+    return probability
+
+
+def density_per_mm3(first: Seen, second: Seen, search_mm: float) -> float:
+    """Return the density of the second frame's particles in the box that holds both frames', no smaller than sought."""
+    both = np.concatenate([first.position_mm, second.position_mm])
+    return len(second) / float(np.prod(np.maximum(np.ptp(both, axis=0), 2.0 * search_mm)))
+
+
+def wrong_link_variance(probability: NDArray[np.float64], scale: Scale) -> NDArray[np.float64]:
+    """Return what is added to the variance (n, 3) of displacements, mm^2, for links being wrong by chance."""
+    off = WRONG_LENSES * scale.lens_mm * of_equal_errors(scale)
+    return (1.0 - probability)[:, np.newaxis] * off**2
+
+
+def of_equal_errors(scale: Scale) -> NDArray[np.float64]:
     """Return what distances (x, y, z) are divided by: as much more in depth as depths are known worse."""
     return np.array([1.0, 1.0, DEPTH_RATIO * scale.depth_ratio])
 
 
-def expected_displacement(
-    points: NDArray[np.float64], displacement: NDArray[np.float64], scale: Scale, forecast: Forecast | None
-) -> NDArray[np.float64]:
-    """Return the displacements (n, 3) that the known ones of the neighbours, and a particle's own past, let expect.
-
-    Where no other one is known, it is the particle's own: from its past, or else as it is.
-    """
-    by_neighbours = _by_neighbours(points, displacement, scale)
-    alone = np.isnan(by_neighbours)
+def _sought(
+    first: Seen, search_mm: float, scale: Scale, forecast: Forecast | None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return around which displacement (n, 3) and how far along each axis (n,) partners are sought."""
+    middle, reach = np.zeros(first.position_mm.shape), np.full(len(first), search_mm)
     if forecast is None:
-        return np.where(alone, displacement, by_neighbours)
-    off = displacement - by_neighbours
-    spread = _spread(off[np.isfinite(off[:, 0])], scale)
-    weight = spread**2 / (spread**2 + forecast.sigma_mm**2)
-    past = np.isfinite(weight)
-    expected = np.where(past, by_neighbours + weight * (forecast.displacement_mm - by_neighbours), by_neighbours)
-    return np.where(alone, np.where(past, forecast.displacement_mm, displacement), expected)
+        return middle, reach
+    has_past = np.isfinite(forecast.sigma_mm).all(axis=1) & np.isfinite(forecast.displacement_mm).all(axis=1)
+    middle[has_past] = forecast.displacement_mm[has_past]
+    wide = FORECAST_SIGMAS * forecast.sigma_mm[has_past].max(axis=1)
+    reach[has_past] = np.clip(wide, FORECAST_LENSES * scale.lens_mm, max(search_mm, FORECAST_LENSES * scale.lens_mm))
+    return middle, reach
 
 
-def _by_neighbours(points: NDArray[np.float64], displacement: NDArray[np.float64], scale: Scale) -> NDArray[np.float64]:
-    """Return at each point the displacement that a robust local fit through the known ones gives; NaN for none.
-
-    A particle's own displacement takes no part in what is expected of it. The fit is linear, a mean where fewer than
-    `FEWEST_OF_FIT` others are known.
-    """
-    known = np.flatnonzero(np.isfinite(displacement[:, 0]))
-    if not known.size:
-        return np.full(points.shape, np.nan)
-    count = min(FIT_TRACKS + 1, len(known))
-    distance, near = KDTree(points[known]).query(points, k=np.arange(1, count + 1))
-    near = known[near]
-    own = near == np.arange(len(points))[:, np.newaxis]
-    alone = own.all(axis=1)
-    # A line through one's own displacement alone is what it takes to go on; it is dropped at the end.
-    own[alone] = False
-    offset = points[near] - points[:, np.newaxis]
-    design = np.concatenate([np.ones((*near.shape, 1)), offset], axis=2)
-    if count <= FEWEST_OF_FIT:
-        design[..., 1:] = 0.0
-    values = displacement[near]
-    middle = np.median(values, axis=1, keepdims=True)
-    for _ in range(3):
-        off = np.linalg.norm((values - middle) / _of_equal_errors(scale), axis=2)
-        spread = np.maximum(MAD_TO_SIGMA * np.median(off, axis=1, keepdims=True), _smallest_spread_mm(scale))
-        weight = np.where(own, 0.0, 1.0 / (1.0 + (off / spread) ** 2) ** 2)
-        weighted = (design * weight[..., np.newaxis]).swapaxes(1, 2)
-        matrix = weighted @ design
-        # A share of the trace on the slopes' diagonal: neighbours in a plane do not determine the slope across it.
-        ridge = 1e-3 * np.mean(distance**2, axis=1)[:, np.newaxis] * weight.sum(axis=1, keepdims=True)
-        matrix[:, [1, 2, 3], [1, 2, 3]] += np.where(ridge > 0.0, ridge, 1.0)
-        fitted = np.linalg.solve(matrix, weighted @ values)
-        middle = design @ fitted
-    return np.where(alone[:, np.newaxis], np.nan, fitted[:, 0])
+def _log_near(candidates: Candidates, search_mm: float, forecast: Forecast | None) -> NDArray[np.float64]:
+    """Return what is added to the votes (c,): short displacements, or those near a forecast, where nobody votes."""
+    off = candidates.displacement_mm
+    if forecast is not None:
+        off = off - np.nan_to_num(forecast.displacement_mm)[candidates.first]
+    return np.asarray(-0.5 * np.sum((off / search_mm) ** 2, axis=1))
 
 
-def gate_mm(residual: NDArray[np.float64], search_mm: float, scale: Scale) -> float:
-    """Return how far from its expected place a particle is sought: some robust deviations of the last round's.
-
-    The mean of few neighbours misses what distinguishes their motions, which may be all that is sought; and few do not
-    show how far they deviate.
-    """
-    known, wide = residual[np.isfinite(residual[:, 0])], 3.0 * ALIKE_LENSES * scale.lens_mm
-    if not len(known):
-        return wide
-    least, most = 2.0 * _smallest_spread_mm(scale), wide
-    if len(known) <= FEWEST_OF_FIT:
-        least, most = wide, max(wide, search_mm)
-    spread = MAD_TO_SIGMA * float(np.median(np.linalg.norm(known / _of_equal_errors(scale), axis=1)))
-    return min(max(OUTLIER_SIGMAS * spread, least), most)
+def _exclusive(candidates: Candidates, score: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return each first particle's best pair, and of those that share a second one the best."""
+    order = np.lexsort((-score, candidates.first))
+    best = order[np.unique(candidates.first[order], return_index=True)[1]]
+    best = best[np.isfinite(score[best])]
+    order = best[np.argsort(-score[best], kind="stable")]
+    return np.sort(order[np.unique(candidates.second[order], return_index=True)[1]])
 
 
-def mutual(
-    expected: NDArray[np.float64], points: NDArray[np.float64], gate_mm: float, scale: Scale
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the pairs that are nearest to each other, within the gate; particles with NaN expect to be nowhere."""
-    equal, expecting = _of_equal_errors(scale), np.flatnonzero(np.isfinite(expected[:, 0]))
-    if not expecting.size:
-        return expecting, expecting
-    forward, to = KDTree(points / equal).query(expected[expecting] / equal)
-    _, back = KDTree(expected[expecting] / equal).query(points / equal)
-    first = np.flatnonzero((back[to] == np.arange(len(expecting))) & (forward <= gate_mm))
-    return expecting[first], to[first]
-
-
-def _outliers(residual: NDArray[np.float64], scale: Scale) -> NDArray[np.bool_]:
-    """Return which residuals (n, 3) lie far outside the others', component by component."""
-    return np.any(np.abs(residual) > OUTLIER_SIGMAS * _spread(residual, scale), axis=1)
-
-
-def _spread(residual: NDArray[np.float64], scale: Scale) -> NDArray[np.float64]:
-    """Return the robust standard deviation (3,) of residuals (n, 3), no smaller than particles are known."""
-    if not len(residual):
-        return np.full(3, _smallest_spread_mm(scale))
-    return np.maximum(MAD_TO_SIGMA * np.median(np.abs(residual), axis=0), _smallest_spread_mm(scale))
-
-
-def _smallest_spread_mm(scale: Scale) -> float:
-    return SMALLEST_SPREAD_LENSES * scale.lens_mm
+def _calibrated(expected: Expected, known: Known) -> Expected:
+    """Return what is expected with variances that the residuals of the known displacements bear out."""
+    if len(known.number) < FEWEST_OF_FIT:
+        return expected
+    off = known.displacement_mm - expected.displacement_mm[known.number]
+    ratio = np.abs(off) / np.sqrt(expected.variance_mm2[known.number])
+    factor = np.maximum(MAD_TO_SIGMA * np.median(ratio, axis=0), SMALLEST_FACTOR)
+    return Expected(expected.displacement_mm, expected.variance_mm2 * factor**2)
