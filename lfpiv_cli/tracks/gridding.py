@@ -1,4 +1,4 @@
-"""Scattered tracks interpolated to vectors on a grid: local polynomials whose degree and reach follow the tracks.
+"""Scattered tracks interpolated to vectors on a grid: by local polynomials in smooth flows, by kriging in rough ones.
 
 A wide fit has little noise and misses what the flow does within its reach; a narrow one is the other way round. Which
 is better depends on the tracks' density and errors and on the flow, and differs from component to component: depth is
@@ -6,6 +6,9 @@ noise, the streamwise component shear. The noise of a fit is known from its trac
 differences of fits, less the noise of these: among parabolas it grows with the cube of the radius, and a line misses
 what distinguishes it from a parabola. Each component of a node takes the fit whose error, of both kinds, is the
 smallest, and states it.
+
+In turbulence neighbours' displacements differ by more than any polynomial through them could tell. Where the structure
+function of the tracks shows that, kriging gives the best linear combination of the nearest ones, and what it misses.
 
 Axes: points (n, 3) and displacements in mm, at the middle of each track.
 """
@@ -19,7 +22,8 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from scipy.special import chdtr, gammaincinv
 
-from lfpiv_cli.tracks.local_fits import LocalFits, fit_around
+from lfpiv_cli.tracks.kriging import kriged, structure_of
+from lfpiv_cli.tracks.local_fits import SMALLEST_SIGMA_SHARE, LocalFits, fit_around
 
 # Degrees and numbers of tracks to choose from: three to ten tracks for each of ten unknowns, five to fifteen for each
 # of four. The first one, whose noise and what it misses are both moderate, is what the others are compared with.
@@ -35,6 +39,11 @@ NODES_TOGETHER = 27
 TRIMMED = 0.15
 # A fit further from the middle one of all than so many of its errors is an outlier, whatever it states.
 LARGEST_DEVIATION = 4.0
+# The structure function of a smooth flow goes with the square of the distance. One that goes with less than this power,
+# and by which neighbours' displacements differ more than by their errors, is that of a rough flow.
+ROUGH_EXPONENT = 1.7
+# Tracks that show a structure function.
+FEWEST_OF_STRUCTURE = 100
 # Nodes that are worked on at a time, which bounds the memory: some 100 MB.
 NODES_AT_ONCE = 2000
 
@@ -81,6 +90,10 @@ def on_grid(
     reached = np.flatnonzero(tree.query(nodes_mm, k=[NEEDED_TRACKS])[0][:, 0] <= reach_mm)
     if not reached.size:
         return value, error
+    rough = _by_kriging(middle_mm, displacement_mm, sigma_mm, nodes_mm[reached])
+    if rough is not None:
+        value[reached], error[reached] = rough
+        return value, error
     choices = [(degree, count) for degree, count in CHOICES if count <= len(middle_mm)]
     if len(middle_mm) < CHOICES[WIDER][1]:
         # Too few for two fits to differ: all of them in one.
@@ -93,6 +106,27 @@ def on_grid(
         parts.append(_candidates(offset, displacement_mm[near], sigma_mm[near], choices))
     value[reached], error[reached] = _best(_joined(parts), nodes_mm[reached], choices)
     return value, error
+
+
+def _by_kriging(
+    middle_mm: NDArray[np.float64],
+    displacement_mm: NDArray[np.float64],
+    sigma_mm: NDArray[np.float64],
+    nodes_mm: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """Return displacements and standard errors (m, 3) at nodes; None in a smooth flow."""
+    if len(middle_mm) < FEWEST_OF_STRUCTURE:
+        return None
+    smallest = SMALLEST_SIGMA_SHARE * float(np.ptp(middle_mm, axis=0).max())
+    noise2 = np.maximum(sigma_mm, smallest) ** 2
+    structure = structure_of(middle_mm, displacement_mm, noise2)
+    apart = float(np.median(KDTree(middle_mm).query(middle_mm, k=[2])[0]))
+    by_errors = structure.nugget + 2.0 * np.median(noise2, axis=0)
+    if structure.exponent >= ROUGH_EXPONENT or np.all(structure.at(apart) < by_errors):
+        return None
+    nobody = np.full(len(nodes_mm), -1)
+    value, variance = kriged(nodes_mm, nobody, middle_mm, displacement_mm, noise2, structure)
+    return value, np.sqrt(variance)
 
 
 def _candidates(

@@ -1,0 +1,175 @@
+"""Links in turbulence: what light and the flow's structure tell, probabilities that come true, and their parts."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lfpiv_cli.scale import Scale
+from lfpiv_cli.synthetic.flows import advect, random_modes
+from lfpiv_cli.tracks.association import marginals
+from lfpiv_cli.tracks.candidates import Candidates, Seen, light_ratio
+from lfpiv_cli.tracks.gridding import on_grid
+from lfpiv_cli.tracks.kriging import Structure, kriged, structure_of
+from lfpiv_cli.tracks.tracking import track
+from lfpiv_cli.tracks.votes import ALONE, LEAST_LIGHT_RATIO, NEIGHBOURS, REACH, WIDTHS_LENSES, votes
+
+# Table 2's camera, the paper's seeding: 8 particles per mm^3, half a millimetre apart.
+SCALE = Scale(0.1, 1.064)
+SIDE_MM, DENSITY, DT_S = 5.0, 8.0, 1e-3
+SIGMA_MM = np.array([0.001, 0.001, 0.01])
+SEARCH_MM = 0.7
+
+
+def turbulent(seed: int, recall: float = 0.95, ghosts: float = 0.05) -> tuple[Seen, Seen, NDArray, NDArray]:
+    """Return two frames of turbulence, 0.15 mm rms, and of each particle its true number, below 0 for ghosts.
+
+    The light of tracers spreads by 29 % and that of one tracer by 2 % from frame to frame; the second is 20 % brighter.
+    """
+    rng = np.random.default_rng([seed, 7])
+    flow, half = random_modes(0.15, seed=seed), 0.5 * SIDE_MM
+    start = rng.uniform(-half - 1.0, half + 1.0, (round(DENSITY * (SIDE_MM + 2.0) ** 3), 3))
+    light = np.exp(rng.normal(0.0, 0.29, len(start)))
+    seen, numbers = [], []
+    for time_s, bright in ((-0.5 * DT_S, 1.0), (0.5 * DT_S, 1.2)):
+        places = advect(flow, start, time_s)
+        there = np.flatnonzero(np.all(np.abs(places) < half, axis=1) & (rng.uniform(size=len(places)) < recall))
+        count = round(ghosts * len(there))
+        found = places[there] + rng.normal(0.0, SIGMA_MM, (len(there), 3))
+        position = np.concatenate([found, rng.uniform(-half, half, (count, 3))])
+        own = np.concatenate([light[there] * rng.normal(1.0, 0.02, len(there)), rng.uniform(0.2, 0.8, count)])
+        order = rng.permutation(len(position))
+        covariance = np.tile([*SIGMA_MM**2, 0.0, 0.0, 0.0], (len(position), 1))
+        seen.append(Seen(position[order], covariance, bright * own[order]))
+        numbers.append(np.concatenate([there, np.full(count, -1)])[order])
+    return seen[0], seen[1], numbers[0], numbers[1]
+
+
+def dark(seen: Seen) -> Seen:
+    """Return particles whose light is not known."""
+    return Seen(seen.position_mm, seen.covariance_mm2)
+
+
+@pytest.mark.parametrize(("with_light", "least", "most_wrong"), [(True, 0.985, 0.01), (False, 0.95, 0.03)])
+def test_links_hold_in_turbulence(with_light: bool, least: float, most_wrong: float) -> None:
+    """Displacements of up to 0.6 mm, neighbours 0.5 mm apart whose displacements differ by half of their own."""
+    right, wrong, expected, both = 0, 0, 0.0, 0
+    for seed in (1, 2):
+        first, second, number_a, number_b = turbulent(seed)
+        links = track(*((first, second) if with_light else (dark(first), dark(second))), SEARCH_MM, SCALE)
+        is_right = (number_a[links.first] == number_b[links.second]) & (number_a[links.first] >= 0)
+        right, wrong = right + int(is_right.sum()), wrong + int((~is_right).sum())
+        expected += float(np.sum(1.0 - links.probability))
+        both += len(np.intersect1d(number_a[number_a >= 0], number_b))
+    assert right > least * both
+    assert wrong < most_wrong * (right + wrong)
+    # The expected share of wrong links is right within two points.
+    assert abs(expected - wrong) < 0.02 * (right + wrong)
+
+
+def test_ambiguous_links_are_not_made() -> None:
+    """One particle, two candidates alike in all: neither is more likely than not."""
+    first, second = Seen(np.zeros((1, 3))), Seen(np.array([[0.1, 0.0, 0.0], [-0.1, 0.0, 0.0]]))
+    assert len(track(first, second, 0.4, SCALE).first) == 0
+    assert len(track(first, Seen(second.position_mm[:1]), 0.4, SCALE).first) == 1
+
+
+def test_probabilities_are_those_of_all_exclusive_choices(rng: np.random.Generator) -> None:
+    """Three particles and three, all pairs possible, against every way to choose."""
+    first, second = (each.ravel() for each in np.meshgrid(np.arange(3), np.arange(3), indexing="ij"))
+    odds = np.exp(rng.normal(0.0, 2.0, 9))
+    total, of_pair = 0.0, np.zeros(9)
+    for chosen in product((False, True), repeat=9):
+        some = np.flatnonzero(chosen)
+        if np.unique(first[some]).size == len(some) == np.unique(second[some]).size:
+            weight = np.prod(odds[some])
+            total += weight
+            of_pair[some] += weight
+    # Belief propagation is near the sum over all choices where pairs form loops ...
+    np.testing.assert_allclose(marginals(first, second, odds, (3, 3)), of_pair / total, atol=0.06)
+    # ... and exact where they form none: one particle with three candidates, of which one has another suitor.
+    first, second, odds = np.array([0, 0, 0, 1]), np.array([0, 1, 2, 2]), np.array([2.0, 1.0, 3.0, 5.0])
+    ways = 1.0 + 2.0 + 1.0 + 3.0 + 5.0 + 2.0 * 5.0 + 1.0 * 5.0
+    exact = np.array([2.0 + 10.0, 1.0 + 5.0, 3.0, 5.0 + 10.0 + 5.0]) / ways
+    np.testing.assert_allclose(marginals(first, second, odds, (2, 3)), exact, atol=1e-5)
+
+
+def test_light_that_stays_tells_partners(rng: np.random.Generator) -> None:
+    light = np.exp(rng.normal(0.0, 0.3, 400))
+    owner = np.repeat(np.arange(400), 20)
+    target = (owner + rng.integers(1, 400, len(owner))) % 400
+    target[::20] = np.arange(400)
+    later = 1.3 * light * rng.normal(1.0, 0.02, 400)
+    ratio = light_ratio(light, later, owner, target).reshape(400, 20)
+    # The peak of partners is 0.02 wide on a background of 0.3 * sqrt(2): where it stands it is twenty times as high.
+    assert np.median(ratio[:, 0]) > 8.0
+    assert np.median(ratio[:, 1:]) < 0.1
+    # Light that changes from frame to frame tells nothing.
+    np.testing.assert_array_equal(light_ratio(light, rng.permutation(light), owner, target), 1.0)
+    assert np.all(light_ratio(light, None, owner, target) == 1.0)
+
+
+def test_votes_are_the_sums_that_they_say(rng: np.random.Generator) -> None:
+    points, equal = rng.uniform(0.0, 2.0, (30, 3)), np.array([1.0, 1.0, 4.0])
+    first = np.sort(rng.integers(0, 30, 90))
+    displacement, ratio = rng.normal(0.0, 0.1, (90, 3)), rng.uniform(0.0, 2.0, 90)
+    ratio[::9] = 0.5 * LEAST_LIGHT_RATIO
+    found = votes(points, Candidates(first, first, displacement, ratio), 5.0, SCALE, equal)
+    taken = ratio > LEAST_LIGHT_RATIO
+    for c in range(90):
+        order = np.argsort(np.linalg.norm(points - points[first[c]], axis=1))[1 : NEIGHBOURS + 1]
+        support = 0.0
+        for neighbour in order:
+            alike = 0.0
+            for other in np.flatnonzero((first == neighbour) & taken):
+                off2 = np.sum(((displacement[other] - displacement[c]) / equal) ** 2)
+                for width in WIDTHS_LENSES:
+                    sigma = width * SCALE.lens_mm
+                    height = 1.0 / ((2.0 * np.pi) ** 1.5 * sigma**3 * 4.0 * len(WIDTHS_LENSES) * 5.0)
+                    near = off2 < (REACH * WIDTHS_LENSES[-1] * SCALE.lens_mm) ** 2
+                    alike += near * ratio[other] * height * np.exp(-0.5 * off2 / sigma**2)
+            support += np.log(ALONE + (1.0 - ALONE) * alike)
+        assert found[c] == (pytest.approx(support + np.log(ratio[c]), rel=1e-12) if taken[c] else -np.inf)
+
+
+def test_kriging_takes_a_linear_flow_exactly_and_states_what_it_misses(rng: np.random.Generator) -> None:
+    points, at = rng.uniform(0.0, 4.0, (400, 3)), rng.uniform(0.5, 3.5, (50, 3))
+    slope = rng.normal(size=(3, 3))
+    structure = Structure(np.zeros(3), np.full(3, 0.01), 2.0 / 3.0)
+    value, _ = kriged(at, np.full(50, -1), points, points @ slope, np.full((400, 3), 1e-6), structure)
+    np.testing.assert_allclose(value, at @ slope, atol=1e-9)
+    # Its own displacement takes no part in what is expected of a particle.
+    values = points @ slope
+    values[7] += 1.0
+    value, _ = kriged(points[7:8], np.array([7]), points, values, np.full((400, 3), 1e-6), structure)
+    np.testing.assert_allclose(value, points[7:8] @ slope, atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_the_structure_of_turbulence_is_found_and_errors_are_stated(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    # 3,000 tracks a millimetre apart, between the longest and the shortest wave
+    flow = random_modes(0.15, shortest_mm=0.2, seed=seed)
+    points = rng.uniform(0.0, 14.4, (3000, 3))
+    sigma = np.full(points.shape, 0.003)
+    moved = flow(points) + rng.normal(0.0, sigma)
+    structure = structure_of(points, moved, sigma**2)
+    assert 0.4 <= structure.exponent <= 1.0  # 2/3 in the inertial range
+    nodes = rng.uniform(1.0, 13.4, (500, 3))
+    value, error = on_grid(points, moved, sigma, nodes, 4.0)
+    covered = np.mean(np.abs(value - flow(nodes)) < 1.96 * error, axis=0)
+    # 500 nodes: 1 % each way, and neighbours share tracks
+    assert np.all(covered > 0.88)
+    assert np.all(covered < 0.985)
+
+
+def test_noise_is_not_taken_for_turbulence(rng: np.random.Generator) -> None:
+    """A uniform flow, whose differences are errors alone, keeps its wide fits."""
+    points = rng.uniform(0.0, 5.0, (1000, 3))
+    sigma = np.broadcast_to(SIGMA_MM, points.shape)
+    value, error = on_grid(points, 0.3 + rng.normal(0.0, sigma), sigma, rng.uniform(1.0, 4.0, (100, 3)), 4.0)
+    assert np.all(np.sqrt(np.mean((value - 0.3) ** 2, axis=0)) < 0.4 * SIGMA_MM)
+    assert np.all(np.median(error, axis=0) < 0.5 * SIGMA_MM)
