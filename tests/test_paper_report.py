@@ -150,8 +150,12 @@ def test_what_is_made_is_kept(parts, tmp_path) -> None:
         validate_paper(tmp_path, TINY, console=QUIET)
     parts["fails"] = False
     resumed = replace(TINY, resume=True)
+    # what is kept is told with the time that it took
+    piece = tmp_path / "work" / "table1" / "piece.json"
+    piece.write_text(json.dumps(json.loads(piece.read_text()) | {"seconds": 5000.0}))
     validate_paper(tmp_path, resumed, console=QUIET)
     assert (parts["table1"], parts["step"]) == (2, 1)
+    assert "This part took 83 min" in (tmp_path / "report.md").read_text(encoding="utf-8")
     validate_paper(tmp_path, resumed, console=QUIET)
     assert (parts["table1"], parts["step"]) == (2, 1)
     # another size is another report; without resuming all is made anew

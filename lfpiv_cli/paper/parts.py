@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
@@ -98,6 +99,7 @@ class Work:
     folder : of the part alone, below that of the report
     made : what a kept result must have been made with to be used again
     resume : use what is kept
+    spared : how long, in seconds, what was kept had taken; each step adds to it
     """
 
     folder: Path
@@ -105,6 +107,7 @@ class Work:
     console: Console
     made: Mapping[str, Any]
     resume: bool = False
+    spared: list[float] = field(default_factory=list)
 
     def by_size(self, tiny: Value, quick: Value, full: Value) -> Value:
         """Return the value for the size."""
@@ -120,17 +123,25 @@ class Work:
     def step(self, name: str, make: Callable[[], Mapping[str, Any]]) -> dict[str, Any]:
         """Return what `make` gives, as JSON has it; kept, so that interrupted work goes on from there."""
         path = self.folder / f"{name}.json"
-        return kept(path, self.made, self.resume, make)
+        begun = time.monotonic()
+        result, seconds = kept(path, self.made, self.resume, make)
+        self.spared.append(max(seconds - (time.monotonic() - begun), 0.0))
+        return result
 
 
-def kept(path: Path, made: Mapping[str, Any], resume: bool, make: Callable[[], Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the result in a file that was made alike, or make it and write the file."""
+def kept(
+    path: Path, made: Mapping[str, Any], resume: bool, make: Callable[[], Mapping[str, Any]]
+) -> tuple[dict[str, Any], float]:
+    """Return the result in a file that was made alike, or make it and write the file; and how long it took, s."""
     if resume and path.exists():
         found = read_json(path)
         if found.get("made") == made:
-            return dict(found["result"])
-    write_json(path, {"result": make(), "made": made}, overwrite=True)
-    return dict(read_json(path)["result"])
+            return dict(found["result"]), float(found.get("seconds", 0.0))
+    begun = time.monotonic()
+    result = make()
+    write_json(path, {"result": result, "seconds": time.monotonic() - begun, "made": made}, overwrite=True)
+    found = read_json(path)
+    return dict(found["result"]), float(found["seconds"])
 
 
 def read_json(path: Path) -> dict[str, Any]:

@@ -89,7 +89,7 @@ def _made(name: PaperPart, work: Work) -> dict[str, Any]:
     """Make a part, write its pictures and return the rest as plain data."""
     begun = time.monotonic()
     found = PARTS[name].find(work)
-    seconds = time.monotonic() - begun
+    seconds = time.monotonic() - begun + sum(work.spared)
     pictures = []
     for drawing in found.drawings:
         path = work.folder.parents[1] / "pictures" / f"{name}_{drawing.name}.png"
