@@ -150,31 +150,6 @@ def make_columns(
     return columns
 
 
-def counted_both_ways(
-    camera: Camera,
-    space: ObjectSpace,
-    centres_mm: NDArray[np.float64],
-    voxel_mm: tuple[float, float, float],
-    rng: np.random.Generator,
-    count: RayCount = PAPERS_COUNT,
-) -> list[dict[str, float]]:
-    """Return for each voxel how rays counted from equivalent points compare with rays traced through the layers.
-
-    As the paper did it: paraxial refraction both times, random points and directions of their own.
-    """
-    points, sides = camera.to_image_axes(centres_mm), camera.to_image_axes(np.asarray(voxel_mm))
-    traced, equivalent = (replace(space, refraction="paraxial", method=method) for method in ("drt", "ert"))
-    compared = []
-    for point in points:
-        images = {
-            "drt": count_rays(camera, traced, point, sides, rng, count),
-            "ert": count_rays(camera, equivalent, point, sides, rng, count),
-        }
-        cut = _cut(images)
-        compared.append(compare_columns(cut["drt"], cut["ert"]))
-    return compared
-
-
 def weights_figures(columns: list[Column], long_count: NDArray[np.int64]) -> dict[str, Any]:
     """Return for each comparison the mean and the worst of SSIM, RMSE and L1, and the figures of each voxel."""
     voxels = []
