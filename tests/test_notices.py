@@ -36,7 +36,7 @@ from lfpiv_cli.files.particle_file import Points
 from lfpiv_cli.files.provenance import earlier_record, with_warnings
 from lfpiv_cli.files.weights_file import open_weights
 from lfpiv_cli.interface.particles import light_notices
-from lfpiv_cli.interface.tracks import Tracked, few_notices, still_notices
+from lfpiv_cli.interface.tracks import Tracked, doubt_notices, few_notices, still_notices
 from lfpiv_cli.interface.weights import plan_of
 from lfpiv_cli.interface.weights_cost import cost_notices, cost_of
 from lfpiv_cli.notice import Notice
@@ -364,8 +364,33 @@ def test_one_image_twice_is_told_of_its_tracks() -> None:
     ("counts", "linked", "told"), [((60, 50), 40, []), ((60, 50), 20, ["few-links"]), ((5, 5), 2, ["few-particles"])]
 )
 def test_few_links_are_told_where_particles_are_many(counts: tuple[int, int], linked: int, told: list[str]) -> None:
-    found = Tracked(tracks(1e-3), "", [], {"tracks": linked}, load_config(ROOT / "configs" / "sample.yaml"))
+    found = Tracked(
+        tracks(1e-3),
+        "",
+        [],
+        {"tracks": linked, "expected_wrong_links": 0.0},
+        load_config(ROOT / "configs" / "sample.yaml"),
+    )
     assert [notice.code for notice in few_notices(counts, ("a", "b"), found)] == told
+
+
+@pytest.mark.parametrize(
+    ("summary", "told"),
+    [
+        ({"tracks": 100, "expected_wrong_links": 4.9}, []),
+        ({"tracks": 100, "expected_wrong_links": 5.1}, ["wrong-links"]),
+        ({"tracks": 0, "expected_wrong_links": 0.0}, []),
+        # a track of five places has four links
+        ({"tracks": 20, "tracked": 100, "expected_wrong_links": 3.9, "noise_over_stated": [1.3, 2.9, 1.0]}, []),
+        ({"tracks": 20, "tracked": 100, "expected_wrong_links": 4.1, "noise_over_stated": None}, ["wrong-links"]),
+        (
+            {"tracks": 20, "tracked": 100, "expected_wrong_links": 0.0, "noise_over_stated": [6.4, 1, 1]},
+            ["tracks-bend"],
+        ),
+    ],
+)
+def test_doubtful_links_and_bent_tracks_are_told(summary: dict[str, Any], told: list[str]) -> None:
+    assert [notice.code for notice in doubt_notices(summary, "a")] == told
 
 
 def test_few_points_of_a_board_are_told() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,6 +29,10 @@ ONE_SIDED = 0.5
 FEW = FEWEST_OF_FIT + 2
 # Of good pairs four in five particles or more are linked; of unrelated images chance links three in ten.
 LEAST_LINKED = 0.5
+# The share of probably wrong links above which vectors of single tracks are in doubt.
+MOST_WRONG = 0.05
+# Particles' places scatter by one to two stated errors about smooth paths; what is more is the flow's.
+LARGEST_NOISE = 3.0
 # Displacements of still particles differ from 0 by a standard error along one axis or another, by chance.
 STILL_SIGMAS = 0.05
 
@@ -219,7 +223,39 @@ def few_notices(counts: Sequence[int], names: Sequence[str], found: Tracked) -> 
                 "some",
             )
         )
-    return notices + still_notices(found.points, names[0])
+    return notices + doubt_notices(found.summary, names[0]) + still_notices(found.points, names[0])
+
+
+def doubt_notices(summary: Mapping[str, Any], name: str) -> list[Notice]:
+    """Return what is said where many links are probably wrong, and where tracks bend more than fits in time follow."""
+    notices, links = [], summary["tracks"]
+    if "tracked" in summary:
+        links = summary["tracked"] - summary["tracks"]
+    wrong = summary["expected_wrong_links"] / links if links else 0.0
+    if wrong > MOST_WRONG:
+        notices.append(
+            Notice(
+                "wrong-links",
+                name,
+                f"{wrong:.0%} of the links are probably wrong, by their alternatives",
+                "a shorter time between the images, fewer tracers, or larger windows and correlate",
+                wrong,
+                f"at most {MOST_WRONG:g}",
+            )
+        )
+    noise = summary.get("noise_over_stated")
+    if noise is not None and max(noise) > LARGEST_NOISE:
+        notices.append(
+            Notice(
+                "tracks-bend",
+                name,
+                f"places lie {max(noise):.1f} times their stated errors off parabolas in time, which velocities are of",
+                "a shorter time between the frames; or believe stated errors of velocities only where tracks are long",
+                max(noise),
+                f"at most {LARGEST_NOISE:g}",
+            )
+        )
+    return notices
 
 
 def still_notices(tracks: Points, name: str) -> list[Notice]:
