@@ -13,6 +13,7 @@ from benchmarks.calibration import bench_calibration
 from benchmarks.correlation import bench_correlation, bench_correlation_accuracy
 from benchmarks.depth import bench_depth
 from benchmarks.faults import bench_faults
+from benchmarks.links import bench_links
 from benchmarks.particles import bench_particles, bench_particles_thrice
 from benchmarks.rigs import bench_rigs
 from benchmarks.simd import bench_simd
@@ -25,6 +26,7 @@ BENCHMARKS: dict[str, Callable[[], None]] = {
     "correlation-accuracy": bench_correlation_accuracy,
     "depth": bench_depth,
     "faults": bench_faults,
+    "links": bench_links,
     "particles": bench_particles,
     "particles-thrice": bench_particles_thrice,
     "rigs": bench_rigs,

@@ -6,10 +6,9 @@ from itertools import product
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from lfpiv_cli.scale import Scale
-from lfpiv_cli.synthetic.flows import advect, random_modes
+from benchmarks.links import SCALE, Turbulence, shares
+from lfpiv_cli.synthetic.flows import random_modes
 from lfpiv_cli.tracks.association import marginals
 from lfpiv_cli.tracks.candidates import Candidates, Seen, light_ratio
 from lfpiv_cli.tracks.gridding import on_grid
@@ -17,57 +16,20 @@ from lfpiv_cli.tracks.kriging import Structure, kriged, structure_of
 from lfpiv_cli.tracks.tracking import track
 from lfpiv_cli.tracks.votes import ALONE, LEAST_LIGHT_RATIO, NEIGHBOURS, REACH, WIDTHS_LENSES, votes
 
-# Table 2's camera, the paper's seeding: 8 particles per mm^3, half a millimetre apart.
-SCALE = Scale(0.1, 1.064)
-SIDE_MM, DENSITY, DT_S = 5.0, 8.0, 1e-3
-SIGMA_MM = np.array([0.001, 0.001, 0.01])
-SEARCH_MM = 0.7
-
-
-def turbulent(seed: int, recall: float = 0.95, ghosts: float = 0.05) -> tuple[Seen, Seen, NDArray, NDArray]:
-    """Return two frames of turbulence, 0.15 mm rms, and of each particle its true number, below 0 for ghosts.
-
-    The light of tracers spreads by 29 % and that of one tracer by 2 % from frame to frame; the second is 20 % brighter.
-    """
-    rng = np.random.default_rng([seed, 7])
-    flow, half = random_modes(0.15, seed=seed), 0.5 * SIDE_MM
-    start = rng.uniform(-half - 1.0, half + 1.0, (round(DENSITY * (SIDE_MM + 2.0) ** 3), 3))
-    light = np.exp(rng.normal(0.0, 0.29, len(start)))
-    seen, numbers = [], []
-    for time_s, bright in ((-0.5 * DT_S, 1.0), (0.5 * DT_S, 1.2)):
-        places = advect(flow, start, time_s)
-        there = np.flatnonzero(np.all(np.abs(places) < half, axis=1) & (rng.uniform(size=len(places)) < recall))
-        count = round(ghosts * len(there))
-        found = places[there] + rng.normal(0.0, SIGMA_MM, (len(there), 3))
-        position = np.concatenate([found, rng.uniform(-half, half, (count, 3))])
-        own = np.concatenate([light[there] * rng.normal(1.0, 0.02, len(there)), rng.uniform(0.2, 0.8, count)])
-        order = rng.permutation(len(position))
-        covariance = np.tile([*SIGMA_MM**2, 0.0, 0.0, 0.0], (len(position), 1))
-        seen.append(Seen(position[order], covariance, bright * own[order]))
-        numbers.append(np.concatenate([there, np.full(count, -1)])[order])
-    return seen[0], seen[1], numbers[0], numbers[1]
-
-
-def dark(seen: Seen) -> Seen:
-    """Return particles whose light is not known."""
-    return Seen(seen.position_mm, seen.covariance_mm2)
+# The paper's seeding in a corner of its volume: particles half a millimetre apart.
+SMALL = Turbulence(side_mm=5.0)
+SIGMA_MM = np.array(SMALL.sigma_mm)
 
 
 @pytest.mark.parametrize(("with_light", "least", "most_wrong"), [(True, 0.985, 0.01), (False, 0.95, 0.03)])
 def test_links_hold_in_turbulence(with_light: bool, least: float, most_wrong: float) -> None:
     """Displacements of up to 0.6 mm, neighbours 0.5 mm apart whose displacements differ by half of their own."""
-    right, wrong, expected, both = 0, 0, 0.0, 0
     for seed in (1, 2):
-        first, second, number_a, number_b = turbulent(seed)
-        links = track(*((first, second) if with_light else (dark(first), dark(second))), SEARCH_MM, SCALE)
-        is_right = (number_a[links.first] == number_b[links.second]) & (number_a[links.first] >= 0)
-        right, wrong = right + int(is_right.sum()), wrong + int((~is_right).sum())
-        expected += float(np.sum(1.0 - links.probability))
-        both += len(np.intersect1d(number_a[number_a >= 0], number_b))
-    assert right > least * both
-    assert wrong < most_wrong * (right + wrong)
-    # The expected share of wrong links is right within two points.
-    assert abs(expected - wrong) < 0.02 * (right + wrong)
+        right, wrong, expected = shares(SMALL, seed, with_light)
+        assert right > least
+        assert wrong < most_wrong
+        # The expected share of wrong links is right within two points.
+        assert abs(expected - wrong) < 0.02
 
 
 def test_ambiguous_links_are_not_made() -> None:
