@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from scipy.special import chdtr, gammaincinv
 
+from lfpiv_cli.robust import MAD_TO_SIGMA
 from lfpiv_cli.tracks.kriging import kriged, structure_of
 from lfpiv_cli.tracks.local_fits import SMALLEST_SIGMA_SHARE, LocalFits, fit_around
 
@@ -41,7 +42,11 @@ TRIMMED = 0.15
 LARGEST_DEVIATION = 4.0
 # The structure function of a smooth flow goes with the square of the distance. One that goes with less than this power,
 # and by which neighbours' displacements differ more than by their errors, is that of a rough flow.
-ROUGH_EXPONENT = 1.7
+ROUGH_EXPONENT = 1.75
+# Tracks further off what the others let expect are outliers.
+OUTLIER_SIGMAS, OUTLIER_ROUNDS = 4.0, 3
+# So many tracks around a node show how large errors are there.
+TRACKS_AROUND = 40
 # Tracks that show a structure function.
 FEWEST_OF_STRUCTURE = 100
 # Nodes that are worked on at a time, which bounds the memory: some 100 MB.
@@ -124,9 +129,22 @@ def _by_kriging(
     by_errors = structure.nugget + 2.0 * np.median(noise2, axis=0)
     if structure.exponent >= ROUGH_EXPONENT or np.all(structure.at(apart) < by_errors):
         return None
-    nobody = np.full(len(nodes_mm), -1)
-    value, variance = kriged(nodes_mm, nobody, middle_mm, displacement_mm, noise2, structure)
-    return value, np.sqrt(variance)
+    # each track against what the others let expect of it: which are outliers, and how large errors then really are
+    kept = np.arange(len(middle_mm))
+    for _ in range(OUTLIER_ROUNDS):
+        tracks = middle_mm[kept], displacement_mm[kept], noise2[kept]
+        expected, missed = kriged(tracks[0], np.arange(len(kept)), *tracks, structure)
+        off = np.abs(tracks[1] - expected) / np.sqrt(missed + tracks[2] + 0.5 * structure.nugget)
+        factor = np.maximum(MAD_TO_SIGMA * np.median(off, axis=0), 1.0)
+        inside = np.all(off <= OUTLIER_SIGMAS * factor, axis=1)
+        kept, off = kept[inside], off[inside]
+    value, variance = kriged(
+        nodes_mm, np.full(len(nodes_mm), -1), middle_mm[kept], displacement_mm[kept], noise2[kept], structure
+    )
+    # depths are known worse in some planes than in others, whatever is stated
+    around = KDTree(middle_mm[kept]).query(nodes_mm, k=np.arange(1, min(TRACKS_AROUND, len(kept)) + 1))[1]
+    here = np.maximum(MAD_TO_SIGMA * np.median(off[around], axis=1), 1.0)
+    return value, np.maximum(factor, here) * np.sqrt(variance)
 
 
 def _candidates(
