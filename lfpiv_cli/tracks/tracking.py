@@ -149,8 +149,8 @@ def known_of(
 ) -> Known:
     """Return the displacements of linked particles."""
     noise = first.covariance()[at_first, :3] + second.covariance()[at_second, :3]
-    smallest = (SMALLEST_SIGMA_LENSES * scale.lens_mm * of_equal_errors(scale)) ** 2
-    return Known(at_first, second.position_mm[at_second] - first.position_mm[at_first], noise + smallest)
+    displacement = second.position_mm[at_second] - first.position_mm[at_first]
+    return Known(at_first, displacement, noise + _variance_of(SMALLEST_SIGMA_LENSES, scale))
 
 
 def expected_of(
@@ -175,8 +175,7 @@ def expected_of(
         variance = variance + np.median(known.variance_mm2, axis=0) + 0.5 * structure.nugget
     if forecast is None:
         return Expected(value, variance)
-    smallest = (SMALLEST_SIGMA_LENSES * scale.lens_mm * of_equal_errors(scale)) ** 2
-    past2 = forecast.sigma_mm**2 + smallest
+    past2 = forecast.sigma_mm**2 + _variance_of(SMALLEST_SIGMA_LENSES, scale)
     weight = variance / (variance + past2)
     has_past = np.isfinite(weight) & np.isfinite(forecast.displacement_mm)
     return Expected(
@@ -220,13 +219,17 @@ def density_per_mm3(first: Seen, second: Seen, search_mm: float) -> float:
 
 def wrong_link_variance(probability: NDArray[np.float64], scale: Scale) -> NDArray[np.float64]:
     """Return what is added to the variance (n, 3) of displacements, mm^2, for links being wrong by chance."""
-    off = WRONG_LENSES * scale.lens_mm * of_equal_errors(scale)
-    return (1.0 - probability)[:, np.newaxis] * off**2
+    return (1.0 - probability)[:, np.newaxis] * _variance_of(WRONG_LENSES, scale)
 
 
 def of_equal_errors(scale: Scale) -> NDArray[np.float64]:
     """Return what distances (x, y, z) are divided by: as much more in depth as depths are known worse."""
     return np.array([1.0, 1.0, DEPTH_RATIO * scale.depth_ratio])
+
+
+def _variance_of(lenses: float, scale: Scale) -> NDArray[np.float64]:
+    """Return the variances (3,) of errors of so many L laterally, mm^2, and as much more in depth."""
+    return np.asarray((lenses * scale.lens_mm * of_equal_errors(scale)) ** 2)
 
 
 def _sought(
