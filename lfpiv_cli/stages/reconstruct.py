@@ -115,7 +115,8 @@ def reconstruct(
     shape = content.image_shape
     dark = image_files.read_image(options.dark, shape) if options.dark else None
     pitch_px = float(content.camera.micro_image_lattice_px().pitch.max())
-    mask = mask_of(options.mask, frames, shape, pitch_px)
+    # What stands still takes a look at every frame: only where there is one to reconstruct.
+    mask = mask_of(options.mask, frames, shape, pitch_px) if needed or mask_file else None
     bench = bench_of(content, settings, dark, mask, with_sums=bool(needed))
     read = reader(level, frames, shape, dark)
     steps = particles.STEPS if as_particles else settings.reconstruction.iterations
