@@ -95,7 +95,11 @@ def write_atomically(
 
 def write_json(path: Path, value: Mapping[str, Any], overwrite: bool) -> None:
     """Write an object as JSON, keys in their order, NaN and infinities as null (JSON has no word for them)."""
-    text = json.dumps(without_nan(value), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    write_text(path, json.dumps(without_nan(value), indent=2, ensure_ascii=False, allow_nan=False) + "\n", overwrite)
+
+
+def write_text(path: Path, text: str, overwrite: bool) -> None:
+    """Write text in UTF-8; names of files that are no UTF-8 keep their bytes."""
 
     def write(temporary: Path) -> None:
         temporary.write_bytes(text.encode("utf-8", "surrogateescape"))

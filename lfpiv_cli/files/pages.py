@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lfpiv_cli.errors import UsageError
-from lfpiv_cli.files.atomic import write_atomically
+from lfpiv_cli.files.atomic import write_text
 from lfpiv_cli.files.inputs import ensure_regular_file
 
 TEMPLATES = Path(__file__).with_name("templates")
@@ -87,18 +87,10 @@ def write_pages(page: Page, html: Path, markdown: Path, overwrite: bool) -> None
         "relative": lambda path: path.relative_to(markdown.parent).as_posix(),
     }
     for target in (html, markdown):
-        text = places.get_template(f"page{target.suffix}").render(page=page)
-        _write_text(target, text, overwrite)
+        write_text(target, places.get_template(f"page{target.suffix}").render(page=page), overwrite)
 
 
 def _data_uri(path: Path) -> str:
     """Return a PNG file as an address that holds the picture itself."""
     ensure_regular_file(path)
     return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode("ascii")
-
-
-def _write_text(target: Path, text: str, overwrite: bool) -> None:
-    def write(temporary: Path) -> None:
-        temporary.write_bytes(text.encode("utf-8"))
-
-    write_atomically(target, write, overwrite=overwrite)

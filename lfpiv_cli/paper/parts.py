@@ -13,7 +13,7 @@ import yaml
 
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import InputError
-from lfpiv_cli.files.atomic import write_atomically, write_json
+from lfpiv_cli.files.atomic import write_json, write_text
 from lfpiv_cli.files.inputs import ensure_regular_file, reason
 from lfpiv_cli.files.pages import Table
 from lfpiv_cli.names import Size
@@ -117,7 +117,7 @@ class Work:
         """Write a config of the part's own and return its path."""
         path = self.folder / f"{name}.yaml"
         text = yaml.safe_dump(dict(sections), sort_keys=False, default_flow_style=None, width=110)
-        write_atomically(path, lambda target: _write_bytes(target, text), overwrite=True)
+        write_text(path, text, overwrite=True)
         return path
 
     def step(self, name: str, make: Callable[[], Mapping[str, Any]]) -> dict[str, Any]:
@@ -169,7 +169,3 @@ def plain(rows: Sequence[Row]) -> list[dict[str, Any]]:
 def rows_of(values: Sequence[Mapping[str, Any]]) -> tuple[Row, ...]:
     """Return the rows that plain data hold."""
     return tuple(Row(**{name: value for name, value in each.items() if name != "verdict"}) for each in values)
-
-
-def _write_bytes(target: Path, text: str) -> None:
-    target.write_bytes(text.encode("utf-8"))
