@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from lfpiv_cli.paper.rig import merged, sections
+from lfpiv_cli.paper.rig import AS_PAPER, BOARD, MISALIGNED, merged, sections
 
 SEED = 7
 # The mean over the channel's section, m/s: 40 L/h through 1 cm2, rounded as the paper has it.
@@ -76,7 +76,7 @@ EM_ITERATIONS = 24
 
 def as_paper(size: ChannelSize) -> dict[str, Any]:
     """Return how the paper reconstructs; SART's volumes are correlated plainly."""
-    return {"solver": "sart", "iterations": size.iterations, "relaxation": 1.0, "accelerate": False}
+    return AS_PAPER | {"iterations": size.iterations}
 
 
 def at_best(size: ChannelSize) -> dict[str, Any]:
@@ -98,29 +98,20 @@ def channel_sections(size: ChannelSize, **changes: Any) -> dict[str, Any]:
         camera={"sensor": {"columns": size.columns, "rows": size.rows}},
         window=None,
         channel={"width_mm": size.width_mm, "wall_mm": 5.0},
-        board={
-            "dots": dots,
-            "spacing_mm": size.spacing_mm,
-            "dot_diameter_mm": 0.2,
-            "medium": "air",
-            "polarity": "bright",
-        },
+        board=BOARD | {"dots": dots, "spacing_mm": size.spacing_mm, "medium": "air"},
         volume={
             "shape_xyz": [round(side / size.voxel_mm) for side in size.volume_mm],
             "voxel_mm": size.voxel_mm,
             "reference": "mid_plane",
         },
         correlation={"windows": list(size.windows), "overlap": 0.5, "dt_s": 0.0018},
-        simulation={
+        simulation=MISALIGNED
+        | {
             "flow": flow,
             "particles": size.particles,
             "particle_diameter_mm": 0.05,
             "board_z_mm": BOARD_Z_MM,
             "mid_plane_z_mm": MID_PLANE_Z_MM,
-            "board_tilt_deg": [-0.3, 0.2],
-            "board_offset_mm": [-0.1, 0.15],
-            "rotation_deg": 0.2,
-            "shift_px": [-1.5, 4.0],
             "distortion_per_mm2": 1.0e-5,
             "rays": size.rays,
             "seed": SEED,

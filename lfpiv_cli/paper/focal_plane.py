@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lfpiv_cli.console import Console
 from lfpiv_cli.files.pages import Table
 from lfpiv_cli.paper.parts import Drawing, Findings, Row, Work
-from lfpiv_cli.paper.rig import sections
+from lfpiv_cli.paper.rig import BOARD, MISALIGNED, sections
 from lfpiv_cli.stages.calibrate import CalibrateOptions, calibrate_snapshot
 from lfpiv_cli.stages.simulate import simulate_board, simulate_white
 from lfpiv_cli.validation.paper_pictures import focal_plane_figure
@@ -29,13 +29,6 @@ LIMIT_SIGMAS = 4.0
 SMALL = {
     "camera": {"microlenses": {"columns": None, "rows": None}, "sensor": {"columns": 600, "rows": 448}},
     "board": {"dots": [5, 4], "spacing_mm": 0.5, "dot_diameter_mm": 0.15},
-}
-FAULTS = {
-    "rotation_deg": 0.2,
-    "shift_px": [-1.5, 4.0],
-    "board_tilt_deg": [-0.3, 0.2],
-    "board_offset_mm": [-0.1, 0.15],
-    "seed": SEED,
 }
 
 
@@ -92,15 +85,14 @@ def focal_plane(work: Work) -> Findings:
 
 def _config(work: Work, name: str, error_mm: float) -> Path:
     small = work.by_size(SMALL, SMALL, {})
-    board: dict[str, Any] = {"dots": [7, 7], "spacing_mm": 1.0, "dot_diameter_mm": 0.2, "medium": "air"}
     return work.config(
         name,
         sections(
             camera=small.get("camera", {}),
-            board=board | small.get("board", {}) | {"polarity": "bright"},
+            board=BOARD | {"medium": "air"} | small.get("board", {}),
             channel={"width_mm": 10.0, "wall_mm": 5.0},
             window=None,
-            simulation=FAULTS | {"board_z_mm": float(error_mm)},
+            simulation=MISALIGNED | {"seed": SEED, "board_z_mm": float(error_mm)},
         ),
     )
 
@@ -133,4 +125,5 @@ def _table(
 
 
 def _size(work: Work) -> str:
-    return work.by_size("", "", "Full sensor, 49 dots.") or "A corner of the sensor, 20 dots half a millimetre apart."
+    corner = "A corner of the sensor, 20 dots half a millimetre apart."
+    return work.by_size(corner, corner, "Full sensor, 49 dots.")

@@ -23,6 +23,18 @@ TABLE_2: dict[str, Any] = {
     "volume": {"shape_xyz": [80, 80, 240], "voxel_mm": 0.1, "centre_mm": [0.0, 0.0, 0.0], "reference": "focal_point"},
 }
 
+# How the paper reconstructs (Section 3.3).
+AS_PAPER: dict[str, Any] = {"solver": "sart", "iterations": 200, "relaxation": 1.0, "accelerate": False}
+# The board (Section 3.3), whatever it stands in.
+BOARD: dict[str, Any] = {"dots": [7, 7], "spacing_mm": 1.0, "dot_diameter_mm": 0.2, "polarity": "bright"}
+# How the array and the board on the wall depart from where they should be.
+MISALIGNED: dict[str, Any] = {
+    "board_tilt_deg": [-0.3, 0.2],
+    "board_offset_mm": [-0.1, 0.15],
+    "rotation_deg": 0.2,
+    "shift_px": [-1.5, 4.0],
+}
+
 
 def sections(**changes: Any) -> dict[str, Any]:
     """Return the sections of the paper's config with changes: those of a section's keys, or whole values.

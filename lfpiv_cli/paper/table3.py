@@ -19,7 +19,7 @@ from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.pages import Table
 from lfpiv_cli.paper.parts import Drawing, Findings, Row, Work
-from lfpiv_cli.paper.rig import merged, sections
+from lfpiv_cli.paper.rig import AS_PAPER, BOARD, merged, sections
 from lfpiv_cli.stages.validate_board import BoardSolver, bench_of, board_solver, placement_of
 from lfpiv_cli.synthetic.board import dot_centres
 from lfpiv_cli.validation.board import DEPTHS_MM, MEASURES, PAPER, DotFigures, board_figures, measure_dots
@@ -43,22 +43,9 @@ SEED = 1
 # The paper's voxels have their centres at whole tenths of a millimetre (Table 1), and so has a volume of an even number
 # of them its centre half a voxel off the focal point. It matters: dots stand at whole millimetres.
 PAPERS = {
-    "board": {
-        "pattern": "dots",
-        "dots": [7, 7],
-        "spacing_mm": 1.0,
-        "dot_diameter_mm": 0.2,
-        "medium": "fluid",
-        "polarity": "bright",
-    },
+    "board": BOARD | {"medium": "fluid"},
     "volume": {"centre_mm": [-0.05, -0.05, -0.05]},
-    "reconstruction": {
-        "solver": "sart",
-        "iterations": 200,
-        "relaxation": 1.0,
-        "accelerate": False,
-        "padding_voxel": [0, 0, 0],
-    },
+    "reconstruction": AS_PAPER | {"padding_voxel": [0, 0, 0]},
     "simulation": {"seed": SEED},
 }
 # Voxels of a third of a microlens hold the edge of a dot.
