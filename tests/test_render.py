@@ -38,11 +38,12 @@ def image_of(camera, sensor_mm, weights):
 
 def test_renderer_equals_the_readable_tracer(small, space, rng):
     points = np.array([[0.05, -0.1, 3.0], [-0.2, 0.1, -4.0]])
-    light, rays, diameter = np.array([1.0, 3.0]), 400, 0.05
-    found = render_points(small, space, Balls(points, light, diameter), np.random.default_rng(5), rays=rays)
+    light, rays, diameters = np.array([1.0, 3.0]), 400, np.array([0.05, 0.2])
+    found = render_points(small, space, Balls(points, light, diameters), np.random.default_rng(5), rays=rays)
 
     expected = np.zeros_like(found)
-    for point, brightness, shift in zip(points, light, np.random.default_rng(5).random((2, 4)), strict=True):
+    shifts = np.random.default_rng(5).random((2, 4))
+    for point, brightness, diameter, shift in zip(points, light, diameters, shifts, strict=True):
         a, b, c, d = ((shift + np.arange(rays)[:, np.newaxis] * render.SEQUENCE) % 1.0).T
         lens = 12.5 * np.sqrt(a)[:, np.newaxis] * np.stack([np.cos(2 * np.pi * b), np.sin(2 * np.pi * b)], axis=1)
         r = 0.5 * diameter * np.sqrt(1 - c ** (2 / 3))

@@ -49,12 +49,12 @@ class Balls:
     ----------
     points_mm : (n, 3) centres, world axes
     light : (n,) or one number, expected counts of each that pass the aperture; those that miss the sensor are lost
-    diameter_mm : of all, 0 for points; their depth does not count
+    diameter_mm : (n,) or one number, 0 for points; their depth does not count
     """
 
     points_mm: ArrayLike
     light: ArrayLike
-    diameter_mm: float
+    diameter_mm: ArrayLike
 
 
 def render_points(
@@ -83,6 +83,7 @@ def render_points(
     """
     points = camera.to_image_axes(balls.points_mm).reshape(-1, 3)
     weights = np.broadcast_to(np.asarray(balls.light, dtype=np.float64), len(points)) / rays
+    radii = np.broadcast_to(0.5 * np.asarray(balls.diameter_mm, dtype=np.float64), len(points))
     last_layers = space.last_layers_mm(camera, points[:, 2])
     _check_depths(points, last_layers)
     shifts = rng.random((len(points), 4))
@@ -92,9 +93,9 @@ def render_points(
     batch = max(RAYS_AT_ONCE // rays, 1)
     for start in range(0, len(points), batch):
         part = slice(start, start + batch)
-        placed = (points[part], last_layers[part], shifts[part])
+        placed = (points[part], radii[part].copy(), last_layers[part], shifts[part])
         pixels = np.empty((len(points[part]), rays), dtype=np.int32)
-        share_out(_trace_points, len(pixels), placed, 0.5 * balls.diameter_mm, layers, seen, pixels)
+        share_out(_trace_points, len(pixels), placed, layers, seen, pixels)
         _add_light(image.ravel(), pixels, weights[part])
         if progress is not None:
             progress(len(pixels))
@@ -111,19 +112,19 @@ def _check_depths(points: NDArray[np.float64], last_layers_mm: NDArray[np.float6
 @njit(cache=True, nogil=True)
 def _trace_points(
     part: tuple[int, int],
-    placed: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
-    ball_radius: float,
+    placed: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
     layers: Layers,
     camera: KernelCamera,
     pixels: NDArray[np.int32],
 ) -> None:
     """Write the flat pixel number that each ray of the points `part` strikes, (n, rays), -1 off the sensor.
 
-    `placed` holds all points, their last layers' thicknesses and the shifts of their rays.
+    `placed` holds all points, the balls' radii, their last layers' thicknesses and the shifts of their rays.
     """
-    points, last_layers, shifts = placed
+    points, radii, last_layers, shifts = placed
     aperture_radius = camera.aperture_radius_mm
     for i in range(part[0], part[1]):
+        ball_radius = radii[i]
         thicknesses = layers.thicknesses_mm.copy()
         thicknesses[-1] = last_layers[i]
         reach = aperture_radius + ball_radius + np.sqrt(points[i, 0] ** 2 + points[i, 1] ** 2)
