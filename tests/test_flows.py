@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.integrate import quad
+from scipy.integrate import quad, solve_ivp
 from scipy.spatial.transform import Rotation
 
 from lfpiv_cli.synthetic.flows import (
     FLOWS,
+    STEADY,
+    Pulsation,
     advect,
     random_modes,
     rigid_rotation,
@@ -130,6 +132,26 @@ def test_advection_forth_and_back_returns(rng):
     points = CENTRE + rng.uniform(-4, 4, (20, 3))
     for flow in EXAMPLES.values():
         assert advect(flow, advect(flow, points, 2e-3), -2e-3) == pytest.approx(points, abs=1e-9)
+
+
+def test_pulsation_carries_tracers_as_its_equation_of_motion_does():
+    flow, pulsation, start = EXAMPLES["taylor_green"], Pulsation(0.7, 40.0), np.array(CENTRE) + (1.0, 0.0, 1.5)
+
+    def motion(time_s, place):
+        return 1e3 * (1.0 + 0.7 * np.sin(2.0 * np.pi * 40.0 * time_s)) * flow(place[np.newaxis])[0]
+
+    for time_s in (-0.02, 0.003, 0.02):
+        expected = solve_ivp(motion, (0.0, time_s), start, rtol=1e-10, atol=1e-10).y[:, -1]
+        # four Runge-Kutta steps over 1 mm in vortices of 8 mm: 1e-5 mm
+        assert advect(flow, [start], pulsation.carried_s(time_s))[0] == pytest.approx(expected, abs=2e-5)
+    assert STEADY.carried_s(-0.0123) == -0.0123
+
+
+def test_pulsation_accelerates_the_flow_in_the_middle():
+    # 50 % at 20 Hz: 2 pi 20 0.5 = 62.83 per second of the velocity; over 0.1 ms the cubic term is 1e-5 of it
+    pulsation, step = Pulsation(0.5, 20.0), 1e-4
+    change = (pulsation.carried_s(step) + pulsation.carried_s(-step) - 2.0 * pulsation.carried_s(0.0)) / step**2
+    assert change == pytest.approx(62.832, rel=1e-4)
 
 
 def test_duct_advection_moves_by_velocity_times_time():

@@ -8,6 +8,7 @@ Axes: world (x, y, z), z away from the camera, in the frame of the points that a
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -191,6 +192,28 @@ FLOWS: dict[str, Callable[..., Flow]] = {
     "uniform": uniform,
     "random_modes": random_modes,
 }
+
+
+@dataclass(frozen=True)
+class Pulsation:
+    """How a flow changes in time, everywhere alike: its velocity times 1 + amplitude sin(2 pi frequency_hz t).
+
+    At t = 0 the flow is as it is given, and its acceleration, 2 pi frequency_hz amplitude of its velocity, is largest.
+    """
+
+    amplitude: float = 0.0
+    frequency_hz: float = 0.0
+
+    def carried_s(self, time_s: float) -> float:
+        """Return for how long the steady flow would carry a tracer as far as this one has from t = 0 to `time_s`.
+
+        It is the integral of the factor, which is the same everywhere: tracers keep the steady flow's paths.
+        """
+        turns = self.frequency_hz * time_s
+        return float(time_s * (1.0 + self.amplitude * np.sin(np.pi * turns) * np.sinc(turns)))
+
+
+STEADY = Pulsation()
 
 
 def advect(flow: Flow, points_mm: ArrayLike, duration_s: float) -> NDArray[np.float64]:
