@@ -5,10 +5,13 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from lfpiv_cli.cli import cli
 from lfpiv_cli.errors import OutputExistsError, UsageError
+from lfpiv_cli.files.particles import Particles, write_particles
+from lfpiv_cli.stages.validate_flow import _truth_of_particles
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 
@@ -20,6 +23,14 @@ def run(*arguments: object) -> None:
 def test_particles_are_no_truth_for_what_is_simulated(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="--vectors"):
         run("validate", "flow", CONFIGS / "sample.yaml", "--particles", "p.npz", "-o", tmp_path / "report")
+
+
+def test_windows_beyond_the_light_have_no_truth_of_particles(tmp_path: Path) -> None:
+    places = np.stack(np.meshgrid([0.0, 1.0], [0.0, 1.0], [0.0, 1.0, 2.0]), axis=-1).reshape(-1, 3)
+    true = Particles(places, np.ones_like(places), (places[:, 2] < 1.5).astype(np.float64))
+    write_particles(tmp_path / "true.npz", true, overwrite=False)
+    centres = np.array([[0.5, 0.5, 0.5], [0.5, 0.5, 1.2]])
+    assert _truth_of_particles(tmp_path / "true.npz", centres)[1].tolist() == [True, False]
 
 
 @pytest.mark.slow

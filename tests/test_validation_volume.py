@@ -11,7 +11,7 @@ import pytest
 
 from lfpiv_cli.cli import cli
 from lfpiv_cli.errors import InputError
-from lfpiv_cli.files.particles import write_particles
+from lfpiv_cli.files.particles import Particles, write_particles
 from lfpiv_cli.files.vtkhdf import write_volume
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.reference import Reference
@@ -106,7 +106,8 @@ def test_validate_volume_moves_the_particles_to_the_frame(particles, tmp_path):
         attributes={"residual": np.array([0.4, 0.3, 0.2])},
         overwrite=False,
     )
-    write_particles(tmp_path / "true.npz", particles + [0.0, 0.0, 0.5], speed, np.ones(10), overwrite=False)
+    true = Particles(particles + [0.0, 0.0, 0.5], speed, np.ones(10))
+    write_particles(tmp_path / "true.npz", true, overwrite=False)
     known = ("--volume", str(tmp_path / "b.vtkhdf"), "--particles", str(tmp_path / "true.npz"))
     for frame in ("a", "b"):
         arguments = ["validate", "volume", str(CONFIG), *known, "--frame", frame, "-o", str(tmp_path / frame)]

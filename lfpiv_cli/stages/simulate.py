@@ -23,7 +23,7 @@ from lfpiv_cli.files.atomic import ensure_writable, write_json
 from lfpiv_cli.files.batch import prepare_folder
 from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.images import write_tiff
-from lfpiv_cli.files.particles import write_particles
+from lfpiv_cli.files.particles import Particles, write_particles
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.reference import FOCAL_POINT, Reference
@@ -112,7 +112,8 @@ def simulate_particles(
         )
     for name, image in zip(images, found.images, strict=True):
         write_tiff(paths[name], image, overwrite)
-    write_particles(paths["particles.npz"], found.positions_mm, found.velocities_m_s, found.brightness, overwrite)
+    particles = Particles(found.positions_mm, found.velocities_m_s, found.brightness)
+    write_particles(paths["particles.npz"], particles, overwrite)
     truth = found.truth | {"reference_z_mm": reference.z_mm}
     if bubbles is not None:
         truth["bubbles_mm"] = bubbles.truth()

@@ -109,6 +109,8 @@ def _summary(figures: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
 def _truth_of_particles(path: Path, centres_mm: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Return the true velocities at the window centres, z from the focal point, and which lie among the particles."""
     particles = read_particles(path)
-    low, high = particles.positions_mm.min(axis=0), particles.positions_mm.max(axis=0)
+    lit = particles.brightness[:, np.newaxis] > 0.0
+    low = particles.positions_mm.min(axis=0, where=lit, initial=np.inf)
+    high = particles.positions_mm.max(axis=0, where=lit, initial=-np.inf)
     inside = np.all((centres_mm >= low) & (centres_mm <= high), axis=-1)
     return truth_at_points(particles.positions_mm, particles.velocities_m_s, centres_mm), inside
