@@ -138,6 +138,7 @@ def test_all_errors_come_in_one_run_in_the_order_of_the_file(write) -> None:
         ("correlation: {windows: []}", "at least one window"),
         ("correlation: {overlap: 1.0}", "less than 1"),
         ("simulation: {brightness: [2, 1]}", "expected a range"),
+        ("simulation: {light_z_mm: [1, 1]}", "light_z_mm: is [1.0, 1.0], expected a range"),
         ("simulation: {brightness: [1, 2], brightness_log_sigma: 0.5}", "contradicts brightness"),
         ("validation: {flow_methods: [volumes, volumes]}", "expected each method once"),
         ("weights: {method: dlfc}\nvalidation: {flow_methods: [particles]}", "fitted with traced rays"),

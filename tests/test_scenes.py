@@ -12,7 +12,7 @@ from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.media import Media, channel_window, fluid_path_to_focus
 from lfpiv_cli.synthetic.board import BoardPlacement
-from lfpiv_cli.synthetic.flows import rigid_rotation, uniform
+from lfpiv_cli.synthetic.flows import Pulsation, rigid_rotation, uniform
 from lfpiv_cli.synthetic.render import Balls, ObjectSpace, render_points
 from lfpiv_cli.synthetic.scenes import (
     Box,
@@ -103,6 +103,71 @@ def test_frames_lie_evenly_about_the_time_of_the_truth(small, frames):
         expected = render_points(small, AIR, Balls(places, light, 0.05), np.random.default_rng(9), rays=20_000)
         # two sets of rays of the same tracers
         assert np.corrcoef(image.ravel(), expected.ravel())[0, 1] > 0.97
+
+
+def test_frames_show_what_their_truth_says(small):
+    """Tracers of different sizes flicker in a flow that accelerates through lit depths: rendered from the truth."""
+    tracers = Tracers(
+        8,
+        Box((-0.2, -0.2, -1.0), (0.2, 0.2, 1.0)),
+        diameter_mm=0.1,
+        light_counts=1e6,
+        rays=80_000,
+        diameter_log_sigma=0.5,
+        brightness_flicker=0.4,
+        light_z_mm=(-0.5, 0.5),
+    )
+    motion = Motion(uniform((0.05, -0.02, 0.3)), 2e-3, 3, Pulsation(0.5, 100.0))
+    found = simulate_particles(RecordingCamera(small, NOISELESS), AIR, tracers, motion, np.random.default_rng(4))
+    assert found.frame_positions_mm.shape == (3, 8, 3)
+    # over 2 ms the factor 1 + 0.5 sin(2 pi 100 t) adds 0.5 (1 - cos 0.4 pi) / (200 pi) s: forth 2.55 ms, back 1.45 ms
+    steps = np.diff(found.frame_positions_mm, axis=0)[:, 0, 2]
+    assert steps == pytest.approx([0.3 * 1.4502, 0.3 * 2.5498], abs=1e-4)
+    depth = found.frame_positions_mm[..., 2]
+    assert np.array_equal(found.frame_brightness > 0.0, (depth > -0.5) & (depth < 0.5))
+    change = np.diff(np.sign(found.frame_brightness), axis=0)
+    assert (change.max(), change.min()) == (1.0, -1.0)  # some come into the light, others leave it
+    for image, places, brightness in zip(found.images, found.frame_positions_mm, found.frame_brightness, strict=True):
+        balls = Balls(places, 1e6 * brightness, found.diameters_mm)
+        expected = render_points(small, AIR, balls, np.random.default_rng(9), rays=80_000)
+        # two sets of rays of the same tracers: 0.997; with balls of one size 0.97
+        assert np.corrcoef(image.ravel(), expected.ravel())[0, 1] > 0.99
+        assert image.sum() - 96.0 * image.size == pytest.approx(expected.sum(), rel=0.02)
+
+
+def test_tracers_come_into_the_light_and_leave_it(small):
+    tracers = Tracers(40, Box((-0.2, -0.2, -3.0), (0.2, 0.2, 3.0)), light_counts=1.0, rays=1, light_z_mm=(-1.0, 1.0))
+    motion = Motion(uniform((0.0, 0.0, 0.5)), 2e-3, 3)
+    found = simulate_particles(RecordingCamera(small, NOISELESS), AIR, tracers, motion, np.random.default_rng(4))
+    start = found.positions_mm[:, 2]
+    for shown, moved in zip(found.frame_brightness, (-1.0, 0.0, 1.0), strict=True):
+        assert np.array_equal(shown > 0.0, np.abs(start + moved) < 1.0)
+    assert np.array_equal(found.brightness, found.frame_brightness[1])
+
+
+def test_sizes_and_flicker_have_their_spread(rng):
+    tracers = Tracers(4000, Box((0, 0, 0), (1, 1, 1)), diameter_log_sigma=0.3, brightness_flicker=0.2)
+    logarithm, flicker = np.log(tracers.draw_sizes(rng)), tracers.draw_flicker(3, rng)
+    # standard errors of 4000 and 12000: 0.005 and 0.0034, 0.002 and 0.0014
+    assert (logarithm.mean(), logarithm.std()) == (pytest.approx(0.0, abs=0.02), pytest.approx(0.3, abs=0.014))
+    assert (flicker.mean(), flicker.std()) == (pytest.approx(1.0, abs=0.008), pytest.approx(0.2, abs=0.008))
+    # each frame has its own
+    assert abs(np.corrcoef(flicker)[0, 1]) < 0.06
+
+
+def test_light_goes_with_the_square_of_the_diameter(small, rng):
+    tracers = Tracers(9, Box((0, 0, 0), (0.1, 0.1, 1)), 0.1, brightness=(2.0, 2.0), rays=1, diameter_log_sigma=0.5)
+    motion = Motion(uniform((0, 0, 0)), 1e-3)
+    found = simulate_particles(RecordingCamera(small, NOISELESS), AIR, tracers, motion, rng)
+    assert found.diameters_mm.max() > 1.5 * found.diameters_mm.min()
+    assert found.frame_brightness == pytest.approx(np.tile(2.0 * (found.diameters_mm / 0.1) ** 2, (2, 1)))
+
+
+def test_tracers_alike_draw_no_numbers_for_their_sizes_and_flicker(rng):
+    before, tracers = rng.bit_generator.state, Tracers(3, Box((0, 0, 0), (1, 1, 1)))
+    assert np.array_equal(tracers.draw_sizes(rng), np.ones(3))
+    assert np.array_equal(tracers.draw_flicker(2, rng), np.ones((2, 3)))
+    assert rng.bit_generator.state == before
 
 
 def test_tracers_fill_the_box_and_the_brightness(small, rng):

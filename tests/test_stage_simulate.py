@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from lfpiv_cli.cli import cli
+from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.files.images import read_image
-from lfpiv_cli.files.particles import read_particles
+from lfpiv_cli.files.particles import Particles, read_particles, write_particles
 
 SAMPLE = Path(__file__).parent.parent / "configs" / "sample.yaml"
 
@@ -32,3 +34,71 @@ def test_tracers_of_a_sequence_are_there_before_they_are_carried_in(tmp_path: Pa
     assert names == [f"frame_{number:04d}.tif" for number in range(6)]
     assert read_image(tmp_path / "6" / names[-1]).max() > read_image(tmp_path / "6" / names[-1]).min()
     assert sorted(path.name for path in (tmp_path / "2").glob("*.tif")) == ["pair_a.tif", "pair_b.tif"]
+
+
+def sequence_of(folder: Path, keys: str, velocity_m_s: str = "[0, 0, 0.2]", layers: int = 40) -> Particles:
+    """Simulate tracers that all move by 0.4 mm between six frames, with few rays; return their truth."""
+    rig, output = folder / "rig.yaml", folder / "out"
+    uniform = f"  flow: {{kind: uniform, velocity_m_s: {velocity_m_s}}}"
+    lines = [uniform if line.startswith("  flow: {") else line for line in SAMPLE.read_text().splitlines()]
+    few = f"simulation:\n  frames: 6\n  rays: 1\n  mid_plane_z_mm: 2.926\n{keys}"
+    text = "\n".join(lines).replace("simulation:\n", few).replace("particles: 400", "particles: 2000")
+    rig.write_text(text.replace("[30, 22, 40]", f"[30, 22, {layers}]"))
+    cli.main(["simulate", "particles", str(rig), "-o", str(output)], standalone_mode=False)
+    return read_particles(output / "particles.npz")
+
+
+def lit_depths(truth: Particles, frame: int) -> np.ndarray:
+    """Return how far behind the mid plane those tracers are that a frame shows."""
+    assert truth.frame_positions_mm is not None
+    assert truth.frame_brightness is not None
+    return truth.frame_positions_mm[frame, truth.frame_brightness[frame] > 0.0, 2] - 2.926
+
+
+@pytest.mark.parametrize(("light", "edges"), [("[-1.0, 1.5]", (-1.0, 1.5)), ("[-3.0, 1.0]", (-2.0, 1.0))])
+def test_lit_depths_are_full_in_every_frame(tmp_path: Path, light: str, edges: tuple[float, float]) -> None:
+    """The flow carries tracers through the light's edges and a porous wall: no layer empties behind them."""
+    truth = sequence_of(tmp_path, f"  light_z_mm: {light}\n")
+    for depth in (lit_depths(truth, 0), lit_depths(truth, 5)):
+        assert (depth.min(), depth.max()) == pytest.approx(edges, abs=0.02)
+        found = np.histogram(depth, 5, edges)[0]
+        # 2000 in the volume's lit depths, and as dense in the margin about it; 5 standard deviations
+        assert np.abs(found - found.mean()).max() < 5.0 * np.sqrt(found.mean())
+
+
+@pytest.mark.parametrize("light", ["[-0.5, 0.5]", "[-2.0, 2.0]"])
+def test_particles_are_counted_in_the_lit_part_of_the_volume(tmp_path: Path, light: str) -> None:
+    truth = sequence_of(tmp_path, f"  light_z_mm: {light}\n", layers=20)
+    inside = np.all(np.abs(truth.positions_mm - (0.0, 0.0, 2.926)) < (1.5, 1.1, 1.0), axis=1)
+    assert np.count_nonzero(inside & (truth.brightness > 0.0)) == pytest.approx(2000, abs=225)  # 5 standard deviations
+
+
+def test_light_beyond_the_wall_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="beyond a wall 2 mm from the mid plane"):
+        sequence_of(tmp_path, "  light_z_mm: [2.5, 3.0]\n")
+
+
+def test_keys_of_the_scene_reach_the_tracers(tmp_path: Path) -> None:
+    keys = "  pulsation: {amplitude: 0.5, frequency_hz: 50}\n  particle_diameter_log_sigma: 0.3\n"
+    truth = sequence_of(tmp_path, keys + "  brightness_flicker: 0.1\n", "[0.2, 0, 0]")
+    assert truth.frame_positions_mm is not None
+    assert truth.frame_brightness is not None
+    assert np.std(np.log(np.asarray(truth.diameters_mm))) == pytest.approx(0.3, rel=0.1)
+    flicker = truth.frame_brightness / truth.brightness
+    assert flicker.std() == pytest.approx(0.1, rel=0.1)
+    # t + 0.5 (1 - cos(100 pi t)) / (100 pi): to 1, 3 and 5 ms as far as steadily in 1.0779, 3.6561 and 6.5915 ms
+    along = truth.frame_positions_mm[3:, 0, 0] - truth.positions_mm[0, 0]
+    assert along == pytest.approx([0.2 * 1.0779, 0.2 * 3.6561, 0.2 * 6.5915], abs=1e-3)
+
+
+@pytest.mark.parametrize("name", ["brightness", "diameter_mm", "frame_position_mm", "frame_brightness"])
+def test_lists_of_particles_whose_arrays_disagree_are_refused(tmp_path: Path, name: str) -> None:
+    whole = Particles(np.zeros((3, 3)), np.ones((3, 3)), np.ones(3), np.ones(3), np.zeros((2, 3, 3)), np.ones((2, 3)))
+    path = tmp_path / "true.npz"
+    write_particles(path, whole, overwrite=False)
+    assert np.shape(read_particles(path).frame_brightness) == (2, 3)
+    with np.load(path) as stored:
+        arrays = {key: stored[key] for key in stored}
+    np.savez(path, **arrays | {name: arrays[name][..., :-1]})
+    with pytest.raises(InputError, match=f"{name} .* for 3 particles"):
+        read_particles(path)

@@ -17,7 +17,7 @@ from lfpiv_cli.files.sections import (
     Microlenses,
     VolumeSection,
 )
-from lfpiv_cli.files.sections_simulated import FlowSection
+from lfpiv_cli.files.sections_simulated import FlowSection, PulsationSection
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
@@ -25,7 +25,7 @@ from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.optics.pupils import thin_lens
 from lfpiv_cli.reference import Reference
 from lfpiv_cli.scale import Scale
-from lfpiv_cli.synthetic.flows import FLOWS, Flow
+from lfpiv_cli.synthetic.flows import FLOWS, STEADY, Flow, Pulsation
 
 UM_TO_MM = 1e-3
 # Of the paper's final window along the axis with the smallest voxels; the coarse one is twice as large: a displacement
@@ -205,3 +205,8 @@ def flow_of(section: FlowSection, reference: Reference) -> Flow:
         x, y, z = parameters["centre_mm"]
         parameters["centre_mm"] = (x, y, reference.depth_to_focal_point(z))
     return FLOWS[section.kind](**parameters)
+
+
+def pulsation_of(section: PulsationSection | None) -> Pulsation:
+    """Return how a flow changes in time."""
+    return STEADY if section is None else Pulsation(section.amplitude, section.frequency_hz)

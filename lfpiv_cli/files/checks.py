@@ -157,7 +157,7 @@ def _scene(sections: Sections) -> Found:
 
 
 def _processing(sections: Sections) -> Found:
-    """Yield windows not from coarse to fine, a mask without walls, and a range of brightness upside down."""
+    """Yield windows not from coarse to fine, a mask without walls, and ranges upside down."""
     correlation, brightness = sections.correlation, sections.simulation.brightness
     place: KeyPath = ("correlation", "windows")
     if correlation.windows is not None:
@@ -172,6 +172,9 @@ def _processing(sections: Sections) -> Found:
         yield ("correlation", "mask"), "is channel, which needs volume.reference: mid_plane"
     if brightness[0] > brightness[1] or brightness[1] == 0.0:
         yield ("simulation", "brightness"), f"is {list(brightness)}, expected a range [smallest, largest]"
+    light = sections.simulation.light_z_mm
+    if light is not None and light[0] >= light[1]:
+        yield ("simulation", "light_z_mm"), f"is {list(light)}, expected a range [nearest, farthest]"
     if sections.simulation.brightness_log_sigma is not None and brightness != SimulationSection().brightness:
         yield ("simulation", "brightness_log_sigma"), "contradicts brightness, expected one of the two"
 

@@ -96,11 +96,25 @@ FlowSection = Annotated[
 ]
 
 
+class PulsationSection(Section):
+    """A flow that is faster and slower by turns, everywhere alike: times 1 + amplitude sin(2 pi frequency_hz t).
+
+    t counts from the middle of the pair or sequence, where the flow is as its own keys say and accelerates most.
+    """
+
+    amplitude: float
+    frequency_hz: Positive
+
+
 class SimulationSection(Section):
     """What `simulate` renders.
 
     Scene: flow (its centre in the volume's coordinates), frames (images of it, correlation.dt_s apart; 2 are a pair),
-    particles (their number in the volume), particle_diameter_mm,
+    pulsation (how the flow changes in time; null: it is steady), light_z_mm (range of depths that are lit, in the
+    volume's coordinates and between a channel's walls: tracers come into the light and leave it; null: those seeded
+    about the volume shine wherever they are), particles (their number in the volume, where it is lit),
+    particle_diameter_mm, particle_diameter_log_sigma (diameters are log-normal, of that median, and light goes with
+    their squares), brightness_flicker (relative standard deviation of a particle's light from frame to frame),
     brightness (range of each particle's light relative to particle_counts) or brightness_log_sigma (log-normal instead,
     of median 1), particle_counts (counts of a whole particle of brightness 1), mid_plane_z_mm (where the origin of a
     mid_plane volume lies behind the focal point; by default where Eq. 21 puts it for the board at board_z_mm).
@@ -117,10 +131,14 @@ class SimulationSection(Section):
 
     flow: FlowSection | None = None
     frames: Annotated[int, Field(ge=2, le=MOST_FRAMES)] = 2
+    pulsation: PulsationSection | None = None
+    light_z_mm: Pair | None = None
     particles: Annotated[int, Field(ge=0, le=MOST_PARTICLES)] = 1000
     particle_diameter_mm: NotNegative = 0.05
+    particle_diameter_log_sigma: NotNegative = 0.0
     brightness: tuple[NotNegative, NotNegative] = (0.6, 1.4)
     brightness_log_sigma: NotNegative | None = None
+    brightness_flicker: NotNegative = 0.0
     particle_counts: Positive = 500_000.0
     mid_plane_z_mm: float | None = None
     bubbles: Annotated[int, Field(ge=0, le=MOST_BUBBLES)] = 0

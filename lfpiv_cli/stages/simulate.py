@@ -21,10 +21,12 @@ from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files.atomic import ensure_writable, write_json
 from lfpiv_cli.files.batch import prepare_folder
+from lfpiv_cli.files.bench import pulsation_of
 from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.images import write_tiff
 from lfpiv_cli.files.particles import Particles, write_particles
 from lfpiv_cli.files.provenance import record
+from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.reference import FOCAL_POINT, Reference
 from lfpiv_cli.synthetic import scenes
@@ -95,7 +97,9 @@ def simulate_particles(
         raise ConfigError(f"{config}: correlation.dt_s: is missing, and images of a flow need it")
     reference = simulated_reference(settings)
     camera, space = _recording(settings), _flow_space(settings, reference)
-    tracers = _tracers(settings, camera.optics, reference, settings.correlation.dt_s)
+    flow, pulsation = settings.simulated_flow(reference), pulsation_of(scene.pulsation)
+    motion = scenes.Motion(flow, settings.correlation.dt_s, scene.frames, pulsation)
+    tracers = _tracers(settings, camera.optics, reference, motion)
     bubbles = _bubbles(settings, tracers.box, reference)
     still: NDArray[np.float64] | float = 0.0
     if bubbles is not None:
@@ -105,15 +109,14 @@ def simulate_particles(
             camera,
             space,
             tracers,
-            scenes.Motion(settings.simulated_flow(reference), settings.correlation.dt_s, scene.frames),
+            motion,
             _generator(settings, 2),
             still=still,
             progress=advance,
         )
     for name, image in zip(images, found.images, strict=True):
         write_tiff(paths[name], image, overwrite)
-    particles = Particles(found.positions_mm, found.velocities_m_s, found.brightness)
-    write_particles(paths["particles.npz"], particles, overwrite)
+    write_particles(paths["particles.npz"], _particles(found), overwrite)
     truth = found.truth | {"reference_z_mm": reference.z_mm}
     if bubbles is not None:
         truth["bubbles_mm"] = bubbles.truth()
@@ -210,25 +213,67 @@ def _flow_space(settings: Config, reference: Reference) -> ObjectSpace:
     return ObjectSpace(media, settings.window_model(reference.z_mm), refraction)
 
 
-def _tracers(settings: Config, camera: Camera, reference: Reference, dt_s: float) -> scenes.Tracers:
+def _particles(found: scenes.SimulatedFrames) -> Particles:
+    return Particles(
+        found.positions_mm,
+        found.velocities_m_s,
+        found.brightness,
+        found.diameters_mm,
+        found.frame_positions_mm,
+        found.frame_brightness,
+    )
+
+
+def _tracers(settings: Config, camera: Camera, reference: Reference, motion: scenes.Motion) -> scenes.Tracers:
     """Return the tracers: as many in the volume as configured, and as dense around it as their light reaches.
 
-    Those that are carried into the volume before a longer sequence ends, or out of it, are there too.
+    Those that are carried into the volume before a longer sequence ends, or out of it, are there too; where the light
+    ends, those that come into it from the first frame on.
     """
     scene, volume = settings.simulation, settings.grid(reference)
-    reach = blur_radius_mm(camera, settings.media_model(), volume)
-    carried_s = 0.5 * (scene.frames - 2) * dt_s
-    flow, walls = settings.simulated_flow(reference), _walls(settings, reference)
-    box, inside = seeded_boxes(volume, reach, flow, carried_s, walls)
+    light = _light_z_mm(settings, reference)
+    lit = volume if light is None else _between(volume, light)
+    reach = blur_radius_mm(camera, settings.media_model(), lit)
+    # Laterally the reach covers half the time between two frames; an edge of the light is sharp.
+    carrying = motion if light is not None else replace(motion, frames=motion.frames - 1)
+    carried_s = max(abs(time_s) for time_s in carrying.carried_s())
+    box, inside = seeded_boxes(lit, reach, motion.flow, carried_s, _walls(settings, reference))
+    measured = inside.within(scenes.Box.around(volume, (0.0, 0.0, 0.0)))
     return scenes.Tracers(
-        round(scene.particles * box.volume_mm3 / inside.volume_mm3),
+        round(scene.particles * box.volume_mm3 / measured.volume_mm3),
         box,
         scene.particle_diameter_mm,
         scene.particle_counts,
         scene.brightness,
         scene.brightness_log_sigma,
         scene.rays or RAYS,
+        scene.particle_diameter_log_sigma,
+        scene.brightness_flicker,
+        light,
     )
+
+
+def _light_z_mm(settings: Config, reference: Reference) -> tuple[float, float] | None:
+    """Return between which depths from the focal point there is light, not beyond a channel's walls; None: everywhere.
+
+    Raises
+    ------
+    ConfigError : the light lies beyond a wall
+    """
+    light, channel = settings.simulation.light_z_mm, settings.channel
+    if light is None:
+        return None
+    half = np.inf if channel is None else 0.5 * channel.width_mm
+    low, high = max(light[0], -half), min(light[1], half)
+    if low >= high:
+        raise ConfigError(f"simulation.light_z_mm: is {list(light)}, beyond a wall {half:g} mm from the mid plane")
+    return reference.depth_to_focal_point(low), reference.depth_to_focal_point(high)
+
+
+def _between(volume: Grid, z_mm: tuple[float, float]) -> Grid:
+    """Return the volume between other depths, one voxel deep."""
+    (nx, ny, _), (dx, dy, _), (x, y, _) = volume.shape_xyz, volume.spacing_mm, volume.origin_mm
+    return Grid((nx, ny, 1), (dx, dy, z_mm[1] - z_mm[0]), (x, y, 0.5 * (z_mm[0] + z_mm[1])))
 
 
 def _walls(settings: Config, reference: Reference) -> scenes.Box | None:

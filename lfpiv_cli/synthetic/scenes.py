@@ -18,7 +18,7 @@ from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.synthetic.board import BoardPlacement, dot_centres, render_board
-from lfpiv_cli.synthetic.flows import Flow, advect
+from lfpiv_cli.synthetic.flows import STEADY, Flow, Pulsation, advect
 from lfpiv_cli.synthetic.render import RAYS, Balls, ObjectSpace, render_points, render_white
 from lfpiv_cli.synthetic.sensor import Readout
 
@@ -83,7 +83,7 @@ class Box:
         low = np.maximum(self.low_mm, other.low_mm)
         high = np.minimum(self.high_mm, other.high_mm)
         if np.any(low >= high):
-            raise ConfigError(f"the tracers' box {self} and the channel {other} have no part in common")
+            raise ConfigError(f"the tracers' box {self} and {other}, of the channel or volume, have no part in common")
         return Box((low[0], low[1], low[2]), (high[0], high[1], high[2]))
 
 
@@ -97,6 +97,10 @@ class Tracers:
     brightness : brightness is evenly spread between these two
     brightness_log_sigma : log-normal instead, of median 1, with this standard deviation of the logarithm
     rays : traced of each
+    diameter_log_sigma : diameters are log-normal, of median `diameter_mm`, with this standard deviation of the
+        logarithm; the light goes with their squares
+    brightness_flicker : relative standard deviation of a tracer's light from frame to frame, log-normal
+    light_z_mm : between these depths there is light; None: everywhere
     """
 
     count: int
@@ -106,12 +110,35 @@ class Tracers:
     brightness: tuple[float, float] = (0.6, 1.4)
     brightness_log_sigma: float | None = None
     rays: int = RAYS
+    diameter_log_sigma: float = 0.0
+    brightness_flicker: float = 0.0
+    light_z_mm: tuple[float, float] | None = None
 
     def draw_brightness(self, rng: np.random.Generator) -> NDArray[np.float64]:
         """Return the brightness (count,) of each tracer."""
         if self.brightness_log_sigma is None:
             return rng.uniform(*self.brightness, self.count)
         return rng.lognormal(0.0, self.brightness_log_sigma, self.count)
+
+    def draw_sizes(self, rng: np.random.Generator) -> NDArray[np.float64]:
+        """Return the diameter (count,) of each tracer over their median; without a spread no numbers are drawn."""
+        if self.diameter_log_sigma == 0.0:
+            return np.ones(self.count)
+        return rng.lognormal(0.0, self.diameter_log_sigma, self.count)
+
+    def draw_flicker(self, frames: int, rng: np.random.Generator) -> NDArray[np.float64]:
+        """Return each tracer's light in each frame (frames, count) over its own, of mean 1, as `draw_sizes` does."""
+        if self.brightness_flicker == 0.0:
+            return np.ones((frames, self.count))
+        variance = np.log1p(self.brightness_flicker**2)
+        return rng.lognormal(-0.5 * variance, np.sqrt(variance), (frames, self.count))
+
+    def lit(self, points_mm: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return which of the points (..., 3) lie in the light."""
+        if self.light_z_mm is None:
+            return np.ones(points_mm.shape[:-1], dtype=np.bool_)
+        low, high = self.light_z_mm
+        return (points_mm[..., 2] > low) & (points_mm[..., 2] < high)
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,15 +155,23 @@ class RecordingCamera:
 
 @dataclass(frozen=True)
 class Motion:
-    """How tracers move while they are recorded: a flow, the time between frames, and how many there are."""
+    """How tracers move while they are recorded: a flow, the time between frames, and how many there are.
+
+    `flow` is that of the middle of the sequence, from where time counts.
+    """
 
     flow: Flow
     dt_s: float
     frames: int = 2
+    pulsation: Pulsation = STEADY
 
     def times_s(self) -> list[float]:
         """Return when the frames are taken, counted from the middle of the sequence."""
         return [(number - 0.5 * (self.frames - 1)) * self.dt_s for number in range(self.frames)]
+
+    def carried_s(self) -> list[float]:
+        """Return for how long the flow of the middle would carry tracers to where each frame finds them."""
+        return [self.pulsation.carried_s(time_s) for time_s in self.times_s()]
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +192,10 @@ class SimulatedFrames:
     images : in the order of time
     positions_mm : (n, 3), world axes
     velocities_m_s : (n, 3)
-    brightness : (n,)
+    brightness : (n,), without flicker, 0 where there is no light at the middle of the sequence
+    diameters_mm : (n,)
+    frame_positions_mm : (frames, n, 3)
+    frame_brightness : (frames, n), 0 where there is no light
     """
 
     images: tuple[NDArray[np.uint16], ...]
@@ -165,6 +203,9 @@ class SimulatedFrames:
     positions_mm: NDArray[np.float64]
     velocities_m_s: NDArray[np.float64]
     brightness: NDArray[np.float64]
+    diameters_mm: NDArray[np.float64]
+    frame_positions_mm: NDArray[np.float64]
+    frame_brightness: NDArray[np.float64]
     truth: dict[str, Any]
 
 
@@ -219,20 +260,18 @@ def simulate_particles(
     Parameters
     ----------
     still : expected counts (rows, columns) of light that does not move, in all frames
-    progress : called with the number of tracers rendered, n for each frame
+    progress : called with the number of tracers rendered, for each frame those that are lit
     """
     positions = rng.uniform(tracers.box.low_mm, tracers.box.high_mm, (tracers.count, 3))
-    brightness = tracers.draw_brightness(rng)
+    brightness, sizes = tracers.draw_brightness(rng), tracers.draw_sizes(rng)
+    brightness, diameters = brightness * sizes**2, tracers.diameter_mm * sizes
+    places = np.stack([advect(motion.flow, positions, carried_s) for carried_s in motion.carried_s()])
+    lit = tracers.lit(places)
+    shown = brightness * tracers.draw_flicker(motion.frames, rng) * lit
     images = []
-    for time_s in motion.times_s():
-        expected = render_points(
-            camera.optics,
-            space,
-            Balls(advect(motion.flow, positions, time_s), tracers.light_counts * brightness, tracers.diameter_mm),
-            rng,
-            rays=tracers.rays,
-            progress=progress,
-        )
+    for place, seen, light in zip(places, lit, tracers.light_counts * shown, strict=True):
+        balls = Balls(place[seen], light[seen], diameters[seen])
+        expected = render_points(camera.optics, space, balls, rng, rays=tracers.rays, progress=progress)
         images.append(camera.readout.record(expected + still, rng))
     truth = {
         **camera_truth(camera.optics),
@@ -240,8 +279,9 @@ def simulate_particles(
         "particles": tracers.count,
         "window_distance_mm": None if space.window is None else space.window.distance_mm,
     }
-    dark = camera.dark_frame(rng)
-    return SimulatedFrames(tuple(images), dark, positions, motion.flow(positions), brightness, truth)
+    dark, at_middle = camera.dark_frame(rng), brightness * tracers.lit(positions)
+    velocities = motion.flow(positions)
+    return SimulatedFrames(tuple(images), dark, positions, velocities, at_middle, diameters, places, shown, truth)
 
 
 def camera_truth(camera: Camera) -> dict[str, Any]:
