@@ -173,6 +173,20 @@ class Motion:
         """Return for how long the flow of the middle would carry tracers to where each frame finds them."""
         return [self.pulsation.carried_s(time_s) for time_s in self.times_s()]
 
+    def places_mm(self, middle_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return where the frames find tracers (frames, n, 3) that are at these places (n, 3) at the middle.
+
+        From the middle on they go from frame to frame: over a whole sequence the steps of `advect` would be too long.
+        """
+        places, carried_s = np.empty((self.frames, *middle_mm.shape)), self.carried_s()
+        later = range(self.frames // 2, self.frames)
+        for numbers in (later, reversed(range(later.start))):
+            place, reached_s = middle_mm, 0.0
+            for number in numbers:
+                place = advect(self.flow, place, carried_s[number] - reached_s)
+                places[number], reached_s = place, carried_s[number]
+        return places
+
 
 @dataclass(frozen=True, eq=False)
 class SimulatedStill:
@@ -265,7 +279,7 @@ def simulate_particles(
     positions = rng.uniform(tracers.box.low_mm, tracers.box.high_mm, (tracers.count, 3))
     brightness, sizes = tracers.draw_brightness(rng), tracers.draw_sizes(rng)
     brightness, diameters = brightness * sizes**2, tracers.diameter_mm * sizes
-    places = np.stack([advect(motion.flow, positions, carried_s) for carried_s in motion.carried_s()])
+    places = motion.places_mm(positions)
     lit = tracers.lit(places)
     shown = brightness * tracers.draw_flicker(motion.frames, rng) * lit
     images = []
