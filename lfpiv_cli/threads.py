@@ -12,6 +12,10 @@ import numba
 # More than one, for pieces of work that do not take equally long; the threads wait for the last part.
 PARTS_A_THREAD = 4
 
+# For compiled functions that make no arrays: of every array that a function is given, in tuples too, numba counts the
+# references, which takes longer than what a short function does.
+COUNT_NO_REFERENCES = {"_nrt": False}
+
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 

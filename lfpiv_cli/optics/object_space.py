@@ -27,6 +27,7 @@ from lfpiv_cli.optics.media import (
     object_space_matrix,
 )
 from lfpiv_cli.optics.tracing import exact_slope
+from lfpiv_cli.threads import COUNT_NO_REFERENCES
 
 # The slope of a refracted ray over its lateral distance is an analytic function of that distance squared, nearly
 # constant: through five points of it, a polynomial is right to 1e-10 for lenses up to f/1.4.
@@ -157,7 +158,7 @@ def slope_polynomial(
     return nodes, factors
 
 
-@njit(cache=True)
+@njit(cache=True, **COUNT_NO_REFERENCES)
 def slope_ratio(lateral2_mm2: float, nodes: NDArray[np.float64], factors: NDArray[np.float64]) -> float:
     """Return slope / lateral distance from `slope_polynomial`."""
     value = factors[-1]

@@ -15,6 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.optics.microlenses import Lattice
+from lfpiv_cli.threads import COUNT_NO_REFERENCES
 from lfpiv_cli.weights.lens_cells import neighbours
 
 # Entries per radius of the ball. Between them second-order terms do: what is left is a quarter of (1/16)^3.
@@ -141,7 +142,7 @@ def _below(t: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(0.5 + (t * np.sqrt(1.0 - t * t) + np.arcsin(t)) / np.pi)
 
 
-@njit(cache=True)
+@njit(cache=True, **COUNT_NO_REFERENCES)
 def level_at(square_mm2: float, side2_mm2: NDArray[np.float64]) -> tuple[int, float]:
     """Return the table's level below a patch's side squared and the share of the next one."""
     level = 0
@@ -151,7 +152,7 @@ def level_at(square_mm2: float, side2_mm2: NDArray[np.float64]) -> tuple[int, fl
     return level, (square - side2_mm2[level]) / (side2_mm2[level + 1] - side2_mm2[level])
 
 
-@njit(cache=True)
+@njit(cache=True, **COUNT_NO_REFERENCES)
 def share_at(
     u: float, v: float, low: NDArray[np.float64], high: NDArray[np.float64], blend: float, step: float
 ) -> tuple[float, float, float, float, float, float]:

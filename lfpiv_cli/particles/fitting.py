@@ -14,6 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.particles.least_squares import (
+    SUMS,
     UNKNOWNS,
     Observation,
     Responses,
@@ -24,10 +25,9 @@ from lfpiv_cli.particles.least_squares import (
     respond_all,
     room_for,
 )
-from lfpiv_cli.particles.response import VALUES, respond
 from lfpiv_cli.particles.tiles import over_tiles
 from lfpiv_cli.particles.view import View, entry_capacity
-from lfpiv_cli.threads import blocks, in_threads
+from lfpiv_cli.threads import COUNT_NO_REFERENCES, blocks, in_threads
 
 # Candidates are brought into the fit from these depths beside their own, in depths over which light spreads by one lens
 # (Table 2: 0.4 mm).
@@ -41,7 +41,7 @@ CLAIM = 0.7
 BLOCK = 64
 
 
-@njit(cache=True)
+@njit(cache=True, fastmath=SUMS, **COUNT_NO_REFERENCES)
 def claimed_share(
     pixels: NDArray[np.int32],
     values: NDArray[np.float64],
@@ -63,7 +63,7 @@ def claimed_share(
     return found / wanted if wanted > 0.0 else 0.0
 
 
-@njit(cache=True)
+@njit(cache=True, fastmath=SUMS, **COUNT_NO_REFERENCES)
 def seen_share(pixels: NDArray[np.int32], values: NDArray[np.float64], weight: NDArray[np.float64]) -> float:
     """Return the share of a particle's light that meets pixels with weight."""
     seen = 0.0
@@ -238,11 +238,11 @@ def _add_all(
     capacity: int,
 ) -> None:
     """Do the work of `add_all` for the particles of a tile."""
-    pixels, values = np.empty(capacity, np.int32), np.empty((capacity, VALUES))
+    responses = room_for(1, capacity, 0)
     for number in numbers:
-        x, y, z, light = particles[number]
-        count = respond(view, x, y, z, pixels, values)
-        add_light(pixels[:count], values[:count], sign * light, image)
+        respond_all(view, particles[number : number + 1], responses)
+        pixels, values = lit_by(responses, 0)
+        add_light(pixels, values, sign * particles[number, 3], image)
 
 
 def judge(

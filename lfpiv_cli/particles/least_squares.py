@@ -18,9 +18,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from lfpiv_cli.particles.refraction import bend_of
 from lfpiv_cli.particles.response import VALUES, respond
+from lfpiv_cli.particles.rows import SLACK, Scratch, respond_rows, scratch
 from lfpiv_cli.particles.tiles import LARGEST_MOVE_LENSES
 from lfpiv_cli.particles.view import View, entry_capacity
+from lfpiv_cli.threads import COUNT_NO_REFERENCES
 
 UNKNOWNS = 4
 # Damping relative to the diagonal: its start, and the factors after a step that failed or helped.
@@ -32,6 +35,8 @@ SMALLEST_GAIN = 0.01
 # Longest step in depth, in depths over which light spreads by one lens (Table 2: 0.5 mm): further away the response is
 # another one and its slope says nothing.
 LONGEST_STEP_DEPTHS = 0.5 / 1.064
+# What the compiler may do to sums: add many terms at once. The order is the same for any number of threads.
+SUMS = {"reassoc", "contract", "nsz"}
 # A fit that may be given up early is judged after so many steps.
 EARLY_STEPS = 4
 
@@ -73,28 +78,31 @@ class Responses(NamedTuple):
 
     Attributes
     ----------
-    counts, pixels, values : (k,), (k, capacity), (k, capacity, 4) as `respond_once` writes them
-    place : (side, side) zeros, as wide as a footprint where there are two; serves to find common pixels
+    counts, pixels, values : (k,), (k, capacity), (k, 4, capacity) as `respond_rows` writes them
+    place : zeros, one for each pixel of as many rows as a footprint spans where there are two particles; serves to
+        find common pixels
+    scratch : room for what one lens shows
     """
 
     counts: NDArray[np.int64]
     pixels: NDArray[np.int32]
     values: NDArray[np.float64]
     place: NDArray[np.int32]
+    scratch: Scratch
 
 
 @njit(cache=True)
-def room_for(members: int, capacity: int, side: int) -> Responses:
+def room_for(members: int, capacity: int, places: int) -> Responses:
     """Return room for the responses of so many particles."""
-    pixels, values = np.empty((members, capacity), np.int32), np.empty((members, capacity, VALUES))
-    return Responses(np.zeros(members, np.int64), pixels, values, np.zeros((side, side), np.int32))
+    room = capacity + SLACK
+    pixels, values = np.empty((members, room), np.int32), np.empty((members, VALUES, room))
+    return Responses(np.zeros(members, np.int64), pixels, values, np.zeros(places, np.int32), scratch(capacity))
 
 
 @njit(cache=True)
 def lit_by(responses: Responses, member: int) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
-    """Return the pixels (n,) that a particle lights, and their values (n, 4)."""
-    count = responses.counts[member]
-    return responses.pixels[member][:count], responses.values[member][:count]
+    """Return the pixels (n,) that a particle lights, and values (n or more, 4), the first of which are theirs."""
+    return responses.pixels[member][: responses.counts[member]], responses.values[member].T
 
 
 @njit(cache=True)
@@ -103,9 +111,7 @@ def respond_once(
 ) -> int:
     """Write the response of a particle of unit light with each pixel named once; return the number of pixels.
 
-    `respond` names a pixel between two micro-images twice where it is lit through both. Its light is squared in
-    chi-squared, so that its two parts must be added first: near the focal plane depths would be wrong by half a
-    millimetre otherwise.
+    The readable twin of `respond_rows`.
     """
     entries = respond(view, x, y, z, pixels, values)
     if entries == 0:
@@ -139,7 +145,7 @@ def _row_and_column(pixel: int, columns: int) -> tuple[int, int]:
     return row, pixel - row * columns
 
 
-@njit(cache=True)
+@njit(cache=True, fastmath=SUMS, **COUNT_NO_REFERENCES)
 def normal_equations(
     pixels: NDArray[np.int32],
     values: NDArray[np.float64],
@@ -150,8 +156,10 @@ def normal_equations(
     right: NDArray[np.float64],
 ) -> float:
     """Fill J^T W J (4, 4) and J^T W (r - I f); return what the particle adds to chi-squared."""
-    matrix[:] = 0.0
-    right[:] = 0.0
+    for row in range(UNKNOWNS):
+        right[row] = 0.0
+        for column in range(UNKNOWNS):
+            matrix[row, column] = 0.0
     change = 0.0
     for k in range(pixels.size):
         at = pixels[k]
@@ -204,22 +212,19 @@ def _pair_equations(
     matrix[second, second] = block
     add_light(pixels_1, values_1, pair[0, 3], residual)
     # What the first explains is off the second's side already; the first's side still lacks the second's light.
-    place, side = responses.place, responses.place.shape[0]
-    top, left = observation.optics.camera.rows, columns
-    for pixel in pixels_1:
-        row, column = _row_and_column(pixel, columns)
-        top, left = min(top, row), min(left, column)
-    for k in range(pixels_1.size):
-        row, column = _row_and_column(pixels_1[k], columns)
-        place[row - top, column - left] = k + 1
     cross = np.zeros((UNKNOWNS, UNKNOWNS))
+    if pixels_1.size == 0:
+        return change
+    place, start = responses.place, pixels_1.min() // columns * columns
+    # Backwards: of a pixel that is named again the first entry counts.
+    for k in range(pixels_1.size - 1, -1, -1):
+        place[pixels_1[k] - start] = k + 1
     one, two = np.empty(UNKNOWNS), np.empty(UNKNOWNS)
     for k in range(pixels_2.size):
-        row, column = _row_and_column(pixels_2[k], columns)
-        row, column = row - top, column - left
-        if not (0 <= row < side and 0 <= column < side) or place[row, column] == 0:
+        away = pixels_2[k] - start
+        if not 0 <= away < place.size or place[away] == 0:
             continue
-        at = place[row, column] - 1
+        at = place[away] - 1
         w = weight[pixels_2[k]]
         for i in range(3):
             one[i] = pair[0, 3] * values_1[at, i + 1]
@@ -232,8 +237,7 @@ def _pair_equations(
     matrix[first, second] = cross
     matrix[second, first] = cross.T
     for pixel in pixels_1:
-        row, column = _row_and_column(pixel, columns)
-        place[row - top, column - left] = 0
+        place[pixel - start] = 0
     return change
 
 
@@ -332,7 +336,7 @@ def _equations(
     return normal_equations(pixels, values, members[0, 3], observation.residual, observation.weight, matrix, right)
 
 
-@njit(cache=True)
+@njit(cache=True, **COUNT_NO_REFERENCES)
 def _move(
     observation: Observation,
     members: NDArray[np.float64],
@@ -358,10 +362,11 @@ def respond_all(view: View, members: NDArray[np.float64], responses: Responses) 
     """Write the responses of one particle or two (k, 4)."""
     for m in range(members.shape[0]):
         x, y, z = members[m, 0], members[m, 1], members[m, 2]
-        responses.counts[m] = respond_once(view, x, y, z, responses.pixels[m], responses.values[m])
+        pixels, values = responses.pixels[m], responses.values[m]
+        responses.counts[m] = respond_rows(view, bend_of(view, x, y, z), pixels, values, responses.scratch)
 
 
-@njit(cache=True)
+@njit(cache=True, fastmath=SUMS, **COUNT_NO_REFERENCES)
 def best_light(
     pixels: NDArray[np.int32],
     values: NDArray[np.float64],
@@ -377,7 +382,7 @@ def best_light(
     return max(top / bottom, 0.0) if bottom > 0.0 else 0.0
 
 
-@njit(cache=True)
+@njit(cache=True, **COUNT_NO_REFERENCES)
 def add_light(pixels: NDArray[np.int32], values: NDArray[np.float64], light: float, image: NDArray[np.float64]) -> None:
     """Add light times the response to an image."""
     for k in range(pixels.size):

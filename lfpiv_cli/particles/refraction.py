@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.optics.object_space import slope_polynomial, slope_ratio
 from lfpiv_cli.particles.view import View
+from lfpiv_cli.threads import COUNT_NO_REFERENCES
 
 # The shift changes by some 1e-3 of what a point moves: twice leaves a millionth of it.
 REPEATS = 2
@@ -48,7 +49,7 @@ class Bend(NamedTuple):
     distance: float
 
 
-@njit(cache=True)
+@njit(cache=True, **COUNT_NO_REFERENCES)
 def _in_fluid(view: View, z: float) -> float:
     """Return a depth, or that just behind the window where it lies in front of the fluid."""
     return max(z, SHALLOWEST_DEPTHS * view.scale.depth_mm - view.layers.thicknesses_mm[-1])
@@ -73,7 +74,7 @@ def bend_of(view: View, x: float, y: float, z: float) -> Bend:
     return Bend(x, y, nodes, factors, middle * x, middle * y, distance)
 
 
-@njit(cache=True)
+@njit(cache=True, **COUNT_NO_REFERENCES)
 def displaced(bend: Bend, at_x: float, at_y: float) -> tuple[float, float]:
     """Return by how much the real ray's slope (x, y) exceeds the straight one's where they cross the main lens."""
     if bend.nodes.size == 0:
@@ -83,7 +84,7 @@ def displaced(bend: Bend, at_x: float, at_y: float) -> tuple[float, float]:
     return ratio * dx - (at_x - bend.seen_x) / bend.distance, ratio * dy - (at_y - bend.seen_y) / bend.distance
 
 
-@njit(cache=True)
+@njit(cache=True, **COUNT_NO_REFERENCES)
 def largest_displacement(bend: Bend, radius: float) -> float:
     """Return a bound of what `displaced` returns on a main lens of that radius."""
     if bend.nodes.size == 0:

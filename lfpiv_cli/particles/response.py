@@ -31,18 +31,13 @@ from lfpiv_cli.particles.cells import BALL_VARIANCE, level_at, share_at
 from lfpiv_cli.particles.refraction import Bend, bend_of, displaced, largest_displacement
 from lfpiv_cli.particles.rim import covered_share
 from lfpiv_cli.particles.view import View
+from lfpiv_cli.simd.micro_images import GAUSS_AT, GAUSS_WEIGHT, LONGEST, SMALLEST_SHARE
+from lfpiv_cli.threads import COUNT_NO_REFERENCES
 
-# Three-point Gauss-Legendre on (-1, 1): exact for the cubic profile wherever it has no kink within the patch.
-GAUSS_AT = np.sqrt(0.6)
-GAUSS_WEIGHT = (5.0 / 18.0, 8.0 / 18.0, 5.0 / 18.0)
 # Rows of a profile: mean and slope of P, their derivatives by x and by z, the patch's middle, and how far from the
 # ball's middle the part of it is that is seen, times P.
 MEAN, SLOPE, MEAN_X, SLOPE_X, MEAN_Z, SLOPE_Z, PATCH, AWAY = range(8)
 PROFILE_ROWS = 8
-# Pixels that one micro-image may span.
-LONGEST_PROFILE = 96
-# Of a ball; what sees less sees nothing.
-SMALLEST_SHARE = 1e-9
 # Columns of the entries' values: light, and its derivatives by x, y and z.
 VALUES = 4
 
@@ -127,7 +122,7 @@ def ball_moment(t: float) -> float:
 
 @njit(cache=True)
 def respond(view: View, x: float, y: float, z: float, pixels: NDArray[np.int32], values: NDArray[np.float64]) -> int:
-    """Write the entries of a particle of unit light; return their number.
+    """Write the entries of a particle of unit light; return their number. Fits use `rows.respond_rows`.
 
     Parameters
     ----------
@@ -137,18 +132,18 @@ def respond(view: View, x: float, y: float, z: float, pixels: NDArray[np.int32],
     """
     camera = view.camera
     bend = bend_of(view, x, y, z)
-    projection = _project(view, bend)
-    low_i, high_i, low_j, high_j = _lenses(view, projection, bend)
-    along_x = np.empty((PROFILE_ROWS, LONGEST_PROFILE))
-    along_y = np.empty((PROFILE_ROWS, LONGEST_PROFILE))
+    projection = project(view, bend)
+    low_i, high_i, low_j, high_j = lenses_of(view, projection, bend)
+    along_x = np.empty((PROFILE_ROWS, LONGEST))
+    along_y = np.empty((PROFILE_ROWS, LONGEST))
     count = 0
     for j in range(low_j, high_j + 1):
         for i in range(low_i, high_i + 1):
             s_x, s_y = view.centres_mm[j, i]
             if view.cell_table.shape[0] > 0:
-                count += _join_cell(view, projection, bend, (s_x, s_y), pixels[count:], values[count:])
+                count += join_cell(view, projection, bend, (s_x, s_y), pixels[count:], values[count:])
                 continue
-            bent_x, bent_y = _bent_at(view, projection, bend, s_x, s_y)
+            bent_x, bent_y = bent_at(view, projection, bend, s_x, s_y)
             axis_x = Axis(projection.x, projection.at_x + bent_x, projection.stretch_x, view.half_x_mm, camera.columns)
             across = _profile(view, projection, axis_x, s_x, along_x)
             if across.number == 0:
@@ -161,8 +156,8 @@ def respond(view: View, x: float, y: float, z: float, pixels: NDArray[np.int32],
     return count
 
 
-@njit(cache=True)
-def _project(view: View, bend: Bend) -> Projection:
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def project(view: View, bend: Bend) -> Projection:
     """Return how the main lens shows a particle."""
     camera = view.camera
     x, y, distance = bend.seen_x, bend.seen_y, bend.distance
@@ -192,8 +187,8 @@ def _project(view: View, bend: Bend) -> Projection:
     )
 
 
-@njit(cache=True)
-def _bent_at(view: View, projection: Projection, bend: Bend, s_x: float, s_y: float) -> tuple[float, float]:
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def bent_at(view: View, projection: Projection, bend: Bend, s_x: float, s_y: float) -> tuple[float, float]:
     """Return what bent rays are moved by (x, y) on the array in the middle of the patches of the lens at s."""
     if bend.nodes.size == 0:
         return 0.0, 0.0
@@ -206,14 +201,14 @@ def _bent_at(view: View, projection: Projection, bend: Bend, s_x: float, s_y: fl
     return projection.stretch_x * distance * slope_x, projection.stretch_y * distance * slope_y
 
 
-@njit(cache=True)
+@njit(cache=True, **COUNT_NO_REFERENCES)
 def _middle_of_part(gain: float, offset: float, reach: float, radius: float) -> float:
     """Return the middle of `_part_of_lens`; where there is none, a place on the main lens all the same."""
     low, high = _part_of_lens(gain, offset, reach, radius)
     return min(max(0.5 * (low + high), -radius), radius)
 
 
-@njit(cache=True)
+@njit(cache=True, **COUNT_NO_REFERENCES)
 def _part_of_lens(gain: float, offset: float, reach: float, radius: float) -> tuple[float, float]:
     """Return between which X of -radius to radius `offset` + `gain` X is within `reach` of 0.
 
@@ -227,8 +222,8 @@ def _part_of_lens(gain: float, offset: float, reach: float, radius: float) -> tu
     return -radius, radius
 
 
-@njit(cache=True)
-def _lenses(view: View, projection: Projection, bend: Bend) -> tuple[int, int, int, int]:
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def lenses_of(view: View, projection: Projection, bend: Bend) -> tuple[int, int, int, int]:
     """Return the ranges of lens indices, first and last along i and j, whose cells the light can reach."""
     camera = view.camera
     widest = max(projection.stretch_x, projection.stretch_y)
@@ -249,8 +244,8 @@ def _lenses(view: View, projection: Projection, bend: Bend) -> tuple[int, int, i
     return low_i, high_i, low_j, high_j
 
 
-@njit(cache=True)
-def _lit_pixels(
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def lit_pixels(
     view: View, gain: float, offset: float, reach: float, scale: float, shift: float, pixels: int
 ) -> tuple[int, int]:
     """Return the first pixel that a lens can light along one axis, and how many.
@@ -266,7 +261,7 @@ def _lit_pixels(
     first = int(np.floor(min(one, other) / camera.pixel_mm + 0.5 * pixels))
     last = int(np.floor(max(one, other) / camera.pixel_mm + 0.5 * pixels))
     first, last = max(first, 0), min(last, pixels - 1)
-    return first, max(min(last - first + 1, LONGEST_PROFILE), 0)
+    return first, max(min(last - first + 1, LONGEST), 0)
 
 
 @njit(cache=True)
@@ -279,7 +274,7 @@ def _profile(view: View, projection: Projection, axis: Axis, s: float, out: NDAr
     radius, growth = projection.radius, projection.growth
     gain = stretch * alpha
     shift = (1.0 - camera.bend) * s - lever * beta * x
-    first, count = _lit_pixels(view, gain, at - s, half + radius, scale, shift, pixels)
+    first, count = lit_pixels(view, gain, at - s, half + radius, scale, shift, pixels)
     width = camera.pixel_mm / scale
     for k in range(count):
         middle = ((first + k + 0.5 - 0.5 * pixels) * camera.pixel_mm - shift) / scale
@@ -378,8 +373,8 @@ def _join(
     return count
 
 
-@njit(cache=True)
-def _join_cell(
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def join_cell(
     view: View,
     projection: Projection,
     bend: Bend,
@@ -397,8 +392,8 @@ def _join_cell(
     gain_x, gain_y = stretch_x * alpha, stretch_y * alpha
     shift_x = (1.0 - camera.bend) * s_x - lever * scale * beta * x
     shift_y = (1.0 - camera.bend) * s_y - lever * scale * beta * y
-    column, columns = _lit_pixels(view, gain_x, off_x, view.half_x_mm + radius, scale, shift_x, camera.columns)
-    row, rows = _lit_pixels(view, gain_y, off_y, view.half_y_mm + radius, scale, shift_y, camera.rows)
+    column, columns = lit_pixels(view, gain_x, off_x, view.half_x_mm + radius, scale, shift_x, camera.columns)
+    row, rows = lit_pixels(view, gain_y, off_y, view.half_y_mm + radius, scale, shift_y, camera.rows)
     width = abs(camera.pixel_mm / scale)
     norm = width * width / (np.pi * camera.aperture_radius_mm**2)
     inside = max(camera.aperture_radius_mm - 0.71 * width, 0.0) ** 2

@@ -12,6 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from lfpiv_cli.threads import COUNT_NO_REFERENCES
 from lfpiv_cli.weights.aperture import disc_area_below
 
 # The share is linear between entries: at sixteen entries per patch it is right to 1e-3 on the rim.
@@ -65,7 +66,7 @@ def _table(count: int, step: float, radius: float, patch: float) -> NDArray[np.f
     return table
 
 
-@njit(cache=True)
+@njit(cache=True, **COUNT_NO_REFERENCES)
 def covered_share(
     x: float, y: float, width: float, radius: float, table: NDArray[np.float64], step: float
 ) -> tuple[float, float, float, float, float]:

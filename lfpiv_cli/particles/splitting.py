@@ -54,11 +54,11 @@ def split(
     the same shape whose other rows are zero. The residual is kept up to date.
     """
     partners = np.zeros_like(particles)
-    side = footprint_px(observation.optics, *observation.depths_mm)
+    places = footprint_px(observation.optics, *observation.depths_mm) * observation.optics.camera.columns
 
     def work(numbers: NDArray[np.int64]) -> None:
         least = (smallest_gain, smallest_light)
-        _split(observation, particles, numbers[suspects[numbers]], side, PAIR_STEPS, least, partners)
+        _split(observation, particles, numbers[suspects[numbers]], places, PAIR_STEPS, least, partners)
 
     over_tiles(work, observation.optics, particles, observation.depths_mm)
     return partners
@@ -69,14 +69,14 @@ def _split(
     observation: Observation,
     particles: NDArray[np.float64],
     numbers: NDArray[np.int64],
-    side: int,
+    places: int,
     steps: int,
     least: tuple[float, float],
     partners: NDArray[np.float64],
 ) -> None:
     """Do the work of `split` for suspects of a tile; `least` is what two must gain, and the light of each."""
     view, residual, scale = observation.optics, observation.residual, observation.optics.scale
-    responses = room_for(2, observation.capacity, side)
+    responses = room_for(2, observation.capacity, places)
     matrix, right = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
     pair, best = np.empty((2, UNKNOWNS)), np.empty((2, UNKNOWNS))
     for number in numbers:

@@ -1,0 +1,312 @@
+"""The response of `response`, for fits: neighbouring pixels of a row at once, and each pixel lit only once.
+
+Where micro-images overlap a pixel is lit through two lenses. Its light is squared in chi-squared, so that its two parts
+must be added first: near the focal plane depths would be wrong by half a millimetre otherwise. The sum stands where the
+pixel is named first; named again, it has no light.
+
+Axes and entries: see `response`. Values are held as rows (4, capacity): light, and its derivatives by x, y and z.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from lfpiv_cli.particles.refraction import Bend
+from lfpiv_cli.particles.response import Projection, bent_at, join_cell, lenses_of, lit_pixels, project
+from lfpiv_cli.particles.rim import ENTRIES_PER_PATCH
+from lfpiv_cli.particles.view import View
+from lfpiv_cli.simd.micro_images import (
+    JOIN_NUMBERS,
+    OF_ROW,
+    PATCH,
+    PROFILE_ROWS,
+    RIM_ROWS,
+    STRIDE,
+    WHOLE,
+    cover_row,
+    fill_profile,
+    join_row,
+)
+from lfpiv_cli.threads import COUNT_NO_REFERENCES
+
+# A row of a micro-image is written up to the end of a register: so many entries more than there are.
+SLACK = 8
+
+
+class Scratch(NamedTuple):
+    """Room for what one lens shows, see `simd.micro_images`."""
+
+    across: NDArray[np.float64]
+    down: NDArray[np.float64]
+    rim: NDArray[np.float64]
+    numbers: NDArray[np.float64]
+    lenses: NDArray[np.int64]
+
+
+@njit(cache=True)
+def scratch(capacity: int) -> Scratch:
+    """Return the room for so many entries."""
+    rim = np.zeros(2 * RIM_ROWS * STRIDE)
+    rim[WHOLE : WHOLE + STRIDE] = 1.0
+    across, down = np.zeros(PROFILE_ROWS * STRIDE), np.zeros(PROFILE_ROWS * STRIDE)
+    return Scratch(across, down, rim, np.zeros(JOIN_NUMBERS), np.empty((capacity + 1, 5), np.int64))
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def respond_rows(
+    view: View,
+    bend: Bend,
+    pixels: NDArray[np.int32],
+    values: NDArray[np.float64],
+    room: Scratch,
+) -> int:
+    """Write the entries of a particle of unit light; return their number.
+
+    Parameters
+    ----------
+    bend : of its rays, see `bend_of`
+    pixels : (capacity,) flat pixel numbers, written
+    values : (4, capacity) light and its derivatives by x, y, z, written
+    """
+    projection = project(view, bend)
+    _set_numbers(view, projection, bend, room.numbers)
+    low_i, high_i, low_j, high_j = lenses_of(view, projection, bend)
+    # Of each lens: end of its entries, first and last row, first and last column.
+    ends = room.lenses
+    ends[0, 0] = 0
+    shown = 0
+    for j in range(low_j, high_j + 1):
+        for i in range(low_i, high_i + 1):
+            lens = (view.centres_mm[j, i, 0], view.centres_mm[j, i, 1])
+            begin = ends[shown, 0]
+            if view.cell_table.shape[0] > 0:
+                count = join_cell(view, projection, bend, lens, pixels[begin:], values.T[begin:])
+                _set_rectangle(pixels[begin : begin + count], view.camera.columns, ends[shown + 1])
+            else:
+                count = _write_lens(view, projection, bend, lens, begin, pixels, values, room, ends[shown + 1])
+            if count == 0:
+                continue
+            shown += 1
+            ends[shown, 0] = begin + count
+            for other in range(1, shown):
+                if (
+                    ends[other, 1] <= ends[shown, 2]
+                    and ends[shown, 1] <= ends[other, 2]
+                    and ends[other, 3] <= ends[shown, 4]
+                    and ends[shown, 3] <= ends[other, 4]
+                ):
+                    _join_twice_lit((ends[other - 1, 0], ends[other, 0]), (begin, ends[shown, 0]), pixels, values)
+    return int(ends[shown, 0])
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def _set_numbers(view: View, projection: Projection, bend: Bend, numbers: NDArray[np.float64]) -> None:
+    """Set `JoinNumbers` of a particle, but for those that each lens has of its own."""
+    camera = view.camera
+    ratio = projection.lever / projection.scale
+    width = camera.pixel_mm / projection.scale
+    numbers[0] = ratio * projection.beta
+    numbers[1], numbers[2] = projection.x, projection.y
+    numbers[3] = ratio * projection.slope
+    numbers[4] = width * width / (np.pi * camera.aperture_radius_mm**2)
+    numbers[5] = -2.0 * ratio * projection.slope
+    for n in range(6, numbers.size):
+        numbers[n] = 0.0
+    if bend.nodes.size > 0:
+        numbers[6], numbers[7], numbers[8], numbers[9] = bend.x, bend.y, bend.seen_x, bend.seen_y
+        numbers[10] = 1.0 / bend.distance
+        for n in range(4):
+            numbers[11 + n] = bend.nodes[n]
+        for n in range(5):
+            numbers[15 + n] = bend.factors[n]
+        # What a profile changes by with x, over what the array point does, times what that moves by.
+        more = camera.image_distance_mm / (projection.alpha * numbers[0] - projection.beta)
+        numbers[20] = numbers[21] = more
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def _write_lens(
+    view: View,
+    projection: Projection,
+    bend: Bend,
+    lens: tuple[float, float],
+    begin: int,
+    pixels: NDArray[np.int32],
+    values: NDArray[np.float64],
+    room: Scratch,
+    rectangle: NDArray[np.int64],
+) -> int:
+    """Write the entries of one lens with a rectangular cell from `begin` on; return their number.
+
+    Sets the rectangle of pixels that they lie in: first and last row, first and last column, from the second number on.
+    """
+    camera, numbers = view.camera, room.numbers
+    radius = projection.radius
+    bent_x, bent_y = bent_at(view, projection, bend, lens[0], lens[1])
+    gain_x, gain_y = projection.stretch_x * projection.alpha, projection.stretch_y * projection.alpha
+    offset_x, offset_y = projection.at_x + bent_x - lens[0], projection.at_y + bent_y - lens[1]
+    shift_x = (1.0 - camera.bend) * lens[0] - projection.lever * projection.beta * projection.x
+    shift_y = (1.0 - camera.bend) * lens[1] - projection.lever * projection.beta * projection.y
+    column, columns = lit_pixels(
+        view, gain_x, offset_x, view.half_x_mm + radius, projection.scale, shift_x, camera.columns
+    )
+    if columns == 0:
+        return 0
+    row, rows = lit_pixels(view, gain_y, offset_y, view.half_y_mm + radius, projection.scale, shift_y, camera.rows)
+    if rows == 0:
+        return 0
+    step = camera.pixel_mm / projection.scale
+    first_x = ((column + 0.5 - 0.5 * camera.columns) * camera.pixel_mm - shift_x) / projection.scale
+    first_y = ((row + 0.5 - 0.5 * camera.rows) * camera.pixel_mm - shift_y) / projection.scale
+    if _nearest(first_x, step, columns) + _nearest(first_y, step, rows) >= _far(view, step):
+        return 0
+    _fill(
+        view, projection, (first_x, offset_x, projection.stretch_x, view.half_x_mm, projection.x), columns, room.across
+    )
+    _fill(view, projection, (first_y, offset_y, projection.stretch_y, view.half_y_mm, projection.y), rows, room.down)
+    if bend.nodes.size > 0:
+        per_array = numbers[20] / camera.image_distance_mm
+        numbers[22] = per_array / projection.stretch_x * bent_x
+        numbers[23] = per_array / projection.stretch_y * bent_y
+    return _write_rows(view, (row, rows), (column, columns), step, begin, pixels, values, room, rectangle)
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def _nearest(first: float, step: float, count: int) -> float:
+    """Return the square of the smallest of |first + n step|."""
+    last = first + (count - 1) * step
+    return 0.0 if first * last <= 0.0 else min(abs(first), abs(last)) ** 2
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def _far(view: View, step: float) -> float:
+    """Return the square of how far from the axis a patch is that the rim does not touch, from outside."""
+    return float((view.camera.aperture_radius_mm + 0.71 * abs(step)) ** 2)
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def _fill(
+    view: View,
+    projection: Projection,
+    axis: tuple[float, float, float, float, float],
+    count: int,
+    out: NDArray[np.float64],
+) -> None:
+    """Fill the profile of one lens along an axis.
+
+    `axis` is its first patch, what the array is off by and stretched, half the cell, and the particle's place.
+    """
+    first, offset, stretch, half, x = axis
+    camera = view.camera
+    step = camera.pixel_mm / projection.scale
+    ratio = projection.lever / projection.scale
+    gain = stretch * projection.alpha
+    numbers = (
+        first,
+        step,
+        abs(step),
+        offset,
+        gain,
+        gain * ratio * projection.beta - projection.beta * stretch,
+        x,
+        projection.slope * (stretch - gain * ratio),
+        half,
+        1.0 / projection.radius,
+        projection.growth,
+        ratio * projection.beta * view.particle_radius_mm,
+    )
+    fill_profile(out, count, numbers)
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def _write_rows(
+    view: View,
+    down: tuple[int, int],
+    across: tuple[int, int],
+    step: float,
+    begin: int,
+    pixels: NDArray[np.int32],
+    values: NDArray[np.float64],
+    room: Scratch,
+    rectangle: NDArray[np.int64],
+) -> int:
+    """Write the entries of one lens whose profiles are known, row by row; see `_write_lens`."""
+    camera = view.camera
+    (row, rows), (column, columns) = down, across
+    width = abs(step)
+    outside = _far(view, step)
+    inside = max(camera.aperture_radius_mm - 0.71 * width, 0.0) ** 2
+    per_width = ENTRIES_PER_PATCH * view.table_step_mm / width
+    rim_numbers = (
+        camera.aperture_radius_mm,
+        per_width,
+        view.table_step_mm,
+        view.table.shape[0] - 1.001,
+        per_width / view.table_step_mm,
+        inside,
+    )
+    first = room.across[PATCH * STRIDE]
+    at = begin
+    rectangle[1], rectangle[2], rectangle[3], rectangle[4] = row + rows, -1, column + columns, -1
+    for m in range(rows):
+        y = room.down[PATCH * STRIDE + m]
+        low, high = _columns_within(outside - y * y, first, step, columns)
+        if low >= high or at + high - low + SLACK > pixels.size:
+            continue
+        whole_low, whole_high = _columns_within(inside - y * y, first, step, columns)
+        whole = whole_low == low and whole_high == high
+        if not whole:
+            cover_row(room.rim, room.across, (low, high - low), room.down, m, view.table, rim_numbers)
+        to = (at, (row + m) * camera.columns + column + low)
+        chosen = (low, high - low, WHOLE if whole else OF_ROW)
+        join_row(pixels, values, to, room.across, chosen, room.down, m, room.rim, room.numbers)
+        at += high - low
+        rectangle[1], rectangle[2] = min(rectangle[1], row + m), row + m
+        rectangle[3], rectangle[4] = min(rectangle[3], column + low), max(rectangle[4], column + high - 1)
+    return at - begin
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def _columns_within(square: float, first: float, step: float, columns: int) -> tuple[int, int]:
+    """Return the first n of those whose (first + n step)^2 is below `square`, and the one behind the last."""
+    if square <= 0.0:
+        return 0, 0
+    reach = np.sqrt(square)
+    one, other = (-reach - first) / step, (reach - first) / step
+    low, high = int(np.ceil(min(one, other))), int(np.floor(max(one, other))) + 1
+    return max(low, 0), min(high, columns)
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def _set_rectangle(pixels: NDArray[np.int32], columns: int, rectangle: NDArray[np.int64]) -> None:
+    """Set the rectangle of pixels: first and last row, first and last column, from the second number on."""
+    rectangle[1], rectangle[2], rectangle[3], rectangle[4] = pixels.size, -1, columns, -1
+    if pixels.size == 0:
+        return
+    rectangle[1], rectangle[2] = pixels[0] // columns, pixels[-1] // columns
+    for pixel in pixels:
+        column = pixel % columns
+        rectangle[3], rectangle[4] = min(rectangle[3], column), max(rectangle[4], column)
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def _join_twice_lit(
+    one: tuple[int, int], other: tuple[int, int], pixels: NDArray[np.int32], values: NDArray[np.float64]
+) -> None:
+    """Move what a lens lights of another's pixels to that one's entries; either's (first, end) ascend."""
+    a, b = one[0], other[0]
+    while a < one[1] and b < other[1]:
+        if pixels[a] < pixels[b]:
+            a += 1
+        elif pixels[b] < pixels[a]:
+            b += 1
+        else:
+            for k in range(values.shape[0]):
+                values[k, a] += values[k, b]
+                values[k, b] = 0.0
+            a += 1
+            b += 1

@@ -1,0 +1,162 @@
+"""Formulas for the vector unit, written as for plain numbers; `Lanes` in place of these generate code for many at once.
+
+A formula is a function of numbers by Python's operators and the functions below. A readable twin calls it with one
+number after the other, its intrinsic once with as many float64 numbers as a register holds. Products and sums may be
+fused.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from llvmlite import ir
+from numba.core import cgutils
+
+from lfpiv_cli.simd.vectors import LANES, index, load_one
+
+# A register holds half as many float64 numbers as float32.
+DOUBLES = LANES // 2
+VECTOR = ir.VectorType(ir.DoubleType(), DOUBLES)
+PIXELS = ir.VectorType(ir.IntType(32), DOUBLES)
+INTEGERS = ir.VectorType(ir.IntType(64), DOUBLES)
+FUSED = ("contract",)
+
+
+class Lanes:
+    """As many float64 numbers as a register holds, at work on which code is generated."""
+
+    def __init__(self, builder: ir.IRBuilder, value: Any) -> None:
+        self.builder = builder
+        self.value = value
+
+    def _with(self, operation: str, a: Any, b: Any) -> Lanes:
+        a, b = (lanes(self.builder, number).value for number in (a, b))
+        return Lanes(self.builder, getattr(self.builder, operation)(a, b, flags=FUSED))
+
+    def __add__(self, other: Lanes | float) -> Lanes:
+        return self._with("fadd", self, other)
+
+    def __radd__(self, other: float) -> Lanes:
+        return self._with("fadd", other, self)
+
+    def __sub__(self, other: Lanes | float) -> Lanes:
+        return self._with("fsub", self, other)
+
+    def __rsub__(self, other: float) -> Lanes:
+        return self._with("fsub", other, self)
+
+    def __mul__(self, other: Lanes | float) -> Lanes:
+        return self._with("fmul", self, other)
+
+    def __rmul__(self, other: float) -> Lanes:
+        return self._with("fmul", other, self)
+
+    def __truediv__(self, other: Lanes | float) -> Lanes:
+        return self._with("fdiv", self, other)
+
+    def called(self, name: str, *others: Lanes | float) -> Lanes:
+        """Return what one of LLVM's functions of whole vectors gives."""
+        kind = ir.FunctionType(VECTOR, [VECTOR] * (1 + len(others)))
+        function = cgutils.get_or_insert_function(self.builder.module, kind, f"llvm.{name}.v{DOUBLES}f64")
+        values = [lanes(self.builder, number).value for number in (self, *others)]
+        return Lanes(self.builder, self.builder.call(function, values))
+
+
+def at_least(number: Any, least: float) -> Any:
+    """Return a number, or `least` where it is smaller or no number."""
+    return number.called("maxnum", least) if isinstance(number, Lanes) else max(least, number)
+
+
+def at_most(number: Any, most: float) -> Any:
+    """Return a number, or `most` where it is larger."""
+    return number.called("minnum", most) if isinstance(number, Lanes) else min(most, number)
+
+
+def root(number: Any) -> Any:
+    """Return a number's square root."""
+    return number.called("sqrt") if isinstance(number, Lanes) else math.sqrt(number)
+
+
+def where_above(number: Any, limit: Any, kept: Any, other: Any) -> Any:
+    """Return one number where another is above a limit, and a third elsewhere."""
+    if not isinstance(number, Lanes):
+        return kept if number > limit else other
+    builder = number.builder
+    limit, kept, other = (lanes(builder, one).value for one in (limit, kept, other))
+    return Lanes(builder, builder.select(builder.fcmp_ordered(">", number.value, limit), kept, other))
+
+
+def lanes(builder: ir.IRBuilder, number: Any) -> Lanes:
+    """Return a number, known when the code is generated or when it runs, in every lane."""
+    if isinstance(number, Lanes):
+        return number
+    if isinstance(number, float | int):
+        return Lanes(builder, ir.Constant(VECTOR, [float(number)] * DOUBLES))
+    undefined = ir.Constant(VECTOR, ir.Undefined)
+    one = builder.insert_element(undefined, number, ir.Constant(ir.IntType(32), 0))
+    order = ir.Constant(ir.VectorType(ir.IntType(32), DOUBLES), [0] * DOUBLES)
+    return Lanes(builder, builder.shuffle_vector(one, undefined, order))
+
+
+def counted_from(builder: ir.IRBuilder, first: Any) -> Lanes:
+    """Return first, first + 1 and so on."""
+    return lanes(builder, builder.sitofp(first, ir.DoubleType())) + Lanes(
+        builder, ir.Constant(VECTOR, [float(lane) for lane in range(DOUBLES)])
+    )
+
+
+def load_lanes(builder: ir.IRBuilder, array: Any, place: Any) -> Lanes:
+    """Return neighbouring elements of an array."""
+    loaded = builder.load(builder.bitcast(builder.gep(array, [place]), VECTOR.as_pointer()))
+    loaded.align = 8
+    return Lanes(builder, loaded)
+
+
+def store_lanes(builder: ir.IRBuilder, numbers: Lanes, array: Any, place: Any) -> None:
+    """Write neighbouring elements of an array."""
+    pointer = builder.bitcast(builder.gep(array, [place]), VECTOR.as_pointer())
+    builder.store(numbers.value, pointer).align = 8
+
+
+def store_count(builder: ir.IRBuilder, first: Any, array: Any, place: Any) -> None:
+    """Write first, first + 1 and so on to neighbouring elements of an array of int32."""
+    narrow = ir.IntType(32)
+    undefined = ir.Constant(PIXELS, ir.Undefined)
+    one = builder.insert_element(undefined, builder.trunc(first, narrow), ir.Constant(narrow, 0))
+    order = ir.Constant(ir.VectorType(narrow, DOUBLES), [0] * DOUBLES)
+    numbers = builder.add(builder.shuffle_vector(one, undefined, order), ir.Constant(PIXELS, list(range(DOUBLES))))
+    pointer = builder.bitcast(builder.gep(array, [place]), PIXELS.as_pointer())
+    builder.store(numbers, pointer).align = 4
+
+
+def groups_of_lanes(builder: ir.IRBuilder, count: Any) -> Any:
+    """Return the loop over as many registers as hold `count` numbers."""
+    return cgutils.for_range(builder, builder.sdiv(builder.add(count, index(DOUBLES - 1)), index(DOUBLES)))
+
+
+def whole_part(numbers: Lanes) -> tuple[Lanes, Any]:
+    """Return numbers from 0 on without their fractions, and as integers."""
+    builder = numbers.builder
+    whole = builder.fptosi(numbers.value, INTEGERS)
+    return Lanes(builder, builder.sitofp(whole, VECTOR)), whole
+
+
+def integers_in_lanes(builder: ir.IRBuilder, number: Any) -> Any:
+    """Return an integer in every lane."""
+    undefined = ir.Constant(INTEGERS, ir.Undefined)
+    one = builder.insert_element(undefined, number, ir.Constant(ir.IntType(32), 0))
+    order = ir.Constant(ir.VectorType(ir.IntType(32), DOUBLES), [0] * DOUBLES)
+    return builder.shuffle_vector(one, undefined, order)
+
+
+def gather(builder: ir.IRBuilder, array: Any, places: Any, offsets: Sequence[Any]) -> list[Lanes]:
+    """Return for each offset the elements of an array that are so far from those at some places."""
+    found: list[Any] = [ir.Constant(VECTOR, ir.Undefined)] * len(offsets)
+    for lane in range(DOUBLES):
+        at = ir.Constant(ir.IntType(32), lane)
+        begin = builder.gep(array, [builder.extract_element(places, at)])
+        for k, offset in enumerate(offsets):
+            found[k] = builder.insert_element(found[k], load_one(builder, begin, offset), at)
+    return [Lanes(builder, value) for value in found]
