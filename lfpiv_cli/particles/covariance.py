@@ -25,7 +25,7 @@ from lfpiv_cli.particles.least_squares import UNKNOWNS, Observation
 from lfpiv_cli.particles.noise import Correlation
 from lfpiv_cli.particles.response import entries_of
 from lfpiv_cli.particles.view import View, footprint_radius_mm, on_array_mm
-from lfpiv_cli.threads import blocks, in_threads
+from lfpiv_cli.threads import COUNT_NO_REFERENCES, blocks, in_threads
 
 # Neighbours that are left free: with twice as many the errors of 8,300 particles change by a thousandth.
 FREE_NEIGHBOURS = 12
@@ -143,7 +143,7 @@ def _overlapping(view: View, particles: NDArray[np.float64]) -> Neighbours:
     return Neighbours(start.astype(np.int64), pairs[1].astype(np.int64))
 
 
-@njit(cache=True)
+@njit(cache=True, **COUNT_NO_REFERENCES)
 def _rectangle(slopes: Slopes, n: int) -> tuple[int, int, int, int]:
     """Return first row, first column, rows and columns of the rectangle of pixels that a particle lights."""
     begin, end = slopes.start[n], slopes.start[n + 1]
@@ -185,7 +185,7 @@ def _fill_blocks(
             _add_products(slopes, neighbours.other[at], own, top, left, block[at])
 
 
-@njit(cache=True)
+@njit(cache=True, **COUNT_NO_REFERENCES)
 def _add_products(
     slopes: Slopes, m: int, own: NDArray[np.float64], top: int, left: int, block: NDArray[np.float64]
 ) -> None:
@@ -224,7 +224,7 @@ def _covariances(
             _add_excess(moved_by, correlation.decay, correlation.share + excess, result[k])
 
 
-@njit(cache=True)
+@njit(cache=True, **COUNT_NO_REFERENCES)
 def _rescale(matrix: NDArray[np.float64], scale: NDArray[np.float64]) -> None:
     """Multiply rows and columns of a matrix by the scales of its unknowns."""
     for i in range(scale.size):
@@ -248,7 +248,7 @@ def _strongest(equations: Equations, n: int) -> NDArray[np.int64]:
     return members
 
 
-@njit(cache=True)
+@njit(cache=True, **COUNT_NO_REFERENCES)
 def _tie(one: NDArray[np.float64], block: NDArray[np.float64], other: NDArray[np.float64]) -> float:
     """Return trace(A B C B^T) of matrices (4, 4)."""
     trace = 0.0
@@ -327,7 +327,7 @@ def _normal_matrix(equations: Equations, members: NDArray[np.int64]) -> NDArray[
     return whole
 
 
-@njit(cache=True)
+@njit(cache=True, **COUNT_NO_REFERENCES)
 def _put(whole: NDArray[np.float64], a: int, b: int, block: NDArray[np.float64]) -> None:
     """Put the block (4, 4) of two particles into the matrix of some."""
     for i in range(UNKNOWNS):
