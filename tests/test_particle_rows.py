@@ -14,6 +14,7 @@ from lfpiv_cli.optics.media import Media, Window
 from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.particles.least_squares import lit_by, respond_all, respond_once, room_for
+from lfpiv_cli.particles.noise import Noise, pixel_weights
 from lfpiv_cli.particles.rim import rim_table
 from lfpiv_cli.particles.view import View, entry_capacity, raw_view
 from lfpiv_cli.simd import micro_images
@@ -103,3 +104,12 @@ def test_rows_equal_their_references() -> None:
         np.testing.assert_array_equal(pixels[0, written], pixels[1, written])
         np.testing.assert_allclose(values[0, :, written], values[1, :, written], rtol=1e-9, atol=1e-12)
         assert np.count_nonzero(values[1, 0]) > 3
+
+
+def test_weights_of_pixels_are_those_of_the_noise(rng: np.random.Generator) -> None:
+    noise = Noise(5.0, 0.7, 0.03)
+    image, residual = rng.normal(100.0, 90.0, 500), rng.normal(0.0, 60.0, 500)
+    usable = rng.random(500) < 0.9
+    found = pixel_weights(noise, image, residual, usable, 0.1)
+    expected = np.where(usable, noise.weights(image - residual, residual, 0.1), 0.0)
+    np.testing.assert_allclose(found, expected, rtol=1e-14)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.particles.fitting import fit_again
-from lfpiv_cli.particles.least_squares import Observation
+from lfpiv_cli.particles.least_squares import CHOICE_GAIN, Effort, Observation
 
 # Starts relative to the particle's depth, in depths over which light spreads by one lens (Table 2: 0.2 to 2 mm); its
 # mirrored depth is another.
@@ -35,4 +35,6 @@ def try_other_depths(
     depth = particles[:, 2:3]
     starts = np.concatenate([depth + OTHER_DEPTHS * observation.optics.scale.depth_mm, -depth], axis=1)
     starts[(starts < observation.low_mm) | (starts > observation.high_mm)] = np.nan
-    return fit_again(observation, particles, suspects, STEPS, starts, (smallest_gain, smallest_light))
+    return fit_again(
+        observation, particles, suspects, Effort(STEPS, CHOICE_GAIN), starts, (smallest_gain, smallest_light)
+    )

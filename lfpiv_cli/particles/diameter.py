@@ -21,7 +21,9 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.particles.fitting import fit_from, judge
 from lfpiv_cli.particles.least_squares import (
+    SMALLEST_GAIN,
     UNKNOWNS,
+    Effort,
     Observation,
     add_light,
     lit_by,
@@ -353,7 +355,7 @@ def _fit_each(
         add_light(pixels, values, tracers[number, 3], residual)
         for depth in depths_mm[number]:
             depth = min(max(depth, sized.low_mm), sized.high_mm)
-            gained = fit_from(sized, tracers[number], depth, trial, responses, STEPS)
+            gained = fit_from(sized, tracers[number], depth, trial, responses, Effort(STEPS, SMALLEST_GAIN))
             if gained < change[number]:
                 change[number] = gained
                 fitted[number] = trial[0]

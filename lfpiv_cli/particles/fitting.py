@@ -14,8 +14,11 @@ from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.particles.least_squares import (
+    CHOICE_GAIN,
+    SMALLEST_GAIN,
     SUMS,
     UNKNOWNS,
+    Effort,
     Observation,
     Responses,
     add_light,
@@ -31,7 +34,7 @@ from lfpiv_cli.threads import COUNT_NO_REFERENCES, blocks, in_threads
 
 # Candidates are brought into the fit from these depths beside their own, in depths over which light spreads by one lens
 # (Table 2: 0.4 mm).
-START_DEPTHS = np.array([0.0, -0.4, 0.4]) / 1.064
+START_DEPTHS = np.array([-0.4, 0.0, 0.4]) / 1.064
 # Steps for a candidate, for a particle in a sweep.
 CANDIDATE_STEPS = 12
 SWEEP_STEPS = 4
@@ -73,16 +76,19 @@ def seen_share(pixels: NDArray[np.int32], values: NDArray[np.float64], weight: N
     return seen
 
 
-def refine(observation: Observation, particles: NDArray[np.float64]) -> None:
-    """Refine all particles (n, 4) once, in place, and keep the residual up to date."""
-    fit_again(observation, particles, np.ones(len(particles), np.bool_), SWEEP_STEPS)
+def refine(observation: Observation, particles: NDArray[np.float64], enough: float = SMALLEST_GAIN) -> None:
+    """Refine all particles (n, 4) once, in place, and keep the residual up to date.
+
+    `enough` is what ends a fit, see `least_squares.Effort`.
+    """
+    fit_again(observation, particles, np.ones(len(particles), np.bool_), Effort(SWEEP_STEPS, enough))
 
 
 def fit_again(
     observation: Observation,
     particles: NDArray[np.float64],
     chosen: NDArray[np.bool_],
-    steps: int,
+    effort: Effort,
     depths_mm: NDArray[np.float64] | None = None,
     least: tuple[float, float] = (0.0, 0.0),
 ) -> NDArray[np.bool_]:
@@ -99,7 +105,7 @@ def fit_again(
     moved = np.zeros(len(particles), np.bool_)
 
     def work(numbers: NDArray[np.int64]) -> None:
-        _fit_again(observation, particles, numbers[chosen[numbers]], steps, depths, least, moved)
+        _fit_again(observation, particles, numbers[chosen[numbers]], effort, depths, least, moved)
 
     over_tiles(work, observation.optics, particles, observation.depths_mm)
     return moved
@@ -110,7 +116,7 @@ def _fit_again(
     observation: Observation,
     particles: NDArray[np.float64],
     numbers: NDArray[np.int64],
-    steps: int,
+    effort: Effort,
     depths: NDArray[np.float64],
     least: tuple[float, float],
     moved: NDArray[np.bool_],
@@ -124,11 +130,11 @@ def _fit_again(
         respond_all(view, best, responses)
         pixels, values = lit_by(responses, 0)
         add_light(pixels, values, best[0, 3], residual)
-        lowest = fit(observation, best, responses, steps, np.inf) - least[0]
+        lowest = fit(observation, best, responses, effort, np.inf) - least[0]
         for depth in depths[number]:
             if np.isnan(depth):
                 continue
-            change = fit_from(observation, particles[number], depth, trial, responses, steps)
+            change = fit_from(observation, particles[number], depth, trial, responses, effort)
             if change < lowest and trial[0, 3] >= least[1]:
                 lowest = change
                 best[:] = trial
@@ -148,15 +154,20 @@ def fit_from(
     depth: float,
     trial: NDArray[np.float64],
     responses: Responses,
-    steps: int,
+    effort: Effort,
 ) -> float:
-    """Fit `trial` (1, 4), a particle with the best light at another depth; return what it adds to chi-squared."""
-    trial[0] = particle
-    trial[0, 2] = depth
+    """Fit `trial` (1, 4), a particle at another depth of its line of sight; return what it adds to chi-squared.
+
+    It begins with the best light there.
+    """
+    view, camera = observation.optics, observation.optics.camera
+    distance = camera.focus_distance_mm + view.depth_ratio * particle[2]
+    stretch = (camera.focus_distance_mm + view.depth_ratio * depth) / distance
+    trial[0, 0], trial[0, 1], trial[0, 2] = particle[0] * stretch, particle[1] * stretch, depth
     respond_all(observation.optics, trial, responses)
     pixels, values = lit_by(responses, 0)
     trial[0, 3] = best_light(pixels, values, observation.residual, observation.weight)
-    return fit(observation, trial, responses, steps, np.inf)
+    return fit(observation, trial, responses, effort, np.inf)
 
 
 class Least(NamedTuple):
@@ -179,8 +190,12 @@ def accept(observation: Observation, candidates: NDArray[np.float64], least: Lea
     """Fit candidates (n, 4) in place, one after the other; return which ones stay, their light off the residual."""
     accepted = np.zeros(len(candidates), np.bool_)
 
+    effort = Effort(CANDIDATE_STEPS, CHOICE_GAIN)
+    depths = candidates[:, 2:3] + START_DEPTHS * observation.optics.scale.depth_mm
+    depths = np.clip(depths, observation.low_mm, observation.high_mm)
+
     def work(numbers: NDArray[np.int64]) -> None:
-        _accept(observation, candidates, numbers, CANDIDATE_STEPS, least, accepted)
+        _accept(observation, candidates, numbers, effort, depths, least, accepted)
 
     over_tiles(work, observation.optics, candidates, observation.depths_mm)
     return accepted
@@ -191,7 +206,8 @@ def _accept(
     observation: Observation,
     candidates: NDArray[np.float64],
     numbers: NDArray[np.int64],
-    steps: int,
+    effort: Effort,
+    depths: NDArray[np.float64],
     least: Least,
     accepted: NDArray[np.bool_],
 ) -> None:
@@ -201,10 +217,8 @@ def _accept(
     trial, best = np.empty((1, UNKNOWNS)), np.empty((1, UNKNOWNS))
     for number in numbers:
         lowest = 0.0
-        for offset in START_DEPTHS:
-            depth = candidates[number, 2] + offset * observation.optics.scale.depth_mm
-            depth = min(max(depth, observation.low_mm), observation.high_mm)
-            change = fit_from(observation, candidates[number], depth, trial, responses, steps)
+        for depth in depths[number]:
+            change = fit_from(observation, candidates[number], depth, trial, responses, effort)
             if change < lowest:
                 lowest = change
                 best[:] = trial

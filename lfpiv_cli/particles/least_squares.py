@@ -30,8 +30,9 @@ UNKNOWNS = 4
 DAMPING = 1e-3
 DAMPING_UP = 10.0
 DAMPING_DOWN = 0.2
-# A step that lowers chi-squared by less ends the fit: a hundredth of what one standard error costs.
-SMALLEST_GAIN = 0.01
+# A step that lowers chi-squared by less ends the fit: a hundredth of what one standard error costs where places are to
+# be final; as much as that where it is only asked which of several places is right, a tenth in between.
+SMALLEST_GAIN, CHOICE_GAIN, SEARCH_GAIN = 0.01, 1.0, 0.1
 # Longest step in depth, in depths over which light spreads by one lens (Table 2: 0.5 mm): further away the response is
 # another one and its slope says nothing.
 LONGEST_STEP_DEPTHS = 0.5 / 1.064
@@ -73,6 +74,13 @@ def observation_of(
     return Observation(view, residual, weight, *depths_mm, entry_capacity(view, *depths_mm))
 
 
+class Effort(NamedTuple):
+    """How far a fit goes: so many steps at most, until one lowers chi-squared by less than `enough`."""
+
+    steps: int
+    enough: float
+
+
 class Responses(NamedTuple):
     """Responses of one particle or two that are fitted together.
 
@@ -81,6 +89,7 @@ class Responses(NamedTuple):
     counts, pixels, values : (k,), (k, capacity), (k, 4, capacity) as `respond_rows` writes them
     place : zeros, one for each pixel of as many rows as a footprint spans where there are two particles; serves to
         find common pixels
+    common : (2, 4, capacity) where there are two particles, room for what both do to common pixels
     scratch : room for what one lens shows
     """
 
@@ -88,6 +97,7 @@ class Responses(NamedTuple):
     pixels: NDArray[np.int32]
     values: NDArray[np.float64]
     place: NDArray[np.int32]
+    common: NDArray[np.float64]
     scratch: Scratch
 
 
@@ -96,7 +106,8 @@ def room_for(members: int, capacity: int, places: int) -> Responses:
     """Return room for the responses of so many particles."""
     room = capacity + SLACK
     pixels, values = np.empty((members, room), np.int32), np.empty((members, VALUES, room))
-    return Responses(np.zeros(members, np.int64), pixels, values, np.zeros(places, np.int32), scratch(capacity))
+    common = np.empty((2, UNKNOWNS, room if members == 2 else 0))
+    return Responses(np.zeros(members, np.int64), pixels, values, np.zeros(places, np.int32), common, scratch(capacity))
 
 
 @njit(cache=True)
@@ -156,11 +167,10 @@ def normal_equations(
     right: NDArray[np.float64],
 ) -> float:
     """Fill J^T W J (4, 4) and J^T W (r - I f); return what the particle adds to chi-squared."""
-    for row in range(UNKNOWNS):
-        right[row] = 0.0
-        for column in range(UNKNOWNS):
-            matrix[row, column] = 0.0
     change = 0.0
+    # Kept out of arrays, sums stay in registers.
+    r0 = r1 = r2 = r3 = 0.0
+    m00 = m01 = m02 = m03 = m11 = m12 = m13 = m22 = m23 = m33 = 0.0
     for k in range(pixels.size):
         at = pixels[k]
         w = weight[at]
@@ -168,24 +178,37 @@ def normal_equations(
         change += w * f * (f - 2.0 * r)
         a, b, c, d = light * values[k, 1], light * values[k, 2], light * values[k, 3], values[k, 0]
         left = w * (r - f)
-        right[0] += a * left
-        right[1] += b * left
-        right[2] += c * left
-        right[3] += d * left
-        matrix[0, 0] += w * a * a
-        matrix[0, 1] += w * a * b
-        matrix[0, 2] += w * a * c
-        matrix[0, 3] += w * a * d
-        matrix[1, 1] += w * b * b
-        matrix[1, 2] += w * b * c
-        matrix[1, 3] += w * b * d
-        matrix[2, 2] += w * c * c
-        matrix[2, 3] += w * c * d
-        matrix[3, 3] += w * d * d
+        r0 += a * left
+        r1 += b * left
+        r2 += c * left
+        r3 += d * left
+        m00 += w * a * a
+        m01 += w * a * b
+        m02 += w * a * c
+        m03 += w * a * d
+        m11 += w * b * b
+        m12 += w * b * c
+        m13 += w * b * d
+        m22 += w * c * c
+        m23 += w * c * d
+        m33 += w * d * d
+    right[0], right[1], right[2], right[3] = r0, r1, r2, r3
+    matrix[0, 0], matrix[0, 1], matrix[0, 2], matrix[0, 3] = m00, m01, m02, m03
+    matrix[1, 1], matrix[1, 2], matrix[1, 3] = m11, m12, m13
+    matrix[2, 2], matrix[2, 3], matrix[3, 3] = m22, m23, m33
     for row in range(1, UNKNOWNS):
         for column in range(row):
             matrix[row, column] = matrix[column, row]
     return change
+
+
+@njit(cache=True, fastmath=SUMS, **COUNT_NO_REFERENCES)
+def _product(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
+    """Return the scalar product of two vectors."""
+    total = 0.0
+    for k in range(one.size):
+        total += one[k] * other[k]
+    return total
 
 
 @njit(cache=True)
@@ -219,21 +242,25 @@ def _pair_equations(
     # Backwards: of a pixel that is named again the first entry counts.
     for k in range(pixels_1.size - 1, -1, -1):
         place[pixels_1[k] - start] = k + 1
-    one, two = np.empty(UNKNOWNS), np.empty(UNKNOWNS)
+    one, two = responses.common[0], responses.common[1]
+    count = 0
     for k in range(pixels_2.size):
         away = pixels_2[k] - start
         if not 0 <= away < place.size or place[away] == 0:
             continue
         at = place[away] - 1
         w = weight[pixels_2[k]]
-        for i in range(3):
-            one[i] = pair[0, 3] * values_1[at, i + 1]
-            two[i] = pair[1, 3] * values_2[k, i + 1]
-        one[3], two[3] = values_1[at, 0], values_2[k, 0]
         for i in range(UNKNOWNS):
-            right[i] -= w * one[i] * pair[1, 3] * values_2[k, 0]
-            for j in range(UNKNOWNS):
-                cross[i, j] += w * one[i] * two[j]
+            one[i, count] = w * values_1[at, i]
+            two[i, count] = values_2[k, i]
+        count += 1
+    for i in range(UNKNOWNS):
+        # Values begin with light, unknowns end with it.
+        by_i, scale_i = (i + 1) % UNKNOWNS, pair[0, 3] if i < 3 else 1.0
+        right[i] -= scale_i * pair[1, 3] * _product(one[by_i, :count], two[0, :count])
+        for j in range(UNKNOWNS):
+            by_j, scale_j = (j + 1) % UNKNOWNS, pair[1, 3] if j < 3 else 1.0
+            cross[i, j] = scale_i * scale_j * _product(one[by_i, :count], two[by_j, :count])
     matrix[first, second] = cross
     matrix[second, first] = cross.T
     for pixel in pixels_1:
@@ -276,7 +303,7 @@ def solve_damped(
 
 @njit(cache=True)
 def fit(
-    observation: Observation, members: NDArray[np.float64], responses: Responses, steps: int, promising: float
+    observation: Observation, members: NDArray[np.float64], responses: Responses, effort: Effort, promising: float
 ) -> float:
     """Improve one particle or two (k, 4) in place; return what they add to chi-squared (below 0 where they help).
 
@@ -293,7 +320,7 @@ def fit(
     step, trial, begin = np.zeros(n), np.empty_like(members), members.copy()
     change = _equations(observation, members, responses, matrix, right)
     damping, last_failed = DAMPING, False
-    for number in range(steps):
+    for number in range(effort.steps):
         if number == EARLY_STEPS and change > promising:
             break
         if not solve_damped(matrix, right, damping, step):
@@ -301,7 +328,7 @@ def fit(
         predicted = 0.0
         for i in range(n):
             predicted += step[i] * right[i]
-        if predicted < SMALLEST_GAIN:
+        if predicted < effort.enough:
             break
         _move(observation, members, begin, step, trial)
         respond_all(observation.optics, trial, responses)
@@ -313,7 +340,7 @@ def fit(
         gain = change - trial_change
         members[:], matrix[:], right[:], change = trial, trial_matrix, trial_right, trial_change
         damping *= DAMPING_DOWN
-        if gain < SMALLEST_GAIN:
+        if gain < effort.enough:
             break
     if last_failed:
         respond_all(observation.optics, members, responses)

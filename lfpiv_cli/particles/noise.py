@@ -10,10 +10,12 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from lfpiv_cli.robust import HALF_NORMAL_MEDIAN
+from lfpiv_cli.threads import COUNT_NO_REFERENCES, share_out
 
 # The optics model of a pixel's light is trusted to this share until what it leaves has been seen.
 MODEL_ERROR = 0.03
@@ -50,6 +52,38 @@ class Noise:
         model = np.maximum(model, 0.0)
         variance = self.read_counts**2 + self.gain_counts * model + (self.model_error * model) ** 2
         return 1.0 / (variance + unexplained * np.maximum(residual, 0.0) ** 2)
+
+
+def pixel_weights(
+    noise: Noise,
+    image: NDArray[np.float64],
+    residual: NDArray[np.float64],
+    usable: NDArray[np.bool_],
+    unexplained: float,
+) -> NDArray[np.float64]:
+    """Return `Noise.weights` (pixels,) of an image and what the model leaves of it; 0 where it is not usable."""
+    weight = np.empty_like(image)
+    numbers = (noise.read_counts, noise.gain_counts, noise.model_error, unexplained)
+    share_out(_fill_weights, image.size, numbers, image, residual, usable, weight)
+    return weight
+
+
+@njit(cache=True, nogil=True, error_model="numpy", **COUNT_NO_REFERENCES)
+def _fill_weights(
+    part: tuple[int, int],
+    numbers: tuple[float, float, float, float],
+    image: NDArray[np.float64],
+    residual: NDArray[np.float64],
+    usable: NDArray[np.bool_],
+    weight: NDArray[np.float64],
+) -> None:
+    """Do the work of `pixel_weights` for some pixels."""
+    read, gain, model_error, unexplained = numbers
+    for k in range(part[0], part[1]):
+        model, rest = max(image[k] - residual[k], 0.0), max(residual[k], 0.0)
+        error = model_error * model
+        variance = read * read + gain * model + error * error + unexplained * (rest * rest)
+        weight[k] = 1.0 / variance if usable[k] else 0.0
 
 
 class Correlation(NamedTuple):

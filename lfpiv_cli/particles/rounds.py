@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.particles.candidates import boxes_of, explain_rest, find_peaks, points_in_raw_frame
 from lfpiv_cli.particles.fitting import Least, accept, judge
+from lfpiv_cli.particles.least_squares import SEARCH_GAIN
 from lfpiv_cli.particles.refraction import places_by_snell
 from lfpiv_cli.particles.search import (
     LAST_SWEEPS,
@@ -123,7 +124,7 @@ def _one_round(task: Task, state: State, settings: Round, progress: Callable[[in
 def explained(task: Task, state: State, candidates: NDArray[np.float64], settings: Round) -> State:
     """Return the state with what of the candidates holds, refined and checked."""
     state = accepted(task, state, candidates, settings)
-    sweep(task, state, settings.unexplained, SWEEPS)
+    sweep(task, state, settings.unexplained, SWEEPS, SEARCH_GAIN)
     state = with_typical_light(task, state)
     return with_typical_light(task, with_suspects_checked(task, state, settings))
 
@@ -165,7 +166,7 @@ def with_suspects_checked(task: Task, state: State, settings: Round) -> State:
     if settings.thorough:
         state = with_depths_corrected(task, state, settings.unexplained)
     state = with_overlaps_split(task, state, settings.unexplained, settings.thorough)
-    sweep(task, state, settings.unexplained, SWEEPS_AFTER_SPLIT)
+    sweep(task, state, settings.unexplained, SWEEPS_AFTER_SPLIT, SEARCH_GAIN)
     return pruned(task, merge(task, state), settings)
 
 

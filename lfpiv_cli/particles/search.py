@@ -15,8 +15,15 @@ from scipy.spatial import KDTree
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.particles.covariance import joint_covariance
 from lfpiv_cli.particles.fitting import add_all, judge, refine
-from lfpiv_cli.particles.least_squares import Observation, observation_of
-from lfpiv_cli.particles.noise import Noise, error_correlation, estimate_noise, measured_noise, read_noise
+from lfpiv_cli.particles.least_squares import SMALLEST_GAIN, Observation, observation_of
+from lfpiv_cli.particles.noise import (
+    Noise,
+    error_correlation,
+    estimate_noise,
+    measured_noise,
+    pixel_weights,
+    read_noise,
+)
 from lfpiv_cli.particles.view import View, lens_pixels
 from lfpiv_cli.reconstruction.equations import Normalisers
 from lfpiv_cli.weights.model import Weights
@@ -153,14 +160,14 @@ def noise_with(task: Task, typical_light: float) -> Noise:
 
 def observed(task: Task, state: State, unexplained: float) -> Observation:
     """Return what particles are fitted to: pixels that are not usable weigh nothing, light above the model less."""
-    weight = state.noise.weights(task.image - state.residual, state.residual, unexplained)
-    return observation_of(task.view, state.residual, np.where(task.usable, weight, 0.0), task.depths_mm)
+    weight = pixel_weights(state.noise, task.image, state.residual, task.usable, unexplained)
+    return observation_of(task.view, state.residual, weight, task.depths_mm)
 
 
-def sweep(task: Task, state: State, unexplained: float, sweeps: int) -> None:
-    """Refine all particles in place, the residual along with them."""
+def sweep(task: Task, state: State, unexplained: float, sweeps: int, enough: float = SMALLEST_GAIN) -> None:
+    """Refine all particles in place, the residual along with them; see `refine`."""
     for _ in range(sweeps):
-        refine(observed(task, state, unexplained), state.particles)
+        refine(observed(task, state, unexplained), state.particles, enough)
 
 
 def merge(task: Task, state: State) -> State:

@@ -12,7 +12,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.particles.least_squares import (
+    CHOICE_GAIN,
     UNKNOWNS,
+    Effort,
     Observation,
     add_light,
     fit,
@@ -58,7 +60,9 @@ def split(
 
     def work(numbers: NDArray[np.int64]) -> None:
         least = (smallest_gain, smallest_light)
-        _split(observation, particles, numbers[suspects[numbers]], places, PAIR_STEPS, least, partners)
+        _split(
+            observation, particles, numbers[suspects[numbers]], places, Effort(PAIR_STEPS, CHOICE_GAIN), least, partners
+        )
 
     over_tiles(work, observation.optics, particles, observation.depths_mm)
     return partners
@@ -70,7 +74,7 @@ def _split(
     particles: NDArray[np.float64],
     numbers: NDArray[np.int64],
     places: int,
-    steps: int,
+    effort: Effort,
     least: tuple[float, float],
     partners: NDArray[np.float64],
 ) -> None:
@@ -98,7 +102,7 @@ def _split(
                 pair[m, 2] = min(max(depth, observation.low_mm), observation.high_mm)
                 pair[m, 3] = 0.5 * light
             respond_all(view, pair, responses)
-            change = fit(observation, pair, responses, steps, promising)
+            change = fit(observation, pair, responses, effort, promising)
             if change < lowest and min(pair[0, 3], pair[1, 3]) >= least[1]:
                 lowest, found = change, True
                 best[:] = pair
