@@ -65,9 +65,9 @@ ROUNDS = (
     Round(20, 0.9, 0.3, thorough=False),
     Round(12, 0.85, 0.2, thorough=False),
     Round(12, 0.8, 0.1, thorough=True),
-    Round(12, 0.75, 0.07, thorough=True),
-    Round(12, 0.7, 0.05, thorough=True),
-    Round(12, 0.6, 0.05, thorough=True),
+    Round(8, 0.75, 0.07, thorough=True),
+    Round(6, 0.7, 0.05, thorough=True),
+    Round(6, 0.6, 0.05, thorough=True),
 )
 
 # Sweeps of refinement after candidates and after splitting.
