@@ -189,7 +189,9 @@ def prune(task: Task, state: State, claimed_share: float, unexplained: float) ->
     _, share, seen = judge(observed(task, state, unexplained), state.particles)
     keep = (state.particles[:, 3] > SMALLEST_LIGHT * state.typical_light) & (seen > SMALLEST_SEEN)
     keep &= share > claimed_share
-    return rebuilt(task, state, state.particles[keep])
+    residual = state.residual.copy()
+    add_all(task.view, state.particles[~keep], 1.0, residual, task.depths_mm)
+    return replace(state, particles=state.particles[keep], residual=residual)
 
 
 def rebuilt(task: Task, state: State, particles: NDArray[np.float64]) -> State:
