@@ -19,7 +19,7 @@ from lfpiv_cli.interface.notices import warn_of
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.scale import Scale
 from lfpiv_cli.tracks.candidates import Seen
-from lfpiv_cli.tracks.sequences import SHORTEST, follow, scatter_in, states_at
+from lfpiv_cli.tracks.sequences import SHORTEST, Trajectories, follow, long_ones, scatter_in, states_at
 from lfpiv_cli.tracks.tracking import FEWEST_OF_FIT, SEARCH_LENSES, Tracks, wrong_link_variance
 from lfpiv_cli.tracks.tracking import track as match
 
@@ -309,15 +309,21 @@ def tracking_of(settings: Config, search_voxel: float | None, shortest: int | No
     return Tracking(settings.correlation.dt_s, search_mm, fewest, scale)
 
 
-def tracked(frames: Sequence[Points], settings: Config, chosen: Tracking, provenance: dict[str, Any]) -> Tracked:
-    """Follow particles from frame to frame."""
+def tracked(
+    frames: Sequence[Points],
+    settings: Config,
+    chosen: Tracking,
+    provenance: dict[str, Any],
+    found: Trajectories | None = None,
+) -> Tracked:
+    """Follow particles from frame to frame; where a sequence has been followed already, `found` says how."""
     reference = frames[0].reference
     told = reference.attributes() | {"dt_s": chosen.dt_s}
     if chosen.shortest is None:
         position, arrays, summary, paths = _pair(frames[0], frames[1], chosen)
         name = TRACKS_FORMAT
     else:
-        position, arrays, summary, paths = _sequence(frames, chosen, chosen.shortest)
+        position, arrays, summary, paths = _sequence(frames, chosen, chosen.shortest, found)
         name = TRAJECTORIES_FORMAT
     return Tracked(Points(position, arrays, reference, told, provenance), name, paths, summary, settings)
 
@@ -327,7 +333,7 @@ Found = tuple[NDArray[np.float64], dict[str, NDArray[Any]], dict[str, Any], list
 
 def _pair(first: Points, second: Points, chosen: Tracking) -> Found:
     """Return places, arrays, summary and paths of particles followed from one frame to the next."""
-    found = match(_seen(first), _seen(second), chosen.search_mm, chosen.scale)
+    found = match(seen_in(first), seen_in(second), chosen.search_mm, chosen.scale)
     paths = _paths(first, second, found, chosen.scale)
     arrays = {
         "velocity": paths.displacement_mm * MM_TO_M / chosen.dt_s,
@@ -346,10 +352,13 @@ def _pair(first: Points, second: Points, chosen: Tracking) -> Found:
     return paths.middle_mm, arrays, summary, [paths]
 
 
-def _sequence(frames: Sequence[Points], chosen: Tracking, shortest: int) -> Found:
+def _sequence(frames: Sequence[Points], chosen: Tracking, shortest: int, found: Trajectories | None) -> Found:
     """Return places, arrays, summary and paths of particles followed over many frames."""
-    seen = [_seen(frame) for frame in frames]
-    found = follow(seen, chosen.search_mm, shortest, chosen.scale)
+    seen = [seen_in(frame) for frame in frames]
+    if found is None:
+        found = follow(seen, chosen.search_mm, shortest, chosen.scale)
+    else:
+        found = long_ones(found, shortest)
     scatter, half = scatter_in(found, seen)
     rows: list[tuple[NDArray[Any], ...]] = []
     for number in range(len(frames)):
@@ -385,7 +394,8 @@ def _sequence(frames: Sequence[Points], chosen: Tracking, shortest: int) -> Foun
     return position[order], arrays, summary, paths
 
 
-def _seen(frame: Points) -> Seen:
+def seen_in(frame: Points) -> Seen:
+    """Return the particles of a file as tracking takes them."""
     return Seen(frame.position_mm, frame.arrays["covariance_mm2"], frame.arrays["intensity"])
 
 

@@ -11,13 +11,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.robust import MAD_TO_SIGMA
 from lfpiv_cli.scale import Scale
 from lfpiv_cli.tracks.candidates import Seen
-from lfpiv_cli.tracks.in_time import Scatter, State, fit_in_time, scatter_of
+from lfpiv_cli.tracks.in_time import FEWEST_TRACKS, Scatter, State, fit_in_time, scatter_of
+from lfpiv_cli.tracks.kriging import kriged, structure_of
 from lfpiv_cli.tracks.tracking import NO_TRACKS, Forecast, Tracks, known_of, link_some, track
 
 # A forecast takes a track's last four places: enough for a parabola and to see its noise.
@@ -26,11 +29,18 @@ PAST_FRAMES = 4
 # that two show by more than this: a parabola then no longer follows the tracks.
 HALVES_FRAMES = (3, 2)
 LARGEST_MISFIT = 1.1
+# Where a particle comes to is not known before how far it moves: the second guess is good enough.
+REPEATS = 2
 # A ghost finds a partner in the next frame by chance, hardly ever in two.
 SHORTEST = 3
 NO_TRACK = NO_PARTICLE = -1
 
-Frames = Sequence[Seen]
+
+class Frames(Protocol):
+    """Particles of frames by their numbers; those that are not asked for need not be there."""
+
+    def __getitem__(self, number: int, /) -> Seen:
+        """Return the particles of a frame."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +66,48 @@ class Trajectories:
         return np.asarray(place[tracks])
 
 
-def follow(frames: Frames, search_mm: float, shortest: int, scale: Scale) -> Trajectories:
+@dataclass(frozen=True, eq=False)
+class Ahead:
+    """Where the particles of a frame should be in the next one, then those that it alone has lost.
+
+    Attributes
+    ----------
+    position_mm, sigma_mm : (n, 3) places and their standard errors; these are NaN where nothing tells
+    light : (n,) as the last frames have it
+    light_sigma : of the logarithm of a particle's light from frame to frame
+    """
+
+    position_mm: NDArray[np.float64]
+    sigma_mm: NDArray[np.float64]
+    light: NDArray[np.float64]
+    light_sigma: float
+
+
+@dataclass(frozen=True, eq=False)
+class SoFar:
+    """How far a sequence has been followed.
+
+    Attributes
+    ----------
+    found : the trajectories up to the last frame that was linked
+    scatter : of those that pass the last frames
+    by_past, by_others : how the last frame's particles should move on by their own pasts, and as others did before
+    ahead : where they should be by both
+    """
+
+    found: Trajectories
+    scatter: Scatter
+    by_past: Forecast | None
+    by_others: Forecast | None
+    ahead: Ahead
+
+    @property
+    def last(self) -> int:
+        """The number of the frame that was linked last."""
+        return len(self.found.labels) - 1
+
+
+def follow(frames: Sequence[Seen], search_mm: float, shortest: int, scale: Scale) -> Trajectories:
     """Follow particles through frames; tracks of fewer than `shortest` places are dropped.
 
     Parameters
@@ -64,38 +115,165 @@ def follow(frames: Frames, search_mm: float, shortest: int, scale: Scale) -> Tra
     search_mm : largest displacement along each axis from the first frame to the second
     scale : of the camera
     """
-    unknown = tuple(np.full(len(frame), np.nan) for frame in frames)
-    found = Trajectories(tuple(np.full(len(frame), NO_TRACK) for frame in frames), 0, unknown)
-    scatter = Scatter.unknown()
-    for number in range(len(frames) - 1):
-        forecast = _forecast(found, frames, number, 1, scatter)
-        links = track(frames[number], frames[number + 1], search_mm, scale, forecast)
-        found = _linked(found, number, number + 1, links)
-        if number:
-            found = _linked(found, number - 1, number + 1, _bridges(found, frames, number, scatter, search_mm, scale))
-        window = _frames_before(number + 2, PAST_FRAMES)
-        position, sigma = _places(found, frames, window, np.arange(found.count))
-        scatter = scatter_of(position, sigma, np.arange(len(window), dtype=np.float64))
-    return _long_ones(found, shortest)
+    so_far = begun(frames)
+    while so_far.last < len(frames) - 1:
+        so_far = followed_further(so_far, frames, search_mm, scale)
+    return long_ones(so_far.found, shortest)
 
 
-def scatter_in(found: Trajectories, frames: Frames) -> tuple[Scatter, int]:
+def begun(frames: Frames) -> SoFar:
+    """Return what is known of the first frame alone: particles, and no tracks."""
+    first = frames[0]
+    unlinked = Trajectories((np.full(len(first), NO_TRACK),), 0, (np.full(len(first), np.nan),))
+    unknown = np.full(first.position_mm.shape, np.nan)
+    nothing = Ahead(first.position_mm, unknown, _light_of(first), 0.0)
+    return SoFar(unlinked, Scatter.unknown(), None, None, nothing)
+
+
+def followed_further(so_far: SoFar, frames: Frames, search_mm: float, scale: Scale) -> SoFar:
+    """Return how far it is with one more frame; of `frames` only the new one and the last few before are looked at."""
+    number, count = so_far.last, len(frames[so_far.last + 1])
+    found = Trajectories(
+        (*so_far.found.labels, np.full(count, NO_TRACK)),
+        so_far.found.count,
+        (*so_far.found.probability, np.full(count, np.nan)),
+    )
+    start, end = frames[number], frames[number + 1]
+    forecast = _expected_displacements(so_far.ahead, start)
+    links = track(start, end, search_mm, scale, forecast)
+    found = _linked(found, number, number + 1, links)
+    if number:
+        earlier = _forecast(found, frames, number - 1, 2, so_far.scatter)
+        found = _linked(found, number - 1, number + 1, _bridges(found, frames, number, earlier, search_mm, scale))
+    window = _frames_before(number + 2, PAST_FRAMES)
+    position, sigma = _places(found, frames, window, _tracks_in(found, window))
+    scatter = scatter_of(position, sigma, np.arange(len(window), dtype=np.float64))
+    past_factor, others_factor = (_surprise(start, end, links, each) for each in (so_far.by_past, so_far.by_others))
+    by_past, by_others = _forecast(found, frames, number + 1, 1, scatter), _by_others(found, frames)
+    forecast = _blended(_widened(by_past, past_factor), by_others, others_factor)
+    over_two = _widened(_forecast(found, frames, number, 2, scatter), past_factor)
+    return SoFar(found, scatter, by_past, by_others, _ahead(found, frames, forecast, over_two))
+
+
+def _expected_displacements(ahead: Ahead, frame: Seen) -> Forecast | None:
+    """Return what is ahead of a frame's particles as displacements; None where nothing is known."""
+    own = slice(0, len(frame))
+    if not np.isfinite(ahead.sigma_mm[own]).any():
+        return None
+    unknown = np.where(np.isfinite(ahead.sigma_mm[own]), 0.0, np.nan)
+    return Forecast(ahead.position_mm[own] - frame.position_mm + unknown, ahead.sigma_mm[own])
+
+
+def _surprise(first: Seen, second: Seen, links: Tracks, forecast: Forecast | None) -> NDArray[np.float64] | None:
+    """Return how large errors (3,) of a forecast are over what is expected of them, at least 1; None: not known.
+
+    Few frames know little of how tracks bend, and a parabola nothing of how their bending changes.
+    """
+    if forecast is None:
+        return None
+    off = second.position_mm[links.second] - first.position_mm[links.first] - forecast.displacement_mm[links.first]
+    noise = np.nan_to_num(second.sigma_mm()[links.second])
+    known = np.isfinite(off).all(axis=1)
+    if np.count_nonzero(known) < FEWEST_TRACKS:
+        return None
+    ratio = np.abs(off[known]) / np.hypot(forecast.sigma_mm[links.first][known], noise[known])
+    return np.maximum(MAD_TO_SIGMA * np.median(ratio, axis=0), 1.0)
+
+
+def _widened(forecast: Forecast | None, factor: NDArray[np.float64] | None) -> Forecast | None:
+    """Return a forecast with so much larger errors; None where there is none, or its errors are not known."""
+    if forecast is None or factor is None:
+        return None
+    return Forecast(forecast.displacement_mm, forecast.sigma_mm * factor)
+
+
+def _blended(
+    by_past: Forecast | None, by_others: Forecast | None, others_factor: NDArray[np.float64] | None
+) -> Forecast | None:
+    """Return the forecast by both; where others are not known, the past is all there is."""
+    if by_others is None:
+        return by_past
+    variance = (by_others.sigma_mm * (1.0 if others_factor is None else others_factor)) ** 2
+    if by_past is None:
+        return Forecast(by_others.displacement_mm, np.sqrt(variance))
+    past2 = by_past.sigma_mm**2
+    weight = np.where(np.isfinite(past2), variance / (variance + past2), 0.0)
+    off = np.nan_to_num(by_past.displacement_mm - by_others.displacement_mm)
+    return Forecast(by_others.displacement_mm + weight * off, np.sqrt((1.0 - weight) * variance))
+
+
+def _ahead(found: Trajectories, frames: Frames, forecast: Forecast | None, over_two: Forecast | None) -> Ahead:
+    """Return where the particles of the last frame should be in the next one, and those that it alone has lost.
+
+    Parameters
+    ----------
+    forecast : of the last frame's particles
+    over_two : of those of the frame before it, two frames later
+    """
+    last = len(found.labels) - 1
+    at, light = frames[last].position_mm, _light_of(frames[last])
+    if forecast is None:
+        forecast = Forecast(np.zeros(at.shape), np.full(at.shape, np.nan))
+    at, sigma = at + np.nan_to_num(forecast.displacement_mm), forecast.sigma_mm
+    if over_two is not None:
+        before = found.labels[last - 1]
+        lost = (before != NO_TRACK) & (found.particles(last, before) == NO_PARTICLE)
+        lost &= np.isfinite(over_two.sigma_mm).all(axis=1)
+        at = np.concatenate([at, (frames[last - 1].position_mm + over_two.displacement_mm)[lost]])
+        sigma = np.concatenate([sigma, over_two.sigma_mm[lost]])
+        light = np.concatenate([light, _light_of(frames[last - 1])[lost]])
+    return Ahead(at, sigma, light, _light_sigma(found, frames))
+
+
+def _by_others(found: Trajectories, frames: Frames) -> Forecast | None:
+    """Return how the last frame's particles should move on: as those did just before that were where they come to."""
+    last = len(found.labels) - 1
+    tracks = np.intersect1d(_tracks_in(found, [last - 1]), _tracks_in(found, [last]))
+    if len(tracks) < 2:
+        return None
+    at = frames[last].position_mm
+    position, sigma = _places(found, frames, [last - 1, last], tracks)
+    moved, noise2 = position[:, 1] - position[:, 0], np.nan_to_num(np.sum(sigma**2, axis=1))
+    middle, structure = position.mean(axis=1), structure_of(position.mean(axis=1), moved, noise2)
+    nobody, displacement = np.full(len(at), -1), np.zeros_like(at)
+    displacement[found.particles(last, tracks)] = moved
+    for _ in range(REPEATS):
+        displacement, variance = kriged(at + 0.5 * displacement, nobody, middle, moved, noise2, structure)
+    return Forecast(displacement, np.sqrt(variance + np.median(noise2, axis=0) + 0.5 * structure.nugget))
+
+
+def _light_of(frame: Seen) -> NDArray[np.float64]:
+    return np.ones(len(frame)) if frame.light is None else frame.light
+
+
+def _light_sigma(found: Trajectories, frames: Frames) -> float:
+    """Return the spread of the logarithm of a particle's light from frame to frame, by tracks through the last two."""
+    numbers = (len(found.labels) - 2, len(found.labels) - 1)
+    tracks = np.intersect1d(_tracks_in(found, [numbers[0]]), _tracks_in(found, [numbers[1]]))
+    if not len(tracks):
+        return 0.0
+    before, now = (_light_of(frames[k])[found.particles(k, tracks)] for k in numbers)
+    ratio = np.log(now / before)
+    return float(MAD_TO_SIGMA * np.median(np.abs(ratio - np.median(ratio))))
+
+
+def scatter_in(found: Trajectories, frames: Sequence[Seen]) -> tuple[Scatter, int]:
     """Return noise and bending of the tracks of a sequence, and how many frames on either side of a time to take."""
     wide, narrow = (_scatter_of_windows(found, frames, 2 * half + 1) for half in HALVES_FRAMES)
     is_followed = np.all(wide.noise <= LARGEST_MISFIT * narrow.noise)
     return (wide, HALVES_FRAMES[0]) if is_followed else (narrow, HALVES_FRAMES[1])
 
 
-def _scatter_of_windows(found: Trajectories, frames: Frames, width: int) -> Scatter:
+def _scatter_of_windows(found: Trajectories, frames: Sequence[Seen], width: int) -> Scatter:
     """Return noise and bending of the tracks in windows of so many frames that do not overlap."""
     windows = [_frames_before(end, width) for end in range(min(width, len(frames)), len(frames) + 1, width)]
-    pieces = [_places(found, frames, window, np.arange(found.count)) for window in windows]
+    pieces = [_places(found, frames, window, _tracks_in(found, window)) for window in windows]
     position, sigma = (np.concatenate(pair) for pair in zip(*pieces, strict=True))
     return scatter_of(position, sigma, np.arange(position.shape[1], dtype=np.float64))
 
 
 def states_at(
-    found: Trajectories, frames: Frames, time: float, scatter: Scatter, half_frames: int
+    found: Trajectories, frames: Sequence[Seen], time: float, scatter: Scatter, half_frames: int
 ) -> tuple[NDArray[np.int64], State]:
     """Return the tracks that pass a time, given in frames, and their states then.
 
@@ -116,6 +294,12 @@ def states_at(
 
 def _frames_before(end: int, count: int) -> list[int]:
     return list(range(max(0, end - count), end))
+
+
+def _tracks_in(found: Trajectories, window: Sequence[int]) -> NDArray[np.int64]:
+    """Return the numbers of the tracks that pass some frames."""
+    numbers = np.unique(np.concatenate([found.labels[k] for k in window]))
+    return numbers[numbers != NO_TRACK]
 
 
 def _places(
@@ -159,12 +343,11 @@ def _linked(found: Trajectories, start: int, end: int, links: Tracks) -> Traject
 
 
 def _bridges(
-    found: Trajectories, frames: Frames, lost_in: int, scatter: Scatter, search_mm: float, scale: Scale
+    found: Trajectories, frames: Frames, lost_in: int, forecast: Forecast | None, search_mm: float, scale: Scale
 ) -> Tracks:
     """Return links over a frame in which tracks have no particle, from the frame before it to the one after."""
     start, end = lost_in - 1, lost_in + 1
     labels = found.labels[start]
-    forecast = _forecast(found, frames, start, 2, scatter)
     if forecast is None:
         return NO_TRACKS
     tracked = labels != NO_TRACK
@@ -176,7 +359,7 @@ def _bridges(
     return link_some((frames[start], lost), (frames[end], free), known, search_mm, scale, forecast)
 
 
-def _long_ones(found: Trajectories, shortest: int) -> Trajectories:
+def long_ones(found: Trajectories, shortest: int) -> Trajectories:
     """Return the tracks with so many places at least, numbered anew in the order of their first frames."""
     every = np.concatenate([labels[labels != NO_TRACK] for labels in found.labels])
     is_long = np.bincount(every, minlength=found.count) >= shortest
