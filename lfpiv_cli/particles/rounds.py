@@ -38,7 +38,7 @@ from lfpiv_cli.particles.search import (
     with_measured_noise,
     with_typical_light,
 )
-from lfpiv_cli.particles.suspects import with_depths_corrected, with_overlaps_split
+from lfpiv_cli.particles.suspects import still_settled, with_depths_corrected, with_overlaps_split
 from lfpiv_cli.particles.view import lens_pixels
 
 
@@ -167,7 +167,7 @@ def with_suspects_checked(task: Task, state: State, settings: Round) -> State:
         state = with_depths_corrected(task, state, settings.unexplained)
     state = with_overlaps_split(task, state, settings.unexplained, settings.thorough)
     sweep(task, state, settings.unexplained, SWEEPS_AFTER_SPLIT, SEARCH_GAIN)
-    return pruned(task, merge(task, state), settings)
+    return pruned(task, merge(task, state, still_settled(task, state)), settings)
 
 
 def candidates_of(

@@ -102,6 +102,7 @@ class State:
     typical_light : of a particle
     noise : of the image
     unsplit, unmoved : (m, 5) those that could not be split, and not be moved in depth, as `_signature` gives them
+    settled : (m, 4) those that are suspected of neither, whatever their chi-squared; without it
     """
 
     particles: NDArray[np.float64]
@@ -110,6 +111,7 @@ class State:
     noise: Noise
     unsplit: NDArray[np.float64]
     unmoved: NDArray[np.float64]
+    settled: NDArray[np.float64]
 
 
 def task_of(
@@ -149,7 +151,7 @@ def task_of(
 def blank(task: Task) -> State:
     """Return the state in which nothing has been found."""
     none = np.zeros((0, 5))
-    return State(np.zeros((0, 4)), task.image.copy(), 0.0, noise_with(task, 0.0), none, none)
+    return State(np.zeros((0, 4)), task.image.copy(), 0.0, noise_with(task, 0.0), none, none, np.zeros((0, 4)))
 
 
 def noise_with(task: Task, typical_light: float) -> Noise:
@@ -170,14 +172,18 @@ def sweep(task: Task, state: State, unexplained: float, sweeps: int, enough: flo
         refine(observed(task, state, unexplained), state.particles, enough)
 
 
-def merge(task: Task, state: State) -> State:
-    """Return the state with particles that have become one added up, and its residual computed anew."""
+def merge(task: Task, state: State, apart: NDArray[np.bool_] | None = None) -> State:
+    """Return the state with particles that have become one added up, and its residual computed anew.
+
+    Two of those that are known to be `apart` (n,) stay two.
+    """
     particles = state.particles.copy()
     merging = task.view.scale.box_mm(MERGE_LENSES, MERGE_DEPTHS)
     pairs = KDTree(particles[:, :3] / merging).query_pairs(1.0, output_type="ndarray")
     merged = np.zeros(len(particles), dtype=bool)
     for a, b in pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]:
-        if not (merged[a] or merged[b]):
+        known = apart is not None and apart[a] and apart[b]
+        if not (known or merged[a] or merged[b]):
             brighter, other = (a, b) if particles[a, 3] >= particles[b, 3] else (b, a)
             particles[brighter, 3] += particles[other, 3]
             merged[other] = True

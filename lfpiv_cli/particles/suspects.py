@@ -29,6 +29,8 @@ SPLIT_GAIN, DEPTH_GAIN = 40.0, 10.0
 # microlenses, in depths over which light spreads by one lens (Table 2: 0.05 mm), and by these shares in light and in
 # chi-squared.
 CHANGED_LENSES, CHANGED_DEPTHS, CHANGED_SHARES = 0.05, 0.05 / 1.064, (0.05, 0.2)
+# One that is settled stays so until it has changed so many times as much.
+SETTLED = 4.0
 
 
 def with_depths_corrected(task: Task, state: State, unexplained: float) -> State:
@@ -39,10 +41,16 @@ def with_depths_corrected(task: Task, state: State, unexplained: float) -> State
     # Light that stays within about one lens fits well at many depths.
     near_focus = footprint_radius_mm(task.view, state.particles[:, 2]) < 2.0 * task.view.half_x_mm
     signature = _signature(task.view.scale, state.particles, chi2)
-    suspects = (near_focus | (chi2 > SUSPECT_CHI2 * good)) & ~_among(state.unmoved, signature)
+    suspects = (near_focus | (chi2 > SUSPECT_CHI2 * good)) & ~_tried(state.unmoved, state, signature)
     light = SMALLEST_LIGHT * state.typical_light
     moved = try_other_depths(observation, state.particles, suspects, light, DEPTH_GAIN * good)
     return replace(state, unmoved=np.concatenate([state.unmoved, signature[suspects & ~moved]]))
+
+
+def settled(task: Task, state: State) -> State:
+    """Return the state whose particles are not suspected as long as they are where they are now: their pasts tell."""
+    chi2 = np.ones(len(state.particles))
+    return replace(state, settled=_signature(task.view.scale, state.particles, chi2)[:, :-1])
 
 
 def with_overlaps_split(task: Task, state: State, unexplained: float, thorough: bool) -> State:
@@ -52,7 +60,7 @@ def with_overlaps_split(task: Task, state: State, unexplained: float, thorough: 
     good = _good(chi2)
     bright = state.particles[:, 3] > (ENOUGH_FOR_TWO if thorough else BRIGHT) * state.typical_light
     signature = _signature(task.view.scale, state.particles, chi2)
-    suspects = bright & (chi2 > SUSPECT_CHI2 * good) & ~_among(state.unsplit, signature)
+    suspects = bright & (chi2 > SUSPECT_CHI2 * good) & ~_tried(state.unsplit, state, signature)
     light = SMALLEST_LIGHT * state.typical_light
     partners = split(observation, state.particles, suspects, light, SPLIT_GAIN * good)
     found = partners[:, 3] > 0.0
@@ -75,8 +83,22 @@ def _signature(scale: Scale, particles: NDArray[np.float64], chi2: NDArray[np.fl
     return np.column_stack([particles[:, :3] / scale.box_mm(CHANGED_LENSES, CHANGED_DEPTHS), shares])
 
 
+def still_settled(task: Task, state: State) -> NDArray[np.bool_]:
+    """Return which particles are settled and still there."""
+    return _settled(state, _signature(task.view.scale, state.particles, np.ones(len(state.particles))))
+
+
+def _settled(state: State, signature: NDArray[np.float64]) -> NDArray[np.bool_]:
+    return _among(state.settled / SETTLED, signature[:, :-1] / SETTLED)
+
+
+def _tried(before: NDArray[np.float64], state: State, signature: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which particles were tried before or are settled, and have hardly changed since."""
+    return _among(before, signature) | _settled(state, signature)
+
+
 def _among(tried: NDArray[np.float64], signature: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which particles were tried before and have hardly changed since."""
+    """Return which signatures are among others, within 1."""
     if not len(tried):
         return np.zeros(len(signature), dtype=bool)
     distance, _ = KDTree(tried).query(signature, p=np.inf, distance_upper_bound=1.0)
