@@ -26,6 +26,7 @@ COMMANDS = (
     vectors.correlate,
     vectors.combine,
     tracks.track,
+    tracks.follow,
     inspection.info,
     validation.validate,
     simulation.simulate,

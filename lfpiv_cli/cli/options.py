@@ -18,6 +18,14 @@ POSITIVE = click.FloatRange(min=0.0, min_open=True)
 
 config_argument = click.argument("config", type=FILE)
 dark_option = click.option("--dark", type=FILE, help="Dark image, taken with the cap on.")
+background_option = click.option(
+    "--background", help="Image to subtract, or minimum or mean over the images given, or as minimum:15."
+)
+mask_option = click.option(
+    "--mask",
+    help="Image that is black where pixels are left out (reflections, bubbles), or still: where light stands still in "
+    "the images given, brighter than what moves.",
+)
 dt_option = click.option("--dt-s", type=POSITIVE, help="Time from one frame to the next; default from the config.")
 pairing_option = click.option(
     "--pairing",

@@ -7,7 +7,16 @@ from typing import Any
 
 import click
 
-from lfpiv_cli.cli.options import FILE, common_options, dark_option, output_option, pairing_option, resume_option
+from lfpiv_cli.cli.options import (
+    FILE,
+    background_option,
+    common_options,
+    dark_option,
+    mask_option,
+    output_option,
+    pairing_option,
+    resume_option,
+)
 from lfpiv_cli.console import Console
 from lfpiv_cli.names import Start, names_in
 from lfpiv_cli.reconstruction.registry import SOLVER_NAMES
@@ -26,12 +35,8 @@ from lfpiv_cli.reconstruction.registry import SOLVER_NAMES
 @click.option("--accelerate/--no-accelerate", default=None, help="Extrapolate between steps; default from the config.")
 @click.option("--start", type=click.Choice(names_in(Start)), help="First volume; default from the config.")
 @dark_option
-@click.option("--background", help="Image to subtract, or minimum or mean over the images given, or as minimum:15.")
-@click.option(
-    "--mask",
-    help="Image that is black where pixels are left out (reflections, bubbles), or still: where light stands still in "
-    "the images given, brighter than what moves.",
-)
+@background_option
+@mask_option
 @pairing_option
 @resume_option
 @click.option("--keep-going", is_flag=True, help="Go on with the next frame when one fails.")

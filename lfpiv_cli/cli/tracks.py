@@ -1,4 +1,4 @@
-"""The command that tracks particles: particle tracking velocimetry."""
+"""The commands that track particles: particle tracking velocimetry."""
 
 from __future__ import annotations
 
@@ -7,7 +7,17 @@ from typing import Any
 
 import click
 
-from lfpiv_cli.cli.options import FILE, POSITIVE, common_options, dt_option, output_option
+from lfpiv_cli.cli.options import (
+    FILE,
+    POSITIVE,
+    background_option,
+    common_options,
+    dark_option,
+    dt_option,
+    mask_option,
+    output_option,
+    resume_option,
+)
 from lfpiv_cli.console import Console
 
 
@@ -44,3 +54,46 @@ def track(
 
     options = stage.TrackOptions(**chosen)
     return stage.track_particles(particles, output, options, overwrite=overwrite, console=console)
+
+
+@click.command("follow")
+@click.argument("weights", type=FILE)
+@click.argument("frames", type=FILE, nargs=-1, required=True)
+@dark_option
+@background_option
+@mask_option
+@dt_option
+@click.option(
+    "--search",
+    "search_voxel",
+    type=POSITIVE,
+    help="Largest displacement from the first frame to the second, voxels; six microlenses when not given.",
+)
+@click.option(
+    "--shortest", type=click.IntRange(min=2), default=4, help="Fewest frames of a track, shorter ones are ghosts; 4."
+)
+@click.option("--both-ways", is_flag=True, help="Go through the frames a second time, backwards: twice the time.")
+@click.option("--residuals", is_flag=True, help="Also write what the particles leave of each image.")
+@resume_option
+@output_option("Folder for the particles of each frame and the tracks.")
+@common_options
+def follow(
+    weights: Path, frames: tuple[Path, ...], output: Path, overwrite: bool, console: Console, **chosen: Any
+) -> dict[str, Any]:
+    """Find and track the particles of a time-resolved sequence together, as in Shake-The-Box.
+
+    The first two frames are searched as a pair. Then each track predicts where its particle is in the next frame, the
+    predicted particles are refined together on the image, and only what they leave of it is searched for others. Give
+    the frames in the order of time, or one multi-page file.
+
+    \b
+    Writes OUTPUT/particles/STEM.vtkhdf for each frame, as reconstruct does, and OUTPUT/tracks.vtkhdf, as track does.
+
+    \b
+    Example: lfpiv follow weights.h5 run.tif --dark dark.tif -o run
+             lfpiv follow weights.h5 frame_*.tif --dark dark.tif --both-ways -o run
+    """
+    from lfpiv_cli.stages import follow as stage
+
+    options = stage.FollowOptions(**chosen)
+    return stage.follow_particles(weights, frames, output, options, overwrite=overwrite, console=console)

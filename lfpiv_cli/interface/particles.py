@@ -194,7 +194,7 @@ class TracerSize:
 def sized(bench: Bench, frames: Iterable[Frame]) -> tuple[Bench, TracerSize]:
     """Return the bench with the tracers' diameter, from the first of its frames where it is not given."""
     given, lens_mm = bench.settings.reconstruction.particle_diameter_mm, _lens_mm(bench)
-    found = diameter_by(_task(bench, frame) for frame in islice(frames, LOOKED_AT))
+    found = diameter_by(task_for(bench, frame) for frame in islice(frames, LOOKED_AT))
     if found is None:
         size = TracerSize(given or UNKNOWN_LENSES * lens_mm)
     else:
@@ -224,20 +224,20 @@ def size_notices(settings: Config, size: TracerSize) -> list[Notice]:
 
 def find(bench: Bench, frame: Frame, progress: Callable[[int], None] | None = None) -> Particles:
     """Return the particles behind an image."""
-    task = _task(bench, frame)
+    task = task_for(bench, frame)
     return result(task, first_pass(task, progress=progress))
 
 
 def find_first(bench: Bench, frame: Frame, progress: Callable[[int], None] | None = None) -> NDArray[np.float64]:
     """Return the particles (n, 4) of a frame's first pass, for its own second pass and those of its neighbours."""
-    return first_pass(_task(bench, frame), progress=progress).particles
+    return first_pass(task_for(bench, frame), progress=progress).particles
 
 
 def find_beside(
     bench: Bench, frame: Frame, own: NDArray[np.float64], neighbours: Sequence[NDArray[np.float64]]
 ) -> Particles:
     """Return the particles behind an image with the help of the first passes of it and of the frames beside it."""
-    task = _task(bench, frame)
+    task = task_for(bench, frame)
     return result(task, second_pass(task, own, neighbours, SEARCH_LENSES * task.view.scale.lens_mm))
 
 
@@ -245,7 +245,8 @@ def _lens_mm(bench: Bench) -> float:
     return bench.content.camera.scale(bench.settings.media_model()).lens_mm
 
 
-def _task(bench: Bench, frame: Frame) -> Task:
+def task_for(bench: Bench, frame: Frame) -> Task:
+    """Return the task that a frame sets."""
     content, settings = bench.content, bench.settings
     radius = 0.5 * (settings.reconstruction.particle_diameter_mm or UNKNOWN_LENSES * _lens_mm(bench))
     space = _space(content, settings)

@@ -136,7 +136,7 @@ def reconstruct(
                 pictures, target = future.result(), targets[number]
                 check_frame(bench, pictures[0], str(frames[number].path))
                 stem = frames[number].stem
-                notices = _file_notices(target.record, stem) + frame_notices(bench, *pictures, stem)
+                notices = file_notices(target.record, stem) + frame_notices(bench, *pictures, stem)
                 console.warn(notices)
                 target = replace(target, record=with_warnings(target.record, notices))
                 if size is not None:
@@ -196,7 +196,7 @@ def _targets(
     ]
 
 
-def _file_notices(made: Mapping[str, Any], name: str) -> list[Notice]:
+def file_notices(made: Mapping[str, Any], name: str) -> list[Notice]:
     """Return what is said of a frame whose file was given as something else, too."""
     other = also_used_as(made, "image")
     if other is None:

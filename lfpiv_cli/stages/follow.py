@@ -1,0 +1,229 @@
+"""The stage of `follow`: the particles of a time-resolved sequence, found and tracked together.
+
+In the output folder: `particles/STEM.vtkhdf` for each frame, as `reconstruct` writes them, and `tracks.vtkhdf`, as
+`track` writes them; with both ways `forwards/STEM.vtkhdf`, too, what was found on the way forwards.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from lfpiv_cli.console import CONSOLE, Console
+from lfpiv_cli.files import images as image_files
+from lfpiv_cli.files.atomic import ensure_writable
+from lfpiv_cli.files.batch import VTKHDF_SUFFIX, Frame, Target, frames_of, output_paths, pending, prepare_folder
+from lfpiv_cli.files.config import Config, carried_config
+from lfpiv_cli.files.inputs import given
+from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, Points, read_points, write_points
+from lfpiv_cli.files.provenance import record, sha256, with_warnings
+from lfpiv_cli.files.vtkhdf import read_header
+from lfpiv_cli.files.weights_file import open_weights
+from lfpiv_cli.interface import particles
+from lfpiv_cli.interface.following import (
+    SHORTEST,
+    Recorded,
+    backwards,
+    ensure_sequence,
+    forwards,
+    steps_of,
+)
+from lfpiv_cli.interface.reconstruction import bench_of, check_frame, frame_notices
+from lfpiv_cli.interface.tracks import Tracking, few_notices, tracked, tracking_of
+from lfpiv_cli.notice import Notice
+from lfpiv_cli.reconstruction.images import Image
+from lfpiv_cli.stages.frames import STILL, Background, mask_of, reader, sequence_digests
+from lfpiv_cli.stages.reconstruct import file_notices, residual_path
+from lfpiv_cli.tracks.sequences import Trajectories
+
+PARTICLES, FORWARDS, TRACKS = "particles", "forwards", f"tracks{VTKHDF_SUFFIX}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class FollowOptions:
+    """What `follow_particles` is given besides weights and images.
+
+    Attributes
+    ----------
+    dark, background, mask : as of `reconstruct`
+    dt_s : time from one frame to the next, in place of the config's
+    search_voxel : displacements from the first frame to the second are sought up to this along each axis
+    shortest : fewest frames of a track
+    both_ways : go through the frames a second time, backwards
+    residuals : write what the particles leave of each image, too
+    resume : go on after the last frame that is complete
+    """
+
+    dark: Path | None = None
+    background: str | None = None
+    mask: str | Path | None = None
+    dt_s: float | None = None
+    search_voxel: float | None = None
+    shortest: int = SHORTEST
+    both_ways: bool = False
+    residuals: bool = False
+    resume: bool = False
+
+
+NO_OPTIONS = FollowOptions()
+
+
+def follow_particles(
+    weights: Path,
+    images: Sequence[Path],
+    output: Path,
+    options: FollowOptions = NO_OPTIONS,
+    *,
+    overwrite: bool = False,
+    console: Console = CONSOLE,
+) -> dict[str, Any]:
+    """Find and follow the particles of a sequence."""
+    frames = frames_of(images)
+    ensure_sequence(len(frames))
+    level = Background.parse(options.background)
+    mask_file = None if options.mask is None or options.mask == STILL else Path(options.mask)
+    common = given(weights=weights, dark=options.dark, background=level.path, mask=mask_file)
+    content = open_weights(weights)
+    settings = carried_config(content.provenance, weights).overridden("reconstruction", solver="particles")
+    settings = settings.overridden("correlation", dt_s=options.dt_s)
+    tracking = tracking_of(settings, options.search_voxel, options.shortest, len(frames), str(weights))
+    content = particles.searchable(content, settings)
+    told = sequence_digests(level, frames, options.mask)
+    passes = _passes(output, frames, told, settings, tracking, common, options.both_ways)
+    prepare_folder([output / TRACKS])
+    inputs = [*common.values(), *images]
+    needed = [_needed(targets, inputs, options, overwrite, targets is passes[-1]) for targets in passes]
+    ensure_writable(output / TRACKS, overwrite or options.resume, inputs)
+    shape = content.image_shape
+    dark = image_files.read_image(options.dark, shape) if options.dark else None
+    pitch_px = float(content.camera.micro_image_lattice_px().pitch.max())
+    bench = bench_of(content, settings, dark, mask_of(options.mask, frames, shape, pitch_px))
+    read = reader(level, frames, shape, dark)
+    bench, size = particles.sized(bench, (particles.frame_of(bench, *read(k)) for k in range(len(frames))))
+    said = particles.size_notices(settings, size)
+    console.warn(said)
+
+    def frame_at(number: int) -> particles.Frame:
+        (raw, lit), stem = read(number), frames[number].stem
+        check_frame(bench, raw, str(frames[number].path))
+        console.warn([*file_notices(passes[0][number].record, stem), *frame_notices(bench, raw, lit, stem)])
+        return particles.frame_of(bench, raw, lit)
+
+    stores = [
+        _Files(targets, frozenset(numbers), said, options.residuals and targets is passes[-1], overwrite, console)
+        for targets, numbers in zip(passes, needed, strict=True)
+    ]
+    sequence = Recorded(bench, size, tracking, frame_at, [frame.stem for frame in frames], {})
+    found: Trajectories | None
+    with console.progress(sum(map(steps_of, needed)), "follow") as advance:
+        found = forwards(sequence, stores[0], advance)
+        if options.both_ways:
+            backwards(sequence, stores[0].read, stores[1], advance)
+            found = None
+    counts = {"frames": len(frames), "found": len(needed[-1]), "skipped": len(frames) - len(needed[-1])}
+    summary = _write_tracks(output / TRACKS, sequence, stores[-1], found, overwrite or options.resume, console)
+    return counts | summary | size.summary()
+
+
+def _needed(
+    targets: Sequence[Target], inputs: Sequence[Path], options: FollowOptions, overwrite: bool, last: bool
+) -> list[int]:
+    """Return the numbers of the frames of a pass that have to be made, after it is known that they can be written."""
+    prepare_folder([target.path for target in targets])
+    needed = pending(targets, inputs, overwrite, options.resume, _record_of)
+    for number in needed if options.residuals and last else []:
+        ensure_writable(residual_path(targets[number].path), overwrite or options.resume, inputs)
+    return needed
+
+
+def _write_tracks(
+    path: Path, sequence: Recorded, store: _Files, found: Trajectories | None, overwrite: bool, console: Console
+) -> dict[str, Any]:
+    """Write the tracks through a sequence; return what is told of them."""
+    points = [store.read(number) for number in range(len(sequence.names))]
+    settings, tracking = sequence.bench.settings, sequence.tracking
+    carried = carried_config(points[0].provenance, store.targets[0].path)
+    inputs = {f"particles_{number:04d}": target.path for number, target in enumerate(store.targets)}
+    provenance = record("follow", carried.resolved() | tracking.told(), inputs)
+    result = tracked(points, settings, tracking, provenance, found)
+    counts = [len(each.position_mm) for each in points]
+    notices = few_notices(counts, sequence.names, result)
+    console.warn(notices)
+    told = replace(result.points, provenance=with_warnings(provenance, notices))
+    write_points(path, result.format_name, told, overwrite=overwrite)
+    return {"particles_fewest": min(counts)} | {k: v for k, v in result.summary.items() if k != "frames"}
+
+
+class _Files:
+    """A store of one file for each frame."""
+
+    def __init__(
+        self,
+        targets: Sequence[Target],
+        needed: frozenset[int],
+        said: Sequence[Notice],
+        residuals: bool,
+        overwrite: bool,
+        console: Console,
+    ) -> None:
+        """Take where the frames' files go, which are to be made, and what is said of all of them."""
+        self.targets, self.needed, self.said = targets, needed, said
+        self.residuals, self.overwrite, self.console = residuals, overwrite, console
+
+    def read(self, number: int) -> Points:
+        """Return the particles of a frame."""
+        return read_points(self.targets[number].path, PARTICLES_FORMAT)
+
+    def made(self, number: int) -> Points | None:
+        """Return the particles of a frame that was complete."""
+        return None if number in self.needed else self.read(number)
+
+    def put(self, number: int, points: Points, left: Image, notices: list[Notice]) -> None:
+        """Write the particles of a frame, what is left of its image before them: what is complete has both."""
+        target = self.targets[number]
+        self.console.warn(notices)
+        if self.residuals:
+            image_files.write_tiff(residual_path(target.path), left, overwrite=True)
+        told = replace(points, provenance=with_warnings(target.record, [*self.said, *notices]))
+        write_points(target.path, PARTICLES_FORMAT, told, overwrite=self.overwrite)
+
+
+def _passes(
+    output: Path,
+    frames: Sequence[Frame],
+    told: Sequence[str],
+    settings: Config,
+    tracking: Tracking,
+    common: Mapping[str, Path],
+    both_ways: bool,
+) -> list[list[Target]]:
+    """Return for each pass where the files of its frames go, and the records that they carry.
+
+    These say which frames each is made with: on the way forwards those before it (the first with the second), on the
+    way back all; `told` says what their background and mask are made of.
+    """
+    every = [f"{sha256(frame.path)} {frame.page}\n" for frame in frames]
+    resolved = settings.resolved()
+
+    def target(path: Path, number: int, way: str, count: int) -> Target:
+        frame, digest = frames[number], hashlib.sha256("".join(every[:count]).encode()).hexdigest()
+        command = (
+            f"follow {way} page {frame.page} of {count} frames, SHA-256 {digest}, within {tracking.search_mm:g} mm"
+        )
+        return Target(path, record(command + told[number], resolved, {**common, "image": frame.path}))
+
+    stems, numbers = [frame.stem for frame in frames], range(len(frames))
+    folder = output / (FORWARDS if both_ways else PARTICLES)
+    paths = output_paths(folder, stems)
+    passes = [[target(paths[k], k, "forwards", max(k + 1, 2)) for k in numbers]]
+    if both_ways:
+        paths = output_paths(output / PARTICLES, stems)
+        passes.append([target(paths[k], k, "backwards", len(frames)) for k in numbers])
+    return passes
+
+
+def _record_of(path: Path) -> dict[str, Any]:
+    return read_header(path).provenance
