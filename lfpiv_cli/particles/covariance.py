@@ -166,7 +166,7 @@ def _fill_blocks(
     alone: NDArray[np.float64],
     block: NDArray[np.float64],
 ) -> None:
-    """Fill J_n^T W J_n (n, 4, 4) of the particles from `first` on, and J_n^T W J_m of each of their neighbours m.
+    """Fill J_n^T W J_n (n, 4, 4) of the particles from `first` on, and J_n^T W J_m of neighbours m > n, either way.
 
     Both from whole pixels: a pixel that two lenses light has one error, and with two it would be less than its
     neighbours' blocks ask for.
@@ -182,7 +182,13 @@ def _fill_blocks(
                 own[row, column, a] += weight[pixel] * slopes.slope[entry, a]
         _add_products(slopes, n, own, top, left, alone[k])
         for at in range(neighbours.start[n], neighbours.start[n + 1]):
-            _add_products(slopes, neighbours.other[at], own, top, left, block[at])
+            m = neighbours.other[at]
+            if m > n:
+                _add_products(slopes, m, own, top, left, block[at])
+                back = neighbours.start[m]
+                while neighbours.other[back] != n:
+                    back += 1
+                block[back] = block[at].T
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
