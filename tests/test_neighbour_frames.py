@@ -2,46 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from lfpiv_cli.errors import UsageError
 from lfpiv_cli.files.batch import frames_beside
-from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.particles.fitting import add_all
 from lfpiv_cli.particles.neighbour_frames import second_pass
-from lfpiv_cli.particles.search import Task, task_of
-from lfpiv_cli.particles.view import raw_view
-from lfpiv_cli.reconstruction.equations import normalisers
-from lfpiv_cli.weights.build import default_padding, factorise
-from lfpiv_cli.weights.model import Weights
+from tests.particle_images import found, task_with
 
 MOVED_MM = np.array([0.12, -0.05, 0.04, 0.0])
-
-
-def task_with(table2: Camera, water: Media, true: NDArray[np.float64], rng: np.random.Generator) -> Task:
-    """Return the task that a noisy image of particles sets."""
-    camera = replace(table2, columns=500, rows=420)
-    grid = Grid.centred((20, 16, 20), (0.1, 0.1, 0.1), (0.0, 0.0, 1.9))
-    padding = default_padding(camera, water, grid)
-    weights = Weights(grid, padding, factorise(camera, water, grid.padded(padding)), camera.column_axis)
-    view, depths = raw_view(camera, water, 0.025), grid.bounds_mm(2)
-    image = np.zeros(camera.rows * camera.columns)
-    add_all(view, true, 1.0, image, depths)
-    image += rng.normal(0.0, 6.0, image.size)
-    shaped = image.reshape(camera.rows, camera.columns).astype(np.float32)
-    return task_of(shaped, view, weights, camera, normalisers(weights.padded), None)
-
-
-def found(particles: NDArray[np.float64], true: NDArray[np.float64]) -> NDArray[np.bool_]:
-    distance, _ = KDTree(particles[:, :3] / (0.02, 0.02, 0.1)).query(true[:, :3] / (0.02, 0.02, 0.1))
-    return np.asarray(distance < 1.0)
 
 
 def test_what_a_neighbour_found_is_found(table2: Camera, water: Media, rng: np.random.Generator) -> None:
