@@ -16,6 +16,10 @@ or with the particles themselves in place of volumes (particle tracking velocime
     tracks = lf.track(p, q)                        # tracks.points.position_mm, .arrays["velocity"]
     field = lf.combine(field, tracks.vectors()[0]).field
 
+and in a time-resolved sequence both at once, each frame predicted by those before it (as in Shake-The-Box)::
+
+    found = lf.follow(weights, images, dark=dark)  # found.particles of each frame, found.tracks
+
 Images are (rows, columns) arrays of counts; `read_image` reads one. `open_calibration`, `open_weights`, `open_volume`,
 `open_vectors`, `open_particles` and `open_tracks` read the files that the commands write, and what they return goes
 into the functions above. Volumes and fields are indexed [z, y, x]; points and vectors are (x, y, z) in mm, m/s.
@@ -26,9 +30,9 @@ Each command is a function as well, files in and files out, with its options as 
 
     reconstruct(Path("weights.h5"), images, Path("volumes"), ReconstructOptions(dark=Path("dark.tif")))
 
-likewise `lfpiv_cli.stages.calibrate`, `.build_weights`, `.correlate`, `.track` and so on. All that can go wrong is an
-`LfpivError` of `lfpiv_cli.errors`, whose message names the place, what was found and what was expected; what speaks
-against a result is an `LfpivWarning`.
+likewise `lfpiv_cli.stages.calibrate`, `.build_weights`, `.correlate`, `.track`, `.follow` and so on. All that can go
+wrong is an `LfpivError` of `lfpiv_cli.errors`, whose message names the place, what was found and what was expected;
+what speaks against a result is an `LfpivWarning`.
 """
 
 from __future__ import annotations
@@ -42,6 +46,7 @@ if TYPE_CHECKING:
     from lfpiv_cli.files.weights_file import open_weights
     from lfpiv_cli.flow.combining import combine
     from lfpiv_cli.interface.calibration import calibrate
+    from lfpiv_cli.interface.following import follow
     from lfpiv_cli.interface.notices import LfpivWarning
     from lfpiv_cli.interface.particles import find_particles
     from lfpiv_cli.interface.readers import load_rig, open_calibration, open_particles, open_tracks, read_image
@@ -60,6 +65,7 @@ __all__ = [
     "combine",
     "correlate",
     "find_particles",
+    "follow",
     "load_rig",
     "open_calibration",
     "open_particles",
@@ -81,6 +87,7 @@ MODULES = {
     "combine": "flow.combining",
     "correlate": "interface.vectors",
     "find_particles": "interface.particles",
+    "follow": "interface.following",
     "load_rig": "interface.readers",
     "open_calibration": "interface.readers",
     "open_particles": "interface.readers",
