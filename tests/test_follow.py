@@ -1,0 +1,210 @@
+"""`follow` as a command and in memory: a small sequence whose tracks are known, interrupted and gone on with."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import lfpiv_cli as lf
+from lfpiv_cli.cli import cli
+from lfpiv_cli.errors import OutputExistsError, UsageError
+from lfpiv_cli.files.images import write_tiff
+from lfpiv_cli.files.particle_file import TRAJECTORIES_FORMAT, Points, read_points
+from lfpiv_cli.particles.fitting import add_all
+from lfpiv_cli.particles.view import raw_view
+from lfpiv_cli.stages import follow as stage
+
+ROOT = Path(__file__).parent.parent
+FRAMES, COUNT = 4, 12
+# 0.8, -0.4 and 0.5 voxels a frame.
+MOVED_MM = np.array([0.08, -0.04, 0.05])
+DT_S, DARK_COUNTS = 0.002, 100.0
+CHANGES = (
+    ("columns: 600, rows: 448", "columns: 290, rows: 270"),
+    ("shape_xyz: [30, 22, 40]", "shape_xyz: [9, 8, 10]"),
+    ("centre_mm: [0, 0, 0], reference: mid_plane", "centre_mm: [0, 0, 1.9], reference: focal_point"),
+)
+
+
+def run(*arguments: object) -> None:
+    cli.main([str(argument) for argument in arguments], standalone_mode=False)
+
+
+def true_places() -> NDArray[np.float64]:
+    """Return the particles' places (frames, n, 3) from the focal point, mm: all are in the volume in each frame."""
+    low, high = np.array([-0.4, -0.2, 1.5]), np.array([0.1, 0.35, 2.2])
+    start = np.random.default_rng(1).uniform(low, high, (COUNT, 3))
+    return start + MOVED_MM * np.arange(FRAMES)[:, np.newaxis, np.newaxis]
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with weights of the sample's rig, a smaller one, and images of particles."""
+    folder = tmp_path_factory.mktemp("rig")
+    text = (ROOT / "configs" / "sample.yaml").read_text()
+    for old, new in CHANGES:
+        assert old in text, old
+        text = text.replace(old, new)
+    (folder / "rig.yaml").write_text(text)
+    run("build-weights", folder / "rig.yaml", "-o", folder / "weights.h5", "-q")
+    content, settings = lf.open_weights(folder / "weights.h5"), lf.load_rig(folder / "rig.yaml")
+    view = raw_view(content.camera, settings.media_model(), 0.025)
+    rng = np.random.default_rng(2)
+    light = rng.uniform(4e5, 6e5, COUNT)
+    for number, places in enumerate(true_places()):
+        image = np.zeros(content.camera.rows * content.camera.columns)
+        particles = np.column_stack([content.camera.to_image_axes(places), light])
+        add_all(view, particles, 1.0, image, content.weights.grid.bounds_mm(2))
+        counts = np.rint(DARK_COUNTS + image + rng.normal(0.0, 6.0, image.size)).clip(0, 65535)
+        write_tiff(
+            folder / f"frame_{number}.tif", counts.astype(np.uint16).reshape(content.image_shape), overwrite=True
+        )
+    dark = np.full(content.image_shape, DARK_COUNTS, np.uint16)
+    write_tiff(folder / "dark.tif", dark, overwrite=True)
+    return folder
+
+
+def images(rig: Path) -> list[Path]:
+    return [rig / f"frame_{number}.tif" for number in range(FRAMES)]
+
+
+def follow(rig: Path, output: Path, *options: object, frames: list[Path] | None = None) -> None:
+    run("follow", rig / "weights.h5", *(frames or images(rig)), "--dark", rig / "dark.tif", *options, "-o", output)
+
+
+@pytest.fixture(scope="module")
+def followed(rig: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    output = tmp_path_factory.mktemp("followed") / "run"
+    follow(rig, output, "--threads", 1)
+    return output
+
+
+def particle_files(output: Path) -> list[Path]:
+    return [output / "particles" / f"frame_{number}.vtkhdf" for number in range(FRAMES)]
+
+
+def bytes_of(output: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(output)): path.read_bytes() for path in sorted(output.rglob("*")) if path.is_file()}
+
+
+def tracks_of(output: Path) -> Points:
+    return read_points(output / "tracks.vtkhdf", TRAJECTORIES_FORMAT)
+
+
+def assert_right(tracks: Points) -> None:
+    """Check that each particle has one track, which is where it is, and moves as it does."""
+    true = tracks.reference.points_from_focal_point(true_places().reshape(-1, 3)).reshape(FRAMES, COUNT, 3)
+    frame, track = tracks.arrays["frame"], tracks.arrays["track"]
+    distance = np.abs(true[frame] - tracks.position_mm[:, np.newaxis]) / (0.01, 0.01, 0.1)
+    nearest = distance.max(axis=2).argmin(axis=1)
+    assert len(track) == FRAMES * COUNT
+    assert distance.max(axis=2).min(axis=1).max() < 1.0
+    assert len(set(zip(track.tolist(), nearest.tolist(), strict=True))) == len(set(track.tolist())) == COUNT
+    velocity = np.median(tracks.arrays["velocity"], axis=0)
+    assert np.all(np.abs(velocity - MOVED_MM * 1e-3 / DT_S) < (2e-4, 2e-4, 2e-3))
+
+
+def test_tracks_are_right(followed: Path) -> None:
+    assert [path.is_file() for path in particle_files(followed)] == [True] * FRAMES
+    assert_right(tracks_of(followed))
+
+
+def test_track_links_the_same(followed: Path, tmp_path: Path) -> None:
+    run("track", *particle_files(followed), "--shortest", 4, "-o", tmp_path / "tracks.vtkhdf")
+    again, tracks = read_points(tmp_path / "tracks.vtkhdf", TRAJECTORIES_FORMAT), tracks_of(followed)
+    np.testing.assert_array_equal(again.position_mm, tracks.position_mm)
+    for name, array in tracks.arrays.items():
+        np.testing.assert_array_equal(again.arrays[name], array)
+
+
+def test_in_memory_it_is_the_same(
+    rig: Path, followed: Path, one_thread: Callable[[], AbstractContextManager[None]]
+) -> None:
+    pictures = [lf.read_image(path) for path in images(rig)]
+    with one_thread():
+        found = lf.follow(lf.open_weights(rig / "weights.h5"), pictures, dark=lf.read_image(rig / "dark.tif"))
+    for points, path in zip(found.particles, particle_files(followed), strict=True):
+        written = lf.open_particles(path)
+        np.testing.assert_array_equal(points.position_mm, written.position_mm)
+        for name, array in written.arrays.items():
+            np.testing.assert_array_equal(points.arrays[name], array)
+    np.testing.assert_array_equal(found.tracks.points.position_mm, tracks_of(followed).position_mm)
+
+
+def test_what_was_interrupted_goes_on(
+    rig: Path, followed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As if it had not been, on other threads; so does what has lost a file."""
+    put = stage._Files.put
+
+    def broken(self: Any, number: int, *rest: Any) -> None:
+        if number == 2:
+            raise RuntimeError("power cut")
+        put(self, number, *rest)
+
+    monkeypatch.setattr(stage._Files, "put", broken)
+    options = stage.FollowOptions(dark=rig / "dark.tif")
+    with pytest.raises(RuntimeError, match="power cut"):
+        stage.follow_particles(rig / "weights.h5", images(rig), tmp_path / "run", options)
+    monkeypatch.undo()
+    assert [path.is_file() for path in particle_files(tmp_path / "run")] == [True, True, False, False]
+    assert not (tmp_path / "run" / "tracks.vtkhdf").exists()
+    follow(rig, tmp_path / "run", "--threads", 2, "--resume")
+    assert bytes_of(tmp_path / "run") == bytes_of(followed)
+    # The frame after it is not made again.
+    made = particle_files(tmp_path / "run")[3].stat().st_mtime_ns
+    particle_files(tmp_path / "run")[2].unlink()
+    (tmp_path / "run" / "tracks.vtkhdf").unlink()
+    follow(rig, tmp_path / "run", "--threads", 1, "--resume")
+    assert bytes_of(tmp_path / "run") == bytes_of(followed)
+    assert particle_files(tmp_path / "run")[3].stat().st_mtime_ns == made
+
+
+def test_what_is_there_is_replaced_when_asked(rig: Path, followed: Path) -> None:
+    before = bytes_of(followed)
+    with pytest.raises(OutputExistsError):
+        follow(rig, followed)
+    assert bytes_of(followed) == before
+    with pytest.raises(OutputExistsError, match="other inputs or settings"):
+        follow(rig, followed, "--search", 3, "--resume")
+    assert bytes_of(followed) == before
+
+
+def test_two_frames_are_refused(rig: Path, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"3 frames at least, got 2; for a pair: .*track"):
+        follow(rig, tmp_path / "run", frames=images(rig)[:2])
+    assert not (tmp_path / "run").exists()
+    with pytest.raises(UsageError, match="3 frames"):
+        lf.follow(lf.open_weights(rig / "weights.h5"), [lf.read_image(path) for path in images(rig)[:2]])
+
+
+def test_a_frame_of_another_sequence_is_said(rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    other = tmp_path / "other.tif"
+    write_tiff(other, np.ascontiguousarray(lf.read_image(rig / "frame_2.tif")[::-1]), overwrite=False)
+    frames = [*images(rig)[:2], other]
+    capsys.readouterr()
+    follow(rig, tmp_path / "run", "--shortest", 2, "--threads", 1, "--json", frames=frames)
+    warnings = json.loads(capsys.readouterr().out)["warnings"]
+    assert [each["about"] for each in warnings if each["code"] == "frame-apart"] == ["other"]
+
+
+def test_both_ways_keep_what_was_found_forwards(rig: Path, followed: Path, tmp_path: Path) -> None:
+    follow(rig, tmp_path / "run", "--both-ways", "--residuals", "--threads", 1)
+    assert_right(tracks_of(tmp_path / "run"))
+    forwards, one_way = (
+        lf.open_particles(tmp_path / "run" / "forwards" / "frame_2.vtkhdf"),
+        particle_files(followed)[2],
+    )
+    np.testing.assert_array_equal(forwards.position_mm, lf.open_particles(one_way).position_mm)
+    for number in range(FRAMES):
+        assert (tmp_path / "run" / "forwards" / f"frame_{number}.vtkhdf").is_file()
+        left = lf.read_image(tmp_path / "run" / "particles" / f"frame_{number}_residual.tif")
+        # The noise is 6 counts.
+        assert np.std(left) < 7.0
