@@ -16,6 +16,7 @@ from benchmarks.faults import bench_faults
 from benchmarks.links import bench_links
 from benchmarks.particles import bench_particles, bench_particles_thrice
 from benchmarks.rigs import bench_rigs
+from benchmarks.sequences import bench_sequences
 from benchmarks.simd import bench_simd
 from benchmarks.solvers import bench_solvers
 from benchmarks.weights import bench_weights
@@ -30,6 +31,7 @@ BENCHMARKS: dict[str, Callable[[], None]] = {
     "particles": bench_particles,
     "particles-thrice": bench_particles_thrice,
     "rigs": bench_rigs,
+    "sequences": bench_sequences,
     "simd": bench_simd,
     "solvers": bench_solvers,
     "weights": bench_weights,

@@ -117,7 +117,7 @@ def follow(
     ConfigError, InputError
         As `find_particles` and `track`.
     """
-    ensure_sequence(len(images))
+    ensure_sequence(len(images), shortest)
     carried = carried_config(weights.provenance, "the weights").overridden("correlation", dt_s=dt_s)
     chosen = carried.overridden("reconstruction", **(settings | {"solver": "particles"}))
     tracking = tracking_of(chosen, search_voxel, shortest, len(images), "the weights")
@@ -183,8 +183,8 @@ class Memory:
         self.notices += notices
 
 
-def ensure_sequence(frames: int) -> None:
-    """Refuse what is no sequence.
+def ensure_sequence(frames: int, shortest: int) -> None:
+    """Refuse what is no sequence, or one that is shorter than its tracks must be.
 
     Raises
     ------
@@ -195,6 +195,8 @@ def ensure_sequence(frames: int) -> None:
             f"follow needs {FEWEST_FRAMES} frames at least, got {frames}; for a pair: reconstruct --solver particles "
             "--pairing ab, then track"
         )
+    if frames < shortest:
+        raise UsageError(f"--shortest: no track has {shortest} places in {frames} frames; give at most {frames}")
 
 
 @dataclass(frozen=True, eq=False)

@@ -82,7 +82,7 @@ def follow_particles(
 ) -> dict[str, Any]:
     """Find and follow the particles of a sequence."""
     frames = frames_of(images)
-    ensure_sequence(len(frames))
+    ensure_sequence(len(frames), options.shortest)
     level = Background.parse(options.background)
     mask_file = None if options.mask is None or options.mask == STILL else Path(options.mask)
     common = given(weights=weights, dark=options.dark, background=level.path, mask=mask_file)
