@@ -113,7 +113,7 @@ def follow(
     Raises
     ------
     UsageError
-        Fewer than three images.
+        Fewer than three images, or than the tracks must have.
     ConfigError, InputError
         As `find_particles` and `track`.
     """
@@ -123,8 +123,6 @@ def follow(
     tracking = tracking_of(chosen, search_voxel, shortest, len(images), "the weights")
     bench = bench_of(searchable(weights, chosen), chosen, given_picture(weights, dark), given_picture(weights, mask))
     level = given_picture(weights, background)
-    names = [f"image {number}" for number in range(len(images))]
-
     names = [f"image {number}" for number in range(len(images))]
     pictures = [picture_for(weights, image) for image in images]
 
@@ -174,7 +172,7 @@ class Memory:
         self.notices: list[Notice] = []
 
     def made(self, number: int) -> Points | None:
-        """Return nothing: a frame is asked for once."""
+        """Return the particles of a frame that were put here."""
         return self.particles.get(number)
 
     def put(self, number: int, points: Points, left: Image, notices: list[Notice]) -> None:
