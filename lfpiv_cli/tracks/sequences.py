@@ -253,7 +253,10 @@ def _light_sigma(found: Trajectories, frames: Frames) -> float:
     if not len(tracks):
         return 0.0
     before, now = (_light_of(frames[k])[found.particles(k, tracks)] for k in numbers)
-    ratio = np.log(now / before)
+    lit = (before > 0.0) & (now > 0.0)
+    if not lit.any():
+        return 0.0
+    ratio = np.log(now[lit] / before[lit])
     return float(MAD_TO_SIGMA * np.median(np.abs(ratio - np.median(ratio))))
 
 
