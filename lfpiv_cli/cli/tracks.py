@@ -87,7 +87,8 @@ def follow(
     the frames in the order of time, or one multi-page file.
 
     \b
-    Writes OUTPUT/particles/STEM.vtkhdf for each frame, as reconstruct does, and OUTPUT/tracks.vtkhdf, as track does.
+    Writes OUTPUT/particles/STEM.vtkhdf for each frame, as reconstruct does, OUTPUT/tracks.vtkhdf, as track does,
+    and OUTPUT/playback.vtkhdf, in which ParaView plays the tracks in time.
 
     \b
     Example: lfpiv follow weights.h5 run.tif --dark dark.tif -o run

@@ -1,7 +1,8 @@
 """The stage of `follow`: the particles of a time-resolved sequence, found and tracked together.
 
-In the output folder: `particles/STEM.vtkhdf` for each frame, as `reconstruct` writes them, and `tracks.vtkhdf`, as
-`track` writes them; with both ways `forwards/STEM.vtkhdf`, too, what was found on the way forwards.
+In the output folder: `particles/STEM.vtkhdf` for each frame, as `reconstruct` writes them, `tracks.vtkhdf`, as `track`
+writes them, and `playback.vtkhdf`, the same for playing them in time; with both ways `forwards/STEM.vtkhdf`, too, what
+was found on the way forwards.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from lfpiv_cli.files.batch import VTKHDF_SUFFIX, Frame, Target, frames_of, outpu
 from lfpiv_cli.files.config import Config, carried_config
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, Points, read_points, write_points
+from lfpiv_cli.files.playback import write_playback
 from lfpiv_cli.files.provenance import record, sha256, with_warnings
 from lfpiv_cli.files.vtkhdf import read_header
 from lfpiv_cli.files.weights_file import open_weights
@@ -39,7 +41,8 @@ from lfpiv_cli.stages.frames import STILL, Background, mask_of, reader, sequence
 from lfpiv_cli.stages.reconstruct import file_notices, residual_path
 from lfpiv_cli.tracks.sequences import Trajectories
 
-PARTICLES, FORWARDS, TRACKS = "particles", "forwards", f"tracks{VTKHDF_SUFFIX}"
+PARTICLES, FORWARDS = "particles", "forwards"
+TRACKS, PLAYBACK = f"tracks{VTKHDF_SUFFIX}", f"playback{VTKHDF_SUFFIX}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,7 +99,8 @@ def follow_particles(
     prepare_folder([output / TRACKS])
     inputs = [*common.values(), *images]
     needed = [_needed(targets, inputs, options, overwrite, targets is passes[-1]) for targets in passes]
-    ensure_writable(output / TRACKS, overwrite or options.resume, inputs)
+    for name in (TRACKS, PLAYBACK):
+        ensure_writable(output / name, overwrite or options.resume, inputs)
     shape = content.image_shape
     dark = image_files.read_image(options.dark, shape) if options.dark else None
     pitch_px = float(content.camera.micro_image_lattice_px().pitch.max())
@@ -124,7 +128,7 @@ def follow_particles(
             backwards(sequence, stores[0].read, stores[1], advance)
             found = None
     counts = {"frames": len(frames), "found": len(needed[-1]), "skipped": len(frames) - len(needed[-1])}
-    summary = _write_tracks(output / TRACKS, sequence, stores[-1], found, overwrite or options.resume, console)
+    summary = _write_tracks(output, sequence, stores[-1], found, overwrite or options.resume, console)
     return counts | summary | size.summary()
 
 
@@ -140,7 +144,7 @@ def _needed(
 
 
 def _write_tracks(
-    path: Path, sequence: Recorded, store: _Files, found: Trajectories | None, overwrite: bool, console: Console
+    output: Path, sequence: Recorded, store: _Files, found: Trajectories | None, overwrite: bool, console: Console
 ) -> dict[str, Any]:
     """Write the tracks through a sequence; return what is told of them."""
     points = [store.read(number) for number in range(len(sequence.names))]
@@ -153,7 +157,8 @@ def _write_tracks(
     notices = few_notices(counts, sequence.names, result)
     console.warn(notices)
     told = replace(result.points, provenance=with_warnings(provenance, notices))
-    write_points(path, result.format_name, told, overwrite=overwrite)
+    write_points(output / TRACKS, result.format_name, told, overwrite=overwrite)
+    write_playback(output / PLAYBACK, told, len(points), tracking.dt_s, overwrite=overwrite)
     return {"particles_fewest": min(counts)} | {k: v for k, v in result.summary.items() if k != "frames"}
 
 

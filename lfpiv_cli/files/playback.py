@@ -1,0 +1,69 @@
+"""Tracks played in time: VTKHDF PolyData with a step for each frame, in which ParaView shows the places of that frame.
+
+Layout: VTK's temporal PolyData, one part a step. The arrays lie under `/VTKHDF` in the order of frames, and within a
+frame in that of tracks: `Points` (mm), and in `PointData` `track`, `velocity` and `velocity_sigma` (m/s). What is
+measured is in the file of tracks; this one is for the eye.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from lfpiv_cli.files.hdf5 import create, ensure_format, open_h5, write_array
+from lfpiv_cli.files.particle_file import TRAJECTORIES_FORMAT, UNITS, Points
+from lfpiv_cli.files.vtk import create_vtk_group, write_root
+
+PLAYBACK_FORMAT, PLAYBACK_VERSION = "lfpiv-playback", 1
+# Of `lfpiv-trajectories`: what is shown at each place.
+SHOWN = ("track", "velocity", "velocity_sigma")
+KINDS = ("Vertices", "Lines", "Polygons", "Strips")
+
+
+def write_playback(path: Path, tracks: Points, frames: int, dt_s: float, *, overwrite: bool) -> None:
+    """Write the tracks of a sequence of so many frames, `dt_s` apart, for playing them in time.
+
+    Raises
+    ------
+    OutputExistsError, OutputError
+    """
+    order = np.lexsort((tracks.arrays["track"], tracks.arrays["frame"]))
+    counts = np.bincount(tracks.arrays["frame"], minlength=frames).astype(np.int64)
+    before = np.cumsum(counts) - counts
+    units = UNITS[TRAJECTORIES_FORMAT]
+
+    def fill(file: h5py.File) -> None:
+        write_root(file, PLAYBACK_FORMAT, PLAYBACK_VERSION, tracks.reference, tracks.attributes, tracks.provenance)
+        vtk = create_vtk_group(file, "PolyData")
+        write_array(vtk, "Points", tracks.position_mm[order], "mm")
+        vtk["NumberOfPoints"] = counts
+        for kind in KINDS:
+            cells = counts if kind == "Vertices" else np.zeros_like(counts)
+            group = vtk.create_group(kind)
+            group["NumberOfCells"] = group["NumberOfConnectivityIds"] = cells
+            # Each step has offsets of its own, one more than cells.
+            group["Offsets"] = np.concatenate([np.arange(count + 1) for count in cells])
+            group["Connectivity"] = np.concatenate([np.arange(count) for count in cells])
+        data = vtk.create_group("PointData")
+        for name in SHOWN:
+            write_array(data, name, tracks.arrays[name][order], units[name])
+        steps = vtk.create_group("Steps")
+        steps.attrs["NSteps"] = np.int64(frames)
+        steps["Values"] = dt_s * np.arange(frames)
+        steps["PartOffsets"] = np.arange(frames, dtype=np.int64)
+        steps["NumberOfParts"] = np.ones(frames, np.int64)
+        steps["PointOffsets"] = before
+        of_kinds = np.zeros((frames, len(KINDS)), np.int64)
+        of_kinds[:, 0] = before
+        steps["CellOffsets"] = steps["ConnectivityIdOffsets"] = of_kinds
+        offsets = steps.create_group("PointDataOffsets")
+        for name in SHOWN:
+            offsets[name] = before
+
+    def check(temporary: Path) -> None:
+        with open_h5(temporary) as file:
+            ensure_format(temporary, file, PLAYBACK_FORMAT, (PLAYBACK_VERSION,))
+
+    create(path, fill, overwrite=overwrite, check=check)
