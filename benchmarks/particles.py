@@ -23,7 +23,7 @@ from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media, channel_window
 from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.particles.rounds import find_particles
-from lfpiv_cli.particles.search import task_of
+from lfpiv_cli.particles.search import Task, task_of
 from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.reconstruction.equations import Normalisers, normalisers
 from lfpiv_cli.robust import MAD_TO_SIGMA
@@ -75,6 +75,31 @@ class Bench:
     weights: Weights
     sums: Normalisers
 
+    @property
+    def space(self) -> ObjectSpace:
+        """What the tracers are seen through."""
+        window = channel_window(self.sheet.focus_distance_mm, WATER, CHANNEL_MM, WALL_MM, mid_plane_z_mm=0.0)
+        return ObjectSpace(WATER, window, "exact")
+
+    def bounds_mm(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the corners of the volume, lowest and highest."""
+        low, high = np.array([self.grid.bounds_mm(axis) for axis in range(3)]).T
+        return low, high
+
+    def photograph(
+        self, points_mm: NDArray[np.float64], light_counts: NDArray[np.float64], rng: np.random.Generator
+    ) -> NDArray[np.float32]:
+        """Return the recorded image (rows, columns) of tracers (n, 3), the dark level taken off."""
+        readout = Readout()
+        expected = render_points(self.real, self.space, Balls(points_mm, light_counts, DIAMETER_MM), rng)
+        return readout.record(expected, rng).astype(np.float32) - np.float32(readout.dark_level_counts)
+
+    def task(self, image: NDArray[np.float32]) -> Task:
+        """Return the task that an image sets."""
+        camera = self.calibration.camera(self.sheet)
+        view = raw_view(camera, WATER, 0.5 * DIAMETER_MM, self.calibration, self.space)
+        return task_of(image, view, self.weights, camera, self.sums)
+
 
 def bench_particles() -> None:
     """Print recall, precision, errors, their coverage and time for growing numbers of tracers at full size."""
@@ -113,21 +138,15 @@ def print_figures(bench: Bench, count: int, seed: int, log_spread: float | None 
     Their brightness is log-normal of this standard deviation of its logarithm, or uniform from 0.6 to 1.4.
     """
     rng = np.random.default_rng(seed)
-    low, high = (np.array([bench.grid.bounds_mm(axis)[side] for axis in range(3)]) for side in (0, 1))
+    low, high = bench.bounds_mm()
     margin = np.array([0.4, 0.4, 0.0])
     around = round(count * np.prod(high - low + 2.0 * margin) / np.prod(high - low))
     true = rng.uniform(low - margin, high + margin, (around, 3))
     brightness = rng.uniform(0.6, 1.4, around) if log_spread is None else rng.lognormal(0.0, log_spread, around)
-    readout = Readout()
-    window = channel_window(bench.sheet.focus_distance_mm, WATER, CHANNEL_MM, WALL_MM, mid_plane_z_mm=0.0)
-    space = ObjectSpace(WATER, window, "exact")
-    expected = render_points(bench.real, space, Balls(true, LIGHT_COUNTS * brightness, DIAMETER_MM), rng)
-    image = readout.record(expected, rng).astype(np.float32) - np.float32(readout.dark_level_counts)
+    image = bench.photograph(true, LIGHT_COUNTS * brightness, rng)
 
-    camera = bench.calibration.camera(bench.sheet)
-    view = raw_view(camera, WATER, 0.5 * DIAMETER_MM, bench.calibration, space)
     began = time.perf_counter()
-    found = find_particles(task_of(image, view, bench.weights, camera, bench.sums))
+    found = find_particles(bench.task(image))
     seconds = time.perf_counter() - began
     sigma = np.sqrt(np.diagonal(found.covariance_mm2, axis1=1, axis2=2))
     what = f"{count} particles" if log_spread is None else f"{count} particles of log-normal brightness {log_spread:g}"

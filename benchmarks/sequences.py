@@ -13,17 +13,13 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.particles import CHANNEL_MM, DIAMETER_MM, LIGHT_COUNTS, VOXEL_MM, WALL_MM, WATER, Bench, calibrated
+from benchmarks.particles import LIGHT_COUNTS, VOXEL_MM, Bench, calibrated
 from lfpiv_cli.files.particle_file import symmetric
-from lfpiv_cli.optics.media import channel_window
 from lfpiv_cli.particles.neighbour_frames import second_pass
 from lfpiv_cli.particles.prediction import Predicted, find_predicted
 from lfpiv_cli.particles.rounds import first_pass
-from lfpiv_cli.particles.search import Particles, Task, result, task_of
-from lfpiv_cli.particles.view import raw_view
+from lfpiv_cli.particles.search import Particles, result
 from lfpiv_cli.synthetic.flows import Flow, advect, random_modes, square_duct, taylor_green
-from lfpiv_cli.synthetic.render import Balls, ObjectSpace, render_points
-from lfpiv_cli.synthetic.sensor import Readout
 from lfpiv_cli.tracks.candidates import Seen
 from lfpiv_cli.tracks.sequences import Ahead, SoFar, begun, followed_further, long_ones, scatter_in, states_at
 from lfpiv_cli.validation.particles import match
@@ -72,18 +68,16 @@ def photographs(
     bench: Bench, flow: Flow, count: int, frames: int, rng: np.random.Generator
 ) -> tuple[list[NDArray[np.float32]], Points]:
     """Return the images and where each tracer is in each of them (frames, n, 3), NaN where it is not lit."""
-    low, high = (np.array([bench.grid.bounds_mm(axis)[side] for axis in range(3)]) for side in (0, 1))
+    low, high = bench.bounds_mm()
     speed = 1e3 * DT_S * np.abs(flow(rng.uniform(low, high, (2000, 3)))).max(axis=0)
     wide = MARGIN_MM + 0.5 * frames * speed
     around = round(count * np.prod(high - low + 2.0 * wide) / np.prod(high - low))
     start, light = rng.uniform(low - wide, high + wide, (around, 3)), LIGHT_COUNTS * rng.uniform(0.6, 1.4, around)
-    readout, space = Readout(), _space(bench)
     images, true = [], []
     at = advect(flow, start, -0.5 * (frames - 1) * DT_S)
     for _ in range(frames):
         lit = np.all((at > low - MARGIN_MM) & (at < high + MARGIN_MM), axis=1)
-        expected = render_points(bench.real, space, Balls(at[lit], light[lit], DIAMETER_MM), rng)
-        images.append(readout.record(expected, rng).astype(np.float32) - np.float32(readout.dark_level_counts))
+        images.append(bench.photograph(at[lit], light[lit], rng))
         true.append(np.where(lit[:, np.newaxis], at, np.nan))
         at = advect(flow, at, DT_S)
     return images, np.array(true)
@@ -91,7 +85,7 @@ def photographs(
 
 def followed(bench: Bench, images: list[NDArray[np.float32]], search_mm: float) -> tuple[list[Seen], SoFar]:
     """Return the particles of each frame, and how they belong together."""
-    tasks = [_task(bench, image) for image in images]
+    tasks = [bench.task(image) for image in images]
     own = [first_pass(task).particles for task in tasks[:2]]
     found = [_seen(result(tasks[k], second_pass(tasks[k], own[k], [own[1 - k]], search_mm))) for k in range(2)]
     scale = tasks[0].view.scale
@@ -110,7 +104,7 @@ def track_figures(
 
     Recall is of tracers that as many frames hold as a track must have. None where no track is.
     """
-    low, high = (np.array([bench.grid.bounds_mm(axis)[side] for axis in range(3)]) for side in (0, 1))
+    low, high = bench.bounds_mm()
 
     def counted(points: Points) -> NDArray[np.bool_]:
         depth = np.abs(points[:, 2])
@@ -142,17 +136,6 @@ def track_figures(
     rms = np.sqrt(np.mean(np.concatenate(errors) ** 2, axis=0))
     figures = {"recall": hit / max(wanted, 1), "precision": right / max(shown, 1)}
     return figures | {"rms_x": rms[0], "rms_y": rms[1], "rms_z": rms[2], "wrong_links": changed / max(links, 1)}
-
-
-def _space(bench: Bench) -> ObjectSpace:
-    window = channel_window(bench.sheet.focus_distance_mm, WATER, CHANNEL_MM, WALL_MM, mid_plane_z_mm=0.0)
-    return ObjectSpace(WATER, window, "exact")
-
-
-def _task(bench: Bench, image: NDArray[np.float32]) -> Task:
-    camera = bench.calibration.camera(bench.sheet)
-    view = raw_view(camera, WATER, 0.5 * DIAMETER_MM, bench.calibration, _space(bench))
-    return task_of(image, view, bench.weights, camera, bench.sums)
 
 
 def _seen(found: Particles) -> Seen:
