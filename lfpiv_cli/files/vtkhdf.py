@@ -208,6 +208,11 @@ def read_header(path: Path | str) -> Header:
         return read_root(file)
 
 
+def read_record(path: Path) -> dict[str, Any]:
+    """Return the record of how a file was made, as `read_header` does."""
+    return read_header(path).provenance
+
+
 def _reads(read: Callable[[Path], object]) -> Callable[[Path], None]:
     """Return a check that reads the file and drops the result."""
 

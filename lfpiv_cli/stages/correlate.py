@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -120,7 +120,7 @@ def correlate(
     if mean is not None:
         ensure_writable(mean, overwrite, [*volumes, *common.values()])
     divergence, qualities, rejected = [], [], 0
-    for number in pending(targets, [*volumes, *common.values()], overwrite, options.resume, _record_of):
+    for number in pending(targets, [*volumes, *common.values()], overwrite, options.resume, vtkhdf.read_record):
         field, reference, notices = _measure(jobs[number], options.mask_volume, console)
         quality = quality_of(field)
         name = targets[number].path.name
@@ -204,10 +204,6 @@ def _write_mean(path: Path, members: Sequence[Path], settings: Config, derived: 
         overwrite=overwrite,
         extra=extra,
     )
-
-
-def _record_of(path: Path) -> Mapping[str, Any]:
-    return vtkhdf.read_header(path).provenance
 
 
 def _pairs(volumes: Sequence[Path], pairing: Pairing | None) -> list[tuple[Path, Path]]:

@@ -22,7 +22,7 @@ from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, Points, read_points, write_points
 from lfpiv_cli.files.playback import write_playback
 from lfpiv_cli.files.provenance import record, sha256, with_warnings
-from lfpiv_cli.files.vtkhdf import read_header
+from lfpiv_cli.files.vtkhdf import read_record
 from lfpiv_cli.files.weights_file import open_weights
 from lfpiv_cli.interface import particles
 from lfpiv_cli.interface.following import (
@@ -137,7 +137,7 @@ def _needed(
 ) -> list[int]:
     """Return the numbers of the frames of a pass that have to be made, after it is known that they can be written."""
     prepare_folder([target.path for target in targets])
-    needed = pending(targets, inputs, overwrite, options.resume, _record_of)
+    needed = pending(targets, inputs, overwrite, options.resume, read_record)
     for number in needed if options.residuals and last else []:
         ensure_writable(residual_path(targets[number].path), overwrite or options.resume, inputs)
     return needed
@@ -228,7 +228,3 @@ def _passes(
         paths = output_paths(output / PARTICLES, stems)
         passes.append([target(paths[k], k, "backwards", len(frames)) for k in numbers])
     return passes
-
-
-def _record_of(path: Path) -> dict[str, Any]:
-    return read_header(path).provenance

@@ -105,7 +105,7 @@ def reconstruct(
     if beside is not None:
         made_of = with_those_beside(made_of, frames, beside)
     targets = _targets(paths, frames, made_of, settings, common)
-    needed = pending(targets, [*common.values(), *images], overwrite, options.resume, _record_of)
+    needed = pending(targets, [*common.values(), *images], overwrite, options.resume, vtkhdf.read_record)
     if as_particles:
         content = particles.searchable(content, settings)
         for number in needed:
@@ -203,10 +203,6 @@ def file_notices(made: Mapping[str, Any], name: str) -> list[Notice]:
         return []
     text = f"the file is also the {other}: it shows no tracers"
     return [Notice("frame-given-before", name, text, "leave it out of the images, or correct the other")]
-
-
-def _record_of(path: Path) -> dict[str, Any]:
-    return vtkhdf.read_header(path).provenance
 
 
 def residual_path(particles: Path) -> Path:
