@@ -23,6 +23,7 @@ LAYERS = (
     {"flow"},
     {"self_calibration"},
     {"synthetic"},
+    {"pictures"},
     {"validation"},
     {"files"},
     {"console"},
