@@ -128,6 +128,7 @@ def test_all_errors_come_in_one_run_in_the_order_of_the_file(write) -> None:
     ("addition", "words"),
     [
         ("window: {distance_mm: 250.0, thickness_mm: 2.0}", "window's far face"),
+        ("window: {thickness_mm: 2.0}", "window.distance_mm: is missing; where only the thickness of a channel's wall"),
         ("board: {dots: [7, 7], spacing_mm: 0.2, dot_diameter_mm: 0.2}", "less than the spacing of 0.2"),
         ("board: {spacing_mm: 0.2, dot_diameter_mm: 0.1}", "dots: is missing for pattern dots"),
         ("board: {pattern: chessboard, squares: [5, 4], marker_mm: 0.1, spacing_mm: 1}", "not for pattern chessboard"),

@@ -31,6 +31,11 @@ KINDS = {
     "model_attributes_type": "a section of keys",
     "dict_type": "a section of keys",
 }
+# Keys without which another section may be what was meant.
+MISSING: dict[KeyPath, str] = {
+    ("window", "distance_mm"): "is missing; where only the thickness of a channel's wall is known, leave window out "
+    "and give channel: {width_mm: ..., wall_mm: ...}, whose calibrated mid plane tells the distance",
+}
 
 
 def report(source: str, problems: Iterable[Problem]) -> str:
@@ -57,7 +62,7 @@ def problem_of(document: Document, details: ErrorDetails) -> Problem:
     elif kind in ("missing", "union_tag_not_found"):
         if kind == "union_tag_not_found":
             path = (*path, "kind")
-        text = "is missing"
+        text = MISSING.get(path, "is missing")
     elif kind == "too_long" or kind == "too_short":
         text = (
             f"has {context['actual_length']} entries, expected {context.get('max_length', context.get('min_length'))}"

@@ -93,12 +93,9 @@ def simulate_particles(
     images = frame_names(load_config(config).simulation.frames)
     settings, paths = _begin(config, output, (*images, "particles.npz", "particles.json"), overwrite)
     scene = settings.simulation
-    if settings.correlation.dt_s is None:
-        raise ConfigError(f"{config}: correlation.dt_s: is missing, and images of a flow need it")
     reference = simulated_reference(settings)
     camera, space = _recording(settings), _flow_space(settings, reference)
-    flow, pulsation = settings.simulated_flow(reference), pulsation_of(scene.pulsation)
-    motion = scenes.Motion(flow, settings.correlation.dt_s, scene.frames, pulsation)
+    motion = _motion(settings, reference)
     tracers = _tracers(settings, camera.optics, reference, motion)
     bubbles = _bubbles(settings, tracers.box, reference)
     still: NDArray[np.float64] | float = 0.0
@@ -121,6 +118,23 @@ def simulate_particles(
     if bubbles is not None:
         truth["bubbles_mm"] = bubbles.truth()
     return _write_truth(paths["particles.json"], "simulate particles", truth, settings, config, overwrite)
+
+
+def ensure_experiment(settings: Config) -> None:
+    """Refuse a config from which no white image, board and flow can be simulated, before anything is.
+
+    Raises
+    ------
+    ConfigError
+    """
+    reference = simulated_reference(settings)
+    _motion(settings, reference)
+    _flow_space(settings, reference)
+    _light_z_mm(settings, reference)
+    _bubbles_walls(settings, reference)
+    _board_space(settings)
+    settings.rig()
+    settings.grid(reference)
 
 
 # What can be simulated, by the name that the command has for it.
@@ -213,6 +227,19 @@ def _flow_space(settings: Config, reference: Reference) -> ObjectSpace:
     return ObjectSpace(media, settings.window_model(reference.z_mm), refraction)
 
 
+def _motion(settings: Config, reference: Reference) -> scenes.Motion:
+    """Return how the tracers move.
+
+    Raises
+    ------
+    ConfigError : there is no flow, or no time between its images
+    """
+    scene, dt_s = settings.simulation, settings.correlation.dt_s
+    if dt_s is None:
+        raise ConfigError(f"{settings.source}: correlation.dt_s: is missing, and images of a flow need it")
+    return scenes.Motion(settings.simulated_flow(reference), dt_s, scene.frames, pulsation_of(scene.pulsation))
+
+
 def _particles(found: scenes.SimulatedFrames) -> Particles:
     return Particles(
         found.positions_mm,
@@ -284,18 +311,26 @@ def _walls(settings: Config, reference: Reference) -> scenes.Box | None:
     return scenes.channel_walls(flow.width_mm, reference.depth_to_focal_point(flow.centre_mm[2]), flow.axis)
 
 
-def _bubbles(settings: Config, seen: scenes.Box, reference: Reference) -> Bubbles | None:
-    """Return the bubbles at the channel's wall, None where there are none.
+def _bubbles_walls(settings: Config, reference: Reference) -> scenes.Box | None:
+    """Return the walls that bubbles stick to, None where there are no bubbles.
 
     Raises
     ------
     ConfigError : there is no channel that they could stick to
     """
-    scene, walls = settings.simulation, _walls(settings, reference)
-    if scene.bubbles == 0:
+    if settings.simulation.bubbles == 0:
         return None
+    walls = _walls(settings, reference)
     if walls is None:
         raise ConfigError("simulation.bubbles: bubbles stick to a channel's wall; simulation.flow is no square_duct")
+    return walls
+
+
+def _bubbles(settings: Config, seen: scenes.Box, reference: Reference) -> Bubbles | None:
+    """Return the bubbles at the channel's wall, None where there are none."""
+    scene, walls = settings.simulation, _bubbles_walls(settings, reference)
+    if walls is None:
+        return None
     return bubbles_at_wall(
         scene.bubbles, scene.bubble_diameter_mm, scene.bubble_wall, seen, walls, _generator(settings, 4)
     )

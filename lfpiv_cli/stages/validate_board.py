@@ -44,7 +44,7 @@ def validate_board(
     settings = load_config(config)
     chosen = settings.validation.board
     halves = ("ideal", "recorded") if chosen.images == "both" else (chosen.images,)
-    depths = _depths(settings, config)
+    depths = depths_in_volume(settings)
     solved = [method for method in chosen.methods if method != "discs"]
     report = output / "board.json"
     drawings = {(half, method): output / f"board_{half}_{method}.png" for half in halves for method in solved}
@@ -78,14 +78,19 @@ def validate_board(
     }
 
 
-def _depths(settings: Config, config: Path) -> tuple[float, ...]:
-    """Return those of the paper's depths that lie in the volume."""
+def depths_in_volume(settings: Config) -> tuple[float, ...]:
+    """Return those of the paper's depths that lie in the volume.
+
+    Raises
+    ------
+    ConfigError : they are too few
+    """
     low, high = settings.grid().bounds_mm(2)
     depths = tuple(depth for depth in DEPTHS_MM if low < depth < high)
     if len(depths) < FEWEST_DEPTHS:
         raise ConfigError(
-            f"{config}: volume: reaches from z = {low:g} to {high:g} mm and holds {len(depths)} of the boards, "
-            f"1 mm apart each; expected at least {FEWEST_DEPTHS}"
+            f"{settings.source}: volume: reaches from z = {low:g} to {high:g} mm and holds {len(depths)} of the "
+            f"boards, 1 mm apart each; expected at least {FEWEST_DEPTHS}"
         )
     return depths
 

@@ -21,6 +21,7 @@ from lfpiv_cli.files.pictures import ensure_drawing, write_picture
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.files.sections_simulated import FlowSection
 from lfpiv_cli.stages.chain import run_chain
+from lfpiv_cli.stages.simulate import ensure_experiment
 from lfpiv_cli.validation.channel import Duct
 from lfpiv_cli.validation.flow import limits_missed, truth_at_points
 from lfpiv_cli.validation.methods import Measured, lower_error
@@ -43,6 +44,8 @@ def validate_flow(
     paths = {name: output / name for name in ("flow.json", "flow.png", "flow_slices.png")}
     prepare_folder(list(paths.values()))
     settings = load_config(config)
+    if is_simulated:
+        ensure_experiment(settings)
     duct = duct_of(settings.simulation.flow if is_simulated else settings.validation.flow or settings.simulation.flow)
     if duct is None:
         del paths["flow_slices.png"]
