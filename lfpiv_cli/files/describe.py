@@ -8,8 +8,7 @@ from typing import Any
 
 import h5py
 
-from lfpiv_cli.errors import InputError
-from lfpiv_cli.files.hdf5 import from_attribute, member, open_h5, read_provenance
+from lfpiv_cli.files.hdf5 import format_of, from_attribute, member, open_h5, read_provenance
 from lfpiv_cli.files.provenance import recorded_warnings
 
 # Attributes that are told in words of their own or are of no interest to a person.
@@ -27,12 +26,11 @@ def describe(path: Path) -> dict[str, Any]:
     ------
     InputError : the file is missing, broken or not one of ours
     """
+    file_format = format_of(path)
     with open_h5(path) as file:
-        if not isinstance(file.attrs.get("format"), bytes):
-            raise InputError(f"{path}: says no format of ours")
         found: dict[str, Any] = {
             "file_bytes": path.stat().st_size,
-            "format": file.attrs["format"].decode(),
+            "format": file_format,
             "format_version": int(file.attrs["format_version"]),
         }
         found |= _made(read_provenance(file))

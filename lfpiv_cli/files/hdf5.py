@@ -180,6 +180,20 @@ def member(group: h5py.Group, name: str) -> h5py.Group | h5py.Dataset:
     return group[name]
 
 
+def format_of(path: Path) -> str:
+    """Return the name of a file's format.
+
+    Raises
+    ------
+    InputError : the file is missing, broken or not one of ours
+    """
+    with open_h5(path) as file:
+        found = file.attrs.get("format")
+        if not isinstance(found, bytes):
+            raise InputError(f"{path}: says no format of ours")
+        return found.decode()
+
+
 def ensure_format(path: Path, file: h5py.File, format_name: str, format_versions: Collection[int]) -> None:
     """Check the root's `format` and `format_version`."""
     found = file.attrs.get("format")

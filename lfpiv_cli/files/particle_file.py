@@ -19,6 +19,7 @@ from lfpiv_cli.errors import InputError
 from lfpiv_cli.files.hdf5 import (
     create,
     ensure_format,
+    format_of,
     member,
     open_h5,
     read_array,
@@ -143,8 +144,7 @@ def read_tracks(path: Path | str) -> Points:
     InputError
         As `read_points`.
     """
-    with open_h5(Path(path)) as file:
-        is_sequence = file.attrs.get("format") == TRAJECTORIES_FORMAT.encode()
+    is_sequence = format_of(Path(path)) == TRAJECTORIES_FORMAT
     return read_points(path, TRAJECTORIES_FORMAT if is_sequence else TRACKS_FORMAT)
 
 
