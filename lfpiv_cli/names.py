@@ -8,6 +8,9 @@ from __future__ import annotations
 
 from typing import Any, Literal, get_args
 
+# The cameras that `init` knows: the paper's, and two microscopes of which only the lattice is known.
+KnownCamera = Literal["table2", "guv", "seaurchin"]
+
 # The microlens array, and the calibration target: what is on it, what it stands in, and its dots beside its ground.
 Layout = Literal["square", "hexagonal"]
 Pattern = Literal["dots", "chessboard", "charuco"]

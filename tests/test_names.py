@@ -17,7 +17,18 @@ from lfpiv_cli.cli import cli
 from lfpiv_cli.files.section_types import Section
 from lfpiv_cli.files.sections import CorrelationSection, Sections
 from lfpiv_cli.files.sections_simulated import FlowSection
-from lfpiv_cli.names import BoardMethod, Method, Moment, Pairing, PaperPart, Refraction, Sampling, Start, names_in
+from lfpiv_cli.names import (
+    BoardMethod,
+    KnownCamera,
+    Method,
+    Moment,
+    Pairing,
+    PaperPart,
+    Refraction,
+    Sampling,
+    Start,
+    names_in,
+)
 from lfpiv_cli.reconstruction.registry import PARTICLES, SOLVER_NAMES, SOLVERS
 from lfpiv_cli.synthetic.flows import FLOWS
 
@@ -27,6 +38,7 @@ TABLE2 = ROOT / "configs" / "table2.yaml"
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 # The options whose choices are names that others share, by command and option.
 OPTIONS = {
+    ("init", "camera"): names_in(KnownCamera),
     ("build-weights", "method"): names_in(Method),
     ("build-weights", "refraction"): names_in(Refraction),
     ("build-weights", "sampling"): names_in(Sampling),

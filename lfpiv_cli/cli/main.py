@@ -11,7 +11,17 @@ from typing import NoReturn
 import click
 
 from lfpiv_cli import __version__
-from lfpiv_cli.cli import calibration, inspection, reconstruction, simulation, tracks, validation, vectors, weights
+from lfpiv_cli.cli import (
+    calibration,
+    inspection,
+    planning,
+    reconstruction,
+    simulation,
+    tracks,
+    validation,
+    vectors,
+    weights,
+)
 from lfpiv_cli.errors import LfpivError
 
 EXIT_BUG = 1
@@ -19,6 +29,7 @@ EXIT_INTERRUPTED = 130
 EXIT_TERMINATED = 143
 
 COMMANDS = (
+    planning.init,
     calibration.calibrate_snapshot,
     calibration.refine_calibration,
     weights.build_weights,

@@ -34,12 +34,22 @@ def _each_window(value: Any) -> Any:
     return tuple(_each_axis(item) for item in value) if isinstance(value, tuple) else value
 
 
-PerAxis = Annotated[tuple[Positive, Positive, Positive], BeforeValidator(_each_axis)]
+# What the JSON schema says of a key that takes one number for all three axes.
+PerAxis = Annotated[
+    tuple[Positive, Positive, Positive],
+    BeforeValidator(_each_axis, json_schema_input_type=Positive | tuple[Positive, Positive, Positive]),
+]
 Voxels = Annotated[int, Field(ge=1, le=MOST_VOXELS_PER_SIDE)]
 WindowSide = Annotated[int, Field(ge=4, le=MOST_VOXELS_PER_SIDE)]
 Overlap = Annotated[float, Field(ge=0.0, lt=1.0)]
-Windows = Annotated[tuple[tuple[WindowSide, WindowSide, WindowSide], ...], BeforeValidator(_each_window)]
-Overlaps = Annotated[tuple[Overlap, Overlap, Overlap], BeforeValidator(_each_axis)]
+Window = tuple[WindowSide, WindowSide, WindowSide]
+Windows = Annotated[
+    tuple[Window, ...], BeforeValidator(_each_window, json_schema_input_type=tuple[WindowSide | Window, ...])
+]
+Overlaps = Annotated[
+    tuple[Overlap, Overlap, Overlap],
+    BeforeValidator(_each_axis, json_schema_input_type=Overlap | tuple[Overlap, Overlap, Overlap]),
+]
 Pixels = Annotated[int, Field(ge=1, le=MOST_PIXELS_PER_SIDE)]
 
 

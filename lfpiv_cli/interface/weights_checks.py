@@ -16,12 +16,9 @@ from lfpiv_cli.notice import Notice
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.object_space import ObjectSpace
-from lfpiv_cli.optics.paraxial import refraction_error_mm, rim_tangent, sine_error_mm
+from lfpiv_cli.optics.paraxial import LARGEST_ERROR_PX, refraction_error_mm, rim_tangent, sine_error_mm
 from lfpiv_cli.weights.scene import Source
 
-# Light that is further off falls into another pixel. The paper's channel and the sample are off by a tenth of this, its
-# simulation behind 134 mm of water by twice this.
-LARGEST_ERROR_PX = 0.5
 # Of the angle under which the rim of the lens is seen: beyond 45 degrees a thin lens is far from any real one.
 LARGEST_TANGENT = 1.0
 DEPTHS = 9

@@ -1,0 +1,237 @@
+"""The few numbers that make a rig, and the configuration that follows from them.
+
+What nobody has an opinion on at first follows from the rest, so that the file can be simulated and run as it is: the
+volume from the field of view, the board and the windows from the microlenses, the tracers and the time between the
+images from both.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from lfpiv_cli.errors import ConfigError
+from lfpiv_cli.files.bench import LATERAL_VOXELS_PER_MICROLENS, UM_TO_MM
+from lfpiv_cli.names import KnownCamera
+from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.media import Media, Window, channel_window
+from lfpiv_cli.optics.microlenses import Lattice
+from lfpiv_cli.optics.paraxial import LARGEST_ERROR_PX, refraction_error_mm
+from lfpiv_cli.validation.planning import (
+    BEST_PER_LENS,
+    depth_of_field_mm,
+    half_view_mm,
+    matched_f_number,
+    time_step_s,
+    tracers_in,
+)
+
+Sides = tuple[float, float, float]
+
+# Of the depths over which light spreads by one lens a volume has ten, as the paper's channel; less where points cannot
+# be refocused as far, or the focal plane lies within five times as much of the lens.
+DEPTHS_IN_VOLUME, SHARE_OF_DISTANCE = 10.0, 0.2
+# Of the full field of view a volume takes so much, and a board.
+SHARE_OF_VIEW, BOARD_SHARE = 0.98, 0.8
+# Interrogation windows of the paper's channel, in microlenses and depths of one lens: at the best seeding some twenty
+# tracers.
+WINDOW_LENSES, WINDOW_DEPTHS = 16.0, 1.5
+# Dots three microlenses wide and five times that apart are found and placed best; five by four of them are enough.
+DOT_LENSES, DOTS_APART, FEWEST_DOTS, MOST_DOTS = 3.0, 5.0, 3, 7
+# What lies between window and volume where nobody says: a share of the volume's depth.
+BEHIND_WINDOW = 0.1
+# Lengths that nobody measured are written with so many digits.
+DIGITS = 3
+
+
+@dataclass(frozen=True, kw_only=True)
+class RigNumbers:
+    """A rig in a few numbers; what is None follows from the others.
+
+    Attributes
+    ----------
+    magnification : negative
+    focal_length_mm, f_number : of the main lens, f_number as engraved
+    pitch_mm, microlens_focal_length_mm : of the microlens array
+    pixel_um, columns, rows : of the sensor
+    fluid, wall : refractive indices
+    wall_mm : thickness of the wall or window
+    channel_mm : inner width of the channel along the optical axis; None where there is none
+    size_mm : of the volume
+    velocity_m_s : expected
+    """
+
+    magnification: float = -1.0
+    focal_length_mm: float = 100.0
+    f_number: float | None = None
+    pitch_mm: float = 0.1
+    microlens_focal_length_mm: float | None = None
+    pixel_um: float = 5.5
+    columns: int = 2352
+    rows: int = 1768
+    fluid: float = 1.33
+    wall: float = 1.49
+    wall_mm: float = 2.0
+    channel_mm: float | None = None
+    size_mm: Sides | None = None
+    velocity_m_s: float = 0.1
+
+    def complete(self) -> RigNumbers:
+        """Return the numbers with what follows from others filled in."""
+        microlens = self.microlens_focal_length_mm or 8.0 * self.pitch_mm
+        f_number = self.f_number or _rounded(matched_f_number(self.magnification, microlens / self.pitch_mm))
+        filled = replace(self, microlens_focal_length_mm=microlens, f_number=f_number)
+        return replace(filled, size_mm=self.size_mm or proposed_size_mm(filled))
+
+    def camera(self) -> Camera:
+        """Return the camera of numbers that are complete but for the volume."""
+        if self.f_number is None or self.microlens_focal_length_mm is None:
+            raise ValueError("the numbers are not complete")
+        return Camera(
+            self.magnification,
+            self.focal_length_mm,
+            self.focal_length_mm / self.f_number,
+            self.microlens_focal_length_mm,
+            self.microlens_focal_length_mm,
+            Lattice.regular(self.pitch_mm),
+            self.pixel_um * UM_TO_MM,
+            self.columns,
+            self.rows,
+        )
+
+    def media(self) -> Media:
+        """Return the refractive indices."""
+        return Media(1.0, self.wall, self.fluid)
+
+
+def proposed_size_mm(numbers: RigNumbers) -> Sides:
+    """Return a volume in full view: as deep as the channel, else as depths are told best."""
+    camera, media = numbers.camera(), numbers.media()
+    depth = numbers.channel_mm or min(
+        DEPTHS_IN_VOLUME * camera.scale(media).depth_mm,
+        2.0 * depth_of_field_mm(camera, media),
+        SHARE_OF_DISTANCE * camera.focus_distance_mm * numbers.fluid,
+    )
+    half = half_view_mm(camera, media, [-0.5 * depth, 0.5 * depth]).min(axis=0)
+    if half.min() <= 0.0:
+        raise ConfigError(
+            f"the sensor ({numbers.columns} x {numbers.rows} pixels of {numbers.pixel_um:g} um) sees no point of a "
+            f"volume {depth:.3g} mm deep with all of its light; check pixels, pitch, f-numbers and the channel's width"
+        )
+    width, height = (_rounded_down(2.0 * SHARE_OF_VIEW * side) for side in half)
+    return width, height, depth if numbers.channel_mm else _rounded(depth)
+
+
+def tree_of(numbers: RigNumbers) -> dict[str, Any]:
+    """Return the configuration, as plain data."""
+    known = numbers.complete()
+    size, has_channel = known.size_mm, known.channel_mm is not None
+    if size is None:
+        raise ValueError("the numbers are not complete")
+    camera, media = known.camera(), known.media()
+    scale = camera.scale(media)
+    window = [_rounded(WINDOW_LENSES * scale.lens_mm)] * 2 + [_rounded(WINDOW_DEPTHS * scale.depth_mm)]
+    tree: dict[str, Any] = {
+        "camera": {
+            "main_lens": {
+                "magnification": known.magnification,
+                "focal_length_mm": known.focal_length_mm,
+                "f_number": known.f_number,
+            },
+            "microlenses": {"focal_length_mm": known.microlens_focal_length_mm, "pitch_mm": known.pitch_mm},
+            "sensor": {
+                "pixel_um": known.pixel_um,
+                "columns": known.columns,
+                "rows": known.rows,
+                "column_axis": "x",
+            },
+        },
+        "media": {"air": 1.0, "window": known.wall, "fluid": known.fluid},
+    }
+    if has_channel:
+        tree["channel"] = {"width_mm": known.channel_mm, "wall_mm": known.wall_mm}
+    elif known.fluid != media.air:
+        tree["window"] = {"distance_mm": _window_distance_mm(known, size[2]), "thickness_mm": known.wall_mm}
+    tree["volume"] = {"size_mm": list(size), "reference": "mid_plane" if has_channel else "focal_point"}
+    if _bends(known, camera, size[2]):
+        tree["weights"] = {"refraction": "exact"}
+    tree["board"] = _board(known, scale.lens_mm)
+    voxel_mm = scale.lens_mm / LATERAL_VOXELS_PER_MICROLENS
+    tree["correlation"] = {"window_mm": window, "dt_s": _rounded(time_step_s(known.velocity_m_s, voxel_mm))}
+    tree["simulation"] = {
+        "flow": {
+            "kind": "shear",
+            "along": "x",
+            "across": "z",
+            "rate_per_s": _rounded(1e3 * known.velocity_m_s / size[2]),
+            "velocity_m_s": [known.velocity_m_s, 0.0, 0.0],
+        },
+        "particles": round(tracers_in(camera, BEST_PER_LENS, size)),
+    }
+    return tree
+
+
+def _bends(numbers: RigNumbers, camera: Camera, depth_mm: float) -> bool:
+    """Return whether Snell's law moves the light of the volume by more than paraxial refraction may be off."""
+    media = numbers.media()
+    if media == media.in_air():
+        return False
+    if numbers.channel_mm is not None:
+        window = channel_window(camera.focus_distance_mm, media, numbers.channel_mm, numbers.wall_mm, 0.0)
+    else:
+        window = Window(_window_distance_mm(numbers, depth_mm), numbers.wall_mm)
+    depths = np.linspace(-0.5 * depth_mm, 0.5 * depth_mm, 9)
+    return refraction_error_mm(camera, media, window, depths) > LARGEST_ERROR_PX * camera.pixel_mm
+
+
+def _window_distance_mm(numbers: RigNumbers, depth_mm: float) -> float:
+    """Return d1 that leaves some fluid between the wall and the volume."""
+    media, path = numbers.media(), (0.5 + BEHIND_WINDOW) * depth_mm
+    before = path * media.depth_ratio + numbers.wall_mm * media.air / media.window
+    return _rounded(numbers.camera().focus_distance_mm - before)
+
+
+def _board(numbers: RigNumbers, lens_mm: float) -> dict[str, Any]:
+    """Return a board of dots that suits the microlenses and is in view."""
+    dot = _rounded(DOT_LENSES * lens_mm)
+    spacing = _rounded(DOTS_APART * dot)
+    view = 2.0 * BOARD_SHARE * half_view_mm(numbers.camera(), numbers.media(), [0.0])[0]
+    dots = [int(min(max(side // spacing, FEWEST_DOTS), MOST_DOTS)) for side in view]
+    medium = "air" if numbers.channel_mm is not None else "fluid"
+    return {"dots": dots, "spacing_mm": spacing, "dot_diameter_mm": dot, "medium": medium}
+
+
+def _rounded(value: float) -> float:
+    """Return a number of a few digits."""
+    return float(f"{value:.{DIGITS}g}")
+
+
+def _rounded_down(value: float) -> float:
+    """Return the largest number of a few digits that is not above a value."""
+    step = 10.0 ** (math.floor(math.log10(value)) - DIGITS + 2)
+    return float(f"{math.floor(value / step) * step:.{DIGITS}g}")
+
+
+def known_camera(name: KnownCamera) -> dict[str, Any]:
+    """Return the configuration of a published camera, as plain data; without its main lens where nobody has told it."""
+    if name == "table2":
+        return tree_of(TABLE2)
+    return {"camera": LATTICES[name]}
+
+
+# Table 2 of the paper.
+TABLE2 = RigNumbers(f_number=4.0, microlens_focal_length_mm=0.8, size_mm=(8.0, 8.0, 24.0))
+# Microscopes of napari-LF's examples.
+LATTICES: dict[str, dict[str, Any]] = {
+    "guv": {
+        "microlenses": {"pitch_mm": 0.1, "layout": "square"},
+        "sensor": {"pixel_um": 6.5, "columns": 436, "rows": 436},
+    },
+    "seaurchin": {
+        "microlenses": {"pitch_mm": 0.125, "layout": "square"},
+        "sensor": {"pixel_um": 7.4, "columns": 2048, "rows": 2048},
+    },
+}

@@ -1,0 +1,178 @@
+"""A configuration to begin with: what it is made from, that it holds, and its schema."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import numpy as np
+import pytest
+import yaml
+from click.testing import CliRunner, Result
+
+from lfpiv_cli.cli import cli
+from lfpiv_cli.errors import ConfigError, OutputExistsError, UsageError
+from lfpiv_cli.files.config import Config, load_config
+from lfpiv_cli.files.rig_numbers import LATTICES, RigNumbers, tree_of
+from lfpiv_cli.files.rig_text import rig_text, schema
+from lfpiv_cli.grid import Grid
+from lfpiv_cli.interface.weights import plan_of
+from lfpiv_cli.stages.calibrate import CalibrateOptions, calibrate_snapshot
+from lfpiv_cli.stages.init import SCHEMA_NAME, InitOptions, init
+from lfpiv_cli.validation.planning import half_view_mm
+from lfpiv_cli.weights.columns import seen_share
+
+ROOT = Path(__file__).parents[1]
+CONFIGS = sorted((ROOT / "configs").glob("*.yaml"))
+OWN = RigNumbers(magnification=-0.5, pitch_mm=0.125, columns=3000, rows=2000)
+RIGS = {
+    "table 2": RigNumbers(),
+    "own": OWN,
+    "channel": RigNumbers(channel_mm=10.0, wall_mm=5.0),
+    "air": RigNumbers(fluid=1.0),
+    "small sensor, large lenses": RigNumbers(magnification=-2.0, pitch_mm=0.2, pixel_um=10.0, columns=640, rows=480),
+}
+
+
+def typed(answers: str, *arguments: str) -> Result:
+    return CliRunner().invoke(cli, ["init", *arguments], input=answers)
+
+
+@pytest.mark.parametrize("numbers", RIGS.values(), ids=RIGS)
+def test_a_rig_of_few_numbers_has_no_contradictions_and_sees_its_volume(numbers: RigNumbers, tmp_path: Path) -> None:
+    path = tmp_path / "rig.yaml"
+    init(path, InitOptions(numbers=numbers))
+    settings = load_config(path)
+    assert settings.resolved() == Config.from_resolved(tree_of(numbers)).resolved()
+    if numbers.channel_mm is None:
+        assert plan_of(settings, None).notices == []
+    camera = settings.camera_model()
+    assert camera.lens_image_width == pytest.approx(1.0, abs=0.01)
+    grid = settings.grid()
+    half = half_view_mm(camera, settings.media_model(), grid.bounds_mm(2)).min(axis=0)
+    assert all(grid.bounds_mm(axis)[1] <= half[axis] for axis in (0, 1))
+
+
+def test_full_view_is_what_the_weights_see() -> None:
+    settings = Config.from_resolved(tree_of(RigNumbers(columns=600, rows=448, size_mm=(1.0, 1.0, 8.0))))
+    camera, media = settings.camera_model(), settings.media_model()
+    for z in (-4.0, 4.0):
+        # Points at the rims of full view and of any view, and in the middle between them.
+        for rim, expected in ((-1.0, 1.0), (0.0, 0.5), (1.0, 0.0)):
+            half = half_view_mm(camera, media, [z], rim)[0]
+            grid = Grid.centred((1, 1, 1), (0.01, 0.01, 0.01), (float(half[0]), 0.0, z))
+            share, _ = seen_share(camera, settings.object_space(), grid)
+            # A lens's cell is square, and a part of the light in its corners.
+            assert share == pytest.approx(expected, abs=0.03)
+
+
+def test_answers_are_asked_for_and_followed(tmp_path: Path) -> None:
+    path = tmp_path / "rig.yaml"
+    answers = "0.5\n\n0.125\nf/8\n18.75 mm\n\n3000\n2000\n\n\n\n\n10, 10 10\nfast\n0.2\n"
+    done = typed(answers, str(path))
+    assert done.exit_code == 0, done.output
+    told = yaml.safe_load(path.read_text())
+    assert told["camera"]["main_lens"] == {"magnification": -0.5, "focal_length_mm": 100.0, "f_number": 100.0 / 18.75}
+    assert told["camera"]["microlenses"]["focal_length_mm"] == 1.0
+    assert told["volume"]["size_mm"] == [10.0, 10.0, 10.0]
+    # Five voxels, a third of a microlens wide each, at 0.2 m/s.
+    assert told["correlation"]["dt_s"] == pytest.approx(5 * 0.25 / 3 / 200, rel=5e-3)
+
+
+def test_nothing_is_asked_before_an_existing_file_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "rig.yaml"
+    path.write_text("mine")
+    done = typed("", str(path))
+    assert isinstance(done.exception, OutputExistsError)
+    assert "magnification" not in done.output
+    with pytest.raises(OutputExistsError):
+        init(path, InitOptions(camera="table2"))
+    assert path.read_text() == "mine"
+
+
+@pytest.mark.parametrize("name", LATTICES)
+def test_microscopes_are_those_of_the_configs(name: Any, tmp_path: Path) -> None:
+    init(tmp_path / "rig.yaml", InitOptions(camera=name))
+    assert load_config(tmp_path / "rig.yaml").resolved() == load_config(ROOT / "configs" / f"{name}.yaml").resolved()
+
+
+def test_the_papers_camera_is_that_of_table_2(tmp_path: Path) -> None:
+    init(tmp_path / "rig.yaml", InitOptions(camera="table2"))
+    ours, papers = (load_config(path) for path in (tmp_path / "rig.yaml", ROOT / "configs" / "table2.yaml"))
+    first, second = ours.camera_model(), papers.camera_model()
+    for name in ("magnification", "focal_length_mm", "aperture_mm", "microlens_distance_mm", "pixel_mm", "columns"):
+        assert getattr(first, name) == getattr(second, name)
+    assert ours.media == papers.media
+    assert [ours.grid().bounds_mm(k) for k in range(3)] == [pytest.approx(papers.grid().bounds_mm(k)) for k in range(3)]
+
+
+def test_what_a_calibration_was_made_with_is_written_again(tmp_path: Path) -> None:
+    sample, data = ROOT / "configs" / "sample.yaml", ROOT / "sample_data"
+    made = tmp_path / "calibration.h5"
+    calibrate_snapshot(sample, made, CalibrateOptions(white=[data / "white.tif"], dark=data / "dark.tif"))
+    init(tmp_path / "rig.yaml", InitOptions(calibration=made))
+    assert load_config(tmp_path / "rig.yaml").resolved() == load_config(sample).resolved()
+
+
+def test_one_source_is_needed(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="2 of them"):
+        init(tmp_path / "rig.yaml", InitOptions(camera="guv", numbers=RigNumbers()))
+    with pytest.raises(UsageError, match="one file"):
+        raise_again(typed("", "a.yaml", "-o", "b.yaml"))
+
+
+def raise_again(done: Result) -> None:
+    assert done.exception is not None
+    raise done.exception
+
+
+def test_a_volume_that_no_sensor_sees_is_refused() -> None:
+    with pytest.raises(ConfigError, match="sees no point"):
+        tree_of(RigNumbers(columns=40, rows=40, channel_mm=20.0))
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
+def test_configs_follow_the_schema(path: Path) -> None:
+    # As editors read it: lists, and numbers where the schema says so.
+    tree = yaml.safe_load(path.read_text())
+    # PyYAML takes 1e-3 without a dot for a string, which the program's reader and editors do not.
+    jsonschema.Draft202012Validator(schema()).validate(json.loads(json.dumps(tree)))
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        (("camera", "sensor", "pixels_um"), 5.5),
+        (("camera", "main_lens", "magnification"), 1.0),
+        (("volume", "voxel_mm"), [0.1, 0.1]),
+        (("correlation", "windows"), [32, "16"]),
+        (("weights", "method"), "art"),
+    ],
+)
+def test_the_schema_refuses_what_the_program_refuses(path: tuple[str, ...], value: Any) -> None:
+    tree = yaml.safe_load((ROOT / "configs" / "table2.yaml").read_text())
+    place = tree
+    for name in path[:-1]:
+        place = place[name]
+    place[path[-1]] = value
+    assert not jsonschema.Draft202012Validator(schema()).is_valid(tree)
+
+
+def test_a_rig_names_the_schema_that_lies_beside_it(tmp_path: Path) -> None:
+    init(tmp_path / "before.yaml", InitOptions(camera="guv"))
+    assert typed("", "--schema", "-o", str(tmp_path / SCHEMA_NAME)).exit_code == 0
+    init(tmp_path / "after.yaml", InitOptions(camera="guv"))
+    line = f"# yaml-language-server: $schema={SCHEMA_NAME}"
+    assert line not in (tmp_path / "before.yaml").read_text()
+    assert (tmp_path / "after.yaml").read_text().splitlines()[0] == line
+    jsonschema.Draft202012Validator.check_schema(json.loads((tmp_path / SCHEMA_NAME).read_text()))
+
+
+def test_text_says_what_was_given() -> None:
+    tree = {"camera": {"sensor": {"pixel_um": 1e-05, "rows": 3}}, "x": {"a": [1, 2.5], "b": None, "c": True}}
+    assert "pixel_um: 1e-05" in rig_text(tree, "title")
+    tree["camera"]["sensor"]["pixel_um"] = 0.25
+    assert yaml.safe_load(rig_text(tree, "title")) == tree
+    assert np.all([len(line) < 121 for line in rig_text(tree_of(OWN), "title").splitlines()])
