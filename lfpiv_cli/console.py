@@ -1,16 +1,29 @@
-"""What a person sees while a command runs: progress on a terminal, a short summary, all of it on stderr."""
+"""What a person sees while a command runs: how far it is, what speaks against it, a summary, all of it on stderr.
+
+On a terminal how far it is shows as a bar; elsewhere a line is printed for each frame, and for work of one piece every
+ten seconds. The log, where one is asked for, gets the same as events.
+"""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterable, Iterator
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 import click
 
+from lfpiv_cli.files.log import EventLog
 from lfpiv_cli.notice import Notice
+
+# Without a terminal, lines of work that is one piece are this far apart.
+SECONDS_BETWEEN_LINES = 10.0
+# Where the summary's figures begin.
+NAME_WIDTH = 28
+# Frames count in fractions while they are worked on.
+FRAMES_BAR = "{desc}: {percentage:3.0f}%|{bar}| {n:.1f}/{total} {unit}s [{elapsed}<{remaining}]"
 
 
 @dataclass(frozen=True)
@@ -23,12 +36,19 @@ class Console:
     quiet : say nothing but errors
     only_warnings : say nothing but errors and warnings: the summary goes elsewhere
     warned : where it is given, all warnings are added to it, and none is printed twice
+    log : where it is given, what happens is added to it, whatever else is silent
     """
 
     verbose: bool = False
     quiet: bool = False
     only_warnings: bool = False
     warned: list[Notice] | None = None
+    log: EventLog | None = None
+
+    def event(self, name: str, /, **fields: Any) -> None:
+        """Add what happens to the log."""
+        if self.log is not None:
+            self.log.write(name, fields)
 
     def say(self, text: str) -> None:
         """Print a line that everybody should see."""
@@ -42,6 +62,7 @@ class Console:
                 if notice in self.warned:
                     continue
                 self.warned.append(notice)
+            self.event("warning", **notice.record())
             if not self.quiet:
                 click.echo(f"lfpiv: warning: {notice}", err=True)
 
@@ -50,30 +71,141 @@ class Console:
         if self.verbose:
             self.say(text)
 
-    def summary(self, figures: dict[str, Any]) -> None:
-        """Print the figures of a command, one a line."""
+    def summary(self, figures: Mapping[str, Any]) -> None:
+        """Print the figures of a command, one a line; those of several methods stand beside each other, in columns."""
+        heads = list(dict.fromkeys(head for value in figures.values() if _is_row(value) for head in value))
+        table = {"": heads} if heads else {}
         for name, value in figures.items():
-            self.say(f"{name:>28}  {_readable(value)}")
+            table[name] = [_readable(value.get(head)) for head in heads] if _is_row(value) else [_readable(value)]
+        rows = [cells for cells in table.values() if len(cells) == len(heads)]
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        first = max([NAME_WIDTH, *map(len, table)])
+        for name, cells in table.items():
+            columns = (
+                [f"{cell:>{width}}" for cell, width in zip(cells, widths, strict=True)] if cells in rows else cells
+            )
+            self.say(f"{name:>{first}}  {'  '.join(columns)}")
 
     @contextmanager
     def progress(self, total: int, label: str) -> Iterator[Callable[[int], None]]:
-        """Show a progress bar on a terminal and nothing elsewhere; yields the function that advances it."""
-        if self._silent or not sys.stderr.isatty():
+        """Show how far a work of so many steps is; yields the function that advances it."""
+        if self._silent:
             yield lambda _steps: None
+        elif self._is_terminal:
+            from tqdm import tqdm
+
+            with tqdm(total=total, desc=label, file=sys.stderr, leave=False) as bar:
+                yield lambda steps: bar.update(steps) and None
+        else:
+            yield _Lines(self, total, label).advance
+
+    @contextmanager
+    def frames(self, total: int, steps: float, label: str, unit: str = "frame") -> Iterator[Frames]:
+        """Show how many frames are done, each of about so many steps."""
+        if self._silent or not self._is_terminal:
+            yield Frames(self, total, steps, label, unit)
             return
         from tqdm import tqdm
 
-        with tqdm(total=total, desc=label, file=sys.stderr, leave=False) as bar:
-            yield lambda steps: bar.update(steps) and None
+        with tqdm(total=total, desc=label, unit=unit, bar_format=FRAMES_BAR, file=sys.stderr, leave=False) as bar:
+            yield Frames(self, total, steps, label, unit, lambda number: bar.update(number - bar.n) and None)
 
     @property
     def _silent(self) -> bool:
         """True where only errors, or these and warnings, are printed."""
         return self.quiet or self.only_warnings
 
+    @property
+    def _is_terminal(self) -> bool:
+        """True where bars can be drawn."""
+        return sys.stderr.isatty()
+
+
+class Frames:
+    """The frames of a batch as they are worked on."""
+
+    def __init__(
+        self,
+        console: Console,
+        total: int,
+        steps: float,
+        label: str,
+        unit: str,
+        draw: Callable[[float], None] | None = None,
+    ) -> None:
+        """Take how many there are, of how many steps each; `draw` shows how many are done, in place of lines."""
+        self.console, self._draw = console, draw
+        self._total, self._steps, self._label, self._unit = total, steps, label, unit
+        self._begun, self._done, self._part = time.monotonic(), 0, 0.0
+
+    def advance(self, steps: float) -> None:
+        """Take so many steps in the frame that is worked on."""
+        self._part = min(self._part + steps / self._steps, 1.0)
+        if self._draw is not None:
+            self._draw(self._done + self._part)
+
+    def done(self, name: str) -> None:
+        """Count a frame that is complete, or given up."""
+        self._done, self._part = self._done + 1, 0.0
+        each = (time.monotonic() - self._begun) / self._done
+        left = each * (self._total - self._done)
+        self.console.event(
+            "frame",
+            step=self._label,
+            name=name,
+            done=self._done,
+            of=self._total,
+            seconds_each=round(each, 3),
+            seconds_left=round(left, 3),
+        )
+        if self._draw is not None:
+            self._draw(self._done)
+        else:
+            count = f"{self._done} of {self._total} {self._unit}s"
+            self.console.say(f"{self._label}: {name}, {count}, {each:.3g} s each, {_duration(left)} left")
+
+
+class _Lines:
+    """A line now and then on how far a work is, where no bar can be drawn."""
+
+    def __init__(self, console: Console, total: int, label: str) -> None:
+        """Take how many steps there are."""
+        self._console, self._total, self._label = console, total, label
+        self._begun = self._told = time.monotonic()
+        self._done = 0
+
+    def advance(self, steps: int) -> None:
+        """Take so many steps."""
+        self._done += steps
+        now = time.monotonic()
+        if now - self._told < SECONDS_BETWEEN_LINES or not self._done:
+            return
+        self._told = now
+        rate = self._done / (now - self._begun)
+        left = _duration(max(self._total - self._done, 0) / rate)
+        self._console.say(f"{self._label}: {self._done} of {self._total} steps, {rate:.3g} a second, {left} left")
+
 
 # For those who call a stage from Python and say nothing of it.
 CONSOLE = Console()
+
+
+def _duration(seconds: float) -> str:
+    """Return a time as a person says it."""
+    if seconds < 60.0:
+        return f"{seconds:.0f} s"
+    minutes = round(seconds / 60.0)
+    return f"{minutes} min" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"
+
+
+def _is_row(value: Any) -> bool:
+    """Return whether a figure is a row of numbers, one for each method."""
+    return isinstance(value, dict) and bool(value) and all(_is_number(each) for each in value.values())
+
+
+def _is_number(value: Any) -> bool:
+    """Return whether a figure is a number, or not known."""
+    return value is None or isinstance(value, (int, float))
 
 
 def _readable(value: Any) -> str:

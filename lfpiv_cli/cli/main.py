@@ -22,11 +22,7 @@ from lfpiv_cli.cli import (
     vectors,
     weights,
 )
-from lfpiv_cli.errors import LfpivError
-
-EXIT_BUG = 1
-EXIT_INTERRUPTED = 130
-EXIT_TERMINATED = 143
+from lfpiv_cli.cli.outcome import Terminated, outcome_of, print_json_error, printable
 
 COMMANDS = (
     planning.init,
@@ -44,10 +40,6 @@ COMMANDS = (
 )
 
 
-class Terminated(BaseException):
-    """SIGTERM arrived; unwinds like KeyboardInterrupt so that temporary files are removed."""
-
-
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="lfpiv")
 def cli() -> None:
@@ -62,44 +54,43 @@ def cli() -> None:
     """
 
 
+def first_sentence(text: str) -> str:
+    """Return the first sentence of a help, on one line and without its full stop."""
+    return " ".join(text.split("\n\n")[0].split()).split(". ")[0].removesuffix(".")
+
+
 for _command in COMMANDS:
+    # click would cut what is longer than a line.
+    _command.short_help = _command.short_help or first_sentence(_command.help or "")
     cli.add_command(_command)
 
 
 def main() -> NoReturn:
     """Run the command line and leave with the exit code of the outcome."""
-    debug = "--debug" in sys.argv[1:]
+    # Asked of the words themselves: a command line that is not understood has no options yet.
+    debug, as_json = ("--debug" in sys.argv[1:], "--json" in sys.argv[1:])
     signal.signal(signal.SIGTERM, _terminate)
     try:
         cli.main(standalone_mode=False)
-        code = 0
         sys.stdout.flush()
-    except click.ClickException as error:
-        error.show()
-        code = error.exit_code
-    except (KeyboardInterrupt, click.Abort):
-        code = EXIT_INTERRUPTED
-    except Terminated:
-        code = EXIT_TERMINATED
+        code = 0
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 0
-    except LfpivError as error:
-        if debug:
-            raise
-        _complain(str(error))
-        code = error.exit_code
-    except Exception as error:
-        if debug:
-            raise
-        _complain(f"a bug: {type(error).__name__}: {error} (run again with --debug to see where)")
-        code = EXIT_BUG
+    except SystemExit:
+        raise
+    except BaseException as error:
+        message, code = outcome_of(error)
+        if as_json:
+            print_json_error(error)
+        if isinstance(error, click.ClickException):
+            error.show()
+        elif isinstance(error, Exception) and not isinstance(error, click.Abort):
+            if debug:
+                raise
+            click.echo(printable(f"lfpiv: {message}"), err=True)
     sys.exit(code)
 
 
 def _terminate(_signal: int, _frame: FrameType | None) -> None:
     raise Terminated
-
-
-def _complain(message: str) -> None:
-    click.echo(f"lfpiv: {message}".encode("utf-8", "surrogateescape").decode("utf-8", "replace"), err=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
@@ -10,6 +9,8 @@ from typing import Any
 
 import click
 
+from lfpiv_cli import __version__
+from lfpiv_cli.cli.outcome import error_record, print_json
 from lfpiv_cli.errors import LimitMissedError
 from lfpiv_cli.names import Pairing, names_in
 
@@ -54,29 +55,40 @@ def common_options(command: Callable[..., dict[str, Any]]) -> Callable[..., None
     @click.option(
         "--json", "as_json", is_flag=True, help="Print one JSON object to stdout, and only warnings to stderr."
     )
+    @click.option(
+        "--log", type=FILE, help="Add a line of JSON to this file for each event: start, frame, warning, end, error."
+    )
     @click.option("-v", "--verbose", is_flag=True, help="Say more on stderr.")
     @click.option("-q", "--quiet", is_flag=True, help="Say nothing on stderr but errors.")
     @click.option("--debug", is_flag=True, expose_value=False, help="Show the traceback of an error.")
     @wraps(command)
-    def run(threads: int | None, as_json: bool, verbose: bool, quiet: bool, **arguments: Any) -> None:
+    def run(threads: int | None, as_json: bool, log: Path | None, verbose: bool, quiet: bool, **arguments: Any) -> None:
         from lfpiv_cli.console import Console
+        from lfpiv_cli.files.log import EventLog
         from lfpiv_cli.notice import Notice
 
         warned: list[Notice] = []
-        console = Console(verbose=verbose, quiet=quiet, only_warnings=as_json, warned=warned)
+        log_file = None if log is None else EventLog(log, click.get_current_context().command.name or "")
+        console = Console(verbose=verbose, quiet=quiet, only_warnings=as_json, warned=warned, log=log_file)
         if threads is not None:
             from lfpiv_cli.threads import use_threads
 
             use_threads(threads)
+        console.event("start", version=__version__)
         missed: LimitMissedError | None = None
         try:
             given = {name: value for name, value in arguments.items() if value is not None}
             summary = command(console=console, **given)
         except LimitMissedError as error:
             missed, summary = error, error.figures
+        except BaseException as error:
+            console.event("error", **error_record(error))
+            raise
+        ended = error_record(missed) if missed else {"exit_code": 0}
+        console.event("end", summary=summary, **ended)
         if as_json:
-            told = summary | {"warnings": [notice.record() for notice in warned]}
-            click.echo(json.dumps(told, allow_nan=False, sort_keys=True))
+            warnings = [notice.record() for notice in warned]
+            print_json(summary | {"warnings": warnings} | (ended if missed else {}))
         else:
             console.summary(summary)
         if missed:

@@ -38,6 +38,12 @@ from lfpiv_cli.reconstruction.registry import SOLVER_NAMES
 @background_option
 @mask_option
 @pairing_option
+@click.option(
+    "--residual/--no-residual",
+    default=None,
+    help="Of particles, also write what they leave of each image, as OUTPUT's name with _residual.tif; written when "
+    "not given.",
+)
 @resume_option
 @click.option("--keep-going", is_flag=True, help="Go on with the next frame when one fails.")
 @output_option("File for one image, folder for several.")

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lfpiv_cli.console import CONSOLE, Console
+from lfpiv_cli.console import CONSOLE, Console, Frames
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.files.atomic import ensure_writable
@@ -120,25 +120,29 @@ def correlate(
     if mean is not None:
         ensure_writable(mean, overwrite, [*volumes, *common.values()])
     divergence, qualities, rejected = [], [], 0
-    for number in pending(targets, [*volumes, *common.values()], overwrite, options.resume, vtkhdf.read_record):
-        field, reference, notices = _measure(jobs[number], options.mask_volume, console)
-        quality = quality_of(field)
-        name = targets[number].path.name
-        notices += [*field_notices(quality, name), *pair_notices(field, quality, name)]
-        console.warn(notices)
-        told_more = derived_fields(field) if derived else None
-        vtkhdf.write_vectors(
-            targets[number].path,
-            field,
-            reference,
-            provenance=with_warnings(targets[number].record, notices),
-            overwrite=overwrite,
-            extra=_arrays_of(told_more) if told_more else None,
-        )
-        qualities.append(quality)
-        rejected += int(np.count_nonzero(field.flag >= REJECTED))
-        if told_more and told_more.divergence_rms is not None:
-            divergence.append(told_more.divergence_rms)
+    needed = pending(targets, [*volumes, *common.values()], overwrite, options.resume, vtkhdf.read_record)
+    with console.frames(len(needed), 1.0, "correlate", "pair" if not options.ensemble else "field") as work:
+        for number in needed:
+            field, reference, notices = _measure(jobs[number], options.mask_volume, work)
+            quality = quality_of(field)
+            name = targets[number].path.name
+            notices += [*field_notices(quality, name), *pair_notices(field, quality, name)]
+            console.warn(notices)
+            told_more = derived_fields(field) if derived else None
+            vtkhdf.write_vectors(
+                targets[number].path,
+                field,
+                reference,
+                provenance=with_warnings(targets[number].record, notices),
+                overwrite=overwrite,
+                extra=_arrays_of(told_more) if told_more else None,
+            )
+            qualities.append(quality)
+            rejected += int(np.count_nonzero(field.flag >= REJECTED))
+            if told_more and told_more.divergence_rms is not None:
+                divergence.append(told_more.divergence_rms)
+            work.done(targets[number].path.stem)
+
     found = quality_of_all(qualities)
     summary: dict[str, Any] = {"pairs": len(pairs), "vectors": found.vectors, "rejected": rejected}
     summary |= found.summary()
@@ -149,7 +153,7 @@ def correlate(
     return summary
 
 
-def _measure(job: Job, mask: Path | None, console: Console) -> tuple[VectorField, Reference, list[Notice]]:
+def _measure(job: Job, mask: Path | None, work: Frames) -> tuple[VectorField, Reference, list[Notice]]:
     """Return the vectors of a job, the origin of its volumes' coordinates, and what speaks against its windows."""
     first = vtkhdf.open_volume(job.pairs[0][0])
     drawn = None if mask is None else vtkhdf.open_volume(mask)
@@ -167,8 +171,8 @@ def _measure(job: Job, mask: Path | None, console: Console) -> tuple[VectorField
     settings = job.settings.correlation_settings(first.grid.spacing_mm)
     records = {f"{role} {path.name}": vtkhdf.read_header(path).provenance for role, path in job.inputs().items()}
     notices = [*calibration_notices(records), *window_notices(first, settings, job.pairs[0][0].name)]
-    with console.progress(count_passes(settings.windows), "correlate") as advance:
-        field = measure(volumes(), first.grid, settings, mask=usable, progress=advance)
+    share = 1.0 / count_passes(settings.windows)
+    field = measure(volumes(), first.grid, settings, mask=usable, progress=lambda passes: work.advance(share * passes))
     field = with_locking(field, first.reference, scale_of(job.settings))
     return field, first.reference, notices
 

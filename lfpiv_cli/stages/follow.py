@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from lfpiv_cli.console import CONSOLE, Console
+from lfpiv_cli.console import CONSOLE, Console, Frames
 from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.batch import VTKHDF_SUFFIX, Frame, Target, frames_of, output_paths, pending, prepare_folder
@@ -116,16 +116,17 @@ def follow_particles(
         console.warn([*file_notices(passes[0][number].record, stem), *frame_notices(bench, raw, lit, stem)])
         return particles.frame_of(bench, raw, lit)
 
-    stores = [
-        _Files(targets, frozenset(numbers), said, options.residuals and targets is passes[-1], overwrite, console)
-        for targets, numbers in zip(passes, needed, strict=True)
-    ]
     sequence = Recorded(bench, size, tracking, frame_at, [frame.stem for frame in frames], {})
     found: Trajectories | None
-    with console.progress(sum(map(steps_of, needed)), "follow") as advance:
-        found = forwards(sequence, stores[0], advance)
+    count = sum(map(len, needed))
+    with console.frames(count, sum(map(steps_of, needed)) / max(count, 1), "follow") as work:
+        stores = [
+            _Files(targets, frozenset(numbers), said, options.residuals and targets is passes[-1], overwrite, work)
+            for targets, numbers in zip(passes, needed, strict=True)
+        ]
+        found = forwards(sequence, stores[0], work.advance)
         if options.both_ways:
-            backwards(sequence, stores[0].read, stores[1], advance)
+            backwards(sequence, stores[0].read, stores[1], work.advance)
             found = None
     counts = {"frames": len(frames), "found": len(needed[-1]), "skipped": len(frames) - len(needed[-1])}
     summary = _write_tracks(output, sequence, stores[-1], found, overwrite or options.resume, console)
@@ -172,11 +173,11 @@ class _Files:
         said: Sequence[Notice],
         residuals: bool,
         overwrite: bool,
-        console: Console,
+        work: Frames,
     ) -> None:
         """Take where the frames' files go, which are to be made, and what is said of all of them."""
         self.targets, self.needed, self.said = targets, needed, said
-        self.residuals, self.overwrite, self.console = residuals, overwrite, console
+        self.residuals, self.overwrite, self.work = residuals, overwrite, work
 
     def read(self, number: int) -> Points:
         """Return the particles of a frame."""
@@ -189,11 +190,12 @@ class _Files:
     def put(self, number: int, points: Points, left: Image, notices: list[Notice]) -> None:
         """Write the particles of a frame, what is left of its image before them: what is complete has both."""
         target = self.targets[number]
-        self.console.warn(notices)
+        self.work.console.warn(notices)
         if self.residuals:
             image_files.write_tiff(residual_path(target.path), left, overwrite=True)
         told = replace(points, provenance=with_warnings(target.record, [*self.said, *notices]))
         write_points(target.path, PARTICLES_FORMAT, told, overwrite=self.overwrite)
+        self.work.done(target.path.stem)
 
 
 def _passes(

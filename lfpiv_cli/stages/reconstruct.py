@@ -57,6 +57,7 @@ class ReconstructOptions:
     background : image to subtract, or `minimum` or `mean` over the images, or as `minimum:15`
     mask : image that is black where pixels are left out, or `still`: where bright light does not move in the images
     pairing : `ab` or `sequence`: find particles with the help of the frames beside
+    residual : of particles, also write what they leave of each image
     resume : skip what is complete and made from the same inputs
     keep_going : go on with the next frame when one fails
     """
@@ -70,6 +71,7 @@ class ReconstructOptions:
     background: str | None = None
     mask: str | Path | None = None
     pairing: Pairing | None = None
+    residual: bool = True
     resume: bool = False
     keep_going: bool = False
 
@@ -108,8 +110,8 @@ def reconstruct(
     needed = pending(targets, [*common.values(), *images], overwrite, options.resume, vtkhdf.read_record)
     if as_particles:
         content = particles.searchable(content, settings)
-        for number in needed:
-            ensure_writable(residual_path(paths[number]), overwrite or options.resume, images)
+        if options.residual:
+            _ensure_residuals(paths, needed, overwrite or options.resume, images, console)
     elif content.weights.on_demand and needed:
         console.say(on_demand_told(math.prod(content.weights.padded.shape)))
     shape = content.image_shape
@@ -129,8 +131,8 @@ def reconstruct(
         said = particles.size_notices(settings, size)
         console.warn(said)
         targets = [replace(target, record=with_warnings(target.record, said)) for target in targets]
-    with console.progress(len(looked_at) * steps, "reconstruct") as advance:
-        find = _finder(bench, read, beside, advance)
+    with console.frames(len(needed), steps * len(looked_at) / max(len(needed), 1), "reconstruct") as work:
+        find = _finder(bench, read, beside, work.advance)
         for number, future in ahead(read, needed):
             try:
                 pictures, target = future.result(), targets[number]
@@ -141,16 +143,16 @@ def reconstruct(
                 target = replace(target, record=with_warnings(target.record, notices))
                 if size is not None:
                     frame = particles.frame_of(bench, *pictures)
-                    outcomes.append(
-                        _write_particles(bench, target, (frame, find(number, frame), size), overwrite, console)
-                    )
+                    made = (frame, find(number, frame), size)
+                    outcomes.append(_write_particles(bench, target, made, options.residual, overwrite, console))
                 else:
-                    outcomes.append(_make_volume(bench, target, pictures, overwrite, advance))
+                    outcomes.append(_make_volume(bench, target, pictures, overwrite, work.advance))
             except InputError as error:
                 if not options.keep_going:
                     raise
                 failures.append(str(error))
                 console.warn([Notice("frame-failed", frames[number].stem, str(error), "leave it out, or mend it")])
+            work.done(frames[number].stem)
     if failures:
         raise PartialError(f"{len(failures)} of {len(frames)} frames failed, the first because {failures[0]}")
     found = [outcome.particles for outcome in outcomes if outcome.particles is not None]
@@ -210,6 +212,17 @@ def residual_path(particles: Path) -> Path:
     return particles.with_name(f"{particles.stem}_residual.tif")
 
 
+def _ensure_residuals(
+    paths: Sequence[Path], needed: Sequence[int], overwrite: bool, images: Sequence[Path], console: Console
+) -> None:
+    """Refuse residual images that could not be written; say of which frames that are complete there is none."""
+    for number in needed:
+        ensure_writable(residual_path(paths[number]), overwrite, images)
+    without = sum(not residual_path(path).exists() for number, path in enumerate(paths) if number not in needed)
+    if without:
+        console.say(f"{without} frames that are complete have no residual image; --overwrite makes both anew")
+
+
 def _make_volume(
     bench: Bench, target: Target, frame: tuple[Image, Image], overwrite: bool, advance: Progress
 ) -> Outcome:
@@ -232,17 +245,19 @@ def _write_particles(
     bench: Bench,
     target: Target,
     made: tuple[particles.Frame, Particles, particles.TracerSize],
+    residual: bool,
     overwrite: bool,
     console: Console,
 ) -> Outcome:
-    """Write the particles found behind a frame and what they leave of it."""
+    """Write the particles found behind a frame and, where it is asked for, what they leave of it."""
     frame, found, size = made
     points = particles.points_of(bench, frame, found, size, target.record)
     notices = particles.light_notices(points, target.path.name)
     console.warn(notices)
-    left = particles.what_is_left(frame, found)
-    # Made again whenever the particles are: an interrupted batch may have left one without them.
-    image_files.write_tiff(residual_path(target.path), left.astype(np.float32), overwrite=True)
+    if residual:
+        left = particles.what_is_left(frame, found)
+        # Made again whenever the particles are: an interrupted batch may have left one without them.
+        image_files.write_tiff(residual_path(target.path), left.astype(np.float32), overwrite=True)
     told = replace(points, provenance=with_warnings(target.record, notices))
     write_points(target.path, PARTICLES_FORMAT, told, overwrite=overwrite)
     return Outcome(points.attributes["residual"], points.attributes["excluded_pixels"], len(points.position_mm))

@@ -70,14 +70,14 @@ def simulate_boards(
     reference = simulated_reference(settings)
     rng, space = _generator(settings, 3), _flow_space(settings, reference)
     board = replace(settings.rig().board, medium="fluid")
-    with console.progress(len(names), "simulate") as advance:
+    with console.frames(len(names), 1.0, "simulate", "board") as work:
         for depth, name in names.items():
             write_tiff(
                 paths[name],
                 _board_still(settings, board, space, reference.depth_to_focal_point(depth), rng).image,
                 overwrite,
             )
-            advance(1)
+            work.done(name)
     return {"boards": len(names), "reference_z_mm": reference.z_mm}
 
 
