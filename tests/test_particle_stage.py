@@ -195,10 +195,14 @@ def test_the_sample_from_images_to_vectors(tmp_path: Path) -> None:
     frames = [tmp_path / "particles" / f"pair_{name}.vtkhdf" for name in "ab"]
     # A frame that is made again alone is the same, its neighbour being looked at again; what is there stays.
     written = [frame.read_bytes() for frame in frames]
+    # Without its residual image it is the same, too.
     frames[1].unlink()
+    (tmp_path / "particles" / "pair_b_residual.tif").unlink()
     made = frames[0].stat().st_mtime_ns
-    run("reconstruct", weights, *still[3:], *beside, "--resume")
+    run("reconstruct", weights, *still[3:], *beside, "--resume", "--no-residual")
     assert [frame.read_bytes() for frame in frames] == written
+    assert not (tmp_path / "particles" / "pair_b_residual.tif").exists()
+    run("reconstruct", weights, *still[3:], *beside, "--resume")
     assert frames[0].stat().st_mtime_ns == made
     attributes = vtkhdf.read_header(frames[0]).attributes
     assert attributes["excluded_pixels"] == 600
