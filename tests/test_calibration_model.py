@@ -176,7 +176,7 @@ def test_a_board_of_another_shape_is_refused(rig: Rig) -> None:
 
 def test_the_picture_shows_lattice_and_board(plain: Calibration, rig: Rig, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
-    from lfpiv_cli.calibration.picture import calibration_figure
+    from lfpiv_cli.pictures.calibration import calibration_figure
 
     without = calibration_figure(plain, white_image())
     pose = exact_pose(0.2)
@@ -186,6 +186,21 @@ def test_the_picture_shows_lattice_and_board(plain: Calibration, rig: Rig, tmp_p
     titles = [axis.get_title() for axis in full.axes]
     assert any("z = 0.200 mm" in title for title in titles)
     assert not any("z =" in axis.get_title() for axis in without.axes)
+
+
+def test_the_summary_shows_residuals_and_dots_without_the_pictures(plain: Calibration, rig: Rig) -> None:
+    pytest.importorskip("matplotlib")
+    from lfpiv_cli.pictures.calibration import summary_figure
+
+    pose = exact_pose(0.2)
+    along_columns, _, passed, board = summary_figure(replace(plain, pose=pose)).axes[:4]
+    residual = (plain.fit.centres_px - plain.fit.centres(plain.fit.indices))[:, 0]
+    np.testing.assert_array_equal(along_columns.collections[0].get_array(), residual)
+    np.testing.assert_array_equal(passed.images[0].get_array(), plain.transmission)
+    np.testing.assert_array_equal(board.collections[0].get_offsets(), pose.dots_px)
+    assert "z = 0.200 mm" in board.get_title()
+    bare = summary_figure(replace(plain, transmission=None)).axes
+    assert [axes.texts[0].get_text() for axes in bare if axes.texts] == ["transmission not measured", "no board"]
 
 
 def test_experiment(data_folder: Path, table2: Camera, water: Media) -> None:

@@ -1,4 +1,4 @@
-"""The command that describes files."""
+"""The commands that describe files and draw what is in them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from lfpiv_cli.cli.options import FILE, common_options
+from lfpiv_cli.cli.options import FILE, common_options, output_option
 from lfpiv_cli.console import Console
 
 
@@ -25,3 +25,23 @@ def info(file: Path, overwrite: bool, console: Console, **chosen: Any) -> dict[s
     from lfpiv_cli.stages import info as stage
 
     return stage.info(file, stage.InfoOptions(**chosen), overwrite=overwrite, console=console)
+
+
+@click.command("plot")
+@click.argument("file", type=FILE)
+@output_option("PDF with a page for each figure, or PNG: one figure, or of several P_NAME.png for each.")
+@click.option("--only", multiple=True, metavar="NAME", help="This figure only; may be repeated. Default: all.")
+@click.option(
+    "--raw", type=FILE, help="Image to draw on: the raw one that particles were found in, a calibration's white image."
+)
+@common_options
+def plot(file: Path, output: Path, overwrite: bool, console: Console, **chosen: Any) -> dict[str, Any]:
+    """Draw what is in a file: vectors, tracks, particles, a volume, a calibration or weights.
+
+    \b
+    Example: lfpiv plot vectors.vtkhdf -o vectors.pdf
+    Example: lfpiv plot vectors.vtkhdf --only planes -o planes.png
+    """
+    from lfpiv_cli.stages import plot as stage
+
+    return stage.plot(file, output, stage.PlotOptions(**chosen), overwrite=overwrite, console=console)

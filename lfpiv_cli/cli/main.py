@@ -35,6 +35,7 @@ COMMANDS = (
     tracks.track,
     tracks.follow,
     inspection.info,
+    inspection.plot,
     validation.validate,
     simulation.simulate,
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,5 +28,17 @@ def write_picture(path: Path, figure: Figure, overwrite: bool) -> None:
 
     def save(target: Path) -> None:
         figure.savefig(target, format="png", dpi=DOTS_PER_INCH, metadata={"Software": None})
+
+    write_atomically(path, save, overwrite=overwrite)
+
+
+def write_pages(path: Path, figures: Iterable[Figure], overwrite: bool) -> None:
+    """Write figures as the pages of a PDF; without time stamps, so that the same figures give the same bytes."""
+    from matplotlib.backends.backend_pdf import PdfPages
+
+    def save(target: Path) -> None:
+        with PdfPages(target, metadata={"CreationDate": None, "Creator": None, "Producer": None}) as pages:
+            for figure in figures:
+                pages.savefig(figure)
 
     write_atomically(path, save, overwrite=overwrite)

@@ -75,13 +75,13 @@ def calibrate_snapshot(
     record = with_warnings(provenance_record("calibrate-snapshot", settings.resolved(), inputs), notices)
     write_calibration(output, calibration, record, overwrite)
     if picture:
-        from lfpiv_cli.calibration.picture import calibration_figure
+        from lfpiv_cli.pictures.calibration import calibration_figure
 
         shown = [frames[name] for name in whites] or [frames["board"]]
         sharpest = shown[by_aperture(shown, frames.get("dark"))[0]]
         write_picture(picture, calibration_figure(calibration, sharpest, frames.get("board")), overwrite)
     if views and camera:
-        from lfpiv_cli.calibration.views_picture import views_figure
+        from lfpiv_cli.pictures.views import views_figure
 
         medium = settings.media_model() if board and settings.board.medium == "fluid" else Media()
         shown_image = light(frames["board" if board else "white"], frames.get("dark"), None)

@@ -6,15 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from lfpiv_cli.console import CONSOLE, Console
-from lfpiv_cli.errors import InputError, UsageError
+from lfpiv_cli.errors import UsageError
 from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.describe import describe
 from lfpiv_cli.files.pictures import ensure_drawing, write_picture
-from lfpiv_cli.files.weights_file import open_weights
-from lfpiv_cli.validation.weights_pictures import column_figure
+from lfpiv_cli.files.weights_file import FORMAT, open_weights
+from lfpiv_cli.stages.plot import column_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,15 +38,12 @@ def info(
     ensure_writable(picture, overwrite, [file])
     ensure_drawing()
     found = describe(file)
-    weights = open_weights(file).weights
-    nx, ny, nz = weights.grid.shape_xyz
+    if found["format"] != FORMAT:
+        raise UsageError(f"--picture draws a voxel of weights; for the figures of {found['format']}: lfpiv plot {file}")
+    content = open_weights(file)
+    nx, ny, nz = content.weights.grid.shape_xyz
     ix, iy, iz = voxel or (nx // 2, ny // 2, nz // 2)
     if not (0 <= ix < nx and 0 <= iy < ny and 0 <= iz < nz):
         raise UsageError(f"--voxel {ix} {iy} {iz}: there are {nx} x {ny} x {nz} voxels, counted from 0")
-    rows, columns, shares = weights.column(iz, iy, ix)
-    if not shares.size:
-        raise InputError(f"{file}: voxel {ix} {iy} {iz} lights no pixel")
-    place = ", ".join(f"{axis:.4g}" for axis in weights.grid.voxel_to_mm(np.array([ix, iy, iz], dtype=np.float64)))
-    title = f"voxel {ix}, {iy}, {iz} at ({place}) mm: {shares.size} pixels, sum {shares.sum():.4f}"
-    write_picture(picture, column_figure(rows, columns, shares, title), overwrite)
+    write_picture(picture, column_of(content, (ix, iy, iz)), overwrite)
     return found

@@ -82,7 +82,7 @@ def refine_calibration(
         made_by = record("refine-calibration", settings.resolved(), inputs)
         write_calibration(output, found.applied(before), made_by, overwrite)
     if picture:
-        from lfpiv_cli.self_calibration.walls_picture import walls_figure
+        from lfpiv_cli.pictures.walls import walls_figure
 
         write_picture(picture, walls_figure(found), overwrite)
     return found.summary()
