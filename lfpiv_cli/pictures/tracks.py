@@ -124,6 +124,6 @@ def lengths_figure(track: NDArray[np.int64]) -> Figure:
     figure = new_figure(6.0, 3.6)
     axes = figure.subplots()
     most = int(lengths.max()) if lengths.size else 1
-    axes.hist(lengths, bins=np.arange(most + 1) + 0.5, color=BLUE, rwidth=0.9)
+    axes.hist(lengths, bins=(np.arange(most + 1) + 0.5).tolist(), color=BLUE, rwidth=0.9)
     axes.set(xlabel="frames in a trajectory", ylabel="trajectories", title=f"{lengths.size} trajectories")
     return figure
