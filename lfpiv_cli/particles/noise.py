@@ -141,10 +141,10 @@ def measured_noise(
     number = min(CLASSES, int(np.count_nonzero(lit)) // SMALLEST_CLASS)
     if number < FEWEST_CLASSES:
         return noise
-    order = np.argsort(model[lit], kind="stable")
-    classes = np.array_split(order, number)
-    brightness = np.array([np.mean(model[lit][members]) for members in classes])
-    variance = np.array([np.median(residual[lit][members] ** 2) for members in classes]) / HALF_NORMAL_MEDIAN**2
+    light, left = model[lit], residual[lit]
+    classes = np.array_split(np.argsort(light, kind="stable"), number)
+    brightness = np.array([np.mean(light[members]) for members in classes])
+    variance = np.array([np.median(left[members] ** 2) for members in classes]) / HALF_NORMAL_MEDIAN**2
     if not np.all(variance > 0.0):
         return noise
     terms = np.column_stack([brightness, brightness**2])
