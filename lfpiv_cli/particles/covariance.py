@@ -21,9 +21,8 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from lfpiv_cli.particles.least_squares import UNKNOWNS, Observation
+from lfpiv_cli.particles.least_squares import SUMS, UNKNOWNS, Observation, lit_by, respond_all, room_for
 from lfpiv_cli.particles.noise import Correlation
-from lfpiv_cli.particles.response import entries_of
 from lfpiv_cli.particles.view import View, footprint_radius_mm, on_array_mm
 from lfpiv_cli.threads import COUNT_NO_REFERENCES, blocks, in_threads
 
@@ -39,15 +38,14 @@ class Slopes(NamedTuple):
     Attributes
     ----------
     start : (n + 1,) where each particle's entries begin
-    pixel : flat numbers
-    slope : (entries, 4) change of the pixel by x, y, z and light
-    columns : of the image
+    row, column : (entries,) of the pixel
+    slope : (entries, 4) change of the pixel by x, y, z and light, over its standard error
     """
 
     start: NDArray[np.int64]
-    pixel: NDArray[np.int32]
+    row: NDArray[np.int32]
+    column: NDArray[np.int32]
     slope: NDArray[np.float32]
-    columns: int
 
 
 class Neighbours(NamedTuple):
@@ -68,7 +66,6 @@ class Equations(NamedTuple):
     Attributes
     ----------
     slopes, neighbours : see there
-    weight : (pixels,) 1/variance
     alone : (n, 4, 4) the blocks of single particles
     block : (2 pairs, 4, 4) those of particles and their neighbours
     inverses : (n, 4, 4) of `alone`
@@ -76,7 +73,6 @@ class Equations(NamedTuple):
 
     slopes: Slopes
     neighbours: Neighbours
-    weight: NDArray[np.float64]
     alone: NDArray[np.float64]
     block: NDArray[np.float64]
     inverses: NDArray[np.float64]
@@ -104,30 +100,47 @@ def joint_covariance(
 
 def _equations(observation: Observation, particles: NDArray[np.float64]) -> Equations:
     """Return the normal matrix of all particles."""
-    slopes = _slopes(observation.optics, particles, observation.capacity)
+    slopes = _slopes(observation, particles)
     neighbours = _overlapping(observation.optics, particles)
     alone = np.zeros((len(particles), UNKNOWNS, UNKNOWNS))
     block = np.zeros((neighbours.other.size, UNKNOWNS, UNKNOWNS))
     in_threads(
-        lambda part: _fill_blocks(slopes, neighbours, observation.weight, part.start, alone[part], block),
+        lambda part: _fill_blocks(slopes, neighbours, part.start, alone[part], block),
         blocks(len(particles), BLOCK),
     )
-    return Equations(slopes, neighbours, observation.weight, alone, block, np.asarray(np.linalg.inv(alone), np.float64))
+    return Equations(slopes, neighbours, alone, block, np.asarray(np.linalg.inv(alone), np.float64))
 
 
-def _slopes(view: View, particles: NDArray[np.float64], capacity: int) -> Slopes:
+def _slopes(observation: Observation, particles: NDArray[np.float64]) -> Slopes:
     """Return what each particle's unknowns do to the pixels."""
-
-    def of(part: slice) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]:
-        counts, pixels, values = entries_of(view, particles[part], capacity)
-        slope = np.empty(values.shape, np.float32)
-        slope[:, :3] = np.repeat(particles[part, 3], counts)[:, np.newaxis] * values[:, 1:]
-        slope[:, 3] = values[:, 0]
-        return counts, pixels, slope
-
-    parts = in_threads(of, blocks(len(particles), BLOCK))
+    parts = in_threads(lambda part: _slopes_of(observation, particles[part]), blocks(len(particles), BLOCK))
     counts, pixel, slope = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-    return Slopes(np.concatenate([[0], np.cumsum(counts)]), pixel, slope, view.camera.columns)
+    row, column = np.divmod(pixel, observation.optics.camera.columns, dtype=np.int32)
+    return Slopes(np.concatenate([[0], np.cumsum(counts)]), row, column, slope)
+
+
+@njit(cache=True, nogil=True)
+def _slopes_of(
+    observation: Observation, particles: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]:
+    """Return the number of entries of each particle, and the pixels and slopes of all."""
+    count, capacity = particles.shape[0], observation.capacity
+    responses = room_for(1, capacity, 0)
+    counts = np.zeros(count, np.int64)
+    pixel, slope = np.empty(count * capacity, np.int32), np.empty((count * capacity, UNKNOWNS), np.float32)
+    end = 0
+    for n in range(count):
+        respond_all(observation.optics, particles[n : n + 1], responses)
+        pixels, values = lit_by(responses, 0)
+        counts[n] = pixels.size
+        for k in range(pixels.size):
+            root = np.sqrt(observation.weight[pixels[k]])
+            pixel[end + k] = pixels[k]
+            for unknown in range(3):
+                slope[end + k, unknown] = root * particles[n, 3] * values[k, 1 + unknown]
+            slope[end + k, 3] = root * values[k, 0]
+        end += pixels.size
+    return counts, pixel[:end].copy(), slope[:end].copy()
 
 
 def _overlapping(view: View, particles: NDArray[np.float64]) -> Neighbours:
@@ -149,19 +162,24 @@ def _rectangle(slopes: Slopes, n: int) -> tuple[int, int, int, int]:
     begin, end = slopes.start[n], slopes.start[n + 1]
     if begin == end:
         return 0, 0, 0, 0
-    top = bottom = slopes.pixel[begin] // slopes.columns
-    left = right = slopes.pixel[begin] % slopes.columns
+    top, left = slopes.row[begin], slopes.column[begin]
+    bottom, right = top, left
     for k in range(begin, end):
-        row, column = slopes.pixel[k] // slopes.columns, slopes.pixel[k] % slopes.columns
-        top, bottom, left, right = min(top, row), max(bottom, row), min(left, column), max(right, column)
+        top, bottom = min(top, slopes.row[k]), max(bottom, slopes.row[k])
+        left, right = min(left, slopes.column[k]), max(right, slopes.column[k])
     return top, left, bottom - top + 1, right - left + 1
+
+
+@njit(cache=True)
+def _at_least(room: NDArray[np.float64], size: int) -> NDArray[np.float64]:
+    """Return an array of at least this size, the one that is there if it will do: large ones take long to make."""
+    return room if room.size >= size else np.empty(size)
 
 
 @njit(cache=True, nogil=True)
 def _fill_blocks(
     slopes: Slopes,
     neighbours: Neighbours,
-    weight: NDArray[np.float64],
     first: int,
     alone: NDArray[np.float64],
     block: NDArray[np.float64],
@@ -171,37 +189,62 @@ def _fill_blocks(
     Both from whole pixels: a pixel that two lenses light has one error, and with two it would be less than its
     neighbours' blocks ask for.
     """
+    room = np.empty(0)
     for k in range(alone.shape[0]):
         n = first + k
         top, left, rows, columns = _rectangle(slopes, n)
-        own = np.zeros((rows, columns, UNKNOWNS))
+        room = _at_least(room, rows * columns * UNKNOWNS)
+        own = room[: rows * columns * UNKNOWNS].reshape(rows, columns, UNKNOWNS)
+        own[:] = 0.0
         for entry in range(slopes.start[n], slopes.start[n + 1]):
-            pixel = slopes.pixel[entry]
-            row, column = pixel // slopes.columns - top, pixel % slopes.columns - left
+            row, column = slopes.row[entry] - top, slopes.column[entry] - left
             for a in range(UNKNOWNS):
-                own[row, column, a] += weight[pixel] * slopes.slope[entry, a]
-        _add_products(slopes, n, own, top, left, alone[k])
+                own[row, column, a] += slopes.slope[entry, a]
+        _set_products(slopes, n, own, top, left, alone[k])
         for at in range(neighbours.start[n], neighbours.start[n + 1]):
             m = neighbours.other[at]
             if m > n:
-                _add_products(slopes, m, own, top, left, block[at])
+                _set_products(slopes, m, own, top, left, block[at])
                 back = neighbours.start[m]
                 while neighbours.other[back] != n:
                     back += 1
                 block[back] = block[at].T
 
 
-@njit(cache=True, **COUNT_NO_REFERENCES)
-def _add_products(
+@njit(cache=True, fastmath=SUMS, **COUNT_NO_REFERENCES)
+def _set_products(
     slopes: Slopes, m: int, own: NDArray[np.float64], top: int, left: int, block: NDArray[np.float64]
 ) -> None:
-    """Add own^T J_m to a block (4, 4), with `own` on a rectangle of pixels."""
+    """Set a block (4, 4) to own^T J_m, with `own` on a rectangle of pixels."""
+    rows, columns = own.shape[0], own.shape[1]
+    # Kept out of arrays, sums stay in registers.
+    m00 = m01 = m02 = m03 = m10 = m11 = m12 = m13 = 0.0
+    m20 = m21 = m22 = m23 = m30 = m31 = m32 = m33 = 0.0
     for k in range(slopes.start[m], slopes.start[m + 1]):
-        i, j = slopes.pixel[k] // slopes.columns - top, slopes.pixel[k] % slopes.columns - left
-        if 0 <= i < own.shape[0] and 0 <= j < own.shape[1]:
-            for a in range(UNKNOWNS):
-                for b in range(UNKNOWNS):
-                    block[a, b] += own[i, j, a] * slopes.slope[k, b]
+        i, j = slopes.row[k] - top, slopes.column[k] - left
+        if 0 <= i < rows and 0 <= j < columns:
+            a, b, c, d = own[i, j, 0], own[i, j, 1], own[i, j, 2], own[i, j, 3]
+            e, f, g, h = slopes.slope[k, 0], slopes.slope[k, 1], slopes.slope[k, 2], slopes.slope[k, 3]
+            m00 += a * e
+            m01 += a * f
+            m02 += a * g
+            m03 += a * h
+            m10 += b * e
+            m11 += b * f
+            m12 += b * g
+            m13 += b * h
+            m20 += c * e
+            m21 += c * f
+            m22 += c * g
+            m23 += c * h
+            m30 += d * e
+            m31 += d * f
+            m32 += d * g
+            m33 += d * h
+    block[0, 0], block[0, 1], block[0, 2], block[0, 3] = m00, m01, m02, m03
+    block[1, 0], block[1, 1], block[1, 2], block[1, 3] = m10, m11, m12, m13
+    block[2, 0], block[2, 1], block[2, 2], block[2, 3] = m20, m21, m22, m23
+    block[3, 0], block[3, 1], block[3, 2], block[3, 3] = m30, m31, m32, m33
 
 
 @njit(cache=True, nogil=True)
@@ -212,6 +255,7 @@ def _covariances(
 
     Each is the particle's part of the inverse of the normal matrix of itself and its strongest neighbours.
     """
+    room = np.empty(0)
     for k in range(result.shape[0]):
         n = first + k
         members = _strongest(equations, n)
@@ -219,21 +263,28 @@ def _covariances(
         # Millimetres beside counts: inverted with a diagonal of ones.
         scale = 1.0 / np.sqrt(np.diag(whole))
         _rescale(whole, scale)
-        inverse = np.linalg.inv(whole)
+        # The inverse's first columns, as its rows.
+        inverse = np.linalg.solve(whole, np.eye(scale.size)[:, :UNKNOWNS].copy()).T
         _rescale(inverse, scale)
         excess = max(chi2[n] - 1.0, 0.0)
         for a in range(UNKNOWNS):
             for b in range(UNKNOWNS):
                 result[k, a, b] = (1.0 + excess) * inverse[a, b]
         if correlation.share + excess > 0.0:
-            moved_by = _moved_by(equations, members, inverse)
+            top, left, rows, columns = _rectangle(equations.slopes, n)
+            room = _at_least(room, rows * columns * UNKNOWNS)
+            moved_by = room[: rows * columns * UNKNOWNS].reshape(rows, columns, UNKNOWNS)
+            moved_by[:] = 0.0
+            for m in range(members.size):
+                of_m = inverse[:, UNKNOWNS * m : UNKNOWNS * (m + 1)]
+                _add_moves(equations.slopes, members[m], of_m, top, left, moved_by)
             _add_excess(moved_by, correlation.decay, correlation.share + excess, result[k])
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
 def _rescale(matrix: NDArray[np.float64], scale: NDArray[np.float64]) -> None:
-    """Multiply rows and columns of a matrix by the scales of its unknowns."""
-    for i in range(scale.size):
+    """Multiply the first rows and all columns of a matrix by the scales of its unknowns."""
+    for i in range(matrix.shape[0]):
         for j in range(scale.size):
             matrix[i, j] = matrix[i, j] * scale[j] * scale[i]
 
@@ -268,53 +319,53 @@ def _tie(one: NDArray[np.float64], block: NDArray[np.float64], other: NDArray[np
     return trace
 
 
-@njit(cache=True)
-def _moved_by(equations: Equations, members: NDArray[np.int64], inverse: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return K (4, rows, columns) of the first member on the rectangle that it lights, its neighbours free."""
-    slopes = equations.slopes
-    top, left, rows, columns = _rectangle(slopes, members[0])
-    moved_by = np.zeros((UNKNOWNS, rows, columns))
-    for m in range(members.size):
-        for k in range(slopes.start[members[m]], slopes.start[members[m] + 1]):
-            i, j = slopes.pixel[k] // slopes.columns - top, slopes.pixel[k] % slopes.columns - left
-            if 0 <= i < rows and 0 <= j < columns:
-                root = np.sqrt(equations.weight[slopes.pixel[k]])
-                for a in range(UNKNOWNS):
-                    for b in range(UNKNOWNS):
-                        moved_by[a, i, j] += inverse[a, UNKNOWNS * m + b] * slopes.slope[k, b] * root
-    return moved_by
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def _add_moves(
+    slopes: Slopes, m: int, inverse: NDArray[np.float64], top: int, left: int, moved_by: NDArray[np.float64]
+) -> None:
+    """Add to K (rows, columns, 4) what one member's slopes do to it, by its part (4, 4) of the inverse."""
+    rows, columns = moved_by.shape[0], moved_by.shape[1]
+    for k in range(slopes.start[m], slopes.start[m + 1]):
+        i, j = slopes.row[k] - top, slopes.column[k] - left
+        if 0 <= i < rows and 0 <= j < columns:
+            e, f, g, h = slopes.slope[k, 0], slopes.slope[k, 1], slopes.slope[k, 2], slopes.slope[k, 3]
+            for a in range(UNKNOWNS):
+                moved_by[i, j, a] += inverse[a, 0] * e + inverse[a, 1] * f + inverse[a, 2] * g + inverse[a, 3] * h
 
 
-@njit(cache=True)
+@njit(cache=True, fastmath=SUMS)
 def _add_excess(moved_by: NDArray[np.float64], decay: float, factor: float, result: NDArray[np.float64]) -> None:
-    """Add factor K (R - 1) K^T (4, 4) for errors whose correlation falls by `decay` from pixel to pixel."""
-    _, rows, columns = moved_by.shape
-    for b in range(UNKNOWNS):
-        alike = _correlated(_correlated(moved_by[b], decay), decay)
-        for a in range(UNKNOWNS):
-            total = 0.0
-            for i in range(rows):
-                for j in range(columns):
-                    total += moved_by[a, i, j] * (alike[i, j] - moved_by[b, i, j])
-            result[a, b] += factor * total
+    """Add factor K (R - 1) K^T (4, 4) for errors whose correlation falls by `decay` from pixel to pixel.
 
-
-@njit(cache=True)
-def _correlated(values: NDArray[np.float64], decay: float) -> NDArray[np.float64]:
-    """Return sum_k decay^|j - k| values[i, k] in row j and column i, by one pass each way."""
-    rows, columns = values.shape
-    result = np.empty((columns, rows))
+    Along an axis, sum_jk decay^|j - k| a_j b_k = (1 - decay^2) sum_n A_n B_n with A_n = sum_(k <= n) decay^(n - k) a_k,
+    n going on behind the last pixel, where A falls by `decay` each step.
+    """
+    rows, columns, _ = moved_by.shape
+    inner = 1.0 - decay * decay
+    carried = np.zeros((columns, UNKNOWNS))
+    m00 = m01 = m02 = m03 = m11 = m12 = m13 = m22 = m23 = m33 = 0.0
     for i in range(rows):
-        carried = 0.0
+        of_row = 1.0 if i == rows - 1 else inner
+        a = b = c = d = 0.0
         for j in range(columns):
-            carried = carried * decay + values[i, j]
-            result[j, i] = carried
-        carried = 0.0
-        for j in range(columns - 1, -1, -1):
-            carried *= decay
-            result[j, i] += carried
-            carried += values[i, j]
-    return result
+            weight = of_row if j == columns - 1 else of_row * inner
+            e, f, g, h = moved_by[i, j, 0], moved_by[i, j, 1], moved_by[i, j, 2], moved_by[i, j, 3]
+            a, b, c, d = decay * a + e, decay * b + f, decay * c + g, decay * d + h
+            p, q = decay * carried[j, 0] + a, decay * carried[j, 1] + b
+            r, t = decay * carried[j, 2] + c, decay * carried[j, 3] + d
+            carried[j, 0], carried[j, 1], carried[j, 2], carried[j, 3] = p, q, r, t
+            m00 += weight * p * p - e * e
+            m01 += weight * p * q - e * f
+            m02 += weight * p * r - e * g
+            m03 += weight * p * t - e * h
+            m11 += weight * q * q - f * f
+            m12 += weight * q * r - f * g
+            m13 += weight * q * t - f * h
+            m22 += weight * r * r - g * g
+            m23 += weight * r * t - g * h
+            m33 += weight * t * t - h * h
+    excess = np.array([[m00, m01, m02, m03], [m01, m11, m12, m13], [m02, m12, m22, m23], [m03, m13, m23, m33]])
+    result += factor * excess
 
 
 @njit(cache=True)
