@@ -30,7 +30,7 @@ from lfpiv_cli.particles.least_squares import (
 )
 from lfpiv_cli.particles.tiles import over_tiles
 from lfpiv_cli.particles.view import View, entry_capacity
-from lfpiv_cli.threads import COUNT_NO_REFERENCES, blocks, in_threads
+from lfpiv_cli.threads import COUNT_NO_REFERENCES
 
 # Candidates are brought into the fit from these depths beside their own, in depths over which light spreads by one lens
 # (Table 2: 0.4 mm).
@@ -40,8 +40,6 @@ CANDIDATE_STEPS = 12
 SWEEP_STEPS = 4
 # A particle claims its light where at least this share of it is found (the rest may be noise and neighbours).
 CLAIM = 0.7
-# Particles that one thread judges at a time.
-BLOCK = 64
 
 
 @njit(cache=True, fastmath=SUMS, **COUNT_NO_REFERENCES)
@@ -268,9 +266,12 @@ def judge(
     nothing.
     """
     chi2, share, seen = (np.zeros(len(particles)) for _ in range(3))
-    in_threads(
-        lambda part: _judge(observation, particles[part], chi2[part], share[part], seen[part]),
-        blocks(len(particles), BLOCK),
+    # By tiles: neighbours' pixels are still at hand.
+    over_tiles(
+        lambda numbers: _judge(observation, particles, numbers, chi2, share, seen),
+        observation.optics,
+        particles,
+        observation.depths_mm,
     )
     return chi2, share, seen
 
@@ -279,14 +280,15 @@ def judge(
 def _judge(
     observation: Observation,
     particles: NDArray[np.float64],
+    numbers: NDArray[np.int64],
     chi2: NDArray[np.float64],
     share: NDArray[np.float64],
     seen: NDArray[np.float64],
 ) -> None:
-    """Do the work of `judge` for some particles."""
+    """Do the work of `judge` for the particles of a tile."""
     residual, weight = observation.residual, observation.weight
     responses = room_for(1, observation.capacity, 0)
-    for number in range(particles.shape[0]):
+    for number in numbers:
         respond_all(observation.optics, particles[number : number + 1], responses)
         pixels, values = lit_by(responses, 0)
         total = squares = 0.0
