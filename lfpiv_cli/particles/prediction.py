@@ -27,9 +27,11 @@ from lfpiv_cli.particles.search import (
     State,
     Task,
     blank,
+    kept,
     noise_with,
     rebuilt,
     sweep,
+    with_light,
 )
 from lfpiv_cli.particles.suspects import settled
 
@@ -102,14 +104,13 @@ def gone_on(task: Task, predicted: Predicted) -> State:
     low, high = at[:, 3] * np.exp(-spread), at[:, 3] * np.exp(spread)
     for unexplained in HELD:
         sweep(task, state, unexplained, 1)
-        light = np.clip(state.particles[:, 3], low, high)
-        state = rebuilt(task, state, np.column_stack([state.particles[:, :3], light]))
+        state = with_light(task, state, np.clip(state.particles[:, 3], low, high))
     for unexplained in FREE:
         sweep(task, state, unexplained, 1)
     found = state.particles
     sure = (np.abs(found[:, :3] - at[:, :3]) <= PREDICTED_SIGMAS * sigma).all(axis=1)
     sure &= (found[:, 3] > low) & (found[:, 3] < high)
-    return rebuilt(task, state, found[sure])
+    return kept(task, state, sure)
 
 
 def _one_search(task: Task, state: State, settings: Round, progress: Callable[[int], None] | None) -> State:

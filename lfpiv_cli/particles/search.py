@@ -173,7 +173,7 @@ def sweep(task: Task, state: State, unexplained: float, sweeps: int, enough: flo
 
 
 def merge(task: Task, state: State, apart: NDArray[np.bool_] | None = None) -> State:
-    """Return the state with particles that have become one added up, and its residual computed anew.
+    """Return the state with particles that have become one added up.
 
     Two of those that are known to be `apart` (n,) stay two.
     """
@@ -187,7 +187,7 @@ def merge(task: Task, state: State, apart: NDArray[np.bool_] | None = None) -> S
             brighter, other = (a, b) if particles[a, 3] >= particles[b, 3] else (b, a)
             particles[brighter, 3] += particles[other, 3]
             merged[other] = True
-    return rebuilt(task, state, particles[~merged])
+    return kept(task, with_light(task, state, particles[:, 3]), ~merged)
 
 
 def prune(task: Task, state: State, claimed_share: float, unexplained: float) -> State:
@@ -195,9 +195,24 @@ def prune(task: Task, state: State, claimed_share: float, unexplained: float) ->
     _, share, seen = judge(observed(task, state, unexplained), state.particles)
     keep = (state.particles[:, 3] > SMALLEST_LIGHT * state.typical_light) & (seen > SMALLEST_SEEN)
     keep &= share > claimed_share
+    return kept(task, state, keep)
+
+
+def kept(task: Task, state: State, keep: NDArray[np.bool_]) -> State:
+    """Return the state with some of its particles, the light of the others put back."""
     residual = state.residual.copy()
     add_all(task.view, state.particles[~keep], 1.0, residual, task.depths_mm)
     return replace(state, particles=state.particles[keep], residual=residual)
+
+
+def with_light(task: Task, state: State, light: NDArray[np.float64]) -> State:
+    """Return the state with particles of other light (n,) at the same places, their residual along with them."""
+    particles, residual = state.particles.copy(), state.residual.copy()
+    particles[:, 3] = light - state.particles[:, 3]
+    changed = particles[:, 3] != 0.0
+    add_all(task.view, particles[changed], -1.0, residual, task.depths_mm)
+    particles[:, 3] = light
+    return replace(state, particles=particles, residual=residual)
 
 
 def rebuilt(task: Task, state: State, particles: NDArray[np.float64]) -> State:
