@@ -21,6 +21,9 @@ from lfpiv_cli.scale import Scale
 # A good particle's chi-squared is the one at this percentile; particles that fit worse by this factor are
 # suspects.
 GOOD_PERCENTILE, SUSPECT_CHI2 = 20.0, 1.5
+# Light that stays within about one lens fits well at many depths: radii, in lenses, of footprints near the focal plane.
+# Elsewhere hardly one in a hundred suspects finds another depth: it must fit worse by this factor.
+NEAR_FOCUS_LENSES, ELSEWHERE_CHI2 = 0.6, 3.0
 # Suspected to be two: brighter than typical by this factor, or, in thorough rounds, bright enough for two.
 BRIGHT, ENOUGH_FOR_TWO = 1.2, 2.0 * SMALLEST_LIGHT
 # What chi-squared must fall by, in units of a good particle's, where one becomes two, and where it changes its depth.
@@ -38,10 +41,9 @@ def with_depths_corrected(task: Task, state: State, unexplained: float) -> State
     observation = observed(task, state, unexplained)
     chi2, *_ = judge(observation, state.particles)
     good = _good(chi2)
-    # Light that stays within about one lens fits well at many depths.
-    near_focus = footprint_radius_mm(task.view, state.particles[:, 2]) < 2.0 * task.view.half_x_mm
+    near_focus = footprint_radius_mm(task.view, state.particles[:, 2]) < NEAR_FOCUS_LENSES * 2.0 * task.view.half_x_mm
     signature = _signature(task.view.scale, state.particles, chi2)
-    suspects = (near_focus | (chi2 > SUSPECT_CHI2 * good)) & ~_tried(state.unmoved, state, signature)
+    suspects = (near_focus | (chi2 > ELSEWHERE_CHI2 * good)) & ~_tried(state.unmoved, state, signature)
     light = SMALLEST_LIGHT * state.typical_light
     moved = try_other_depths(observation, state.particles, suspects, light, DEPTH_GAIN * good)
     return replace(state, unmoved=np.concatenate([state.unmoved, signature[suspects & ~moved]]))
