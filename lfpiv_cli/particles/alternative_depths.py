@@ -35,6 +35,5 @@ def try_other_depths(
     depth = particles[:, 2:3]
     starts = np.concatenate([depth + OTHER_DEPTHS * observation.optics.scale.depth_mm, -depth], axis=1)
     starts[(starts < observation.low_mm) | (starts > observation.high_mm)] = np.nan
-    return fit_again(
-        observation, particles, suspects, Effort(STEPS, CHOICE_GAIN), starts, (smallest_gain, smallest_light)
-    )
+    effort, least = Effort(STEPS, CHOICE_GAIN), (smallest_gain, smallest_light)
+    return fit_again(observation, particles, suspects, effort, starts, least).moved

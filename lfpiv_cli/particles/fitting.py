@@ -23,6 +23,7 @@ from lfpiv_cli.particles.least_squares import (
     Responses,
     add_light,
     best_light,
+    change_by,
     fit,
     lit_by,
     respond_all,
@@ -74,12 +75,31 @@ def seen_share(pixels: NDArray[np.int32], values: NDArray[np.float64], weight: N
     return seen
 
 
-def refine(observation: Observation, particles: NDArray[np.float64], enough: float = SMALLEST_GAIN) -> None:
-    """Refine all particles (n, 4) once, in place, and keep the residual up to date.
+def refine(
+    observation: Observation,
+    particles: NDArray[np.float64],
+    enough: float = SMALLEST_GAIN,
+    chosen: NDArray[np.bool_] | None = None,
+) -> NDArray[np.float64]:
+    """Refine all or the chosen ones of particles (n, 4) once, in place, and keep the residual up to date.
 
-    `enough` is what ends a fit, see `least_squares.Effort`.
+    `enough` is what ends a fit, see `least_squares.Effort`. Returns what each fit lowered chi-squared by.
     """
-    fit_again(observation, particles, np.ones(len(particles), np.bool_), Effort(SWEEP_STEPS, enough))
+    every = np.ones(len(particles), np.bool_) if chosen is None else chosen
+    return fit_again(observation, particles, every, Effort(SWEEP_STEPS, enough)).gain
+
+
+class Refitted(NamedTuple):
+    """What came of fits of particles that were known.
+
+    Attributes
+    ----------
+    moved : (n,) which particles have been moved to another depth
+    gain : (n,) what each fit lowered chi-squared by, 0 for particles that were not fitted
+    """
+
+    moved: NDArray[np.bool_]
+    gain: NDArray[np.float64]
 
 
 def fit_again(
@@ -89,10 +109,10 @@ def fit_again(
     effort: Effort,
     depths_mm: NDArray[np.float64] | None = None,
     least: tuple[float, float] = (0.0, 0.0),
-) -> NDArray[np.bool_]:
+) -> Refitted:
     """Fit the chosen ones of particles (n, 4) in place, from where they are and from other depths.
 
-    The residual is kept up to date. Returns which particles have been moved to another depth.
+    The residual is kept up to date.
 
     Parameters
     ----------
@@ -100,13 +120,13 @@ def fit_again(
     least : what another depth must gain in chi-squared, and the light that a particle must have there
     """
     depths = np.empty((len(particles), 0)) if depths_mm is None else depths_mm
-    moved = np.zeros(len(particles), np.bool_)
+    refitted = Refitted(np.zeros(len(particles), np.bool_), np.zeros(len(particles)))
 
     def work(numbers: NDArray[np.int64]) -> None:
-        _fit_again(observation, particles, numbers[chosen[numbers]], effort, depths, least, moved)
+        _fit_again(observation, particles, numbers[chosen[numbers]], effort, depths, least, refitted)
 
     over_tiles(work, observation.optics, particles, observation.depths_mm)
-    return moved
+    return refitted
 
 
 @njit(cache=True, nogil=True)
@@ -117,7 +137,7 @@ def _fit_again(
     effort: Effort,
     depths: NDArray[np.float64],
     least: tuple[float, float],
-    moved: NDArray[np.bool_],
+    refitted: Refitted,
 ) -> None:
     """Do the work of `fit_again` for the particles of a tile."""
     view, residual = observation.optics, observation.residual
@@ -128,15 +148,19 @@ def _fit_again(
         respond_all(view, best, responses)
         pixels, values = lit_by(responses, 0)
         add_light(pixels, values, best[0, 3], residual)
-        lowest = fit(observation, best, responses, effort, np.inf) - least[0]
+        before = change_by(pixels, values, best[0, 3], residual, observation.weight)
+        after = fit(observation, best, responses, effort, np.inf)
+        lowest = after - least[0]
         for depth in depths[number]:
             if np.isnan(depth):
                 continue
             change = fit_from(observation, particles[number], depth, trial, responses, effort)
             if change < lowest and trial[0, 3] >= least[1]:
                 lowest = change
+                after = change
                 best[:] = trial
-                moved[number] = True
+                refitted.moved[number] = True
+        refitted.gain[number] = before - after
         particles[number] = best[0]
         if depths.shape[1] > 0:
             respond_all(view, best, responses)

@@ -409,6 +409,22 @@ def best_light(
     return max(top / bottom, 0.0) if bottom > 0.0 else 0.0
 
 
+@njit(cache=True, fastmath=SUMS, **COUNT_NO_REFERENCES)
+def change_by(
+    pixels: NDArray[np.int32],
+    values: NDArray[np.float64],
+    light: float,
+    residual: NDArray[np.float64],
+    weight: NDArray[np.float64],
+) -> float:
+    """Return what a particle of this light adds to chi-squared."""
+    change = 0.0
+    for k in range(pixels.size):
+        f = light * values[k, 0]
+        change += weight[pixels[k]] * f * (f - 2.0 * residual[pixels[k]])
+    return change
+
+
 @njit(cache=True, **COUNT_NO_REFERENCES)
 def add_light(pixels: NDArray[np.int32], values: NDArray[np.float64], light: float, image: NDArray[np.float64]) -> None:
     """Add light times the response to an image."""

@@ -103,10 +103,10 @@ def gone_on(task: Task, predicted: Predicted) -> State:
     spread = PREDICTED_SIGMAS * max(predicted.light_sigma, SURE_LIGHT)
     low, high = at[:, 3] * np.exp(-spread), at[:, 3] * np.exp(spread)
     for unexplained in HELD:
-        sweep(task, state, unexplained, 1)
+        sweep(task, state, unexplained, 1, SEARCH_GAIN)
         state = with_light(task, state, np.clip(state.particles[:, 3], low, high))
     for unexplained in FREE:
-        sweep(task, state, unexplained, 1)
+        sweep(task, state, unexplained, 1, SEARCH_GAIN)
     found = state.particles
     sure = (np.abs(found[:, :3] - at[:, :3]) <= PREDICTED_SIGMAS * sigma).all(axis=1)
     sure &= (found[:, 3] > low) & (found[:, 3] < high)

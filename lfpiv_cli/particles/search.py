@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.particles.active_set import DISTURBING, disturbance, overlaps_of
 from lfpiv_cli.particles.covariance import joint_covariance
 from lfpiv_cli.particles.fitting import add_all, judge, refine
 from lfpiv_cli.particles.least_squares import SMALLEST_GAIN, Observation, observation_of
@@ -167,9 +168,17 @@ def observed(task: Task, state: State, unexplained: float) -> Observation:
 
 
 def sweep(task: Task, state: State, unexplained: float, sweeps: int, enough: float = SMALLEST_GAIN) -> None:
-    """Refine all particles in place, the residual along with them; see `refine`."""
+    """Refine particles in place, the residual along with them; see `refine`.
+
+    The first sweep fits all, the others those whose last fit, or their neighbours' since, changed more than `enough`.
+    """
+    overlaps = overlaps_of(task.view, state.particles) if sweeps > 1 else None
+    active, disturbed = np.ones(len(state.particles), np.bool_), np.zeros(len(state.particles))
     for _ in range(sweeps):
-        refine(observed(task, state, unexplained), state.particles, enough)
+        gain = refine(observed(task, state, unexplained), state.particles, enough, active)
+        if overlaps is not None:
+            disturbed = np.where(active, 0.0, disturbed) + disturbance(overlaps, gain)
+            active = (gain > enough) | (disturbed > DISTURBING * enough)
 
 
 def merge(task: Task, state: State, apart: NDArray[np.bool_] | None = None) -> State:
