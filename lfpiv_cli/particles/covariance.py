@@ -132,14 +132,16 @@ def _slopes_of(
     for n in range(count):
         respond_all(observation.optics, particles[n : n + 1], responses)
         pixels, values = lit_by(responses, 0)
-        counts[n] = pixels.size
         for k in range(pixels.size):
-            root = np.sqrt(observation.weight[pixels[k]])
-            pixel[end + k] = pixels[k]
-            for unknown in range(3):
-                slope[end + k, unknown] = root * particles[n, 3] * values[k, 1 + unknown]
-            slope[end + k, 3] = root * values[k, 0]
-        end += pixels.size
+            # A pixel that is named again has no light.
+            if values[k, 0] > 0.0:
+                root = np.sqrt(observation.weight[pixels[k]])
+                pixel[end] = pixels[k]
+                for unknown in range(3):
+                    slope[end, unknown] = root * particles[n, 3] * values[k, 1 + unknown]
+                slope[end, 3] = root * values[k, 0]
+                counts[n] += 1
+                end += 1
     return counts, pixel[:end].copy(), slope[:end].copy()
 
 

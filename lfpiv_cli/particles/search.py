@@ -182,7 +182,7 @@ def sweep(task: Task, state: State, unexplained: float, sweeps: int, enough: flo
 
 
 def merge(task: Task, state: State, apart: NDArray[np.bool_] | None = None) -> State:
-    """Return the state with particles that have become one added up.
+    """Return the state with particles that have become one added up, and its residual computed anew.
 
     Two of those that are known to be `apart` (n,) stay two.
     """
@@ -196,7 +196,7 @@ def merge(task: Task, state: State, apart: NDArray[np.bool_] | None = None) -> S
             brighter, other = (a, b) if particles[a, 3] >= particles[b, 3] else (b, a)
             particles[brighter, 3] += particles[other, 3]
             merged[other] = True
-    return kept(task, with_light(task, state, particles[:, 3]), ~merged)
+    return rebuilt(task, state, particles[~merged])
 
 
 def prune(task: Task, state: State, claimed_share: float, unexplained: float) -> State:
