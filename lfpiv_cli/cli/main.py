@@ -13,6 +13,7 @@ import click
 from lfpiv_cli import __version__
 from lfpiv_cli.cli import (
     calibration,
+    exports,
     inspection,
     planning,
     reconstruction,
@@ -36,6 +37,7 @@ COMMANDS = (
     tracks.follow,
     inspection.info,
     inspection.plot,
+    exports.export,
     validation.validate,
     simulation.simulate,
 )
