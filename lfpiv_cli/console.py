@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import groupby
 from typing import Any
 
 import click
@@ -72,19 +73,23 @@ class Console:
             self.say(text)
 
     def summary(self, figures: Mapping[str, Any]) -> None:
-        """Print the figures of a command, one a line; those of several methods stand beside each other, in columns."""
-        heads = list(dict.fromkeys(head for value in figures.values() if _is_row(value) for head in value))
-        table = {"": heads} if heads else {}
-        for name, value in figures.items():
-            table[name] = [_readable(value.get(head)) for head in heads] if _is_row(value) else [_readable(value)]
-        rows = [cells for cells in table.values() if len(cells) == len(heads)]
-        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-        first = max([NAME_WIDTH, *map(len, table)])
-        for name, cells in table.items():
-            columns = (
-                [f"{cell:>{width}}" for cell, width in zip(cells, widths, strict=True)] if cells in rows else cells
-            )
-            self.say(f"{name:>{first}}  {'  '.join(columns)}")
+        """Print the figures of a command, one a line.
+
+        What there is for several things, as a figure with a value for each or under names like `recorded.ert.error`,
+        stands in a table.
+        """
+        blocks = _blocks(figures)
+        first = max([NAME_WIDTH, *(len(name) for block in blocks for name in block)])
+        for block in blocks:
+            heads = list(dict.fromkeys(head for value in block.values() if _is_row(value) for head in value))
+            table = {"": heads} if heads else {}
+            for name, value in block.items():
+                table[name] = [_readable(value.get(head)) for head in heads] if _is_row(value) else [_readable(value)]
+            rows = [name for name, cells in table.items() if not name or _is_row(block[name])]
+            widths = [max(map(len, column)) for column in zip(*(table[name] for name in rows), strict=True)]
+            for name, cells in table.items():
+                columns = map(str.rjust, cells, widths) if name in rows else cells
+                self.say(f"{name:>{first}}  {'  '.join(columns)}")
 
     @contextmanager
     def progress(self, total: int, label: str) -> Iterator[Callable[[int], None]]:
@@ -196,6 +201,32 @@ def _duration(seconds: float) -> str:
         return f"{seconds:.0f} s"
     minutes = round(seconds / 60.0)
     return f"{minutes} min" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"
+
+
+def _blocks(figures: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return figures in blocks, each with heads of its own: names with a point are what the figure is of, and which.
+
+    Where there are more figures than things they are of, each thing has a column.
+    """
+    blocks: list[dict[str, Any]] = []
+    for of, items in groupby(figures.items(), lambda item: item[0].rpartition(".")[0] if _is_number(item[1]) else ""):
+        if not of:
+            blocks.append(dict(items))
+            continue
+        row = {name.rpartition(".")[2]: value for name, value in items}
+        if blocks and all(_is_row(each) and list(each) == list(row) for each in blocks[-1].values()):
+            blocks[-1][of] = row
+        else:
+            blocks.append({of: row})
+    return [_turned(block) if all(map(_is_row, block.values())) else block for block in blocks]
+
+
+def _turned(block: dict[str, Any]) -> dict[str, Any]:
+    """Return a table with its longer side downwards."""
+    heads = list(next(iter(block.values()), {}))
+    if len(heads) <= len(block):
+        return block
+    return {head: {name: row.get(head) for name, row in block.items()} for head in heads}
 
 
 def _is_row(value: Any) -> bool:

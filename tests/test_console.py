@@ -145,6 +145,28 @@ def test_figures_of_several_methods_stand_in_columns(capsys) -> None:
     assert [line.split(maxsplit=1)[1] for line in capsys.readouterr().err.splitlines()] == ["2", "1, 2", "a x.tif"]
 
 
+def test_figures_of_several_things_stand_in_a_table_that_is_longer_than_wide(capsys) -> None:
+    Console().summary(
+        {"voxels": 25, "a.ssim": 0.9, "a.l1": 0.1, "b.ssim": 0.8, "b.l1": None, "c.ssim": 1.0, "c.l1": 0.0}
+    )
+    assert [line.split() for line in capsys.readouterr().err.splitlines()] == [
+        ["voxels", "25"],
+        ["ssim", "l1"],
+        ["a", "0.9", "0.1"],
+        ["b", "0.8", "unknown"],
+        ["c", "1", "0"],
+    ]
+    Console().summary({"ideal.ert.x": 1.0, "ideal.ert.y": 2.0, "ideal.ert.z": 3.0, "flow.slope": 4.0})
+    assert [line.split() for line in capsys.readouterr().err.splitlines()] == [
+        ["ideal.ert"],
+        ["x", "1"],
+        ["y", "2"],
+        ["z", "3"],
+        ["slope"],
+        ["flow", "4"],
+    ]
+
+
 def command_that(act: Any) -> click.Command:
     """Return a command with the common options whose body is `act`."""
 
