@@ -21,7 +21,7 @@ from lfpiv_cli.validation.methods import Measured
 from lfpiv_cli.validation.near_wall import near_wall
 from lfpiv_cli.validation.pictures import profile_at, slice_at
 
-DUCT = Duct(4.0, (0.0, 0.0, 0.0), "x")
+DUCT = Duct(4.0, (0.0, 0.0, 0.0), "x", 0.1082)
 GRID = Grid.centred((4, 10, 10), (0.4, 0.4, 0.4), (0.0, 0.0, 0.0))
 
 

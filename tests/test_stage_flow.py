@@ -7,11 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from lfpiv_cli.cli import cli
 from lfpiv_cli.errors import OutputExistsError, UsageError
 from lfpiv_cli.files.particles import Particles, write_particles
+from lfpiv_cli.files.vtkhdf import write_vectors
+from lfpiv_cli.flow.field import VectorField
+from lfpiv_cli.grid import Grid
+from lfpiv_cli.reference import Reference
 from lfpiv_cli.stages.validate_flow import _truth_of_particles
+from lfpiv_cli.synthetic.flows import shear
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 
@@ -31,6 +37,65 @@ def test_windows_beyond_the_light_have_no_truth_of_particles(tmp_path: Path) -> 
     write_particles(tmp_path / "true.npz", true, overwrite=False)
     centres = np.array([[0.5, 0.5, 0.5], [0.5, 0.5, 1.2]])
     assert _truth_of_particles(tmp_path / "true.npz", centres)[1].tolist() == [True, False]
+
+
+def true_particles(path: Path, rate_per_s: float) -> Path:
+    """Write particles of a shear along z: all over the volume of `vectors`."""
+    places = np.random.default_rng(3).uniform(-2.0, 2.0, (500, 3))
+    velocities = shear(rate_per_s, velocity_m_s=(0.12, 0.0, 0.0))(places)
+    write_particles(path, Particles(places, velocities, np.ones(500)), overwrite=True)
+    return path
+
+
+@pytest.fixture
+def vectors(tmp_path: Path) -> Path:
+    """The sample's flow, measured without an error."""
+    grid = Grid.centred((3, 4, 5), (0.5, 0.5, 0.5), (0.0, 0.0, 0.0))
+    velocity = shear(30.0, velocity_m_s=(0.12, 0.0, 0.0))(grid.centres_mm().reshape(-1, 3)).reshape(5, 4, 3, 3)
+    displacement, one = velocity * 1e-3 / 1e-4, np.ones((5, 4, 3))
+    flag = np.zeros((5, 4, 3), np.uint8)
+    field = VectorField(grid, displacement, displacement, one, one, one, flag, None, (0.1,) * 3, 1e-3, (8,) * 3)
+    write_vectors(tmp_path / "vectors.vtkhdf", field, Reference("focal_point", 0.0), provenance={}, overwrite=True)
+    return tmp_path / "vectors.vtkhdf"
+
+
+def judged(config: Path, vectors: Path, particles: Path, report: Path) -> dict:
+    run("validate", "flow", config, "--vectors", vectors, "--particles", particles, "-o", report, "--json")
+    return json.loads((report / "flow.json").read_text())
+
+
+def test_the_flow_that_the_config_names_is_the_truth_before_particles(vectors: Path, tmp_path: Path, capsys) -> None:
+    pytest.importorskip("matplotlib")
+    particles = true_particles(tmp_path / "true.npz", 30.0)
+    told = judged(CONFIGS / "sample.yaml", vectors, particles, tmp_path / "report")
+    assert told["truth"] == "analytic flow"
+    assert told["figures"]["rms_u_voxel"] < 1e-12
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["truth"] == "analytic flow"
+    assert printed["warnings"] == []
+    assert sorted(path.name for path in (tmp_path / "report").glob("*.png")) == [
+        "flow.png",
+        "flow_errors.png",
+        "flow_profiles.png",
+    ]
+
+
+def test_particles_are_the_truth_where_the_config_names_no_flow_or_another(
+    vectors: Path, tmp_path: Path, capsys
+) -> None:
+    pytest.importorskip("matplotlib")
+    particles = true_particles(tmp_path / "true.npz", 60.0)
+    told = judged(CONFIGS / "sample.yaml", vectors, particles, tmp_path / "other")
+    assert told["truth"] == "particles"
+    assert told["figures"]["rms_u_voxel"] > 0.1
+    (warning,) = json.loads(capsys.readouterr().out)["warnings"]
+    assert warning["code"] == "truth-contradicts"
+    sections = yaml.safe_load((CONFIGS / "sample.yaml").read_text())
+    del sections["simulation"]["flow"], sections["validation"]["flow"]
+    (tmp_path / "rig.yaml").write_text(yaml.safe_dump(sections))
+    told = judged(tmp_path / "rig.yaml", vectors, particles, tmp_path / "none")
+    assert told["truth"] == "particles"
+    assert json.loads(capsys.readouterr().out)["warnings"] == []
 
 
 @pytest.mark.slow

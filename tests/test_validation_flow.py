@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.flow.field import REJECTED, VALID, VectorField
 from lfpiv_cli.grid import Grid
+from lfpiv_cli.synthetic.flows import shear, square_duct
 from lfpiv_cli.validation.channel import Duct, table_4
 from lfpiv_cli.validation.flow import (
     compare,
@@ -165,7 +166,7 @@ def test_table_4_takes_the_paper_s_slices_of_a_duct() -> None:
     measured = truth * (1.0 + 0.01 * across[:, np.newaxis] + 0.02 * across[:, np.newaxis, np.newaxis])[..., np.newaxis]
     everywhere = np.ones(truth.shape[:3], dtype=np.bool_)
     field = replace(field_of(truth), grid=grid, displacement_voxel=measured * DT_S / (np.array(VOXEL_MM) * 1e-3))
-    duct = Duct(10.0, (0.0, 0.0, -1.0), "x")
+    duct = Duct(10.0, (0.0, 0.0, -1.0), "x", 0.1082)
     table = table_4(field, truth, everywhere, duct)
     assert table["overall"]["ours_percent"] == pytest.approx(0.0, abs=1e-9)
     for share in (0.3, 0.54, 0.78):
@@ -177,7 +178,18 @@ def test_table_4_takes_the_paper_s_slices_of_a_duct() -> None:
 
     panel = slices_figure({"measured": Measured(field, truth, everywhere)}, duct).axes[0]
     profile = 0.1 * (1.0 + 0.01 * across + 0.02 * -2.0)
-    np.testing.assert_allclose(panel.lines[1].get_ydata(), profile)
+    told = {line.get_label(): line for line in panel.lines}
+    np.testing.assert_allclose(told["measured"].get_ydata(), profile)
+    np.testing.assert_allclose(told["true, at the windows"].get_ydata(), 0.1)
+    assert "(paper 3.51 %)" in panel.get_title()
+    # An analytic flow is a line from wall to wall; another duct is not held against the paper's.
+    for other in (replace(duct, width_mm=8.0), replace(duct, mean_velocity_m_s=0.2)):
+        flow = square_duct(other.width_mm, 0.1, other.centre_mm)
+        panel = slices_figure({"measured": Measured(field, truth, everywhere, flow)}, other).axes[0]
+        assert panel.get_title() == f"z/D = 0.3\nmean error: measured {0.4 * other.width_mm:.2f} %"
+        line = next(line for line in panel.lines if line.get_label() == "true, analytic")
+        assert np.abs(line.get_ydata()[[0, -1]]).max() < 1e-6
+        assert line.get_xdata()[0] == -0.5 * other.width_mm
 
 
 def test_cumulative_distribution_meets_the_share(
@@ -226,21 +238,78 @@ def test_truth_needs_particles() -> None:
         truth_at_points(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((1, 3)))
 
 
-def test_picture_shows_a_field_with_misses(truth: NDArray[np.float64], inside: NDArray[np.bool_]) -> None:
-    pytest.importorskip("matplotlib")
-    from lfpiv_cli.validation.pictures import flow_figure
-
+@pytest.fixture
+def methods(truth: NDArray[np.float64], inside: NDArray[np.bool_]) -> dict[str, Measured]:
+    """One method that errs by a tenth and has missed a column of windows, and a perfect one."""
     field = field_of(truth * 1.1)
     flag = field.flag.copy()
     flag[:, 0] = REJECTED
-    methods = {"volumes": replace(field, flag=flag), "particles": field_of(truth)}
-    figure = flow_figure({name: Measured(field, truth, inside) for name, field in methods.items()})
-    figure.canvas.draw()
-    for line, scale in zip(figure.axes[6].lines[:3], (1.0, 1.1, 1.0), strict=True):
-        np.testing.assert_allclose(line.get_ydata(), scale * truth[0, 1, :, 1])
-    assert all(axes.get_xlabel() and axes.get_ylabel() for axes in figure.axes[:9])
-    # Two methods' errors are on one scale.
-    assert figure.axes[1].images[0].get_clim() == figure.axes[4].images[0].get_clim()
+    fields = {"volumes": replace(field, flag=flag), "particles": field_of(truth)}
+    return {name: Measured(field, truth, inside) for name, field in fields.items()}
+
+
+def test_the_picture_shows_truth_and_methods_in_three_planes_on_one_scale(
+    methods: dict[str, Measured], truth: NDArray[np.float64], inside: NDArray[np.bool_]
+) -> None:
+    pytest.importorskip("matplotlib")
+    from lfpiv_cli.validation.pictures import flow_figure
+
+    panels = np.array(flow_figure(methods).axes[:9]).reshape(3, 3)
+    assert [row[0].get_title().split("\n")[0] for row in panels] == ["true: w", "volumes: w", "particles: w"]
+    assert len({axes.images[0].get_clim() for axes in panels.ravel()}) == 1
+    assert all(axes.get_xlabel() and axes.get_ylabel() for axes in panels.ravel())
+    shown = np.where(inside, truth[..., 1], np.nan)[:, SHAPE[1] // 2]
+    np.testing.assert_allclose(np.ma.filled(panels[0, 1].images[0].get_array(), np.nan), shown)
+    np.testing.assert_allclose(np.ma.filled(panels[1, 1].images[0].get_array(), np.nan), 1.1 * shown)
+
+
+def test_errors_of_methods_are_on_one_scale_a_component(methods: dict[str, Measured]) -> None:
+    pytest.importorskip("matplotlib")
+    from lfpiv_cli.validation.pictures import errors_figure
+
+    figure = errors_figure(methods)
+    panels = np.array([axes for axes in figure.axes if axes.images and axes.get_title()]).reshape(3, 2, 3)
+    assert panels[1, 0, 0].get_title().startswith("volumes: error of v")
+    for rows in panels:
+        assert len({axes.images[0].get_clim() for axes in rows.ravel()}) == 1
+    error = methods["volumes"].field.velocity - methods["volumes"].truth
+    shown = np.ma.filled(panels[1, 0, 0].images[0].get_array(), np.nan)
+    # 1 mm/s is told as such
+    np.testing.assert_allclose(
+        shown[1:], 1e3 * np.where(methods["volumes"].inside[..., np.newaxis], error, np.nan)[SHAPE[0] // 2, 1:, :, 1]
+    )
+    assert np.isnan(shown[0]).all()
+
+
+def test_profiles_are_over_the_windows_that_all_have_found(
+    methods: dict[str, Measured], truth: NDArray[np.float64]
+) -> None:
+    pytest.importorskip("matplotlib")
+    from lfpiv_cli.validation.pictures import profiles_figure
+
+    panel = np.array(profiles_figure(methods).axes[:9]).reshape(3, 3)[1, 0]
+    told = {line.get_label(): line.get_ydata() for line in panel.lines}
+    for name, scale in (("true, at the windows", 1.0), ("volumes", 1.1), ("particles", 1.0)):
+        np.testing.assert_allclose(told[name], scale * truth[0, 1, :, 1])
+    assert "true, analytic" not in told
+
+
+def test_an_analytic_flow_is_a_line_beyond_the_outer_windows(inside: NDArray[np.bool_]) -> None:
+    pytest.importorskip("matplotlib")
+    from lfpiv_cli.validation.pictures import profiles_figure
+
+    flow = shear(100.0, "x", "z")
+    field = field_of(np.zeros((*SHAPE, 3)))
+    centres = field.grid.centres_mm()
+    truth = flow(centres.reshape(-1, 3)).reshape(centres.shape)
+    everywhere = np.ones(SHAPE, bool)
+    figure = profiles_figure({"measured": Measured(field_of(truth), truth, everywhere, flow)})
+    along_z, along_v = figure.axes[2], figure.axes[5]
+    line = next(line for line in along_z.lines if line.get_label() == "true, analytic")
+    low, high = field.grid.bounds_mm(2)
+    np.testing.assert_allclose(line.get_ydata()[[0, -1]], [0.1 * low, 0.1 * high], rtol=1e-9)
+    # What does not flow is not blown up: at least 2 % of the largest speed is shown.
+    assert along_v.get_ylim()[1] >= 0.02 * np.abs(truth).max()
 
 
 def test_the_method_with_the_lower_error_is_named(truth: NDArray[np.float64], inside: NDArray[np.bool_]) -> None:

@@ -29,7 +29,11 @@ NEEDED = {"volume": ("volume", "particles", "frame")}
 @click.argument("config", type=FILE, required=False)
 @click.option("--vectors", type=FILE, help="flow: vectors to judge, not those of a simulation.")
 @click.option("--volume", type=FILE, help="volume: volume to judge.")
-@click.option("--particles", type=FILE, help="volume, flow: true particles (.npz) to judge by; flow needs none.")
+@click.option(
+    "--particles",
+    type=FILE,
+    help="volume, flow: true particles (.npz) to judge by; a flow that the config names comes first.",
+)
 @click.option("--frame", type=click.Choice(names_in(Moment)), help="volume: when in the pair it was taken.")
 @click.option("--quick", is_flag=True, help="paper: reduced sizes, at most ten minutes on two cores.")
 @click.option("--only", type=click.Choice(names_in(PaperPart)), multiple=True, help="paper: one part; repeatable.")

@@ -79,9 +79,10 @@ def image_figure(image: NDArray[np.float64], places: NDArray[np.float64], z_mm: 
     figure = _image_canvas(image)
     (axes,) = figure.axes
     axes.imshow(image, cmap="gray", vmin=0.0, vmax=_bright(image), interpolation="nearest")
-    rings = axes.scatter(places[:, 0], places[:, 1], c=z_mm, s=14, cmap=SEQUENTIAL, marker="o", linewidths=0.8)
-    rings.set_facecolor("none")
-    figure.colorbar(rings, ax=axes, label="depth z (mm)", shrink=0.7)
+    dots = axes.scatter(places[:, 0], places[:, 1], c=z_mm, s=12, cmap=SEQUENTIAL, edgecolors="black", linewidths=0.4)
+    rows, columns = image.shape
+    axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5))
+    figure.colorbar(dots, ax=axes, label="depth z (mm)", shrink=0.7)
     axes.set_title(f"image and the places of {len(z_mm)} particles (rays through the middle of the lens)")
     return figure
 

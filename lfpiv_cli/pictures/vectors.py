@@ -5,7 +5,7 @@ Velocities are drawn in m/s or mm/s, whichever reads better; fields without a ti
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.flow.derived import derived_fields
 from lfpiv_cli.flow.field import MASKED, MM_TO_M, REJECTED, REPLACED, SECOND_PEAK, VALID, VectorField
+from lfpiv_cli.grid import Grid
 from lfpiv_cli.pictures.planes import PLANES, Plane, draw_maps, plane_panels
 from lfpiv_cli.pictures.style import (
     AXIS_NAMES,
@@ -61,54 +62,66 @@ class Shown:
 
 def shown(field: VectorField) -> Shown:
     """Return the velocities in a unit that reads well; displacements where the time is not known."""
-    values, scale, unit = field.velocity, np.ones(3), "voxel"
     if field.dt_s is None:
-        values = np.where((field.flag >= REJECTED)[..., np.newaxis], np.nan, field.displacement_voxel)
+        values, scale, unit = field.displacement_voxel, np.ones(3), "voxel"
+        values = np.where((field.flag >= REJECTED)[..., np.newaxis], np.nan, values)
     else:
-        scale, unit = np.asarray(field.voxel_mm) * MM_TO_M / field.dt_s, "m/s"
-        if np.isfinite(values).any() and symmetric_limit(values) < SLOW_M_S:
-            values, scale, unit = values / MM_TO_M, scale / MM_TO_M, "mm/s"
+        factor, unit = speed_unit(field.velocity)
+        values, scale = factor * field.velocity, factor * np.asarray(field.voxel_mm) * MM_TO_M / field.dt_s
     known = np.isfinite(values).all(axis=-1, keepdims=True)
     sigma = field.uncertainty_voxel
     return Shown(values, None if sigma is None else np.where(known, sigma * scale, np.nan), unit)
 
 
-@styled
 def planes_figure(field: VectorField) -> Figure:
-    """Return the vectors in the three middle planes: arrows in the plane, the component across it as colour.
-
-    Arrows and colours have one scale in all three. Crosses are missing vectors.
-    """
+    """Return the vectors in the three middle planes, see `compared_figure`."""
     told = shown(field)
-    figure, axes = plane_panels(field.grid)
-    across = [told.values[..., plane.normal] for plane in PLANES]
-    titles = [COMPONENT_NAMES[plane.normal] for plane in PLANES]
-    image = draw_maps(axes[0], field.grid, across, titles, **signed_scale(across))
-    longest = symmetric_limit(*(plane.of(told.values)[..., [plane.right, plane.up]] for plane in PLANES))
-    step = [-(-n // MOST_ARROWS) for n in field.grid.shape_xyz]
-    spacing = max(spacing * n for spacing, n in zip(field.grid.spacing_mm, step, strict=True))
-    for panel, plane in zip(axes[0], PLANES, strict=True):
-        arrows = _draw_arrows(panel, field, plane, told, step, longest / (ARROW_REACH * spacing))
+    return compared_figure(field.grid, {"": told.values}, told.unit)
+
+
+@styled
+def compared_figure(grid: Grid, fields: Mapping[str, NDArray[np.float64]], unit: str) -> Figure:
+    """Return vectors (nz, ny, nx, 3) in the three middle planes, a row for each field, by its name.
+
+    Arrows show the components in the plane and colour the one across it; both have one scale in all. Crosses are
+    missing vectors.
+    """
+    figure, axes = plane_panels(grid, rows=len(fields))
+    across = {name: [values[..., plane.normal] for plane in PLANES] for name, values in fields.items()}
+    scale = signed_scale(*across.values())
+    longest = symmetric_limit(
+        *(plane.of(values)[..., [plane.right, plane.up]] for values in fields.values() for plane in PLANES)
+    )
+    step = [-(-n // MOST_ARROWS) for n in grid.shape_xyz]
+    spacing = max(spacing * n for spacing, n in zip(grid.spacing_mm, step, strict=True))
+    for row, (name, values) in zip(axes, fields.items(), strict=True):
+        components = [COMPONENT_NAMES[plane.normal] for plane in PLANES]
+        titles = [f"{name}: {component}" if name else component for component in components]
+        image = draw_maps(row, grid, across[name], titles, **scale)
+        for panel, plane in zip(row, PLANES, strict=True):
+            arrows = _draw_arrows(panel, grid, plane, values, (step, longest / (ARROW_REACH * spacing)))
     length = float(f"{0.7 * longest:.1g}")
-    axes[0, 0].quiverkey(arrows, 0.96, 0.06, length, f"{length:g} {told.unit}", coordinates="figure", labelpos="W")
-    figure.colorbar(image, ax=axes[0].tolist(), label=f"component across the plane ({told.unit})", shrink=0.75)
+    place = 1.0 - 0.25 / figure.get_figheight()
+    axes[0, 0].quiverkey(arrows, 0.96, place, length, f"{length:g} {unit}", coordinates="figure", labelpos="W")
+    figure.colorbar(image, ax=axes.ravel().tolist(), label=f"component across the plane ({unit})", shrink=0.75)
     return figure
 
 
 def _draw_arrows(
-    axes: Axes, field: VectorField, plane: Plane, told: Shown, step: Sequence[int], speed_per_mm: float
+    axes: Axes, grid: Grid, plane: Plane, values: NDArray[np.float64], arrows: tuple[Sequence[int], float]
 ) -> Any:
-    """Draw a plane's arrows, `step` vectors apart along x, y, z, so long that a mm stands for `speed_per_mm`."""
+    """Draw a plane's arrows, so many vectors apart along x, y, z, and so long that a mm stands for a speed."""
+    step, speed_per_mm = arrows
     chosen = (slice(None, None, step[plane.up]), slice(None, None, step[plane.right]))
-    values = plane.of(told.values)[chosen]
-    right, up = np.meshgrid(field.grid.axis_mm(plane.right)[chosen[1]], field.grid.axis_mm(plane.up)[chosen[0]])
-    known = np.isfinite(values).all(axis=-1)
+    of_plane = plane.of(values)[chosen]
+    right, up = np.meshgrid(grid.axis_mm(plane.right)[chosen[1]], grid.axis_mm(plane.up)[chosen[0]])
+    known = np.isfinite(of_plane).all(axis=-1)
     axes.plot(right[~known], up[~known], "x", color=GREY, markersize=3)
     return axes.quiver(
         right[known],
         up[known],
-        values[known, plane.right],
-        values[known, plane.up],
+        of_plane[known, plane.right],
+        of_plane[known, plane.up],
         angles="xy",
         scale_units="xy",
         scale=speed_per_mm,
@@ -116,6 +129,12 @@ def _draw_arrows(
         width=ARROW_WIDTH,
         pivot="mid",
     )
+
+
+def speed_unit(*velocities_m_s: NDArray[np.float64]) -> tuple[float, str]:
+    """Return the unit in which velocities read well: what m/s are multiplied by, and its name."""
+    known = any(np.isfinite(each).any() for each in velocities_m_s)
+    return (1.0 / MM_TO_M, "mm/s") if known and symmetric_limit(*velocities_m_s) < SLOW_M_S else (1.0, "m/s")
 
 
 @styled
@@ -131,9 +150,9 @@ def components_figure(field: VectorField) -> Figure:
     return figure
 
 
-def signed_scale(maps: Sequence[NDArray[np.float64]]) -> dict[str, Any]:
-    """Return the colours of the middle planes of maps that have a sign, symmetric about zero."""
-    limit = symmetric_limit(*(plane.of(values) for plane, values in zip(PLANES, maps, strict=True)))
+def signed_scale(*rows: Sequence[NDArray[np.float64]]) -> dict[str, Any]:
+    """Return the colours of rows of three maps with a sign, symmetric about zero: by what the middle planes show."""
+    limit = symmetric_limit(*(plane.of(values) for maps in rows for plane, values in zip(PLANES, maps, strict=True)))
     return {"cmap": DIVERGING, "vmin": -limit, "vmax": limit}
 
 
@@ -286,8 +305,7 @@ def gradients_figure(field: VectorField) -> Figure:
     across = [derived.vorticity[..., plane.normal] for plane in PLANES]
     names = [f"vorticity along {AXIS_NAMES[plane.normal]}" for plane in PLANES]
     # One scale for both: the divergence, which should be zero, tells how much of the vorticity is noise.
-    limit = max(signed_scale(maps)["vmax"] for maps in (across, [derived.divergence] * 3))
-    scale = {"cmap": DIVERGING, "vmin": -limit, "vmax": limit}
+    scale = signed_scale(across, [derived.divergence] * 3)
     draw_maps(axes[0], field.grid, across, names, **scale)
     image = draw_maps(axes[1], field.grid, [derived.divergence] * 3, ["divergence"] * 3, **scale)
     figure.colorbar(image, ax=axes.ravel().tolist(), label="1/s", shrink=0.7)

@@ -6,6 +6,7 @@ x/D. Its flow runs along its y; ours along x or y, so that its x is our other la
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -22,15 +23,25 @@ PAPER_SLICES = {
     "x/D": {0.24: (7.28, 10.43), 0.48: (2.06, 4.00), 0.72: (12.01, 12.37)},
 }
 PAPER_OVERALL = (6.25, 6.77)
+# The paper's duct: its width, and its mean velocity, which its 40 L/h through 1 cm2 meet to 3 %.
+PAPER_WIDTH_MM, PAPER_MEAN_VELOCITY_M_S, VELOCITY_TOLERANCE = 10.0, 0.1082, 0.03
 
 
 @dataclass(frozen=True)
 class Duct:
-    """A square duct: its width, its centre in the vectors' coordinates, and the axis that the flow follows."""
+    """A square duct: its width, its centre in the vectors' coordinates, the axis that the flow follows, its mean."""
 
     width_mm: float
     centre_mm: tuple[float, float, float]
     axis: Literal["x", "y"]
+    mean_velocity_m_s: float
+
+    @property
+    def is_the_papers(self) -> bool:
+        """Whether the paper's figures are of this duct."""
+        return math.isclose(self.width_mm, PAPER_WIDTH_MM) and math.isclose(
+            abs(self.mean_velocity_m_s), PAPER_MEAN_VELOCITY_M_S, rel_tol=VELOCITY_TOLERANCE
+        )
 
     @property
     def across(self) -> dict[str, int]:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.flow.field import VectorField
+from lfpiv_cli.synthetic.flows import Flow
 from lfpiv_cli.validation.channel import Duct, table_4, worst_slice
 from lfpiv_cli.validation.flow import flow_figures
 
@@ -28,11 +29,13 @@ class Measured:
     ----------
     truth : (nz, ny, nx, 3) m/s at the window centres
     inside : (nz, ny, nx) True for the windows that are judged
+    flow : the analytic flow that the truth is of, in the field's coordinates; None where it is of particles
     """
 
     field: VectorField
     truth: NDArray[np.float64]
     inside: NDArray[np.bool_]
+    flow: Flow | None = None
 
     def figures(self, duct: Duct | None) -> dict[str, Any]:
         """Return the figures of `flow_figures`, and Table 4's where the flow is a duct's."""

@@ -1,88 +1,185 @@
-"""Pictures of a measured flow beside the true one.
+"""Pictures of a measured flow beside the true one, all components of it in three planes.
 
-matplotlib is imported inside: it is an optional extra, and slow to load.
+What is compared has one scale. The truth is a line where the flow is analytic; of true particles only its values at
+the windows are known, as fits to the nearest ones, and are drawn as such.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import cycle
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lfpiv_cli.flow.field import VectorField
+from lfpiv_cli.pictures.planes import draw_maps, plane_panels
+from lfpiv_cli.pictures.style import (
+    AXIS_NAMES,
+    BLACK,
+    COLOURS,
+    COMPONENT_NAMES,
+    GREY,
+    MARKERS,
+    new_figure,
+    styled,
+    symmetric_limit,
+)
+from lfpiv_cli.pictures.vectors import compared_figure, mean_of_known, signed_scale, speed_unit
+from lfpiv_cli.synthetic.flows import Flow
 from lfpiv_cli.validation.channel import PAPER_SLICES, Duct, table_4
-from lfpiv_cli.validation.flow import Comparison, compare, cumulative_distribution
+from lfpiv_cli.validation.flow import TOLERANCE, compare, cumulative_distribution
 from lfpiv_cli.validation.methods import Measured
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-COMPONENT_NAMES = ("u", "v", "w")
-# Of the truth, and of the methods in their order.
-STYLES = ("-", "o", "x")
+# Profiles show at least this share of the largest true speed to both sides of zero: less is noise of no account.
+LEAST_RANGE = 0.02
+# Points of the lines of an analytic flow.
+LINE_POINTS = 101
 
 
 def flow_figure(methods: Mapping[str, Measured]) -> Figure:
-    """Return a picture of flows measured on one grid, at least one of them.
+    """Return the true vectors and those of each method, at least one, in three middle planes on one scale.
 
-    A row for each: vectors and errors in the mid plane (errors on one scale), cumulative distribution; below them the
-    profiles of all.
+    The fields have one grid; what is not judged is left out.
     """
-    from matplotlib.figure import Figure
+    first = next(iter(methods.values()))
+    fields = {"true": first.truth} | {name: m.field.velocity for name, m in methods.items()}
+    factor, unit = speed_unit(_judged(first, first.truth))
+    rows = {name: factor * _judged(methods.get(name, first), values) for name, values in fields.items()}
+    return compared_figure(first.field.grid, rows, unit)
 
-    pairs = {name: compare(m.field, m.truth, m.inside) for name, m in methods.items()}
-    direction = next(iter(pairs.values())).direction
-    main = int(np.argmax(np.abs(direction))) if direction is not None else 0
-    errors = {name: _mid_plane_error(m, main) for name, m in methods.items()}
-    found = np.concatenate([np.abs(error[np.isfinite(error)]) for error in errors.values()])
-    limit = float(found.max()) if found.size and found.max() > 0.0 else 1.0
-    figure = Figure(figsize=(12.0, 3.75 * (len(methods) + 1)), layout="constrained")
-    axes = figure.subplots(len(methods) + 1, 3)
-    for row, (name, m) in zip(axes, methods.items(), strict=False):
-        _draw_plane(row[0], m.field, main, name)
-        _draw_error(row[1], m.field, errors[name], limit, main, name)
-        _draw_cumulative(row[2], pairs[name], name)
-    for axis in range(3):
-        _draw_profile(axes[-1, axis], methods, axis, main)
+
+def _judged(measured: Measured, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return vectors where they are judged, else NaN."""
+    return np.where(measured.inside[..., np.newaxis], values, np.nan)
+
+
+@styled
+def errors_figure(methods: Mapping[str, Measured]) -> Figure:
+    """Return measured less true velocities in three middle planes: rows of methods, on one scale a component."""
+    errors = {name: _judged(m, m.field.velocity - m.truth) for name, m in methods.items()}
+    factor, unit = speed_unit(*errors.values())
+    grid = next(iter(methods.values())).field.grid
+    figure, axes = plane_panels(grid, rows=3 * len(methods))
+    for component, rows in enumerate(axes.reshape(3, len(methods), 3)):
+        maps = {name: [factor * error[..., component]] * 3 for name, error in errors.items()}
+        scale = signed_scale(*maps.values())
+        for row, (name, values) in zip(rows, maps.items(), strict=True):
+            image = draw_maps(row, grid, values, [f"{name}: error of {COMPONENT_NAMES[component]}"] * 3, **scale)
+        label = f"{COMPONENT_NAMES[component]}, measured less true ({unit})"
+        figure.colorbar(image, ax=rows.ravel().tolist(), label=label)
     return figure
 
 
-def slices_figure(methods: Mapping[str, Measured], duct: Duct) -> Figure:
-    """Return the paper's six slices: streamwise profiles across each (Fig. 16), and their errors beside Table 4's.
+@styled
+def profiles_figure(methods: Mapping[str, Measured]) -> Figure:
+    """Return means of each component over the planes across each axis, and how many vectors err by how much.
 
-    Profiles are means along the flow, over the planes of windows on both sides of a slice.
+    Means are over the windows that all methods have found; the true ones over the same.
     """
-    from matplotlib.figure import Figure
+    first = next(iter(methods.values()))
+    factor, unit = speed_unit(_judged(first, first.truth))
+    figure = new_figure(11.0, 11.0)
+    axes = figure.subplots(4, 3, sharey="row")
+    least = LEAST_RANGE * factor * symmetric_limit(_judged(first, first.truth))
+    for component, row in enumerate(axes[:3]):
+        for axis, panel in enumerate(row):
+            _draw_profile(panel, methods, axis, component, factor)
+            panel.set(
+                xlabel=f"{AXIS_NAMES[axis]} (mm)", ylabel=f"{COMPONENT_NAMES[component]} ({unit}), mean over the plane"
+            )
+        low, high = row[0].get_ylim()
+        row[0].set_ylim(min(low, -least), max(high, least))
+    shares = {name: cumulative_distribution(compare(m.field, m.truth, m.inside)) for name, m in methods.items()}
+    for panel, key, what in zip(
+        axes[3], ("streamwise_share", "vector_share"), ("along the mean flow", "of the whole vector"), strict=False
+    ):
+        for (name, found), colour in zip(shares.items(), cycle(COLOURS), strict=False):
+            if found[key] is not None:
+                panel.plot(found["relative_error"], found[key], color=colour, label=name)
+        panel.axvline(TOLERANCE, color=GREY, linewidth=0.8)
+        panel.set(xlabel=f"relative error {what}", ylabel="share of the vectors", xlim=(0.0, 1.0), ylim=(0.0, 1.01))
+    axes[3, 2].set_axis_off()
+    axes[3, 2].legend(*axes[0, 0].get_legend_handles_labels(), loc="center", title="in all pictures")
+    return figure
 
-    figure = Figure(figsize=(12.0, 7.0), layout="constrained")
-    axes = figure.subplots(2, 3)
-    tables = {name: table_4(m.field, m.truth, m.inside, duct) for name, m in methods.items()}
-    main = "xyz".index(duct.axis)
+
+def _draw_profile(axes: Axes, methods: Mapping[str, Measured], axis: int, component: int, factor: float) -> None:
+    """Draw the means over planes across an axis, over the windows that all methods have found."""
+    others = tuple(k for k in range(3) if k != 2 - axis)
     first = next(iter(methods.values()))
     grid = first.field.grid
-    curves = {"true": first.truth} | {
-        name: np.where(m.inside[..., np.newaxis], m.field.velocity, np.nan) for name, m in methods.items()
-    }
+    judged = np.all([m.inside & np.isfinite(m.field.velocity).all(axis=-1) for m in methods.values()], axis=0)
+    axes.axhline(0.0, color=GREY, linewidth=0.8)
+    if first.flow is not None:
+        places = np.linspace(*grid.bounds_mm(axis), LINE_POINTS)
+        planes = _on_planes(first.flow, grid.centres_mm()[first.inside], places, axis)
+        axes.plot(places, factor * planes[..., component].mean(axis=1), color=BLACK, label="true, analytic")
+    curves = {"true, at the windows": first.truth} | {name: m.field.velocity for name, m in methods.items()}
+    styles = zip((BLACK, *COLOURS), ("+", *MARKERS), strict=True)
+    for (label, values), (colour, marker) in zip(curves.items(), styles, strict=False):
+        mean = mean_of_known(np.where(judged, values[..., component], np.nan), others)
+        axes.plot(grid.axis_mm(axis), factor * mean, marker, color=colour, markerfacecolor="none", label=label)
+
+
+def _on_planes(
+    flow: Flow, points_mm: NDArray[np.float64], places_mm: NDArray[np.float64], axis: int
+) -> NDArray[np.float64]:
+    """Return a flow in m/s, (places, m, 3), on planes across an axis, at the lateral places of points (n, 3)."""
+    lateral = np.unique(np.delete(points_mm, axis, axis=1), axis=0)
+    points = np.insert(np.tile(lateral, (places_mm.size, 1)), axis, np.repeat(places_mm, len(lateral)), axis=1)
+    return flow(points).reshape(places_mm.size, len(lateral), 3)
+
+
+@styled
+def slices_figure(methods: Mapping[str, Measured], duct: Duct) -> Figure:
+    """Return streamwise profiles across six slices of a duct, those of the paper's Fig. 16, and their errors.
+
+    Profiles are means along the flow, over the planes of windows on both sides of a slice. The paper's errors (Table 4)
+    stand beside ours only where the duct is the paper's.
+    """
+    figure = new_figure(12.0, 7.0)
+    axes = figure.subplots(2, 3)
+    tables = {name: table_4(m.field, m.truth, m.inside, duct) for name, m in methods.items()}
+    main = AXIS_NAMES.index(duct.axis)
     for row, (name, axis) in zip(axes, duct.across.items(), strict=True):
-        other = 3 - axis - main
         for panel, share in zip(row, PAPER_SLICES[name], strict=True):
-            position = duct.position_mm(axis, share)
-            for (label, values), style in zip(curves.items(), STYLES, strict=False):
-                profile = profile_at(values[..., main], grid.axis_mm(axis), position, axis, main)
-                panel.plot(grid.axis_mm(other), profile, style, markersize=4, label=label)
+            _draw_slice(panel, methods, duct, axis, duct.position_mm(axis, share))
             rows = {method: table[f"{name} {share}"] for method, table in tables.items()}
             told = [_told(method, errors["ours_percent"]) for method, errors in rows.items()]
             paper = next(iter(rows.values()))["paper_ert_percent"]
+            beside = f" (paper {paper:.2f} %)" if duct.is_the_papers else ""
+            other = 3 - axis - main
             panel.set(
-                title=f"{name} = {share} (paper {paper:.2f} %)\n{', '.join(told)}",
-                xlabel=f"{'xyz'[other]} (mm)",
+                title=f"{name} = {share}{beside}\nmean error: {', '.join(told)}",
+                xlabel=f"{AXIS_NAMES[other]} (mm)",
                 ylabel=f"{COMPONENT_NAMES[main]} (m/s)",
             )
-            panel.legend()
+    axes[0, 0].legend()
     return figure
+
+
+def _draw_slice(axes: Axes, methods: Mapping[str, Measured], duct: Duct, axis: int, position: float) -> None:
+    """Draw profiles along what is left of a slice across an axis: the true one as far as the walls."""
+    main = AXIS_NAMES.index(duct.axis)
+    other = 3 - axis - main
+    first = next(iter(methods.values()))
+    grid = first.field.grid
+    axes.axhline(0.0, color=GREY, linewidth=0.8)
+    if first.flow is not None:
+        places = np.linspace(duct.position_mm(other, 0.0), duct.position_mm(other, 1.0), LINE_POINTS)
+        points = np.tile(duct.centre_mm, (LINE_POINTS, 1))
+        points[:, axis], points[:, other] = position, places
+        axes.plot(places, first.flow(points)[:, main], color=BLACK, label="true, analytic")
+    curves = {"true, at the windows": _judged(first, first.truth)} if first.flow is None else {}
+    curves |= {name: _judged(m, m.field.velocity) for name, m in methods.items()}
+    for (label, values), colour, marker in zip(curves.items(), COLOURS, MARKERS, strict=False):
+        profile = profile_at(values[..., main], grid.axis_mm(axis), position, axis, main)
+        axes.plot(grid.axis_mm(other), profile, marker, color=colour, markerfacecolor="none", label=label)
 
 
 def _told(method: str, percent: float | None) -> str:
@@ -112,72 +209,3 @@ def slice_at(
     high = min(low + 1, places.size - 1)
     planes = np.moveaxis(values, 2 - axis, 0)
     return np.asarray((1.0 - (at - low)) * planes[low] + (at - low) * planes[high])
-
-
-def _mid_plane(values: NDArray) -> NDArray:
-    """Return the middle x-y plane of an array [z, y, x]."""
-    return values[values.shape[0] // 2]
-
-
-def _draw_plane(axes: Axes, field: VectorField, main: int, name: str) -> None:
-    """Draw the measured vectors of the mid plane, coloured by the main component."""
-    velocity = _mid_plane(field.velocity)
-    x, y = np.meshgrid(field.grid.axis_mm(0), field.grid.axis_mm(1))
-    shown = np.isfinite(velocity).all(axis=-1)
-    if shown.any():
-        u, v = velocity[shown, 0], velocity[shown, 1]
-        arrows = axes.quiver(x[shown], y[shown], u, v, velocity[shown, main], angles="xy")
-        axes.figure.colorbar(arrows, ax=axes, label=f"{COMPONENT_NAMES[main]} (m/s)")
-    _label_plane(axes, field, name)
-
-
-def _mid_plane_error(measured: Measured, main: int) -> NDArray[np.float64]:
-    """Return measured less true main component in the mid plane, m/s; NaN where missing or outside."""
-    error = _mid_plane(measured.field.velocity - measured.truth)[..., main]
-    return np.asarray(np.where(_mid_plane(measured.inside), error, np.nan))
-
-
-def _draw_error(axes: Axes, field: VectorField, error: NDArray[np.float64], limit: float, main: int, name: str) -> None:
-    """Draw errors of the main component in the mid plane, from -limit to limit; blank where unknown."""
-    x_low, x_high = field.grid.bounds_mm(0)
-    y_low, y_high = field.grid.bounds_mm(1)
-    image = axes.imshow(
-        error, origin="lower", extent=(x_low, x_high, y_low, y_high), cmap="RdBu_r", vmin=-limit, vmax=limit
-    )
-    axes.figure.colorbar(image, ax=axes, label=f"{COMPONENT_NAMES[main]} measured - true (m/s)")
-    _label_plane(axes, field, f"error of {name}")
-
-
-def _label_plane(axes: Axes, field: VectorField, title: str) -> None:
-    """Name the axes of a mid-plane picture."""
-    depth = field.grid.axis_mm(2)[field.grid.shape_xyz[2] // 2]
-    axes.set(xlabel="x (mm)", ylabel="y (mm)", title=f"{title}, z = {depth:.2f} mm", aspect="equal")
-
-
-def _draw_cumulative(axes: Axes, pairs: Comparison, name: str) -> None:
-    """Draw the share of vectors over their relative error."""
-    shares = cumulative_distribution(pairs)
-    for share, label in (("streamwise_share", "streamwise"), ("vector_share", "whole vector")):
-        if shares[share] is not None:
-            axes.plot(shares["relative_error"], shares[share], label=label)
-    axes.axvline(0.25, color="0.7", linewidth=0.8)
-    axes.set(xlabel="relative error", ylabel="share of vectors", title=f"{name}, cumulative", ylim=(0.0, 1.0))
-    axes.legend()
-
-
-def _draw_profile(axes: Axes, methods: Mapping[str, Measured], axis: int, main: int) -> None:
-    """Draw the means over planes across an axis: the main component, over the windows that all methods have found."""
-    others = tuple(k for k in range(3) if k != 2 - axis)
-    first = next(iter(methods.values()))
-    curves = {"true": first.truth} | {name: m.field.velocity for name, m in methods.items()}
-    judged = np.all([m.inside & np.isfinite(m.field.velocity).all(axis=-1) for m in methods.values()], axis=0)
-    count = judged.sum(axis=others)
-    for (label, values), style in zip(curves.items(), STYLES, strict=False):
-        total = np.where(judged, values[..., main], 0.0).sum(axis=others)
-        mean = np.full(count.shape, np.nan)
-        np.divide(total, count, out=mean, where=count > 0)
-        axes.plot(first.field.grid.axis_mm(axis), mean, style, markersize=4, label=label)
-    # Zero belongs in the picture: else the scale would blow up noise of a per mille.
-    axes.axhline(0.0, color="0.7", linewidth=0.8)
-    axes.set(xlabel=f"{'xyz'[axis]} (mm)", ylabel=f"{COMPONENT_NAMES[main]} (m/s), mean over the plane")
-    axes.legend()
