@@ -203,6 +203,19 @@ def test_the_summary_shows_residuals_and_dots_without_the_pictures(plain: Calibr
     assert [axes.texts[0].get_text() for axes in bare if axes.texts] == ["transmission not measured", "no board"]
 
 
+def test_each_view_is_named_by_its_point_and_none_is_black(plain: Calibration, rig: Rig) -> None:
+    pytest.importorskip("matplotlib")
+    from lfpiv_cli.pictures.views import views_figure
+
+    panels = views_figure(plain, rig.camera, rig.media, white_image()).axes
+    views = [axes for axes in panels if axes.get_title().startswith("X = ")]
+    assert len(views) == 21
+    assert {axes.get_title() for axes in views} >= {"X = 0, Y = 0 mm", "X = 10, Y = -5 mm"}
+    assert min(axes.images[0].get_array().mean() for axes in views) > 100.0
+    assert len({axes.images[0].get_clim() for axes in views}) == 1
+    assert sum(axes.get_title().startswith("refocused at z = ") for axes in panels) == 5
+
+
 def test_experiment(data_folder: Path, table2: Camera, water: Media) -> None:
     """Against the experiment's truth, from its pictures and data sheet alone."""
     folder = data_folder / "channel"

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from lfpiv_cli.calibration.views import refocused_stack, sub_aperture_view, view_mosaic
+from lfpiv_cli.calibration.views import refocused_stack, sub_aperture_view, views_across
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.tracing import disc_points, slopes_equivalent, trace
@@ -46,9 +46,12 @@ def test_refocused_at_its_depth_a_point_is_sharp_and_in_its_place(small: Camera,
     np.testing.assert_allclose(found, POINT[:2], atol=0.03)
 
 
-def test_the_mosaic_is_made_of_views_in_the_order_of_their_points(small: Camera, image) -> None:
-    mosaic = view_mosaic(image, small, 3)
-    rows, columns = (n // 3 for n in mosaic.shape)
-    right = sub_aperture_view(image, small, (small.aperture_radius_mm, 0.0))
-    np.testing.assert_array_equal(mosaic[rows : 2 * rows, 2 * columns :], right)
-    assert not mosaic[:rows, :columns].any()
+def test_views_stand_in_the_order_of_their_points_and_none_beyond_the_rim(small: Camera, image) -> None:
+    views = views_across(image, small, 5)
+    radius = small.aperture_radius_mm
+    point, right = views[2, 4]
+    np.testing.assert_allclose(point, (0.8 * radius, 0.0))
+    np.testing.assert_array_equal(right, sub_aperture_view(image, small, point))
+    np.testing.assert_allclose(views[0, 1][0], (-0.4 * radius, -0.8 * radius))
+    corners = {(row, column) for row in (0, 4) for column in (0, 4)}
+    assert set(views) == {(row, column) for row in range(5) for column in range(5)} - corners

@@ -70,21 +70,21 @@ def sub_aperture_view(image: ArrayLike, camera: Camera, crossing_mm: ArrayLike) 
     return ndimage.map_coordinates(pixels, [places[..., 1], places[..., 0]], order=1, mode="nearest")
 
 
-def view_mosaic(image: ArrayLike, camera: Camera, views_per_side: int) -> NDArray[np.float64]:
-    """Return the views from a square grid of points of the main lens side by side, 0 where the aperture ends.
+def views_across(
+    image: ArrayLike, camera: Camera, views_per_side: int
+) -> dict[tuple[int, int], tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Return the points (X, Y) in mm and the views from a square grid of them, by its row and column.
 
-    Views stand as their points do, X growing with the columns and Y with the rows: (views_per_side x lens rows,
-    views_per_side x lens columns). The grid's outermost middles lie on the rim.
+    The grid's cells cover the main lens; a cell whose middle lies beyond the rim has no view. X grows with the columns
+    and Y with the rows.
     """
-    line = np.linspace(-1.0, 1.0, views_per_side) * camera.aperture_radius_mm
-    blocks = []
-    for y in line:
-        row = []
-        for x in line:
-            view = sub_aperture_view(image, camera, (x, y))
-            row.append(view if np.hypot(x, y) <= camera.aperture_radius_mm else np.zeros_like(view))
-        blocks.append(row)
-    return np.block(blocks)
+    line = (2.0 * np.arange(views_per_side) - (views_per_side - 1)) / views_per_side * camera.aperture_radius_mm
+    places = {(row, column): np.array([x, y]) for row, y in enumerate(line) for column, x in enumerate(line)}
+    return {
+        cell: (point, sub_aperture_view(image, camera, point))
+        for cell, point in places.items()
+        if np.hypot(*point) <= camera.aperture_radius_mm
+    }
 
 
 def refocused_stack(

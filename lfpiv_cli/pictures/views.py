@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lfpiv_cli.calibration.model import Calibration
-from lfpiv_cli.calibration.views import refocused_stack, view_mosaic
+from lfpiv_cli.calibration.views import refocused_stack, views_across
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
+from lfpiv_cli.pictures.style import new_figure, styled
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -21,13 +22,12 @@ VIEWS_PER_SIDE = 5
 STEPS = (-4.0, -2.0, 0.0, 2.0, 4.0)
 
 
+@styled
 def views_figure(calibration: Calibration, camera: Camera, media: Media, image: ArrayLike) -> Figure:
     """Return a figure with the views of a raw picture less its dark frame, and the same refocused about the board.
 
     `camera` is the data sheet's and `media` what the picture was taken in. Needs matplotlib.
     """
-    from matplotlib.figure import Figure
-
     measured = calibration.camera(camera)
     rectified = calibration.rectification.apply(image)
     unit = float(measured.lattice.pitch.max()) / measured.aperture_radius_mm * measured.focus_distance_mm
@@ -35,15 +35,19 @@ def views_figure(calibration: Calibration, camera: Camera, media: Media, image: 
     depths = middle + np.array(STEPS) * unit * abs(1.0 / measured.magnification) / media.depth_ratio
     stack = refocused_stack(rectified, measured, media, depths, calibration.transmission)
 
-    figure = Figure(figsize=(16.0, 14.0), layout="constrained")
-    grid = figure.add_gridspec(2, len(STEPS), height_ratios=(3.0, 1.0))
-    views = figure.add_subplot(grid[0, :])
-    views.imshow(view_mosaic(rectified, measured, VIEWS_PER_SIDE), cmap="gray", interpolation="nearest")
-    views.set_title(f"views from {VIEWS_PER_SIDE} x {VIEWS_PER_SIDE} points of the main lens, one sample per microlens")
-    views.set_axis_off()
+    views = views_across(rectified, measured, VIEWS_PER_SIDE)
+    brightest = max(float(view.max()) for _, view in views.values())
+    figure = new_figure(13.0, 12.5)
+    grid = figure.add_gridspec(VIEWS_PER_SIDE + 1, len(STEPS), height_ratios=(1.0,) * VIEWS_PER_SIDE + (1.3,))
+    for (row, column), (point, view) in views.items():
+        axis = figure.add_subplot(grid[row, column])
+        axis.imshow(view, cmap="gray", vmin=0.0, vmax=brightest, interpolation="nearest")
+        axis.set_title(f"X = {point[0]:.2g}, Y = {point[1]:.2g} mm")
+        axis.set_axis_off()
     for k, (depth, picture) in enumerate(zip(depths, stack, strict=True)):
-        axis = figure.add_subplot(grid[1, k])
+        axis = figure.add_subplot(grid[-1, k])
         axis.imshow(picture, cmap="gray", interpolation="nearest", vmin=0.0, vmax=float(stack.max()))
         axis.set_title(f"refocused at z = {depth:.2f} mm")
         axis.set_axis_off()
+    figure.suptitle("views from points (X, Y) of the main lens, one sample per microlens; below, refocused")
     return figure

@@ -1,7 +1,7 @@
 """Pictures of reconstructed boards by several methods side by side, after the paper's Figs. 8 to 13.
 
 Each function takes a mapping from a method's name, as it is to be read, to what was measured by it; all methods are
-drawn on one scale. matplotlib is imported inside: it is an optional extra, and slow to load.
+drawn on one scale.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.grid import Grid
+from lfpiv_cli.pictures.style import BLUE, GREEN, SEQUENTIAL, VERMILION, new_figure, styled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -21,9 +22,9 @@ if TYPE_CHECKING:
 
 # Colours that people with any kind of colour vision tell apart; marks and lines differ as well, for print in grey.
 STYLES: tuple[dict[str, Any], ...] = (
-    {"color": "#D55E00", "marker": "s", "linestyle": "--"},
-    {"color": "#0072B2", "marker": "o", "linestyle": "-"},
-    {"color": "#009E73", "marker": "^", "linestyle": "-."},
+    {"color": VERMILION, "marker": "s", "linestyle": "--"},
+    {"color": BLUE, "marker": "o", "linestyle": "-"},
+    {"color": GREEN, "marker": "^", "linestyle": "-."},
 )
 BAND = {"color": "#BBBBBB", "alpha": 0.5, "linewidth": 0.0}
 # Of a board in three dimensions voxels are shown that are brighter than this share of the brightest: 1/e, as for e_z.
@@ -71,23 +72,24 @@ class BoardView:
         return cls(**{name: np.array(each, np.float64) for name, each in values.items()})
 
 
+@styled
 def views_figure(views: Mapping[str, BoardView]) -> Figure:
     """Return boards in the focal plane, a row for each method: front, side and in three dimensions (Fig. 8)."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11.0, 3.7 * len(views)), layout="constrained")
+    figure = new_figure(11.0, 3.7 * len(views))
     drawn = None
     # as much of the depth for each as shows the longest dots and their surroundings
     reach = SHOWN_DEPTHS * max(float(np.abs(view.bright_mm[:, 2]).max()) for view in views.values())
     for row, (label, view) in enumerate(views.items()):
         x, y, z = ((low, high) for low, high in view.bounds_mm)
         front, side = (figure.add_subplot(len(views), 3, 3 * row + column) for column in (1, 2))
-        drawn = front.imshow(view.front, origin="lower", extent=(*x, *y), cmap="viridis", vmin=0.0, vmax=1.0)
+        drawn = front.imshow(view.front, origin="lower", extent=(*x, *y), cmap=SEQUENTIAL, vmin=0.0, vmax=1.0)
         front.set(title=f"{label}: maximum along z", xlabel="x (mm)", ylabel="y (mm)")
-        side.imshow(view.side, origin="lower", extent=(*x, *z), cmap="viridis", vmin=0.0, vmax=1.0, aspect="auto")
+        side.imshow(view.side, origin="lower", extent=(*x, *z), cmap=SEQUENTIAL, vmin=0.0, vmax=1.0, aspect="auto")
         side.set(title=f"{label}: maximum along y", xlabel="x (mm)", ylabel="z (mm)", ylim=(-reach, reach))
         space: Any = figure.add_subplot(len(views), 3, 3 * row + 3, projection="3d")
-        space.scatter(*view.bright_mm.T, c=view.bright_mm[:, 2], cmap="viridis", s=1.5, linewidths=0.0, rasterized=True)
+        space.scatter(
+            *view.bright_mm.T, c=view.bright_mm[:, 2], cmap=SEQUENTIAL, s=1.5, linewidths=0.0, rasterized=True
+        )
         space.set(title=f"{label}: brighter than 1/e", xlabel="x (mm)", ylabel="y (mm)", zlabel="z (mm)")
         space.set(zlim=(-reach, reach))
         space.set_box_aspect((1.0, 1.0, 1.2), zoom=0.85)
@@ -97,6 +99,7 @@ def views_figure(views: Mapping[str, BoardView]) -> Figure:
     return figure
 
 
+@styled
 def elongation_figure(
     methods: Mapping[str, Mapping[str, Any]], paper_mm: tuple[float, float], paper_sigma_mm: float
 ) -> Figure:
@@ -108,9 +111,7 @@ def elongation_figure(
     paper_mm : lowest and highest elongation that the paper has
     paper_sigma_mm : what its spread stays below
     """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(10.0, 3.8), layout="constrained")
+    figure = new_figure(10.0, 3.8)
     length, spread = figure.subplots(1, 2)
     length.axhspan(*paper_mm, label=f"paper: {paper_mm[0]:g} to {paper_mm[1]:g} mm", **BAND)
     spread.axhspan(0.0, paper_sigma_mm, label=f"paper: below {paper_sigma_mm:g} mm", **BAND)
@@ -126,6 +127,7 @@ def elongation_figure(
     return figure
 
 
+@styled
 def location_figure(
     methods: Mapping[str, Mapping[str, Any]], spacing_mm: float, paper_steps_mm: tuple[float, float] | None
 ) -> Figure:
@@ -137,9 +139,7 @@ def location_figure(
     spacing_mm : x_g of Eq. 19
     paper_steps_mm : shortest and longest depth separation that the paper has, where it says
     """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(10.0, 6.6), layout="constrained")
+    figure = new_figure(10.0, 6.6)
     (lateral, depth), (lateral_error, depth_error) = figure.subplots(2, 2)
     lateral.axhline(spacing_mm, color="black", linewidth=0.8, label="true")
     depth.axhline(1.0, color="black", linewidth=0.8, label="true")
@@ -165,18 +165,17 @@ def location_figure(
     return figure
 
 
+@styled
 def centres_figure(centres_mm: Mapping[str, NDArray[np.float64]]) -> Figure:
     """Return the centres of all dots of all boards, (n, 3) for each method, coloured by depth (Fig. 10)."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(5.2 * len(centres_mm) + 0.8, 4.2), layout="constrained")
+    figure = new_figure(5.2 * len(centres_mm) + 0.8, 4.2)
     deepest = max(float(np.abs(each[:, 2]).max()) for each in centres_mm.values())
     drawn = None
     for number, (label, each) in enumerate(centres_mm.items(), start=1):
         space: Any = figure.add_subplot(1, len(centres_mm), number, projection="3d")
         # depth along the page, as the boards were moved
         drawn = space.scatter(
-            each[:, 2], each[:, 0], each[:, 1], c=each[:, 2], cmap="viridis", vmin=-deepest, vmax=deepest, s=6.0
+            each[:, 2], each[:, 0], each[:, 1], c=each[:, 2], cmap=SEQUENTIAL, vmin=-deepest, vmax=deepest, s=6.0
         )
         space.set(title=label, xlabel="z (mm)", ylabel="x (mm)", zlabel="y (mm)")
         space.set_box_aspect((2.0, 1.0, 1.0), zoom=1.1)

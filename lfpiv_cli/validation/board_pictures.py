@@ -8,19 +8,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.grid import Grid
+from lfpiv_cli.pictures.style import new_figure, styled
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+@styled
 def board_figure(figures: dict[str, Any], volume: NDArray[np.float32], grid: Grid) -> Figure:
     """Return a figure of a board (its light in the plane and from the side) and of the errors by depth.
 
     `volume` [z, y, x] is the reconstruction of the board nearest the focal plane; `figures` are `board_figures`.
     """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(13.0, 8.0), layout="constrained")
+    figure = new_figure(13.0, 8.0)
     axes = figure.subplots(2, 3).ravel()
     bounds = [grid.bounds_mm(axis) for axis in range(3)]
     axes[0].imshow(volume.max(axis=0), origin="lower", extent=(*bounds[0], *bounds[1]))

@@ -1,7 +1,4 @@
-"""Pictures of bubbles on a channel's wall and of what they do to velocities (the paper's Figs. 16 and 17).
-
-matplotlib is imported inside: it is an optional extra, and slow to load.
-"""
+"""Pictures of bubbles on a channel's wall and of what they do to velocities (the paper's Figs. 16 and 17)."""
 
 from __future__ import annotations
 
@@ -11,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.pictures.style import BLUE, DIVERGING, GREEN, ORANGE, PURPLE, SEQUENTIAL, VERMILION, new_figure, styled
 from lfpiv_cli.validation.channel import Duct
 from lfpiv_cli.validation.methods import Measured
 from lfpiv_cli.validation.near_wall import PAPERS_WALL
@@ -19,14 +17,13 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-STYLES = (("#0072B2", "o"), ("#D55E00", "s"), ("#009E73", "^"), ("#CC79A7", "v"), ("#E69F00", "D"))
+STYLES = ((BLUE, "o"), (VERMILION, "s"), (GREEN, "^"), (PURPLE, "v"), (ORANGE, "D"))
 
 
+@styled
 def raw_figure(image: NDArray[np.float32], mask: NDArray[np.bool_]) -> Figure:
     """Return a part of a raw image with bubbles, alone and with the outline of what a mask leaves out."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(10.0, 10.0 * 0.5 * image.shape[0] / image.shape[1] + 1.0), layout="constrained")
+    figure = new_figure(10.0, 10.0 * 0.5 * image.shape[0] / image.shape[1] + 1.0)
     highest = float(np.percentile(image[~mask], 99.9)) if not mask.all() else float(image.max())
     for axes, title in zip(figure.subplots(1, 2), ("raw image", "left out by the mask"), strict=True):
         shown = axes.imshow(np.sqrt(np.clip(image, 0.0, highest)), cmap="gray", vmin=0.0, interpolation="nearest")
@@ -38,14 +35,13 @@ def raw_figure(image: NDArray[np.float32], mask: NDArray[np.bool_]) -> Figure:
     return figure
 
 
+@styled
 def plane_figure(methods: Mapping[str, Measured], duct: Duct, plane: int) -> Figure:
     """Return vectors and the error of the velocity along the flow in one x-y plane of windows, by way to measure."""
-    from matplotlib.figure import Figure
-
     main, axis = "xyz".index(duct.axis), duct.across["x/D"]
     first = next(iter(methods.values()))
     highest = float(first.truth[..., main].max())
-    figure = Figure(figsize=(3.2 * len(methods) + 1.0, 8.2), layout="constrained")
+    figure = new_figure(3.2 * len(methods) + 1.0, 8.2)
     axes = figure.subplots(2, len(methods), squeeze=False, sharex=True, sharey=True)
     for column, (name, m) in zip(axes.T, methods.items(), strict=True):
         places = [m.field.grid.axis_mm(k) for k in (main, axis)]
@@ -59,12 +55,12 @@ def plane_figure(methods: Mapping[str, Measured], duct: Duct, plane: int) -> Fig
             velocity[..., main],
             velocity[..., axis],
             velocity[..., main],
-            cmap="viridis",
+            cmap=SEQUENTIAL,
             clim=(0.0, highest),
             scale=12.0 * highest,
             width=0.008,
         )
-        image = column[1].pcolormesh(along, shares, error, cmap="RdBu_r", vmin=-0.5 * highest, vmax=0.5 * highest)
+        image = column[1].pcolormesh(along, shares, error, cmap=DIVERGING, vmin=-0.5 * highest, vmax=0.5 * highest)
         column[0].set(title=name)
         column[1].set(xlabel=f"{'xyz'[main]}, along the flow (mm)")
         for panel in column:
@@ -76,11 +72,10 @@ def plane_figure(methods: Mapping[str, Measured], duct: Duct, plane: int) -> Fig
     return figure
 
 
+@styled
 def wall_profile_figure(methods: Mapping[str, Measured], duct: Duct) -> Figure:
     """Return the mean over flow and depth of the velocity along the flow, over x/D, and its error beside it."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(10.0, 4.2), layout="constrained")
+    figure = new_figure(10.0, 4.2)
     left, right = figure.subplots(1, 2)
     main, axis = "xyz".index(duct.axis), duct.across["x/D"]
     first = next(iter(methods.values()))

@@ -1,7 +1,7 @@
 """Pictures of the paper's channel flow (Figs. 15, 16 and 18): its six slices, by several ways to measure.
 
 Axes: lengths as shares of the channel's width from its low wall, as the paper has them; its x is our other lateral
-axis. matplotlib is imported inside: it is an optional extra, and slow to load.
+axis.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.pictures.style import BLUE, GREEN, PURPLE, SEQUENTIAL, VERMILION, new_figure, styled
 from lfpiv_cli.synthetic.flows import Flow
 from lfpiv_cli.validation.channel import PAPER_SLICES, Duct
 from lfpiv_cli.validation.flow import TOLERANCE, compare, cumulative_distribution
@@ -22,19 +23,18 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 # Colours that the colour-blind tell apart; in print markers do.
-STYLES = (("#D55E00", "s", "--"), ("#0072B2", "o", "-."), ("#009E73", "^", "-"), ("#CC79A7", "v", ":"))
+STYLES = ((VERMILION, "s", "--"), (BLUE, "o", "-."), (GREEN, "^", "-"), (PURPLE, "v", ":"))
 # Points of the lines of the true flow.
 LINE_POINTS = 101
 
 
+@styled
 def slice_maps_figure(methods: Mapping[str, Measured], duct: Duct) -> Figure:
     """Return the size of the velocity in the six slices (columns), true and by each way (rows), on one scale."""
-    from matplotlib.figure import Figure
-
     first = next(iter(methods.values()))
     rows = {"true": (first, first.truth)} | {name: (m, m.field.velocity) for name, m in methods.items()}
     highest = max(float(np.linalg.norm(m.truth[m.inside], axis=-1).max()) for m in methods.values())
-    figure = Figure(figsize=(13.0, 2.3 * len(rows) + 0.6), layout="constrained")
+    figure = new_figure(13.0, 2.3 * len(rows) + 0.6)
     axes = figure.subplots(len(rows), 6, squeeze=False, sharey=True)
     main = "xyz".index(duct.axis)
     for row, (name, (measured, velocity)) in zip(axes, rows.items(), strict=True):
@@ -52,7 +52,7 @@ def slice_maps_figure(methods: Mapping[str, Measured], duct: Duct) -> Figure:
                 extent=(*_shares(measured, duct, other), *_shares(measured, duct, main)),
                 vmin=0.0,
                 vmax=highest,
-                cmap="viridis",
+                cmap=SEQUENTIAL,
                 aspect="auto",
             )
             panel.set(xlabel=f"{_paper_name(other)}/D", title=f"{key} = {share}")
@@ -61,11 +61,10 @@ def slice_maps_figure(methods: Mapping[str, Measured], duct: Duct) -> Figure:
     return figure
 
 
+@styled
 def profiles_figure(methods: Mapping[str, Measured], duct: Duct, flow: Flow) -> Figure:
     """Return the velocity along the flow in the six slices, means along the flow, with lines of the true flow."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11.0, 6.5), layout="constrained")
+    figure = new_figure(11.0, 6.5)
     axes = figure.subplots(2, 3, sharey=True)
     main = "xyz".index(duct.axis)
     for row, (key, axis) in zip(axes, duct.across.items(), strict=True):
@@ -88,11 +87,10 @@ def profiles_figure(methods: Mapping[str, Measured], duct: Duct, flow: Flow) -> 
     return figure
 
 
+@styled
 def cumulative_figure(methods: Mapping[str, Measured]) -> Figure:
     """Return the share of vectors over their relative error, along the flow and of the whole vector, with the 25 %."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(10.0, 4.2), layout="constrained")
+    figure = new_figure(10.0, 4.2)
     panels = figure.subplots(1, 2, sharey=True)
     for (name, m), (colour, _, line) in zip(methods.items(), STYLES, strict=False):
         shares = cumulative_distribution(compare(m.field, m.truth, m.inside))

@@ -1,7 +1,4 @@
-"""Pictures of which figures give a mistake away.
-
-matplotlib is imported inside: it is an optional extra, and slow to load.
-"""
+"""Pictures of which figures give a mistake away."""
 
 from __future__ import annotations
 
@@ -10,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lfpiv_cli.pictures.style import new_figure, styled
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
@@ -17,14 +16,13 @@ if TYPE_CHECKING:
 DECADES = (-1.0, 3.0)
 
 
+@styled
 def faults_figure(over: Mapping[str, Mapping[str, float]], words: Mapping[str, str]) -> Figure:
     """Return a table in colours of figures over their limits: a row for each measurement, a column for each figure."""
-    from matplotlib.figure import Figure
-
     names = list(words)
     table = np.array([[each[name] for name in names] for each in over.values()])
     shade = np.clip(np.log10(np.maximum(table, 10.0 ** DECADES[0])), *DECADES)
-    figure = Figure(figsize=(10.0, 1.9 + 0.38 * len(table)), layout="constrained")
+    figure = new_figure(10.0, 1.9 + 0.38 * len(table))
     axes = figure.subplots()
     image = axes.imshow(shade, cmap="cividis", vmin=DECADES[0], vmax=DECADES[1], aspect="auto")
     for (row, column), value in np.ndenumerate(table):

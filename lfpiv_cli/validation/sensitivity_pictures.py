@@ -1,7 +1,4 @@
-"""Pictures of errors over what makes them, with the straight lines through them.
-
-matplotlib is imported inside: it is an optional extra, and slow to load.
-"""
+"""Pictures of errors over what makes them, with the straight lines through them."""
 
 from __future__ import annotations
 
@@ -12,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.pictures.style import BLUE, GREEN, ORANGE, PURPLE, VERMILION, new_figure, styled
 from lfpiv_cli.validation.place_errors import Line
 
 if TYPE_CHECKING:
@@ -19,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 # Colours that colour-blind people tell apart, and marks that a print in grey keeps apart.
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00")
+COLOURS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE)
 MARKS, DASHES = ("o", "s", "^", "D", "v"), ("-", "--", "-.", ":", (0, (5, 1, 1, 1)))
 
 # Names of so many curves find room among them.
@@ -69,6 +67,7 @@ class Curves:
         return result
 
 
+@styled
 def influence_figure(
     curves: Curves,
     panels: tuple[Panel, Panel],
@@ -84,10 +83,9 @@ def influence_figure(
     lines : through the figures that have one
     notes : what is written into the first and the second panel; empty: nothing
     """
-    from matplotlib.figure import Figure
     from matplotlib.ticker import LogLocator, NullFormatter
 
-    figure = Figure(figsize=(9.0, 3.8), layout="constrained")
+    figure = new_figure(9.0, 3.8)
     for axes, panel, note in zip(figure.subplots(1, 2), panels, notes, strict=True):
         for number, series in enumerate(panel.series):
             _draw(axes, curves, series, number, lines.get(series.figure))
