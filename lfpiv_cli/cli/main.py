@@ -13,10 +13,10 @@ import click
 from lfpiv_cli import __version__
 from lfpiv_cli.cli import (
     calibration,
-    exports,
     inspection,
     planning,
     reconstruction,
+    report,
     simulation,
     tracks,
     validation,
@@ -37,7 +37,7 @@ COMMANDS = (
     tracks.follow,
     inspection.info,
     inspection.plot,
-    exports.export,
+    report.report,
     validation.validate,
     simulation.simulate,
 )

@@ -76,12 +76,14 @@ def write_atomically(
         temporary = _reserve(target)
         write(temporary)
         if check is not None:
-            _read_back(target, temporary, check)
+            check(temporary)
         _flush(temporary)
         ensure_writable(target, overwrite)
         os.replace(temporary, target)
         temporary = None
         _flush_folder(target.parent)
+    except InputError as error:
+        raise OutputError(f"{target}: what was written does not read back: {error}") from error
     except LfpivError:
         raise
     except OSError as error:
@@ -89,14 +91,6 @@ def write_atomically(
     finally:
         if temporary is not None:
             temporary.unlink(missing_ok=True)
-
-
-def _read_back(target: Path, temporary: Path, check: Callable[[Path], None]) -> None:
-    """Raise where a finished file is not what was meant."""
-    try:
-        check(temporary)
-    except InputError as error:
-        raise OutputError(f"{target}: what was written does not read back: {error}") from error
 
 
 def write_json(path: Path, value: Mapping[str, Any], overwrite: bool) -> None:

@@ -18,7 +18,7 @@ TEMPLATES = Path(__file__).with_name("templates")
 
 @dataclass(frozen=True)
 class Table:
-    """A table of text; cells that are verdicts (met, missed, unknown) are coloured."""
+    """A table of text; cells that are verdicts (met, missed, unknown; good, look, no) are coloured."""
 
     caption: str
     head: tuple[str, ...]
@@ -35,7 +35,14 @@ class Picture:
 
 @dataclass(frozen=True)
 class Section:
-    """A part of a page; `anchor` is its name in links, `commands` are what a person types to make its figures."""
+    """A part of a page.
+
+    Attributes
+    ----------
+    anchor : its name in links
+    commands : what a person types to make its figures, or settings as they stand in a file
+    view : an interactive picture as HTML that loads nothing; on paper, and in Markdown, its pictures stand for it
+    """
 
     title: str
     anchor: str
@@ -43,6 +50,7 @@ class Section:
     tables: tuple[Table, ...] = ()
     pictures: tuple[Picture, ...] = ()
     commands: tuple[str, ...] = ()
+    view: str = ""
 
 
 @dataclass(frozen=True)
@@ -71,6 +79,22 @@ def write_pages(page: Page, html: Path, markdown: Path, overwrite: bool) -> None
     ------
     InputError : a picture cannot be read
     """
+    for target in (html, markdown):
+        write_text(target, _rendered(page, target), overwrite)
+
+
+def write_page(page: Page, html: Path, overwrite: bool) -> None:
+    """Write a page as HTML with its pictures inside.
+
+    Raises
+    ------
+    InputError : a picture cannot be read
+    """
+    write_text(html, _rendered(page, html), overwrite)
+
+
+def _rendered(page: Page, target: Path) -> str:
+    """Return a page in the language that a file's name ends in."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     places = Environment(
@@ -84,10 +108,9 @@ def write_pages(page: Page, html: Path, markdown: Path, overwrite: bool) -> None
     places.filters |= {
         "data_uri": _data_uri,
         "cell": lambda text: text.replace("|", "\\|"),
-        "relative": lambda path: path.relative_to(markdown.parent).as_posix(),
+        "relative": lambda path: path.relative_to(target.parent).as_posix(),
     }
-    for target in (html, markdown):
-        write_text(target, places.get_template(f"page{target.suffix}").render(page=page), overwrite)
+    return places.get_template(f"page{target.suffix}").render(page=page)
 
 
 def _data_uri(path: Path) -> str:

@@ -1,0 +1,162 @@
+"""`report`: what is found in a folder, the page made of it, and what a browser makes of the page."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from lfpiv_cli.cli import cli
+from lfpiv_cli.console import Console
+from lfpiv_cli.errors import InputError, OutputExistsError, UsageError
+from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, Points, write_points
+from lfpiv_cli.files.provenance import sha256
+from lfpiv_cli.files.vtkhdf import write_vectors
+from lfpiv_cli.pictures.interactive import MOST_LINES, lines_view
+from lfpiv_cli.reference import Reference
+from lfpiv_cli.stages import report as stage
+from lfpiv_cli.stages.plot import figures_of
+from lfpiv_cli.stages.report import ReportOptions, contents_of, report
+from tests.browser import CHROMIUM, opened
+from tests.vector_fields import SIGMA_VOXEL, field_of, noise_mm, rotation_mm
+
+QUIET = Console(quiet=True)
+REFERENCE = Reference("focal_point", 0.0)
+WARNING = {"code": "few-tracers", "about": "a <b>", "text": "too few", "remedy": "seed more", "measured": None}
+TRACKS = 40
+
+
+def record(command: str, *warnings: dict[str, Any]) -> dict[str, Any]:
+    made: dict[str, Any] = {
+        "command": command,
+        "version": "0.1.0",
+        "libraries": {"numpy": "2"},
+        "config": {"camera": {"pitch_mm": 0.125}},
+        "inputs": {"volume_a": {"name": "a.vtkhdf", "sha256": "0123456789abcdef" * 4}},
+    }
+    return made | ({"warnings": list(warnings)} if warnings else {})
+
+
+@pytest.fixture
+def results(tmp_path: Path) -> Path:
+    """A folder with vectors by volumes, vectors by tracks in a folder below, and the tracks."""
+    folder = tmp_path / "results"
+    (folder / "tracked").mkdir(parents=True)
+    flow = 20.0 * rotation_mm()
+    for number, name in enumerate(("vectors.vtkhdf", "tracked/grid.vtkhdf")):
+        field = field_of(flow + noise_mm(number), SIGMA_VOXEL)
+        warnings = (WARNING,) if number else ()
+        write_vectors(folder / name, field, REFERENCE, provenance=record("correlate", *warnings), overwrite=False)
+    numbers = np.arange(TRACKS)
+    along = np.tile([0.3, 0.0, 0.1], (TRACKS, 1))
+    arrays = {"velocity": along, "velocity_sigma": 0.1 * along, "displacement_mm": along}
+    arrays |= {"particle_a": numbers, "particle_b": numbers, "link_probability": np.ones(TRACKS)}
+    position = np.random.default_rng(0).uniform(-2.0, 2.0, (TRACKS, 3))
+    points = Points(position, arrays, REFERENCE, {}, record("track"))
+    write_points(folder / "tracks.vtkhdf", TRACKS_FORMAT, points, overwrite=False)
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def few_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One figure of each file: drawing them all takes long, and tests of their own look at them."""
+    monkeypatch.setattr(stage, "figures_of", lambda *given: dict([next(iter(figures_of(*given).items()))]))
+
+
+def test_contents_are_in_the_order_of_the_chain(results: Path) -> None:
+    found = contents_of(results)
+    assert [path.name for path in found.of("vectors")] == ["grid.vtkhdf", "vectors.vtkhdf"]
+    assert list(found.records) == ["tracked/grid.vtkhdf", "vectors.vtkhdf", "tracks.vtkhdf"]
+
+
+def test_a_folder_without_results_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="holds no file of lfpiv"):
+        contents_of(tmp_path)
+    with pytest.raises(InputError, match="is no folder"):
+        contents_of(tmp_path / "none")
+
+
+def test_a_broken_file_is_named(results: Path) -> None:
+    (results / "volume.vtkhdf").write_bytes(b"\x89HDF\r\n\x1a\n broken")
+    with pytest.raises(InputError, match=r"volume\.vtkhdf"):
+        contents_of(results)
+
+
+def test_the_page_holds_all(results: Path, tmp_path: Path) -> None:
+    page = tmp_path / "page.html"
+    summary = report(results, page, console=QUIET)
+    assert summary["verdict"] == {"calibration": "look", "images": "look", "vectors": "look"}
+    text = page.read_text(encoding="utf-8")
+    for words in ("Vectors", "Tracks", "Warnings", "Settings", "Provenance", "pitch_mm: 0.125", "few-tracers"):
+        assert words in text
+    assert "a &lt;b&gt;: too few" in text
+    assert text.count('<figure><img src="data:image/png;base64,') == summary["pictures"]
+
+
+def test_a_page_is_made_once(results: Path, tmp_path: Path) -> None:
+    page = tmp_path / "page.html"
+    page.write_text("mine")
+    with pytest.raises(OutputExistsError):
+        report(results, page, console=QUIET)
+    assert page.read_text() == "mine"
+    with pytest.raises(UsageError, match=r"ends in \.html"):
+        report(results, tmp_path / "page.pdf", console=QUIET)
+
+
+def test_pictures_are_drawn_on_the_raw_image_that_a_file_was_made_from(
+    results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    image, other = results / "image.tif", results / "other.tif"
+    image.write_bytes(b"this one")
+    other.write_bytes(b"another")
+    made = {"inputs": {"image": {"name": "image.tif", "sha256": sha256(image)}}}
+    arrays = {"intensity": np.ones(3), "covariance_mm2": np.ones((3, 6)), "chi2": np.ones(3), "seen": np.ones(3)}
+    points = Points(np.zeros((3, 3)), arrays | {"flag": np.zeros(3, np.uint8)}, REFERENCE, {}, made)
+    write_points(results / "particles.vtkhdf", PARTICLES_FORMAT, points, overwrite=False)
+    drawn_on: dict[str, Path | None] = {}
+
+    def none_of(path: Path, raw: Path | None = None) -> dict[str, Any]:
+        drawn_on[path.name] = raw
+        return {}
+
+    monkeypatch.setattr(stage, "figures_of", none_of)
+    report(results, tmp_path / "page.html", ReportOptions(raw=[other, image]), console=QUIET)
+    assert {name for name, raw in drawn_on.items() if raw} == {"particles.vtkhdf"}
+    assert drawn_on["particles.vtkhdf"] == image
+
+
+def test_the_command_prints_the_verdict(results: Path, tmp_path: Path) -> None:
+    outcome = CliRunner().invoke(cli, ["report", str(results), "-o", str(tmp_path / "page.html")])
+    assert outcome.exit_code == 0, outcome.output
+    assert re.search(r"verdict +calibration look, images look, vectors look", outcome.stderr)
+
+
+def test_a_view_shows_some_of_many_lines() -> None:
+    pytest.importorskip("plotly")
+    lines = [np.array([[k, 0.0, 0.0], [k, 1.0, 0.0]]) for k in range(3 * MOST_LINES)]
+    values = [np.full(2, 0.1) for _ in lines]
+    few, many = lines_view(lines[:MOST_LINES], values[:MOST_LINES], "m/s"), lines_view(lines, values, "m/s")
+    assert len(many) == pytest.approx(len(few), rel=0.01)
+    assert lines_view([], [], "m/s")
+
+
+def test_a_browser_sees_the_page_and_loads_nothing(results: Path, tmp_path: Path) -> None:
+    if CHROMIUM is None:
+        pytest.skip("no Chromium on this machine")
+    pytest.importorskip("plotly")
+    page = tmp_path / "page.html"
+    summary = report(results, page, console=QUIET)
+    with opened(page, tmp_path / "profile") as browser:
+        widths = browser.evaluate("[...document.images].map(image => image.complete ? image.naturalWidth : 0)")
+        # Drawn by JavaScript: the view of the tracks, which is not on paper.
+        assert browser.evaluate("document.querySelectorAll('.view canvas').length") > 0
+        browser.print(tmp_path / "page.pdf")
+        asked = [address for address in browser.requests if not address.startswith(("data:", "blob:"))]
+    assert len(widths) == summary["pictures"]
+    assert min(widths) > 400
+    assert asked == [page.resolve().as_uri()]
+    assert (tmp_path / "page.pdf").read_bytes().startswith(b"%PDF")

@@ -1,0 +1,102 @@
+"""The verdict of a result: what warnings and vectors make of it."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lfpiv_cli.flow.field import MASKED, REJECTED
+from lfpiv_cli.interface.verdicts import (
+    FOR_INFORMATION,
+    WORTHLESS,
+    Reason,
+    of_two_ways,
+    of_vectors,
+    of_warnings,
+    verdicts,
+)
+from tests.vector_fields import SHAPE, SIGMA_VOXEL, VOXEL_MM, field_of, noise_mm, rotation_mm
+
+TROUBLESHOOTING = Path(__file__).parents[1] / "docs" / "troubleshooting.md"
+
+
+def made(command: str, *codes: str) -> dict[str, Any]:
+    warnings = [
+        {"code": code, "about": "a.tif", "text": f"found {code}", "remedy": "mend it", "measured": None}
+        for code in codes
+    ]
+    return {"command": command, "warnings": warnings}
+
+
+def words(reasons: list[Reason]) -> dict[str, str]:
+    return {each.part: each.word for each in verdicts(reasons, ("calibration", "images", "vectors"))}
+
+
+def test_codes_are_those_that_are_documented() -> None:
+    documented = set(re.findall(r"^\| `([a-z-]+)` \|", TROUBLESHOOTING.read_text(encoding="utf-8"), re.MULTILINE))
+    assert documented >= WORTHLESS | FOR_INFORMATION
+
+
+def test_a_warning_counts_for_the_part_that_its_command_makes() -> None:
+    records = {
+        "calibration.h5": made("calibrate-snapshot", "f-numbers"),
+        "particles/a.vtkhdf": made("reconstruct page 0", "light-unexplained"),
+        "tracks.vtkhdf": made("track"),
+    }
+    assert words(of_warnings(records)) == {"calibration": "look", "images": "no", "vectors": "good"}
+
+
+def test_what_is_said_for_information_speaks_against_nothing() -> None:
+    found = of_warnings({"a.vtkhdf": made("reconstruct", "particle-diameter-limit")})
+    assert [(each.part, each.word) for each in found] == [("images", "good")]
+
+
+def test_a_warning_of_a_whole_batch_is_told_once_with_its_count() -> None:
+    records = {f"{number}.vtkhdf": made("reconstruct", "frame-saturated") for number in range(5)}
+    [reason] = of_warnings(records)
+    assert "(and 4 more)" in reason.text
+    assert "mend it" in reason.text
+
+
+def test_the_worst_reason_comes_first() -> None:
+    reasons = [Reason("images", "good", "fine"), Reason("images", "no", "dark"), Reason("images", "look", "dim")]
+    [found] = verdicts(reasons, ("images",))
+    assert (found.word, found.reasons) == ("no", ("dark", "dim", "fine"))
+
+
+def test_vectors_as_good_as_they_state() -> None:
+    field = field_of(rotation_mm() * 20.0 + noise_mm(0), SIGMA_VOXEL)
+    assert words(of_vectors(field, "v"))["vectors"] == "good"
+
+
+@pytest.mark.parametrize("understated", [2.0, 6.0])
+def test_errors_larger_than_stated_are_to_be_looked_at(understated: float) -> None:
+    field = field_of(rotation_mm() * 20.0 + noise_mm(0), SIGMA_VOXEL / understated)
+    assert words(of_vectors(field, "v"))["vectors"] == ("look" if understated > 3.0 else "good")
+
+
+def test_displacements_within_their_errors_are_to_be_looked_at() -> None:
+    [_, reason] = of_vectors(field_of(noise_mm(0), SIGMA_VOXEL), "v")
+    assert reason.word == "look"
+    assert "standard deviations of zero" in reason.text
+
+
+def test_no_vector_left_is_no() -> None:
+    field = field_of(rotation_mm(), SIGMA_VOXEL)
+    field.flag[:] = REJECTED
+    assert words(of_vectors(field, "v"))["vectors"] == "no"
+    field.flag[:] = MASKED
+    assert words(of_vectors(field, "v"))["vectors"] == "no"
+
+
+def test_two_ways_that_contradict_each_other() -> None:
+    one = field_of(rotation_mm() + noise_mm(1), SIGMA_VOXEL)
+    same = field_of(rotation_mm() + noise_mm(2), SIGMA_VOXEL)
+    off = field_of(rotation_mm() + noise_mm(3) + 8.0 * SIGMA_VOXEL * VOXEL_MM, SIGMA_VOXEL)
+    assert of_two_ways(one, same, ("a", "b"))[0].word == "good"
+    assert of_two_ways(one, off, ("a", "b"))[0].word == "look"
+    assert not of_two_ways(one, field_of(np.zeros((*SHAPE, 3)), None), ("a", "b"))
