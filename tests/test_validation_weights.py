@@ -17,12 +17,14 @@ from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.validation.weights import (
     GREY_LEVELS,
     WINDOW_RADIUS_PX,
+    Column,
     compare_columns,
     limits_missed,
     make_columns,
     ssim,
     weights_figures,
 )
+from lfpiv_cli.validation.weights_pictures import columns_figure, similarity_figure
 
 
 def test_ssim_of_constants_eq_16():
@@ -124,3 +126,17 @@ def test_validate_weights_writes_its_report_and_fails_on_a_limit(tmp_path):
     assert report["figures"]["factorised_to_converged"]["l1_largest"] < 0.02
     assert (tmp_path / "report" / "weights_columns.png").stat().st_size > 10_000
     assert (tmp_path / "report" / "weights_similarity.png").stat().st_size > 10_000
+
+
+def test_curves_of_the_similarity_are_told_apart_and_columns_have_axes() -> None:
+    pytest.importorskip("matplotlib")
+    names = [f"comparison_{k}" for k in range(9)]
+    voxel = {name: {"ssim": 0.9, "rmse_grey": 1.0, "l1": 0.1} for name in names}
+    figure = similarity_figure({"voxels": [voxel], "unknown": None} | dict.fromkeys(names, {"l1_mean": 0.1}), 1)
+    looks = {(line.get_color(), line.get_marker(), line.get_linestyle()) for line in figure.axes[0].lines}
+    assert len(looks) == 9
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == [name.replace("_", " ") for name in names]
+    images = {"ert": np.eye(3), "factorised": 0.5 * np.eye(3)}
+    columns = columns_figure([Column((0.0, 0.0, 1.0), images)]).axes[:2]
+    assert [axes.get_xlabel() for axes in columns] == ["column (px)"] * 2
+    assert len({axes.images[0].get_clim() for axes in columns}) == 1

@@ -17,7 +17,7 @@ from lfpiv_cli.console import Console
 @click.option("--voxel", type=int, nargs=3, metavar="IX IY IZ", help="weights: which voxel; default the middle one.")
 @common_options
 def info(file: Path, overwrite: bool, console: Console, **chosen: Any) -> dict[str, Any]:
-    """Describe a file that lfpiv wrote; of weights, draw the point-spread function of one voxel.
+    """Describe a file that lfpiv wrote: its figures; of weights, draw the point-spread function of one voxel.
 
     \b
     Example: lfpiv info weights.h5 --picture column.png --voxel 50 40 120

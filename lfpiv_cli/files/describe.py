@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+import numpy as np
 
 from lfpiv_cli.files.hdf5 import format_of, from_attribute, member, open_h5, read_provenance
 from lfpiv_cli.files.provenance import recorded_warnings
@@ -68,7 +69,7 @@ def _list_group(group: h5py.Group, prefix: str, found: dict[str, Any]) -> None:
         item = member(group, name)
         if isinstance(item, h5py.Group):
             _list_group(item, f"{prefix}{name}/", found)
-        elif item.shape in TOLD_SHAPES:
+        elif item.shape in TOLD_SHAPES and np.isfinite(item[()]).all():
             found[prefix + name] = item[()].tolist()
         else:
             found[prefix + name] = f"{item.dtype} {list(item.shape)}"

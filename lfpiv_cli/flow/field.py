@@ -20,6 +20,8 @@ SECOND_PEAK = 2
 REJECTED = 3
 MASKED = 4
 
+FLAG_NAMES = {VALID: "valid", SECOND_PEAK: "second peak", REPLACED: "replaced", REJECTED: "rejected", MASKED: "masked"}
+
 MM_TO_M = 1e-3
 
 
@@ -53,6 +55,11 @@ class VectorField:
     voxel_mm: tuple[float, float, float]
     dt_s: float | None
     window_voxel: tuple[int, int, int]
+
+    @property
+    def flag_counts(self) -> dict[str, int]:
+        """How many vectors have each flag, by its name."""
+        return {name: int(np.count_nonzero(self.flag == flag)) for flag, name in FLAG_NAMES.items()}
 
     @property
     def velocity(self) -> NDArray[np.float64]:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.flow.derived import derived_fields
-from lfpiv_cli.flow.field import MASKED, MM_TO_M, REJECTED, REPLACED, SECOND_PEAK, VALID, VectorField
+from lfpiv_cli.flow.field import FLAG_NAMES, MASKED, MM_TO_M, REJECTED, REPLACED, SECOND_PEAK, VALID, VectorField
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.pictures.planes import PLANES, Plane, draw_maps, plane_panels
 from lfpiv_cli.pictures.style import (
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-FLAG_NAMES = {VALID: "valid", SECOND_PEAK: "second peak", REPLACED: "replaced", REJECTED: "rejected", MASKED: "masked"}
 FLAG_COLOURS = {VALID: BLUE, SECOND_PEAK: SKY_BLUE, REPLACED: ORANGE, REJECTED: VERMILION, MASKED: "0.85"}
 # More arrows than this along an axis hide each other.
 MOST_ARROWS = 32
@@ -240,10 +239,11 @@ def flags_figure(field: VectorField) -> Figure:
     colours = ListedColormap([FLAG_COLOURS[flag] for flag in sorted(FLAG_COLOURS)])
     norm = BoundaryNorm(np.arange(len(FLAG_COLOURS) + 1) - 0.5, len(FLAG_COLOURS))
     draw_maps(axes[0], field.grid, [field.flag] * 3, [""] * 3, cmap=colours, norm=norm)
+    counts = field.flag_counts
     patches = [
-        Patch(facecolor=FLAG_COLOURS[flag], edgecolor="0.3", label=f"{name}: {count}")
+        Patch(facecolor=FLAG_COLOURS[flag], edgecolor="0.3", label=f"{name}: {counts[name]}")
         for flag, name in FLAG_NAMES.items()
-        if (count := int(np.sum(field.flag == flag)))
+        if counts[name]
     ]
     figure.legend(handles=patches, loc="outside lower center", ncols=len(patches), title="vectors in the whole field")
     return figure

@@ -10,6 +10,7 @@ from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import UsageError
 from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.describe import describe
+from lfpiv_cli.files.figures import file_figures
 from lfpiv_cli.files.pictures import ensure_drawing, write_picture
 from lfpiv_cli.files.weights_file import FORMAT, open_weights
 from lfpiv_cli.stages.plot import column_of
@@ -29,15 +30,15 @@ NO_OPTIONS = InfoOptions()
 def info(
     file: Path, options: InfoOptions = NO_OPTIONS, *, overwrite: bool = False, console: Console = CONSOLE
 ) -> dict[str, Any]:
-    """Tell what is in a file of ours; of weights, draw the column of one voxel."""
+    """Tell what is in a file of ours, its figures last; of weights, draw the column of one voxel."""
     picture, voxel = options.picture, options.voxel
     if picture is None:
         if voxel is not None:
             raise UsageError("--voxel needs --picture")
-        return describe(file)
+        return _told(file)
     ensure_writable(picture, overwrite, [file])
     ensure_drawing()
-    found = describe(file)
+    found = _told(file)
     if found["format"] != FORMAT:
         raise UsageError(f"--picture draws a voxel of weights; for the figures of {found['format']}: lfpiv plot {file}")
     content = open_weights(file)
@@ -47,3 +48,8 @@ def info(
         raise UsageError(f"--voxel {ix} {iy} {iz}: there are {nx} x {ny} x {nz} voxels, counted from 0")
     write_picture(picture, column_of(content, (ix, iy, iz)), overwrite)
     return found
+
+
+def _told(file: Path) -> dict[str, Any]:
+    found = describe(file)
+    return found | file_figures(file, found["format"])

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from lfpiv_cli.errors import InputError
-from lfpiv_cli.flow.field import MASKED, MM_TO_M, REJECTED, REPLACED, SECOND_PEAK, VALID, VectorField
+from lfpiv_cli.flow.field import FLAG_NAMES, MM_TO_M, VectorField
 
 # The paper's Fig. 18: the share of vectors within a quarter of the truth.
 TOLERANCE = 0.25
@@ -110,9 +110,8 @@ def flow_figures(field: VectorField, truth_velocity: NDArray[np.float64], inside
 def _counts(field: VectorField, inside: NDArray[np.bool_]) -> dict[str, int]:
     """Return how many windows there are, of each flag, and how many are missing."""
     flags = field.flag[inside]
-    names = {VALID: "valid", REPLACED: "replaced", SECOND_PEAK: "second_peak", REJECTED: "rejected", MASKED: "masked"}
     counts = {"vectors": int(field.flag.size), "vectors_inside": int(flags.size)}
-    counts |= {f"vectors_{name}": int(np.sum(flags == flag)) for flag, name in names.items()}
+    counts |= {f"vectors_{name.replace(' ', '_')}": int(np.sum(flags == flag)) for flag, name in FLAG_NAMES.items()}
     counts["vectors_missing"] = int(np.sum(~np.isfinite(field.velocity[inside]).all(axis=1)))
     return counts
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import cycle
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -52,13 +51,14 @@ def similarity_figure(figures: dict[str, Any], shown: int) -> Figure:
     for axis, (key, label) in zip(
         figure.subplots(1, 3), {"ssim": "SSIM", "rmse_grey": "RMSE (grey levels)", "l1": "L1"}.items(), strict=True
     ):
-        for name, colour, marker in zip(names, cycle(COLOURS), cycle(MARKERS), strict=False):
+        for number, name in enumerate(names):
+            again, k = divmod(number, len(COLOURS))
             values = [voxel.get(name, {}).get(key, np.nan) for voxel in voxels]
             axis.plot(
                 np.arange(1, len(voxels) + 1),
                 values,
-                f"{marker}-",
-                color=colour,
+                MARKERS[k] + ("-", "--")[again],
+                color=COLOURS[k],
                 markerfacecolor="none",
                 label=name.replace("_", " "),
             )
