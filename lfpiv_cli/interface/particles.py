@@ -32,6 +32,7 @@ from lfpiv_cli.particles.diameter import LIMIT_SIGMAS, UNKNOWN_LENSES, diameter_
 from lfpiv_cli.particles.neighbour_frames import second_pass
 from lfpiv_cli.particles.rounds import ROUNDS, first_pass
 from lfpiv_cli.particles.search import Particles, Task, result, task_of
+from lfpiv_cli.particles.second_frames import second_frame
 from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.reconstruction.equations import Normalisers
 from lfpiv_cli.reconstruction.images import Image, Mask, filled, light
@@ -48,7 +49,7 @@ LARGEST_CROWD = 1.3
 LOOKED_AT = 5
 # Beyond so many standard errors a given diameter contradicts the images.
 CONTRADICTING_SIGMAS = 4.0
-# Units of progress that `find` and `find_first` report.
+# Units of progress that `find`, `find_first` and `find_second` report.
 STEPS = sum(settings.iterations + 1 for settings in ROUNDS)
 
 
@@ -231,6 +232,18 @@ def find(bench: Bench, frame: Frame, progress: Callable[[int], None] | None = No
 def find_first(bench: Bench, frame: Frame, progress: Callable[[int], None] | None = None) -> NDArray[np.float64]:
     """Return the particles (n, 4) of a frame's first pass, for its own second pass and those of its neighbours."""
     return first_pass(task_for(bench, frame), progress=progress).particles
+
+
+def find_second(
+    bench: Bench,
+    frame: Frame,
+    before: Frame,
+    particles: NDArray[np.float64],
+    progress: Callable[[int], None] | None = None,
+) -> NDArray[np.float64]:
+    """Return what `find_first` returns, for the second frame of a pair: with those (n, 4) of the first, `before`."""
+    task = task_for(bench, frame)
+    return second_frame(task, task_for(bench, before), particles, SEARCH_LENSES * task.view.scale.lens_mm, progress)
 
 
 def find_beside(

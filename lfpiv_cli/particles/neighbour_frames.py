@@ -2,7 +2,8 @@
 
 A particle that was found in a neighbour frame and has no partner here is put where the displacements around it lead,
 whether its light seems free or not; then all particles are refined, and those that do not find their light are
-dropped. So overlapping particles that splitting did not find are separated. Only first passes serve as neighbours: each
+dropped. So overlapping particles that splitting did not find are separated. Only first passes serve as neighbours, and
+of a pair the second frame's first pass begins with the first frame's, never the other way round (`second_frames`): each
 frame's result depends on the images alone, not on the order in which frames are done.
 
 Axes: particles are rows (x, y, z, light) in image axes, mm and counts.

@@ -95,12 +95,18 @@ def find_particles(
 
 def first_pass(task: Task, rounds: tuple[Round, ...] = ROUNDS, progress: Callable[[int], None] | None = None) -> State:
     """Return the state after the rounds, without the help of other frames; see `find_particles`."""
-    state = blank(task)
+    return finished(task, after_rounds(task, blank(task), rounds, progress), rounds[-1])
+
+
+def after_rounds(
+    task: Task, state: State, rounds: tuple[Round, ...], progress: Callable[[int], None] | None = None
+) -> State:
+    """Return the state after some more rounds."""
     for settings in rounds:
         state = _one_round(task, state, settings, progress)
         if progress:
             progress(1)
-    return finished(task, state, rounds[-1])
+    return state
 
 
 def finished(task: Task, state: State, settings: Round) -> State:

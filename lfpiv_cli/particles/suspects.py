@@ -40,7 +40,7 @@ def with_depths_corrected(task: Task, state: State, unexplained: float) -> State
     """Return the state with particles moved to depths that explain the light better, the residual in place."""
     observation = observed(task, state, unexplained)
     chi2, *_ = judge(observation, state.particles)
-    good = _good(chi2)
+    good = good_chi2(chi2)
     near_focus = footprint_radius_mm(task.view, state.particles[:, 2]) < NEAR_FOCUS_LENSES * 2.0 * task.view.half_x_mm
     signature = _signature(task.view.scale, state.particles, chi2)
     suspects = (near_focus | (chi2 > ELSEWHERE_CHI2 * good)) & ~_tried(state.unmoved, state, signature)
@@ -59,7 +59,7 @@ def with_overlaps_split(task: Task, state: State, unexplained: float, thorough: 
     """Return the state with overlapping particles separated; `thorough`: also those of usual brightness."""
     observation = observed(task, state, unexplained)
     chi2, *_ = judge(observation, state.particles)
-    good = _good(chi2)
+    good = good_chi2(chi2)
     bright = state.particles[:, 3] > (ENOUGH_FOR_TWO if thorough else BRIGHT) * state.typical_light
     signature = _signature(task.view.scale, state.particles, chi2)
     suspects = bright & (chi2 > SUSPECT_CHI2 * good) & ~_tried(state.unsplit, state, signature)
@@ -73,7 +73,7 @@ def with_overlaps_split(task: Task, state: State, unexplained: float, thorough: 
     )
 
 
-def _good(chi2: NDArray[np.float64]) -> float:
+def good_chi2(chi2: NDArray[np.float64]) -> float:
     """Return chi-squared of a particle that fits well."""
     return max(float(np.percentile(chi2, GOOD_PERCENTILE)), 1.0) if chi2.size else 1.0
 

@@ -132,7 +132,7 @@ def reconstruct(
         console.warn(said)
         targets = [replace(target, record=with_warnings(target.record, said)) for target in targets]
     with console.frames(len(needed), steps * len(looked_at) / max(len(needed), 1), "reconstruct") as work:
-        find = _finder(bench, read, beside, work.advance)
+        find = _finder(bench, read, beside, options.pairing, work.advance)
         for number, future in ahead(read, needed):
             try:
                 pictures, target = future.result(), targets[number]
@@ -264,14 +264,26 @@ def _write_particles(
 
 
 def _finder(
-    bench: Bench, read: Read, beside: Sequence[tuple[int, ...]] | None, advance: Progress
+    bench: Bench,
+    read: Read,
+    beside: Sequence[tuple[int, ...]] | None,
+    pairing: Pairing | None,
+    advance: Progress,
 ) -> Callable[[int, particles.Frame], Particles]:
-    """Return the function that finds the particles of a frame, alone or with the first passes of those beside it."""
+    """Return the function that finds the particles of a frame, alone or with the first passes of those beside it.
+
+    That of the second frame of a pair begins with what the first frame's found, never the other way round: so it does
+    not matter which frames are there already.
+    """
 
     # A frame needs itself and one at either side, the next one two of these again.
     @lru_cache(maxsize=3)
     def first_pass_of(number: int) -> NDArray[np.float64]:
-        return particles.find_first(bench, particles.frame_of(bench, *read(number)), advance)
+        frame = particles.frame_of(bench, *read(number))
+        if pairing != "ab" or number % 2 == 0:
+            return particles.find_first(bench, frame, advance)
+        before = particles.frame_of(bench, *read(number - 1))
+        return particles.find_second(bench, frame, before, first_pass_of(number - 1), advance)
 
     def find(number: int, frame: particles.Frame) -> Particles:
         if beside is None:
