@@ -61,6 +61,10 @@ PaperPart = Literal[
 Size = Literal["tiny", "quick", "full"]
 
 
+# The formats of other programs that results are exported to.
+ExportFormat = Literal["netcdf", "tecplot", "csv", "mat", "vti", "vtp", "vtkhdf-series"]
+
+
 def names_in(kind: Any) -> tuple[str, ...]:
     """Return the names of one of the kinds above, in their order."""
     return get_args(kind)

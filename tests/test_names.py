@@ -19,6 +19,7 @@ from lfpiv_cli.files.sections import CorrelationSection, Sections
 from lfpiv_cli.files.sections_simulated import FlowSection
 from lfpiv_cli.names import (
     BoardMethod,
+    ExportFormat,
     KnownCamera,
     Method,
     Moment,
@@ -46,6 +47,7 @@ OPTIONS = {
     ("reconstruct", "start"): names_in(Start),
     ("reconstruct", "pairing"): names_in(Pairing),
     ("correlate", "pairing"): names_in(Pairing),
+    ("export", "to"): names_in(ExportFormat),
     ("validate", "frame"): names_in(Moment),
     ("validate", "only"): names_in(PaperPart),
 }

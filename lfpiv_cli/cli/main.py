@@ -13,6 +13,7 @@ import click
 from lfpiv_cli import __version__
 from lfpiv_cli.cli import (
     calibration,
+    exports,
     inspection,
     planning,
     reconstruction,
@@ -38,6 +39,7 @@ COMMANDS = (
     inspection.info,
     inspection.plot,
     report.report,
+    exports.export,
     validation.validate,
     simulation.simulate,
 )

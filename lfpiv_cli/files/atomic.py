@@ -76,14 +76,12 @@ def write_atomically(
         temporary = _reserve(target)
         write(temporary)
         if check is not None:
-            check(temporary)
+            _read_back(target, temporary, check)
         _flush(temporary)
         ensure_writable(target, overwrite)
         os.replace(temporary, target)
         temporary = None
         _flush_folder(target.parent)
-    except InputError as error:
-        raise OutputError(f"{target}: what was written does not read back: {error}") from error
     except LfpivError:
         raise
     except OSError as error:
@@ -91,6 +89,14 @@ def write_atomically(
     finally:
         if temporary is not None:
             temporary.unlink(missing_ok=True)
+
+
+def _read_back(target: Path, temporary: Path, check: Callable[[Path], None]) -> None:
+    """Raise where a finished file is not what was meant."""
+    try:
+        check(temporary)
+    except InputError as error:
+        raise OutputError(f"{target}: what was written does not read back: {error}") from error
 
 
 def write_json(path: Path, value: Mapping[str, Any], overwrite: bool) -> None:

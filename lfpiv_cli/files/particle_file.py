@@ -101,7 +101,7 @@ def write_points(path: Path, format_name: str, points: Points, *, overwrite: boo
         vtk = create_vtk_group(file, "PolyData")
         vtk["Points"] = write_array(file, POSITION, position_mm, "mm")
         vtk["NumberOfPoints"] = np.array([len(position_mm)], dtype=np.int64)
-        _write_cells(vtk, len(position_mm), _lines(arrays["track"]) if "track" in arrays else np.zeros(1, np.int64))
+        _write_cells(vtk, len(position_mm), lines_of(arrays["track"]) if "track" in arrays else np.zeros(1, np.int64))
         data = vtk.create_group("PointData")
         for name, unit in units.items():
             data[name] = write_array(file, name, arrays[name], unit)
@@ -153,7 +153,7 @@ def symmetric(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack([matrices[:, i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))], axis=1)
 
 
-def _lines(track: NDArray[np.int64]) -> NDArray[np.int64]:
+def lines_of(track: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return where each track's rows begin, and where the last one's end."""
     return np.concatenate([[0], np.flatnonzero(np.diff(track)) + 1, [len(track)]]) if len(track) else np.zeros(1, int)
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from lfpiv_cli.files.hdf5 import create, ensure_format, open_h5, write_array
 from lfpiv_cli.files.particle_file import TRAJECTORIES_FORMAT, UNITS, Points
-from lfpiv_cli.files.vtk import create_vtk_group, write_root
+from lfpiv_cli.files.vtk import create_vtk_group, write_root, write_steps
 
 PLAYBACK_FORMAT, PLAYBACK_VERSION = "lfpiv-playback", 1
 # Of `lfpiv-trajectories`: what is shown at each place.
@@ -49,18 +49,13 @@ def write_playback(path: Path, tracks: Points, frames: int, dt_s: float, *, over
         data = vtk.create_group("PointData")
         for name in SHOWN:
             write_array(data, name, tracks.arrays[name][order], units[name])
-        steps = vtk.create_group("Steps")
-        steps.attrs["NSteps"] = np.int64(frames)
-        steps["Values"] = dt_s * np.arange(frames)
+        steps = write_steps(vtk, (dt_s * np.arange(frames)).tolist(), dict.fromkeys(SHOWN, before))
         steps["PartOffsets"] = np.arange(frames, dtype=np.int64)
         steps["NumberOfParts"] = np.ones(frames, np.int64)
         steps["PointOffsets"] = before
         of_kinds = np.zeros((frames, len(KINDS)), np.int64)
         of_kinds[:, 0] = before
         steps["CellOffsets"] = steps["ConnectivityIdOffsets"] = of_kinds
-        offsets = steps.create_group("PointDataOffsets")
-        for name in SHOWN:
-            offsets[name] = before
 
     def check(temporary: Path) -> None:
         with open_h5(temporary) as file:

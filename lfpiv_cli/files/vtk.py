@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import h5py
 import numpy as np
+from numpy.typing import NDArray
 
 from lfpiv_cli.files.hdf5 import RESERVED, from_attribute, read_provenance, to_attribute, write_header
+from lfpiv_cli.grid import Grid
 from lfpiv_cli.reference import Reference
 
 # The version of VTK's layout that ParaView 5.12 reads and later ones still do.
@@ -32,6 +34,26 @@ def create_vtk_group(file: h5py.File, kind: Literal["ImageData", "PolyData"]) ->
     # A string of fixed length: VTK up to 9.4.2 fails on a variable one.
     vtk.attrs["Type"] = np.bytes_(kind)
     return vtk
+
+
+def place_image(vtk: h5py.Group, grid: Grid) -> None:
+    """Say where the points of an ImageData lie."""
+    nx, ny, nz = grid.shape_xyz
+    vtk.attrs["WholeExtent"] = np.array([0, nx - 1, 0, ny - 1, 0, nz - 1], dtype=np.int64)
+    vtk.attrs["Origin"] = np.array(grid.origin_mm, dtype=np.float64)
+    vtk.attrs["Spacing"] = np.array(grid.spacing_mm, dtype=np.float64)
+    vtk.attrs["Direction"] = np.eye(3).ravel()
+
+
+def write_steps(vtk: h5py.Group, times: Sequence[float], begins: Mapping[str, NDArray[np.int64]]) -> h5py.Group:
+    """Write the steps of what changes in time, and where the rows of each point array begin in each; return them."""
+    steps = vtk.create_group("Steps")
+    steps.attrs["NSteps"] = np.int64(len(times))
+    steps["Values"] = np.asarray(times, dtype=np.float64)
+    offsets = steps.create_group("PointDataOffsets")
+    for name, of_steps in begins.items():
+        offsets[name] = of_steps
+    return steps
 
 
 def write_root(

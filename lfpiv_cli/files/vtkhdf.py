@@ -25,7 +25,7 @@ from lfpiv_cli.files.hdf5 import (
     read_array,
     write_array,
 )
-from lfpiv_cli.files.vtk import Header, create_vtk_group, read_root, write_root
+from lfpiv_cli.files.vtk import Header, create_vtk_group, place_image, read_root, write_root
 from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.reference import Reference
@@ -197,6 +197,25 @@ def open_vectors(path: Path | str) -> VectorField:
     return field
 
 
+def read_arrays(path: Path | str) -> tuple[Grid, dict[str, tuple[NDArray[Any], str]]]:
+    """Read the grid of a vector field and every array on it with its unit: those that commands store besides, too.
+
+    Raises
+    ------
+    InputError
+    """
+    path = Path(path)
+    with open_h5(path) as file:
+        ensure_format(path, file, VECTORS_FORMAT, (FORMAT_VERSION,))
+        grid, size, found = _read_grid(file), path.stat().st_size, {}
+        places = 2 if grid.shape_zyx[0] == 1 else 3
+        for name in member(member(file, "VTKHDF"), "PointData"):
+            dataset = member(file, name)
+            array = _read_points(file, name, grid, size, components=dataset.ndim > places)
+            found[name] = (array, dataset.attrs["units"].decode())
+    return grid, found
+
+
 def read_header(path: Path | str) -> Header:
     """Read what a volume, a vector field or points say about themselves.
 
@@ -230,12 +249,8 @@ def _write_frame(file: h5py.File, grid: Grid, with_component: bool) -> h5py.Grou
         scale.make_scale(name)
     if with_component:
         file.create_dataset("component", data=np.arange(3), track_times=False).make_scale("component")
-    nx, ny, nz = grid.shape_xyz
     vtk = create_vtk_group(file, "ImageData")
-    vtk.attrs["WholeExtent"] = np.array([0, nx - 1, 0, ny - 1, 0, nz - 1], dtype=np.int64)
-    vtk.attrs["Origin"] = np.array(grid.origin_mm, dtype=np.float64)
-    vtk.attrs["Spacing"] = np.array(grid.spacing_mm, dtype=np.float64)
-    vtk.attrs["Direction"] = np.eye(3).ravel()
+    place_image(vtk, grid)
     return vtk.create_group("PointData")
 
 

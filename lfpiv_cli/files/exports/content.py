@@ -1,0 +1,159 @@
+"""What is in a volume, vectors, particles or tracks, all of it, in the one form that the formats are written from."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lfpiv_cli.errors import InputError
+from lfpiv_cli.files.hdf5 import format_of
+from lfpiv_cli.files.particle_file import (
+    PARTICLES_FORMAT,
+    POSITION,
+    TRACKS_FORMAT,
+    TRAJECTORIES_FORMAT,
+    UNITS,
+    read_points,
+)
+from lfpiv_cli.files.vtkhdf import VECTORS_FORMAT, VOLUME_FORMAT, open_vectors, open_volume, read_arrays, read_header
+from lfpiv_cli.grid import Grid
+
+# What each format holds, as a person says it.
+KINDS = {
+    VOLUME_FORMAT: "a volume",
+    VECTORS_FORMAT: "vectors",
+    PARTICLES_FORMAT: "particles",
+    TRACKS_FORMAT: "tracks of a pair",
+    TRAJECTORIES_FORMAT: "tracks of a sequence",
+}
+ON_GRIDS = (VOLUME_FORMAT, VECTORS_FORMAT)
+OF_POINTS = (PARTICLES_FORMAT, TRACKS_FORMAT, TRAJECTORIES_FORMAT)
+# The last axis of an array, by its length: vectors, and symmetric tensors in VTK's order.
+COMPONENTS = {3: ("x", "y", "z"), 6: ("xx", "yy", "zz", "xy", "yz", "xz")}
+
+
+@dataclass(frozen=True, eq=False)
+class Content:
+    """The content of a file.
+
+    Attributes
+    ----------
+    format_name : one of `KINDS`
+    grid : of a volume and of vectors, None of points
+    arrays : by name, (nz, ny, nx) or (n,), and with a last axis of components
+    units : of the arrays
+    attributes : what the file says about itself: scalars, strings and short lists
+    provenance : the record of how it was made
+    """
+
+    format_name: str
+    grid: Grid | None
+    arrays: dict[str, NDArray[Any]]
+    units: dict[str, str]
+    attributes: dict[str, Any]
+    provenance: dict[str, Any]
+
+    def told(self) -> dict[str, Any]:
+        """Return what is told besides the arrays: the format, the attributes, and the provenance as JSON."""
+        return {"format": self.format_name, **self.attributes, "provenance": json.dumps(self.provenance)}
+
+    def comments(self) -> Iterator[str]:
+        """Yield the same as lines of comments, the provenance as JSON over as many lines as it needs."""
+        for name, value in self.told().items():
+            if name != "provenance":
+                yield f"# {name}: {json.dumps(value)}"
+        yield "# provenance:"
+        for line in json.dumps(self.provenance, indent=1).splitlines():
+            yield f"# {line}"
+
+
+def read_content(path: Path) -> Content:
+    """Read a volume, vectors, particles or tracks.
+
+    Raises
+    ------
+    InputError : it is missing, broken or something else
+    """
+    name = format_of(path)
+    if name not in KINDS:
+        raise InputError(f"{path}: holds {name}, expected {', '.join(KINDS)}")
+    if name == VOLUME_FORMAT:
+        volume = open_volume(path)
+        return Content(
+            name, volume.grid, {"intensity": volume.array}, {"intensity": "1"}, volume.attributes, volume.provenance
+        )
+    if name == VECTORS_FORMAT:
+        open_vectors(path)  # for its checks
+        grid, found = read_arrays(path)
+        header = read_header(path)
+        # The velocity comes first, as it is what is asked for.
+        names = sorted(found, key=lambda each: (each != "velocity", each))
+        arrays, units = {each: found[each][0] for each in names}, {each: found[each][1] for each in names}
+        return Content(name, grid, arrays, units, header.attributes, header.provenance)
+    points = read_points(path, name)
+    arrays = {POSITION: points.position_mm, **points.arrays}
+    return Content(name, None, arrays, {POSITION: "mm", **UNITS[name]}, points.attributes, points.provenance)
+
+
+def plane_of(content: Content, number: int) -> Content:
+    """Return one plane across z of what lies on a grid, counted from 0."""
+    if content.grid is None:
+        raise ValueError("points have no planes")
+    grid = content.grid
+    nx, ny, _ = grid.shape_xyz
+    x, y, _ = grid.origin_mm
+    plane = Grid((nx, ny, 1), grid.spacing_mm, (x, y, float(grid.axis_mm(2)[number])))
+    return replace(
+        content, grid=plane, arrays={name: array[number : number + 1] for name, array in content.arrays.items()}
+    )
+
+
+def columns_of(content: Content) -> dict[str, NDArray[Any]]:
+    """Return everything as columns of one row for each place: coordinates first, then each component of each array.
+
+    The velocity's are called u, v, w; x varies fastest on a grid, z slowest.
+    """
+    columns: dict[str, NDArray[Any]] = {}
+    if content.grid is not None:
+        centres = content.grid.centres_mm().reshape(-1, 3)
+        columns = {axis: centres[:, k] for k, axis in enumerate("xyz")}
+    places = 1 if content.grid is None else 3
+    for name, array in content.arrays.items():
+        if array.ndim == places:
+            columns[name] = array.ravel()
+            continue
+        parts = array.reshape(-1, array.shape[-1])
+        for k, column in enumerate(component_names(name, parts.shape[1])):
+            columns[column] = parts[:, k]
+    return columns
+
+
+def column_units(content: Content) -> dict[str, str]:
+    """Return the unit of each of `columns_of`."""
+    units = dict.fromkeys("xyz", "mm") if content.grid is not None else {}
+    places = 1 if content.grid is None else 3
+    for name, array in content.arrays.items():
+        names = [name] if array.ndim == places else component_names(name, array.shape[-1])
+        units |= dict.fromkeys(names, content.units[name])
+    return units
+
+
+def component_names(name: str, count: int) -> list[str]:
+    """Return what the components of an array are called."""
+    if name == POSITION:
+        return ["x", "y", "z"]
+    if name == "velocity":
+        return ["u", "v", "w"]
+    return [f"{name}_{suffix}" for suffix in COMPONENTS.get(count, range(count))]
+
+
+def frames_of(content: Content) -> list[NDArray[np.int64]]:
+    """Return the rows of each frame of a sequence's tracks."""
+    frame = content.arrays["frame"]
+    return [np.flatnonzero(frame == number) for number in range(int(frame.max(initial=-1)) + 1)]

@@ -1,0 +1,354 @@
+"""`export`: what other programs read is what the file holds, to the last bit."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from scipy.io import loadmat, netcdf_file
+
+from lfpiv_cli.cli import cli
+from lfpiv_cli.errors import InputError, OutputError, UsageError
+from lfpiv_cli.files.exports import mat, netcdf
+from lfpiv_cli.files.exports.content import Content, columns_of, read_content
+from lfpiv_cli.files.exports.formats import FORMATS
+from lfpiv_cli.files.hdf5 import write_tree
+from lfpiv_cli.files.particle_file import (
+    PARTICLES_FORMAT,
+    TRACKS_FORMAT,
+    TRAJECTORIES_FORMAT,
+    UNITS,
+    Points,
+    write_points,
+)
+from lfpiv_cli.files.vtkhdf import write_vectors, write_volume
+from lfpiv_cli.flow.field import VectorField
+from lfpiv_cli.grid import Grid
+from lfpiv_cli.names import ExportFormat, names_in
+from lfpiv_cli.reference import Reference
+
+GRID = Grid((4, 3, 2), (0.1, 0.3, 0.7), (-0.15, 1 / 3, 2.0))
+REFERENCE = Reference("mid_plane", 0.1 + 0.2)
+# Non-ASCII and quotes have to survive wherever a record is kept.
+MADE = {"command": "correlate", "inputs": {"a": {"name": 'm"ü<&>.tif', "sha256": "00"}}}
+KINDS = ("volume", "vectors", "particles", "tracks", "trajectories")
+
+
+def write_field(path: Path, rng: np.random.Generator, grid: Grid = GRID, dt_s: float = 0.002) -> None:
+    shape = grid.shape_zyx
+    flag = np.zeros(shape, np.uint8)
+    flag[0, 0, 0] = 3
+    displacement = rng.normal(size=(*shape, 3))
+    scalars = [rng.random(shape) for _ in range(3)]
+    field = VectorField(grid, displacement, displacement + 0.1, *scalars, flag, None, (0.1, 0.1, 0.1), dt_s, (8, 8, 8))
+    extra = {"vorticity": (rng.normal(size=(*shape, 3)), "1/s"), "divergence": (rng.normal(size=shape), "1/s")}
+    write_vectors(path, field, REFERENCE, provenance=MADE, overwrite=False, extra=extra)
+
+
+def points_of(name: str, rng: np.random.Generator) -> Points:
+    """Return five points; in a sequence a track of three frames and one of two, and no light in frame 1."""
+    shapes = {"covariance_mm2": (5, 6), "velocity": (5, 3), "velocity_sigma": (5, 3), "displacement_mm": (5, 3)}
+    integers = {"particle", "particle_a", "particle_b"}
+    arrays: dict[str, Any] = {
+        each: rng.integers(0, 9, 5) if each in integers else rng.normal(size=shapes.get(each, (5,)))
+        for each in UNITS[name]
+    }
+    if name == PARTICLES_FORMAT:
+        arrays["flag"] = np.array([0, 1, 0, 0, 1], np.uint8)
+    else:
+        arrays["link_probability"][0] = np.nan
+    if name == TRAJECTORIES_FORMAT:
+        arrays |= {"track": np.array([0, 0, 0, 4, 4]), "frame": np.array([0, 2, 3, 2, 3])}
+    return Points(rng.normal(size=(5, 3)), arrays, REFERENCE, {"dt_s": 0.002}, MADE)
+
+
+@pytest.fixture(params=KINDS)
+def source(request: pytest.FixtureRequest, tmp_path: Path, rng: np.random.Generator) -> Path:
+    """A file of each kind."""
+    return write_kind(request.param, tmp_path, rng)
+
+
+def write_kind(kind: str, folder: Path, rng: np.random.Generator) -> Path:
+    path = folder / f"{kind}.vtkhdf"
+    if kind == "volume":
+        array = rng.random(GRID.shape_zyx).astype(np.float32)
+        told = {"residual": np.array([1.0, 0.1]), "excluded_pixels": 3}
+        write_volume(path, array, GRID, REFERENCE, provenance=MADE, attributes=told, overwrite=False)
+    elif kind == "vectors":
+        write_field(path, rng)
+    else:
+        name = {"particles": PARTICLES_FORMAT, "tracks": TRACKS_FORMAT, "trajectories": TRAJECTORIES_FORMAT}[kind]
+        write_points(path, name, points_of(name, rng), overwrite=False)
+    return path
+
+
+def run(*arguments: object) -> None:
+    cli.main([*map(str, arguments), "--quiet"], standalone_mode=False)
+
+
+def exported(source: Path, to: ExportFormat) -> tuple[Path, Content]:
+    """Return what `export` writes of a file, and what was in it; skip what does not fit."""
+    content = read_content(source)
+    if content.format_name not in FORMATS[to].takes:
+        pytest.skip("does not fit")
+    run("export", source, "--to", to)
+    return source.with_name(source.stem + FORMATS[to].ending), content
+
+
+def same(found: np.ndarray, expected: np.ndarray) -> None:
+    """Assert that two arrays are the same to the last bit, in floating point also by type."""
+    if expected.dtype.kind == "f":
+        assert found.dtype.newbyteorder("=") == expected.dtype
+    assert np.array_equal(found, expected, equal_nan=expected.dtype.kind == "f")
+
+
+def ensure_record(text: str) -> None:
+    """Assert that a record is that of the export, with the record of what was exported in it."""
+    made = json.loads(text)
+    assert made["command"].startswith("export ")
+    assert list(made["made_from"].values()) == [MADE]
+
+
+def test_content_is_all_that_is_in_the_file(source: Path) -> None:
+    content = read_content(source)
+    with h5py.File(source) as file:
+        assert set(content.arrays) == set(file) - {"VTKHDF", "x", "y", "z", "component"}
+        for name, array in content.arrays.items():
+            same(array, file[name][()])
+            assert content.units[name] == file[name].attrs["units"].decode()
+
+
+def test_netcdf_comes_back(source: Path) -> None:
+    path, content = exported(source, "netcdf")
+    with netcdf_file(path, mmap=False) as file:
+        ensure_record(file.provenance.decode())
+        assert file.format.decode() == content.format_name
+        assert file.reference_z_mm.item() == 0.1 + 0.2
+        found = {name: variable[...].copy() for name, variable in file.variables.items()}
+        units = {name: getattr(variable, "units", b"").decode() for name, variable in file.variables.items()}
+    if content.grid is not None:
+        for k, axis in enumerate("xyz"):
+            same(found[axis], content.grid.axis_mm(k))
+    for name, array in content.arrays.items():
+        if name == "velocity" and content.grid is not None:
+            same(np.stack([found[each][..., 0] for each in "uvw"], axis=-1), array)
+            continue
+        same(found[name][:, :, :, 0] if source.stem == "vectors" else found[name], array)
+        assert units[name] == content.units[name]
+    if source.stem == "vectors":
+        assert found["chc"].sum() == 23
+
+
+def test_matlab_comes_back(source: Path) -> None:
+    path, content = exported(source, "mat")
+    assert path.read_bytes()[:128].startswith(b"MATLAB 5.0 MAT-file, written by lfpiv  ")
+    found = loadmat(path)
+    ensure_record(found["provenance"].item())
+    assert found["reference_z_mm"].item() == 0.1 + 0.2
+    for name, array in content.arrays.items():
+        same(found[name].reshape(array.shape), array)
+
+
+@pytest.mark.parametrize("to", ["csv", "tecplot"])
+def test_text_comes_back(source: Path, to: ExportFormat) -> None:
+    path, content = exported(source, to)
+    lines = path.read_text(encoding="utf-8").splitlines()
+    comments = [line.removeprefix("# ") for line in lines if line.startswith("#")]
+    begin, end = comments.index("provenance:"), len(comments) - (to == "csv")
+    ensure_record("".join(comments[begin + 1 : end]))
+    if to == "csv":
+        head, *rows = csv.reader(line for line in lines if not line.startswith("#"))
+    else:
+        names = next(line for line in lines if line.startswith("VARIABLES"))
+        head = [each.split(" [")[0] for each in names.split('"')[1::2]]
+        rows = [line.split() for line in lines if line[0] in "-0123456789n"]
+    expected = columns_of(content)
+    assert head == list(expected)
+    found = dict(zip(head, np.array(rows).T, strict=True))
+    order = np.argsort(content.arrays["frame"], kind="stable") if to == "tecplot" and "frame" in expected else ...
+    for name, column in expected.items():
+        same(found[name].astype(column.dtype), column[order])
+
+
+def test_tecplot_has_a_zone_for_each_frame_with_its_time(tmp_path: Path, rng: np.random.Generator) -> None:
+    path, _ = exported(write_kind("trajectories", tmp_path, rng), "tecplot")
+    zones = [line for line in path.read_text().splitlines() if line.startswith("ZONE")]
+    assert zones == [
+        'ZONE T="frame 0", STRANDID=1, SOLUTIONTIME=0.0, I=1, DATAPACKING=POINT',
+        'ZONE T="frame 2", STRANDID=1, SOLUTIONTIME=0.004, I=2, DATAPACKING=POINT',
+        'ZONE T="frame 3", STRANDID=1, SOLUTIONTIME=0.006, I=2, DATAPACKING=POINT',
+    ]
+
+
+def test_vtk_reads_images_and_points(source: Path) -> None:
+    vtk = pytest.importorskip("vtkmodules.vtkIOXML")
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    on_grid = source.stem in ("volume", "vectors")
+    path, content = exported(source, "vti" if on_grid else "vtp")
+    reader = vtk.vtkXMLImageDataReader() if on_grid else vtk.vtkXMLPolyDataReader()
+    reader.SetFileName(str(path))
+    reader.Update()
+    assert reader.GetErrorCode() == 0
+    data = reader.GetOutput()
+    told = data.GetFieldData()
+    ensure_record(told.GetAbstractArray("provenance").GetValue(0))
+    assert told.GetArray("reference_z_mm").GetValue(0) == 0.1 + 0.2
+    if content.grid is not None:
+        assert data.GetDimensions() == content.grid.shape_xyz
+        assert data.GetOrigin() == content.grid.origin_mm
+        assert data.GetSpacing() == content.grid.spacing_mm
+    for name, array in content.arrays.items():
+        stored = data.GetPoints().GetData() if name == "position_mm" else data.GetPointData().GetArray(name)
+        same(vtk_to_numpy(stored).reshape(array.shape), array)
+    if not on_grid:
+        assert data.GetNumberOfVerts() == 5
+        lines = [data.GetCell(5 + k).GetNumberOfPoints() for k in range(data.GetNumberOfLines())]
+        assert lines == ([3, 2] if source.stem == "trajectories" else [])
+
+
+@pytest.mark.parametrize("planes", [1, 2])
+def test_vtk_plays_vectors(planes: int, tmp_path: Path, rng: np.random.Generator) -> None:
+    vtk = pytest.importorskip("vtkmodules.vtkIOHDF")
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    paths = [tmp_path / f"{number}.vtkhdf" for number in range(3)]
+    grid = Grid((4, 3, planes), GRID.spacing_mm, GRID.origin_mm)
+    for path in paths:
+        write_field(path, rng, grid)
+    run("export", *paths, "--to", "vtkhdf-series", "--step-s", "0.5", "-o", tmp_path / "series.vtkhdf")
+    reader = vtk.vtkHDFReader()
+    reader.SetFileName(str(tmp_path / "series.vtkhdf"))
+    reader.UpdateInformation()
+    assert reader.GetNumberOfSteps() == 3
+    for step, path in enumerate(paths):
+        reader.SetStep(step)
+        reader.Update()
+        assert reader.GetTimeValue() == 0.5 * step
+        image, content = reader.GetOutput(), read_content(path)
+        assert (image.GetDimensions(), image.GetOrigin()) == ((4, 3, planes), grid.origin_mm)
+        for name, array in content.arrays.items():
+            same(vtk_to_numpy(image.GetPointData().GetArray(name)).reshape(array.shape), array)
+    with h5py.File(tmp_path / "series.vtkhdf") as file:
+        assert file.attrs["format"] == b"lfpiv-series"
+        assert json.loads(file.attrs["provenance"])["inputs"]["file_0002"]["name"] == "2.vtkhdf"
+
+
+def test_tracks_of_a_sequence_are_played_as_follow_writes_them(tmp_path: Path, rng: np.random.Generator) -> None:
+    source = write_kind("trajectories", tmp_path, rng)
+    run("export", source, "--to", "vtkhdf-series", "-o", tmp_path / "playback.vtkhdf")
+    with h5py.File(tmp_path / "playback.vtkhdf") as file:
+        assert file.attrs["format"] == b"lfpiv-playback"
+        np.testing.assert_array_equal(file["VTKHDF/NumberOfPoints"], [1, 0, 2, 2])
+        np.testing.assert_allclose(file["VTKHDF/Steps/Values"], [0.0, 0.002, 0.004, 0.006])
+
+
+def test_xarray_opens_vectors_of_several_times(tmp_path: Path, rng: np.random.Generator) -> None:
+    xarray = pytest.importorskip("xarray")
+    paths = [tmp_path / f"{number}.vtkhdf" for number in range(2)]
+    for path in paths:
+        write_field(path, rng)
+    run("export", *paths, "--to", "netcdf", "--step-s", "0.25", "-o", tmp_path / "run.nc")
+    with xarray.open_dataset(tmp_path / "run.nc") as found:
+        assert found["u"].dims == ("z", "y", "x", "t")
+        assert found["t"].values.tolist() == [0.0, 0.25]
+        assert (found["u"].units, found["t"].units, found["x"].units) == ("m/s", "s", "mm")
+        assert found.attrs["delta_t"] == 0.002
+        for number, path in enumerate(paths):
+            same(found["displacement_voxel"].values[:, :, :, number], read_content(path).arrays["displacement_voxel"])
+        # One plane has what pivpy's schema asks for, its dimensions in that order.
+        plane = found.isel(z=1)
+        assert plane["u"].dims == plane["v"].dims == plane["chc"].dims == ("y", "x", "t")
+
+
+def test_pivpy_reads_a_plane(tmp_path: Path, rng: np.random.Generator) -> None:
+    pytest.importorskip("pivpy")
+    from pivpy import io, schema
+
+    source = write_kind("vectors", tmp_path, rng)
+    run("export", source, "--to", "netcdf", "--plane", 1, "-o", tmp_path / "plane.nc")
+    found = io.read_piv(tmp_path / "plane.nc")
+    schema.validate(found)
+    same(found["u"].values[..., 0], read_content(source).arrays["velocity"][1, :, :, 0])
+    assert found.attrs["delta_t"] == 0.002
+
+
+def test_flowtracks_reads_the_tracks_of_a_sequence(tmp_path: Path, rng: np.random.Generator) -> None:
+    flowtracks = pytest.importorskip("flowtracks.io")
+    path, content = exported(write_kind("trajectories", tmp_path, rng), "mat")
+    found = flowtracks.trajectories_mat(str(path))
+    assert [track.trajid() for track in found] == [0, 4]
+    assert [track.time().tolist() for track in found] == [[0, 2, 3], [2, 3]]
+    # It converts mm to m.
+    same(np.concatenate([track.pos() for track in found]), content.arrays["position_mm"] / 1000.0)
+    velocity = np.concatenate([track.velocity() for track in found])
+    np.testing.assert_allclose(velocity, content.arrays["velocity"], rtol=1e-15)
+
+
+def test_the_same_work_gives_the_same_bytes(source: Path, tmp_path: Path) -> None:
+    for to in names_in(ExportFormat):
+        if read_content(source).format_name in FORMATS[to].takes:
+            for name in ("once", "again"):
+                run("export", source, "--to", to, "-o", tmp_path / name)
+            assert (tmp_path / "once").read_bytes() == (tmp_path / "again").read_bytes()
+            (tmp_path / "once").unlink()
+            (tmp_path / "again").unlink()
+
+
+def test_what_does_not_fit_is_refused_with_what_does(source: Path) -> None:
+    refused = [to for to in FORMATS if read_content(source).format_name not in FORMATS[to].takes]
+    assert refused
+    for to in refused:
+        with pytest.raises(UsageError, match=r"does not fit into .+; what fits is netcdf"):
+            run("export", source, "--to", to)
+    assert sorted(source.parent.iterdir()) == [source]
+
+
+def test_several_files_need_a_name_and_a_format_for_them(tmp_path: Path, rng: np.random.Generator) -> None:
+    paths = [tmp_path / "a.vtkhdf", tmp_path / "b.vtkhdf"]
+    for path in paths:
+        write_field(path, rng)
+    with pytest.raises(UsageError, match="whose name -o has to say"):
+        run("export", *paths, "--to", "netcdf")
+    with pytest.raises(UsageError, match="several go into netcdf, vtkhdf-series"):
+        run("export", *paths, "--to", "vti", "-o", tmp_path / "all.vti")
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [({"grid": Grid((4, 3, 3), GRID.spacing_mm, GRID.origin_mm)}, "on Grid"), ({"dt_s": 0.003}, "'dt_s': 0.003")],
+)
+@pytest.mark.parametrize("to", ["netcdf", "vtkhdf-series"])
+def test_times_that_do_not_belong_together_are_refused(to, changes, words, tmp_path, rng) -> None:
+    write_field(tmp_path / "a.vtkhdf", rng)
+    write_field(tmp_path / "b.vtkhdf", rng, **changes)
+    with pytest.raises(InputError, match=words):
+        run("export", tmp_path / "a.vtkhdf", tmp_path / "b.vtkhdf", "--to", to, "-o", tmp_path / "all")
+    assert not (tmp_path / "all").exists()
+
+
+def test_planes_are_counted_from_0_and_points_have_none(tmp_path: Path, rng: np.random.Generator) -> None:
+    with pytest.raises(UsageError, match="--plane 2: .* has 2 planes"):
+        run("export", write_kind("vectors", tmp_path, rng), "--to", "vti", "--plane", 2)
+    with pytest.raises(UsageError, match="no planes"):
+        run("export", write_kind("tracks", tmp_path, rng), "--to", "csv", "--plane", 0)
+
+
+def test_other_files_are_refused(tmp_path: Path) -> None:
+    write_tree(tmp_path / "c.h5", {}, format_name="lfpiv-calibration", format_version=1, provenance={}, overwrite=False)
+    with pytest.raises(InputError, match="holds lfpiv-calibration, expected lfpiv-volume"):
+        run("export", tmp_path / "c.h5", "--to", "mat")
+
+
+@pytest.mark.parametrize(("module", "to"), [(mat, "mat"), (netcdf, "netcdf")])
+def test_arrays_that_are_too_large_are_refused(module, to, tmp_path, rng, monkeypatch) -> None:
+    source = write_kind("volume", tmp_path, rng)
+    monkeypatch.setattr(module, "LARGEST_BYTES", 40)
+    with pytest.raises(OutputError, match="intensity has 96 bytes"):
+        run("export", source, "--to", to)
+    assert sorted(tmp_path.iterdir()) == [source]
