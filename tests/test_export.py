@@ -159,29 +159,45 @@ def test_text_comes_back(source: Path, to: ExportFormat) -> None:
     path, content = exported(source, to)
     lines = path.read_text(encoding="utf-8").splitlines()
     comments = [line.removeprefix("# ") for line in lines if line.startswith("#")]
-    begin, end = comments.index("provenance:"), len(comments) - (to == "csv")
-    ensure_record("".join(comments[begin + 1 : end]))
+    ensure_record("".join(comments[comments.index("provenance:") + 1 : -1]))
+    units = json.loads(comments[-1].removeprefix("units: "))
     if to == "csv":
         head, *rows = csv.reader(line for line in lines if not line.startswith("#"))
     else:
         names = next(line for line in lines if line.startswith("VARIABLES"))
-        head = [each.split(" [")[0] for each in names.split('"')[1::2]]
+        head = names.split('"')[1::2]
         rows = [line.split() for line in lines if line[0] in "-0123456789n"]
     expected = columns_of(content)
-    assert head == list(expected)
+    assert head == list(expected) == list(units)
+    assert (units["x"], units.get("u", "m/s")) == ("mm", "m/s")
     found = dict(zip(head, np.array(rows).T, strict=True))
     order = np.argsort(content.arrays["frame"], kind="stable") if to == "tecplot" and "frame" in expected else ...
     for name, column in expected.items():
         same(found[name].astype(column.dtype), column[order])
 
 
+def test_tecplot_is_understood_by_the_reader_of_vtk(tmp_path: Path, rng: np.random.Generator) -> None:
+    vtk = pytest.importorskip("vtkmodules.vtkIOGeometry")
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    path, content = exported(write_kind("vectors", tmp_path, rng), "tecplot")
+    reader = vtk.vtkTecplotReader()
+    reader.SetFileName(str(path))
+    reader.Update()
+    zone = reader.GetOutput().GetBlock(0)
+    # It keeps 32 bits.
+    places, columns = vtk_to_numpy(zone.GetPoints().GetData()), columns_of(content)
+    np.testing.assert_allclose(places, np.stack([columns[axis] for axis in "xyz"], axis=1), rtol=1e-6)
+    np.testing.assert_allclose(vtk_to_numpy(zone.GetPointData().GetArray("u")), columns["u"], rtol=1e-6)
+
+
 def test_tecplot_has_a_zone_for_each_frame_with_its_time(tmp_path: Path, rng: np.random.Generator) -> None:
     path, _ = exported(write_kind("trajectories", tmp_path, rng), "tecplot")
     zones = [line for line in path.read_text().splitlines() if line.startswith("ZONE")]
     assert zones == [
-        'ZONE T="frame 0", STRANDID=1, SOLUTIONTIME=0.0, I=1, DATAPACKING=POINT',
-        'ZONE T="frame 2", STRANDID=1, SOLUTIONTIME=0.004, I=2, DATAPACKING=POINT',
-        'ZONE T="frame 3", STRANDID=1, SOLUTIONTIME=0.006, I=2, DATAPACKING=POINT',
+        'ZONE T="frame 0", STRANDID=1, SOLUTIONTIME=0.0, I=1, J=1, K=1, DATAPACKING=POINT',
+        'ZONE T="frame 2", STRANDID=1, SOLUTIONTIME=0.004, I=2, J=1, K=1, DATAPACKING=POINT',
+        'ZONE T="frame 3", STRANDID=1, SOLUTIONTIME=0.006, I=2, J=1, K=1, DATAPACKING=POINT',
     ]
 
 

@@ -15,26 +15,33 @@ from lfpiv_cli.files.particle_file import TRAJECTORIES_FORMAT
 
 def write_csv(path: Path, content: Content) -> None:
     """Write one row for each place below the columns' names; lines of comments before them begin with #."""
-    columns, units = columns_of(content), column_units(content)
+    columns = columns_of(content)
     with open(path, "w", encoding="utf-8", newline="\n") as file:
-        file.writelines(f"{line}\n" for line in content.comments())
-        file.write(f"# units: {json.dumps(units)}\n")
+        file.writelines(_comments(content))
         file.write(",".join(columns) + "\n")
         file.writelines(",".join(row) + "\n" for row in _rows(columns))
 
 
 def write_tecplot(path: Path, content: Content) -> None:
-    """Write an ordered zone on a grid, one of points, or of a sequence's tracks one for each frame with its time."""
-    columns, units = columns_of(content), column_units(content)
+    """Write an ordered zone on a grid, one of points, or of a sequence's tracks one for each frame with its time.
+
+    Names of variables have no units, by which readers would not know coordinates as such: comments have them.
+    """
+    columns = columns_of(content)
     with open(path, "w", encoding="utf-8", newline="\n") as file:
-        file.writelines(f"{line}\n" for line in content.comments())
+        file.writelines(_comments(content))
         file.write(f'TITLE = "{KINDS[content.format_name]}"\n')
-        names = (f'"{name}"' if units[name] == "1" else f'"{name} [{units[name]}]"' for name in columns)
-        file.write(f"VARIABLES = {' '.join(names)}\n")
+        file.write("VARIABLES = " + " ".join(f'"{name}"' for name in columns) + "\n")
         for head, rows in _zones(content):
             file.write(f"ZONE {head}, DATAPACKING=POINT\nDT=({'DOUBLE ' * len(columns)})\n")
             here = columns if rows is None else {name: column[rows] for name, column in columns.items()}
             file.writelines(" ".join(row) + "\n" for row in _rows(here))
+
+
+def _comments(content: Content) -> Iterator[str]:
+    """Yield what the file says about itself as lines that begin with #; the units are the last."""
+    yield from (f"{line}\n" for line in content.comments())
+    yield f"# units: {json.dumps(column_units(content))}\n"
 
 
 def _zones(content: Content) -> Iterator[tuple[str, NDArray[np.int64] | None]]:
@@ -47,9 +54,9 @@ def _zones(content: Content) -> Iterator[tuple[str, NDArray[np.int64] | None]]:
         dt_s = float(content.attributes["dt_s"])
         for number, rows in enumerate(frames_of(content)):
             if rows.size:
-                yield f'T="frame {number}", STRANDID=1, SOLUTIONTIME={number * dt_s!r}, I={rows.size}', rows
+                yield f'T="frame {number}", STRANDID=1, SOLUTIONTIME={number * dt_s!r}, I={rows.size}, J=1, K=1', rows
     else:
-        yield f'T="{kind}", I={len(content.arrays["position_mm"])}', None
+        yield f'T="{kind}", I={len(content.arrays["position_mm"])}, J=1, K=1', None
 
 
 def _rows(columns: dict[str, NDArray[np.generic]]) -> Iterator[tuple[str, ...]]:
