@@ -306,6 +306,26 @@ def test_flowtracks_reads_the_tracks_of_a_sequence(tmp_path: Path, rng: np.rando
     np.testing.assert_allclose(velocity, content.arrays["velocity"], rtol=1e-15)
 
 
+@pytest.mark.parametrize("name", [PARTICLES_FORMAT, TRACKS_FORMAT, TRAJECTORIES_FORMAT])
+def test_no_points_are_no_fault(name: str, tmp_path: Path, rng: np.random.Generator) -> None:
+    full = points_of(name, rng)
+    arrays = {each: array[:0] for each, array in full.arrays.items()}
+    none = Points(np.empty((0, 3)), arrays, REFERENCE, full.attributes, MADE)
+    write_points(tmp_path / "none.vtkhdf", name, none, overwrite=False)
+    for to, each in FORMATS.items():
+        if name in each.takes:
+            run("export", tmp_path / "none.vtkhdf", "--to", to)
+    with netcdf_file(tmp_path / "none.nc", mmap=False) as file:
+        assert file.variables["position_mm"].shape == (0, 3)
+    assert (tmp_path / "none.csv").read_text().splitlines()[-1].startswith("x,y,z,")
+    assert loadmat(tmp_path / "none.mat")["position_mm"].shape == (0, 3)
+    vtk = pytest.importorskip("vtkmodules.vtkIOXML")
+    reader = vtk.vtkXMLPolyDataReader()
+    reader.SetFileName(str(tmp_path / "none.vtp"))
+    reader.Update()
+    assert (reader.GetErrorCode(), reader.GetOutput().GetNumberOfPoints()) == (0, 0)
+
+
 def test_the_same_work_gives_the_same_bytes(source: Path, tmp_path: Path) -> None:
     for to in names_in(ExportFormat):
         if read_content(source).format_name in FORMATS[to].takes:
@@ -320,7 +340,7 @@ def test_what_does_not_fit_is_refused_with_what_does(source: Path) -> None:
     refused = [to for to in FORMATS if read_content(source).format_name not in FORMATS[to].takes]
     assert refused
     for to in refused:
-        with pytest.raises(UsageError, match=r"does not fit into .+; what fits is netcdf"):
+        with pytest.raises(UsageError, match=r"holds .+, which .+ does not take; netcdf, .+ do$"):
             run("export", source, "--to", to)
     assert sorted(source.parent.iterdir()) == [source]
 

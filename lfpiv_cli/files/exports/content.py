@@ -61,7 +61,8 @@ class Content:
 
     def told(self) -> dict[str, Any]:
         """Return what is told besides the arrays: the format, the attributes, and the provenance as JSON."""
-        return {"format": self.format_name, **self.attributes, "provenance": json.dumps(self.provenance)}
+        known = {name: value for name, value in self.attributes.items() if value is not None}
+        return {"format": self.format_name, **known, "provenance": json.dumps(self.provenance)}
 
     def comments(self) -> Iterator[str]:
         """Yield the same as lines of comments, the provenance as JSON over as many lines as it needs."""

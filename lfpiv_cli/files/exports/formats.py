@@ -58,8 +58,8 @@ def ensure_fits(path: Path, format_name: str, to: ExportFormat, count: int) -> N
     """
     kind, fitting = KINDS[format_name], [name for name, each in FORMATS.items() if format_name in each.takes]
     if to not in fitting:
-        raise UsageError(f"{path}: {kind}: does not fit into {to}; what fits is {', '.join(fitting)}")
+        raise UsageError(f"{path}: holds {kind}, which {to} does not take; {', '.join(fitting)} do")
     if count > 1 and format_name not in FORMATS[to].several:
         fitting = [name for name, each in FORMATS.items() if format_name in each.several]
         where = f"several go into {', '.join(fitting)}" if fitting else "give one file at a time"
-        raise UsageError(f"{path}: {kind}: {to} takes one file, got {count}; {where}")
+        raise UsageError(f"{path}: holds {kind}, of which {to} takes one file, got {count}; {where}")

@@ -43,10 +43,8 @@ def write_mat(path: Path, content: Content) -> None:
         variables["tracks"] = _tracks(content)
     if content.grid is not None:
         variables |= {axis: content.grid.axis_mm(k) for k, axis in enumerate("xyz")}
-    told = {name: value for name, value in content.told().items() if value is not None}
-    savemat(
-        path, variables | content.arrays | told, appendmat=False, format="5", long_field_names=True, oned_as="column"
-    )
+    variables |= content.arrays | content.told()
+    savemat(path, variables, appendmat=False, format="5", long_field_names=True, oned_as="column")
     with open(path, "rb+") as file:
         file.write(WORDS)
 

@@ -41,8 +41,7 @@ def write_netcdf(path: Path, contents: Sequence[Content], times_s: Sequence[floa
 
     with netcdf_file(path, "w", version=2) as file:
         for name, value in contents[0].told().items():
-            if value is not None:
-                setattr(file, name, _attribute(value))
+            setattr(file, name, _attribute(value))
         if contents[0].format_name == VECTORS_FORMAT:
             _write_vectors(file, contents, times_s)
         elif contents[0].grid is not None:

@@ -5,7 +5,6 @@ The arrays lie behind the XML as raw bytes, each after its length, so that nothi
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import quoteattr
@@ -88,8 +87,7 @@ def _cells(name: str, begins: NDArray[np.int64], appended: _Appended) -> str:
 
 def _field_data(content: Content) -> str:
     """Return what the file says about itself, as arrays of text and numbers."""
-    told: Mapping[str, Any] = {name: value for name, value in content.told().items() if value is not None}
-    return "<FieldData>\n" + "".join(_field(name, value) for name, value in told.items()) + "</FieldData>\n"
+    return f"<FieldData>\n{''.join(_field(name, value) for name, value in content.told().items())}</FieldData>\n"
 
 
 def _field(name: str, value: Any) -> str:
