@@ -42,6 +42,7 @@ CHAIN = {
     "particles": f"reconstruct weights.h5 a.tif b.tif {RIG} --solver particles --pairing ab -o particles",
     "track": "track particles/a.vtkhdf particles/b.vtkhdf -o tracks.vtkhdf --grid",
     "flow_particles": "validate flow rig.yaml --vectors tracks_grid.vtkhdf -o report_particles",
+    "plot": "plot tracks_grid.vtkhdf --only planes -o planes.png",
     "refine": f"refine-calibration rig.yaml a.tif b.tif --calibration calibration.h5 {RIG} --picture walls.png",
 }
 # The sample's files under the names that the pages use.

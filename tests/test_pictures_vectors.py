@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.vtkhdf import write_vectors
 from lfpiv_cli.flow.field import MASKED, REJECTED, VALID, VectorField
 from lfpiv_cli.grid import Grid
@@ -17,6 +19,8 @@ from lfpiv_cli.stages.plot import figures_of
 pytest.importorskip("matplotlib")
 from matplotlib.quiver import Quiver, QuiverKey  # noqa: E402
 
+AT_FOCUS = Reference("focal_point", 0.0)
+SAMPLE = Path(__file__).parents[1] / "configs" / "sample.yaml"
 SHAPE = (5, 4, 3)  # z, y, x
 
 
@@ -142,7 +146,7 @@ def test_gradients_show_the_turn_and_no_divergence_on_one_scale(field) -> None:
 def test_figures_of_a_file_follow_what_it_knows(field, tmp_path) -> None:
     path = tmp_path / "vectors.vtkhdf"
     varied = replace(field, correlation=np.linspace(0.2, 0.9, 60).reshape(SHAPE))
-    write_vectors(path, varied, Reference("focal_point", 0.0), provenance={}, overwrite=True)
+    write_vectors(path, varied, AT_FOCUS, provenance={}, overwrite=True)
     figures = figures_of(path)
     assert list(figures) == [
         "planes",
@@ -157,6 +161,14 @@ def test_figures_of_a_file_follow_what_it_knows(field, tmp_path) -> None:
     assert "correlation at the peak." in figures["quality"].caption
     drawn = figures["quality"].draw()
     np.testing.assert_array_equal(image_of(panels(drawn)[0]), varied.correlation[2])
+    assert len(figures["displacements"].draw().axes) == 6
+    # With the camera known, what displacements are beyond whole microlenses (0.1 mm) is shown, too.
+    write_vectors(path, varied, AT_FOCUS, provenance={"config": load_config(SAMPLE).resolved()}, overwrite=True)
+    below = figures_of(path)["displacements"].draw().axes[-3:]
+    assert [axes.get_xlabel() for axes in below] == [f"{name} beyond whole microlenses (microlenses)" for name in "uvw"]
+    parts = field.displacement_voxel[field.flag == VALID][:, 0]
+    counts, _ = np.histogram(parts - np.round(parts), bins=20, range=(-0.5, 0.5))
+    np.testing.assert_array_equal([bar.get_height() for bar in below[0].patches], counts)
     poor = replace(field, uncertainty_voxel=None, dt_s=None)
-    write_vectors(path, poor, Reference("focal_point", 0.0), provenance={}, overwrite=True)
+    write_vectors(path, poor, AT_FOCUS, provenance={}, overwrite=True)
     assert list(figures_of(path)) == ["planes", "components", "profiles", "flags", "displacements"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -34,6 +35,7 @@ pytest.importorskip("matplotlib")
 
 AT_FOCUS = Reference("focal_point", 0.0)
 N = 12
+DOCS = Path(__file__).parents[1] / "docs"
 
 
 def run(*arguments: str) -> str:
@@ -96,6 +98,18 @@ def test_wrong_names_outputs_and_images_are_refused_before_drawing(volume, tmp_p
     write_tree(other, {"a": np.zeros(9)}, format_name="x", format_version=1, provenance={}, overwrite=True)
     with pytest.raises(InputError, match="x has no figures"):
         figures_of(other)
+
+
+def test_documents_list_the_figures(volume, tmp_path):
+    rows = re.findall(r"^\| ([\w ]+) \| (`.*`) \|$", (DOCS / "files.md").read_text(), re.MULTILINE)
+    listed = {what: [name.strip("`") for name in names.split(", ")] for what, names in rows}
+    rng = np.random.default_rng(1)
+    for what, of_format in (("tracks of a pair", TRACKS_FORMAT), ("tracks of a sequence", TRAJECTORIES_FORMAT)):
+        path = tmp_path / "t.vtkhdf"
+        write_points(path, of_format, points(rng, of_format, {}), overwrite=True)
+        assert listed[what] == list(figures_of(path))
+    assert listed["volume"] == list(figures_of(volume))
+    assert len(listed) == 7
 
 
 def test_particles_bring_their_residual_and_are_drawn_on_the_raw_image(config, tmp_path):

@@ -128,8 +128,9 @@ def _of_vectors(path: Path) -> dict[str, Drawn]:
             partial(of_vectors.quality_figure, field, qualities),
         )
     figures["displacements"] = Drawn(
-        "Displacements of the valid vectors, and what they are beyond whole voxels: evenly spread unless they lock.",
-        partial(of_vectors.displacements_figure, field),
+        "Displacements of the valid vectors, and what they are beyond whole voxels and, where the camera is known, "
+        "whole microlenses: crowded about zero where they lock.",
+        partial(of_vectors.displacements_figure, field, _lens_mm(path)),
     )
     if field.dt_s is not None:
         figures["gradients"] = Drawn(
@@ -138,6 +139,16 @@ def _of_vectors(path: Path) -> dict[str, Drawn]:
             partial(of_vectors.gradients_figure, field),
         )
     return figures
+
+
+def _lens_mm(path: Path) -> float | None:
+    """Return the width of a microlens in the scene; None where the file does not say with what camera it was taken."""
+    made = vtkhdf.read_record(path)
+    if not made.get("config"):
+        return None
+    config = carried_config(made, path)
+    camera = config.complete_camera()
+    return None if camera is None else camera.scale(config.media_model()).lens_mm
 
 
 def _qualities(path: Path, field: VectorField) -> dict[str, NDArray[np.float64]]:
