@@ -7,7 +7,8 @@
 #   make check      ruff and mypy         make bench      speed as ratios against a stated peer
 #   make docs       the documents, with pictures from the sample, into out/docs/
 #
-# DATA holds white.tif, dark.tif, board.tif and the images A.tif and B.tif. Safe under -j; a failed step leaves no target.
+# DATA holds white.tif, dark.tif, board.tif and the images A.tif and B.tif. METHOD is auto (volumes or particles, by how
+# many tracers there are), volumes, particles or both. Safe under -j; a failed step leaves no target.
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -22,14 +23,18 @@ DATA ?= sample_data
 OUT ?= out/sample
 A ?= pair_a
 B ?= pair_b
-# True particles to judge by, where they are known; empty where they are not.
-TRUTH ?= $(wildcard $(DATA)/particles.npz)
+IMAGES ?= $(DATA)/$(A).tif $(DATA)/$(B).tif
+PHOTOGRAPHS := $(DATA)/white.tif $(DATA)/dark.tif $(DATA)/board.tif
+# The sample is measured both ways, and its config says what is true; of others, the program chooses.
+METHOD ?= $(if $(filter configs/sample.yaml,$(CONFIG)),both,auto)
+MEASURED := $(if $(filter volumes both,$(METHOD)),report) $(if $(filter particles both,$(METHOD)),report_particles)
+REPORTS := $(if $(filter configs/sample.yaml,$(CONFIG)),$(MEASURED))
 
 .DELETE_ON_ERROR:
 .PHONY: flow install test test-all test-interpreted check format docs bench clean
 .SECONDARY:
 
-flow: $(OUT)/report/flow.json
+flow: $(OUT)/run.json $(REPORTS:%=$(OUT)/%/flow.json)
 
 install: $(INSTALLED)
 
@@ -45,25 +50,17 @@ $(INSTALLED): $(CORE)
 	$(PIP_INSTALL) --requirement requirements.lock
 	@touch $@
 
-$(OUT)/calibration.h5: $(CONFIG) $(DATA)/white.tif $(DATA)/dark.tif $(DATA)/board.tif | $(CORE)
+# Steps that are complete and made alike are kept by the command itself.
+$(OUT)/run.json: $(CONFIG) $(PHOTOGRAPHS) $(IMAGES) | $(CORE)
 	@mkdir -p $(@D)
-	$(LFPIV) calibrate-snapshot $(CONFIG) --white $(DATA)/white.tif --dark $(DATA)/dark.tif --board $(DATA)/board.tif \
-	    --output $(OUT)/calibration.h5 --picture $(OUT)/calibration.png --overwrite
+	$(LFPIV) run $(CONFIG) $(IMAGES) --white $(DATA)/white.tif --dark $(DATA)/dark.tif --board $(DATA)/board.tif \
+	    --method $(METHOD) --output $(OUT) --overwrite
 
-$(OUT)/weights.h5: $(CONFIG) $(OUT)/calibration.h5 | $(CORE)
-	$(LFPIV) build-weights $(CONFIG) --calibration $(OUT)/calibration.h5 --output $@ --overwrite
+$(OUT)/report/flow.json: $(CONFIG) $(OUT)/run.json | $(CORE)
+	$(LFPIV) validate flow $(CONFIG) --vectors $(OUT)/vectors.vtkhdf --output $(@D) --overwrite
 
-$(OUT)/volumes/%.vtkhdf: $(DATA)/%.tif $(OUT)/weights.h5 $(DATA)/dark.tif | $(CORE)
-	@mkdir -p $(@D)
-	$(LFPIV) reconstruct $(OUT)/weights.h5 $< --dark $(DATA)/dark.tif --output $@ --overwrite
-
-$(OUT)/vectors.vtkhdf: $(OUT)/volumes/$(A).vtkhdf $(OUT)/volumes/$(B).vtkhdf | $(CORE)
-	$(LFPIV) correlate $^ --output $@ --overwrite
-
-$(OUT)/report/flow.json: $(CONFIG) $(OUT)/vectors.vtkhdf $(TRUTH) | $(CORE)
-	@mkdir -p $(@D)
-	$(LFPIV) validate flow $(CONFIG) --vectors $(OUT)/vectors.vtkhdf $(if $(TRUTH),--particles $(TRUTH)) \
-	    --output $(@D) --overwrite
+$(OUT)/report_particles/flow.json: $(CONFIG) $(OUT)/run.json | $(CORE)
+	$(LFPIV) validate flow $(CONFIG) --vectors $(OUT)/tracks_grid.vtkhdf --output $(@D) --overwrite
 
 # Two processes: the first run is all compilation, which takes one core each.
 test: $(INSTALLED)

@@ -38,6 +38,9 @@ BubbleWall = Literal["near", "far", "low", "high"]
 Start = Literal["uniform", "line_of_sight"]
 Pairing = Literal["ab", "sequence"]
 
+# How `run` measures a flow.
+RunMethod = Literal["auto", "volumes", "particles", "both"]
+
 # What is validated: flows and boards by which methods, boards in which images, and volumes of which moment of a pair.
 FlowMethod = Literal["volumes", "particles"]
 BoardMethod = Literal["ert", "dlfc", "discs"]

@@ -26,6 +26,7 @@ from lfpiv_cli.names import (
     Pairing,
     PaperPart,
     Refraction,
+    RunMethod,
     Sampling,
     Start,
     names_in,
@@ -40,6 +41,8 @@ DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs
 # The options whose choices are names that others share, by command and option.
 OPTIONS = {
     ("init", "camera"): names_in(KnownCamera),
+    ("run", "method"): names_in(RunMethod),
+    ("run", "pairing"): names_in(Pairing),
     ("build-weights", "method"): names_in(Method),
     ("build-weights", "refraction"): names_in(Refraction),
     ("build-weights", "sampling"): names_in(Sampling),

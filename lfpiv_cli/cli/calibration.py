@@ -7,26 +7,25 @@ from typing import Any
 
 import click
 
-from lfpiv_cli.cli.options import FILE, common_options, config_argument, dark_option, output_option
+from lfpiv_cli.cli.options import (
+    FILE,
+    board_option,
+    common_options,
+    config_argument,
+    dark_option,
+    depth_option,
+    output_option,
+    white_option,
+)
 from lfpiv_cli.console import Console
 
 
 @click.command("calibrate-snapshot")
 @config_argument
-@click.option("--white", type=FILE, multiple=True, help="White image, uniform light; twice: stopped down and not.")
+@white_option
 @dark_option
-@click.option(
-    "--board",
-    type=FILE,
-    multiple=True,
-    help="Snapshot of the calibration target: dots, a chessboard or a ChArUco board; or several.",
-)
-@click.option(
-    "--depth-mm",
-    type=float,
-    multiple=True,
-    help="Depth of each target in the fluid, for dlfc; without a target, of the channel's mid plane.",
-)
+@board_option
+@depth_option
 @output_option("Calibration file to write (.h5).")
 @click.option("--picture", type=FILE, help="Picture of the fitted lattice and board to write (.png).")
 @click.option("--views", type=FILE, help="Picture of views and refocused depths to write (.png).")

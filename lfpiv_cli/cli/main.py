@@ -13,6 +13,7 @@ import click
 from lfpiv_cli import __version__
 from lfpiv_cli.cli import (
     calibration,
+    chain,
     exports,
     inspection,
     planning,
@@ -28,6 +29,7 @@ from lfpiv_cli.cli.outcome import Terminated, outcome_of, print_json_error, prin
 
 COMMANDS = (
     planning.init,
+    chain.run,
     calibration.calibrate_snapshot,
     calibration.refine_calibration,
     weights.build_weights,
@@ -51,6 +53,8 @@ def cli() -> None:
     """From raw light-field camera images to three-dimensional velocity fields (PIV and PTV).
 
     \b
+    lfpiv run rig.yaml a.tif b.tif --white white.tif --dark dark.tif --board board.tif -o results
+    or step by step
     lfpiv calibrate-snapshot rig.yaml --white white.tif --board board.tif -o calibration.h5
     lfpiv build-weights rig.yaml --calibration calibration.h5 -o weights.h5
     lfpiv reconstruct weights.h5 a.tif b.tif --dark dark.tif -o volumes

@@ -18,6 +18,21 @@ FILE = click.Path(path_type=Path)
 POSITIVE = click.FloatRange(min=0.0, min_open=True)
 
 config_argument = click.argument("config", type=FILE)
+white_option = click.option(
+    "--white", type=FILE, multiple=True, help="White image, uniform light; twice: stopped down and not."
+)
+board_option = click.option(
+    "--board",
+    type=FILE,
+    multiple=True,
+    help="Snapshot of the calibration target: dots, a chessboard or a ChArUco board; or several.",
+)
+depth_option = click.option(
+    "--depth-mm",
+    type=float,
+    multiple=True,
+    help="Depth of each target in the fluid, for dlfc; without a target, of the channel's mid plane.",
+)
 dark_option = click.option("--dark", type=FILE, help="Dark image, taken with the cap on.")
 background_option = click.option(
     "--background", help="Image to subtract, or minimum or mean over the images given, or as minimum:15."

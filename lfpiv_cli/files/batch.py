@@ -10,7 +10,7 @@ from typing import Any
 from lfpiv_cli.errors import InputError, OutputExistsError, UsageError
 from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.images import count_pages
-from lfpiv_cli.files.provenance import without_warnings
+from lfpiv_cli.files.provenance import carried_record, without_warnings
 from lfpiv_cli.names import Pairing
 
 VTKHDF_SUFFIX = ".vtkhdf"
@@ -103,6 +103,18 @@ def pending(
         ensure_writable(target.path, overwrite, inputs)
         needed.append(number)
     return needed
+
+
+def is_kept(
+    paths: Sequence[Path], made: Mapping[str, Any], inputs: Iterable[Path], overwrite: bool, resume: bool
+) -> bool:
+    """Return whether all results of a step, which carry one record, are there already, see `pending`.
+
+    Raises
+    ------
+    OutputExistsError : as `pending`
+    """
+    return not pending([Target(path, made) for path in paths], inputs, overwrite, resume, carried_record)
 
 
 def _made_alike(target: Target, read_record: Callable[[Path], Mapping[str, Any]]) -> bool:

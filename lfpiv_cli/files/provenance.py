@@ -126,6 +126,18 @@ def _sha256(path: Path, size: int, modified_ns: int) -> str:
         raise InputError(f"{path}: cannot be read: {reason(error)}") from error
 
 
+def carried_record(path: Path) -> dict[str, Any]:
+    """Return the record that a file of ours carries.
+
+    Raises
+    ------
+    InputError
+        If there is none, or the file is broken.
+    """
+    with open_h5(path) as file:
+        return read_provenance(file)
+
+
 def earlier_record(path: Path) -> dict[str, Any] | None:
     """Return the record that a file of ours carries, None for any other file."""
     ensure_regular_file(path)

@@ -28,6 +28,7 @@ from lfpiv_cli.interface.reconstruction import (
 )
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.optics.object_space import ObjectSpace
+from lfpiv_cli.particles.counting import tracers_per_lens as counted
 from lfpiv_cli.particles.diameter import LIMIT_SIGMAS, UNKNOWN_LENSES, diameter_by
 from lfpiv_cli.particles.neighbour_frames import second_pass
 from lfpiv_cli.particles.rounds import ROUNDS, first_pass
@@ -348,6 +349,14 @@ def _space(content: WeightsFile, settings: Config) -> ObjectSpace:
     if (settings.channel is None or mid_plane is None) and settings.sections.window is None:
         return ObjectSpace(settings.media_model(), None, "paraxial")
     return ObjectSpace(settings.media_model(), settings.window_model(mid_plane), "exact")
+
+
+def tracers_per_lens(bench: Bench, frame: Frame) -> float | None:
+    """Return the tracers for each microlens, counted by how uneven their light is.
+
+    None where too little is seen of the volume to tell.
+    """
+    return counted(task_for(bench, frame), bench.lens_images.lattice_px)
 
 
 def _lenses_before(bench: Bench) -> float:

@@ -8,11 +8,12 @@ from typing import Any
 
 from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.files.atomic import ensure_writable
+from lfpiv_cli.files.batch import is_kept
 from lfpiv_cli.files.calibration_file import read_calibration
 from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.provenance import record, with_warnings
-from lfpiv_cli.files.weights_file import write_weights
+from lfpiv_cli.files.weights_file import open_weights, write_weights
 from lfpiv_cli.interface.weights import plan_of, weights_of
 from lfpiv_cli.interface.weights_cost import cost_notices, cost_of
 from lfpiv_cli.names import Method, Refraction, Sampling
@@ -27,6 +28,7 @@ class BuildWeightsOptions:
     calibration : file of `calibrate_snapshot`; None: the data sheet is believed
     method, refraction, sampling : in place of the config's, see its section `weights`
     dry_run : check everything and estimate the work, make nothing
+    resume : keep what is complete and made from the same inputs with the same settings
     """
 
     calibration: Path | None = None
@@ -34,6 +36,7 @@ class BuildWeightsOptions:
     refraction: Refraction | None = None
     sampling: Sampling | None = None
     dry_run: bool = False
+    resume: bool = False
 
 
 NO_OPTIONS = BuildWeightsOptions()
@@ -52,12 +55,10 @@ def build_weights(
     What speaks against the work's size is no fault of the result, and not kept with it.
     """
     inputs = given(config=config, calibration=options.calibration)
-    ensure_writable(output, overwrite, inputs.values())
+    ensure_writable(output, overwrite or options.resume, inputs.values())
     settings = load_config(config).overridden_by("weights", options)
     found = read_calibration(options.calibration) if options.calibration else None
     plan = plan_of(settings, found)
-    cost = cost_of(settings, plan.camera, plan.source, plan.grid.padded(plan.padding))
-    console.warn([*plan.notices, *cost_notices(cost)])
     summary = {
         "voxels_xyz": list(plan.grid.shape_xyz),
         "voxel_mm": list(plan.grid.spacing_mm),
@@ -66,10 +67,14 @@ def build_weights(
         "method": settings.weights.method,
         "refraction": settings.weights.refraction,
     }
+    made = record("build-weights", settings.resolved(), inputs)
+    if options.resume and is_kept([output], made, inputs.values(), overwrite, resume=True):
+        return summary | {"frame": open_weights(output).frame, "file_bytes": output.stat().st_size}
+    cost = cost_of(settings, plan.camera, plan.source, plan.grid.padded(plan.padding))
+    console.warn([*plan.notices, *cost_notices(cost)])
     if options.dry_run:
         return summary | cost.summary()
     console.detail(f"about {cost.weights_core_s:.2g} s of a core and {cost.weights_bytes / 1e9:.2g} GB")
-    provenance = with_warnings(record("build-weights", settings.resolved(), inputs), plan.notices)
-    content = weights_of(plan, provenance, console)
+    content = weights_of(plan, with_warnings(made, plan.notices), console)
     write_weights(output, content, overwrite)
     return summary | {"frame": content.weights.frame, "file_bytes": output.stat().st_size}

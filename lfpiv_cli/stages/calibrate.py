@@ -11,7 +11,8 @@ from lfpiv_cli.calibration.white import by_aperture
 from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files.atomic import ensure_writable
-from lfpiv_cli.files.calibration_file import write_calibration
+from lfpiv_cli.files.batch import is_kept
+from lfpiv_cli.files.calibration_file import read_calibration, write_calibration
 from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.pictures import ensure_drawing, write_picture
@@ -34,6 +35,7 @@ class CalibrateOptions:
     depth_mm : depths of the boards in the fluid, for fitted rays; empty for a single snapshot; without a board the one
         of the channel's mid plane
     picture, views : pictures to write: lattice and board; views and refocused depths
+    resume : keep what is complete and made from the same inputs with the same settings
     """
 
     white: Sequence[Path] = ()
@@ -42,6 +44,7 @@ class CalibrateOptions:
     depth_mm: Sequence[float] = ()
     picture: Path | None = None
     views: Path | None = None
+    resume: bool = False
 
 
 def calibrate_snapshot(
@@ -58,11 +61,18 @@ def calibrate_snapshot(
     ensure_pictures(len(white), len(board), len(depth_mm))
     whites, boards = _numbered("white", white), _numbered("board", board)
     inputs = given(config=config, dark=options.dark) | whites | boards
-    for target in filter(None, (output, picture, views)):
-        ensure_writable(target, overwrite, inputs.values())
-    if picture or views:
+    drawings = [path for path in (picture, views) if path]
+    for target in (output, *drawings):
+        ensure_writable(target, overwrite or options.resume, inputs.values())
+    if drawings:
         ensure_drawing()
     settings = load_config(config)
+    record = provenance_record("calibrate-snapshot", settings.resolved(), inputs)
+    if options.resume:
+        kept = is_kept([output], record, inputs.values(), overwrite, resume=True)
+        if kept and all(path.exists() for path in drawings):
+            return read_calibration(output).summary()
+        overwrite = True
     shape = settings.image_shape()
     frames = {name: image_files.read_image(path, shape) for name, path in inputs.items() if name != "config"}
     camera = settings.camera_model() if views else None
@@ -72,8 +82,7 @@ def calibrate_snapshot(
     calibration = calibration_of(settings, pictures)
     notices = calibration_notices(settings, pictures, calibration)
     console.warn(notices)
-    record = with_warnings(provenance_record("calibrate-snapshot", settings.resolved(), inputs), notices)
-    write_calibration(output, calibration, record, overwrite)
+    write_calibration(output, calibration, with_warnings(record, notices), overwrite)
     if picture:
         from lfpiv_cli.pictures.calibration import calibration_figure
 

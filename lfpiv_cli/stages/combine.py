@@ -11,26 +11,38 @@ from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.files.atomic import ensure_writable
+from lfpiv_cli.files.batch import is_kept
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.flow.combining import combine
 from lfpiv_cli.flow.field import MASKED, REJECTED
 
 
 def combine_vectors(
-    vectors_a: Path, vectors_b: Path, output: Path, *, overwrite: bool = False, console: Console = CONSOLE
+    vectors_a: Path,
+    vectors_b: Path,
+    output: Path,
+    *,
+    resume: bool = False,
+    overwrite: bool = False,
+    console: Console = CONSOLE,
 ) -> dict[str, Any]:
-    """Weight the vectors of two files by their uncertainties."""
+    """Weight the vectors of two files by their uncertainties; with `resume`, keep what was made from the same."""
     inputs = {"vectors_a": vectors_a, "vectors_b": vectors_b}
-    ensure_writable(output, overwrite, inputs.values())
+    ensure_writable(output, overwrite or resume, inputs.values())
     headers = [vtkhdf.read_header(path) for path in inputs.values()]
     if headers[0].reference != headers[1].reference:
         raise InputError(f"{vectors_b}: its coordinates have another origin than those of {vectors_a}")
+    made = record("combine", headers[0].provenance.get("config"), inputs)
+    if resume:
+        if is_kept([output], made, inputs.values(), overwrite, resume=True):
+            return {"vectors": vtkhdf.open_vectors(output).flag.size}
+        overwrite = True
     found = combine(*(vtkhdf.open_vectors(path) for path in inputs.values()))
     vtkhdf.write_vectors(
         output,
         found.field,
         headers[0].reference,
-        provenance=record("combine", headers[0].provenance.get("config"), inputs),
+        provenance=made,
         overwrite=overwrite,
         extra={"share_a": (found.first_share, "1"), "disagreement": (found.disagreement, "1")},
     )

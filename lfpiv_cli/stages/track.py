@@ -12,7 +12,8 @@ import numpy as np
 from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.files.atomic import ensure_writable
-from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, read_points, write_points
+from lfpiv_cli.files.batch import is_kept
+from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, read_points, read_tracks, write_points
 from lfpiv_cli.files.provenance import record, with_warnings
 from lfpiv_cli.flow.field import REJECTED
 from lfpiv_cli.interface.tracks import (
@@ -39,12 +40,14 @@ class TrackOptions:
     search_voxel : displacements are sought up to this along each axis, six microlenses in the scene where None
     shortest : fewest frames of a track in a sequence, three where None
     grid : vectors on the grid of the correlation windows, too
+    resume : keep what is complete and made from the same particles with the same settings
     """
 
     dt_s: float | None = None
     search_voxel: float | None = None
     shortest: int | None = None
     grid: bool = False
+    resume: bool = False
 
 
 NO_OPTIONS = TrackOptions()
@@ -63,13 +66,18 @@ def track_particles(
     inputs = dict(zip(_roles(len(particles)), particles, strict=True))
     grids = grid_paths(output, len(particles) - 1) if options.grid else []
     for target in (output, *grids):
-        ensure_writable(target, overwrite, inputs.values())
+        ensure_writable(target, overwrite or options.resume, inputs.values())
     frames, names = [read_points(path, PARTICLES_FORMAT) for path in particles], [str(path) for path in particles]
     settings = settings_of(frames, names).overridden_by("correlation", options)
     counts = [len(frame.position_mm) for frame in frames]
     ensure_particles(counts, names)
     chosen = tracking_of(settings, options.search_voxel, options.shortest, len(frames), names[0])
-    found = tracked(frames, settings, chosen, record("track", settings.resolved() | chosen.told(), inputs))
+    made = record("track", settings.resolved() | chosen.told(), inputs)
+    if options.resume:
+        if is_kept([output, *grids], made, inputs.values(), overwrite, resume=True):
+            return {"tracks": count_tracks(output)}
+        overwrite = True
+    found = tracked(frames, settings, chosen, made)
     short = [path.name for path in particles]
     records = {
         f"{role} {path.name}": frame.provenance for (role, path), frame in zip(inputs.items(), frames, strict=True)
@@ -79,6 +87,13 @@ def track_particles(
     provenance = with_warnings(found.points.provenance, notices)
     write_points(output, found.format_name, replace(found.points, provenance=provenance), overwrite=overwrite)
     return found.summary | _sigmas(found) | _write_grids(grids, found, provenance, overwrite, console)
+
+
+def count_tracks(path: Path) -> int:
+    """Return how many tracks a file holds, of two frames or of a sequence."""
+    points = read_tracks(path)
+    number = points.arrays.get("track")
+    return len(points.position_mm) if number is None else len(np.unique(number))
 
 
 def grid_paths(output: Path, intervals: int) -> list[Path]:

@@ -1,0 +1,72 @@
+"""The command that takes all steps from raw images to vectors."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from lfpiv_cli.cli.options import (
+    FILE,
+    background_option,
+    board_option,
+    common_options,
+    config_argument,
+    dark_option,
+    depth_option,
+    dt_option,
+    mask_option,
+    output_option,
+    pairing_option,
+    white_option,
+)
+from lfpiv_cli.console import Console
+from lfpiv_cli.names import RunMethod, names_in
+
+
+@click.command("run")
+@config_argument
+@click.argument("images", type=FILE, nargs=-1)
+@click.option("--images", "named", type=FILE, multiple=True, help="The same: images of the flow.")
+@white_option
+@dark_option
+@board_option
+@depth_option
+@background_option
+@mask_option
+@click.option(
+    "--method", type=click.Choice(names_in(RunMethod)), help="By what the flow is measured; auto when not given."
+)
+@pairing_option
+@dt_option
+@click.option("--combine", is_flag=True, help="With both: also one field that weights their vectors.")
+@click.option("--follow", is_flag=True, help="Time-resolved sequence: find and track particles together.")
+@output_option("Folder for all that is made.")
+@common_options
+def run(
+    config: Path,
+    images: tuple[Path, ...],
+    named: tuple[Path, ...],
+    output: Path,
+    overwrite: bool,
+    console: Console,
+    **chosen: Any,
+) -> dict[str, Any]:
+    """Go from raw images to vectors: calibrate, build weights, measure the flow.
+
+    Every step writes what its own command does, into OUTPUT. By itself it counts the tracers for each microlens, and
+    measures by particles up to about two, where these err less, and by volumes beyond; OUTPUT/run.json says which and
+    why. Run it again, and it keeps what is complete and made alike, and goes on from there; with --overwrite it makes
+    anew what was made from other inputs or settings. More than two images need --pairing or --follow.
+
+    \b
+    Example: lfpiv run rig.yaml a.tif b.tif --white white.tif --dark dark.tif --board board.tif -o results
+    by both ways, and one field of the two:
+             lfpiv run rig.yaml a.tif b.tif --white white.tif --dark dark.tif --board board.tif \\
+                 --method both --combine -o results
+    """
+    from lfpiv_cli.stages import run as stage
+
+    options = stage.RunOptions(images=(*named, *images), **chosen)
+    return stage.run(config, output, options, overwrite=overwrite, console=console)

@@ -1,0 +1,122 @@
+"""How many tracers there are for each microlens, told by how unevenly they light the microlenses, without finding them.
+
+Tracers lie at random: the light of a microlens is the sum over those that light it, and the fewer they are, the more it
+differs from one microlens to the next. mean^2 / variance goes with their number (Campbell's theorem), by a factor that
+depends on how many microlenses share a tracer's light. It is taken from an image of tracers of known number, at random
+places in the same volume. Crowded tracers, of which single ones cannot be told any more, are counted as well as few.
+
+Axes: raw images [row, column].
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from lfpiv_cli.optics.microlenses import Lattice
+from lfpiv_cli.particles.fitting import add_all
+from lfpiv_cli.particles.search import Task
+
+# Tracers for each microlens in the image that others are held against, and by how much their light differs: that of 0.6
+# to 1.4 of its mean. The light of real tracers often differs more, and they are then taken for fewer.
+KNOWN_NUMBER, LIGHT_SPREAD = 1.0, 0.23
+# Seeding and illumination change over an image: microlenses are compared with those in a field of so many along each
+# side around them. A tracer lights some five of them side by side at the ends of usual volumes.
+FIELD_LENSES = 24
+# A microlens counts that has this share of a whole one's pixels, and of them before the volume.
+LEAST_PIXELS = 0.9
+# So many microlenses tell the variance to a third; of the known tracers as many images are made as show so many.
+FEWEST_LENSES, LENSES_OF_KNOWN = 50, 4000
+# Darker pixels than this percentile lie between lens images, and show what is left of a background.
+BACKGROUND_PERCENTILE = 1.0
+# The nearest microlenses of so many rows are sought at once: of all, it would take gigabytes.
+ROWS_AT_ONCE = 64
+
+
+class Lenses(NamedTuple):
+    """Which microlens each pixel of an image belongs to: its number (pixels,), of so many, rows times columns."""
+
+    number: NDArray[np.int64]
+    shape: tuple[int, int]
+
+    @classmethod
+    def of(cls, lattice_px: Lattice, image_shape: tuple[int, int]) -> Lenses:
+        """Return them for an image (rows, columns) on a lattice of lens images (column, row)."""
+        rows, columns = image_shape
+        indices = np.empty((rows, columns, 2), np.int64)
+        for first in range(0, rows, ROWS_AT_ONCE):
+            block = slice(first, min(first + ROWS_AT_ONCE, rows))
+            y, x = np.mgrid[block, 0:columns]
+            indices[block] = lattice_px.nearest(np.stack([x, y], axis=-1))
+        indices -= indices.min(axis=(0, 1))
+        ni, nj = (int(n) + 1 for n in indices.max(axis=(0, 1)))
+        return cls((indices[..., 1] * ni + indices[..., 0]).ravel(), (nj, ni))
+
+    def sums(self, values: NDArray[Any]) -> NDArray[np.float64]:
+        """Return the sum of pixels' values over each microlens (nj, ni)."""
+        total = np.bincount(self.number, values, math.prod(self.shape)).astype(np.float64)
+        return total.reshape(self.shape)
+
+
+def tracers_per_lens(task: Task, lattice_px: Lattice) -> float | None:
+    """Return the tracers for each microlens of the volume in the scene; None where too little of it is seen to tell.
+
+    Parameters
+    ----------
+    lattice_px : of the lens images, (column, row) in the raw image
+    """
+    lenses = Lenses.of(lattice_px, task.prepared.shape)
+    counted = lenses.sums(task.usable) > LEAST_PIXELS * np.median(lenses.sums(np.ones(task.image.size)))
+    counted &= lenses.sums(_sees_volume(task)) > LEAST_PIXELS * lenses.sums(np.ones(task.image.size))
+    seen = int(np.count_nonzero(counted))
+    if seen < FEWEST_LENSES:
+        return None
+    background = np.percentile(task.image[task.usable], BACKGROUND_PERCENTILE)
+    found = _unevenness(lenses.sums(np.where(task.usable, task.image - background, 0.0)), counted)
+    rng, known = np.random.default_rng(0), []
+    for _ in range(-(-LENSES_OF_KNOWN // seen)):
+        image = np.zeros(task.image.size)
+        add_all(task.view, known_tracers(task, rng), 1.0, image, task.depths_mm)
+        known.append(_unevenness(lenses.sums(np.where(task.usable, image, 0.0)), counted))
+    return KNOWN_NUMBER * float(np.mean(known)) / found if found > 0.0 else None
+
+
+def known_tracers(task: Task, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Return tracers (n, 4) of light about 1 at random places: `KNOWN_NUMBER` in the depth of the volume.
+
+    As real ones, they are around it, too, as far as their light reaches it.
+    """
+    camera = task.camera
+    lateral, depth = task.weights.padded.grid, task.weights.grid
+    low, high = np.array([lateral.bounds_mm(0), lateral.bounds_mm(1), depth.bounds_mm(2)]).T
+    area_mm2 = camera.lattice.cell_area / camera.magnification**2
+    count = round(KNOWN_NUMBER * float(np.prod((high - low)[:2])) / area_mm2)
+    places = camera.to_image_axes(rng.uniform(low, high, (count, 3)))
+    return np.column_stack([places, rng.normal(1.0, LIGHT_SPREAD, count).clip(0.0)])
+
+
+def _sees_volume(task: Task) -> NDArray[np.bool_]:
+    """Return which pixels (pixels,) lie before the volume, as the focal plane is seen."""
+    camera, grid = task.camera, task.weights.grid
+    corners = camera.to_image_axes(np.array([grid.bounds_mm(axis) for axis in range(2)]).T)
+    ends = camera.mm_to_px(camera.magnification * corners)
+    (left, top), (right, bottom) = ends.min(axis=0), ends.max(axis=0)
+    row, column = np.indices(task.prepared.shape)
+    return np.asarray((column >= left) & (column <= right) & (row >= top) & (row <= bottom)).ravel()
+
+
+def _unevenness(light: NDArray[np.float64], counted: NDArray[np.bool_]) -> float:
+    """Return variance / mean^2 of the light of microlenses, each compared with those near it; 0 without light."""
+    near = _means_near(light, counted)[counted]
+    return float(np.mean((light[counted] - near) ** 2) / np.mean(near**2)) if np.any(near > 0.0) else 0.0
+
+
+def _means_near(light: NDArray[np.float64], counted: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return the mean light of those microlenses that are counted in the field around each, 0 where there are none."""
+    share = ndimage.uniform_filter(counted.astype(np.float64), FIELD_LENSES, mode="constant")
+    total = ndimage.uniform_filter(np.where(counted, light, 0.0), FIELD_LENSES, mode="constant")
+    return np.divide(total, share, out=np.zeros_like(total), where=share > 0.5 / FIELD_LENSES**2)

@@ -1,0 +1,63 @@
+"""Tracers counted for each microlens by how uneven their light is, against images of known number."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import lfpiv_cli as lf
+from lfpiv_cli.files.config import carried_config
+from lfpiv_cli.files.weights_file import WeightsFile
+from lfpiv_cli.interface.particles import frame_of, tracers_per_lens
+from lfpiv_cli.interface.reconstruction import Bench, bench_of
+from lfpiv_cli.particles.fitting import add_all
+from lfpiv_cli.particles.view import raw_view
+
+SAMPLE = Path(__file__).parent.parent / "configs" / "sample.yaml"
+CHANGES = (
+    ("columns: 600, rows: 448", "columns: 420, rows: 380"),
+    ("shape_xyz: [30, 22, 40]", "shape_xyz: [16, 14, 10]"),
+    ("centre_mm: [0, 0, 0], reference: mid_plane", "centre_mm: [0, 0, 1.9], reference: focal_point"),
+)
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
+    """What images of a small rig share: 20 x 23 microlenses on the sensor, 10 planes of 0.1 mm."""
+    rig, text = tmp_path_factory.mktemp("rig") / "rig.yaml", SAMPLE.read_text()
+    for old, new in CHANGES:
+        assert old in text, old
+        text = text.replace(old, new)
+    rig.write_text(text)
+    content: WeightsFile = lf.build_weights(lf.load_rig(rig))
+    return bench_of(content, carried_config(content.provenance, "weights"), None, None)
+
+
+def image_of(bench: Bench, number: float, seed: int) -> np.ndarray:
+    """Return an image of so many tracers for each microlens, also around the volume."""
+    content, rng = bench.content, np.random.default_rng(seed)
+    low, high = np.array([-1.2, -1.1, 1.4]), np.array([1.2, 1.1, 2.4])
+    count = rng.poisson(number * 2.4 * 2.2 / 0.1**2)
+    view = raw_view(content.camera, bench.settings.media_model(), 0.025)
+    places = content.camera.to_image_axes(rng.uniform(low, high, (count, 3)))
+    image = rng.normal(100.0, 6.0, content.camera.rows * content.camera.columns)
+    particles = np.column_stack([places, rng.uniform(3e5, 7e5, count)])
+    add_all(view, particles, 1.0, image, content.weights.grid.bounds_mm(2))
+    return image.reshape(content.image_shape).astype(np.float32)
+
+
+@pytest.mark.parametrize("number", [0.3, 3.0])
+def test_few_and_crowded_tracers_are_counted(bench: Bench, number: float) -> None:
+    counts = [tracers_per_lens(bench, frame_of(bench, *[image_of(bench, number, seed)] * 2)) for seed in range(3)]
+    # Some 200 microlenses, some five of which share a tracer's light, tell the variance of one image to a fifth.
+    assert np.mean(counts) == pytest.approx(number, rel=0.2)
+
+
+def test_light_that_does_not_tell_is_not_counted(bench: Bench) -> None:
+    image = image_of(bench, 0.5, 0)
+    masked = np.full_like(image, np.nan)
+    masked[:100, :100] = image[:100, :100]
+    assert tracers_per_lens(bench, frame_of(bench, masked, np.nan_to_num(masked))) is None
+    assert tracers_per_lens(bench, frame_of(bench, *[np.zeros_like(image)] * 2)) is None

@@ -1,0 +1,187 @@
+"""`run`: the whole chain at once, gone on with, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from lfpiv_cli.cli import cli
+from lfpiv_cli.console import Console
+from lfpiv_cli.errors import ConfigError, InputError, LfpivError, OutputExistsError, UsageError
+from lfpiv_cli.stages import run as stage
+from lfpiv_cli.stages.run import RunOptions
+
+ROOT = Path(__file__).parent.parent
+SAMPLE = ROOT / "sample_data"
+PAIR = SAMPLE / "pair_a.tif", SAMPLE / "pair_b.tif"
+PHOTOGRAPHS = [word for name in ("white", "dark", "board") for word in (f"--{name}", SAMPLE / f"{name}.tif")]
+FILES = ("calibration.h5", "calibration.png", "weights.h5", "volumes/pair_a.vtkhdf", "volumes/pair_b.vtkhdf")
+VECTORS = "vectors.vtkhdf"
+
+
+def lfpiv(*arguments: object) -> None:
+    cli.main([str(argument) for argument in arguments], standalone_mode=False)
+
+
+def run(rig: Path, output: Path, *options: object, images: tuple[Path, ...] = PAIR) -> None:
+    lfpiv("run", rig, *images, *PHOTOGRAPHS, "--method", "volumes", *options, "-o", output)
+
+
+def rig_in(folder: Path, *changes: tuple[str, str]) -> Path:
+    """Write the sample's rig, its volumes by two iterations."""
+    text = (ROOT / "configs" / "sample.yaml").read_text()
+    for old, new in (("iterations: 16", "iterations: 2"), *changes):
+        assert old in text, old
+        text = text.replace(old, new)
+    (folder / "rig.yaml").write_text(text)
+    return folder / "rig.yaml"
+
+
+@pytest.fixture(scope="module")
+def ran(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a rig and, in `out`, what a run by volumes has made of the sample with it."""
+    folder = tmp_path_factory.mktemp("run")
+    run(rig_in(folder), folder / "out", "-q")
+    return folder
+
+
+@pytest.fixture
+def again(ran: Path, tmp_path: Path) -> Path:
+    """A copy of it to run again in, with the times of its files."""
+    import shutil
+
+    shutil.copytree(ran, tmp_path, dirs_exist_ok=True)
+    return tmp_path
+
+
+def states(folder: Path) -> dict[str, str]:
+    told = json.loads((folder / "out" / "run.json").read_text())
+    return {name: step["state"] for name, step in told["steps"].items()}
+
+
+def stamps(folder: Path) -> dict[str, int]:
+    return {name: (folder / "out" / name).stat().st_mtime_ns for name in (*FILES, VECTORS)}
+
+
+def test_files_are_those_of_the_single_commands(ran: Path, tmp_path: Path) -> None:
+    rig, calibration, weights = ran / "rig.yaml", tmp_path / "calibration.h5", tmp_path / "weights.h5"
+    picture = ("--picture", tmp_path / "calibration.png")
+    lfpiv("calibrate-snapshot", rig, *PHOTOGRAPHS, "-o", calibration, *picture, "-q")
+    lfpiv("build-weights", rig, "--calibration", calibration, "-o", weights, "-q")
+    lfpiv("reconstruct", weights, *PAIR, "--dark", SAMPLE / "dark.tif", "-o", tmp_path / "volumes", "-q")
+    lfpiv("correlate", *(tmp_path / name for name in FILES[3:]), "-o", tmp_path / VECTORS, "-q")
+    for name in (*FILES, VECTORS):
+        assert (tmp_path / name).read_bytes() == (ran / "out" / name).read_bytes(), name
+
+
+def test_it_says_what_was_chosen_and_what_came_of_it(ran: Path) -> None:
+    told = json.loads((ran / "out" / "run.json").read_text(), parse_constant=pytest.fail)
+    assert (told["method"], told["reason"]) == ("volumes", "as --method asks for")
+    # 400 tracers before 660 microlenses.
+    assert told["tracers_per_lens"] == pytest.approx(0.61, rel=0.2)
+    assert list(told["summaries"]) == ["calibrate-snapshot", "build-weights", "reconstruct", "correlate"]
+    assert told["figures"]["vectors"] == {"volumes": 90}
+    assert told["figures"]["u_from_voxel"]["volumes"] < told["figures"]["u_to_voxel"]["volumes"]
+
+
+def test_what_is_done_is_kept_with_its_summary(again: Path) -> None:
+    before, earlier = stamps(again), json.loads((again / "out" / "run.json").read_text())
+    run(again / "rig.yaml", again / "out")
+    assert stamps(again) == before
+    assert set(states(again).values()) == {"kept"}
+    told = json.loads((again / "out" / "run.json").read_text())
+    assert told["summaries"] == earlier["summaries"]
+    assert told["warnings"] == earlier["warnings"]
+
+
+def test_only_what_depends_on_a_change_is_made_anew(again: Path) -> None:
+    with pytest.raises(OutputExistsError, match=r"step 4, correlate: .*vectors.vtkhdf"):
+        run(again / "rig.yaml", again / "out", "--dt-s", 0.001)
+    before = stamps(again)
+    run(again / "rig.yaml", again / "out", "--dt-s", 0.001, "--overwrite")
+    after = stamps(again)
+    assert {name for name in after if after[name] != before[name]} == {VECTORS}
+
+
+def test_a_torn_file_is_refused_or_made_again(again: Path) -> None:
+    torn, whole = again / "out" / "weights.h5", (again / "out" / "weights.h5").read_bytes()
+    torn.write_bytes(whole[:-1000])
+    with pytest.raises(OutputExistsError, match="step 2, build-weights"):
+        run(again / "rig.yaml", again / "out")
+    run(again / "rig.yaml", again / "out", "--overwrite")
+    assert torn.read_bytes() == whole
+    assert [name for name, state in states(again).items() if state == "made"] == ["build-weights"]
+
+
+def test_a_step_that_fails_leaves_those_before_it(again: Path) -> None:
+    bad = again / "pair_b.tif"
+    bad.write_bytes(PAIR[1].read_bytes()[:-5000])
+    (again / "out" / "volumes" / "pair_b.vtkhdf").unlink()
+    (again / "out" / "run.json").unlink()
+    with pytest.raises(InputError, match=r"step 3, reconstruct: .*pair_b.*the same command goes on"):
+        run(again / "rig.yaml", again / "out", images=(PAIR[0], bad))
+    assert states(again) == {"calibrate-snapshot": "kept", "build-weights": "kept"}
+
+
+def test_a_lost_picture_is_drawn_again(again: Path) -> None:
+    (again / "out" / "calibration.png").unlink()
+    run(again / "rig.yaml", again / "out")
+    assert (again / "out" / "calibration.png").exists()
+    assert states(again)["build-weights"] == "kept"
+
+
+def test_what_is_not_of_a_run_is_not_replaced(ran: Path, tmp_path: Path) -> None:
+    (tmp_path / "run.json").write_text("mine")
+    with pytest.raises(OutputExistsError, match=r"run.json"):
+        run(ran / "rig.yaml", tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "said"),
+    [
+        ({"images": PAIR[:1]}, UsageError, "1 frames"),
+        ({"images": (*PAIR, PAIR[0])}, UsageError, "--pairing"),
+        ({"images": (PAIR[0], PAIR[0])}, UsageError, "same output"),
+        ({"white": (), "board": ()}, UsageError, "--white"),
+        ({"dark": Path("missing.tif")}, InputError, "missing.tif"),
+        ({"combine": True}, UsageError, "--method both"),
+        ({"follow": True, "method": "volumes"}, UsageError, "--follow"),
+        ({"follow": True, "method": "both", "combine": True}, UsageError, "--follow"),
+        ({"change": (", dt_s: 0.002", "")}, ConfigError, "correlation.dt_s"),
+        ({"change": ("solver: em", "solver: particles"), "method": "both"}, ConfigError, "solver"),
+        ({"change": ("correlation:", "weights: {method: dlfc}\ncorrelation:"), "method": "both"}, ConfigError, "dlfc"),
+        ({"change": ("columns: 600", "columns: 599")}, InputError, "pair_a"),
+    ],
+)
+def test_what_cannot_be_is_said_before_anything_is_made(
+    options: dict[str, Any], error: type[LfpivError], said: str, tmp_path: Path
+) -> None:
+    rig = rig_in(tmp_path, *filter(None, (options.pop("change", None),)))
+    given = {"images": PAIR, "white": [SAMPLE / "white.tif"], "board": [SAMPLE / "board.tif"]} | options
+    with pytest.raises(error, match=said):
+        stage.run(rig, tmp_path / "out", RunOptions(**given), console=Console(quiet=True))
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("count", "method", "methods", "said"),
+    [
+        (0.6, "auto", ("particles",), "0.6 tracers for each microlens"),
+        (3.1, "auto", ("volumes",), "3.1 tracers for each microlens"),
+        (None, "auto", ("particles",), "too little"),
+        (3.1, "both", ("volumes", "particles"), "--method"),
+        (3.1, "particles", ("particles",), "--method"),
+    ],
+)
+def test_the_method_is_what_errs_less(
+    count: float | None, method: Any, methods: tuple[str, ...], said: str, tmp_path: Path, monkeypatch
+) -> None:
+    monkeypatch.setattr(stage, "_tracers_per_lens", lambda *_: count)
+    settings = stage.load_config(rig_in(tmp_path))
+    choice = stage._chosen(settings, RunOptions(images=PAIR, method=method), tmp_path, [])
+    assert choice.methods == methods
+    assert said in choice.reason
+    assert choice.tracers_per_lens == count
