@@ -76,9 +76,9 @@ class Console:
         """Print the figures of a command, one a line.
 
         What there is for several things, as a figure with a value for each or under names like `recorded.ert.error`,
-        stands in a table.
+        stands in a table. Of a list of records each has a line, which begins with its first entry.
         """
-        blocks = _blocks(figures)
+        blocks = _blocks(dict(_unfolded(figures)))
         first = max([NAME_WIDTH, *(len(name) for block in blocks for name in block)])
         for block in blocks:
             heads = list(dict.fromkeys(head for value in block.values() if _is_row(value) for head in value))
@@ -227,6 +227,16 @@ def _turned(block: dict[str, Any]) -> dict[str, Any]:
     if len(heads) <= len(block):
         return block
     return {head: {name: row.get(head) for name, row in block.items()} for head in heads}
+
+
+def _unfolded(figures: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Yield figures by name, the records of a list by their first entries."""
+    for name, value in figures.items():
+        if isinstance(value, list) and value and all(isinstance(each, dict) for each in value):
+            for first, *rest in (list(record.values()) for record in value):
+                yield _readable(first), "  ".join(map(_readable, rest))
+        else:
+            yield name, value
 
 
 def _is_row(value: Any) -> bool:

@@ -151,16 +151,7 @@ class LensImages:
 
     def background(self, picture: NDArray[np.floating]) -> tuple[float, float]:
         """Return level and noise of a picture's background: what darker pixels between lens images vary about."""
-        between = picture.ravel()[self.between]
-        between = between[np.isfinite(between)]
-        if not between.size:
-            return 0.0, 0.0
-        # Whole counts are spread evenly over what was rounded: of little noise percentiles are steps.
-        values = np.unique(between)
-        step = float(np.diff(values).min()) if values.size > 1 else 0.0
-        rounded = step * ((GOLDEN * np.arange(between.size)) % 1.0 - 0.5)
-        two, one = np.percentile(between + rounded, [TWO_BELOW, ONE_BELOW])
-        return float(2.0 * one - two), float(one - two)
+        return dark_level(picture.ravel()[self.between])
 
     def _settled(self, light: NDArray[np.float64], unknowns: NDArray[np.float64]) -> tuple[System, NDArray[np.float64]]:
         """Return the last normal equations, and the unknowns by Gauss-Newton from first values of them."""
@@ -168,6 +159,19 @@ class LensImages:
             system = _system(light, self.pattern, self.lattice_px, unknowns)
             unknowns = unknowns + system.step
         return system, unknowns
+
+
+def dark_level(pixels: NDArray[np.floating]) -> tuple[float, float]:
+    """Return level and noise of what darker ones of pixels vary about; those that are not numbers do not count."""
+    known = pixels[np.isfinite(pixels)]
+    if not known.size:
+        return 0.0, 0.0
+    # Whole counts are spread evenly over what was rounded: of little noise percentiles are steps.
+    values = np.unique(known)
+    step = float(np.diff(values).min()) if values.size > 1 else 0.0
+    rounded = step * ((GOLDEN * np.arange(known.size)) % 1.0 - 0.5)
+    two, one = np.percentile(known + rounded, [TWO_BELOW, ONE_BELOW])
+    return float(2.0 * one - two), float(one - two)
 
 
 def folded(picture: NDArray[np.floating], level: float, cells: Cells, bins: int) -> NDArray[np.float64]:

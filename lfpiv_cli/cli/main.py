@@ -29,6 +29,7 @@ from lfpiv_cli.cli.outcome import Terminated, outcome_of, print_json_error, prin
 
 COMMANDS = (
     planning.init,
+    planning.check,
     chain.run,
     calibration.calibrate_snapshot,
     calibration.refine_calibration,

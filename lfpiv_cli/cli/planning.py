@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from lfpiv_cli.cli.options import FILE, common_options
+from lfpiv_cli.cli.options import FILE, POSITIVE, common_options, config_argument, dark_option
 from lfpiv_cli.console import Console
 from lfpiv_cli.names import KnownCamera, names_in
 
@@ -57,6 +57,32 @@ def init(
     if not chosen:
         chosen["numbers"] = _asked()
     return stage.init(target, stage.InitOptions(**chosen), overwrite=overwrite, console=console)
+
+
+@click.command("check")
+@config_argument
+@click.argument("images", type=FILE, nargs=-1)
+@click.option("--white", type=FILE, help="White image, which tells where the lens images lie.")
+@dark_option
+@click.option("--calibration", type=FILE, help="From calibrate-snapshot, in place of the data sheet.")
+@click.option("--velocity-m-s", type=POSITIVE, help="Velocity to expect; default that of the configured flow.")
+@click.option("--picture", type=FILE, help="Picture of errors and field of view by depth to write (.png).")
+@common_options
+def check(config: Path, images: tuple[Path, ...], overwrite: bool, console: Console, **chosen: Any) -> dict[str, Any]:
+    """Tell what a rig and its images are good for, in seconds, before any work.
+
+    Each line has its verdict: good; look, worth a look; no, it cannot work so; or unknown, where nobody can tell. The
+    verdict on the whole is the worst of them. Errors are the smallest that the light allows. The exit code is 0
+    whatever the verdict, which --json has as `verdict`.
+
+    \b
+    Example: lfpiv check rig.yaml --velocity-m-s 0.2 --picture rig.png
+             lfpiv check rig.yaml a.tif b.tif --white white.tif --dark dark.tif
+             lfpiv check rig.yaml a.tif b.tif --calibration calibration.h5 --dark dark.tif
+    """
+    from lfpiv_cli.stages import check as stage
+
+    return stage.check(config, images, stage.CheckOptions(**chosen), overwrite=overwrite, console=console)
 
 
 def _asked() -> RigNumbers:

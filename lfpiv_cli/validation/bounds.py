@@ -111,6 +111,18 @@ def cramer_rao_bound(slope: sparse.csc_array, variance: NDArray[np.float64]) -> 
     return Bound(alone, joint)
 
 
+def errors_alone_mm(
+    view: View, particles: NDArray[np.float64], readout: Readout, counts_per_ray: float = 0.0
+) -> NDArray[np.float64]:
+    """Return the bound (n, 3) of x, y and z of particles each of which is alone in an image of its own."""
+    errors = np.empty((len(particles), 3))
+    for number, particle in enumerate(particles):
+        slope = slopes(view, particle[np.newaxis])
+        variance = pixel_variance(expected_image(slope, particle[np.newaxis]), readout, counts_per_ray)
+        errors[number] = cramer_rao_bound(slope, variance).sigma_mm(joint=False)[0]
+    return errors
+
+
 def _first_block_of_inverse(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the first (4, 4) of a symmetric matrix's inverse; a diagonal of 0 is of something that cannot be known."""
     diagonal = np.diag(matrix)

@@ -17,7 +17,7 @@ from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.reconstruction.solvers import SolverSettings, reconstruct
 from lfpiv_cli.synthetic.sensor import Readout
 from lfpiv_cli.validation.board import elongation_mm
-from lfpiv_cli.validation.bounds import cramer_rao_bound, expected_image, pixel_variance, slopes
+from lfpiv_cli.validation.bounds import cramer_rao_bound, errors_alone_mm, expected_image, pixel_variance, slopes
 from lfpiv_cli.weights.build import default_padding, factorise
 
 # Counts of a whole tracer, as `simulate particles` has them.
@@ -43,14 +43,8 @@ def smallest_errors_mm(
     camera: Camera, media: Media, depths_mm: Sequence[float], readout: Readout
 ) -> NDArray[np.float64]:
     """Return the Cramer-Rao bound (n, 3) of x, y and z of a tracer alone, by its depth."""
-    view = raw_view(camera, media, RADIUS_MM)
-    errors = []
-    for depth in depths_mm:
-        particle = np.array([[*BESIDE_MM, depth, LIGHT_COUNTS]])
-        slope = slopes(view, particle)
-        bound = cramer_rao_bound(slope, pixel_variance(expected_image(slope, particle), readout))
-        errors.append(bound.sigma_mm(joint=False)[0])
-    return np.array(errors)
+    particles = np.array([[*BESIDE_MM, depth, LIGHT_COUNTS] for depth in depths_mm])
+    return errors_alone_mm(raw_view(camera, media, RADIUS_MM), particles, readout)
 
 
 def smallest_errors_crowded_mm(

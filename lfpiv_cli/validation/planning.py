@@ -5,11 +5,17 @@ Axes: world x, y, z in mm, z away from the camera from the nominal focal point; 
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
+from lfpiv_cli.particles.response import VALUES, respond
+from lfpiv_cli.particles.view import View, entry_capacity, raw_view
+from lfpiv_cli.synthetic.sensor import Readout
+from lfpiv_cli.validation.bounds import errors_alone_mm
 
 # Tracers for each microlens in view that serve velocity best: each lights about as many pixels as a microlens has, so
 # that with one of them the pixels of neighbours overlap, and particles go wrong from two on.
@@ -17,6 +23,26 @@ BEST_PER_LENS = 0.5
 SPARSE_PER_LENS, CROWDED_PER_LENS, MOST_PER_LENS = 0.05, 1.3, 3.0
 # Displacements in voxels that are large against the errors and small against a coarse window.
 SMALLEST_STEP, BEST_STEP, LARGEST_STEP = 3.0, 5.0, 8.0
+# Places in front of a lens that stand for all: multiples of two irrational numbers lie evenly. In the middle of the
+# camera, where lenses are whole.
+PLACES, STEPS = 8, np.array([0.7548776662466927, 0.5698402909980532])
+# Beyond the light of a tracer a camera in miniature has so many lenses.
+LENSES_AROUND = 3
+# Rounds in which light and number of an image's tracers are told from each other.
+ROUNDS = 4
+# Pixels are lit that a lens image's rim only touches.
+RIM_PX = 0.43
+# Of the pixels that lens images reach; where more are lit, tracers cannot be counted.
+MOST_LIT = 0.98
+
+
+@dataclass(frozen=True)
+class Tracer:
+    """A tracer alone: its light in counts, its radius in mm, and the sensor that records it."""
+
+    light_counts: float
+    radius_mm: float
+    readout: Readout
 
 
 def half_view_mm(camera: Camera, media: Media, z_mm: ArrayLike, rim: float = -1.0) -> NDArray[np.float64]:
@@ -51,6 +77,17 @@ def share_in_view(
     return float(np.mean(np.prod(sides, axis=1)))
 
 
+def part_in_front(camera: Camera, media: Media, bounds_mm: NDArray[np.float64]) -> tuple[slice, slice]:
+    """Return the rows and columns of an image that look at the middle of a box, bounds (3, 2)."""
+    middle = float(bounds_mm[2].mean())
+    distance = float(equivalent_object_distance(middle, camera.focus_distance_mm, media))
+    corners = camera.to_image_axes(bounds_mm[:2].T) * (-camera.image_distance_mm / distance)
+    ends = np.sort(camera.mm_to_px(corners), axis=0)
+    low = np.clip(np.rint(ends[0]), 0, [camera.columns - 1, camera.rows - 1]).astype(int)
+    high = np.maximum(np.rint(ends[1]).astype(int), low + 1)
+    return slice(int(low[1]), int(high[1])), slice(int(low[0]), int(high[0]))
+
+
 def depth_of_field_mm(camera: Camera, media: Media) -> float:
     """Return how far before and behind the focal plane points can be refocused.
 
@@ -78,3 +115,79 @@ def tracers_in(camera: Camera, per_lens: float, sides_mm: ArrayLike) -> float:
 def time_step_s(velocity_m_s: float, voxel_mm: float, voxels: float = BEST_STEP) -> float:
     """Return the time in which a velocity crosses so many voxels."""
     return voxels * voxel_mm / (abs(velocity_m_s) * 1e3)
+
+
+def errors_by_depth_mm(
+    camera: Camera, media: Media, depths_mm: ArrayLike, tracer: Tracer, counts_per_ray: float = 0.0
+) -> NDArray[np.float64]:
+    """Return the smallest errors (n, 3) of x, y and z, rms over places, of a tracer alone at depths (n,).
+
+    The Cramer-Rao bound; no image tells more. `counts_per_ray` is of images that are rendered ray by ray.
+    """
+    depths = np.asarray(depths_mm, dtype=np.float64)
+    view = _in_miniature(camera, media, depths, tracer.radius_mm)
+    errors = errors_alone_mm(view, _particles(view, depths, tracer.light_counts), tracer.readout, counts_per_ray)
+    return np.asarray(np.sqrt(np.mean(errors.reshape(depths.size, PLACES, 3) ** 2, axis=1)))
+
+
+def lit_pixels(camera: Camera, media: Media, depths_mm: ArrayLike, tracer: Tracer, level_counts: float) -> float:
+    """Return how many pixels a tracer lights above a level on average over places and depths."""
+    depths = np.asarray(depths_mm, dtype=np.float64)
+    view = _in_miniature(camera, media, depths, tracer.radius_mm)
+    capacity = entry_capacity(view, float(depths.min()), float(depths.max()))
+    pixels, values = np.empty(capacity, np.int32), np.empty((capacity, VALUES))
+    lit = []
+    for x, y, z, light in _particles(view, depths, tracer.light_counts):
+        count = respond(view, x, y, z, pixels, values)
+        image = np.bincount(pixels[:count], light * values[:count, 0])
+        lit.append(np.count_nonzero(image > level_counts))
+    return float(np.mean(lit))
+
+
+def tracers_per_lens(
+    camera: Camera, media: Media, depths_mm: ArrayLike, tracer: Tracer, lit: tuple[float, float, float]
+) -> tuple[float, float]:
+    """Return how many tracers for each lens lit an image, and the light of one; infinitely many where all is lit.
+
+    Tracers lie about at random, so that the share of pixels that stay dark falls exponentially with their number.
+
+    Parameters
+    ----------
+    tracer : its radius is taken; its light is what the image has
+    lit : share of the pixels above a level, that level in counts, mean counts of a pixel above the background
+    """
+    share, level, mean = lit
+    pitch, cell = pixels_per_lens(camera), camera.micro_image_lattice_px().cell_area
+    radius = 0.5 * pitch * min(camera.lens_image_width, 1.0) + RIM_PX
+    most = min(float(np.pi * radius**2 / cell), 1.0)
+    if share >= MOST_LIT * most:
+        return np.inf, 0.0
+    number, light = -np.log(1.0 - share / most), 0.0
+    if number <= 0.0:
+        return 0.0, 0.0
+    for _ in range(ROUNDS):
+        light = mean * cell / number
+        each = lit_pixels(camera, media, depths_mm, Tracer(light, tracer.radius_mm, tracer.readout), level)
+        number = -np.log(1.0 - share / most) * most * cell / max(each, 1.0)
+    return float(number), float(light)
+
+
+def _in_miniature(camera: Camera, media: Media, depths_mm: NDArray[np.float64], radius_mm: float) -> View:
+    """Return the view of a sensor just large enough for the light of tracers in its middle."""
+    distance = equivalent_object_distance(depths_mm, camera.focus_distance_mm, media)
+    blur = np.abs(camera.defocus(distance)) * camera.aperture_radius_mm
+    reach = float(np.max(blur + radius_mm * camera.image_distance_mm / distance))
+    reach += LENSES_AROUND * float(camera.lattice.pitch.max())
+    # As many more as there are fewer on the other side: lenses stay where they are.
+    columns, rows = (2 * int(np.ceil(reach / camera.pixel_mm)) + side % 2 for side in (camera.columns, camera.rows))
+    return raw_view(replace(camera, columns=columns, rows=rows), media, radius_mm)
+
+
+def _particles(view: View, depths_mm: NDArray[np.float64], light: float) -> NDArray[np.float64]:
+    """Return particles (depths * PLACES, 4) whose light is at places all over a lens."""
+    cell = (np.outer(np.arange(PLACES) + 0.5, STEPS) % 1.0 - 0.5) @ np.linalg.inv(view.inverse_basis)
+    beta = view.camera.image_distance_mm / (view.camera.focus_distance_mm + view.depth_ratio * depths_mm)
+    lateral = -cell[np.newaxis] / beta[:, np.newaxis, np.newaxis]
+    columns = np.broadcast_to(depths_mm[:, np.newaxis, np.newaxis], (depths_mm.size, PLACES, 1))
+    lights = np.full_like(columns, light)
+    return np.concatenate([lateral, columns, lights], axis=2).reshape(-1, 4)

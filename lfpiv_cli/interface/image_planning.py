@@ -1,0 +1,270 @@
+"""What images tell of an experiment before anything is made of them: a verdict a line.
+
+The lines are those of `interface.planning`. Images are raw, [row, column], in counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lfpiv_cli.calibration.lens_light import LensImages, dark_level
+from lfpiv_cli.calibration.light_checks import CERTAIN_SIGMAS, level_notices, position_notices, uniform_notices
+from lfpiv_cli.calibration.model import Calibration
+from lfpiv_cli.errors import ConfigError, InputError
+from lfpiv_cli.files.config import Config
+from lfpiv_cli.interface.calibration import NO_BOARD, calibration_notices, calibration_of, photographs
+from lfpiv_cli.interface.planning import Bench, Line, Verdict, error_verdict, graded, seeding_line, worst
+from lfpiv_cli.particles.noise import read_noise
+from lfpiv_cli.reconstruction.images import FULL_SCALES, defects, light, saturated
+from lfpiv_cli.validation import planning
+from lfpiv_cli.validation.light_beyond import share_beyond
+from lfpiv_cli.weights.build import aligned
+
+Image = NDArray[np.float32]
+
+# A pixel is lit so many standard deviations of the noise above the background: of a million dark ones two hundred.
+LIT_SIGMAS = 3.5
+# The brightest pixels but so many show what tracers' light is; noise alone reaches five standard deviations there.
+BRIGHTEST, GOOD_SIGNAL, LEAST_SIGNAL = 200, 20.0, 7.0
+# Shares of the lit pixels that are saturated.
+GOOD_SATURATED, MOST_SATURATED = 0.01, 0.1
+# Shares of the pitch by which lens images may have moved since the white image: beyond, light is given to other lenses.
+MOST_MOVED = 0.1
+# Of the light in the middle of an image, so much may be put before and behind the volume.
+GOOD_BEYOND, MOST_BEYOND = 0.25, 0.6
+# Of full scale, for a white image.
+BRIGHTEST_WHITE = 0.95
+DEPTHS = 7
+
+
+@dataclass(frozen=True, eq=False)
+class Pictures:
+    """What is checked: images by name, and the white and dark image where there are any."""
+
+    images: Mapping[str, Image]
+    white: Image | None = None
+    dark: Image | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """One image: raw, less its dark one, its background's level and noise, and the lens images where they are known."""
+
+    name: str
+    raw: Image
+    less_dark: Image
+    level: float
+    noise: float
+    lens_images: LensImages | None
+
+    @property
+    def above(self) -> Image:
+        """Light above the background, 0 where it is within noise."""
+        rest = self.less_dark - np.float32(self.level)
+        return np.where(rest > LIT_SIGMAS * self.noise, rest, np.float32(0.0))
+
+
+def lattice_of(settings: Config, pictures: Pictures) -> tuple[Calibration | None, list[Line]]:
+    """Return the microlenses that a white image shows, and what it says of itself."""
+    if pictures.white is None:
+        return None, []
+    photographed = photographs([pictures.white], [], pictures.dark, ())
+    try:
+        found = calibration_of(settings, photographed)
+    except (ConfigError, InputError) as error:
+        return None, [Line("white image", "no", str(error))]
+    told = [each for each in calibration_notices(settings, photographed, found) if each not in (NO_BOARD,)]
+    told = [each for each in told if each.code != "f-numbers"]
+    share = float(np.nanmax(pictures.white)) / full_scale(pictures.white, settings)
+    reason = f"{found.fit.lenses} lens images {float(found.fit.lattice_px.pitch.mean()):.4g} px apart"
+    verdict: Verdict = "good"
+    if share > BRIGHTEST_WHITE:
+        verdict, reason = "look", f"{reason}; it reaches {share:.0%} of full scale, two thirds are good"
+    if told:
+        verdict, reason = "look", "; ".join([reason, *(f"{each.text}: {each.remedy}" for each in told)])
+    return found, [Line("white image", verdict, reason)]
+
+
+def image_lines(bench: Bench, pictures: Pictures, lattice: Calibration | None) -> tuple[list[Line], dict[str, Any]]:
+    """Return what speaks for and against images, the worst of them for each question, and their figures.
+
+    Parameters
+    ----------
+    lattice : the microlenses by a white image or a calibration; None: nobody knows where they lie
+    """
+    asked: list[list[Line]] = []
+    figures: list[dict[str, Any]] = []
+    for name, image in pictures.images.items():
+        seen = _seen(bench, name, image, pictures.dark, lattice)
+        number, tracer_light = _counted(bench, seen)
+        asked.append([question(bench, seen) for question in QUESTIONS] + [_tracers(bench, seen, number)])
+        asked[-1].append(_precision(bench, seen, tracer_light))
+        figures.append(_figures(seen, number, tracer_light))
+    lines = [_worst_of(answers) for answers in zip(*asked, strict=True)]
+    return lines, {name: [each[name] for each in figures] for name in figures[0]} if figures else {}
+
+
+def full_scale(image: Image, settings: Config) -> float:
+    """Return the counts at which a sensor ends: as configured, else the least number of bits that holds an image."""
+    given = settings.reconstruction.saturation_counts
+    largest = float(np.nanmax(image))
+    return given or next((scale for scale in FULL_SCALES if largest <= scale), largest)
+
+
+def _seen(bench: Bench, name: str, raw: Image, dark: Image | None, lattice: Calibration | None) -> Seen:
+    less_dark = light(raw, dark)
+    if dark is not None:
+        less_dark = np.where(defects(dark), np.float32(0.0), less_dark)
+    lens_images = None
+    if lattice is not None:
+        width = bench.camera.lens_image_width
+        lens_images = LensImages.of(lattice.rectification, lattice.transmission, width)
+    return Seen(name, raw, less_dark, *_background_of(less_dark, dark is not None, lens_images), lens_images)
+
+
+def _background_of(less_dark: Image, has_dark: bool, lens_images: LensImages | None) -> tuple[float, float]:
+    """Return level and noise of a background, between the lens images where it is known where they lie."""
+    if lens_images is not None:
+        return lens_images.background(less_dark)
+    return (0.0, read_noise(less_dark.astype(np.float64))) if has_dark else dark_level(less_dark.ravel())
+
+
+def _worst_of(answers: Sequence[Line]) -> Line:
+    """Return the first of the worst answers to one question."""
+    verdict = worst(answers)
+    return next(line for line in answers if line.verdict == verdict)
+
+
+def _counted(bench: Bench, seen: Seen) -> tuple[float, float]:
+    """Return tracers for each lens that looks at the volume, and the light of one."""
+    level = max(LIT_SIGMAS * seen.noise, 0.5)
+    part = planning.part_in_front(bench.camera, bench.media, bench.bounds_mm)
+    rest = seen.less_dark[part] - np.float32(seen.level)
+    lit = float(np.mean(rest > level)), level, float(np.mean(rest, dtype=np.float64))
+    depths = np.linspace(bench.bounds_mm[2, 0], bench.bounds_mm[2, 1], DEPTHS)
+    return planning.tracers_per_lens(bench.camera, bench.media, depths, bench.tracer(), lit)
+
+
+def _exposure(bench: Bench, seen: Seen) -> Line:
+    lit = seen.above > 0.0
+    at_end = saturated(seen.raw, bench.settings.reconstruction.saturation_counts)
+    share = float(np.count_nonzero(at_end & lit)) / max(int(np.count_nonzero(lit)), 1)
+    scale = full_scale(seen.raw, bench.settings)
+    reason = (
+        f"{seen.name}: the brightest pixel is at {float(np.nanmax(seen.raw)) / scale:.0%} of {scale:g} counts, "
+        f"{share:.2%} of the lit ones are saturated"
+    )
+    verdict = graded(share, GOOD_SATURATED, MOST_SATURATED)
+    return Line("exposure", verdict, reason + ("" if verdict == "good" else ": less light"))
+
+
+def _light(_bench: Bench, seen: Seen) -> Line:
+    signal = _signal(seen)
+    reason = (
+        f"{seen.name}: bright pixels stand {signal:.3g} times the noise of {seen.noise:.2g} counts above the background"
+    )
+    verdict = graded(signal, GOOD_SIGNAL, LEAST_SIGNAL)
+    return Line("light", verdict, reason + {"look": ": more light", "no": ": no tracers are seen"}.get(verdict, ""))
+
+
+def _signal(seen: Seen) -> float:
+    """Return the light of bright pixels in standard deviations of the noise."""
+    rest = seen.less_dark.ravel() - seen.level
+    place = max(rest.size - BRIGHTEST, 0)
+    return float(np.partition(rest, place)[place] / max(seen.noise, np.sqrt(1.0 / 12.0)))
+
+
+def _lens_images(_bench: Bench, seen: Seen) -> Line:
+    about = "drift"
+    if seen.lens_images is None:
+        return Line(about, "unknown", "where they lie nobody has told: --white, or --calibration")
+    found = seen.lens_images.beside(seen.less_dark)
+    sizes = [(float(np.hypot(*place.shift_px)), place.sigma_px) for place in found.places]
+    pitch = float(seen.lens_images.lattice_px.pitch.mean())
+    size, sigma = max(sizes, default=(0.0, np.inf))
+    if not found.lit or not np.isfinite(sigma):
+        return Line(about, "unknown", f"{seen.name}: too little light tells whether they have moved")
+    remedy = "take white image and frames with the camera as it is"
+    notices = position_notices(seen.lens_images, seen.less_dark, seen.name, remedy)
+    if not notices:
+        return Line(about, "good", f"{seen.name}: moved by {size:.2f} +- {sigma:.2f} px since the white image")
+    off = notices[0].code == "light-off-lens-images" or size - CERTAIN_SIGMAS * sigma > MOST_MOVED * pitch
+    return Line(about, "no" if off else "look", f"{notices[0].about}: {notices[0].text}; {notices[0].remedy}")
+
+
+def _background(_bench: Bench, seen: Seen) -> Line:
+    """Say whether it is dark between the lens images, and tracers are on the lens images."""
+    if seen.lens_images is None:
+        reason = f"{seen.name}: {seen.level:.3g} counts, with noise of {seen.noise:.2g}; --white tells more"
+        return Line("background", "unknown", reason)
+    notices = level_notices(seen.lens_images, seen.less_dark, seen.name)
+    if notices:
+        return Line("background", "look", f"{seen.name}: {notices[0].text}; {notices[0].remedy}")
+    return Line("background", "good", f"{seen.name}: {seen.level:.2g} counts beside the dark image")
+
+
+def _beyond(bench: Bench, seen: Seen) -> Line:
+    about = "light outside"
+    if bench.found is None and not aligned(bench.camera):
+        return Line(about, "unknown", "the array is not aligned with the sensor: --calibration, or --white")
+    if bench.settings.volume.reference == "mid_plane" and not bench.knows_mid_plane:
+        return Line(about, "unknown", "where the volume lies a calibration with a board tells: --calibration")
+    picture = seen.above
+    if bench.found is not None:
+        picture = bench.found.rectification.apply(picture).astype(np.float32)
+    low, high = bench.bounds_mm[2]
+    share = share_beyond(bench.camera, bench.media, (float(low), float(high)), np.maximum(picture, np.float32(0.0)))
+    reason = f"{seen.name}: {share:.0%} of the light in its middle comes from before or behind the volume"
+    verdict = graded(share, GOOD_BEYOND, MOST_BEYOND)
+    return Line(about, verdict, reason + ("" if verdict == "good" else ": a deeper volume, or thinner illumination"))
+
+
+def _tracers(bench: Bench, seen: Seen, number: float) -> Line:
+    if seen.lens_images is not None and bench.found is not None:
+        for notice in uniform_notices(seen.lens_images, bench.found.fit, seen.less_dark, seen.name):
+            return Line("tracers", "no", f"{notice.about}: {notice.text}; {notice.remedy}")
+    if not np.isfinite(number):
+        reason = "hardly a pixel is dark: two tracers per microlens or more, or haze; volumes err less than particles"
+        return Line("tracers", "look", f"{seen.name}: {reason}")
+    line = seeding_line(bench, number, "in the image")
+    return replace(line, about="tracers", reason=f"{seen.name}: {line.reason}")
+
+
+def _precision(bench: Bench, seen: Seen, tracer_light: float) -> Line:
+    about = "precision, measured"
+    if not 0.0 < tracer_light < np.inf:
+        return Line(about, "unknown", f"{seen.name}: no tracer could be told from others")
+    errors = _errors(bench, seen, tracer_light)
+    reason = (
+        f"{seen.name}: a tracer alone of {tracer_light:.2g} counts, as here, is placed to {1e3 * errors[0]:.2g} um "
+        f"across and {1e3 * errors[2]:.2g} um in depth at best"
+    )
+    return Line(about, error_verdict(bench, errors[2]), reason)
+
+
+def _errors(bench: Bench, seen: Seen, tracer_light: float) -> NDArray[np.float64]:
+    """Return the median smallest errors (3,) of tracers of a light, with the noise of an image."""
+    plain = bench.tracer()
+    tracer = replace(plain, light_counts=tracer_light, readout=replace(plain.readout, read_noise_counts=seen.noise))
+    depths = np.linspace(bench.bounds_mm[2, 0], bench.bounds_mm[2, 1], DEPTHS)
+    return np.asarray(np.median(planning.errors_by_depth_mm(bench.camera, bench.media, depths, tracer), axis=0))
+
+
+def _figures(seen: Seen, number: float, tracer_light: float) -> dict[str, Any]:
+    known = np.isfinite(number)
+    return {
+        "image": seen.name,
+        "background_counts": seen.level,
+        "noise_counts": seen.noise,
+        "signal_to_noise": _signal(seen),
+        "tracers_per_lens": number if known else None,
+        "tracer_counts": tracer_light if known else None,
+    }
+
+
+QUESTIONS: Sequence[Callable[[Bench, Seen], Line]] = (_exposure, _light, _background, _lens_images, _beyond)

@@ -1,0 +1,409 @@
+"""What to expect of a rig before it records anything: a verdict a line, from the configuration and a calibration.
+
+A line is good, or worth a look, or says that the experiment cannot work so; or nobody can know.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lfpiv_cli.calibration.model import Calibration
+from lfpiv_cli.calibration.sheet import LARGE_F_RATIO, LARGEST_F_RATIO
+from lfpiv_cli.errors import ConfigError, InputError
+from lfpiv_cli.files.config import Config
+from lfpiv_cli.grid import Grid
+from lfpiv_cli.interface.weights import ray_source
+from lfpiv_cli.interface.weights_checks import check_rig, rig_notices
+from lfpiv_cli.interface.weights_cost import cost_notices, cost_of
+from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.media import Media
+from lfpiv_cli.reference import Reference
+from lfpiv_cli.scale import Scale
+from lfpiv_cli.synthetic.flows import MM_PER_M
+from lfpiv_cli.synthetic.sensor import Readout
+from lfpiv_cli.validation import planning
+from lfpiv_cli.validation.planning import Tracer
+from lfpiv_cli.weights.build import default_padding
+from lfpiv_cli.weights.scene import Source
+
+Verdict = Literal["good", "look", "no", "unknown"]
+# From the best to the worst; what is not known counts for nothing.
+ORDER: tuple[Verdict, ...] = ("unknown", "good", "look", "no")
+
+# Shares of the volume: in full view, and within the depth of field.
+GOOD_VIEW, LEAST_VIEW = 0.97, 0.5
+GOOD_DEPTH, LEAST_DEPTH = 0.99, 0.7
+# Pixels of a lens image, which are the views from across the aperture.
+GOOD_PIXELS, LEAST_PIXELS = 8.0, 5.0
+# Error of a tracer's depth over the depth in which its light spreads by one lens.
+GOOD_ERROR, LARGEST_ERROR = 0.05, 0.25
+# Voxels in microlenses and in depths of one lens: particles lock to wider ones.
+GOOD_VOXEL, LARGEST_VOXEL = 0.55, 1.05
+# Vectors along each axis, and tracers in a window.
+FEWEST_VECTORS, FEWEST_TRACERS = 3, 5.0
+# Of the coarse window's side: up to the one displacements are measured well, beyond the other hardly at all.
+GOOD_SHARE_OF_WINDOW, LARGEST_SHARE_OF_WINDOW = 0.25, 0.5
+DEPTHS = 21
+# Points along each axis at which a configured flow is asked for its speed, and the percentile that counts.
+FLOW_POINTS, FAST_PERCENTILE = 9, 95.0
+# Bytes of a raw image's pixel, and of a volume's voxel.
+PIXEL_BYTES, VOXEL_BYTES = 2, 4
+
+
+@dataclass(frozen=True)
+class Line:
+    """A verdict: what it is about, and why."""
+
+    about: str
+    verdict: Verdict
+    reason: str
+
+    def row(self) -> dict[str, str]:
+        """Return it as plain data."""
+        return {"about": self.about, "verdict": self.verdict, "reason": self.reason}
+
+
+@dataclass(frozen=True, eq=False)
+class Bench:
+    """A rig as far as it is known.
+
+    Attributes
+    ----------
+    settings, found : the config, and the calibration or None
+    camera, media : calibrated where there is a calibration
+    grid : the volume, z from the focal point
+    velocity_m_s : to expect; None: nobody says
+    """
+
+    settings: Config
+    found: Calibration | None
+    camera: Camera
+    media: Media
+    grid: Grid
+    velocity_m_s: float | None
+
+    @property
+    def scale(self) -> Scale:
+        """The camera's lengths in the scene."""
+        return self.camera.scale(self.media)
+
+    @property
+    def knows_mid_plane(self) -> bool:
+        """Whether a calibration tells where a channel's mid plane lies."""
+        return self.found is not None and self.found.mid_plane_z_mm is not None
+
+    @property
+    def mid_plane_z_mm(self) -> float:
+        """Depth of a channel's mid plane; where it is not known, the camera is focused on it."""
+        return (self.found.mid_plane_z_mm if self.found else None) or 0.0
+
+    @property
+    def bounds_mm(self) -> NDArray[np.float64]:
+        """(3, 2) of the volume, z from the focal point."""
+        return np.array([self.grid.bounds_mm(axis) for axis in range(3)])
+
+    @property
+    def depths_mm(self) -> NDArray[np.float64]:
+        """Depths of the volume, from the focal point."""
+        return np.linspace(self.bounds_mm[2, 0], self.bounds_mm[2, 1], DEPTHS)
+
+    @property
+    def sides_mm(self) -> NDArray[np.float64]:
+        """(3,) of the volume."""
+        return np.diff(self.bounds_mm)[:, 0]
+
+    @cached_property
+    def errors_mm(self) -> NDArray[np.float64]:
+        """Smallest errors (n, 3) of simulated tracers at `depths_mm`."""
+        return planning.errors_by_depth_mm(self.camera, self.media, self.depths_mm, self.tracer())
+
+    def tracer(self) -> Tracer:
+        """Return a tracer as the config simulates it."""
+        scene = self.settings.simulation
+        readout = Readout(scene.photons_per_count, scene.read_noise_counts, scene.dark_level_counts, scene.bits)
+        return Tracer(scene.particle_counts, 0.5 * scene.particle_diameter_mm, readout)
+
+
+def bench_of(settings: Config, found: Calibration | None, velocity_m_s: float | None = None) -> Bench:
+    """Return a rig; without a calibration the focal plane is taken to lie where it should.
+
+    Raises
+    ------
+    ConfigError, InputError
+        The configuration lacks camera, media or volume, or the calibration is of another sensor.
+    """
+    camera = settings.camera_model()
+    if found is not None:
+        camera = found.camera(camera)
+    z_mm = 0.0 if found is None or found.mid_plane_z_mm is None else found.mid_plane_z_mm
+    named = settings.volume.reference
+    grid = settings.grid(Reference(named, z_mm if named == "mid_plane" else 0.0))
+    velocity = velocity_m_s if velocity_m_s is not None else _configured_speed_m_s(settings)
+    return Bench(settings, found, camera, settings.media_model(), grid, velocity)
+
+
+def rig_lines(bench: Bench) -> list[Line]:
+    """Return what is to be expected of a rig, a line for each question."""
+    questions: Sequence[Callable[[Bench], Line]] = (
+        _field_of_view,
+        _depth_of_field,
+        _f_numbers,
+        _lens_images,
+        _rays,
+        _precision,
+        _seeding,
+        _voxels,
+        _windows,
+        _time_step,
+        _cost,
+    )
+    return [question(bench) for question in questions]
+
+
+def worst(lines: Sequence[Line]) -> Verdict:
+    """Return the verdict on the whole."""
+    return max((line.verdict for line in lines), key=ORDER.index, default="unknown")
+
+
+def rig_figures(bench: Bench) -> dict[str, Any]:
+    """Return what a rig's lines are about, as numbers."""
+    view = 2.0 * planning.half_view_mm(bench.camera, bench.media, [0.0])[0]
+    best = planning.tracers_in(bench.camera, planning.BEST_PER_LENS, bench.sides_mm)
+    camera = bench.camera
+    figures = {
+        "field_of_view_mm": view.tolist(),
+        "depth_of_field_mm": planning.depth_of_field_mm(camera, bench.media),
+        "lens_image_width": camera.lens_image_width,
+        "pixels_per_lens": planning.pixels_per_lens(camera),
+        "sigma_mm": np.median(bench.errors_mm, axis=0).tolist(),
+        "best_tracers": round(best),
+        "best_tracers_per_lens": planning.BEST_PER_LENS,
+        "best_tracers_per_mm3": best / float(np.prod(bench.sides_mm)),
+        "best_ppp": planning.BEST_PER_LENS / camera.micro_image_lattice_px().cell_area,
+        "voxels_xyz": list(bench.grid.shape_xyz),
+        "voxel_mm": list(bench.grid.spacing_mm),
+        "windows_voxel": [list(window) for window in bench.settings.windows_voxel(bench.grid.spacing_mm)],
+        "expected_velocity_m_s": bench.velocity_m_s,
+        "best_dt_s": _best_time_s(bench),
+    }
+    return figures | _cost_figures(bench)
+
+
+def by_depth(bench: Bench) -> dict[str, NDArray[np.float64]]:
+    """Return errors and fields of view by depth, for a picture."""
+    depths, camera, media = bench.depths_mm, bench.camera, bench.media
+    return {
+        "depth_mm": depths,
+        "sigma_mm": bench.errors_mm,
+        "full_view_mm": planning.half_view_mm(camera, media, depths),
+        "any_view_mm": planning.half_view_mm(camera, media, depths, 1.0),
+    }
+
+
+def _configured_speed_m_s(settings: Config) -> float | None:
+    """Return the speed of the configured flow in the volume, None where there is no flow."""
+    try:
+        flow = settings.true_flow()
+    except ConfigError:
+        return None
+    grid = settings.grid()
+    axes = [np.linspace(*grid.bounds_mm(axis), FLOW_POINTS) for axis in range(3)]
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    speed = float(np.percentile(np.linalg.norm(flow(points), axis=1), FAST_PERCENTILE))
+    return speed if speed > 0.0 else None
+
+
+def graded(value: float, good: float, limit: float) -> Verdict:
+    """Return good up to one limit, no beyond another one, and look between them; the first may be the larger one."""
+    if good > limit:
+        value, good, limit = -value, -good, -limit
+    return "good" if value <= good else "look" if value <= limit else "no"
+
+
+def _field_of_view(bench: Bench) -> Line:
+    share = planning.share_in_view(bench.camera, bench.media, bench.bounds_mm)
+    width, height = 2.0 * planning.half_view_mm(bench.camera, bench.media, [0.0])[0]
+    ends = planning.half_view_mm(bench.camera, bench.media, bench.bounds_mm[2]).min(axis=0)
+    reason = f"{width:.3g} x {height:.3g} mm at the focal plane; {share:.0%} of the volume is in full view"
+    verdict = graded(share, GOOD_VIEW, LEAST_VIEW)
+    if verdict != "good":
+        reason += f", {2.0 * ends[0]:.3g} x {2.0 * ends[1]:.3g} mm would be at all of its depths"
+    return Line("field of view", verdict, reason)
+
+
+def _depth_of_field(bench: Bench) -> Line:
+    reach = planning.depth_of_field_mm(bench.camera, bench.media)
+    (low, high), inside = bench.bounds_mm[2], np.clip(bench.bounds_mm[2], -reach, reach)
+    share = float(inside[1] - inside[0]) / float(high - low)
+    reason = f"points can be refocused within {reach:.3g} mm of the focal plane; the volume is {low:.3g} to {high:.3g}"
+    return Line("depth of field", graded(share, GOOD_DEPTH, LEAST_DEPTH), reason + " mm from it")
+
+
+def _f_numbers(bench: Bench) -> Line:
+    width = bench.camera.lens_image_width
+    main = bench.camera.image_distance_mm / bench.camera.aperture_mm
+    reason = f"f/{main:.3g} towards the array and f/{main * width:.3g} of the microlenses: lens images "
+    if width > LARGE_F_RATIO:
+        reason += f"overlap, {width:.2f} of their pitch wide; stop the main lens down"
+    elif width < 1.0 / LARGE_F_RATIO:
+        reason += f"fill only {width:.2f} of their pitch; open the main lens"
+    else:
+        reason += "just touch"
+    return Line("f-numbers", graded(max(width, 1.0 / width), LARGE_F_RATIO, LARGEST_F_RATIO), reason)
+
+
+def _lens_images(bench: Bench) -> Line:
+    pixels = planning.pixels_per_lens(bench.camera)
+    reason = f"{pixels:.3g} pixels across, as many views tell depths apart; {GOOD_PIXELS:g} or more are good"
+    return Line("lens images", graded(pixels, GOOD_PIXELS, LEAST_PIXELS), reason)
+
+
+def _rays(bench: Bench) -> Line:
+    try:
+        check_rig(bench.settings, bench.found)
+        source = _source(bench)
+        notices = rig_notices(bench.settings, bench.found, bench.camera, source, bench.grid)
+    except (ConfigError, InputError) as error:
+        return Line("rays", "no", str(error))
+    told = [notice for notice in notices if notice.code != "f-numbers"]
+    if not told:
+        return Line("rays", "good", "paraxial lens and refraction are right to half a pixel")
+    return Line("rays", "look", "; ".join(f"{notice.about} {notice.text}: {notice.remedy}" for notice in told))
+
+
+def _source(bench: Bench) -> Source:
+    """Return how rays are found; a channel's mid plane that is not known is where the camera is focused."""
+    if bench.settings.weights.method == "dlfc":
+        return ray_source(bench.settings, bench.found)
+    return bench.settings.object_space(bench.mid_plane_z_mm)
+
+
+def _precision(bench: Bench) -> Line:
+    errors = bench.errors_mm
+    lateral, depth = float(np.median(errors[:, :2])), float(np.median(errors[:, 2]))
+    usable = float(np.mean(errors[:, 2] <= LARGEST_ERROR * bench.scale.depth_mm))
+    reason = (
+        f"a tracer alone of {bench.tracer().light_counts:.3g} counts is placed to {1e3 * lateral:.2g} um across and "
+        f"{1e3 * depth:.2g} um in depth; depths are told in {usable:.0%} of the volume"
+    )
+    return Line("precision", error_verdict(bench, depth), reason)
+
+
+def error_verdict(bench: Bench, depth_error_mm: float) -> Verdict:
+    """Return the verdict on an error in depth."""
+    return graded(depth_error_mm / bench.scale.depth_mm, GOOD_ERROR, LARGEST_ERROR)
+
+
+def _seeding(bench: Bench) -> Line:
+    return seeding_line(bench, bench.settings.simulation.particles / _lenses(bench), "simulated")
+
+
+def seeding_line(bench: Bench, per_lens: float, what: str) -> Line:
+    """Return the verdict on tracers for each microlens, `what` says whose they are."""
+    best = planning.tracers_in(bench.camera, planning.BEST_PER_LENS, bench.sides_mm)
+    reason = (
+        f"{per_lens:.2g} tracers per microlens are {what}; {planning.BEST_PER_LENS:g} are best, {best:.0f} in the "
+        f"volume, {best / float(np.prod(bench.sides_mm)):.2g} per mm3, "
+        f"{planning.BEST_PER_LENS / bench.camera.micro_image_lattice_px().cell_area:.2g} per pixel"
+    )
+    if per_lens < planning.SPARSE_PER_LENS:
+        return Line("seeding", "look", reason + ": few vectors")
+    if per_lens > planning.CROWDED_PER_LENS:
+        reason += ": neighbours are taken for one another, volumes err less than particles"
+    return Line("seeding", graded(per_lens, planning.CROWDED_PER_LENS, planning.MOST_PER_LENS), reason)
+
+
+def _lenses(bench: Bench) -> float:
+    """Return the microlenses that look into the volume."""
+    return max(planning.tracers_in(bench.camera, 1.0, bench.sides_mm), 1.0)
+
+
+def _voxels(bench: Bench) -> Line:
+    shape, voxel, scale = bench.grid.shape_xyz, bench.grid.spacing_mm, bench.scale
+    share = max(max(voxel[:2]) / scale.lens_mm, voxel[2] / scale.depth_mm)
+    reason = (
+        f"{shape[0]} x {shape[1]} x {shape[2]} of {voxel[0]:.3g} x {voxel[1]:.3g} x {voxel[2]:.3g} mm; a microlens is "
+        f"{scale.lens_mm:.3g} mm wide and {scale.depth_mm:.3g} mm deep"
+    )
+    verdict = graded(share, GOOD_VOXEL, LARGEST_VOXEL)
+    if verdict != "good":
+        reason += ": tracers lock to voxels as large, volume.size_mm leaves them to the program"
+    return Line("voxels", verdict, reason)
+
+
+def _windows(bench: Bench) -> Line:
+    voxel, shape = np.array(bench.grid.spacing_mm), np.array(bench.grid.shape_xyz)
+    final = np.array(bench.settings.windows_voxel(bench.grid.spacing_mm)[-1])
+    step = np.maximum(final * (1.0 - np.array(bench.settings.overlap(bench.grid.spacing_mm))), 1.0)
+    vectors = np.maximum((shape - final) // step + 1, 0).astype(int)
+    density = planning.tracers_in(bench.camera, planning.BEST_PER_LENS, bench.sides_mm) / float(np.prod(bench.sides_mm))
+    tracers = density * float(np.prod(final * voxel))
+    reason = (
+        f"{final[0]} x {final[1]} x {final[2]} voxels give {vectors[0]} x {vectors[1]} x {vectors[2]} vectors, with "
+        f"{tracers:.2g} tracers each at the best seeding"
+    )
+    if vectors.min() == 0:
+        return Line("windows", "no", reason + ": they do not fit into the volume")
+    few = vectors.min() < FEWEST_VECTORS or tracers < FEWEST_TRACERS
+    return Line("windows", "look" if few else "good", reason + (": set correlation.window_mm" if few else ""))
+
+
+def _best_time_s(bench: Bench) -> float | None:
+    if bench.velocity_m_s is None:
+        return None
+    return planning.time_step_s(bench.velocity_m_s, min(bench.grid.spacing_mm[:2]))
+
+
+def _time_step(bench: Bench) -> Line:
+    about, given, best = "time step", bench.settings.correlation.dt_s, _best_time_s(bench)
+    if bench.velocity_m_s is None or best is None:
+        return Line(about, "unknown", "no flow is configured; --velocity-m-s tells what to expect")
+    advice = f"{best:.2g} s let {bench.velocity_m_s:.3g} m/s cross {planning.BEST_STEP:g} voxels"
+    if given is None:
+        return Line(about, "unknown", f"{advice}; correlation.dt_s is not set")
+    voxel = min(bench.grid.spacing_mm[:2])
+    crossed = bench.velocity_m_s * MM_PER_M * given / voxel
+    coarse = min(bench.settings.windows_voxel(bench.grid.spacing_mm)[0][:2])
+    reason = (
+        f"{given:.3g} s cross {crossed:.2g} voxels, {planning.SMALLEST_STEP:g} to {planning.LARGEST_STEP:g} are good"
+    )
+    if planning.SMALLEST_STEP <= crossed <= planning.LARGEST_STEP:
+        return Line(about, "good", reason)
+    beyond = crossed > max(LARGEST_SHARE_OF_WINDOW * coarse, planning.LARGEST_STEP)
+    return Line(about, "no" if beyond else "look", f"{reason}; {advice}")
+
+
+def _cost_figures(bench: Bench) -> dict[str, Any]:
+    """Return bytes and seconds for one image, where the rig can be worked with at all."""
+    try:
+        return _cost_of(bench).summary() | {
+            "image_file_bytes": PIXEL_BYTES * bench.camera.columns * bench.camera.rows,
+            "volume_file_bytes": VOXEL_BYTES * int(np.prod(bench.grid.shape_xyz)),
+        }
+    except (ConfigError, InputError):
+        return {}
+
+
+def _cost_of(bench: Bench) -> Any:
+    settings, camera = bench.settings, bench.camera
+    padding = settings.reconstruction.padding_voxel or default_padding(camera, bench.media, bench.grid)
+    return cost_of(settings, camera, _source(bench), bench.grid.padded(padding))
+
+
+def _cost(bench: Bench) -> Line:
+    try:
+        cost = _cost_of(bench)
+    except (ConfigError, InputError) as error:
+        return Line("work", "no", str(error))
+    files = PIXEL_BYTES * bench.camera.columns * bench.camera.rows + VOXEL_BYTES * int(np.prod(bench.grid.shape_xyz))
+    reason = (
+        f"weights {cost.weights_core_s:.2g} s of a core, each image {cost.image_core_s:.2g} s; "
+        f"{max(cost.weights_bytes, cost.image_bytes) / 1e9:.2g} GB of memory, {files / 1e6:.2g} MB of disk an image"
+    )
+    return Line("work", "look" if cost_notices(cost) else "good", reason)

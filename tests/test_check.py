@@ -1,0 +1,283 @@
+"""What `check` says of rigs and images: ten good ones, ten bad ones, and what its figures are worth."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from numpy.typing import NDArray
+
+from lfpiv_cli.calibration.model import Channel
+from lfpiv_cli.cli import cli
+from lfpiv_cli.errors import ConfigError
+from lfpiv_cli.files.config import Config
+from lfpiv_cli.files.images import write_tiff
+from lfpiv_cli.files.rig_numbers import RigNumbers, tree_of
+from lfpiv_cli.files.rig_text import rig_text
+from lfpiv_cli.interface.image_planning import Pictures, image_lines, lattice_of
+from lfpiv_cli.interface.planning import Line, bench_of, rig_lines, worst
+from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.media import Media
+from lfpiv_cli.optics.microlenses import Lattice
+from lfpiv_cli.synthetic.render import Balls, ObjectSpace, render_points, render_white
+from lfpiv_cli.synthetic.sensor import Readout
+from lfpiv_cli.validation.place_errors import pairs_of
+from lfpiv_cli.validation.planning import Tracer, errors_by_depth_mm, half_view_mm, part_in_front, share_in_view
+from lfpiv_cli.validation.tracer_bench import Rig, Search
+
+WATER = Media(1.0, 1.49, 1.33)
+Tree = dict[str, Any]
+Image = NDArray[np.float32]
+
+
+def changed(tree: Tree, **keys: Any) -> Tree:
+    """Return a configuration with keys, named section__key or section__part__key, replaced."""
+    copy = json.loads(json.dumps(tree))
+    for name, value in keys.items():
+        *path, last = name.split("__")
+        place = copy
+        for part in path:
+            place = place[part]
+        place[last] = value
+    return copy
+
+
+def settings_of(tree: Tree) -> Config:
+    return Config.from_resolved(tree, "rig.yaml")
+
+
+def verdicts(lines: list[Line]) -> dict[str, str]:
+    return {line.about: line.verdict for line in lines}
+
+
+PLAIN = tree_of(RigNumbers())
+LENS = "camera__main_lens__"
+GOOD_RIGS = {
+    "Table 2": PLAIN,
+    "half size, large lenses": tree_of(RigNumbers(magnification=-0.5, pitch_mm=0.125, columns=3000, rows=2000)),
+    "twice life size": tree_of(RigNumbers(magnification=-2.0)),
+    "channel": tree_of(RigNumbers(channel_mm=10.0, wall_mm=5.0)),
+    "in air": tree_of(RigNumbers(fluid=1.0)),
+}
+BAD_RIGS = {
+    "f-numbers differ a little": (changed(PLAIN, camera__main_lens__f_number=2.8), "f-numbers", "look"),
+    "f-numbers differ": (changed(PLAIN, camera__main_lens__f_number=16.0), "f-numbers", "no"),
+    "beyond the depth of field": (
+        changed(PLAIN, volume__size_mm=[2.0, 2.0, 70.0], window=None),
+        "depth of field",
+        "no",
+    ),
+    "beyond the field of view": (changed(PLAIN, volume__size_mm=[20.0, 20.0, 8.0]), "field of view", "no"),
+    "too dense": (changed(PLAIN, simulation__particles=60000), "seeding", "no"),
+    "too sparse": (changed(PLAIN, simulation__particles=20), "seeding", "look"),
+    "hardly any light": (changed(PLAIN, simulation__particle_counts=300.0), "precision", "no"),
+    "a long time between images": (changed(PLAIN, correlation__dt_s=0.1), "time step", "no"),
+    "voxels too wide": (
+        changed(PLAIN, volume={"shape_xyz": [40, 40, 50], "voxel_mm": [0.2, 0.2, 0.2]}),
+        "voxels",
+        "no",
+    ),
+    "windows too large": (changed(PLAIN, correlation__window_mm=20.0), "windows", "no"),
+}
+REFUSED = {
+    "sign of the magnification": (changed(PLAIN, camera__main_lens__magnification=1.0), "magnification"),
+    "pixels in millimetres": (changed(PLAIN, camera__sensor__pixel_um=0.0055), "pixel_um"),
+}
+
+
+@pytest.mark.parametrize("tree", GOOD_RIGS.values(), ids=GOOD_RIGS)
+def test_good_rigs_are_good(tree: Tree) -> None:
+    lines = rig_lines(bench_of(settings_of(tree), None))
+    assert worst(lines) == "good", [line for line in lines if line.verdict != "good"]
+
+
+@pytest.mark.parametrize(("tree", "about", "verdict"), BAD_RIGS.values(), ids=BAD_RIGS)
+def test_bad_rigs_are_told(tree: Tree, about: str, verdict: str) -> None:
+    lines = rig_lines(bench_of(settings_of(tree), None))
+    assert verdicts(lines)[about] == verdict
+    assert worst(lines) in ("look", "no")
+
+
+@pytest.mark.parametrize(("tree", "key"), REFUSED.values(), ids=REFUSED)
+def test_what_cannot_be_is_refused_by_its_key(tree: Tree, key: str) -> None:
+    with pytest.raises(ConfigError, match=key):
+        settings_of(tree)
+
+
+# A corner of Table 2's sensor; the whole chain of figures on it takes seconds.
+SMALL = tree_of(RigNumbers(columns=400, rows=360, size_mm=(1.5, 1.3, 6.0)))
+SMALL["simulation"]["particles"] = 100
+SMALL["correlation"]["window_mm"] = [0.4, 0.4, 1.6]
+READOUT = Readout()
+
+
+class Photographer:
+    """Takes pictures with the small rig."""
+
+    def __init__(self) -> None:
+        self.settings = settings_of(SMALL)
+        self.camera = self.settings.camera_model()
+        self.rng = np.random.default_rng(5)
+
+    def tracers(
+        self,
+        per_lens: float = 0.5,
+        counts: float = 5e5,
+        depth_mm: tuple[float, float] = (-3.0, 3.0),
+        readout: Readout = READOUT,
+        camera: Camera | None = None,
+    ) -> Image:
+        low, high = np.array([-2.2, -2.0, depth_mm[0]]), np.array([2.2, 2.0, depth_mm[1]])
+        count = round(per_lens * float(np.prod((high - low)[:2])) / 0.01)
+        balls = Balls(self.rng.uniform(low, high, (count, 3)), np.full(count, counts), 0.05)
+        space = ObjectSpace(WATER, None, "paraxial")
+        light = render_points(camera or self.camera, space, balls, self.rng, rays=4000)
+        return readout.record(light, self.rng).astype(np.float32)
+
+    def white(self, camera: Camera | None = None, peak: float = 40000.0) -> Image:
+        light = render_white(camera or self.camera, peak, 4)
+        return READOUT.record(light, self.rng).astype(np.float32)
+
+    def dark(self, level: float = 96.0) -> Image:
+        readout = replace(READOUT, dark_level_counts=level)
+        return readout.record(np.zeros((360, 400)), self.rng).astype(np.float32)
+
+    def moved(self, pixels: float) -> Camera:
+        """Return the camera with its array moved along the columns."""
+        lattice = self.camera.lattice
+        by = np.array([pixels * self.camera.pixel_mm, 0.0])
+        return replace(self.camera, lattice=Lattice(lattice.origin + by, lattice.basis, lattice.layout))
+
+
+@pytest.fixture(scope="module")
+def take() -> Photographer:
+    return Photographer()
+
+
+def image_verdicts(take: Photographer, image: Image, white: Image, dark: Image) -> dict[str, str]:
+    pictures = Pictures({"a.tif": image}, white, dark)
+    found, lines = lattice_of(take.settings, pictures)
+    of_images, _ = image_lines(bench_of(take.settings, found), pictures, found)
+    return verdicts([*lines, *of_images])
+
+
+GOOD_IMAGES: dict[str, Callable[[Photographer], Image]] = {
+    "half a tracer per lens": lambda take: take.tracers(),
+    "few tracers": lambda take: take.tracers(0.1),
+    "one per lens": lambda take: take.tracers(1.0),
+    "dimmer": lambda take: take.tracers(counts=1e5),
+    "in the upper half of the volume": lambda take: take.tracers(depth_mm=(0.5, 3.0)),
+}
+BAD_IMAGES: dict[str, tuple[Callable[[Photographer], Image], str, tuple[str, ...]]] = {
+    "saturated": (lambda take: np.minimum(take.tracers(counts=4e6), 4095.0), "exposure", ("no",)),
+    "black": (lambda take: take.dark(), "light", ("no",)),
+    "too dense": (lambda take: take.tracers(4.0), "tracers", ("look",)),
+    "noisy": (
+        lambda take: take.tracers(counts=2e4, readout=replace(READOUT, read_noise_counts=40.0)),
+        "light",
+        ("look", "no"),
+    ),
+    "array moved since the white image": (lambda take: take.tracers(camera=take.moved(1.0)), "drift", ("look",)),
+    "array moved far": (lambda take: take.tracers(camera=take.moved(5.0)), "drift", ("no",)),
+    "light from behind the volume": (lambda take: take.tracers(depth_mm=(6.0, 9.0)), "light outside", ("no",)),
+    "white image as a frame": (lambda take: take.white(), "tracers", ("no",)),
+    "another dark level": (lambda take: take.tracers() + np.float32(200.0), "background", ("look",)),
+}
+
+
+@pytest.mark.parametrize("make", GOOD_IMAGES.values(), ids=GOOD_IMAGES)
+def test_good_images_are_good(take: Photographer, make: Callable[[Photographer], Image]) -> None:
+    found = image_verdicts(take, make(take), take.white(), take.dark())
+    assert set(found.values()) == {"good"}, found
+
+
+@pytest.mark.parametrize(("make", "about", "expected"), BAD_IMAGES.values(), ids=BAD_IMAGES)
+def test_bad_images_are_told(
+    take: Photographer, make: Callable[[Photographer], Image], about: str, expected: tuple[str, ...]
+) -> None:
+    assert image_verdicts(take, make(take), take.white(), take.dark())[about] in expected
+
+
+def test_a_white_image_of_another_camera_is_told(take: Photographer) -> None:
+    other = replace(take.camera, lattice=Lattice.regular(0.12))
+    found = image_verdicts(take, take.tracers(), take.white(other), take.dark())
+    assert found["white image"] == "no"
+    assert found["drift"] == "unknown"
+
+
+@pytest.mark.parametrize("per_lens", [0.1, 0.5, 1.5])
+def test_tracers_are_counted(take: Photographer, per_lens: float) -> None:
+    pictures = Pictures({"a.tif": take.tracers(per_lens)}, None, take.dark())
+    _, figures = image_lines(bench_of(take.settings, None), pictures, None)
+    # Of the 200 lenses of the volume, a few tens of tracers: to a fifth by chance.
+    assert figures["tracers_per_lens"][0] == pytest.approx(per_lens, rel=0.35)
+    assert figures["tracer_counts"][0] == pytest.approx(5e5, rel=0.35)
+
+
+def test_the_part_in_front_of_a_box_is_where_its_tracers_are(take: Photographer) -> None:
+    bounds = np.array([[0.3, 0.9], [-0.8, -0.5], [2.0, 2.2]])
+    balls = Balls(np.array([[0.6, -0.65, 2.1]]), np.array([5e5]), 0.05)
+    light = render_points(take.camera, ObjectSpace(WATER, None, "paraxial"), balls, take.rng, rays=4000)
+    rows, columns = part_in_front(take.camera, WATER, bounds)
+    row, column = (np.sum(light * each) / light.sum() for each in np.indices(light.shape))
+    assert (rows.start + rows.stop) / 2 == pytest.approx(row, abs=3.0)
+    assert (columns.start + columns.stop) / 2 == pytest.approx(column, abs=3.0)
+    assert columns.stop - columns.start == pytest.approx(0.6 / 0.0055, rel=0.03)
+
+
+def test_share_in_view_is_that_of_points(take: Photographer) -> None:
+    bounds = np.array([[-1.5, 1.5], [-0.5, 0.5], [-4.0, 4.0]])
+    points = take.rng.uniform(bounds[:, 0], bounds[:, 1], (20000, 3))
+    inside = np.abs(points[:, 0]) <= half_view_mm(take.camera, WATER, points[:, 2])[:, 0]
+    # Of so many points a share is known to a hundredth.
+    assert share_in_view(take.camera, WATER, bounds) == pytest.approx(np.mean(inside), abs=0.012)
+
+
+@pytest.mark.slow
+def test_errors_are_those_that_are_measured() -> None:
+    """Tracers that stand apart, found by the program, err by what was told before; rays make hardly any noise."""
+    camera = Camera(-1.0, 100.0, 25.0, 0.8, 0.8, Lattice.regular(0.1), 0.0055, 560, 560)
+    rig = Rig(camera, WATER, Channel(12.0, 2.0), refraction="paraxial")
+    search, rng = Search(rig, (2.6, 2.6, 8.4)), np.random.default_rng(3)
+    depths, rays = np.array([-4.0, -2.5, 1.5, 3.0]), 400_000
+    told = errors_by_depth_mm(camera, WATER, depths, Tracer(5e5, 0.025, READOUT), 5e5 / rays)
+    ratios = []
+    for _ in range(4):
+        x, y = (each.ravel() for each in np.meshgrid([-0.85, 0.0, 0.85], [-0.85, 0.0, 0.85]))
+        layer = rng.integers(0, 4, x.size)
+        points = np.column_stack([x, y, depths[layer]])
+        points[:, :2] += rng.uniform(-0.045, 0.045, (x.size, 2))
+        balls = Balls(rig.reference.points_to_focal_point(points), np.full(x.size, 5e5), 0.05)
+        image = READOUT.record(render_points(camera, rig.space, balls, rng, rays=rays), rng)
+        pairs = pairs_of(search.particles(image.astype(np.float32) - np.float32(96.0)), points, 0.03)
+        assert len(pairs.true) == x.size
+        ratios.append(pairs.error_voxel / told[layer[pairs.true]])
+    lateral, depth = np.concatenate(ratios)[:, :2], np.concatenate(ratios)[:, 2]
+    # Of 36 tracers a standard deviation is known to an eighth.
+    assert np.sqrt(np.mean(lateral**2)) == pytest.approx(1.0, abs=0.3)
+    assert np.sqrt(np.mean(depth**2)) == pytest.approx(1.0, abs=0.3)
+
+
+def test_the_command_tells_all(tmp_path: Path) -> None:
+    rig, image, picture = tmp_path / "rig.yaml", tmp_path / "a.tif", tmp_path / "rig.png"
+    rig.write_text(rig_text(SMALL, "small"))
+    write_tiff(image, Photographer().tracers().astype(np.uint16), False)
+    done = CliRunner().invoke(cli, ["check", str(rig), str(image), "--picture", str(picture), "--json"])
+    assert done.exit_code == 0, done.output
+    told = json.loads(done.stdout)
+    # Windows that fit into so small a volume hold few tracers.
+    assert {line["about"] for line in told["verdicts"] if line["verdict"] == "look"} == {"windows"}
+    assert told["verdict"] == "look"
+    assert {line["about"] for line in told["verdicts"]} >= {"field of view", "time step", "exposure", "tracers"}
+    assert told["best_dt_s"] == pytest.approx(5 * 0.1 / 3 / told["expected_velocity_m_s"] / 1e3, rel=0.05)
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    faster = CliRunner().invoke(cli, ["check", str(rig), "--velocity-m-s", "10"])
+    assert faster.exit_code == 0
+    assert re.search(r"time step +no +", faster.output)
