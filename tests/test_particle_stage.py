@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 from lfpiv_cli.cli import cli
 from lfpiv_cli.errors import InputError, OutputExistsError, UsageError
 from lfpiv_cli.files import vtkhdf
-from lfpiv_cli.files.config import load_config
+from lfpiv_cli.files.config import carried_config, load_config
 from lfpiv_cli.files.images import read_image
 from lfpiv_cli.files.particle_file import (
     PARTICLES_FORMAT,
@@ -63,6 +63,9 @@ def test_track_writes_tracks_and_vectors(pair: tuple[Path, Path], tmp_path: Path
     # 2 voxels of 0.1 mm in 2 ms.
     np.testing.assert_allclose(np.median(tracks.arrays["velocity"], axis=0), (0.1, -0.05, 0.025), atol=1e-9)
     assert tracks.reference == Reference("mid_plane", 0.5)
+    # What tracking chose stands beside the config's sections.
+    assert tracks.provenance["config"]["search_mm"] > 0.0
+    assert carried_config(tracks.provenance, "tracks").resolved() == load_config(CONFIG).resolved()
     field = vtkhdf.open_vectors(tmp_path / "tracks_grid.vtkhdf")
     assert field.flag.shape == (6, 3, 5)
     assert np.abs(field.displacement_voxel[field.flag == 0] - (2.0, -1.0, 0.5)).max() < 1e-6

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ def lfpiv(*arguments: object) -> None:
 
 
 def run(rig: Path, output: Path, *options: object, images: tuple[Path, ...] = PAIR) -> None:
-    lfpiv("run", rig, *images, *PHOTOGRAPHS, "--method", "volumes", *options, "-o", output)
+    lfpiv("run", rig, *images, *PHOTOGRAPHS, "--method", "volumes", "--no-report", *options, "-o", output)
 
 
 def rig_in(folder: Path, *changes: tuple[str, str]) -> Path:
@@ -51,8 +52,6 @@ def ran(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def again(ran: Path, tmp_path: Path) -> Path:
     """A copy of it to run again in, with the times of its files."""
-    import shutil
-
     shutil.copytree(ran, tmp_path, dirs_exist_ok=True)
     return tmp_path
 
@@ -131,6 +130,22 @@ def test_a_lost_picture_is_drawn_again(again: Path) -> None:
     run(again / "rig.yaml", again / "out")
     assert (again / "out" / "calibration.png").exists()
     assert states(again)["build-weights"] == "kept"
+
+
+def test_the_report_is_made_of_what_was_made(again: Path, monkeypatch) -> None:
+    made = []
+
+    def report(folder: Path, page: Path, options: Any, **_: Any) -> dict[str, Any]:
+        made.append((folder, {path.name for path in options.raw}))
+        page.write_text("<html>")
+        return {"verdict": {"vectors": "good"}}
+
+    monkeypatch.setattr(stage, "report", report)
+    for _ in range(2):
+        run(again / "rig.yaml", again / "out", "--report")
+    assert made == [(again / "out", {"pair_a.tif", "pair_b.tif", "white.tif", "board.tif"})]
+    told = json.loads((again / "out" / "run.json").read_text())
+    assert told["summaries"]["report"] == {"verdict": {"vectors": "good"}}
 
 
 def test_what_is_not_of_a_run_is_not_replaced(ran: Path, tmp_path: Path) -> None:

@@ -42,6 +42,7 @@ from lfpiv_cli.names import RunMethod, names_in
 @dt_option
 @click.option("--combine", is_flag=True, help="With both: also one field that weights their vectors.")
 @click.option("--follow", is_flag=True, help="Time-resolved sequence: find and track particles together.")
+@click.option("--report/--no-report", default=True, help="Make OUTPUT/report.html, a page of all of it.")
 @output_option("Folder for all that is made.")
 @common_options
 def run(
@@ -57,8 +58,9 @@ def run(
 
     Every step writes what its own command does, into OUTPUT. By itself it counts the tracers for each microlens, and
     measures by particles up to about two, where these err less, and by volumes beyond; OUTPUT/run.json says which and
-    why. Run it again, and it keeps what is complete and made alike, and goes on from there; with --overwrite it makes
-    anew what was made from other inputs or settings. More than two images need --pairing or --follow.
+    why, and OUTPUT/report.html shows all of it. Run it again, and it keeps what is complete and made alike, and goes on
+    from there; with --overwrite it makes anew what was made from other inputs or settings. More than two images need
+    --pairing or --follow.
 
     \b
     Example: lfpiv run rig.yaml a.tif b.tif --white white.tif --dark dark.tif --board board.tif -o results

@@ -313,6 +313,8 @@ def load_config(path: Path) -> Config:
 def carried_config(record: Mapping[str, Any], source: Path | str) -> Config:
     """Return the resolved configuration in the record that one of our files carries.
 
+    What tracking chose beside it stands in the same place of the record, and is left out.
+
     Raises
     ------
     InputError
@@ -321,7 +323,7 @@ def carried_config(record: Mapping[str, Any], source: Path | str) -> Config:
     config = record.get("config")
     if not config:
         raise InputError(f"{source}: carries no config; give one with --config")
-    return Config.from_resolved(config)
+    return Config.from_resolved({name: value for name, value in config.items() if name in Sections.model_fields})
 
 
 def _validated(document: Document, source: str) -> Config:

@@ -3,7 +3,7 @@
 In the output folder: `calibration.h5`, `calibration.png`, `weights.h5`; by volumes `volumes/STEM.vtkhdf` and
 `vectors.vtkhdf`; by particles `particles/STEM.vtkhdf`, `tracks.vtkhdf` and `tracks_grid.vtkhdf`; of both together
 `combined.vtkhdf`; of several pairs the folders `vectors`, `tracks` and `combined`. `run.json` says what was chosen,
-why, and what each step told.
+why, and what each step told; `report.html` shows all of it.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from lfpiv_cli.files.atomic import without_nan
 from lfpiv_cli.files.batch import VTKHDF_SUFFIX, Frame, frames_beside, frames_of, output_paths, prepare_folder
 from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.inputs import ensure_regular_file
+from lfpiv_cli.files.pages import ensure_pages
 from lfpiv_cli.files.pictures import ensure_drawing
 from lfpiv_cli.files.vtkhdf import open_vectors
 from lfpiv_cli.files.weights_file import open_weights
@@ -38,8 +39,11 @@ from lfpiv_cli.stages.correlate import CorrelateOptions, correlate
 from lfpiv_cli.stages.follow import PLAYBACK, TRACKS, FollowOptions, follow_particles
 from lfpiv_cli.stages.frames import STILL, Background, mask_of, reader
 from lfpiv_cli.stages.reconstruct import ReconstructOptions, reconstruct
+from lfpiv_cli.stages.report import ReportOptions, report
 from lfpiv_cli.stages.steps import RECORD, Steps, earlier_run
 from lfpiv_cli.stages.track import TrackOptions, grid_paths, track_particles
+
+REPORT = "report.html"
 
 # Vectors by particles err less than those by volumes up to 1.9 tracers for each microlens, and more from 2.4 on, in the
 # laminar channel of the paper.
@@ -62,6 +66,7 @@ class RunOptions:
     dt_s : time from one image to the next, in place of the config's
     combine : of both methods, also one field that weights their vectors by their uncertainties
     follow : find and track the particles of a time-resolved sequence together, as `follow_particles` does
+    report : make the page of all that the folder holds, too
     """
 
     images: Sequence[Path]
@@ -76,6 +81,7 @@ class RunOptions:
     dt_s: float | None = None
     combine: bool = False
     follow: bool = False
+    report: bool = True
 
 
 @dataclass(frozen=True)
@@ -111,11 +117,10 @@ def run(
     figures = _figures(fields)
     steps.told["figures"] = figures
     steps.write()
-    return (
-        choice.told()
-        | figures
-        | {"steps_made": steps.count("made"), "steps_kept": steps.count("kept"), "folder": str(output)}
-    )
+    told = choice.told() | figures
+    if options.report:
+        told |= {"verdict": chain.report().get("verdict"), "report": str(output / REPORT)}
+    return told | {"steps_made": steps.count("made"), "steps_kept": steps.count("kept"), "folder": str(output)}
 
 
 def _ensure_possible(settings: Config, options: RunOptions) -> list[Frame]:
@@ -123,6 +128,8 @@ def _ensure_possible(settings: Config, options: RunOptions) -> list[Frame]:
     _ensure_settings(settings, options)
     _ensure_methods(settings, options)
     ensure_drawing()
+    if options.report:
+        ensure_pages()
     ensure_pictures(len(options.white), len(options.board), len(options.depth_mm))
     background = Background.parse(options.background).path
     for path in (*options.white, *options.board, *filter(None, (options.dark, background))):
@@ -260,6 +267,21 @@ class _Chain:
 
         self.steps.take("combine", paths, combine_all)
         return paths
+
+    def report(self) -> dict[str, Any]:
+        """Make the page of all that the folder holds, where a step has made anything; return what it tells."""
+        page = self.steps.output / REPORT
+        is_kept = page.exists() and not self.steps.count("made")
+        raw = (*self.options.images, *self.options.white, *self.options.board)
+        overwrite = self.overwrite or bool(self.steps.earlier)
+
+        def make() -> dict[str, Any]:
+            if is_kept:
+                return {}
+            console = self.steps.console
+            return report(self.steps.output, page, ReportOptions(raw=raw), overwrite=overwrite, console=console)
+
+        return self.steps.take("report", [page], make)
 
     def _by_volumes(self, weights: Path) -> list[Path]:
         options = self.options

@@ -38,8 +38,8 @@ class Steps:
     told: dict[str, Any] = field(default_factory=lambda: {"steps": {}, "summaries": {}})
     files: list[Path] = field(default_factory=list)
 
-    def take(self, name: str, files: Sequence[Path], make: Callable[[], dict[str, Any]]) -> None:
-        """Take a step, which makes files, and write down what it told.
+    def take(self, name: str, files: Sequence[Path], make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+        """Take a step, which makes files; write down and return what it told.
 
         Raises
         ------
@@ -63,6 +63,7 @@ class Steps:
         self.told["summaries"][name] = summary
         self.files.extend(files)
         self.write()
+        return summary
 
     def count(self, state: str) -> int:
         """Return how many steps were `made`, or `kept`."""
