@@ -24,7 +24,7 @@ SECONDS_BETWEEN_LINES = 10.0
 # Where the summary's figures begin.
 NAME_WIDTH = 28
 # Frames count in fractions while they are worked on.
-FRAMES_BAR = "{desc}: {percentage:3.0f}%|{bar}| {n:.1f}/{total} {unit}s [{elapsed}<{remaining}]"
+FRAMES_BAR = "{desc}: {percentage:3.0f}%|{bar}| {n:.1f}/{total} {unit}s [{elapsed}<{remaining}, {rate_fmt}]"
 
 
 @dataclass(frozen=True)
