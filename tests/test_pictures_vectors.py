@@ -169,6 +169,8 @@ def test_figures_of_a_file_follow_what_it_knows(field, tmp_path) -> None:
     parts = field.displacement_voxel[field.flag == VALID][:, 0]
     counts, _ = np.histogram(parts - np.round(parts), bins=20, range=(-0.5, 0.5))
     np.testing.assert_array_equal([bar.get_height() for bar in below[0].patches], counts)
+    write_vectors(path, varied, AT_FOCUS, provenance={"config": {"of": "another version"}}, overwrite=True)
+    assert len(figures_of(path)["displacements"].draw().axes) == 6
     poor = replace(field, uncertainty_voxel=None, dt_s=None)
     write_vectors(path, poor, AT_FOCUS, provenance={}, overwrite=True)
     assert list(figures_of(path)) == ["planes", "components", "profiles", "flags", "displacements"]

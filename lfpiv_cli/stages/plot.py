@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.console import CONSOLE, Console
-from lfpiv_cli.errors import InputError, UsageError
+from lfpiv_cli.errors import ConfigError, InputError, UsageError
 from lfpiv_cli.files import calibration_file, vtkhdf, weights_file
 from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.calibration_file import read_calibration
@@ -142,11 +142,14 @@ def _of_vectors(path: Path) -> dict[str, Drawn]:
 
 
 def _lens_mm(path: Path) -> float | None:
-    """Return the width of a microlens in the scene; None where the file does not say with what camera it was taken."""
-    made = vtkhdf.read_record(path)
-    if not made.get("config"):
+    """Return the width of a microlens in the scene; None where the file does not say with what camera it was taken.
+
+    Nor does one whose config is that of another version, which must not keep its figures from being drawn.
+    """
+    try:
+        config = carried_config(vtkhdf.read_record(path), path)
+    except (InputError, ConfigError):
         return None
-    config = carried_config(made, path)
     camera = config.complete_camera()
     return None if camera is None else camera.scale(config.media_model()).lens_mm
 
