@@ -31,6 +31,8 @@ IMAGE_PERCENT = 99.5
 # chi2 beyond this is drawn in the last bar.
 LARGEST_CHI2 = 5.0
 CHI2_BARS = 50
+# The area of all dots on an image, and the smallest and largest of one, in square points: many must not hide it.
+DOTS_AREA, DOT_SIZES = 15_000.0, (6.0, 26.0)
 # Width of pictures with an image, in inches.
 IMAGE_WIDTH = 10.0
 
@@ -79,7 +81,8 @@ def image_figure(image: NDArray[np.float64], places: NDArray[np.float64], z_mm: 
     figure = _image_canvas(image)
     (axes,) = figure.axes
     axes.imshow(image, cmap="gray", vmin=0.0, vmax=_bright(image), interpolation="nearest")
-    dots = axes.scatter(places[:, 0], places[:, 1], c=z_mm, s=12, cmap=SEQUENTIAL, edgecolors="black", linewidths=0.4)
+    size = float(np.clip(DOTS_AREA / max(len(z_mm), 1), *DOT_SIZES))
+    dots = axes.scatter(places[:, 0], places[:, 1], c=z_mm, s=size, cmap=SEQUENTIAL, edgecolors="white", linewidths=0.5)
     rows, columns = image.shape
     axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5))
     figure.colorbar(dots, ax=axes, label="depth z (mm)", shrink=0.7)
