@@ -178,7 +178,7 @@ GOOD_IMAGES: dict[str, Callable[[Photographer], Image]] = {
 BAD_IMAGES: dict[str, tuple[Callable[[Photographer], Image], str, tuple[str, ...]]] = {
     "saturated": (lambda take: np.minimum(take.tracers(counts=4e6), 4095.0), "exposure", ("no",)),
     "black": (lambda take: take.dark(), "light", ("no",)),
-    "too dense": (lambda take: take.tracers(4.0), "tracers", ("look",)),
+    "too dense": (lambda take: take.tracers(6.0), "tracers", ("no",)),
     "noisy": (
         lambda take: take.tracers(counts=2e4, readout=replace(READOUT, read_noise_counts=40.0)),
         "light",

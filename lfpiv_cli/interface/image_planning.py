@@ -19,11 +19,13 @@ from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.files.config import Config
 from lfpiv_cli.interface.calibration import NO_BOARD, calibration_notices, calibration_of, photographs
 from lfpiv_cli.interface.planning import Bench, Line, Verdict, error_verdict, graded, seeding_line, worst
+from lfpiv_cli.particles.counting import Seeded, tracers_in_image
 from lfpiv_cli.particles.noise import read_noise
+from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.reconstruction.images import FULL_SCALES, defects, light, saturated
 from lfpiv_cli.validation import planning
 from lfpiv_cli.validation.light_beyond import share_beyond
-from lfpiv_cli.weights.build import aligned
+from lfpiv_cli.weights.build import aligned, default_padding
 
 Image = NDArray[np.float32]
 
@@ -147,7 +149,22 @@ def _counted(bench: Bench, seen: Seen) -> tuple[float, float]:
     rest = seen.less_dark[part] - np.float32(seen.level)
     lit = float(np.mean(rest > level)), level, float(np.mean(rest, dtype=np.float64))
     depths = np.linspace(bench.bounds_mm[2, 0], bench.bounds_mm[2, 1], DEPTHS)
-    return planning.tracers_per_lens(bench.camera, bench.media, depths, bench.tracer(), lit)
+    number, tracer_light = planning.tracers_per_lens(bench.camera, bench.media, depths, bench.tracer(), lit)
+    if np.isfinite(number):
+        return number, tracer_light
+    crowded = _crowded(bench, seen)
+    if crowded is None:
+        return number, tracer_light
+    return crowded, lit[2] * float(bench.camera.micro_image_lattice_px().cell_area) / crowded
+
+
+def _crowded(bench: Bench, seen: Seen) -> float | None:
+    """Return tracers for each lens where hardly a pixel is dark; None where nobody can tell."""
+    camera, padding = bench.camera, default_padding(bench.camera, bench.media, bench.grid)
+    view = raw_view(camera, bench.media, bench.tracer().radius_mm, bench.found)
+    lattice_px = camera.micro_image_lattice_px() if bench.found is None else bench.found.fit.lattice_px
+    seeded = Seeded(view, camera, bench.grid.padded(padding), bench.grid, bench.grid.bounds_mm(2))
+    return tracers_in_image(seeded, seen.less_dark.astype(np.float64), np.isfinite(seen.less_dark), lattice_px)
 
 
 def _exposure(bench: Bench, seen: Seen) -> Line:

@@ -17,9 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from lfpiv_cli.grid import Grid
+from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.particles.fitting import add_all
 from lfpiv_cli.particles.search import Task
+from lfpiv_cli.particles.view import View
 
 # Tracers for each microlens in the image that others are held against, and by how much their light differs: that of 0.6
 # to 1.4 of its mean. The light of real tracers often differs more, and they are then taken for fewer.
@@ -62,6 +65,22 @@ class Lenses(NamedTuple):
         return total.reshape(self.shape)
 
 
+class Seeded(NamedTuple):
+    """Where tracers are and what sees them.
+
+    Attributes
+    ----------
+    around, volume : grids: as far as light from beside the volume reaches, and the volume
+    depths_mm : between which tracers may lie
+    """
+
+    view: View
+    camera: Camera
+    around: Grid
+    volume: Grid
+    depths_mm: tuple[float, float]
+
+
 def tracers_per_lens(task: Task, lattice_px: Lattice) -> float | None:
     """Return the tracers for each microlens of the volume in the scene; None where too little of it is seen to tell.
 
@@ -69,29 +88,40 @@ def tracers_per_lens(task: Task, lattice_px: Lattice) -> float | None:
     ----------
     lattice_px : of the lens images, (column, row) in the raw image
     """
-    lenses = Lenses.of(lattice_px, task.prepared.shape)
-    counted = lenses.sums(task.usable) > LEAST_PIXELS * np.median(lenses.sums(np.ones(task.image.size)))
-    counted &= lenses.sums(_sees_volume(task)) > LEAST_PIXELS * lenses.sums(np.ones(task.image.size))
+    shape = task.prepared.shape
+    weights = task.weights
+    seeded = Seeded(task.view, task.camera, weights.padded.grid, weights.grid, task.depths_mm)
+    return tracers_in_image(seeded, task.image.reshape(shape), task.usable.reshape(shape), lattice_px)
+
+
+def tracers_in_image(
+    seeded: Seeded, picture: NDArray[np.float64], usable_pixels: NDArray[np.bool_], lattice_px: Lattice
+) -> float | None:
+    """Return what `tracers_per_lens` does of a picture (rows, columns), of which pixels are usable."""
+    lenses = Lenses.of(lattice_px, (picture.shape[0], picture.shape[1]))
+    counts, usable = picture.ravel(), usable_pixels.ravel()
+    counted = lenses.sums(usable) > LEAST_PIXELS * np.median(lenses.sums(np.ones(counts.size)))
+    counted &= lenses.sums(_sees_volume(seeded, picture.shape)) > LEAST_PIXELS * lenses.sums(np.ones(counts.size))
     seen = int(np.count_nonzero(counted))
     if seen < FEWEST_LENSES:
         return None
-    background = np.percentile(task.image[task.usable], BACKGROUND_PERCENTILE)
-    found = _unevenness(lenses.sums(np.where(task.usable, task.image - background, 0.0)), counted)
+    background = np.percentile(counts[usable], BACKGROUND_PERCENTILE)
+    found = _unevenness(lenses.sums(np.where(usable, counts - background, 0.0)), counted)
     rng, known = np.random.default_rng(0), []
     for _ in range(-(-LENSES_OF_KNOWN // seen)):
-        image = np.zeros(task.image.size)
-        add_all(task.view, known_tracers(task, rng), 1.0, image, task.depths_mm)
-        known.append(_unevenness(lenses.sums(np.where(task.usable, image, 0.0)), counted))
+        image = np.zeros(counts.size)
+        add_all(seeded.view, known_tracers(seeded, rng), 1.0, image, seeded.depths_mm)
+        known.append(_unevenness(lenses.sums(np.where(usable, image, 0.0)), counted))
     return KNOWN_NUMBER * float(np.mean(known)) / found if found > 0.0 else None
 
 
-def known_tracers(task: Task, rng: np.random.Generator) -> NDArray[np.float64]:
+def known_tracers(seeded: Seeded, rng: np.random.Generator) -> NDArray[np.float64]:
     """Return tracers (n, 4) of light about 1 at random places: `KNOWN_NUMBER` in the depth of the volume.
 
     As real ones, they are around it, too, as far as their light reaches it.
     """
-    camera = task.camera
-    lateral, depth = task.weights.padded.grid, task.weights.grid
+    camera = seeded.camera
+    lateral, depth = seeded.around, seeded.volume
     low, high = np.array([lateral.bounds_mm(0), lateral.bounds_mm(1), depth.bounds_mm(2)]).T
     area_mm2 = camera.lattice.cell_area / camera.magnification**2
     count = round(KNOWN_NUMBER * float(np.prod((high - low)[:2])) / area_mm2)
@@ -99,13 +129,13 @@ def known_tracers(task: Task, rng: np.random.Generator) -> NDArray[np.float64]:
     return np.column_stack([places, rng.normal(1.0, LIGHT_SPREAD, count).clip(0.0)])
 
 
-def _sees_volume(task: Task) -> NDArray[np.bool_]:
+def _sees_volume(seeded: Seeded, shape: tuple[int, ...]) -> NDArray[np.bool_]:
     """Return which pixels (pixels,) lie before the volume, as the focal plane is seen."""
-    camera, grid = task.camera, task.weights.grid
+    camera, grid = seeded.camera, seeded.volume
     corners = camera.to_image_axes(np.array([grid.bounds_mm(axis) for axis in range(2)]).T)
     ends = camera.mm_to_px(camera.magnification * corners)
     (left, top), (right, bottom) = ends.min(axis=0), ends.max(axis=0)
-    row, column = np.indices(task.prepared.shape)
+    row, column = np.indices(shape)
     return np.asarray((column >= left) & (column <= right) & (row >= top) & (row <= bottom)).ravel()
 
 

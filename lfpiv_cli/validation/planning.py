@@ -149,6 +149,8 @@ def tracers_per_lens(
 ) -> tuple[float, float]:
     """Return how many tracers for each lens lit an image, and the light of one; infinitely many where all is lit.
 
+    Unlike the unevenness of the light (`particles.counting`) this needs few lenses and tracers, which may differ in
+    their light, and ends where hardly a pixel is dark.
     Tracers lie about at random, so that the share of pixels that stay dark falls exponentially with their number.
 
     Parameters
