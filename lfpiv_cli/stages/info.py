@@ -13,7 +13,7 @@ from lfpiv_cli.files.describe import describe
 from lfpiv_cli.files.figures import file_figures
 from lfpiv_cli.files.pictures import ensure_drawing, write_picture
 from lfpiv_cli.files.weights_file import FORMAT, open_weights
-from lfpiv_cli.stages.plot import column_of
+from lfpiv_cli.stages.plot_sources import column_of
 
 
 @dataclass(frozen=True, kw_only=True)
