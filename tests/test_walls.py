@@ -6,6 +6,10 @@ import numpy as np
 import pytest
 
 from lfpiv_cli.errors import InputError
+from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.microlenses import Lattice
+from lfpiv_cli.self_calibration.nuisances import Nuisances
+from lfpiv_cli.self_calibration.refinement import Refinement
 from lfpiv_cli.self_calibration.walls import Walls, find_walls
 
 WIDTH, MIDDLE, SLOPE = 8.0, -0.37, np.array([0.02, -0.013])
@@ -60,3 +64,20 @@ def test_what_is_not_the_channel_is_refused(rng: np.random.Generator) -> None:
         walls_of(seeded[seeded[:, 2] < 2.0])
     with pytest.raises(InputError, match="where the search ended"):
         find_walls(seeded, np.full(500, 0.005), (-6.0, 3.6), WIDTH)
+
+
+def test_the_picture_shows_all_particles_and_both_walls(rng: np.random.Generator) -> None:
+    pytest.importorskip("matplotlib")
+    from lfpiv_cli.pictures.walls import walls_figure
+
+    position = between_walls(300, rng)
+    walls = walls_of(position)
+    camera = Camera(-1.0, 100.0, 25.0, 0.8, 0.8, Lattice.regular(0.1, "square"), 0.0055, 100, 100)
+    refined = Refinement(walls, Nuisances(), Nuisances(), position, SEARCHED, 2, 0.0, None, 0.01, WIDTH, 0.05, camera)
+    whole, across, near, far = walls_figure(refined).axes
+    assert whole.get_title() == "300 particles in 2 images"
+    assert sum(bar.get_height() for bar in whole.patches) == 300
+    for axes, side in ((near, -1.0), (far, 1.0)):
+        assert f"z = {walls.middle_mm + side * 0.5 * walls.width_mm:.3f} mm" in axes.get_title()
+        assert axes.get_xlim()[0] < side * 0.5 * walls.width_mm < axes.get_xlim()[1]
+    np.testing.assert_array_equal(across.lines[0].get_ydata(), position[:, 2])
