@@ -7,11 +7,13 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import h5py
 import pytest
 
 from lfpiv_cli.cli import cli
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import ConfigError, InputError, LfpivError, OutputExistsError, UsageError
+from lfpiv_cli.files.provenance import carried_record
 from lfpiv_cli.stages import run as stage
 from lfpiv_cli.stages.run import RunOptions
 
@@ -103,6 +105,34 @@ def test_only_what_depends_on_a_change_is_made_anew(again: Path) -> None:
     run(again / "rig.yaml", again / "out", "--dt-s", 0.001, "--overwrite")
     after = stamps(again)
     assert {name for name in after if after[name] != before[name]} == {VECTORS}
+
+
+def test_settings_of_a_later_step_leave_what_was_made_before(again: Path) -> None:
+    names = [name for name in FILES if name.endswith(("h5", "vtkhdf"))]
+    text = (again / "rig.yaml").read_text()
+    (again / "rig.yaml").write_text(text.replace("windows: [24, 12]", "windows: [24, 10]"))
+    before = {name: data_of(again / "out" / name) for name in names}
+    earlier = json.loads((again / "out" / "run.json").read_text())["summaries"]
+    run(again / "rig.yaml", again / "out", "--overwrite")
+    assert list(states(again).values()) == ["recorded anew"] * 3 + ["made"]
+    assert {name: data_of(again / "out" / name) for name in names} == before
+    told = json.loads((again / "out" / "run.json").read_text())
+    assert told["summaries"]["reconstruct"] == earlier["reconstruct"]
+    # What each carries is what a run from the beginning would have written, and it is kept from now on.
+    carried = carried_record(again / "out" / "vectors.vtkhdf")
+    assert {made["config"]["correlation"]["windows"][1][0] for made in carried["made_from"].values()} == {10}
+    run(again / "rig.yaml", again / "out")
+    assert set(states(again).values()) == {"kept"}
+
+
+def data_of(path: Path) -> dict[str, bytes]:
+    """Return the bytes of all datasets in a file."""
+    found: dict[str, bytes] = {}
+    with h5py.File(path) as file:
+        file.visititems(
+            lambda name, item: found.update({name: item[()].tobytes()}) if isinstance(item, h5py.Dataset) else None
+        )
+    return found
 
 
 def test_a_torn_file_is_refused_or_made_again(again: Path) -> None:

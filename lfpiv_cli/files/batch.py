@@ -9,8 +9,9 @@ from typing import Any
 
 from lfpiv_cli.errors import InputError, OutputExistsError, UsageError
 from lfpiv_cli.files.atomic import ensure_writable
+from lfpiv_cli.files.hdf5 import replace_provenance
 from lfpiv_cli.files.images import count_pages
-from lfpiv_cli.files.provenance import carried_record, without_warnings
+from lfpiv_cli.files.provenance import bear_alike, carried_record, without_warnings
 from lfpiv_cli.names import Pairing
 
 VTKHDF_SUFFIX = ".vtkhdf"
@@ -85,7 +86,8 @@ def pending(
 ) -> list[int]:
     """Return the numbers of the targets that have to be made.
 
-    With `resume`, a target that is complete and carries the very record that it would get is left as it is.
+    With `resume`, a target that is complete and carries the very record that it would get is left as it is; with
+    `overwrite` besides, one whose record differs in nothing that it depends on gets the new record, and keeps its data.
 
     Raises
     ------
@@ -95,6 +97,8 @@ def pending(
     needed = []
     for number, target in enumerate(targets):
         if resume and target.path.exists() and _made_alike(target, read_record):
+            continue
+        if resume and overwrite and target.path.exists() and _recorded_anew(target, read_record):
             continue
         if resume and target.path.exists() and not overwrite:
             raise OutputExistsError(
@@ -115,6 +119,19 @@ def is_kept(
     OutputExistsError : as `pending`
     """
     return not pending([Target(path, made) for path in paths], inputs, overwrite, resume, carried_record)
+
+
+def _recorded_anew(target: Target, read_record: Callable[[Path], Mapping[str, Any]]) -> bool:
+    """Give a target its new record, if the old one differs in nothing that it depends on; return whether it does."""
+    try:
+        old = read_record(target.path)
+    except InputError:
+        return False
+    if not bear_alike(old, target.record):
+        return False
+    warnings = {name: old[name] for name in ("warnings",) if name in old}
+    replace_provenance(target.path, dict(target.record) | warnings)
+    return True
 
 
 def _made_alike(target: Target, read_record: Callable[[Path], Mapping[str, Any]]) -> bool:

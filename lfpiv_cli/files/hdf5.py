@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -211,6 +212,21 @@ def write_header(file: h5py.File, format_name: str, format_version: int, provena
     file.attrs["format"] = np.bytes_(format_name)
     file.attrs["format_version"] = np.int64(format_version)
     file.attrs["provenance"] = np.bytes_(json.dumps(provenance, allow_nan=False))
+
+
+def replace_provenance(path: Path, provenance: Mapping[str, Any]) -> None:
+    """Give a file another record, its data as they are."""
+
+    def write(temporary: Path) -> None:
+        shutil.copyfile(path, temporary)
+        with h5py.File(temporary, "r+", libver=LIBRARY_VERSIONS) as file:
+            file.attrs["provenance"] = np.bytes_(json.dumps(provenance, allow_nan=False))
+
+    def check(temporary: Path) -> None:
+        with open_h5(temporary) as file:
+            read_provenance(file)
+
+    write_atomically(path, write, overwrite=True, check=check)
 
 
 def read_provenance(file: h5py.File) -> dict[str, Any]:

@@ -27,6 +27,14 @@ FILES_REMEMBERED = 64
 # The libraries that the figures pass through.
 LIBRARIES = ("numpy", "scipy", "numba", "h5py", "tifffile", "imagecodecs", "opencv-contrib-python-headless")
 
+# Sections of the config that a command does not read: whatever they say, it makes the same.
+AFTER_VOLUMES = ("correlation", "simulation", "validation")
+UNREAD = {
+    "calibrate-snapshot": ("volume", "reconstruction", *AFTER_VOLUMES),
+    "build-weights": AFTER_VOLUMES,
+    "reconstruct": AFTER_VOLUMES,
+}
+
 
 def record(command: str, config: Mapping[str, Any] | None, inputs: Mapping[str, Path]) -> dict[str, Any]:
     """Return the record of a result.
@@ -124,6 +132,24 @@ def _sha256(path: Path, size: int, modified_ns: int) -> str:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {reason(error)}") from error
+
+
+def bear_alike(first: Mapping[str, Any], second: Mapping[str, Any]) -> bool:
+    """Return whether two records are of the same result: alike but for settings that it does not depend on."""
+    return _bearing(first, first["made_from"]) == _bearing(second, second["made_from"])
+
+
+def _bearing(made: Mapping[str, Any], earlier: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what of a record, and of those that it is made from, a result depends on."""
+    unread = UNREAD.get(made["command"].split()[0], ())
+    inputs = {
+        role: _bearing(earlier[given["sha256"]], earlier) if given["sha256"] in earlier else given
+        for role, given in made["inputs"].items()
+        if role != "config"
+    }
+    config = {name: value for name, value in (made["config"] or {}).items() if name not in unread}
+    same = {name: made[name] for name in ("program", "version", "libraries", "command")}
+    return same | {"config": config, "inputs": inputs}
 
 
 def carried_record(path: Path) -> dict[str, Any]:

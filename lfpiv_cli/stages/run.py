@@ -40,7 +40,7 @@ from lfpiv_cli.stages.follow import PLAYBACK, TRACKS, FollowOptions, follow_part
 from lfpiv_cli.stages.frames import STILL, Background, mask_of, reader
 from lfpiv_cli.stages.reconstruct import ReconstructOptions, reconstruct
 from lfpiv_cli.stages.report import ReportOptions, report
-from lfpiv_cli.stages.steps import RECORD, Steps, earlier_run
+from lfpiv_cli.stages.steps import KEPT, MADE, RECORD, Steps, earlier_run
 from lfpiv_cli.stages.track import TrackOptions, grid_paths, track_particles
 
 REPORT = "report.html"
@@ -120,7 +120,7 @@ def run(
     told = choice.told() | figures
     if options.report:
         told |= {"verdict": chain.report().get("verdict"), "report": str(output / REPORT)}
-    return told | {"steps_made": steps.count("made"), "steps_kept": steps.count("kept"), "folder": str(output)}
+    return told | {"steps_made": steps.count(MADE), "steps_kept": steps.count(KEPT), "folder": str(output)}
 
 
 def _ensure_possible(settings: Config, options: RunOptions) -> list[Frame]:
@@ -271,7 +271,7 @@ class _Chain:
     def report(self) -> dict[str, Any]:
         """Make the page of all that the folder holds, where a step has made anything; return what it tells."""
         page = self.steps.output / REPORT
-        is_kept = page.exists() and not self.steps.count("made")
+        is_kept = page.exists() and not self.steps.count(MADE)
         raw = (*self.options.images, *self.options.white, *self.options.board)
         overwrite = self.overwrite or bool(self.steps.earlier)
 

@@ -13,11 +13,15 @@ from pathlib import Path
 from typing import Any
 
 from lfpiv_cli.console import Console
-from lfpiv_cli.errors import LfpivError, OutputExistsError
+from lfpiv_cli.errors import InputError, LfpivError, OutputExistsError
 from lfpiv_cli.files.atomic import write_json
-from lfpiv_cli.files.provenance import carried_record, sha256
+from lfpiv_cli.files.provenance import bear_alike, carried_record, sha256
 
 RECORD = "run.json"
+# What becomes of a step: its files are made; complete and left as they are; or complete and their record is another, as
+# settings have changed that they do not depend on.
+MADE, KEPT, RECORDED = "made", "kept", "recorded anew"
+OURS = (".h5", ".vtkhdf")
 
 
 @dataclass(frozen=True)
@@ -47,26 +51,30 @@ class Steps:
         """
         number = len(self.told["steps"]) + 1
         self.console.say(f"step {number}: {name}")
-        before = [_stamp(path) for path in files]
+        before, times = [_recorded(path) for path in files], [_stamp(path) for path in files]
+        hashes = self._hashes(path for path in files if path.exists())
         try:
             summary = make()
         except LfpivError as error:
             done = "; what is done stays, and the same command goes on from there" if number > 1 else ""
             raise type(error)(f"step {number}, {name}: {error}{done}") from error
-        made = {path.relative_to(self.output).as_posix(): sha256(path) for path in files}
-        is_kept = before == [_stamp(path) for path in files]
-        if is_kept:
-            self.console.say(f"step {number}: kept, complete and made alike")
-            if self.earlier.get("steps", {}).get(name, {}).get("files") == made:
+        state = _state(files, before, times)
+        if state != MADE:
+            self.console.say(f"step {number}: {state}, complete and made alike")
+            if self.earlier.get("steps", {}).get(name, {}).get("files") == hashes:
                 summary = self.earlier.get("summaries", {}).get(name, summary)
-        self.told["steps"][name] = {"state": "kept" if is_kept else "made", "files": made}
+        self.told["steps"][name] = {"state": state, "files": self._hashes(files)}
         self.told["summaries"][name] = summary
         self.files.extend(files)
         self.write()
         return summary
 
+    def _hashes(self, files: Iterable[Path]) -> dict[str, str]:
+        """Return the hash of each file by its name in the folder."""
+        return {path.relative_to(self.output).as_posix(): sha256(path) for path in files}
+
     def count(self, state: str) -> int:
-        """Return how many steps were `made`, or `kept`."""
+        """Return how many steps were made, kept, or recorded anew."""
         return sum(step["state"] == state for step in self.told["steps"].values())
 
     def write(self) -> None:
@@ -75,7 +83,7 @@ class Steps:
 
     def _warnings(self) -> list[dict[str, Any]]:
         """Return what was warned of, in this run and when what it kept was made."""
-        recorded = [warning for path in self.files for warning in _recorded(path)]
+        recorded = [warning for path in self.files for warning in (_recorded(path) or {}).get("warnings", ())]
         every: list[dict[str, Any]] = []
         for warning in (*recorded, *(notice.record() for notice in self.console.warned or ())):
             if warning not in every:
@@ -102,9 +110,25 @@ def earlier_run(output: Path, overwrite: bool) -> dict[str, Any]:
     return {}
 
 
-def _recorded(path: Path) -> Iterable[dict[str, Any]]:
-    """Return the warnings that a file of ours carries of its own making."""
-    return carried_record(path).get("warnings", ()) if path.suffix in (".h5", ".vtkhdf") else ()
+def _state(
+    files: Sequence[Path], before: Sequence[Mapping[str, Any] | None], times: Sequence[tuple[int, int] | None]
+) -> str:
+    """Return what became of files, given the records and times that they had before a step."""
+    if list(times) == [_stamp(path) for path in files]:
+        return KEPT
+    records = [(old, _recorded(path)) for path, old in zip(files, before, strict=True) if path.suffix in OURS]
+    alike = bool(records) and all(old and new and old != new and bear_alike(old, new) for old, new in records)
+    return RECORDED if alike else MADE
+
+
+def _recorded(path: Path) -> dict[str, Any] | None:
+    """Return the record that a file of ours carries; None where there is none, or a broken one."""
+    if path.suffix not in OURS or not path.exists():
+        return None
+    try:
+        return carried_record(path)
+    except InputError:
+        return None
 
 
 def _stamp(path: Path) -> tuple[int, int] | None:
