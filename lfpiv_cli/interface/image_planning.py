@@ -149,7 +149,7 @@ def _counted(bench: Bench, seen: Seen) -> tuple[float, float]:
     rest = seen.less_dark[part] - np.float32(seen.level)
     lit = float(np.mean(rest > level)), level, float(np.mean(rest, dtype=np.float64))
     depths = np.linspace(bench.bounds_mm[2, 0], bench.bounds_mm[2, 1], DEPTHS)
-    number, tracer_light = planning.tracers_per_lens(bench.camera, bench.media, depths, bench.tracer(), lit)
+    number, tracer_light = planning.tracers_per_lens(bench.camera, bench.media, depths, bench.tracer().radius_mm, lit)
     if np.isfinite(number):
         return number, tracer_light
     crowded = _crowded(bench, seen)
@@ -183,7 +183,7 @@ def _exposure(bench: Bench, seen: Seen) -> Line:
 def _light(_bench: Bench, seen: Seen) -> Line:
     signal = _signal(seen)
     reason = (
-        f"{seen.name}: bright pixels stand {signal:.3g} times the noise of {seen.noise:.2g} counts above the background"
+        f"{seen.name}: bright pixels stand {signal:.0f} times the noise of {seen.noise:.2g} counts above the background"
     )
     verdict = graded(signal, GOOD_SIGNAL, LEAST_SIGNAL)
     return Line("light", verdict, reason + {"look": ": more light", "no": ": no tracers are seen"}.get(verdict, ""))

@@ -23,7 +23,7 @@ LONGER, LEAST_DEPTHS, MOST_DEPTHS = 0.75, 3.0, 10.0
 NEAR_DEPTHS = 1.0
 # Of the way to the lens volumes keep clear.
 CLEAR = 0.5
-SOLVER = SolverSettings("em", 12, accelerate=True)
+SOLVER = SolverSettings("em", 8, accelerate=True)
 
 
 def share_beyond(camera: Camera, media: Media, z_mm: tuple[float, float], light: NDArray[np.float32]) -> float:

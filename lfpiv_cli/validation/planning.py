@@ -130,14 +130,12 @@ def errors_by_depth_mm(
     return np.asarray(np.sqrt(np.mean(errors.reshape(depths.size, PLACES, 3) ** 2, axis=1)))
 
 
-def lit_pixels(camera: Camera, media: Media, depths_mm: ArrayLike, tracer: Tracer, level_counts: float) -> float:
-    """Return how many pixels a tracer lights above a level on average over places and depths."""
-    depths = np.asarray(depths_mm, dtype=np.float64)
-    view = _in_miniature(camera, media, depths, tracer.radius_mm)
-    capacity = entry_capacity(view, float(depths.min()), float(depths.max()))
+def lit_pixels(view: View, depths_mm: NDArray[np.float64], light_counts: float, level_counts: float) -> float:
+    """Return how many pixels a tracer of so much light lights above a level, on average over places and depths."""
+    capacity = entry_capacity(view, float(depths_mm.min()), float(depths_mm.max()))
     pixels, values = np.empty(capacity, np.int32), np.empty((capacity, VALUES))
     lit = []
-    for x, y, z, light in _particles(view, depths, tracer.light_counts):
+    for x, y, z, light in _particles(view, depths_mm, light_counts):
         count = respond(view, x, y, z, pixels, values)
         image = np.bincount(pixels[:count], light * values[:count, 0])
         lit.append(np.count_nonzero(image > level_counts))
@@ -145,7 +143,7 @@ def lit_pixels(camera: Camera, media: Media, depths_mm: ArrayLike, tracer: Trace
 
 
 def tracers_per_lens(
-    camera: Camera, media: Media, depths_mm: ArrayLike, tracer: Tracer, lit: tuple[float, float, float]
+    camera: Camera, media: Media, depths_mm: ArrayLike, radius_mm: float, lit: tuple[float, float, float]
 ) -> tuple[float, float]:
     """Return how many tracers for each lens lit an image, and the light of one; infinitely many where all is lit.
 
@@ -155,7 +153,7 @@ def tracers_per_lens(
 
     Parameters
     ----------
-    tracer : its radius is taken; its light is what the image has
+    radius_mm : of the tracers
     lit : share of the pixels above a level, that level in counts, mean counts of a pixel above the background
     """
     share, level, mean = lit
@@ -167,9 +165,11 @@ def tracers_per_lens(
     number, light = -np.log(1.0 - share / most), 0.0
     if number <= 0.0:
         return 0.0, 0.0
+    depths = np.asarray(depths_mm, dtype=np.float64)
+    view = _in_miniature(camera, media, depths, radius_mm)
     for _ in range(ROUNDS):
         light = mean * cell / number
-        each = lit_pixels(camera, media, depths_mm, Tracer(light, tracer.radius_mm, tracer.readout), level)
+        each = lit_pixels(view, depths, light, level)
         number = -np.log(1.0 - share / most) * most * cell / max(each, 1.0)
     return float(number), float(light)
 
