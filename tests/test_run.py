@@ -138,10 +138,12 @@ def data_of(path: Path) -> dict[str, bytes]:
 def test_a_torn_file_is_refused_or_made_again(again: Path) -> None:
     torn, whole = again / "out" / "weights.h5", (again / "out" / "weights.h5").read_bytes()
     torn.write_bytes(whole[:-1000])
+    told = json.loads((again / "out" / "run.json").read_text())["summaries"]
     with pytest.raises(OutputExistsError, match="step 2, build-weights"):
         run(again / "rig.yaml", again / "out")
     run(again / "rig.yaml", again / "out", "--overwrite")
     assert torn.read_bytes() == whole
+    assert json.loads((again / "out" / "run.json").read_text())["summaries"] == told
     assert [name for name, state in states(again).items() if state == "made"] == ["build-weights"]
 
 

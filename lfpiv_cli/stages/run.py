@@ -116,10 +116,10 @@ def run(
         fields["combined"] = chain.combined(fields["volumes"], fields["particles"])
     figures = _figures(fields)
     steps.told["figures"] = figures
-    steps.write()
     told = choice.told() | figures
     if options.report:
         told |= {"verdict": chain.report().get("verdict"), "report": str(output / REPORT)}
+    steps.write(whole=True)
     return told | {"steps_made": steps.count(MADE), "steps_kept": steps.count(KEPT), "folder": str(output)}
 
 

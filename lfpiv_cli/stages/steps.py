@@ -77,9 +77,15 @@ class Steps:
         """Return how many steps were made, kept, or recorded anew."""
         return sum(step["state"] == state for step in self.told["steps"].values())
 
-    def write(self) -> None:
-        """Write down what is known so far."""
-        write_json(self.output / RECORD, self.told | {"warnings": self._warnings()}, overwrite=True)
+    def write(self, *, whole: bool = False) -> None:
+        """Write down what is known so far: of steps to come what the run before told, unless this is the `whole` run.
+
+        What a step told would be lost where another one fails before it is found to be complete.
+        """
+        told = dict(self.told)
+        for part in () if whole else ("steps", "summaries"):
+            told[part] = self.earlier.get(part, {}) | self.told[part]
+        write_json(self.output / RECORD, told | {"warnings": self._warnings()}, overwrite=True)
 
     def _warnings(self) -> list[dict[str, Any]]:
         """Return what was warned of, in this run and when what it kept was made."""
