@@ -21,6 +21,7 @@ ROOT = Path(__file__).parent.parent
 SAMPLE = ROOT / "sample_data"
 PAIR = SAMPLE / "pair_a.tif", SAMPLE / "pair_b.tif"
 PHOTOGRAPHS = [word for name in ("white", "dark", "board") for word in (f"--{name}", SAMPLE / f"{name}.tif")]
+RIGHT = "0.57 tracers for each microlens, and particles err less up to about 2"
 FILES = ("calibration.h5", "calibration.png", "weights.h5", "volumes/pair_a.vtkhdf", "volumes/pair_b.vtkhdf")
 VECTORS = "vectors.vtkhdf"
 
@@ -80,7 +81,7 @@ def test_files_are_those_of_the_single_commands(ran: Path, tmp_path: Path) -> No
 
 def test_it_says_what_was_chosen_and_what_came_of_it(ran: Path) -> None:
     told = json.loads((ran / "out" / "run.json").read_text(), parse_constant=pytest.fail)
-    assert (told["method"], told["reason"]) == ("volumes", "as --method asks for")
+    assert (told["method"], told["reason"]) == ("volumes", f"as asked for; but there are {RIGHT}")
     # 400 tracers before 660 microlenses.
     assert told["tracers_per_lens"] == pytest.approx(0.61, rel=0.2)
     assert list(told["summaries"]) == ["calibrate-snapshot", "build-weights", "reconstruct", "correlate"]
@@ -220,7 +221,8 @@ def test_what_cannot_be_is_said_before_anything_is_made(
         (3.1, "auto", ("volumes",), "3.1 tracers for each microlens"),
         (None, "auto", ("particles",), "too little"),
         (3.1, "both", ("volumes", "particles"), "--method"),
-        (3.1, "particles", ("particles",), "--method"),
+        (3.1, "particles", ("particles",), "as asked for; but there are 3.1 tracers"),
+        (0.6, "volumes", ("volumes",), "particles err less up to about 2"),
     ],
 )
 def test_the_method_is_what_errs_less(

@@ -183,20 +183,21 @@ def _chosen(settings: Config, options: RunOptions, weights: Path, frames: Sequen
     if settings.weights.method == "dlfc":
         return Choice(("volumes",), "weights.method is dlfc, whose fitted rays particles cannot be fitted with")
     count = _tracers_per_lens(settings, options, weights, frames)
+    asked: FlowMethod | None = "particles" if options.follow else None
     if options.method == "both":
         return Choice(("volumes", "particles"), "as --method asks for", count)
     if options.method != "auto":
-        return Choice((options.method,), "as --method asks for", count)
-    if options.follow:
-        return Choice(("particles",), "as --follow asks for", count)
-    if settings.reconstruction.solver == "particles":
+        asked = options.method
+    elif settings.reconstruction.solver == "particles":
         return Choice(("particles",), "reconstruction.solver is particles", count)
     if count is None:
-        return Choice(("particles",), "too little is seen of the volume to count tracers by their light")
-    found = f"{count:.2g} tracers for each microlens"
-    if count <= MOST_FOR_PARTICLES:
-        return Choice(("particles",), f"{found}; particles err less up to about {MOST_FOR_PARTICLES:g}", count)
-    return Choice(("volumes",), f"{found}; volumes err less from about {MOST_FOR_PARTICLES:g} on", count)
+        return Choice((asked or "particles",), "too little is seen of the volume to count tracers by their light")
+    better: FlowMethod = "particles" if count <= MOST_FOR_PARTICLES else "volumes"
+    side = "up to" if better == "particles" else "beyond"
+    reason = f"{count:.2g} tracers for each microlens, and {better} err less {side} about {MOST_FOR_PARTICLES:g}"
+    if asked is None or asked == better:
+        return Choice((better,), reason, count)
+    return Choice((asked,), f"as asked for; but there are {reason}", count)
 
 
 def _tracers_per_lens(settings: Config, options: RunOptions, weights: Path, frames: Sequence[Frame]) -> float | None:
