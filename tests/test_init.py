@@ -30,6 +30,7 @@ OWN = RigNumbers(magnification=-0.5, pitch_mm=0.125, columns=3000, rows=2000)
 RIGS = {
     "table 2": RigNumbers(),
     "own": OWN,
+    "a third of its sensor": RigNumbers(magnification=-0.5, pitch_mm=0.125, columns=1000, rows=668),
     "channel": RigNumbers(channel_mm=10.0, wall_mm=5.0),
     "air": RigNumbers(fluid=1.0),
     "small sensor, large lenses": RigNumbers(magnification=-2.0, pitch_mm=0.2, pixel_um=10.0, columns=640, rows=480),
@@ -50,6 +51,10 @@ def test_a_rig_of_few_numbers_has_no_contradictions_and_sees_its_volume(numbers:
         assert plan_of(settings, None).notices == []
     camera = settings.camera_model()
     assert camera.lens_image_width == pytest.approx(1.0, abs=0.01)
+    board, view = settings.board, 2.0 * half_view_mm(camera, settings.media_model(), [0.0])[0]
+    assert board.dots is not None
+    assert min(board.dots) >= 4
+    assert all((count - 1) * board.spacing_mm < 0.9 * side for count, side in zip(board.dots, view, strict=True))
     grid = settings.grid()
     half = half_view_mm(camera, settings.media_model(), grid.bounds_mm(2)).min(axis=0)
     assert all(grid.bounds_mm(axis)[1] <= half[axis] for axis in (0, 1))

@@ -39,8 +39,10 @@ SHARE_OF_VIEW, BOARD_SHARE = 0.98, 0.8
 # Interrogation windows of the paper's channel, in microlenses and depths of one lens: at the best seeding some twenty
 # tracers.
 WINDOW_LENSES, WINDOW_DEPTHS = 16.0, 1.5
-# Dots three microlenses wide and five times that apart are found and placed best; five by four of them are enough.
-DOT_LENSES, DOTS_APART, FEWEST_DOTS, MOST_DOTS = 3.0, 5.0, 3, 7
+# Dots three microlenses wide and five times that apart are found and placed best; five by four of them are enough. A
+# small sensor needs smaller ones, nearer to each other, as the sample's.
+DOT_LENSES, DOTS_APART, FEWEST_DOTS, MOST_DOTS = 3.0, 5.0, 4, 7
+LEAST_DOT_LENSES, LEAST_APART = 1.5, 3.0
 # What lies between window and volume where nobody says: a share of the volume's depth.
 BEHIND_WINDOW = 0.1
 # Lengths that nobody measured are written with so many digits.
@@ -196,10 +198,11 @@ def _window_distance_mm(numbers: RigNumbers, depth_mm: float) -> float:
 
 def _board(numbers: RigNumbers, lens_mm: float) -> dict[str, Any]:
     """Return a board of dots that suits the microlenses and is in view."""
-    dot = _rounded(DOT_LENSES * lens_mm)
-    spacing = _rounded(DOTS_APART * dot)
     view = 2.0 * BOARD_SHARE * half_view_mm(numbers.camera(), numbers.media(), [0.0])[0]
-    dots = [int(min(max(side // spacing, FEWEST_DOTS), MOST_DOTS)) for side in view]
+    spacing = min(DOT_LENSES * DOTS_APART * lens_mm, float(view.min()) / FEWEST_DOTS)
+    dot = max(min(DOT_LENSES * lens_mm, spacing / DOTS_APART), min(LEAST_DOT_LENSES * lens_mm, spacing / LEAST_APART))
+    spacing, dot = _rounded(spacing), _rounded(dot)
+    dots = [int(min((side - dot) // spacing + 1, MOST_DOTS)) for side in view]
     medium = "air" if numbers.channel_mm is not None else "fluid"
     return {"dots": dots, "spacing_mm": spacing, "dot_diameter_mm": dot, "medium": medium}
 
