@@ -86,6 +86,13 @@ def test_answers_are_asked_for_and_followed(tmp_path: Path) -> None:
     assert told["correlation"]["dt_s"] == pytest.approx(5 * 0.25 / 3 / 200, rel=5e-3)
 
 
+@pytest.mark.parametrize(("answer", "expected"), [("-0.5", -0.5), ("0.5", -0.5), ("0\n2", -2.0)])
+def test_a_magnification_is_negative_with_or_without_its_minus(answer: str, expected: float, tmp_path: Path) -> None:
+    done = typed(answer + 14 * "\n", str(tmp_path / "rig.yaml"))
+    assert done.exit_code == 0, done.output
+    assert load_config(tmp_path / "rig.yaml").sections.camera.main_lens.magnification == expected
+
+
 def test_nothing_is_asked_before_an_existing_file_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "rig.yaml"
     path.write_text("mine")

@@ -91,7 +91,7 @@ def _asked() -> RigNumbers:
 
     plain = RigNumbers()
     answers: dict[str, Any] = {
-        "magnification": -abs(_number("magnification, image over object", abs(plain.magnification))),
+        "magnification": _magnification(plain.magnification),
         "focal_length_mm": _number("focal length of the main lens, mm", plain.focal_length_mm),
         "pitch_mm": (pitch := _number("pitch of the microlenses, mm", plain.pitch_mm)),
     }
@@ -123,6 +123,16 @@ def _asked() -> RigNumbers:
     answers["size_mm"] = _sides("size of the volume, mm", guess.size_mm or (1.0, 1.0, 1.0))
     answers["velocity_m_s"] = _number("velocity to expect, m/s", plain.velocity_m_s)
     return RigNumbers(**answers)
+
+
+def _magnification(default: float) -> float:
+    """Ask for the magnification; images are inverted, whether the answer has its minus or not."""
+
+    def parsed(answer: str) -> float:
+        return -_above_zero(answer.strip().removeprefix("-"))
+
+    text = "magnification, image over object, negative because the image is inverted"
+    return float(click.prompt(text, f"{default:g}", value_proc=parsed, err=True))
 
 
 def _number(text: str, default: float) -> float:
