@@ -19,8 +19,8 @@ import click
 from lfpiv_cli.files.log import EventLog
 from lfpiv_cli.notice import Notice
 
-# Without a terminal, lines of work that is one piece are this far apart.
-SECONDS_BETWEEN_LINES = 10.0
+# Without a terminal, lines of work that is one piece are this far apart, and those within a frame that takes long.
+SECONDS_BETWEEN_LINES, SECONDS_WITHIN_FRAME = 10.0, 60.0
 # Where the summary's figures begin.
 NAME_WIDTH = 28
 # Frames count in fractions while they are worked on.
@@ -142,16 +142,20 @@ class Frames:
         self.console, self._draw = console, draw
         self._total, self._steps, self._label, self._unit = total, steps, label, unit
         self._begun, self._done, self._part = time.monotonic(), 0, 0.0
+        self._told = self._begun
 
     def advance(self, steps: float) -> None:
         """Take so many steps in the frame that is worked on."""
         self._part = min(self._part + steps / self._steps, 1.0)
         if self._draw is not None:
             self._draw(self._done + self._part)
+        elif time.monotonic() - self._told >= SECONDS_WITHIN_FRAME:
+            self._told = time.monotonic()
+            self.console.say(f"{self._label}: {self._done + self._part:.1f} of {self._total} {self._unit}s")
 
     def done(self, name: str) -> None:
         """Count a frame that is complete, or given up."""
-        self._done, self._part = self._done + 1, 0.0
+        self._done, self._part, self._told = self._done + 1, 0.0, time.monotonic()
         each = (time.monotonic() - self._begun) / self._done
         left = each * (self._total - self._done)
         self.console.event(

@@ -62,6 +62,20 @@ def test_without_a_terminal_each_frame_has_a_line_with_rate_and_time_left(clock,
     ]
 
 
+def test_without_a_terminal_a_frame_that_takes_long_has_a_line_a_minute(clock, capsys) -> None:
+    with Console().frames(2, 10, "reconstruct") as work:
+        for _ in range(10):
+            clock.now += 25.0
+            work.advance(1)
+        work.done("a")
+    assert capsys.readouterr().err.splitlines() == [
+        "reconstruct: 0.3 of 2 frames",
+        "reconstruct: 0.6 of 2 frames",
+        "reconstruct: 0.9 of 2 frames",
+        "reconstruct: a, 1 of 2 frames, 250 s each, 4 min left",
+    ]
+
+
 def test_without_a_terminal_work_of_one_piece_has_a_line_now_and_then(clock, capsys) -> None:
     with Console().progress(100, "refine") as advance:
         for _ in range(100):
