@@ -85,6 +85,15 @@ def test_displacements_within_their_errors_are_to_be_looked_at() -> None:
     assert "standard deviations of zero" in reason.text
 
 
+def test_a_component_that_is_hardly_known_is_named() -> None:
+    flow = np.zeros((*SHAPE, 3))
+    flow[..., 0] = 1.0
+    reasons = of_vectors(field_of(flow, np.array([0.05, 0.02, 1.2])), "v")
+    [reason] = [each for each in reasons if each.word == "look"]
+    assert "w is known to 0.36 mm, 36% of the usual displacement" in reason.text
+    assert words(of_vectors(field_of(flow, SIGMA_VOXEL), "v"))["vectors"] == "good"
+
+
 def test_no_vector_left_is_no() -> None:
     field = field_of(rotation_mm(), SIGMA_VOXEL)
     field.flag[:] = REJECTED

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lfpiv_cli.flow.consistency import difference_over_stated, divergence_over_stated
 from lfpiv_cli.flow.field import MASKED, REJECTED, VectorField
@@ -42,6 +43,8 @@ OF_IMAGES = ("reconstruct", "find_particles", "follow")
 LARGEST_OVER_STATED = 3.0
 # Vectors that are shorter than so many standard deviations on every axis show no flow.
 SHORTEST_SIGMAS = 3.0
+# A component tells little whose usual stated error is a larger share of the usual displacement.
+LARGEST_SHARE = 0.25
 
 
 @dataclass(frozen=True)
@@ -114,6 +117,8 @@ def of_vectors(field: VectorField, name: str) -> list[Reason]:
         if np.mean(long.any(axis=1)) < 0.5:
             text = f"{name}: most displacements are within {SHORTEST_SIGMAS:g} standard deviations of zero"
             reasons.append(Reason("vectors", "look", f"{text}; a longer time between the images would show the flow"))
+        else:
+            reasons += _components(field, there, field.uncertainty_voxel[there], name)
     ratio = divergence_over_stated(field)
     if ratio is not None and ratio > LARGEST_OVER_STATED:
         text = f"{name}: the divergence is {ratio:.1f} times what the stated errors make, and a liquid has none"
@@ -121,6 +126,27 @@ def of_vectors(field: VectorField, name: str) -> list[Reason]:
             Reason("vectors", "look", f"{text}: errors are larger than stated, or the flow finer than windows")
         )
     return reasons
+
+
+def _components(
+    field: VectorField, there: NDArray[np.bool_], sigma_voxel: NDArray[np.float64], name: str
+) -> list[Reason]:
+    """Return which components are known too badly to tell much of the flow."""
+    usual_mm = float(np.median(np.linalg.norm(field.displacement_voxel[there] * field.voxel_mm, axis=1)))
+    known = sigma_voxel[np.isfinite(sigma_voxel).all(axis=1)]
+    if not len(known):
+        return []
+    sigma_mm = np.median(known, axis=0) * field.voxel_mm
+    return [
+        Reason(
+            "vectors",
+            "look",
+            f"{name}: {component} is known to {sigma:.2g} mm, {sigma / usual_mm:.0%} of the usual displacement; "
+            "particles in place of volumes, or a longer time between the images, tell more",
+        )
+        for component, sigma in zip("uvw", sigma_mm, strict=True)
+        if sigma > LARGEST_SHARE * usual_mm > 0.0
+    ]
 
 
 def of_two_ways(one: VectorField, other: VectorField, names: tuple[str, str]) -> list[Reason]:
