@@ -129,6 +129,18 @@ def test_pictures_are_drawn_on_the_raw_image_that_a_file_was_made_from(
     assert drawn_on["particles.vtkhdf"] == image
 
 
+def test_of_all_but_the_best_vectors_a_few_figures_are_drawn(
+    results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stage, "figures_of", figures_of)
+    drawn: list[str] = []
+    monkeypatch.setattr(stage.Drawer, "_drawn", lambda _self, caption, _figure: drawn.append(caption.split(":")[0]))
+    monkeypatch.setattr(stage, "write_page", lambda *_given: None)
+    report(results, tmp_path / "page.html", console=QUIET)
+    assert drawn.count("grid.vtkhdf") > 5
+    assert drawn.count("vectors.vtkhdf") == 3
+
+
 def test_the_command_prints_the_verdict(results: Path, tmp_path: Path) -> None:
     outcome = CliRunner().invoke(cli, ["report", str(results), "-o", str(tmp_path / "page.html")])
     assert outcome.exit_code == 0, outcome.output

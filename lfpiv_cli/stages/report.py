@@ -54,6 +54,8 @@ SUFFIXES = (".h5", ".vtkhdf")
 DEEPEST = 2
 # A table of a batch ends here, and pictures are of the first file of each kind, of vectors of so many.
 LONGEST_TABLE, MOST_FIELDS = 100, 3
+# What is drawn of vectors beside the best ones: a figure takes a second.
+OF_OTHERS = ("planes", "profiles", "sigma")
 TITLE = "Velocity from light-field images"
 
 
@@ -151,14 +153,15 @@ class Drawer:
     raw: Mapping[str, Path]
     count: int = 0
 
-    def pictures(self, path: Path, role: str = "") -> list[Picture]:
-        """Return all pictures of a file; `role` is that of the input to draw on."""
+    def pictures(self, path: Path, role: str = "", only: Sequence[str] = ()) -> list[Picture]:
+        """Return all pictures of a file, or `only` those of some names; `role` is that of the input to draw on."""
         raw = None
         if role:
             with open_h5(path) as file:
                 given = read_provenance(file).get("inputs", {}).get(role, {})
             raw = self.raw.get(given.get("sha256", ""))
-        return [self._drawn(f"{path.name}: {each.caption}", each.draw()) for each in figures_of(path, raw).values()]
+        chosen = [each for name, each in figures_of(path, raw).items() if not only or name in only]
+        return [self._drawn(f"{path.name}: {each.caption}", each.draw()) for each in chosen]
 
     def _drawn(self, caption: str, figure: Figure) -> Picture:
         target = self.folder / f"{self.count:04d}.png"
@@ -205,7 +208,9 @@ def _chain(contents: Contents, drawer: Drawer) -> Iterable[Section]:
         text, table = _batch_table(fields, len(contents.of("vectors")), _field_row)
         if len(fields) > 1 and np.isfinite(_sigma(fields[0])):
             text = (*text, f"The smallest stated errors are those of {fields[0].name}, the first in the table.")
-        pictures = [picture for path in fields[:MOST_FIELDS] for picture in drawer.pictures(path)]
+        pictures = drawer.pictures(fields[0])
+        for path in fields[1:MOST_FIELDS]:
+            pictures += drawer.pictures(path, only=OF_OTHERS)
         yield Section("Vectors", "vectors", text, (table,), tuple(pictures))
     for path in contents.of("tracks")[:1]:
         points = read_tracks(path)
