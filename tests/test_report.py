@@ -22,7 +22,7 @@ from lfpiv_cli.stages import report as stage
 from lfpiv_cli.stages.plot import figures_of
 from lfpiv_cli.stages.report import ReportOptions, contents_of, report
 from tests.browser import CHROMIUM, opened
-from tests.vector_fields import SIGMA_VOXEL, field_of, noise_mm, rotation_mm
+from tests.vector_fields import SHAPE, SIGMA_VOXEL, field_of, noise_mm, rotation_mm
 
 QUIET = Console(quiet=True)
 REFERENCE = Reference("focal_point", 0.0)
@@ -127,6 +127,30 @@ def test_pictures_are_drawn_on_the_raw_image_that_a_file_was_made_from(
     report(results, tmp_path / "page.html", ReportOptions(raw=[other, image]), console=QUIET)
     assert {name for name, raw in drawn_on.items() if raw} == {"particles.vtkhdf"}
     assert drawn_on["particles.vtkhdf"] == image
+
+
+@pytest.mark.parametrize(("commands", "word"), [(("track", "correlate"), "good"), (("correlate", "correlate"), "look")])
+def test_poor_vectors_count_unless_better_ones_stand_beside_them(
+    commands: tuple[str, str], word: str, tmp_path: Path
+) -> None:
+    flow = np.zeros((*SHAPE, 3))
+    flow[..., 0] = 1.0
+    for name, command, sigma in zip("ab", commands, (SIGMA_VOXEL, [0.05, 0.02, 1.2]), strict=True):
+        field = field_of(flow, np.asarray(sigma))
+        write_vectors(tmp_path / f"{name}.vtkhdf", field, REFERENCE, provenance=record(command), overwrite=False)
+    summary = report(tmp_path, tmp_path / "page.html", console=QUIET)
+    assert summary["verdict"]["vectors"] == word
+    assert "w is known to 0.36 mm" in (tmp_path / "page.html").read_text(encoding="utf-8")
+
+
+def test_vectors_of_different_times_are_not_held_against_each_other(tmp_path: Path) -> None:
+    for number in range(3):
+        flow = np.zeros((*SHAPE, 3))
+        flow[..., 0] = 1.0 + number
+        field = field_of(flow, SIGMA_VOXEL)
+        made = record("correlate")
+        write_vectors(tmp_path / f"{number}.vtkhdf", field, REFERENCE, provenance=made, overwrite=False)
+    assert report(tmp_path, tmp_path / "page.html", console=QUIET)["verdict"]["vectors"] == "good"
 
 
 def test_of_all_but_the_best_vectors_a_few_figures_are_drawn(

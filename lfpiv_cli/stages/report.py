@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -71,14 +71,19 @@ NO_OPTIONS = ReportOptions()
 
 @dataclass(frozen=True)
 class Contents:
-    """The files of ours in a folder by what they are, and the record of each by its name."""
+    """The files of ours in a folder by what they are, and the record of each by its name in the folder."""
 
-    files: Mapping[str, list[Path]] = field(default_factory=dict)
-    records: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    folder: Path
+    files: Mapping[str, list[Path]]
+    records: Mapping[str, Mapping[str, Any]]
 
     def of(self, kind: str) -> list[Path]:
         """Return the files of a kind, in the order of their names."""
         return self.files.get(kind, [])
+
+    def made_by(self, path: Path) -> str:
+        """Return the command that made a file."""
+        return str(self.records[path.relative_to(self.folder).as_posix()].get("command")).split(" ")[0]
 
     @property
     def last(self) -> Mapping[str, Any]:
@@ -142,7 +147,7 @@ def contents_of(folder: Path) -> Contents:
     order = list(dict.fromkeys(KINDS.values()))
     in_order = {kind: files[kind] for kind in order if kind in files}
     names = [path.relative_to(folder).as_posix() for kind in in_order.values() for path in kind]
-    return Contents(in_order, {name: records[name] for name in names})
+    return Contents(folder, in_order, {name: records[name] for name in names})
 
 
 @dataclass
@@ -172,12 +177,7 @@ class Drawer:
 
 def _verdicts(contents: Contents) -> list[Verdict]:
     """Return what is thought of each part of the chain."""
-    reasons = of_warnings(contents.records)
-    fields = [(path.name, open_vectors(path)) for path in contents.of("vectors")[:MOST_FIELDS]]
-    for name, each in fields:
-        reasons += of_vectors(each, name)
-    for (one, first), (other, second) in combinations(fields, 2):
-        reasons += of_two_ways(first, second, (one, other))
+    reasons = [*of_warnings(contents.records), *_of_all_vectors(contents)]
     counted: list[tuple[Part, bool, str]] = [
         ("calibration", bool(contents.of("calibration")), "no calibration: lengths are as the data sheet has them"),
         ("images", bool(contents.of("volumes") or contents.of("particles")), "no volumes and no particles"),
@@ -185,6 +185,35 @@ def _verdicts(contents: Contents) -> list[Verdict]:
     ]
     reasons += [Reason(part, "look", text) for part, there, text in counted if not there]
     return verdicts(reasons, [part for part, _, _ in counted])
+
+
+def _of_all_vectors(contents: Contents) -> list[Reason]:
+    """Return what vectors say of themselves and of each other.
+
+    What speaks against vectors that better ones by another command stand beside is told, and not counted.
+    """
+    by_command: dict[str, list[Path]] = {}
+    for path in _best_first(contents):
+        by_command.setdefault(contents.made_by(path), []).append(path)
+    reasons: list[Reason] = []
+    for number, paths in enumerate(by_command.values()):
+        found = [each for path in paths for each in of_vectors(open_vectors(path), path.name)]
+        against = [each for each in found if each.word != "good"]
+        reasons += [replace(each, word="good") if number else each for each in against[:MOST_FIELDS]]
+        if len(against) > MOST_FIELDS:
+            text = f"{len(against) - MOST_FIELDS} more reasons like these in other files"
+            reasons.append(Reason("vectors", "good" if number else "look", text))
+        reasons += [each for each in found if each.word == "good"][:1]
+    if all(len(paths) == 1 for paths in by_command.values()):
+        fields = [(paths[0].name, open_vectors(paths[0])) for paths in by_command.values()]
+        for (one, first), (other, second) in combinations(fields, 2):
+            reasons += of_two_ways(first, second, (one, other))
+    return reasons
+
+
+def _best_first(contents: Contents) -> list[Path]:
+    """Return the files of vectors, those with the smallest stated errors first."""
+    return sorted(contents.of("vectors")[:LONGEST_TABLE], key=_sigma)
 
 
 def _told(judged: Sequence[Verdict]) -> str:
@@ -203,7 +232,7 @@ def _verdict_table(judged: Sequence[Verdict]) -> Table:
 
 def _chain(contents: Contents, drawer: Drawer) -> Iterable[Section]:
     """Yield the sections of vectors, tracks, images and calibration, as far as they are there."""
-    fields = sorted(contents.of("vectors")[:LONGEST_TABLE], key=_sigma)
+    fields = _best_first(contents)
     if fields:
         text, table = _batch_table(fields, len(contents.of("vectors")), _field_row)
         if len(fields) > 1 and np.isfinite(_sigma(fields[0])):
