@@ -14,14 +14,22 @@ import yaml
 
 from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import InputError, UsageError
+from lfpiv_cli.files import calibration_file, weights_file
 from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.calibration_file import read_calibration
 from lfpiv_cli.files.hdf5 import open_h5, read_provenance
 from lfpiv_cli.files.pages import Page, Picture, Section, Table, ensure_pages, write_page
-from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, Points, read_points, read_tracks
+from lfpiv_cli.files.particle_file import (
+    PARTICLES_FORMAT,
+    TRACKS_FORMAT,
+    TRAJECTORIES_FORMAT,
+    Points,
+    read_points,
+    read_tracks,
+)
 from lfpiv_cli.files.pictures import ensure_drawing, write_picture
 from lfpiv_cli.files.provenance import sha256
-from lfpiv_cli.files.vtkhdf import open_vectors, read_header
+from lfpiv_cli.files.vtkhdf import VECTORS_FORMAT, VOLUME_FORMAT, open_vectors, read_header
 from lfpiv_cli.flow.field import MASKED, REJECTED, VALID
 from lfpiv_cli.interface.vectors_checks import quality_of
 from lfpiv_cli.interface.verdicts import (
@@ -34,6 +42,7 @@ from lfpiv_cli.interface.verdicts import (
     verdicts,
 )
 from lfpiv_cli.pictures.interactive import MOST_LINES, has_views, lines_view
+from lfpiv_cli.pictures.tracks import trajectory_lines
 from lfpiv_cli.stages.plot import figures_of
 
 if TYPE_CHECKING:
@@ -41,13 +50,13 @@ if TYPE_CHECKING:
 
 # By the formats of our files, in the order of the chain.
 KINDS = {
-    "lfpiv-calibration": "calibration",
-    "lfpiv-weights": "weights",
-    "lfpiv-volume": "volumes",
-    "lfpiv-particles": "particles",
-    "lfpiv-vectors": "vectors",
-    "lfpiv-tracks": "tracks",
-    "lfpiv-trajectories": "tracks",
+    calibration_file.FORMAT: "calibration",
+    weights_file.FORMAT: "weights",
+    VOLUME_FORMAT: "volumes",
+    PARTICLES_FORMAT: "particles",
+    VECTORS_FORMAT: "vectors",
+    TRACKS_FORMAT: "tracks",
+    TRAJECTORIES_FORMAT: "tracks",
 }
 SUFFIXES = (".h5", ".vtkhdf")
 # Folders below the one that is given: of volumes, of particles, of a batch's vectors.
@@ -81,9 +90,9 @@ class Contents:
         """Return the files of a kind, in the order of their names."""
         return self.files.get(kind, [])
 
-    def made_by(self, path: Path) -> str:
-        """Return the command that made a file."""
-        return str(self.records[path.relative_to(self.folder).as_posix()].get("command")).split(" ")[0]
+    def record(self, path: Path) -> Mapping[str, Any]:
+        """Return the record of a file."""
+        return self.records[path.relative_to(self.folder).as_posix()]
 
     @property
     def last(self) -> Mapping[str, Any]:
@@ -108,7 +117,7 @@ def report(
     contents = contents_of(folder)
     judged = _verdicts(contents)
     with TemporaryDirectory() as pictures:
-        drawer = Drawer(Path(pictures), {sha256(path): path for path in options.raw})
+        drawer = Drawer(contents, Path(pictures), {sha256(path): path for path in options.raw})
         sections = [*_chain(contents, drawer), *_records(contents)]
         if not has_views():
             console.say('the page has no view to turn: that needs plotly, pip install "lfpiv[report]"')
@@ -154,6 +163,7 @@ def contents_of(folder: Path) -> Contents:
 class Drawer:
     """Draws the pictures of files into a folder, over the raw images that these are made from, known by their hash."""
 
+    contents: Contents
     folder: Path
     raw: Mapping[str, Path]
     count: int = 0
@@ -162,8 +172,7 @@ class Drawer:
         """Return all pictures of a file, or `only` those of some names; `role` is that of the input to draw on."""
         raw = None
         if role:
-            with open_h5(path) as file:
-                given = read_provenance(file).get("inputs", {}).get(role, {})
+            given = self.contents.record(path).get("inputs", {}).get(role, {})
             raw = self.raw.get(given.get("sha256", ""))
         chosen = [each for name, each in figures_of(path, raw).items() if not only or name in only]
         return [self._drawn(f"{path.name}: {each.caption}", each.draw()) for each in chosen]
@@ -194,7 +203,7 @@ def _of_all_vectors(contents: Contents) -> list[Reason]:
     """
     by_command: dict[str, list[Path]] = {}
     for path in _best_first(contents):
-        by_command.setdefault(contents.made_by(path), []).append(path)
+        by_command.setdefault(str(contents.record(path).get("command")).split(" ")[0], []).append(path)
     reasons: list[Reason] = []
     for number, paths in enumerate(by_command.values()):
         found = [each for path in paths for each in of_vectors(open_vectors(path), path.name)]
@@ -323,8 +332,8 @@ def _view(points: Points) -> str:
     """Return the view of tracks, coloured by speed; by displacement where no time is known."""
     speed = np.linalg.norm(points.arrays["velocity"], axis=1)
     if points.arrays.keys() >= {"track"}:
-        starts = np.flatnonzero(np.diff(points.arrays["track"])) + 1
-        return lines_view(np.split(points.position_mm, starts), np.split(speed, starts), "speed (m/s)")
+        track = points.arrays["track"]
+        return lines_view(trajectory_lines(points.position_mm, track), trajectory_lines(speed, track), "speed (m/s)")
     # A link's place is half-way.
     half = 0.5 * points.arrays["displacement_mm"]
     lines = list(np.stack([points.position_mm - half, points.position_mm + half], axis=1))
