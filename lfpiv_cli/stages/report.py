@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
@@ -30,7 +30,7 @@ from lfpiv_cli.files.particle_file import (
 from lfpiv_cli.files.pictures import ensure_drawing, write_picture
 from lfpiv_cli.files.provenance import sha256
 from lfpiv_cli.files.vtkhdf import VECTORS_FORMAT, VOLUME_FORMAT, open_vectors, read_header
-from lfpiv_cli.flow.field import MASKED, REJECTED, VALID
+from lfpiv_cli.flow.field import MASKED, REJECTED, VALID, VectorField
 from lfpiv_cli.interface.vectors_checks import quality_of
 from lfpiv_cli.interface.verdicts import (
     Part,
@@ -65,6 +65,8 @@ DEEPEST = 2
 LONGEST_TABLE, MOST_FIELDS = 100, 3
 # What is drawn of vectors beside the best ones: a figure takes a second.
 OF_OTHERS = ("planes", "profiles", "sigma")
+# Vectors by their files.
+Fields = Mapping[Path, VectorField]
 TITLE = "Velocity from light-field images"
 
 
@@ -115,10 +117,11 @@ def report(
     ensure_pages()
     ensure_drawing()
     contents = contents_of(folder)
-    judged = _verdicts(contents)
+    fields = _best_first(contents)
+    judged = _verdicts(contents, fields)
     with TemporaryDirectory() as pictures:
         drawer = Drawer(contents, Path(pictures), {sha256(path): path for path in options.raw})
-        sections = [*_chain(contents, drawer), *_records(contents)]
+        sections = [*_chain(contents, fields, drawer), *_records(contents)]
         if not has_views():
             console.say('the page has no view to turn: that needs plotly, pip install "lfpiv[report]"')
         made = contents.last
@@ -184,9 +187,9 @@ class Drawer:
         return Picture(target, caption)
 
 
-def _verdicts(contents: Contents) -> list[Verdict]:
+def _verdicts(contents: Contents, fields: Fields) -> list[Verdict]:
     """Return what is thought of each part of the chain."""
-    reasons = [*of_warnings(contents.records), *_of_all_vectors(contents)]
+    reasons = [*of_warnings(contents.records), *_of_all_vectors(contents, fields)]
     counted: list[tuple[Part, bool, str]] = [
         ("calibration", bool(contents.of("calibration")), "no calibration: lengths are as the data sheet has them"),
         ("images", bool(contents.of("volumes") or contents.of("particles")), "no volumes and no particles"),
@@ -196,17 +199,17 @@ def _verdicts(contents: Contents) -> list[Verdict]:
     return verdicts(reasons, [part for part, _, _ in counted])
 
 
-def _of_all_vectors(contents: Contents) -> list[Reason]:
+def _of_all_vectors(contents: Contents, fields: Fields) -> list[Reason]:
     """Return what vectors say of themselves and of each other.
 
     What speaks against vectors that better ones by another command stand beside is told, and not counted.
     """
     by_command: dict[str, list[Path]] = {}
-    for path in _best_first(contents):
+    for path in fields:
         by_command.setdefault(str(contents.record(path).get("command")).split(" ")[0], []).append(path)
     reasons: list[Reason] = []
     for number, paths in enumerate(by_command.values()):
-        found = [each for path in paths for each in of_vectors(open_vectors(path), path.name)]
+        found = [each for path in paths for each in of_vectors(fields[path], path.name)]
         against = [each for each in found if each.word != "good"]
         reasons += [replace(each, word="good") if number else each for each in against[:MOST_FIELDS]]
         if len(against) > MOST_FIELDS:
@@ -214,15 +217,15 @@ def _of_all_vectors(contents: Contents) -> list[Reason]:
             reasons.append(Reason("vectors", "good" if number else "look", text))
         reasons += [each for each in found if each.word == "good"][:1]
     if all(len(paths) == 1 for paths in by_command.values()):
-        fields = [(paths[0].name, open_vectors(paths[0])) for paths in by_command.values()]
-        for (one, first), (other, second) in combinations(fields, 2):
-            reasons += of_two_ways(first, second, (one, other))
+        for one, other in combinations(fields, 2):
+            reasons += of_two_ways(fields[one], fields[other], (one.name, other.name))
     return reasons
 
 
-def _best_first(contents: Contents) -> list[Path]:
-    """Return the files of vectors, those with the smallest stated errors first."""
-    return sorted(contents.of("vectors")[:LONGEST_TABLE], key=_sigma)
+def _best_first(contents: Contents) -> Fields:
+    """Return the vectors of each file, those with the smallest stated errors first."""
+    fields = {path: open_vectors(path) for path in contents.of("vectors")[:LONGEST_TABLE]}
+    return dict(sorted(fields.items(), key=lambda item: _sigma(item[1])))
 
 
 def _told(judged: Sequence[Verdict]) -> str:
@@ -239,15 +242,15 @@ def _verdict_table(judged: Sequence[Verdict]) -> Table:
     return Table("Verdict: good, look (at the reasons), or no", ("part", "verdict", "reasons"), rows)
 
 
-def _chain(contents: Contents, drawer: Drawer) -> Iterable[Section]:
+def _chain(contents: Contents, fields: Fields, drawer: Drawer) -> Iterable[Section]:
     """Yield the sections of vectors, tracks, images and calibration, as far as they are there."""
-    fields = _best_first(contents)
     if fields:
-        text, table = _batch_table(fields, len(contents.of("vectors")), _field_row)
-        if len(fields) > 1 and np.isfinite(_sigma(fields[0])):
-            text = (*text, f"The smallest stated errors are those of {fields[0].name}, the first in the table.")
-        pictures = drawer.pictures(fields[0])
-        for path in fields[1:MOST_FIELDS]:
+        best, *others = fields
+        text, table = _batch_table(fields, len(contents.of("vectors")), map(_field_row, fields.values()))
+        if others and np.isfinite(_sigma(fields[best])):
+            text = (*text, f"The smallest stated errors are those of {best.name}, the first in the table.")
+        pictures = drawer.pictures(best)
+        for path in others[: MOST_FIELDS - 1]:
             pictures += drawer.pictures(path, only=OF_OTHERS)
         yield Section("Vectors", "vectors", text, (table,), tuple(pictures))
     for path in contents.of("tracks")[:1]:
@@ -258,7 +261,8 @@ def _chain(contents: Contents, drawer: Drawer) -> Iterable[Section]:
     for kind, title, rows_of in (("particles", "Particles", _particle_row), ("volumes", "Volumes", _volume_row)):
         paths = contents.of(kind)
         if paths:
-            text, table = _batch_table(paths[:LONGEST_TABLE], len(paths), rows_of)
+            shown = paths[:LONGEST_TABLE]
+            text, table = _batch_table(shown, len(paths), map(rows_of, shown))
             role = "image" if kind == "particles" else ""
             yield Section(title, kind, text, (table,), tuple(drawer.pictures(paths[0], role)))
     for path in contents.of("calibration")[:1]:
@@ -271,9 +275,8 @@ def _chain(contents: Contents, drawer: Drawer) -> Iterable[Section]:
         yield Section("Weights", "weights", pictures=tuple(drawer.pictures(path)))
 
 
-def _sigma(vectors: Path) -> float:
-    """Return the size of the usual stated error of a file's vectors, mm; infinite where none is stated."""
-    field = open_vectors(vectors)
+def _sigma(field: VectorField) -> float:
+    """Return the size of the usual stated error of vectors, mm; infinite where none is stated."""
     sigma = quality_of(field).summary()["uncertainty_voxel_median"]
     return float("inf") if sigma is None else float(np.linalg.norm(np.multiply(sigma, field.voxel_mm)))
 
@@ -287,11 +290,11 @@ def _beside(calibration: Path) -> list[Picture]:
 Row = dict[str, str]
 
 
-def _batch_table(paths: Sequence[Path], count: int, row_of: Callable[[Path], Row]) -> tuple[tuple[str, ...], Table]:
+def _batch_table(paths: Iterable[Path], count: int, rows: Iterable[Row]) -> tuple[tuple[str, ...], Table]:
     """Return a table of files, and words where there are more of them."""
-    rows = [{"file": path.name} | row_of(path) for path in paths]
-    text = () if len(paths) == count else (f"The first {len(paths)} of {count} files.",)
-    return text, Table("Files", tuple(rows[0]), tuple(tuple(row.values()) for row in rows))
+    named = [{"file": path.name} | row for path, row in zip(paths, rows, strict=True)]
+    text = () if len(named) == count else (f"The first {len(named)} of {count} files.",)
+    return text, Table("Files", tuple(named[0]), tuple(tuple(row.values()) for row in named))
 
 
 def _volume_row(path: Path) -> Row:
@@ -316,8 +319,7 @@ def _particle_row(path: Path) -> Row:
     }
 
 
-def _field_row(path: Path) -> Row:
-    vectors = open_vectors(path)
+def _field_row(vectors: VectorField) -> Row:
     quality, there, used = quality_of(vectors), vectors.flag < REJECTED, vectors.flag < MASKED
     moved = vectors.displacement_voxel[there]
     return {
