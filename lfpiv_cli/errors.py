@@ -57,3 +57,9 @@ class LimitMissedError(LfpivError):
     def __init__(self, message: str, figures: dict[str, Any]) -> None:
         super().__init__(message)
         self.figures = figures
+
+
+class StoppedEarlyError(LfpivError):
+    """A batch stopped before its time limit; what it has not made yet is left for the same command with --resume."""
+
+    exit_code = 75
