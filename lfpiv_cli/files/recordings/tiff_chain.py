@@ -11,17 +11,17 @@ import struct
 from typing import BinaryIO
 
 from lfpiv_cli.errors import InputError
+from lfpiv_cli.files.recordings.pixels import CUT
 
 # Bytes of one value of each tag type, TIFF 6.0 and BigTIFF.
 TYPE_BYTES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8, 17: 8, 18: 8}
 CLASSIC, BIG = 42, 43
 # A camera's directory holds some 20 tags; the decoder gives up at 4096.
 MOST_TAGS = 4096
-CUT = "the file is cut off or damaged"
 
 
-def count_directories(file: BinaryIO, size: int) -> int:
-    """Return the number of pages of a TIFF file after checking that each directory lies inside the file.
+def directories(file: BinaryIO, size: int) -> list[int]:
+    """Return where the directory of each page of a TIFF file begins, after checking that each lies inside the file.
 
     Parameters
     ----------
@@ -44,15 +44,15 @@ def count_directories(file: BinaryIO, size: int) -> int:
         raise InputError(f"its header has {len(head)} bytes: {CUT}") from None
     if magic not in (CLASSIC, BIG):
         raise InputError(f"its TIFF version is {magic}, expected {CLASSIC} or {BIG}")
-    seen: set[int] = set()
+    seen: dict[int, None] = {}
     while offset:
         if offset in seen:
             raise InputError(f"its directories form a circle after page {len(seen) - 1}")
-        seen.add(offset)
+        seen[offset] = None
         offset = _next_directory(file, size, offset, len(seen) - 1, order, big)
     if not seen:
         raise InputError("it holds no pages")
-    return len(seen)
+    return list(seen)
 
 
 def _next_directory(file: BinaryIO, size: int, offset: int, page: int, order: str, big: bool) -> int:
