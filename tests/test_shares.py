@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from lfpiv_cli.errors import StoppedEarlyError, UsageError
+from lfpiv_cli.errors import UsageError
 from lfpiv_cli.files import shares
-from lfpiv_cli.files.shares import Deadline, Shard, parse_time_limit
+from lfpiv_cli.files.shares import Deadline, Runs, Shard, parse_time_limit
 
 
 @pytest.mark.parametrize(("total", "count"), [(0, 3), (2, 3), (7, 3), (100, 7), (1000, 1000)])
@@ -73,17 +73,32 @@ def test_a_frame_that_would_not_be_done_is_not_begun(monkeypatch: pytest.MonkeyP
     clock = [0.0]
     monkeypatch.setattr(shares.time, "monotonic", lambda: clock[0])
     deadline = Deadline(100.0, begun=0.0)
-    deadline.ensure_time(0, 5)
-    deadline.frame_took(40.0)
-    deadline.frame_took(10.0)
+    assert deadline.leaves_time()
+    deadline.took(40.0)
+    deadline.took(10.0)
     clock[0] = 59.0
-    deadline.ensure_time(1, 5)
+    assert deadline.leaves_time()
     clock[0] = 61.0
-    with pytest.raises(StoppedEarlyError, match="2 of 5 frames are complete.*--resume goes on") as stopped:
-        deadline.ensure_time(2, 5)
-    assert stopped.value.exit_code == 75
+    assert not deadline.leaves_time()
+    told = deadline.error(2, 5, "frame")
+    assert "39 s are left" in str(told)
+    assert "2 of 5 frames are done; the same command with --resume goes on" in str(told)
+    assert told.exit_code == 75
 
 
 def test_without_a_limit_nothing_stops() -> None:
-    deadline = Deadline(None, longest_s=1e9, begun=-1e9)
-    deadline.ensure_time(0, 5)
+    assert Deadline(None, longest_s=1e9, begun=-1e9).leaves_time()
+
+
+def test_workers_go_on_where_they_are_and_begin_where_most_is_left() -> None:
+    left = Runs([10, 11, 12, 13, 14, 15, 16, 17])
+    assert [left.next_for(worker) for worker in "ab"] == [10, 14]
+    assert [left.next_for(worker) for worker in "aab"] == [11, 12, 15]
+    # a third worker takes the second half of the longest run, a worker without one the rest of another's
+    assert [left.next_for(worker) for worker in "caa"] == [17, 13, 16]
+    assert not left
+
+
+def test_a_single_worker_goes_through_in_order() -> None:
+    left = Runs(range(5))
+    assert [left.next_for("a") for _ in range(len(left))] == list(range(5))

@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import re
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from lfpiv_cli.errors import StoppedEarlyError, UsageError
@@ -109,23 +109,59 @@ class Deadline:
     longest_s: float = 0.0
     begun: float = field(default_factory=time.monotonic)
 
-    def frame_took(self, seconds: float) -> None:
+    def took(self, seconds: float) -> None:
         """Remember the longest frame: by it the next one is judged."""
         self.longest_s = max(self.longest_s, seconds)
 
-    def ensure_time(self, done: int, total: int, unit: str = "frame") -> None:
-        """Stop before a frame that would probably not be done in time.
+    def leaves_time(self) -> bool:
+        """Return whether a frame that takes as long as the longest one so far would be done in time."""
+        return self.limit_s is None or self._left_s() > self.longest_s
 
-        Raises
-        ------
-        StoppedEarlyError
-        """
-        if self.limit_s is None:
-            return
-        left = self.limit_s - (time.monotonic() - self.begun)
-        if left <= self.longest_s:
-            raise StoppedEarlyError(
-                f"stopped before the time limit of {self.limit_s:g} s, {max(left, 0.0):.0f} s left and "
-                f"{self.longest_s:.1f} s for the longest {unit} so far: {done} of {total} {unit}s are complete; the "
-                "same command with --resume goes on"
-            )
+    def error(self, done: int, total: int, unit: str) -> StoppedEarlyError:
+        """Return the error of a batch that stops for lack of time."""
+        return StoppedEarlyError(
+            f"stopped before the time limit of {self.limit_s:g} s: {max(self._left_s(), 0.0):.0f} s are left, and a "
+            f"{unit} took up to {self.longest_s:.1f} s; {done} of {total} {unit}s are done; the same command with "
+            "--resume goes on"
+        )
+
+    def _left_s(self) -> float:
+        return (self.limit_s or 0.0) - (time.monotonic() - self.begun)
+
+
+class Runs:
+    """Frames that are left, for workers of which each goes on with the next frame after its last.
+
+    So what neighbouring frames have in common, a pair or the frames of a background, is mostly read by one worker.
+    """
+
+    def __init__(self, numbers: Sequence[int]) -> None:
+        """Take the numbers of the frames, in their order."""
+        self._numbers = list(numbers)
+        self._left = set(range(len(self._numbers)))
+        # The place in the order that each worker was given last.
+        self._last: dict[str, int] = {}
+
+    def __len__(self) -> int:
+        """Return how many frames are left."""
+        return len(self._left)
+
+    def next_for(self, worker: str) -> int:
+        """Return the next frame for a worker, of which there are some left."""
+        place = self._last.get(worker, -1) + 1
+        if worker not in self._last or place not in self._left:
+            place = self._new_begin()
+        self._last[worker] = place
+        self._left.remove(place)
+        return self._numbers[place]
+
+    def _new_begin(self) -> int:
+        """Return where the longest run that is left begins, or its middle if somebody else comes to its begin."""
+        runs: list[list[int]] = []
+        for place in sorted(self._left):
+            if runs and place == runs[-1][-1] + 1:
+                runs[-1].append(place)
+            else:
+                runs.append([place])
+        longest = max(runs, key=len)
+        return longest[len(longest) // 2 if longest[0] - 1 in self._last.values() else 0]
