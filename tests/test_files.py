@@ -30,6 +30,7 @@ from lfpiv_cli.files.vtkhdf import open_vectors, open_volume, read_header, write
 from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.reference import Reference
+from tests.hostile_files import edited
 
 GRID = Grid.centred((4, 3, 2), (0.1, 0.2, 0.3), (1.0, 2.0, 3.0))
 REFERENCE = Reference("mid_plane", -0.3)
@@ -419,15 +420,22 @@ def test_volume_and_vectors_are_not_taken_for_each_other(tmp_path: Path) -> None
         (lambda file: file["VTKHDF"].attrs.__setitem__("WholeExtent", [0, 3, 0, 2, 0, 2]), "its extent says"),
         (lambda file: file["VTKHDF"].attrs.__setitem__("WholeExtent", [1, 3, 0, 2, 0, 1]), "starts at 0"),
         (lambda file: file["VTKHDF"].attrs.__setitem__("Spacing", [0.1, 0.0, 0.1]), "spacing"),
+        (lambda file: file["VTKHDF"].attrs.__setitem__("Spacing", [0.1, 0.1]), "one entry for each axis"),
+        (lambda file: file["VTKHDF"].attrs.__setitem__("Spacing", [0.1, 0.1, 1j]), "Spacing has type complex128"),
         (lambda file: file["VTKHDF"].attrs.__setitem__("Origin", [0.1, np.nan, 0.1]), "origin"),
         (lambda file: file["intensity"].__setitem__((0, 0, 0), np.nan), "1 voxels are not finite"),
         (lambda file: file.__delitem__("intensity"), "intensity"),
+        (lambda file: (file.__delitem__("intensity"), file.create_group("intensity")), "is a group, expected an array"),
+        (lambda file: (file.__delitem__("VTKHDF"), file.create_dataset("VTKHDF", data=[1])), "WholeExtent"),
+        (lambda file: file.attrs.__setitem__("provenance", np.bytes_(b"[1]")), "its provenance is not a record"),
+        (lambda file: file.attrs.__setitem__("provenance", np.bytes_(b"[" * 100_000)), "maximum recursion depth"),
+        (lambda file: file.attrs.__setitem__("format_version", [1, 1]), "format_version"),
         (lambda file: file.__delitem__("VTKHDF"), "VTKHDF"),
     ],
 )
 def test_a_volume_that_contradicts_itself_is_refused(tmp_path: Path, damage: Callable, words: str) -> None:
     path = save_volume(tmp_path / "v.vtkhdf", np.zeros(GRID.shape_zyx))
-    with h5py.File(path, "r+") as file:
+    with edited(path) as file:
         damage(file)
     assert refused(lambda: open_volume(path), "v.vtkhdf", words)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import h5py
 import numpy as np
 import pytest
 import yaml
@@ -16,6 +15,7 @@ from lfpiv_cli.optics.media import Media, Window
 from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.optics.pupils import real_lens, refocused, thin_lens
 from lfpiv_cli.optics.tracing import disc_points, slopes_equivalent, slopes_exact, trace
+from tests.hostile_files import edited
 
 F_1, F_2 = 150.0, 150.0
 # From the front lens to the object in focus, mm.
@@ -176,7 +176,7 @@ def test_weights_files_know_the_lens_and_those_without_pupils_are_read(tmp_path)
     made, read = lf.load_rig(config).camera_model(), lf.open_weights(output).camera
     for name in ("focal_length_mm", "microlens_distance_mm", "pixel_mm", "entrance_over_exit"):
         assert getattr(read, name) == getattr(made, name)
-    with h5py.File(output, "r+") as file:
+    with edited(output) as file:
         del file["camera"].attrs["entrance_over_exit"]
     assert lf.open_weights(output).camera.entrance_over_exit == 1.0
 

@@ -9,11 +9,10 @@ from typing import Any
 import h5py
 import numpy as np
 
-from lfpiv_cli.files.hdf5 import format_of, from_attribute, member, open_h5, read_provenance
+from lfpiv_cli.files.hdf5 import RESERVED, format_of, from_attribute, open_h5, read_provenance
+from lfpiv_cli.files.hdf5_checks import member
 from lfpiv_cli.files.provenance import recorded_warnings
 
-# Attributes that are told in words of their own or are of no interest to a person.
-SILENT = ("format", "format_version", "provenance")
 # Arrays that are told whole: places, sizes, a lattice's basis.
 TOLD_SHAPES = ((2,), (3,), (2, 2))
 # Groups that show our data to other programs once more.
@@ -59,7 +58,7 @@ def _made(record: dict[str, Any]) -> dict[str, Any]:
 def _list_group(group: h5py.Group, prefix: str, found: dict[str, Any]) -> None:
     """Add the scalars and arrays of a group and of those in it."""
     for name, value in group.attrs.items():
-        if (prefix or name not in SILENT) and getattr(value, "ndim", 0) == 0 and name not in ("CLASS", "NAME"):
+        if (prefix or name not in RESERVED) and getattr(value, "ndim", 0) == 0 and name not in ("CLASS", "NAME"):
             scalar = from_attribute(name, value)
             if not isinstance(scalar, float) or math.isfinite(scalar):
                 found[prefix + name] = scalar

@@ -7,7 +7,6 @@ attribute `units`), all else attributes. The root says `format`, `format_version
 from __future__ import annotations
 
 import json
-import math
 import shutil
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
@@ -20,12 +19,13 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.errors import InputError, LfpivError, OutputError
 from lfpiv_cli.files.atomic import write_atomically
-from lfpiv_cli.files.inputs import ensure_regular_file, physical_memory, reason
+from lfpiv_cli.files.hdf5_checks import DEEPEST, DIGEST, ensure_array, ensure_ours, member, write_digest
+from lfpiv_cli.files.inputs import ensure_regular_file, reason
 
 Tree = Mapping[str, Any]
 
 # Root attributes that a tree cannot use for itself.
-RESERVED = ("format", "format_version", "provenance")
+RESERVED = ("format", "format_version", "provenance", DIGEST)
 # With the chunk cache on, a full disk kills the process with SIGSEGV; without it the write raises.
 CHUNK_CACHE_BYTES = 0
 # The 1.10 format has checksums on all metadata, so that a flipped bit there is noticed too.
@@ -34,11 +34,6 @@ LIBRARY_VERSIONS = ("v110", "v110")
 FILTERS = {"compression": "gzip", "compression_opts": 1, "shuffle": True, "fletcher32": True}
 # A chunk of 1 MiB is read in one piece and compresses as well as a larger one.
 CHUNK_BYTES = 2**20
-# Deflate cannot shrink data by more than 1032; a dataset that claims more was never written.
-LARGEST_RATIO = 1100
-# Our deepest tree has four levels; hard links can form circles.
-DEEPEST = 12
-
 # What h5py raises on a broken file, depending on where it breaks.
 BROKEN_FILE_ERRORS = (
     OSError,
@@ -97,7 +92,7 @@ def read_tree(path: Path, format_name: str, format_versions: Collection[int]) ->
         provenance = read_provenance(file)
         tree = _read_group(file, path.stat().st_size, DEEPEST)
     for name in RESERVED:
-        del tree[name]
+        tree.pop(name, None)
     return tree, provenance
 
 
@@ -114,6 +109,7 @@ def create(
         try:
             with h5py.File(temporary, "w", libver=LIBRARY_VERSIONS, rdcc_nbytes=CHUNK_CACHE_BYTES) as file:
                 fill(file)
+                write_digest(file)
         except RuntimeError as error:  # h5py's word for a write that fails on closing
             raise OutputError(f"{path}: cannot be written: {reason(error)}") from error
 
@@ -141,22 +137,7 @@ def read_array(dataset: h5py.Dataset, file_bytes: int) -> NDArray[Any]:
     ----------
     file_bytes : size of the file, the bound on what may be declared
     """
-    name = dataset.name
-    if dataset.is_virtual or dataset.external:
-        raise ValueError(f"{name} lies in another file")
-    if dataset.dtype.kind not in "fiu" or dataset.shape is None:
-        raise ValueError(f"{name} has type {dataset.dtype}, expected numbers")
-    allowed = min(LARGEST_RATIO * file_bytes, physical_memory())
-    declared = math.prod(dataset.shape) * dataset.dtype.itemsize
-    if declared > allowed:
-        raise ValueError(f"{name} declares {declared} bytes, more than the {allowed} that are possible")
-    if dataset.chunks is None and dataset.id.get_storage_size() < declared:
-        raise ValueError(f"{name} was never written")
-    if dataset.chunks is not None and dataset.size:
-        expected = math.prod(-(-n // c) for n, c in zip(dataset.shape, dataset.chunks, strict=True))
-        found = dataset.id.get_num_chunks()
-        if found != expected:
-            raise ValueError(f"{name} has {found} of its {expected} chunks")
+    ensure_array(dataset, file_bytes)
     return dataset[()]
 
 
@@ -166,19 +147,13 @@ def open_h5(path: Path) -> Iterator[h5py.File]:
     ensure_regular_file(path)
     try:
         with h5py.File(path, "r", locking="best-effort") as file:
+            if "format" in file.attrs:
+                ensure_ours(file, path.stat().st_size)
             yield file
     except LfpivError:
         raise
     except BROKEN_FILE_ERRORS as error:
         raise InputError(f"{path}: not a readable HDF5 file of ours: {reason(error)}") from error
-
-
-def member(group: h5py.Group, name: str) -> h5py.Group | h5py.Dataset:
-    """Return a group's member by hard link only: soft and external links can lead anywhere."""
-    link = group.get(name, getlink=True)
-    if not isinstance(link, h5py.HardLink):
-        raise ValueError(f"{group.name}/{name} is not a hard link")
-    return group[name]
 
 
 def format_of(path: Path) -> str:
@@ -201,7 +176,7 @@ def ensure_format(path: Path, file: h5py.File, format_name: str, format_versions
     if not isinstance(found, bytes) or found.decode() != format_name:
         name = found.decode("utf-8", "replace") if isinstance(found, bytes) else "no format of ours"
         raise InputError(f"{path}: holds {name}, expected {format_name}")
-    version = int(file.attrs["format_version"])
+    version = from_attribute("format_version", file.attrs["format_version"])
     if version not in format_versions:
         known = ", ".join(str(v) for v in sorted(format_versions))
         raise InputError(f"{path}: has {format_name} version {version}, this program reads {known}")
@@ -221,6 +196,7 @@ def replace_provenance(path: Path, provenance: Mapping[str, Any]) -> None:
         shutil.copyfile(path, temporary)
         with h5py.File(temporary, "r+", libver=LIBRARY_VERSIONS) as file:
             file.attrs["provenance"] = np.bytes_(json.dumps(provenance, allow_nan=False))
+            write_digest(file)
 
     def check(temporary: Path) -> None:
         with open_h5(temporary) as file:
@@ -230,11 +206,39 @@ def replace_provenance(path: Path, provenance: Mapping[str, Any]) -> None:
 
 
 def read_provenance(file: h5py.File) -> dict[str, Any]:
-    """Return the provenance record."""
-    record = json.loads(file.attrs["provenance"])
-    if not isinstance(record, dict):
+    """Return the provenance record.
+
+    Raises
+    ------
+    KeyError, ValueError, RecursionError : there is none, or it is no record
+    """
+    text = file.attrs["provenance"]
+    if not isinstance(text, bytes):
+        raise ValueError(f"its provenance is a {type(text).__name__}, expected bytes")
+    record = json.loads(text)
+    made_from = record.get("made_from", {}) if isinstance(record, dict) else None
+    if not isinstance(made_from, dict) or not all(map(_is_record, (record, *made_from.values()))):
         raise ValueError("its provenance is not a record")
     return record
+
+
+def _is_record(value: Any) -> bool:
+    """Return whether a value is built as `provenance.record` builds records, as far as it says anything."""
+    if not isinstance(value, dict) or not isinstance(value.get("command", ""), str):
+        return False
+    inputs, warnings, config = (value.get(name) or {} for name in ("inputs", "warnings", "config"))
+    return (
+        isinstance(config, dict)
+        and isinstance(inputs, dict)
+        and all(_are_texts(entry, "name", "sha256") for entry in inputs.values())
+        and (not warnings or isinstance(warnings, list))
+        and all(_are_texts(entry, "code", "about", "text", "remedy") for entry in warnings)
+    )
+
+
+def _are_texts(entry: Any, *names: str) -> bool:
+    """Return whether an object has a text under each of the names."""
+    return isinstance(entry, dict) and all(isinstance(entry.get(name), str) for name in names)
 
 
 def _write_group(group: h5py.Group, tree: Tree, prefix: str, units: Mapping[str, str]) -> None:
@@ -257,10 +261,8 @@ def _read_group(group: h5py.Group, file_bytes: int, levels: int) -> dict[str, An
         item = member(group, name)
         if isinstance(item, h5py.Group):
             tree[name] = _read_group(item, file_bytes, levels - 1)
-        elif isinstance(item, h5py.Dataset):
-            tree[name] = read_array(item, file_bytes)
         else:
-            raise ValueError(f"{item.name} is neither a group nor an array")
+            tree[name] = read_array(item, file_bytes)
     return tree
 
 

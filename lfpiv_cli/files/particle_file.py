@@ -20,11 +20,11 @@ from lfpiv_cli.files.hdf5 import (
     create,
     ensure_format,
     format_of,
-    member,
     open_h5,
     read_array,
     write_array,
 )
+from lfpiv_cli.files.hdf5_checks import array_member
 from lfpiv_cli.files.vtk import create_vtk_group, read_root, write_root
 from lfpiv_cli.reference import Reference
 
@@ -100,7 +100,7 @@ def write_points(path: Path, format_name: str, points: Points, *, overwrite: boo
         write_root(file, format_name, FORMAT_VERSION, points.reference, points.attributes, points.provenance)
         vtk = create_vtk_group(file, "PolyData")
         vtk["Points"] = write_array(file, POSITION, position_mm, "mm")
-        vtk["NumberOfPoints"] = np.array([len(position_mm)], dtype=np.int64)
+        write_array(vtk, "NumberOfPoints", np.array([len(position_mm)], dtype=np.int64))
         _write_cells(vtk, len(position_mm), lines_of(arrays["track"]) if "track" in arrays else np.zeros(1, np.int64))
         data = vtk.create_group("PointData")
         for name, unit in units.items():
@@ -124,8 +124,8 @@ def read_points(path: Path | str, format_name: str) -> Points:
     with open_h5(path) as file:
         ensure_format(path, file, format_name, (FORMAT_VERSION,))
         size = path.stat().st_size
-        position = read_array(member(file, POSITION), size)
-        arrays = {name: read_array(member(file, name), size) for name in UNITS[format_name]}
+        position = read_array(array_member(file, POSITION), size)
+        arrays = {name: read_array(array_member(file, name), size) for name in UNITS[format_name]}
         root = read_root(file)
     if position.ndim != 2 or position.shape[1] != 3:
         raise InputError(f"{path}: its positions have the shape {position.shape}, expected (n, 3)")
@@ -164,7 +164,7 @@ def _write_cells(vtk: h5py.Group, count: int, lines: NDArray[np.int64]) -> None:
     for name in ("Vertices", "Lines", "Polygons", "Strips"):
         of_cells = offsets.get(name, np.zeros(1, dtype=np.int64))
         group = vtk.create_group(name)
-        group["NumberOfCells"] = np.array([len(of_cells) - 1], dtype=np.int64)
-        group["NumberOfConnectivityIds"] = of_cells[-1:]
-        group["Offsets"] = of_cells
-        group["Connectivity"] = np.arange(of_cells[-1], dtype=np.int64)
+        write_array(group, "NumberOfCells", np.array([len(of_cells) - 1], dtype=np.int64))
+        write_array(group, "NumberOfConnectivityIds", of_cells[-1:])
+        write_array(group, "Offsets", of_cells)
+        write_array(group, "Connectivity", np.arange(of_cells[-1], dtype=np.int64))

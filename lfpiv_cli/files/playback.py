@@ -38,24 +38,26 @@ def write_playback(path: Path, tracks: Points, frames: int, dt_s: float, *, over
         write_root(file, PLAYBACK_FORMAT, PLAYBACK_VERSION, tracks.reference, tracks.attributes, tracks.provenance)
         vtk = create_vtk_group(file, "PolyData")
         write_array(vtk, "Points", tracks.position_mm[order], "mm")
-        vtk["NumberOfPoints"] = counts
+        write_array(vtk, "NumberOfPoints", counts)
         for kind in KINDS:
             cells = counts if kind == "Vertices" else np.zeros_like(counts)
             group = vtk.create_group(kind)
-            group["NumberOfCells"] = group["NumberOfConnectivityIds"] = cells
+            write_array(group, "NumberOfCells", cells)
+            write_array(group, "NumberOfConnectivityIds", cells)
             # Each step has offsets of its own, one more than cells.
-            group["Offsets"] = np.concatenate([np.arange(count + 1) for count in cells])
-            group["Connectivity"] = np.concatenate([np.arange(count) for count in cells])
+            write_array(group, "Offsets", np.concatenate([np.arange(count + 1) for count in cells]))
+            write_array(group, "Connectivity", np.concatenate([np.arange(count) for count in cells]))
         data = vtk.create_group("PointData")
         for name in SHOWN:
             write_array(data, name, tracks.arrays[name][order], units[name])
         steps = write_steps(vtk, (dt_s * np.arange(frames)).tolist(), dict.fromkeys(SHOWN, before))
-        steps["PartOffsets"] = np.arange(frames, dtype=np.int64)
-        steps["NumberOfParts"] = np.ones(frames, np.int64)
-        steps["PointOffsets"] = before
+        write_array(steps, "PartOffsets", np.arange(frames, dtype=np.int64))
+        write_array(steps, "NumberOfParts", np.ones(frames, np.int64))
+        write_array(steps, "PointOffsets", before)
         of_kinds = np.zeros((frames, len(KINDS)), np.int64)
         of_kinds[:, 0] = before
-        steps["CellOffsets"] = steps["ConnectivityIdOffsets"] = of_kinds
+        write_array(steps, "CellOffsets", of_kinds)
+        write_array(steps, "ConnectivityIdOffsets", of_kinds)
 
     def check(temporary: Path) -> None:
         with open_h5(temporary) as file:

@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from lfpiv_cli.files.hdf5 import RESERVED, from_attribute, read_provenance, to_attribute, write_header
+from lfpiv_cli.files.hdf5 import RESERVED, from_attribute, read_provenance, to_attribute, write_array, write_header
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.reference import Reference
 
@@ -49,10 +49,10 @@ def write_steps(vtk: h5py.Group, times: Sequence[float], begins: Mapping[str, ND
     """Write the steps of what changes in time, and where the rows of each point array begin in each; return them."""
     steps = vtk.create_group("Steps")
     steps.attrs["NSteps"] = np.int64(len(times))
-    steps["Values"] = np.asarray(times, dtype=np.float64)
+    write_array(steps, "Values", np.asarray(times, dtype=np.float64))
     offsets = steps.create_group("PointDataOffsets")
     for name, of_steps in begins.items():
-        offsets[name] = of_steps
+        write_array(offsets, name, of_steps)
     return steps
 
 

@@ -20,11 +20,11 @@ from lfpiv_cli.errors import InputError
 from lfpiv_cli.files.hdf5 import (
     create,
     ensure_format,
-    member,
     open_h5,
     read_array,
     write_array,
 )
+from lfpiv_cli.files.hdf5_checks import array_member, member
 from lfpiv_cli.files.vtk import Header, create_vtk_group, place_image, read_root, write_root
 from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.grid import Grid
@@ -210,7 +210,7 @@ def read_arrays(path: Path | str) -> tuple[Grid, dict[str, tuple[NDArray[Any], s
         grid, size, found = _read_grid(file), path.stat().st_size, {}
         places = 2 if grid.shape_zyx[0] == 1 else 3
         for name in member(member(file, "VTKHDF"), "PointData"):
-            dataset = member(file, name)
+            dataset = array_member(file, name)
             array = _read_points(file, name, grid, size, components=dataset.ndim > places)
             found[name] = (array, dataset.attrs["units"].decode())
     return grid, found
@@ -244,11 +244,9 @@ def _reads(read: Callable[[Path], object]) -> Callable[[Path], None]:
 def _write_frame(file: h5py.File, grid: Grid, with_component: bool) -> h5py.Group:
     """Write the dimension scales and `/VTKHDF`, return its `PointData`."""
     for axis, name in enumerate("xyz"):
-        scale = file.create_dataset(name, data=grid.axis_mm(axis), track_times=False)
-        scale.attrs["units"] = np.bytes_("mm")
-        scale.make_scale(name)
+        write_array(file, name, grid.axis_mm(axis), "mm").make_scale(name)
     if with_component:
-        file.create_dataset("component", data=np.arange(3), track_times=False).make_scale("component")
+        write_array(file, "component", np.arange(3)).make_scale("component")
     vtk = create_vtk_group(file, "ImageData")
     place_image(vtk, grid)
     return vtk.create_group("PointData")
@@ -287,7 +285,7 @@ def _read_points(file: h5py.File, name: str, grid: Grid, file_bytes: int, compon
     """Read an array of the grid's shape, with the third axis put back on a single plane."""
     shape = grid.shape_zyx + ((3,) if components else ())
     stored = shape[1:] if shape[0] == 1 else shape
-    dataset = member(file, name)
+    dataset = array_member(file, name)
     if dataset.shape != stored:
         raise ValueError(f"{name} has the shape {dataset.shape}, its extent says {stored}")
     return read_array(dataset, file_bytes).reshape(shape)

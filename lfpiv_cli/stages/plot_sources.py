@@ -15,7 +15,8 @@ from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.files import calibration_file, vtkhdf, weights_file
 from lfpiv_cli.files.calibration_file import read_calibration
 from lfpiv_cli.files.config import carried_config
-from lfpiv_cli.files.hdf5 import member, open_h5
+from lfpiv_cli.files.hdf5 import open_h5
+from lfpiv_cli.files.hdf5_checks import member
 from lfpiv_cli.files.images import read_image
 from lfpiv_cli.files.particle_file import (
     PARTICLES_FORMAT,

@@ -1,0 +1,33 @@
+"""Files that are damaged or made to do harm, and how a command ends that is given one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import h5py
+
+from lfpiv_cli.cli import cli
+from lfpiv_cli.cli.outcome import outcome_of
+from lfpiv_cli.files.hdf5_checks import DIGEST, write_digest
+
+
+def ended(*arguments: object) -> tuple[int, str]:
+    """Run a command in this process; return its exit code and what it would say of it."""
+    try:
+        cli.main([str(argument) for argument in arguments], standalone_mode=False)
+    except BaseException as error:
+        message, code = outcome_of(error)
+        return code, message
+    return 0, ""
+
+
+@contextmanager
+def edited(path: Path) -> Iterator[h5py.File]:
+    """Open a file of ours for an edit by somebody who knows of its check sum."""
+    with h5py.File(path, "r+") as file:
+        del file.attrs[DIGEST]
+        yield file
+        with suppress(ValueError, TypeError):  # of what is hostile there is none
+            write_digest(file)

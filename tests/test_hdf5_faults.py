@@ -1,0 +1,158 @@
+"""HDF5 files that are damaged or lead elsewhere, through the command that opens every kind of them."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import yaml
+
+from lfpiv_cli.files.hdf5_checks import DIGEST
+from lfpiv_cli.files.particle_file import (
+    PARTICLES_FORMAT,
+    TRACKS_FORMAT,
+    TRAJECTORIES_FORMAT,
+    UNITS,
+    Points,
+    read_points,
+    write_points,
+)
+from lfpiv_cli.files.vtkhdf import open_vectors, write_vectors, write_volume
+from lfpiv_cli.grid import Grid
+from lfpiv_cli.reference import FOCAL_POINT
+from tests.hostile_files import edited, ended
+from tests.vector_fields import SHAPE, field_of
+
+ROOT = Path(__file__).parent.parent
+# Longer than what HDF5 keeps under a check sum of its own.
+PROVENANCE = {"command": "test", "config": {"numbers": list(range(2000))}}
+KINDS = ("vectors", "volume", "particles", "tracks", "trajectories", "weights")
+
+
+def points(format_name: str, count: int = 9) -> Points:
+    """Return points with made-up quantities."""
+    rng = np.random.default_rng(2)
+    wide = {"covariance_mm2": 6, "velocity": 3, "velocity_sigma": 3, "displacement_mm": 3}
+    whole = {"flag", "particle_a", "particle_b", "track", "frame", "particle"}
+    arrays = {
+        name: np.arange(count) if name in whole else rng.random((count, wide[name]) if name in wide else count)
+        for name in UNITS[format_name]
+    }
+    told = {"dt_s": 0.1, "residual": 0.1, "refraction": "exact", "excluded_pixels": 0, "read_noise_counts": 1.0}
+    return Points(rng.random((count, 3)), arrays, FOCAL_POINT, told | {"particle_diameter_mm": 0.1}, PROVENANCE)
+
+
+def write_kind(path: Path, kind: str) -> None:
+    """Write a small file of a kind."""
+    rng = np.random.default_rng(1)
+    if kind == "vectors":
+        field = field_of(rng.normal(size=(*SHAPE, 3)), None)
+        write_vectors(path, field, FOCAL_POINT, provenance=PROVENANCE, overwrite=False)
+    elif kind == "volume":
+        grid = Grid.centred((4, 3, 2), (0.1, 0.1, 0.1), (0.0, 0.0, 0.0))
+        told = {"residual": np.ones(3), "excluded_pixels": 0, "support_voxels": 24}
+        array = rng.random(grid.shape_zyx)
+        write_volume(path, array, grid, FOCAL_POINT, provenance=PROVENANCE, attributes=told, overwrite=False)
+    elif kind == "weights":
+        config = yaml.safe_load((ROOT / "configs" / "sample.yaml").read_text())
+        config["volume"] |= {"shape_xyz": [3, 2, 2], "reference": "focal_point"}
+        rig = path.with_name("rig.yaml")
+        rig.write_text(yaml.safe_dump(config))
+        assert ended("build-weights", rig, "-o", path) == (0, "")
+    else:
+        names = {"particles": PARTICLES_FORMAT, "tracks": TRACKS_FORMAT, "trajectories": TRAJECTORIES_FORMAT}
+        write_points(path, names[kind], points(names[kind]), overwrite=False)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """The bytes of a small file of each kind."""
+    folder = tmp_path_factory.mktemp("whole")
+    for kind in KINDS:
+        write_kind(folder / kind, kind)
+    return {kind: (folder / kind).read_bytes() for kind in KINDS}
+
+
+@pytest.mark.parametrize("kind", ["vectors", "particles"])
+def test_no_damage_of_a_long_provenance_is_read_as_data(tmp_path: Path, whole: dict[str, bytes], kind: str) -> None:
+    def read() -> object:
+        found = open_vectors(path) if kind == "vectors" else read_points(path, PARTICLES_FORMAT).provenance
+        return found if kind == "particles" else found.flag.tolist()
+
+    path = tmp_path / "file"
+    at = whole[kind].index(b"1000, 1001")
+    path.write_bytes(whole[kind][:at] + b"1009" + whole[kind][at + 4 :])
+    code, said = ended("info", path)
+    assert code == 4
+    assert "attributes" in said
+
+
+def test_files_from_before_the_check_sum_are_read(tmp_path: Path, whole: dict[str, bytes]) -> None:
+    for kind in KINDS:
+        path = tmp_path / kind
+        path.write_bytes(whole[kind])
+        with h5py.File(path, "r+") as file:
+            del file.attrs[DIGEST]
+        assert ended("info", path) == (0, "")
+
+
+def test_every_array_has_a_check_sum(tmp_path: Path, whole: dict[str, bytes]) -> None:
+    def ensure(name: str, item: h5py.Dataset | h5py.Group) -> None:
+        assert not isinstance(item, h5py.Dataset) or item.fletcher32 or not item.size, name
+
+    for kind in KINDS:
+        (tmp_path / kind).write_bytes(whole[kind])
+        with h5py.File(tmp_path / kind) as file:
+            file.visititems(ensure)
+
+
+def virtual(file: h5py.File, other: Path) -> None:
+    """Add an array whose shape is that of another file's."""
+    layout = h5py.VirtualLayout((4, 24), "f8", maxshape=(None, 24))
+    unlimited = h5py.VirtualSource(str(other), "array", (4, 24), maxshape=(None, 24))
+    layout[: h5py.h5s.UNLIMITED, :] = unlimited[: h5py.h5s.UNLIMITED, :]
+    file.create_virtual_dataset("extra", layout)
+
+
+HOSTILE: dict[str, Callable[[h5py.File, Path], object]] = {
+    "external storage": lambda file, other: file.create_dataset(
+        "extra", (3,), "f8", external=[(str(other), 0, h5py.h5f.UNLIMITED)]
+    ),
+    "virtual": virtual,
+    "external link": lambda file, other: file.__setitem__("extra", h5py.ExternalLink(str(other), "/array")),
+    "soft link": lambda file, other: file.__setitem__("extra", h5py.SoftLink("/none")),
+    "strings": lambda file, other: file.create_dataset("extra", (3,), h5py.string_dtype()),
+    "compound": lambda file, other: file.create_dataset("extra", (3,), [("a", "f8"), ("b", "i4")]),
+    "complex": lambda file, other: file.create_dataset("extra", data=np.array([1j])),
+    "a type": lambda file, other: file.__setitem__("extra", np.dtype("f8")),
+    "never written": lambda file, other: file.create_dataset("extra", (10**9,), "f8"),
+    "chunks of a gigabyte": lambda file, other: file.create_dataset(
+        "extra", (2**30,), "u1", chunks=(2**30,), compression="gzip"
+    ),
+    "strings as attribute": lambda file, other: file.attrs.__setitem__("extra", "text"),
+    "compound as attribute": lambda file, other: file.attrs.__setitem__("extra", np.zeros(2, [("a", "f8")])),
+    "many groups": lambda file, other: [file.create_group(f"extra/{number}") for number in range(10_001)],
+    "a record that is a list": lambda file, other: file.attrs.__setitem__("provenance", np.bytes_(b"[1]")),
+    "inputs that are a list": lambda file, other: file.attrs.__setitem__(
+        "provenance", np.bytes_(b'{"inputs": [1], "config": [2], "warnings": 3, "made_from": "x", "command": {}}')
+    ),
+}
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no named pipes in folders")
+@pytest.mark.parametrize("harm", HOSTILE)
+@pytest.mark.parametrize("kind", ["vectors", "tracks", "weights"])
+def test_what_no_file_of_ours_has_is_refused(tmp_path: Path, whole: dict[str, bytes], kind: str, harm: str) -> None:
+    path, other = tmp_path / "file", tmp_path / "other"
+    path.write_bytes(whole[kind])
+    with edited(path) as file:
+        HOSTILE[harm](file, other)
+    os.mkfifo(other)  # whoever opens it waits for ever
+    code, said = ended("info", path)
+    assert code == 4
+    assert "file: " in said
