@@ -1,0 +1,312 @@
+"""Which frames of a batch belong together: by their names, and never across one that is missing."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import PurePath
+
+from lfpiv_cli.errors import InputError, UsageError
+from lfpiv_cli.files.frame_names import Place, places_by, places_of
+from lfpiv_cli.names import Pairing
+from lfpiv_cli.notice import Notice
+
+REMEDY = "say how names tell it with --pair-by, or leave such frames out with --keep-going"
+NO_PLACE = "its name has neither a number nor a letter that says where it belongs"
+# Numbers in a sequence may be times, which are not quite even: beyond so many steps a frame is missing.
+MOST_STEPS = 1.5
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """A frame that belongs with no other, and why."""
+
+    name: str
+    why: str
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """The frames that belong together.
+
+    Attributes
+    ----------
+    pairs : numbers of the frames of each pair, the earlier first
+    left_out : frames that should have a partner and have none, and gaps in sequences
+    notices : what was taken for granted
+    """
+
+    pairs: tuple[tuple[int, int], ...]
+    left_out: tuple[LeftOut, ...] = ()
+    notices: tuple[Notice, ...] = ()
+
+    def beside(self, count: int) -> list[tuple[int, ...]]:
+        """Return for each of `count` frames the numbers of those that it is paired with."""
+        found: list[list[int]] = [[] for _ in range(count)]
+        for first, second in self.pairs:
+            found[first].append(second)
+            found[second].append(first)
+        return [tuple(sorted(numbers)) for numbers in found]
+
+    def settled(self, keep_going: bool) -> list[Notice]:
+        """Return what is to be said of the pairs, where they can be taken.
+
+        Raises
+        ------
+        InputError : a frame has no partner, or one is missing in a sequence, and `keep_going` is false; or no two
+            belong together
+        """
+        if self.left_out and not (keep_going and self.pairs):
+            first, *others = self.left_out
+            more = f", and {len(others)} more" if others else ""
+            raise InputError(f"{first.name}: {first.why}{more}; {REMEDY}")
+        skipped = [Notice("frame-unpaired", each.name, each.why, REMEDY) for each in self.left_out]
+        return [*self.notices, *skipped]
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What is known of a frame.
+
+    Attributes
+    ----------
+    name : what it is called in messages
+    stem : of the file that the camera wrote, where that is known, else of its own
+    path : of its own file, without suffix
+    page : in a file of several, counted from 0; None where a file is one frame
+    image : what is the same only for the same image; None where it is not known
+    """
+
+    name: str
+    stem: str
+    path: str
+    page: int | None = None
+    image: str | None = None
+
+
+@dataclass
+class _Found:
+    """Pairs as they are found."""
+
+    names: Sequence[str]
+    pairs: list[tuple[int, int]] = field(default_factory=list)
+    left_out: list[LeftOut] = field(default_factory=list)
+    notices: list[Notice] = field(default_factory=list)
+
+    def leave_out(self, numbers: Iterable[int], why: str) -> None:
+        self.left_out += [LeftOut(self.names[number], why) for number in numbers]
+
+    def told(self) -> Pairs:
+        return Pairs(tuple(self.pairs), tuple(self.left_out), tuple(self.notices))
+
+
+def pair_names(names: Sequence[str], how: Pairing, by: str | None = None) -> Pairs:
+    """Return which of the frames with these names belong together.
+
+    Parameters
+    ----------
+    names : of files, without suffix, with folders or without
+    how : `ab` for separate pairs, `sequence` for each frame with the next
+    by : how names tell it, as `img_{pair}_{frame}`, see `places_by`; None: as cameras usually name frames
+
+    Raises
+    ------
+    UsageError : there is only one name, or `by` is no such template
+    """
+    return pair_frames([Seen(name, PurePath(name).name, PurePath(name).as_posix()) for name in names], how, by)
+
+
+def pair_frames(frames: Sequence[Seen], how: Pairing, by: str | None = None) -> Pairs:
+    """Return which frames belong together, see `pair_names`; pages of one file belong together by their numbers."""
+    if len(frames) < 2:
+        raise UsageError(f"--pairing {how}: needs two or more frames, got {len(frames)}")
+    found = _Found([frame.name for frame in frames])
+    once = _without_repeated(frames, found)
+    places = _places([frames[number] for number in once], how, by)
+    if all(place is None for place in places) and by is None and len(once) == len(frames):
+        return _by_order(frames, how)
+    placed = {number: place for number, place in zip(once, places, strict=True) if place is not None}
+    missed = NO_PLACE if by is None else f"its name is not of the form {by}"
+    found.leave_out((number for number in once if number not in placed), missed)
+    if how == "ab":
+        _pair(placed, found)
+    else:
+        _follow(placed, found)
+    return found.told()
+
+
+def in_order(frames: Sequence[Seen]) -> tuple[list[int], list[Notice]]:
+    """Return the frames of one sequence in the order of time, and what is to be said of it.
+
+    That is the order of their numbers, where all have one and no two the same; else the order in which they are given.
+    """
+    given = list(range(len(frames)))
+    places = _places(frames, "sequence", None)
+    known = {number: place for number, place in enumerate(places) if place is not None}
+    at = {(place.series, _position(place)) for place in known.values()}
+    if len({place.series for place in known.values()}) > 1 or not len(at) == len(known) == len(frames):
+        return given, []
+    order = sorted(given, key=lambda number: _position(known[number]))
+    found = _Found([frame.name for frame in frames])
+    _follow(known, found)
+    notices = [
+        Notice("frames-missing", each.name, each.why, "tracks end or go on across the gap; leave out what is before it")
+        for each in found.left_out
+    ]
+    if order != given:
+        wrong = next(after for before, after in pairwise(given) if _position(known[after]) < _position(known[before]))
+        text = f"is given behind {frames[wrong - 1].name}, and its number is before; numbers say what is first"
+        notices.append(Notice("frames-reordered", frames[wrong].name, text, "give frames in the order of time"))
+    return order, [*found.notices, *notices]
+
+
+def _places(frames: Sequence[Seen], how: Pairing, by: str | None) -> list[Place | None]:
+    """Return where each frame belongs."""
+    if by is not None:
+        return places_by(by, [frame.path for frame in frames])
+    places = places_of([frame.stem for frame in frames], how)
+    return [
+        place if frame.page is None else Place(f"pages of {frame.stem}", frame.page, begins=0)
+        for frame, place in zip(frames, places, strict=True)
+    ]
+
+
+def _without_repeated(frames: Sequence[Seen], found: _Found) -> list[int]:
+    """Return the numbers of the frames, of each image the first only."""
+    first: dict[str, int] = {}
+    kept = []
+    for number, frame in enumerate(frames):
+        earlier = number if frame.image is None else first.setdefault(frame.image, number)
+        if earlier == number:
+            kept.append(number)
+        else:
+            found.leave_out([number], f"shows the same image as {frames[earlier].name}")
+    return kept
+
+
+def _by_order(frames: Sequence[Seen], how: Pairing) -> Pairs:
+    """Return the pairs where names tell nothing: as they were given."""
+    count, step = len(frames), 2 if how == "ab" else 1
+    pairs = tuple((k, k + 1) for k in range(0, count - 1, step))
+    if count == 2:
+        return Pairs(pairs)
+    notice = Notice(
+        "paired-by-order",
+        frames[0].name,
+        f"the names of {count} frames have no numbers, and only the order in which they are given pairs them",
+        "number them, so that a missing one is seen",
+    )
+    alone = (LeftOut(frames[-1].name, "no frame comes after it"),) if how == "ab" and count % 2 else ()
+    return Pairs(pairs, alone, (notice,))
+
+
+def _pair(places: Mapping[int, Place], found: _Found) -> None:
+    """Find separate pairs."""
+    numbered = _by_series({number: place for number, place in places.items() if place.frame is None})
+    slots: dict[tuple[str, int], dict[int, list[int]]] = defaultdict(lambda: {0: [], 1: []})
+    for number, place in places.items():
+        if place.frame is not None:
+            slots[place.series, place.number][place.frame].append(number)
+    open_ones = [series for series, members in numbered.items() if places[members[0]].begins is None]
+    for series, members in numbered.items():
+        begins = places[members[0]].begins
+        if begins is None and len(open_ones) > 1:
+            found.leave_out(members, _several(open_ones))
+            continue
+        begins = _beginning([places[k].number for k in members]) if begins is None else begins
+        if begins is None:
+            found.leave_out(members, _unknown_beginning([places[k].number for k in members]))
+            continue
+        if begins > 1 and series in open_ones:
+            found.notices.append(_assumed(found.names[members[0]], found.names[members[1]]))
+        for k in members:
+            pair, frame = divmod(places[k].number - begins, 2)
+            slots[series, pair][frame].append(k)
+    for _, slot in sorted(slots.items()):
+        _take(slot[0], slot[1], found)
+
+
+def _take(first: Sequence[int], second: Sequence[int], found: _Found) -> None:
+    """Take a pair, or say which frame of it is missing or there twice."""
+    if len(first) == len(second) == 1:
+        found.pairs.append((first[0], second[0]))
+    elif len(first) > 1 or len(second) > 1:
+        names = " and ".join(found.names[k] for k in (first if len(first) > 1 else second))
+        found.leave_out((*first, *second), f"of its pair one frame is there twice: {names}")
+    else:
+        found.leave_out((*first, *second), f"the {'second' if first else 'first'} frame of its pair is missing")
+
+
+def _by_series(places: Mapping[int, Place]) -> dict[str, list[int]]:
+    """Return the frames of each series in the order of their numbers."""
+    found: dict[str, list[int]] = defaultdict(list)
+    for number in sorted(places, key=lambda k: (places[k].series, _position(places[k]))):
+        found[places[number].series].append(number)
+    return found
+
+
+def _position(place: Place) -> int:
+    """Return where a frame is in its series."""
+    return place.number if place.frame is None else 2 * place.number + place.frame
+
+
+def _beginning(numbers: Sequence[int]) -> int | None:
+    """Return where running numbers begin that are those of whole pairs; None where a lost frame leaves it open.
+
+    Frames count from 0 or from 1. With 0 there, it is known; without it, 0 may be what is missing, and where any number
+    is missing all others might stand in the wrong halves of pairs.
+    """
+    if numbers[0] == 0:
+        return 0
+    whole = len(numbers) % 2 == 0 and list(numbers) == list(range(numbers[0], numbers[0] + len(numbers)))
+    return numbers[0] if whole else None
+
+
+def _unknown_beginning(numbers: Sequence[int]) -> str:
+    missing = next((before + 1 for before, after in pairwise(numbers) if after > before + 1), None)
+    lost = "not all make pairs" if missing is None else f"{missing} is missing"
+    return (
+        f"of the running numbers {numbers[0]} to {numbers[-1]} {lost}, so it is open whether even or odd ones begin "
+        f"pairs (--pair-by with {{number}} for even, {{number:1}} for odd)"
+    )
+
+
+def _several(series: Sequence[str]) -> str:
+    names = ", ".join(series[:3])
+    return f"running numbers are of {len(series)} series ({names}), so it is open what is first and second of a pair"
+
+
+def _assumed(first: str, second: str) -> Notice:
+    text = f"its number is taken to begin a pair, with {second} as the second frame, as no earlier frame is there"
+    return Notice("pair-assumed", first, text, "say it with --pair-by if that is wrong")
+
+
+def _follow(places: Mapping[int, Place], found: _Found) -> None:
+    """Find pairs of each frame with the next."""
+    for members in _by_series(places).values():
+        at: dict[int, list[int]] = defaultdict(list)
+        for number in members:
+            at[_position(places[number])].append(number)
+        for twice in (numbers for numbers in at.values() if len(numbers) > 1):
+            names = " and ".join(found.names[k] for k in twice)
+            found.leave_out(twice, f"the same frame is there twice: {names}")
+        once = [(position, numbers[0]) for position, numbers in at.items() if len(numbers) == 1]
+        _neighbours(once, found)
+
+
+def _neighbours(frames: Sequence[tuple[int, int]], found: _Found) -> None:
+    """Pair each frame with the next, none across a gap."""
+    if len(frames) == 1:
+        found.leave_out([frames[0][1]], "no frame comes before or after it")
+    step = min((after[0] - before[0] for before, after in pairwise(frames)), default=1)
+    for (position, number), (following, after) in pairwise(frames):
+        if following - position <= MOST_STEPS * step:
+            found.pairs.append((number, after))
+        else:
+            found.leave_out([after], f"frames are missing between {found.names[number]} and it")
+    if step > 1:
+        text = f"numbers go up by {step}; each frame is taken with the next that is there"
+        remedy = "where frames are missing between them, set dt_s to the time between those that are there"
+        found.notices.append(Notice("numbers-apart", found.names[frames[0][1]], text, remedy, float(step), "1"))
