@@ -32,9 +32,13 @@ class InputError(LfpivError):
 
 
 class PartialError(LfpivError):
-    """Some frames of a batch failed; the others were written."""
+    """Some frames of a batch failed; the others were written, and `figures` are what is told of all of them."""
 
     exit_code = 5
+
+    def __init__(self, message: str, figures: dict[str, Any] | None = None) -> None:
+        super().__init__(message)
+        self.figures = figures or {}
 
 
 class OutputExistsError(LfpivError):

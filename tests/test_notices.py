@@ -31,6 +31,7 @@ from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.files.batch import Target, pending
 from lfpiv_cli.files.calibration_file import read_calibration
 from lfpiv_cli.files.config import Config, load_config
+from lfpiv_cli.files.hdf5 import write_tree
 from lfpiv_cli.files.images import write_tiff
 from lfpiv_cli.files.particle_file import Points
 from lfpiv_cli.files.provenance import earlier_record, with_warnings
@@ -128,12 +129,12 @@ def test_a_warning_is_on_the_terminal_in_json_and_in_the_file(tmp_path: Path, ca
 
 
 def test_a_result_that_was_warned_of_is_not_made_again(tmp_path: Path) -> None:
-    target = Target(tmp_path / "a.vtkhdf", {"command": "track"})
-    target.path.touch()
+    target = Target(tmp_path / "a.vtkhdf", lambda: {"command": "track"})
     made = with_warnings(target.record, [NOTICE])
     assert made["warnings"] == [NOTICE.record()]
     assert with_warnings(target.record, []) == target.record
-    assert pending([target], [], False, True, lambda path: made) == []
+    write_tree(target.path, {}, format_name="lfpiv-tracks", format_version=1, provenance=made, overwrite=False)
+    assert pending([target], [], False, True) == []
 
 
 def test_a_console_collects_what_it_warns_of(capsys) -> None:

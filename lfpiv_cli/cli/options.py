@@ -11,7 +11,7 @@ import click
 
 from lfpiv_cli import __version__
 from lfpiv_cli.cli.outcome import error_record, print_json
-from lfpiv_cli.errors import LimitMissedError
+from lfpiv_cli.errors import LimitMissedError, PartialError
 from lfpiv_cli.names import Pairing, names_in
 
 FILE = click.Path(path_type=Path)
@@ -53,6 +53,13 @@ resume_option = click.option(
 )
 
 
+def batch_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Give a command the options of all batches."""
+    keep_going = click.option("--keep-going", is_flag=True, help="Go on with the next one when an input fails; exit 5.")
+    failures = click.option("--failures", type=FILE, help="File to list what failed in, with the reason (JSON).")
+    return resume_option(keep_going(failures(command)))
+
+
 def output_option(text: str, required: bool = True) -> Callable[..., Any]:
     """Return the option -o of a command, with what it writes."""
     return click.option("-o", "--output", type=FILE, required=required, help=text)
@@ -90,23 +97,23 @@ def common_options(command: Callable[..., dict[str, Any]]) -> Callable[..., None
 
             use_threads(threads)
         console.event("start", version=__version__)
-        missed: LimitMissedError | None = None
+        ended_with: LimitMissedError | PartialError | None = None
         try:
             given = {name: value for name, value in arguments.items() if value is not None}
             summary = command(console=console, **given)
-        except LimitMissedError as error:
-            missed, summary = error, error.figures
+        except (LimitMissedError, PartialError) as error:
+            ended_with, summary = error, error.figures
         except BaseException as error:
             console.event("error", **error_record(error))
             raise
-        ended = error_record(missed) if missed else {"exit_code": 0}
+        ended = error_record(ended_with) if ended_with else {"exit_code": 0}
         console.event("end", summary=summary, **ended)
         if as_json:
             warnings = [notice.record() for notice in warned]
-            print_json(summary | {"warnings": warnings} | (ended if missed else {}))
+            print_json(summary | {"warnings": warnings} | (ended if ended_with else {}))
         else:
             console.summary(summary)
-        if missed:
-            raise missed
+        if ended_with:
+            raise ended_with
 
     return run

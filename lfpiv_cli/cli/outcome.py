@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from lfpiv_cli.errors import LfpivError, LimitMissedError
+from lfpiv_cli.errors import LfpivError, LimitMissedError, PartialError
 
 EXIT_BUG = 1
 EXIT_INTERRUPTED = 130
@@ -37,8 +37,8 @@ def print_json(figures: dict[str, Any]) -> None:
 
 
 def print_json_error(error: BaseException) -> None:
-    """Print an error as the JSON object of a command; a missed limit stands in that of the figures already."""
-    if not isinstance(error, LimitMissedError):
+    """Print an error as the JSON object of a command; one that came with figures stands in theirs already."""
+    if not isinstance(error, (LimitMissedError, PartialError)):
         print_json(error_record(error))
 
 

@@ -10,12 +10,12 @@ import click
 from lfpiv_cli.cli.options import (
     FILE,
     background_option,
+    batch_options,
     common_options,
     dark_option,
     mask_option,
     output_option,
     pairing_option,
-    resume_option,
 )
 from lfpiv_cli.console import Console
 from lfpiv_cli.names import Start, names_in
@@ -44,8 +44,7 @@ from lfpiv_cli.reconstruction.registry import SOLVER_NAMES
     help="Of particles, also write what they leave of each image, as OUTPUT's name with _residual.tif; written when "
     "not given.",
 )
-@resume_option
-@click.option("--keep-going", is_flag=True, help="Go on with the next frame when one fails.")
+@batch_options
 @output_option("File for one image, folder for several.")
 @common_options
 def reconstruct(

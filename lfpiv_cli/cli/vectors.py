@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from lfpiv_cli.cli.options import FILE, common_options, dt_option, output_option, pairing_option, resume_option
+from lfpiv_cli.cli.options import FILE, batch_options, common_options, dt_option, output_option, pairing_option
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import UsageError
 
@@ -38,7 +38,7 @@ def _window(text: str) -> int | tuple[int, ...]:
 @click.option("--ensemble", is_flag=True, help="One field of all pairs together, for a flow that does not change.")
 @click.option("--derived", is_flag=True, help="Also write vorticity, divergence, strain rate and Q criterion.")
 @click.option("--mean", type=FILE, help="File of the pairs' mean and fluctuations to write (.vtkhdf).")
-@resume_option
+@batch_options
 @output_option("File for one pair, folder for several.")
 @common_options
 def correlate(

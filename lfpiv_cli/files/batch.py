@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from enum import Enum, auto
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,8 @@ from lfpiv_cli.errors import InputError, OutputExistsError, UsageError
 from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.hdf5 import replace_provenance
 from lfpiv_cli.files.images import count_pages
-from lfpiv_cli.files.provenance import bear_alike, carried_record, without_warnings
+from lfpiv_cli.files.provenance import bear_alike, without_warnings
+from lfpiv_cli.files.whole import read_whole
 from lfpiv_cli.names import Pairing
 
 VTKHDF_SUFFIX = ".vtkhdf"
@@ -19,11 +21,12 @@ VTKHDF_SUFFIX = ".vtkhdf"
 
 @dataclass(frozen=True)
 class Frame:
-    """One image of a batch: page `page` of the `pages` of a file."""
+    """One image of a batch: page `page` of the `pages` of a file, or a file that cannot be read, for its `fault`."""
 
     path: Path
     page: int
     pages: int
+    fault: str | None = None
 
     @property
     def stem(self) -> str:
@@ -33,17 +36,56 @@ class Frame:
 
 @dataclass(frozen=True)
 class Target:
-    """One output of a batch: where it goes and the provenance record it will carry."""
+    """One output of a batch: where it goes, and what makes the provenance record that it will carry.
+
+    Thousands of records are not held in memory: each is made when it is asked for, which reads its inputs.
+    """
 
     path: Path
-    record: Mapping[str, Any]
+    make_record: Callable[[], Mapping[str, Any]]
+
+    @property
+    def record(self) -> Mapping[str, Any]:
+        """The record, made anew.
+
+        Raises
+        ------
+        InputError : an input cannot be read
+        """
+        return self.make_record()
 
 
-def frames_of(paths: Iterable[Path]) -> list[Frame]:
-    """Return the frames of image files in order, every page of a sequence."""
+class State(Enum):
+    """What is there in a target's place.
+
+    Nothing, the very result, one that differs in nothing that it depends on, a broken file, or something else.
+    """
+
+    MISSING = auto()
+    COMPLETE = auto()
+    BEARS_ALIKE = auto()
+    BROKEN = auto()
+    OTHER = auto()
+
+
+def frames_of(paths: Iterable[Path], keep_going: bool = False) -> list[Frame]:
+    """Return the frames of image files in order, every page of a sequence.
+
+    With `keep_going` a file that cannot be read stands for one frame, with its fault.
+
+    Raises
+    ------
+    InputError : a file cannot be read
+    """
     frames = []
     for path in paths:
-        pages = count_pages(path)
+        try:
+            pages = count_pages(path)
+        except InputError as error:
+            if not keep_going:
+                raise
+            frames.append(Frame(path, 0, 1, str(error)))
+            continue
         frames += [Frame(path, page, pages) for page in range(pages)]
     return frames
 
@@ -77,36 +119,40 @@ def prepare_folder(paths: Sequence[Path]) -> None:
         folder.mkdir(exist_ok=True)
 
 
-def pending(
-    targets: Sequence[Target],
-    inputs: Iterable[Path],
-    overwrite: bool,
-    resume: bool,
-    read_record: Callable[[Path], Mapping[str, Any]],
-) -> list[int]:
+def state_of(target: Target) -> State:
+    """Return what is there in a target's place; what is called complete has been read back, all of it.
+
+    Raises
+    ------
+    InputError : an input of the target cannot be read
+    """
+    if not target.path.exists():
+        return State.MISSING
+    try:
+        carried = read_whole(target.path)
+    except InputError:
+        return State.BROKEN
+    made = target.record
+    if carried is None:
+        return State.OTHER
+    if without_warnings(carried) == made:
+        return State.COMPLETE
+    return State.BEARS_ALIKE if bear_alike(carried, made) else State.OTHER
+
+
+def pending(targets: Sequence[Target], inputs: Iterable[Path], overwrite: bool, resume: bool) -> list[int]:
     """Return the numbers of the targets that have to be made.
 
-    With `resume`, a target that is complete and carries the very record that it would get is left as it is; with
-    `overwrite` besides, one whose record differs in nothing that it depends on gets the new record, and keeps its data.
+    With `resume`, a target that is complete and carries the very record that it would get is left as it is, and a
+    broken one is made anew; with `overwrite` besides, one whose record differs in nothing that it depends on gets the
+    new record, and keeps its data.
 
     Raises
     ------
     OutputExistsError : a target is there and neither `overwrite` nor a matching `resume` covers it.
     """
     inputs = list(inputs)
-    needed = []
-    for number, target in enumerate(targets):
-        if resume and target.path.exists() and _made_alike(target, read_record):
-            continue
-        if resume and overwrite and target.path.exists() and _recorded_anew(target, read_record):
-            continue
-        if resume and target.path.exists() and not overwrite:
-            raise OutputExistsError(
-                f"{target.path}: exists and was made from other inputs or settings; --overwrite makes it anew"
-            )
-        ensure_writable(target.path, overwrite, inputs)
-        needed.append(number)
-    return needed
+    return [number for number, target in enumerate(targets) if not _is_kept(target, inputs, overwrite, resume)]
 
 
 def is_kept(
@@ -118,27 +164,38 @@ def is_kept(
     ------
     OutputExistsError : as `pending`
     """
-    return not pending([Target(path, made) for path in paths], inputs, overwrite, resume, carried_record)
+    return not pending([Target(path, lambda: made) for path in paths], inputs, overwrite, resume)
 
 
-def _recorded_anew(target: Target, read_record: Callable[[Path], Mapping[str, Any]]) -> bool:
-    """Give a target its new record, if the old one differs in nothing that it depends on; return whether it does."""
+def _is_kept(target: Target, inputs: Sequence[Path], overwrite: bool, resume: bool) -> bool:
+    """Return whether a target is left as it is, after it is known that it could be written if not."""
+    found = _state_or_none(target) if resume else None
+    if found is State.COMPLETE:
+        return True
+    if found is State.BEARS_ALIKE and overwrite:
+        _record_anew(target)
+        return True
+    if found in (State.BEARS_ALIKE, State.OTHER) and not overwrite:
+        raise OutputExistsError(
+            f"{target.path}: exists and was made from other inputs or settings; --overwrite makes it anew"
+        )
+    ensure_writable(target.path, overwrite or resume, inputs)
+    return False
+
+
+def _state_or_none(target: Target) -> State | None:
+    """Return what is there in a target's place, None where its inputs cannot be read: that is told when it is made."""
     try:
-        old = read_record(target.path)
+        return state_of(target)
     except InputError:
-        return False
-    if not bear_alike(old, target.record):
-        return False
+        return None
+
+
+def _record_anew(target: Target) -> None:
+    """Give a target its new record, and let it keep its data and what was warned of."""
+    old = read_whole(target.path) or {}
     warnings = {name: old[name] for name in ("warnings",) if name in old}
     replace_provenance(target.path, dict(target.record) | warnings)
-    return True
-
-
-def _made_alike(target: Target, read_record: Callable[[Path], Mapping[str, Any]]) -> bool:
-    try:
-        return without_warnings(read_record(target.path)) == target.record
-    except InputError:
-        return False
 
 
 def frames_beside(count: int, pairing: Pairing) -> list[tuple[int, ...]]:

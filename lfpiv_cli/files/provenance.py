@@ -136,7 +136,10 @@ def _sha256(path: Path, size: int, modified_ns: int) -> str:
 
 def bear_alike(first: Mapping[str, Any], second: Mapping[str, Any]) -> bool:
     """Return whether two records are of the same result: alike but for settings that it does not depend on."""
-    return _bearing(first, first["made_from"]) == _bearing(second, second["made_from"])
+    try:
+        return _bearing(first, first["made_from"]) == _bearing(second, second["made_from"])
+    except (KeyError, AttributeError, TypeError):  # one of them is no record of a result
+        return False
 
 
 def _bearing(made: Mapping[str, Any], earlier: Mapping[str, Any]) -> dict[str, Any]:

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.calibration.transmission import vignetting_surface
 from lfpiv_cli.errors import InputError
-from lfpiv_cli.files.hdf5 import read_tree, write_tree
+from lfpiv_cli.files.hdf5 import ensure_format, open_h5, read_provenance, read_tree, write_tree
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import Refraction, TracedMethod, names_in
 from lfpiv_cli.optics.camera import Camera
@@ -177,6 +177,18 @@ def open_weights(path: Path | str) -> WeightsFile:
         raise InputError(f"{path}: not a whole weights file: {error}") from error
     weights = Weights(grid, padding, operator, camera.column_axis, calibration, bend)
     return WeightsFile(weights, camera, reference, provenance, vignetting).behind_vignetting()
+
+
+def read_weights_record(path: Path) -> dict[str, Any]:
+    """Return the record that a weights file carries; the weights themselves are not read.
+
+    Raises
+    ------
+    InputError : as `open_weights`
+    """
+    with open_h5(path) as file:
+        ensure_format(path, file, FORMAT, READABLE_VERSIONS)
+        return read_provenance(file)
 
 
 def _operator_tree(operator: WeightsOperator) -> dict[str, Any]:

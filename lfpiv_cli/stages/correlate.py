@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from lfpiv_cli.console import CONSOLE, Console, Frames
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.files.atomic import ensure_writable
-from lfpiv_cli.files.batch import Target, output_paths, pending, prepare_folder
+from lfpiv_cli.files.batch import Target, output_paths
 from lfpiv_cli.files.config import Config, carried_config, load_config
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.provenance import record, with_warnings
@@ -26,6 +27,7 @@ from lfpiv_cli.flow.locking import with_locking
 from lfpiv_cli.flow.statistics import statistics_of
 from lfpiv_cli.interface.vectors import ensure_alike, scale_of, usable_voxels
 from lfpiv_cli.interface.vectors_checks import (
+    Quality,
     calibration_notices,
     field_notices,
     pair_notices,
@@ -36,6 +38,7 @@ from lfpiv_cli.interface.vectors_checks import (
 from lfpiv_cli.names import Pairing
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.reference import Reference
+from lfpiv_cli.stages.batches import BatchOptions, Worked, work_through
 
 Extra = dict[str, tuple[NDArray[Any], str]]
 
@@ -59,7 +62,7 @@ class Job:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CorrelateOptions:
+class CorrelateOptions(BatchOptions):
     """What `correlate` is given besides the volumes.
 
     Attributes
@@ -71,7 +74,6 @@ class CorrelateOptions:
     ensemble : one field of all pairs together
     derived : vorticity, divergence, strain rate and Q criterion, too
     mean : file of the pairs' mean and fluctuations, to write
-    resume : skip what is complete and made from the same inputs
     """
 
     config: Path | None = None
@@ -83,7 +85,6 @@ class CorrelateOptions:
     ensemble: bool = False
     derived: bool = False
     mean: Path | None = None
-    resume: bool = False
 
 
 NO_OPTIONS = CorrelateOptions()
@@ -98,59 +99,110 @@ def correlate(
     console: Console = CONSOLE,
 ) -> dict[str, Any]:
     """Measure the displacements between pairs of volumes."""
-    mean, derived = options.mean, options.derived
-    pairs = _pairs(volumes, options.pairing)
-    if mean is not None and (options.ensemble or len(pairs) < 2):
-        raise UsageError("--mean needs several pairs, each correlated by itself")
-    together = [pairs] if options.ensemble else [[pair] for pair in pairs]
-    paths = output_paths(output, [group[0][0].stem for group in together])
-    prepare_folder(paths)
-    told = load_config(options.config) if options.config else None
-    jobs = []
-    for group in together:
-        first = group[0][0]
-        settings = told or carried_config(vtkhdf.read_header(first).provenance, first)
-        jobs.append(Job(group, settings.overridden_by("correlation", options)))
-    common = given(config=options.config, mask=options.mask_volume)
-    command = " ".join(["correlate", *["ensemble"] * options.ensemble, *["derived"] * derived])
-    targets = [
-        Target(path, record(command, job.settings.resolved(), common | job.inputs()))
-        for path, job in zip(paths, jobs, strict=True)
-    ]
-    if mean is not None:
-        ensure_writable(mean, overwrite, [*volumes, *common.values()])
-    divergence, qualities, rejected = [], [], 0
-    needed = pending(targets, [*volumes, *common.values()], overwrite, options.resume, vtkhdf.read_record)
-    with console.frames(len(needed), 1.0, "correlate", "pair" if not options.ensemble else "field") as work:
-        for number in needed:
-            field, reference, notices = _measure(jobs[number], options.mask_volume, work)
-            quality = quality_of(field)
-            name = targets[number].path.name
-            notices += [*field_notices(quality, name), *pair_notices(field, quality, name)]
-            console.warn(notices)
-            told_more = derived_fields(field) if derived else None
-            vtkhdf.write_vectors(
-                targets[number].path,
-                field,
-                reference,
-                provenance=with_warnings(targets[number].record, notices),
-                overwrite=overwrite,
-                extra=_arrays_of(told_more) if told_more else None,
-            )
-            qualities.append(quality)
-            rejected += int(np.count_nonzero(field.flag >= REJECTED))
-            if told_more and told_more.divergence_rms is not None:
-                divergence.append(told_more.divergence_rms)
-            work.done(targets[number].path.stem)
+    batch = Correlation(volumes, output, options, overwrite)
+    if options.mean is not None:
+        ensure_writable(options.mean, overwrite or options.resume, batch.inputs)
+    worked = work_through(batch, options, console)
+    fields = batch.fields(worked)
+    if options.mean is not None and fields:
+        mean = Mean(options.mean, fields, batch.settings.resolved(), options.derived, overwrite)
+        # What another worker made of the same fields in the meantime is as good.
+        work_through(mean, replace(options, resume=True, failures=None), console)
+    return worked.ensure_whole(batch.summary(worked), batch.unit)
 
-    found = quality_of_all(qualities)
-    summary: dict[str, Any] = {"pairs": len(pairs), "vectors": found.vectors, "rejected": rejected}
-    summary |= found.summary()
-    if divergence:
-        summary["divergence_rms_per_s"] = float(np.mean(divergence))
-    if mean is not None:
-        _write_mean(mean, paths, jobs[0].settings, derived, overwrite)
-    return summary
+
+@dataclass(frozen=True)
+class Outcome:
+    """What is told of a field: how good it is, how many vectors are rejected, and the divergence where it is asked."""
+
+    quality: Quality
+    rejected: int
+    divergence_rms: float | None = None
+
+
+class Correlation:
+    """The batch of `correlate`: a field of vectors for each pair of volumes, or one of all pairs together."""
+
+    label = "correlate"
+
+    def __init__(self, volumes: Sequence[Path], output: Path, options: CorrelateOptions, overwrite: bool) -> None:
+        """Take the arguments of `correlate`; see which pairs there are, and read no volume.
+
+        Raises
+        ------
+        LfpivError : volumes or outputs do not go together, or the config is wrong
+        """
+        self._options, self.overwrite = options, overwrite
+        self.unit = "field" if options.ensemble else "pair"
+        self._pairs = pairs = _pairs(volumes, options.pairing)
+        if options.mean is not None and (options.ensemble or len(pairs) < 2):
+            raise UsageError("--mean needs several pairs, each correlated by itself")
+        self._groups = [pairs] if options.ensemble else [[pair] for pair in pairs]
+        self._common = given(config=options.config, mask=options.mask_volume)
+        self._config = load_config(options.config) if options.config else None
+        self.inputs = [*volumes, *self._common.values()]
+        paths = output_paths(output, [group[0][0].stem for group in self._groups])
+        self.names = [path.stem for path in paths]
+        self.targets = [Target(path, partial(self._record, number)) for number, path in enumerate(paths)]
+        self.settings = self._settings_of(_ensure_readable(volumes, options.keep_going))
+
+    def begin(self, _numbers: Sequence[int], _console: Console) -> float:
+        """Do nothing: pairs share nothing but the settings."""
+        return 1.0
+
+    def make(self, number: int, work: Frames) -> Outcome:
+        """Correlate a pair, or all of them, and write the vectors."""
+        target = self.targets[number]
+        field, reference, notices = _measure(self._job(number), self._options.mask_volume, work)
+        quality, name = quality_of(field), target.path.name
+        notices += [*field_notices(quality, name), *pair_notices(field, quality, name)]
+        work.console.warn(notices)
+        derived = derived_fields(field) if self._options.derived else None
+        vtkhdf.write_vectors(
+            target.path,
+            field,
+            reference,
+            provenance=with_warnings(target.record, notices),
+            # What is complete is skipped: in the place of what is made there is nothing, or something broken.
+            overwrite=self.overwrite or self._options.resume,
+            extra=_arrays_of(derived) if derived else None,
+        )
+        rejected = int(np.count_nonzero(field.flag >= REJECTED))
+        return Outcome(quality, rejected, derived.divergence_rms if derived else None)
+
+    def summary(self, worked: Worked[Outcome]) -> dict[str, Any]:
+        """Return what is told of the batch."""
+        outcomes = list(worked.outcomes.values())
+        found = quality_of_all([outcome.quality for outcome in outcomes])
+        told: dict[str, Any] = {
+            "pairs": len(self._pairs),
+            "skipped": worked.skipped,
+            "vectors": found.vectors,
+            "rejected": sum(outcome.rejected for outcome in outcomes),
+        }
+        divergence = [outcome.divergence_rms for outcome in outcomes if outcome.divergence_rms is not None]
+        return told | found.summary() | ({"divergence_rms_per_s": float(np.mean(divergence))} if divergence else {})
+
+    def fields(self, worked: Worked[Outcome]) -> list[Path]:
+        """Return the files of the fields that are there."""
+        failed = {failure.name for failure in worked.failures}
+        return [target.path for target, name in zip(self.targets, self.names, strict=True) if name not in failed]
+
+    def _job(self, number: int) -> Job:
+        """Return the pairs that a field is made of, and the settings."""
+        group = self._groups[number]
+        return Job(group, self._settings_of(group[0][0]))
+
+    def _settings_of(self, volume: Path) -> Config:
+        """Return the settings for a volume: its own, or those of a config in their place."""
+        settings = self._config or carried_config(vtkhdf.read_header(volume).provenance, volume)
+        return settings.overridden_by("correlation", self._options)
+
+    def _record(self, number: int) -> dict[str, Any]:
+        """Return the record that a field will carry."""
+        options, job = self._options, self._job(number)
+        command = " ".join(["correlate", *["ensemble"] * options.ensemble, *["derived"] * options.derived])
+        return record(command, job.settings.resolved(), self._common | job.inputs())
 
 
 def _measure(job: Job, mask: Path | None, work: Frames) -> tuple[VectorField, Reference, list[Notice]]:
@@ -187,27 +239,68 @@ def _arrays_of(derived: Derived) -> Extra:
     }
 
 
-def _write_mean(path: Path, members: Sequence[Path], settings: Config, derived: bool, overwrite: bool) -> None:
-    """Write the mean of a batch's vectors, and their fluctuations as `velocity_rms` and `displacement_rms_voxel`."""
-    found = statistics_of(vtkhdf.open_vectors(member) for member in members)
-    extra: Extra = {
-        "displacement_rms_voxel": (found.rms_voxel, "voxel"),
-        "samples": (found.samples, "1"),
-    }
-    if found.mean.dt_s is not None:
-        to_velocity = np.asarray(found.mean.voxel_mm) * MM_TO_M / found.mean.dt_s
-        extra["velocity_rms"] = (found.rms_voxel * to_velocity, "m/s")
-    if derived:
-        extra |= _arrays_of(derived_fields(found.mean))
-    inputs = {f"vectors_{number:04d}": member for number, member in enumerate(members)}
-    vtkhdf.write_vectors(
-        path,
-        found.mean,
-        vtkhdf.read_header(members[0]).reference,
-        provenance=record("correlate mean", settings.resolved(), inputs),
-        overwrite=overwrite,
-        extra=extra,
-    )
+class Mean:
+    """The mean of a batch's vectors, with their fluctuations as `velocity_rms` and `displacement_rms_voxel`."""
+
+    label, unit = "mean", "file"
+
+    def __init__(
+        self, path: Path, fields: Sequence[Path], resolved: Mapping[str, Any], derived: bool, overwrite: bool
+    ) -> None:
+        """Take where it goes, the files of vectors, and their settings."""
+        self.inputs, self._resolved, self._derived, self.overwrite = fields, resolved, derived, overwrite
+        self.names, self.targets = [path.stem], [Target(path, self._record)]
+
+    def begin(self, _numbers: Sequence[int], _console: Console) -> float:
+        """Do nothing: there is one."""
+        return 1.0
+
+    def make(self, number: int, _work: Frames) -> None:
+        """Write it."""
+        found = statistics_of(vtkhdf.open_vectors(field) for field in self.inputs)
+        extra: Extra = {
+            "displacement_rms_voxel": (found.rms_voxel, "voxel"),
+            "samples": (found.samples, "1"),
+        }
+        if found.mean.dt_s is not None:
+            to_velocity = np.asarray(found.mean.voxel_mm) * MM_TO_M / found.mean.dt_s
+            extra["velocity_rms"] = (found.rms_voxel * to_velocity, "m/s")
+        if self._derived:
+            extra |= _arrays_of(derived_fields(found.mean))
+        vtkhdf.write_vectors(
+            self.targets[number].path,
+            found.mean,
+            vtkhdf.read_header(self.inputs[0]).reference,
+            provenance=self.targets[number].record,
+            overwrite=True,
+            extra=extra,
+        )
+
+    def _record(self) -> dict[str, Any]:
+        inputs = {f"vectors_{number:04d}": field for number, field in enumerate(self.inputs)}
+        return record("correlate mean", self._resolved, inputs)
+
+
+def _ensure_readable(volumes: Sequence[Path], keep_going: bool) -> Path:
+    """Return the first volume that can be opened, after it is known whether the others can, where one is to stop.
+
+    Raises
+    ------
+    InputError : one cannot, or with `keep_going` none
+    """
+    readable, first_fault = [], None
+    for path in volumes:
+        try:
+            vtkhdf.read_header(path)
+        except InputError as error:
+            if not keep_going:
+                raise
+            first_fault = first_fault or error
+        else:
+            readable.append(path)
+    if not readable and first_fault is not None:
+        raise first_fault
+    return readable[0]
 
 
 def _pairs(volumes: Sequence[Path], pairing: Pairing | None) -> list[tuple[Path, Path]]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,6 @@ from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, Points, read_points, write_points
 from lfpiv_cli.files.playback import write_playback
 from lfpiv_cli.files.provenance import record, sha256, with_warnings
-from lfpiv_cli.files.vtkhdf import read_record
 from lfpiv_cli.files.weights_file import open_weights
 from lfpiv_cli.interface import particles
 from lfpiv_cli.interface.following import (
@@ -138,7 +138,7 @@ def _needed(
 ) -> list[int]:
     """Return the numbers of the frames of a pass that have to be made, after it is known that they can be written."""
     prepare_folder([target.path for target in targets])
-    needed = pending(targets, inputs, overwrite, options.resume, read_record)
+    needed = pending(targets, inputs, overwrite, options.resume)
     for number in needed if options.residuals and last else []:
         ensure_writable(residual_path(targets[number].path), overwrite or options.resume, inputs)
     return needed
@@ -220,7 +220,7 @@ def _passes(
         command = (
             f"follow {way} page {frame.page} of {count} frames, SHA-256 {digest}, within {tracking.search_mm:g} mm"
         )
-        return Target(path, record(command + told[number], resolved, {**common, "image": frame.path}))
+        return Target(path, partial(record, command + told[number], resolved, {**common, "image": frame.path}))
 
     stems, numbers = [frame.stem for frame in frames], range(len(frames))
     folder = output / (FORWARDS if both_ways else PARTICLES)

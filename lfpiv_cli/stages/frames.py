@@ -4,19 +4,24 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.errors import InputError
 from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files.batch import Frame
 from lfpiv_cli.files.provenance import sha256
 from lfpiv_cli.reconstruction.images import Image, light, mean_background, minimum_background, still_light
+
+# Reads frame `number`: raw, and with dark or background taken off.
+Read = Callable[[int], tuple[Image, Image]]
 
 # In place of a mask's file: what does not move in the frames is left out.
 STILL = "still"
@@ -59,19 +64,22 @@ class Background:
 
 
 def reader(
-    level: Background, frames: Sequence[Frame], shape: tuple[int, int], dark: Image | None
-) -> Callable[[int], tuple[Image, Image]]:
-    """Return the function that reads frame `number`: raw, and with dark or background taken off."""
+    level: Background, frames: Sequence[Frame], shape: tuple[int, int], dark: Image | None, keep_going: bool = False
+) -> Read:
+    """Return the function that reads frame `number`: raw, and with dark or background taken off.
+
+    With `keep_going` frames that cannot be read are left out of the backgrounds of others.
+    """
     fixed = image_files.read_image(level.path, shape) if level.path else None
     window = len(level.around(0, len(frames)))
 
     @lru_cache(maxsize=window if level.frames else 1)
     def page(number: int) -> Image:
-        return image_files.read_page(frames[number].path, frames[number].page, shape)
+        return read_frame(frames[number], shape)
 
     @lru_cache(maxsize=1)
     def over(numbers: range) -> NDArray[np.float32]:
-        return BACKGROUNDS[level.kind or ""](page(k) for k in numbers)
+        return BACKGROUNDS[level.kind or ""](_readable(page, numbers, keep_going))
 
     def read(number: int) -> tuple[Image, Image]:
         numbers = level.around(number, len(frames))
@@ -81,51 +89,105 @@ def reader(
     return read
 
 
-def mask_of(given: str | Path | None, frames: Sequence[Frame], shape: tuple[int, int], pitch_px: float) -> Image | None:
+def read_frame(frame: Frame, shape: tuple[int, int]) -> Image:
+    """Read a frame.
+
+    Raises
+    ------
+    InputError : it cannot be read, or has another shape
+    """
+    if frame.fault is not None:
+        raise InputError(frame.fault)
+    return image_files.read_page(frame.path, frame.page, shape)
+
+
+def _readable(read: Callable[[int], Image], numbers: Iterable[int], keep_going: bool) -> Iterator[Image]:
+    """Yield images, those that cannot be read left out where the others are to go on."""
+    for number in numbers:
+        try:
+            image = read(number)
+        except InputError:
+            if not keep_going:
+                raise
+            continue
+        yield image
+
+
+def mask_of(
+    given: str | Path | None,
+    frames: Sequence[Frame],
+    shape: tuple[int, int],
+    pitch_px: float,
+    keep_going: bool = False,
+) -> Image | None:
     """Return the mask, 0 where pixels are left out: of a file, or of what does not move in the frames (`still`)."""
     if given is None:
         return None
     if given != STILL:
         return image_files.read_image(Path(given), shape)
-    images = (image_files.read_page(frame.path, frame.page, shape) for frame in frames)
+    images = _readable(lambda number: read_frame(frames[number], shape), range(len(frames)), keep_going)
     still = still_light(images, pitch_px)
     return np.where(still, np.float32(0.0), np.float32(1.0))
 
 
-def ahead(
-    read: Callable[[int], tuple[Image, Image]], numbers: Sequence[int]
-) -> Iterator[tuple[int, Future[tuple[Image, Image]]]]:
-    """Yield each number with its frame, read while the one before is worked on."""
-    with ThreadPoolExecutor(max_workers=1) as pool:
-        coming = [pool.submit(read, number) for number in numbers[:1]]
-        for place, number in enumerate(numbers):
-            current = coming.pop()
-            coming = [pool.submit(read, following) for following in numbers[place + 1 : place + 2]]
-            yield number, current
+class Ahead:
+    """Frames, each read while the one before is worked on."""
+
+    def __init__(self, read: Read, numbers: Sequence[int]) -> None:
+        """Take the function that reads a frame, and the numbers of those that are coming in their order."""
+        self._read, self._pool = read, ThreadPoolExecutor(max_workers=1)
+        self._following = dict(pairwise(numbers))
+        self._coming: tuple[int, Future[tuple[Image, Image]]] | None = None
+
+    def __call__(self, number: int) -> tuple[Image, Image]:
+        """Return a frame, and begin to read the one that follows."""
+        coming, self._coming = self._coming, None
+        current = coming[1] if coming and coming[0] == number else self._pool.submit(self._read, number)
+        following = self._following.get(number)
+        if following is not None:
+            self._coming = following, self._pool.submit(self._read, following)
+        return current.result()
+
+
+def other_frames(level: Background, frames: Sequence[Frame], mask: str | Path | None = None) -> Callable[[int], str]:
+    """Return the function that says which other frames the background and mask of one are made from.
+
+    Frames whose files cannot be read at all are not among them.
+    """
+
+    # The frames around one are nearly those around the next.
+    @lru_cache(maxsize=max(2 * (level.frames or 0), 1))
+    def page(number: int) -> str:
+        return f"{sha256(frames[number].path)} {frames[number].page}\n"
+
+    # Where the background is made from all frames, it is the same for all, as the mask is.
+    @lru_cache(maxsize=2)
+    def over(numbers: range) -> str:
+        pages = [page(k) for k in numbers if frames[k].fault is None]
+        digest = hashlib.sha256("".join(pages).encode()).hexdigest()
+        return f"over {len(pages)} frames, SHA-256 {digest}"
+
+    def words(number: int) -> str:
+        around = level.around(number, len(frames))
+        background = "" if level.kind is None else f", background: {level.kind} {over(around)}"
+        return background + (f", mask: {STILL} {over(range(len(frames)))}" if mask == STILL else "")
+
+    return words
 
 
 def sequence_digests(level: Background, frames: Sequence[Frame], mask: str | Path | None = None) -> list[str]:
     """Return for each frame which other frames its background and mask are made from, as words for its record."""
-    words = [""] * len(frames)
-    if level.kind is None and mask != STILL:
-        return words
-    pages = [f"{sha256(frame.path)} {frame.page}\n" for frame in frames]
-
-    def over(numbers: range) -> str:
-        digest = hashlib.sha256("".join(pages[k] for k in numbers).encode()).hexdigest()
-        return f"over {len(numbers)} frames, SHA-256 {digest}"
-
-    if level.kind is not None:
-        words = [f", background: {level.kind} {over(level.around(k, len(frames)))}" for k in range(len(frames))]
-    if mask == STILL:
-        words = [f"{word}, mask: {STILL} {over(range(len(frames)))}" for word in words]
-    return words
+    words = other_frames(level, frames, mask)
+    return [words(number) for number in range(len(frames))]
 
 
-def with_those_beside(made_of: Sequence[str], frames: Sequence[Frame], beside: Sequence[tuple[int, ...]]) -> list[str]:
-    """Return the words of each frame's record with those of the frames that help it."""
-    alone = [
-        f", beside page {frame.page}{words} of SHA-256 {sha256(frame.path)}"
-        for frame, words in zip(frames, made_of, strict=True)
-    ]
-    return ["".join([words, *(alone[k] for k in numbers)]) for words, numbers in zip(made_of, beside, strict=True)]
+def beside_frames(
+    words: Callable[[int], str], frames: Sequence[Frame], beside: Sequence[tuple[int, ...]]
+) -> Callable[[int], str]:
+    """Return the function that says which frames help one, besides those of its own background and mask (`words`)."""
+
+    def alone(number: int) -> str:
+        frame = frames[number]
+        return f", beside page {frame.page}{words(number)} of SHA-256 {sha256(frame.path)}"
+
+    return lambda number: "".join([words(number), *(alone(k) for k in beside[number] if frames[k].fault is None)])

@@ -3,26 +3,25 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lfpiv_cli.console import CONSOLE, Console
-from lfpiv_cli.errors import InputError, PartialError, UsageError
+from lfpiv_cli.console import CONSOLE, Console, Frames
+from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.files.atomic import ensure_writable
-from lfpiv_cli.files.batch import Frame, Target, frames_beside, frames_of, output_paths, pending, prepare_folder
-from lfpiv_cli.files.config import Config, carried_config
+from lfpiv_cli.files.batch import Target, frames_beside, frames_of, output_paths
+from lfpiv_cli.files.config import carried_config
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, write_points
 from lfpiv_cli.files.provenance import also_used_as, record, with_warnings
-from lfpiv_cli.files.weights_file import open_weights
+from lfpiv_cli.files.weights_file import open_weights, read_weights_record
 from lfpiv_cli.interface import particles
 from lfpiv_cli.interface.reconstruction import Bench, Progress, bench_of, check_frame, frame_notices, volume_of
 from lfpiv_cli.interface.weights_cost import on_demand_told
@@ -31,10 +30,9 @@ from lfpiv_cli.notice import Notice
 from lfpiv_cli.particles.search import Particles
 from lfpiv_cli.reconstruction.images import Image
 from lfpiv_cli.reconstruction.registry import SolverName
-from lfpiv_cli.stages.frames import STILL, Background, ahead, mask_of, reader, sequence_digests, with_those_beside
-
-# Reads frame `number`: raw, and with dark or background taken off.
-Read = Callable[[int], tuple[Image, Image]]
+from lfpiv_cli.stages.batches import BatchOptions, Worked, work_through
+from lfpiv_cli.stages.finding import Finder
+from lfpiv_cli.stages.frames import STILL, Ahead, Background, Read, beside_frames, mask_of, other_frames, reader
 
 
 @dataclass(frozen=True)
@@ -47,7 +45,7 @@ class Outcome:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReconstructOptions:
+class ReconstructOptions(BatchOptions):
     """What `reconstruct` is given besides weights and images.
 
     Attributes
@@ -58,8 +56,6 @@ class ReconstructOptions:
     mask : image that is black where pixels are left out, or `still`: where bright light does not move in the images
     pairing : `ab` or `sequence`: find particles with the help of the frames beside
     residual : of particles, also write what they leave of each image
-    resume : skip what is complete and made from the same inputs
-    keep_going : go on with the next frame when one fails
     """
 
     solver: SolverName | None = None
@@ -72,8 +68,6 @@ class ReconstructOptions:
     mask: str | Path | None = None
     pairing: Pairing | None = None
     residual: bool = True
-    resume: bool = False
-    keep_going: bool = False
 
 
 NO_OPTIONS = ReconstructOptions()
@@ -89,113 +83,174 @@ def reconstruct(
     console: Console = CONSOLE,
 ) -> dict[str, Any]:
     """Reconstruct the volume behind each image, or find its particles."""
-    level = Background.parse(options.background)
-    mask_file = None if options.mask is None or options.mask == STILL else Path(options.mask)
-    common = given(weights=weights, dark=options.dark, background=level.path, mask=mask_file)
-    frames = frames_of(images)
-    beside = None if options.pairing is None else frames_beside(len(frames), options.pairing)
-    paths = output_paths(output, [frame.stem for frame in frames])
-    prepare_folder(paths)
-    content = open_weights(weights)
-    settings = carried_config(content.provenance, weights).overridden_by("reconstruction", options)
-    as_particles = settings.reconstruction.solver == "particles"
-    if beside is not None and not as_particles:
-        raise UsageError(
-            f"--pairing: {settings.reconstruction.solver} takes each frame alone; --solver particles does not"
-        )
-    made_of = sequence_digests(level, frames, options.mask)
-    if beside is not None:
-        made_of = with_those_beside(made_of, frames, beside)
-    targets = _targets(paths, frames, made_of, settings, common)
-    needed = pending(targets, [*common.values(), *images], overwrite, options.resume, vtkhdf.read_record)
-    if as_particles:
-        content = particles.searchable(content, settings)
-        if options.residual:
-            _ensure_residuals(paths, needed, overwrite or options.resume, images, console)
-    elif content.weights.on_demand and needed:
-        console.say(on_demand_told(math.prod(content.weights.padded.shape)))
-    shape = content.image_shape
-    dark = image_files.read_image(options.dark, shape) if options.dark else None
-    pitch_px = float(content.camera.micro_image_lattice_px().pitch.max())
-    # What stands still takes a look at every frame: only where there is one to reconstruct.
-    mask = mask_of(options.mask, frames, shape, pitch_px) if needed or mask_file else None
-    bench = bench_of(content, settings, dark, mask, with_sums=bool(needed))
-    read = reader(level, frames, shape, dark)
-    steps = particles.STEPS if as_particles else settings.reconstruction.iterations
-    outcomes: list[Outcome] = []
-    failures: list[str] = []
-    looked_at = needed if beside is None else {k for number in needed for k in (number, *beside[number])}
-    size = None
-    if as_particles and needed:
-        bench, size = particles.sized(bench, _frames(bench, read, len(frames)))
-        said = particles.size_notices(settings, size)
-        console.warn(said)
-        targets = [replace(target, record=with_warnings(target.record, said)) for target in targets]
-    with console.frames(len(needed), steps * len(looked_at) / max(len(needed), 1), "reconstruct") as work:
-        find = _finder(bench, read, beside, options.pairing, work.advance)
-        for number, future in ahead(read, needed):
-            try:
-                pictures, target = future.result(), targets[number]
-                check_frame(bench, pictures[0], str(frames[number].path))
-                stem = frames[number].stem
-                notices = file_notices(target.record, stem) + frame_notices(bench, *pictures, stem)
-                console.warn(notices)
-                target = replace(target, record=with_warnings(target.record, notices))
-                if size is not None:
-                    frame = particles.frame_of(bench, *pictures)
-                    made = (frame, find(number, frame), size)
-                    outcomes.append(_write_particles(bench, target, made, options.residual, overwrite, console))
-                else:
-                    outcomes.append(_make_volume(bench, target, pictures, overwrite, work.advance))
-            except InputError as error:
-                if not options.keep_going:
-                    raise
-                failures.append(str(error))
-                console.warn([Notice("frame-failed", frames[number].stem, str(error), "leave it out, or mend it")])
-            work.done(frames[number].stem)
-    if failures:
-        raise PartialError(f"{len(failures)} of {len(frames)} frames failed, the first because {failures[0]}")
-    found = [outcome.particles for outcome in outcomes if outcome.particles is not None]
-    counts = {"particles": sum(found), "particles_fewest": min(found)} if found else {}
-    return (
-        {
-            "frames": len(frames),
+    batch = Reconstruction(weights, images, output, options, overwrite)
+    worked = work_through(batch, options, console)
+    return worked.ensure_whole(batch.summary(worked), batch.unit)
+
+
+@dataclass(frozen=True, eq=False)
+class _Ready:
+    """What all frames share: with particles their size, and what is said of it."""
+
+    bench: Bench
+    ahead: Ahead
+    finder: Finder
+    size: particles.TracerSize | None
+    said: Sequence[Notice]
+
+
+class Reconstruction:
+    """The batch of `reconstruct`: a volume, or particles, for each frame."""
+
+    label, unit = "reconstruct", "frame"
+
+    def __init__(
+        self, weights: Path, images: Sequence[Path], output: Path, options: ReconstructOptions, overwrite: bool
+    ) -> None:
+        """Take the arguments of `reconstruct`; see which frames there are, and read no image.
+
+        Raises
+        ------
+        LfpivError : frames or outputs do not go together, or a file cannot be opened
+        """
+        self._options, self.overwrite = options, overwrite
+        # What is complete is skipped: in the place of what is made there is nothing, or something broken.
+        self._replace = overwrite or options.resume
+        self._level = level = Background.parse(options.background)
+        mask_file = None if options.mask is None or options.mask == STILL else Path(options.mask)
+        self._common = given(weights=weights, dark=options.dark, background=level.path, mask=mask_file)
+        self.inputs = [*self._common.values(), *images]
+        self._frames = frames = frames_of(images, options.keep_going)
+        self._beside = None if options.pairing is None else frames_beside(len(frames), options.pairing)
+        self.names = [frame.stem for frame in frames]
+        self._paths = output_paths(output, self.names)
+        self._settings = carried_config(read_weights_record(weights), weights).overridden_by("reconstruction", options)
+        solver = self._settings.reconstruction.solver
+        self._as_particles = solver == "particles"
+        if self._beside is not None and not self._as_particles:
+            raise UsageError(f"--pairing: {solver} takes each frame alone; --solver particles does not")
+        words = other_frames(level, frames, options.mask)
+        self._words = words if self._beside is None else beside_frames(words, frames, self._beside)
+        self._resolved = self._settings.resolved()
+        self.targets = [Target(path, partial(self._record, number)) for number, path in enumerate(self._paths)]
+        self._ready: _Ready | None = None
+
+    def begin(self, numbers: Sequence[int], console: Console) -> float:
+        """Open the weights, and prepare what all frames share."""
+        options, settings, frames = self._options, self._settings, self._frames
+        if self._as_particles and options.residual:
+            self._ensure_residuals(numbers, console)
+        if not numbers:
+            return 0.0
+        content = open_weights(self._common["weights"])
+        if self._as_particles:
+            content = particles.searchable(content, settings)
+        elif content.weights.on_demand:
+            console.say(on_demand_told(math.prod(content.weights.padded.shape)))
+        shape = content.image_shape
+        dark = image_files.read_image(options.dark, shape) if options.dark else None
+        pitch_px = float(content.camera.micro_image_lattice_px().pitch.max())
+        mask = mask_of(options.mask, frames, shape, pitch_px, options.keep_going)
+        bench = bench_of(content, settings, dark, mask)
+        read = reader(self._level, frames, shape, dark, options.keep_going)
+        size, said = None, []
+        if self._as_particles:
+            bench, size = particles.sized(bench, self._looked_at(bench, read))
+            said = particles.size_notices(settings, size)
+            console.warn(said)
+        finder = Finder(bench, read, frames, self._beside, options.pairing, options.keep_going)
+        self._ready = _Ready(bench, Ahead(read, numbers), finder, size, said)
+        if not self._as_particles:
+            return settings.reconstruction.iterations
+        looks = numbers if self._beside is None else {k for number in numbers for k in (number, *self._beside[number])}
+        return particles.STEPS * len(looks) / len(numbers)
+
+    def make(self, number: int, work: Frames) -> Outcome:
+        """Reconstruct a frame, or find its particles, and write them."""
+        ready, name, target = self._begun(), self.names[number], self.targets[number]
+        pictures = ready.ahead(number)
+        check_frame(ready.bench, pictures[0], str(self._frames[number].path))
+        made = target.record
+        notices = file_notices(made, name) + frame_notices(ready.bench, *pictures, name)
+        work.console.warn(notices)
+        if ready.size is None:
+            made = with_warnings(made, notices)
+            return _make_volume(ready.bench, target.path, made, pictures, self._replace, work.advance)
+        frame = particles.frame_of(ready.bench, *pictures)
+        found, alone = ready.finder.find(number, frame, work.advance)
+        work.console.warn(alone)
+        made = with_warnings(made, [*ready.said, *notices, *alone])
+        return self._write_particles(target.path, made, (frame, found, ready.size), work.console)
+
+    def summary(self, worked: Worked[Outcome]) -> dict[str, Any]:
+        """Return what is told of the batch."""
+        outcomes = list(worked.outcomes.values())
+        found = [outcome.particles for outcome in outcomes if outcome.particles is not None]
+        told = {
+            "frames": len(self._frames),
             "reconstructed": len(outcomes),
-            "skipped": len(frames) - len(needed),
-            "solver": settings.reconstruction.solver,
-            "iterations": None if as_particles else settings.reconstruction.iterations,
+            "skipped": worked.skipped,
+            "solver": self._settings.reconstruction.solver,
+            "iterations": None if self._as_particles else self._settings.reconstruction.iterations,
             "residual": max((outcome.residual for outcome in outcomes), default=None),
             "excluded_pixels": max((outcome.excluded_pixels for outcome in outcomes), default=None),
         }
-        | counts
-        | (size.summary() if size else {})
-    )
+        counts = {"particles": sum(found), "particles_fewest": min(found)} if found else {}
+        size = self._ready.size if self._ready else None
+        return told | counts | (size.summary() if size else {})
 
+    def _record(self, number: int) -> dict[str, Any]:
+        """Return the record that a frame's result will carry."""
+        frame = self._frames[number]
+        if frame.fault is not None:
+            raise InputError(frame.fault)
+        command = f"reconstruct page {frame.page}{self._words(number)}"
+        return record(command, self._resolved, {**self._common, "image": frame.path})
 
-def _frames(bench: Bench, read: Read, number: int) -> Iterator[particles.Frame]:
-    """Yield the frames that can be read."""
-    for k in range(number):
-        try:
-            pictures = read(k)
-        except InputError:
-            continue  # it is told where its turn comes
-        yield particles.frame_of(bench, *pictures)
+    def _begun(self) -> _Ready:
+        if self._ready is None:
+            raise RuntimeError("a batch begins before anything of it is made")
+        return self._ready
 
+    def _looked_at(self, bench: Bench, read: Read) -> Iterator[particles.Frame]:
+        """Yield the frames that can be read."""
+        for number in range(len(self._frames)):
+            try:
+                pictures = read(number)
+            except InputError:
+                continue  # it is told where its turn comes
+            yield particles.frame_of(bench, *pictures)
 
-def _targets(
-    paths: Sequence[Path],
-    frames: Sequence[Frame],
-    made_of: Sequence[str],
-    settings: Config,
-    common: Mapping[str, Path],
-) -> list[Target]:
-    """Return where each frame's result goes and the record that it will carry, with words of other frames."""
-    return [
-        Target(
-            path, record(f"reconstruct page {frame.page}{words}", settings.resolved(), {**common, "image": frame.path})
+    def _write_particles(
+        self,
+        path: Path,
+        made: Mapping[str, Any],
+        result: tuple[particles.Frame, Particles, particles.TracerSize],
+        console: Console,
+    ) -> Outcome:
+        """Write the particles found behind a frame and, where it is asked for, what they leave of it."""
+        frame, found, size = result
+        points = particles.points_of(self._begun().bench, frame, found, size, made)
+        notices = particles.light_notices(points, path.name)
+        console.warn(notices)
+        if self._options.residual:
+            left = particles.what_is_left(frame, found)
+            # Made again whenever the particles are: an interrupted batch may have left one without them.
+            image_files.write_tiff(residual_path(path), left.astype(np.float32), overwrite=True)
+        told = replace(points, provenance=with_warnings(made, notices))
+        write_points(path, PARTICLES_FORMAT, told, overwrite=self._replace)
+        return Outcome(points.attributes["residual"], points.attributes["excluded_pixels"], len(points.position_mm))
+
+    def _ensure_residuals(self, numbers: Sequence[int], console: Console) -> None:
+        """Refuse residual images that could not be written; say of how many frames that are complete there is none."""
+        for number in numbers:
+            ensure_writable(residual_path(self._paths[number]), self._replace, self.inputs)
+        coming = set(numbers)
+        without = sum(
+            not residual_path(path).exists() for number, path in enumerate(self._paths) if number not in coming
         )
-        for path, frame, words in zip(paths, frames, made_of, strict=True)
-    ]
+        if without:
+            console.say(f"{without} frames that are complete have no residual image; --overwrite makes both anew")
 
 
 def file_notices(made: Mapping[str, Any], name: str) -> list[Notice]:
@@ -212,83 +267,24 @@ def residual_path(particles: Path) -> Path:
     return particles.with_name(f"{particles.stem}_residual.tif")
 
 
-def _ensure_residuals(
-    paths: Sequence[Path], needed: Sequence[int], overwrite: bool, images: Sequence[Path], console: Console
-) -> None:
-    """Refuse residual images that could not be written; say of which frames that are complete there is none."""
-    for number in needed:
-        ensure_writable(residual_path(paths[number]), overwrite, images)
-    without = sum(not residual_path(path).exists() for number, path in enumerate(paths) if number not in needed)
-    if without:
-        console.say(f"{without} frames that are complete have no residual image; --overwrite makes both anew")
-
-
 def _make_volume(
-    bench: Bench, target: Target, frame: tuple[Image, Image], overwrite: bool, advance: Progress
+    bench: Bench,
+    path: Path,
+    made: Mapping[str, Any],
+    pictures: tuple[Image, Image],
+    overwrite: bool,
+    advance: Progress,
 ) -> Outcome:
     """Reconstruct and write the volume of a frame."""
-    volume = volume_of(bench, *frame, target.record, advance)
+    volume = volume_of(bench, *pictures, made, advance)
     told = volume.attributes
     vtkhdf.write_volume(
-        target.path,
+        path,
         volume.array,
         volume.grid,
         volume.reference,
-        provenance=target.record,
+        provenance=made,
         attributes=told,
         overwrite=overwrite,
     )
     return Outcome(float(told["residual"][-1]), told["excluded_pixels"])
-
-
-def _write_particles(
-    bench: Bench,
-    target: Target,
-    made: tuple[particles.Frame, Particles, particles.TracerSize],
-    residual: bool,
-    overwrite: bool,
-    console: Console,
-) -> Outcome:
-    """Write the particles found behind a frame and, where it is asked for, what they leave of it."""
-    frame, found, size = made
-    points = particles.points_of(bench, frame, found, size, target.record)
-    notices = particles.light_notices(points, target.path.name)
-    console.warn(notices)
-    if residual:
-        left = particles.what_is_left(frame, found)
-        # Made again whenever the particles are: an interrupted batch may have left one without them.
-        image_files.write_tiff(residual_path(target.path), left.astype(np.float32), overwrite=True)
-    told = replace(points, provenance=with_warnings(target.record, notices))
-    write_points(target.path, PARTICLES_FORMAT, told, overwrite=overwrite)
-    return Outcome(points.attributes["residual"], points.attributes["excluded_pixels"], len(points.position_mm))
-
-
-def _finder(
-    bench: Bench,
-    read: Read,
-    beside: Sequence[tuple[int, ...]] | None,
-    pairing: Pairing | None,
-    advance: Progress,
-) -> Callable[[int, particles.Frame], Particles]:
-    """Return the function that finds the particles of a frame, alone or with the first passes of those beside it.
-
-    That of the second frame of a pair begins with what the first frame's found, never the other way round: so it does
-    not matter which frames are there already.
-    """
-
-    # A frame needs itself and one at either side, the next one two of these again.
-    @lru_cache(maxsize=3)
-    def first_pass_of(number: int) -> NDArray[np.float64]:
-        frame = particles.frame_of(bench, *read(number))
-        if pairing != "ab" or number % 2 == 0:
-            return particles.find_first(bench, frame, advance)
-        before = particles.frame_of(bench, *read(number - 1))
-        return particles.find_second(bench, frame, before, first_pass_of(number - 1), advance)
-
-    def find(number: int, frame: particles.Frame) -> Particles:
-        if beside is None:
-            return particles.find(bench, frame, advance)
-        seen = {k: first_pass_of(k) for k in sorted((number, *beside[number]))}
-        return particles.find_beside(bench, frame, seen[number], [seen[k] for k in beside[number]])
-
-    return find
