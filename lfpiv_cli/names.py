@@ -38,6 +38,9 @@ BubbleWall = Literal["near", "far", "low", "high"]
 Start = Literal["uniform", "line_of_sight"]
 Pairing = Literal["ab", "sequence"]
 
+# What a command takes by the thousand: images, or what other commands made of them.
+InputKind = Literal["images", "results"]
+
 # How `run` measures a flow.
 RunMethod = Literal["auto", "volumes", "particles", "both"]
 

@@ -12,7 +12,7 @@ import click
 from lfpiv_cli import __version__
 from lfpiv_cli.cli.outcome import error_record, print_json
 from lfpiv_cli.errors import LimitMissedError, PartialError
-from lfpiv_cli.names import Pairing, names_in
+from lfpiv_cli.names import InputKind, Pairing, names_in
 
 FILE = click.Path(path_type=Path)
 POSITIVE = click.FloatRange(min=0.0, min_open=True)
@@ -51,6 +51,27 @@ pairing_option = click.option(
 resume_option = click.option(
     "--resume", is_flag=True, help="Skip outputs that are complete and made from the same inputs."
 )
+
+
+def inputs_argument(name: str, kind: InputKind = "images") -> Callable[..., Any]:
+    """Give a command the argument of its many inputs, with --files-from: lists and folders are files to it."""
+
+    def with_inputs(command: Callable[..., Any]) -> Callable[..., Any]:
+        @click.argument(name, type=FILE, nargs=-1)
+        @click.option("--files-from", type=FILE, help=f"List of more {name}, a file or folder a line; - for stdin.")
+        @wraps(command)
+        def run(files_from: Path | None = None, **arguments: Any) -> Any:
+            from lfpiv_cli.files.listing import expanded, listed
+
+            more = [] if files_from is None else listed(files_from)
+            arguments[name] = tuple(expanded([*arguments[name], *more], kind))
+            if not arguments[name]:
+                raise click.UsageError(f"no {name} were given")
+            return command(**arguments)
+
+        return run
+
+    return with_inputs
 
 
 def batch_options(command: Callable[..., Any]) -> Callable[..., Any]:

@@ -13,6 +13,7 @@ from lfpiv_cli.cli.options import (
     batch_options,
     common_options,
     dark_option,
+    inputs_argument,
     mask_option,
     output_option,
     pairing_option,
@@ -24,7 +25,7 @@ from lfpiv_cli.reconstruction.registry import SOLVER_NAMES
 
 @click.command("reconstruct")
 @click.argument("weights", type=FILE)
-@click.argument("images", type=FILE, nargs=-1, required=True)
+@inputs_argument("images")
 @click.option("--solver", type=click.Choice(SOLVER_NAMES), help="Of volumes, or particles; default from the config.")
 @click.option("--iterations", type=click.IntRange(min=1), help="Steps of the solver; default from the config.")
 @click.option(
@@ -62,6 +63,8 @@ def reconstruct(
              lfpiv reconstruct weights.h5 a.tif b.tif --dark dark.tif --solver particles --pairing ab -o particles
     over a long sequence, the background of each frame from the fifteen around it:
              lfpiv reconstruct weights.h5 run.tif --background minimum:15 --mask mask.png -o volumes
+    all images of a folder, in the order of their numbers, and those of a list:
+             lfpiv reconstruct weights.h5 images --files-from more.txt --resume --keep-going -o volumes
     """
     from lfpiv_cli.stages import reconstruct as stage
 

@@ -7,7 +7,15 @@ from typing import Any
 
 import click
 
-from lfpiv_cli.cli.options import FILE, batch_options, common_options, dt_option, output_option, pairing_option
+from lfpiv_cli.cli.options import (
+    FILE,
+    batch_options,
+    common_options,
+    dt_option,
+    inputs_argument,
+    output_option,
+    pairing_option,
+)
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import UsageError
 
@@ -28,7 +36,7 @@ def _window(text: str) -> int | tuple[int, ...]:
 
 
 @click.command("correlate")
-@click.argument("volumes", type=FILE, nargs=-1, required=True)
+@inputs_argument("volumes", "results")
 @click.option("--config", type=FILE, help="In place of the config carried by the volumes.")
 @dt_option
 @click.option("--windows", callback=parse_windows, help="Interrogation windows in voxels, coarse to fine, as 32,16.")
@@ -51,7 +59,7 @@ def correlate(
 
     \b
     Example: lfpiv correlate volumes/a.vtkhdf volumes/b.vtkhdf -o vectors.vtkhdf
-             lfpiv correlate volumes/*.vtkhdf --pairing sequence --mean mean.vtkhdf -o vectors
+             lfpiv correlate volumes --pairing sequence --mean mean.vtkhdf -o vectors
     """
     from lfpiv_cli.stages import correlate as stage
 

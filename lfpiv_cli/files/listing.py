@@ -1,0 +1,89 @@
+"""Inputs by the thousand: lists of files, and folders, whose files stand in natural order."""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from lfpiv_cli.errors import InputError
+from lfpiv_cli.files.batch import VTKHDF_SUFFIX
+from lfpiv_cli.files.inputs import ensure_regular_file, reason
+from lfpiv_cli.files.recordings.formats import format_of
+from lfpiv_cli.names import InputKind
+
+# In place of a list's name: the list is read from standard input.
+STANDARD_INPUT = "-"
+# Files with these names are images, also where nothing of that kind is in them, so that it is told.
+IMAGE_SUFFIXES = (".tif", ".tiff", ".png")
+
+
+def listed(path: Path) -> list[Path]:
+    """Return the files that a list names, a line each; lines with nothing in them count for nothing.
+
+    Names are relative to where the command runs, as in a command line.
+
+    Raises
+    ------
+    InputError : the list cannot be read
+    """
+    try:
+        if str(path) == STANDARD_INPUT:
+            content = sys.stdin.buffer.read()
+        else:
+            ensure_regular_file(path)
+            content = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {reason(error)}") from error
+    if b"\0" in content:
+        raise InputError(f"{path}: is no list of files: it holds a zero byte")
+    return [Path(os.fsdecode(line)) for line in content.splitlines() if line.strip()]
+
+
+def expanded(paths: Iterable[Path], kind: InputKind) -> list[Path]:
+    """Return the files that were given, in place of a folder those in it that are of a kind, in natural order.
+
+    Raises
+    ------
+    InputError : a folder cannot be read, or holds none
+    """
+    return [path for given in paths for path in (_files_in(given, kind) if given.is_dir() else [given])]
+
+
+def in_natural_order(paths: Sequence[Path]) -> list[Path]:
+    """Return files by their names as people count: `b2` before `b10`."""
+    return sorted(paths, key=lambda path: (_natural(path.name), path.name))
+
+
+def _natural(name: str) -> list[str | int]:
+    """Return the parts of a name, numbers by their value; texts and numbers take turns."""
+    return [int(part) if place % 2 else part for place, part in enumerate(re.split(r"([0-9]+)", name.casefold()))]
+
+
+def _files_in(folder: Path, kind: InputKind) -> list[Path]:
+    try:
+        found = [path for path in folder.iterdir() if not path.name.startswith(".") and _is_of(path, kind)]
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be read: {reason(error)}") from error
+    if not found:
+        what = "no images" if kind == "images" else f"no {VTKHDF_SUFFIX} files"
+        raise InputError(f"{folder}: holds {what}")
+    return in_natural_order(found)
+
+
+def _is_of(path: Path, kind: InputKind) -> bool:
+    """Return whether a file in a folder is of a kind: by its name, an image also by its first bytes."""
+    suffix = path.suffix.lower()
+    if path.is_dir():
+        return False
+    if kind == "results":
+        return suffix == VTKHDF_SUFFIX
+    if suffix in IMAGE_SUFFIXES:
+        return True
+    try:
+        format_of(path)
+    except InputError:
+        return False
+    return True
