@@ -20,10 +20,20 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
+# What `use_threads` was called with last.
+_told: list[int] = []
+
+
 def use_threads(threads: int) -> None:
     """Use at most `threads` threads from here on."""
+    _told[:] = [threads]
     numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
     cv2.setNumThreads(threads)
+
+
+def told_threads() -> int | None:
+    """Return how many threads were asked for, None if nothing was."""
+    return _told[0] if _told else None
 
 
 def in_threads(work: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:

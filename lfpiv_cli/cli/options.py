@@ -12,6 +12,7 @@ import click
 from lfpiv_cli import __version__
 from lfpiv_cli.cli.outcome import error_record, print_json
 from lfpiv_cli.errors import LimitMissedError, PartialError
+from lfpiv_cli.files.shares import Shard, parse_time_limit
 from lfpiv_cli.names import InputKind, Pairing, names_in
 
 FILE = click.Path(path_type=Path)
@@ -74,11 +75,38 @@ def inputs_argument(name: str, kind: InputKind = "images") -> Callable[..., Any]
     return with_inputs
 
 
+def parsed_by(parse: Callable[[str], Any]) -> Callable[[click.Context, click.Parameter, str | None], Any]:
+    """Return the callback of an option whose text is parsed by a function, if it is given."""
+    return lambda _context, _option, text: None if text is None else parse(text)
+
+
+shard_option = click.option(
+    "--shard",
+    metavar="I/N|slurm",
+    callback=parsed_by(Shard.parse),
+    help="Make part I of N only, or that of this job in Slurm's array.",
+)
+time_limit_option = click.option(
+    "--time-limit",
+    "time_limit_s",
+    metavar="TIME",
+    callback=parsed_by(parse_time_limit),
+    help="Stop before so long, as 3600, 50m or 00:50:00, with exit code 75; --resume goes on.",
+)
+dask_option = click.option(
+    "--dask",
+    metavar="ADDRESS|local[:N]",
+    help="Work on the workers of this Dask scheduler, or on N workers on this machine.",
+)
+
+
 def batch_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Give a command the options of all batches."""
     keep_going = click.option("--keep-going", is_flag=True, help="Go on with the next one when an input fails; exit 5.")
     failures = click.option("--failures", type=FILE, help="File to list what failed in, with the reason (JSON).")
-    return resume_option(keep_going(failures(command)))
+    for option in (dask_option, time_limit_option, shard_option, failures, keep_going, resume_option):
+        command = option(command)
+    return command
 
 
 def output_option(text: str, required: bool = True) -> Callable[..., Any]:

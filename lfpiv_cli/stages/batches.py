@@ -8,16 +8,20 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass, field
+from enum import Enum, auto
+from functools import partial
 from pathlib import Path
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, Self, TypeVar
 
 from lfpiv_cli.console import Console, Frames
-from lfpiv_cli.errors import InputError, PartialError
+from lfpiv_cli.errors import InputError, PartialError, UsageError
 from lfpiv_cli.files.atomic import ensure_writable, write_text
 from lfpiv_cli.files.batch import State, Target, pending, prepare_folder, state_of
 from lfpiv_cli.files.claims import claimed
+from lfpiv_cli.files.shares import Deadline, Shard
 from lfpiv_cli.notice import Notice
 
 # How often a worker that has done all of its own looks at what others have claimed.
@@ -26,6 +30,20 @@ SECONDS_BETWEEN_LOOKS = 0.5
 Made = TypeVar("Made", covariant=True)
 # What tells a file from another one under its name; None where there is none.
 Stamp = tuple[int, int] | None
+
+
+class Turn(Enum):
+    """What keeps an output from being made: another worker makes it now, or has made it since the batch began."""
+
+    CLAIMED = auto()
+    SKIPPED = auto()
+
+
+# The numbers of outputs with what became of each, as it is known.
+Attempts = Generator[tuple[int, Made | Turn | InputError], None, None]
+
+
+ALL = Shard(1, 1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,11 +55,19 @@ class BatchOptions:
     resume : skip what is complete and made from the same inputs with the same settings
     keep_going : go on with the next one when an input cannot be read
     failures : file to list those that failed in, as JSON
+    shard : make this share of the outputs only
+    time_limit_s : stop before so many seconds have gone by, with what is left for another time
+    dask : address of the scheduler whose workers make the outputs, or `local` for workers on this machine
+    begun_s : when the time began, by the clock that never goes back
     """
 
     resume: bool = False
     keep_going: bool = False
     failures: Path | None = None
+    shard: Shard = ALL
+    time_limit_s: float | None = None
+    dask: str | None = None
+    begun_s: float = field(default_factory=time.monotonic, compare=False, repr=False)
 
 
 class Batch(Protocol[Made]):
@@ -83,6 +109,22 @@ class Batch(Protocol[Made]):
         """
 
 
+class ByArguments:
+    """A batch that another process makes again from its arguments: these are sent, and not what it holds."""
+
+    _made_by: Callable[[], Self]
+
+    def __new__(cls, *arguments: Any, **named: Any) -> Self:
+        """Keep the arguments."""
+        batch = super().__new__(cls)
+        batch._made_by = partial(cls, *arguments, **named)
+        return batch
+
+    def __reduce__(self) -> tuple[Callable[[], Self], tuple[()]]:
+        """Return what makes it again."""
+        return self._made_by, ()
+
+
 @dataclass(frozen=True)
 class Failure:
     """An output that could not be made: its name, and the sentence that says why."""
@@ -106,6 +148,10 @@ class Worked(Generic[Made]):
     skipped: int = 0
     failures: list[Failure] = field(default_factory=list)
 
+    def total(self) -> int:
+        """Return how many outputs it was about."""
+        return len(self.outcomes) + self.skipped + len(self.failures)
+
     def ensure_whole(self, summary: dict[str, Any], unit: str) -> dict[str, Any]:
         """Return the summary of a batch of which nothing failed.
 
@@ -115,8 +161,7 @@ class Worked(Generic[Made]):
         """
         if not self.failures:
             return summary
-        total = len(self.outcomes) + self.skipped + len(self.failures)
-        told = f"{len(self.failures)} of {total} {unit}s failed, the first because {self.failures[0].error}"
+        told = f"{len(self.failures)} of {self.total()} {unit}s failed, the first because {self.failures[0].error}"
         raise PartialError(told, summary | {"failures": [asdict(failure) for failure in self.failures]})
 
 
@@ -127,49 +172,112 @@ def work_through(batch: Batch[Made], options: BatchOptions, console: Console) ->
     ------
     OutputExistsError : an output is there, and is not to be skipped or replaced
     InputError : an input cannot be read, and the batch is not to go on without it
+    StoppedEarlyError : the time is over
     """
     prepare_folder([target.path for target in batch.targets])
     if options.failures is not None:
         ensure_writable(options.failures, batch.overwrite or options.resume, batch.inputs)
-    left = pending(batch.targets, batch.inputs, batch.overwrite, options.resume)
-    worked: Worked[Made] = Worked(skipped=len(batch.targets) - len(left))
+    share = options.shard.numbers(len(batch.targets))
+    targets = batch.targets[share.start : share.stop]
+    left = [share[k] for k in pending(targets, batch.inputs, batch.overwrite, options.resume)]
+    worked: Worked[Made] = Worked(skipped=len(share) - len(left))
     before = {number: _stamp(batch.targets[number].path) for number in left}
-    steps = batch.begin(left, console)
-    with console.frames(len(left), steps, batch.label, batch.unit) as work:
-        while left:
-            of_others = [k for k in left if not _is_settled(batch, k, before[k], options.keep_going, work, worked)]
-            if len(of_others) == len(left):
-                time.sleep(SECONDS_BETWEEN_LOOKS)
-            left = of_others
+    deadline = Deadline(options.time_limit_s, begun=options.begun_s)
+    steps = batch.begin(left, console) if options.dask is None else 1.0
+    with (
+        console.frames(len(left), steps, batch.label, batch.unit) as work,
+        closing(_attempts(batch, before, options, deadline, work)) as attempts,
+    ):
+        # Closed at once where one fails: workers are let go.
+        for number, made in attempts:
+            _settle(batch, number, made, options.keep_going, work, worked)
+    worked.outcomes = dict(sorted(worked.outcomes.items()))
     if options.failures is not None:
         listed = json.dumps([asdict(failure) for failure in worked.failures], indent=2, ensure_ascii=False)
         write_text(options.failures, listed + "\n", overwrite=True)
+    if worked.total() < len(share):
+        raise deadline.error(worked.total(), len(share), batch.unit)
     return worked
 
 
-def _is_settled(
-    batch: Batch[Made], number: int, before: Stamp, keep_going: bool, work: Frames, worked: Worked[Made]
-) -> bool:
-    """Make an output, unless another worker does or did; return False while one does.
+def attempt(batch: Batch[Made], number: int, before: Stamp, work: Frames) -> Made | Turn:
+    """Make an output, unless another worker does or did; `before` is what was in its place when the batch began.
 
-    `before` is what was in its place when the batch began.
+    Raises
+    ------
+    InputError : as `Batch.make`
     """
-    target, name = batch.targets[number], batch.names[number]
+    target = batch.targets[number]
     with claimed(target.path) as granted:
         if not granted:
-            return False
+            return Turn.CLAIMED
         if _stamp(target.path) != before and state_of(target) is State.COMPLETE:
-            worked.skipped += 1
-        else:
+            return Turn.SKIPPED
+        return batch.make(number, work)
+
+
+def _attempts(
+    batch: Batch[Made], before: Mapping[int, Stamp], options: BatchOptions, deadline: Deadline, work: Frames
+) -> Attempts[Made]:
+    """Yield outputs with what became of each, as long as there is time; `before` is what was in their places."""
+    if options.dask is None:
+        return _made_here(batch, before, deadline, work)
+    try:
+        from lfpiv_cli.stages.distributed import made_by_workers
+    except ImportError as error:
+        raise UsageError(f'--dask needs distributed: pip install "lfpiv[cluster]" ({error})') from error
+    return made_by_workers(batch, before, options.dask, deadline, work.console)
+
+
+def _made_here(batch: Batch[Made], before: Mapping[int, Stamp], deadline: Deadline, work: Frames) -> Attempts[Made]:
+    """Make outputs one after the other; what another worker has claimed is asked for again, after all others."""
+    left = list(before)
+    while left:
+        of_others = []
+        for number in left:
+            if not deadline.leaves_time():
+                return
+            begun = time.monotonic()
+            made: Made | Turn | InputError
             try:
-                worked.outcomes[number] = batch.make(number, work)
+                made = attempt(batch, number, before[number], work)
             except InputError as error:
-                if not keep_going:
-                    raise InputError(f"{error}{_done_before(batch, worked)}") from error
-                worked.failures.append(Failure(name, str(error)))
-                work.console.warn([Notice("frame-failed", name, str(error), "leave it out, or mend it")])
+                made = error
+            if made is Turn.CLAIMED:
+                of_others.append(number)
+            else:
+                deadline.took(time.monotonic() - begun)
+                yield number, made
+        if len(of_others) == len(left):
+            time.sleep(SECONDS_BETWEEN_LOOKS)
+        left = of_others
+
+
+def _settle(
+    batch: Batch[Made],
+    number: int,
+    made: Made | Turn | InputError,
+    keep_going: bool,
+    work: Frames,
+    worked: Worked[Made],
+) -> None:
+    """Note what became of an output.
+
+    Raises
+    ------
+    InputError : it could not be made, and the batch is not to go on without it
+    """
+    name = batch.names[number]
+    if isinstance(made, InputError):
+        if not keep_going:
+            raise InputError(f"{made}{_done_before(batch, worked)}") from made
+        worked.failures.append(Failure(name, str(made)))
+        work.console.warn([Notice("frame-failed", name, str(made), "leave it out, or mend it")])
+    elif isinstance(made, Turn):
+        worked.skipped += 1
+    else:
+        worked.outcomes[number] = made
     work.done(name)
-    return True
 
 
 def _stamp(path: Path) -> Stamp:

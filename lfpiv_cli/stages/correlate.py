@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -38,7 +38,7 @@ from lfpiv_cli.interface.vectors_checks import (
 from lfpiv_cli.names import Pairing
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.reference import Reference
-from lfpiv_cli.stages.batches import BatchOptions, Worked, work_through
+from lfpiv_cli.stages.batches import ALL, BatchOptions, ByArguments, Worked, work_through
 
 Extra = dict[str, tuple[NDArray[Any], str]]
 
@@ -107,7 +107,7 @@ def correlate(
     if options.mean is not None and fields:
         mean = Mean(options.mean, fields, batch.settings.resolved(), options.derived, overwrite)
         # What another worker made of the same fields in the meantime is as good.
-        work_through(mean, replace(options, resume=True, failures=None), console)
+        work_through(mean, BatchOptions(resume=True), console)
     return worked.ensure_whole(batch.summary(worked), batch.unit)
 
 
@@ -120,7 +120,7 @@ class Outcome:
     divergence_rms: float | None = None
 
 
-class Correlation:
+class Correlation(ByArguments):
     """The batch of `correlate`: a field of vectors for each pair of volumes, or one of all pairs together."""
 
     label = "correlate"
@@ -137,6 +137,11 @@ class Correlation:
         self._pairs = pairs = _pairs(volumes, options.pairing)
         if options.mean is not None and (options.ensemble or len(pairs) < 2):
             raise UsageError("--mean needs several pairs, each correlated by itself")
+        if options.mean is not None and options.shard != ALL:
+            raise UsageError(
+                "--mean needs the fields of all shards: once they are there, the same command without --shard and with "
+                "--resume makes it"
+            )
         self._groups = [pairs] if options.ensemble else [[pair] for pair in pairs]
         self._common = given(config=options.config, mask=options.mask_volume)
         self._config = load_config(options.config) if options.config else None

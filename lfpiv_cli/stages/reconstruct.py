@@ -30,7 +30,7 @@ from lfpiv_cli.notice import Notice
 from lfpiv_cli.particles.search import Particles
 from lfpiv_cli.reconstruction.images import Image
 from lfpiv_cli.reconstruction.registry import SolverName
-from lfpiv_cli.stages.batches import BatchOptions, Worked, work_through
+from lfpiv_cli.stages.batches import BatchOptions, ByArguments, Worked, work_through
 from lfpiv_cli.stages.finding import Finder
 from lfpiv_cli.stages.frames import STILL, Ahead, Background, Read, beside_frames, mask_of, other_frames, reader
 
@@ -99,7 +99,7 @@ class _Ready:
     said: Sequence[Notice]
 
 
-class Reconstruction:
+class Reconstruction(ByArguments):
     """The batch of `reconstruct`: a volume, or particles, for each frame."""
 
     label, unit = "reconstruct", "frame"

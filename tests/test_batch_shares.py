@@ -1,0 +1,170 @@
+"""Batches divided among jobs and workers: the same files, byte for byte, as of one command."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+
+from lfpiv_cli.cli import cli
+from lfpiv_cli.errors import StoppedEarlyError, UsageError
+from lfpiv_cli.files.images import read_image
+from lfpiv_cli.files.shares import Deadline
+
+ROOT = Path(__file__).parent.parent
+SAMPLE = ROOT / "sample_data"
+SMALL = {"shape_xyz: [30, 22, 40]": "shape_xyz: [8, 6, 12]", "reference: mid_plane": "reference: focal_point"}
+
+
+def run(*arguments: object) -> None:
+    cli.main([str(argument) for argument in arguments], standalone_mode=False)
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Weights of a small part of the sample's volume."""
+    folder = tmp_path_factory.mktemp("weights")
+    text = (ROOT / "configs" / "sample.yaml").read_text()
+    for old, new in SMALL.items():
+        assert old in text
+        text = text.replace(old, new)
+    (folder / "rig.yaml").write_text(text)
+    run("build-weights", folder / "rig.yaml", "-o", folder / "weights.h5")
+    return folder / "weights.h5"
+
+
+@pytest.fixture(scope="module")
+def frames(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Five frames, each of other light."""
+    folder, rng = tmp_path_factory.mktemp("frames"), np.random.default_rng(3)
+    image = read_image(SAMPLE / "pair_a.tif")
+    paths = [folder / f"{number}.tif" for number in range(5)]
+    for path in paths:
+        tifffile.imwrite(path, (image + rng.uniform(0.0, 9.0, image.shape)).astype(np.uint16))
+    return paths
+
+
+@pytest.fixture(scope="module")
+def volumes(weights: Path, frames: list[Path], tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """The volumes of the frames, by one command."""
+    folder = tmp_path_factory.mktemp("volumes") / "volumes"
+    reconstruct(weights, frames, folder)
+    return sorted(folder.iterdir())
+
+
+@pytest.fixture
+def in_process() -> Iterator[str]:
+    """The address of a scheduler with two workers in this process."""
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None
+    ) as cluster:
+        yield cluster.scheduler_address
+
+
+def reconstruct(weights: Path, frames: list[Path], output: Path, *options: object) -> None:
+    common = ("--iterations", 2, "--background", "minimum:3", "--quiet")
+    run("reconstruct", weights, *frames, *common, *options, "-o", output)
+
+
+def correlate(volumes: list[Path], output: Path, *options: object) -> None:
+    run("correlate", *volumes, "--pairing", "sequence", "--windows", "4", "--quiet", *options, "-o", output)
+
+
+def bytes_of(folder: Path | list[Path]) -> dict[str, bytes]:
+    """Return what is in the files of a folder, hidden ones too."""
+    paths = folder if isinstance(folder, list) else folder.iterdir()
+    return {path.name: path.read_bytes() for path in paths}
+
+
+def test_shards_together_give_what_one_command_gives(
+    weights: Path, frames: list[Path], volumes: list[Path], tmp_path: Path
+) -> None:
+    for number in (3, 1, 2):
+        reconstruct(weights, frames, tmp_path / "v", "--shard", f"{number}/3")
+    assert bytes_of(tmp_path / "v") == bytes_of(volumes)
+
+
+def test_the_share_of_an_array_job_is_made(
+    weights: Path, frames: list[Path], volumes: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in {"ID": 12, "MIN": 10, "COUNT": 3, "STEP": 2}.items():
+        monkeypatch.setenv(f"SLURM_ARRAY_TASK_{name}", str(value))
+    reconstruct(weights, frames, tmp_path / "v", "--shard", "slurm")
+    assert sorted(bytes_of(tmp_path / "v")) == ["1.vtkhdf", "2.vtkhdf"]
+
+
+def test_more_shards_than_frames(weights: Path, frames: list[Path], tmp_path: Path) -> None:
+    for number in range(1, 5):
+        reconstruct(weights, frames[:2], tmp_path / "v", "--shard", f"{number}/4")
+    assert len(bytes_of(tmp_path / "v")) == 2
+
+
+def test_workers_give_what_one_command_gives(
+    weights: Path, frames: list[Path], volumes: list[Path], in_process: str, tmp_path: Path, capsys
+) -> None:
+    reconstruct(weights, frames, tmp_path / "v", "--dask", in_process, "--json", "--log", tmp_path / "log")
+    assert bytes_of(tmp_path / "v") == bytes_of(volumes)
+    assert json.loads(capsys.readouterr().out)["reconstructed"] == 5
+    events = [json.loads(line) for line in (tmp_path / "log").read_text().splitlines()]
+    assert [event["done"] for event in events if event["event"] == "frame"] == [1, 2, 3, 4, 5]
+    correlate(volumes, tmp_path / "one")
+    correlate(volumes, tmp_path / "many", "--dask", in_process)
+    assert bytes_of(tmp_path / "many") == bytes_of(tmp_path / "one")
+
+
+def test_fields_of_shards_and_their_mean_by_a_last_command(volumes: list[Path], tmp_path: Path) -> None:
+    correlate(volumes, tmp_path / "one", "--mean", tmp_path / "mean_one.vtkhdf")
+    with pytest.raises(UsageError, match="--mean needs the fields of all shards.*without --shard and with --resume"):
+        correlate(volumes, tmp_path / "v", "--mean", tmp_path / "mean.vtkhdf", "--shard", "1/2")
+    for number in (1, 2):
+        correlate(volumes, tmp_path / "v", "--shard", f"{number}/2")
+    made = {path: path.stat().st_mtime_ns for path in (tmp_path / "v").iterdir()}
+    correlate(volumes, tmp_path / "v", "--mean", tmp_path / "mean.vtkhdf", "--resume")
+    assert bytes_of(tmp_path / "v") == bytes_of(tmp_path / "one")
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "v").iterdir()} == made
+    assert (tmp_path / "mean.vtkhdf").read_bytes() == (tmp_path / "mean_one.vtkhdf").read_bytes()
+
+
+def test_a_batch_stops_before_its_time_limit_and_goes_on(
+    weights: Path, frames: list[Path], volumes: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    listed = tmp_path / "failures.json"
+    with monkeypatch.context() as clock:
+        # After two frames the third would not be done in time.
+        took = iter([0.1, 2000.0])
+        clock.setattr(Deadline, "took", lambda self, _seconds: setattr(self, "longest_s", next(took)))
+        with pytest.raises(StoppedEarlyError, match="2 of 5 frames are done; .*--resume"):
+            reconstruct(weights, frames, tmp_path / "v", "--time-limit", "30m", "--failures", listed)
+    assert len(bytes_of(tmp_path / "v")) == 2
+    assert json.loads(listed.read_text()) == []
+    reconstruct(weights, frames, tmp_path / "v", "--time-limit", "30m", "--resume")
+    assert bytes_of(tmp_path / "v") == bytes_of(volumes)
+
+
+def test_a_time_limit_that_is_over_at_once(weights: Path, frames: list[Path], tmp_path: Path) -> None:
+    with pytest.raises(StoppedEarlyError, match="0 of 5 frames are done"):
+        reconstruct(weights, frames, tmp_path / "v", "--time-limit", "0.000001s")
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("--solver", "particles"),
+        ("--solver", "particles", "--pairing", "ab"),
+        ("--solver", "particles", "--background", "minimum:5"),
+    ],
+    ids=["alone", "pairs", "background"],
+)
+@pytest.mark.slow
+def test_particles_of_shards_are_those_of_one_command(
+    weights: Path, frames: list[Path], options: tuple[str, ...], tmp_path: Path
+) -> None:
+    for share in ("1/1", "2/3", "1/3", "3/3"):
+        folder = tmp_path / ("one" if share == "1/1" else "shards")
+        run("reconstruct", weights, *frames[:4], *options, "--shard", share, "--quiet", "-o", folder)
+    assert bytes_of(tmp_path / "shards") == bytes_of(tmp_path / "one")

@@ -1,0 +1,111 @@
+"""Batches on Dask's workers: the same files as without, a killed worker loses nothing, what kills workers is named."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from lfpiv_cli.console import Console, Frames
+from lfpiv_cli.errors import InputError, StoppedEarlyError, UsageError
+from lfpiv_cli.files.batch import Target
+from lfpiv_cli.notice import Notice
+from lfpiv_cli.stages.batches import BatchOptions, ByArguments, Worked, work_through
+
+distributed = pytest.importorskip("distributed")
+pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")
+
+
+class Toy(ByArguments):
+    """Outputs that say in which process they were made; some are faulty, or kill their process."""
+
+    label, unit, overwrite = "toy", "frame", True
+
+    def __init__(self, folder: Path, count: int, faulty: Sequence[int] = (), deadly: Sequence[int] = ()) -> None:
+        self.folder, self.faulty, self.deadly = folder, faulty, deadly
+        self.targets = [Target(folder / f"{number}.vtkhdf", dict) for number in range(count)]
+        self.names = [str(number) for number in range(count)]
+        self.inputs: list[Path] = []
+
+    def begin(self, numbers: Sequence[int], console: Console) -> float:
+        with open(self.folder / "begun", "a") as file:
+            file.write(f"{os.getpid()}\n")
+        return 1.0
+
+    def make(self, number: int, work: Frames) -> int:
+        if number in self.faulty:
+            raise InputError(f"{number}: is cut")
+        if number in self.deadly:
+            os.kill(os.getpid(), signal.SIGKILL)
+        work.console.warn([Notice("frame-dark", str(number), "is dark", "light")])
+        self.targets[number].path.write_text(str(number))
+        return os.getpid()
+
+
+@pytest.fixture(scope="module")
+def in_process() -> Iterator[str]:
+    """The address of a scheduler with two workers in this process."""
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None
+    ) as cluster:
+        yield cluster.scheduler_address
+
+
+def work(batch: Toy, dask: str, **options: Any) -> tuple[Worked[int], list[Notice]]:
+    warned: list[Notice] = []
+    console = Console(quiet=True, warned=warned)
+    return work_through(batch, BatchOptions(dask=dask, **options), console), warned
+
+
+def written(folder: Path) -> list[str]:
+    return sorted(path.read_text() for path in folder.glob("*.vtkhdf"))
+
+
+def test_every_output_is_made_and_what_is_said_comes_back(in_process: str, tmp_path: Path) -> None:
+    worked, warned = work(Toy(tmp_path, 5), in_process)
+    assert written(tmp_path) == list("01234")
+    assert list(worked.outcomes) == [0, 1, 2, 3, 4]
+    assert sorted(notice.about for notice in warned) == list("01234")
+    # once for each worker, not for each output
+    assert len((tmp_path / "begun").read_text().split()) == 2
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_a_faulty_output_is_listed_or_stops_the_batch(in_process: str, tmp_path: Path) -> None:
+    worked, _ = work(Toy(tmp_path, 4, faulty=[1]), in_process, keep_going=True)
+    assert [failure.name for failure in worked.failures] == ["1"]
+    assert written(tmp_path) == list("023")
+    with pytest.raises(InputError, match="1: is cut"):
+        work(Toy(tmp_path, 4, faulty=[1]), in_process)
+
+
+def test_a_share_of_the_outputs_is_made(in_process: str, tmp_path: Path) -> None:
+    from lfpiv_cli.files.shares import Shard
+
+    worked, _ = work(Toy(tmp_path, 5), in_process, shard=Shard(2, 2))
+    assert list(worked.outcomes) == [2, 3, 4]
+
+
+def test_no_time_is_told(in_process: str, tmp_path: Path) -> None:
+    with pytest.raises(StoppedEarlyError, match="0 of 5 frames are done"):
+        work(Toy(tmp_path, 5), in_process, time_limit_s=1e-9)
+
+
+def test_an_address_where_nobody_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from lfpiv_cli.stages import distributed as stage
+
+    monkeypatch.setattr(stage, "CONNECT_S", 0.2)
+    for address in ("tcp://127.0.0.1:1", "nonsense"):
+        with pytest.raises(UsageError, match=f"--dask {address}"):
+            work(Toy(tmp_path, 2), address)
+
+
+def test_without_distributed_the_remedy_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "lfpiv_cli.stages.distributed", None)
+    with pytest.raises(UsageError, match=r'pip install "lfpiv\[cluster\]"'):
+        work(Toy(tmp_path, 2), "local")
