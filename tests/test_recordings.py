@@ -3,15 +3,25 @@
 from __future__ import annotations
 
 import os
+import re
+import struct
+import sys
+import time
+from contextlib import suppress
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 import tifffile
 
-from lfpiv_cli.errors import InputError
+from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files import images
+from lfpiv_cli.files.inputs import split_part
 from lfpiv_cli.files.recordings import tiff
+from lfpiv_cli.files.recordings.bayer import PATTERNS, green_of
+from lfpiv_cli.files.recordings.packing import PACKED_BITS, Packing, Pixels
+from tests import camera_files
 
 
 def test_a_sequence_is_looked_through_once_and_again_when_it_changes(
@@ -40,3 +50,379 @@ def test_a_header_tells_shape_and_bits(tmp_path: Path) -> None:
     recording = images.frames(tmp_path / "t.tif")
     assert (recording.pages, recording.shape, recording.bits) == (2, (3, 4), 16)
     assert images.times_of(tmp_path / "t.tif") is None
+
+
+def stack_of(rng: np.random.Generator, bits: int, shape: tuple[int, int, int] = (3, 5, 7)) -> np.ndarray:
+    return rng.integers(0, 2**bits, shape, dtype=np.uint8 if bits == 8 else np.uint16)
+
+
+def read_all(path: Path) -> None:
+    for page in range(images.count_pages(path)):
+        images.read_page(path, page)
+
+
+def kinds(folder: Path, rng: np.random.Generator) -> dict[str, tuple[Path, np.ndarray]]:
+    """Write a recording of each kind; return where, and what is in it."""
+    wide, narrow, ten, twelve = (stack_of(rng, bits) for bits in (16, 8, 10, 12))
+    camera_files.write_cine(folder / "c16.cine", wide, notes=b"range data")
+    camera_files.write_cine(folder / "c8.cine", narrow, version=0)
+    camera_files.write_cine(folder / "c12.cine", twelve, packed=12)
+    camera_files.write_seq(folder / "s16.seq", wide)
+    camera_files.write_seq(folder / "s8.seq", narrow, version=3)
+    camera_files.write_mraw(folder / "m16.mraw", wide, bits=16)
+    camera_files.write_mraw(folder / "m8.mraw", narrow, bits=8, xml=False)
+    camera_files.write_mraw(folder / "m12.mraw", twelve, bits=12)
+    camera_files.write_mraw(folder / "m10.mraw", ten, bits=10, xml=False)
+    camera_files.write_stack(folder / "h.h5", wide)
+    (folder / "r.raw").write_bytes(b"".join(camera_files.bits_low_first(frame, 12) for frame in twelve))
+    found = {name: (folder / name, wide) for name in ("c16.cine", "s16.seq", "m16.mraw", "h.h5")}
+    found |= {name: (folder / name, narrow) for name in ("c8.cine", "s8.seq", "m8.mraw")}
+    found |= {name: (folder / name, twelve) for name in ("c12.cine", "m12.mraw")}
+    return found | {
+        "m10.mraw": (folder / "m10.mraw", ten),
+        "r.raw": (folder / "r.raw:7x5x12:packing=low-first:rate=2000", twelve),
+        "h.h5 named": (folder / "h.h5:/entry/data/frames", wide),
+    }
+
+
+KINDS = (
+    "c16.cine",
+    "c8.cine",
+    "c12.cine",
+    "s16.seq",
+    "s8.seq",
+    "m16.mraw",
+    "m8.mraw",
+    "m12.mraw",
+    "m10.mraw",
+    "h.h5",
+    "r.raw",
+    "h.h5 named",
+)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_each_format_gives_the_counts_and_times_that_were_written(
+    tmp_path: Path, rng: np.random.Generator, kind: str
+) -> None:
+    path, stack = kinds(tmp_path, rng)[kind]
+    found = images.frames(path)
+    assert (found.pages, found.shape) == (3, (5, 7))
+    for page in range(3):
+        image = images.read_page(path, page, (5, 7))
+        assert image.dtype == np.float32
+        np.testing.assert_array_equal(image, stack[page])
+    # Norpix' older versions have milliseconds.
+    second = 0.0 if kind == "s8.seq" else 0.0005
+    np.testing.assert_allclose(images.times_of(path), [0.0, second, 0.001], rtol=0, atol=1e-9)
+    with pytest.raises(InputError, match=r"7 x 5 pixels.*, expected the sensor's 8 x 5"):
+        images.read_page(path, 0, (5, 8))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_recording_cut_anywhere_is_refused_by_its_name(tmp_path: Path, rng: np.random.Generator, kind: str) -> None:
+    given, _ = kinds(tmp_path, rng)[kind]
+    path, _ = split_part(given)
+    content = path.read_bytes()
+    # A sequence's frames are padded, and what is cut off the last one's padding is not missed; frames without a header
+    # are whole where the file ends with one.
+    padding = 469 if kind == "s8.seq" else 434 if kind == "s16.seq" else 0
+    end = len(content) - padding
+    for kept in {*range(1, end, max(end // 40, 1)), end - 1}:
+        if kind == "r.raw" and kept % 53 == 0:
+            continue
+        path.write_bytes(content[:kept])
+        with pytest.raises(InputError, match=path.name):
+            read_all(given)
+
+
+def naive(data: bytes, bits: int, count: int, high_first: bool) -> list[int]:
+    """Unpack bit by bit."""
+    numbers = []
+    for k in range(count):
+        number = 0
+        for j in range(bits):
+            byte, place = divmod(k * bits + j, 8)
+            bit = data[byte] >> (7 - place if high_first else place) & 1
+            number = number << 1 | bit if high_first else number | bit << j
+        numbers.append(number)
+    return numbers
+
+
+@pytest.mark.parametrize("bits", PACKED_BITS)
+@pytest.mark.parametrize("packing", ["high-first", "low-first"])
+@pytest.mark.parametrize("columns", [1, 4, 7, 8])
+def test_packed_pixels_are_what_their_bits_say_one_by_one(
+    rng: np.random.Generator, bits: int, packing: Packing, columns: int
+) -> None:
+    pixels = Pixels((3, columns), bits, packing)
+    data = rng.bytes(pixels.frame_bytes)
+    expected = naive(data, bits, 3 * columns, packing == "high-first")
+    np.testing.assert_array_equal(pixels.decode(data).ravel(), expected)
+
+
+@pytest.mark.parametrize("bits", PACKED_BITS)
+def test_gige_packs_two_pixels_in_three_bytes(rng: np.random.Generator, bits: int) -> None:
+    stack = stack_of(rng, bits, (1, 5, 7))
+    assert Pixels((5, 7), bits, "gige").frame_bytes == len(camera_files.gige(stack, bits))
+    np.testing.assert_array_equal(Pixels((5, 7), bits, "gige").decode(camera_files.gige(stack, bits)), stack[0])
+
+
+def test_a_cine_packed_to_ten_bits_has_linear_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    codes = np.arange(1024, dtype=np.uint16).reshape(1, 32, 32)
+    camera_files.write_cine(tmp_path / "t.cine", codes, packed=10)
+    assert images.frames(tmp_path / "t.cine").bits == 12
+    counts = images.read_page(tmp_path / "t.cine", 0).ravel()
+    # The manufacturer's anchors: black stays, white is at 4064 of 4095; and more light is never darker.
+    assert (counts[64], counts[1014], counts[1023]) == (64, 4064, 4095)
+    assert (np.diff(counts) >= 0).all()
+    images.read_page.__globals__["_frames"].cache_clear()
+    monkeypatch.setitem(sys.modules, "cine_reader.unpack", None)
+    with pytest.raises(UsageError, match=re.escape('t.cine: is packed to 10 bits: pip install "lfpiv[cameras]"')):
+        images.frames(tmp_path / "t.cine")
+
+
+def test_images_of_davis(tmp_path: Path, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    lvpyio = pytest.importorskip("lvpyio")
+    stack, path = stack_of(rng, 12, (2, 30, 40)), tmp_path / "B00001.im7"
+    for packed in (True, False):
+        lvpyio.write_buffer(lvpyio.arrays_to_buffer(list(stack)), str(path), compress=packed)
+        found = images.frames(path)
+        assert (found.pages, found.shape, found.bits, found.time_s) == (2, (30, 40), 16, None)
+        for page in range(2):
+            np.testing.assert_array_equal(images.read_page(path, page, (30, 40)), stack[page])
+        content = path.read_bytes()
+        for percent in range(1, 95, 4):
+            path.write_bytes(content[: len(content) * percent // 100])
+            with pytest.raises(InputError, match="B00001.im7"):
+                read_all(path)
+    path.write_bytes(content)
+    (tmp_path / "run.set").write_text("set")
+    with pytest.raises(UsageError, match=r"give the \.im7 files of the folder .*run"):
+        images.frames(tmp_path / "run.set")
+    monkeypatch.setitem(sys.modules, "lvpyio", None)
+    with pytest.raises(UsageError, match=re.escape('pip install "lfpiv[cameras]"')):
+        images.frames(path)
+
+
+def edited(path: Path, place: int, layout: str, value: int) -> None:
+    content = bytearray(path.read_bytes())
+    struct.pack_into(layout, content, place, value)
+    path.write_bytes(content)
+
+
+# Where a header has a number, as in `camera_files`, what a hostile one says, and how it is refused.
+HOSTILE = {
+    "cine, frames": ("c16.cine", 20, "<I", 2**31, "ends at byte"),
+    "cine, no frames": ("c16.cine", 20, "<I", 0, "no frames"),
+    "cine, place of the bitmap": ("c16.cine", 24, "<I", 2**32 - 1, "ends at byte"),
+    "cine, place of the setup": ("c16.cine", 28, "<I", 2**32 - 1, "ends at byte"),
+    "cine, place of the places": ("c16.cine", 32, "<I", 2**32 - 1, "ends at byte"),
+    "cine, width": ("c16.cine", 48, "<i", 2**31 - 1, "bytes a frame"),
+    "cine, negative width": ("c16.cine", 48, "<i", -7, "-7 x 5"),
+    "cine, no setup": ("c16.cine", 84 + 140, "<H", 0, "no SETUP"),
+    "cine, compression": ("c16.cine", 4, "<H", 1, "raw cine"),
+    "cine, bits": ("c16.cine", 58, "<H", 24, "24 bits a pixel"),
+    "seq, width": ("s16.seq", 548, "<I", 400_000, "expected 4000000 for 400000 x 5"),
+    "seq, frames": ("s16.seq", 572, "<I", 2**32 - 1, "of which the last ends"),
+    "seq, no frames": ("s16.seq", 572, "<I", 0, "no frames"),
+    "seq, bits": ("s16.seq", 556, "<I", 12, "expected them in 8 or 16"),
+    "seq, step": ("s16.seq", 580, "<I", 8, "every 8 bytes"),
+    "seq, compressed": ("s16.seq", 620, "<I", 1, "compressed"),
+    "seq, colour": ("s16.seq", 568, "<I", 101, "bayer=RGGB"),
+}
+
+
+@pytest.mark.parametrize("what", HOSTILE)
+def test_hostile_headers_are_refused_quickly(tmp_path: Path, rng: np.random.Generator, what: str) -> None:
+    name, place, layout, value, words = HOSTILE[what]
+    path, _ = kinds(tmp_path, rng)[name]
+    edited(path, place, layout, value)
+    began = time.monotonic()
+    with pytest.raises(InputError, match=words) as raised:
+        read_all(path)
+    assert name in str(raised.value)
+    assert time.monotonic() - began < 1.0
+
+
+def test_places_and_notes_of_a_cine_must_lie_in_it(tmp_path: Path, rng: np.random.Generator) -> None:
+    path, stack = tmp_path / "t.cine", stack_of(rng, 16, (2, 4, 6))
+    for wrong in (-1, 2**40):
+        camera_files.write_cine(path, stack)
+        content = path.read_bytes()
+        (places_at,) = struct.unpack_from("<I", content, 32)
+        (second,) = struct.unpack_from("<q", content, places_at + 8)
+        edited(path, places_at, "<q", wrong)
+        with pytest.raises(InputError, match=r"t\.cine: declares 2 frames"):
+            images.frames(path)
+    for notes_bytes in (0, 2**31):
+        camera_files.write_cine(path, stack)
+        edited(path, second, "<I", notes_bytes)
+        np.testing.assert_array_equal(images.read_page(path, 0), stack[0])
+        with pytest.raises(InputError, match=r"t\.cine: "):
+            images.read_page(path, 1)
+    camera_files.write_cine(path, stack)
+    edited(path, second + 4, "<I", 3)
+    with pytest.raises(InputError, match="declares 3 bytes, expected 48"):
+        images.read_page(path, 1)
+
+
+def test_other_ways_of_writing_a_cine(tmp_path: Path, rng: np.random.Generator) -> None:
+    path, stack = tmp_path / "t.cine", stack_of(rng, 8, (2, 4, 5))
+    camera_files.write_cine(path, stack, times=False, tight=True)
+    np.testing.assert_array_equal(images.read_page(path, 1), stack[1])
+    np.testing.assert_allclose(images.times_of(path), [0.0, 1 / camera_files.RATE_HZ])
+    edited(path, 52, "<i", -4)
+    np.testing.assert_array_equal(images.read_page(path, 1), stack[1, ::-1])
+    camera_files.write_cine(path, stack, filters=3)
+    with pytest.raises(InputError, match="frames of a colour sensor.*bayer=RGGB"):
+        images.frames(path)
+
+
+CIH = "Total Frame : 1\nImage Width : 7\nImage Height : 5\nColor Type : Mono\nColor Bit : 8\n"
+
+
+@pytest.mark.parametrize(
+    ("header", "words"),
+    [
+        (CIH.replace("7", "-7"), "Image Width is -7"),
+        (CIH.replace("7", "7e3"), "Image Width is 7e3"),
+        (CIH.replace("Bit : 8", "Bit : 9"), "Color Bit is 9"),
+        (CIH.replace("Total Frame : 1", "Total Frame : 99999999"), "of which the last ends"),
+        (CIH.replace("Mono", "Bayer"), "bayer=RGGB"),
+        (CIH.replace("Image Height : 5\n", ""), "Image Height is None"),
+        ("", "is empty"),
+        ("\0" * (2**20 + 1), "no header"),
+    ],
+)
+def test_headers_of_photron_that_do_not_fit(tmp_path: Path, header: str, words: str) -> None:
+    path = tmp_path / "t.mraw"
+    path.write_bytes(bytes(35))
+    with pytest.raises(InputError, match=r"t\.cihx or \.cih is not beside it"):
+        images.frames(path)
+    (tmp_path / "t.cih").write_text(header)
+    with pytest.raises(InputError, match=words):
+        images.frames(path)
+
+
+def test_xml_that_declares_entities_or_ends_early_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "t.mraw").write_bytes(bytes(35))
+    for text in ("<cih><frameInfo>", "<cih><a></cih>", '<!DOCTYPE cih [<!ENTITY a "b">]><cih>&a;</cih>'):
+        (tmp_path / "t.cihx").write_text(text)
+        with pytest.raises(InputError, match=r"t\.cihx: "):
+            images.frames(tmp_path / "t.mraw")
+
+
+def test_a_photron_recording_that_left_frames_out_is_timed_by_what_it_kept(tmp_path: Path) -> None:
+    (tmp_path / "t.mraw").write_bytes(bytes(70))
+    (tmp_path / "t.cih").write_text(CIH.replace("e : 1", "e : 2") + "Record Rate(fps) : 1000\nSave Step : 5\n")
+    np.testing.assert_allclose(images.times_of(tmp_path / "t.mraw"), [0.0, 0.005])
+
+
+@pytest.mark.parametrize(
+    ("layout", "words"),
+    [
+        ("7x5", "is no layout of frames; a layout is WIDTHxHEIGHTxBITS"),
+        ("7x5x17", "17 bits a pixel"),
+        ("0x5x8", "is no layout"),
+        ("7x5x8:packing=high-first", "8 bits are not packed"),
+        ("7x5x12:packing=other", "packing is 'other', expected whole, high-first, low-first, gige"),
+        ("7x5x8:header=-1", "header is '-1', expected a number of bytes"),
+        ("7x5x8:rate=nan", "rate is 'nan', expected frames in a second"),
+        ("7x5x8:rate=5:rate=5", "'rate' is no option, or there twice"),
+        ("7x5x8:size=5", "'size' is no option"),
+        ("7x5x8:bayer=RGB", "expected RGGB, BGGR, GRBG, GBRG"),
+    ],
+)
+def test_a_layout_that_is_none(tmp_path: Path, layout: str, words: str) -> None:
+    (tmp_path / "t.raw").write_bytes(bytes(35))
+    with pytest.raises(UsageError, match=words):
+        images.frames(tmp_path / f"t.raw:{layout}")
+    with pytest.raises(UsageError, match="has no header: state its layout with --raw"):
+        images.frames(tmp_path / "t.raw")
+
+
+def test_frames_without_a_header_lie_as_stated(tmp_path: Path, rng: np.random.Generator) -> None:
+    stack, path = stack_of(rng, 16), tmp_path / "t.bin"
+    gap = b"--"
+    path.write_bytes(b"head" + gap.join(frame.astype(">u2").tobytes() for frame in stack))
+    layout = "7x5x16:header=4:gap=2:order=big"
+    for content in (path.read_bytes(), path.read_bytes() + gap):
+        path.write_bytes(content)
+        assert images.count_pages(tmp_path / f"t.bin:{layout}") == 3
+        np.testing.assert_array_equal(images.read_page(tmp_path / f"t.bin:{layout}", 2), stack[2])
+    with pytest.raises(InputError, match=r"3\.\d\d frames .*expected a whole number"):
+        images.frames(tmp_path / "t.bin:7x5x16:header=4")
+    with pytest.raises(InputError, match="frames"):
+        images.frames(tmp_path / "t.bin:7x5x16:header=400000")
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_green_of_a_colour_sensor(tmp_path: Path, rng: np.random.Generator, pattern: str) -> None:
+    """Green pixels stay as they are; an even light behind all filters is even, whatever red and blue see."""
+    mosaic = stack_of(rng, 16, (1, 5, 6))[0]
+    green = np.array([[pattern[2 * (row % 2) + column % 2] == "G" for column in range(6)] for row in range(5)])
+    (tmp_path / "t.raw").write_bytes(mosaic.tobytes())
+    seen = images.read_page(tmp_path / f"t.raw:6x5x16:bayer={pattern}", 0)
+    np.testing.assert_array_equal(seen[green], mosaic[green])
+    row, column = np.argwhere(~green)[np.argmax(np.all(np.argwhere(~green) % 4 > 0, axis=1))]
+    beside = mosaic[[row - 1, row + 1, row, row], [column, column, column - 1, column + 1]]
+    assert seen[row, column] == beside.mean()
+    even = np.where(green, 100, mosaic).astype(np.float32)
+    np.testing.assert_array_equal(green_of(even, pattern), np.full((5, 6), 100))
+
+
+def test_stacks_that_are_refused(tmp_path: Path, rng: np.random.Generator) -> None:
+    path, other = tmp_path / "t.h5", tmp_path / "other.h5"
+    stack = stack_of(rng, 16)
+    camera_files.write_stack(other, stack, "frames")
+    with h5py.File(path, "w") as file:
+        file["a"] = file["b"] = stack
+        file["flat"], file["line"], file["text"] = stack[0], stack[0, 0], np.bytes_("x")
+        file["link"] = h5py.ExternalLink("other.h5", "frames")
+        file.create_dataset("unwritten", stack.shape, "u2", chunks=(1, 5, 7))
+        file.create_dataset("huge", (1, 400_000, 400_000), "u2", chunks=(1, 10, 10))
+        file.create_dataset("outside", stack.shape, "u2", external=[("raw.bin", 0, stack.nbytes)])
+        layout = h5py.VirtualLayout(stack.shape, "u2")
+        layout[:] = h5py.VirtualSource("other.h5", "frames", stack.shape)
+        file.create_virtual_dataset("virtual", layout)
+    np.testing.assert_array_equal(images.read_image(tmp_path / "t.h5:/flat"), stack[0])
+    for name, words in {
+        "": "datasets of frames, expected one, or to be told which: t.h5:/a, t.h5:/b",
+        ":/line": "expected numbers of (frames, rows, columns)",
+        ":/text": "expected numbers of (frames, rows, columns)",
+        ":/none": "holds no dataset /none",
+        ":/link": "link",
+        ":/unwritten": "0 of its 3 chunks",
+        ":/huge": "400000 x 400000",
+        ":/outside": "another file",
+        ":/virtual": "another file",
+    }.items():
+        with pytest.raises(InputError, match=re.escape(words)) as raised:
+            images.frames(tmp_path / f"t.h5{name}")
+        assert "t.h5" in str(raised.value)
+
+
+def test_a_part_of_a_format_without_parts(tmp_path: Path, rng: np.random.Generator) -> None:
+    path, _ = kinds(tmp_path, rng)["c8.cine"]
+    with pytest.raises(UsageError, match="have no parts or layouts"):
+        images.frames(path.with_name("c8.cine:7x5x8"))
+    (tmp_path / "t.dat").write_bytes(b"?")
+    with pytest.raises(InputError, match="neither a TIFF nor a PNG image, nor a recording of HDF5, Phantom cine"):
+        images.frames(tmp_path / "t.dat:/entry")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_mutated_headers_raise_nothing_else(tmp_path: Path, rng: np.random.Generator, kind: str) -> None:
+    given, _ = kinds(tmp_path, rng)[kind]
+    path, _ = split_part(given)
+    header = path if path.suffix != ".mraw" else next(path.parent.glob(f"{path.stem}.cih*"))
+    content = header.read_bytes()
+    telling = np.concatenate([np.arange(min(700, len(content))), np.arange(min(6_000, len(content)))])
+    for _ in range(60):
+        mutated = bytearray(content)
+        for place in rng.choice(telling, 3):
+            mutated[place] = rng.choice([0, 1, 0x7F, 0x80, 0xFF, rng.integers(256)])
+        header.write_bytes(mutated)
+        with suppress(InputError, UsageError):
+            read_all(given)

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from lfpiv_cli.errors import InputError, LfpivError, OutputError, OutputExistsError, UsageError
-from lfpiv_cli.files.inputs import reason
+from lfpiv_cli.files.inputs import reason, split_part
 
 # How much of the target's name the temporary file keeps: 40 characters of 4 bytes and the rest stay below the 255 bytes
 # that common file systems allow.
@@ -35,7 +35,7 @@ def ensure_writable(target: Path, overwrite: bool, inputs: Iterable[Path] = ()) 
         If it is not a regular file, or its folder is missing or read-only.
     """
     for path in inputs:
-        if _same_file(target, path):
+        if _same_file(target, split_part(path)[0]):
             raise UsageError(f"{target}: the output is also an input")
     if target.is_dir():
         raise OutputError(f"{target}: cannot be written: it is a folder")

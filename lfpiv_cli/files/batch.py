@@ -12,6 +12,7 @@ from lfpiv_cli.errors import InputError, OutputExistsError, UsageError
 from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.hdf5 import replace_provenance
 from lfpiv_cli.files.images import count_pages
+from lfpiv_cli.files.inputs import split_part
 from lfpiv_cli.files.provenance import bear_alike, without_warnings
 from lfpiv_cli.files.whole import read_whole
 from lfpiv_cli.names import Pairing
@@ -31,7 +32,8 @@ class Frame:
     @property
     def stem(self) -> str:
         """The file's stem, numbered where the file holds a sequence."""
-        return self.path.stem if self.pages == 1 else f"{self.path.stem}_{self.page:04d}"
+        stem = split_part(self.path)[0].stem
+        return stem if self.pages == 1 else f"{stem}_{self.page:04d}"
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.files.atomic import write_atomically
-from lfpiv_cli.files.inputs import ensure_regular_file
+from lfpiv_cli.files.inputs import ensure_regular_file, split_part
 from lfpiv_cli.files.recordings import tiff
-from lfpiv_cli.files.recordings.formats import format_of
+from lfpiv_cli.files.recordings.formats import open_recording
 from lfpiv_cli.files.recordings.recording import Image, Recording, Shape
 
 # Files whose headers are kept, so that a recording of thousands of frames is not looked through again for each. A batch
@@ -28,20 +28,27 @@ KEPT_HEADERS = 8
 def frames(path: Path) -> Recording:
     """Return what the header of a file of frames says: pages, shape, bits, time stamps.
 
+    Parameters
+    ----------
+    path : of the file, or `FILE.h5:/PATH` for a dataset in it, `FILE.raw:LAYOUT` for frames without a header
+
     Raises
     ------
     InputError
         If the file is missing, broken, or of no known format.
+    UsageError
+        If more has to be said, or what is said does not fit the format.
     """
-    ensure_regular_file(path)
-    status = path.stat()
-    return _frames(path, status.st_size, status.st_mtime_ns, status.st_ino)
+    file, part = split_part(path)
+    size = ensure_regular_file(file)
+    status = file.stat()
+    return _frames(file, part, size, status.st_mtime_ns, status.st_ino)
 
 
 @lru_cache(KEPT_HEADERS)
-def _frames(path: Path, size: int, mtime_ns: int, inode: int) -> Recording:
+def _frames(file: Path, part: str | None, size: int, mtime_ns: int, inode: int) -> Recording:
     """Read a header once; a file that has another size, time or place on the disk is looked at anew."""
-    return format_of(path).frames(path)
+    return open_recording(file, part)
 
 
 def count_pages(path: Path) -> int:

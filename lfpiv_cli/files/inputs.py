@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import stat
 from pathlib import Path
 
@@ -10,6 +11,17 @@ from lfpiv_cli.errors import InputError
 
 # Where the system does not tell its memory (Windows), files that declare more than this are refused.
 MEMORY_WHERE_UNKNOWN = 16 * 1024**3
+
+# A file, and what of it is meant: a dataset in it, or how its frames are laid out.
+PART = re.compile(r"(.+?\.[A-Za-z][A-Za-z0-9]*):(.+)", re.DOTALL)
+
+
+def split_part(path: Path) -> tuple[Path, str | None]:
+    """Return the file that `FILE.h5:/PATH` or `FILE.raw:LAYOUT` names, and the part; of any other path, itself."""
+    found = PART.fullmatch(path.as_posix())
+    if found is None or os.path.lexists(path):
+        return path, None
+    return Path(found[1]), found[2]
 
 
 def given(**inputs: Path | str | None) -> dict[str, Path]:

@@ -83,7 +83,6 @@ def _is_of(path: Path, kind: InputKind) -> bool:
     if suffix in IMAGE_SUFFIXES:
         return True
     try:
-        format_of(path)
+        return format_of(path).in_folders
     except InputError:
         return False
-    return True

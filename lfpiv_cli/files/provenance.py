@@ -19,7 +19,7 @@ import lfpiv_cli
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.files.atomic import without_nan
 from lfpiv_cli.files.hdf5 import open_h5, read_provenance
-from lfpiv_cli.files.inputs import ensure_regular_file, reason
+from lfpiv_cli.files.inputs import ensure_regular_file, reason, split_part
 from lfpiv_cli.notice import Notice
 
 # Files whose hash is remembered: those that a batch has in common are few.
@@ -60,9 +60,10 @@ def record(command: str, config: Mapping[str, Any] | None, inputs: Mapping[str, 
     named: dict[str, dict[str, str]] = {}
     made_from: dict[str, Any] = {}
     for role, path in sorted(inputs.items()):
+        file, part = split_part(path)
         digest = sha256(path)
-        named[role] = {"name": path.name, "sha256": digest}
-        earlier = earlier_record(path)
+        named[role] = {"name": file.name if part is None else f"{file.name}:{part}", "sha256": digest}
+        earlier = earlier_record(file)
         if earlier is not None:
             made_from.update(earlier.pop("made_from", {}))
             made_from[digest] = earlier
@@ -100,12 +101,17 @@ def recorded_warnings(made: Mapping[str, Any]) -> list[str]:
 
 def also_used_as(made: Mapping[str, Any], role: str) -> str | None:
     """Return as what the input of a role was given besides, to this command or to one before; None if to none."""
-    digest = made["inputs"][role]["sha256"]
+    asked = _file_and_part(made["inputs"][role])
     for each in (made, *made["made_from"].values()):
         for name, given in each["inputs"].items():
-            if given["sha256"] == digest and (each is not made or name != role):
+            if _file_and_part(given) == asked and (each is not made or name != role):
                 return f"{name} of {each['command'].split()[0]}"
     return None
+
+
+def _file_and_part(given: Mapping[str, str]) -> tuple[str, str | None]:
+    """Return what tells an input of a record from others: the file's content, and which part of it is meant."""
+    return given["sha256"], split_part(Path(given["name"]))[1]
 
 
 def calibrated_with(made: Mapping[str, Any]) -> str | None:
@@ -119,9 +125,10 @@ def calibrated_with(made: Mapping[str, Any]) -> str | None:
 
 
 def sha256(path: Path) -> str:
-    """Return the SHA-256 of a file, in hexadecimal digits."""
-    size = ensure_regular_file(path)
-    return _sha256(path, size, path.stat().st_mtime_ns)
+    """Return the SHA-256 of a file, in hexadecimal digits; of the whole file where a part of it is named."""
+    file, _ = split_part(path)
+    size = ensure_regular_file(file)
+    return _sha256(file, size, file.stat().st_mtime_ns)
 
 
 @lru_cache(maxsize=FILES_REMEMBERED)

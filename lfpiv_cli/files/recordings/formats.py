@@ -6,9 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from lfpiv_cli.errors import InputError
+from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files.inputs import ensure_regular_file, reason
-from lfpiv_cli.files.recordings import png, tiff
+from lfpiv_cli.files.recordings import cine, im7, mraw, png, raw, seq, stack, tiff
 from lfpiv_cli.files.recordings.recording import Recording
 
 
@@ -22,23 +22,53 @@ class Format:
     starts : the first bytes of its files, where they tell
     suffixes : of its files' names, in small letters, where the first bytes do not tell
     frames : reads a file's header
+    frames_of : reads what FILE:PART says of a file, where the format has parts
+    in_folders : whether its files are meant where a folder is given for the images in it; an HDF5 file can be anything
     """
 
     name: str
-    starts: tuple[bytes, ...]
-    suffixes: tuple[str, ...]
     frames: Callable[[Path], Recording]
+    starts: tuple[bytes, ...] = ()
+    suffixes: tuple[str, ...] = ()
+    frames_of: Callable[[Path, str], Recording] | None = None
+    in_folders: bool = True
 
 
+RAW = Format("raw", raw.frames, suffixes=raw.SUFFIXES, frames_of=raw.frames_laid_out)
 FORMATS = (
-    Format("TIFF", tiff.STARTS, (), tiff.frames),
-    Format("PNG", (png.START,), (), png.frames),
+    Format("TIFF", tiff.frames, starts=tiff.STARTS),
+    Format("PNG", png.frames, starts=(png.START,)),
+    Format("HDF5", stack.frames, starts=(stack.START,), frames_of=stack.frames_named, in_folders=False),
+    Format("Phantom cine", cine.frames, starts=(cine.START,)),
+    Format("Norpix seq", seq.frames, starts=(seq.START,)),
+    Format("Photron mraw", mraw.frames, suffixes=(".mraw",)),
+    Format("LaVision im7", im7.frames, suffixes=(".im7",)),
+    Format("LaVision set", im7.frames_of_set, suffixes=(".set",), in_folders=False),
+    RAW,
 )
 LONGEST_START = max(len(start) for each in FORMATS for start in each.starts)
 
 
-def format_of(path: Path) -> Format:
+def open_recording(path: Path, part: str | None) -> Recording:
+    """Return what a file's header says of its frames.
+
+    Raises
+    ------
+    InputError : the file is broken or of no known format
+    UsageError : the format has no parts and one was named, or needs more to be said
+    """
+    found = format_of(path, part)
+    if part is None:
+        return found.frames(path)
+    if found.frames_of is None:
+        raise UsageError(f"{path}:{part}: {found.name} files have no parts or layouts to name")
+    return found.frames_of(path, part)
+
+
+def format_of(path: Path, part: str | None = None) -> Format:
     """Return the format of a file: by its first bytes, and where they tell nothing by its name.
+
+    What is neither is raw where a layout is stated.
 
     Raises
     ------
@@ -50,10 +80,19 @@ def format_of(path: Path) -> Format:
             start = file.read(LONGEST_START)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {reason(error)}") from error
-    for each in FORMATS:
-        if start.startswith(each.starts):
-            return each
-    for each in FORMATS:
-        if path.suffix.lower() in each.suffixes:
-            return each
-    raise InputError(f"{path}: is neither a TIFF nor a PNG image")
+    by_name = [each for each in FORMATS if path.suffix.lower() in each.suffixes]
+    # Frames without a header can begin with any bytes.
+    if not by_name:
+        for each in FORMATS:
+            if each.starts and start.startswith(each.starts):
+                return each
+    if by_name:
+        return by_name[0]
+    if part is not None and raw.LOOKS_LAID_OUT.match(part):
+        return RAW
+    raise InputError(f"{path}: is neither a TIFF nor a PNG image, nor a recording of {_others()}")
+
+
+def _others() -> str:
+    names = [each.name for each in FORMATS if each.name not in ("TIFF", "PNG")]
+    return ", ".join(names[:-1]) + f" or {names[-1]}"

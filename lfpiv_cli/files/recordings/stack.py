@@ -1,0 +1,135 @@
+"""Frames in an HDF5 file: a dataset (frames, rows, columns), named as FILE.h5:/PATH, or the only one of three axes.
+
+Where a dataset `time_s` with a number for each frame lies beside it, these are its times.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from lfpiv_cli.errors import InputError
+from lfpiv_cli.files.hdf5 import DEEPEST, member, open_h5
+from lfpiv_cli.files.recordings.pixels import CUT, as_counts, ensure_size
+from lfpiv_cli.files.recordings.recording import Image, Recording, Shape
+
+START = b"\x89HDF\r\n\x1a\n"
+TIMES = "time_s"
+# A chunk is unpacked whole for each frame in it; cameras' programs write a frame or a few in each.
+MOST_CHUNK_BYTES = 2**28
+# Names of datasets that an error lists.
+MOST_LISTED = 5
+
+
+def frames(path: Path) -> Recording:
+    """Return the frames of the only dataset of three dimensions.
+
+    Raises
+    ------
+    InputError : there is none, there are several, or it is a file of ours
+    """
+    with open_h5(path) as file:
+        if "format" in file.attrs and "provenance" in file.attrs:
+            raise InputError(f"{path}: is a result of this program, expected images")
+        names = [dataset.name for dataset in _datasets(file, DEEPEST) if dataset.ndim == 3]
+        if len(names) != 1:
+            listed = ", ".join(f"{path.name}:{name}" for name in names[:MOST_LISTED])
+            raise InputError(
+                f"{path}: holds {len(names)} datasets of frames, expected one, or to be told which"
+                + (f": {listed}" if names else "")
+            )
+        return _frames_in(path, file[names[0]])
+
+
+def frames_named(path: Path, name: str) -> Recording:
+    """Return the frames of a dataset: of one with two dimensions, the only frame.
+
+    Raises
+    ------
+    InputError
+    """
+    with open_h5(path) as file:
+        return _frames_in(path, _dataset(path, file, name))
+
+
+def _datasets(group: h5py.Group, levels: int) -> Iterator[h5py.Dataset]:
+    """Yield the numeric datasets of a group and of those in it."""
+    for name in group:
+        if not isinstance(group.get(name, getlink=True), h5py.HardLink):
+            continue
+        item = group[name]
+        if isinstance(item, h5py.Group) and levels:
+            yield from _datasets(item, levels - 1)
+        elif isinstance(item, h5py.Dataset) and item.dtype.kind in "uif":
+            yield item
+
+
+def _dataset(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
+    """Return a dataset by its path of hard links."""
+    found: h5py.Group | h5py.Dataset = file
+    for part in name.strip("/").split("/"):
+        if not isinstance(found, h5py.Group) or part not in found:
+            raise InputError(f"{path}: holds no dataset {name}")
+        found = member(found, part)
+    if not isinstance(found, h5py.Dataset):
+        raise InputError(f"{path}: {name} is a group, expected a dataset of frames")
+    return found
+
+
+def _frames_in(path: Path, dataset: h5py.Dataset) -> Recording:
+    """Return the frames of a dataset whose bytes are all in this very file."""
+    name = dataset.name
+    if dataset.is_virtual or dataset.external:
+        raise InputError(f"{path}: {name} lies in another file")
+    if dataset.shape is None or dataset.ndim not in (2, 3) or dataset.dtype.kind not in "uif" or not dataset.size:
+        raise InputError(
+            f"{path}: {name} is {dataset.dtype} {dataset.shape}, expected numbers of (frames, rows, columns)"
+        )
+    shape = (int(dataset.shape[-2]), int(dataset.shape[-1]))
+    size = path.stat().st_size
+    ensure_size(f"{path}: a frame of {name}", shape, dataset.dtype.itemsize, None, size)
+    _ensure_whole(path, dataset)
+    pages = int(dataset.shape[0]) if dataset.ndim == 3 else 1
+    bits = 8 * dataset.dtype.itemsize
+    return Recording(pages, shape, bits, partial(_read_page, path, name), _times(dataset, pages))
+
+
+def _ensure_whole(path: Path, dataset: h5py.Dataset) -> None:
+    """Refuse a dataset of which parts were never written, which would be read as zeros."""
+    name, item_bytes = dataset.name, dataset.dtype.itemsize
+    if dataset.chunks is None:
+        stored = dataset.id.get_storage_size()
+        if stored < dataset.size * item_bytes:
+            raise InputError(f"{path}: {name} has {stored} of its {dataset.size * item_bytes} bytes: {CUT}")
+        return
+    if math.prod(dataset.chunks) * item_bytes > MOST_CHUNK_BYTES:
+        raise InputError(f"{path}: {name} has chunks of {dataset.chunks}, more than {MOST_CHUNK_BYTES} bytes each")
+    expected = math.prod(-(-n // c) for n, c in zip(dataset.shape, dataset.chunks, strict=True))
+    found = dataset.id.get_num_chunks()
+    if found != expected:
+        raise InputError(f"{path}: {name} has {found} of its {expected} chunks: {CUT}")
+
+
+def _times(dataset: h5py.Dataset, pages: int) -> NDArray[np.float64] | None:
+    """Return the times beside a dataset of frames, where there are as many as frames."""
+    group = dataset.parent
+    if TIMES not in group:
+        return None
+    times = member(group, TIMES)
+    if not isinstance(times, h5py.Dataset) or times.shape != (pages,) or times.dtype.kind not in "uif":
+        return None
+    found = np.asarray(times[()], np.float64)
+    return found if np.isfinite(found).all() else None
+
+
+def _read_page(path: Path, name: str, page: int, shape: Shape | None) -> Image:
+    with open_h5(path) as file:
+        dataset = _dataset(path, file, name)
+        ensure_size(f"{path}: frame {page}", dataset.shape[-2:], dataset.dtype.itemsize, shape, path.stat().st_size)
+        return as_counts(dataset[page] if dataset.ndim == 3 else dataset[()])
