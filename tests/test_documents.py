@@ -193,6 +193,7 @@ def write_images(folder: Path) -> None:
     for name, source in {"a": "pair_a", "b": "pair_b", "white": "white", "dark": "dark", "board": "board"}.items():
         shutil.copyfile(SAMPLE / f"{source}.tif", folder / f"{name}.tif")
     shutil.copyfile(SAMPLE / "particles.npz", folder / "true.npz")
+    (folder / "pairs.txt").write_text("run_0000 run_0001\nrun_0003, run_0002 # the other way round\n")
     pages = [tifffile.imread(folder / f"{name}.tif") for name in "abab"]
     tifffile.imwrite(folder / "run.tif", np.stack(pages), photometric="minisblack")
     imagecodecs.imwrite(folder / "mask.png", np.full(pages[0].shape, 255, np.uint8))

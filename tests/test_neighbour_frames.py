@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
-from lfpiv_cli.errors import UsageError
-from lfpiv_cli.files.batch import frames_beside
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.particles.neighbour_frames import second_pass
@@ -33,11 +30,3 @@ def test_what_a_neighbour_found_is_found(table2: Camera, water: Media, rng: np.r
     both = second_pass(task, own, [before, np.concatenate([true, ghosts]) + MOVED_MM], 0.6).particles
     assert found(both, true).all()
     assert len(both) == len(true)
-
-
-def test_frames_know_those_beside_them() -> None:
-    assert frames_beside(4, "ab") == [(1,), (0,), (3,), (2,)]
-    assert frames_beside(3, "sequence") == [(1,), (0, 2), (1,)]
-    for count, pairing in ((3, "ab"), (1, "sequence")):
-        with pytest.raises(UsageError, match="--pairing"):
-            frames_beside(count, pairing)

@@ -230,12 +230,18 @@ def test_a_pair_has_two_frames() -> None:
 
 
 def test_one_frame_is_no_pair() -> None:
-    with pytest.raises(UsageError, match="--pairing ab: needs two or more"):
-        pair_names(["1a"], "ab")
+    for how in ("ab", "sequence"):
+        with pytest.raises(UsageError, match=f"--pairing {how}: needs two or more"):
+            pair_names(["1a"], how)
 
 
 def test_those_beside() -> None:
-    assert pair_names(["2", "1", "0"], "sequence").beside(3) == [(1,), (0, 2), (1,)]
+    found = pair_names(["2", "1", "0"], "sequence")
+    assert found.beside(3) == [(1,), (0, 2), (1,)]
+    assert found.first_of() == {}
+    found = pair_names(["1a", "2a", "2b", "1b"], "ab")
+    assert found.beside(4) == [(3,), (2,), (1,), (0,)]
+    assert found.first_of() == {3: 0, 2: 1}
 
 
 def seen(*names: str) -> list[Seen]:

@@ -14,7 +14,7 @@ from scipy.ndimage import gaussian_filter
 from benchmarks.volumes import Seeding, volume_pair
 from lfpiv_cli import open_vectors
 from lfpiv_cli.cli import cli
-from lfpiv_cli.errors import InputError, UsageError
+from lfpiv_cli.errors import InputError, PartialError, UsageError
 from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.files.vtkhdf import read_header, write_volume
@@ -215,3 +215,34 @@ def test_vectors_without_an_uncertainty_or_in_doubt_are_told() -> None:
     assert [each.code for each in field_notices(replace(good, in_doubt=60), "v")] == ["vectors-in-doubt"]
     nothing = quality_of_all([]).summary()
     assert nothing == {"uncertainty_voxel_median": None, "without_uncertainty_share": None, "in_doubt_share": None}
+
+
+def test_a_lost_frame_costs_its_pair_alone(tmp_path: Path, capsys) -> None:
+    made_by = record("test", load_config(CONFIG).resolved(), {})
+    rng = np.random.default_rng(6)
+    seeding = Seeding(40.0, (1.0,) * 3, lost=0.0)
+    pair = volume_pair(lambda points: np.tile(SHIFT, (len(points), 1)), SHAPE, seeding, rng)
+    for name, array in (("a1", 0), ("a2", 0), ("b2", 1), ("b3", 1), ("a4", 0), ("b4", 1)):
+        path = tmp_path / f"{name}.vtkhdf"
+        write_volume(path, pair[array], GRID, REFERENCE, provenance=made_by, attributes={}, overwrite=False)
+    left, folder = sorted(tmp_path.glob("*.vtkhdf")), tmp_path / "vectors"
+    with pytest.raises(InputError, match=r"a1.vtkhdf: the second frame of its pair is missing, and 1 more"):
+        run("correlate", *left, "--pairing", "ab", "-o", folder)
+    assert not folder.exists()
+    capsys.readouterr()
+    failures = tmp_path / "failures.json"
+    with pytest.raises(PartialError, match="2 of 4 pairs failed"):
+        run("correlate", *left, "--pairing", "ab", "--keep-going", "--failures", failures, "-o", folder, "--json")
+    told = json.loads(capsys.readouterr().out)
+    assert [each["about"][-9:] for each in told["warnings"] if each["code"] == "frame-unpaired"] == [
+        "a1.vtkhdf",
+        "b3.vtkhdf",
+    ]
+    assert [Path(each["name"]).stem for each in json.loads(failures.read_text())] == ["a1", "b3"]
+    assert sorted(path.name for path in folder.iterdir()) == ["a2.vtkhdf", "a4.vtkhdf"]
+    for path in folder.iterdir():
+        field = open_vectors(path)
+        np.testing.assert_allclose(np.median(field.displacement_voxel, axis=(0, 1, 2)), SHIFT, atol=0.1)
+    (tmp_path / "pairs.txt").write_text("a2 b3\n")
+    run("correlate", *left, "--pairs", tmp_path / "pairs.txt", "-o", tmp_path / "listed.vtkhdf")
+    assert open_vectors(tmp_path / "listed.vtkhdf").flag.size

@@ -18,7 +18,7 @@ from lfpiv_cli.cli.options import (
     dt_option,
     mask_option,
     output_option,
-    pairing_option,
+    pairing_options,
     white_option,
 )
 from lfpiv_cli.console import Console
@@ -38,7 +38,7 @@ from lfpiv_cli.names import RunMethod, names_in
 @click.option(
     "--method", type=click.Choice(names_in(RunMethod)), help="By what the flow is measured; auto when not given."
 )
-@pairing_option
+@pairing_options
 @dt_option
 @click.option("--combine", is_flag=True, help="With both: also one field that weights their vectors.")
 @click.option("--follow", is_flag=True, help="Time-resolved sequence: find and track particles together.")

@@ -44,11 +44,6 @@ mask_option = click.option(
     "the images given, brighter than what moves.",
 )
 dt_option = click.option("--dt-s", type=POSITIVE, help="Time from one frame to the next; default from the config.")
-pairing_option = click.option(
-    "--pairing",
-    type=click.Choice(names_in(Pairing)),
-    help="Frames belong together in separate pairs, or each with the next.",
-)
 resume_option = click.option(
     "--resume", is_flag=True, help="Skip outputs that are complete and made from the same inputs."
 )
@@ -107,6 +102,20 @@ def batch_options(command: Callable[..., Any]) -> Callable[..., Any]:
     for option in (dask_option, time_limit_option, shard_option, failures, keep_going, resume_option):
         command = option(command)
     return command
+
+
+def pairing_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Give a command the options that say which frames belong together."""
+    how = click.option(
+        "--pairing",
+        type=click.Choice(names_in(Pairing)),
+        help="Frames belong together in separate pairs, or each with the next, by their names.",
+    )
+    template = click.option(
+        "--pair-by", help="How names tell pairs, where they do it in no usual way: img_{pair}_{frame}, or img_{number}."
+    )
+    listed = click.option("--pairs", type=FILE, help="File that lists pairs, two names a line.")
+    return how(template(listed(command)))
 
 
 def output_option(text: str, required: bool = True) -> Callable[..., Any]:

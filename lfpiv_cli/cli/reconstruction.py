@@ -16,7 +16,7 @@ from lfpiv_cli.cli.options import (
     inputs_argument,
     mask_option,
     output_option,
-    pairing_option,
+    pairing_options,
 )
 from lfpiv_cli.console import Console
 from lfpiv_cli.names import Start, names_in
@@ -38,7 +38,7 @@ from lfpiv_cli.reconstruction.registry import SOLVER_NAMES
 @dark_option
 @background_option
 @mask_option
-@pairing_option
+@pairing_options
 @click.option(
     "--residual/--no-residual",
     default=None,

@@ -14,7 +14,7 @@ from lfpiv_cli.cli.options import (
     dt_option,
     inputs_argument,
     output_option,
-    pairing_option,
+    pairing_options,
 )
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import UsageError
@@ -41,7 +41,7 @@ def _window(text: str) -> int | tuple[int, ...]:
 @dt_option
 @click.option("--windows", callback=parse_windows, help="Interrogation windows in voxels, coarse to fine, as 32,16.")
 @click.option("--overlap", type=click.FloatRange(min=0.0, max=1.0, max_open=True), help="Of neighbouring windows.")
-@pairing_option
+@pairing_options
 @click.option("--mask", "mask_volume", type=FILE, help="Volume on the same grid: voxels of 0 are left out.")
 @click.option("--ensemble", is_flag=True, help="One field of all pairs together, for a flow that does not change.")
 @click.option("--derived", is_flag=True, help="Also write vorticity, divergence, strain rate and Q criterion.")
@@ -55,7 +55,8 @@ def correlate(
     """Measure the displacements between two volumes by multi-pass three-dimensional cross-correlation.
 
     From pass to pass interrogation windows get finer and the volumes are deformed by what was found; false vectors are
-    detected by a median test and replaced. More than two volumes need --pairing.
+    detected by a median test and replaced. More than two volumes need --pairing: ab pairs them by their names (img_1_a
+    with img_1_b, or by numbers), sequence takes each with the next, none across a gap.
 
     \b
     Example: lfpiv correlate volumes/a.vtkhdf volumes/b.vtkhdf -o vectors.vtkhdf

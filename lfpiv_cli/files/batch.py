@@ -15,7 +15,6 @@ from lfpiv_cli.files.images import count_pages
 from lfpiv_cli.files.inputs import split_part
 from lfpiv_cli.files.provenance import bear_alike, without_warnings
 from lfpiv_cli.files.whole import read_whole
-from lfpiv_cli.names import Pairing
 
 VTKHDF_SUFFIX = ".vtkhdf"
 
@@ -198,19 +197,3 @@ def _record_anew(target: Target) -> None:
     old = read_whole(target.path) or {}
     warnings = {name: old[name] for name in ("warnings",) if name in old}
     replace_provenance(target.path, dict(target.record) | warnings)
-
-
-def frames_beside(count: int, pairing: Pairing) -> list[tuple[int, ...]]:
-    """Return for each frame the numbers of those it belongs with: its partner (`ab`), or the one before and after.
-
-    Raises
-    ------
-    UsageError : there is only one frame, or one of the last pair is missing.
-    """
-    if count < 2 or (pairing == "ab" and count % 2):
-        raise UsageError(
-            f"--pairing {pairing}: needs {'pairs' if pairing == 'ab' else 'two or more'}, got {count} frames"
-        )
-    if pairing == "ab":
-        return [(number ^ 1,) for number in range(count)]
-    return [tuple(k for k in (number - 1, number + 1) if 0 <= k < count) for number in range(count)]

@@ -36,11 +36,13 @@ class Pairs:
     pairs : numbers of the frames of each pair, the earlier first
     left_out : frames that should have a partner and have none, and gaps in sequences
     notices : what was taken for granted
+    separate : False where frames are in two pairs, one with the frame before and one with the next
     """
 
     pairs: tuple[tuple[int, int], ...]
     left_out: tuple[LeftOut, ...] = ()
     notices: tuple[Notice, ...] = ()
+    separate: bool = True
 
     def beside(self, count: int) -> list[tuple[int, ...]]:
         """Return for each of `count` frames the numbers of those that it is paired with."""
@@ -49,6 +51,10 @@ class Pairs:
             found[first].append(second)
             found[second].append(first)
         return [tuple(sorted(numbers)) for numbers in found]
+
+    def first_of(self) -> dict[int, int]:
+        """Return of each second frame of separate pairs the first."""
+        return {second: first for first, second in self.pairs} if self.separate else {}
 
     def settled(self, keep_going: bool) -> list[Notice]:
         """Return what is to be said of the pairs, where they can be taken.
@@ -98,8 +104,8 @@ class _Found:
     def leave_out(self, numbers: Iterable[int], why: str) -> None:
         self.left_out += [LeftOut(self.names[number], why) for number in numbers]
 
-    def told(self) -> Pairs:
-        return Pairs(tuple(self.pairs), tuple(self.left_out), tuple(self.notices))
+    def told(self, how: Pairing) -> Pairs:
+        return Pairs(tuple(self.pairs), tuple(self.left_out), tuple(self.notices), how == "ab")
 
 
 def pair_names(names: Sequence[str], how: Pairing, by: str | None = None) -> Pairs:
@@ -134,7 +140,7 @@ def pair_frames(frames: Sequence[Seen], how: Pairing, by: str | None = None) -> 
         _pair(placed, found)
     else:
         _follow(placed, found)
-    return found.told()
+    return found.told(how)
 
 
 def in_order(frames: Sequence[Seen]) -> tuple[list[int], list[Notice]]:
@@ -191,7 +197,7 @@ def _by_order(frames: Sequence[Seen], how: Pairing) -> Pairs:
     count, step = len(frames), 2 if how == "ab" else 1
     pairs = tuple((k, k + 1) for k in range(0, count - 1, step))
     if count == 2:
-        return Pairs(pairs)
+        return Pairs(pairs, separate=how == "ab")
     notice = Notice(
         "paired-by-order",
         frames[0].name,
@@ -199,7 +205,7 @@ def _by_order(frames: Sequence[Seen], how: Pairing) -> Pairs:
         "number them, so that a missing one is seen",
     )
     alone = (LeftOut(frames[-1].name, "no frame comes after it"),) if how == "ab" and count % 2 else ()
-    return Pairs(pairs, alone, (notice,))
+    return Pairs(pairs, alone, (notice,), how == "ab")
 
 
 def _pair(places: Mapping[int, Place], found: _Found) -> None:

@@ -70,6 +70,14 @@ class BatchOptions:
     begun_s: float = field(default_factory=time.monotonic, compare=False, repr=False)
 
 
+@dataclass(frozen=True)
+class Failure:
+    """An output that could not be made: its name, and the sentence that says why."""
+
+    name: str
+    error: str
+
+
 class Batch(Protocol[Made]):
     """Outputs that are made one after the other, each from inputs of its own.
 
@@ -92,6 +100,14 @@ class Batch(Protocol[Made]):
     @property
     def inputs(self) -> Sequence[Path]:
         """All files that are read, none of which may be written."""
+
+    @property
+    def notices(self) -> Sequence[Notice]:
+        """What is to be said before anything is made."""
+
+    @property
+    def left_out(self) -> Sequence[Failure]:
+        """What is known to have no output before anything is made, as a frame without its partner."""
 
     @property
     def overwrite(self) -> bool:
@@ -123,14 +139,6 @@ class ByArguments:
     def __reduce__(self) -> tuple[Callable[[], Self], tuple[()]]:
         """Return what makes it again."""
         return self._made_by, ()
-
-
-@dataclass(frozen=True)
-class Failure:
-    """An output that could not be made: its name, and the sentence that says why."""
-
-    name: str
-    error: str
 
 
 @dataclass
@@ -182,6 +190,7 @@ def work_through(batch: Batch[Made], options: BatchOptions, console: Console) ->
     left = [share[k] for k in pending(targets, batch.inputs, batch.overwrite, options.resume)]
     worked: Worked[Made] = Worked(skipped=len(share) - len(left))
     before = {number: _stamp(batch.targets[number].path) for number in left}
+    console.warn(batch.notices)
     deadline = Deadline(options.time_limit_s, begun=options.begun_s)
     steps = batch.begin(left, console) if options.dask is None else 1.0
     with (
@@ -192,11 +201,15 @@ def work_through(batch: Batch[Made], options: BatchOptions, console: Console) ->
         for number, made in attempts:
             _settle(batch, number, made, options.keep_going, work, worked)
     worked.outcomes = dict(sorted(worked.outcomes.items()))
+    done = worked.total()
+    if share.start == 0:
+        # Of several shards the first one tells them.
+        worked.failures[:0] = batch.left_out
     if options.failures is not None:
         listed = json.dumps([asdict(failure) for failure in worked.failures], indent=2, ensure_ascii=False)
         write_text(options.failures, listed + "\n", overwrite=True)
-    if worked.total() < len(share):
-        raise deadline.error(worked.total(), len(share), batch.unit)
+    if done < len(share):
+        raise deadline.error(done, len(share), batch.unit)
     return worked
 
 

@@ -18,6 +18,7 @@ from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.batch import Target, output_paths
 from lfpiv_cli.files.config import Config, carried_config, load_config
 from lfpiv_cli.files.inputs import given
+from lfpiv_cli.files.pairing import Pairs
 from lfpiv_cli.files.provenance import record, with_warnings
 from lfpiv_cli.flow.correlation import correlate as measure
 from lfpiv_cli.flow.correlation import count_passes
@@ -35,10 +36,10 @@ from lfpiv_cli.interface.vectors_checks import (
     quality_of_all,
     window_notices,
 )
-from lfpiv_cli.names import Pairing
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.reference import Reference
-from lfpiv_cli.stages.batches import ALL, BatchOptions, ByArguments, Worked, work_through
+from lfpiv_cli.stages.batches import ALL, BatchOptions, ByArguments, Failure, Worked, work_through
+from lfpiv_cli.stages.pairs import PairOptions, result_pairs
 
 Extra = dict[str, tuple[NDArray[Any], str]]
 
@@ -62,14 +63,13 @@ class Job:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CorrelateOptions(BatchOptions):
+class CorrelateOptions(PairOptions, BatchOptions):
     """What `correlate` is given besides the volumes.
 
     Attributes
     ----------
     config : in place of the one that the volumes carry
     dt_s, windows, overlap : in place of the config's, see its section `correlation`
-    pairing : `ab` for separate pairs, `sequence` for each volume with the next; needed for more than two
     mask_volume : volume on the same grid, 0 where the volumes are left out
     ensemble : one field of all pairs together
     derived : vorticity, divergence, strain rate and Q criterion, too
@@ -80,7 +80,6 @@ class CorrelateOptions(BatchOptions):
     dt_s: float | None = None
     windows: Sequence[int | Sequence[int]] | None = None
     overlap: float | Sequence[float] | None = None
-    pairing: Pairing | None = None
     mask_volume: Path | None = None
     ensemble: bool = False
     derived: bool = False
@@ -97,9 +96,10 @@ def correlate(
     *,
     overwrite: bool = False,
     console: Console = CONSOLE,
+    pairs: Pairs | None = None,
 ) -> dict[str, Any]:
-    """Measure the displacements between pairs of volumes."""
-    batch = Correlation(volumes, output, options, overwrite)
+    """Measure the displacements between pairs of volumes; `pairs`, where they are known already."""
+    batch = Correlation(volumes, output, options, overwrite, pairs)
     if options.mean is not None:
         ensure_writable(options.mean, overwrite or options.resume, batch.inputs)
     worked = work_through(batch, options, console)
@@ -125,7 +125,14 @@ class Correlation(ByArguments):
 
     label = "correlate"
 
-    def __init__(self, volumes: Sequence[Path], output: Path, options: CorrelateOptions, overwrite: bool) -> None:
+    def __init__(
+        self,
+        volumes: Sequence[Path],
+        output: Path,
+        options: CorrelateOptions,
+        overwrite: bool,
+        pairs: Pairs | None = None,
+    ) -> None:
         """Take the arguments of `correlate`; see which pairs there are, and read no volume.
 
         Raises
@@ -134,15 +141,18 @@ class Correlation(ByArguments):
         """
         self._options, self.overwrite = options, overwrite
         self.unit = "field" if options.ensemble else "pair"
-        self._pairs = pairs = _pairs(volumes, options.pairing)
-        if options.mean is not None and (options.ensemble or len(pairs) < 2):
+        found = result_pairs(volumes, options) if pairs is None else pairs
+        self.notices = found.settled(options.keep_going)
+        self.left_out = [Failure(each.name, each.why) for each in found.left_out]
+        self._pairs = [(volumes[first], volumes[second]) for first, second in found.pairs]
+        if options.mean is not None and (options.ensemble or len(self._pairs) < 2):
             raise UsageError("--mean needs several pairs, each correlated by itself")
         if options.mean is not None and options.shard != ALL:
             raise UsageError(
                 "--mean needs the fields of all shards: once they are there, the same command without --shard and with "
                 "--resume makes it"
             )
-        self._groups = [pairs] if options.ensemble else [[pair] for pair in pairs]
+        self._groups = [self._pairs] if options.ensemble else [[pair] for pair in self._pairs]
         self._common = given(config=options.config, mask=options.mask_volume)
         self._config = load_config(options.config) if options.config else None
         self.inputs = [*volumes, *self._common.values()]
@@ -248,6 +258,7 @@ class Mean:
     """The mean of a batch's vectors, with their fluctuations as `velocity_rms` and `displacement_rms_voxel`."""
 
     label, unit = "mean", "file"
+    notices, left_out = (), ()
 
     def __init__(
         self, path: Path, fields: Sequence[Path], resolved: Mapping[str, Any], derived: bool, overwrite: bool
@@ -306,15 +317,3 @@ def _ensure_readable(volumes: Sequence[Path], keep_going: bool) -> Path:
     if not readable and first_fault is not None:
         raise first_fault
     return readable[0]
-
-
-def _pairs(volumes: Sequence[Path], pairing: Pairing | None) -> list[tuple[Path, Path]]:
-    """Return the pairs to correlate: (1, 2), (3, 4) ... for `ab`, (1, 2), (2, 3) ... for `sequence`."""
-    if len(volumes) < 2 or (pairing != "sequence" and len(volumes) % 2):
-        raise UsageError(f"correlate needs pairs of volumes, got {len(volumes)}")
-    if len(volumes) > 2 and pairing is None:
-        raise UsageError(
-            f"{len(volumes)} volumes need --pairing: ab for separate pairs or sequence for each with the next"
-        )
-    step = 1 if pairing == "sequence" else 2
-    return [(volumes[k], volumes[k + 1]) for k in range(0, len(volumes) - 1, step)]

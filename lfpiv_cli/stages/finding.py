@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -12,7 +12,6 @@ from lfpiv_cli.errors import InputError
 from lfpiv_cli.files.batch import Frame
 from lfpiv_cli.interface import particles
 from lfpiv_cli.interface.reconstruction import Bench, Progress, check_frame
-from lfpiv_cli.names import Pairing
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.particles.search import Particles
 from lfpiv_cli.stages.frames import Read
@@ -31,12 +30,15 @@ class Finder:
         read: Read,
         frames: Sequence[Frame],
         beside: Sequence[tuple[int, ...]] | None,
-        pairing: Pairing | None,
+        first_of: Mapping[int, int],
         keep_going: bool,
     ) -> None:
-        """Take how frames are read, and which are beside each; with `keep_going`, one of these may be unreadable."""
+        """Take how frames are read, which are beside each, and of each second of a pair the first.
+
+        With `keep_going`, one of those beside may be unreadable.
+        """
         self._bench, self._read, self._frames = bench, read, frames
-        self._beside, self._pairing, self._keep_going = beside, pairing, keep_going
+        self._beside, self._first_of, self._keep_going = beside, first_of, keep_going
         # A frame needs itself and one at either side, the next one two of these again.
         self._first_pass_of: Callable[[int], NDArray[np.float64]] = lru_cache(maxsize=3)(self._first_pass)
         self._advance: Progress | None = None
@@ -65,11 +67,11 @@ class Finder:
         return particles.find_beside(self._bench, frame, seen[number], [seen[k] for k in helping]), notices
 
     def _first_pass(self, number: int) -> NDArray[np.float64]:
-        frame, second = self._frame(number), self._pairing == "ab" and number % 2 == 1
-        if not second:
+        frame, first = self._frame(number), self._first_of.get(number)
+        if first is None:
             return particles.find_first(self._bench, frame, self._advance)
-        before = self._frame(number - 1)
-        return particles.find_second(self._bench, frame, before, self._first_pass_of(number - 1), self._advance)
+        before = self._frame(first)
+        return particles.find_second(self._bench, frame, before, self._first_pass_of(first), self._advance)
 
     def _frame(self, number: int) -> particles.Frame:
         raw, lit = self._read(number)

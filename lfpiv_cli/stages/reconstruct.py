@@ -16,16 +16,17 @@ from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.files.atomic import ensure_writable
-from lfpiv_cli.files.batch import Target, frames_beside, frames_of, output_paths
+from lfpiv_cli.files.batch import Target, frames_of, output_paths
 from lfpiv_cli.files.config import carried_config
 from lfpiv_cli.files.inputs import given
+from lfpiv_cli.files.pairing import Pairs
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, write_points
 from lfpiv_cli.files.provenance import also_used_as, record, with_warnings
 from lfpiv_cli.files.weights_file import open_weights, read_weights_record
 from lfpiv_cli.interface import particles
 from lfpiv_cli.interface.reconstruction import Bench, Progress, bench_of, check_frame, frame_notices, volume_of
 from lfpiv_cli.interface.weights_cost import on_demand_told
-from lfpiv_cli.names import Pairing, Start
+from lfpiv_cli.names import Start
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.particles.search import Particles
 from lfpiv_cli.reconstruction.images import Image
@@ -33,6 +34,7 @@ from lfpiv_cli.reconstruction.registry import SolverName
 from lfpiv_cli.stages.batches import BatchOptions, ByArguments, Worked, work_through
 from lfpiv_cli.stages.finding import Finder
 from lfpiv_cli.stages.frames import STILL, Ahead, Background, Read, beside_frames, mask_of, other_frames, reader
+from lfpiv_cli.stages.pairs import PairOptions, image_pairs
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,7 @@ class Outcome:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReconstructOptions(BatchOptions):
+class ReconstructOptions(PairOptions, BatchOptions):
     """What `reconstruct` is given besides weights and images.
 
     Attributes
@@ -54,7 +56,6 @@ class ReconstructOptions(BatchOptions):
     dark : image taken with the cap on; its hot and dead pixels are left out
     background : image to subtract, or `minimum` or `mean` over the images, or as `minimum:15`
     mask : image that is black where pixels are left out, or `still`: where bright light does not move in the images
-    pairing : `ab` or `sequence`: find particles with the help of the frames beside
     residual : of particles, also write what they leave of each image
     """
 
@@ -66,7 +67,6 @@ class ReconstructOptions(BatchOptions):
     dark: Path | None = None
     background: str | None = None
     mask: str | Path | None = None
-    pairing: Pairing | None = None
     residual: bool = True
 
 
@@ -81,9 +81,10 @@ def reconstruct(
     *,
     overwrite: bool = False,
     console: Console = CONSOLE,
+    pairs: Pairs | None = None,
 ) -> dict[str, Any]:
-    """Reconstruct the volume behind each image, or find its particles."""
-    batch = Reconstruction(weights, images, output, options, overwrite)
+    """Reconstruct the volume behind each image, or find its particles; `pairs`, where they are known already."""
+    batch = Reconstruction(weights, images, output, options, overwrite, pairs)
     worked = work_through(batch, options, console)
     return worked.ensure_whole(batch.summary(worked), batch.unit)
 
@@ -103,9 +104,16 @@ class Reconstruction(ByArguments):
     """The batch of `reconstruct`: a volume, or particles, for each frame."""
 
     label, unit = "reconstruct", "frame"
+    left_out = ()
 
     def __init__(
-        self, weights: Path, images: Sequence[Path], output: Path, options: ReconstructOptions, overwrite: bool
+        self,
+        weights: Path,
+        images: Sequence[Path],
+        output: Path,
+        options: ReconstructOptions,
+        overwrite: bool,
+        pairs: Pairs | None = None,
     ) -> None:
         """Take the arguments of `reconstruct`; see which frames there are, and read no image.
 
@@ -121,7 +129,11 @@ class Reconstruction(ByArguments):
         self._common = given(weights=weights, dark=options.dark, background=level.path, mask=mask_file)
         self.inputs = [*self._common.values(), *images]
         self._frames = frames = frames_of(images, options.keep_going)
-        self._beside = None if options.pairing is None else frames_beside(len(frames), options.pairing)
+        if pairs is None and options.are_told:
+            pairs = image_pairs(frames, options)
+        self.notices = [] if pairs is None else pairs.settled(options.keep_going)
+        self._beside = None if pairs is None else pairs.beside(len(frames))
+        self._first_of = {} if pairs is None else pairs.first_of()
         self.names = [frame.stem for frame in frames]
         self._paths = output_paths(output, self.names)
         self._settings = carried_config(read_weights_record(weights), weights).overridden_by("reconstruction", options)
@@ -158,7 +170,7 @@ class Reconstruction(ByArguments):
             bench, size = particles.sized(bench, self._looked_at(bench, read))
             said = particles.size_notices(settings, size)
             console.warn(said)
-        finder = Finder(bench, read, frames, self._beside, options.pairing, options.keep_going)
+        finder = Finder(bench, read, frames, self._beside, self._first_of, options.keep_going)
         self._ready = _Ready(bench, Ahead(read, numbers), finder, size, said)
         if not self._as_particles:
             return settings.reconstruction.iterations

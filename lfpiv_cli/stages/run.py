@@ -19,7 +19,7 @@ from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import ConfigError, UsageError
 from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files.atomic import without_nan
-from lfpiv_cli.files.batch import VTKHDF_SUFFIX, Frame, frames_beside, frames_of, output_paths, prepare_folder
+from lfpiv_cli.files.batch import VTKHDF_SUFFIX, Frame, frames_of, output_paths, prepare_folder
 from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.inputs import ensure_regular_file
 from lfpiv_cli.files.pages import ensure_pages
@@ -29,6 +29,7 @@ from lfpiv_cli.files.weights_file import open_weights
 from lfpiv_cli.flow.field import REJECTED, VALID, VectorField
 from lfpiv_cli.interface import particles
 from lfpiv_cli.interface.calibration import ensure_pictures
+from lfpiv_cli.interface.following import SHORTEST, ensure_sequence
 from lfpiv_cli.interface.reconstruction import bench_of
 from lfpiv_cli.interface.vectors_checks import quality_of, quality_of_all
 from lfpiv_cli.names import FlowMethod, Pairing, RunMethod
@@ -38,6 +39,7 @@ from lfpiv_cli.stages.combine import combine_vectors
 from lfpiv_cli.stages.correlate import CorrelateOptions, correlate
 from lfpiv_cli.stages.follow import PLAYBACK, TRACKS, FollowOptions, follow_particles
 from lfpiv_cli.stages.frames import STILL, Background, mask_of, reader
+from lfpiv_cli.stages.pairs import PairOptions, image_pairs
 from lfpiv_cli.stages.reconstruct import ReconstructOptions, reconstruct
 from lfpiv_cli.stages.report import ReportOptions, report
 from lfpiv_cli.stages.steps import KEPT, MADE, RECORD, Steps, earlier_run
@@ -53,7 +55,7 @@ LEFT_OUT_PERCENT = 5.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunOptions:
+class RunOptions(PairOptions):
     """What `run` is given besides the config.
 
     Attributes
@@ -62,7 +64,6 @@ class RunOptions:
     white, dark, board, depth_mm : as of `calibrate_snapshot`; the dark image also of the flow
     background, mask : as of `reconstruct`
     method : by volumes, particles or both; `auto`: by how many tracers there are
-    pairing : `ab` for separate pairs, `sequence` for each image with the next; needed for more than two
     dt_s : time from one image to the next, in place of the config's
     combine : of both methods, also one field that weights their vectors by their uncertainties
     follow : find and track the particles of a time-resolved sequence together, as `follow_particles` does
@@ -77,7 +78,6 @@ class RunOptions:
     background: str | None = None
     mask: str | Path | None = None
     method: RunMethod = "auto"
-    pairing: Pairing | None = None
     dt_s: float | None = None
     combine: bool = False
     follow: bool = False
@@ -135,11 +135,10 @@ def _ensure_possible(settings: Config, options: RunOptions) -> list[Frame]:
     for path in (*options.white, *options.board, *filter(None, (options.dark, background))):
         ensure_regular_file(path)
     frames = frames_of(options.images)
-    if len(frames) > 2 and options.pairing is None and not options.follow:
-        raise UsageError(
-            f"{len(frames)} images need --pairing: ab for separate pairs or sequence for each with the next"
-        )
-    frames_beside(len(frames), _pairing(options))
+    if options.follow:
+        ensure_sequence(len(frames), SHORTEST)
+    else:
+        image_pairs(frames, options).settled(keep_going=False)
     output_paths(Path(), [frame.stem for frame in frames])
     image_files.read_page(frames[0].path, frames[0].page, settings.image_shape())
     return frames
