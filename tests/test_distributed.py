@@ -25,6 +25,7 @@ class Toy(ByArguments):
     """Outputs that say in which process they were made; some are faulty, or kill their process."""
 
     label, unit, overwrite = "toy", "frame", True
+    notices, left_out = (), ()
 
     def __init__(self, folder: Path, count: int, faulty: Sequence[int] = (), deadly: Sequence[int] = ()) -> None:
         self.folder, self.faulty, self.deadly = folder, faulty, deadly
