@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import groupby
+from pathlib import Path
 from typing import Any
 
 import click
@@ -50,6 +51,11 @@ class Console:
         """Add what happens to the log."""
         if self.log is not None:
             self.log.write(name, fields)
+
+    @property
+    def log_file(self) -> Path | None:
+        """Where the log goes, if there is one."""
+        return None if self.log is None else self.log.path
 
     def say(self, text: str) -> None:
         """Print a line that everybody should see."""

@@ -13,6 +13,7 @@ from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.hdf5 import replace_provenance
 from lfpiv_cli.files.images import count_pages
 from lfpiv_cli.files.inputs import split_part
+from lfpiv_cli.files.places import ensure_apart, folded
 from lfpiv_cli.files.provenance import bear_alike, without_warnings
 from lfpiv_cli.files.whole import read_whole
 
@@ -106,9 +107,12 @@ def output_paths(output: Path, stems: Sequence[str]) -> list[Path]:
         return [output]
     if len(stems) > 1 and output.exists() and not output.is_dir():
         raise UsageError(f"{output}: {len(stems)} results need a folder, and this is a file")
-    twice = sorted({stem for stem in stems if stems.count(stem) > 1}) if len(set(stems)) < len(stems) else []
-    if twice:
-        raise UsageError(f"{output}: two inputs are called {twice[0]!r} and would give the same output")
+    seen: set[str] = set()
+    for stem in stems:
+        name = folded(stem, output)
+        if name in seen:
+            raise UsageError(f"{output}: two inputs are called {stem!r} and would give the same output")
+        seen.add(name)
     return [output / f"{stem}{VTKHDF_SUFFIX}" for stem in stems]
 
 
@@ -150,10 +154,11 @@ def pending(targets: Sequence[Target], inputs: Iterable[Path], overwrite: bool, 
 
     Raises
     ------
+    UsageError : two targets have one name, or one is an input
     OutputExistsError : a target is there and neither `overwrite` nor a matching `resume` covers it.
     """
-    inputs = list(inputs)
-    return [number for number, target in enumerate(targets) if not _is_kept(target, inputs, overwrite, resume)]
+    ensure_apart((target.path for target in targets), inputs)
+    return [number for number, target in enumerate(targets) if not _is_kept(target, overwrite, resume)]
 
 
 def is_kept(
@@ -168,7 +173,7 @@ def is_kept(
     return not pending([Target(path, lambda: made) for path in paths], inputs, overwrite, resume)
 
 
-def _is_kept(target: Target, inputs: Sequence[Path], overwrite: bool, resume: bool) -> bool:
+def _is_kept(target: Target, overwrite: bool, resume: bool) -> bool:
     """Return whether a target is left as it is, after it is known that it could be written if not."""
     found = _state_or_none(target) if resume else None
     if found is State.COMPLETE:
@@ -180,7 +185,7 @@ def _is_kept(target: Target, inputs: Sequence[Path], overwrite: bool, resume: bo
         raise OutputExistsError(
             f"{target.path}: exists and was made from other inputs or settings; --overwrite makes it anew"
         )
-    ensure_writable(target.path, overwrite or resume, inputs)
+    ensure_writable(target.path, overwrite or resume)
     return False
 
 

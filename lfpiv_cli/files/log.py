@@ -28,7 +28,7 @@ class EventLog:
         ------
         UsageError : it exists and holds something else
         """
-        self._path, self._command = path, command
+        self.path, self._command = path, command
         if path.is_file() and path.stat().st_size and not _begins_as_log(path):
             raise UsageError(f"{path}: is no log: its first line is no JSON object; --log would add to it")
 
@@ -47,13 +47,13 @@ class EventLog:
         }
         line = json.dumps(head | without_nan(fields), allow_nan=False) + "\n"
         try:
-            descriptor = os.open(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
+            descriptor = os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
             try:
                 os.write(descriptor, line.encode())
             finally:
                 os.close(descriptor)
         except OSError as error:
-            raise OutputError(f"{self._path}: cannot be written: {reason(error)}") from error
+            raise OutputError(f"{self.path}: cannot be written: {reason(error)}") from error
 
 
 def _begins_as_log(path: Path) -> bool:

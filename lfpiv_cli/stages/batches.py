@@ -21,6 +21,7 @@ from lfpiv_cli.errors import InputError, PartialError, UsageError
 from lfpiv_cli.files.atomic import ensure_writable, write_text
 from lfpiv_cli.files.batch import State, Target, pending, prepare_folder, state_of
 from lfpiv_cli.files.claims import claimed
+from lfpiv_cli.files.places import ensure_apart
 from lfpiv_cli.files.shares import Deadline, Shard
 from lfpiv_cli.notice import Notice
 
@@ -92,6 +93,10 @@ class Batch(Protocol[Made]):
     @property
     def targets(self) -> Sequence[Target]:
         """Where each output goes."""
+
+    @property
+    def outputs(self) -> Sequence[Path]:
+        """All files that are written: where the targets go, and what lies beside them."""
 
     @property
     def names(self) -> Sequence[str]:
@@ -182,12 +187,13 @@ def work_through(batch: Batch[Made], options: BatchOptions, console: Console) ->
     InputError : an input cannot be read, and the batch is not to go on without it
     StoppedEarlyError : the time is over
     """
+    ensure_apart([*batch.outputs, *filter(None, (options.failures, console.log_file))], batch.inputs)
     prepare_folder([target.path for target in batch.targets])
     if options.failures is not None:
-        ensure_writable(options.failures, batch.overwrite or options.resume, batch.inputs)
+        ensure_writable(options.failures, batch.overwrite or options.resume)
     share = options.shard.numbers(len(batch.targets))
     targets = batch.targets[share.start : share.stop]
-    left = [share[k] for k in pending(targets, batch.inputs, batch.overwrite, options.resume)]
+    left = [share[k] for k in pending(targets, (), batch.overwrite, options.resume)]
     worked: Worked[Made] = Worked(skipped=len(share) - len(left))
     before = {number: _stamp(batch.targets[number].path) for number in left}
     console.warn(batch.notices)

@@ -20,6 +20,7 @@ from lfpiv_cli.files.config import Config, carried_config, load_config
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.pairing import Pairs
 from lfpiv_cli.files.provenance import record, with_warnings
+from lfpiv_cli.files.whole import ensure_opens
 from lfpiv_cli.flow.correlation import correlate as measure
 from lfpiv_cli.flow.correlation import count_passes
 from lfpiv_cli.flow.derived import Derived, derived_fields
@@ -161,6 +162,11 @@ class Correlation(ByArguments):
         self.targets = [Target(path, partial(self._record, number)) for number, path in enumerate(paths)]
         self.settings = self._settings_of(_ensure_readable(volumes, options.keep_going))
 
+    @property
+    def outputs(self) -> list[Path]:
+        """The fields, and their mean."""
+        return [*(target.path for target in self.targets), *([self._options.mean] if self._options.mean else [])]
+
     def begin(self, _numbers: Sequence[int], _console: Console) -> float:
         """Do nothing: pairs share nothing but the settings."""
         return 1.0
@@ -267,6 +273,11 @@ class Mean:
         self.inputs, self._resolved, self._derived, self.overwrite = fields, resolved, derived, overwrite
         self.names, self.targets = [path.stem], [Target(path, self._record)]
 
+    @property
+    def outputs(self) -> list[Path]:
+        """The mean."""
+        return [target.path for target in self.targets]
+
     def begin(self, _numbers: Sequence[int], _console: Console) -> float:
         """Do nothing: there is one."""
         return 1.0
@@ -307,7 +318,7 @@ def _ensure_readable(volumes: Sequence[Path], keep_going: bool) -> Path:
     readable, first_fault = [], None
     for path in volumes:
         try:
-            vtkhdf.read_header(path)
+            ensure_opens(path)
         except InputError as error:
             if not keep_going:
                 raise

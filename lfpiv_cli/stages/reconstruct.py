@@ -147,6 +147,12 @@ class Reconstruction(ByArguments):
         self.targets = [Target(path, partial(self._record, number)) for number, path in enumerate(self._paths)]
         self._ready: _Ready | None = None
 
+    @property
+    def outputs(self) -> list[Path]:
+        """Volumes or particles, and the residual images of these."""
+        with_residuals = self._as_particles and self._options.residual
+        return [*self._paths, *(map(residual_path, self._paths) if with_residuals else [])]
+
     def begin(self, numbers: Sequence[int], console: Console) -> float:
         """Open the weights, and prepare what all frames share."""
         options, settings, frames = self._options, self._settings, self._frames
@@ -256,7 +262,7 @@ class Reconstruction(ByArguments):
     def _ensure_residuals(self, numbers: Sequence[int], console: Console) -> None:
         """Refuse residual images that could not be written; say of how many frames that are complete there is none."""
         for number in numbers:
-            ensure_writable(residual_path(self._paths[number]), self._replace, self.inputs)
+            ensure_writable(residual_path(self._paths[number]), self._replace)
         coming = set(numbers)
         without = sum(
             not residual_path(path).exists() for number, path in enumerate(self._paths) if number not in coming
