@@ -32,6 +32,7 @@ class Toy(ByArguments):
         self.targets = [Target(folder / f"{number}.vtkhdf", dict) for number in range(count)]
         self.names = [str(number) for number in range(count)]
         self.inputs: list[Path] = []
+        self.outputs = [target.path for target in self.targets]
 
     def begin(self, numbers: Sequence[int], console: Console) -> float:
         with open(self.folder / "begun", "a") as file:
