@@ -50,6 +50,7 @@ OPTIONS = {
     ("reconstruct", "start"): names_in(Start),
     ("reconstruct", "pairing"): names_in(Pairing),
     ("correlate", "pairing"): names_in(Pairing),
+    ("track", "pairing"): names_in(Pairing),
     ("export", "to"): names_in(ExportFormat),
     ("validate", "frame"): names_in(Moment),
     ("validate", "only"): names_in(PaperPart),

@@ -11,18 +11,21 @@ from lfpiv_cli.cli.options import (
     FILE,
     POSITIVE,
     background_option,
+    batch_options,
     common_options,
     dark_option,
     dt_option,
+    inputs_argument,
     mask_option,
     output_option,
+    pairing_options,
     resume_option,
 )
 from lfpiv_cli.console import Console
 
 
 @click.command("track")
-@click.argument("particles", type=FILE, nargs=-1, required=True)
+@inputs_argument("particles", "results")
 @dt_option
 @click.option(
     "--search", "search_voxel", type=POSITIVE, help="Largest displacement, voxels; six microlenses when not given."
@@ -33,7 +36,9 @@ from lfpiv_cli.console import Console
     help="Sequence: fewest frames of a track, shorter ones are ghosts; 3 when not given.",
 )
 @click.option("--grid", is_flag=True, help="Also write vectors on correlate's grid, as OUTPUT's name with _grid.")
-@output_option("File of tracks to write (.vtkhdf).")
+@pairing_options
+@batch_options
+@output_option("File of tracks to write (.vtkhdf), folder for several pairs.")
 @common_options
 def track(
     particles: tuple[Path, ...], output: Path, overwrite: bool, console: Console, **chosen: Any
@@ -42,11 +47,13 @@ def track(
 
     Two files give a displacement for each particle that is in both. More than two, in the order of time, give tracks:
     each place with the number of its track and frame and with a velocity by a local polynomial in time; --grid then
-    writes one file for each interval between frames (OUTPUT's name with _grid_0000, ...).
+    writes one file for each interval between frames (OUTPUT's name with _grid_0000, ...). With --pairing ab they are
+    separate pairs by their names, and each gives a file.
 
     \b
     Example: lfpiv track particles/a.vtkhdf particles/b.vtkhdf -o tracks.vtkhdf --grid
              lfpiv track particles/frame_*.vtkhdf -o tracks.vtkhdf --grid
+             lfpiv track particles --pairing ab --grid --resume --keep-going -o tracks
     with particles from
              lfpiv reconstruct weights.h5 a.tif b.tif --dark dark.tif --solver particles -o particles
     """

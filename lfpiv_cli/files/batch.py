@@ -41,10 +41,20 @@ class Target:
     """One output of a batch: where it goes, and what makes the provenance record that it will carry.
 
     Thousands of records are not held in memory: each is made when it is asked for, which reads its inputs.
+
+    Attributes
+    ----------
+    beside : other files that are made with it and carry the same record
     """
 
     path: Path
     make_record: Callable[[], Mapping[str, Any]]
+    beside: Sequence[Path] = ()
+
+    @property
+    def paths(self) -> list[Path]:
+        """All its files."""
+        return [self.path, *self.beside]
 
     @property
     def record(self) -> Mapping[str, Any]:
@@ -68,6 +78,10 @@ class State(Enum):
     BEARS_ALIKE = auto()
     BROKEN = auto()
     OTHER = auto()
+
+
+# What keeps a target of several files from being complete, the worst last.
+WORST_LAST = (State.COMPLETE, State.BEARS_ALIKE, State.MISSING, State.BROKEN, State.OTHER)
 
 
 def frames_of(paths: Iterable[Path], keep_going: bool = False) -> list[Frame]:
@@ -127,17 +141,28 @@ def prepare_folder(paths: Sequence[Path]) -> None:
 def state_of(target: Target) -> State:
     """Return what is there in a target's place; what is called complete has been read back, all of it.
 
+    Of several files it is what most of all keeps the target from being complete.
+
     Raises
     ------
     InputError : an input of the target cannot be read
     """
-    if not target.path.exists():
+    paths = [path for path in target.paths if path.exists()]
+    if not paths:
         return State.MISSING
+    made = target.record
+    states = [_state_of(path, made) for path in paths]
+    if len(paths) <= len(target.beside):
+        states.append(State.MISSING)
+    return max(states, key=lambda state: WORST_LAST.index(state))
+
+
+def _state_of(path: Path, made: Mapping[str, Any]) -> State:
+    """Return what a file is that is there in the place of one with this record."""
     try:
-        carried = read_whole(target.path)
+        carried = read_whole(path)
     except InputError:
         return State.BROKEN
-    made = target.record
     if carried is None:
         return State.OTHER
     if without_warnings(carried) == made:
@@ -157,7 +182,7 @@ def pending(targets: Sequence[Target], inputs: Iterable[Path], overwrite: bool, 
     UsageError : two targets have one name, or one is an input
     OutputExistsError : a target is there and neither `overwrite` nor a matching `resume` covers it.
     """
-    ensure_apart((target.path for target in targets), inputs)
+    ensure_apart((path for target in targets for path in target.paths), inputs)
     return [number for number, target in enumerate(targets) if not _is_kept(target, overwrite, resume)]
 
 
@@ -185,7 +210,8 @@ def _is_kept(target: Target, overwrite: bool, resume: bool) -> bool:
         raise OutputExistsError(
             f"{target.path}: exists and was made from other inputs or settings; --overwrite makes it anew"
         )
-    ensure_writable(target.path, overwrite or resume)
+    for path in target.paths:
+        ensure_writable(path, overwrite or resume)
     return False
 
 
@@ -199,6 +225,7 @@ def _state_or_none(target: Target) -> State | None:
 
 def _record_anew(target: Target) -> None:
     """Give a target its new record, and let it keep its data and what was warned of."""
-    old = read_whole(target.path) or {}
-    warnings = {name: old[name] for name in ("warnings",) if name in old}
-    replace_provenance(target.path, dict(target.record) | warnings)
+    made = dict(target.record)
+    for path in target.paths:
+        old = read_whole(path) or {}
+        replace_provenance(path, made | {name: old[name] for name in ("warnings",) if name in old})

@@ -10,6 +10,7 @@ from pathlib import Path, PurePath
 
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.files.batch import Frame
+from lfpiv_cli.files.inputs import split_part
 from lfpiv_cli.files.pairing import Seen
 from lfpiv_cli.files.provenance import earlier_record
 
@@ -21,7 +22,7 @@ def images_seen(frames: Sequence[Frame]) -> list[Seen]:
     return [
         Seen(
             name=str(frame.path) if frame.pages == 1 else f"{frame.path}, page {frame.page}",
-            stem=frame.path.stem,
+            stem=split_part(frame.path)[0].stem,
             path=(frame.path.parent / frame.stem).as_posix(),
             page=None if frame.pages == 1 else frame.page,
             image=f"{frame.path} {frame.page}",

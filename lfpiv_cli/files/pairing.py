@@ -64,6 +64,8 @@ class Pairs:
         InputError : a frame has no partner, or one is missing in a sequence, and `keep_going` is false; or no two
             belong together
         """
+        if not self.left_out and not self.pairs:
+            raise InputError("no two of the frames given are a pair")
         if self.left_out and not (keep_going and self.pairs):
             first, *others = self.left_out
             more = f", and {len(others)} more" if others else ""

@@ -74,7 +74,7 @@ def track(
     """
     ensure_frames(len(particles), shortest)
     names = [f"frame {number}" for number in range(len(particles))]
-    settings = settings_of(particles, names).overridden("correlation", dt_s=dt_s)
+    settings = settings_of([each.provenance for each in particles], names).overridden("correlation", dt_s=dt_s)
     counts = [len(each.position_mm) for each in particles]
     ensure_particles(counts, names)
     chosen = tracking_of(settings, search_voxel, shortest, len(particles), names[0])
@@ -277,18 +277,18 @@ def still_notices(tracks: Points, name: str) -> list[Notice]:
     ]
 
 
-def settings_of(frames: Sequence[Points], names: Sequence[str]) -> Config:
-    """Return the config that all frames were made with.
+def settings_of(records: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Config:
+    """Return the config that all frames were made with, by the records that they carry.
 
     Raises
     ------
     InputError
         They were not.
     """
-    for name, frame in zip(names[1:], frames[1:], strict=True):
-        if frame.provenance.get("config") != frames[0].provenance.get("config"):
+    for name, made in zip(names[1:], records[1:], strict=True):
+        if made.get("config") != records[0].get("config"):
             raise InputError(f"{name}: was made with another config than {names[0]}")
-    return carried_config(frames[0].provenance, names[0])
+    return carried_config(records[0], names[0])
 
 
 def tracking_of(settings: Config, search_voxel: float | None, shortest: int | None, frames: int, name: str) -> Tracking:

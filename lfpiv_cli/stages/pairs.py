@@ -46,6 +46,15 @@ def result_pairs(paths: Sequence[Path], options: PairOptions) -> Pairs:
     return _found(results_seen(paths), options)
 
 
+def sequence_of(paths: Sequence[Path]) -> tuple[list[int], list[Notice]]:
+    """Return files of particles in the order of time, by their names, and what is to be said of it.
+
+    Two are taken as they are given.
+    """
+    frames = results_seen(paths)
+    return ([0, 1], _backwards(frames)) if len(frames) == 2 else in_order(frames)
+
+
 def _found(frames: Sequence[Seen], options: PairOptions) -> Pairs:
     """Return which frames belong together: by a list, by names; without options two as they are given.
 
