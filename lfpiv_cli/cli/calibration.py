@@ -15,6 +15,7 @@ from lfpiv_cli.cli.options import (
     dark_option,
     depth_option,
     output_option,
+    raw_option,
     white_option,
 )
 from lfpiv_cli.console import Console
@@ -30,6 +31,7 @@ from lfpiv_cli.console import Console
 @click.option("--picture", type=FILE, help="Picture of the fitted lattice and board to write (.png).")
 @click.option("--views", type=FILE, help="Picture of views and refocused depths to write (.png).")
 @common_options
+@raw_option
 def calibrate_snapshot(config: Path, output: Path, overwrite: bool, console: Console, **chosen: Any) -> dict[str, Any]:
     """Find microlenses and focal plane from a white image and one snapshot of a calibration target.
 
@@ -57,6 +59,7 @@ def calibrate_snapshot(config: Path, output: Path, overwrite: bool, console: Con
 @output_option("Corrected calibration to write (.h5); without it, only report.", required=False)
 @click.option("--picture", type=FILE, help="Picture of the particles' depths and the walls to write (.png).")
 @common_options
+@raw_option
 def refine_calibration(
     config: Path, images: tuple[Path, ...], calibration: Path, overwrite: bool, console: Console, **chosen: Any
 ) -> dict[str, Any]:

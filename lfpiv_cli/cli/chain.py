@@ -19,6 +19,7 @@ from lfpiv_cli.cli.options import (
     mask_option,
     output_option,
     pairing_options,
+    raw_option,
     white_option,
 )
 from lfpiv_cli.console import Console
@@ -45,6 +46,7 @@ from lfpiv_cli.names import RunMethod, names_in
 @click.option("--report/--no-report", default=True, help="Make OUTPUT/report.html, a page of all of it.")
 @output_option("Folder for all that is made.")
 @common_options
+@raw_option
 def run(
     config: Path,
     images: tuple[Path, ...],

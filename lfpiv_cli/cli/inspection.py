@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from lfpiv_cli.cli.options import FILE, common_options, output_option
+from lfpiv_cli.cli.options import FILE, common_options, output_option, raw_option
 from lfpiv_cli.console import Console
 
 
@@ -16,6 +16,7 @@ from lfpiv_cli.console import Console
 @click.option("--picture", type=FILE, help="weights: picture of one voxel's pixels to write (.png).")
 @click.option("--voxel", type=int, nargs=3, metavar="IX IY IZ", help="weights: which voxel; default the middle one.")
 @common_options
+@raw_option
 def info(file: Path, overwrite: bool, console: Console, **chosen: Any) -> dict[str, Any]:
     """Describe a file that lfpiv wrote: its figures; of weights, draw the point-spread function of one voxel.
 

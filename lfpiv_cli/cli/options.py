@@ -95,6 +95,37 @@ dask_option = click.option(
 )
 
 
+def raw_option(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Give a command the layout of images without a header, which their names carry from here on."""
+
+    @click.option(
+        "--raw",
+        metavar="LAYOUT",
+        help="Layout of the .raw and .bin images among those given: WIDTHxHEIGHTxBITS and options, as in "
+        "2352x1768x12:packing=low-first.",
+    )
+    @wraps(command)
+    def run(raw: str | None = None, **arguments: Any) -> Any:
+        if raw is None:
+            return command(**arguments)
+        from lfpiv_cli.files.recordings.raw import parse_layout, with_layout
+
+        parse_layout(raw)
+
+        def named(value: Any) -> Any:
+            if isinstance(value, tuple):
+                return tuple(named(each) for each in value)
+            return with_layout(value, raw) if isinstance(value, Path) else value
+
+        # These may be words, and are no paths for that.
+        for name in ("background", "mask"):
+            if isinstance(arguments.get(name), str):
+                arguments[name] = str(with_layout(Path(arguments[name]), raw))
+        return command(**{name: named(value) for name, value in arguments.items()})
+
+    return run
+
+
 def batch_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Give a command the options of all batches."""
     keep_going = click.option("--keep-going", is_flag=True, help="Go on with the next one when an input fails; exit 5.")

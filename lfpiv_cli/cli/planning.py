@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from lfpiv_cli.cli.options import FILE, POSITIVE, common_options, config_argument, dark_option
+from lfpiv_cli.cli.options import FILE, POSITIVE, common_options, config_argument, dark_option, raw_option
 from lfpiv_cli.console import Console
 from lfpiv_cli.names import KnownCamera, names_in
 
@@ -68,6 +68,7 @@ def init(
 @click.option("--velocity-m-s", type=POSITIVE, help="Velocity to expect; default that of the configured flow.")
 @click.option("--picture", type=FILE, help="Picture of errors and field of view by depth to write (.png).")
 @common_options
+@raw_option
 def check(config: Path, images: tuple[Path, ...], overwrite: bool, console: Console, **chosen: Any) -> dict[str, Any]:
     """Tell what a rig and its images are good for, in seconds, before any work.
 

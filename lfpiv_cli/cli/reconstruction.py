@@ -17,6 +17,7 @@ from lfpiv_cli.cli.options import (
     mask_option,
     output_option,
     pairing_options,
+    raw_option,
 )
 from lfpiv_cli.console import Console
 from lfpiv_cli.names import Start, names_in
@@ -48,6 +49,7 @@ from lfpiv_cli.reconstruction.registry import SOLVER_NAMES
 @batch_options
 @output_option("File for one image, folder for several.")
 @common_options
+@raw_option
 def reconstruct(
     weights: Path, images: tuple[Path, ...], output: Path, overwrite: bool, console: Console, **chosen: Any
 ) -> dict[str, Any]:

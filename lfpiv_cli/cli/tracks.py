@@ -19,6 +19,7 @@ from lfpiv_cli.cli.options import (
     mask_option,
     output_option,
     pairing_options,
+    raw_option,
     resume_option,
 )
 from lfpiv_cli.console import Console
@@ -84,6 +85,7 @@ def track(
 @resume_option
 @output_option("Folder for the particles of each frame and the tracks.")
 @common_options
+@raw_option
 def follow(
     weights: Path, frames: tuple[Path, ...], output: Path, overwrite: bool, console: Console, **chosen: Any
 ) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from typing import Any
 from lfpiv_cli.errors import InputError, OutputExistsError, UsageError
 from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.hdf5 import replace_provenance
-from lfpiv_cli.files.images import count_pages
+from lfpiv_cli.files.images import count_pages, times_of
 from lfpiv_cli.files.inputs import split_part
 from lfpiv_cli.files.places import ensure_apart, folded
 from lfpiv_cli.files.provenance import bear_alike, without_warnings
@@ -34,6 +34,12 @@ class Frame:
         """The file's stem, numbered where the file holds a sequence."""
         stem = split_part(self.path)[0].stem
         return stem if self.pages == 1 else f"{stem}_{self.page:04d}"
+
+    @property
+    def time_s(self) -> float | None:
+        """When it was taken, in s from a moment of its file's own; None where the file does not tell."""
+        times = times_of(self.path)
+        return None if times is None else float(times[self.page])
 
 
 @dataclass(frozen=True)

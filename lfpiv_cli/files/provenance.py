@@ -36,7 +36,12 @@ UNREAD = {
 }
 
 
-def record(command: str, config: Mapping[str, Any] | None, inputs: Mapping[str, Path]) -> dict[str, Any]:
+def record(
+    command: str,
+    config: Mapping[str, Any] | None,
+    inputs: Mapping[str, Path],
+    taken_s: Mapping[str, float | None] | None = None,
+) -> dict[str, Any]:
     """Return the record of a result.
 
     Parameters
@@ -44,25 +49,29 @@ def record(command: str, config: Mapping[str, Any] | None, inputs: Mapping[str, 
     command : the subcommand and the options that bear on the result
     config : the resolved config, as plain data, or None where there is none
     inputs : the files that the result is made from, by their role
+    taken_s : when images among these were taken, in s from a moment of their file's own, where it tells
 
     Returns
     -------
     dict
-        `program`, `version`, `libraries`, `command`, `config`, `inputs` (name without folder and SHA-256, by role)
-        and `made_from`: the records of those inputs, and of what these were made from, that are results of this
-        program, by SHA-256.
+        `program`, `version`, `libraries`, `command`, `config`, `inputs` (by role: name without folder, SHA-256, and the
+        time where there is one) and `made_from`: the records of those inputs, and of what these were made from, that
+        are results of this program, by SHA-256.
 
     Raises
     ------
     InputError
         If an input cannot be read.
     """
-    named: dict[str, dict[str, str]] = {}
+    named: dict[str, dict[str, Any]] = {}
     made_from: dict[str, Any] = {}
     for role, path in sorted(inputs.items()):
         file, part = split_part(path)
         digest = sha256(path)
         named[role] = {"name": file.name if part is None else f"{file.name}:{part}", "sha256": digest}
+        taken = (taken_s or {}).get(role)
+        if taken is not None:
+            named[role]["time_s"] = taken
         earlier = earlier_record(file)
         if earlier is not None:
             made_from.update(earlier.pop("made_from", {}))
@@ -107,6 +116,18 @@ def also_used_as(made: Mapping[str, Any], role: str) -> str | None:
             if _file_and_part(given) == asked and (each is not made or name != role):
                 return f"{name} of {each['command'].split()[0]}"
     return None
+
+
+def seconds_between(first: Mapping[str, Any], second: Mapping[str, Any]) -> float | None:
+    """Return the time from the image of one record to that of another; None where it is not told.
+
+    Times count from a moment of the recording's own: only those of one file can be compared.
+    """
+    images = [made.get("inputs", {}).get("image", {}) for made in (first, second)]
+    before, after = (image.get("time_s") for image in images)
+    if before is None or after is None or images[0]["sha256"] != images[1]["sha256"]:
+        return None
+    return float(after) - float(before)
 
 
 def _file_and_part(given: Mapping[str, str]) -> tuple[str, str | None]:

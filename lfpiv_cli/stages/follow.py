@@ -220,7 +220,8 @@ def _passes(
         command = (
             f"follow {way} page {frame.page} of {count} frames, SHA-256 {digest}, within {tracking.search_mm:g} mm"
         )
-        return Target(path, partial(record, command + told[number], resolved, {**common, "image": frame.path}))
+        inputs, taken_s = {**common, "image": frame.path}, {"image": frame.time_s}
+        return Target(path, partial(record, command + told[number], resolved, inputs, taken_s))
 
     stems, numbers = [frame.stem for frame in frames], range(len(frames))
     folder = output / (FORWARDS if both_ways else PARTICLES)

@@ -12,6 +12,7 @@ from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.describe import describe
 from lfpiv_cli.files.figures import file_figures
 from lfpiv_cli.files.pictures import ensure_drawing, write_picture
+from lfpiv_cli.files.recordings.figures import is_recording, recording_figures
 from lfpiv_cli.files.weights_file import FORMAT, open_weights
 from lfpiv_cli.stages.plot_sources import column_of
 
@@ -30,7 +31,7 @@ NO_OPTIONS = InfoOptions()
 def info(
     file: Path, options: InfoOptions = NO_OPTIONS, *, overwrite: bool = False, console: Console = CONSOLE
 ) -> dict[str, Any]:
-    """Tell what is in a file of ours, its figures last; of weights, draw the column of one voxel."""
+    """Tell what is in a file of ours or of frames, its figures last; of weights, draw the column of one voxel."""
     picture, voxel = options.picture, options.voxel
     if picture is None:
         if voxel is not None:
@@ -40,7 +41,8 @@ def info(
     ensure_drawing()
     found = _told(file)
     if found["format"] != FORMAT:
-        raise UsageError(f"--picture draws a voxel of weights; for the figures of {found['format']}: lfpiv plot {file}")
+        others = "" if is_recording(file) else f"; for the figures of {found['format']}: lfpiv plot {file}"
+        raise UsageError(f"--picture draws a voxel of weights{others}")
     content = open_weights(file)
     nx, ny, nz = content.weights.grid.shape_xyz
     ix, iy, iz = voxel or (nx // 2, ny // 2, nz // 2)
@@ -51,5 +53,7 @@ def info(
 
 
 def _told(file: Path) -> dict[str, Any]:
+    if is_recording(file):
+        return recording_figures(file)
     found = describe(file)
     return found | file_figures(file, found["format"])

@@ -223,7 +223,7 @@ class Reconstruction(ByArguments):
         if frame.fault is not None:
             raise InputError(frame.fault)
         command = f"reconstruct page {frame.page}{self._words(number)}"
-        return record(command, self._resolved, {**self._common, "image": frame.path})
+        return record(command, self._resolved, {**self._common, "image": frame.path}, {"image": frame.time_s})
 
     def _begun(self) -> _Ready:
         if self._ready is None:
