@@ -152,13 +152,12 @@ def test_commands_refuse_a_cut_recording_by_its_name(folder: Path, tmp_path: Pat
 
 
 def test_other_commands_take_the_layout(folder: Path, tmp_path: Path) -> None:
-    one = tmp_path / "one.raw"
-    one.write_bytes((folder / "raw.raw").read_bytes()[: (folder / "raw.raw").stat().st_size // 2])
+    one = f"{folder / 'raw.raw'}:page=0"
     single = tmp_path / "one.tif"
     tifffile.imwrite(single, tifffile.imread(folder / "tiff.tif", key=0), photometric="minisblack")
     expected = json.loads(run("check", folder / "rig.yaml", single, "--dark", single, "--json"))
     found = json.loads(run("check", folder / "rig.yaml", one, "--dark", one, "--raw", PACKED, "--json"))
-    assert json.dumps(found).replace(f"one.raw:{PACKED}", "one.tif") == json.dumps(expected)
+    assert json.dumps(found).replace(f"raw.raw:{PACKED}:page=0", "one.tif") == json.dumps(expected)
     assert fault_of("check", folder / "rig.yaml", one, "--raw", "12")[1] == 2
 
 

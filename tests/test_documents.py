@@ -27,6 +27,7 @@ import lfpiv_cli
 from lfpiv_cli.cli import cli
 from lfpiv_cli.errors import LimitMissedError
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, read_points, write_points
+from tests import camera_files
 
 ROOT = Path(__file__).parent.parent
 SAMPLE = ROOT / "sample_data"
@@ -197,6 +198,8 @@ def write_images(folder: Path) -> None:
     pages = [tifffile.imread(folder / f"{name}.tif") for name in "abab"]
     tifffile.imwrite(folder / "run.tif", np.stack(pages), photometric="minisblack")
     imagecodecs.imwrite(folder / "mask.png", np.full(pages[0].shape, 255, np.uint8))
+    camera_files.write_cine(folder / "shot.cine", np.stack(pages[:2]))
+    np.stack(pages[:2]).tofile(folder / "shot.raw")
 
 
 def write_configs(folder: Path) -> None:

@@ -413,6 +413,18 @@ def test_a_part_of_a_format_without_parts(tmp_path: Path, rng: np.random.Generat
 
 
 @pytest.mark.parametrize("kind", KINDS)
+def test_one_page_of_any_recording_is_an_image(tmp_path: Path, rng: np.random.Generator, kind: str) -> None:
+    given, stack = kinds(tmp_path, rng)[kind]
+    with pytest.raises(InputError, match="holds 3 pages, expected a single image; .*:page=0 is the first one"):
+        images.read_image(given)
+    one = Path(f"{given}:page=2")
+    np.testing.assert_array_equal(images.read_image(one, (5, 7)), stack[2])
+    np.testing.assert_array_equal(images.times_of(one), images.times_of(given)[2:])
+    with pytest.raises(InputError, match="has no page 3, it holds 3"):
+        images.read_image(Path(f"{given}:page=3"))
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_mutated_headers_raise_nothing_else(tmp_path: Path, rng: np.random.Generator, kind: str) -> None:
     given, _ = kinds(tmp_path, rng)[kind]
     path, _ = split_part(given)

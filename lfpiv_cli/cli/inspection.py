@@ -18,10 +18,12 @@ from lfpiv_cli.console import Console
 @common_options
 @raw_option
 def info(file: Path, overwrite: bool, console: Console, **chosen: Any) -> dict[str, Any]:
-    """Describe a file that lfpiv wrote: its figures; of weights, draw the point-spread function of one voxel.
+    """Describe a file that lfpiv wrote, or a recording; of weights, draw the point-spread function of one voxel.
 
     \b
     Example: lfpiv info weights.h5 --picture column.png --voxel 50 40 120
+    of a camera's recording, its pages, size, bits and frame rate:
+             lfpiv info shot.cine
     """
     from lfpiv_cli.stages import info as stage
 

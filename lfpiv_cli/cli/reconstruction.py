@@ -63,6 +63,8 @@ def reconstruct(
     Example: lfpiv reconstruct weights.h5 a.tif b.tif --dark dark.tif -o volumes
     particles of a pair:
              lfpiv reconstruct weights.h5 a.tif b.tif --dark dark.tif --solver particles --pairing ab -o particles
+    frames without a header:
+             lfpiv reconstruct weights.h5 shot.raw --raw 2352x1768x12:packing=low-first -o volumes
     over a long sequence, the background of each frame from the fifteen around it:
              lfpiv reconstruct weights.h5 run.tif --background minimum:15 --mask mask.png -o volumes
     all images of a folder, in the order of their numbers, and those of a list:

@@ -5,6 +5,7 @@ Images are float32 arrays `[row, column]` in counts. Colour is read where its ch
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.files.atomic import write_atomically
-from lfpiv_cli.files.inputs import ensure_regular_file, split_part
+from lfpiv_cli.files.inputs import ensure_regular_file, split_page, split_part
 from lfpiv_cli.files.recordings import tiff
 from lfpiv_cli.files.recordings.formats import open_recording
 from lfpiv_cli.files.recordings.recording import Image, Recording, Shape
@@ -30,7 +31,8 @@ def frames(path: Path) -> Recording:
 
     Parameters
     ----------
-    path : of the file, or `FILE.h5:/PATH` for a dataset in it, `FILE.raw:LAYOUT` for frames without a header
+    path : of the file, or `FILE.h5:/PATH` for a dataset in it, `FILE.raw:LAYOUT` for frames without a header; at the
+        end `:page=N` for one of them
 
     Raises
     ------
@@ -48,7 +50,17 @@ def frames(path: Path) -> Recording:
 @lru_cache(KEPT_HEADERS)
 def _frames(file: Path, part: str | None, size: int, mtime_ns: int, inode: int) -> Recording:
     """Read a header once; a file that has another size, time or place on the disk is looked at anew."""
-    return open_recording(file, part)
+    part, page = split_page(part)
+    recording = open_recording(file, part)
+    return recording if page is None else _only(file, recording, page)
+
+
+def _only(file: Path, recording: Recording, page: int) -> Recording:
+    """Return one page of a recording as a recording."""
+    if page >= recording.pages:
+        raise InputError(f"{file}: has no page {page}, it holds {recording.pages}")
+    time_s = None if recording.time_s is None else recording.time_s[page : page + 1]
+    return replace(recording, pages=1, time_s=time_s, read_page=lambda _, shape: recording.read_page(page, shape))
 
 
 def count_pages(path: Path) -> int:
@@ -80,7 +92,7 @@ def read_image(path: Path, shape: Shape | None = None) -> Image:
     """
     pages = count_pages(path)
     if pages != 1:
-        raise InputError(f"{path}: holds {pages} pages, expected a single image")
+        raise InputError(f"{path}: holds {pages} pages, expected a single image; {path}:page=0 is the first one")
     return read_page(path, 0, shape)
 
 

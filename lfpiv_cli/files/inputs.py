@@ -12,8 +12,9 @@ from lfpiv_cli.errors import InputError
 # Where the system does not tell its memory (Windows), files that declare more than this are refused.
 MEMORY_WHERE_UNKNOWN = 16 * 1024**3
 
-# A file, and what of it is meant: a dataset in it, or how its frames are laid out.
+# A file, and what of it is meant: a dataset in it, or how its frames are laid out; and which of these, counted from 0.
 PART = re.compile(r"(.+?\.[A-Za-z][A-Za-z0-9]*):(.+)", re.DOTALL)
+PAGE = re.compile(r"(?:(.+):)?page=(\d{1,9})", re.DOTALL)
 
 
 def split_part(path: Path) -> tuple[Path, str | None]:
@@ -22,6 +23,12 @@ def split_part(path: Path) -> tuple[Path, str | None]:
     if found is None or os.path.lexists(path):
         return path, None
     return Path(found[1]), found[2]
+
+
+def split_page(part: str | None) -> tuple[str | None, int | None]:
+    """Return a part without the page that it names at its end, and this page."""
+    found = None if part is None else PAGE.fullmatch(part)
+    return (part, None) if found is None else (found[1], int(found[2]))
 
 
 def given(**inputs: Path | str | None) -> dict[str, Path]:

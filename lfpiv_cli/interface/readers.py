@@ -30,7 +30,9 @@ def load_rig(path: Path | str) -> Config:
 
 
 def read_image(path: Path | str, page: int = 0) -> images.Image:
-    """Read an image of a TIFF or PNG file, or one page of a sequence.
+    """Read an image of a TIFF or PNG file or of a camera's recording, or one page of a sequence.
+
+    `FILE.h5:/PATH` names a dataset, `FILE.raw:LAYOUT` the layout of frames without a header.
 
     Returns
     -------

@@ -21,7 +21,7 @@ from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files.atomic import without_nan
 from lfpiv_cli.files.batch import VTKHDF_SUFFIX, Frame, frames_of, output_paths, prepare_folder
 from lfpiv_cli.files.config import Config, load_config
-from lfpiv_cli.files.inputs import ensure_regular_file
+from lfpiv_cli.files.inputs import ensure_regular_file, split_part
 from lfpiv_cli.files.pages import ensure_pages
 from lfpiv_cli.files.pictures import ensure_drawing
 from lfpiv_cli.files.vtkhdf import open_vectors
@@ -133,7 +133,7 @@ def _ensure_possible(settings: Config, options: RunOptions) -> list[Frame]:
     ensure_pictures(len(options.white), len(options.board), len(options.depth_mm))
     background = Background.parse(options.background).path
     for path in (*options.white, *options.board, *filter(None, (options.dark, background))):
-        ensure_regular_file(path)
+        ensure_regular_file(split_part(path)[0])
     frames = frames_of(options.images)
     if options.follow:
         ensure_sequence(len(frames), SHORTEST)

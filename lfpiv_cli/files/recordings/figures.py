@@ -10,7 +10,7 @@ import numpy as np
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.files.hdf5 import open_h5
 from lfpiv_cli.files.images import frames
-from lfpiv_cli.files.inputs import ensure_regular_file, split_part
+from lfpiv_cli.files.inputs import ensure_regular_file, split_page, split_part
 from lfpiv_cli.files.recordings import stack
 from lfpiv_cli.files.recordings.formats import format_of
 
@@ -26,7 +26,7 @@ def recording_figures(path: Path) -> dict[str, Any]:
     recording = frames(path)
     found: dict[str, Any] = {
         "file_bytes": file.stat().st_size,
-        "format": format_of(file, part).name,
+        "format": format_of(file, split_page(part)[0]).name,
         "pages": recording.pages,
         "columns": recording.shape[1],
         "rows": recording.shape[0],
@@ -51,7 +51,7 @@ def is_recording(path: Path) -> bool:
     file, part = split_part(path)
     ensure_regular_file(file)
     try:
-        kind = format_of(file, part)
+        kind = format_of(file, split_page(part)[0])
     except InputError:
         return False
     if kind.starts != (stack.START,) or part is not None:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from lfpiv_cli.errors import InputError, UsageError
+from lfpiv_cli.files.inputs import split_page, split_part
 from lfpiv_cli.files.recordings.bayer import PATTERNS
 from lfpiv_cli.files.recordings.blocks import at_rate, recording
 from lfpiv_cli.files.recordings.packing import MOST_BITS, PACKED_BITS, Packing, Pixels
@@ -73,7 +74,11 @@ def frames_laid_out(path: Path, layout: str) -> Recording:
 
 def with_layout(path: Path, layout: str) -> Path:
     """Return the name of a file with a layout, where it is one without a header by its name and has none yet."""
-    return path.with_name(f"{path.name}:{layout}") if path.suffix.lower() in SUFFIXES else path
+    file, part = split_part(path)
+    other, page = split_page(part)
+    if file.suffix.lower() not in SUFFIXES or other is not None:
+        return path
+    return file.with_name(f"{file.name}:{layout}" + ("" if page is None else f":page={page}"))
 
 
 def parse_layout(text: str) -> Layout:
