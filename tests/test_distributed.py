@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
 import os
 import signal
+import subprocess
 import sys
+import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,7 +16,7 @@ from typing import Any
 import pytest
 
 from lfpiv_cli.console import Console, Frames
-from lfpiv_cli.errors import InputError, StoppedEarlyError, UsageError
+from lfpiv_cli.errors import InputError, PartialError, StoppedEarlyError, UsageError
 from lfpiv_cli.files.batch import Target
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.stages.batches import BatchOptions, ByArguments, Worked, work_through
@@ -111,3 +115,78 @@ def test_without_distributed_the_remedy_is_told(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setitem(sys.modules, "lfpiv_cli.stages.distributed", None)
     with pytest.raises(UsageError, match=r'pip install "lfpiv\[cluster\]"'):
         work(Toy(tmp_path, 2), "local")
+
+
+class Fatal(Toy):
+    """The first process to make output 0 ends there, once; output 2 takes until that has happened."""
+
+    def make(self, number: int, work: Frames) -> int:
+        ended = self.folder / "ended"
+        if number == 0 and not ended.exists():
+            ended.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().make(number, work)
+
+
+@pytest.mark.slow
+def test_a_killed_worker_loses_nothing(tmp_path: Path) -> None:
+    worked, warned = work(Fatal(tmp_path, 4), "local:2")
+    assert written(tmp_path) == list("0123")
+    assert not worked.failures
+    assert [notice.about for notice in warned if notice.code == "worker-ended"] == ["0"]
+    # The claim of the killed worker was taken over.
+    assert not list(tmp_path.glob(".*"))
+
+
+@pytest.mark.slow
+def test_an_output_that_kills_workers_is_named_and_alone(tmp_path: Path) -> None:
+    worked, warned = work(Toy(tmp_path, 5, deadly=[1]), "local:2", keep_going=True)
+    assert written(tmp_path) == list("0234")
+    assert [(failure.name, failure.error) for failure in worked.failures] == [
+        ("1", "1: 3 workers ended while they worked on it")
+    ]
+    with pytest.raises(PartialError, match="1 of 5 frames failed, the first because 1: 3 workers ended"):
+        worked.ensure_whole({}, "frame")
+
+
+@pytest.mark.slow
+def test_without_keep_going_the_others_are_made_first(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"0: 3 workers ended .*; 2 of 3 frames were written before"):
+        work(Toy(tmp_path, 3, deadly=[0]), "local:2")
+    assert written(tmp_path) == list("12")
+
+
+class Ending(Toy):
+    """Ends the scheduler, whose process is told in a file, with its last output."""
+
+    def make(self, number: int, work: Frames) -> int:
+        if number == len(self.targets) - 1:
+            os.kill(int((self.folder / "scheduler").read_text()), signal.SIGKILL)
+        return super().make(number, work)
+
+
+@pytest.mark.slow
+def test_workers_elsewhere_and_a_scheduler_that_ends(tmp_path: Path) -> None:
+    tests = Path(__file__).parent
+    environment = os.environ | {"PYTHONPATH": f"{tests.parent}{os.pathsep}{tests}"}
+    told = ["--scheduler-file", str(tmp_path / "told.json")]
+    with contextlib.ExitStack() as processes:
+
+        def start(module: str, *options: str) -> int:
+            command = [sys.executable, "-m", f"distributed.cli.{module}", *told, *options]
+            process = subprocess.Popen(command, env=environment, cwd="/", stderr=subprocess.DEVNULL)
+            processes.callback(process.wait, 20)
+            processes.callback(process.terminate)
+            return process.pid
+
+        scheduler = start("dask_scheduler", "--port", "0", "--no-dashboard")
+        start("dask_worker", "--nthreads", "1", "--no-nanny", "--no-dashboard", "--local-directory", str(tmp_path))
+        while not (tmp_path / "told.json").exists():
+            time.sleep(0.1)
+        address = json.loads((tmp_path / "told.json").read_text())["address"]
+        worked, _ = work(Toy(tmp_path, 3), address)
+        assert list(worked.outcomes) == [0, 1, 2]
+        assert os.getpid() not in worked.outcomes.values()
+        (tmp_path / "scheduler").write_text(str(scheduler))
+        with pytest.raises(StoppedEarlyError, match="the scheduler has ended; the same command with --resume goes on"):
+            work(Ending(tmp_path, 2), address)

@@ -102,3 +102,10 @@ def test_workers_go_on_where_they_are_and_begin_where_most_is_left() -> None:
 def test_a_single_worker_goes_through_in_order() -> None:
     left = Runs(range(5))
     assert [left.next_for("a") for _ in range(len(left))] == list(range(5))
+
+
+def test_a_frame_that_is_put_back_goes_to_another_worker() -> None:
+    left = Runs([5, 6])
+    assert left.next_for("a") == 5
+    left.put_back(5)
+    assert sorted([left.next_for("b"), left.next_for("c")]) == [5, 6]

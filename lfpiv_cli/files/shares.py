@@ -155,6 +155,10 @@ class Runs:
         self._left.remove(place)
         return self._numbers[place]
 
+    def put_back(self, number: int) -> None:
+        """Take back a frame that a worker was given."""
+        self._left.add(self._numbers.index(number))
+
     def _new_begin(self) -> int:
         """Return where the longest run that is left begins, or its middle if somebody else comes to its begin."""
         runs: list[list[int]] = []

@@ -15,6 +15,7 @@ import re
 import tempfile
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError
 from contextlib import ExitStack, contextmanager
@@ -23,7 +24,6 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
-import dask
 from distributed import Client, Future, KilledWorker, LocalCluster, Worker, WorkerPlugin, get_worker
 
 import lfpiv_cli
@@ -37,7 +37,7 @@ from lfpiv_cli.threads import told_threads, use_threads
 
 # Workers on this machine, as many as it has cores, or `local:4`.
 LOCAL = re.compile(r"local(?::(\d{1,4}))?", re.ASCII)
-# An output at which so many workers have ended is given up; of clusters that are not ours, their scheduler decides.
+# An output at which so many workers have ended is given up.
 WORKERS_GIVEN_UP = 3
 # How often it is looked whether workers have come or gone, and for how long a scheduler is asked.
 LOOK_S, CONNECT_S = 1.0, 20.0
@@ -165,12 +165,11 @@ def _own_cluster(workers: int) -> Iterator[str]:
     workers = workers or max((os.cpu_count() or 1) // (told_threads() or 1), 1)
     with (
         tempfile.TemporaryDirectory(prefix="lfpiv-dask-", ignore_cleanup_errors=True) as folder,
-        dask.config.set({"distributed.scheduler.allowed-failures": WORKERS_GIVEN_UP - 1}),
         LocalCluster(
             n_workers=workers,
             threads_per_worker=1,
             memory_limit=0,  # a worker may take what the command itself might
-            dashboard_address=None,
+            dashboard_address="127.0.0.1:0",  # a port of its own, for this machine alone
             local_directory=folder,
             silence_logs=logging.CRITICAL,  # what matters of them is told as a warning
         ) as cluster,
@@ -185,7 +184,11 @@ def _leave(client: Client, name: str) -> None:
 
 
 class _Outputs:
-    """The outputs of a batch that are left, and which worker makes each of the others."""
+    """The outputs of a batch that are left, and which worker makes each of the others.
+
+    Each is given to one worker and no other, and taken back when that one ends. So it is known at which output a worker
+    ended, which the scheduler does not tell of workers that it has given several.
+    """
 
     def __init__(
         self, client: Client, kept: str, before: Mapping[int, Stamp], names: Sequence[str], console: Console
@@ -193,17 +196,17 @@ class _Outputs:
         """Take which outputs there are to make, and what was in their places before."""
         self._client, self._kept, self._before, self._names, self._console = client, kept, before, names, console
         self._left = Runs(list(before))
-        # The worker that an output was given to; None after that one has ended, and the scheduler chose another.
-        self._running: dict[Future, tuple[int, str | None]] = {}
+        self._running: dict[Future, tuple[int, str]] = {}
         self._some_done = threading.Event()
         self._claimed: list[int] = []
-        self._given_up: list[int] = []
+        # How many workers have ended at each output.
+        self._ends: Counter[int] = Counter()
 
     def as_done(self, deadline: Deadline) -> Iterator[tuple[int, Reply]]:
         """Yield outputs as they are done."""
         while self._running or ((self._left or self._claimed) and deadline.leaves_time()):
             workers = self._workers()
-            self._tell_ends(workers)
+            self._take_back(workers)
             if deadline.leaves_time():
                 self._hand_out(workers)
             for number, reply in self._done():
@@ -211,9 +214,10 @@ class _Outputs:
                     self._claimed.append(number)
                 else:
                     yield number, reply
-        for number in self._given_up:
-            text = f"{self._names[number]}: {WORKERS_GIVEN_UP} workers ended while they worked on it"
-            yield number, Reply(InputError(text))
+        for number, ends in self._ends.items():
+            if ends >= WORKERS_GIVEN_UP:
+                text = f"{self._names[number]}: {ends} workers ended while they worked on it"
+                yield number, Reply(InputError(text))
 
     def cancel(self) -> None:
         """Give up what is still being made."""
@@ -228,38 +232,33 @@ class _Outputs:
         except OSError as error:
             raise StoppedEarlyError(SCHEDULER_ENDED) from error
 
-    def _tell_ends(self, workers: set[str]) -> None:
-        """Say which workers ended while they made something."""
-        for future, (number, worker) in self._running.items():
-            if worker is None or worker in workers or future.done():
-                continue
+    def _take_back(self, workers: set[str]) -> None:
+        """Take back what was given to workers that have ended."""
+        for future, (number, worker) in list(self._running.items()):
+            if worker not in workers and not future.done():
+                self._worker_ended(future, number, worker)
+
+    def _worker_ended(self, future: Future, number: int, worker: str) -> None:
+        """Leave an output to another worker, or give it up after some."""
+        self._running.pop(future, None)
+        self._client.cancel([future], force=True)
+        self._ends[number] += 1
+        if self._ends[number] < WORKERS_GIVEN_UP:
             text = f"the worker {worker} ended while it worked on it, which goes to another"
             self._console.warn([Notice("worker-ended", self._names[number], text, "memory, or its time limit")])
-            self._running[future] = number, None
+            self._left.put_back(number)
 
     def _hand_out(self, workers: set[str]) -> None:
         """Give each worker that has nothing to do an output."""
-        busy = {worker for _, worker in self._running.values()}
-        if None in busy:
-            keys = {future.key for future in self._running}
-            busy |= {worker for worker, made in self._client.processing().items() if keys & set(made)}
         if not self._left and not self._running:
             # What another command was making may be left by it.
             time.sleep(SECONDS_BETWEEN_LOOKS)
             self._left, self._claimed = Runs(self._claimed), []
-        for worker in sorted(workers - busy):
+        for worker in sorted(workers - {worker for _, worker in self._running.values()}):
             if not self._left:
                 return
             number = self._left.next_for(worker)
-            future = self._client.submit(
-                _make,
-                self._kept,
-                number,
-                self._before[number],
-                workers=[worker],
-                allow_other_workers=True,
-                pure=False,
-            )
+            future = self._client.submit(_make, self._kept, number, self._before[number], workers=[worker], pure=False)
             self._running[future] = number, worker
             future.add_done_callback(lambda _future: self._some_done.set())
 
@@ -267,11 +266,13 @@ class _Outputs:
         """Yield what is done, after a while at the latest."""
         self._some_done.wait(LOOK_S)
         self._some_done.clear()
-        for future in [future for future in self._running if future.done()]:
-            number, _ = self._running.pop(future)
+        for future, (number, worker) in [item for item in self._running.items() if item[0].done()]:
             try:
-                yield number, future.result()
-            except KilledWorker:
-                self._given_up.append(number)
+                reply = future.result(timeout=CONNECT_S)
+            except (KilledWorker, TimeoutError):  # it ended after it was done, and before it could tell
+                self._worker_ended(future, number, worker)
             except CancelledError as error:
                 raise StoppedEarlyError(SCHEDULER_ENDED) from error
+            else:
+                del self._running[future]
+                yield number, reply
