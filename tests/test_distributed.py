@@ -8,6 +8,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -16,8 +17,9 @@ from typing import Any
 import pytest
 
 from lfpiv_cli.console import Console, Frames
-from lfpiv_cli.errors import InputError, PartialError, StoppedEarlyError, UsageError
+from lfpiv_cli.errors import InputError, OutputError, PartialError, StoppedEarlyError, UsageError
 from lfpiv_cli.files.batch import Target
+from lfpiv_cli.files.claims import claimed
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.stages.batches import BatchOptions, ByArguments, Worked, work_through
 
@@ -88,6 +90,32 @@ def test_a_faulty_output_is_listed_or_stops_the_batch(in_process: str, tmp_path:
     assert written(tmp_path) == list("023")
     with pytest.raises(InputError, match="1: is cut"):
         work(Toy(tmp_path, 4, faulty=[1]), in_process)
+
+
+class Full(Toy):
+    """Its disk is full."""
+
+    def make(self, number: int, work: Frames) -> int:
+        raise OutputError(f"{number}: no space left on device")
+
+
+def test_any_other_error_ends_the_batch(in_process: str, tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match="no space left"):
+        work(Full(tmp_path, 4), in_process, keep_going=True)
+
+
+def test_what_another_command_makes_is_left_to_it_and_made_if_it_does_not(in_process: str, tmp_path: Path) -> None:
+    batch, ended = Toy(tmp_path, 3), threading.Event()
+
+    def other_command() -> None:
+        with claimed(batch.targets[1].path):
+            ended.wait(0.3)
+
+    other = threading.Thread(target=other_command)
+    other.start()
+    worked, _ = work(batch, in_process)
+    other.join()
+    assert sorted(worked.outcomes) == [0, 1, 2]
 
 
 def test_a_share_of_the_outputs_is_made(in_process: str, tmp_path: Path) -> None:
