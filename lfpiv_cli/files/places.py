@@ -9,6 +9,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from lfpiv_cli.errors import UsageError
+from lfpiv_cli.files.inputs import split_part
 
 # The folder as the system knows it, and the name in it; what an existing file is, whatever leads to it.
 Place = tuple[str, str]
@@ -22,7 +23,7 @@ def ensure_apart(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
     ------
     UsageError
     """
-    inputs = list(inputs)
+    inputs = [split_part(path)[0] for path in inputs]
     read = {place_of(path) for path in inputs}
     files = {identity for identity in map(_identity, inputs) if identity is not None}
     written: set[Place] = set()

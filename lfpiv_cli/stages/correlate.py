@@ -101,8 +101,6 @@ def correlate(
 ) -> dict[str, Any]:
     """Measure the displacements between pairs of volumes; `pairs`, where they are known already."""
     batch = Correlation(volumes, output, options, overwrite, pairs)
-    if options.mean is not None:
-        ensure_writable(options.mean, overwrite or options.resume, batch.inputs)
     worked = work_through(batch, options, console)
     fields = batch.fields(worked)
     if options.mean is not None and fields:
@@ -168,7 +166,9 @@ class Correlation(ByArguments):
         return [*(target.path for target in self.targets), *([self._options.mean] if self._options.mean else [])]
 
     def begin(self, _numbers: Sequence[int], _console: Console) -> float:
-        """Do nothing: pairs share nothing but the settings."""
+        """Refuse a mean that could not be written; pairs share nothing but the settings."""
+        if self._options.mean is not None:
+            ensure_writable(self._options.mean, self.overwrite or self._options.resume)
         return 1.0
 
     def make(self, number: int, work: Frames) -> Outcome:

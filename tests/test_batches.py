@@ -1,0 +1,363 @@
+"""Batches through the real commands: what is skipped, what fails and is listed, and two workers at once."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import click
+import h5py
+import numpy as np
+import pytest
+import tifffile
+
+from lfpiv_cli import open_volume
+from lfpiv_cli.cli import cli
+from lfpiv_cli.cli.outcome import Terminated
+from lfpiv_cli.errors import InputError, OutputError, OutputExistsError, PartialError, UsageError
+from lfpiv_cli.files import claims, places
+from lfpiv_cli.files.claims import DEAD_AFTER_S, claim_path, claimed
+from lfpiv_cli.files.config import load_config
+from lfpiv_cli.files.images import read_image
+from lfpiv_cli.files.places import ignores_case
+from lfpiv_cli.files.provenance import record
+from lfpiv_cli.files.vtkhdf import write_volume
+from lfpiv_cli.grid import Grid
+from lfpiv_cli.reference import Reference
+from lfpiv_cli.stages import reconstruct as stage
+
+ROOT = Path(__file__).parent.parent
+SAMPLE, CONFIG = ROOT / "sample_data", ROOT / "configs" / "sample.yaml"
+QUICK = ("--iterations", 1, "--dark", SAMPLE / "dark.tif")
+
+
+def run(*arguments: object) -> None:
+    cli.main([str(argument) for argument in arguments], standalone_mode=False)
+
+
+def told(capsys: pytest.CaptureFixture[str], *arguments: object) -> dict[str, Any]:
+    """Run a command; return its summary."""
+    capsys.readouterr()
+    try:
+        run(*arguments, "--json")
+    finally:
+        out = capsys.readouterr().out
+    summary: dict[str, Any] = json.loads(out)
+    return summary
+
+
+def stamps(folder: Path) -> dict[str, tuple[int, bytes]]:
+    """Return when each file of a folder was written, and what is in it."""
+    return {path.name: (path.stat().st_mtime_ns, path.read_bytes()) for path in folder.iterdir()}
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Weights of a few voxels of the sample's volume, without a calibration."""
+    folder = tmp_path_factory.mktemp("weights")
+    text = CONFIG.read_text().replace("shape_xyz: [30, 22, 40]", "shape_xyz: [6, 5, 4]")
+    (folder / "rig.yaml").write_text(text.replace("reference: mid_plane", "reference: focal_point"))
+    run("build-weights", folder / "rig.yaml", "-o", folder / "weights.h5")
+    return folder / "weights.h5"
+
+
+@pytest.fixture(scope="module")
+def raw() -> np.ndarray:
+    return read_image(SAMPLE / "pair_a.tif").astype(np.uint16)
+
+
+@pytest.fixture
+def images(tmp_path: Path, raw: np.ndarray) -> list[Path]:
+    """Three frames, each a little brighter than the one before."""
+    paths = [tmp_path / f"f{number}.tif" for number in range(3)]
+    for number, path in enumerate(paths):
+        tifffile.imwrite(path, raw + np.uint16(number), compression="zlib")
+    return paths
+
+
+def spoil(path: Path, kind: str) -> None:
+    """Make a frame that cannot be read."""
+    content = path.read_bytes()
+    if kind == "missing":
+        path.unlink()
+    elif kind == "empty":
+        path.write_bytes(b"")
+    elif kind == "cut":
+        path.write_bytes(content[: len(content) // 2])
+    elif kind == "size":
+        tifffile.imwrite(path, np.ones((20, 30), np.uint16))
+    else:
+        path.write_bytes(b"no image at all")
+
+
+def test_a_finished_batch_is_skipped_and_stays_as_it_is(weights, images, tmp_path, capsys) -> None:
+    command = ("reconstruct", weights, *images, *QUICK, "-o", tmp_path / "out")
+    assert told(capsys, *command)["reconstructed"] == 3
+    before = stamps(tmp_path / "out")
+    assert sorted(before) == ["f0.vtkhdf", "f1.vtkhdf", "f2.vtkhdf"]
+    with pytest.raises(OutputExistsError):
+        run(*command)
+    again = told(capsys, *command, "--resume")
+    assert (again["reconstructed"], again["skipped"]) == (0, 3)
+    assert stamps(tmp_path / "out") == before
+
+
+def damage(path: Path, part: str) -> None:
+    """Damage a volume: its first bytes, its record, its data, or its end."""
+    content = bytearray(path.read_bytes())
+    with h5py.File(path) as file:
+        data = file["intensity"].id.get_chunk_info(0).byte_offset
+    at = {"head": 9, "record": content.index(b'"command"'), "data": data}.get(part)
+    if at is None:
+        del content[-100:]
+    else:
+        content[at] ^= 0x10
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize("part", ["head", "record", "data", "end"])
+def test_a_damaged_result_is_made_anew(weights, images, tmp_path, capsys, part) -> None:
+    command = ("reconstruct", weights, *images[:2], *QUICK, "-o", tmp_path / "out")
+    run(*command)
+    before = stamps(tmp_path / "out")
+    damage(tmp_path / "out" / "f1.vtkhdf", part)
+    summary = told(capsys, *command, "--resume")
+    assert (summary["reconstructed"], summary["skipped"]) == (1, 1)
+    after = stamps(tmp_path / "out")
+    assert after["f0.vtkhdf"] == before["f0.vtkhdf"]
+    assert after["f1.vtkhdf"][1] == before["f1.vtkhdf"][1]
+
+
+def test_what_somebody_else_put_there_is_not_replaced(weights, images, tmp_path) -> None:
+    (tmp_path / "out").mkdir()
+    write_volume(
+        tmp_path / "out" / "f1.vtkhdf",
+        np.ones((2, 2, 2)),
+        Grid.centred((2, 2, 2), (0.1,) * 3, (0.0,) * 3),
+        Reference("mid_plane", 0.0),
+        provenance={},
+        attributes={},
+        overwrite=False,
+    )
+    with pytest.raises(OutputExistsError, match=r"f1.vtkhdf: exists and was made from other inputs"):
+        run("reconstruct", weights, *images, *QUICK, "-o", tmp_path / "out", "--resume")
+
+
+@pytest.mark.parametrize("kind", ["missing", "empty", "cut", "size", "no image"])
+def test_one_bad_frame_stops_the_batch_or_is_listed(weights, images, tmp_path, capsys, kind) -> None:
+    spoil(images[1], kind)
+    command = ("reconstruct", weights, *images, *QUICK, "-o")
+    with pytest.raises(InputError, match=r"f1\.tif: "):
+        run(*command, tmp_path / "stop")
+    listed, go = tmp_path / "failed.json", tmp_path / "go"
+    with pytest.raises(PartialError, match=r"1 of 3 frames failed, the first because .*f1\.tif: "):
+        run(*command, go, "--keep-going", "--failures", listed)
+    (failed,) = json.loads(listed.read_text())
+    assert failed["name"] == "f1"
+    assert "f1.tif: " in failed["error"]
+    before = stamps(go)
+    assert sorted(before) == ["f0.vtkhdf", "f2.vtkhdf"]
+    # the same again: what is there stays as it is, and the frame is listed again
+    listed.unlink()
+    with pytest.raises(PartialError) as error:
+        run(*command, go, "--keep-going", "--resume", "--failures", listed)
+    assert stamps(go) == before
+    assert error.value.figures["skipped"] == 2
+    assert error.value.figures["failures"] == json.loads(listed.read_text()) == [failed]
+
+
+def test_what_was_written_before_a_bad_page_is_said(weights, raw, tmp_path, capsys) -> None:
+    with tifffile.TiffWriter(tmp_path / "run.tif") as writer:
+        for number in range(3):
+            writer.write(raw + np.uint16(number), compression="zlib", metadata=None)
+    with tifffile.TiffFile(tmp_path / "run.tif") as tiff:
+        last, length = tiff.pages[2].dataoffsets[-1], tiff.pages[2].databytecounts[-1]
+    content = bytearray((tmp_path / "run.tif").read_bytes())
+    content[last : last + length] = bytes(length)
+    (tmp_path / "run.tif").write_bytes(content)
+    command = ("reconstruct", weights, tmp_path / "run.tif", *QUICK, "-o")
+    with pytest.raises(InputError, match="2 of 3 frames were written before: run_0000 to run_0001"):
+        run(*command, tmp_path / "stop")
+    assert sorted(stamps(tmp_path / "stop")) == ["run_0000.vtkhdf", "run_0001.vtkhdf"]
+    with pytest.raises(PartialError, match="1 of 3"):
+        run(*command, tmp_path / "go", "--keep-going")
+    assert stamps(tmp_path / "go").keys() == stamps(tmp_path / "stop").keys()
+
+
+@pytest.mark.parametrize("kind", ["empty", "cut"])
+def test_a_bad_frame_is_left_out_of_the_background_of_others(weights, images, raw, tmp_path, kind) -> None:
+    spoil(images[1], kind)
+    output = ("--background", "minimum", "--iterations", 1, "-o", tmp_path / "out", "--keep-going")
+    with pytest.raises(PartialError):
+        run("reconstruct", weights, *images, *output)
+    run("reconstruct", weights, images[0], images[2], *output[:-2], tmp_path / "two")
+    for name in ("f0", "f2"):
+        found, expected = (open_volume(tmp_path / folder / f"{name}.vtkhdf") for folder in ("out", "two"))
+        np.testing.assert_array_equal(found.array, expected.array)
+
+
+@pytest.fixture(scope="module")
+def pairs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Two pairs of small volumes."""
+    folder, rng = tmp_path_factory.mktemp("pairs"), np.random.default_rng(5)
+    made_by = record("test", load_config(CONFIG).resolved(), {})
+    grid = Grid.centred((12, 12, 12), (0.1,) * 3, (0.0,) * 3)
+    paths = [folder / f"{name}.vtkhdf" for name in ("a0", "b0", "a1", "b1")]
+    for path in paths:
+        array = rng.random((12, 12, 12)).astype(np.float32)
+        write_volume(path, array, grid, Reference("mid_plane", 0.0), provenance=made_by, attributes={}, overwrite=False)
+    return paths
+
+
+def test_a_finished_mean_is_kept(pairs, tmp_path, capsys) -> None:
+    mean = tmp_path / "mean.vtkhdf"
+    command = ("correlate", *pairs, "--pairing", "ab", "--windows", 8, "--mean", mean, "-o", tmp_path / "out")
+    assert told(capsys, *command)["skipped"] == 0
+    before, at = stamps(tmp_path / "out"), mean.stat().st_mtime_ns
+    assert told(capsys, *command, "--resume")["skipped"] == 2
+    assert (stamps(tmp_path / "out"), mean.stat().st_mtime_ns) == (before, at)
+    # a damaged field is made again as it was, and the mean of the same fields stays
+    (tmp_path / "out" / "a1.vtkhdf").write_bytes(before["a1.vtkhdf"][1][:-9])
+    assert told(capsys, *command, "--resume")["skipped"] == 1
+    assert mean.stat().st_mtime_ns == at
+    third = [path.with_name(f"{name}2.vtkhdf") for name, path in zip("ab", pairs, strict=False)]
+    for path, other in zip(third, pairs, strict=False):
+        path.write_bytes(other.read_bytes())
+    with pytest.raises(OutputExistsError, match=r"mean.vtkhdf: exists and was made from other inputs"):
+        run("correlate", *pairs, *third, *command[5:], "--resume")
+
+
+def test_a_bad_volume_is_listed(pairs, tmp_path, capsys) -> None:
+    bad = tmp_path / "b1.vtkhdf"
+    bad.write_bytes(pairs[3].read_bytes()[:-300])
+    command = ("correlate", *pairs[:3], bad, "--pairing", "ab", "--windows", 8, "-o")
+    with pytest.raises(InputError, match="b1.vtkhdf"):
+        run(*command, tmp_path / "stop")
+    assert not (tmp_path / "stop").exists()
+    with pytest.raises(PartialError, match="1 of 2 pairs failed"):
+        run(*command, tmp_path / "go", "--keep-going", "--mean", tmp_path / "mean.vtkhdf")
+    assert sorted(stamps(tmp_path / "go")) == ["a0.vtkhdf"]
+
+
+def claims_in(folder: Path) -> list[str]:
+    return [path.name for path in folder.glob(".*.claim")]
+
+
+def test_what_another_worker_makes_is_left_to_it(weights, images, tmp_path, capsys) -> None:
+    command = ("reconstruct", weights, *images, *QUICK, "-o")
+    run(*command, tmp_path / "before")
+    out = tmp_path / "out"
+    out.mkdir()
+
+    def other() -> None:
+        with claimed(out / "f1.vtkhdf") as granted:
+            claiming.set()
+            assert granted
+            while not (out / "f2.vtkhdf").exists():
+                time.sleep(0.01)
+            (tmp_path / "before" / "f1.vtkhdf").rename(out / "f1.vtkhdf")
+
+    claiming, worker = threading.Event(), threading.Thread(target=other)
+    worker.start()
+    assert claiming.wait(10)
+    summary = told(capsys, *command, out)
+    worker.join()
+    assert (summary["reconstructed"], summary["skipped"]) == (2, 1)
+    assert sorted(stamps(out)) == ["f0.vtkhdf", "f1.vtkhdf", "f2.vtkhdf"]
+
+
+@pytest.mark.parametrize("fate", ["dead", "silent", "half written"])
+def test_the_claim_of_a_dead_worker_is_taken_over(weights, images, tmp_path, capsys, fate) -> None:
+    dead = subprocess.Popen([sys.executable, "-c", ""])
+    dead.wait()
+    claim = claim_path(tmp_path / "f0.vtkhdf")
+    host = socket.gethostname() if fate == "dead" else "another"
+    claim.write_text("" if fate == "half written" else json.dumps({"host": host, "process": dead.pid}))
+    if fate != "dead":
+        os.utime(claim, (time.time() - 2 * DEAD_AFTER_S,) * 2)
+    assert told(capsys, "reconstruct", weights, images[0], *QUICK, "-o", tmp_path / "f0.vtkhdf")["reconstructed"] == 1
+    assert not claims_in(tmp_path)
+
+
+def test_the_claim_of_a_living_worker_is_respected(tmp_path) -> None:
+    claim = claim_path(tmp_path / "f0.vtkhdf")
+    for host, process in ((socket.gethostname(), os.getpid()), ("another", 1)):
+        claim.write_text(json.dumps({"host": host, "process": process}))
+        with claimed(tmp_path / "f0.vtkhdf") as granted:
+            assert not granted
+        assert claim.exists()
+
+
+@pytest.mark.parametrize("end", [KeyboardInterrupt, Terminated, OutputError("no space"), InputError("no frame")])
+def test_no_claim_stays(weights, images, tmp_path, monkeypatch, end) -> None:
+    def ends(*_arguments: object) -> None:
+        assert len(claims_in(tmp_path / "out")) == 1
+        raise end
+
+    monkeypatch.setattr(stage, "volume_of", ends)
+    with pytest.raises((click.Abort, Terminated, OutputError, InputError)):
+        run("reconstruct", weights, *images, *QUICK, "-o", tmp_path / "out")
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_a_worker_shows_that_it_is_alive(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(claims, "TOUCHED_EVERY_S", 0.01)
+    with claimed(tmp_path / "x.vtkhdf") as granted:
+        assert granted
+        claim = claim_path(tmp_path / "x.vtkhdf")
+        os.utime(claim, (0, 0))
+        for _ in range(500):
+            if claim.stat().st_mtime > 0:
+                break
+            time.sleep(0.01)
+        assert claim.stat().st_mtime > 0
+    assert not claim.exists()
+
+
+@pytest.mark.parametrize("case", ["stems", "page", "input", "failures", "log", "case"])
+def test_outputs_of_one_name_are_refused_before_any_work(weights, images, raw, tmp_path, monkeypatch, case) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    first, options, target = images[0], [], out
+    (tmp_path / "other").mkdir()
+    second = tmp_path / "other" / {"stems": "f0.tif", "page": "run_0001.tif"}.get(case, "F0.tif")
+    second.write_bytes(first.read_bytes())
+    if case == "page":
+        first = tmp_path / "run.tif"
+        tifffile.imwrite(first, np.stack([raw] * 2), photometric="minisblack")
+    elif case == "input":
+        target = tmp_path
+        first = first.rename(tmp_path / "F0.vtkhdf")
+    elif case in ("failures", "log"):
+        options = [f"--{case}", out / "f0.vtkhdf"]
+    elif case == "case":
+        monkeypatch.setattr(places, "ignores_case", lambda folder: True)
+    with pytest.raises(UsageError, match="would give the same output|two outputs of this command|is also an input"):
+        run("reconstruct", weights, first, second, *QUICK, *options, "-o", target, "--overwrite")
+    assert list(out.glob("*.vtkhdf")) in ([], [out / "f0.vtkhdf"])
+
+
+def test_a_mean_and_residuals_meet_nothing(weights, images, pairs, tmp_path) -> None:
+    for mean in (tmp_path / "out" / "a0.vtkhdf", pairs[0]):
+        with pytest.raises(UsageError, match="two outputs of this command|is also an input"):
+            run("correlate", *pairs, "--pairing", "ab", "--mean", mean, "-o", tmp_path / "out", "--overwrite")
+    images[1] = images[1].rename(tmp_path / "f0_residual.tif")
+    with pytest.raises(UsageError, match="is also an input"):
+        run("reconstruct", weights, *images, *QUICK, "--solver", "particles", "-o", tmp_path, "--overwrite")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_tells_whether_it_minds_case(tmp_path, monkeypatch) -> None:
+    ignores_case.cache_clear()
+    (tmp_path / "Folder").mkdir()
+    minds = not (tmp_path / "fOLDER").exists()
+    assert ignores_case(tmp_path / "Folder") == ignores_case(tmp_path / "Folder" / "not yet") == (not minds)
+    monkeypatch.setattr(places, "ignores_case", lambda folder: True)
+    assert places.folded("Ü.tif", tmp_path) == places.folded("u\u0308.TIF", tmp_path)
