@@ -26,6 +26,7 @@ from lfpiv_cli.files import claims, places
 from lfpiv_cli.files.claims import DEAD_AFTER_S, claim_path, claimed
 from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.images import read_image
+from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, read_points
 from lfpiv_cli.files.places import ignores_case
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.files.vtkhdf import write_volume
@@ -361,3 +362,63 @@ def test_a_folder_tells_whether_it_minds_case(tmp_path, monkeypatch) -> None:
     assert ignores_case(tmp_path / "Folder") == ignores_case(tmp_path / "Folder" / "not yet") == (not minds)
     monkeypatch.setattr(places, "ignores_case", lambda folder: True)
     assert places.folded("Ü.tif", tmp_path) == places.folded("u\u0308.TIF", tmp_path)
+
+
+@pytest.mark.slow
+def test_a_pair_with_a_bad_frame_stays_as_it_is(tmp_path, capsys) -> None:
+    text = CONFIG.read_text().replace("shape_xyz: [30, 22, 40]", "shape_xyz: [16, 12, 20]")
+    (tmp_path / "rig.yaml").write_text(text.replace("reference: mid_plane", "reference: focal_point"))
+    run("build-weights", tmp_path / "rig.yaml", "-o", tmp_path / "weights.h5")
+    images = [tmp_path / f"pair_{name}.tif" for name in "ab"]
+    for image in images:
+        image.write_bytes((SAMPLE / image.name).read_bytes())
+    whole = images[0].read_bytes()
+    spoil(images[0], "cut")
+    out = tmp_path / "out"
+    dark = ("--dark", SAMPLE / "dark.tif", "--solver", "particles", "--no-residual")
+    beside = ("reconstruct", tmp_path / "weights.h5", *images, *dark, "--pairing", "ab", "--resume", "-o", out)
+    with pytest.raises(PartialError, match=r"1 of 2 frames failed, the first because .*pair_a\.tif"):
+        run(*beside, "--keep-going")
+    assert "pair_b: is found without the help of pair_a" in capsys.readouterr().err
+    before = stamps(out)
+    with pytest.raises(PartialError):
+        run(*beside, "--keep-going")
+    assert stamps(out) == before
+    run("reconstruct", tmp_path / "weights.h5", images[1], *dark, "-o", tmp_path / "alone.vtkhdf")
+    found, alone = (read_points(path, PARTICLES_FORMAT) for path in (out / "pair_b.vtkhdf", tmp_path / "alone.vtkhdf"))
+    np.testing.assert_array_equal(found.position_mm, alone.position_mm)
+    images[0].write_bytes(whole)
+    with pytest.raises(OutputExistsError, match="pair_b.vtkhdf: exists and was made from other inputs"):
+        run(*beside)
+
+
+@pytest.mark.slow
+def test_two_workers_share_a_folder_and_a_killed_one_is_replaced(weights, raw, tmp_path) -> None:
+    folder, out = tmp_path / "images", tmp_path / "out"
+    folder.mkdir()
+    for number in range(12):
+        tifffile.imwrite(folder / f"f{number}.tif", raw + np.uint16(number))
+    base = [sys.executable, "-m", "lfpiv_cli", "reconstruct", str(weights), str(folder)]
+    command = [*base, *map(str, QUICK), "--iterations", "40", "-q"]
+
+    def start(to: Path, *options: str) -> subprocess.Popen[bytes]:
+        return subprocess.Popen([*command, *options, "-o", str(to)], cwd=ROOT, stderr=subprocess.PIPE)
+
+    assert start(tmp_path / "one").wait(120) == 0
+    killed = start(out, "--resume")
+    while not list(out.glob("f*.vtkhdf")) and killed.poll() is None:
+        time.sleep(0.01)
+    killed.kill()
+    killed.wait()
+    workers = [start(out, "--resume") for _ in range(2)]
+    assert [worker.wait(120) for worker in workers] == [0, 0], [worker.communicate()[1] for worker in workers]
+    assert claims_in(out) == []
+    assert {name: content for name, (_, content) in stamps(out).items() if not name.startswith(".")} == {
+        name: content for name, (_, content) in stamps(tmp_path / "one").items()
+    }
+    stopped = start(tmp_path / "stopped")
+    while not claims_in(tmp_path / "stopped") and stopped.poll() is None:
+        time.sleep(0.001)
+    stopped.terminate()
+    assert stopped.wait(10) == 143
+    assert [path.name for path in (tmp_path / "stopped").iterdir() if path.name.startswith(".")] == []
