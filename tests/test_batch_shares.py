@@ -11,7 +11,8 @@ import pytest
 import tifffile
 
 from lfpiv_cli.cli import cli
-from lfpiv_cli.errors import StoppedEarlyError, UsageError
+from lfpiv_cli.errors import InputError, PartialError, StoppedEarlyError, UsageError
+from lfpiv_cli.files import watching
 from lfpiv_cli.files.images import read_image
 from lfpiv_cli.files.shares import Deadline
 
@@ -149,6 +150,97 @@ def test_a_batch_stops_before_its_time_limit_and_goes_on(
 def test_a_time_limit_that_is_over_at_once(weights: Path, frames: list[Path], tmp_path: Path) -> None:
     with pytest.raises(StoppedEarlyError, match="0 of 5 frames are done"):
         reconstruct(weights, frames, tmp_path / "v", "--time-limit", "0.000001s")
+
+
+class Filling:
+    """A clock with which files come into a folder, each at its time, the first half of it a second before."""
+
+    def __init__(self, folder: Path, plan: dict[float, Path]) -> None:
+        self.folder, self.plan, self.now_s = folder, plan, 0.0
+        folder.mkdir()
+
+    def monotonic(self) -> float:
+        return self.now_s
+
+    def sleep(self, seconds: float) -> None:
+        self.now_s += seconds
+        for time_s, path in self.plan.items():
+            whole, there = path.read_bytes(), self.folder / path.name
+            if self.now_s >= time_s:
+                if not there.exists() or there.stat().st_size < len(whole):
+                    there.write_bytes(whole)
+            elif self.now_s >= time_s - 1.0:
+                there.write_bytes(whole[: len(whole) // 2])
+
+
+def alone(weights: Path, frames: list[Path], output: Path, *options: object) -> None:
+    run("reconstruct", weights, *frames, "--iterations", 2, "--quiet", *options, "-o", output)
+
+
+def test_frames_of_a_folder_that_is_being_filled(
+    weights: Path, frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    camera = Filling(tmp_path / "run", {1.0: frames[0], 2.0: frames[1], 14.0: frames[2]})
+    monkeypatch.setattr(watching, "time", camera)
+    alone(weights, [camera.folder], tmp_path / "v", "--watch", "--idle-s", 20, "--json")
+    told = json.loads(capsys.readouterr().out)
+    assert (told["frames"], told["reconstructed"]) == (3, 3)
+    alone(weights, frames[:3], tmp_path / "one")
+    assert bytes_of(tmp_path / "v") == bytes_of(tmp_path / "one")
+    # once more, with one that never becomes whole
+    (camera.folder / "9.tif").write_bytes(frames[0].read_bytes()[:9000])
+    listed = tmp_path / "failures.json"
+    options = ("--watch", "--idle-s", 5, "--resume", "--keep-going", "--failures", listed)
+    with pytest.raises(PartialError, match="1 of 4 frames failed, the first because .*9.tif"):
+        alone(weights, [camera.folder], tmp_path / "v", *options)
+    assert [failure["name"] for failure in json.loads(listed.read_text())] == ["9"]
+
+
+@pytest.mark.parametrize("pairing", ["ab", "sequence"])
+def test_pairs_of_a_folder_that_is_being_filled(
+    pairing: str, volumes: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    named = [tmp_path / f"{1 + number // 2}{'ab'[number % 2]}.vtkhdf" for number in range(4)]
+    for path, volume in zip(named, volumes, strict=False):
+        path.write_bytes(volume.read_bytes())
+    common = ("--pairing", pairing, "--windows", "4", "--quiet")
+    folder = Filling(tmp_path / "volumes", dict(zip((1.0, 6.0, 12.0, 13.0), named, strict=True)))
+    monkeypatch.setattr(watching, "time", folder)
+    run("correlate", folder.folder, *common, "--watch", "--idle-s", 20, "-o", tmp_path / "v")
+    run("correlate", *named, *common, "-o", tmp_path / "one")
+    assert len(bytes_of(tmp_path / "one")) == (2 if pairing == "ab" else 3)
+    assert bytes_of(tmp_path / "v") == bytes_of(tmp_path / "one")
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (("--background", "minimum:3"), "--background minimum:3 is made from all frames"),
+        (("--mask", "still"), "--mask still is made from all frames"),
+        (("--solver", "particles"), "the tracers' size, which --solver particles needs"),
+        (("--shard", "1/2"), "leave out --shard"),
+    ],
+)
+def test_what_needs_all_frames_does_not_go_with_a_folder_that_is_being_filled(
+    weights: Path, tmp_path: Path, options: tuple[str, ...], told: str
+) -> None:
+    with pytest.raises(UsageError, match=told):
+        alone(weights, [tmp_path], tmp_path / "v", "--watch", *options)
+
+
+def test_a_mean_needs_all_pairs_and_a_folder_is_needed(weights: Path, volumes: list[Path], tmp_path: Path) -> None:
+    for options in (("--mean", tmp_path / "mean.vtkhdf"), ("--ensemble",)):
+        with pytest.raises(UsageError, match=f"--watch: {options[0]} is made from all pairs"):
+            run("correlate", tmp_path, "--pairing", "ab", "--watch", *options, "-o", tmp_path / "v")
+    with pytest.raises(UsageError, match="--watch takes folders"):
+        alone(weights, volumes[:1], tmp_path / "v", "--watch")
+
+
+def test_nothing_comes(weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    camera = Filling(tmp_path / "run", {})
+    monkeypatch.setattr(watching, "time", camera)
+    with pytest.raises(InputError, match="no images have come in 5 s"):
+        alone(weights, [camera.folder], tmp_path / "v", "--watch", "--idle-s", 5)
 
 
 @pytest.mark.parametrize(

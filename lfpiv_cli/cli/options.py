@@ -59,6 +59,10 @@ def inputs_argument(name: str, kind: InputKind = "images") -> Callable[..., Any]
         def run(files_from: Path | None = None, **arguments: Any) -> Any:
             from lfpiv_cli.files.listing import expanded, listed
 
+            if arguments.get("watch"):
+                if files_from is not None:
+                    raise click.UsageError("--watch takes folders, and no list of files")
+                return command(**arguments)
             more = [] if files_from is None else listed(files_from)
             arguments[name] = tuple(expanded([*arguments[name], *more], kind))
             if not arguments[name]:
@@ -95,6 +99,17 @@ dask_option = click.option(
 )
 
 
+def watch_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Give a command the options of folders that are still being filled."""
+    watch = click.option(
+        "--watch",
+        is_flag=True,
+        help="The folders given are still being filled: take files as they become complete, in order.",
+    )
+    idle = click.option("--idle-s", type=POSITIVE, help="With --watch, end so long after the last change; 60.")
+    return watch(idle(command))
+
+
 def raw_option(command: Callable[..., Any]) -> Callable[..., Any]:
     """Give a command the layout of images without a header, which their names carry from here on."""
 
@@ -111,6 +126,8 @@ def raw_option(command: Callable[..., Any]) -> Callable[..., Any]:
         from lfpiv_cli.files.recordings.raw import parse_layout, with_layout
 
         parse_layout(raw)
+        if arguments.get("watch"):
+            raise click.UsageError("--watch takes no --raw: a file without a header does not tell when it is whole")
 
         def named(value: Any) -> Any:
             if isinstance(value, tuple):

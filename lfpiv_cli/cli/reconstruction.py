@@ -18,6 +18,7 @@ from lfpiv_cli.cli.options import (
     output_option,
     pairing_options,
     raw_option,
+    watch_options,
 )
 from lfpiv_cli.console import Console
 from lfpiv_cli.names import Start, names_in
@@ -47,6 +48,7 @@ from lfpiv_cli.reconstruction.registry import SOLVER_NAMES
     "not given.",
 )
 @batch_options
+@watch_options
 @output_option("File for one image, folder for several.")
 @common_options
 @raw_option
@@ -69,6 +71,10 @@ def reconstruct(
              lfpiv reconstruct weights.h5 run.tif --background minimum:15 --mask mask.png -o volumes
     all images of a folder, in the order of their numbers, and those of a list:
              lfpiv reconstruct weights.h5 images --files-from more.txt --resume --keep-going -o volumes
+    on a cluster, a third of them; on this machine, by four processes; while the camera still writes them:
+             lfpiv reconstruct weights.h5 images --shard 2/3 --time-limit 50m --resume -o volumes
+             lfpiv reconstruct weights.h5 images --dask local:4 -o volumes
+             lfpiv reconstruct weights.h5 images --watch --idle-s 30 -o volumes
     """
     from lfpiv_cli.stages import reconstruct as stage
 

@@ -15,6 +15,7 @@ from lfpiv_cli.cli.options import (
     inputs_argument,
     output_option,
     pairing_options,
+    watch_options,
 )
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import UsageError
@@ -47,6 +48,7 @@ def _window(text: str) -> int | tuple[int, ...]:
 @click.option("--derived", is_flag=True, help="Also write vorticity, divergence, strain rate and Q criterion.")
 @click.option("--mean", type=FILE, help="File of the pairs' mean and fluctuations to write (.vtkhdf).")
 @batch_options
+@watch_options
 @output_option("File for one pair, folder for several.")
 @common_options
 def correlate(

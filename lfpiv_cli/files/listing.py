@@ -49,7 +49,7 @@ def expanded(paths: Iterable[Path], kind: InputKind) -> list[Path]:
     ------
     InputError : a folder cannot be read, or holds none
     """
-    return [path for given in paths for path in (_files_in(given, kind) if given.is_dir() else [given])]
+    return [path for given in paths for path in (_some_in(given, kind) if given.is_dir() else [given])]
 
 
 def in_natural_order(paths: Sequence[Path]) -> list[Path]:
@@ -62,15 +62,26 @@ def _natural(name: str) -> list[str | int]:
     return [int(part) if place % 2 else part for place, part in enumerate(re.split(r"([0-9]+)", name.casefold()))]
 
 
-def _files_in(folder: Path, kind: InputKind) -> list[Path]:
+def files_in(folder: Path, kind: InputKind) -> list[Path]:
+    """Return the files in a folder that are of a kind, in natural order; those whose names begin with a dot are not.
+
+    Raises
+    ------
+    InputError : the folder cannot be read
+    """
     try:
         found = [path for path in folder.iterdir() if not path.name.startswith(".") and _is_of(path, kind)]
     except OSError as error:
         raise InputError(f"{folder}: cannot be read: {reason(error)}") from error
+    return in_natural_order(found)
+
+
+def _some_in(folder: Path, kind: InputKind) -> list[Path]:
+    found = files_in(folder, kind)
     if not found:
         what = "no images" if kind == "images" else f"no {VTKHDF_SUFFIX} files"
         raise InputError(f"{folder}: holds {what}")
-    return in_natural_order(found)
+    return found
 
 
 def _is_of(path: Path, kind: InputKind) -> bool:

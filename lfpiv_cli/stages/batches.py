@@ -59,6 +59,8 @@ class BatchOptions:
     shard : make this share of the outputs only
     time_limit_s : stop before so many seconds have gone by, with what is left for another time
     dask : address of the scheduler whose workers make the outputs, or `local` for workers on this machine
+    watch : the inputs are folders that are still being filled
+    idle_s : such folders end when nothing in them has changed for so long
     begun_s : when the time began, by the clock that never goes back
     """
 
@@ -68,6 +70,8 @@ class BatchOptions:
     shard: Shard = ALL
     time_limit_s: float | None = None
     dask: str | None = None
+    watch: bool = False
+    idle_s: float = 60.0
     begun_s: float = field(default_factory=time.monotonic, compare=False, repr=False)
 
 
@@ -165,6 +169,12 @@ class Worked(Generic[Made]):
         """Return how many outputs it was about."""
         return len(self.outcomes) + self.skipped + len(self.failures)
 
+    def add(self, other: Worked[Made]) -> None:
+        """Add what became of another batch, after that of this one."""
+        self.outcomes |= dict(enumerate(other.outcomes.values(), len(self.outcomes)))
+        self.skipped += other.skipped
+        self.failures += other.failures
+
     def ensure_whole(self, summary: dict[str, Any], unit: str) -> dict[str, Any]:
         """Return the summary of a batch of which nothing failed.
 
@@ -211,12 +221,17 @@ def work_through(batch: Batch[Made], options: BatchOptions, console: Console) ->
     if share.start == 0:
         # Of several shards the first one tells them.
         worked.failures[:0] = batch.left_out
-    if options.failures is not None:
-        listed = json.dumps([asdict(failure) for failure in worked.failures], indent=2, ensure_ascii=False)
-        write_text(options.failures, listed + "\n", overwrite=True)
+    write_failures(options, worked)
     if done < len(share):
         raise deadline.error(done, len(share), batch.unit)
     return worked
+
+
+def write_failures(options: BatchOptions, worked: Worked[Any]) -> None:
+    """Write the list of those that failed, where it is asked for."""
+    if options.failures is not None:
+        listed = json.dumps([asdict(failure) for failure in worked.failures], indent=2, ensure_ascii=False)
+        write_text(options.failures, listed + "\n", overwrite=True)
 
 
 def attempt(batch: Batch[Made], number: int, before: Stamp, work: Frames) -> Made | Turn:

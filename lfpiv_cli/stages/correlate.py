@@ -15,7 +15,7 @@ from lfpiv_cli.console import CONSOLE, Console, Frames
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.files.atomic import ensure_writable
-from lfpiv_cli.files.batch import Target, output_paths
+from lfpiv_cli.files.batch import Target, output_paths, prepare_folder
 from lfpiv_cli.files.config import Config, carried_config, load_config
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.pairing import Pairs
@@ -41,6 +41,7 @@ from lfpiv_cli.notice import Notice
 from lfpiv_cli.reference import Reference
 from lfpiv_cli.stages.batches import ALL, BatchOptions, ByArguments, Failure, Worked, work_through
 from lfpiv_cli.stages.pairs import PairOptions, result_pairs
+from lfpiv_cli.stages.watched import paired_from_first, watched, work_as_they_come
 
 Extra = dict[str, tuple[NDArray[Any], str]]
 
@@ -100,6 +101,9 @@ def correlate(
     pairs: Pairs | None = None,
 ) -> dict[str, Any]:
     """Measure the displacements between pairs of volumes; `pairs`, where they are known already."""
+    if options.watch:
+        batch, worked = _as_they_come(volumes, output, options, overwrite, console)
+        return worked.ensure_whole(batch.summary(worked), batch.unit)
     batch = Correlation(volumes, output, options, overwrite, pairs)
     worked = work_through(batch, options, console)
     fields = batch.fields(worked)
@@ -108,6 +112,36 @@ def correlate(
         # What another worker made of the same fields in the meantime is as good.
         work_through(mean, BatchOptions(resume=True), console)
     return worked.ensure_whole(batch.summary(worked), batch.unit)
+
+
+def _as_they_come(
+    folders: Sequence[Path], output: Path, options: CorrelateOptions, overwrite: bool, console: Console
+) -> tuple[Correlation, Worked[Outcome]]:
+    """Correlate the volumes of folders that are still being filled, each pair when both are there.
+
+    Raises
+    ------
+    UsageError : something is made from all pairs
+    """
+    if options.ensemble or options.mean is not None:
+        refused = "--ensemble" if options.ensemble else "--mean"
+        raise UsageError(f"--watch: {refused} is made from all pairs, some of which have not come yet; wait for them")
+    if not options.are_told:
+        raise UsageError("--watch needs --pairing: ab or sequence")
+    prepare_folder([output / folders[0].name])
+    sequence = options.pairing == "sequence"
+
+    def pairs_in(paths: Sequence[Path]) -> int:
+        return len(paths) if sequence else paired_from_first(lambda some: result_pairs(some, options), paths)
+
+    def groups() -> Iterator[Sequence[Path]]:
+        last: list[Path] = []
+        for group in watched(folders, "results", options, console, pairs_in):
+            if len(last) + len(group) > 1 or not sequence:
+                yield [*last, *group]
+            last = group[-1:] if sequence else []
+
+    return work_as_they_come(lambda group: Correlation(group, output, options, overwrite), groups(), options, console)
 
 
 @dataclass(frozen=True)
@@ -196,7 +230,7 @@ class Correlation(ByArguments):
         outcomes = list(worked.outcomes.values())
         found = quality_of_all([outcome.quality for outcome in outcomes])
         told: dict[str, Any] = {
-            "pairs": len(self._pairs),
+            "pairs": len(self._pairs) if self._options.ensemble else worked.total(),
             "skipped": worked.skipped,
             "vectors": found.vectors,
             "rejected": sum(outcome.rejected for outcome in outcomes),

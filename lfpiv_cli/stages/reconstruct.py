@@ -16,7 +16,7 @@ from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.files.atomic import ensure_writable
-from lfpiv_cli.files.batch import Target, frames_of, output_paths
+from lfpiv_cli.files.batch import Target, frames_of, output_paths, prepare_folder
 from lfpiv_cli.files.config import carried_config
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.pairing import Pairs
@@ -35,6 +35,7 @@ from lfpiv_cli.stages.batches import BatchOptions, ByArguments, Worked, work_thr
 from lfpiv_cli.stages.finding import Finder
 from lfpiv_cli.stages.frames import STILL, Ahead, Background, Read, beside_frames, mask_of, other_frames, reader
 from lfpiv_cli.stages.pairs import PairOptions, image_pairs
+from lfpiv_cli.stages.watched import watched, work_as_they_come
 
 
 @dataclass(frozen=True)
@@ -84,9 +85,36 @@ def reconstruct(
     pairs: Pairs | None = None,
 ) -> dict[str, Any]:
     """Reconstruct the volume behind each image, or find its particles; `pairs`, where they are known already."""
-    batch = Reconstruction(weights, images, output, options, overwrite, pairs)
-    worked = work_through(batch, options, console)
+    if options.watch:
+        _ensure_frames_alone(weights, options)
+        prepare_folder([output / weights.name])
+        groups = watched(images, "images", options, console)
+        batch, worked = work_as_they_come(
+            lambda group: Reconstruction(weights, group, output, options, overwrite), groups, options, console
+        )
+    else:
+        batch = Reconstruction(weights, images, output, options, overwrite, pairs)
+        worked = work_through(batch, options, console)
     return worked.ensure_whole(batch.summary(worked), batch.unit)
+
+
+def _ensure_frames_alone(weights: Path, options: ReconstructOptions) -> None:
+    """Refuse what is made from other frames than a frame's own, where these are still coming.
+
+    Raises
+    ------
+    UsageError
+    """
+    settings = carried_config(read_weights_record(weights), weights).overridden_by("reconstruction", options)
+    if Background.parse(options.background).kind is not None:
+        refused = f"--background {options.background} is"
+    elif options.mask == STILL:
+        refused = f"--mask {STILL} is"
+    elif settings.reconstruction.solver == "particles":
+        refused = "the tracers' size, which --solver particles needs, is"
+    else:
+        return
+    raise UsageError(f"--watch: {refused} made from all frames, some of which have not come yet; wait for them")
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,7 +233,7 @@ class Reconstruction(ByArguments):
         outcomes = list(worked.outcomes.values())
         found = [outcome.particles for outcome in outcomes if outcome.particles is not None]
         told = {
-            "frames": len(self._frames),
+            "frames": worked.total(),
             "reconstructed": len(outcomes),
             "skipped": worked.skipped,
             "solver": self._settings.reconstruction.solver,
