@@ -16,7 +16,7 @@ from click.testing import CliRunner
 
 from lfpiv_cli.cli import cli
 from lfpiv_cli.cli.outcome import outcome_of
-from lfpiv_cli.files.provenance import carried_record, seconds_between
+from lfpiv_cli.files.provenance import carried_record, seconds_between, sha256
 from lfpiv_cli.files.vtkhdf import open_volume
 from tests import camera_files
 
@@ -85,6 +85,9 @@ def test_volumes_are_the_same_from_every_format(folder: Path) -> None:
     assert seconds_between(*records["hdf5"]) == pytest.approx(camera_files.STEP_US / 1e6)
     assert seconds_between(*records["tiff"]) is None
     assert seconds_between(records["cine"][0], records["hdf5"][1]) is None
+    mraw = carried_record(folder / "volumes" / "mraw_0000.vtkhdf")["inputs"]["image"]
+    assert mraw["beside"] == {"mraw.cihx": sha256(folder / "mraw.cihx")}
+    assert "beside" not in records["tiff"][0]["inputs"]["image"]
     assert "time_s" not in records["tiff"][0]["inputs"]["image"]
 
 

@@ -412,6 +412,16 @@ def test_a_part_of_a_format_without_parts(tmp_path: Path, rng: np.random.Generat
         images.frames(tmp_path / "t.dat:/entry")
 
 
+@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="the system does not list what is open")
+def test_nothing_stays_open(tmp_path: Path, rng: np.random.Generator) -> None:
+    recordings = [path for path, _ in kinds(tmp_path, rng).values()]
+    read_all(recordings[0])
+    before = len(list(Path("/proc/self/fd").iterdir()))
+    for path in recordings:
+        read_all(path)
+    assert len(list(Path("/proc/self/fd").iterdir())) <= before
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_one_page_of_any_recording_is_an_image(tmp_path: Path, rng: np.random.Generator, kind: str) -> None:
     given, stack = kinds(tmp_path, rng)[kind]

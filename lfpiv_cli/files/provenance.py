@@ -20,6 +20,7 @@ from lfpiv_cli.errors import InputError
 from lfpiv_cli.files.atomic import without_nan
 from lfpiv_cli.files.hdf5 import open_h5, read_provenance
 from lfpiv_cli.files.inputs import ensure_regular_file, reason, split_part
+from lfpiv_cli.files.recordings.formats import files_beside
 from lfpiv_cli.notice import Notice
 
 # Files whose hash is remembered: those that a batch has in common are few.
@@ -54,9 +55,9 @@ def record(
     Returns
     -------
     dict
-        `program`, `version`, `libraries`, `command`, `config`, `inputs` (by role: name without folder, SHA-256, and the
-        time where there is one) and `made_from`: the records of those inputs, and of what these were made from, that
-        are results of this program, by SHA-256.
+        `program`, `version`, `libraries`, `command`, `config`, `inputs` (by role: name without folder and SHA-256; of
+        images that have them the time, and the SHA-256 of a header `beside`) and `made_from`: the records of those
+        inputs, and of what these were made from, that are results of this program, by SHA-256.
 
     Raises
     ------
@@ -72,6 +73,8 @@ def record(
         taken = (taken_s or {}).get(role)
         if taken is not None:
             named[role]["time_s"] = taken
+        for other in files_beside(file):
+            named[role].setdefault("beside", {})[other.name] = sha256(other)
         earlier = earlier_record(file)
         if earlier is not None:
             made_from.update(earlier.pop("made_from", {}))

@@ -23,6 +23,7 @@ class Format:
     suffixes : of its files' names, in small letters, where the first bytes do not tell
     frames : reads a file's header
     frames_of : reads what FILE:PART says of a file, where the format has parts
+    beside : finds the other files that one is read with
     in_folders : whether its files are meant where a folder is given for the images in it; an HDF5 file can be anything
     """
 
@@ -31,6 +32,7 @@ class Format:
     starts: tuple[bytes, ...] = ()
     suffixes: tuple[str, ...] = ()
     frames_of: Callable[[Path, str], Recording] | None = None
+    beside: Callable[[Path], tuple[Path, ...]] | None = None
     in_folders: bool = True
 
 
@@ -41,7 +43,7 @@ FORMATS = (
     Format("HDF5", stack.frames, starts=(stack.START,), frames_of=stack.frames_named, in_folders=False),
     Format("Phantom cine", cine.frames, starts=(cine.START,)),
     Format("Norpix seq", seq.frames, starts=(seq.START,)),
-    Format("Photron mraw", mraw.frames, suffixes=(".mraw",)),
+    Format("Photron mraw", mraw.frames, suffixes=(mraw.SUFFIX,), beside=mraw.beside),
     Format("LaVision im7", im7.frames, suffixes=(".im7",)),
     Format("LaVision set", im7.frames_of_set, suffixes=(".set",), in_folders=False),
     RAW,
@@ -63,6 +65,14 @@ def open_recording(path: Path, part: str | None) -> Recording:
     if found.frames_of is None:
         raise UsageError(f"{path}:{part}: {found.name} files have no parts or layouts to name")
     return found.frames_of(path, part)
+
+
+def files_beside(path: Path) -> tuple[Path, ...]:
+    """Return the files that one is read with, whatever it is: none of most."""
+    for each in FORMATS:
+        if each.beside is not None and path.suffix.lower() in each.suffixes:
+            return each.beside(path)
+    return ()
 
 
 def format_of(path: Path, part: str | None = None) -> Format:

@@ -15,6 +15,7 @@ from lfpiv_cli.files.recordings.packing import PACKED_BITS, Pixels
 from lfpiv_cli.files.recordings.pixels import CUT
 from lfpiv_cli.files.recordings.recording import Recording
 
+SUFFIX = ".mraw"
 # Where the figures stand: the words of a .cih, and the elements of a .cihx.
 NAMES = {
     "pages": ("Total Frame", "frameInfo/totalFrame"),
@@ -49,6 +50,11 @@ def frames(path: Path) -> Recording:
     pixels = Pixels((rows, columns), bits, "high-first" if bits in PACKED_BITS else "whole")
     places = range(0, pages * pixels.frame_bytes, pixels.frame_bytes)
     return recording(path, places, pixels, at_rate(pages, _rate_hz(found)))
+
+
+def beside(path: Path) -> tuple[Path, ...]:
+    """Return the header of a file, which the counts depend on as on the file itself."""
+    return (_header_beside(path),)
 
 
 def _header_beside(path: Path) -> Path:
