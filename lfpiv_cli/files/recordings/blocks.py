@@ -47,14 +47,12 @@ def recording(
     pixels: Pixels,
     time_s: NDArray[np.float64] | None = None,
     begin: Callable[[BinaryIO, int], int] | None = None,
-    before: int = 0,
 ) -> Recording:
     """Return a recording whose frame k lies at byte `places[k]`, after checking that all end inside the file.
 
     Parameters
     ----------
     begin : tells where the pixels of the frame at a place begin, where that is not the place itself
-    before : bytes that lie at least between the two
 
     Raises
     ------
@@ -65,11 +63,14 @@ def recording(
         raise InputError(f"{path}: it holds no frames")
     ensure_size(f"{path}: a frame", pixels.shape, 1, None, size)
     ends = (places[0], places[-1]) if isinstance(places, range) else (int(np.min(places)), int(np.max(places)))
-    needed = max(ends) + before + pixels.frame_bytes
-    if min(ends) < 0 or needed > size:
+    last = max(ends)
+    if begin is not None and 0 <= last < size:
+        with open(path, "rb") as file:
+            last = begin(file, last)
+    if min(ends) < 0 or last + pixels.frame_bytes > size:
         raise InputError(
             f"{path}: declares {len(places)} frames of {pixels.frame_bytes} bytes, of which the last ends at byte "
-            f"{needed} of {size}: {CUT}"
+            f"{last + pixels.frame_bytes} of {size}: {CUT}"
         )
     return Recording(len(places), pixels.shape, pixels.bits, partial(_read_page, path, places, pixels, begin), time_s)
 

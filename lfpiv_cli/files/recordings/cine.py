@@ -78,7 +78,7 @@ def _frames(path: Path, file: BinaryIO) -> Recording:
     def begin(file: BinaryIO, place: int) -> int:
         return _after_notes(path, file, place, pixels.frame_bytes)
 
-    found = recording(path, places, pixels, begin=begin, before=SHORTEST_NOTES)
+    found = recording(path, places, pixels, begin=begin)
     return Recording(pages, found.shape, used, found.read_page, times)
 
 
