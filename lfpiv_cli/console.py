@@ -17,7 +17,7 @@ from typing import Any
 
 import click
 
-from lfpiv_cli.files.log import EventLog
+from lfpiv_cli.files.log import EventLog, largest_memory_mb
 from lfpiv_cli.notice import Notice
 
 # Without a terminal, lines of work that is one piece are this far apart, and those within a frame that takes long.
@@ -172,6 +172,7 @@ class Frames:
             of=self._total,
             seconds_each=round(each, 3),
             seconds_left=round(left, 3),
+            memory_mb=largest_memory_mb(),
         )
         if self._draw is not None:
             self._draw(self._done)

@@ -147,7 +147,12 @@ def batch_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Give a command the options of all batches."""
     keep_going = click.option("--keep-going", is_flag=True, help="Go on with the next one when an input fails; exit 5.")
     failures = click.option("--failures", type=FILE, help="File to list what failed in, with the reason (JSON).")
-    for option in (dask_option, time_limit_option, shard_option, failures, keep_going, resume_option):
+    dry_run = click.option(
+        "--dry-run",
+        is_flag=True,
+        help="Tell what would be made, how large and, by the --log of an earlier run, in which time; write nothing.",
+    )
+    for option in (dry_run, dask_option, time_limit_option, shard_option, failures, keep_going, resume_option):
         command = option(command)
     return command
 
@@ -196,7 +201,11 @@ def common_options(command: Callable[..., dict[str, Any]]) -> Callable[..., None
         from lfpiv_cli.notice import Notice
 
         warned: list[Notice] = []
-        log_file = None if log is None else EventLog(log, click.get_current_context().command.name or "")
+        log_file = (
+            None
+            if log is None
+            else EventLog(log, click.get_current_context().command.name or "", read_only=bool(arguments.get("dry_run")))
+        )
         console = Console(verbose=verbose, quiet=quiet, only_warnings=as_json, warned=warned, log=log_file)
         if threads is not None:
             from lfpiv_cli.threads import use_threads

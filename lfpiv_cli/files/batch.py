@@ -176,12 +176,15 @@ def _state_of(path: Path, made: Mapping[str, Any]) -> State:
     return State.BEARS_ALIKE if bear_alike(carried, made) else State.OTHER
 
 
-def pending(targets: Sequence[Target], inputs: Iterable[Path], overwrite: bool, resume: bool) -> list[int]:
+def pending(
+    targets: Sequence[Target], inputs: Iterable[Path], overwrite: bool, resume: bool, dry: bool = False
+) -> list[int]:
     """Return the numbers of the targets that have to be made.
 
     With `resume`, a target that is complete and carries the very record that it would get is left as it is, and a
     broken one is made anew; with `overwrite` besides, one whose record differs in nothing that it depends on gets the
-    new record, and keeps its data.
+    new record, and keeps its data. Where it is `dry`, nothing is written, and a folder may be missing that could be
+    made.
 
     Raises
     ------
@@ -189,7 +192,7 @@ def pending(targets: Sequence[Target], inputs: Iterable[Path], overwrite: bool, 
     OutputExistsError : a target is there and neither `overwrite` nor a matching `resume` covers it.
     """
     ensure_apart((path for target in targets for path in target.paths), inputs)
-    return [number for number, target in enumerate(targets) if not _is_kept(target, overwrite, resume)]
+    return [number for number, target in enumerate(targets) if not _is_kept(target, overwrite, resume, dry)]
 
 
 def is_kept(
@@ -204,18 +207,22 @@ def is_kept(
     return not pending([Target(path, lambda: made) for path in paths], inputs, overwrite, resume)
 
 
-def _is_kept(target: Target, overwrite: bool, resume: bool) -> bool:
+def _is_kept(target: Target, overwrite: bool, resume: bool, dry: bool) -> bool:
     """Return whether a target is left as it is, after it is known that it could be written if not."""
     found = _state_or_none(target) if resume else None
     if found is State.COMPLETE:
         return True
     if found is State.BEARS_ALIKE and overwrite:
-        _record_anew(target)
+        if not dry:
+            _record_anew(target)
         return True
     if found in (State.BEARS_ALIKE, State.OTHER) and not overwrite:
         raise OutputExistsError(
             f"{target.path}: exists and was made from other inputs or settings; --overwrite makes it anew"
         )
+    if dry and not target.path.parent.exists():
+        ensure_writable(target.path.parent, overwrite=False)
+        return False
     for path in target.paths:
         ensure_writable(path, overwrite or resume)
     return False

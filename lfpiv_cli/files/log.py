@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+import sys
+from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -21,14 +22,14 @@ class EventLog:
     several commands can share a file.
     """
 
-    def __init__(self, path: Path, command: str) -> None:
-        """Take the file, which need not exist.
+    def __init__(self, path: Path, command: str, read_only: bool = False) -> None:
+        """Take the file, which need not exist; with `read_only` nothing is added to it.
 
         Raises
         ------
         UsageError : it exists and holds something else
         """
-        self.path, self._command = path, command
+        self.path, self._command, self._read_only = path, command, read_only
         if path.is_file() and path.stat().st_size and not _begins_as_log(path):
             raise UsageError(f"{path}: is no log: its first line is no JSON object; --log would add to it")
 
@@ -39,6 +40,8 @@ class EventLog:
         ------
         OutputError
         """
+        if self._read_only:
+            return
         head = {
             "time": datetime.now(UTC).isoformat(timespec="milliseconds"),
             "process": os.getpid(),
@@ -54,6 +57,35 @@ class EventLog:
                 os.close(descriptor)
         except OSError as error:
             raise OutputError(f"{self.path}: cannot be written: {reason(error)}") from error
+
+    def last(self, event: str, **fields: Any) -> dict[str, Any] | None:
+        """Return the last event of this command with this name and these fields; None where there is none."""
+        wanted = {"command": self._command, "event": event} | fields
+        found = None
+        for line in self._lines():
+            try:
+                told = json.loads(line)
+            except ValueError:
+                continue  # a line that was cut with its process
+            if isinstance(told, dict) and wanted.items() <= told.items():
+                found = told
+        return found
+
+    def _lines(self) -> Iterator[bytes]:
+        """Yield the lines that are there."""
+        if self.path.is_file():
+            with open(self.path, "rb") as file:
+                yield from file
+
+
+def largest_memory_mb() -> float | None:
+    """Return the most memory that this process has had so far; None where the system does not tell (Windows)."""
+    try:
+        import resource
+    except ImportError:
+        return None
+    units = 1e6 if sys.platform == "darwin" else 1e3
+    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / units, 1)
 
 
 def _begins_as_log(path: Path) -> bool:

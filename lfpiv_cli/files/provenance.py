@@ -6,9 +6,10 @@ It holds no time, folder, host or user, so that the same work gives the same byt
 from __future__ import annotations
 
 import hashlib
+import json
 import platform
 from collections.abc import Iterable, Mapping
-from functools import lru_cache
+from functools import cache, lru_cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -82,12 +83,18 @@ def record(
     return {
         "program": "lfpiv",
         "version": lfpiv_cli.__version__,
-        "libraries": {"python": platform.python_version(), **{name: version(name) for name in LIBRARIES}},
+        "libraries": dict(_libraries()),
         "command": command,
         "config": None if config is None else without_nan(config),
         "inputs": named,
         "made_from": dict(sorted(made_from.items())),
     }
+
+
+@cache
+def _libraries() -> dict[str, str]:
+    """Return the versions of what figures pass through: to ask the system takes longer than the rest of a record."""
+    return {"python": platform.python_version(), **{name: version(name) for name in LIBRARIES}}
 
 
 def with_warnings(made: Mapping[str, Any], notices: Iterable[Notice]) -> dict[str, Any]:
@@ -200,8 +207,15 @@ def carried_record(path: Path) -> dict[str, Any]:
 
 def earlier_record(path: Path) -> dict[str, Any] | None:
     """Return the record that a file of ours carries, None for any other file."""
-    ensure_regular_file(path)
+    size = ensure_regular_file(path)
+    text = _earlier_record(path, size, path.stat().st_mtime_ns)
+    return None if text is None else json.loads(text)
+
+
+@lru_cache(maxsize=FILES_REMEMBERED)
+def _earlier_record(path: Path, _size: int, _modified_ns: int) -> str | None:
+    """Read a record once as long as its file does not change, as JSON: whoever asks gets one of his own."""
     if not h5py.is_hdf5(path):
         return None
     with open_h5(path) as file:
-        return read_provenance(file) if "provenance" in file.attrs else None
+        return json.dumps(read_provenance(file)) if "provenance" in file.attrs else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -49,3 +50,31 @@ def ensure_opens(path: Path) -> None:
             return
     except BROKEN_FILE_ERRORS as error:
         raise InputError(f"{path}: not a readable HDF5 file of ours: {reason(error)}") from error
+
+
+def fault_of(paths: Iterable[Path]) -> str | None:
+    """Return why one of these files cannot be opened, None where all can."""
+    for path in paths:
+        try:
+            ensure_opens(path)
+        except InputError as error:
+            return str(error)
+    return None
+
+
+def unpacked_bytes(path: Path) -> int:
+    """Return what the arrays of a file of ours take without compression.
+
+    Raises
+    ------
+    InputError
+    """
+    sizes: list[int] = []
+
+    def add(_name: str, item: h5py.Group | h5py.Dataset) -> None:
+        if isinstance(item, h5py.Dataset):
+            sizes.append(item.size * item.dtype.itemsize)
+
+    with open_h5(path) as file:
+        file.visititems(add)
+    return sum(sizes)

@@ -59,11 +59,11 @@ def cost_of(settings: Config, camera: Camera, source: Source, grid: Grid) -> Cos
     """Return what the weights of a grid, padding included, and a volume on it will cost."""
     columns, rows, planes = grid.shape_xyz if camera.column_axis == "x" else (grid.shape_xyz[1], *grid.shape_xyz[::2])
     voxels, pixels = math.prod(grid.shape_xyz), camera.columns * camera.rows
-    held = FLOAT_BYTES * (VOLUMES_HELD * voxels + IMAGES_HELD * pixels)
+    held = held_bytes(voxels, pixels)
     projections = 2 * settings.reconstruction.iterations
     rays = _rays(settings, source, grid)
     if rays or not separates(camera, source, grid):
-        kept = min(voxels * COLUMN_BYTES, LARGEST_BYTES)
+        kept = columns_bytes(voxels)
         solving = projections * voxels * COLUMN_BYTES / ENTRY_BYTES / MULTIPLICATIONS_PER_S
         weights_bytes, making = (kept, 0.0) if rays else (0.0, voxels * COLUMN_S)
         return Cost(voxels, weights_bytes, 3600.0 * rays / RAYS_PER_CORE_HOUR, held + kept, making + solving)
@@ -77,6 +77,16 @@ def cost_of(settings: Config, camera: Camera, source: Source, grid: Grid) -> Cos
         held + both_axes * ENTRY_BYTES + pixel_bytes,
         projections * products / MULTIPLICATIONS_PER_S,
     )
+
+
+def held_bytes(voxels: int, pixels: int) -> float:
+    """Return what a solver holds in memory besides the weights, for a volume, padding included, and an image."""
+    return FLOAT_BYTES * (VOLUMES_HELD * voxels + IMAGES_HELD * pixels)
+
+
+def columns_bytes(voxels: int) -> float:
+    """Return what columns take in memory that are made on demand, at most."""
+    return float(min(voxels * COLUMN_BYTES, LARGEST_BYTES))
 
 
 def on_demand_told(voxels: int) -> str:

@@ -56,6 +56,7 @@ class BatchOptions:
     resume : skip what is complete and made from the same inputs with the same settings
     keep_going : go on with the next one when an input cannot be read
     failures : file to list those that failed in, as JSON
+    dry_run : tell what would be made and what that takes, and write nothing
     shard : make this share of the outputs only
     time_limit_s : stop before so many seconds have gone by, with what is left for another time
     dask : address of the scheduler whose workers make the outputs, or `local` for workers on this machine
@@ -67,6 +68,7 @@ class BatchOptions:
     resume: bool = False
     keep_going: bool = False
     failures: Path | None = None
+    dry_run: bool = False
     shard: Shard = ALL
     time_limit_s: float | None = None
     dask: str | None = None

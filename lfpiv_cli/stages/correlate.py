@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -19,14 +20,14 @@ from lfpiv_cli.files.batch import Target, output_paths, prepare_folder
 from lfpiv_cli.files.config import Config, carried_config, load_config
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.pairing import Pairs
-from lfpiv_cli.files.provenance import record, with_warnings
-from lfpiv_cli.files.whole import ensure_opens
+from lfpiv_cli.files.provenance import earlier_record, record, with_warnings
+from lfpiv_cli.files.whole import ensure_opens, fault_of
 from lfpiv_cli.flow.correlation import correlate as measure
 from lfpiv_cli.flow.correlation import count_passes
-from lfpiv_cli.flow.derived import Derived, derived_fields
-from lfpiv_cli.flow.field import MM_TO_M, REJECTED, VectorField
+from lfpiv_cli.flow.derived import derived_fields
+from lfpiv_cli.flow.field import REJECTED, VectorField
 from lfpiv_cli.flow.locking import with_locking
-from lfpiv_cli.flow.statistics import statistics_of
+from lfpiv_cli.flow.windows import layout_windows
 from lfpiv_cli.interface.vectors import ensure_alike, scale_of, usable_voxels
 from lfpiv_cli.interface.vectors_checks import (
     Quality,
@@ -40,10 +41,13 @@ from lfpiv_cli.interface.vectors_checks import (
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.reference import Reference
 from lfpiv_cli.stages.batches import ALL, BatchOptions, ByArguments, Failure, Worked, work_through
+from lfpiv_cli.stages.dry_runs import Expected, dry_run
+from lfpiv_cli.stages.means import Mean, arrays_of
 from lfpiv_cli.stages.pairs import PairOptions, result_pairs
 from lfpiv_cli.stages.watched import paired_from_first, watched, work_as_they_come
 
-Extra = dict[str, tuple[NDArray[Any], str]]
+# Numbers of eight bytes that a file has of each vector at most, and derived ones besides.
+NUMBERS_A_VECTOR, NUMBERS_DERIVED, NUMBER_BYTES = 16, 6, 8
 
 
 @dataclass(frozen=True)
@@ -105,6 +109,8 @@ def correlate(
         batch, worked = _as_they_come(volumes, output, options, overwrite, console)
         return worked.ensure_whole(batch.summary(worked), batch.unit)
     batch = Correlation(volumes, output, options, overwrite, pairs)
+    if options.dry_run:
+        return dry_run(batch, options, console)
     worked = work_through(batch, options, console)
     fields = batch.fields(worked)
     if options.mean is not None and fields:
@@ -192,12 +198,25 @@ class Correlation(ByArguments):
         paths = output_paths(output, [group[0][0].stem for group in self._groups])
         self.names = [path.stem for path in paths]
         self.targets = [Target(path, partial(self._record, number)) for number, path in enumerate(paths)]
-        self.settings = self._settings_of(_ensure_readable(volumes, options.keep_going))
+        self._first = _ensure_readable(volumes, options.keep_going)
+        self.settings = self._settings_of(self._first)
 
     @property
     def outputs(self) -> list[Path]:
         """The fields, and their mean."""
         return [*(target.path for target in self.targets), *([self._options.mean] if self._options.mean else [])]
+
+    def fault(self, number: int) -> str | None:
+        """Return why a volume of a field cannot be opened."""
+        return fault_of(path for pair in self._groups[number] for path in pair)
+
+    def expected(self) -> Expected:
+        """Return the bytes of a field's arrays; what is held in memory is not known."""
+        grid = vtkhdf.open_volume(self._first).grid
+        settings = self.settings.correlation_settings(grid.spacing_mm)
+        windows = math.prod(layout_windows(grid.shape_xyz, settings.windows[-1], settings.overlap).count)
+        numbers = NUMBERS_A_VECTOR + self._options.derived * NUMBERS_DERIVED
+        return Expected(NUMBER_BYTES * numbers * windows)
 
     def begin(self, _numbers: Sequence[int], _console: Console) -> float:
         """Refuse a mean that could not be written; pairs share nothing but the settings."""
@@ -220,7 +239,7 @@ class Correlation(ByArguments):
             provenance=with_warnings(target.record, notices),
             # What is complete is skipped: in the place of what is made there is nothing, or something broken.
             overwrite=self.overwrite or self._options.resume,
-            extra=_arrays_of(derived) if derived else None,
+            extra=arrays_of(derived) if derived else None,
         )
         rejected = int(np.count_nonzero(field.flag >= REJECTED))
         return Outcome(quality, rejected, derived.divergence_rms if derived else None)
@@ -250,7 +269,7 @@ class Correlation(ByArguments):
 
     def _settings_of(self, volume: Path) -> Config:
         """Return the settings for a volume: its own, or those of a config in their place."""
-        settings = self._config or carried_config(vtkhdf.read_header(volume).provenance, volume)
+        settings = self._config or carried_config(earlier_record(volume) or {}, volume)
         return settings.overridden_by("correlation", self._options)
 
     def _record(self, number: int) -> dict[str, Any]:
@@ -276,70 +295,12 @@ def _measure(job: Job, mask: Path | None, work: Frames) -> tuple[VectorField, Re
 
     usable = usable_voxels(job.settings, first.grid, None if drawn is None else drawn.array)
     settings = job.settings.correlation_settings(first.grid.spacing_mm)
-    records = {f"{role} {path.name}": vtkhdf.read_header(path).provenance for role, path in job.inputs().items()}
+    records = {f"{role} {path.name}": earlier_record(path) or {} for role, path in job.inputs().items()}
     notices = [*calibration_notices(records), *window_notices(first, settings, job.pairs[0][0].name)]
     share = 1.0 / count_passes(settings.windows)
     field = measure(volumes(), first.grid, settings, mask=usable, progress=lambda passes: work.advance(share * passes))
     field = with_locking(field, first.reference, scale_of(job.settings))
     return field, first.reference, notices
-
-
-def _arrays_of(derived: Derived) -> Extra:
-    """Return derived fields with the names and units that files give them."""
-    return {
-        "vorticity": (derived.vorticity, "1/s"),
-        "divergence": (derived.divergence, "1/s"),
-        "strain_rate": (derived.strain_rate, "1/s"),
-        "q_criterion": (derived.q_criterion, "1/s2"),
-    }
-
-
-class Mean:
-    """The mean of a batch's vectors, with their fluctuations as `velocity_rms` and `displacement_rms_voxel`."""
-
-    label, unit = "mean", "file"
-    notices, left_out = (), ()
-
-    def __init__(
-        self, path: Path, fields: Sequence[Path], resolved: Mapping[str, Any], derived: bool, overwrite: bool
-    ) -> None:
-        """Take where it goes, the files of vectors, and their settings."""
-        self.inputs, self._resolved, self._derived, self.overwrite = fields, resolved, derived, overwrite
-        self.names, self.targets = [path.stem], [Target(path, self._record)]
-
-    @property
-    def outputs(self) -> list[Path]:
-        """The mean."""
-        return [target.path for target in self.targets]
-
-    def begin(self, _numbers: Sequence[int], _console: Console) -> float:
-        """Do nothing: there is one."""
-        return 1.0
-
-    def make(self, number: int, _work: Frames) -> None:
-        """Write it."""
-        found = statistics_of(vtkhdf.open_vectors(field) for field in self.inputs)
-        extra: Extra = {
-            "displacement_rms_voxel": (found.rms_voxel, "voxel"),
-            "samples": (found.samples, "1"),
-        }
-        if found.mean.dt_s is not None:
-            to_velocity = np.asarray(found.mean.voxel_mm) * MM_TO_M / found.mean.dt_s
-            extra["velocity_rms"] = (found.rms_voxel * to_velocity, "m/s")
-        if self._derived:
-            extra |= _arrays_of(derived_fields(found.mean))
-        vtkhdf.write_vectors(
-            self.targets[number].path,
-            found.mean,
-            vtkhdf.read_header(self.inputs[0]).reference,
-            provenance=self.targets[number].record,
-            overwrite=True,
-            extra=extra,
-        )
-
-    def _record(self) -> dict[str, Any]:
-        inputs = {f"vectors_{number:04d}": field for number, field in enumerate(self.inputs)}
-        return record("correlate mean", self._resolved, inputs)
 
 
 def _ensure_readable(volumes: Sequence[Path], keep_going: bool) -> Path:

@@ -23,15 +23,17 @@ from lfpiv_cli.files.pairing import Pairs
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, write_points
 from lfpiv_cli.files.provenance import also_used_as, record, with_warnings
 from lfpiv_cli.files.weights_file import open_weights, read_weights_record
+from lfpiv_cli.files.whole import unpacked_bytes
 from lfpiv_cli.interface import particles
 from lfpiv_cli.interface.reconstruction import Bench, Progress, bench_of, check_frame, frame_notices, volume_of
-from lfpiv_cli.interface.weights_cost import on_demand_told
+from lfpiv_cli.interface.weights_cost import FLOAT_BYTES, columns_bytes, held_bytes, on_demand_told
 from lfpiv_cli.names import Start
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.particles.search import Particles
 from lfpiv_cli.reconstruction.images import Image
 from lfpiv_cli.reconstruction.registry import SolverName
 from lfpiv_cli.stages.batches import BatchOptions, ByArguments, Worked, work_through
+from lfpiv_cli.stages.dry_runs import Expected, dry_run
 from lfpiv_cli.stages.finding import Finder
 from lfpiv_cli.stages.frames import STILL, Ahead, Background, Read, beside_frames, mask_of, other_frames, reader
 from lfpiv_cli.stages.pairs import PairOptions, image_pairs
@@ -94,6 +96,8 @@ def reconstruct(
         )
     else:
         batch = Reconstruction(weights, images, output, options, overwrite, pairs)
+        if options.dry_run:
+            return dry_run(batch, options, console)
         worked = work_through(batch, options, console)
     return worked.ensure_whole(batch.summary(worked), batch.unit)
 
@@ -180,6 +184,20 @@ class Reconstruction(ByArguments):
         """Volumes or particles, and the residual images of these."""
         with_residuals = self._as_particles and self._options.residual
         return [*self._paths, *(map(residual_path, self._paths) if with_residuals else [])]
+
+    def fault(self, number: int) -> str | None:
+        """Return why a frame's file cannot be read."""
+        return self._frames[number].fault
+
+    def expected(self) -> Expected:
+        """Return the bytes of a volume's voxels and what the solver holds; of particles neither is known."""
+        if self._as_particles:
+            return Expected()
+        path = self._common["weights"]
+        weights = open_weights(path).weights
+        voxels, pixels = math.prod(weights.padded.shape), math.prod(weights.image_shape)
+        rows = columns_bytes(voxels) if weights.on_demand else unpacked_bytes(path)
+        return Expected(FLOAT_BYTES * math.prod(weights.shape), held_bytes(voxels, pixels) + rows)
 
     def begin(self, numbers: Sequence[int], console: Console) -> float:
         """Open the weights, and prepare what all frames share."""

@@ -17,6 +17,7 @@ from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.pairing import Pairs
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, read_points, read_tracks, write_points
 from lfpiv_cli.files.provenance import carried_record, record, with_warnings
+from lfpiv_cli.files.whole import fault_of
 from lfpiv_cli.flow.field import REJECTED
 from lfpiv_cli.interface.tracks import (
     Tracked,
@@ -35,6 +36,7 @@ from lfpiv_cli.interface.vectors_checks import (
     quality_of_all,
 )
 from lfpiv_cli.stages.batches import BatchOptions, ByArguments, Failure, Worked, work_through
+from lfpiv_cli.stages.dry_runs import Expected, dry_run
 from lfpiv_cli.stages.pairs import PairOptions, result_pairs, sequence_of
 
 
@@ -70,6 +72,8 @@ def track_particles(
 ) -> dict[str, Any]:
     """Follow particles from frame to frame, in pairs or over a sequence; `pairs`, where they are known already."""
     batch = Tracks(particles, output, options, overwrite, pairs)
+    if options.dry_run:
+        return dry_run(batch, options, console)
     worked = work_through(batch, options, console)
     return worked.ensure_whole(batch.summary(worked), batch.unit)
 
@@ -127,6 +131,14 @@ class Tracks(ByArguments):
     def outputs(self) -> list[Path]:
         """All files that may be written."""
         return [path for target in self.targets for path in target.paths]
+
+    def fault(self, number: int) -> str | None:
+        """Return why particles of a result cannot be opened."""
+        return fault_of(self._groups[number])
+
+    def expected(self) -> Expected:
+        """Return that neither is known: how many tracks will be found is not."""
+        return Expected()
 
     def begin(self, _numbers: Sequence[int], _console: Console) -> float:
         """Do nothing: pairs share nothing but the settings."""
