@@ -219,6 +219,7 @@ def test_pairs_of_a_folder_that_is_being_filled(
         (("--mask", "still"), "--mask still is made from all frames"),
         (("--solver", "particles"), "the tracers' size, which --solver particles needs"),
         (("--shard", "1/2"), "leave out --shard"),
+        (("--dry-run",), "leave out one of them"),
     ],
 )
 def test_what_needs_all_frames_does_not_go_with_a_folder_that_is_being_filled(

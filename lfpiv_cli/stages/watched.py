@@ -38,6 +38,8 @@ def watched(
     """
     if options.shard != ALL:
         raise UsageError("--watch: which frames make a share is known when the last one is there; leave out --shard")
+    if options.dry_run:
+        raise UsageError("--watch waits for what is not there, and --dry-run tells what is: leave out one of them")
     for folder in folders:
         if not folder.is_dir():
             raise UsageError(f"{folder}: --watch takes folders")
