@@ -60,7 +60,7 @@ def nearest_points(
     """Return the lattice points nearest to points, both (n, 2)."""
     found = np.empty_like(points)
     for n in range(len(points)):
-        found[n] = nearest_point(points[n, 0], points[n, 1], origin, basis)
+        found[n, 0], found[n, 1] = nearest_point(points[n, 0], points[n, 1], origin, basis)
     return found
 
 

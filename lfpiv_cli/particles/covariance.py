@@ -21,7 +21,16 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from lfpiv_cli.particles.least_squares import SUMS, UNKNOWNS, Observation, lit_by, respond_all, room_for
+from lfpiv_cli.particles.least_squares import (
+    SUMS,
+    UNKNOWNS,
+    Observation,
+    factored,
+    lit_by,
+    respond_all,
+    room_for,
+    substitute,
+)
 from lfpiv_cli.particles.noise import Correlation
 from lfpiv_cli.particles.view import View, footprint_radius_mm, on_array_mm
 from lfpiv_cli.threads import COUNT_NO_REFERENCES, blocks, in_threads
@@ -210,7 +219,9 @@ def _fill_blocks(
                 back = neighbours.start[m]
                 while neighbours.other[back] != n:
                     back += 1
-                block[back] = block[at].T
+                for a in range(UNKNOWNS):
+                    for b in range(UNKNOWNS):
+                        block[back, a, b] = block[at, b, a]
 
 
 @njit(cache=True, fastmath=SUMS, **COUNT_NO_REFERENCES)
@@ -263,10 +274,11 @@ def _covariances(
         members = _strongest(equations, n)
         whole = _normal_matrix(equations, members)
         # Millimetres beside counts: inverted with a diagonal of ones.
-        scale = 1.0 / np.sqrt(np.diag(whole))
+        scale = np.empty(whole.shape[0])
+        for i in range(scale.size):
+            scale[i] = 1.0 / np.sqrt(whole[i, i])
         _rescale(whole, scale)
-        # The inverse's first columns, as its rows.
-        inverse = np.linalg.solve(whole, np.eye(scale.size)[:, :UNKNOWNS].copy()).T
+        inverse = _first_columns(whole)
         _rescale(inverse, scale)
         excess = max(chi2[n] - 1.0, 0.0)
         for a in range(UNKNOWNS):
@@ -281,6 +293,19 @@ def _covariances(
                 of_m = inverse[:, UNKNOWNS * m : UNKNOWNS * (m + 1)]
                 _add_moves(equations.slopes, members[m], of_m, top, left, moved_by)
             _add_excess(moved_by, correlation.decay, correlation.share + excess, result[k])
+
+
+@njit(cache=True)
+def _first_columns(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the first columns of a matrix's inverse as rows (4, n); not numbers where it is not positive definite."""
+    size = matrix.shape[0]
+    lower, one, columns = np.empty((size, size)), np.zeros(size), np.full((UNKNOWNS, size), np.nan)
+    if factored(matrix, 0.0, lower):
+        for i in range(UNKNOWNS):
+            one[i] = 1.0
+            substitute(lower, one, columns[i])
+            one[i] = 0.0
+    return columns
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
@@ -299,11 +324,16 @@ def _strongest(equations: Equations, n: int) -> NDArray[np.int64]:
     for k in range(end - begin):
         block = equations.block[begin + k]
         strength[k] = _tie(equations.inverses[n], block, equations.inverses[equations.neighbours.other[begin + k]])
-    chosen = np.argsort(-strength)[:FREE_NEIGHBOURS]
-    members = np.empty(chosen.size + 1, np.int64)
+    members = np.empty(1 + min(FREE_NEIGHBOURS, strength.size), np.int64)
     members[0] = n
-    for k in range(chosen.size):
-        members[k + 1] = equations.neighbours.other[begin + chosen[k]]
+    # One after the other: sorting takes seconds to compile.
+    for place in range(1, members.size):
+        strongest = 0
+        for k in range(1, strength.size):
+            if strength[k] > strength[strongest]:
+                strongest = k
+        members[place] = equations.neighbours.other[begin + strongest]
+        strength[strongest] = -np.inf
     return members
 
 

@@ -26,6 +26,7 @@ from lfpiv_cli.particles.least_squares import (
     Effort,
     Observation,
     add_light,
+    copy_rows,
     lit_by,
     observation_of,
     respond_all,
@@ -325,10 +326,10 @@ def _fitted(
     tracers : (n, 4) where fits begin
     depths_mm : (n, k) their depths
     """
-    change, fitted = np.zeros(len(tracers)), tracers.copy()
+    change, fitted, starts = np.zeros(len(tracers)), tracers.copy(), np.ascontiguousarray(depths_mm)
 
     def work(numbers: NDArray[np.int64]) -> None:
-        _fit_each(observation, sized, tracers, numbers, depths_mm, change, fitted)
+        _fit_each(observation, sized, tracers, numbers, starts, change, fitted)
 
     larger = max(observation.optics, sized.optics, key=lambda view: view.particle_radius_mm)
     over_tiles(work, larger, tracers, observation.depths_mm)
@@ -358,5 +359,5 @@ def _fit_each(
             gained = fit_from(sized, tracers[number], depth, trial, responses, Effort(STEPS, SMALLEST_GAIN))
             if gained < change[number]:
                 change[number] = gained
-                fitted[number] = trial[0]
+                copy_rows(trial, fitted[number : number + 1])
         add_light(pixels, values, -tracers[number, 3], residual)

@@ -24,6 +24,7 @@ from lfpiv_cli.particles.least_squares import (
     add_light,
     best_light,
     change_by,
+    copy_rows,
     fit,
     lit_by,
     respond_all,
@@ -144,7 +145,7 @@ def _fit_again(
     responses = room_for(1, observation.capacity, 0)
     trial, best = np.empty((1, UNKNOWNS)), np.empty((1, UNKNOWNS))
     for number in numbers:
-        best[0] = particles[number]
+        copy_rows(particles[number : number + 1], best)
         respond_all(view, best, responses)
         pixels, values = lit_by(responses, 0)
         add_light(pixels, values, best[0, 3], residual)
@@ -158,10 +159,10 @@ def _fit_again(
             if change < lowest and trial[0, 3] >= least[1]:
                 lowest = change
                 after = change
-                best[:] = trial
+                copy_rows(trial, best)
                 refitted.moved[number] = True
         refitted.gain[number] = before - after
-        particles[number] = best[0]
+        copy_rows(best, particles[number : number + 1])
         if depths.shape[1] > 0:
             respond_all(view, best, responses)
         pixels, values = lit_by(responses, 0)
@@ -243,7 +244,7 @@ def _accept(
             change = fit_from(observation, candidates[number], depth, trial, responses, effort)
             if change < lowest:
                 lowest = change
-                best[:] = trial
+                copy_rows(trial, best)
         if lowest > -least.gain or lowest == 0.0 or best[0, 3] < least.light:
             continue
         respond_all(observation.optics, best, responses)
@@ -251,7 +252,7 @@ def _accept(
         if seen_share(pixels, values, weight) <= least.seen:
             continue
         if claimed_share(pixels, values, best[0, 3], residual, weight, 0.0) >= least.found:
-            candidates[number] = best[0]
+            copy_rows(best, candidates[number : number + 1])
             accepted[number] = True
             add_light(pixels, values, -best[0, 3], residual)
 

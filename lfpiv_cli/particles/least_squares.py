@@ -110,6 +110,14 @@ def room_for(members: int, capacity: int, places: int) -> Responses:
     return Responses(np.zeros(members, np.int64), pixels, values, np.zeros(places, np.int32), common, scratch(capacity))
 
 
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def copy_rows(source: NDArray[np.float64], target: NDArray[np.float64]) -> None:
+    """Copy the rows of an array (n, m) into another; `target[:] = source` takes a second longer to compile."""
+    for row in range(source.shape[0]):
+        for column in range(source.shape[1]):
+            target[row, column] = source[row, column]
+
+
 @njit(cache=True)
 def lit_by(responses: Responses, member: int) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
     """Return the pixels (n,) that a particle lights, and values (n or more, 4), the first of which are theirs."""
@@ -224,21 +232,22 @@ def _pair_equations(
     The place of the responses is zero again on return.
     """
     columns, residual, weight = observation.optics.camera.columns, observation.residual, observation.weight
-    first, second = slice(0, UNKNOWNS), slice(UNKNOWNS, 2 * UNKNOWNS)
     block = np.empty((UNKNOWNS, UNKNOWNS))
     pixels_1, values_1 = lit_by(responses, 0)
     pixels_2, values_2 = lit_by(responses, 1)
-    change = normal_equations(pixels_1, values_1, pair[0, 3], residual, weight, block, right[first])
-    matrix[first, first] = block
+    change = normal_equations(pixels_1, values_1, pair[0, 3], residual, weight, block, right[:UNKNOWNS])
+    copy_rows(block, matrix[:UNKNOWNS, :UNKNOWNS])
     add_light(pixels_1, values_1, -pair[0, 3], residual)
-    change += normal_equations(pixels_2, values_2, pair[1, 3], residual, weight, block, right[second])
-    matrix[second, second] = block
+    change += normal_equations(pixels_2, values_2, pair[1, 3], residual, weight, block, right[UNKNOWNS:])
+    copy_rows(block, matrix[UNKNOWNS:, UNKNOWNS:])
     add_light(pixels_1, values_1, pair[0, 3], residual)
     # What the first explains is off the second's side already; the first's side still lacks the second's light.
-    cross = np.zeros((UNKNOWNS, UNKNOWNS))
     if pixels_1.size == 0:
         return change
-    place, start = responses.place, pixels_1.min() // columns * columns
+    place, start = responses.place, pixels_1[0]
+    for pixel in pixels_1:
+        start = min(start, pixel)
+    start = start // columns * columns
     # Backwards: of a pixel that is named again the first entry counts.
     for k in range(pixels_1.size - 1, -1, -1):
         place[pixels_1[k] - start] = k + 1
@@ -260,22 +269,17 @@ def _pair_equations(
         right[i] -= scale_i * pair[1, 3] * _product(one[by_i, :count], two[0, :count])
         for j in range(UNKNOWNS):
             by_j, scale_j = (j + 1) % UNKNOWNS, pair[1, 3] if j < 3 else 1.0
-            cross[i, j] = scale_i * scale_j * _product(one[by_i, :count], two[by_j, :count])
-    matrix[first, second] = cross
-    matrix[second, first] = cross.T
+            cross = scale_i * scale_j * _product(one[by_i, :count], two[by_j, :count])
+            matrix[i, UNKNOWNS + j] = matrix[UNKNOWNS + j, i] = cross
     for pixel in pixels_1:
         place[pixel - start] = 0
     return change
 
 
-@njit(cache=True)
-def solve_damped(
-    matrix: NDArray[np.float64], right: NDArray[np.float64], damping: float, step: NDArray[np.float64]
-) -> bool:
-    """Solve (A + damping diag A) step = b by Cholesky's method; return False where A is not positive definite."""
-    n = right.size
-    lower = np.empty((n, n))
-    for i in range(n):
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def factored(matrix: NDArray[np.float64], damping: float, lower: NDArray[np.float64]) -> bool:
+    """Fill L of A + damping diag A = L L^T (Cholesky); return False where that is not positive definite."""
+    for i in range(matrix.shape[0]):
         for j in range(i + 1):
             total = matrix[i, j]
             if i == j:
@@ -288,17 +292,23 @@ def solve_damped(
                 lower[i, i] = np.sqrt(total)
             else:
                 lower[i, j] = total / lower[j, j]
+    return True
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def substitute(lower: NDArray[np.float64], right: NDArray[np.float64], solution: NDArray[np.float64]) -> None:
+    """Fill the x of L L^T x = b."""
+    n = lower.shape[0]
     for i in range(n):
         total = right[i]
         for k in range(i):
-            total -= lower[i, k] * step[k]
-        step[i] = total / lower[i, i]
+            total -= lower[i, k] * solution[k]
+        solution[i] = total / lower[i, i]
     for i in range(n - 1, -1, -1):
-        total = step[i]
+        total = solution[i]
         for k in range(i + 1, n):
-            total -= lower[k, i] * step[k]
-        step[i] = total / lower[i, i]
-    return True
+            total -= lower[k, i] * solution[k]
+        solution[i] = total / lower[i, i]
 
 
 @njit(cache=True)
@@ -315,7 +325,7 @@ def fit(
     promising : given up early where this is not undercut after a few steps
     """
     n = UNKNOWNS * members.shape[0]
-    matrix, trial_matrix = np.empty((n, n)), np.empty((n, n))
+    matrix, trial_matrix, lower = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
     right, trial_right = np.empty(n), np.empty(n)
     step, trial, begin = np.zeros(n), np.empty_like(members), members.copy()
     change = _equations(observation, members, responses, matrix, right)
@@ -323,8 +333,9 @@ def fit(
     for number in range(effort.steps):
         if number == EARLY_STEPS and change > promising:
             break
-        if not solve_damped(matrix, right, damping, step):
+        if not factored(matrix, damping, lower):
             break
+        substitute(lower, right, step)
         predicted = 0.0
         for i in range(n):
             predicted += step[i] * right[i]
@@ -338,7 +349,8 @@ def fit(
             damping *= DAMPING_UP
             continue
         gain = change - trial_change
-        members[:], matrix[:], right[:], change = trial, trial_matrix, trial_right, trial_change
+        copy_rows(trial, members)
+        matrix, trial_matrix, right, trial_right, change = trial_matrix, matrix, trial_right, right, trial_change
         damping *= DAMPING_DOWN
         if gain < effort.enough:
             break

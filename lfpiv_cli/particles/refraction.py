@@ -112,5 +112,5 @@ def paraxial_shift(points_mm: NDArray[np.float64], view: View) -> NDArray[np.flo
         x, y, z = points_mm[n, 0], points_mm[n, 1], _in_fluid(view, points_mm[n, 2])
         bend = bend_of(view, x, y, z)
         depth = (bend.distance - view.camera.focus_distance_mm) / view.depth_ratio
-        shift[n] = bend.seen_x - x, bend.seen_y - y, depth - z
+        shift[n, 0], shift[n, 1], shift[n, 2] = bend.seen_x - x, bend.seen_y - y, depth - z
     return shift

@@ -17,6 +17,7 @@ from lfpiv_cli.particles.least_squares import (
     Effort,
     Observation,
     add_light,
+    copy_rows,
     fit,
     lit_by,
     normal_equations,
@@ -105,10 +106,10 @@ def _split(
             change = fit(observation, pair, responses, effort, promising)
             if change < lowest and min(pair[0, 3], pair[1, 3]) >= least[1]:
                 lowest, found = change, True
-                best[:] = pair
+                copy_rows(pair, best)
         if found:
-            particles[number] = best[0]
-            partners[number] = best[1]
+            copy_rows(best[:1], one)
+            copy_rows(best[1:], partners[number : number + 1])
             respond_all(view, best, responses)
             for m in range(2):
                 pixels, values = lit_by(responses, m)
