@@ -40,6 +40,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from lfpiv_cli.files.kernel_cache import ensure_place
+
 if TYPE_CHECKING:
     from lfpiv_cli.errors import LfpivError
     from lfpiv_cli.files.vtkhdf import open_vectors, open_volume
@@ -99,6 +101,9 @@ MODULES = {
     "reconstruct": "interface.reconstruction",
     "track": "interface.tracks",
 }
+
+# Before any kernel is imported.
+ensure_place()
 
 
 def __getattr__(name: str) -> Any:

@@ -48,3 +48,25 @@ def plot(file: Path, output: Path, overwrite: bool, console: Console, **chosen: 
     from lfpiv_cli.stages import plot as stage
 
     return stage.plot(file, output, stage.PlotOptions(**chosen), overwrite=overwrite, console=console)
+
+
+@click.command("warm-up")
+@click.option("--cache", type=FILE, help="Folder to fill; where lfpiv keeps compiled code when not given.")
+@common_options
+def warm_up(overwrite: bool, console: Console, cache: Path | None = None) -> dict[str, Any]:
+    """Compile all that lfpiv would compile when it is used for the first time, in a minute or two.
+
+    For images of containers and for clusters: fill a folder once, and set NUMBA_CACHE_DIR to it where lfpiv runs, on
+    processors of the same kind. The folder may be read-only there.
+
+    \b
+    Example: lfpiv warm-up
+             lfpiv warm-up --cache /opt/lfpiv-kernels
+    """
+    from lfpiv_cli.files import kernel_cache
+
+    if cache is not None:
+        kernel_cache.use(cache)
+    from lfpiv_cli.stages import warm_up as stage
+
+    return stage.warm_up(console=console)

@@ -41,6 +41,7 @@ COMMANDS = (
     tracks.follow,
     inspection.info,
     inspection.plot,
+    inspection.warm_up,
     report.report,
     exports.export,
     validation.validate,

@@ -1,0 +1,65 @@
+"""Where compiled kernels are kept from one run to the next: where numba keeps them, but never without a place.
+
+Numba keeps them beside the package, else in the user's folder for caches, or in the folder that `NUMBA_CACHE_DIR`
+names, and refuses to work where it can write to none of these, as in a container that is read-only. There a folder
+for this process alone takes their place, with a copy of what the folder that cannot be written holds.
+"""
+
+from __future__ import annotations
+
+import atexit
+import os
+import shutil
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+VARIABLE = "NUMBA_CACHE_DIR"
+HINT = (
+    f"compiled code cannot be kept, each run compiles anew: set {VARIABLE} to a folder that can be written, or to one "
+    "that `lfpiv warm-up --cache` has filled"
+)
+
+
+# Set where this process compiles into a folder that goes with it, and has found nothing compiled.
+lost = False
+
+
+def ensure_place() -> None:
+    """Give this process a folder for compiled kernels where numba would find none, before any is asked for."""
+    global lost
+    given = os.environ.get(VARIABLE)
+    if any(map(_is_writable, [Path(given)] if given else _numbas_places())):
+        return
+    place = tempfile.mkdtemp(prefix="lfpiv-kernels-")
+    atexit.register(shutil.rmtree, place, ignore_errors=True)
+    lost = not given or not os.path.isdir(given)
+    if given and not lost:
+        shutil.copytree(given, place, dirs_exist_ok=True)
+    use(Path(place))
+
+
+def use(place: Path) -> None:
+    """Keep compiled kernels in a folder from here on, in processes started from this one, too."""
+    os.environ[VARIABLE] = str(place)
+    if "numba" in sys.modules:
+        sys.modules["numba"].config.CACHE_DIR = str(place)
+
+
+def _numbas_places() -> Iterator[Path]:
+    """Yield where numba keeps compiled code of its own accord: beside the source, then with the user."""
+    package = Path(__file__).parents[1]
+    yield package / "__pycache__"
+    if sys.platform == "win32":
+        yield Path(os.environ.get("LOCALAPPDATA", package))
+    elif sys.platform == "darwin":
+        yield Path(os.path.expanduser("~/Library/Caches"))
+    else:
+        yield Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
+
+
+def _is_writable(folder: Path) -> bool:
+    """Return whether a folder can be written, or made."""
+    there = next((path for path in (folder, *folder.parents) if path.exists()), None)
+    return there is not None and there.is_dir() and os.access(there, os.W_OK | os.X_OK)
