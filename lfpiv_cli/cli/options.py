@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
@@ -12,6 +13,7 @@ import click
 from lfpiv_cli import __version__
 from lfpiv_cli.cli.outcome import error_record, print_json
 from lfpiv_cli.errors import LimitMissedError, PartialError
+from lfpiv_cli.files import kernel_cache
 from lfpiv_cli.files.shares import Shard, parse_time_limit
 from lfpiv_cli.names import InputKind, Pairing, names_in
 
@@ -223,6 +225,8 @@ def common_options(command: Callable[..., dict[str, Any]]) -> Callable[..., None
             raise
         ended = error_record(ended_with) if ended_with else {"exit_code": 0}
         console.event("end", summary=summary, **ended)
+        if kernel_cache.lost and "numba" in sys.modules:
+            console.say(f"lfpiv: {kernel_cache.HINT}")
         if as_json:
             warnings = [notice.record() for notice in warned]
             print_json(summary | {"warnings": warnings} | (ended if ended_with else {}))
