@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from typing import Any
 
 from lfpiv_cli.files.bench import (
     camera_of,
@@ -34,8 +35,16 @@ AGREEMENT = 1e-3
 FEWEST_PIXELS_A_LENS, MOST_PIXELS_A_LENS = 3.0, 1000.0
 
 
+# No length on a bench, in mm, nor any other number here, is as large or as small; squares of these are still numbers.
+LARGEST_NUMBER, SMALLEST_NUMBER = 1e12, 1e-12
+
+
 def contradictions(sections: Sections) -> Found:
     """Yield the place and the sentence of everything that cannot be."""
+    beyond = list(_beyond_numbers(sections.model_dump(), ()))
+    if beyond:
+        yield from beyond
+        return
     yield from _lens(sections)
     yield from _sensor(sections)
     yield from _volume(sections)
@@ -44,6 +53,18 @@ def contradictions(sections: Sections) -> Found:
     yield from _processing(sections)
     yield from _rays(sections)
     yield from _object_space(sections)
+
+
+def _beyond_numbers(value: Any, path: KeyPath) -> Found:
+    """Yield numbers so large, or so close to 0, that nothing can be calculated with them."""
+    if isinstance(value, dict):
+        for name, item in value.items():
+            yield from _beyond_numbers(item, (*path, name))
+    elif isinstance(value, (tuple, list)):
+        for place, item in enumerate(value):
+            yield from _beyond_numbers(item, (*path, place))
+    elif isinstance(value, float) and value and not SMALLEST_NUMBER <= abs(value) <= LARGEST_NUMBER:
+        yield path, f"is {value:g}, expected a size of {SMALLEST_NUMBER:g} to {LARGEST_NUMBER:g}"
 
 
 def _disagree(first: float, second: float) -> bool:

@@ -18,6 +18,7 @@ LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 LARGEST_BYTES = 2**20
 DEEPEST = 20
+LARGEST_INTEGER = 2**63 - 1
 
 KeyPath = tuple[str | int, ...]
 """A place in the tree: the keys and positions that lead to it."""
@@ -147,7 +148,7 @@ def _plain(node: yaml.Node, path: KeyPath, document: Document) -> Any:
     plain = isinstance(node, yaml.ScalarNode) and not node.style
     try:
         return _scalar(node.value) if plain else node.value
-    except ValueError:  # Python converts no integer of more than 4300 digits
+    except ValueError:
         document.problems.append(Problem(*_place(node), key_name(path), "is too long a number"))
         return 0
 
@@ -170,10 +171,19 @@ def _plain_mapping(node: yaml.MappingNode, path: KeyPath, document: Document) ->
 
 
 def _scalar(text: str) -> Any:
-    """Return what an unquoted scalar means by the core schema of YAML 1.2."""
+    """Return what an unquoted scalar means by the core schema of YAML 1.2.
+
+    Raises
+    ------
+    ValueError : it is an integer of more digits than any of ours has
+    """
     for pattern, convert in SCALARS:
         if pattern.fullmatch(text):
-            return convert(text)
+            value = convert(text)
+            # Python prints no integer of more than 4300 digits, and none of ours needs more than 64 bits.
+            if isinstance(value, int) and abs(value) > LARGEST_INTEGER:
+                raise ValueError
+            return value
     return text
 
 
