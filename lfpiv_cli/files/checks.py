@@ -33,6 +33,9 @@ FEWEST_SQUARES = 4
 AGREEMENT = 1e-3
 # Three pixels tell the middle of a lens image from its rims; the widest lens images in use are some 100 px wide.
 FEWEST_PIXELS_A_LENS, MOST_PIXELS_A_LENS = 3.0, 1000.0
+# The sensor stands at the microlenses' focal length or, in focused cameras, not far from it; and lens images that are
+# many pitches wide can be told apart by nothing.
+MOST_FOCAL_LENGTHS, MOST_PITCHES = 20.0, 50.0
 
 
 # No length on a bench, in mm, nor any other number here, is as large or as small; squares of these are still numbers.
@@ -47,6 +50,7 @@ def contradictions(sections: Sections) -> Found:
         return
     yield from _lens(sections)
     yield from _sensor(sections)
+    yield from _lens_images(sections)
     yield from _volume(sections)
     yield from _board(sections)
     yield from _scene(sections)
@@ -128,6 +132,27 @@ def _sensor(sections: Sections) -> Found:
             ("camera", "sensor", "pixel_um"),
             f"is {sensor.pixel_um:g}: lens images would be {pitch_px:.4g} px apart (pitch_mm is {pitch_mm:g}), "
             f"expected {FEWEST_PIXELS_A_LENS:g} to {MOST_PIXELS_A_LENS:g}: pixels in um, the pitch in mm",
+        )
+
+
+def _lens_images(sections: Sections) -> Found:
+    """Yield a sensor far out of the microlenses' focus, and an aperture whose images cover many lenses."""
+    section = sections.camera
+    if section is None or missing_for_camera(section) is not None:
+        return
+    camera = camera_of(section)
+    ratio = camera.microlens_distance_mm / camera.microlens_focal_length_mm
+    if not 1.0 / MOST_FOCAL_LENGTHS <= ratio <= MOST_FOCAL_LENGTHS:
+        yield (
+            ("camera", "sensor", "microlens_distance_mm"),
+            f"is {camera.microlens_distance_mm:g}, {ratio:.4g} times the microlenses' focal length of "
+            f"{camera.microlens_focal_length_mm:g}, expected {1.0 / MOST_FOCAL_LENGTHS:g} to {MOST_FOCAL_LENGTHS:g}",
+        )
+    if camera.lens_image_width > MOST_PITCHES:
+        yield (
+            ("camera", "main_lens"),
+            f"has an aperture of {camera.aperture_mm:g} mm: lens images would be {camera.lens_image_width:.4g} of their "
+            f"pitch wide, expected at most {MOST_PITCHES:g}, and best 1",
         )
 
 
@@ -226,7 +251,8 @@ def _object_space(sections: Sections) -> Found:
     if volume.size_mm is None and (volume.shape_xyz is None or volume.voxel_mm is None):
         return
     camera, media = camera_of(section), media_of(sections.media)
-    nearest = grid_of(volume, camera.scale(media), FOCAL_POINT).bounds_mm(2)[0]
+    grid = grid_of(volume, camera.scale(media), FOCAL_POINT)
+    nearest = grid.bounds_mm(2)[0]
     distance = float(equivalent_object_distance(nearest, camera.focus_distance_mm, media))
     if distance <= 0.0:
         yield (
@@ -234,7 +260,9 @@ def _object_space(sections: Sections) -> Found:
             f"begins at z = {nearest:g} mm, behind the lens, which is {camera.focus_distance_mm:g} mm away",
         )
         return
-    sine = math.sin(math.atan(camera.aperture_radius_mm / distance)) * media.air
+    # The steepest ray is that from a corner of the volume to the far side of the lens.
+    aside = math.hypot(*(max(map(abs, grid.bounds_mm(axis))) for axis in (0, 1)))
+    sine = math.sin(math.atan((camera.aperture_radius_mm + aside) / distance)) * media.air
     for name in ("window", "fluid"):
         if getattr(media, name) <= sine:
             yield (
