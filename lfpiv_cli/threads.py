@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
 import cv2
 import numba
+
+from lfpiv_cli.errors import UsageError
 
 # More than one, for pieces of work that do not take equally long; the threads wait for the last part.
 PARTS_A_THREAD = 4
@@ -16,12 +19,42 @@ PARTS_A_THREAD = 4
 # references, which takes longer than what a short function does.
 COUNT_NO_REFERENCES = {"_nrt": False}
 
+# True in a process that was forked when OpenMP's threads ran, which were lost with that: another loop would end it.
+_lost_threads = False
+
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
 # What `use_threads` was called with last.
 _told: list[int] = []
+
+
+def _note_fork() -> None:
+    """Note, in a forked process, whether it has lost the threads of compiled loops."""
+    global _lost_threads
+    try:
+        _lost_threads = _lost_threads or numba.threading_layer() == "omp"
+    except ValueError:  # none has begun
+        return
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_note_fork)
+
+
+def ensure_own_threads() -> None:
+    """Refuse parallel loops in a process that was forked after the first one: OpenMP would end it, a pool would hang.
+
+    Raises
+    ------
+    UsageError
+    """
+    if _lost_threads:
+        raise UsageError(
+            "this process was forked after compiled loops had begun to use threads, which it has lost; make workers "
+            'with multiprocessing.get_context("spawn"), or set NUMBA_THREADING_LAYER=workqueue before the start'
+        )
 
 
 def use_threads(threads: int) -> None:

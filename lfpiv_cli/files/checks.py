@@ -151,7 +151,7 @@ def _lens_images(sections: Sections) -> Found:
     if camera.lens_image_width > MOST_PITCHES:
         yield (
             ("camera", "main_lens"),
-            f"has an aperture of {camera.aperture_mm:g} mm: lens images would be {camera.lens_image_width:.4g} of their "
+            f"is open {camera.aperture_mm:g} mm wide: lens images would be {camera.lens_image_width:.4g} of their "
             f"pitch wide, expected at most {MOST_PITCHES:g}, and best 1",
         )
 

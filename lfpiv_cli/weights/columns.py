@@ -24,6 +24,7 @@ from lfpiv_cli.optics.microlenses import nearest_point
 from lfpiv_cli.optics.tracing import struck_pixel
 from lfpiv_cli.robust import BRIGHTEST_PERCENTILE, LIT_SHARE
 from lfpiv_cli.threads import share_out
+from lfpiv_cli.weights.arguments import real_array, voxel_index
 from lfpiv_cli.weights.build import factorise_through, separates
 from lfpiv_cli.weights.operators import Column, FactorisedOperator
 from lfpiv_cli.weights.quadrature import DEPTH_NODES, TILES, Columns, integrate_columns
@@ -64,7 +65,7 @@ class ColumnOperator:
 
     def forward(self, volume: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the image (rows, columns) of a volume."""
-        light = np.ascontiguousarray(volume).ravel()[self.voxel]
+        light = np.ascontiguousarray(real_array(volume, self.shape, "a volume")).ravel()[self.voxel]
         pixels = self.image_shape[0] * self.image_shape[1]
         return _add_columns(light, self.columns.start, self.columns.pixel, self.columns.share, pixels).reshape(
             self.image_shape
@@ -73,13 +74,13 @@ class ColumnOperator:
     def adjoint(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the volume that an image is spread back to."""
         volume = np.zeros(self.shape, np.float32)
-        flat = np.ascontiguousarray(image, dtype=np.float32).ravel()
+        flat = np.ascontiguousarray(real_array(image, self.image_shape, "an image"), dtype=np.float32).ravel()
         volume.ravel()[self.voxel] = _gather(flat, self.columns.start, self.columns.pixel, self.columns.share)
         return volume
 
     def column(self, plane: int, row_voxel: int, column_voxel: int) -> Column:
         """Return the rows, columns (int64) and weights (float32) of the pixels that one voxel lights."""
-        flat = int(np.ravel_multi_index((plane, row_voxel, column_voxel), self.shape))
+        flat = int(np.ravel_multi_index(voxel_index((plane, row_voxel, column_voxel), self.shape), self.shape))
         at = int(np.searchsorted(self.voxel, flat))
         if at == self.voxel.size or self.voxel[at] != flat:
             return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.float32)
@@ -116,7 +117,7 @@ class OnDemandOperator:
 
     def forward(self, volume: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the image (rows, columns) of a volume; dark voxels cost nothing."""
-        flat = np.ascontiguousarray(volume).ravel()
+        flat = np.ascontiguousarray(real_array(volume, self.shape, "a volume")).ravel()
         lit = np.flatnonzero(flat)
         image = np.zeros(self.image_shape[0] * self.image_shape[1], np.float32)
         for first in range(0, lit.size, VOXELS_AT_ONCE):
@@ -127,6 +128,7 @@ class OnDemandOperator:
 
     def adjoint(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the volume that an image is spread back to; makes every column."""
+        image = real_array(image, self.image_shape, "an image")
         volume = np.empty(self.shape, np.float32)
         flat, pixels = volume.ravel(), np.ascontiguousarray(image, dtype=np.float32).ravel()
         for first in range(0, flat.size, VOXELS_AT_ONCE):
@@ -137,7 +139,7 @@ class OnDemandOperator:
 
     def column(self, plane: int, row_voxel: int, column_voxel: int) -> Column:
         """Return the rows, columns (int64) and weights (float32) of the pixels that one voxel lights."""
-        flat = np.ravel_multi_index((plane, row_voxel, column_voxel), self.shape)
+        flat = np.ravel_multi_index(voxel_index((plane, row_voxel, column_voxel), self.shape), self.shape)
         return _as_column(self.columns_of(np.array([flat])), 0, self.image_shape[1])
 
     def columns_of(self, voxel: NDArray[np.int64]) -> Columns:

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from lfpiv_cli.errors import InputError
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import ColumnAxis
+from lfpiv_cli.weights.arguments import real_array, voxel_index
 from lfpiv_cli.weights.columns import ColumnOperator, OnDemandOperator
 from lfpiv_cli.weights.operators import BrickOperator, Column, FactorisedOperator
 
@@ -81,8 +81,7 @@ class Weights:
 
     def prepare(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
         """Take a raw image (rows, columns) to the frame of the weights."""
-        if image.shape != self.image_shape:
-            raise InputError(f"an image of {image.shape} pixels does not fit weights made for {self.image_shape}")
+        image = real_array(image, self.image_shape, "an image")
         if self.calibration is None:
             return image.astype(np.float32)
         return self.calibration.rectification.apply(image).astype(np.float32)
@@ -90,16 +89,18 @@ class Weights:
     def forward(self, volume: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the image (rows, columns) that a volume [z, y, x] gives."""
         padded = np.zeros(self.grid.padded(self.padding_xyz).shape_zyx, np.float32)
-        padded[self._inner] = volume
+        padded[self._inner] = real_array(volume, self.shape, "a volume")
         return self.solver_operator.forward(np.ascontiguousarray(self._to_sensor_order(padded)))
 
     def adjoint(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the volume [z, y, x] that an image is spread back to."""
+        image = real_array(image, self.image_shape, "an image")
         volume = self.solver_operator.adjoint(np.asarray(image, dtype=np.float32))
         return np.ascontiguousarray(self._to_sensor_order(volume)[self._inner])
 
     def column(self, iz: int, iy: int, ix: int) -> Column:
         """Return the rows, columns and weights of the pixels that voxel (iz, iy, ix) lights."""
+        iz, iy, ix = voxel_index((iz, iy, ix), self.shape)
         px, py, pz = self.padding_xyz
         row_voxel, column_voxel = (iy + py, ix + px) if self.column_axis == "x" else (ix + px, iy + py)
         return self.solver_operator.column(iz + pz, row_voxel, column_voxel)

@@ -23,7 +23,9 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.simd.combine import GROUP, TILE
 from lfpiv_cli.simd.vectors import LANES
+from lfpiv_cli.threads import ensure_own_threads
 from lfpiv_cli.weights import kernels
+from lfpiv_cli.weights.arguments import real_array, voxel_index
 from lfpiv_cli.weights.axis import AxisWeights
 from lfpiv_cli.weights.axis_cells import Cells
 from lfpiv_cli.weights.kernels import PLANES_BACK, PLANES_FORWARD, CellBlocks, LitRows, Terms, VoxelSums
@@ -58,6 +60,8 @@ class FactorisedOperator:
 
     def forward(self, volume: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the image (rows, columns) of a volume [plane, row voxel, column voxel]."""
+        ensure_own_threads()
+        volume = real_array(volume, self.shape, "a volume")
         first, last = self._lit_columns
         tiles = _filled(last - first, TILE) // TILE
         _, height, width = self.shape
@@ -67,6 +71,8 @@ class FactorisedOperator:
 
     def adjoint(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the volume [plane, row voxel, column voxel] that an image is spread back to."""
+        ensure_own_threads()
+        image = real_array(image, self.image_shape, "an image")
         by_cell = kernels.unfold(image, self.mask, self._runs, self._lit_rows, self.rows.cells.pixel)
         planes, height, width = self.shape
         turned = (planes, width, _filled(height, LANES))
@@ -75,6 +81,7 @@ class FactorisedOperator:
 
     def column(self, plane: int, row_voxel: int, column_voxel: int) -> Column:
         """Return the rows, columns (int64) and weights (float32) of the pixels that one voxel lights."""
+        plane, row_voxel, column_voxel = voxel_index((plane, row_voxel, column_voxel), self.shape)
         row, along_rows = self.rows.row(plane, row_voxel)
         column, along_columns = self.columns.row(plane, column_voxel)
         by_cell = np.outer(along_rows, along_columns) * self.mask[np.ix_(row, column)]
