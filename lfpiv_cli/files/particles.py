@@ -7,6 +7,7 @@ each frame `frame_position_mm` (frames, n, 3) and `frame_brightness` (frames, n)
 
 from __future__ import annotations
 
+import math
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +24,12 @@ MM_PER_M = 1000.0
 
 # What a list need not tell, in the order of the attributes of `Particles`.
 OPTIONAL = ("brightness", "diameter_mm", "frame_position_mm", "frame_brightness")
+# Places, which deflate can hardly shrink, tell how large the others may be: they can all be alike, and shrink to nothing.
+PLACES, LARGEST_PLACES_RATIO = "position_mm", 300
+# Arrays are of 8 bytes a number at most, float64 in memory.
+NUMBER_BYTES = 8
+# Of what is measured in mm, mm/s and counts; squares of more leave the range of float32.
+LARGEST_VALUE = 1e15
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,11 +61,14 @@ def read_particles(path: Path) -> Particles:
     """
     ensure_regular_file(path)
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            position, velocity = (np.asarray(stored[name], np.float64) for name in ("position_mm", "velocity_mm_s"))
-            told = {name: np.asarray(stored[name], np.float64) for name in OPTIONAL if name in stored}
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        with zipfile.ZipFile(path) as stored:
+            arrays: dict[str, NDArray[np.float64]] = {}
+            for name in _wanted(stored):
+                arrays[name] = _read_array(stored, name, max((array.size for array in arrays.values()), default=0))
+    except Exception as error:  # a damaged archive can raise anything in zipfile and NumPy
         raise InputError(f"{path}: not a list of particles: {reason(error)}") from error
+    position, velocity = arrays.pop("position_mm"), arrays.pop("velocity_mm_s")
+    told = arrays
     if position.ndim != 2 or position.shape[1:] != (3,) or position.shape != velocity.shape or not position.size:
         raise InputError(f"{path}: positions {position.shape} and velocities {velocity.shape}, expected twice (n, 3)")
     told.setdefault("brightness", np.ones(len(position)))
@@ -68,9 +78,46 @@ def read_particles(path: Path) -> Particles:
         expected = of_frames + (position.shape if name == "frame_position_mm" else position.shape[:1])
         if array.shape != expected:
             raise InputError(f"{path}: {name} {array.shape} for {len(position)} particles, expected {expected}")
-    if not all(np.isfinite(values).all() for values in (position, velocity, *told.values())):
-        raise InputError(f"{path}: a position, velocity, brightness or diameter is not a finite number")
+    if not all((np.abs(values) < LARGEST_VALUE).all() for values in (position, velocity, *told.values())):
+        raise InputError(
+            f"{path}: a position, velocity, brightness or diameter is not a finite number below {LARGEST_VALUE:g}"
+        )
     return Particles(position, velocity / MM_PER_M, told["brightness"], *(told.get(name) for name in OPTIONAL[1:]))
+
+
+def _wanted(stored: zipfile.ZipFile) -> list[str]:
+    """Return the names of the arrays that are read, places first; those that are not optional must be there."""
+    names = set(stored.namelist())
+    told = [name for name in OPTIONAL if f"{name}.npy" in names]
+    return sorted(["position_mm", "velocity_mm_s", *told], key=lambda name: not name.endswith(PLACES))
+
+
+def _read_array(stored: zipfile.ZipFile, name: str, largest: int) -> NDArray[np.float64]:
+    """Return an array of an archive, after asking its header whether it is what the archive's list says.
+
+    Parameters
+    ----------
+    largest : numbers of the largest array before it
+
+    Raises
+    ------
+    ValueError : it is of no real numbers, of another size than it declares, or too large
+    """
+    entry = stored.getinfo(f"{name}.npy")
+    with stored.open(entry) as file:
+        if np.lib.format.read_magic(file) != (1, 0):
+            raise ValueError(f"{name} has another version of NumPy's format than 1.0")
+        shape, _, dtype = np.lib.format.read_array_header_1_0(file)
+        if dtype.kind not in "fiu" or dtype.itemsize > NUMBER_BYTES or min(shape, default=0) < 0:
+            raise ValueError(f"{name} is of {dtype} {shape}, expected real numbers")
+        begin, count = file.tell(), math.prod(shape)
+        if entry.file_size - begin != count * dtype.itemsize:
+            raise ValueError(f"{name} declares {shape} numbers of {dtype}, it has {entry.file_size - begin} bytes")
+        allowed = LARGEST_PLACES_RATIO * entry.compress_size // dtype.itemsize if name.endswith(PLACES) else largest
+        if count > allowed:
+            raise ValueError(f"{name} declares {shape} numbers, more than the {allowed} that are possible")
+    with stored.open(entry) as file:
+        return np.asarray(np.lib.format.read_array(file, allow_pickle=False), np.float64)
 
 
 def write_particles(path: Path, particles: Particles, overwrite: bool) -> None:
