@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 from lfpiv_cli.errors import LfpivError, LimitMissedError, PartialError
+from lfpiv_cli.files.atomic import without_nan
 
 EXIT_BUG = 1
 EXIT_INTERRUPTED = 130
@@ -32,8 +33,8 @@ def outcome_of(error: BaseException) -> tuple[str, int]:
 
 
 def print_json(figures: dict[str, Any]) -> None:
-    """Print the one JSON object of a command to stdout."""
-    click.echo(json.dumps(figures, allow_nan=False, sort_keys=True))
+    """Print the one JSON object of a command to stdout; what is no number is null there."""
+    click.echo(json.dumps(without_nan(figures), allow_nan=False, sort_keys=True))
 
 
 def print_json_error(error: BaseException) -> None:

@@ -24,6 +24,8 @@ from lfpiv_cli.files.recordings.recording import Image, Recording, Shape
 # Files whose headers are kept, so that a recording of thousands of frames is not looked through again for each. A batch
 # reads one recording after the other, beside a white and a dark image; long ones have some megabytes of places.
 KEPT_HEADERS = 8
+# Far above what any sensor counts; sums of the squares of so large numbers still are numbers.
+MOST_COUNTS = 1e12
 
 
 def frames(path: Path) -> Recording:
@@ -94,6 +96,20 @@ def read_image(path: Path, shape: Shape | None = None) -> Image:
     if pages != 1:
         raise InputError(f"{path}: holds {pages} pages, expected a single image; {path}:page=0 is the first one")
     return read_page(path, 0, shape)
+
+
+def read_reference(path: Path, shape: Shape | None = None) -> Image:
+    """Read an image that others are measured by (white, dark, target, background, mask): each pixel holds counts.
+
+    Raises
+    ------
+    InputError : as `read_image`, and where a pixel is not a number, or no camera could have it
+    """
+    image = read_image(path, shape)
+    bad = int(np.count_nonzero(~(np.abs(image) <= MOST_COUNTS)))
+    if bad:
+        raise InputError(f"{path}: {bad} of its {image.size} pixels are not counts, numbers below {MOST_COUNTS:g}")
+    return image
 
 
 def read_page(path: Path, page: int, shape: Shape | None = None) -> Image:

@@ -24,7 +24,7 @@ MM_PER_M = 1000.0
 
 # What a list need not tell, in the order of the attributes of `Particles`.
 OPTIONAL = ("brightness", "diameter_mm", "frame_position_mm", "frame_brightness")
-# Places, which deflate can hardly shrink, tell how large the others may be: they can all be alike, and shrink to nothing.
+# Places, which deflate can hardly shrink, tell how large the others may be, which can all be alike.
 PLACES, LARGEST_PLACES_RATIO = "position_mm", 300
 # Arrays are of 8 bytes a number at most, float64 in memory.
 NUMBER_BYTES = 8

@@ -74,7 +74,7 @@ def calibrate_snapshot(
             return read_calibration(output).summary()
         overwrite = True
     shape = settings.image_shape()
-    frames = {name: image_files.read_image(path, shape) for name, path in inputs.items() if name != "config"}
+    frames = {name: image_files.read_reference(path, shape) for name, path in inputs.items() if name != "config"}
     camera = settings.camera_model() if views else None
     pictures = photographs(
         [frames[name] for name in whites], [frames[name] for name in boards], frames.get("dark"), depth_mm

@@ -11,7 +11,7 @@ from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.calibration_file import read_calibration
 from lfpiv_cli.files.config import load_config
-from lfpiv_cli.files.images import read_image
+from lfpiv_cli.files.images import read_image, read_reference
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.pictures import ensure_drawing, write_picture
 from lfpiv_cli.interface.image_planning import Pictures, image_lines, lattice_of
@@ -57,8 +57,8 @@ def check(
     shape = settings.image_shape()
     pictures = Pictures(
         {path.name: read_image(path, shape) for path in images},
-        None if options.white is None else read_image(options.white, shape),
-        None if options.dark is None else read_image(options.dark, shape),
+        None if options.white is None else read_reference(options.white, shape),
+        None if options.dark is None else read_reference(options.dark, shape),
     )
     found = None if options.calibration is None else read_calibration(options.calibration)
     of_white, lines = lattice_of(settings, pictures)

@@ -102,7 +102,7 @@ def follow_particles(
     for name in (TRACKS, PLAYBACK):
         ensure_writable(output / name, overwrite or options.resume, inputs)
     shape = content.image_shape
-    dark = image_files.read_image(options.dark, shape) if options.dark else None
+    dark = image_files.read_reference(options.dark, shape) if options.dark else None
     pitch_px = float(content.camera.micro_image_lattice_px().pitch.max())
     bench = bench_of(content, settings, dark, mask_of(options.mask, frames, shape, pitch_px))
     read = reader(level, frames, shape, dark)

@@ -70,7 +70,7 @@ def reader(
 
     With `keep_going` frames that cannot be read are left out of the backgrounds of others.
     """
-    fixed = image_files.read_image(level.path, shape) if level.path else None
+    fixed = image_files.read_reference(level.path, shape) if level.path else None
     window = len(level.around(0, len(frames)))
 
     @lru_cache(maxsize=window if level.frames else 1)
@@ -124,7 +124,7 @@ def mask_of(
     if given is None:
         return None
     if given != STILL:
-        return image_files.read_image(Path(given), shape)
+        return image_files.read_reference(Path(given), shape)
     images = _readable(lambda number: read_frame(frames[number], shape), range(len(frames)), keep_going)
     still = still_light(images, pitch_px)
     return np.where(still, np.float32(0.0), np.float32(1.0))

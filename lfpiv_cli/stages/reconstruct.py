@@ -212,7 +212,7 @@ class Reconstruction(ByArguments):
         elif content.weights.on_demand:
             console.say(on_demand_told(math.prod(content.weights.padded.shape)))
         shape = content.image_shape
-        dark = image_files.read_image(options.dark, shape) if options.dark else None
+        dark = image_files.read_reference(options.dark, shape) if options.dark else None
         pitch_px = float(content.camera.micro_image_lattice_px().pitch.max())
         mask = mask_of(options.mask, frames, shape, pitch_px, options.keep_going)
         bench = bench_of(content, settings, dark, mask)

@@ -67,7 +67,7 @@ def refine_calibration(
     frames, shape = frames_of(images), settings.image_shape()
     before = read_calibration(calibration)
     window = settings.window_model(before.mid_plane_z_mm or 0.0)
-    dark_image, empty = (image_files.read_image(path, shape) if path else None for path in (dark, background))
+    dark_image, empty = (image_files.read_reference(path, shape) if path else None for path in (dark, background))
     lit = [light(image_files.read_page(frame.path, frame.page, shape), dark_image, empty) for frame in frames]
     with console.progress(len(lit) * STEPS + 1, "refine") as advance:
         found = refine(

@@ -203,7 +203,7 @@ def _tracers_per_lens(settings: Config, options: RunOptions, weights: Path, fram
     """Return how many tracers for each microlens the first image holds."""
     content = particles.searchable(open_weights(weights), settings)
     shape, level = content.image_shape, Background.parse(options.background)
-    dark = image_files.read_image(options.dark, shape) if options.dark else None
+    dark = image_files.read_reference(options.dark, shape) if options.dark else None
     # What stands still would take a look at every image, and a pair hardly shows it better than one counts without.
     mask = None if options.mask == STILL else mask_of(options.mask, frames, shape, 0.0)
     bench = bench_of(content, settings, dark, mask)
