@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import sys
 from types import FrameType
@@ -26,6 +25,7 @@ from lfpiv_cli.cli import (
     weights,
 )
 from lfpiv_cli.cli.outcome import Terminated, outcome_of, print_json_error, printable
+from lfpiv_cli.cli.streams import ensure_said, open_streams
 
 COMMANDS = (
     planning.init,
@@ -81,12 +81,10 @@ def main() -> NoReturn:
     # Asked of the words themselves: a command line that is not understood has no options yet.
     debug, as_json = ("--debug" in sys.argv[1:], "--json" in sys.argv[1:])
     signal.signal(signal.SIGTERM, _terminate)
+    stdout = open_streams()
     try:
         cli.main(standalone_mode=False)
-        sys.stdout.flush()
-        code = 0
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        ensure_said(stdout)
         code = 0
     except SystemExit:
         raise

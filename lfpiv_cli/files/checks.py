@@ -16,6 +16,7 @@ from lfpiv_cli.files.bench import (
 from lfpiv_cli.files.sections import MainLens, Sections
 from lfpiv_cli.files.sections_simulated import SimulationSection
 from lfpiv_cli.files.yaml_nodes import KeyPath
+from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Window, equivalent_object_distance, fluid_path_to_focus
 from lfpiv_cli.reference import FOCAL_POINT
 
@@ -140,17 +141,22 @@ def _lens_images(sections: Sections) -> Found:
     section = sections.camera
     if section is None or missing_for_camera(section) is not None:
         return
-    camera = camera_of(section)
+    for place, text in lens_image_faults(camera_of(section)):
+        yield ("camera", *place), text
+
+
+def lens_image_faults(camera: Camera) -> Found:
+    """Yield the place in `camera` and the sentence of lens images that nobody could tell apart."""
     ratio = camera.microlens_distance_mm / camera.microlens_focal_length_mm
     if not 1.0 / MOST_FOCAL_LENGTHS <= ratio <= MOST_FOCAL_LENGTHS:
         yield (
-            ("camera", "sensor", "microlens_distance_mm"),
+            ("sensor", "microlens_distance_mm"),
             f"is {camera.microlens_distance_mm:g}, {ratio:.4g} times the microlenses' focal length of "
             f"{camera.microlens_focal_length_mm:g}, expected {1.0 / MOST_FOCAL_LENGTHS:g} to {MOST_FOCAL_LENGTHS:g}",
         )
     if camera.lens_image_width > MOST_PITCHES:
         yield (
-            ("camera", "main_lens"),
+            ("main_lens",),
             f"is open {camera.aperture_mm:g} mm wide: lens images would be {camera.lens_image_width:.4g} of their "
             f"pitch wide, expected at most {MOST_PITCHES:g}, and best 1",
         )

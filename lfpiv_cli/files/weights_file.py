@@ -26,11 +26,10 @@ from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.calibration.transmission import vignetting_surface
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.files.hdf5 import ensure_format, open_h5, read_provenance, read_tree, write_tree
+from lfpiv_cli.files.weights_fields import CAMERA_SCALARS, read_camera, read_grid, read_media, read_window
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import Refraction, TracedMethod, names_in
 from lfpiv_cli.optics.camera import Camera
-from lfpiv_cli.optics.media import Media, Window
-from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.reference import Reference
 from lfpiv_cli.weights.aperture import aperture_mask
@@ -46,20 +45,8 @@ from lfpiv_cli.weights.scene import Source
 FORMAT = "lfpiv-weights"
 VERSION = 2
 READABLE_VERSIONS = (1, 2)
-
-CAMERA_SCALARS = (
-    "magnification",
-    "focal_length_mm",
-    "aperture_mm",
-    "microlens_focal_length_mm",
-    "microlens_distance_mm",
-    "pixel_mm",
-    "columns",
-    "rows",
-    "column_axis",
-    "distortion_per_mm2",
-    "entrance_over_exit",
-)
+# Coefficients of `transmission.vignetting_surface`.
+VIGNETTING_SHAPE = (5, 5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,23 +144,14 @@ def open_weights(path: Path | str) -> WeightsFile:
     path = Path(path)
     tree, provenance = read_tree(path, FORMAT, READABLE_VERSIONS)
     try:
-        camera = _camera(tree["camera"])
-        grid = Grid(
-            _triple(tree["grid"]["shape_xyz"], int),
-            _triple(tree["grid"]["spacing_mm"], float),
-            _triple(tree["grid"]["origin_mm"], float),
-        )
-        padding = _triple(tree["grid"]["padding_xyz"], int)
+        camera = read_camera(_group(tree, "camera"))
+        grid, padding = read_grid(_group(tree, "grid"))
         calibration = Calibration.from_tree(tree["calibration"]) if tree.get("calibration") else None
         operator = _operator(tree, camera, grid.padded(padding), calibration)
-        vignetting = tree.get("vignetting")
-        if vignetting is not None and (vignetting.ndim != 2 or not np.isfinite(vignetting).all()):
-            raise ValueError(f"a vignetting of shape {vignetting.shape}")
-        bend = tree["grid"].get("scene_distortion_per_mm2")
-        if bend is not None and (bend.shape != (grid.shape_xyz[2],) or not np.isfinite(bend).all()):
-            raise ValueError(f"a distortion of shape {bend.shape} for {grid.shape_xyz[2]} planes")
+        vignetting = _numbers(tree, "vignetting", VIGNETTING_SHAPE)
+        bend = _numbers(tree["grid"], "scene_distortion_per_mm2", (grid.shape_xyz[2],))
         reference = Reference.from_attributes(tree["grid"])
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError, np.linalg.LinAlgError, MemoryError) as error:
         raise InputError(f"{path}: not a whole weights file: {error}") from error
     weights = Weights(grid, padding, operator, camera.column_axis, calibration, bend)
     return WeightsFile(weights, camera, reference, provenance, vignetting).behind_vignetting()
@@ -189,6 +167,22 @@ def read_weights_record(path: Path) -> dict[str, Any]:
     with open_h5(path) as file:
         ensure_format(path, file, FORMAT, READABLE_VERSIONS)
         return read_provenance(file)
+
+
+def _group(tree: dict[str, Any], name: str) -> dict[str, Any]:
+    """Return a group of a tree."""
+    found = tree[name]
+    if not isinstance(found, dict):
+        raise ValueError(f"{name} is no group")
+    return found
+
+
+def _numbers(tree: dict[str, Any], name: str, shape: tuple[int, ...]) -> NDArray[Any] | None:
+    """Return an array of finite numbers of a shape, None where it is missing."""
+    found = tree.get(name)
+    if found is not None and (np.shape(found) != shape or not np.isfinite(found).all()):
+        raise ValueError(f"{name} has the shape {np.shape(found)}, or is not finite; expected {shape}")
+    return found
 
 
 def _operator_tree(operator: WeightsOperator) -> dict[str, Any]:
@@ -230,11 +224,11 @@ def _source(tree: dict[str, Any], calibration: Calibration | None) -> Source:
         if calibration is None or calibration.ray_fit is None:
             raise ValueError("fitted rays are missing")
         return calibration.ray_fit.rays
-    media = Media(*(float(tree[name]) for name in ("air", "window", "fluid")))
+    media = read_media(tree)
     face = tree.get("window_face")
     if tree["method"] not in names_in(TracedMethod) or tree["refraction"] not in names_in(Refraction):
         raise ValueError(f"unknown tracing: {tree['method']}, {tree['refraction']}")
-    return ObjectSpace(media, Window(**face) if face else None, tree["refraction"], tree["method"])
+    return ObjectSpace(media, read_window(face) if face else None, tree["refraction"], tree["method"])
 
 
 def _counted(tree: dict[str, Any], voxels: int, pixels: int) -> Columns:
@@ -276,14 +270,3 @@ def _axis_weights(tree: dict[str, Any], planes: int, voxels: int, optics: AxisOp
         cell.astype(np.int32),
         share.astype(np.float32),
     )
-
-
-def _camera(tree: dict[str, Any]) -> Camera:
-    lattice = Lattice(tree["lattice_origin_mm"], tree["lattice_basis_mm"], tree["layout"])
-    known = {"entrance_over_exit": 1.0} | tree  # files from before pupils have thin lenses
-    return Camera(lattice=lattice, **{name: known[name] for name in CAMERA_SCALARS})
-
-
-def _triple(values: Any, kind: type) -> tuple[Any, Any, Any]:
-    first, second, third = (kind(value) for value in values)
-    return first, second, third

@@ -114,7 +114,7 @@ def image_lines(bench: Bench, pictures: Pictures, lattice: Calibration | None) -
 def full_scale(image: Image, settings: Config) -> float:
     """Return the counts at which a sensor ends: as configured, else the least number of bits that holds an image."""
     given = settings.reconstruction.saturation_counts
-    largest = float(np.nanmax(image))
+    largest = float(np.max(image, initial=0.0, where=np.isfinite(image)))
     return given or next((scale for scale in FULL_SCALES if largest <= scale), largest)
 
 
@@ -171,9 +171,12 @@ def _exposure(bench: Bench, seen: Seen) -> Line:
     lit = seen.above > 0.0
     at_end = saturated(seen.raw, bench.settings.reconstruction.saturation_counts)
     share = float(np.count_nonzero(at_end & lit)) / max(int(np.count_nonzero(lit)), 1)
+    is_known = np.isfinite(seen.raw)
+    if not is_known.any():
+        return Line("exposure", "no", f"{seen.name}: none of its pixels is a number")
     scale = full_scale(seen.raw, bench.settings)
     reason = (
-        f"{seen.name}: the brightest pixel is at {float(np.nanmax(seen.raw)) / scale:.0%} of {scale:g} counts, "
+        f"{seen.name}: the brightest pixel is at {float(seen.raw[is_known].max()) / scale:.0%} of {scale:g} counts, "
         f"{share:.2%} of the lit ones are saturated"
     )
     verdict = graded(share, GOOD_SATURATED, MOST_SATURATED)

@@ -1,0 +1,154 @@
+"""The camera and the grid that a weights file holds, believed only as far as a config would be."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lfpiv_cli.files.checks import (
+    FEWEST_PIXELS_A_LENS,
+    LARGEST_NUMBER,
+    MOST_PIXELS_A_LENS,
+    SMALLEST_NUMBER,
+    lens_image_faults,
+)
+from lfpiv_cli.files.inputs import physical_memory
+from lfpiv_cli.files.section_types import MOST_PIXELS_PER_SIDE, MOST_VOXELS_PER_SIDE
+from lfpiv_cli.grid import Grid
+from lfpiv_cli.names import ColumnAxis, Layout, names_in
+from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.media import Media, Window
+from lfpiv_cli.optics.microlenses import Lattice
+
+# Of the camera, those above 0; what else there is of numbers may have any sign.
+POSITIVE = (
+    "focal_length_mm",
+    "aperture_mm",
+    "microlens_focal_length_mm",
+    "microlens_distance_mm",
+    "pixel_mm",
+    "entrance_over_exit",
+)
+CAMERA_SCALARS = ("magnification", *POSITIVE, "columns", "rows", "column_axis", "distortion_per_mm2")
+# A kernel holds a volume, its padding, what it is made from, and as many numbers of each pixel.
+BYTES_A_VOXEL, BYTES_A_PIXEL = 8, 8
+# A basis whose vectors are nearly parallel is of no array: hexagons have 0.87.
+LEAST_SINE = 0.5
+LARGEST_INDEX = 5.0
+
+
+def read_camera(tree: dict[str, Any]) -> Camera:
+    """Return the camera of a weights file.
+
+    Raises
+    ------
+    KeyError, ValueError : something is missing, of another kind, or nothing that a camera could have
+    """
+    known = {"entrance_over_exit": 1.0} | tree  # files from before pupils have thin lenses
+    values: dict[str, Any] = {name: _positive(name, known[name]) for name in POSITIVE}
+    values |= {name: _whole(name, known[name], 1, MOST_PIXELS_PER_SIDE) for name in ("columns", "rows")}
+    values["magnification"] = -_positive(
+        "the reverse of magnification", -_number("magnification", known["magnification"])
+    )
+    values["distortion_per_mm2"] = _number("distortion_per_mm2", known["distortion_per_mm2"])
+    for name, allowed in (("column_axis", names_in(ColumnAxis)), ("layout", names_in(Layout))):
+        if known[name] not in allowed:
+            raise ValueError(f"{name} is {known[name]!r}, expected one of {', '.join(allowed)}")
+    values["column_axis"] = known["column_axis"]
+    pixels = values["columns"] * values["rows"]
+    if BYTES_A_PIXEL * pixels > physical_memory():
+        raise ValueError(f"{values['columns']} x {values['rows']} pixels do not fit into memory")
+    camera = Camera(lattice=_lattice(known), **values)
+    pitch_px = camera.lattice.pitch / camera.pixel_mm
+    if not (pitch_px.min() >= FEWEST_PIXELS_A_LENS and pitch_px.max() <= MOST_PIXELS_A_LENS):
+        raise ValueError(f"its lens images are {pitch_px.tolist()} px apart")
+    for fault in lens_image_faults(camera):
+        raise ValueError(fault[1])
+    return camera
+
+
+def read_grid(tree: dict[str, Any]) -> tuple[Grid, tuple[int, int, int]]:
+    """Return the grid of a weights file and its padding.
+
+    Raises
+    ------
+    KeyError, ValueError
+    """
+    shape, padding = (_whole_triple(name, tree[name], least) for name, least in (("shape_xyz", 1), ("padding_xyz", 0)))
+    spacing = _triple("spacing_mm", tree["spacing_mm"], _positive)
+    origin = _triple("origin_mm", tree["origin_mm"], _number)
+    grid = Grid(shape, spacing, origin)
+    voxels = math.prod(grid.padded(padding).shape_xyz)
+    if BYTES_A_VOXEL * voxels > physical_memory():
+        raise ValueError(f"{voxels} voxels do not fit into memory")
+    return grid, padding
+
+
+def read_media(tree: dict[str, Any]) -> Media:
+    """Return the media that rays cross.
+
+    Raises
+    ------
+    KeyError, ValueError
+    """
+    indices = [_number(name, tree[name]) for name in ("air", "window", "fluid")]
+    if not (min(indices) >= 1.0 and max(indices) <= LARGEST_INDEX):
+        raise ValueError(f"its refractive indices are {indices}, expected 1 to {LARGEST_INDEX:g}")
+    return Media(*indices)
+
+
+def read_window(tree: dict[str, Any]) -> Window:
+    """Return the window that rays cross.
+
+    Raises
+    ------
+    TypeError, ValueError
+    """
+    return Window(**{name: _number(name, value) for name, value in tree.items()})
+
+
+def _lattice(tree: dict[str, Any]) -> Lattice:
+    origin, basis = _array("lattice_origin_mm", tree, (2,)), _array("lattice_basis_mm", tree, (2, 2))
+    lattice = Lattice(origin, basis, tree["layout"])
+    if not lattice.cell_area >= LEAST_SINE * math.prod(lattice.pitch):
+        raise ValueError(f"the lattice's basis {basis.tolist()} is of no array of lenses")
+    return lattice
+
+
+def _array(name: str, tree: dict[str, Any], shape: tuple[int, ...]) -> NDArray[np.float64]:
+    array = np.asarray(tree[name])
+    if array.shape != shape or array.dtype.kind not in "fiu" or not (np.abs(array) <= LARGEST_NUMBER).all():
+        raise ValueError(f"{name} is {array.tolist()}, expected numbers of the shape {shape}")
+    return array.astype(np.float64)
+
+
+def _triple(name: str, values: Any, kind: Any) -> tuple[Any, Any, Any]:
+    if np.shape(values) != (3,):
+        raise ValueError(f"{name} has the shape {np.shape(values)}, expected (3,)")
+    first, second, third = (kind(name, value.item()) for value in np.asarray(values))
+    return first, second, third
+
+
+def _whole_triple(name: str, values: Any, least: int) -> tuple[int, int, int]:
+    return _triple(name, values, lambda name, value: _whole(name, value, least, MOST_VOXELS_PER_SIDE))
+
+
+def _number(name: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= LARGEST_NUMBER:
+        raise ValueError(f"{name} is {value!r}, expected a number")
+    return float(value)
+
+
+def _positive(name: str, value: Any) -> float:
+    if not _number(name, value) >= SMALLEST_NUMBER:
+        raise ValueError(f"{name} is {value!r}, expected {SMALLEST_NUMBER:g} or more")
+    return float(value)
+
+
+def _whole(name: str, value: Any, least: int, most: int) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
+        raise ValueError(f"{name} is {value!r}, expected a whole number from {least} to {most}")
+    return value
