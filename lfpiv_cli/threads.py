@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from multiprocessing.util import register_after_fork
 from typing import TypeVar
 
 import cv2
@@ -30,8 +30,8 @@ Result = TypeVar("Result")
 _told: list[int] = []
 
 
-def _note_fork() -> None:
-    """Note, in a forked process, whether it has lost the threads of compiled loops."""
+def _note_fork(_registered: object) -> None:
+    """Note, in a forked worker, whether it has lost the threads of compiled loops."""
     global _lost_threads
     try:
         _lost_threads = _lost_threads or numba.threading_layer() == "omp"
@@ -39,8 +39,7 @@ def _note_fork() -> None:
         return
 
 
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_note_fork)
+register_after_fork(_note_fork, _note_fork)
 
 
 def ensure_own_threads() -> None:

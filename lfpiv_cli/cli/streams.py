@@ -57,8 +57,10 @@ def open_streams() -> Stream:
     streams = {}
     for name, number in (("stdout", 1), ("stderr", 2)):
         before = getattr(sys, name)
-        encoding, errors = (before.encoding, before.errors) if before else ("utf-8", "backslashreplace")
         streams[name] = Stream(number)
+        if before is not getattr(sys, f"__{name}__"):  # whoever has put another one there wants what is said
+            continue
+        encoding, errors = (before.encoding, before.errors) if before else ("utf-8", "backslashreplace")
         text = io.TextIOWrapper(
             io.BufferedWriter(streams[name]),  # type: ignore[type-var]
             encoding=encoding,
