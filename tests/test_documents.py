@@ -196,6 +196,9 @@ def write_images(folder: Path) -> None:
     shutil.copyfile(SAMPLE / "particles.npz", folder / "true.npz")
     (folder / "pairs.txt").write_text("run_0000 run_0001\nrun_0003, run_0002 # the other way round\n")
     pages = [tifffile.imread(folder / f"{name}.tif") for name in "abab"]
+    (folder / "images").mkdir()
+    for number, name in enumerate("abab"):
+        shutil.copyfile(folder / f"{name}.tif", folder / "images" / f"{1 + number // 2}{name}.tif")
     tifffile.imwrite(folder / "run.tif", np.stack(pages), photometric="minisblack")
     imagecodecs.imwrite(folder / "mask.png", np.full(pages[0].shape, 255, np.uint8))
     camera_files.write_cine(folder / "shot.cine", np.stack(pages[:2]))
