@@ -1,7 +1,8 @@
 """Run the benchmarks that are named, or all of them: `python -m benchmarks [NAME ...]`.
 
 To add one: a function that takes no arguments, prints its figures, and has a line in `BENCHMARKS`; it lives in a
-function of its own with a size, which the tests call with a tiny one. `rigs` and `faults` have options of their own.
+function of its own with a size, which the tests call with a tiny one. `rigs`, `faults` and `batches` have options of
+their own.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 
+from benchmarks.batches import bench_batches
 from benchmarks.calibration import bench_calibration
 from benchmarks.correlation import bench_correlation, bench_correlation_accuracy
 from benchmarks.depth import bench_depth
@@ -22,6 +24,7 @@ from benchmarks.solvers import bench_solvers
 from benchmarks.weights import bench_weights
 
 BENCHMARKS: dict[str, Callable[[], None]] = {
+    "batches": bench_batches,
     "calibration": bench_calibration,
     "correlation": bench_correlation,
     "correlation-accuracy": bench_correlation_accuracy,
@@ -39,7 +42,7 @@ BENCHMARKS: dict[str, Callable[[], None]] = {
 
 
 def main(names: list[str]) -> None:
-    for name, bench in (("rigs", bench_rigs), ("faults", bench_faults)):
+    for name, bench in (("rigs", bench_rigs), ("faults", bench_faults), ("batches", bench_batches)):
         if names[:1] == [name]:
             bench(names[1:])
             return
