@@ -41,6 +41,9 @@ Pairing = Literal["ab", "sequence"]
 # What a command takes by the thousand: images, or what other commands made of them.
 InputKind = Literal["images", "results"]
 
+# What `run` leaves in its folder.
+Kept = Literal["all", "results"]
+
 # How `run` measures a flow.
 RunMethod = Literal["auto", "volumes", "particles", "both"]
 

@@ -20,6 +20,7 @@ from lfpiv_cli.files.sections_simulated import FlowSection
 from lfpiv_cli.names import (
     BoardMethod,
     ExportFormat,
+    Kept,
     KnownCamera,
     Method,
     Moment,
@@ -43,6 +44,7 @@ OPTIONS = {
     ("init", "camera"): names_in(KnownCamera),
     ("run", "method"): names_in(RunMethod),
     ("run", "pairing"): names_in(Pairing),
+    ("run", "keep"): names_in(Kept),
     ("build-weights", "method"): names_in(Method),
     ("build-weights", "refraction"): names_in(Refraction),
     ("build-weights", "sampling"): names_in(Sampling),

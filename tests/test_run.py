@@ -12,8 +12,9 @@ import pytest
 
 from lfpiv_cli.cli import cli
 from lfpiv_cli.console import Console
-from lfpiv_cli.errors import ConfigError, InputError, LfpivError, OutputExistsError, UsageError
+from lfpiv_cli.errors import ConfigError, InputError, LfpivError, OutputExistsError, PartialError, UsageError
 from lfpiv_cli.files.provenance import carried_record
+from lfpiv_cli.stages import prepared
 from lfpiv_cli.stages import run as stage
 from lfpiv_cli.stages.run import RunOptions
 
@@ -181,6 +182,39 @@ def test_the_report_is_made_of_what_was_made(again: Path, monkeypatch) -> None:
     assert told["summaries"]["report"] == {"verdict": {"vectors": "good"}}
 
 
+def test_results_are_kept_without_their_volumes_and_whatever_fails(again: Path, monkeypatch) -> None:
+    images = again / "images"
+    images.mkdir()
+    for name, source in (("pair_a", 0), ("pair_b", 1), ("next_a", 0), ("next_b", 1), ("lost_a", 0)):
+        shutil.copyfile(PAIR[source], images / f"{name}.tif")
+    (images / "next_b.tif").write_bytes(b"")
+    out, failures = again / "out", again / "failures.json"
+    options = ("--pairing", "ab", "--keep", "results", "--keep-going", "--failures", failures)
+
+    def failed() -> list[str]:
+        with pytest.raises(PartialError) as caught:
+            run(again / "rig.yaml", out, *options, images=(images,))
+        listed = json.loads(failures.read_text())
+        assert listed == caught.value.figures["failures"]
+        return [Path(each["name"]).stem for each in listed]
+
+    # The second frame of one pair cannot be read, that of another is not there.
+    assert failed() == ["lost_a", "next_a"]
+    assert (out / "vectors" / "pair_a.vtkhdf").read_bytes() == (out / VECTORS).read_bytes()
+    assert not (out / "volumes" / "pair_a.vtkhdf").exists()
+    first = (out / "vectors" / "pair_a.vtkhdf").stat().st_mtime_ns
+    shutil.copyfile(PAIR[1], images / "next_b.tif")
+    assert failed() == ["lost_a"]
+    assert sorted(path.name for path in (out / "vectors").iterdir()) == ["next_a.vtkhdf", "pair_a.vtkhdf"]
+    assert not (out / "volumes").exists()
+    # What stands is known without its volumes, and without the weights.
+    monkeypatch.setattr(prepared, "open_weights", lambda _: pytest.fail("weights were opened"))
+    failed()
+    assert set(states(again).values()) == {"kept"}
+    assert (out / "vectors" / "pair_a.vtkhdf").stat().st_mtime_ns == first
+    assert not (out / "volumes").exists()
+
+
 def test_what_is_not_of_a_run_is_not_replaced(ran: Path, tmp_path: Path) -> None:
     (tmp_path / "run.json").write_text("mine")
     with pytest.raises(OutputExistsError, match=r"run.json"):
@@ -226,11 +260,10 @@ def test_what_cannot_be_is_said_before_anything_is_made(
     ],
 )
 def test_the_method_is_what_errs_less(
-    count: float | None, method: Any, methods: tuple[str, ...], said: str, tmp_path: Path, monkeypatch
+    count: float | None, method: Any, methods: tuple[str, ...], said: str, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(stage, "_tracers_per_lens", lambda *_: count)
     settings = stage.load_config(rig_in(tmp_path))
-    choice = stage._chosen(settings, RunOptions(images=PAIR, method=method), tmp_path, [])
+    choice = stage._chosen(settings, RunOptions(images=PAIR, method=method), lambda: count)
     assert choice.methods == methods
     assert said in choice.reason
     assert choice.tracers_per_lens == count

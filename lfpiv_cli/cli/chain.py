@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import wraps
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +18,9 @@ from lfpiv_cli.cli.options import (
     dark_option,
     depth_option,
     dt_option,
+    failures_option,
+    inputs_argument,
+    keep_going_option,
     mask_option,
     output_option,
     pairing_options,
@@ -23,13 +28,24 @@ from lfpiv_cli.cli.options import (
     white_option,
 )
 from lfpiv_cli.console import Console
-from lfpiv_cli.names import RunMethod, names_in
+from lfpiv_cli.names import Kept, RunMethod, names_in
+
+
+def named_images(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Let a command take its images by the option --images, too."""
+
+    @click.option("--images", "named", type=FILE, multiple=True, help="The same: images of the flow.")
+    @wraps(command)
+    def run(named: tuple[Path, ...], images: tuple[Path, ...], **arguments: Any) -> Any:
+        return command(images=(*named, *images), **arguments)
+
+    return run
 
 
 @click.command("run")
 @config_argument
-@click.argument("images", type=FILE, nargs=-1)
-@click.option("--images", "named", type=FILE, multiple=True, help="The same: images of the flow.")
+@named_images
+@inputs_argument("images")
 @white_option
 @dark_option
 @board_option
@@ -43,6 +59,13 @@ from lfpiv_cli.names import RunMethod, names_in
 @dt_option
 @click.option("--combine", is_flag=True, help="With both: also one field that weights their vectors.")
 @click.option("--follow", is_flag=True, help="Time-resolved sequence: find and track particles together.")
+@click.option(
+    "--keep",
+    type=click.Choice(names_in(Kept)),
+    help="results: drop volumes, and particles of separate pairs, as soon as their vectors stand; all when not given.",
+)
+@keep_going_option
+@failures_option
 @click.option("--report/--no-report", default=True, help="Make OUTPUT/report.html, a page of all of it.")
 @output_option("Folder for all that is made.")
 @common_options
@@ -50,7 +73,6 @@ from lfpiv_cli.names import RunMethod, names_in
 def run(
     config: Path,
     images: tuple[Path, ...],
-    named: tuple[Path, ...],
     output: Path,
     overwrite: bool,
     console: Console,
@@ -62,15 +84,18 @@ def run(
     measures by particles up to about two, where these err less, and by volumes beyond; OUTPUT/run.json says which and
     why, and OUTPUT/report.html shows all of it. Run it again, and it keeps what is complete and made alike, and goes on
     from there; with --overwrite it makes anew what was made from other inputs or settings. More than two images need
-    --pairing or --follow.
+    --pairing or --follow; thousands of pairs take no more disk than their vectors with --keep results.
 
     \b
     Example: lfpiv run rig.yaml a.tif b.tif --white white.tif --dark dark.tif --board board.tif -o results
     by both ways, and one field of the two:
              lfpiv run rig.yaml a.tif b.tif --white white.tif --dark dark.tif --board board.tif \\
                  --method both --combine -o results
+    a folder of pairs, whatever becomes of single ones:
+             lfpiv run rig.yaml images --pairing ab --white white.tif --dark dark.tif --board board.tif \\
+                 --keep results --keep-going -o results
     """
     from lfpiv_cli.stages import run as stage
 
-    options = stage.RunOptions(images=(*named, *images), **chosen)
+    options = stage.RunOptions(images=images, **chosen)
     return stage.run(config, output, options, overwrite=overwrite, console=console)

@@ -145,16 +145,28 @@ def raw_option(command: Callable[..., Any]) -> Callable[..., Any]:
     return run
 
 
+keep_going_option = click.option(
+    "--keep-going", is_flag=True, help="Go on with the next one when an input fails; exit 5."
+)
+failures_option = click.option("--failures", type=FILE, help="File to list what failed in, with the reason (JSON).")
+
+
 def batch_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Give a command the options of all batches."""
-    keep_going = click.option("--keep-going", is_flag=True, help="Go on with the next one when an input fails; exit 5.")
-    failures = click.option("--failures", type=FILE, help="File to list what failed in, with the reason (JSON).")
     dry_run = click.option(
         "--dry-run",
         is_flag=True,
         help="Tell what would be made, how large and, by the --log of an earlier run, in which time; write nothing.",
     )
-    for option in (dry_run, dask_option, time_limit_option, shard_option, failures, keep_going, resume_option):
+    for option in (
+        dry_run,
+        dask_option,
+        time_limit_option,
+        shard_option,
+        failures_option,
+        keep_going_option,
+        resume_option,
+    ):
         command = option(command)
     return command
 

@@ -6,7 +6,7 @@ import re
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path, PurePath
+from pathlib import Path
 
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.files.batch import Frame
@@ -65,7 +65,8 @@ def _source(path: Path) -> _Source | None:
     try:
         made = earlier_record(path) or {}
         image, page = made["inputs"]["image"], PAGE.search(made["command"])
-        return page and _Source(PurePath(image["name"]).stem, image["sha256"], int(page[1]))
+        stem = split_part(Path(image["name"]))[0].stem
+        return page and _Source(stem, image["sha256"], int(page[1]))
     except (InputError, KeyError, TypeError):
         return None  # what is broken is told where its turn comes
 

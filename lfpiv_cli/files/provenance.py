@@ -9,9 +9,11 @@ import hashlib
 import json
 import platform
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from functools import cache, lru_cache
 from importlib.metadata import version
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import h5py
@@ -38,11 +40,20 @@ UNREAD = {
 }
 
 
+@dataclass(frozen=True)
+class Gone:
+    """An input that is no longer there: its SHA-256 and the record that it carried."""
+
+    sha256: str
+    record: Mapping[str, Any]
+
+
 def record(
     command: str,
     config: Mapping[str, Any] | None,
     inputs: Mapping[str, Path],
     taken_s: Mapping[str, float | None] | None = None,
+    gone: Mapping[Path, Gone] = MappingProxyType({}),
 ) -> dict[str, Any]:
     """Return the record of a result.
 
@@ -52,6 +63,7 @@ def record(
     config : the resolved config, as plain data, or None where there is none
     inputs : the files that the result is made from, by their role
     taken_s : when images among these were taken, in s from a moment of their file's own, where it tells
+    gone : of these, those that are no longer there
 
     Returns
     -------
@@ -69,14 +81,15 @@ def record(
     made_from: dict[str, Any] = {}
     for role, path in sorted(inputs.items()):
         file, part = split_part(path)
-        digest = sha256(path)
+        known = gone.get(path)
+        digest = sha256(path) if known is None else known.sha256
         named[role] = {"name": file.name if part is None else f"{file.name}:{part}", "sha256": digest}
         taken = (taken_s or {}).get(role)
         if taken is not None:
             named[role]["time_s"] = taken
         for other in files_beside(file):
             named[role].setdefault("beside", {})[other.name] = sha256(other)
-        earlier = earlier_record(file)
+        earlier = earlier_record(file) if known is None else dict(known.record)
         if earlier is not None:
             made_from.update(earlier.pop("made_from", {}))
             made_from[digest] = earlier

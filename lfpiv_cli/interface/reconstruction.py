@@ -131,11 +131,11 @@ class Bench:
 
 
 def bench_of(
-    content: WeightsFile, settings: Config, dark: Image | None, mask: Image | None, with_sums: bool = True
+    content: WeightsFile, settings: Config, dark: Image | None, mask: Image | None, earlier: Bench | None = None
 ) -> Bench:
     """Return what all frames share, given a dark image and a mask (rows, columns) that is 0 where nothing is believed.
 
-    `with_sums` is False where no frame is going to be solved.
+    The sums are those of an `earlier` one with the same weights and pixels.
 
     Raises
     ------
@@ -151,7 +151,10 @@ def bench_of(
     excluded = touched(lasting, weights.prepare) if lasting.any() else np.zeros(weights.image_shape, np.bool_)
     if weights.calibration is not None:
         excluded |= ~weights.calibration.rectification.inside
-    sums = normalisers(weights.padded, excluded) if with_sums and not weights.on_demand else None
+    if earlier is not None and earlier.content is content and np.array_equal(earlier.excluded, excluded):
+        sums = earlier.sums
+    else:
+        sums = None if weights.on_demand else normalisers(weights.padded, excluded)
     return Bench(content, settings, dark, lasting, excluded, sums, _lens_images(content))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -20,7 +20,7 @@ from lfpiv_cli.files.batch import Target, output_paths, prepare_folder
 from lfpiv_cli.files.config import Config, carried_config, load_config
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.pairing import Pairs
-from lfpiv_cli.files.provenance import earlier_record, record, with_warnings
+from lfpiv_cli.files.provenance import Gone, earlier_record, record, with_warnings
 from lfpiv_cli.files.whole import ensure_opens, fault_of
 from lfpiv_cli.flow.correlation import correlate as measure
 from lfpiv_cli.flow.correlation import count_passes
@@ -171,6 +171,7 @@ class Correlation(ByArguments):
         options: CorrelateOptions,
         overwrite: bool,
         pairs: Pairs | None = None,
+        gone: Mapping[Path, Gone] | None = None,
     ) -> None:
         """Take the arguments of `correlate`; see which pairs there are, and read no volume.
 
@@ -198,8 +199,8 @@ class Correlation(ByArguments):
         paths = output_paths(output, [group[0][0].stem for group in self._groups])
         self.names = [path.stem for path in paths]
         self.targets = [Target(path, partial(self._record, number)) for number, path in enumerate(paths)]
-        self._first = _ensure_readable(volumes, options.keep_going)
-        self.settings = self._settings_of(self._first)
+        self._gone = gone or {}
+        self._first = volumes[0] if gone else _ensure_readable(volumes, options.keep_going)
 
     @property
     def outputs(self) -> list[Path]:
@@ -246,21 +247,17 @@ class Correlation(ByArguments):
 
     def summary(self, worked: Worked[Outcome]) -> dict[str, Any]:
         """Return what is told of the batch."""
-        outcomes = list(worked.outcomes.values())
-        found = quality_of_all([outcome.quality for outcome in outcomes])
-        told: dict[str, Any] = {
-            "pairs": len(self._pairs) if self._options.ensemble else worked.total(),
-            "skipped": worked.skipped,
-            "vectors": found.vectors,
-            "rejected": sum(outcome.rejected for outcome in outcomes),
-        }
-        divergence = [outcome.divergence_rms for outcome in outcomes if outcome.divergence_rms is not None]
-        return told | found.summary() | ({"divergence_rms_per_s": float(np.mean(divergence))} if divergence else {})
+        return summary_of(worked, len(self._pairs) if self._options.ensemble else worked.total())
 
     def fields(self, worked: Worked[Outcome]) -> list[Path]:
         """Return the files of the fields that are there."""
         failed = {failure.name for failure in worked.failures}
         return [target.path for target, name in zip(self.targets, self.names, strict=True) if name not in failed]
+
+    @property
+    def settings(self) -> Config:
+        """Those of the first volume that can be opened."""
+        return self._settings_of(self._first)
 
     def _job(self, number: int) -> Job:
         """Return the pairs that a field is made of, and the settings."""
@@ -269,14 +266,29 @@ class Correlation(ByArguments):
 
     def _settings_of(self, volume: Path) -> Config:
         """Return the settings for a volume: its own, or those of a config in their place."""
-        settings = self._config or carried_config(earlier_record(volume) or {}, volume)
+        made = self._gone[volume].record if volume in self._gone else earlier_record(volume) or {}
+        settings = self._config or carried_config(made, volume)
         return settings.overridden_by("correlation", self._options)
 
     def _record(self, number: int) -> dict[str, Any]:
         """Return the record that a field will carry."""
         options, job = self._options, self._job(number)
         command = " ".join(["correlate", *["ensemble"] * options.ensemble, *["derived"] * options.derived])
-        return record(command, job.settings.resolved(), self._common | job.inputs())
+        return record(command, job.settings.resolved(), self._common | job.inputs(), gone=self._gone)
+
+
+def summary_of(worked: Worked[Outcome], pairs: int) -> dict[str, Any]:
+    """Return what is told of the fields of so many pairs."""
+    outcomes = list(worked.outcomes.values())
+    found = quality_of_all([outcome.quality for outcome in outcomes])
+    told: dict[str, Any] = {
+        "pairs": pairs,
+        "skipped": worked.skipped,
+        "vectors": found.vectors,
+        "rejected": sum(outcome.rejected for outcome in outcomes),
+    }
+    divergence = [outcome.divergence_rms for outcome in outcomes if outcome.divergence_rms is not None]
+    return told | found.summary() | ({"divergence_rms_per_s": float(np.mean(divergence))} if divergence else {})
 
 
 def _measure(job: Job, mask: Path | None, work: Frames) -> tuple[VectorField, Reference, list[Notice]]:

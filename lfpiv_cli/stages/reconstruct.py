@@ -22,10 +22,10 @@ from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.pairing import Pairs
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, write_points
 from lfpiv_cli.files.provenance import also_used_as, record, with_warnings
-from lfpiv_cli.files.weights_file import open_weights, read_weights_record
+from lfpiv_cli.files.weights_file import read_weights_record
 from lfpiv_cli.files.whole import unpacked_bytes
 from lfpiv_cli.interface import particles
-from lfpiv_cli.interface.reconstruction import Bench, Progress, bench_of, check_frame, frame_notices, volume_of
+from lfpiv_cli.interface.reconstruction import Bench, Progress, check_frame, frame_notices, volume_of
 from lfpiv_cli.interface.weights_cost import FLOAT_BYTES, columns_bytes, held_bytes, on_demand_told
 from lfpiv_cli.names import Start
 from lfpiv_cli.notice import Notice
@@ -37,6 +37,7 @@ from lfpiv_cli.stages.dry_runs import Expected, dry_run
 from lfpiv_cli.stages.finding import Finder
 from lfpiv_cli.stages.frames import STILL, Ahead, Background, Read, beside_frames, mask_of, other_frames, reader
 from lfpiv_cli.stages.pairs import PairOptions, image_pairs
+from lfpiv_cli.stages.prepared import Prepared
 from lfpiv_cli.stages.watched import watched, work_as_they_come
 
 
@@ -85,8 +86,12 @@ def reconstruct(
     overwrite: bool = False,
     console: Console = CONSOLE,
     pairs: Pairs | None = None,
+    prepared: Prepared | None = None,
 ) -> dict[str, Any]:
-    """Reconstruct the volume behind each image, or find its particles; `pairs`, where they are known already."""
+    """Reconstruct the volume behind each image, or find its particles.
+
+    `pairs` and `prepared`, where these are known already.
+    """
     if options.watch:
         _ensure_frames_alone(weights, options)
         prepare_folder([output / weights.name])
@@ -95,7 +100,7 @@ def reconstruct(
             lambda group: Reconstruction(weights, group, output, options, overwrite), groups, options, console
         )
     else:
-        batch = Reconstruction(weights, images, output, options, overwrite, pairs)
+        batch = Reconstruction(weights, images, output, options, overwrite, pairs, prepared)
         if options.dry_run:
             return dry_run(batch, options, console)
         worked = work_through(batch, options, console)
@@ -146,6 +151,7 @@ class Reconstruction(ByArguments):
         options: ReconstructOptions,
         overwrite: bool,
         pairs: Pairs | None = None,
+        prepared: Prepared | None = None,
     ) -> None:
         """Take the arguments of `reconstruct`; see which frames there are, and read no image.
 
@@ -153,7 +159,7 @@ class Reconstruction(ByArguments):
         ------
         LfpivError : frames or outputs do not go together, or a file cannot be opened
         """
-        self._options, self.overwrite = options, overwrite
+        self._options, self.overwrite, self._prepared = options, overwrite, prepared or Prepared()
         # What is complete is skipped: in the place of what is made there is nothing, or something broken.
         self._replace = overwrite or options.resume
         self._level = level = Background.parse(options.background)
@@ -194,7 +200,7 @@ class Reconstruction(ByArguments):
         if self._as_particles:
             return Expected()
         path = self._common["weights"]
-        weights = open_weights(path).weights
+        weights = self._prepared.weights(path).weights
         voxels, pixels = math.prod(weights.padded.shape), math.prod(weights.image_shape)
         rows = columns_bytes(voxels) if weights.on_demand else unpacked_bytes(path)
         return Expected(FLOAT_BYTES * math.prod(weights.shape), held_bytes(voxels, pixels) + rows)
@@ -206,16 +212,15 @@ class Reconstruction(ByArguments):
             self._ensure_residuals(numbers, console)
         if not numbers:
             return 0.0
-        content = open_weights(self._common["weights"])
-        if self._as_particles:
-            content = particles.searchable(content, settings)
-        elif content.weights.on_demand:
+        prepared, weights = self._prepared, self._common["weights"]
+        content = prepared.searchable(weights, settings) if self._as_particles else prepared.weights(weights)
+        if not self._as_particles and content.weights.on_demand:
             console.say(on_demand_told(math.prod(content.weights.padded.shape)))
         shape = content.image_shape
         dark = image_files.read_reference(options.dark, shape) if options.dark else None
         pitch_px = float(content.camera.micro_image_lattice_px().pitch.max())
         mask = mask_of(options.mask, frames, shape, pitch_px, options.keep_going)
-        bench = bench_of(content, settings, dark, mask)
+        bench = prepared.bench(content, settings, dark, mask)
         read = reader(self._level, frames, shape, dark, options.keep_going)
         size, said = None, []
         if self._as_particles:

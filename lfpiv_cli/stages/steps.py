@@ -52,7 +52,7 @@ class Steps:
         number = len(self.told["steps"]) + 1
         self.console.say(f"step {number}: {name}")
         before, times = [_recorded(path) for path in files], [_stamp(path) for path in files]
-        hashes = self._hashes(path for path in files if path.exists())
+        hashes = self._hashes(files)
         try:
             summary = make()
         except LfpivError as error:
@@ -70,8 +70,8 @@ class Steps:
         return summary
 
     def _hashes(self, files: Iterable[Path]) -> dict[str, str]:
-        """Return the hash of each file by its name in the folder."""
-        return {path.relative_to(self.output).as_posix(): sha256(path) for path in files}
+        """Return the hash of each file that is there by its name in the folder; of those that failed there is none."""
+        return {path.relative_to(self.output).as_posix(): sha256(path) for path in files if path.exists()}
 
     def count(self, state: str) -> int:
         """Return how many steps were made, kept, or recorded anew."""

@@ -16,7 +16,7 @@ from lfpiv_cli.files.batch import Target, output_paths
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.pairing import Pairs
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, read_points, read_tracks, write_points
-from lfpiv_cli.files.provenance import carried_record, record, with_warnings
+from lfpiv_cli.files.provenance import Gone, carried_record, record, with_warnings
 from lfpiv_cli.files.whole import fault_of
 from lfpiv_cli.flow.field import REJECTED
 from lfpiv_cli.interface.tracks import (
@@ -99,6 +99,7 @@ class Tracks(ByArguments):
         options: TrackOptions,
         overwrite: bool,
         pairs: Pairs | None = None,
+        gone: Mapping[Path, Gone] | None = None,
     ) -> None:
         """Take the arguments of `track`; see which frames belong together, and read no particles.
 
@@ -106,7 +107,7 @@ class Tracks(ByArguments):
         ------
         LfpivError : frames or outputs do not go together
         """
-        self._options, self.overwrite, self.inputs = options, overwrite, particles
+        self._options, self.overwrite, self.inputs, self._gone = options, overwrite, particles, gone or {}
         in_pairs = pairs is not None or (options.are_told and options.pairing != "sequence")
         self.unit, self.left_out = "pair" if in_pairs else "sequence", []
         if in_pairs:
@@ -171,27 +172,33 @@ class Tracks(ByArguments):
 
     def summary(self, worked: Worked[Outcome]) -> dict[str, Any]:
         """Return what is told of the batch: all figures of a single result, the sums of several."""
-        outcomes = list(worked.outcomes.values())
-        tracks = sum(outcome.figures["tracks"] for outcome in outcomes)
-        if len(self.targets) == 1:
-            told = outcomes[0].figures if outcomes else {"tracks": count_tracks(self.targets[0].path)}
-        else:
-            told = {"pairs": len(self.targets), "skipped": worked.skipped, "tracks": tracks}
-        qualities = [quality for outcome in outcomes for quality in outcome.qualities]
-        if not qualities:
-            return told
-        every = quality_of_all(qualities)
-        rejected = sum(outcome.rejected for outcome in outcomes)
-        return told | {"vectors": every.vectors, "rejected": rejected} | every.summary()
+        return summary_of(worked, [target.path for target in self.targets])
 
     def _record(self, number: int) -> dict[str, Any]:
         """Return the record that tracks will carry."""
         options, paths = self._options, self._groups[number]
         names = [str(path) for path in paths]
-        settings = settings_of([carried_record(path) for path in paths], names)
+        records = [self._gone[path].record if path in self._gone else carried_record(path) for path in paths]
+        settings = settings_of(records, names)
         settings = settings.overridden("correlation", dt_s=options.dt_s)
         chosen = tracking_of(settings, options.search_voxel, options.shortest, len(paths), names[0])
-        return record("track", settings.resolved() | chosen.told(), _roles(paths))
+        return record("track", settings.resolved() | chosen.told(), _roles(paths), gone=self._gone)
+
+
+def summary_of(worked: Worked[Outcome], paths: Sequence[Path]) -> dict[str, Any]:
+    """Return what is told of so many files of tracks."""
+    outcomes = list(worked.outcomes.values())
+    if len(paths) == 1:
+        told = outcomes[0].figures if outcomes else {"tracks": count_tracks(paths[0]) if paths[0].exists() else 0}
+    else:
+        tracks = sum(outcome.figures["tracks"] for outcome in outcomes)
+        told = {"pairs": len(paths), "skipped": worked.skipped, "tracks": tracks}
+    qualities = [quality for outcome in outcomes for quality in outcome.qualities]
+    if not qualities:
+        return told
+    every = quality_of_all(qualities)
+    rejected = sum(outcome.rejected for outcome in outcomes)
+    return told | {"vectors": every.vectors, "rejected": rejected} | every.summary()
 
 
 def count_tracks(path: Path) -> int:
