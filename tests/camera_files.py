@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import zlib
 from pathlib import Path
 
 import h5py
@@ -143,6 +144,14 @@ def write_mraw(path: Path, stack: np.ndarray, *, bits: int, xml: bool = True, co
             f"Image Width : {columns}\nImage Height : {rows}\nColor Type : {colour}\nColor Bit : {bits}\n"
             f"File Format : MRaw\nEffectiveBit Depth : {bits}\nEffectiveBit Side : Lower\n"
         )
+
+
+def write_im7(path: Path, stack: np.ndarray) -> None:
+    """Write a DaVis recording of frames (frame, row, column) of 16 bits, packed."""
+    count, rows, columns = stack.shape
+    header = struct.pack("<4h4i3h", 0, 2, -4, 0, columns, rows, 1, count, 0, 1, 0).ljust(256, b"\0")
+    packed = zlib.compress(stack.tobytes())
+    path.write_bytes(header + struct.pack("<I", len(packed)) + packed + struct.pack("<2i", 1, 4) + b"1 0\0")
 
 
 def write_stack(path: Path, stack: np.ndarray, name: str = "entry/data/frames") -> None:

@@ -57,8 +57,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     camera_files.write_mraw(made / "mraw.mraw", stack, bits=12)
     camera_files.write_stack(made / "hdf5.h5", stack)
     (made / "raw.raw").write_bytes(b"".join(camera_files.bits_low_first(frame, 12) for frame in stack))
-    lvpyio = pytest.importorskip("lvpyio")
-    lvpyio.write_buffer(lvpyio.arrays_to_buffer(list(stack)), str(made / "davis.im7"))
+    camera_files.write_im7(made / "davis.im7", stack)
     (made / "rig.yaml").write_text(yaml.safe_dump(RIG))
     run("build-weights", made / "rig.yaml", "-o", made / "weights.h5")
     return made
@@ -136,7 +135,7 @@ FAULTS: dict[str, tuple[Callable[[Path], None], str, int]] = {
     "seq.seq": (lambda path: _cut(path, 0.9), "cut off or damaged", 4),
     "mraw.mraw": (lambda path: _cut(path, 1.0), "mraw.cihx or .cih is not beside it", 4),
     "hdf5.h5": (lambda path: _cut(path, 0.9), "hdf5.h5", 4),
-    "davis.im7": (lambda path: _cut(path, 0.9), "davis.im7", 4),
+    "davis.im7": (lambda path: _cut(path, 0.9), "cut off or damaged", 4),
     "raw.raw": (lambda path: _cut(path, 1.0), "state its layout with --raw", 2),
 }
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 import struct
 import sys
 import time
+import zlib
 from contextlib import suppress
 from pathlib import Path
 
@@ -183,29 +185,53 @@ def test_a_cine_packed_to_ten_bits_has_linear_counts(tmp_path: Path, monkeypatch
         images.frames(tmp_path / "t.cine")
 
 
-def test_images_of_davis(tmp_path: Path, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_images_of_davis(tmp_path: Path, rng: np.random.Generator) -> None:
     lvpyio = pytest.importorskip("lvpyio")
-    stack, path = stack_of(rng, 12, (2, 30, 40)), tmp_path / "B00001.im7"
-    for packed in (True, False):
+    path = tmp_path / "B00001.im7"
+    for packed, kind in itertools.product((True, False), (np.uint16, np.float32)):
+        stack = stack_of(rng, 12, (2, 30, 40)).astype(kind)
         lvpyio.write_buffer(lvpyio.arrays_to_buffer(list(stack)), str(path), compress=packed)
         found = images.frames(path)
-        assert (found.pages, found.shape, found.bits, found.time_s) == (2, (30, 40), 16, None)
+        assert (found.pages, found.shape, found.bits, found.time_s) == (2, (30, 40), 8 * stack.itemsize, None)
         for page in range(2):
             np.testing.assert_array_equal(images.read_page(path, page, (30, 40)), stack[page])
         content = path.read_bytes()
         # After the counts the file has attributes.
-        end = len(content) if packed else 256 + stack.nbytes
-        for percent in range(1, 95, 4):
-            path.write_bytes(content[: end * percent // 100])
+        end = 260 + struct.unpack_from("<I", content, 256)[0] if packed else 256 + stack.nbytes
+        for kept in (*range(1, end, end // 20), end - 1):
+            path.write_bytes(content[:kept])
             with pytest.raises(InputError, match="B00001.im7"):
-                read_all(path) if packed else images.frames(path)
-    path.write_bytes(content)
+                images.frames(path)
+        if packed:
+            flipped = bytearray(content)
+            flipped[end // 2] ^= 1
+            path.write_bytes(flipped)
+            with pytest.raises(InputError, match=r"B00001\.im7: (cannot be unpacked|does not unpack)"):
+                images.read_page(path, 0)
     (tmp_path / "run.set").write_text("set")
     with pytest.raises(UsageError, match=r"give the \.im7 files of the folder .*run"):
         images.frames(tmp_path / "run.set")
-    monkeypatch.setitem(sys.modules, "lvpyio", None)
-    with pytest.raises(UsageError, match=re.escape('pip install "lfpiv[cameras]"')):
-        images.frames(path)
+
+
+@pytest.mark.parametrize(
+    ("header", "words"),
+    [
+        ((0, 0, 3, 0, 7, 5, 1, 1), "expected images: save it from DaVis"),
+        ((0, 0, -4, 0, 7, 5, 2, 1), "2 planes"),
+        ((0, 1, -4, 0, 7, 5, 1, 1), "packed in a way of its own"),
+        ((0, 0, -4, 0, -7, 5, 1, 1), "-7 x 5"),
+        ((0, 2, -4, 0, 30_000, 30_000, 1, 1000), "expected at most"),
+        ((0, 0, -4, 0, 7, 5, 1, 4), "end at byte 536 of 396"),
+        ((0, 2, -4, 0, 7, 5, 1, 3), "does not unpack to 3 frames"),
+        ((0, 2, -4, 0, 7, 5, 1, 1), "does not unpack to 1 frames"),
+    ],
+)
+def test_headers_of_davis_that_do_not_fit(tmp_path: Path, header: tuple[int, ...], words: str) -> None:
+    packed = zlib.compress(bytes(140))
+    content = struct.pack("<4h4i", *header).ljust(256, b"\0") + struct.pack("<I", len(packed)) + packed
+    (tmp_path / "t.im7").write_bytes(content.ljust(396, b"\0"))
+    with pytest.raises(InputError, match=words):
+        read_all(tmp_path / "t.im7")
 
 
 def edited(path: Path, place: int, layout: str, value: int) -> None:
@@ -319,6 +345,15 @@ def test_xml_that_declares_entities_or_ends_early_is_refused(tmp_path: Path) -> 
         (tmp_path / "t.cihx").write_text(text)
         with pytest.raises(InputError, match=r"t\.cihx: "):
             images.frames(tmp_path / "t.mraw")
+
+
+def test_a_header_that_changes_is_read_anew(tmp_path: Path) -> None:
+    path = tmp_path / "t.mraw"
+    path.write_bytes(bytes(35))
+    path.with_suffix(".cih").write_text(CIH)
+    assert images.frames(path).shape == (5, 7)
+    path.with_suffix(".cih").write_text(CIH.replace("Width : 7", "Width : 5") + "\n")
+    assert images.frames(path).shape == (5, 5)
 
 
 def test_a_photron_recording_that_left_frames_out_is_timed_by_what_it_kept(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from lfpiv_cli.errors import InputError
 from lfpiv_cli.files.atomic import write_atomically
 from lfpiv_cli.files.inputs import ensure_regular_file, split_page, split_part
 from lfpiv_cli.files.recordings import tiff
-from lfpiv_cli.files.recordings.formats import open_recording
+from lfpiv_cli.files.recordings.formats import files_beside, open_recording
 from lfpiv_cli.files.recordings.recording import Image, Recording, Shape
 
 # Files whose headers are kept, so that a recording of thousands of frames is not looked through again for each. A batch
@@ -44,13 +44,18 @@ def frames(path: Path) -> Recording:
         If more has to be said, or what is said does not fit the format.
     """
     file, part = split_part(path)
-    size = ensure_regular_file(file)
+    ensure_regular_file(file)
+    return _frames(file, part, tuple(_state_of(each) for each in (file, *files_beside(file))))
+
+
+def _state_of(file: Path) -> tuple[int, int, int]:
+    """Return what changes when a file does."""
     status = file.stat()
-    return _frames(file, part, size, status.st_mtime_ns, status.st_ino)
+    return status.st_size, status.st_mtime_ns, status.st_ino
 
 
 @lru_cache(KEPT_HEADERS)
-def _frames(file: Path, part: str | None, size: int, mtime_ns: int, inode: int) -> Recording:
+def _frames(file: Path, part: str | None, states: tuple[tuple[int, int, int], ...]) -> Recording:
     """Read a header once; a file that has another size, time or place on the disk is looked at anew."""
     part, page = split_page(part)
     recording = open_recording(file, part)

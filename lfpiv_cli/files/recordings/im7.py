@@ -1,54 +1,75 @@
-"""LaVision's .im7: the frames of one recording, read by the manufacturer's library lvpyio (extra `cameras`).
+"""LaVision DaVis' .im7: the frames of one recording, one below the other, as they are or packed by zlib.
 
-Header as in the manufacturer's published reader ReadIM7.
+Header as the manufacturer published it (ReadIM7). Counts are those that are stored, without the scale that DaVis shows.
 """
 
 from __future__ import annotations
 
+import math
+import zlib
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from lfpiv_cli.errors import InputError, LfpivError, UsageError
+from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files.inputs import reason
-from lfpiv_cli.files.recordings.blocks import values_at
+from lfpiv_cli.files.recordings.blocks import bytes_at, values_at
 from lfpiv_cli.files.recordings.pixels import CUT, as_counts, ensure_size
 from lfpiv_cli.files.recordings.recording import Image, Recording, Shape
 
 # Version, packing, format, sparse; columns, rows, planes, frames.
 HEADER, HEADER_BYTES = "<4h4i", 256
-# Bits of a pixel by the format of images; positive ones are of vectors.
-BITS = {-2: 16, -3: 32, -4: 16, -5: 64}
-NOT_PACKED = 0
-COUNTS = "PIXEL"
+# Kinds of counts by the format of images; positive ones are of vectors.
+KINDS = {-3: "<f4", -4: "<u2", -5: "<f8"}
+NOT_PACKED, ZLIB = 0, 2
+# The number of packed bytes, before these.
+LENGTH, LENGTH_BYTES = "<I", 4
+EXPORT_HINT = "save it from DaVis without compression, or as TIFF"
+
+
+@dataclass(frozen=True)
+class _Content:
+    """What a header declares."""
+
+    pages: int
+    shape: Shape
+    kind: str
+    packed: bool
+
+    @property
+    def frame_bytes(self) -> int:
+        return math.prod(self.shape) * np.dtype(self.kind).itemsize
 
 
 def frames(path: Path) -> Recording:
-    """Return the frames that a header declares.
+    """Return the frames that a header declares, after checking that their bytes are there.
 
     Raises
     ------
     InputError
-    UsageError : lvpyio is not installed
     """
-    try:
-        import lvpyio  # noqa: F401
-    except ImportError as error:
-        raise UsageError(f'{path}: images of DaVis need lvpyio: pip install "lfpiv[cameras]"') from error
+    size = path.stat().st_size
     with open(path, "rb") as file:
         _, packing, kind, _, columns, rows, planes, pages = values_at(path, file, 0, HEADER)
-    size = path.stat().st_size
-    if kind not in BITS or planes != 1:
-        raise InputError(f"{path}: is of format {kind} with {planes} planes, expected images of counts")
-    if min(columns, rows, pages) < 1:
-        raise InputError(f"{path}: declares {pages} frames of {columns} x {rows} pixels (columns x rows)")
-    ensure_size(f"{path}: a recording", (rows * pages, columns), BITS[kind] // 8, None, size)
-    needed = HEADER_BYTES + rows * columns * pages * BITS[kind] // 8
-    if packing == NOT_PACKED and needed > size:
-        raise InputError(f"{path}: declares {pages} frames that end at byte {needed} of {size}: {CUT}")
-    return Recording(pages, (rows, columns), BITS[kind], partial(_read_page, path))
+        if kind not in KINDS or planes != 1:
+            raise InputError(f"{path}: is of format {kind} with {planes} planes, expected images: {EXPORT_HINT}")
+        if packing not in (NOT_PACKED, ZLIB):
+            raise InputError(f"{path}: is packed in a way of its own ({packing}): {EXPORT_HINT}")
+        if min(columns, rows, pages) < 1:
+            raise InputError(f"{path}: declares {pages} frames of {columns} x {rows} pixels (columns x rows)")
+        found = _Content(pages, (rows, columns), KINDS[kind], packing == ZLIB)
+        item_bytes = np.dtype(found.kind).itemsize
+        ensure_size(f"{path}: all frames together", (rows * pages, columns), item_bytes, None, size)
+        stored = found.frame_bytes * pages
+        if found.packed:
+            stored = LENGTH_BYTES + values_at(path, file, HEADER_BYTES, LENGTH)[0]
+        if HEADER_BYTES + stored > size:
+            raise InputError(
+                f"{path}: declares {pages} frames that end at byte {HEADER_BYTES + stored} of {size}: {CUT}"
+            )
+    return Recording(pages, found.shape, 8 * item_bytes, partial(_read_page, path, found))
 
 
 def frames_of_set(path: Path) -> Recording:
@@ -56,22 +77,30 @@ def frames_of_set(path: Path) -> Recording:
     raise UsageError(f"{path}: lists a set of images: give the .im7 files of the folder {path.with_suffix('')}")
 
 
-def _read_page(path: Path, page: int, shape: Shape | None) -> Image:
-    expected = frames(path).shape
-    ensure_size(f"{path}: frame {page}", expected, 1, shape, path.stat().st_size)
+def _read_page(path: Path, found: _Content, page: int, shape: Shape | None) -> Image:
     try:
-        counts = _counts(path, page)
-        if counts.shape != expected:
-            raise InputError(f"{path}: frame {page} decodes to {counts.shape}, it declares {expected}")
-        return as_counts(counts)
-    except LfpivError:
-        raise
-    except Exception as error:  # a damaged file can raise anything inside the library
-        raise InputError(f"{path}: cannot be decoded: {reason(error)}") from error
+        ensure_size(f"{path}: frame {page}", found.shape, 1, shape, path.stat().st_size)
+        data = _bytes_of(path, found, page)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {reason(error)}") from error
+    return as_counts(np.frombuffer(data, found.kind).reshape(found.shape))
 
 
-def _counts(path: Path, page: int) -> np.ndarray[Any, Any]:
-    """Return the counts of a frame as they are stored, without the scale that DaVis shows them in."""
-    import lvpyio
-
-    return np.asarray(lvpyio.read_buffer(str(path))[page].components[COUNTS].planes[0])
+def _bytes_of(path: Path, found: _Content, page: int) -> bytes:
+    """Return the bytes of a frame; of packed ones all are unpacked, whose check sum tells damage."""
+    begin, end = page * found.frame_bytes, (page + 1) * found.frame_bytes
+    with open(path, "rb") as file:
+        if not found.packed:
+            return bytes_at(path, file, HEADER_BYTES + begin, found.frame_bytes)
+        (length,) = values_at(path, file, HEADER_BYTES, LENGTH)
+        packed = bytes_at(path, file, HEADER_BYTES + LENGTH_BYTES, length)
+    expected = found.pages * found.frame_bytes
+    unpacking = zlib.decompressobj()
+    try:
+        # One byte more than there should be, and the check sum after it is looked at.
+        data = unpacking.decompress(packed, expected + 1)
+    except zlib.error as error:
+        raise InputError(f"{path}: cannot be unpacked: {reason(error)}: {CUT}") from error
+    if len(data) != expected or not unpacking.eof:
+        raise InputError(f"{path}: does not unpack to {found.pages} frames of {found.frame_bytes} bytes: {CUT}")
+    return data[begin:end]
