@@ -15,7 +15,9 @@ from lfpiv_cli.cli.options import (
     common_options,
     dark_option,
     dt_option,
+    failures_option,
     inputs_argument,
+    keep_going_option,
     mask_option,
     output_option,
     pairing_options,
@@ -66,7 +68,7 @@ def track(
 
 @click.command("follow")
 @click.argument("weights", type=FILE)
-@click.argument("frames", type=FILE, nargs=-1, required=True)
+@inputs_argument("frames")
 @dark_option
 @background_option
 @mask_option
@@ -83,6 +85,8 @@ def track(
 @click.option("--both-ways", is_flag=True, help="Go through the frames a second time, backwards: twice the time.")
 @click.option("--residuals", is_flag=True, help="Also write what the particles leave of each image.")
 @resume_option
+@keep_going_option
+@failures_option
 @output_option("Folder for the particles of each frame and the tracks.")
 @common_options
 @raw_option
@@ -92,8 +96,9 @@ def follow(
     """Find and track the particles of a time-resolved sequence together, as in Shake-The-Box.
 
     The first two frames are searched as a pair. Then each track predicts where its particle is in the next frame, the
-    predicted particles are refined together on the image, and only what they leave of it is searched for others. Give
-    the frames in the order of time, or one multi-page file.
+    predicted particles are refined together on the image, and only what they leave of it is searched for others. Frames
+    are taken in the order of their numbers, or the pages of one file. With --keep-going, tracks end before a frame that
+    cannot be read, and others begin behind it.
 
     \b
     Writes OUTPUT/particles/STEM.vtkhdf for each frame, as reconstruct does, OUTPUT/tracks.vtkhdf, as track does,

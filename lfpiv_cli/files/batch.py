@@ -38,7 +38,7 @@ class Frame:
     @property
     def time_s(self) -> float | None:
         """When it was taken, in s from a moment of its file's own; None where the file does not tell."""
-        times = times_of(self.path)
+        times = None if self.fault is not None else times_of(self.path)
         return None if times is None else float(times[self.page])
 
 

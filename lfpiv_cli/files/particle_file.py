@@ -85,6 +85,12 @@ class Points:
     provenance: dict[str, Any]
 
 
+def no_points(format_name: str, reference: Reference) -> Points:
+    """Return points of a format of which there are none."""
+    arrays = {name: np.zeros((0, 6) if name.startswith("covariance") else 0) for name in UNITS[format_name]}
+    return Points(np.zeros((0, 3)), arrays, reference, {}, {})
+
+
 def write_points(path: Path, format_name: str, points: Points, *, overwrite: bool) -> None:
     """Write points; their arrays are all that the format has, each with as many rows as there are points.
 

@@ -177,6 +177,12 @@ class Worked(Generic[Made]):
         self.skipped += other.skipped
         self.failures += other.failures
 
+    def list_failures(self, path: Path | None) -> None:
+        """Write those that failed, with the reasons, as JSON, where it is asked for."""
+        if path is not None:
+            listed = json.dumps([asdict(failure) for failure in self.failures], indent=2, ensure_ascii=False)
+            write_text(path, listed + "\n", overwrite=True)
+
     def ensure_whole(self, summary: dict[str, Any], unit: str) -> dict[str, Any]:
         """Return the summary of a batch of which nothing failed.
 
@@ -231,9 +237,7 @@ def work_through(batch: Batch[Made], options: BatchOptions, console: Console) ->
 
 def write_failures(options: BatchOptions, worked: Worked[Any]) -> None:
     """Write the list of those that failed, where it is asked for."""
-    if options.failures is not None:
-        listed = json.dumps([asdict(failure) for failure in worked.failures], indent=2, ensure_ascii=False)
-        write_text(options.failures, listed + "\n", overwrite=True)
+    worked.list_failures(options.failures)
 
 
 def attempt(batch: Batch[Made], number: int, before: Stamp, work: Frames) -> Made | Turn:

@@ -15,12 +15,15 @@ from pathlib import Path
 from typing import Any
 
 from lfpiv_cli.console import CONSOLE, Console, Frames
+from lfpiv_cli.errors import InputError
 from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.batch import VTKHDF_SUFFIX, Frame, Target, frames_of, output_paths, pending, prepare_folder
 from lfpiv_cli.files.config import Config, carried_config
+from lfpiv_cli.files.frame_sources import images_seen
 from lfpiv_cli.files.inputs import given
-from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, Points, read_points, write_points
+from lfpiv_cli.files.pairing import in_order
+from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, Points, no_points, read_points, write_points
 from lfpiv_cli.files.playback import write_playback
 from lfpiv_cli.files.provenance import record, sha256, with_warnings
 from lfpiv_cli.files.weights_file import open_weights
@@ -37,7 +40,9 @@ from lfpiv_cli.interface.reconstruction import bench_of, check_frame, frame_noti
 from lfpiv_cli.interface.tracks import Tracking, few_notices, tracked, tracking_of
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.reconstruction.images import Image
-from lfpiv_cli.stages.frames import STILL, Background, mask_of, reader, sequence_digests
+from lfpiv_cli.reference import Reference
+from lfpiv_cli.stages.batches import Failure, Worked
+from lfpiv_cli.stages.frames import STILL, Background, mask_of, read_frame, reader, sequence_digests
 from lfpiv_cli.stages.reconstruct import file_notices, residual_path
 from lfpiv_cli.tracks.sequences import Trajectories
 
@@ -58,6 +63,8 @@ class FollowOptions:
     both_ways : go through the frames a second time, backwards
     residuals : write what the particles leave of each image, too
     resume : go on after the last frame that is complete
+    keep_going : leave out frames that cannot be read: tracks end before them, and others begin behind
+    failures : file to list these in, as JSON
     """
 
     dark: Path | None = None
@@ -69,6 +76,8 @@ class FollowOptions:
     both_ways: bool = False
     residuals: bool = False
     resume: bool = False
+    keep_going: bool = False
+    failures: Path | None = None
 
 
 NO_OPTIONS = FollowOptions()
@@ -83,9 +92,19 @@ def follow_particles(
     overwrite: bool = False,
     console: Console = CONSOLE,
 ) -> dict[str, Any]:
-    """Find and follow the particles of a sequence."""
-    frames = frames_of(images)
+    """Find and follow the particles of a sequence.
+
+    Raises
+    ------
+    PartialError : frames were left out
+    """
+    frames = frames_of(images, options.keep_going)
     ensure_sequence(len(frames), options.shortest)
+    if options.failures is not None:
+        ensure_writable(options.failures, overwrite or options.resume, images)
+    order, notices = in_order(images_seen(frames))
+    frames = [frames[number] for number in order]
+    console.warn(notices)
     level = Background.parse(options.background)
     mask_file = None if options.mask is None or options.mask == STILL else Path(options.mask)
     common = given(weights=weights, dark=options.dark, background=level.path, mask=mask_file)
@@ -93,20 +112,26 @@ def follow_particles(
     settings = carried_config(content.provenance, weights).overridden("reconstruction", solver="particles")
     settings = settings.overridden("correlation", dt_s=options.dt_s)
     tracking = tracking_of(settings, options.search_voxel, options.shortest, len(frames), str(weights))
+    shape = content.image_shape
+    left_out: list[Failure] = []
+    if options.keep_going:
+        frames, left_out = _readable(frames, shape)
+        console.warn(Notice("frame-failed", each.name, each.error, "leave it out, or mend it") for each in left_out)
+        ensure_sequence(len(frames), options.shortest)
     content = particles.searchable(content, settings)
     told = sequence_digests(level, frames, options.mask)
     passes = _passes(output, frames, told, settings, tracking, common, options.both_ways)
     prepare_folder([output / TRACKS])
     inputs = [*common.values(), *images]
-    needed = [_needed(targets, inputs, options, overwrite, targets is passes[-1]) for targets in passes]
+    there = [number for number, frame in enumerate(frames) if frame.fault is None]
+    needed = [_needed(targets, there, inputs, options, overwrite, targets is passes[-1]) for targets in passes]
     for name in (TRACKS, PLAYBACK):
         ensure_writable(output / name, overwrite or options.resume, inputs)
-    shape = content.image_shape
     dark = image_files.read_reference(options.dark, shape) if options.dark else None
     pitch_px = float(content.camera.micro_image_lattice_px().pitch.max())
-    bench = bench_of(content, settings, dark, mask_of(options.mask, frames, shape, pitch_px))
-    read = reader(level, frames, shape, dark)
-    bench, size = particles.sized(bench, (particles.frame_of(bench, *read(k)) for k in range(len(frames))))
+    bench = bench_of(content, settings, dark, mask_of(options.mask, frames, shape, pitch_px, options.keep_going))
+    read = reader(level, frames, shape, dark, options.keep_going)
+    bench, size = particles.sized(bench, (particles.frame_of(bench, *read(k)) for k in there))
     said = particles.size_notices(settings, size)
     console.warn(said)
 
@@ -121,24 +146,62 @@ def follow_particles(
     count = sum(map(len, needed))
     with console.frames(count, sum(map(steps_of, needed)) / max(count, 1), "follow") as work:
         stores = [
-            _Files(targets, frozenset(numbers), said, options.residuals and targets is passes[-1], overwrite, work)
+            _Files(
+                targets,
+                frozenset(numbers),
+                frozenset(there),
+                content.reference,
+                said,
+                options.residuals and targets is passes[-1],
+                overwrite,
+                work,
+            )
             for targets, numbers in zip(passes, needed, strict=True)
         ]
         found = forwards(sequence, stores[0], work.advance)
         if options.both_ways:
             backwards(sequence, stores[0].read, stores[1], work.advance)
             found = None
-    counts = {"frames": len(frames), "found": len(needed[-1]), "skipped": len(frames) - len(needed[-1])}
+    counts = {"frames": len(frames), "found": len(needed[-1]), "skipped": len(there) - len(needed[-1])}
     summary = _write_tracks(output, sequence, stores[-1], found, overwrite or options.resume, console)
-    return counts | summary | size.summary()
+    worked = Worked(dict.fromkeys(there), failures=left_out)
+    worked.list_failures(options.failures)
+    return worked.ensure_whole(counts | summary | size.summary(), "frame")
+
+
+def _readable(frames: Sequence[Frame], shape: tuple[int, int]) -> tuple[list[Frame], list[Failure]]:
+    """Return a sequence with the faults of its frames, and those that are left out of it.
+
+    It begins with two that can be read, as these are found together.
+    """
+    seen = [replace(frame, fault=_fault(frame, shape)) for frame in frames]
+    begins = (k for k in range(len(seen) - 1) if seen[k].fault is None and seen[k + 1].fault is None)
+    begin = next(begins, len(seen))
+    before = "is before the first two frames in a row that can be read"
+    left_out = [frame for k, frame in enumerate(seen) if k < begin or frame.fault is not None]
+    return seen[begin:], [Failure(frame.stem, frame.fault or f"{frame.path}: {before}") for frame in left_out]
+
+
+def _fault(frame: Frame, shape: tuple[int, int]) -> str | None:
+    """Return why a frame cannot be followed; None where it can."""
+    try:
+        raw = read_frame(frame, shape)
+    except InputError as error:
+        return str(error)
+    return f"{frame.path}: has one value everywhere; it shows no particles" if raw.min() == raw.max() else None
 
 
 def _needed(
-    targets: Sequence[Target], inputs: Sequence[Path], options: FollowOptions, overwrite: bool, last: bool
+    targets: Sequence[Target],
+    there: Sequence[int],
+    inputs: Sequence[Path],
+    options: FollowOptions,
+    overwrite: bool,
+    last: bool,
 ) -> list[int]:
-    """Return the numbers of the frames of a pass that have to be made, after it is known that they can be written."""
+    """Return which of the frames that are there have to be made, after it is known that they can be written."""
     prepare_folder([target.path for target in targets])
-    needed = pending(targets, inputs, overwrite, options.resume)
+    needed = [there[k] for k in pending([targets[k] for k in there], inputs, overwrite, options.resume)]
     for number in needed if options.residuals and last else []:
         ensure_writable(residual_path(targets[number].path), overwrite or options.resume, inputs)
     return needed
@@ -151,11 +214,11 @@ def _write_tracks(
     points = [store.read(number) for number in range(len(sequence.names))]
     settings, tracking = sequence.bench.settings, sequence.tracking
     carried = carried_config(points[0].provenance, store.targets[0].path)
-    inputs = {f"particles_{number:04d}": target.path for number, target in enumerate(store.targets)}
+    inputs = {f"particles_{number:04d}": store.targets[number].path for number in sorted(store.there)}
     provenance = record("follow", carried.resolved() | tracking.told(), inputs)
     result = tracked(points, settings, tracking, provenance, found)
-    counts = [len(each.position_mm) for each in points]
-    notices = few_notices(counts, sequence.names, result)
+    counts = [len(points[number].position_mm) for number in sorted(store.there)]
+    notices = few_notices(counts, [sequence.names[number] for number in sorted(store.there)], result)
     console.warn(notices)
     told = replace(result.points, provenance=with_warnings(provenance, notices))
     write_points(output / TRACKS, result.format_name, told, overwrite=overwrite)
@@ -170,17 +233,22 @@ class _Files:
         self,
         targets: Sequence[Target],
         needed: frozenset[int],
+        there: frozenset[int],
+        reference: Reference,
         said: Sequence[Notice],
         residuals: bool,
         overwrite: bool,
         work: Frames,
     ) -> None:
-        """Take where the frames' files go, which are to be made, and what is said of all of them."""
-        self.targets, self.needed, self.said = targets, needed, said
+        """Take where the frames' files go, which are to be made, which there are, and what is said of all of them."""
+        self.targets, self.needed, self.there, self.said = targets, needed, there, said
+        self._nothing = no_points(PARTICLES_FORMAT, reference)
         self.residuals, self.overwrite, self.work = residuals, overwrite, work
 
     def read(self, number: int) -> Points:
-        """Return the particles of a frame."""
+        """Return the particles of a frame; none of one that was left out."""
+        if number not in self.there:
+            return self._nothing
         return read_points(self.targets[number].path, PARTICLES_FORMAT)
 
     def made(self, number: int) -> Points | None:
@@ -212,7 +280,7 @@ def _passes(
     These say which frames each is made with: on the way forwards those before it (the first with the second), on the
     way back all; `told` says what their background and mask are made of.
     """
-    every = [f"{sha256(frame.path)} {frame.page}\n" for frame in frames]
+    every = ["left out\n" if frame.fault else f"{sha256(frame.path)} {frame.page}\n" for frame in frames]
     resolved = settings.resolved()
 
     def target(path: Path, number: int, way: str, count: int) -> Target:

@@ -166,7 +166,7 @@ class Chain:
     def _followed(self, weights: Path) -> Vectors:
         given, output = self.options, self.steps.output
         chosen = FollowOptions(
-            dark=given.dark, background=given.background, mask=given.mask, dt_s=given.dt_s, resume=True
+            dark=given.dark, background=given.background, mask=given.mask, dt_s=given.dt_s, **self._resuming
         )
         files = [*self._of_frames("particles"), output / TRACKS, output / PLAYBACK]
         self._take("follow", files, lambda: follow_particles(weights, given.images, output, chosen, **self.common))
