@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from lfpiv_cli.files.batch import Frame
 from lfpiv_cli.interface import particles as particles_interface
 from lfpiv_cli.interface.particles import STEPS
 from lfpiv_cli.optics.camera import Camera
@@ -15,7 +18,8 @@ from lfpiv_cli.particles.prediction import Predicted
 from lfpiv_cli.particles.rounds import first_pass
 from lfpiv_cli.particles.second_frames import beyond_doubt, predicted_by, second_frame
 from lfpiv_cli.scale import Scale
-from lfpiv_cli.stages.reconstruct import _finder
+from lfpiv_cli.stages import finding
+from lfpiv_cli.stages.finding import Finder
 from tests.particle_images import found, task_with
 
 SEARCH_MM, SCALE = 0.6, Scale(0.1, 1.064)
@@ -105,11 +109,16 @@ def test_the_order_of_a_pairs_frames_does_not_matter(order: tuple[int, ...], mon
     monkeypatch.setattr(particles_interface, "find_first", first_of)
     monkeypatch.setattr(particles_interface, "find_second", second_of)
     monkeypatch.setattr(particles_interface, "find_beside", lambda bench, frame, own, beside: (own, beside))
+    monkeypatch.setattr(finding, "check_frame", lambda bench, raw, name: None)
+    frames = [Frame(Path(f"{number}.tif"), 0, 1) for number in range(4)]
+
+    def finder(beside: list[tuple[int, ...]], first_of: dict[int, int]) -> Finder:
+        return Finder(None, lambda number: (number, number), frames, beside, first_of, keep_going=False)
+
     second = "second 3 after 2, first 2"
     wanted = {0: ("first 2", [second]), 1: (second, ["first 2"])}
-    find = _finder(None, lambda number: (number, number), [(1,), (0,), (3,), (2,)], "ab", None)
+    pairs = finder([(1,), (0,), (3,), (2,)], {1: 0, 3: 2})
     for number in order:
-        assert find(2 + number, 2 + number) == wanted[number]
+        assert pairs.find(2 + number, 2 + number, None) == (wanted[number], [])
     # A sequence's frames stand alone at first.
-    find = _finder(None, lambda number: (number, number), [(1,), (0,)], "sequence", None)
-    assert find(1, 1) == ("first 1", ["first 0"])
+    assert finder([(1,), (0,)], {}).find(1, 1, None) == (("first 1", ["first 0"]), [])
