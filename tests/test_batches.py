@@ -136,19 +136,21 @@ def test_a_damaged_result_is_made_anew(weights, images, tmp_path, capsys, part) 
     assert after["f1.vtkhdf"][1] == before["f1.vtkhdf"][1]
 
 
-def test_what_somebody_else_put_there_is_not_replaced(weights, images, tmp_path) -> None:
+@pytest.mark.parametrize("whose", ["ours", "another program's"])
+def test_what_somebody_else_put_there_is_not_replaced(weights, images, tmp_path, whose) -> None:
     (tmp_path / "out").mkdir()
-    write_volume(
-        tmp_path / "out" / "f1.vtkhdf",
-        np.ones((2, 2, 2)),
-        Grid.centred((2, 2, 2), (0.1,) * 3, (0.0,) * 3),
-        Reference("mid_plane", 0.0),
-        provenance={},
-        attributes={},
-        overwrite=False,
-    )
+    there = tmp_path / "out" / "f1.vtkhdf"
+    if whose == "ours":
+        grid = Grid.centred((2, 2, 2), (0.1,) * 3, (0.0,) * 3)
+        reference = Reference("mid_plane", 0.0)
+        write_volume(there, np.ones((2, 2, 2)), grid, reference, provenance={}, attributes={}, overwrite=False)
+    else:
+        with h5py.File(there, "w") as file:
+            file["names"] = ["a", "b"]
+    before = there.read_bytes()
     with pytest.raises(OutputExistsError, match=r"f1.vtkhdf: exists and was made from other inputs"):
         run("reconstruct", weights, *images, *QUICK, "-o", tmp_path / "out", "--resume")
+    assert there.read_bytes() == before
 
 
 @pytest.mark.parametrize("kind", ["missing", "empty", "cut", "size", "no image"])
@@ -359,6 +361,7 @@ def test_a_folder_tells_whether_it_minds_case(tmp_path, monkeypatch) -> None:
     ignores_case.cache_clear()
     (tmp_path / "Folder").mkdir()
     minds = not (tmp_path / "fOLDER").exists()
+    assert (places.folded("A", tmp_path / "Folder") == "A") == minds
     assert ignores_case(tmp_path / "Folder") == ignores_case(tmp_path / "Folder" / "not yet") == (not minds)
     monkeypatch.setattr(places, "ignores_case", lambda folder: True)
     assert places.folded("Ü.tif", tmp_path) == places.folded("u\u0308.TIF", tmp_path)
