@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import wraps
 from pathlib import Path
 from typing import Any
@@ -190,6 +190,17 @@ def output_option(text: str, required: bool = True) -> Callable[..., Any]:
     return click.option("-o", "--output", type=FILE, required=required, help=text)
 
 
+# Of the paths that a command is given, those that it writes.
+OUTPUTS = ("output", "picture", "failures", "cache")
+
+
+def _inputs(arguments: Mapping[str, Any]) -> list[Path]:
+    """Return the files and folders that a command is given to read; a text may be one, too."""
+    given = [value for name, value in arguments.items() if name not in OUTPUTS]
+    flat = [each for value in given for each in (value if isinstance(value, tuple) else (value,))]
+    return [Path(each) for each in flat if isinstance(each, Path) or (isinstance(each, str) and Path(each).exists())]
+
+
 def common_options(command: Callable[..., dict[str, Any]]) -> Callable[..., None]:
     """Give a command the options that all share, and print the summary it returns.
 
@@ -205,13 +216,23 @@ def common_options(command: Callable[..., dict[str, Any]]) -> Callable[..., None
     @click.option(
         "--log", type=FILE, help="Add a line of JSON to this file for each event: start, frame, warning, end, error."
     )
+    @click.option("--verify", type=FILE, help="Check all inputs by this list of sha256sum before any work.")
     @click.option("-v", "--verbose", is_flag=True, help="Say more on stderr.")
     @click.option("-q", "--quiet", is_flag=True, help="Say nothing on stderr but errors.")
     @click.option("--debug", is_flag=True, expose_value=False, help="Show the traceback of an error.")
     @wraps(command)
-    def run(threads: int | None, as_json: bool, log: Path | None, verbose: bool, quiet: bool, **arguments: Any) -> None:
+    def run(
+        threads: int | None,
+        as_json: bool,
+        log: Path | None,
+        verify: Path | None,
+        verbose: bool,
+        quiet: bool,
+        **arguments: Any,
+    ) -> None:
         from lfpiv_cli.console import Console
         from lfpiv_cli.files.log import EventLog
+        from lfpiv_cli.files.recordings.complaints import taken_complaints
         from lfpiv_cli.notice import Notice
 
         warned: list[Notice] = []
@@ -229,12 +250,17 @@ def common_options(command: Callable[..., dict[str, Any]]) -> Callable[..., None
         ended_with: LimitMissedError | PartialError | None = None
         try:
             given = {name: value for name, value in arguments.items() if value is not None}
+            if verify is not None:
+                from lfpiv_cli.files.checksums import ensure_verified
+
+                ensure_verified(verify, _inputs(given))
             summary = command(console=console, **given)
         except (LimitMissedError, PartialError) as error:
             ended_with, summary = error, error.figures
         except BaseException as error:
             console.event("error", **error_record(error))
             raise
+        console.warn(taken_complaints())
         ended = error_record(ended_with) if ended_with else {"exit_code": 0}
         console.event("end", summary=summary, **ended)
         if kernel_cache.lost and "numba" in sys.modules:

@@ -45,6 +45,7 @@ def _read_page(path: Path, page: int, shape: Shape | None) -> Image:
         if colour not in PNG_SAMPLES:
             raise InputError(f"is a PNG of colour type {colour}: {GREY_HINT}")
         ensure_size("the image", (rows, columns), PNG_SAMPLES[colour] * (1 if bits <= 8 else 2), shape, len(content))
+        _ensure_pixels(content, rows, columns, bits * PNG_SAMPLES[colour])
         array = imagecodecs.png_decode(content)
         if array.shape[:2] != (rows, columns):
             raise InputError(f"decodes to {array.shape}, it declares {rows, columns}")
@@ -53,6 +54,25 @@ def _read_page(path: Path, page: int, shape: Shape | None) -> Image:
         raise type(error)(f"{path}: {error}") from error
     except Exception as error:  # a damaged file can raise anything inside the decoder
         raise InputError(f"{path}: cannot be decoded: {reason(error)}") from error
+
+
+def _ensure_pixels(content: bytes, rows: int, columns: int, bits: int) -> None:
+    """Refuse packed data that are more than the declared pixels, which a decoder may unpack all the same.
+
+    Parameters
+    ----------
+    bits : of a pixel, at most
+    """
+    # A byte for each line; interlaced images have seven passes, the lines of each filled up.
+    largest = rows * (columns * bits // 8 + 2) + 7 * (2 * rows + columns)
+    unpacker, place = zlib.decompressobj(), len(START)
+    while place < len(content):
+        length = int.from_bytes(content[place : place + 4], "big")
+        if content[place + 4 : place + 8] == b"IDAT":
+            largest -= len(unpacker.decompress(content[place + 8 : place + 8 + length], largest + 1))
+            if largest < 0 or unpacker.unconsumed_tail:
+                raise InputError(f"its data are more than the {columns} x {rows} pixels that it declares")
+        place += 12 + length
 
 
 def _png_header(content: bytes) -> tuple[int, int, int, int]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 import re
 from collections.abc import Iterator, Sequence
@@ -15,6 +14,7 @@ import tifffile
 
 from lfpiv_cli.errors import InputError, LfpivError
 from lfpiv_cli.files.inputs import reason
+from lfpiv_cli.files.recordings.complaints import keep_complaints, reading
 from lfpiv_cli.files.recordings.pixels import CUT, GREY_HINT, as_counts, ensure_size, one_channel
 from lfpiv_cli.files.recordings.recording import Image, Recording, Shape
 from lfpiv_cli.files.recordings.tiff_chain import directories
@@ -24,12 +24,12 @@ STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 BLACK_IS_ZERO, RGB, PALETTE = 1, 2, 3
 # TIFF's palettes hold 16-bit colours for indices of 8 bits.
 PALETTE_SHIFT = 8
+# Compressions of faxes: CCITT's three, and the first of them with lines of whole words.
+BLACK_AND_WHITE = (2, 3, 4, 32771)
 # How a TIFF says that its channels lie apart.
 SEPARATE = 2
 
-# The decoder's warnings about a damaged file repeat what our errors say.
-logging.getLogger("tifffile").addHandler(logging.NullHandler())
-logging.getLogger("tifffile").propagate = False
+keep_complaints("tifffile")
 
 
 def frames(path: Path) -> Recording:
@@ -64,12 +64,15 @@ def _naming(path: Path) -> Iterator[None]:
 
     A damaged file can raise anything inside the decoders, so anything becomes an `InputError`.
     """
+    token = reading.set(path)
     try:
         yield
     except LfpivError as error:
         raise type(error)(f"{path}: {error}") from error
     except Exception as error:
         raise InputError(f"{path}: cannot be decoded: {reason(error)}") from error
+    finally:
+        reading.reset(token)
 
 
 def _ensure_one_frame_a_page(tiff: tifffile.TiffFile, pages: int) -> None:
@@ -92,6 +95,8 @@ def _decode_page(page: tifffile.TiffPage, number: int, shape: Shape | None) -> I
         raise InputError(f"page {number} is {kind} with {page.samplesperpixel} samples per pixel: {GREY_HINT}")
     if page.dtype is None or page.dtype.kind not in "uif":
         raise InputError(f"page {number} has {page.bitspersample} bits per pixel of an unknown kind")
+    if page.compression in BLACK_AND_WHITE:
+        raise InputError(f"page {number} is packed as {page.compression.name}, for black and white alone: {GREY_HINT}")
     size = page.parent.filehandle.size
     pixel_bytes = page.dtype.itemsize * page.samplesperpixel
     ensure_size(f"page {number}", (page.imagelength, page.imagewidth), pixel_bytes, shape, size)

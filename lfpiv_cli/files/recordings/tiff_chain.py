@@ -18,6 +18,10 @@ TYPE_BYTES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4
 CLASSIC, BIG = 42, 43
 # A camera's directory holds some 20 tags; the decoder gives up at 4096.
 MOST_TAGS = 4096
+# Ten hours at 25 frames a second; a chain of more is looked through for minutes.
+MOST_PAGES = 1_000_000
+# Width, height and where the data of strips or tiles lie: without them a directory is of no image.
+SIZE_TAGS, DATA_TAGS = {256, 257}, {273, 324}
 
 
 def directories(file: BinaryIO, size: int) -> list[int]:
@@ -49,6 +53,8 @@ def directories(file: BinaryIO, size: int) -> list[int]:
         if offset in seen:
             raise InputError(f"its directories form a circle after page {len(seen) - 1}")
         seen[offset] = None
+        if len(seen) > MOST_PAGES:
+            raise InputError(f"it holds more than {MOST_PAGES} pages")
         offset = _next_directory(file, size, offset, len(seen) - 1, order, big)
     if not seen:
         raise InputError("it holds no pages")
@@ -70,12 +76,16 @@ def _next_directory(file: BinaryIO, size: int, offset: int, page: int, order: st
     body = file.read(length)
     if len(body) < length:
         raise InputError(f"the directory of page {page} ends after {size} bytes: {CUT}")
+    tags = set()
     for k in range(count):
         tag, kind, values = struct.unpack_from(order + "HH" + pointer_format, body, k * entry_bytes)
+        tags.add(tag)
         bytes_used = values * TYPE_BYTES.get(kind, 1)
         if bytes_used > inline_bytes:
             (place,) = struct.unpack_from(order + pointer_format, body, (k + 1) * entry_bytes - inline_bytes)
             if place + bytes_used > size:
                 raise InputError(f"tag {tag} of page {page} ends at byte {place + bytes_used} of {size}: {CUT}")
+    if not tags >= SIZE_TAGS or not tags & DATA_TAGS:
+        raise InputError(f"the directory of page {page} is of no image, it has the tags {sorted(tags)[:20]}: {CUT}")
     (following,) = struct.unpack_from(order + pointer_format, body, count * entry_bytes)
     return following
