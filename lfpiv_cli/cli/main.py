@@ -26,6 +26,7 @@ from lfpiv_cli.cli import (
 )
 from lfpiv_cli.cli.outcome import Terminated, outcome_of, print_json_error, printable
 from lfpiv_cli.cli.streams import ensure_said, open_streams
+from lfpiv_cli.files.inputs import ensure_address_space
 
 COMMANDS = (
     planning.init,
@@ -83,6 +84,7 @@ def main() -> NoReturn:
     signal.signal(signal.SIGTERM, _terminate)
     stdout = open_streams()
     try:
+        ensure_address_space()
         cli.main(standalone_mode=False)
         ensure_said(stdout)
         code = 0

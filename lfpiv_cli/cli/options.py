@@ -17,7 +17,8 @@ from lfpiv_cli.files import kernel_cache
 from lfpiv_cli.files.shares import Shard, parse_time_limit
 from lfpiv_cli.names import InputKind, Pairing, names_in
 
-FILE = click.Path(path_type=Path)
+# Whether a file can be read its reader tells: an input's fault, and none of the command line.
+FILE = click.Path(path_type=Path, readable=False)
 POSITIVE = click.FloatRange(min=0.0, min_open=True)
 
 config_argument = click.argument("config", type=FILE)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import os
+from pathlib import Path
 from typing import Any
 
 import click
 
-from lfpiv_cli.errors import LfpivError, LimitMissedError, PartialError
-from lfpiv_cli.files.atomic import without_nan
+from lfpiv_cli.errors import LfpivError, LimitMissedError, OutputError, PartialError
+from lfpiv_cli.files.atomic import shown, without_nan
+from lfpiv_cli.files.inputs import reason
 
 EXIT_BUG = 1
 EXIT_INTERRUPTED = 130
@@ -29,6 +32,12 @@ def outcome_of(error: BaseException) -> tuple[str, int]:
         return "terminated", EXIT_TERMINATED
     if isinstance(error, LfpivError):
         return str(error), error.exit_code
+    if isinstance(error, MemoryError) or "can't start new thread" in str(error):
+        words = reason(error) if str(error) else "the system gave no more"
+        return f"too little memory: {words}; a smaller volume, or fewer --threads, need less", OutputError.exit_code
+    if isinstance(error, OSError) and error.errno and error.filename is not None:
+        # What readers meet they say themselves: this is a place where nothing can be made.
+        return f"{shown(Path(os.fsdecode(error.filename)))}: cannot be used: {reason(error)}", OutputError.exit_code
     return f"a bug: {type(error).__name__}: {error} (run again with --debug to see where)", EXIT_BUG
 
 

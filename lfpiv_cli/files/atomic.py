@@ -20,6 +20,8 @@ from lfpiv_cli.files.inputs import reason, split_part
 # How much of the target's name the temporary file keeps: 40 characters of 4 bytes and the rest stay below the 255 bytes
 # that common file systems allow.
 KEPT_CHARACTERS = 40
+# Of a path in a message: a line or two.
+LONGEST_SHOWN = 200
 
 
 def ensure_writable(target: Path, overwrite: bool, inputs: Iterable[Path] = ()) -> None:
@@ -37,6 +39,7 @@ def ensure_writable(target: Path, overwrite: bool, inputs: Iterable[Path] = ()) 
     for path in inputs:
         if _same_file(target, split_part(path)[0]):
             raise UsageError(f"{target}: the output is also an input")
+    _ensure_possible(target)
     if target.is_dir():
         raise OutputError(f"{target}: cannot be written: it is a folder")
     if os.path.lexists(target):
@@ -49,6 +52,22 @@ def ensure_writable(target: Path, overwrite: bool, inputs: Iterable[Path] = ()) 
         raise OutputError(f"{target}: cannot be written: the folder {folder} does not exist")
     if not os.access(folder, os.W_OK | os.X_OK):
         raise OutputError(f"{target}: cannot be written: the folder {folder} is read-only")
+
+
+def _ensure_possible(target: Path) -> None:
+    """Refuse a name that no file can have: the system would raise wherever it is asked of it."""
+    try:
+        os.lstat(target)
+    except (FileNotFoundError, NotADirectoryError):
+        return
+    except (OSError, ValueError) as error:
+        raise OutputError(f"{shown(target)}: cannot be written: {reason(error)}") from error
+
+
+def shown(path: Path) -> str:
+    """Return a path as a message names it: one that is too long for any file by its end."""
+    text = str(path)
+    return text if len(text) <= LONGEST_SHOWN else f"...{text[-LONGEST_SHOWN:]}"
 
 
 def write_atomically(

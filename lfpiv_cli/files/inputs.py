@@ -7,10 +7,13 @@ import re
 import stat
 from pathlib import Path
 
-from lfpiv_cli.errors import InputError
+from lfpiv_cli.errors import InputError, OutputError
 
 # Where the system does not tell its memory (Windows), files that declare more than this are refused.
 MEMORY_WHERE_UNKNOWN = 16 * 1024**3
+
+# With 0.8 GiB numerical libraries end by SIGSEGV as they are loaded, with 1.2 GiB small work is done.
+LEAST_ADDRESS_SPACE = 5 * 2**28
 
 # A file, and what of it is meant: a dataset in it, or how its frames are laid out; and which of these, counted from 0.
 PART = re.compile(r"(.+?\.[A-Za-z][A-Za-z0-9]*):(.+)", re.DOTALL)
@@ -70,9 +73,36 @@ def reason(error: BaseException) -> str:
     return lines[0] if lines else type(error).__name__
 
 
-def physical_memory() -> int:
-    """Return the machine's memory in bytes."""
+def address_space() -> int | None:
+    """Return the limit of this process's address space in bytes, None where there is none."""
     try:
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+        import resource
+    except ImportError:  # of Unix alone
+        return None
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    return None if limit == resource.RLIM_INFINITY else limit
+
+
+def ensure_address_space() -> None:
+    """Refuse to begin where the libraries would end the process, without a word, for want of addresses.
+
+    Raises
+    ------
+    OutputError
+    """
+    limit = address_space()
+    if limit is not None and limit < LEAST_ADDRESS_SPACE:
+        raise OutputError(
+            f"too little memory: the address space of this process is limited to {limit / 1e9:.2f} GB (ulimit -v), and "
+            f"the libraries alone need {LEAST_ADDRESS_SPACE / 1e9:.2f} GB"
+        )
+
+
+def physical_memory() -> int:
+    """Return the machine's memory in bytes, or what of it this process may use."""
+    limit = address_space()
+    try:
+        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, ValueError, OSError):
-        return MEMORY_WHERE_UNKNOWN
+        memory = MEMORY_WHERE_UNKNOWN
+    return memory if limit is None else min(memory, limit)
