@@ -42,7 +42,6 @@ def vectors(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("build-weights", CONFIG, "-o", "{place}.h5"),
         ("calibrate-snapshot", CONFIG, "--white", SAMPLE / "white.tif", "-o", "{place}.h5"),
         ("combine", "{vectors}", "{vectors}", "-o", "{place}.vtkhdf"),
-        ("correlate", "{vectors}", "{vectors}", "-o", "{place}.vtkhdf"),
         ("track", "{vectors}", "{vectors}", "-o", "{place}.vtkhdf"),
         ("validate", "flow", CONFIG, "--vectors", "{vectors}", "-o", "{place}"),
         ("run", CONFIG, SAMPLE / "pair_a.tif", SAMPLE / "pair_b.tif", "--white", SAMPLE / "white.tif", "-o", "{place}"),
