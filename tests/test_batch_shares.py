@@ -15,6 +15,7 @@ from lfpiv_cli.errors import InputError, PartialError, StoppedEarlyError, UsageE
 from lfpiv_cli.files import watching
 from lfpiv_cli.files.images import read_image
 from lfpiv_cli.files.shares import Deadline
+from tests.test_particle_stage import write_frame
 
 ROOT = Path(__file__).parent.parent
 SAMPLE = ROOT / "sample_data"
@@ -129,6 +130,25 @@ def test_fields_of_shards_and_their_mean_by_a_last_command(volumes: list[Path], 
     assert bytes_of(tmp_path / "v") == bytes_of(tmp_path / "one")
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "v").iterdir()} == made
     assert (tmp_path / "mean.vtkhdf").read_bytes() == (tmp_path / "mean_one.vtkhdf").read_bytes()
+
+
+def test_tracks_of_workers_and_shards(in_process: str, tmp_path: Path, rng: np.random.Generator) -> None:
+    particles = tmp_path / "particles"
+    particles.mkdir()
+    for pair in (1, 2):
+        start = rng.uniform((-1.5, -1.1, -2.0), (1.5, 1.1, 2.0), (60, 3))
+        for name, moved in (("a", 0.0), ("b", 0.1)):
+            write_frame(particles / f"{pair}{name}.vtkhdf", start + (moved, 0.0, 0.0))
+    for name, shares in {
+        "one": [()],
+        "dask": [("--dask", in_process)],
+        "shards": [("--shard", "1/2"), ("--shard", "2/2")],
+    }.items():
+        for share in shares:
+            run("track", particles, "--pairing", "ab", "--quiet", *share, "-o", tmp_path / name)
+    assert len(bytes_of(tmp_path / "one")) == 2
+    assert bytes_of(tmp_path / "dask") == bytes_of(tmp_path / "one")
+    assert bytes_of(tmp_path / "shards") == bytes_of(tmp_path / "one")
 
 
 def test_a_batch_stops_before_its_time_limit_and_goes_on(

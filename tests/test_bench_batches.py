@@ -32,7 +32,7 @@ def test_the_cost_of_a_batch_and_what_workers_gain_are_printed(tmp_path: Path, c
         assert share is not None
         assert 0.3 < float(share[1]) <= 1.0
     print_workers(experiment, tmp_path)
-    assert len(re.findall(r"[\d.]+ times", capsys.readouterr().out)) == 2
+    assert len(re.findall(r"[\d.]+ times", capsys.readouterr().out)) == 4
 
 
 @pytest.mark.slow
