@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import hashlib
+import json
 import shutil
 import signal
 import subprocess
@@ -19,6 +20,7 @@ import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -204,17 +206,33 @@ def seconds_of(*commands: Sequence[str]) -> float:
 
 
 def print_workers(experiment: Experiment, folder: Path) -> None:
-    """Print what two workers of Dask gain over one, and two processes over one, each with one thread."""
+    """Print what two workers of Dask gain over one, and two processes over one, each with one thread.
+
+    In seconds with all that starts, and in frames a second from the first frame's end to the last one's.
+    """
     for name, ways in {
         "workers of Dask": ([("--dask", "local:1")], [("--dask", "local:2")]),
         "processes": ([()], [("--shard", "1/2"), ("--shard", "2/2")]),
     }.items():
-        taken = []
+        taken, rates = [], []
         for number, shares in enumerate(ways):
             output = folder / f"{name.split()[0]}_{number}"
-            taken.append(seconds_of(*(command(experiment, output, "--threads", "1", *share) for share in shares)))
-        one_s, two_s = taken
-        print(f"{name}: one {one_s:.1f} s, two {two_s:.1f} s, {one_s / two_s:.2f} times (limit 1.8)", flush=True)
+            log = output.with_suffix(".log")
+            common = ("--threads", "1", "--log", str(log))
+            taken.append(seconds_of(*(command(experiment, output, *common, *share) for share in shares)))
+            rates.append(frames_per_s(log))
+        print(
+            f"{name}: one {taken[0]:.1f} s, two {taken[1]:.1f} s, {taken[0] / taken[1]:.2f} times; from the first frame "
+            f"on {rates[0]:.3f} and {rates[1]:.3f} frames a second, {rates[1] / rates[0]:.2f} times (limit 1.8)",
+            flush=True,
+        )
+
+
+def frames_per_s(log: Path) -> float:
+    """Return how many frames were done in a second, from the first one's end to the last one's."""
+    events = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
+    ends = sorted(datetime.fromisoformat(event["time"]) for event in events if event["event"] == "frame")
+    return (len(ends) - 1) / (ends[-1] - ends[0]).total_seconds()
 
 
 def print_kills(experiment: Experiment, folder: Path, kills: int, rng: np.random.Generator) -> None:
