@@ -222,8 +222,8 @@ def print_workers(experiment: Experiment, folder: Path) -> None:
             taken.append(seconds_of(*(command(experiment, output, *common, *share) for share in shares)))
             rates.append(frames_per_s(log))
         print(
-            f"{name}: one {taken[0]:.1f} s, two {taken[1]:.1f} s, {taken[0] / taken[1]:.2f} times; from the first frame "
-            f"on {rates[0]:.3f} and {rates[1]:.3f} frames a second, {rates[1] / rates[0]:.2f} times (limit 1.8)",
+            f"{name}: one {taken[0]:.1f} s, two {taken[1]:.1f} s, {taken[0] / taken[1]:.2f} times; after the first "
+            f"frame {rates[0]:.3f} and {rates[1]:.3f} frames a second, {rates[1] / rates[0]:.2f} times (limit 1.8)",
             flush=True,
         )
 
