@@ -78,6 +78,7 @@ def test_a_frame_that_would_not_be_done_is_not_begun(monkeypatch: pytest.MonkeyP
     deadline.took(10.0)
     clock[0] = 59.0
     assert deadline.leaves_time()
+    assert not deadline.leaves_time(2)
     clock[0] = 61.0
     assert not deadline.leaves_time()
     told = deadline.error(2, 5, "frame")

@@ -113,9 +113,9 @@ class Deadline:
         """Remember the longest frame: by it the next one is judged."""
         self.longest_s = max(self.longest_s, seconds)
 
-    def leaves_time(self) -> bool:
-        """Return whether a frame that takes as long as the longest one so far would be done in time."""
-        return self.limit_s is None or self._left_s() > self.longest_s
+    def leaves_time(self, frames: int = 1) -> bool:
+        """Return whether so many frames, each as long as the longest one so far, would be done in time."""
+        return self.limit_s is None or self._left_s() > frames * self.longest_s
 
     def error(self, done: int, total: int, unit: str) -> StoppedEarlyError:
         """Return the error of a batch that stops for lack of time."""

@@ -1,8 +1,8 @@
 """Batches on the workers of Dask: paths and numbers go to them, what is told of each output comes back.
 
-Each worker process makes the batch once, from the arguments that the command itself made it from, and keeps it. It gets
-one output at a time: so a worker that ends takes one with it, which goes to another, and an output at which several
-workers end is known by it.
+Each worker process makes the batch once, from the arguments that the command itself made it from, and keeps it. It
+makes one output at a time, and has a second one to go on with: so it is known at which output a worker ended, what it
+had goes to others, and an output at which several workers end is given up alone.
 """
 
 from __future__ import annotations
@@ -187,7 +187,7 @@ class _Outputs:
     """The outputs of a batch that are left, and which worker makes each of the others.
 
     Each is given to one worker and no other, and taken back when that one ends. So it is known at which output a worker
-    ended, which the scheduler does not tell of workers that it has given several.
+    ended, which the scheduler does not tell of workers that it has given several: the first of those that it had.
     """
 
     def __init__(
@@ -208,7 +208,7 @@ class _Outputs:
             workers = self._workers()
             self._take_back(workers)
             if deadline.leaves_time():
-                self._hand_out(workers)
+                self._hand_out(workers, deadline.leaves_time(2))
             for number, reply in self._done():
                 if reply.made is Turn.CLAIMED:
                     self._claimed.append(number)
@@ -234,29 +234,47 @@ class _Outputs:
 
     def _take_back(self, workers: set[str]) -> None:
         """Take back what was given to workers that have ended."""
-        for future, (number, worker) in list(self._running.items()):
-            if worker not in workers and not future.done():
-                self._worker_ended(future, number, worker)
+        for worker in {worker for _, worker in self._running.values()} - workers:
+            at_work, *waiting = [future for future, given in self._running.items() if given[1] == worker]
+            for future in waiting:
+                if not future.done():
+                    self._left.put_back(self._let_go(future)[0])
+            if not at_work.done():
+                self._worker_ended(at_work)
 
-    def _worker_ended(self, future: Future, number: int, worker: str) -> None:
-        """Leave an output to another worker, or give it up after some."""
-        self._running.pop(future, None)
+    def _let_go(self, future: Future) -> tuple[int, str]:
+        """Ask no longer for an output; return its number and its worker."""
         self._client.cancel([future], force=True)
+        return self._running.pop(future)
+
+    def _worker_ended(self, future: Future) -> None:
+        """Leave an output to another worker than the one that ended at it, or give it up after some."""
+        number, worker = self._let_go(future)
         self._ends[number] += 1
         if self._ends[number] < WORKERS_GIVEN_UP:
             text = f"the worker {worker} ended while it worked on it, which goes to another"
             self._console.warn([Notice("worker-ended", self._names[number], text, "memory, or its time limit")])
             self._left.put_back(number)
 
-    def _hand_out(self, workers: set[str]) -> None:
-        """Give each worker that has nothing to do an output."""
+    def _hand_out(self, workers: set[str], ahead: bool) -> None:
+        """Give each worker that has nothing to do an output; then one to go on with, if it is to be done `ahead`.
+
+        The last outputs are kept for whoever is done first.
+        """
         if not self._left and not self._running:
             # What another command was making may be left by it.
             time.sleep(SECONDS_BETWEEN_LOOKS)
             self._left, self._claimed = Runs(self._claimed), []
-        for worker in sorted(workers - {worker for _, worker in self._running.values()}):
-            if not self._left:
-                return
+        given = Counter(worker for _, worker in self._running.values())
+        for worker in sorted(worker for worker in workers if not given[worker]):
+            self._give(worker)
+        for worker in sorted(worker for worker in workers if given[worker] < 2):
+            if ahead and len(self._left) > len(workers):
+                self._give(worker)
+
+    def _give(self, worker: str) -> None:
+        """Give a worker an output, if there is one left."""
+        if self._left:
             number = self._left.next_for(worker)
             future = self._client.submit(_make, self._kept, number, self._before[number], workers=[worker], pure=False)
             self._running[future] = number, worker
@@ -266,13 +284,12 @@ class _Outputs:
         """Yield what is done, after a while at the latest."""
         self._some_done.wait(LOOK_S)
         self._some_done.clear()
-        for future, (number, worker) in [item for item in self._running.items() if item[0].done()]:
+        for future in [future for future in self._running if future.done()]:
             try:
                 reply = future.result(timeout=CONNECT_S)
             except (KilledWorker, TimeoutError):  # it ended after it was done, and before it could tell
-                self._worker_ended(future, number, worker)
+                self._worker_ended(future)
             except CancelledError as error:
                 raise StoppedEarlyError(SCHEDULER_ENDED) from error
             else:
-                del self._running[future]
-                yield number, reply
+                yield self._running.pop(future)[0], reply
