@@ -16,6 +16,9 @@ import sys
 from dask_jobqueue import SLURMCluster
 
 WALL_TIME = "02:00:00"
+# Dask has its workers give back the memory of each array at once, which takes longer than a small frame's work; these
+# are the values that programs have otherwise.
+PROLOGUE = ["export MALLOC_MMAP_THRESHOLD_=33554432", "export MALLOC_TRIM_THRESHOLD_=67108864"]
 # A worker ends by itself before Slurm ends it, and so that not all end at once; frames go to others.
 WORKER_OPTIONS = ["--lifetime", "110m", "--lifetime-stagger", "5m"]
 
@@ -36,6 +39,7 @@ def main() -> int:
         memory=given.memory,
         walltime=WALL_TIME,
         job_name="lfpiv",
+        job_script_prologue=PROLOGUE,
         worker_extra_args=WORKER_OPTIONS,
     ) as cluster:
         cluster.scale(jobs=given.jobs)

@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
+import dask
 from distributed import Client, Future, KilledWorker, LocalCluster, Worker, WorkerPlugin, get_worker
 
 import lfpiv_cli
@@ -39,6 +40,9 @@ from lfpiv_cli.threads import told_threads, use_threads
 LOCAL = re.compile(r"local(?::(\d{1,4}))?", re.ASCII)
 # An output at which so many workers have ended is given up.
 WORKERS_GIVEN_UP = 3
+# Of workers on this machine. By Dask's own they would give back the memory of each array at once (MALLOC_TRIM_THRESHOLD_):
+# half as long again for small frames.
+ENVIRONMENT = {name: 1 for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")}
 # How often it is looked whether workers have come or gone, and for how long a scheduler is asked.
 LOOK_S, CONNECT_S = 1.0, 20.0
 SCHEDULER_ENDED = "--dask: the scheduler has ended; the same command with --resume goes on"
@@ -165,6 +169,7 @@ def _own_cluster(workers: int) -> Iterator[str]:
     workers = workers or max((os.cpu_count() or 1) // (told_threads() or 1), 1)
     with (
         tempfile.TemporaryDirectory(prefix="lfpiv-dask-", ignore_cleanup_errors=True) as folder,
+        dask.config.set({"distributed.nanny.pre-spawn-environ": ENVIRONMENT}),
         LocalCluster(
             n_workers=workers,
             threads_per_worker=1,
