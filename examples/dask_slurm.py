@@ -16,7 +16,7 @@ import sys
 from dask_jobqueue import SLURMCluster
 
 WALL_TIME = "02:00:00"
-# Dask has its workers give back the memory of each array at once, which takes longer than a small frame's work; these
+# Dask has its workers give back the memory of each array at once, which takes half as long again for small frames; these
 # are the values that programs have otherwise.
 PROLOGUE = ["export MALLOC_MMAP_THRESHOLD_=33554432", "export MALLOC_TRIM_THRESHOLD_=67108864"]
 # A worker ends by itself before Slurm ends it, and so that not all end at once; frames go to others.
@@ -32,7 +32,7 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=20)
     parser.add_argument("--memory", default="8GB")
     given = parser.parse_args()
-    # One frame at a time in each process: a frame takes all the memory bandwidth that a core has.
+    # One frame at a time in each process, with one thread.
     with SLURMCluster(
         cores=1,
         processes=1,

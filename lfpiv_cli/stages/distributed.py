@@ -40,9 +40,9 @@ from lfpiv_cli.threads import told_threads, use_threads
 LOCAL = re.compile(r"local(?::(\d{1,4}))?", re.ASCII)
 # An output at which so many workers have ended is given up.
 WORKERS_GIVEN_UP = 3
-# Of workers on this machine. By Dask's own they would give back the memory of each array at once (MALLOC_TRIM_THRESHOLD_):
-# half as long again for small frames.
-ENVIRONMENT = {name: 1 for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")}
+# Of workers on this machine. Dask's own has them give back the memory of each array at once (MALLOC_TRIM_THRESHOLD_),
+# which takes half as long again for small frames.
+ENVIRONMENT = {"OMP_NUM_THREADS": 1, "MKL_NUM_THREADS": 1, "OPENBLAS_NUM_THREADS": 1}
 # How often it is looked whether workers have come or gone, and for how long a scheduler is asked.
 LOOK_S, CONNECT_S = 1.0, 20.0
 SCHEDULER_ENDED = "--dask: the scheduler has ended; the same command with --resume goes on"
