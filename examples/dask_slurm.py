@@ -16,8 +16,8 @@ import sys
 from dask_jobqueue import SLURMCluster
 
 WALL_TIME = "02:00:00"
-# Dask has its workers give back the memory of each array at once, which takes half as long again for small frames; these
-# are the values that programs have otherwise.
+# Dask has its workers give back the memory of each array at once, which takes half as long again for small frames.
+# These are the values that programs have otherwise.
 PROLOGUE = ["export MALLOC_MMAP_THRESHOLD_=33554432", "export MALLOC_TRIM_THRESHOLD_=67108864"]
 # A worker ends by itself before Slurm ends it, and so that not all end at once; frames go to others.
 WORKER_OPTIONS = ["--lifetime", "110m", "--lifetime-stagger", "5m"]
