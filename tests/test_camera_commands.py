@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,8 +17,10 @@ from click.testing import CliRunner
 
 from lfpiv_cli.cli import cli
 from lfpiv_cli.cli.outcome import outcome_of
-from lfpiv_cli.files.provenance import carried_record, seconds_between, sha256
-from lfpiv_cli.files.vtkhdf import open_volume
+from lfpiv_cli.errors import InputError
+from lfpiv_cli.files.batch import frames_of, step_between
+from lfpiv_cli.files.provenance import carried_record, even_step_s, seconds_between, sha256
+from lfpiv_cli.files.vtkhdf import open_vectors, open_volume
 from tests import camera_files
 
 ROWS, COLUMNS = 100, 120
@@ -28,7 +31,7 @@ RIG = {
         "sensor": {"pixel_um": 5.5, "columns": COLUMNS, "rows": ROWS},
     },
     "media": {"air": 1.0, "window": 1.49, "fluid": 1.33},
-    "volume": {"shape_xyz": [4, 3, 3], "voxel_mm": [0.1, 0.1, 0.4]},
+    "volume": {"shape_xyz": [8, 8, 4], "voxel_mm": [0.1, 0.1, 0.4]},
 }
 PACKED = f"{COLUMNS}x{ROWS}x12:packing=low-first"
 
@@ -112,6 +115,41 @@ def test_info_tells_pages_size_bits_and_rate(folder: Path, name: str) -> None:
     if timed:
         assert found["frame_rate_hz"] == pytest.approx(camera_files.RATE_HZ, rel=1e-6)
         assert found["longest_step_s"] == pytest.approx(0.0005, abs=1e-9)
+
+
+def test_the_recording_tells_the_time_between_frames(folder: Path, tmp_path: Path) -> None:
+    def correlated(name: str, *options: object) -> dict[str, Any]:
+        run("reconstruct", folder / "weights.h5", folder / name, "--iterations", 1, "-o", tmp_path / name)
+        stem = Path(name).stem
+        pair = [tmp_path / name / f"{stem}_000{page}.vtkhdf" for page in range(2)]
+        output = tmp_path / f"{name}.vtkhdf"
+        windows = ("--windows", "4", "--overlap", "0")
+        run("correlate", *pair, *windows, *options, "-o", output)
+        return {"pair": pair, "record": carried_record(output), "field": open_vectors(output)}
+
+    timed = correlated("cine.cine")
+    assert timed["record"]["config"]["correlation"]["dt_s"] == pytest.approx(0.0005, abs=1e-9)
+    assert timed["field"].dt_s == pytest.approx(0.0005, abs=1e-9)
+    assert correlated("tiff.tif")["field"].dt_s is None
+    given = correlated("seq.seq", "--dt-s", 0.25)
+    assert given["field"].dt_s == 0.25
+    told, code = fault_of("correlate", *reversed(timed["pair"]), "-o", tmp_path / "back.vtkhdf")
+    assert "do not increase" in told
+    assert code == 4
+
+
+def test_steps_between_frames_are_even_or_refused(tmp_path: Path) -> None:
+    def records(*times: float) -> list[dict[str, Any]]:
+        return [{"inputs": {"image": {"sha256": "0", "time_s": time}}} for time in times]
+
+    names = ["a", "b", "c"]
+    assert even_step_s(records(0.0, 0.1, 0.201), names) == pytest.approx(0.1005)
+    assert even_step_s([*records(0.0, 0.1), {"inputs": {"image": {"sha256": "0"}}}], names) is None
+    with pytest.raises(InputError, match=r"a to c: .* are 0\.1 to 0\.2 s apart.*--dt-s"):
+        even_step_s(records(0.0, 0.1, 0.3), names)
+    camera_files.write_cine(tmp_path / "t.cine", np.zeros((3, 2, 4), np.uint8))
+    assert step_between(frames_of([tmp_path / "t.cine"])) == pytest.approx(0.0005, abs=1e-9)
+    assert step_between(frames_of([tmp_path / "t.cine"])[:1]) is None
 
 
 def test_info_still_tells_of_results_and_of_nothing_else(folder: Path) -> None:

@@ -46,7 +46,9 @@ mask_option = click.option(
     help="Image that is black where pixels are left out (reflections, bubbles), or still: where light stands still in "
     "the images given, brighter than what moves.",
 )
-dt_option = click.option("--dt-s", type=POSITIVE, help="Time from one frame to the next; default from the config.")
+dt_option = click.option(
+    "--dt-s", type=POSITIVE, help="Time from one frame to the next; default from the config, or the recording."
+)
 resume_option = click.option(
     "--resume", is_flag=True, help="Skip outputs that are complete and made from the same inputs."
 )

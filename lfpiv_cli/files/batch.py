@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum, auto
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from lfpiv_cli.files.hdf5 import replace_provenance
 from lfpiv_cli.files.images import count_pages, times_of
 from lfpiv_cli.files.inputs import split_part
 from lfpiv_cli.files.places import ensure_apart, folded
-from lfpiv_cli.files.provenance import bear_alike, without_warnings
+from lfpiv_cli.files.provenance import bear_alike, ensure_even, without_warnings
 from lfpiv_cli.files.whole import read_whole
 
 VTKHDF_SUFFIX = ".vtkhdf"
@@ -40,6 +41,21 @@ class Frame:
         """When it was taken, in s from a moment of its file's own; None where the file does not tell."""
         times = None if self.fault is not None else times_of(self.path)
         return None if times is None else float(times[self.page])
+
+
+def step_between(frames: Sequence[Frame]) -> float | None:
+    """Return the time from one frame to the next; None where they are not of one recording, or it does not tell.
+
+    Raises
+    ------
+    InputError : frames were not taken at an even rate, or not in this order
+    """
+    times = [frame.time_s for frame in frames if frame.path == frames[0].path]
+    told = [time for time in times if time is not None]
+    if len(told) < max(len(frames), 2):
+        return None
+    names = [f"{frame.path} page {frame.page}" for frame in frames]
+    return ensure_even([after - before for before, after in pairwise(told)], names)
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,11 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from importlib.metadata import version
+from itertools import pairwise
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -30,6 +31,9 @@ from lfpiv_cli.notice import Notice
 FILES_REMEMBERED = 64
 # The libraries that the figures pass through.
 LIBRARIES = ("numpy", "scipy", "numba", "h5py", "tifffile", "imagecodecs", "opencv-contrib-python-headless")
+
+# Steps between frames that differ by this share of their mean are not even: a dropped frame, or stamps too coarse.
+UNEVEN = 0.02
 
 # Sections of the config that a command does not read: whatever they say, it makes the same.
 AFTER_VOLUMES = ("correlation", "simulation", "validation")
@@ -151,6 +155,30 @@ def seconds_between(first: Mapping[str, Any], second: Mapping[str, Any]) -> floa
     if before is None or after is None or images[0]["sha256"] != images[1]["sha256"]:
         return None
     return float(after) - float(before)
+
+
+def even_step_s(records: Sequence[Mapping[str, Any]], names: Sequence[str]) -> float | None:
+    """Return the time from one frame to the next by the records of results; None where it is not told.
+
+    Raises
+    ------
+    InputError : frames are not in the order in which they were taken, or not evenly spaced in time
+    """
+    steps = [seconds_between(*pair) for pair in pairwise(records)]
+    told = [step for step in steps if step is not None]
+    if not told or len(told) < len(steps):
+        return None
+    return ensure_even(told, names)
+
+
+def ensure_even(steps_s: Sequence[float], names: Sequence[str]) -> float:
+    """Return the mean of the times between frames, which are to be alike; see `even_step_s`."""
+    mean_s, span = sum(steps_s) / len(steps_s), f"{names[0]} to {names[-1]}: the recording's times"
+    if min(steps_s) <= 0.0:
+        raise InputError(f"{span} do not increase from frame to frame; give them in order, or --dt-s")
+    if max(steps_s) - min(steps_s) > UNEVEN * mean_s:
+        raise InputError(f"{span} are {min(steps_s):g} to {max(steps_s):g} s apart, expected even steps; give --dt-s")
+    return mean_s
 
 
 def _file_and_part(given: Mapping[str, str]) -> tuple[str, str | None]:

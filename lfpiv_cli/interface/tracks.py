@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files.config import Config, carried_config
 from lfpiv_cli.files.particle_file import TRACKS_FORMAT, TRAJECTORIES_FORMAT, Points
-from lfpiv_cli.files.provenance import record
+from lfpiv_cli.files.provenance import even_step_s, record
 from lfpiv_cli.flow.field import MM_TO_M, VectorField
 from lfpiv_cli.flow.from_tracks import Paths, WindowGrid, vectors_from_paths
 from lfpiv_cli.interface.notices import warn_of
@@ -74,7 +74,7 @@ def track(
     """
     ensure_frames(len(particles), shortest)
     names = [f"frame {number}" for number in range(len(particles))]
-    settings = settings_of([each.provenance for each in particles], names).overridden("correlation", dt_s=dt_s)
+    settings = settings_of([each.provenance for each in particles], names, dt_s)
     counts = [len(each.position_mm) for each in particles]
     ensure_particles(counts, names)
     chosen = tracking_of(settings, search_voxel, shortest, len(particles), names[0])
@@ -277,18 +277,23 @@ def still_notices(tracks: Points, name: str) -> list[Notice]:
     ]
 
 
-def settings_of(records: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Config:
+def settings_of(records: Sequence[Mapping[str, Any]], names: Sequence[str], dt_s: float | None = None) -> Config:
     """Return the config that all frames were made with, by the records that they carry.
+
+    The time between frames is the one given here, else the config's, else what the recording of the frames tells.
 
     Raises
     ------
     InputError
-        They were not.
+        They were made with different ones, or were not taken at an even rate.
     """
     for name, made in zip(names[1:], records[1:], strict=True):
         if made.get("config") != records[0].get("config"):
             raise InputError(f"{name}: was made with another config than {names[0]}")
-    return carried_config(records[0], names[0])
+    settings = carried_config(records[0], names[0]).overridden("correlation", dt_s=dt_s)
+    if settings.correlation.dt_s is None:
+        settings = settings.overridden("correlation", dt_s=even_step_s(records, names))
+    return settings
 
 
 def tracking_of(settings: Config, search_voxel: float | None, shortest: int | None, frames: int, name: str) -> Tracking:

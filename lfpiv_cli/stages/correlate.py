@@ -20,7 +20,7 @@ from lfpiv_cli.files.batch import Target, output_paths, prepare_folder
 from lfpiv_cli.files.config import Config, carried_config, load_config
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.pairing import Pairs
-from lfpiv_cli.files.provenance import Gone, earlier_record, record, with_warnings
+from lfpiv_cli.files.provenance import Gone, earlier_record, ensure_even, record, seconds_between, with_warnings
 from lfpiv_cli.files.whole import ensure_opens, fault_of
 from lfpiv_cli.flow.correlation import correlate as measure
 from lfpiv_cli.flow.correlation import count_passes
@@ -262,12 +262,29 @@ class Correlation(ByArguments):
     def _job(self, number: int) -> Job:
         """Return the pairs that a field is made of, and the settings."""
         group = self._groups[number]
-        return Job(group, self._settings_of(group[0][0]))
+        settings = self._settings_of(group[0][0])
+        if settings.correlation.dt_s is None:
+            settings = settings.overridden("correlation", dt_s=self._step_s(group))
+        return Job(group, settings)
+
+    def _step_s(self, group: Sequence[tuple[Path, Path]]) -> float | None:
+        """Return the time within the pairs of a field, where the recordings of their frames tell it.
+
+        Raises
+        ------
+        InputError : it is not the same in all of them
+        """
+        steps = [seconds_between(self._record_of(first), self._record_of(second)) for first, second in group]
+        told = [step for step in steps if step is not None]
+        return ensure_even(told, [str(group[0][0]), str(group[-1][1])]) if told and len(told) == len(steps) else None
+
+    def _record_of(self, volume: Path) -> Mapping[str, Any]:
+        """Return the record of a volume, which may be gone."""
+        return self._gone[volume].record if volume in self._gone else earlier_record(volume) or {}
 
     def _settings_of(self, volume: Path) -> Config:
         """Return the settings for a volume: its own, or those of a config in their place."""
-        made = self._gone[volume].record if volume in self._gone else earlier_record(volume) or {}
-        settings = self._config or carried_config(made, volume)
+        settings = self._config or carried_config(self._record_of(volume), volume)
         return settings.overridden_by("correlation", self._options)
 
     def _record(self, number: int) -> dict[str, Any]:

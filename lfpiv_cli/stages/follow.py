@@ -18,7 +18,16 @@ from lfpiv_cli.console import CONSOLE, Console, Frames
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files.atomic import ensure_writable
-from lfpiv_cli.files.batch import VTKHDF_SUFFIX, Frame, Target, frames_of, output_paths, pending, prepare_folder
+from lfpiv_cli.files.batch import (
+    VTKHDF_SUFFIX,
+    Frame,
+    Target,
+    frames_of,
+    output_paths,
+    pending,
+    prepare_folder,
+    step_between,
+)
 from lfpiv_cli.files.config import Config, carried_config
 from lfpiv_cli.files.frame_sources import images_seen
 from lfpiv_cli.files.inputs import given
@@ -111,6 +120,8 @@ def follow_particles(
     content = open_weights(weights)
     settings = carried_config(content.provenance, weights).overridden("reconstruction", solver="particles")
     settings = settings.overridden("correlation", dt_s=options.dt_s)
+    if settings.correlation.dt_s is None:
+        settings = settings.overridden("correlation", dt_s=step_between(frames))
     tracking = tracking_of(settings, options.search_voxel, options.shortest, len(frames), str(weights))
     shape = content.image_shape
     left_out: list[Failure] = []

@@ -21,6 +21,7 @@ from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files.atomic import ensure_writable, write_text
 from lfpiv_cli.files.batch import Frame, frames_of, output_paths, prepare_folder
 from lfpiv_cli.files.config import Config, load_config
+from lfpiv_cli.files.images import times_of
 from lfpiv_cli.files.inputs import ensure_regular_file, split_part
 from lfpiv_cli.files.pages import ensure_pages
 from lfpiv_cli.files.pairing import Pairs
@@ -168,9 +169,14 @@ def _first_readable(frames: Sequence[Frame], shape: tuple[int, int], keep_going:
     raise InputError("no images were given")
 
 
+def _tell_times(images: Sequence[Path]) -> bool:
+    """Return whether the recordings of the frames say when each was taken."""
+    return all(times_of(path) is not None for path in images)
+
+
 def _ensure_settings(settings: Config, options: RunOptions) -> None:
     """Raise where the config lacks what a later step needs."""
-    if options.dt_s is None and settings.correlation.dt_s is None:
+    if options.dt_s is None and settings.correlation.dt_s is None and not _tell_times(options.images):
         raise ConfigError(
             f"{settings.source}: correlation.dt_s: is missing, and velocities need it; give it there, or --dt-s"
         )

@@ -152,9 +152,7 @@ class Tracks(ByArguments):
         frames = [read_points(path, PARTICLES_FORMAT) for path in paths]
         counts = [len(frame.position_mm) for frame in frames]
         ensure_particles(counts, names)
-        settings = settings_of([frame.provenance for frame in frames], names).overridden(
-            "correlation", dt_s=self._options.dt_s
-        )
+        settings = settings_of([frame.provenance for frame in frames], names, self._options.dt_s)
         chosen = tracking_of(settings, self._options.search_voxel, self._options.shortest, len(frames), names[0])
         found = tracked(frames, settings, chosen, dict(target.record))
         records = {
@@ -179,8 +177,7 @@ class Tracks(ByArguments):
         options, paths = self._options, self._groups[number]
         names = [str(path) for path in paths]
         records = [self._gone[path].record if path in self._gone else carried_record(path) for path in paths]
-        settings = settings_of(records, names)
-        settings = settings.overridden("correlation", dt_s=options.dt_s)
+        settings = settings_of(records, names, options.dt_s)
         chosen = tracking_of(settings, options.search_voxel, options.shortest, len(paths), names[0])
         return record("track", settings.resolved() | chosen.told(), _roles(paths), gone=self._gone)
 
