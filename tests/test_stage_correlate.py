@@ -246,3 +246,16 @@ def test_a_lost_frame_costs_its_pair_alone(tmp_path: Path, capsys) -> None:
     (tmp_path / "pairs.txt").write_text("a2 b3\n")
     run("correlate", *left, "--pairs", tmp_path / "pairs.txt", "-o", tmp_path / "listed.vtkhdf")
     assert open_vectors(tmp_path / "listed.vtkhdf").flag.size
+
+
+def test_a_stated_time_that_the_recording_contradicts_is_told(tmp_path: Path, capsys) -> None:
+    resolved = load_config(CONFIG).resolved()
+    rng = np.random.default_rng(7)
+    pair = volume_pair(lambda p: np.tile(SHIFT, (len(p), 1)), SHAPE, Seeding(40.0, (1.0,) * 3, lost=0.0), rng)
+    paths = [tmp_path / "a.vtkhdf", tmp_path / "b.vtkhdf"]
+    for k, (path, array) in enumerate(zip(paths, pair, strict=True)):
+        made_by = record("test", resolved, {})
+        made_by["inputs"] = {"image": {"name": "run.cine", "sha256": "x", "time_s": 0.5 + 0.004 * k}}
+        write_volume(path, array, GRID, REFERENCE, provenance=made_by, attributes={}, overwrite=False)
+    run("correlate", *paths, "-o", tmp_path / "v.vtkhdf")
+    assert "recorded 0.004 s apart, and 0.002 s are stated" in capsys.readouterr().err

@@ -42,6 +42,7 @@ from lfpiv_cli.notice import Notice
 from lfpiv_cli.reference import Reference
 from lfpiv_cli.stages.batches import ALL, BatchOptions, ByArguments, Failure, Worked, work_through
 from lfpiv_cli.stages.dry_runs import Expected, dry_run
+from lfpiv_cli.stages.intervals import dt_notices
 from lfpiv_cli.stages.means import Mean, arrays_of
 from lfpiv_cli.stages.pairs import PairOptions, result_pairs
 from lfpiv_cli.stages.watched import paired_from_first, watched, work_as_they_come
@@ -228,8 +229,11 @@ class Correlation(ByArguments):
     def make(self, number: int, work: Frames) -> Outcome:
         """Correlate a pair, or all of them, and write the vectors."""
         target = self.targets[number]
-        field, reference, notices = _measure(self._job(number), self._options.mask_volume, work)
+        job = self._job(number)
+        field, reference, notices = _measure(job, self._options.mask_volume, work)
         quality, name = quality_of(field), target.path.name
+        records = ([self._record_of(path) for path in pair] for pair in job.pairs)
+        notices += dt_notices(job.settings.correlation.dt_s, records, name)
         notices += [*field_notices(quality, name), *pair_notices(field, quality, name)]
         work.console.warn(notices)
         derived = derived_fields(field) if self._options.derived else None

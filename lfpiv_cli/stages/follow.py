@@ -52,6 +52,7 @@ from lfpiv_cli.reconstruction.images import Image
 from lfpiv_cli.reference import Reference
 from lfpiv_cli.stages.batches import Failure, Worked
 from lfpiv_cli.stages.frames import STILL, Background, mask_of, read_frame, reader, sequence_digests
+from lfpiv_cli.stages.intervals import frames_dt_notices
 from lfpiv_cli.stages.reconstruct import file_notices, residual_path
 from lfpiv_cli.tracks.sequences import Trajectories
 
@@ -122,6 +123,7 @@ def follow_particles(
     settings = settings.overridden("correlation", dt_s=options.dt_s)
     if settings.correlation.dt_s is None:
         settings = settings.overridden("correlation", dt_s=step_between(frames))
+    console.warn(frames_dt_notices(settings.correlation.dt_s, frames))
     tracking = tracking_of(settings, options.search_voxel, options.shortest, len(frames), str(weights))
     shape = content.image_shape
     left_out: list[Failure] = []

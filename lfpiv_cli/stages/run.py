@@ -12,6 +12,7 @@ import hashlib
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, cast
 
@@ -140,7 +141,7 @@ def _ensure_possible(settings: Config, options: RunOptions) -> tuple[list[Frame]
     frames = frames_of(options.images, options.keep_going)
     if options.follow:
         ensure_sequence(len(frames), SHORTEST)
-        pairs = Pairs((), separate=False)
+        pairs = Pairs(tuple(pairwise(range(len(frames)))), separate=False)
     else:
         pairs = image_pairs(frames, options)
         pairs.settled(options.keep_going)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +38,7 @@ from lfpiv_cli.interface.vectors_checks import (
 )
 from lfpiv_cli.stages.batches import BatchOptions, ByArguments, Failure, Worked, work_through
 from lfpiv_cli.stages.dry_runs import Expected, dry_run
+from lfpiv_cli.stages.intervals import dt_notices
 from lfpiv_cli.stages.pairs import PairOptions, result_pairs, sequence_of
 
 
@@ -159,7 +161,8 @@ class Tracks(ByArguments):
             f"{role} {path.name}": frame.provenance
             for (role, path), frame in zip(_roles(paths).items(), frames, strict=True)
         }
-        notices = [*calibration_notices(records), *few_notices(counts, [path.name for path in paths], found)]
+        doubts = dt_notices(chosen.dt_s, pairwise(frame.provenance for frame in frames), paths[0].name)
+        notices = [*doubts, *calibration_notices(records), *few_notices(counts, [path.name for path in paths], found)]
         work.console.warn(notices)
         provenance = with_warnings(found.points.provenance, notices)
         # What is complete is skipped: in the place of what is made there is nothing, or something broken.
