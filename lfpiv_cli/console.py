@@ -10,7 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -46,6 +46,8 @@ class Console:
     only_warnings: bool = False
     warned: list[Notice] | None = None
     log: EventLog | None = None
+    # Those of `warned`, to look them up in: thousands of frames may each have some.
+    _told: set[Notice] = field(default_factory=set, init=False, repr=False, compare=False)
 
     def event(self, name: str, /, **fields: Any) -> None:
         """Add what happens to the log."""
@@ -66,8 +68,9 @@ class Console:
         """Print what speaks against a result and does not keep the command from going on, a line each."""
         for notice in notices:
             if self.warned is not None:
-                if notice in self.warned:
+                if notice in self._told:
                     continue
+                self._told.add(notice)
                 self.warned.append(notice)
             self.event("warning", **notice.record())
             if not self.quiet:

@@ -357,6 +357,33 @@ def test_a_mean_and_residuals_meet_nothing(weights, images, pairs, tmp_path) -> 
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("options", [("--picture", "c.h5"), ("--picture", "x.png", "--views", "x.png")])
+def test_pictures_of_a_calibration_have_names_of_their_own(tmp_path, monkeypatch, options) -> None:
+    monkeypatch.chdir(tmp_path)
+    stills = ("--white", SAMPLE / "white.tif", "--dark", SAMPLE / "dark.tif")
+    with pytest.raises(UsageError, match="two outputs of this command"):
+        run("calibrate-snapshot", CONFIG, *stills, *options, "-o", "c.h5", "--overwrite")
+    with pytest.raises(UsageError, match="two outputs of this command"):
+        run(
+            "refine-calibration",
+            CONFIG,
+            SAMPLE / "pair_a.tif",
+            "--calibration",
+            "z.h5",
+            "--picture",
+            "c.h5",
+            "-o",
+            "c.h5",
+        )
+
+
+def test_a_log_lies_beside_all_other_files(pairs, tmp_path) -> None:
+    output = tmp_path / "v.vtkhdf"
+    with pytest.raises(UsageError, match=r"v.vtkhdf: is the log, and another file of this command, too"):
+        run("correlate", *pairs[:2], "-o", output, "--log", tmp_path / "." / "v.vtkhdf", "--overwrite")
+    assert not output.exists()
+
+
 def test_a_folder_tells_whether_it_minds_case(tmp_path, monkeypatch) -> None:
     ignores_case.cache_clear()
     (tmp_path / "Folder").mkdir()

@@ -6,16 +6,19 @@ import sys
 from collections.abc import Callable, Mapping
 from functools import wraps
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from lfpiv_cli import __version__
 from lfpiv_cli.cli.outcome import error_record, print_json
-from lfpiv_cli.errors import LimitMissedError, PartialError
+from lfpiv_cli.errors import LimitMissedError, PartialError, UsageError
 from lfpiv_cli.files import kernel_cache
 from lfpiv_cli.files.shares import Shard, parse_time_limit
 from lfpiv_cli.names import InputKind, Pairing, names_in
+
+if TYPE_CHECKING:
+    from lfpiv_cli.files.log import EventLog
 
 # Whether a file can be read its reader tells: an input's fault, and none of the command line.
 FILE = click.Path(path_type=Path, readable=False)
@@ -234,16 +237,11 @@ def common_options(command: Callable[..., dict[str, Any]]) -> Callable[..., None
         **arguments: Any,
     ) -> None:
         from lfpiv_cli.console import Console
-        from lfpiv_cli.files.log import EventLog
         from lfpiv_cli.files.recordings.complaints import taken_complaints
         from lfpiv_cli.notice import Notice
 
         warned: list[Notice] = []
-        log_file = (
-            None
-            if log is None
-            else EventLog(log, click.get_current_context().command.name or "", read_only=bool(arguments.get("dry_run")))
-        )
+        log_file = None if log is None else _event_log(log, arguments)
         console = Console(verbose=verbose, quiet=quiet, only_warnings=as_json, warned=warned, log=log_file)
         if threads is not None:
             from lfpiv_cli.threads import use_threads
@@ -277,3 +275,19 @@ def common_options(command: Callable[..., dict[str, Any]]) -> Callable[..., None
             raise ended_with
 
     return run
+
+
+def _event_log(path: Path, arguments: Mapping[str, Any]) -> EventLog:
+    """Return the log of a command, of a dry run for reading alone.
+
+    Raises
+    ------
+    UsageError : it would lie in the place of another file of the command
+    """
+    from lfpiv_cli.files.log import EventLog
+    from lfpiv_cli.files.places import place_of
+
+    values = [each for value in arguments.values() for each in (value if isinstance(value, tuple) else (value,))]
+    if place_of(path) in [place_of(other) for other in values if isinstance(other, Path)]:
+        raise UsageError(f"{path}: is the log, and another file of this command, too")
+    return EventLog(path, click.get_current_context().command.name or "", read_only=bool(arguments.get("dry_run")))

@@ -16,6 +16,7 @@ from lfpiv_cli.files.calibration_file import read_calibration, write_calibration
 from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.pictures import ensure_drawing, write_picture
+from lfpiv_cli.files.places import ensure_apart
 from lfpiv_cli.files.provenance import record as provenance_record
 from lfpiv_cli.files.provenance import with_warnings
 from lfpiv_cli.interface.calibration import calibration_notices, calibration_of, ensure_pictures, photographs
@@ -62,8 +63,9 @@ def calibrate_snapshot(
     whites, boards = _numbered("white", white), _numbered("board", board)
     inputs = given(config=config, dark=options.dark) | whites | boards
     drawings = [path for path in (picture, views) if path]
+    ensure_apart([output, *drawings], inputs.values())
     for target in (output, *drawings):
-        ensure_writable(target, overwrite or options.resume, inputs.values())
+        ensure_writable(target, overwrite or options.resume)
     if drawings:
         ensure_drawing()
     settings = load_config(config)

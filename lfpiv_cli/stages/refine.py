@@ -16,6 +16,7 @@ from lfpiv_cli.files.calibration_file import read_calibration, write_calibration
 from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.pictures import ensure_drawing, write_picture
+from lfpiv_cli.files.places import ensure_apart
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.reconstruction.images import light
@@ -57,8 +58,10 @@ def refine_calibration(
     dark, background, output, picture = options.dark, options.background, options.output, options.picture
     named = {"image" if k == 0 else f"image_{k + 1}": path for k, path in enumerate(images)}
     inputs = given(config=config, calibration=calibration, dark=dark, background=background) | named
-    for target in filter(None, (output, picture)):
-        ensure_writable(target, overwrite, inputs.values())
+    outputs = [path for path in (output, picture) if path is not None]
+    ensure_apart(outputs, inputs.values())
+    for target in outputs:
+        ensure_writable(target, overwrite)
     if picture:
         ensure_drawing()
     settings = load_config(config)
