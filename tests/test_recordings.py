@@ -234,6 +234,16 @@ def test_headers_of_davis_that_do_not_fit(tmp_path: Path, header: tuple[int, ...
         read_all(tmp_path / "t.im7")
 
 
+def test_packed_images_of_davis_end_with_their_check_sum(tmp_path: Path, rng: np.random.Generator) -> None:
+    path, stack = tmp_path / "t.im7", stack_of(rng, 16)
+    camera_files.write_im7(path, stack)
+    np.testing.assert_array_equal(images.read_page(path, 1), stack[1])
+    (length,) = struct.unpack_from("<I", path.read_bytes(), 256)
+    edited(path, 256, "<I", length - 2)
+    with pytest.raises(InputError, match="does not unpack to 3 frames"):
+        images.read_page(path, 1)
+
+
 def edited(path: Path, place: int, layout: str, value: int) -> None:
     content = bytearray(path.read_bytes())
     struct.pack_into(layout, content, place, value)
