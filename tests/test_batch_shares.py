@@ -224,7 +224,7 @@ def test_pairs_of_a_folder_that_is_being_filled(
     for path, volume in zip(named, volumes, strict=False):
         path.write_bytes(volume.read_bytes())
     common = ("--pairing", pairing, "--windows", "4", "--quiet")
-    folder = Filling(tmp_path / "volumes", dict(zip((1.0, 6.0, 6.5, 14.0), named, strict=True)))
+    folder = Filling(tmp_path / "volumes", dict(zip((1.0, 5.9, 6.0, 14.0), named, strict=True)))
     monkeypatch.setattr(watching, "time", folder)
     run("correlate", folder.folder, *common, "--watch", "--idle-s", 20, "-o", tmp_path / "v")
     run("correlate", *named, *common, "-o", tmp_path / "one")
