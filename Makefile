@@ -5,6 +5,7 @@
 #   make test       quick tests           make test-all   the slow ones too
 #   make test-interpreted   a few tests whose kernels run uncompiled, readable twins in place of vectorised loops
 #   make check      ruff and mypy         make bench      speed as ratios against a stated peer
+#   make fuzz       hours of damaged, edited and made-up files for the readers, CASES=1000000 of each kind
 #   make docs       the documents, with pictures from the sample, into out/docs/
 #
 # DATA holds white.tif, dark.tif, board.tif and the images A.tif and B.tif. METHOD is auto (volumes or particles, by how
@@ -31,7 +32,7 @@ MEASURED := $(if $(filter volumes both,$(METHOD)),report) $(if $(filter particle
 REPORTS := $(if $(filter configs/sample.yaml,$(CONFIG)),$(MEASURED))
 
 .DELETE_ON_ERROR:
-.PHONY: flow install test test-all test-interpreted check format docs bench clean
+.PHONY: flow install test test-all test-interpreted check format docs bench fuzz clean
 .SECONDARY:
 
 flow: $(OUT)/run.json $(REPORTS:%=$(OUT)/%/flow.json)
@@ -86,6 +87,10 @@ docs: $(INSTALLED)
 
 bench: $(INSTALLED)
 	$(BIN)/python -m benchmarks
+
+CASES ?= 1000000
+fuzz: $(INSTALLED)
+	$(BIN)/python -m benchmarks fuzz --cases $(CASES) --failures out/fuzz
 
 clean:
 	rm -rf out docs/_generated

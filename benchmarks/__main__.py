@@ -15,6 +15,7 @@ from benchmarks.calibration import bench_calibration
 from benchmarks.correlation import bench_correlation, bench_correlation_accuracy
 from benchmarks.depth import bench_depth
 from benchmarks.faults import bench_faults
+from benchmarks.fuzz import bench_fuzz
 from benchmarks.links import bench_links
 from benchmarks.particles import bench_particles, bench_particles_thrice
 from benchmarks.rigs import bench_rigs
