@@ -388,11 +388,13 @@ def fuzz(reader_name: str, cases: int, first: int, failures: Path) -> Counter[st
 def bench_fuzz(words: Sequence[str] = ()) -> None:
     """Fuzz the readers that are named, or all of them; exits with 1 where there were failures."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks fuzz")
-    parser.add_argument("readers", nargs="*", choices=[*READERS, []], default=[])
+    parser.add_argument("readers", nargs="*", metavar="READER")
     parser.add_argument("--cases", type=int, default=CASES)
     parser.add_argument("--first", type=int, default=0, help="Number of the first case; each number makes one case.")
     parser.add_argument("--failures", type=Path, default=Path("out/fuzz"))
     given = parser.parse_args(words)
+    if unknown := set(given.readers) - set(READERS):
+        parser.error(f"no reader is called {', '.join(unknown)}; there are {', '.join(READERS)}")
     failed = 0
     for name in given.readers or READERS:
         counts = fuzz(name, given.cases, given.first, given.failures)
