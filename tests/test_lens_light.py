@@ -180,11 +180,14 @@ def test_dark_image_with_the_light_on_is_told(images: LensImages, lattice: Latti
 
 
 def test_a_picture_that_was_given_before_is_known() -> None:
-    before = {"command": "calibrate-snapshot", "inputs": {"white": {"sha256": "w"}, "board": {"sha256": "b"}}}
+    def given(digest: str) -> dict[str, str]:
+        return {"name": f"{digest}.tif", "sha256": digest}
+
+    before = {"command": "calibrate-snapshot", "inputs": {"white": given("w"), "board": given("b")}}
 
     def made(image: str) -> dict[str, object]:
-        given = {"image": {"sha256": image}, "dark": {"sha256": "d"}}
-        return {"command": "reconstruct page 0", "inputs": given, "made_from": {"c": before}}
+        inputs = {"image": given(image), "dark": given("d")}
+        return {"command": "reconstruct page 0", "inputs": inputs, "made_from": {"c": before}}
 
     assert also_used_as(made("b"), "image") == "board of calibrate-snapshot"
     assert also_used_as(made("d"), "image") == "dark of reconstruct"
