@@ -2,7 +2,8 @@
 #
 #   make            install into .venv and go from the sample's raw images to velocity vectors and pictures
 #   make flow CONFIG=rig.yaml DATA=images OUT=results A=img_a B=img_b      the same on your own images
-#   make test       quick tests           make test-all   the slow ones too
+#   make test       quick tests, in two minutes      make test-thorough   those that take a second or more each
+#   make test-all   all tests, the slow ones too
 #   make test-interpreted   a few tests whose kernels run uncompiled, readable twins in place of vectorised loops
 #   make check      ruff and mypy         make bench      speed as ratios against a stated peer
 #   make fuzz       hours of damaged, edited and made-up files for the readers, CASES=1000000 of each kind
@@ -32,7 +33,7 @@ MEASURED := $(if $(filter volumes both,$(METHOD)),report) $(if $(filter particle
 REPORTS := $(if $(filter configs/sample.yaml,$(CONFIG)),$(MEASURED))
 
 .DELETE_ON_ERROR:
-.PHONY: flow install test test-all test-interpreted check format docs bench fuzz clean
+.PHONY: flow install test test-thorough test-all test-interpreted check format docs bench fuzz clean
 .SECONDARY:
 
 flow: $(OUT)/run.json $(REPORTS:%=$(OUT)/%/flow.json)
@@ -67,11 +68,14 @@ $(OUT)/report_particles/flow.json: $(CONFIG) $(OUT)/run.json | $(CORE)
 test: $(INSTALLED)
 	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile
 
+test-thorough: $(INSTALLED)
+	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile -m thorough
+
 test-all: $(INSTALLED)
-	$(BIN)/python -m pytest -m "slow or not slow"
+	$(BIN)/python -m pytest -m "slow or thorough or not slow"
 
 test-interpreted: $(INSTALLED)
-	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest tests/test_interpreted.py
+	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest -m "thorough or not thorough" tests/test_interpreted.py
 
 check: $(INSTALLED)
 	$(BIN)/ruff check .

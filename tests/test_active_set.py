@@ -35,6 +35,7 @@ def begun(task: Task, true: NDArray[np.float64]) -> search.State:
     return search.replace(state, noise=noise_with(task, 5e5))
 
 
+@pytest.mark.thorough
 def test_sweeps_end_where_those_over_all_particles_end(
     task: Task, true: NDArray[np.float64], monkeypatch: pytest.MonkeyPatch
 ) -> None:

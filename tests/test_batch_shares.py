@@ -83,6 +83,7 @@ def bytes_of(folder: Path | list[Path]) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in paths}
 
 
+@pytest.mark.thorough
 def test_shards_together_give_what_one_command_gives(
     weights: Path, frames: list[Path], volumes: list[Path], tmp_path: Path
 ) -> None:
@@ -91,6 +92,7 @@ def test_shards_together_give_what_one_command_gives(
     assert bytes_of(tmp_path / "v") == bytes_of(volumes)
 
 
+@pytest.mark.thorough
 def test_the_share_of_an_array_job_is_made(
     weights: Path, frames: list[Path], volumes: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -106,6 +108,7 @@ def test_more_shards_than_frames(weights: Path, frames: list[Path], tmp_path: Pa
     assert len(bytes_of(tmp_path / "v")) == 2
 
 
+@pytest.mark.thorough
 def test_workers_give_what_one_command_gives(
     weights: Path, frames: list[Path], volumes: list[Path], in_process: str, tmp_path: Path, capsys
 ) -> None:
@@ -119,6 +122,7 @@ def test_workers_give_what_one_command_gives(
     assert bytes_of(tmp_path / "many") == bytes_of(tmp_path / "one")
 
 
+@pytest.mark.thorough
 def test_fields_of_shards_and_their_mean_by_a_last_command(volumes: list[Path], tmp_path: Path) -> None:
     correlate(volumes, tmp_path / "one", "--mean", tmp_path / "mean_one.vtkhdf")
     with pytest.raises(UsageError, match="--mean needs the fields of all shards.*without --shard and with --resume"):
@@ -132,6 +136,7 @@ def test_fields_of_shards_and_their_mean_by_a_last_command(volumes: list[Path], 
     assert (tmp_path / "mean.vtkhdf").read_bytes() == (tmp_path / "mean_one.vtkhdf").read_bytes()
 
 
+@pytest.mark.thorough
 def test_tracks_of_workers_and_shards(in_process: str, tmp_path: Path, rng: np.random.Generator) -> None:
     particles = tmp_path / "particles"
     particles.mkdir()
@@ -151,6 +156,7 @@ def test_tracks_of_workers_and_shards(in_process: str, tmp_path: Path, rng: np.r
     assert bytes_of(tmp_path / "shards") == bytes_of(tmp_path / "one")
 
 
+@pytest.mark.thorough
 def test_a_batch_stops_before_its_time_limit_and_goes_on(
     weights: Path, frames: list[Path], volumes: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -197,6 +203,7 @@ def alone(weights: Path, frames: list[Path], output: Path, *options: object) -> 
     run("reconstruct", weights, *frames, "--iterations", 2, "--quiet", *options, "-o", output)
 
 
+@pytest.mark.thorough
 def test_frames_of_a_folder_that_is_being_filled(
     weights: Path, frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
 ) -> None:
@@ -216,6 +223,7 @@ def test_frames_of_a_folder_that_is_being_filled(
     assert [failure["name"] for failure in json.loads(listed.read_text())] == ["9"]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("pairing", ["ab", "sequence"])
 def test_pairs_of_a_folder_that_is_being_filled(
     pairing: str, volumes: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -98,6 +98,7 @@ def spoil(path: Path, kind: str) -> None:
         path.write_bytes(b"no image at all")
 
 
+@pytest.mark.thorough
 def test_a_finished_batch_is_skipped_and_stays_as_it_is(weights, images, tmp_path, capsys) -> None:
     command = ("reconstruct", weights, *images, *QUICK, "-o", tmp_path / "out")
     assert told(capsys, *command)["reconstructed"] == 3
@@ -123,6 +124,7 @@ def damage(path: Path, part: str) -> None:
     path.write_bytes(content)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("part", ["head", "record", "data", "end"])
 def test_a_damaged_result_is_made_anew(weights, images, tmp_path, capsys, part) -> None:
     command = ("reconstruct", weights, *images[:2], *QUICK, "-o", tmp_path / "out")
@@ -153,6 +155,7 @@ def test_what_somebody_else_put_there_is_not_replaced(weights, images, tmp_path,
     assert there.read_bytes() == before
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kind", ["missing", "empty", "cut", "size", "no image"])
 def test_one_bad_frame_stops_the_batch_or_is_listed(weights, images, tmp_path, capsys, kind) -> None:
     spoil(images[1], kind)
@@ -176,6 +179,7 @@ def test_one_bad_frame_stops_the_batch_or_is_listed(weights, images, tmp_path, c
     assert error.value.figures["failures"] == json.loads(listed.read_text()) == [failed]
 
 
+@pytest.mark.thorough
 def test_what_was_written_before_a_bad_page_is_said(weights, raw, tmp_path, capsys) -> None:
     with tifffile.TiffWriter(tmp_path / "run.tif") as writer:
         for number in range(3):
@@ -194,6 +198,7 @@ def test_what_was_written_before_a_bad_page_is_said(weights, raw, tmp_path, caps
     assert stamps(tmp_path / "go").keys() == stamps(tmp_path / "stop").keys()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kind", ["empty", "cut"])
 def test_a_bad_frame_is_left_out_of_the_background_of_others(weights, images, raw, tmp_path, kind) -> None:
     spoil(images[1], kind)
@@ -219,6 +224,7 @@ def pairs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     return paths
 
 
+@pytest.mark.thorough
 def test_a_finished_mean_is_kept(pairs, tmp_path, capsys) -> None:
     mean = tmp_path / "mean.vtkhdf"
     command = ("correlate", *pairs, "--pairing", "ab", "--windows", 8, "--mean", mean, "-o", tmp_path / "out")
@@ -253,6 +259,7 @@ def claims_in(folder: Path) -> list[str]:
     return [path.name for path in folder.glob(".*.claim")]
 
 
+@pytest.mark.thorough
 def test_what_another_worker_makes_is_left_to_it(weights, images, tmp_path, capsys) -> None:
     command = ("reconstruct", weights, *images, *QUICK, "-o")
     run(*command, tmp_path / "before")
@@ -276,6 +283,7 @@ def test_what_another_worker_makes_is_left_to_it(weights, images, tmp_path, caps
     assert sorted(stamps(out)) == ["f0.vtkhdf", "f1.vtkhdf", "f2.vtkhdf"]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("fate", ["dead", "silent", "half written"])
 def test_the_claim_of_a_dead_worker_is_taken_over(weights, images, tmp_path, capsys, fate) -> None:
     dead = subprocess.Popen([sys.executable, "-c", ""])
@@ -298,6 +306,7 @@ def test_the_claim_of_a_living_worker_is_respected(tmp_path) -> None:
         assert claim.exists()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("end", [KeyboardInterrupt, Terminated, OutputError("no space"), InputError("no frame")])
 def test_no_claim_stays(weights, images, tmp_path, monkeypatch, end) -> None:
     def ends(*_arguments: object) -> None:

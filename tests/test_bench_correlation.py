@@ -9,6 +9,7 @@ from benchmarks.correlation import accuracy_series, against_openpiv, openpiv_pas
 from benchmarks.volumes import Seeding, volume_pair
 
 
+@pytest.mark.thorough
 def test_every_case_of_the_accuracy_has_figures() -> None:
     series = accuracy_series((40, 40, 40), [(16, 16, 16)], per_window=(8.0,), flows=("channel", "taylor_green"))
     assert len(series) == 8

@@ -44,6 +44,7 @@ def test_what_was_said() -> None:
     assert told_by([Step("track", 1, "KeyError: 'a'", [], 0.0)]) == "CRASH: KeyError: 'a'"
 
 
+@pytest.mark.thorough
 def test_a_fault_is_told_and_a_good_picture_is_not(bench: Bench) -> None:
     by_name = {fault.name: fault for fault in FAULTS}
     assert told_by([bench.calibrate(bench.good)]) == ""

@@ -20,6 +20,7 @@ def operator(table2, water):
     return factorise(camera, water, Grid.centred((6, 5, 4), (0.1, 0.1, 0.5), (0.0, 0.0, 2.0)))
 
 
+@pytest.mark.thorough
 def test_both_weights_give_one_volume(operator, rng):
     matrix = sparse_matrix(operator)
     explicit = SparseOperator(matrix, matrix.T.tocsr(), operator.shape, operator.image_shape)
@@ -29,6 +30,7 @@ def test_both_weights_give_one_volume(operator, rng):
     assert against_sparse_matrix(operator, 1, 1) > 0.0
 
 
+@pytest.mark.thorough
 def test_momentum_catches_up(operator, rng):
     image = operator.forward(rng.random(operator.shape, np.float32))
     figures = catching_up(operator, image, 40, 40)

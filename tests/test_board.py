@@ -71,6 +71,7 @@ def agrees(pose: BoardPose, z_mm: float, offset: ArrayLike) -> None:
     np.testing.assert_allclose(pose.offset_mm, offset, atol=3e-3)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("z_mm", [-0.4, 0.0, 1.7])
 def test_board_in_air_is_found_in_both_layouts(camera: Camera, rng: np.random.Generator, z_mm: float) -> None:
     camera = small(camera)
@@ -81,6 +82,7 @@ def test_board_in_air_is_found_in_both_layouts(camera: Camera, rng: np.random.Ge
     assert pose.magnification == pytest.approx(-1.0, abs=4 * pose.magnification_sigma + 1e-4)
 
 
+@pytest.mark.thorough
 def test_board_in_water_with_the_columns_along_y(table2: Camera, water: Media, rng: np.random.Generator) -> None:
     camera = replace(small(table2), column_axis="y")
     board = replace(BOARD, medium="fluid", dots=(3, 2))
@@ -91,6 +93,7 @@ def test_board_in_water_with_the_columns_along_y(table2: Camera, water: Media, r
     np.testing.assert_allclose(pose.tilt_deg, (20.0, -14.0), atol=7.0)
 
 
+@pytest.mark.thorough
 def test_a_turned_sensor_is_turned_back(table2: Camera, rng: np.random.Generator) -> None:
     """The picture of a rectified frame shows the scene turned by minus the lattice's rotation."""
     camera = small(table2)
@@ -104,6 +107,7 @@ def test_a_turned_sensor_is_turned_back(table2: Camera, rng: np.random.Generator
     assert pose.rotation_deg == pytest.approx(0.0, abs=0.3)
 
 
+@pytest.mark.thorough
 def test_dark_dots_and_the_transmission(table2: Camera, rng: np.random.Generator) -> None:
     camera = small(table2)
     row, column = np.mgrid[: camera.rows, : camera.columns]
@@ -118,6 +122,7 @@ def test_dark_dots_and_the_transmission(table2: Camera, rng: np.random.Generator
     agrees(pose, 0.6, (0.05, -0.03))
 
 
+@pytest.mark.thorough
 def test_magnification_is_measured(table2: Camera, rng: np.random.Generator) -> None:
     true = small(table2)
     true = replace(true, magnification=-1.01)
@@ -191,6 +196,7 @@ def test_a_dot_off_the_plane_does_not_move_the_board(table2: Camera, rng: np.ran
     assert pose.z0_mm == pytest.approx(3.0, abs=1e-3)
 
 
+@pytest.mark.thorough
 def test_disc_and_polygon_share_what_a_fine_grid_counts(layout: str, rng: np.random.Generator) -> None:
     cell = lens_cell(Lattice.regular(1.0, layout))
     step = np.linspace(-1.2, 1.2, 634)
@@ -228,6 +234,7 @@ def test_undistorted_undoes_the_distortion() -> None:
     np.testing.assert_allclose(undistorted(seen, 2e-4), ideal, atol=1e-7)
 
 
+@pytest.mark.thorough
 def test_pictures_without_a_board_are_refused(table2: Camera, rng: np.random.Generator) -> None:
     camera = small(table2)
     empty = np.zeros((camera.rows, camera.columns), dtype=np.float32)

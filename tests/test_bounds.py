@@ -53,6 +53,7 @@ def fitted(view: View, image: NDArray[np.float64], weight: NDArray[np.float64]) 
     return particles
 
 
+@pytest.mark.thorough
 def test_slopes_are_finite_differences(view: View) -> None:
     slope = slopes(view, PARTICLES)
     for unknown, step in enumerate((1e-3, 1e-3, 1e-2, 1.0)):
@@ -64,6 +65,7 @@ def test_slopes_are_finite_differences(view: View) -> None:
         assert np.abs(analytic - difference).sum() < 0.04 * np.abs(difference).sum()
 
 
+@pytest.mark.thorough
 def test_bound_is_the_inverse_of_the_whole_matrix(view: View) -> None:
     # A chain: the first and the last share no pixel, the middle one some with both.
     chain = np.array([[-0.4, 0.0, 2.0, 4e5], [0.0, 0.02, 2.1, 5e5], [0.38, 0.0, 1.9, 3e5]])
@@ -79,6 +81,7 @@ def test_bound_is_the_inverse_of_the_whole_matrix(view: View) -> None:
         assert np.diag(bound.joint[number]) == pytest.approx(np.diag(np.linalg.inv(matrix)[part, part]), rel=0.02)
 
 
+@pytest.mark.thorough
 def test_no_fit_is_better_and_a_good_one_as_good(view: View) -> None:
     slope = slopes(view, PARTICLES)
     expected = expected_image(slope, PARTICLES)
@@ -94,6 +97,7 @@ def test_no_fit_is_better_and_a_good_one_as_good(view: View) -> None:
     assert np.abs(ratio - 1.0).max() < 3.0 / np.sqrt(2.0 * IMAGES)
 
 
+@pytest.mark.thorough
 def test_neighbours_cost_accuracy_and_only_where_they_are(view: View) -> None:
     particles = PARTICLES.copy()
     particles[1] = particles[0] + (0.01, 0.01, 0.05, 0.0)

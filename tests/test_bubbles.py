@@ -49,6 +49,7 @@ def test_bubbles_touch_their_wall_and_stay_in_the_channel(rng, axis, wall, is_de
         bubbles_at_wall(5, (4.1, 4.2), wall, seen, walls, rng)
 
 
+@pytest.mark.thorough
 def test_a_bubble_gives_its_level_in_the_middle_and_fades_to_its_rim(camera, rng):
     small = replace(camera, columns=220, rows=180)
     bubble = Bubbles(np.array([[0.1, -0.05, 0.0]]), np.array([0.6]))
@@ -132,6 +133,7 @@ def test_frames_that_hardly_differ_show_no_bubbles(rng):
         still_light([image], MARGIN_PX)
 
 
+@pytest.mark.thorough
 def test_a_mask_of_what_is_still_is_that_of_its_image(tmp_path):
     root = Path(__file__).parent.parent
     text = (root / "configs" / "sample.yaml").read_text()
@@ -163,6 +165,7 @@ def test_a_mask_of_what_is_still_is_that_of_its_image(tmp_path):
     assert "mask: still over 2 frames, SHA-256" in found.provenance["command"]
 
 
+@pytest.mark.thorough
 def test_the_part_measures_beside_bubbles_in_all_ways(tmp_path):
     found = bubbles(Work(tmp_path, "tiny", Console(only_warnings=True), {}))
     kept = {path.stem: read_json(path)["result"] for path in tmp_path.glob("*_figures.json")}

@@ -174,6 +174,7 @@ def test_a_board_of_another_shape_is_refused(rig: Rig) -> None:
         calibrate(Photographs([white_image()], board=np.zeros((3, 3))), rig)
 
 
+@pytest.mark.thorough
 def test_the_picture_shows_lattice_and_board(plain: Calibration, rig: Rig, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     from lfpiv_cli.pictures.calibration import calibration_figure
@@ -216,6 +217,7 @@ def test_each_view_is_named_by_its_point_and_none_is_black(plain: Calibration, r
     assert sum(axes.get_title().startswith("refocused at z = ") for axes in panels) == 5
 
 
+@pytest.mark.thorough
 def test_experiment(data_folder: Path, table2: Camera, water: Media) -> None:
     """Against the experiment's truth, from its pictures and data sheet alone."""
     folder = data_folder / "channel"

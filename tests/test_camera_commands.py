@@ -69,6 +69,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 IMAGES = ("tiff.tif", "cine.cine", "packed.cine", "seq.seq", "mraw.mraw", "hdf5.h5:/entry/data/frames", "davis.im7")
 
 
+@pytest.mark.thorough
 def test_volumes_are_the_same_from_every_format(folder: Path) -> None:
     paths = [folder / name for name in (*IMAGES, "raw.raw")]
     run("reconstruct", folder / "weights.h5", *paths, "--raw", PACKED, "--iterations", 1, "-o", folder / "volumes")
@@ -117,6 +118,7 @@ def test_info_tells_pages_size_bits_and_rate(folder: Path, name: str) -> None:
         assert found["longest_step_s"] == pytest.approx(0.0005, abs=1e-9)
 
 
+@pytest.mark.thorough
 def test_the_recording_tells_the_time_between_frames(folder: Path, tmp_path: Path) -> None:
     def correlated(name: str, *options: object) -> dict[str, Any]:
         run("reconstruct", folder / "weights.h5", folder / name, "--iterations", 1, "-o", tmp_path / name)
@@ -191,6 +193,7 @@ def test_commands_refuse_a_cut_recording_by_its_name(folder: Path, tmp_path: Pat
     assert not [path for path in tmp_path.rglob("*") if path.is_file() and path.suffix == ".vtkhdf"]
 
 
+@pytest.mark.thorough
 def test_other_commands_take_the_layout(folder: Path, tmp_path: Path) -> None:
     one = f"{folder / 'raw.raw'}:page=0"
     single = tmp_path / "one.tif"
@@ -201,6 +204,7 @@ def test_other_commands_take_the_layout(folder: Path, tmp_path: Path) -> None:
     assert fault_of("check", folder / "rig.yaml", one, "--raw", "12")[1] == 2
 
 
+@pytest.mark.thorough
 def test_a_folder_of_a_camera_holds_its_recordings(folder: Path, tmp_path: Path) -> None:
     for name in ("cine.cine", "mraw.mraw", "mraw.cihx", "weights.h5", "hdf5.h5"):
         (tmp_path / name).write_bytes((folder / name).read_bytes())
@@ -213,6 +217,7 @@ def test_a_folder_of_a_camera_holds_its_recordings(folder: Path, tmp_path: Path)
     ]
 
 
+@pytest.mark.thorough
 def test_the_command_itself(folder: Path, tmp_path: Path) -> None:
     copy = tmp_path / "t.cine"
     copy.write_bytes((folder / "cine.cine").read_bytes()[:-1000])

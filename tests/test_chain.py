@@ -46,6 +46,7 @@ def truth(name: str) -> dict:
     return json.loads((SAMPLE / f"{name}.json").read_text())
 
 
+@pytest.mark.thorough
 def test_calibration_finds_what_was_simulated(chain, capsys):
     capsys.readouterr()
     board = ("--board", SAMPLE / "board.tif")
@@ -98,6 +99,7 @@ def test_report_holds_figures_and_no_nan(chain):
     assert (chain / "report" / "flow.png").stat().st_size > 10_000
 
 
+@pytest.mark.thorough
 def test_true_particles_judge_like_the_analytic_flow(chain, tmp_path):
     particles = SAMPLE / "particles.npz"
     vectors = chain / "vectors.vtkhdf"
@@ -121,6 +123,7 @@ def test_weights_from_python(chain):
     assert share.sum() == pytest.approx(1.0, abs=0.01)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("threads", [1, 2])
 def test_same_bytes_for_any_number_of_threads(chain, tmp_path, threads):
     import numba
@@ -152,6 +155,7 @@ def test_existing_outputs_are_refused_or_resumed(chain, capsys):
     assert target.stat().st_mtime_ns == before
 
 
+@pytest.mark.thorough
 def test_one_bad_frame_leaves_the_others(chain, tmp_path):
     bad = tmp_path / "bad.tif"
     bad.write_bytes((SAMPLE / "pair_b.tif").read_bytes()[:-5000])
@@ -165,6 +169,7 @@ def test_one_bad_frame_leaves_the_others(chain, tmp_path):
     assert not (tmp_path / "go" / "bad.vtkhdf").exists()
 
 
+@pytest.mark.thorough
 def test_missed_limit_is_told_after_report_and_figures(chain, tmp_path, capsys):
     strict = tmp_path / "strict.yaml"
     strict.write_text(CONFIG.read_text() + "  limits: {streamwise_mean_error: 0.0}\n")
@@ -174,6 +179,7 @@ def test_missed_limit_is_told_after_report_and_figures(chain, tmp_path, capsys):
     assert (tmp_path / "report" / "flow.json").exists()
 
 
+@pytest.mark.thorough
 def test_volumes_that_do_not_belong_together_are_refused(chain, tmp_path):
     a, b = (chain / "volumes" / f"pair_{name}.vtkhdf" for name in "ab")
     weights, image = chain / "weights.h5", SAMPLE / "pair_b.tif"

@@ -208,6 +208,7 @@ def test_rendered_tracers_are_those_of_the_data(true_likeness):
     assert true_likeness > 0.95
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("name", "turn"),
     [
@@ -222,6 +223,7 @@ def test_a_turned_axis_is_not_the_data_s(experiment, true_likeness, name, turn):
     assert likeness(experiment, "pair_a", places=turned) < 0.4
 
 
+@pytest.mark.thorough
 def test_depth_s_origin_is_the_focal_point(experiment, true_likeness):
     """Tracers 0.2 mm nearer or further, or measured from the mid plane (0.4655 mm), fit less."""
     losses = []
@@ -234,6 +236,7 @@ def test_depth_s_origin_is_the_focal_point(experiment, true_likeness):
     assert losses[3] > 0.04
 
 
+@pytest.mark.thorough
 def test_frame_a_is_half_a_delay_before_the_middle(experiment, true_likeness):
     assert likeness(experiment, "pair_b", places=experiment.frame_a(0.5)) == pytest.approx(true_likeness, abs=0.01)
     assert likeness(experiment, "pair_a", places=experiment.frame_a(0.5)) < 0.6
@@ -244,11 +247,13 @@ def test_rotation_goes_from_the_columns_towards_the_rows(experiment, true_likene
     assert likeness(experiment, "pair_a", experiment.camera(rotation=-1.0)) < 0.5
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("shift", [(-1.0, 1.0), (1.0, -1.0)])
 def test_shift_moves_the_array_along_columns_and_rows(experiment, true_likeness, shift):
     assert likeness(experiment, "pair_a", experiment.camera(shift=shift)) < 0.6
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("half_px", [(0.5, 0.0), (-0.5, 0.0), (0.0, 0.5), (0.0, -0.5)])
 def test_the_axis_meets_the_middle_of_the_sensor(experiment, true_likeness, half_px):
     """A sensor counted from its pixels' corners, or from one pixel further, would be half a pixel off."""
@@ -258,12 +263,14 @@ def test_the_axis_meets_the_middle_of_the_sensor(experiment, true_likeness, half
     assert likeness(experiment, "pair_a", camera, places) < true_likeness - 0.02
 
 
+@pytest.mark.thorough
 def test_distortion_moves_rays_outwards_before_the_lens_is_chosen(experiment, true_likeness):
     without, turned = (likeness(experiment, "pair_a", experiment.camera(distortion=k)) for k in (0.0, -1.0))
     assert without < true_likeness - 0.003
     assert turned < true_likeness - 0.015
 
 
+@pytest.mark.thorough
 def test_the_white_image_shows_lattice_and_half_pixels(experiment):
     def likeness_of(camera):
         return np.corrcoef(render_white(camera, 1.0, 2).ravel(), experiment.images["white"].ravel())[0, 1]
@@ -292,6 +299,7 @@ def board_misfit(experiment, camera, z_factor=1.0, tilt=(1.0, 1.0), offset=(1.0,
     return 1.0 - np.corrcoef(picture[part].ravel(), experiment.images["board"][part].ravel())[0, 1] ** 2
 
 
+@pytest.mark.thorough
 def test_the_board_stands_as_the_data_s(experiment, monkeypatch):
     monkeypatch.setattr(board_module, "RAYS_PER_POINT", 600)
     camera = experiment.camera()

@@ -93,12 +93,14 @@ REFUSED = {
 }
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("tree", GOOD_RIGS.values(), ids=GOOD_RIGS)
 def test_good_rigs_are_good(tree: Tree) -> None:
     lines = rig_lines(bench_of(settings_of(tree), None))
     assert worst(lines) == "good", [line for line in lines if line.verdict != "good"]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("tree", "about", "verdict"), BAD_RIGS.values(), ids=BAD_RIGS)
 def test_bad_rigs_are_told(tree: Tree, about: str, verdict: str) -> None:
     lines = rig_lines(bench_of(settings_of(tree), None))
@@ -199,12 +201,14 @@ BAD_IMAGES: dict[str, tuple[Callable[[Photographer], Image], str, tuple[str, ...
 }
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("make", GOOD_IMAGES.values(), ids=GOOD_IMAGES)
 def test_good_images_are_good(take: Photographer, make: Callable[[Photographer], Image]) -> None:
     found = take.verdicts(make(take))
     assert set(found.values()) == {"good"}, found
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("make", "about", "expected"), BAD_IMAGES.values(), ids=BAD_IMAGES)
 def test_bad_images_are_told(
     take: Photographer, make: Callable[[Photographer], Image], about: str, expected: tuple[str, ...]
@@ -217,6 +221,7 @@ def test_crowded_tracers_are_told(take: Photographer) -> None:
     assert take.verdicts(take.tracers(6.0))["tracers"] == "no"
 
 
+@pytest.mark.thorough
 def test_a_white_image_of_another_camera_is_told(take: Photographer) -> None:
     other = replace(take.camera, lattice=Lattice.regular(0.12))
     pictures = Pictures({"a.tif": take.tracers(0.1)}, take.white(other), take.cap_on)
@@ -226,6 +231,7 @@ def test_a_white_image_of_another_camera_is_told(take: Photographer) -> None:
     assert verdicts(told)["drift"] == "unknown"
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("per_lens", [0.1, 0.5, 1.5])
 def test_tracers_are_counted(per_lens: float) -> None:
     own = Photographer()
@@ -280,6 +286,7 @@ def test_errors_are_those_that_are_measured() -> None:
     assert np.sqrt(np.mean(depth**2)) == pytest.approx(1.0, abs=0.3)
 
 
+@pytest.mark.thorough
 def test_the_command_tells_all(tmp_path: Path) -> None:
     rig, image, picture = tmp_path / "rig.yaml", tmp_path / "a.tif", tmp_path / "rig.png"
     rig.write_text(rig_text(SMALL, "small"))

@@ -26,6 +26,7 @@ def test_help_imports_nothing_heavy():
     assert subprocess.run([sys.executable, "-c", script], capture_output=True, text=True).stdout.strip() == "[]"
 
 
+@pytest.mark.thorough
 def test_usage_errors_give_2(tmp_path):
     assert lfpiv("no-such-command").returncode == 2
     assert lfpiv("simulate", "white", CONFIG).returncode == 2
@@ -33,6 +34,7 @@ def test_usage_errors_give_2(tmp_path):
     assert lfpiv("build-weights", CONFIG, "-o", CONFIG, "--overwrite").returncode == 2
 
 
+@pytest.mark.thorough
 def test_config_errors_give_3_with_line_and_near_miss(tmp_path):
     broken = tmp_path / "rig.yaml"
     broken.write_text(CONFIG.read_text().replace("layout:", "layuot:"))
@@ -44,6 +46,7 @@ def test_config_errors_give_3_with_line_and_near_miss(tmp_path):
     assert not (tmp_path / "w.h5").exists()
 
 
+@pytest.mark.thorough
 def test_missing_input_gives_4_and_names_it(tmp_path):
     done = lfpiv("calibrate-snapshot", CONFIG, "--white", tmp_path / "no such.tif", "-o", tmp_path / "c.h5")
     assert done.returncode == 4
@@ -51,6 +54,7 @@ def test_missing_input_gives_4_and_names_it(tmp_path):
     assert done.stderr.count("\n") == 1
 
 
+@pytest.mark.thorough
 def test_existing_output_gives_6_and_is_untouched(tmp_path):
     target = tmp_path / "w.h5"
     target.write_text("mine")
@@ -58,10 +62,12 @@ def test_existing_output_gives_6_and_is_untouched(tmp_path):
     assert target.read_text() == "mine"
 
 
+@pytest.mark.thorough
 def test_unwritable_output_gives_7_before_computing(tmp_path):
     assert lfpiv("build-weights", CONFIG, "-o", tmp_path / "no" / "such" / "w.h5").returncode == 7
 
 
+@pytest.mark.thorough
 def test_json_goes_to_stdout_alone(tmp_path):
     config = tmp_path / "air.yaml"
     config.write_text(CONFIG.read_text().replace("reference: mid_plane", "reference: focal_point"))
@@ -81,6 +87,7 @@ def test_a_closed_pipe_is_quiet():
     assert done.stderr == ""
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGTERM to send")
 @pytest.mark.parametrize(("sent", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
 def test_signals_end_the_work_and_leave_nothing(tmp_path, sent, code):

@@ -46,6 +46,7 @@ def cubic_rays():
     return PolynomialRays(np.array([1.0, 1.0, 4.0, 12.5, 12.5]), exponents, bent)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("method", ["ert", "drt", "dlfc"])
 @pytest.mark.parametrize("column_axis", ["x", "y"])
 def test_forward_and_adjoint_are_adjoint(turned, water, window, rng, column_axis, method):
@@ -73,6 +74,7 @@ def fitted_to(space, camera, depths_mm=(-1.5, -0.5, 0.5, 1.5, 2.5), twist=0.0):
     return PolynomialRays(scale, exponents, np.linalg.lstsq(terms, array, rcond=None)[0])
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("column_axis", ["x", "y"])
 def test_fitted_rays_factorise_where_their_axes_separate(table2, water, column_axis):
     camera = replace(table2, columns=380, rows=260, column_axis=column_axis, distortion_per_mm2=2e-3)
@@ -94,6 +96,7 @@ def test_fitted_rays_factorise_where_their_axes_separate(table2, water, column_a
     assert isinstance(operator_of(camera, fitted_to(space, camera, twist=0.03), GRID), OnDemandOperator)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("column_axis", ["x", "y"])
 def test_columns_agree_with_the_factorised_form(table2, water, rng, column_axis):
     camera = replace(table2, columns=380, rows=260, column_axis=column_axis)
@@ -122,6 +125,7 @@ def test_column_is_the_image_of_one_voxel(turned, water):
         np.testing.assert_array_equal(one, other)
 
 
+@pytest.mark.thorough
 def test_lines_of_sight_keep_what_is_lit_and_leave_most_out(turned, water):
     grid = Grid.centred((12, 12, 12), (0.1, 0.1, 0.6), (0.0, 0.0, 0.0))
     operator = OnDemandOperator(turned, ObjectSpace(water, None, "paraxial"), grid)
@@ -143,6 +147,7 @@ def test_a_dark_image_has_no_columns(turned, water):
     assert not restricted.adjoint(dark + 1.0).any()
 
 
+@pytest.mark.thorough
 def test_too_many_columns_are_refused_with_their_size(turned, water, monkeypatch):
     operator = OnDemandOperator(turned, ObjectSpace(water, None, "paraxial"), GRID)
     monkeypatch.setattr(columns_module, "LARGEST_BYTES", 1000)
@@ -150,6 +155,7 @@ def test_too_many_columns_are_refused_with_their_size(turned, water, monkeypatch
         operator.restricted(np.ones(operator.image_shape, np.float32))
 
 
+@pytest.mark.thorough
 def test_same_bits_for_any_number_of_threads(turned, water, rng, one_thread):
     operator = OnDemandOperator(turned, ObjectSpace(water, None, "paraxial"), GRID)
     volume = rng.random(operator.shape, dtype=np.float32)
@@ -172,6 +178,7 @@ def test_counted_columns_agree_with_integrated_ones(turned, water, rng):
         assert np.abs(counted.image(n, operator.image_shape) - exact).sum() < 0.12  # 2000 points: about 0.07
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("column_axis", ["x", "y"])
 def test_bricks_are_adjoint_and_nearly_hexagons(table2, water, rng, column_axis):
     lattice = Lattice.regular(0.1, "hexagonal", 0.0, (0.013, -0.021))
@@ -248,6 +255,7 @@ def test_a_hexagonal_rig_is_reconstructed_from_columns_on_demand(rig, tmp_path):
     assert np.unravel_index(np.argmax(found), found.shape) == (1, 2, 3)
 
 
+@pytest.mark.thorough
 def test_counted_rays_share_the_file_format(rig):
     small = yaml.safe_dump(RIG | {"weights": {"points": 400, "rays_per_point": 50}})
     rig.write_text(small)

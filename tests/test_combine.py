@@ -51,6 +51,7 @@ def turned_square(out, to, source, lines):
     turn(out, to, source, lines)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("onto", [0, 3])
 @pytest.mark.parametrize("count", [0, 1, 7])
 @pytest.mark.parametrize(
@@ -70,6 +71,7 @@ def test_combine_equals_its_reference(rng, compiled, shape, onto, count, term_st
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("count", [0, 1, 3])
 def test_combine_turned_equals_its_reference(rng, count):
     step = LANES + 3
@@ -97,6 +99,7 @@ def test_lanes_are_those_of_the_processor():
     assert lanes_of("+avx2,-avx512f") == lanes_of("") == 8
 
 
+@pytest.mark.thorough
 def test_benchmarks_run_at_a_tiny_size(water: Media, table2):
     operator = factorise(table2, water, Grid.centred((3, 3, 2), (0.1, 0.1, 0.1), (0.0, 0.0, 0.0)))
     assert share_of_matrix_product_rate(operator, 1e6, side=32, repeats=1)["share"] > 0.0

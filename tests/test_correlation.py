@@ -234,6 +234,7 @@ def test_joint_mask_takes_both_volumes_where_either_source_is_unseen() -> None:
     np.testing.assert_array_equal(got_a > 0.5, got_b > 0.5)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("shift", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (2.3, -3.6, 0.7)])
 def test_rigid_shift_is_found_with_its_sign_up_to_the_borders(
     shift: tuple[float, float, float], rng: np.random.Generator
@@ -249,6 +250,7 @@ def test_rigid_shift_is_found_with_its_sign_up_to_the_borders(
     assert np.all(np.abs(error[1:-1, 1:-1, 1:-1]) < 0.02)
 
 
+@pytest.mark.thorough
 def test_linear_shear_is_found_up_to_the_borders(rng: np.random.Generator) -> None:
     shape = (48, 48, 48)
 
@@ -265,6 +267,7 @@ def test_linear_shear_is_found_up_to_the_borders(rng: np.random.Generator) -> No
     assert np.all(root_mean_square(error[1:-1, 1:-1, 1:-1]) < 0.015)
 
 
+@pytest.mark.thorough
 def test_elongated_particles_and_windows(rng: np.random.Generator) -> None:
     shape, shift = (40, 40, 48), (1.3, 0.7, 1.5)
     a, b = moving_pair(rigid(*shift), shape, rng, sigma=(1.0, 1.0, 4.0))
@@ -276,6 +279,7 @@ def test_elongated_particles_and_windows(rng: np.random.Generator) -> None:
     assert field.uncertainty_voxel is not None
 
 
+@pytest.mark.thorough
 def test_long_particles_do_not_flatten_a_curved_flow(rng: np.random.Generator) -> None:
     shape = (40, 40, 96)
 
@@ -297,6 +301,7 @@ def test_long_particles_do_not_flatten_a_curved_flow(rng: np.random.Generator) -
     assert abs(slopes[0] - 1.0) < 0.6 * abs(slopes[1] - 1.0)
 
 
+@pytest.mark.thorough
 def test_roots_of_intensities_let_dim_particles_count(rng: np.random.Generator) -> None:
     shape, shift = (40, 40, 40), (1.3, -0.7, 0.4)
     sharp = (0.5, 0.5, 0.5)
@@ -309,6 +314,7 @@ def test_roots_of_intensities_let_dim_particles_count(rng: np.random.Generator) 
     assert errors[1] < 0.7 * errors[0]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("windows", "overlap"),
     [
@@ -327,6 +333,7 @@ def test_any_windows_and_overlap_work(
     np.testing.assert_allclose(field.displacement_voxel, np.broadcast_to(shift, (*field.flag.shape, 3)), atol=0.03)
 
 
+@pytest.mark.thorough
 def test_exchanging_the_volumes_turns_the_vectors_round(rng: np.random.Generator) -> None:
     shape = (40, 40, 40)
     a, b = moving_pair(rigid(1.3, -0.7, 0.4), shape, rng)
@@ -336,6 +343,7 @@ def test_exchanging_the_volumes_turns_the_vectors_round(rng: np.random.Generator
     np.testing.assert_allclose(there.displacement_voxel, -back.displacement_voxel, atol=1e-4)
 
 
+@pytest.mark.thorough
 def test_exchanging_axes_exchanges_components(rng: np.random.Generator) -> None:
     a, b = moving_pair(rigid(1.3, -0.7, 0.4), (40, 44, 36), rng)
     straight = correlate([(a, b)], unit_grid((40, 44, 36)), CorrelationSettings([(16, 16, 16)], HALF))
@@ -360,6 +368,7 @@ def test_constant_volumes_have_finite_or_flagged_vectors() -> None:
     assert np.all(np.isfinite(field.velocity[field.flag < REJECTED]))
 
 
+@pytest.mark.thorough
 def test_half_empty_volume_keeps_its_other_half(rng: np.random.Generator) -> None:
     shape, shift = (64, 32, 32), (1.3, -0.7, 0.4)
     a, b = moving_pair(rigid(*shift), shape, rng)
@@ -373,6 +382,7 @@ def test_half_empty_volume_keeps_its_other_half(rng: np.random.Generator) -> Non
     assert np.array_equal(np.isnan(field.velocity).any(axis=-1), field.flag >= REJECTED)
 
 
+@pytest.mark.thorough
 def test_masked_windows_are_masked_and_their_neighbours_unharmed(rng: np.random.Generator) -> None:
     shape, shift = (64, 32, 32), (1.3, -0.7, 0.4)
     a, b = moving_pair(rigid(*shift), shape, rng)
@@ -386,6 +396,7 @@ def test_masked_windows_are_masked_and_their_neighbours_unharmed(rng: np.random.
     np.testing.assert_allclose(field.displacement_voxel[seen], np.broadcast_to(shift, (seen.sum(), 3)), atol=CORNER)
 
 
+@pytest.mark.thorough
 def test_voxels_that_are_not_finite_are_masked(rng: np.random.Generator) -> None:
     shape, shift = (40, 40, 40), (1.3, -0.7, 0.4)
     a, b = moving_pair(rigid(*shift), shape, rng)
@@ -394,6 +405,7 @@ def test_voxels_that_are_not_finite_are_masked(rng: np.random.Generator) -> None
     np.testing.assert_allclose(field.displacement_voxel, np.broadcast_to(shift, (*field.flag.shape, 3)), atol=CORNER)
 
 
+@pytest.mark.thorough
 def test_an_ensemble_finds_what_its_pairs_are_too_sparse_for(rng: np.random.Generator) -> None:
     shape, shift = (40, 40, 40), (1.3, -0.7, 0.4)
     pairs = [moving_pair(rigid(*shift), shape, rng, per_window=1.0) for _ in range(12)]
@@ -406,6 +418,7 @@ def test_an_ensemble_finds_what_its_pairs_are_too_sparse_for(rng: np.random.Gene
         correlate([], unit_grid(shape), CorrelationSettings([(16, 16, 16)], HALF))
 
 
+@pytest.mark.thorough
 def test_an_ensemble_of_one_pair_twice_is_that_pair(rng: np.random.Generator) -> None:
     shape = (32, 32, 32)
     a, b = moving_pair(rigid(1.3, -0.7, 0.4), shape, rng)
@@ -415,6 +428,7 @@ def test_an_ensemble_of_one_pair_twice_is_that_pair(rng: np.random.Generator) ->
     np.testing.assert_allclose(twice.correlation, once.correlation, atol=1e-6)
 
 
+@pytest.mark.thorough
 def test_threads_do_not_change_a_bit(rng: np.random.Generator, one_thread) -> None:
     shape = (40, 40, 40)
     a, b = moving_pair(rigid(1.3, -0.7, 0.4), shape, rng)
@@ -456,6 +470,7 @@ def test_arguments_that_do_not_belong_together_are_refused(change: dict, error: 
         correlate(**arguments, settings=CorrelationSettings(**settings))
 
 
+@pytest.mark.thorough
 def test_a_region_without_tracers_has_no_vectors(rng: np.random.Generator) -> None:
     shape = (48, 32, 32)
     pair = moving_pair(rigid(0.6, -0.3, 0.2), shape, rng)

@@ -48,6 +48,7 @@ def image_of(bench: Bench, number: float, seed: int) -> np.ndarray:
     return image.reshape(content.image_shape).astype(np.float32)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("number", [0.3, 3.0])
 def test_few_and_crowded_tracers_are_counted(bench: Bench, number: float) -> None:
     counts = [tracers_per_lens(bench, frame_of(bench, *[image_of(bench, number, seed)] * 2)) for seed in range(3)]
@@ -55,6 +56,7 @@ def test_few_and_crowded_tracers_are_counted(bench: Bench, number: float) -> Non
     assert np.mean(counts) == pytest.approx(number, rel=0.2)
 
 
+@pytest.mark.thorough
 def test_light_that_does_not_tell_is_not_counted(bench: Bench) -> None:
     image = image_of(bench, 0.5, 0)
     masked = np.full_like(image, np.nan)

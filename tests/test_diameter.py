@@ -54,6 +54,7 @@ def tasks_of(
     return [task_of(image.astype(np.float32), view, weights, camera, sums) for image in noisy]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("lenses", "assumed"), [(0.1, 2.0), (0.5, 0.1), (2.0, 0.5)])
 def test_the_diameter_is_found_whatever_was_assumed(
     table2: Camera, water: Media, rng: np.random.Generator, lenses: float, assumed: float
@@ -71,6 +72,7 @@ def test_the_diameter_is_found_whatever_was_assumed(
     assert found.lenses == pytest.approx(lenses, rel=0.02, abs=0.01)
 
 
+@pytest.mark.thorough
 def test_frames_are_taken_until_they_hold_enough_tracers(
     table2: Camera, water: Media, rng: np.random.Generator
 ) -> None:
@@ -100,6 +102,7 @@ def test_sizes_of_frames_are_pooled_and_a_point_has_a_limit() -> None:
     assert 0.1 < point.lenses + 3.0 * point.sigma_lenses < 0.25
 
 
+@pytest.mark.thorough
 def test_a_view_of_other_balls_is_that_made_for_them(table2: Camera, water: Media) -> None:
     for layout in ("square", "hexagonal"):
         camera = replace(table2, columns=120, rows=110, lattice=Lattice.regular(0.1, layout))

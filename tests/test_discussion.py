@@ -55,11 +55,13 @@ def test_neighbours_cost_accuracy(small):
     assert many[2] > 1.2 * few[2]
 
 
+@pytest.mark.thorough
 def test_more_iterations_make_a_tracer_shorter(small):
     first, later = (elongations_mm(small, WATER, [3.0], SolverSettings("sart", count))[0] for count in (2, 12))
     assert 0.5 < later < first < 8.0
 
 
+@pytest.mark.thorough
 def test_the_part_names_the_papers_seeding_per_microlens(tmp_path: Path):
     found = discussion(Work(tmp_path, "tiny", Console(only_warnings=True), {}))
     # 330.6 pixels each

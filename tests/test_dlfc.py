@@ -44,6 +44,7 @@ def pictures(camera, media, rng, places, board=BOARD):
     return [render_board(camera, space, board, place, LEVEL, rng) for place in places]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("column_axis", ["x", "y"])
 def test_fitted_rays_meet_the_array_where_traced_ones_do_eq_1(camera, water, rng, column_axis):
     seen_by = replace(small(camera), distortion_per_mm2=2e-3, column_axis=column_axis)
@@ -63,6 +64,7 @@ def test_fitted_rays_meet_the_array_where_traced_ones_do_eq_1(camera, water, rng
     assert np.sqrt(np.mean(error**2)) < 0.9e-3
 
 
+@pytest.mark.thorough
 def test_boards_at_several_depths_show_the_entrance_pupil_and_rays_are_fitted_behind_it(table2, water, rng):
     """A lens of P = 1.3, told as a thin one: its entrance pupil is 100 (1/1.3 + 1) = 176.9 mm away, not 200."""
     told = replace(small(table2), aperture_mm=22.0)
@@ -106,6 +108,7 @@ def test_the_entrance_pupil_follows_from_how_boards_shrink(table2, rng, entrance
     assert entrance_pupil_mm([replace(each, z_mm=-each.z_mm) for each in boards], 1.0 / 1.33) is None
 
 
+@pytest.mark.thorough
 def test_three_depths_give_degree_two_and_two_are_refused(table2, water, rng):
     camera = small(table2)
     images = pictures(camera, water, rng, [BoardPlacement(z) for z in (-4.0, 0.5, 5.0)])
@@ -153,6 +156,7 @@ def run(*arguments):
     return CliRunner().invoke(cli, [str(argument) for argument in arguments])
 
 
+@pytest.mark.thorough
 def test_from_boards_at_depths_to_columns(rig, tmp_path, table2, water, rng):
     lattice = table2.lattice
     camera = replace(table2, columns=520, rows=440, lattice=lattice)

@@ -66,6 +66,7 @@ def test_there_are_commands_to_test():
     assert {page.name for page, _ in LFPIV} >= {"README.md", "start.md", "your-rig.md", "batches.md"}
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("command", sorted({command for _, command in LFPIV}))
 def test_every_command_is_understood(command):
     name, *arguments = shlex.split(command)[1:]

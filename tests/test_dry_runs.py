@@ -33,6 +33,7 @@ def test_a_dry_run_tells_and_writes_nothing(weights, images, tmp_path, capsys) -
     assert written < summary["disk_mb"] < 10.0 * written
 
 
+@pytest.mark.thorough
 def test_a_dry_run_believes_what_is_there_and_the_log(weights, images, tmp_path, capsys) -> None:
     command = ("reconstruct", weights, *images, *QUICK, "-o", tmp_path / "out", "--log", tmp_path / "log", "--resume")
     run(*command)

@@ -114,6 +114,7 @@ def ensure_record(text: str) -> None:
     assert list(made["made_from"].values()) == [MADE]
 
 
+@pytest.mark.thorough
 def test_content_is_all_that_is_in_the_file(source: Path) -> None:
     content = read_content(source)
     with h5py.File(source) as file:
@@ -123,6 +124,7 @@ def test_content_is_all_that_is_in_the_file(source: Path) -> None:
             assert content.units[name] == file[name].attrs["units"].decode()
 
 
+@pytest.mark.thorough
 def test_netcdf_comes_back(source: Path) -> None:
     path, content = exported(source, "netcdf")
     with netcdf_file(path, mmap=False) as file:
@@ -144,6 +146,7 @@ def test_netcdf_comes_back(source: Path) -> None:
         assert found["chc"].sum() == 23
 
 
+@pytest.mark.thorough
 def test_matlab_comes_back(source: Path) -> None:
     path, content = exported(source, "mat")
     assert path.read_bytes()[:128].startswith(b"MATLAB 5.0 MAT-file, written by lfpiv  ")
@@ -154,6 +157,7 @@ def test_matlab_comes_back(source: Path) -> None:
         same(found[name].reshape(array.shape), array)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("to", ["csv", "tecplot"])
 def test_text_comes_back(source: Path, to: ExportFormat) -> None:
     path, content = exported(source, to)
@@ -201,6 +205,7 @@ def test_tecplot_has_a_zone_for_each_frame_with_its_time(tmp_path: Path, rng: np
     ]
 
 
+@pytest.mark.thorough
 def test_vtk_reads_images_and_points(source: Path) -> None:
     vtk = pytest.importorskip("vtkmodules.vtkIOXML")
     from vtkmodules.util.numpy_support import vtk_to_numpy
@@ -228,6 +233,7 @@ def test_vtk_reads_images_and_points(source: Path) -> None:
         assert lines == ([3, 2] if source.stem == "trajectories" else [])
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("planes", [1, 2])
 def test_vtk_plays_vectors(planes: int, tmp_path: Path, rng: np.random.Generator) -> None:
     vtk = pytest.importorskip("vtkmodules.vtkIOHDF")
@@ -264,6 +270,7 @@ def test_tracks_of_a_sequence_are_played_as_follow_writes_them(tmp_path: Path, r
         np.testing.assert_allclose(file["VTKHDF/Steps/Values"], [0.0, 0.002, 0.004, 0.006])
 
 
+@pytest.mark.thorough
 def test_xarray_opens_vectors_of_several_times(tmp_path: Path, rng: np.random.Generator) -> None:
     xarray = pytest.importorskip("xarray")
     paths = [tmp_path / f"{number}.vtkhdf" for number in range(2)]
@@ -306,6 +313,7 @@ def test_flowtracks_reads_the_tracks_of_a_sequence(tmp_path: Path, rng: np.rando
     np.testing.assert_allclose(velocity, content.arrays["velocity"], rtol=1e-15)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", [PARTICLES_FORMAT, TRACKS_FORMAT, TRAJECTORIES_FORMAT])
 def test_no_points_are_no_fault(name: str, tmp_path: Path, rng: np.random.Generator) -> None:
     full = points_of(name, rng)
@@ -326,6 +334,7 @@ def test_no_points_are_no_fault(name: str, tmp_path: Path, rng: np.random.Genera
     assert (reader.GetErrorCode(), reader.GetOutput().GetNumberOfPoints()) == (0, 0)
 
 
+@pytest.mark.thorough
 def test_the_same_work_gives_the_same_bytes(source: Path, tmp_path: Path) -> None:
     for to in names_in(ExportFormat):
         if read_content(source).format_name in FORMATS[to].takes:
@@ -336,6 +345,7 @@ def test_the_same_work_gives_the_same_bytes(source: Path, tmp_path: Path) -> Non
             (tmp_path / "again").unlink()
 
 
+@pytest.mark.thorough
 def test_what_does_not_fit_is_refused_with_what_does(source: Path) -> None:
     refused = [to for to in FORMATS if read_content(source).format_name not in FORMATS[to].takes]
     assert refused
@@ -345,6 +355,7 @@ def test_what_does_not_fit_is_refused_with_what_does(source: Path) -> None:
     assert sorted(source.parent.iterdir()) == [source]
 
 
+@pytest.mark.thorough
 def test_several_files_need_a_name_and_a_format_for_them(tmp_path: Path, rng: np.random.Generator) -> None:
     paths = [tmp_path / "a.vtkhdf", tmp_path / "b.vtkhdf"]
     for path in paths:
@@ -355,6 +366,7 @@ def test_several_files_need_a_name_and_a_format_for_them(tmp_path: Path, rng: np
         run("export", *paths, "--to", "vti", "-o", tmp_path / "all.vti")
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("changes", "words"),
     [({"grid": Grid((4, 3, 3), GRID.spacing_mm, GRID.origin_mm)}, "on Grid"), ({"dt_s": 0.003}, "'dt_s': 0.003")],

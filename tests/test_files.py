@@ -175,6 +175,7 @@ def write_under_limits(path: Path) -> None:
     assert os.listdir(path.parent) == [path.name]
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(sys.platform == "win32", reason="no limit on the size of files")
 def test_a_full_disk_is_an_error_and_never_a_crash(tmp_path: Path) -> None:
     code = f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})\nimport pathlib, test_files\n"
@@ -199,12 +200,14 @@ def test_tree_round_trip(tmp_path: Path) -> None:
         assert file["array"].fletcher32
 
 
+@pytest.mark.thorough
 def test_same_content_gives_the_same_bytes(tmp_path: Path) -> None:
     first = save_tree(tmp_path / "a.h5").read_bytes()
     time.sleep(1.1)  # HDF5 keeps times in seconds
     assert save_tree(tmp_path / "b.h5").read_bytes() == first
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("damage", ["cut", "flipped", "zero tail"])
 def test_damage_is_never_read_as_data(tmp_path: Path, damage: str) -> None:
     whole = save_tree(tmp_path / "t.h5").read_bytes()
@@ -372,6 +375,7 @@ def test_vectors_round_trip(tmp_path: Path, uncertainty: bool) -> None:
     np.testing.assert_array_equal(np.isfinite(velocity).all(-1), field.flag <= 2)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("nz", [1, 2])
 def test_paraviews_reader_opens_the_very_files(tmp_path: Path, rng: np.random.Generator, nz: int) -> None:
     vtk = pytest.importorskip("vtk")
@@ -399,6 +403,7 @@ def test_paraviews_reader_opens_the_very_files(tmp_path: Path, rng: np.random.Ge
     assert found.keys() >= {"displacement_voxel", "displacement_raw_voxel", "peak_ratio", "uncertainty_voxel"}
 
 
+@pytest.mark.thorough
 def test_xarray_opens_the_very_files(tmp_path: Path, rng: np.random.Generator) -> None:
     xarray = pytest.importorskip("xarray")
     array = rng.random(GRID.shape_zyx).astype(np.float32)
@@ -414,6 +419,7 @@ def test_volume_and_vectors_are_not_taken_for_each_other(tmp_path: Path) -> None
     assert refused(lambda: open_vectors(path), "v.vtkhdf: holds lfpiv-volume, expected lfpiv-vectors")
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
@@ -464,6 +470,7 @@ def test_records_are_carried_along_and_say_nothing_of_time_or_place(tmp_path: Pa
 FRAMES = np.random.default_rng(1).integers(0, 4096, (3, 40, 50)).astype(np.uint16)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "options",
     [
@@ -639,6 +646,7 @@ def test_absurd_images_are_refused_quickly(tmp_path: Path, content: bytes, words
     tracemalloc.stop()
 
 
+@pytest.mark.thorough
 def test_flipped_bits_in_a_tiff_lose_no_page_and_raise_nothing_else(tmp_path: Path, rng: np.random.Generator) -> None:
     path = tmp_path / "t.tif"
     tifffile.imwrite(path, FRAMES, photometric="minisblack", compression="zlib", rowsperstrip=16)
@@ -651,6 +659,7 @@ def test_flipped_bits_in_a_tiff_lose_no_page_and_raise_nothing_else(tmp_path: Pa
             assert len(pages_of(path, (40, 50))) == 3
 
 
+@pytest.mark.thorough
 def test_written_images_read_back_and_hold_no_time(tmp_path: Path) -> None:
     for dtype in (np.uint8, np.uint16):
         image = FRAMES[0].astype(dtype)

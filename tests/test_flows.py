@@ -160,6 +160,7 @@ def test_duct_advection_moves_by_velocity_times_time():
     assert moved[0] == pytest.approx([0.40827, 0, 0], abs=1e-5)
 
 
+@pytest.mark.thorough
 def test_duct_line_mean_by_quadrature():
     """The flux through the section, by nested quadrature, does not depend on the series' own mean."""
     flow = square_duct(2.0, 1.0)
@@ -167,6 +168,7 @@ def test_duct_line_mean_by_quadrature():
     assert quad(line, 0, 1, epsabs=1e-6)[0] == pytest.approx(1.0, abs=1e-5)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_random_modes_have_their_rms_and_a_kolmogorov_spectrum(seed, rng):
     points = rng.uniform(-2000.0, 2000.0, (20000, 3))

@@ -112,11 +112,13 @@ def assert_right(tracks: Points) -> None:
     assert np.all(np.abs(velocity - MOVED_MM * 1e-3 / DT_S) < (2e-4, 2e-4, 2e-3))
 
 
+@pytest.mark.thorough
 def test_tracks_are_right(followed: Path) -> None:
     assert [path.is_file() for path in particle_files(followed)] == [True] * FRAMES
     assert_right(tracks_of(followed))
 
 
+@pytest.mark.thorough
 def test_track_links_the_same(followed: Path, tmp_path: Path) -> None:
     run("track", *particle_files(followed), "--shortest", 4, "-o", tmp_path / "tracks.vtkhdf")
     again, tracks = read_points(tmp_path / "tracks.vtkhdf", TRAJECTORIES_FORMAT), tracks_of(followed)
@@ -125,6 +127,7 @@ def test_track_links_the_same(followed: Path, tmp_path: Path) -> None:
         np.testing.assert_array_equal(again.arrays[name], array)
 
 
+@pytest.mark.thorough
 def test_in_memory_it_is_the_same(
     rig: Path, followed: Path, one_thread: Callable[[], AbstractContextManager[None]]
 ) -> None:
@@ -139,6 +142,7 @@ def test_in_memory_it_is_the_same(
     np.testing.assert_array_equal(found.tracks.points.position_mm, tracks_of(followed).position_mm)
 
 
+@pytest.mark.thorough
 def test_what_was_interrupted_goes_on(
     rig: Path, followed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -168,6 +172,7 @@ def test_what_was_interrupted_goes_on(
     assert particle_files(tmp_path / "run")[3].stat().st_mtime_ns == made
 
 
+@pytest.mark.thorough
 def test_what_is_there_is_replaced_when_asked(rig: Path, followed: Path) -> None:
     before = bytes_of(followed)
     with pytest.raises(OutputExistsError):
@@ -186,6 +191,7 @@ def test_two_frames_are_refused(rig: Path, tmp_path: Path) -> None:
         lf.follow(lf.open_weights(rig / "weights.h5"), [lf.read_image(path) for path in images(rig)[:2]])
 
 
+@pytest.mark.thorough
 def test_a_frame_of_another_sequence_is_said(rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     other = tmp_path / "other.tif"
     write_tiff(other, np.ascontiguousarray(lf.read_image(rig / "frame_2.tif")[::-1]), overwrite=False)
@@ -196,6 +202,7 @@ def test_a_frame_of_another_sequence_is_said(rig: Path, tmp_path: Path, capsys: 
     assert [each["about"] for each in warnings if each["code"] == "frame-apart"] == ["other"]
 
 
+@pytest.mark.thorough
 def test_both_ways_keep_what_was_found_forwards(rig: Path, followed: Path, tmp_path: Path) -> None:
     follow(rig, tmp_path / "run", "--both-ways", "--residuals", "--threads", 1)
     assert_right(tracks_of(tmp_path / "run"))
@@ -211,6 +218,7 @@ def test_both_ways_keep_what_was_found_forwards(rig: Path, followed: Path, tmp_p
         assert np.std(left) < 7.0
 
 
+@pytest.mark.thorough
 def test_tracks_end_before_a_frame_that_cannot_be_read(rig: Path, tmp_path: Path, capsys) -> None:
     names = [tmp_path / f"t_{number}.tif" for number in (8, 9, 10, 11, 13)]
     for path, source in zip(names, [0, 1, 2, None, 3], strict=True):

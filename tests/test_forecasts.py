@@ -99,6 +99,7 @@ def errors_over_stated(recorded: Recorded, so_far: SoFar) -> NDArray[np.float64]
     return (so_far.ahead.position_mm - recorded.places[so_far.last + 1][true]) / so_far.ahead.sigma_mm
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("flow", "least"), [("vortex", 0.9), ("turbulence", 0.85)])
 def test_stated_errors_of_forecasts_cover(flow: str, least: float, request: pytest.FixtureRequest) -> None:
     """In turbulence errors have longer tails than normal ones: 0.87 to 0.89 were measured."""
@@ -110,6 +111,7 @@ def test_stated_errors_of_forecasts_cover(flow: str, least: float, request: pyte
     assert np.all((covered > least) & (covered < 0.99))
 
 
+@pytest.mark.thorough
 def test_what_one_frame_lost_is_still_ahead(vortex: Recorded) -> None:
     gone, expected, ratios = [], [], []
     for so_far in vortex.steps[2:-1]:
@@ -126,6 +128,7 @@ def test_what_one_frame_lost_is_still_ahead(vortex: Recorded) -> None:
     assert np.mean(np.abs(np.concatenate(ratios)) < 3.0) > 0.95
 
 
+@pytest.mark.thorough
 def test_a_memory_of_few_frames_gives_the_same_tracks(turbulence: Recorded) -> None:
     recent = {0: turbulence.frames[0]}
     so_far = begun(recent)

@@ -90,6 +90,7 @@ def sums(folder: Path, *names: str) -> Path:
     return folder / "SHA256SUMS"
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("packed", ["lzw", "packbits", "zstd"])
 def test_a_list_of_sums_tells_what_the_format_cannot(tmp_path: Path, packed: str) -> None:
     frame, config = tmp_path / "a.tif", tmp_path / "rig.yaml"

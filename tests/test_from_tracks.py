@@ -21,6 +21,7 @@ def paths_in(count: int, share: float, rng: np.random.Generator) -> Paths:
     return Paths(points, np.tile((0.05, 0.0, 0.0), (count, 1)), np.full((count, 3), 0.002))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("count", [200, 1000])
 def test_a_region_without_tracks_has_no_vectors(count: int, rng: np.random.Generator) -> None:
     field = vectors_from_paths(paths_in(count, 0.6, rng), WINDOWS, None)

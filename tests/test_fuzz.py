@@ -15,6 +15,7 @@ from lfpiv_cli.errors import InputError
 FEW = {"config": 20, "images": 150, "results": 30, "edited": 20}
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", READERS)
 def test_readers_take_or_refuse_whatever_comes(tmp_path: Path, name: str) -> None:
     reader = READERS[name]

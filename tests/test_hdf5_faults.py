@@ -144,6 +144,7 @@ HOSTILE: dict[str, Callable[[h5py.File, Path], object]] = {
 }
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(sys.platform == "win32", reason="no named pipes in folders")
 @pytest.mark.parametrize("harm", HOSTILE)
 @pytest.mark.parametrize("kind", ["vectors", "tracks", "weights"])

@@ -38,6 +38,7 @@ def picture(path: Path, value: float) -> Path:
     return path
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e300, 1e30])
 @pytest.mark.parametrize("option", ["--dark", "--background", "--mask"])
 def test_a_reference_that_holds_no_counts_is_the_inputs_fault(
@@ -59,6 +60,7 @@ def test_so_it_is_in_a_calibration(tmp_path: Path, option: str) -> None:
     assert "reference.tif: 1 of its" in said
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e300, 1e30])
 def test_frames_with_such_pixels_give_volumes_of_numbers(tmp_path: Path, weights: Path, value: float) -> None:
     frame = picture(tmp_path / "frame.tif", value)
@@ -72,6 +74,7 @@ def test_figures_that_are_no_numbers_are_null(capsys) -> None:
     assert json.loads(capsys.readouterr().out) == {"error": None, "by_plane": [1.0, None]}
 
 
+@pytest.mark.thorough
 def test_images_without_a_number_are_judged_in_json(tmp_path: Path, weights: Path, capsys) -> None:
     tifffile.imwrite(tmp_path / "a.tif", np.full((ROWS, COLUMNS), np.nan, np.float32))
     assert ended("check", weights.with_name("rig.yaml"), tmp_path / "a.tif", "--json")[0] in (0, 4)

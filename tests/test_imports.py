@@ -58,11 +58,13 @@ def imported(module: Path) -> Iterator[str]:
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("module", MODULES, ids=lambda m: str(m.relative_to(PACKAGE)))
 def test_every_module_has_its_layer(module: Path) -> None:
     assert any(place_of(module) in names for names in LAYERS)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("module", MODULES, ids=lambda m: str(m.relative_to(PACKAGE)))
 def test_imports_point_back(module: Path) -> None:
     here = layer_of(module)
@@ -72,6 +74,7 @@ def test_imports_point_back(module: Path) -> None:
             assert layer_of(PACKAGE / parts[1]) <= here, f"{module.name} imports {name}, which lies ahead of it"
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("module", [m for m in MODULES if layer_of(m) < FIRST_OUTER_LAYER], ids=lambda m: m.name)
 def test_the_core_touches_no_disk_and_no_terminal(module: Path) -> None:
     outer = {name.split(".")[0] for name in imported(module)} & OUTER_ONLY

@@ -59,6 +59,7 @@ def test_info_names_format_method_shapes_and_origin(weights):
     assert found["inputs"] == ["config rig.yaml"]
 
 
+@pytest.mark.thorough
 def test_info_draws_a_column(weights, tmp_path):
     picture = tmp_path / "column.png"
     run("info", str(weights), "--picture", str(picture), "--voxel", "4", "0", "2")

@@ -120,6 +120,7 @@ def test_the_papers_camera_is_that_of_table_2(tmp_path: Path) -> None:
     assert [ours.grid().bounds_mm(k) for k in range(3)] == [pytest.approx(papers.grid().bounds_mm(k)) for k in range(3)]
 
 
+@pytest.mark.thorough
 def test_what_a_calibration_was_made_with_is_written_again(tmp_path: Path) -> None:
     sample, data = ROOT / "configs" / "sample.yaml", ROOT / "sample_data"
     made = tmp_path / "calibration.h5"

@@ -57,6 +57,7 @@ def by_commands(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+@pytest.mark.thorough
 def test_calibration_and_weights_are_those_of_the_commands(by_commands: Path) -> None:
     rig = lf.load_rig(CONFIG)
     calibration = lf.calibrate(image("white"), image("board"), rig, dark=image("dark"))
@@ -69,6 +70,7 @@ def test_calibration_and_weights_are_those_of_the_commands(by_commands: Path) ->
     assert weights.reference == stored.reference
 
 
+@pytest.mark.thorough
 def test_volumes_and_vectors_are_those_of_the_commands(by_commands: Path) -> None:
     weights = lf.open_weights(by_commands / "weights.h5")
     pair = [lf.reconstruct(weights, image(name), dark=image("dark"), **FEW) for name in ("pair_a", "pair_b")]
@@ -87,6 +89,7 @@ def test_volumes_and_vectors_are_those_of_the_commands(by_commands: Path) -> Non
     np.testing.assert_array_equal(plain.displacement_voxel, written_field.displacement_voxel)
 
 
+@pytest.mark.thorough
 def test_particles_and_tracks_are_those_of_the_commands(by_commands: Path) -> None:
     weights = lf.open_weights(by_commands / "weights.h5")
     found = [
@@ -107,6 +110,7 @@ def test_particles_and_tracks_are_those_of_the_commands(by_commands: Path) -> No
     assert lf.combine(correlated, on_grid).field.flag.shape == correlated.flag.shape
 
 
+@pytest.mark.thorough
 def test_what_cannot_be_is_refused(by_commands: Path) -> None:
     weights, rig = lf.open_weights(by_commands / "weights.h5"), lf.load_rig(str(CONFIG))
     with pytest.raises(ConfigError, match="iteratoins"):

@@ -98,6 +98,7 @@ def test_columns_are_what_rays_make(water: Media, coarse: Camera, rng: np.random
     assert np.abs(counted - column).sum() < 1.3 * sampling_error(column, 1000)
 
 
+@pytest.mark.thorough
 def test_particles_are_balls_as_rays_make_them(water: Media, coarse: Camera, rng: np.random.Generator) -> None:
     view, particles = raw_view(coarse, water, 0.025), np.array([(*PLACE_MM, 1.0)])
     image = np.zeros(400)

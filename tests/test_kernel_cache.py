@@ -78,6 +78,7 @@ def test_a_file_in_the_way_is_no_place(tmp_path: Path) -> None:
     assert kernel_cache._is_writable(tmp_path / "cache")
 
 
+@pytest.mark.thorough
 def test_kernels_compile_where_neither_package_nor_home_can_be_written() -> None:
     surroundings = {name: value for name, value in os.environ.items() if name != kernel_cache.VARIABLE}
     done = subprocess.run(

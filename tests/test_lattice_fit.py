@@ -76,6 +76,7 @@ def test_index_zero_is_the_lens_nearest_the_middle(layout: str, rng: np.random.G
     np.testing.assert_array_equal(fit.indices[np.argmin(distance)], [0, 0])
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("pitch", "angle_deg"), [(7.2, 44.0), (18.25, -0.12), (18.25, -44.0), (40.0, 20.0), (59.0, 1.0)]
 )
@@ -95,6 +96,7 @@ def test_spectrum_of_hexagons_turns_to_the_columns(angle_deg: float) -> None:
     np.testing.assert_allclose(basis, truth.basis, atol=17.0 / 50)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("radius_per_pitch", [0.2, 0.45])
 @pytest.mark.parametrize(("pitch", "angle_deg"), [(6.1, 2.7), (10.3, -41.0), (23.0, 0.4), (60.0, -2.0)])
 def test_lattices_are_found_stopped_down_or_at_working_aperture(
@@ -167,6 +169,7 @@ def test_dirt_and_a_missing_lens_do_not_move_the_lattice(rng: np.random.Generato
     assert np.rad2deg(fit.lattice_px.rotation_rad) == pytest.approx(3.0, abs=0.02)
 
 
+@pytest.mark.thorough
 def test_standard_errors_match_the_scatter_of_repeats(rng: np.random.Generator) -> None:
     turns, pitches = [], []
     for _ in range(20):
@@ -222,6 +225,7 @@ def read(path: Path) -> NDArray[np.float64]:
     return cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("name", "lenses", "pitch", "tolerance"), [("seaurchin", 13500, 17.195, 0.02), ("guv", 650, 15.40, 0.02)]
 )
@@ -236,6 +240,7 @@ def test_photographs(data_folder: Path, name: str, lenses: int, pitch: float, to
         assert np.rad2deg(fit.lattice_px.rotation_rad) == pytest.approx(0.177, abs=0.02)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", ["spots_b", "spots_c"])
 def test_hexagonal_spots_with_known_centres(data_folder: Path, name: str) -> None:
     fit = fit_lattice(read(data_folder / "real" / f"{name}.png"))
@@ -244,6 +249,7 @@ def test_hexagonal_spots_with_known_centres(data_folder: Path, name: str) -> Non
     assert np.hypot(*error.T).mean() < 0.03
 
 
+@pytest.mark.thorough
 def test_experiment_gives_the_true_rotation_and_shift(data_folder: Path) -> None:
     folder = data_folder / "channel"
     fit = fit_lattice(read(folder / "white.tif"), read(folder / "dark.tif"))

@@ -63,6 +63,7 @@ def codes(images: LensImages, picture: NDArray[np.float64]) -> list[str]:
     return [notice.code for notice in position_notices(images, picture, "a", "b")]
 
 
+@pytest.mark.thorough
 def test_folding_is_a_histogram(lattice: Lattice, rng: np.random.Generator) -> None:
     picture, bins = rng.normal(1.0, 1.0, SHAPE), 8
     picture[3, 5] = np.nan
@@ -96,6 +97,7 @@ def test_folding_follows_a_lattice_that_is_bent(lattice: Lattice, table2: Camera
     assert middle > 0.99 * light.sum()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (0.3, 0.0), (-2.4, 3.1)])
 @pytest.mark.parametrize("tilt", [0.0, 0.4])
 def test_shift_is_found_within_its_error(
@@ -110,6 +112,7 @@ def test_shift_is_found_within_its_error(
     assert codes(images, tracers(lattice, shift, tilt=tilt)) == (["lens-images-moved"] if any(shift) else [])
 
 
+@pytest.mark.thorough
 def test_stated_errors_are_those_made(images: LensImages, lattice: Lattice) -> None:
     relative = []
     for seed in range(12):
@@ -119,11 +122,13 @@ def test_stated_errors_are_those_made(images: LensImages, lattice: Lattice) -> N
     assert 0.2 < np.sqrt(np.mean(np.square(relative))) < 1.3
 
 
+@pytest.mark.thorough
 def test_a_lattice_that_has_turned_is_told(images: LensImages, lattice: Lattice) -> None:
     turned = Lattice.regular(PITCH_PX, lattice.layout, np.deg2rad(1.0), lattice.origin)
     assert codes(images, tracers(turned)) == ["lens-images-moved"]
 
 
+@pytest.mark.thorough
 def test_too_little_light_tells_nothing(images: LensImages, lattice: Lattice, rng: np.random.Generator) -> None:
     assert codes(images, rng.normal(0.0, NOISE, SHAPE)) == []
     # a tracer behind one lens, in the middle of one of the parts
@@ -135,6 +140,7 @@ def test_too_little_light_tells_nothing(images: LensImages, lattice: Lattice, rn
     assert codes(images, rng.normal(0.0, NOISE, SHAPE) + 500.0 * (rng.random(SHAPE) < 1e-3)) == []
 
 
+@pytest.mark.thorough
 def test_rounding_is_no_light(images: LensImages, lattice: Lattice, rng: np.random.Generator) -> None:
     """A few counts of light, of a sensor whose noise is less than one count."""
     faint = 0.02 * tracers(lattice, share=0.1) + rng.normal(0.0, 0.5, SHAPE)
@@ -143,11 +149,13 @@ def test_rounding_is_no_light(images: LensImages, lattice: Lattice, rng: np.rand
     assert codes(images, np.rint(faint)) == []
 
 
+@pytest.mark.thorough
 def test_light_of_another_camera_is_told(images: LensImages, lattice: Lattice) -> None:
     other = Lattice.regular(1.21 * PITCH_PX, lattice.layout, 0.1, (95.0, 80.0))
     assert codes(images, tracers(other)) == ["light-off-lens-images"]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("offset", "told"), [(0.0, []), (2.0 * NOISE, []), (60.0, ["dark-level"]), (-60.0, ["dark-level"])]
 )
@@ -158,6 +166,7 @@ def test_offset_between_lens_images_is_told(
     assert [notice.code for notice in level_notices(images, picture, "a")] == told
 
 
+@pytest.mark.thorough
 def test_uniform_light_is_no_frame(images: LensImages, lattice: Lattice, table2: Camera) -> None:
     camera = replace(table2, columns=SHAPE[1], rows=SHAPE[0]).with_micro_images(lattice)
     indices = np.unique(lattice.nearest(places()).reshape(-1, 2), axis=0)

@@ -21,6 +21,7 @@ SMALL = Turbulence(side_mm=5.0)
 SIGMA_MM = np.array(SMALL.sigma_mm)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("with_light", "least", "most_wrong"), [(True, 0.985, 0.01), (False, 0.95, 0.03)])
 def test_links_hold_in_turbulence(with_light: bool, least: float, most_wrong: float) -> None:
     """Displacements of up to 0.6 mm, neighbours 0.5 mm apart whose displacements differ by half of their own."""
@@ -110,6 +111,7 @@ def test_kriging_takes_a_linear_flow_exactly_and_states_what_it_misses(rng: np.r
     np.testing.assert_allclose(value, points[7:8] @ slope, atol=1e-9)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_the_structure_of_turbulence_is_found_and_errors_are_stated(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -137,6 +139,7 @@ def test_noise_is_not_taken_for_turbulence(rng: np.random.Generator) -> None:
     assert np.all(np.median(error, axis=0) < 0.5 * SIGMA_MM)
 
 
+@pytest.mark.thorough
 def test_false_tracks_do_not_mislead_rough_flows() -> None:
     """One track in twenty half a millimetre off: no worse than without them, and errors are still stated."""
     rng = np.random.default_rng(4)

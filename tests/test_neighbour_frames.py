@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
@@ -12,6 +13,7 @@ from tests.particle_images import found, task_with
 MOVED_MM = np.array([0.12, -0.05, 0.04, 0.0])
 
 
+@pytest.mark.thorough
 def test_what_a_neighbour_found_is_found(table2: Camera, water: Media, rng: np.random.Generator) -> None:
     true = rng.uniform((-1.0, -0.8, 1.0, 4e5), (1.0, 0.8, 2.8, 6e5), (45, 4))
     # One beside an overlapping one that splitting may not have separated: what it explains is not free.

@@ -101,6 +101,7 @@ def test_documents_list_all_codes() -> None:
     assert sorted(listed) == sorted(made)
 
 
+@pytest.mark.thorough
 def test_a_warning_is_on_the_terminal_in_json_and_in_the_file(tmp_path: Path, capsys) -> None:
     write_tiff(tmp_path / "white.tif", white(radius_px=2.5), overwrite=False)
     output = tmp_path / "c.h5"
@@ -147,6 +148,7 @@ def test_a_console_collects_what_it_warns_of(capsys) -> None:
     assert capsys.readouterr().err == "lfpiv: warning: a.vtkhdf: no tracks; look [no-tracks]\n"
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("fault", "code"),
     [
@@ -417,6 +419,7 @@ def test_crowded_particles_are_told(crowd: float, codes: list[str]) -> None:
     assert [notice.code for notice in found] == codes
 
 
+@pytest.mark.thorough
 def test_without_a_board_the_data_sheet_is_believed() -> None:
     rig = lf.load_rig(ROOT / "configs" / "sample.yaml")
     white, dark, board = (lf.read_image(ROOT / "sample_data" / f"{name}.tif") for name in ("white", "dark", "board"))

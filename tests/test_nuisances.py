@@ -33,6 +33,7 @@ def picture(view: View, particles: NDArray[np.float64], rng: np.random.Generator
     return image + rng.normal(0.0, np.sqrt(NOISE.read_counts**2 + NOISE.gain_counts * image))
 
 
+@pytest.mark.thorough
 def test_what_the_camera_lacks_is_found(view: View, rng: np.random.Generator) -> None:
     true = rng.uniform((-1.0, -0.9, -3.5, 4e5), (1.0, 0.9, 3.5, 6e5), (60, 4))
     image = picture(TRUE.applied(view), true, rng)
@@ -47,6 +48,7 @@ def test_what_the_camera_lacks_is_found(view: View, rng: np.random.Generator) ->
     assert depth_error < 0.01
 
 
+@pytest.mark.thorough
 def test_a_camera_that_is_right_is_left_as_it_is(view: View, rng: np.random.Generator) -> None:
     true = rng.uniform((-1.0, -0.9, -3.5, 4e5), (1.0, 0.9, 3.5, 6e5), (30, 4))
     fit = fit_nuisances(picture(view, true, rng), view, true, NOISE, DEPTHS)

@@ -35,6 +35,7 @@ def weights(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
     return weights_of(tmp_path_factory.mktemp("weights"), request.param, 2 if request.param == "square" else 0)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("shape", [(), (600,), (448, 1), (447, 600), (448, 601), (600, 448), (1, 448, 600)])
 def test_images_of_another_shape_are_refused(weights: WeightsFile, shape: tuple[int, ...]) -> None:
     with pytest.raises(InputError, match="does not fit weights made for"):
@@ -70,11 +71,13 @@ def test_voxels_outside_the_volume_have_no_column(weights: WeightsFile, index: t
         weights.column(0.5, 0, 0)
 
 
+@pytest.mark.thorough
 def test_whole_numbers_and_lists_are_taken(weights: WeightsFile) -> None:
     volume = np.ones(weights.shape, np.int64)
     np.testing.assert_array_equal(weights.forward(volume.tolist()), weights.forward(volume.astype(np.float32)))
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(sys.platform != "linux", reason="workers are not forked")
 def test_a_forked_worker_says_that_it_has_lost_its_threads(tmp_path: Path) -> None:
     found = weights_of(tmp_path, "square", 0)

@@ -58,6 +58,7 @@ def test_running_numbers_are_pairs_from_where_they_begin(form: str, begins: int)
     assert pair_names(names, "ab").pairs == tuple((k, k + 1) for k in range(0, 12, 2))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("form", SEPARATE)
 def test_whatever_is_lost_or_moved_no_pair_is_wrong(form: str) -> None:
     pairs = [SEPARATE[form](k) for k in range(1, 6)]
@@ -74,6 +75,7 @@ def test_whatever_is_lost_or_moved_no_pair_is_wrong(form: str) -> None:
         assert found.left_out or named(left, found) == whole
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("form", RUNNING)
 def test_whatever_of_running_numbers_is_lost_no_pair_is_wrong(form: str) -> None:
     names = [RUNNING[form](n) for n in range(10)]
@@ -91,6 +93,7 @@ def test_whatever_of_running_numbers_is_lost_no_pair_is_wrong(form: str) -> None
             assert bool(found.notices) == (numbers[0] > 1)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("form", RUNNING)
 def test_whatever_of_a_sequence_is_lost_no_pair_is_wrong(form: str) -> None:
     names = [RUNNING[form](n) for n in range(10)]

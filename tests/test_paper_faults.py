@@ -158,6 +158,7 @@ def vectors_of_a_shear(turned: tuple[float, float, float]) -> VectorField:
     return VectorField(grid, moved, moved, ones, ones, ones, flag, None, (0.1, 0.1, 0.1), 0.001, (16, 16, 16))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("signs", "exit_code"),
     [((1.0, 1.0, 1.0), 0), ((-1.0, -1.0, -1.0), 8), ((-1.0, 1.0, 1.0), 8), ((1.0, 1.0, -1.0), 8)],

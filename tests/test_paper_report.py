@@ -234,6 +234,7 @@ def test_the_quick_report(tmp_path) -> None:
     assert all(each.startswith("data:image/png;base64,") for each in page.loads)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", ["table1", "table2", "focal-plane", "sensitivities", "faults"])
 def test_parts_at_a_tiny_size(name: PaperPart, tmp_path) -> None:
     chosen = PaperOptions(only=(name,), size="tiny")

@@ -215,6 +215,7 @@ def test_from_where_tracers_crowd(recall: tuple[float, ...], told: str):
     assert told in crowding(Measured(SEEDING, curves))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("influence", INFLUENCES, ids=lambda each: each.name)
 def test_pictures_show_all_series(influence: Influence):
     drawing = drawing_of(by_theory(influence))

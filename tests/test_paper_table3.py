@@ -37,6 +37,7 @@ def _work(folder, name: str, resume: bool = False) -> Work:
     return Work(own, "tiny", QUIET, {"program": "this one"}, resume)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("part", "half"), [("table3", "numerical"), ("table3-experiment", "simulated")])
 def test_a_row_for_each_measure_of_table_3(found, part, half):
     rows = found[part].rows
@@ -50,11 +51,13 @@ def test_a_row_for_each_measure_of_table_3(found, part, half):
         assert row.ert <= row.paper_ert or row.reason
 
 
+@pytest.mark.thorough
 def test_halves_and_methods_are_measured_apart(found):
     depth_errors = [(row.dlfc, row.ert, row.best) for each in found.values() for row in each.rows[-1:]]
     assert len(np.unique(depth_errors)) == 6
 
 
+@pytest.mark.thorough
 def test_a_part_goes_on_from_the_boards_that_are_kept(found, folder, monkeypatch):
     (folder / "table3" / "best_+1mm.json").unlink()
     made = []
@@ -107,6 +110,7 @@ def test_a_view_and_its_plain_form():
     np.testing.assert_allclose(view.bounds_mm[2], [-0.7, 0.7])
 
 
+@pytest.mark.thorough
 def test_pictures_show_all_methods_with_units(found):
     for name, part in found.items():
         drawn = {drawing.name: drawing for drawing in part.drawings}

@@ -36,6 +36,7 @@ def measured(velocity: np.ndarray) -> Measured:
     return Measured(field, truth, np.ones(GRID.shape_zyx, bool))
 
 
+@pytest.mark.thorough
 def test_the_part_measures_the_flow_and_shows_it(tmp_path: Path) -> None:
     found = part.table4(Work(tmp_path, "tiny", Console(only_warnings=True), {}))
     assert [row.limit for row in found.rows] == [

@@ -22,6 +22,9 @@ from lfpiv_cli.particles.splitting import split
 from lfpiv_cli.particles.tiles import groups_of_tiles
 from lfpiv_cli.particles.view import View, entry_capacity, raw_view
 
+# The fits take half a minute to compile.
+pytestmark = pytest.mark.thorough
+
 DEPTHS = (-4.0, 4.0)
 
 

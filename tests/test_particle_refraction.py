@@ -16,6 +16,9 @@ from lfpiv_cli.particles.refraction import paraxial_shift, places_by_snell
 from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.synthetic.render import Balls, render_points
 
+# The fits take half a minute to compile.
+pytestmark = pytest.mark.thorough
+
 DEPTHS = (-4.5, 4.5)
 
 

@@ -54,6 +54,7 @@ def images(view: View, point: tuple[float, float, float]) -> NDArray[np.float64]
     return result
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("place", PLACES)
 def test_response_is_what_rays_make(small: Camera, view: View, water: Media, place: tuple[float, float, float]) -> None:
     response = images(view, place)
@@ -77,6 +78,7 @@ def test_response_is_what_rays_make(small: Camera, view: View, water: Media, pla
     assert abs(bias[2]) < 3e-3
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("place", PLACES)
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_derivatives_are_finite_differences(
@@ -135,6 +137,7 @@ def test_rim_shares_of_narrower_patches() -> None:
         assert slope == pytest.approx(-1.0 / 1.2, rel=0.05)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("layout", ["square", "hexagonal"])
 def test_depths_before_a_slow_lens_are_true(layout: Layout) -> None:
     # At f/14 and M = -0.38 one lens more spreads the rays by a fortieth: rays that strike one place on the sensor
@@ -157,6 +160,7 @@ def test_depths_before_a_slow_lens_are_true(layout: Layout) -> None:
         assert np.abs(found[0, :2] - true[0, :2]).max() < 2e-3 * view.scale.lens_mm
 
 
+@pytest.mark.thorough
 def test_hexagonal_cells_share_out_all_light() -> None:
     lattice = Lattice.regular(0.1, "hexagonal", np.deg2rad(0.7))
     table, side2, step, radius = cell_shares(lattice, RADIUS_MM)

@@ -34,6 +34,7 @@ def weights_of(camera: Camera, media: Media, grid: Grid) -> Weights:
     return Weights(grid, padding, factorised(camera, media, grid.padded(padding)), camera.column_axis)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("column_axis", "layout"), [("x", "square"), ("y", "square"), ("y", "hexagonal")])
 def test_particles_are_found_where_they_are(
     table2: Camera, water: Media, rng: np.random.Generator, column_axis: ColumnAxis, layout: Layout
@@ -77,6 +78,7 @@ def scaled(camera: Camera, factor: float) -> Camera:
     )
 
 
+@pytest.mark.thorough
 def test_the_same_image_in_a_larger_world_shows_the_same(
     table2: Camera, water: Media, rng: np.random.Generator
 ) -> None:
@@ -99,6 +101,7 @@ def test_the_same_image_in_a_larger_world_shows_the_same(
         np.testing.assert_allclose(others, found[0], rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_single_tracer_is_found_in_a_volume_that_is_partly_out_of_view(
     table2: Camera, water: Media, seed: int
@@ -129,6 +132,7 @@ def thresholded(light: NDArray[np.float64], rng: np.random.Generator) -> NDArray
     return np.where(noisy < 25.0, 0.0, noisy)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("counts", "recorded"),
     [
@@ -164,6 +168,7 @@ def test_any_brightness_will_do(
     assert len(np.unique(nearest)) == len(true)
 
 
+@pytest.mark.thorough
 def test_pixels_that_are_left_out_do_not_matter(table2: Camera, water: Media, rng: np.random.Generator) -> None:
     camera = replace(table2, columns=360, rows=300)
     grid = Grid.centred((14, 11, 10), (0.1, 0.1, 0.1), (0.0, 0.0, 1.9))
@@ -197,6 +202,7 @@ def test_photons_count_as_the_camera_has_them(table2: Camera, water: Media, rng:
     assert noise_with(task_of(*given), 5e5).gain_counts == 2.0
 
 
+@pytest.mark.thorough
 def test_an_empty_image_has_no_particles(table2: Camera, water: Media) -> None:
     camera = replace(table2, columns=200, rows=200)
     weights = weights_of(camera, water, Grid.centred((6, 6, 4), (0.1, 0.1, 0.1), (0.0, 0.0, 2.0)))

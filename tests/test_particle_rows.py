@@ -35,6 +35,7 @@ def view(table2: Camera, water: Media, request: pytest.FixtureRequest) -> View:
     return raw_view(camera, water, 0.025, space=space)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("place", PLACES)
 def test_rows_are_the_pixels_one_by_one(view: View, place: tuple[float, float, float]) -> None:
     capacity = entry_capacity(view, -5.0, 5.0)
@@ -81,6 +82,7 @@ def profile(first: float, offset: float) -> NDArray[np.float64]:
     return table.ravel()
 
 
+@pytest.mark.thorough
 def test_rows_equal_their_references() -> None:
     across, down = profile(9.0, 0.02), profile(13.4, -0.08)
     table, step = rim_table(12.5, 1.375)

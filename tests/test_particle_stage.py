@@ -81,6 +81,7 @@ def frames_of(counts: list[int], folder: Path, rng: np.random.Generator) -> list
     return paths
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("counts", "said", "tracks"),
     [
@@ -144,6 +145,7 @@ def test_track_replaces_nothing_unasked(pair: tuple[Path, Path], tmp_path: Path)
     assert not (tmp_path / "tracks.vtkhdf").exists()
 
 
+@pytest.mark.thorough
 def test_a_sequence_gives_tracks_and_vectors_of_each_interval(tmp_path: Path, rng: np.random.Generator) -> None:
     start = rng.uniform((-1.5, -1.1, -2.0), (1.5, 1.1, 2.0), (300, 3))
     frames = [tmp_path / f"frame_{number}.vtkhdf" for number in range(4)]

@@ -121,6 +121,7 @@ def test_profiles_are_means_over_planes_with_a_band_of_sigma(field) -> None:
     assert (band.min(), band.max()) == (pytest.approx(-0.03), pytest.approx(0.03))
 
 
+@pytest.mark.thorough
 def test_displacements_show_their_parts_beyond_whole_voxels_and_microlenses(field) -> None:
     axes = np.array(pictures.displacements_figure(field, lens_mm=0.4).axes).reshape(3, 3)
     valid = field.displacement_voxel[field.flag == VALID]
@@ -143,6 +144,7 @@ def test_gradients_show_the_turn_and_no_divergence_on_one_scale(field) -> None:
         pictures.gradients_figure(replace(field, dt_s=None))
 
 
+@pytest.mark.thorough
 def test_figures_of_a_file_follow_what_it_knows(field, tmp_path) -> None:
     path = tmp_path / "vectors.vtkhdf"
     varied = replace(field, correlation=np.linspace(0.2, 0.9, 60).reshape(SHAPE))

@@ -27,6 +27,7 @@ def vectors(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("place", ["a name that is too long", "below a file", "a path that is too long"])
 @pytest.mark.parametrize(
     "command",

@@ -70,6 +70,7 @@ def volume(tmp_path):
     return path
 
 
+@pytest.mark.thorough
 def test_a_pdf_has_a_page_a_figure_and_the_same_bytes_again(volume, tmp_path):
     found = json.loads(run("plot", str(volume), "-o", str(tmp_path / "v.pdf"), "--json"))
     assert found["figures"] == ["projections", "depths"]
@@ -79,6 +80,7 @@ def test_a_pdf_has_a_page_a_figure_and_the_same_bytes_again(volume, tmp_path):
     assert (tmp_path / "v.pdf").read_bytes() == content
 
 
+@pytest.mark.thorough
 def test_png_is_one_figure_or_one_for_each_name(volume, tmp_path):
     run("plot", str(volume), "-o", str(tmp_path / "one.png"), "--only", "depths")
     assert cv2.imread(str(tmp_path / "one.png")) is not None

@@ -40,6 +40,7 @@ def predicted(particles: NDArray[np.float64], seed: int = 5) -> Predicted:
     return Predicted(off, sigma, float(OFF[3]))
 
 
+@pytest.mark.thorough
 def test_what_is_predicted_is_found_and_so_is_the_rest(task: Task, true: NDArray[np.float64]) -> None:
     state = find_predicted(task, predicted(true[NEW:-1]))
     assert state is not None
@@ -47,6 +48,7 @@ def test_what_is_predicted_is_found_and_so_is_the_rest(task: Task, true: NDArray
     assert len(state.particles) == len(true)
 
 
+@pytest.mark.thorough
 def test_what_is_not_there_goes(task: Task, true: NDArray[np.float64]) -> None:
     """As surely as it was predicted: ghosts, and particles that have left."""
     gone = np.random.default_rng(6).uniform((-0.9, -0.7, 1.2, 4e5), (0.9, 0.7, 2.6, 6e5), (4, 4))
@@ -57,6 +59,7 @@ def test_what_is_not_there_goes(task: Task, true: NDArray[np.float64]) -> None:
     assert len(state.particles) == len(true)
 
 
+@pytest.mark.thorough
 def test_a_track_goes_on_beside_one_that_nobody_expected(task: Task, true: NDArray[np.float64]) -> None:
     """The light of the overlapping one draws it away until that one is found."""
     state = find_predicted(task, predicted(true[:-1]))

@@ -243,6 +243,7 @@ def data_sheet(lenses, folder):
     return lf.load_rig(path)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", [pytest.param("1.3", marks=pytest.mark.slow), "telecentric"])
 def test_tracers_are_found_where_they_are_behind_two_lenses_and_a_stop(name, tmp_path, rng):
     """The whole experiment, white picture, board and tracers, in pictures that the program had no part in."""

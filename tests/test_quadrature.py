@@ -31,6 +31,7 @@ def quadrature_image(camera, source, centre, voxel=VOXEL, tiles=128):
     return integrate_columns(camera, source, [centre], voxel, tiles, 5).image(0, SMALL)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("focal_length_mm", [0.8, 0.7])
 @pytest.mark.parametrize("refraction", ["paraxial", "exact"])
 @pytest.mark.parametrize("rotation_rad", [0.0, 0.02])

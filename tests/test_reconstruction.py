@@ -82,6 +82,7 @@ def test_true_volume_is_a_fixed_point(optical, rng, solver):
     np.testing.assert_allclose(stepped[seen], truth[seen], rtol=1e-4)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_residual_falls_and_volume_stays_non_negative(optical, rng, solver):
     truth = np.zeros(optical.shape, np.float32)
@@ -174,6 +175,7 @@ def test_line_of_sight_leaves_dark_voxels_out_for_good(optical):
     assert volume[2, 3, 4] == volume.max()
 
 
+@pytest.mark.thorough
 def test_stopping_by_change_and_by_residual(optical, rng):
     image = optical.forward(rng.random(optical.shape, dtype=np.float32))
     whole = reconstruct(optical, image, SolverSettings("em", 60))
@@ -194,6 +196,7 @@ def test_pixels_and_voxels_out_of_sight_take_no_part():
         np.testing.assert_allclose(volume, [2.0, 4.0, 0.0], rtol=0.02)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_dark_image_gives_an_empty_volume(optical, solver):
     result = reconstruct(optical, np.full(optical.image_shape, -3.0, np.float32), SolverSettings(solver, 3))
@@ -201,6 +204,7 @@ def test_dark_image_gives_an_empty_volume(optical, solver):
     assert np.all(np.isfinite(result.residual))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_momentum_reaches_the_same_residual_in_fewer_steps(optical, rng, solver):
     truth = np.zeros(optical.shape, np.float32)

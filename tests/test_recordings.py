@@ -103,6 +103,7 @@ KINDS = (
 )
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kind", KINDS)
 def test_each_format_gives_the_counts_and_times_that_were_written(
     tmp_path: Path, rng: np.random.Generator, kind: str
@@ -487,6 +488,7 @@ def test_one_page_of_any_recording_is_an_image(tmp_path: Path, rng: np.random.Ge
         images.read_image(Path(f"{given}:page=3"))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kind", KINDS)
 def test_mutated_headers_raise_nothing_else(tmp_path: Path, rng: np.random.Generator, kind: str) -> None:
     given, _ = kinds(tmp_path, rng)[kind]

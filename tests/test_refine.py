@@ -89,6 +89,7 @@ def test_half_a_millimetre_on_the_recorded_pair(
     assert abs(summary["k1_per_mm2"] - truth["camera"]["k1"]) < 2 * summary["k1_per_mm2_sigma"]
 
 
+@pytest.mark.thorough
 def test_a_config_without_a_channel_is_refused(wrong: Path, tmp_path: Path) -> None:
     config = tmp_path / "rig.yaml"
     lines = [line for line in CONFIG.read_text().splitlines() if not line.startswith("channel")]

@@ -126,6 +126,7 @@ def test_a_point_in_front_of_the_fluid_is_refused(small, water, rng):
         render_points(small, ObjectSpace(water, window), Balls(np.array([[0, 0, -path - 0.5]]), 1.0, 0.05), rng)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("microlens_distance", [0.8, 0.7])
 def test_white_light_backwards_equals_forwards(small, rng, microlens_distance):
     """Rays from points evenly on the aperture to points evenly on the array, against the backward count."""

@@ -86,6 +86,7 @@ def test_a_broken_file_is_named(results: Path) -> None:
         contents_of(results)
 
 
+@pytest.mark.thorough
 def test_the_page_holds_all(results: Path, tmp_path: Path) -> None:
     page = tmp_path / "page.html"
     summary = report(results, page, console=QUIET)
@@ -129,6 +130,7 @@ def test_pictures_are_drawn_on_the_raw_image_that_a_file_was_made_from(
     assert drawn_on["particles.vtkhdf"] == image
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("commands", "word"), [(("track", "correlate"), "good"), (("correlate", "correlate"), "look")])
 def test_poor_vectors_count_unless_better_ones_stand_beside_them(
     commands: tuple[str, str], word: str, tmp_path: Path
@@ -143,6 +145,7 @@ def test_poor_vectors_count_unless_better_ones_stand_beside_them(
     assert "w is known to 0.36 mm" in (tmp_path / "page.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.thorough
 def test_vectors_of_different_times_are_not_held_against_each_other(tmp_path: Path) -> None:
     for number in range(3):
         flow = np.zeros((*SHAPE, 3))
@@ -153,6 +156,7 @@ def test_vectors_of_different_times_are_not_held_against_each_other(tmp_path: Pa
     assert report(tmp_path, tmp_path / "page.html", console=QUIET)["verdict"]["vectors"] == "good"
 
 
+@pytest.mark.thorough
 def test_of_all_but_the_best_vectors_a_few_figures_are_drawn(
     results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -165,6 +169,7 @@ def test_of_all_but_the_best_vectors_a_few_figures_are_drawn(
     assert drawn.count("vectors.vtkhdf") == 3
 
 
+@pytest.mark.thorough
 def test_the_command_prints_the_verdict(results: Path, tmp_path: Path) -> None:
     outcome = CliRunner().invoke(cli, ["report", str(results), "-o", str(tmp_path / "page.html")])
     assert outcome.exit_code == 0, outcome.output
@@ -180,6 +185,7 @@ def test_a_view_shows_some_of_many_lines() -> None:
     assert lines_view([], [], "m/s")
 
 
+@pytest.mark.thorough
 def test_a_browser_sees_the_page_and_loads_nothing(results: Path, tmp_path: Path) -> None:
     if CHROMIUM is None:
         pytest.skip("no Chromium on this machine")

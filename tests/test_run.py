@@ -69,6 +69,7 @@ def stamps(folder: Path) -> dict[str, int]:
     return {name: (folder / "out" / name).stat().st_mtime_ns for name in (*FILES, VECTORS)}
 
 
+@pytest.mark.thorough
 def test_files_are_those_of_the_single_commands(ran: Path, tmp_path: Path) -> None:
     rig, calibration, weights = ran / "rig.yaml", tmp_path / "calibration.h5", tmp_path / "weights.h5"
     picture = ("--picture", tmp_path / "calibration.png")
@@ -80,6 +81,7 @@ def test_files_are_those_of_the_single_commands(ran: Path, tmp_path: Path) -> No
         assert (tmp_path / name).read_bytes() == (ran / "out" / name).read_bytes(), name
 
 
+@pytest.mark.thorough
 def test_it_says_what_was_chosen_and_what_came_of_it(ran: Path) -> None:
     told = json.loads((ran / "out" / "run.json").read_text(), parse_constant=pytest.fail)
     assert (told["method"], told["reason"]) == ("volumes", f"as asked for; but there are {RIGHT}")
@@ -90,6 +92,7 @@ def test_it_says_what_was_chosen_and_what_came_of_it(ran: Path) -> None:
     assert told["figures"]["u_from_voxel"]["volumes"] < told["figures"]["u_to_voxel"]["volumes"]
 
 
+@pytest.mark.thorough
 def test_what_is_done_is_kept_with_its_summary(again: Path) -> None:
     before, earlier = stamps(again), json.loads((again / "out" / "run.json").read_text())
     run(again / "rig.yaml", again / "out")
@@ -100,6 +103,7 @@ def test_what_is_done_is_kept_with_its_summary(again: Path) -> None:
     assert told["warnings"] == earlier["warnings"]
 
 
+@pytest.mark.thorough
 def test_only_what_depends_on_a_change_is_made_anew(again: Path) -> None:
     with pytest.raises(OutputExistsError, match=r"step 4, correlate: .*vectors.vtkhdf"):
         run(again / "rig.yaml", again / "out", "--dt-s", 0.001)
@@ -109,6 +113,7 @@ def test_only_what_depends_on_a_change_is_made_anew(again: Path) -> None:
     assert {name for name in after if after[name] != before[name]} == {VECTORS}
 
 
+@pytest.mark.thorough
 def test_settings_of_a_later_step_leave_what_was_made_before(again: Path) -> None:
     names = [name for name in FILES if name.endswith(("h5", "vtkhdf"))]
     text = (again / "rig.yaml").read_text()
@@ -137,6 +142,7 @@ def data_of(path: Path) -> dict[str, bytes]:
     return found
 
 
+@pytest.mark.thorough
 def test_a_torn_file_is_refused_or_made_again(again: Path) -> None:
     torn, whole = again / "out" / "weights.h5", (again / "out" / "weights.h5").read_bytes()
     torn.write_bytes(whole[:-1000])
@@ -149,6 +155,7 @@ def test_a_torn_file_is_refused_or_made_again(again: Path) -> None:
     assert [name for name, state in states(again).items() if state == "made"] == ["build-weights"]
 
 
+@pytest.mark.thorough
 def test_a_step_that_fails_leaves_those_before_it(again: Path) -> None:
     bad = again / "pair_b.tif"
     bad.write_bytes(PAIR[1].read_bytes()[:-5000])
@@ -159,6 +166,7 @@ def test_a_step_that_fails_leaves_those_before_it(again: Path) -> None:
     assert states(again) == {"calibrate-snapshot": "kept", "build-weights": "kept"}
 
 
+@pytest.mark.thorough
 def test_a_lost_picture_is_drawn_again(again: Path) -> None:
     (again / "out" / "calibration.png").unlink()
     run(again / "rig.yaml", again / "out")
@@ -166,6 +174,7 @@ def test_a_lost_picture_is_drawn_again(again: Path) -> None:
     assert states(again)["build-weights"] == "kept"
 
 
+@pytest.mark.thorough
 def test_the_report_is_made_of_what_was_made(again: Path, monkeypatch) -> None:
     made = []
 
@@ -182,6 +191,7 @@ def test_the_report_is_made_of_what_was_made(again: Path, monkeypatch) -> None:
     assert told["summaries"]["report"] == {"verdict": {"vectors": "good"}}
 
 
+@pytest.mark.thorough
 def test_results_are_kept_without_their_volumes_and_whatever_fails(again: Path, monkeypatch) -> None:
     images = again / "images"
     images.mkdir()
@@ -215,6 +225,7 @@ def test_results_are_kept_without_their_volumes_and_whatever_fails(again: Path, 
     assert not (out / "volumes").exists()
 
 
+@pytest.mark.thorough
 def test_what_is_not_of_a_run_is_not_replaced(ran: Path, tmp_path: Path) -> None:
     (tmp_path / "run.json").write_text("mine")
     with pytest.raises(OutputExistsError, match=r"run.json"):

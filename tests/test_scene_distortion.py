@@ -31,6 +31,7 @@ def spot(camera: Camera, media: Media, place: tuple[float, float, float], rng: n
     return counts.reshape(camera.rows, camera.columns).astype(np.float32)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("column_axis", ["x", "y"])
 def test_a_point_off_the_axis_comes_back_to_its_place(table2: Camera, water: Media, rng, column_axis: str) -> None:
     lattice = Lattice.regular(0.1, origin=(0.013, -0.021))

@@ -105,6 +105,7 @@ def test_frames_lie_evenly_about_the_time_of_the_truth(small, frames):
         assert np.corrcoef(image.ravel(), expected.ravel())[0, 1] > 0.97
 
 
+@pytest.mark.thorough
 def test_frames_show_what_their_truth_says(small):
     """Tracers of different sizes flicker in a flow that accelerates through lit depths: rendered from the truth."""
     tracers = Tracers(
@@ -135,6 +136,7 @@ def test_frames_show_what_their_truth_says(small):
         assert image.sum() - 96.0 * image.size == pytest.approx(expected.sum(), rel=0.02)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("frames", [2, 3, 12])
 def test_tracers_of_a_long_sequence_stay_on_their_paths(frames, rng):
     """In turbulence that moves by 0.15 mm rms between frames, held against a hundred times as many steps."""

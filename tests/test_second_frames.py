@@ -22,6 +22,9 @@ from lfpiv_cli.stages import finding
 from lfpiv_cli.stages.finding import Finder
 from tests.particle_images import found, task_with
 
+# The fits take half a minute to compile.
+pytestmark = pytest.mark.thorough
+
 SEARCH_MM, SCALE = 0.6, Scale(0.1, 1.064)
 MOVED = np.array([0.12, -0.05, 0.04, 0.0])
 

@@ -88,6 +88,7 @@ def error_over_sigma(recorded: Recorded, found: Trajectories, frames: int) -> ND
     return np.concatenate(both, axis=1)
 
 
+@pytest.mark.thorough
 def test_errors_fall_with_the_number_of_frames_and_are_stated(recorded: Recorded, followed: Trajectories) -> None:
     pair = track(*recorded.seen[:2], 0.4, SCALE)
     moved = recorded.points[1][pair.second] - recorded.points[0][pair.first]
@@ -105,6 +106,7 @@ def test_errors_fall_with_the_number_of_frames_and_are_stated(recorded: Recorded
     assert np.all(spread[2] < 0.75 * spread[1])
 
 
+@pytest.mark.thorough
 def test_ghosts_fall_with_the_length_of_tracks() -> None:
     """As many ghosts as particles, which are known so badly that a ghost is often where one is expected."""
     crowd = record(np.random.default_rng(6), ghosts=1.0, noise=4.0)
@@ -120,6 +122,7 @@ def test_ghosts_fall_with_the_length_of_tracks() -> None:
     assert shares[2] < 0.25 * of_pair
 
 
+@pytest.mark.thorough
 def test_short_tracks_hold_few_particles() -> None:
     """As many ghosts as particles, known half as badly: nine of ten are there in each frame, and gaps are bridged."""
     crowd = record(np.random.default_rng(6), ghosts=1.0, noise=2.0)
@@ -128,6 +131,7 @@ def test_short_tracks_hold_few_particles() -> None:
     assert np.mean(length[truth >= 0] >= 3) > 0.85
 
 
+@pytest.mark.thorough
 def test_tracks_go_on_over_a_frame_that_has_lost_them(recorded: Recorded, followed: Trajectories) -> None:
     before, lost, after = recorded.true_number[2:5]
     gone = np.setdiff1d(np.intersect1d(before[before >= 0], after), lost)

@@ -61,6 +61,7 @@ def test_layout_is_found_and_checked_when_given(tmp_path: Path) -> None:
         calibrated(tmp_path, config(tmp_path, layout="layout: square"), [picture])
 
 
+@pytest.mark.thorough
 def test_small_aperture_gives_the_lattice_and_wide_the_transmission(tmp_path: Path, square: Lattice) -> None:
     # The array has moved between the two pictures, so that it shows which one the lattice is from.
     moved = Lattice(square.origin + (0.5, 0.0), square.basis)
@@ -106,6 +107,7 @@ def test_a_known_focus_needs_no_board(tmp_path: Path, square: Lattice) -> None:
         calibrate_snapshot(rig, tmp_path / "d.h5", replace(options, depth_mm=[np.nan]), console=QUIET)
 
 
+@pytest.mark.thorough
 def test_a_whole_camera_tells_its_image_distance_and_shows_views(tmp_path: Path, square: Lattice) -> None:
     pytest.importorskip("matplotlib")
     rig = config(tmp_path, pitch=14.2 * 0.005 / 1.004, layout="focal_length_mm: 0.8")

@@ -89,6 +89,7 @@ def test_the_channel_s_walls_mask_what_lies_beyond(volumes: list[Path], tmp_path
     assert np.all(field.flag[np.abs(field.grid.axis_mm(2)) < 0.9] != MASKED)
 
 
+@pytest.mark.thorough
 def test_an_ensemble_is_one_field_and_a_batch_has_a_mean(volumes: list[Path], tmp_path: Path, capsys) -> None:
     run("correlate", *volumes[:4], "--pairing", "ab", "--ensemble", "-o", tmp_path / "together.vtkhdf")
     together = open_vectors(tmp_path / "together.vtkhdf")
@@ -217,6 +218,7 @@ def test_vectors_without_an_uncertainty_or_in_doubt_are_told() -> None:
     assert nothing == {"uncertainty_voxel_median": None, "without_uncertainty_share": None, "in_doubt_share": None}
 
 
+@pytest.mark.thorough
 def test_a_lost_frame_costs_its_pair_alone(tmp_path: Path, capsys) -> None:
     made_by = record("test", load_config(CONFIG).resolved(), {})
     rng = np.random.default_rng(6)

@@ -64,6 +64,7 @@ def judged(config: Path, vectors: Path, particles: Path, report: Path) -> dict:
     return json.loads((report / "flow.json").read_text())
 
 
+@pytest.mark.thorough
 def test_the_flow_that_the_config_names_is_the_truth_before_particles(vectors: Path, tmp_path: Path, capsys) -> None:
     pytest.importorskip("matplotlib")
     particles = true_particles(tmp_path / "true.npz", 30.0)
@@ -80,6 +81,7 @@ def test_the_flow_that_the_config_names_is_the_truth_before_particles(vectors: P
     ]
 
 
+@pytest.mark.thorough
 def test_particles_are_the_truth_where_the_config_names_no_flow_or_another(
     vectors: Path, tmp_path: Path, capsys
 ) -> None:

@@ -52,6 +52,7 @@ def volume_of(weights: Path, image: Path, output: Path, *options: object) -> np.
     return open_volume(output).array
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("layout", ["square", "hexagonal"])
 def test_what_the_mask_hides_does_not_matter(weights, layout, frame, tmp_path, capsys):
     if layout == "hexagonal":  # whose columns are made on demand
@@ -74,6 +75,7 @@ def test_what_the_mask_hides_does_not_matter(weights, layout, frame, tmp_path, c
     assert open_volume(tmp_path / "m.vtkhdf").attributes["excluded_pixels"] == 50 * 70
 
 
+@pytest.mark.thorough
 def test_saturated_pixels_and_defects_of_the_dark_image_are_left_out(weights, frame, tmp_path):
     dark = read_image(SAMPLE / "dark.tif").astype(np.uint16)
     dark[200, 300] = frame[200, 300] = 9000
@@ -89,6 +91,7 @@ def test_saturated_pixels_and_defects_of_the_dark_image_are_left_out(weights, fr
     np.testing.assert_array_equal(found, volume_of(weights, tmp_path / "a.tif", tmp_path / "m.vtkhdf", *masked))
 
 
+@pytest.mark.thorough
 def test_a_background_over_the_frames_is_that_of_its_image(weights, frame, tmp_path):
     rng = np.random.default_rng(3)
     frames = np.stack([frame, *rng.integers(90, 400, (3, *frame.shape)).astype(np.uint16)])
@@ -126,6 +129,7 @@ def test_frames_around_a_frame():
     assert not Background.parse("background.tif").around(0, 4)
 
 
+@pytest.mark.thorough
 def test_voxels_without_light_stay_out_with_lines_of_sight(weights, tmp_path):
     dark = ("--dark", SAMPLE / "dark.tif")
     volume = volume_of(weights, SAMPLE / "pair_a.tif", tmp_path / "a.vtkhdf", *dark, "--start", "line_of_sight")
@@ -135,6 +139,7 @@ def test_voxels_without_light_stay_out_with_lines_of_sight(weights, tmp_path):
     assert taking_part < open_volume(tmp_path / "u.vtkhdf").attributes["support_voxels"]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("stop", "done"), [("stop_noise: 1000.0", 0), ("stop_noise: 1.0e-3", 6), ("stop_change: 0.9", 1)]
 )
@@ -183,6 +188,7 @@ def test_a_dark_image_as_a_frame_is_told(weights, tmp_path, capsys):
     assert told["text"] == "the file is also the dark of reconstruct: it shows no tracers"
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("fault", TOLD)
 def test_a_frame_of_noise_or_half_saturated_is_told(weights, frame, fault, tmp_path, rng, capsys):
     dark = read_image(SAMPLE / "dark.tif")

@@ -26,6 +26,7 @@ def particles_of(folder: Path, frames: int) -> tuple[float, float]:
     return float(x.min()), float(x.max())
 
 
+@pytest.mark.thorough
 def test_tracers_of_a_sequence_are_there_before_they_are_carried_in(tmp_path: Path) -> None:
     pair, sequence = (particles_of(tmp_path, frames) for frames in (2, 6))
     # 0.12 m/s for four times 2 ms, half of it upstream; a few hundred tracers fill 5 mm to some 0.02 mm.
@@ -55,6 +56,7 @@ def lit_depths(truth: Particles, frame: int) -> np.ndarray:
     return truth.frame_positions_mm[frame, truth.frame_brightness[frame] > 0.0, 2] - 2.926
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("light", "edges"), [("[-1.0, 1.5]", (-1.0, 1.5)), ("[-3.0, 1.0]", (-2.0, 1.0))])
 def test_lit_depths_are_full_in_every_frame(tmp_path: Path, light: str, edges: tuple[float, float]) -> None:
     """The flow carries tracers through the light's edges and a porous wall: no layer empties behind them."""
@@ -66,6 +68,7 @@ def test_lit_depths_are_full_in_every_frame(tmp_path: Path, light: str, edges: t
         assert np.abs(found - found.mean()).max() < 5.0 * np.sqrt(found.mean())
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("light", ["[-0.5, 0.5]", "[-2.0, 2.0]"])
 def test_particles_are_counted_in_the_lit_part_of_the_volume(tmp_path: Path, light: str) -> None:
     truth = sequence_of(tmp_path, f"  light_z_mm: {light}\n", layers=20)

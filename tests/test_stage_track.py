@@ -47,6 +47,7 @@ def test_each_pair_has_a_file_whatever_becomes_of_others(particles: Path, tmp_pa
     assert "frame-unpaired" in capsys.readouterr().err
 
 
+@pytest.mark.thorough
 def test_what_is_complete_with_its_vectors_is_skipped(particles: Path, tmp_path: Path, capsys) -> None:
     folder = tmp_path / "tracks"
     batch = ("track", particles, "--pairing", "ab", "-o", folder, "--json")

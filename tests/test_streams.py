@@ -18,6 +18,7 @@ def shell(line: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(["bash", "-o", "pipefail", "-c", line], capture_output=True, text=True, timeout=60)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("closed", ["2>/dev/full", "<&- >&- 2>&-"])
 def test_a_rig_file_is_written_though_nothing_can_be_said(tmp_path: Path, closed: str) -> None:
     done = shell(f"{LFPIV} init --camera table2 -o '{tmp_path}/rig.yaml' {closed}")
@@ -25,6 +26,7 @@ def test_a_rig_file_is_written_though_nothing_can_be_said(tmp_path: Path, closed
     assert (tmp_path / "rig.yaml").stat().st_size > 100
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("closed", "code"), [("| true", 0), (">&-", 0), (">/dev/full", 7)])
 def test_an_answer_that_is_lost_is_a_failure_but_for_a_reader_that_has_gone(
     tmp_path: Path, closed: str, code: int
@@ -36,6 +38,7 @@ def test_an_answer_that_is_lost_is_a_failure_but_for_a_reader_that_has_gone(
     assert "Exception" not in done.stderr
 
 
+@pytest.mark.thorough
 def test_errors_keep_their_codes(tmp_path: Path) -> None:
     assert shell(f"{LFPIV} info '{tmp_path}/none.h5' 2>/dev/full").returncode == 4
     assert shell(f"{LFPIV} no-such-command 2>/dev/full").returncode == 2

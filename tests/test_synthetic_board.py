@@ -41,6 +41,7 @@ def test_a_tilted_board_stays_rigid(rng):
     assert distances == pytest.approx(np.linalg.norm(plate[:, np.newaxis] - plate, axis=2))
 
 
+@pytest.mark.thorough
 def test_a_wide_dot_is_as_bright_as_white_light(camera, rng):
     """Where a dot fills the field of a lens, its pixels are those of a white image of the same level."""
     camera = replace(camera, columns=90, rows=90)
@@ -53,6 +54,7 @@ def test_a_wide_dot_is_as_bright_as_white_light(camera, rng):
         assert image[lit].mean() == pytest.approx(1000.0, rel=0.01), z
 
 
+@pytest.mark.thorough
 def test_a_dark_dot_is_what_a_bright_one_leaves_of_white_light(camera):
     camera = replace(camera, columns=90, rows=90)
     bright = BoardGeometry((1, 1), 1.0, 0.2)

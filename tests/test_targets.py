@@ -62,6 +62,7 @@ def agrees(pose: BoardPose, placement: BoardPlacement) -> None:
     assert pose.rotation_deg == pytest.approx(placement.rotation_deg, abs=4 * pose.rotation_sigma_deg + 0.02)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("z_mm", "tilt_deg"),
     [
@@ -77,6 +78,7 @@ def test_a_chessboard_is_found_in_both_layouts(camera: Camera, z_mm: float, tilt
     agrees(pose, placement)
 
 
+@pytest.mark.thorough
 def test_a_chessboard_in_focus_and_a_quarter_turn(table2: Camera) -> None:
     """Turned, the longer side stands along y."""
     camera = replace(small(table2, 448, 600), column_axis="y")
@@ -88,6 +90,7 @@ def test_a_chessboard_in_focus_and_a_quarter_turn(table2: Camera) -> None:
     assert pose.indices.max(axis=0).tolist() == [2, 3]
 
 
+@pytest.mark.thorough
 def test_magnification_is_measured(table2: Camera) -> None:
     true = replace(small(table2), magnification=-1.01)
     sheet = replace(true, magnification=-1.0).with_micro_images(true.micro_image_lattice_px())
@@ -96,6 +99,7 @@ def test_magnification_is_measured(table2: Camera) -> None:
     assert pose.z0_mm == pytest.approx(3.0, abs=4 * pose.z0_sigma_mm)
 
 
+@pytest.mark.thorough
 def test_a_charuco_board_may_reach_beyond_the_view(table2: Camera) -> None:
     """The markers tell which corners are seen, so that the board's middle is known."""
     camera, placement = large(table2), BoardPlacement(2.0, (1.3, -0.1), rotation_deg=-1.0)
@@ -112,6 +116,7 @@ def test_numbers_grow_with_x_and_y_however_the_board_is_turned() -> None:
         assert board.dots == ((4, 3) if expected == [3, 2] else (3, 4))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("shown", "said", "expected"),
     [
@@ -167,6 +172,7 @@ def test_particles_are_no_board(table2: Camera, rng: np.random.Generator) -> Non
         pose_of_dots(tracers, np.full(tracers.shape, 1e-3), -tracers[:, :2], table2, board)
 
 
+@pytest.mark.thorough
 def test_few_tracers_are_no_small_board(table2: Camera, rng: np.random.Generator) -> None:
     """Half of a board of 4 x 3 is soon found among tracers, near enough to a grid of which six numbers are free."""
     for _ in range(40):
@@ -192,6 +198,7 @@ def dots_askew(diameter_mm: float, *, is_origin: bool) -> NDArray[np.float32]:
     return render_board(small(PAPERS), AIR, board, ASKEW, LEVEL, np.random.default_rng(5), shown)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("polarity", "diameters_mm"), [("bright", ()), ("dark", ()), ("bright", (0.5,)), ("dark", (0.5, 0.3))]
 )
@@ -213,6 +220,7 @@ def test_a_charuco_board_is_not_called_dots() -> None:
     assert sentence("a board of 9 dark dots", "dots", CHESS) is not None
 
 
+@pytest.mark.thorough
 def test_particles_are_called_nothing(table2: Camera, rng: np.random.Generator) -> None:
     """Nor is white light: OpenCV alone finds three by three corners in both."""
     camera = small(table2)
@@ -263,6 +271,7 @@ def test_slopes_of_the_corners_shares_are_their_differences(camera: Camera, wate
         assert np.percentile(off, 98) < 1e-4 * np.abs(slopes[:, axis]).max()
 
 
+@pytest.mark.thorough
 def test_quadrants_share_what_a_fine_grid_counts(layout: str) -> None:
     lattice = Lattice.regular(1.0, layout)
     line = np.linspace(-0.7, 0.7, 701)

@@ -53,6 +53,7 @@ def test_no_particles_give_no_track() -> None:
     assert track(Seen(np.zeros((3, 3))), Seen(np.zeros((0, 3))), 0.5, SCALE).first.size == 0
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("count", [1, 2, 5, 12, 27])
 def test_few_particles_are_followed_among_ghosts(count: int, rng: np.random.Generator) -> None:
     """A fifth as many ghosts, at least one, in each frame; forty pairs of frames for the few."""
@@ -113,6 +114,7 @@ def test_grid_states_its_error_and_ignores_strays(rng: np.random.Generator) -> N
     assert np.all(np.median(np.abs(value - moved(nodes)), axis=0) < 0.25 * sigma[0])
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("wavelength_mm", "tracks"), [(4.0, 1500), (8.0, 300), (2.5, 1500)])
 def test_errors_are_stated_whatever_the_density_and_the_flow(
     wavelength_mm: float, tracks: int, rng: np.random.Generator

@@ -81,6 +81,7 @@ HARM: dict[str, Callable[[], bytes]] = {
 }
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("harm", HARM)
 def test_what_is_no_list_of_particles_is_refused(tmp_path: Path, harm: str) -> None:
     vectors, particles = tmp_path / "v.vtkhdf", tmp_path / "true.npz"

@@ -78,6 +78,7 @@ def test_limits_are_lower_ones_on_ssim_and_upper_ones_elsewhere():
     assert len(limits_missed(figures, {"a": {"ssim_smallest": 0.95, "l1_mean": 0.01}, "b": {"l1_mean": 0.1}})) == 3
 
 
+@pytest.mark.thorough
 def test_every_way_agrees_within_its_error(table2, water, window, rng):
     camera = replace(table2, columns=380, rows=260)
     columns = make_columns(
@@ -94,6 +95,7 @@ def test_every_way_agrees_within_its_error(table2, water, window, rng):
     assert figures["ert_exact_to_long_count"]["l1_largest"] < 4.0 * expected
 
 
+@pytest.mark.thorough
 def test_a_hexagonal_array_is_judged_without_the_factorised_form(table2, water, rng):
     camera = replace(table2, columns=380, rows=260, lattice=Lattice.regular(0.1, "hexagonal"))
     columns = make_columns(
@@ -105,6 +107,7 @@ def test_a_hexagonal_array_is_judged_without_the_factorised_form(table2, water, 
     assert figures["ray_count_to_converged"]["l1_largest"] < 0.1
 
 
+@pytest.mark.thorough
 def test_validate_weights_writes_its_report_and_fails_on_a_limit(tmp_path):
     config = {
         "camera": {

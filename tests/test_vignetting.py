@@ -30,6 +30,7 @@ def shading() -> np.ndarray:
     return 1.0 / (1.0 + 0.145 * (x**2 + y**2)) ** 2
 
 
+@pytest.mark.thorough
 def test_vignetting_is_found_under_the_rims_of_the_lens_images(small):
     white = render_white(small, 1000.0) * shading()
     lattice = small.micro_image_lattice_px()
@@ -42,6 +43,7 @@ def test_too_few_lit_pixels_say_nothing():
     assert fit_vignetting(np.zeros((60, 60), np.float32), Lattice.regular(18.0)) is None
 
 
+@pytest.mark.thorough
 def test_weights_behind_a_transmission_scale_their_pixels(table2, water, rng):
     camera = replace(table2, rows=260, columns=380)
     grid = Grid.centred((3, 3, 2), (0.1, 0.1, 0.5), (0.1, 0.0, 1.0))

@@ -31,6 +31,7 @@ def walls_of(position: np.ndarray, **options: int) -> Walls:
     return find_walls(position, np.full(len(position), 0.005), SEARCHED, WIDTH, **options)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("count", "largest_sigma"), [(300, 0.2), (3000, 0.02)])
 def test_walls_are_found_within_their_errors(count: int, largest_sigma: float, rng: np.random.Generator) -> None:
     walls = walls_of(between_walls(count, rng, strays=count // 50))
@@ -41,6 +42,7 @@ def test_walls_are_found_within_their_errors(count: int, largest_sigma: float, r
     assert walls.stray_share < 0.05
 
 
+@pytest.mark.thorough
 def test_standard_errors_are_what_repetitions_scatter_by(rng: np.random.Generator) -> None:
     found = [walls_of(between_walls(1000, rng)) for _ in range(12)]
     off = [(walls.middle_mm - MIDDLE) / walls.middle_sigma_mm for walls in found]
@@ -50,6 +52,7 @@ def test_standard_errors_are_what_repetitions_scatter_by(rng: np.random.Generato
     assert 0.2 < np.std(tilted) < 1.4
 
 
+@pytest.mark.thorough
 def test_the_same_particles_again_tell_no_more(rng: np.random.Generator) -> None:
     once = between_walls(1500, rng)
     twice = np.concatenate([once, once + (0.1, 0.05, 0.0)])

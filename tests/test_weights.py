@@ -48,6 +48,7 @@ def ray_count(
     return counts.reshape(camera.rows, camera.columns) / RAYS
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("z_mm", [-4.0, -1.0, 0.0, 3.0])
 @pytest.mark.parametrize("spacing", [(0.1, 0.1, 0.1), (0.05, 0.05, 0.2)])
 def test_column_agrees_with_counted_rays_eq_13(small, water, rng, z_mm, spacing):
@@ -61,6 +62,7 @@ def test_column_agrees_with_counted_rays_eq_13(small, water, rng, z_mm, spacing)
     assert np.abs(exact - counted).sum() < 0.027 + sampling
 
 
+@pytest.mark.thorough
 def test_column_axis_y_exchanges_the_lateral_axes(small, water, rng):
     camera = replace(small, column_axis="y")
     grid = Grid.centred((2, 4, 1), (0.1, 0.1, 0.1), (0.4, -0.5, 2.0))
@@ -71,6 +73,7 @@ def test_column_axis_y_exchanges_the_lateral_axes(small, water, rng):
     assert np.allclose(at, [np.sum(weight * rows) / weight.sum(), np.sum(weight * columns) / weight.sum()], atol=0.2)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("column_axis", ["x", "y"])
 @pytest.mark.parametrize("padding", [(0, 0, 0), (2, 1, 1)])
 def test_forward_and_adjoint_are_adjoint(small, media, rng, column_axis, padding):
@@ -119,6 +122,7 @@ def test_no_light_is_lost_inside_the_sensor(small, water):
         np.testing.assert_allclose(sums, 1.0, rtol=1e-6)  # float32 shares
 
 
+@pytest.mark.thorough
 def test_one_pitch_in_focus_moves_the_image_by_one_micro_image(table2, water):
     # Table 2: 0.1 mm (1 + 0.8/200) / 5.5 um = 18.2545 px; M = -1 turns the direction round.
     grid = Grid.centred((3, 1, 1), (0.1, 0.1, 0.1), (0.05, 0.0, 0.0))
@@ -130,6 +134,7 @@ def test_one_pitch_in_focus_moves_the_image_by_one_micro_image(table2, water):
     np.testing.assert_allclose(np.diff(centroids), -18.2545, atol=0.02)
 
 
+@pytest.mark.thorough
 def test_a_point_at_plus_x_lights_the_sensor_at_minus_x(table2, water):
     weights = weights_of(table2, water, Grid.centred((1, 1, 1), (0.1, 0.1, 0.1), (2.0, 1.0, 0.0)))
     rows, columns, weight = weights.column(0, 0, 0)

@@ -96,6 +96,7 @@ def wrong(weights: bytes, folder: Path, edit: Callable[[h5py.File], object]) -> 
     return ended("reconstruct", path, image, "--iterations", 1, "-q", "-o", folder / "v.vtkhdf")
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("name", "value"), EDITS, ids=[f"{name}={value}" for name, value in EDITS])
 def test_an_edit_that_cannot_be_is_named(tmp_path: Path, weights: bytes, name: str, value: Any) -> None:
     code, said = wrong(weights, tmp_path, lambda file: put(file, name, value))
@@ -104,6 +105,7 @@ def test_an_edit_that_cannot_be_is_named(tmp_path: Path, weights: bytes, name: s
     assert not (tmp_path / "v.vtkhdf").exists()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", ["camera", "grid", "columns", "rows", "columns/share", "grid/spacing_mm"])
 def test_what_is_missing_or_of_another_kind_is_named(tmp_path: Path, weights: bytes, name: str) -> None:
     assert wrong(weights, tmp_path, lambda file: file.__delitem__(name))[0] == 4
