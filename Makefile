@@ -75,7 +75,7 @@ test-all: $(INSTALLED)
 	$(BIN)/python -m pytest -m "slow or thorough or not slow"
 
 test-interpreted: $(INSTALLED)
-	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest -m "thorough or not thorough" tests/test_interpreted.py
+	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest -m "not slow" tests/test_interpreted.py
 
 check: $(INSTALLED)
 	$(BIN)/ruff check .
