@@ -5,7 +5,10 @@ from __future__ import annotations
 import os
 import re
 import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
 from lfpiv_cli.errors import InputError, OutputError
 
@@ -32,6 +35,16 @@ def split_page(part: str | None) -> tuple[str | None, int | None]:
     """Return a part without the page that it names at its end, and this page."""
     found = None if part is None else PAGE.fullmatch(part)
     return (part, None) if found is None else (found[1], int(found[2]))
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[BinaryIO]:
+    """Open a file for reading its bytes; what the system refuses, then or later, is an `InputError` that names it."""
+    try:
+        with open(path, "rb") as file:
+            yield file
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {reason(error)}") from error
 
 
 def given(**inputs: Path | str | None) -> dict[str, Path]:

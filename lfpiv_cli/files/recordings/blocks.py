@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.errors import InputError
-from lfpiv_cli.files.inputs import reason
+from lfpiv_cli.files.inputs import opened
 from lfpiv_cli.files.recordings.packing import Pixels
 from lfpiv_cli.files.recordings.pixels import CUT, ensure_size
 from lfpiv_cli.files.recordings.recording import Image, Recording, Shape
@@ -83,13 +83,10 @@ def _read_page(
     page: int,
     shape: Shape | None,
 ) -> Image:
-    try:
-        with open(path, "rb") as file:
-            ensure_size(f"{path}: frame {page}", pixels.shape, 1, shape, file.seek(0, 2))
-            place = int(places[page])
-            data = bytes_at(path, file, begin(file, place) if begin else place, pixels.frame_bytes)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {reason(error)}") from error
+    with opened(path) as file:
+        ensure_size(f"{path}: frame {page}", pixels.shape, 1, shape, file.seek(0, 2))
+        place = int(places[page])
+        data = bytes_at(path, file, begin(file, place) if begin else place, pixels.frame_bytes)
     return pixels.decode(data)
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lfpiv_cli.errors import InputError, UsageError
-from lfpiv_cli.files.inputs import ensure_regular_file, reason
+from lfpiv_cli.files.inputs import ensure_regular_file, opened
 from lfpiv_cli.files.recordings import cine, im7, mraw, png, raw, seq, stack, tiff
 from lfpiv_cli.files.recordings.recording import Recording
 
@@ -85,11 +85,8 @@ def format_of(path: Path, part: str | None = None) -> Format:
     InputError : the file is missing, not a regular file, empty, or of no known format
     """
     ensure_regular_file(path)
-    try:
-        with open(path, "rb") as file:
-            start = file.read(LONGEST_START)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {reason(error)}") from error
+    with opened(path) as file:
+        start = file.read(LONGEST_START)
     by_name = [each for each in FORMATS if path.suffix.lower() in each.suffixes]
     # Frames without a header can begin with any bytes.
     if not by_name:

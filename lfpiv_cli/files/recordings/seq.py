@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.errors import InputError
-from lfpiv_cli.files.inputs import reason
+from lfpiv_cli.files.inputs import opened
 from lfpiv_cli.files.recordings.bayer import COLOUR_HINT
 from lfpiv_cli.files.recordings.blocks import recording, values_at
 from lfpiv_cli.files.recordings.packing import Pixels
@@ -39,11 +39,8 @@ def frames(path: Path) -> Recording:
     ------
     InputError
     """
-    try:
-        with open(path, "rb") as file:
-            return _frames(path, file)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {reason(error)}") from error
+    with opened(path) as file:
+        return _frames(path, file)
 
 
 def _frames(path: Path, file: BinaryIO) -> Recording:
