@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 
 import lfpiv_cli as lf
 from lfpiv_cli.cli import cli
-from lfpiv_cli.errors import InputError, OutputExistsError, PartialError, UsageError
+from lfpiv_cli.errors import InputError, OutputExistsError, PartialError, StoppedEarlyError, UsageError
 from lfpiv_cli.files.batch import Frame
 from lfpiv_cli.files.images import write_tiff
 from lfpiv_cli.files.particle_file import TRAJECTORIES_FORMAT, Points, read_points
+from lfpiv_cli.files.shares import Deadline
 from lfpiv_cli.particles.fitting import add_all
 from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.stages import follow as stage
@@ -147,14 +148,14 @@ def test_what_was_interrupted_goes_on(
     rig: Path, followed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As if it had not been, on other threads; so does what has lost a file."""
-    put = stage._Files.put
+    put = stage.FrameFiles.put
 
     def broken(self: Any, number: int, *rest: Any) -> None:
         if number == 2:
             raise RuntimeError("power cut")
         put(self, number, *rest)
 
-    monkeypatch.setattr(stage._Files, "put", broken)
+    monkeypatch.setattr(stage.FrameFiles, "put", broken)
     options = stage.FollowOptions(dark=rig / "dark.tif")
     with pytest.raises(RuntimeError, match="power cut"):
         stage.follow_particles(rig / "weights.h5", images(rig), tmp_path / "run", options)
@@ -255,3 +256,37 @@ def test_a_sequence_begins_with_two_frames_that_can_be_read(tmp_path: Path) -> N
     assert [(frame.stem, frame.fault is None) for frame in frames] == [("2", True), ("3", True), ("4", False)]
     assert [each.name for each in left_out] == ["0", "1", "4"]
     assert "one value everywhere" in left_out[2].error
+
+
+def test_a_sequence_is_not_divided(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="cannot be divided"):
+        run("follow", tmp_path / "weights.h5", tmp_path / "a.tif", "--shard", "1/2", "-o", tmp_path / "run")
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("ways", [(), ("--both-ways",)])
+def test_it_stops_before_its_time_limit_and_goes_on(
+    rig: Path, followed: Path, tmp_path: Path, ways: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    output, asked = tmp_path / "run", 0
+
+    def leaves_time(_: Deadline) -> bool:
+        nonlocal asked
+        asked += 1
+        return asked <= 3
+
+    options = ("--threads", 1, *ways)
+    follow(rig, output, *options, "--dry-run", "--json")
+    told = json.loads(capsys.readouterr().out)
+    assert (told["frames"], told["to_make"], output.exists()) == (FRAMES, FRAMES, False)
+    with monkeypatch.context() as patch:
+        patch.setattr(Deadline, "leaves_time", leaves_time)
+        with pytest.raises(StoppedEarlyError, match=f"3 of {FRAMES} frames are done"):
+            follow(rig, output, *options, "--time-limit", "1h")
+    assert not (output / "tracks.vtkhdf").exists()
+    follow(rig, output, *options, "--dry-run", "--resume", "--json")
+    told = json.loads(capsys.readouterr().out)
+    assert told["to_make"] == (FRAMES if ways else 1)
+    follow(rig, output, *options, "--time-limit", "1h", "--resume")
+    if not ways:
+        assert bytes_of(output) == bytes_of(followed)

@@ -7,9 +7,11 @@ attribute `units`) and are linked under `/VTKHDF`, so that readers of HDF5 and o
 
 from __future__ import annotations
 
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import h5py
 import numpy as np
@@ -23,6 +25,7 @@ from lfpiv_cli.files.hdf5 import (
     open_h5,
     read_array,
     write_array,
+    write_rows,
 )
 from lfpiv_cli.files.hdf5_checks import array_member
 from lfpiv_cli.files.vtk import create_vtk_group, read_root, write_root
@@ -34,6 +37,8 @@ TRAJECTORIES_FORMAT = "lfpiv-trajectories"
 FORMAT_VERSION = 1
 
 POSITION = "position_mm"
+# So many rows are read back or counted at a time: a few megabytes.
+CHECKED_ROWS = 2**16
 
 # Units of the arrays, by format; tensors are symmetric, as xx, yy, zz, xy, yz, xz (VTK's order).
 UNITS = {
@@ -62,6 +67,8 @@ UNITS = {
         "link_probability": "1",
     },
 }
+# Arrays that a file may have besides: those of earlier versions have them not.
+OPTIONAL = {TRACKS_FORMAT: {"displacement_covariance_mm2": "mm^2"}}
 # Arrays in which NaN stands for what is not known.
 MAY_BE_UNKNOWN = {"link_probability"}
 
@@ -84,6 +91,59 @@ class Points:
     attributes: dict[str, Any]
     provenance: dict[str, Any]
 
+    @property
+    def count(self) -> int:
+        """How many points there are."""
+        return len(self.position_mm)
+
+    def rows(self, name: str) -> Iterator[NDArray[Any]]:
+        """Yield the rows of an array, or of the positions, all in one piece."""
+        yield self.position_mm if name == POSITION else self.arrays[name]
+
+    def lines(self) -> NDArray[np.int64]:
+        """Return where each track's rows begin, and where the last one's end."""
+        return lines_of(self.arrays["track"]) if "track" in self.arrays else np.zeros(1, np.int64)
+
+    def in_frames(self, frames: int) -> tuple[NDArray[np.int64], Callable[[str], Iterator[NDArray[Any]]]]:
+        """Return how many places of tracks each of so many frames has, and what yields an array's rows in each."""
+        order = np.lexsort((self.arrays["track"], self.arrays["frame"]))
+        counts = np.bincount(self.arrays["frame"], minlength=frames).astype(np.int64)
+
+        def rows(name: str) -> Iterator[NDArray[Any]]:
+            (array,) = self.rows(name)
+            return (array[each] for each in np.split(order, np.cumsum(counts)[:-1]))
+
+        return counts, rows
+
+
+class PointRows(Protocol):
+    """Points whose arrays can be had in pieces, in memory or not; as `Points`."""
+
+    @property
+    def reference(self) -> Reference:
+        """The origin of their coordinates."""
+
+    @property
+    def attributes(self) -> dict[str, Any]:
+        """What their file says about itself."""
+
+    @property
+    def provenance(self) -> dict[str, Any]:
+        """How they were made."""
+
+    @property
+    def count(self) -> int:
+        """How many points there are."""
+
+    def rows(self, name: str) -> Iterator[NDArray[Any]]:
+        """Yield the rows of an array, or of the positions, in pieces; one at least."""
+
+    def lines(self) -> NDArray[np.int64]:
+        """Return where each track's rows begin, and where the last one's end."""
+
+    def in_frames(self, frames: int) -> tuple[NDArray[np.int64], Callable[[str], Iterator[NDArray[Any]]]]:
+        """Return how many places of tracks each of so many frames has, and what yields an array's rows in each."""
+
 
 def no_points(format_name: str, reference: Reference) -> Points:
     """Return points of a format of which there are none."""
@@ -91,31 +151,47 @@ def no_points(format_name: str, reference: Reference) -> Points:
     return Points(np.zeros((0, 3)), arrays, reference, {}, {})
 
 
-def write_points(path: Path, format_name: str, points: Points, *, overwrite: bool) -> None:
-    """Write points; their arrays are all that the format has, each with as many rows as there are points.
+def write_points(path: Path, format_name: str, points: PointRows, *, overwrite: bool) -> None:
+    """Write points; their arrays are all that the format needs or may have, each with a row for each point.
 
     Raises
     ------
     OutputExistsError, OutputError
     """
-    units, position_mm, arrays = UNITS[format_name], points.position_mm, points.arrays
-    if set(arrays) != set(units) or any(len(array) != len(position_mm) for array in arrays.values()):
-        raise ValueError(f"{format_name} has the arrays {sorted(units)} of {len(position_mm)} rows each")
+    units = UNITS[format_name]
+    if isinstance(points, Points):
+        units = units | _optional(points.arrays, format_name)
+        _ensure_whole(points, units, format_name)
 
     def fill(file: h5py.File) -> None:
         write_root(file, format_name, FORMAT_VERSION, points.reference, points.attributes, points.provenance)
         vtk = create_vtk_group(file, "PolyData")
-        vtk["Points"] = write_array(file, POSITION, position_mm, "mm")
-        write_array(vtk, "NumberOfPoints", np.array([len(position_mm)], dtype=np.int64))
-        _write_cells(vtk, len(position_mm), lines_of(arrays["track"]) if "track" in arrays else np.zeros(1, np.int64))
+        vtk["Points"] = write_rows(file, POSITION, points.count, points.rows(POSITION), "mm")
+        write_array(vtk, "NumberOfPoints", np.array([points.count], dtype=np.int64))
+        _write_cells(vtk, points.count, points.lines())
         data = vtk.create_group("PointData")
         for name, unit in units.items():
-            data[name] = write_array(file, name, arrays[name], unit)
+            data[name] = write_rows(file, name, points.count, points.rows(name), unit)
 
     def check(temporary: Path) -> None:
-        read_points(temporary, format_name)
+        with _opened(temporary, format_name) as (file, datasets):
+            read_root(file)
+            for name, dataset in datasets.items():
+                for begin in range(0, len(dataset), CHECKED_ROWS):
+                    _ensure_finite(temporary, name, dataset[begin : begin + CHECKED_ROWS], len(dataset))
 
     create(path, fill, overwrite=overwrite, check=check)
+
+
+def _optional(names: Container[str], format_name: str) -> dict[str, str]:
+    """Return the units of those arrays that a format may have and that are there."""
+    return {name: unit for name, unit in OPTIONAL.get(format_name, {}).items() if name in names}
+
+
+def _ensure_whole(points: Points, units: Mapping[str, str], format_name: str) -> None:
+    """Raise where points have other arrays than these, or arrays not a row for each."""
+    if set(points.arrays) != set(units) or any(len(array) != points.count for array in points.arrays.values()):
+        raise ValueError(f"{format_name} has the arrays {sorted(units)} of {points.count} rows each")
 
 
 def read_points(path: Path | str, format_name: str) -> Points:
@@ -127,19 +203,41 @@ def read_points(path: Path | str, format_name: str) -> Points:
         If the file is missing, broken, of another format, or holds values that are not finite.
     """
     path = Path(path)
+    with _opened(path, format_name) as (file, datasets):
+        size = path.stat().st_size
+        arrays = {name: read_array(dataset, size) for name, dataset in datasets.items()}
+        root = read_root(file)
+    for name, array in arrays.items():
+        _ensure_finite(path, name, array, len(array))
+    position = arrays.pop(POSITION).astype(np.float64)
+    return Points(position, arrays, root.reference, root.attributes, root.provenance)
+
+
+@contextmanager
+def _opened(path: Path, format_name: str) -> Iterator[tuple[h5py.File, dict[str, h5py.Dataset]]]:
+    """Open a file of points; its arrays, positions first, have as many rows each."""
     with open_h5(path) as file:
         ensure_format(path, file, format_name, (FORMAT_VERSION,))
-        size = path.stat().st_size
-        position = read_array(array_member(file, POSITION), size)
-        arrays = {name: read_array(array_member(file, name), size) for name in UNITS[format_name]}
-        root = read_root(file)
-    if position.ndim != 2 or position.shape[1] != 3:
-        raise InputError(f"{path}: its positions have the shape {position.shape}, expected (n, 3)")
-    for name, array in (arrays | {POSITION: position}).items():
-        known = array[~np.isnan(array)] if name in MAY_BE_UNKNOWN else array
-        if len(array) != len(position) or not np.isfinite(known).all():
-            raise InputError(f"{path}: {name} has not one finite value for each of its {len(position)} points")
-    return Points(position.astype(np.float64), arrays, root.reference, root.attributes, root.provenance)
+        names = [POSITION, *UNITS[format_name], *_optional(file, format_name)]
+        datasets = {name: array_member(file, name) for name in names}
+        shape = datasets[POSITION].shape
+        if len(shape) != 2 or shape[1] != 3:
+            raise InputError(f"{path}: its positions have the shape {shape}, expected (n, 3)")
+        for name, dataset in datasets.items():
+            if len(dataset) != shape[0]:
+                raise _not_one_value(path, name, shape[0])
+        yield file, datasets
+
+
+def _ensure_finite(path: Path, name: str, rows: NDArray[Any], count: int) -> None:
+    """Raise where rows of an array of so many are not numbers, or not known where they must be."""
+    known = rows[~np.isnan(rows)] if name in MAY_BE_UNKNOWN else rows
+    if not np.isfinite(known).all():
+        raise _not_one_value(path, name, count)
+
+
+def _not_one_value(path: Path, name: str, count: int) -> InputError:
+    return InputError(f"{path}: {name} has not one finite value for each of its {count} points")
 
 
 def read_tracks(path: Path | str) -> Points:
@@ -159,6 +257,11 @@ def symmetric(matrices: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack([matrices[:, i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))], axis=1)
 
 
+def matrices(symmetric_parts: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return symmetric matrices (n, 3, 3) of what `symmetric` gives, (n, 6)."""
+    return np.asarray(symmetric_parts[:, [[0, 3, 5], [3, 1, 4], [5, 4, 2]]])
+
+
 def lines_of(track: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return where each track's rows begin, and where the last one's end."""
     return np.concatenate([[0], np.flatnonzero(np.diff(track)) + 1, [len(track)]]) if len(track) else np.zeros(1, int)
@@ -166,11 +269,20 @@ def lines_of(track: NDArray[np.int64]) -> NDArray[np.int64]:
 
 def _write_cells(vtk: h5py.Group, count: int, lines: NDArray[np.int64]) -> None:
     """Write one vertex for each point, lines of consecutive points that begin and end as told, and no other cells."""
-    offsets = {"Vertices": np.arange(count + 1, dtype=np.int64), "Lines": lines.astype(np.int64)}
+    counts: dict[str, tuple[int, int, Iterable[NDArray[np.int64]]]] = {
+        "Vertices": (count, count, _counted(count + 1)),
+        "Lines": (len(lines) - 1, int(lines[-1]), [lines.astype(np.int64)]),
+    }
     for name in ("Vertices", "Lines", "Polygons", "Strips"):
-        of_cells = offsets.get(name, np.zeros(1, dtype=np.int64))
+        cells, ids, offsets = counts.get(name, (0, 0, [np.zeros(1, dtype=np.int64)]))
         group = vtk.create_group(name)
-        write_array(group, "NumberOfCells", np.array([len(of_cells) - 1], dtype=np.int64))
-        write_array(group, "NumberOfConnectivityIds", of_cells[-1:])
-        write_array(group, "Offsets", of_cells)
-        write_array(group, "Connectivity", np.arange(of_cells[-1], dtype=np.int64))
+        write_array(group, "NumberOfCells", np.array([cells], dtype=np.int64))
+        write_array(group, "NumberOfConnectivityIds", np.array([ids], dtype=np.int64))
+        write_rows(group, "Offsets", cells + 1, offsets)
+        write_rows(group, "Connectivity", ids, _counted(ids))
+
+
+def _counted(count: int) -> Iterator[NDArray[np.int64]]:
+    """Yield the numbers from 0 on, so many, in pieces; one at least."""
+    for begin in range(0, max(count, 1), CHECKED_ROWS):
+        yield np.arange(begin, min(begin + CHECKED_ROWS, count), dtype=np.int64)

@@ -12,8 +12,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from lfpiv_cli.files.hdf5 import create, ensure_format, open_h5, write_array
-from lfpiv_cli.files.particle_file import TRAJECTORIES_FORMAT, UNITS, Points
+from lfpiv_cli.files.hdf5 import create, ensure_format, open_h5, write_array, write_rows
+from lfpiv_cli.files.particle_file import POSITION, TRAJECTORIES_FORMAT, UNITS, PointRows
 from lfpiv_cli.files.vtk import create_vtk_group, write_root, write_steps
 
 PLAYBACK_FORMAT, PLAYBACK_VERSION = "lfpiv-playback", 1
@@ -22,22 +22,22 @@ SHOWN = ("track", "velocity", "velocity_sigma")
 KINDS = ("Vertices", "Lines", "Polygons", "Strips")
 
 
-def write_playback(path: Path, tracks: Points, frames: int, dt_s: float, *, overwrite: bool) -> None:
+def write_playback(path: Path, tracks: PointRows, frames: int, dt_s: float, *, overwrite: bool) -> None:
     """Write the tracks of a sequence of so many frames, `dt_s` apart, for playing them in time.
 
     Raises
     ------
     OutputExistsError, OutputError
     """
-    order = np.lexsort((tracks.arrays["track"], tracks.arrays["frame"]))
-    counts = np.bincount(tracks.arrays["frame"], minlength=frames).astype(np.int64)
+    counts, rows = tracks.in_frames(frames)
     before = np.cumsum(counts) - counts
+    count = int(counts.sum())
     units = UNITS[TRAJECTORIES_FORMAT]
 
     def fill(file: h5py.File) -> None:
         write_root(file, PLAYBACK_FORMAT, PLAYBACK_VERSION, tracks.reference, tracks.attributes, tracks.provenance)
         vtk = create_vtk_group(file, "PolyData")
-        write_array(vtk, "Points", tracks.position_mm[order], "mm")
+        write_rows(vtk, "Points", count, rows(POSITION), "mm")
         write_array(vtk, "NumberOfPoints", counts)
         for kind in KINDS:
             cells = counts if kind == "Vertices" else np.zeros_like(counts)
@@ -45,11 +45,12 @@ def write_playback(path: Path, tracks: Points, frames: int, dt_s: float, *, over
             write_array(group, "NumberOfCells", cells)
             write_array(group, "NumberOfConnectivityIds", cells)
             # Each step has offsets of its own, one more than cells.
-            write_array(group, "Offsets", np.concatenate([np.arange(count + 1) for count in cells]))
-            write_array(group, "Connectivity", np.concatenate([np.arange(count) for count in cells]))
+            ids = int(cells.sum())
+            write_rows(group, "Offsets", ids + len(cells), (np.arange(each + 1) for each in cells))
+            write_rows(group, "Connectivity", ids, (np.arange(each) for each in cells))
         data = vtk.create_group("PointData")
         for name in SHOWN:
-            write_array(data, name, tracks.arrays[name][order], units[name])
+            write_rows(data, name, count, rows(name), units[name])
         steps = write_steps(vtk, (dt_s * np.arange(frames)).tolist(), dict.fromkeys(SHOWN, before))
         write_array(steps, "PartOffsets", np.arange(frames, dtype=np.int64))
         write_array(steps, "NumberOfParts", np.ones(frames, np.int64))

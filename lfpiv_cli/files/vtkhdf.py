@@ -216,6 +216,17 @@ def read_arrays(path: Path | str) -> tuple[Grid, dict[str, tuple[NDArray[Any], s
     return grid, found
 
 
+def read_grid(path: Path) -> Grid:
+    """Read the grid of a volume or a vector field.
+
+    Raises
+    ------
+    InputError
+    """
+    with open_h5(path) as file:
+        return _read_grid(file)
+
+
 def read_header(path: Path | str) -> Header:
     """Read what a volume, a vector field or points say about themselves.
 

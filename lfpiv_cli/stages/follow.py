@@ -14,8 +14,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from lfpiv_cli.console import CONSOLE, Console, Frames
-from lfpiv_cli.errors import InputError
+from lfpiv_cli.console import CONSOLE, Console
+from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.batch import (
@@ -32,10 +32,9 @@ from lfpiv_cli.files.config import Config, carried_config
 from lfpiv_cli.files.frame_sources import images_seen
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.pairing import in_order
-from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, Points, no_points, read_points, write_points
+from lfpiv_cli.files.particle_file import write_points
 from lfpiv_cli.files.playback import write_playback
 from lfpiv_cli.files.provenance import record, sha256, with_warnings
-from lfpiv_cli.files.weights_file import open_weights
 from lfpiv_cli.interface import particles
 from lfpiv_cli.interface.following import (
     SHORTEST,
@@ -46,23 +45,26 @@ from lfpiv_cli.interface.following import (
     steps_of,
 )
 from lfpiv_cli.interface.reconstruction import bench_of, check_frame, frame_notices
-from lfpiv_cli.interface.tracks import Tracking, few_notices, tracked, tracking_of
+from lfpiv_cli.interface.tracks import Tracking, few_notices, tracking_of
 from lfpiv_cli.notice import Notice
-from lfpiv_cli.reconstruction.images import Image
-from lfpiv_cli.reference import Reference
-from lfpiv_cli.stages.batches import Failure, Worked
+from lfpiv_cli.stages.batches import ALL, Failure, Worked, WorkOptions
+from lfpiv_cli.stages.dry_runs import dry_run
+from lfpiv_cli.stages.followed_files import FrameFiles, PlannedFrames
 from lfpiv_cli.stages.frames import STILL, Background, mask_of, read_frame, reader, sequence_digests
 from lfpiv_cli.stages.intervals import frames_dt_notices
+from lfpiv_cli.stages.prepared import open_weights_that_fit
 from lfpiv_cli.stages.reconstruct import file_notices, residual_path
+from lfpiv_cli.stages.stored_tracks import SeenFrames, stored_tracks
 from lfpiv_cli.tracks.sequences import Trajectories
 
+SEQUENCE_IS_WHOLE = "--shard: a sequence is followed from frame to frame and cannot be divided; leave out --shard"
 PARTICLES, FORWARDS = "particles", "forwards"
 TRACKS, PLAYBACK = f"tracks{VTKHDF_SUFFIX}", f"playback{VTKHDF_SUFFIX}"
 
 
 @dataclass(frozen=True, kw_only=True)
-class FollowOptions:
-    """What `follow_particles` is given besides weights and images.
+class FollowOptions(WorkOptions):
+    """What `follow_particles` is given besides weights and images; with `keep_going` tracks end before bad frames.
 
     Attributes
     ----------
@@ -72,9 +74,6 @@ class FollowOptions:
     shortest : fewest frames of a track
     both_ways : go through the frames a second time, backwards
     residuals : write what the particles leave of each image, too
-    resume : go on after the last frame that is complete
-    keep_going : leave out frames that cannot be read: tracks end before them, and others begin behind
-    failures : file to list these in, as JSON
     """
 
     dark: Path | None = None
@@ -85,9 +84,6 @@ class FollowOptions:
     shortest: int = SHORTEST
     both_ways: bool = False
     residuals: bool = False
-    resume: bool = False
-    keep_going: bool = False
-    failures: Path | None = None
 
 
 NO_OPTIONS = FollowOptions()
@@ -107,7 +103,11 @@ def follow_particles(
     Raises
     ------
     PartialError : frames were left out
+    UsageError : a share is asked for
+    StoppedEarlyError : the time is over
     """
+    if options.shard != ALL:
+        raise UsageError(SEQUENCE_IS_WHOLE)
     frames = frames_of(images, options.keep_going)
     ensure_sequence(len(frames), options.shortest)
     if options.failures is not None:
@@ -118,7 +118,7 @@ def follow_particles(
     level = Background.parse(options.background)
     mask_file = None if options.mask is None or options.mask == STILL else Path(options.mask)
     common = given(weights=weights, dark=options.dark, background=level.path, mask=mask_file)
-    content = open_weights(weights)
+    content = open_weights_that_fit(weights)
     settings = carried_config(content.provenance, weights).overridden("reconstruction", solver="particles")
     settings = settings.overridden("correlation", dt_s=options.dt_s)
     if settings.correlation.dt_s is None:
@@ -131,11 +131,15 @@ def follow_particles(
         frames, left_out = _readable(frames, shape)
         console.warn(Notice("frame-failed", each.name, each.error, "leave it out, or mend it") for each in left_out)
         ensure_sequence(len(frames), options.shortest)
-    content = particles.searchable(content, settings)
     told = sequence_digests(level, frames, options.mask)
     passes = _passes(output, frames, told, settings, tracking, common, options.both_ways)
-    prepare_folder([output / TRACKS])
     inputs = [*common.values(), *images]
+    if options.dry_run:
+        beside = [output / TRACKS, output / PLAYBACK, *(target.path for targets in passes[:-1] for target in targets)]
+        here = [target for target, frame in zip(passes[-1], frames, strict=True) if frame.fault is None]
+        return dry_run(PlannedFrames(here, beside, inputs, left_out, overwrite), options, console, folders=2)
+    prepare_folder([output / TRACKS])
+    content = particles.searchable(content, settings)
     there = [number for number, frame in enumerate(frames) if frame.fault is None]
     needed = [_needed(targets, there, inputs, options, overwrite, targets is passes[-1]) for targets in passes]
     for name in (TRACKS, PLAYBACK):
@@ -156,10 +160,10 @@ def follow_particles(
 
     sequence = Recorded(bench, size, tracking, frame_at, [frame.stem for frame in frames], {})
     found: Trajectories | None
-    count = sum(map(len, needed))
+    count, deadline = sum(map(len, needed)), options.deadline()
     with console.frames(count, sum(map(steps_of, needed)) / max(count, 1), "follow") as work:
         stores = [
-            _Files(
+            FrameFiles(
                 targets,
                 frozenset(numbers),
                 frozenset(there),
@@ -168,6 +172,7 @@ def follow_particles(
                 options.residuals and targets is passes[-1],
                 overwrite,
                 work,
+                deadline,
             )
             for targets, numbers in zip(passes, needed, strict=True)
         ]
@@ -221,62 +226,23 @@ def _needed(
 
 
 def _write_tracks(
-    output: Path, sequence: Recorded, store: _Files, found: Trajectories | None, overwrite: bool, console: Console
+    output: Path, sequence: Recorded, store: FrameFiles, found: Trajectories | None, overwrite: bool, console: Console
 ) -> dict[str, Any]:
     """Write the tracks through a sequence; return what is told of them."""
-    points = [store.read(number) for number in range(len(sequence.names))]
-    settings, tracking = sequence.bench.settings, sequence.tracking
-    carried = carried_config(points[0].provenance, store.targets[0].path)
-    inputs = {f"particles_{number:04d}": store.targets[number].path for number in sorted(store.there)}
+    settings, tracking, there = sequence.bench.settings, sequence.tracking, sorted(store.there)
+    first = store.read(0)
+    carried = carried_config(first.provenance, store.targets[0].path)
+    inputs = {f"particles_{number:04d}": store.targets[number].path for number in there}
     provenance = record("follow", carried.resolved() | tracking.told(), inputs)
-    result = tracked(points, settings, tracking, provenance, found)
-    counts = [len(points[number].position_mm) for number in sorted(store.there)]
-    notices = few_notices(counts, [sequence.names[number] for number in sorted(store.there)], result)
-    console.warn(notices)
-    told = replace(result.points, provenance=with_warnings(provenance, notices))
-    write_points(output / TRACKS, result.format_name, told, overwrite=overwrite)
-    write_playback(output / PLAYBACK, told, len(points), tracking.dt_s, overwrite=overwrite)
+    frames = SeenFrames(len(sequence.names), store.read)
+    with stored_tracks(frames, first.reference, settings, tracking, provenance, output, found) as result:
+        counts = [frames.particles(number) for number in there]
+        notices = few_notices(counts, [sequence.names[number] for number in there], result)
+        console.warn(notices)
+        told = replace(result.points, provenance=with_warnings(provenance, notices))
+        write_points(output / TRACKS, result.format_name, told, overwrite=overwrite)
+        write_playback(output / PLAYBACK, told, len(frames), tracking.dt_s, overwrite=overwrite)
     return {"particles_fewest": min(counts)} | {k: v for k, v in result.summary.items() if k != "frames"}
-
-
-class _Files:
-    """A store of one file for each frame."""
-
-    def __init__(
-        self,
-        targets: Sequence[Target],
-        needed: frozenset[int],
-        there: frozenset[int],
-        reference: Reference,
-        said: Sequence[Notice],
-        residuals: bool,
-        overwrite: bool,
-        work: Frames,
-    ) -> None:
-        """Take where the frames' files go, which are to be made, which there are, and what is said of all of them."""
-        self.targets, self.needed, self.there, self.said = targets, needed, there, said
-        self._nothing = no_points(PARTICLES_FORMAT, reference)
-        self.residuals, self.overwrite, self.work = residuals, overwrite, work
-
-    def read(self, number: int) -> Points:
-        """Return the particles of a frame; none of one that was left out."""
-        if number not in self.there:
-            return self._nothing
-        return read_points(self.targets[number].path, PARTICLES_FORMAT)
-
-    def made(self, number: int) -> Points | None:
-        """Return the particles of a frame that was complete."""
-        return None if number in self.needed else self.read(number)
-
-    def put(self, number: int, points: Points, left: Image, notices: list[Notice]) -> None:
-        """Write the particles of a frame, what is left of its image before them: what is complete has both."""
-        target = self.targets[number]
-        self.work.console.warn(notices)
-        if self.residuals:
-            image_files.write_tiff(residual_path(target.path), left, overwrite=True)
-        told = replace(points, provenance=with_warnings(target.record, [*self.said, *notices]))
-        write_points(target.path, PARTICLES_FORMAT, told, overwrite=self.overwrite)
-        self.work.done(target.path.stem)
 
 
 def _passes(

@@ -9,6 +9,7 @@ Axes: places (n, m, 3) in mm of n tracks in m frames, NaN where a track has none
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -80,24 +81,45 @@ def fit_in_time(
 
 def scatter_of(position_mm: NDArray[np.float64], sigma_mm: NDArray[np.float64], time: NDArray[np.float64]) -> Scatter:
     """Return noise and bending of tracks; the unknown ones where too few tracks are long enough."""
+    return scatter_of_pieces([(position_mm, sigma_mm)], time)
+
+
+def scatter_of_pieces(
+    pieces: Iterable[tuple[NDArray[np.float64], NDArray[np.float64]]], time: NDArray[np.float64]
+) -> Scatter:
+    """Return noise and bending as `scatter_of` does, of tracks that come in pieces: of each but little is kept."""
+    bends = list(zip(*(_bends_of(position, sigma, time) for position, sigma in pieces), strict=True))
+    # Pieces go as soon as they are put together.
+    misfit, variance, bending = (np.concatenate(bends.pop()) for _ in range(3))
+    if len(bending) < FEWEST_TRACKS:
+        return Scatter.unknown()
+    noise2: NDArray[np.float64] = np.ones(3)
+    noise_known = len(misfit) >= FEWEST_TRACKS
+    if noise_known:
+        noise2 = np.median(misfit, axis=0)
+    variance *= noise2
+    spread = MAD_TO_SIGMA * np.median(np.abs(bending) / np.sqrt(variance), axis=0)
+    squared = np.maximum(spread**2 - 1.0, 0.0) * np.median(variance, axis=0)
+    return Scatter(np.sqrt(noise2), squared, noise_known=noise_known, bending_known=True)
+
+
+def _bends_of(
+    position_mm: NDArray[np.float64], sigma_mm: NDArray[np.float64], time: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], ...]:
+    """Return second derivatives and their variances (k, 3) of the tracks that are long enough, and misfits (l, 3).
+
+    The misfits are of those with a place more than a parabola needs: squares over what stated errors let expect.
+    """
     count = np.isfinite(position_mm[..., 0]).sum(axis=1)
     bent = count >= TERMS
-    if np.count_nonzero(bent) < FEWEST_TRACKS:
-        return Scatter.unknown()
     position, sigma, freedom = position_mm[bent], sigma_mm[bent], count[bent] - TERMS
     solution, covariance = _parabola(position, sigma, time, np.full(3, np.inf))
-    noise2: NDArray[np.float64] = np.ones(3)
-    noise_known = np.count_nonzero(freedom) >= FEWEST_TRACKS
-    if noise_known:
-        left = position - np.einsum("mi,nai->nma", _terms(time), solution)
-        squares = np.nansum((left / sigma) ** 2, axis=1)[freedom > 0]
-        # The median of chi-squared.
-        median = 2.0 * gammaincinv(0.5 * freedom[freedom > 0], 0.5)
-        noise2 = np.median(squares / median[:, np.newaxis], axis=0)
-    variance = noise2 * covariance[..., 2, 2]
-    spread = MAD_TO_SIGMA * np.median(np.abs(solution[..., 2]) / np.sqrt(variance), axis=0)
-    bending = np.maximum(spread**2 - 1.0, 0.0) * np.median(variance, axis=0)
-    return Scatter(np.sqrt(noise2), bending, noise_known=bool(noise_known), bending_known=True)
+    left = position - np.einsum("mi,nai->nma", _terms(time), solution)
+    squares = np.nansum((left / sigma) ** 2, axis=1)[freedom > 0]
+    # The median of chi-squared.
+    median = 2.0 * gammaincinv(0.5 * freedom[freedom > 0], 0.5)
+    # Copies, as views would keep all of the solution.
+    return solution[..., 2].copy(), covariance[..., 2, 2].copy(), squares / median[:, np.newaxis]
 
 
 def _terms(time: NDArray[np.float64]) -> NDArray[np.float64]:

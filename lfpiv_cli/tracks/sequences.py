@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from lfpiv_cli.robust import MAD_TO_SIGMA
 from lfpiv_cli.scale import Scale
 from lfpiv_cli.tracks.candidates import Seen
-from lfpiv_cli.tracks.in_time import FEWEST_TRACKS, Scatter, State, fit_in_time, scatter_of
+from lfpiv_cli.tracks.in_time import FEWEST_TRACKS, Scatter, State, fit_in_time, scatter_of, scatter_of_pieces
 from lfpiv_cli.tracks.kriging import kriged, structure_of
 from lfpiv_cli.tracks.tracking import NO_TRACKS, Forecast, Tracks, known_of, link_some, track
 
@@ -64,6 +64,25 @@ class Trajectories:
         place = np.full(self.count, NO_PARTICLE)
         place[labels[labels != NO_TRACK]] = np.flatnonzero(labels != NO_TRACK)
         return np.asarray(place[tracks])
+
+    def lengths(self) -> NDArray[np.int64]:
+        """Return how many places each track has."""
+        counts = np.zeros(self.count, dtype=np.int64)
+        for labels in self.labels:
+            counts += np.bincount(labels[labels != NO_TRACK], minlength=self.count)
+        return counts
+
+    def expected_wrong_links(self) -> float:
+        """Return how many links are wrong, by their probabilities."""
+        wrong = np.empty(int(self.lengths().sum()))
+        end = 0
+        for labels, probability in zip(self.labels, self.probability, strict=True):
+            tracked = np.flatnonzero(labels != NO_TRACK)
+            end += len(tracked)
+            # By track in each frame: the last bits of a sum are of the order.
+            wrong[end - len(tracked) : end] = 1.0 - probability[tracked[np.argsort(labels[tracked])]]
+        wrong[np.isnan(wrong)] = 0.0
+        return float(np.sum(wrong))
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,9 +289,8 @@ def scatter_in(found: Trajectories, frames: Sequence[Seen]) -> tuple[Scatter, in
 def _scatter_of_windows(found: Trajectories, frames: Sequence[Seen], width: int) -> Scatter:
     """Return noise and bending of the tracks in windows of so many frames that do not overlap."""
     windows = [_frames_before(end, width) for end in range(min(width, len(frames)), len(frames) + 1, width)]
-    pieces = [_places(found, frames, window, _tracks_in(found, window)) for window in windows]
-    position, sigma = (np.concatenate(pair) for pair in zip(*pieces, strict=True))
-    return scatter_of(position, sigma, np.arange(position.shape[1], dtype=np.float64))
+    pieces = (_places(found, frames, window, _tracks_in(found, window)) for window in windows)
+    return scatter_of_pieces(pieces, np.arange(len(windows[0]), dtype=np.float64))
 
 
 def states_at(
@@ -364,10 +382,10 @@ def _bridges(
 
 def long_ones(found: Trajectories, shortest: int) -> Trajectories:
     """Return the tracks with so many places at least, numbered anew in the order of their first frames."""
-    every = np.concatenate([labels[labels != NO_TRACK] for labels in found.labels])
-    is_long = np.bincount(every, minlength=found.count) >= shortest
+    is_long = found.lengths() >= shortest
     number = np.where(is_long, np.cumsum(is_long) - 1, NO_TRACK)
-    labels = tuple(np.where(old == NO_TRACK, NO_TRACK, np.append(number, NO_TRACK)[old]) for old in found.labels)
+    number = np.append(number, NO_TRACK)
+    labels = tuple(np.where(old == NO_TRACK, NO_TRACK, number[old]) for old in found.labels)
     probability = tuple(
         np.where(label == NO_TRACK, np.nan, each) for label, each in zip(labels, found.probability, strict=True)
     )
