@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
 
 import h5py
@@ -152,6 +153,16 @@ def write_im7(path: Path, stack: np.ndarray) -> None:
     header = struct.pack("<4h4i3h", 0, 2, -4, 0, columns, rows, 1, count, 0, 1, 0).ljust(256, b"\0")
     packed = zlib.compress(stack.tobytes())
     path.write_bytes(header + struct.pack("<I", len(packed)) + packed + struct.pack("<2i", 1, 4) + b"1 0\0")
+
+
+def write_set(path: Path, stacks: Sequence[np.ndarray], first: int = 1) -> None:
+    """Write a DaVis set: its text, and beside it the folder of its images, each of frames (frame, row, column)."""
+    # As LaVision's own library begins it.
+    path.write_text(f"// set file <{path.name}> created by DaVis\n\n#GROUP Sets\nSetType = 256;\nSetStart = {first};\n")
+    folder = path.with_suffix("")
+    folder.mkdir()
+    for number, stack in enumerate(stacks, start=first):
+        write_im7(folder / f"B{number:05d}.im7", stack)
 
 
 def write_stack(path: Path, stack: np.ndarray, name: str = "entry/data/frames") -> None:

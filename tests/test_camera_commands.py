@@ -61,12 +61,22 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     camera_files.write_stack(made / "hdf5.h5", stack)
     (made / "raw.raw").write_bytes(b"".join(camera_files.bits_low_first(frame, 12) for frame in stack))
     camera_files.write_im7(made / "davis.im7", stack)
+    camera_files.write_set(made / "set.set", [stack[:1], stack[1:]])
     (made / "rig.yaml").write_text(yaml.safe_dump(RIG))
     run("build-weights", made / "rig.yaml", "-o", made / "weights.h5")
     return made
 
 
-IMAGES = ("tiff.tif", "cine.cine", "packed.cine", "seq.seq", "mraw.mraw", "hdf5.h5:/entry/data/frames", "davis.im7")
+IMAGES = (
+    "tiff.tif",
+    "cine.cine",
+    "packed.cine",
+    "seq.seq",
+    "mraw.mraw",
+    "hdf5.h5:/entry/data/frames",
+    "davis.im7",
+    "set.set",
+)
 
 
 @pytest.mark.thorough
@@ -76,7 +86,7 @@ def test_volumes_are_the_same_from_every_format(folder: Path) -> None:
     for page in range(2):
         expected = open_volume(folder / "volumes" / f"tiff_000{page}.vtkhdf").array
         assert expected.any()
-        for name in ("cine", "packed", "seq", "mraw", "hdf5", "davis", "raw"):
+        for name in ("cine", "packed", "seq", "mraw", "hdf5", "davis", "set", "raw"):
             found = open_volume(folder / "volumes" / f"{name}_000{page}.vtkhdf").array
             np.testing.assert_array_equal(found, expected, err_msg=name)
     records = {
@@ -102,6 +112,7 @@ FORMATS = {
     "mraw.mraw": ("Photron mraw", 12, True),
     "hdf5.h5": ("HDF5", 16, True),
     "davis.im7": ("LaVision im7", 16, False),
+    "set.set": ("LaVision set", 16, False),
     f"raw.raw:{PACKED}:rate=2000": ("raw", 12, True),
 }
 
@@ -176,6 +187,7 @@ FAULTS: dict[str, tuple[Callable[[Path], None], str, int]] = {
     "mraw.mraw": (lambda path: _cut(path, 1.0), "mraw.cihx or .cih is not beside it", 4),
     "hdf5.h5": (lambda path: _cut(path, 0.9), "hdf5.h5", 4),
     "davis.im7": (lambda path: _cut(path, 0.9), "cut off or damaged", 4),
+    "set.set": (lambda path: _cut(path, 1.0), "the folder of its images, set, is not beside it", 4),
     "raw.raw": (lambda path: _cut(path, 1.0), "state its layout with --raw", 2),
 }
 

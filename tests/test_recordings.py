@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 import os
 import re
@@ -9,6 +10,7 @@ import struct
 import sys
 import time
 import zlib
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
@@ -20,6 +22,7 @@ import tifffile
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files import images
 from lfpiv_cli.files.inputs import split_part
+from lfpiv_cli.files.provenance import record, sha256
 from lfpiv_cli.files.recordings import tiff
 from lfpiv_cli.files.recordings.bayer import PATTERNS, green_of
 from lfpiv_cli.files.recordings.packing import PACKED_BITS, Packing, Pixels
@@ -209,9 +212,6 @@ def test_images_of_davis(tmp_path: Path, rng: np.random.Generator) -> None:
             path.write_bytes(flipped)
             with pytest.raises(InputError, match=r"B00001\.im7: (cannot be unpacked|does not unpack)"):
                 images.read_page(path, 0)
-    (tmp_path / "run.set").write_text("set")
-    with pytest.raises(UsageError, match=r"give the \.im7 files of the folder .*run"):
-        images.frames(tmp_path / "run.set")
 
 
 @pytest.mark.parametrize(
@@ -243,6 +243,91 @@ def test_packed_images_of_davis_end_with_their_check_sum(tmp_path: Path, rng: np
     edited(path, 256, "<I", length - 2)
     with pytest.raises(InputError, match="does not unpack to 3 frames"):
         images.read_page(path, 1)
+
+
+def test_a_set_of_davis_is_the_frames_of_its_images_one_after_the_other(
+    tmp_path: Path, rng: np.random.Generator
+) -> None:
+    path = tmp_path / "run.set"
+    # Ten images, so that by letters B10 would come before B2; the second has a frame more.
+    stacks = [stack_of(rng, 12, (1 + (k == 1), 5, 7)) for k in range(10)]
+    camera_files.write_set(path, stacks)
+    for number in range(10):
+        (tmp_path / "run" / f"B{number + 1:05d}.im7").rename(tmp_path / "run" / f"b{number + 1}.IM7")
+    found = images.frames(path)
+    assert (found.pages, found.shape, found.bits, found.time_s) == (11, (5, 7), 16, None)
+    for page, expected in enumerate(np.concatenate(stacks)):
+        np.testing.assert_array_equal(images.read_page(path, page, (5, 7)), expected)
+    np.testing.assert_array_equal(images.read_image(Path(f"{path}:page=2")), stacks[1][1])
+    camera_files.write_im7(tmp_path / "run" / "b11.im7", stacks[0])
+    assert images.count_pages(path) == 12
+    camera_files.write_im7(tmp_path / "run" / "b2.IM7", stacks[0])
+    with pytest.raises(InputError, match=r"b2\.IM7: holds 1 frames, fewer than"):
+        images.read_page(path, 2)
+
+
+def test_sets_as_lavision_writes_them(tmp_path: Path, rng: np.random.Generator) -> None:
+    lvpyio = pytest.importorskip("lvpyio")
+    stacks = [stack_of(rng, 12, (2, 30, 40)) for _ in range(3)]
+    lvpyio.write_set([lvpyio.arrays_to_buffer(list(stack)) for stack in stacks], str(tmp_path / "run.set"))
+    for page, expected in enumerate(np.concatenate(stacks)):
+        np.testing.assert_array_equal(images.read_page(tmp_path / "run.set", page), expected)
+
+
+def _only_vectors(folder: Path) -> None:
+    for file in folder.iterdir():
+        file.rename(file.with_suffix(".vc7"))
+
+
+def _set_in_set(folder: Path) -> None:
+    folder.rename(folder.with_name("S00001"))
+    folder.mkdir()
+    folder.with_name("S00001").rename(folder / "S00001")
+
+
+SETS: dict[str, tuple[Callable[[Path], object], str]] = {
+    "no folder": (lambda folder: folder.rename(folder.with_name("other")), "folder of its images, run, is not beside"),
+    "gap": (lambda folder: (folder / "B00002.im7").unlink(), r"B00003\.im7 is not the next image after B00001\.im7"),
+    "first": (lambda folder: (folder / "B00001.im7").unlink(), r"first image is B00002\.im7, and those before"),
+    "twice": (lambda folder: (folder / "B2.im7").write_bytes(b"x"), r"im7 has the same number as B.*2\.im7"),
+    "empty": (lambda folder: [file.unlink() for file in folder.iterdir()], r"no images B00001\.im7, .*: save it from"),
+    "vectors": (_only_vectors, r"but \.vc7 files: save it from DaVis as a set of \.im7 images, or as TIFF"),
+    "sets": (_set_in_set, "holds several sets: give one of these folders, as .*S00001"),
+    "archive": (lambda folder: folder.with_suffix(".set").write_bytes(b"PK\3\4\0\0"), "is no text .*or as TIFF"),
+    "size": (
+        lambda folder: camera_files.write_im7(folder / "B00002.im7", np.zeros((1, 5, 8), np.uint16)),
+        r"B00002\.im7: has .*\(5, 8\), the first image of its set \(5, 7\)",
+    ),
+    "cut": (lambda folder: _cut(folder / "B00003.im7"), r"B00003\.im7: .*cut off"),
+}
+
+
+def _cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-20])
+
+
+@pytest.mark.parametrize("fault", SETS)
+def test_sets_that_are_not_whole_are_refused(tmp_path: Path, fault: str) -> None:
+    spoil, words = SETS[fault]
+    camera_files.write_set(tmp_path / "run.set", [np.zeros((1, 5, 7), np.uint16)] * 3)
+    spoil(tmp_path / "run")
+    with pytest.raises(InputError, match=words):
+        images.frames(tmp_path / "run.set")
+
+
+def test_the_record_of_a_set_changes_with_each_of_its_images(tmp_path: Path) -> None:
+    path = tmp_path / "run.set"
+    camera_files.write_set(path, [np.zeros((1, 5, 7), np.uint16)] * 2)
+
+    def beside() -> dict[str, str]:
+        return record("reconstruct", None, {"image": path})["inputs"]["image"]["beside"]
+
+    (tmp_path / "run" / ".hidden").write_text("not of the set")
+    lines = [f"{sha256(tmp_path / 'run' / name)}  {name}\n" for name in ("B00001.im7", "B00002.im7")]
+    first = beside()
+    assert first == {"run": hashlib.sha256("".join(lines).encode()).hexdigest()}
+    camera_files.write_im7(tmp_path / "run" / "B00002.im7", np.ones((1, 5, 7), np.uint16))
+    assert beside() != first
 
 
 def edited(path: Path, place: int, layout: str, value: int) -> None:

@@ -7,8 +7,9 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from lfpiv_cli.errors import InputError
-from lfpiv_cli.files.inputs import ensure_regular_file, reason, split_part
+from lfpiv_cli.files.inputs import content_of, ensure_regular_file, split_part
 from lfpiv_cli.files.provenance import sha256
+from lfpiv_cli.files.recordings.formats import files_beside
 
 # `sha256sum` writes a star before the names of files that are read as bytes.
 LINE = re.compile(r"([0-9a-fA-F]{64}) [ *](.+)")
@@ -28,7 +29,8 @@ def ensure_verified(listed: Path, inputs: Iterable[Path]) -> int:
     InputError
     """
     expected = _read(listed)
-    asked = dict(pair for path in inputs for pair in _files(path, listed, expected))
+    read = (each for path in inputs for each in _with_those_beside(split_part(path)[0]))
+    asked = dict(pair for path in read for pair in _files(path, listed, expected))
     for file, name in asked.items():
         found = sha256(file)
         if found != expected[file]:
@@ -38,9 +40,13 @@ def ensure_verified(listed: Path, inputs: Iterable[Path]) -> int:
     return len(asked)
 
 
+def _with_those_beside(path: Path) -> tuple[Path, ...]:
+    """Return a file, and those that it is read with."""
+    return (path,) if path.is_dir() else (path, *files_beside(path))
+
+
 def _files(path: Path, listed: Path, expected: dict[Path, str]) -> Iterator[tuple[Path, Path]]:
     """Yield the resolved name of each file that an input is, with the one that it was given under."""
-    path = split_part(path)[0]
     resolved = path.resolve()
     inside = [file for file in expected if resolved in file.parents] if resolved.is_dir() else [resolved]
     if not inside or (inside == [resolved] and resolved not in expected):
@@ -54,10 +60,7 @@ def _read(listed: Path) -> dict[Path, str]:
     size = ensure_regular_file(listed)
     if size > LARGEST_LIST_BYTES:
         raise InputError(f"{listed}: has {size} bytes, expected a list of at most {LARGEST_LIST_BYTES}")
-    try:
-        lines = listed.read_text(encoding="utf-8", errors="surrogateescape").splitlines()
-    except OSError as error:
-        raise InputError(f"{listed}: cannot be read: {reason(error)}") from error
+    lines = content_of(listed).decode("utf-8", errors="surrogateescape").splitlines()
     found: dict[Path, str] = {}
     for number, line in enumerate(lines, 1):
         if not line.strip() or line.startswith("#"):

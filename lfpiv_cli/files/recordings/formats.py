@@ -8,7 +8,7 @@ from pathlib import Path
 
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files.inputs import ensure_regular_file, opened
-from lfpiv_cli.files.recordings import cine, im7, mraw, png, raw, seq, stack, tiff
+from lfpiv_cli.files.recordings import cine, davis_set, im7, mraw, png, raw, seq, stack, tiff
 from lfpiv_cli.files.recordings.recording import Recording
 
 
@@ -23,8 +23,9 @@ class Format:
     suffixes : of its files' names, in small letters, where the first bytes do not tell
     frames : reads a file's header
     frames_of : reads what FILE:PART says of a file, where the format has parts
-    beside : finds the other files that one is read with
-    in_folders : whether its files are meant where a folder is given for the images in it; an HDF5 file can be anything
+    beside : finds the other files that one is read with; a folder stands for all files in it
+    in_folders : whether its files are meant where a folder is given for the images in it; an HDF5 file can be anything,
+        and a set's images are there besides
     """
 
     name: str
@@ -45,7 +46,7 @@ FORMATS = (
     Format("Norpix seq", seq.frames, starts=(seq.START,)),
     Format("Photron mraw", mraw.frames, suffixes=(mraw.SUFFIX,), beside=mraw.beside),
     Format("LaVision im7", im7.frames, suffixes=(".im7",)),
-    Format("LaVision set", im7.frames_of_set, suffixes=(".set",), in_folders=False),
+    Format("LaVision set", davis_set.frames, suffixes=(davis_set.SUFFIX,), beside=davis_set.beside, in_folders=False),
     RAW,
 )
 LONGEST_START = max(len(start) for each in FORMATS for start in each.starts)
@@ -68,7 +69,7 @@ def open_recording(path: Path, part: str | None) -> Recording:
 
 
 def files_beside(path: Path) -> tuple[Path, ...]:
-    """Return the files that one is read with, whatever it is: none of most."""
+    """Return the files, or the folder of files, that one is read with, whatever it is: none of most."""
     for each in FORMATS:
         if each.beside is not None and path.suffix.lower() in each.suffixes:
             return each.beside(path)

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lfpiv_cli.errors import InputError, UsageError
-from lfpiv_cli.files.inputs import reason
+from lfpiv_cli.errors import InputError
+from lfpiv_cli.files.inputs import opened, reason
 from lfpiv_cli.files.recordings.blocks import bytes_at, values_at
 from lfpiv_cli.files.recordings.pixels import CUT, as_counts, ensure_size
 from lfpiv_cli.files.recordings.recording import Image, Recording, Shape
@@ -50,8 +50,8 @@ def frames(path: Path) -> Recording:
     ------
     InputError
     """
-    size = path.stat().st_size
-    with open(path, "rb") as file:
+    with opened(path) as file:
+        size = file.seek(0, 2)
         _, packing, kind, _, columns, rows, planes, pages = values_at(path, file, 0, HEADER)
         if kind not in KINDS or planes != 1:
             raise InputError(f"{path}: is of format {kind} with {planes} planes, expected images: {EXPORT_HINT}")
@@ -72,24 +72,16 @@ def frames(path: Path) -> Recording:
     return Recording(pages, found.shape, 8 * item_bytes, partial(_read_page, path, found))
 
 
-def frames_of_set(path: Path) -> Recording:
-    """Refuse a set: what it lists are files with names of their own."""
-    raise UsageError(f"{path}: lists a set of images: give the .im7 files of the folder {path.with_suffix('')}")
-
-
 def _read_page(path: Path, found: _Content, page: int, shape: Shape | None) -> Image:
-    try:
-        ensure_size(f"{path}: frame {page}", found.shape, 1, shape, path.stat().st_size)
-        data = _bytes_of(path, found, page)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {reason(error)}") from error
+    data = _bytes_of(path, found, page, shape)
     return as_counts(np.frombuffer(data, found.kind).reshape(found.shape))
 
 
-def _bytes_of(path: Path, found: _Content, page: int) -> bytes:
+def _bytes_of(path: Path, found: _Content, page: int, shape: Shape | None) -> bytes:
     """Return the bytes of a frame; of packed ones all are unpacked, whose check sum tells damage."""
     begin, end = page * found.frame_bytes, (page + 1) * found.frame_bytes
-    with open(path, "rb") as file:
+    with opened(path) as file:
+        ensure_size(f"{path}: frame {page}", found.shape, 1, shape, file.seek(0, 2))
         if not found.packed:
             return bytes_at(path, file, HEADER_BYTES + begin, found.frame_bytes)
         (length,) = values_at(path, file, HEADER_BYTES, LENGTH)

@@ -8,7 +8,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from lfpiv_cli.errors import InputError
-from lfpiv_cli.files.inputs import ensure_regular_file, reason
+from lfpiv_cli.files.inputs import content_of, ensure_regular_file, reason
 from lfpiv_cli.files.recordings.bayer import COLOUR_HINT
 from lfpiv_cli.files.recordings.blocks import at_rate, recording
 from lfpiv_cli.files.recordings.packing import PACKED_BITS, Pixels
@@ -70,10 +70,7 @@ def _read_header(header: Path) -> dict[str, str]:
     """Return the words of a header by our names; what it does not say is missing."""
     if ensure_regular_file(header) > MOST_HEADER_BYTES:
         raise InputError(f"{header}: has more than {MOST_HEADER_BYTES} bytes, and is no header of frames")
-    try:
-        content = header.read_bytes()
-    except OSError as error:
-        raise InputError(f"{header}: cannot be read: {reason(error)}") from error
+    content = content_of(header)
     if header.suffix.lower() == ".cih":
         lines = (line.split(" : ", 1) for line in content.decode("latin-1").splitlines())
         words = {line[0].strip(): line[1].strip() for line in lines if len(line) == 2}
