@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from multiprocessing.util import register_after_fork
+from threading import get_native_id, local
 from typing import TypeVar
 
 import cv2
@@ -25,6 +27,10 @@ _lost_threads = False
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
+
+# `pool`: of each thread that shares out work, its number (another in a forked process, which has lost the threads), the
+# number of further threads and their pool. It is kept, since new threads take longer than a short loop does.
+_here = local()
 
 # What `use_threads` was called with last.
 _told: list[int] = []
@@ -77,8 +83,36 @@ def in_threads(work: Callable[[Item], Result], items: Iterable[Item]) -> list[Re
     threads = min(numba.get_num_threads(), len(pieces))
     if threads < 2:
         return [work(piece) for piece in pieces]
-    with ThreadPoolExecutor(threads) as pool:
-        return list(pool.map(work, pieces))
+    done: dict[int, Result] = {}
+    left = deque(enumerate(pieces))
+
+    def take() -> None:
+        while True:
+            try:
+                place, piece = left.popleft()
+            except IndexError:
+                return
+            done[place] = work(piece)
+
+    others = [_further(threads - 1).submit(take) for _ in range(threads - 1)]
+    try:
+        take()
+        # One that has not begun by now has nothing left to do.
+        for other in [other for other in others if not other.cancel()]:
+            other.result()
+    finally:
+        left.clear()
+        wait([other for other in others if not other.cancel()])
+    return [done[place] for place in range(len(pieces))]
+
+
+def _further(threads: int) -> ThreadPoolExecutor:
+    """Return the calling thread's own pool of so many threads."""
+    owner, size, pool = getattr(_here, "pool", (0, 0, None))
+    if pool is None or (owner, size) != (get_native_id(), threads):
+        pool = ThreadPoolExecutor(threads)
+        _here.pool = (get_native_id(), threads, pool)
+    return pool
 
 
 def share_out(kernel: Callable[..., None], count: int, *arguments: object) -> None:
@@ -86,7 +120,8 @@ def share_out(kernel: Callable[..., None], count: int, *arguments: object) -> No
 
     The kernel is compiled with `nogil`; what it does for one piece may not depend on another.
     """
-    size = -(-count // (PARTS_A_THREAD * numba.get_num_threads()))
+    threads = numba.get_num_threads()
+    size = -(-count // (PARTS_A_THREAD * threads)) if threads > 1 else count
     in_threads(lambda part: kernel((part.start, part.stop), *arguments), blocks(count, max(size, 1)))
 
 

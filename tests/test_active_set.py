@@ -64,6 +64,7 @@ def light_of(task: Task, particles: NDArray[np.float64]) -> NDArray[np.float64]:
     return image
 
 
+@pytest.mark.thorough
 def test_a_fit_s_gain_is_what_chi_squared_falls_by(task: Task, true: NDArray[np.float64]) -> None:
     state = begun(task, true)
     observation = observed(task, state, 0.05)

@@ -112,6 +112,7 @@ def test_columns_agree_with_the_factorised_form(table2, water, rng, column_axis)
     assert np.abs(images[0] - images[1]).sum() < 0.03 * images[0].sum()
 
 
+@pytest.mark.thorough
 def test_column_is_the_image_of_one_voxel(turned, water):
     operator = OnDemandOperator(turned, ObjectSpace(water, None, "paraxial"), GRID)
     volume = np.zeros(operator.shape, np.float32)

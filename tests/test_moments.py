@@ -90,22 +90,28 @@ def test_windows_without_light_or_with_few_groups_say_that_nothing_is_known(rng:
 
 
 def test_windows_that_overhang_have_an_uncertainty_of_their_own(rng: np.random.Generator) -> None:
-    a, b = shifted(rng, (1.0, 1.0, 1.0), noise=0.02)
     layout = layout_windows(SHAPE, (16, 16, 8), HALF)
-    before, after = margins(layout, a.shape, 1)
+    before, after = margins(layout, SHAPE[::-1], 1)
     margin = list(zip(before, after, strict=True))
-    valid = np.ones(a.shape, np.uint8)
-    _, whole = steps(a, b, layout)
+    valid = np.ones(SHAPE[::-1], np.uint8)
     # As where particles move 4 voxels in depth: of the outermost windows half is left.
     valid[:2] = valid[-2:] = 0
-    padded = (np.pad(volume, margin) for volume in (a, b, valid))
-    _, deviation, _ = gauss_newton(pair_moments(*padded, layout, before), layout, ROUND)
-    assert np.isfinite(deviation).all()
-    # What is left out is missed: of eight pairs drawn anew, 1.21 to 1.39 times the error of the whole windows.
-    assert 1.1 < np.median(deviation[[0, -1]]) / np.median(whole[[0, -1]]) < 2.0
-    inside = np.median(deviation[1:-1])
-    # Half the voxels, and some of the particles cut: a root of two more, or a little beyond.
-    assert 1.0 < np.median(deviation[[0, -1]]) / inside < 2.5
+    over_whole, over_inner = [], []
+    for _ in range(4):
+        a, b = shifted(rng, (1.0, 1.0, 1.0), noise=0.02)
+        _, whole = steps(a, b, layout)
+        padded = (np.pad(volume, margin) for volume in (a, b, valid))
+        _, deviation, _ = gauss_newton(pair_moments(*padded, layout, before), layout, ROUND)
+        assert np.isfinite(deviation).all()
+        outermost = np.median(deviation[[0, -1]])
+        over_whole.append(outermost / np.median(whole[[0, -1]]))
+        over_inner.append(outermost / np.median(deviation[1:-1]))
+    # What is left out is missed: in a pair, 1.21 to 1.44 times the error of the whole windows.
+    assert min(over_whole) > 1.1
+    assert max(over_whole) < 2.0
+    # Half the voxels, and some of the particles cut: a root of two more, or a little beyond. Of eight pairs 1.43 to
+    # 1.67, in the mean 1.56 times the error of the inner ones; with nothing left out 1.06 to 1.34, in the mean 1.20.
+    assert 1.38 < np.mean(over_inner) < 1.8
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from time import sleep
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -31,3 +33,22 @@ def test_every_piece_of_work_is_shared_out_once(count: int) -> None:
 
     share_out(work, count, 2.0, done)
     assert done.tolist() == [2.0] * count
+
+
+def test_nothing_more_is_begun_after_an_error() -> None:
+    begun = []
+
+    def work(piece: int) -> None:
+        begun.append(piece)
+        sleep(1e-3)
+        if piece == 0:
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        in_threads(work, range(50))
+    assert len(begun) < 25
+
+
+def test_loops_within_loops_end() -> None:
+    sums = in_threads(lambda row: sum(in_threads(lambda k: row * k, range(5))), range(5))
+    assert sums == [10 * row for row in range(5)]

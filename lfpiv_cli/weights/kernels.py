@@ -17,7 +17,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.simd.combine import (
@@ -31,6 +31,7 @@ from lfpiv_cli.simd.combine import (
     turn,
 )
 from lfpiv_cli.simd.vectors import LANES
+from lfpiv_cli.threads import in_threads, share_out
 
 Floats = NDArray[np.float32]
 Index = NDArray[np.int64]
@@ -112,19 +113,23 @@ def room_for(size: int) -> Floats:
     return room[skipped : skipped + size]
 
 
-@njit(cache=True, parallel=True)
 def turned(volume: Floats, shape: tuple[int, int]) -> Floats:
     """Return a volume (planes, rows, columns) as (planes, columns, rows), cut or filled up with zeros to `shape`."""
-    found = np.zeros((volume.shape[0], shape[0], shape[1]), np.float32)
-    columns, rows = min(shape[0], volume.shape[2]), min(shape[1], volume.shape[1])
-    for plane in prange(volume.shape[0]):
-        for column in range(columns):
-            for row in range(rows):
-                found[plane, column, row] = volume[plane, row, column]
+    found = np.zeros((volume.shape[0], *shape), np.float32)
+    share_out(_turn_planes, len(volume), volume, found)
     return found
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, nogil=True)
+def _turn_planes(part: tuple[int, int], volume: Floats, found: Floats) -> None:
+    """Write what a part of the planes are when turned."""
+    columns, rows = min(found.shape[1], volume.shape[2]), min(found.shape[2], volume.shape[1])
+    for plane in range(part[0], part[1]):
+        for column in range(columns):
+            for row in range(rows):
+                found[plane, column, row] = volume[plane, row, column]
+
+
 def project(volume: Floats, columns: CellBlocks, rows: Terms, tiles: int) -> Floats:
     """Return sum_z B_z V_z A_z^T by cells of a volume (planes, width, filled height).
 
@@ -132,14 +137,23 @@ def project(volume: Floats, columns: CellBlocks, rows: Terms, tiles: int) -> Flo
     planes in `rows` gives lines g * GROUP on of `by_cell`; its terms are lines plane * height + voxel, planes counted
     from the first of these.
     """
+    sums = (rows.start.size - 1) // -(-volume.shape[0] // PLANES_FORWARD)
+    flat_cell = room_for(tiles * GROUP * sums * TILE)
+    share_out(_project_tiles, tiles, volume, columns, rows, flat_cell)
+    return flat_cell.reshape(tiles, GROUP * sums, TILE)
+
+
+@njit(cache=True, nogil=True)
+def _project_tiles(part: tuple[int, int], volume: Floats, columns: CellBlocks, rows: Terms, flat_cell: Floats) -> None:
+    """Write a part of the tiles of `project`."""
     planes, width, height = volume.shape
     chunks = -(-planes // PLANES_FORWARD)
     sums = (rows.start.size - 1) // chunks
-    flat_cell, flat_volume = room_for(tiles * GROUP * sums * TILE), volume.reshape(-1)
+    flat_volume = volume.reshape(-1)
     block_start, block_voxel, block_share = columns.start, columns.voxel, columns.share.reshape(-1)
     start, line, share = rows.start, rows.line, rows.share.reshape(-1)
-    for tile in prange(tiles):
-        lines = room_for(PLANES_FORWARD * height * TILE)
+    lines = room_for(PLANES_FORWARD * height * TILE)
+    for tile in range(part[0], part[1]):
         lit_chunks = 0
         for chunk in range(chunks):
             first = chunk * PLANES_FORWARD
@@ -165,47 +179,56 @@ def project(volume: Floats, columns: CellBlocks, rows: Terms, tiles: int) -> Flo
             lit_chunks += 1
         if lit_chunks == 0:
             flat_cell[tile * sums * GROUP * TILE : (tile + 1) * sums * GROUP * TILE] = 0.0
-    return flat_cell.reshape(tiles, GROUP * sums, TILE)
 
 
-@njit(cache=True, parallel=True)
 def back_project(by_cell: Floats, shape: tuple[int, int, int], rows: Terms, columns: VoxelSums, threads: int) -> Floats:
     """Return B_z^T I A_z as a volume of `shape` (planes, width, filled height).
 
     Each `PLANES_BACK` planes have for each voxel PLANES_BACK / GROUP sums in `rows`, whose terms are lines of
     `by_cell`. Tile * planes + plane owns sums in `columns`.
     """
-    planes, width, height = shape
+    volume = np.zeros(shape, np.float32)
+    chunks = -(-shape[0] // PLANES_BACK)
+    # A thread takes a tile through all of its planes, so that the cells come into its cache once.
+    in_threads(
+        lambda part: _back_project_planes(part, by_cell, volume, rows, columns),
+        [(thread * chunks // threads, (thread + 1) * chunks // threads) for thread in range(threads)],
+    )
+    return volume
+
+
+@njit(cache=True, nogil=True)
+def _back_project_planes(
+    part: tuple[int, int], by_cell: Floats, volume: Floats, rows: Terms, columns: VoxelSums
+) -> None:
+    """Write a part of the volume of `back_project`, counted in `PLANES_BACK` planes."""
+    planes, width, height = volume.shape
     tiles, size = by_cell.shape[0], by_cell.shape[1] * TILE
-    volume = np.zeros((planes, width, height), np.float32)
     flat_cell, flat_volume = by_cell.reshape(-1), volume.reshape(-1)
     start, line, share = rows.start, rows.line, rows.share.reshape(-1)
-    pairs, chunks = PLANES_BACK // GROUP, -(-planes // PLANES_BACK)
-    # A thread takes a tile through all of its planes, so that the cells come into its cache once.
-    for thread in prange(threads):
-        lines, cells = room_for(PLANES_BACK * height * TILE), room_for(TILE * height)
-        for tile in range(tiles):
-            for chunk in range(thread * chunks // threads, (thread + 1) * chunks // threads):
-                first = chunk * PLANES_BACK
-                last = min(first + PLANES_BACK, planes)
-                if columns.owned[tile * planes + first] == columns.owned[tile * planes + last]:
-                    continue
-                # One voxel through all planes: these see the same cells, which stay in the fastest cache.
-                for voxel in range(height):
-                    for pair in range(pairs):
-                        at = (chunk * height + voxel) * pairs + pair
-                        to = ((pair * GROUP * height + voxel) * TILE, height * TILE, 0)
-                        terms = (tile * size, TILE, start[at], start[at + 1] - start[at])
-                        combine_long(lines, to, flat_cell, line, terms, share, (start[at] * GROUP, GROUP, 1))
-                for plane in range(first, last):
-                    for y in range(0, height, LANES):
-                        for v in range(0, TILE, LANES):
-                            source = (((plane - first) * height + y) * TILE + v, TILE)
-                            turn(cells, (v * height + y, height), lines, source)
-                    owner = tile * planes + plane
-                    to_voxel = (plane * width + columns.voxel[owner]) * height
-                    _add_voxels(flat_volume, to_voxel, cells, height, columns, owner)
-    return volume
+    pairs = PLANES_BACK // GROUP
+    lines, cells = room_for(PLANES_BACK * height * TILE), room_for(TILE * height)
+    for tile in range(tiles):
+        for chunk in range(part[0], part[1]):
+            first = chunk * PLANES_BACK
+            last = min(first + PLANES_BACK, planes)
+            if columns.owned[tile * planes + first] == columns.owned[tile * planes + last]:
+                continue
+            # One voxel through all planes: these see the same cells, which stay in the fastest cache.
+            for voxel in range(height):
+                for pair in range(pairs):
+                    at = (chunk * height + voxel) * pairs + pair
+                    to = ((pair * GROUP * height + voxel) * TILE, height * TILE, 0)
+                    terms = (tile * size, TILE, start[at], start[at + 1] - start[at])
+                    combine_long(lines, to, flat_cell, line, terms, share, (start[at] * GROUP, GROUP, 1))
+            for plane in range(first, last):
+                for y in range(0, height, LANES):
+                    for v in range(0, TILE, LANES):
+                        source = (((plane - first) * height + y) * TILE + v, TILE)
+                        turn(cells, (v * height + y, height), lines, source)
+                owner = tile * planes + plane
+                to_voxel = (plane * width + columns.voxel[owner]) * height
+                _add_voxels(flat_volume, to_voxel, cells, height, columns, owner)
 
 
 @njit(cache=True)
@@ -222,7 +245,6 @@ def _add_voxels(volume: Floats, at: int, cells: Floats, height: int, columns: Vo
         at += height
 
 
-@njit(cache=True, parallel=True)
 def fold(by_cell: Floats, mask: Floats, runs: Index, rows: LitRows, shape: tuple[int, int]) -> Floats:
     """Return the image (rows, columns) of `shape`: C times the light of each lit cell, added up by pixel.
 
@@ -230,7 +252,14 @@ def fold(by_cell: Floats, mask: Floats, runs: Index, rows: LitRows, shape: tuple
     among the lit, its pixel, and how many they are.
     """
     image = np.empty(shape, np.float32)
-    for row in prange(shape[0]):
+    share_out(_fold_rows, shape[0], by_cell, mask, runs, rows, image)
+    return image
+
+
+@njit(cache=True, nogil=True)
+def _fold_rows(part: tuple[int, int], by_cell: Floats, mask: Floats, runs: Index, rows: LitRows, image: Floats) -> None:
+    """Write a part of the image rows of `fold`."""
+    for row in range(part[0], part[1]):
         target = image[row]
         target[:] = 0.0
         for at in range(rows.start[row], rows.start[row + 1]):
@@ -240,20 +269,32 @@ def fold(by_cell: Floats, mask: Floats, runs: Index, rows: LitRows, shape: tuple
                 source, k = by_cell[lit // TILE, line], lit % TILE
                 for n in range(count):
                     target[pixel + n] += weight[cell + n] * source[k + n]
-    return image
 
 
-@njit(cache=True, parallel=True)
 def unfold(image: Floats, mask: Floats, runs: Index, rows: tuple[int, int], row_pixel: NDArray[np.int32]) -> Floats:
     """Return C times the pixel that each lit cell belongs to, (tiles, lit row cells, TILE); `runs` as in `fold`."""
-    tiles, lines = -(-runs[:, 3].sum() // TILE), rows[1] - rows[0]
+    tiles, lines = -(-int(runs[:, 3].sum()) // TILE), rows[1] - rows[0]
     by_cell = room_for(tiles * lines * TILE).reshape(tiles, lines, TILE)
-    for line in prange(lines):
-        source, weight = image[row_pixel[rows[0] + line]], mask[rows[0] + line]
-        by_cell[tiles - 1 :, line] = 0.0
+    share_out(_unfold_lines, lines, image, mask, runs, row_pixel[rows[0] : rows[1]], rows[0], by_cell)
+    return by_cell
+
+
+@njit(cache=True, nogil=True)
+def _unfold_lines(
+    part: tuple[int, int],
+    image: Floats,
+    mask: Floats,
+    runs: Index,
+    row_pixel: NDArray[np.int32],
+    first: int,
+    by_cell: Floats,
+) -> None:
+    """Write a part of the lit row cells of `unfold`, the first of which is row cell `first`."""
+    for line in range(part[0], part[1]):
+        source, weight = image[row_pixel[line]], mask[first + line]
+        by_cell[-1:, line] = 0.0
         for run in range(runs.shape[0]):
             cell, lit, pixel, count = runs[run]
             target, k = by_cell[lit // TILE, line], lit % TILE
             for n in range(count):
                 target[k + n] = weight[cell + n] * source[pixel + n]
-    return by_cell
