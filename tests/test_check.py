@@ -23,7 +23,7 @@ from lfpiv_cli.files.images import write_tiff
 from lfpiv_cli.files.rig_numbers import RigNumbers, tree_of
 from lfpiv_cli.files.rig_text import rig_text
 from lfpiv_cli.interface.image_planning import Pictures, image_lines, lattice_of
-from lfpiv_cli.interface.planning import Line, bench_of, rig_lines, worst
+from lfpiv_cli.interface.planning import Line, bench_of, rig_figures, rig_lines, worst
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.microlenses import Lattice
@@ -119,6 +119,18 @@ SMALL = tree_of(RigNumbers(columns=400, rows=360, size_mm=(1.5, 1.3, 6.0)))
 SMALL["simulation"]["particles"] = 100
 SMALL["correlation"]["window_mm"] = [0.4, 0.4, 1.6]
 READOUT = Readout()
+
+
+@pytest.mark.thorough
+def test_the_work_by_particles_goes_with_the_tracers_and_is_told_beside_that_by_volumes() -> None:
+    bench = bench_of(settings_of(SMALL), None)
+    tracers = 0.5 * 15 * 13
+    figures = rig_figures(bench)
+    # As in an image of the shipped sample, whose 582 tracers take 9.1 s of a core; microlenses here are as large.
+    assert figures["estimated_particles_core_s"] == pytest.approx(9.1 / 582 * tracers, rel=0.5)
+    (work,) = (line.reason for line in rig_lines(bench) if line.about == "work")
+    assert f"{figures['estimated_image_core_s']:.2g} s by volumes, " in work
+    assert f"{figures['estimated_particles_core_s']:.2g} s by particles" in work
 
 
 class Photographer:

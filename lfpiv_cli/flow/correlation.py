@@ -155,7 +155,7 @@ def correlate(
     report(1)
     # One BLAS thread: with more, the bits of the predictor would depend on their number.
     with _matrix_libraries().limit(limits=1, user_api="blas"):
-        for step in _plan(grid.shape_xyz, windows, overlap):
+        for step in plan(grid.shape_xyz, windows, overlap):
             measured = _refine(ready, _between_layouts(predictor, layout, step.layout), step, is_elongated)
             filled, is_elongated = fill_field(measured.displacement), bool(measured.is_long.any())
             predictor = smooth_field(filled, is_elongated)
@@ -235,7 +235,7 @@ def _refined_sizes(windows: Sequence[Triple]) -> list[Triple]:
     return [*larger, *[windows[-1]] * FINAL_PASSES]
 
 
-def _plan(shape_xyz: Triple, windows: Sequence[Triple], overlap: tuple[float, float, float]) -> list[Pass]:
+def plan(shape_xyz: Triple, windows: Sequence[Triple], overlap: tuple[float, float, float]) -> list[Pass]:
     """Return the passes after the coarse one."""
     sizes = _refined_sizes(windows)
     passes = []

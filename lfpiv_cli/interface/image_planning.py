@@ -149,6 +149,7 @@ def _counted(bench: Bench, seen: Seen) -> tuple[float, float]:
     rest = seen.less_dark[part] - np.float32(seen.level)
     lit = float(np.mean(rest > level)), level, float(np.mean(rest, dtype=np.float64))
     depths = np.linspace(bench.bounds_mm[2, 0], bench.bounds_mm[2, 1], DEPTHS)
+    # Dark pixels count tracers of any light, up to where all are lit; unevenness any number, of tracers that are alike.
     number, tracer_light = planning.tracers_per_lens(bench.camera, bench.media, depths, bench.tracer().radius_mm, lit)
     if np.isfinite(number):
         return number, tracer_light

@@ -18,9 +18,10 @@ from lfpiv_cli.calibration.sheet import LARGE_F_RATIO, LARGEST_F_RATIO
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.files.config import Config
 from lfpiv_cli.grid import Grid
+from lfpiv_cli.interface.verdicts import WORDS, Word
 from lfpiv_cli.interface.weights import ray_source
 from lfpiv_cli.interface.weights_checks import check_rig, rig_notices
-from lfpiv_cli.interface.weights_cost import cost_notices, cost_of
+from lfpiv_cli.interface.weights_cost import cost_notices, cost_of, particles_core_s
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.reference import Reference
@@ -32,9 +33,9 @@ from lfpiv_cli.validation.planning import Tracer
 from lfpiv_cli.weights.build import default_padding
 from lfpiv_cli.weights.scene import Source
 
-Verdict = Literal["good", "look", "no", "unknown"]
+Verdict = Word | Literal["unknown"]
 # From the best to the worst; what is not known counts for nothing.
-ORDER: tuple[Verdict, ...] = ("unknown", "good", "look", "no")
+ORDER: tuple[Verdict, ...] = ("unknown", *WORDS)
 
 # Shares of the volume: in full view, and within the depth of field.
 GOOD_VIEW, LEAST_VIEW = 0.97, 0.5
@@ -192,7 +193,7 @@ def rig_figures(bench: Bench) -> dict[str, Any]:
         "expected_velocity_m_s": bench.velocity_m_s,
         "best_dt_s": _best_time_s(bench),
     }
-    return figures | _cost_figures(bench)
+    return figures | {"estimated_particles_core_s": particles_core_s(best)} | _cost_figures(bench)
 
 
 def by_depth(bench: Bench) -> dict[str, NDArray[np.float64]]:
@@ -401,9 +402,11 @@ def _cost(bench: Bench) -> Line:
         cost = _cost_of(bench)
     except (ConfigError, InputError) as error:
         return Line("work", "no", str(error))
+    best = planning.tracers_in(bench.camera, planning.BEST_PER_LENS, bench.sides_mm)
     files = PIXEL_BYTES * bench.camera.columns * bench.camera.rows + VOXEL_BYTES * int(np.prod(bench.grid.shape_xyz))
     reason = (
-        f"weights {cost.weights_core_s:.2g} s of a core, each image {cost.image_core_s:.2g} s; "
+        f"weights {cost.weights_core_s:.2g} s of a core, each image {cost.image_core_s:.2g} s by volumes, "
+        f"{particles_core_s(best):.2g} s by particles at the best seeding; "
         f"{max(cost.weights_bytes, cost.image_bytes) / 1e9:.2g} GB of memory, {files / 1e6:.2g} MB of disk an image"
     )
     return Line("work", "look" if cost_notices(cost) else "good", reason)
