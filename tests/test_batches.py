@@ -31,8 +31,10 @@ from lfpiv_cli.files.places import ignores_case
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.files.vtkhdf import write_volume
 from lfpiv_cli.grid import Grid
+from lfpiv_cli.interface.particles import TracerSize
 from lfpiv_cli.reference import Reference
 from lfpiv_cli.stages import reconstruct as stage
+from lfpiv_cli.stages.batches import Worked
 
 ROOT = Path(__file__).parent.parent
 SAMPLE, CONFIG = ROOT / "sample_data", ROOT / "configs" / "sample.yaml"
@@ -461,3 +463,21 @@ def test_two_workers_share_a_folder_and_a_killed_one_is_replaced(weights, raw, t
     stopped.terminate()
     assert stopped.wait(10) == 143
     assert [path.name for path in (tmp_path / "stopped").iterdir() if path.name.startswith(".")] == []
+
+
+def test_frames_are_searched_by_pairs_however_they_are_given(weights, images, tmp_path) -> None:
+    given = [
+        path.rename(tmp_path / name) for path, name in zip(images, ("p0_a.tif", "p1_a.tif", "p0_b.tif"), strict=True)
+    ]
+    given.append(tmp_path / "p1_b.tif")
+    given[-1].write_bytes(given[0].read_bytes())
+    options = stage.ReconstructOptions(solver="particles", pairing="ab")
+    assert stage.Reconstruction(weights, given, tmp_path / "out", options, False).order == [0, 2, 1, 3]
+
+
+def test_whoever_makes_a_frame_tells_the_size_of_the_tracers(weights, images, tmp_path) -> None:
+    # The command itself has not begun: workers have.
+    batch = stage.Reconstruction(weights, images, tmp_path / "out", stage.ReconstructOptions(solver="particles"), False)
+    size = TracerSize(0.02, 0.03, 0.001)
+    told = batch.summary(Worked({0: stage.Outcome(0.1, 0, 5, size)}))
+    assert told == told | size.summary()

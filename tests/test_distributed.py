@@ -36,7 +36,7 @@ class Toy(ByArguments):
     def __init__(self, folder: Path, count: int, faulty: Sequence[int] = (), deadly: Sequence[int] = ()) -> None:
         self.folder, self.faulty, self.deadly = folder, faulty, deadly
         self.targets = [Target(folder / f"{number}.vtkhdf", dict) for number in range(count)]
-        self.names = [str(number) for number in range(count)]
+        self.names, self.order = [str(number) for number in range(count)], range(count)
         self.inputs: list[Path] = []
         self.outputs = [target.path for target in self.targets]
 

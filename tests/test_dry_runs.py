@@ -72,7 +72,8 @@ def test_a_dry_run_ends_as_the_batch_would(weights, images, tmp_path, capsys) ->
 def test_a_dry_run_of_pairs(pairs, tmp_path, capsys) -> None:
     command = ("correlate", *pairs, "--pairing", "ab", "--windows", 8, "--derived", "-o", tmp_path / "out")
     summary = dry(capsys, *command)
-    assert (summary["pairs"], summary["to_make"], summary["memory_mb"]) == (2, 2, None)
+    assert (summary["pairs"], summary["to_make"]) == (2, 2)
+    assert 300.0 < summary["memory_mb"] < 310.0
     run(*command)
     written = sum(path.stat().st_size for path in (tmp_path / "out").iterdir()) / 1e6
     assert written < summary["disk_mb"] < 10.0 * written

@@ -261,3 +261,9 @@ def test_a_sequence_is_in_the_order_of_its_numbers() -> None:
     ]
     for names in (("late", "early"), ("x_2", "y_1"), ("t_2", "t_1", "t_1"), ("t_2", "early")):
         assert in_order(seen(*names)) == (list(range(len(names))), [])
+
+
+def test_the_work_goes_by_pairs_and_frames_without_a_partner_are_last() -> None:
+    pairs = Pairs(((0, 3), (2, 4)))
+    assert pairs.order(6) == [0, 3, 2, 4, 1, 5]
+    assert Pairs(((0, 1), (1, 2)), separate=False).order(3) == [0, 1, 2]

@@ -244,6 +244,11 @@ def test_what_is_not_of_a_run_is_not_replaced(ran: Path, tmp_path: Path) -> None
         ({"follow": True, "method": "volumes"}, UsageError, "--follow"),
         ({"follow": True, "method": "both", "combine": True}, UsageError, "--follow"),
         ({"change": (", dt_s: 0.002", "")}, ConfigError, "correlation.dt_s"),
+        (
+            {"change": (", dt_s: 0.002", ""), "images": (*PAIR, Path("missing.tif")), "keep_going": True},
+            ConfigError,
+            "correlation.dt_s",
+        ),
         ({"change": ("solver: em", "solver: particles"), "method": "both"}, ConfigError, "solver"),
         ({"change": ("correlation:", "weights: {method: dlfc}\ncorrelation:"), "method": "both"}, ConfigError, "dlfc"),
         ({"change": ("columns: 600", "columns: 599")}, InputError, "pair_a"),

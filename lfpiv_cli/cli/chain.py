@@ -18,14 +18,13 @@ from lfpiv_cli.cli.options import (
     dark_option,
     depth_option,
     dt_option,
-    failures_option,
     inputs_argument,
-    keep_going_option,
     mask_option,
     output_option,
     pairing_options,
     raw_option,
     white_option,
+    work_options,
 )
 from lfpiv_cli.console import Console
 from lfpiv_cli.names import Kept, RunMethod, names_in
@@ -64,8 +63,7 @@ def named_images(command: Callable[..., Any]) -> Callable[..., Any]:
     type=click.Choice(names_in(Kept)),
     help="results: drop volumes, and particles of separate pairs, as soon as their vectors stand; all when not given.",
 )
-@keep_going_option
-@failures_option
+@work_options
 @click.option("--report/--no-report", default=True, help="Make OUTPUT/report.html, a page of all of it.")
 @output_option("Folder for all that is made.")
 @common_options
@@ -83,8 +81,9 @@ def run(
     Every step writes what its own command does, into OUTPUT. By itself it counts the tracers for each microlens, and
     measures by particles up to about two, where these err less, and by volumes beyond; OUTPUT/run.json says which and
     why, and OUTPUT/report.html shows all of it. Run it again, and it keeps what is complete and made alike, and goes on
-    from there; with --overwrite it makes anew what was made from other inputs or settings. More than two images need
-    --pairing or --follow; thousands of pairs take no more disk than their vectors with --keep results.
+    from there, with --resume or without; with --overwrite it makes anew what was made from other inputs or settings.
+    More than two images need --pairing or --follow; thousands of pairs take no more disk than their vectors with --keep
+    results. A --shard makes the files of its pairs; the same command without it then makes run.json and the page.
 
     \b
     Example: lfpiv run rig.yaml a.tif b.tif --white white.tif --dark dark.tif --board board.tif -o results
@@ -94,6 +93,9 @@ def run(
     a folder of pairs, whatever becomes of single ones:
              lfpiv run rig.yaml images --pairing ab --white white.tif --dark dark.tif --board board.tif \\
                  --keep results --keep-going -o results
+    a third of its pairs, as a job of its own, that stops before the limit of the job:
+             lfpiv run rig.yaml images --pairing ab --white white.tif --dark dark.tif --board board.tif \\
+                 --shard 2/3 --time-limit 50m -o results
     """
     from lfpiv_cli.stages import run as stage
 

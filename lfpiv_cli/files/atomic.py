@@ -9,17 +9,22 @@ import contextlib
 import json
 import math
 import os
+import re
 import secrets
 from collections.abc import Callable, Iterable, Mapping
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from lfpiv_cli.errors import InputError, LfpivError, OutputError, OutputExistsError, UsageError
 from lfpiv_cli.files.inputs import reason, split_part
+from lfpiv_cli.files.processes import host_digest, is_running
 
 # How much of the target's name the temporary file keeps: 40 characters of 4 bytes and the rest stay below the 255 bytes
 # that common file systems allow.
 KEPT_CHARACTERS = 40
+# The name of a file that is being written, with the process that writes it.
+PARTIAL = re.compile(r"\..*\.(?P<host>[0-9a-f]{8})-(?P<process>\d{1,10})-[0-9a-f]{8}\.partial(\..*)?", re.DOTALL)
 # Of a path in a message: a line or two.
 LONGEST_SHOWN = 200
 
@@ -147,10 +152,25 @@ def without_nan(value: Any) -> Any:
 
 def _reserve(target: Path) -> Path:
     """Create an empty file beside the target that nobody else has, with the permissions the umask allows."""
-    name = f".{target.stem[:KEPT_CHARACTERS]}.{secrets.token_hex(4)}.partial{target.suffix}"
-    temporary = target.with_name(name)
+    _clear(target.parent.absolute(), os.getpid())
+    begun_by = f"{host_digest()}-{os.getpid()}-{secrets.token_hex(4)}"
+    temporary = target.with_name(f".{target.stem[:KEPT_CHARACTERS]}.{begun_by}.partial{target.suffix}")
     os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
     return temporary
+
+
+@lru_cache(maxsize=64)
+def _clear(folder: Path, _process: int) -> None:
+    """Remove from a folder what processes of this host had begun to write when they were killed.
+
+    Once a folder: there may be thousands of files. What is of a dead process whose number another one has now stays.
+    """
+    with contextlib.suppress(OSError), os.scandir(folder) as entries:
+        for entry in entries:
+            left = PARTIAL.fullmatch(entry.name)
+            if left is not None and left["host"] == host_digest() and not is_running(int(left["process"])):
+                with contextlib.suppress(OSError):
+                    os.unlink(entry.path)
 
 
 def _flush(path: Path) -> None:

@@ -193,14 +193,19 @@ def _state_of(path: Path, made: Mapping[str, Any]) -> State:
 
 
 def pending(
-    targets: Sequence[Target], inputs: Iterable[Path], overwrite: bool, resume: bool, dry: bool = False
+    targets: Sequence[Target],
+    inputs: Iterable[Path],
+    overwrite: bool,
+    resume: bool,
+    dry: bool = False,
+    folders: int = 1,
 ) -> list[int]:
     """Return the numbers of the targets that have to be made.
 
     With `resume`, a target that is complete and carries the very record that it would get is left as it is, and a
     broken one is made anew; with `overwrite` besides, one whose record differs in nothing that it depends on gets the
-    new record, and keeps its data. Where it is `dry`, nothing is written, and a folder may be missing that could be
-    made.
+    new record, and keeps its data. Where it is `dry`, nothing is written, and so many `folders` above a target may be
+    missing that could be made.
 
     Raises
     ------
@@ -208,7 +213,11 @@ def pending(
     OutputExistsError : a target is there and neither `overwrite` nor a matching `resume` covers it.
     """
     ensure_apart((path for target in targets for path in target.paths), inputs)
-    return [number for number, target in enumerate(targets) if not _is_kept(target, overwrite, resume, dry)]
+    return [
+        number
+        for number, target in enumerate(targets)
+        if not _is_kept(target, overwrite, resume, folders if dry else 0)
+    ]
 
 
 def is_kept(
@@ -223,9 +232,12 @@ def is_kept(
     return not pending([Target(path, lambda: made) for path in paths], inputs, overwrite, resume)
 
 
-def _is_kept(target: Target, overwrite: bool, resume: bool, dry: bool) -> bool:
-    """Return whether a target is left as it is, after it is known that it could be written if not."""
-    found = _state_or_none(target) if resume else None
+def _is_kept(target: Target, overwrite: bool, resume: bool, dry: int) -> bool:
+    """Return whether a target is left as it is, after it is known that it could be written if not.
+
+    Nothing is written where it is `dry`, by the number of folders that may be missing.
+    """
+    found = state_or_none(target) if resume else None
     if found is State.COMPLETE:
         return True
     if found is State.BEARS_ALIKE and overwrite:
@@ -237,14 +249,15 @@ def _is_kept(target: Target, overwrite: bool, resume: bool, dry: bool) -> bool:
             f"{target.path}: exists and was made from other inputs or settings; --overwrite makes it anew"
         )
     if dry and not target.path.parent.exists():
-        ensure_writable(target.path.parent, overwrite=False)
+        above = [target.path.parent, *target.path.parent.parents][:dry]
+        ensure_writable([folder for folder in above if not folder.exists()][-1], overwrite=False)
         return False
     for path in target.paths:
         ensure_writable(path, overwrite or resume)
     return False
 
 
-def _state_or_none(target: Target) -> State | None:
+def state_or_none(target: Target) -> State | None:
     """Return what is there in a target's place, None where its inputs cannot be read: that is told when it is made."""
     try:
         return state_of(target)

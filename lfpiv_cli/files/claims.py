@@ -20,10 +20,13 @@ from pathlib import Path
 from lfpiv_cli.errors import OutputError
 from lfpiv_cli.files.atomic import KEPT_CHARACTERS
 from lfpiv_cli.files.inputs import reason
+from lfpiv_cli.files.processes import is_running
 
 # A worker touches its claim this often; one that was not touched for so long belongs to a worker that is dead, on
 # whatever host. The clocks of hosts that share a disk differ by less.
 TOUCHED_EVERY_S, DEAD_AFTER_S = 20.0, 300.0
+# How often a worker looks at what others have claimed, where it waits for it.
+SECONDS_BETWEEN_LOOKS = 0.5
 
 
 @contextmanager
@@ -44,6 +47,22 @@ def claimed(target: Path) -> Iterator[bool]:
         ended.set()
         if granted:
             claim.unlink(missing_ok=True)
+
+
+@contextmanager
+def awaited(target: Path) -> Iterator[None]:
+    """Claim an output, after another worker that makes it now has ended.
+
+    Raises
+    ------
+    OutputError : as `claimed`
+    """
+    while True:
+        with claimed(target) as granted:
+            if granted:
+                yield
+                return
+        time.sleep(SECONDS_BETWEEN_LOOKS)
 
 
 def claim_path(target: Path) -> Path:
@@ -83,20 +102,7 @@ def _is_dead(claim: Path) -> bool:
         return False  # its worker has just ended; the next look finds what it made
     except (OSError, ValueError, KeyError, TypeError):
         return silent_s > DEAD_AFTER_S  # it is being written, or its worker was killed while it was
-    return silent_s > DEAD_AFTER_S or (host == socket.gethostname() and not _is_running(process))
-
-
-def _is_running(process: int) -> bool:
-    """Return whether a process of this host runs."""
-    if os.name != "posix":  # where asking with a signal would send it
-        return True
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return True
+    return silent_s > DEAD_AFTER_S or (host == socket.gethostname() and not is_running(process))
 
 
 def _keep_touching(claim: Path, ended: threading.Event) -> None:

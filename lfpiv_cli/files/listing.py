@@ -10,7 +10,7 @@ from pathlib import Path
 
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.files.batch import VTKHDF_SUFFIX
-from lfpiv_cli.files.inputs import ensure_regular_file, reason
+from lfpiv_cli.files.inputs import content_of, ensure_regular_file, reading_from
 from lfpiv_cli.files.recordings.formats import format_of
 from lfpiv_cli.names import InputKind
 
@@ -29,14 +29,12 @@ def listed(path: Path) -> list[Path]:
     ------
     InputError : the list cannot be read
     """
-    try:
-        if str(path) == STANDARD_INPUT:
+    if str(path) == STANDARD_INPUT:
+        with reading_from(path):
             content = sys.stdin.buffer.read()
-        else:
-            ensure_regular_file(path)
-            content = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {reason(error)}") from error
+    else:
+        ensure_regular_file(path)
+        content = content_of(path)
     if b"\0" in content:
         raise InputError(f"{path}: is no list of files: it holds a zero byte")
     return [Path(os.fsdecode(line)) for line in content.splitlines() if line.strip()]
@@ -69,10 +67,8 @@ def files_in(folder: Path, kind: InputKind) -> list[Path]:
     ------
     InputError : the folder cannot be read
     """
-    try:
+    with reading_from(folder):
         found = [path for path in folder.iterdir() if not path.name.startswith(".") and _is_of(path, kind)]
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be read: {reason(error)}") from error
     return in_natural_order(found)
 
 

@@ -52,6 +52,10 @@ class Pairs:
             found[second].append(first)
         return [tuple(sorted(numbers)) for numbers in found]
 
+    def order(self, count: int) -> list[int]:
+        """Return the numbers of `count` frames, the second of a pair behind its first, those without a partner last."""
+        return list(dict.fromkeys([*(number for pair in self.pairs for number in pair), *range(count)]))
+
     def first_of(self) -> dict[int, int]:
         """Return of each second frame of separate pairs the first."""
         return {second: first for first, second in self.pairs} if self.separate else {}

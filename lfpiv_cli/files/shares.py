@@ -60,9 +60,19 @@ class Shard:
             )
         return cls(place + 1, count)
 
+    @property
+    def is_last(self) -> bool:
+        """True of the last part."""
+        return self.number == self.count
+
     def numbers(self, total: int) -> range:
         """Return the numbers of the frames of this share, of `total` frames counted from 0."""
         return range((self.number - 1) * total // self.count, self.number * total // self.count)
+
+    def of(self, order: Sequence[int]) -> Sequence[int]:
+        """Return those of this share, of the numbers of frames in the order in which they are divided."""
+        places = self.numbers(len(order))
+        return order[places.start : places.stop]
 
 
 def _slurms(environment: Mapping[str, str], name: str, default: int | None = None) -> int:

@@ -20,13 +20,10 @@ from lfpiv_cli.console import Console, Frames
 from lfpiv_cli.errors import InputError, PartialError, UsageError
 from lfpiv_cli.files.atomic import ensure_writable, write_text
 from lfpiv_cli.files.batch import State, Target, pending, prepare_folder, state_of
-from lfpiv_cli.files.claims import claimed
+from lfpiv_cli.files.claims import SECONDS_BETWEEN_LOOKS, claimed
 from lfpiv_cli.files.places import ensure_apart
 from lfpiv_cli.files.shares import Deadline, Shard
 from lfpiv_cli.notice import Notice
-
-# How often a worker that has done all of its own looks at what others have claimed.
-SECONDS_BETWEEN_LOOKS = 0.5
 
 Made = TypeVar("Made", covariant=True)
 # What tells a file from another one under its name; None where there is none.
@@ -48,8 +45,8 @@ ALL = Shard(1, 1)
 
 
 @dataclass(frozen=True, kw_only=True)
-class BatchOptions:
-    """What every batch is given.
+class WorkOptions:
+    """What all that goes through many frames is given.
 
     Attributes
     ----------
@@ -59,9 +56,6 @@ class BatchOptions:
     dry_run : tell what would be made and what that takes, and write nothing
     shard : make this share of the outputs only
     time_limit_s : stop before so many seconds have gone by, with what is left for another time
-    dask : address of the scheduler whose workers make the outputs, or `local` for workers on this machine
-    watch : the inputs are folders that are still being filled
-    idle_s : such folders end when nothing in them has changed for so long
     begun_s : when the time began, by the clock that never goes back
     """
 
@@ -71,10 +65,27 @@ class BatchOptions:
     dry_run: bool = False
     shard: Shard = ALL
     time_limit_s: float | None = None
+    begun_s: float = field(default_factory=time.monotonic, compare=False, repr=False)
+
+    def deadline(self) -> Deadline:
+        """Return when the work has to be done."""
+        return Deadline(self.time_limit_s, begun=self.begun_s)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BatchOptions(WorkOptions):
+    """What every batch is given.
+
+    Attributes
+    ----------
+    dask : address of the scheduler whose workers make the outputs, or `local` for workers on this machine
+    watch : the inputs are folders that are still being filled
+    idle_s : such folders end when nothing in them has changed for so long
+    """
+
     dask: str | None = None
     watch: bool = False
     idle_s: float = 60.0
-    begun_s: float = field(default_factory=time.monotonic, compare=False, repr=False)
 
 
 @dataclass(frozen=True)
@@ -107,6 +118,10 @@ class Batch(Protocol[Made]):
     @property
     def names(self) -> Sequence[str]:
         """What each output is called."""
+
+    @property
+    def order(self) -> Sequence[int]:
+        """The numbers of the outputs that are to be made, in the order of the work; shares are cut from it."""
 
     @property
     def inputs(self) -> Sequence[Path]:
@@ -209,13 +224,13 @@ def work_through(batch: Batch[Made], options: BatchOptions, console: Console) ->
     prepare_folder([target.path for target in batch.targets])
     if options.failures is not None:
         ensure_writable(options.failures, batch.overwrite or options.resume)
-    share = options.shard.numbers(len(batch.targets))
-    targets = batch.targets[share.start : share.stop]
+    share = options.shard.of(batch.order)
+    targets = [batch.targets[number] for number in share]
     left = [share[k] for k in pending(targets, (), batch.overwrite, options.resume)]
     worked: Worked[Made] = Worked(skipped=len(share) - len(left))
-    before = {number: _stamp(batch.targets[number].path) for number in left}
+    before = {number: stamp_of(batch.targets[number].path) for number in left}
     console.warn(batch.notices)
-    deadline = Deadline(options.time_limit_s, begun=options.begun_s)
+    deadline = options.deadline()
     steps = batch.begin(left, console) if options.dask is None else 1.0
     with (
         console.frames(len(left), steps, batch.label, batch.unit) as work,
@@ -226,7 +241,7 @@ def work_through(batch: Batch[Made], options: BatchOptions, console: Console) ->
             _settle(batch, number, made, options.keep_going, work, worked)
     worked.outcomes = dict(sorted(worked.outcomes.items()))
     done = worked.total()
-    if share.start == 0:
+    if options.shard.number == 1:
         # Of several shards the first one tells them.
         worked.failures[:0] = batch.left_out
     write_failures(options, worked)
@@ -251,7 +266,7 @@ def attempt(batch: Batch[Made], number: int, before: Stamp, work: Frames) -> Mad
     with claimed(target.path) as granted:
         if not granted:
             return Turn.CLAIMED
-        if _stamp(target.path) != before and state_of(target) is State.COMPLETE:
+        if stamp_of(target.path) != before and state_of(target) is State.COMPLETE:
             return Turn.SKIPPED
         return batch.make(number, work)
 
@@ -320,7 +335,7 @@ def _settle(
     work.done(name)
 
 
-def _stamp(path: Path) -> Stamp:
+def stamp_of(path: Path) -> Stamp:
     """Return what tells a file from another one under its name, None where there is none."""
     try:
         status = path.stat()

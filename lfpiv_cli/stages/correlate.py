@@ -13,21 +13,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.console import CONSOLE, Console, Frames
-from lfpiv_cli.errors import InputError, UsageError
+from lfpiv_cli.errors import InputError, LfpivError, UsageError
 from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.batch import Target, output_paths, prepare_folder
 from lfpiv_cli.files.config import Config, carried_config, load_config
 from lfpiv_cli.files.inputs import given
+from lfpiv_cli.files.memory import ensure_room
 from lfpiv_cli.files.pairing import Pairs
-from lfpiv_cli.files.provenance import Gone, earlier_record, ensure_even, record, seconds_between, with_warnings
+from lfpiv_cli.files.provenance import earlier_record, ensure_even, record, seconds_between, with_warnings
 from lfpiv_cli.files.whole import ensure_opens, fault_of
 from lfpiv_cli.flow.correlation import correlate as measure
 from lfpiv_cli.flow.correlation import count_passes
 from lfpiv_cli.flow.derived import derived_fields
 from lfpiv_cli.flow.field import REJECTED, VectorField
+from lfpiv_cli.flow.footprint import held_bytes
 from lfpiv_cli.flow.locking import with_locking
 from lfpiv_cli.flow.windows import layout_windows
+from lfpiv_cli.grid import Grid
 from lfpiv_cli.interface.vectors import ensure_alike, scale_of, usable_voxels
 from lfpiv_cli.interface.vectors_checks import (
     Quality,
@@ -40,11 +43,11 @@ from lfpiv_cli.interface.vectors_checks import (
 )
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.reference import Reference
-from lfpiv_cli.stages.batches import ALL, BatchOptions, ByArguments, Failure, Worked, work_through
+from lfpiv_cli.stages.batches import ALL, BatchOptions, Worked, work_through
 from lfpiv_cli.stages.dry_runs import Expected, dry_run
 from lfpiv_cli.stages.intervals import dt_notices
 from lfpiv_cli.stages.means import Mean, arrays_of
-from lfpiv_cli.stages.pairs import PairOptions, result_pairs
+from lfpiv_cli.stages.pairs import PairBatch, PairBatchOptions, result_pairs
 from lfpiv_cli.stages.watched import paired_from_first, watched, work_as_they_come
 
 # Numbers of eight bytes that a file has of each vector at most, and derived ones besides.
@@ -70,7 +73,7 @@ class Job:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CorrelateOptions(PairOptions, BatchOptions):
+class CorrelateOptions(PairBatchOptions):
     """What `correlate` is given besides the volumes.
 
     Attributes
@@ -160,32 +163,15 @@ class Outcome:
     divergence_rms: float | None = None
 
 
-class Correlation(ByArguments):
+class Correlation(PairBatch[CorrelateOptions]):
     """The batch of `correlate`: a field of vectors for each pair of volumes, or one of all pairs together."""
 
     label = "correlate"
 
-    def __init__(
-        self,
-        volumes: Sequence[Path],
-        output: Path,
-        options: CorrelateOptions,
-        overwrite: bool,
-        pairs: Pairs | None = None,
-        gone: Mapping[Path, Gone] | None = None,
-    ) -> None:
-        """Take the arguments of `correlate`; see which pairs there are, and read no volume.
-
-        Raises
-        ------
-        LfpivError : volumes or outputs do not go together, or the config is wrong
-        """
-        self._options, self.overwrite = options, overwrite
+    def _arrange(self, files: Sequence[Path], output: Path, pairs: Pairs | None) -> None:
+        options = self._options
         self.unit = "field" if options.ensemble else "pair"
-        found = result_pairs(volumes, options) if pairs is None else pairs
-        self.notices = found.settled(options.keep_going)
-        self.left_out = [Failure(each.name, each.why) for each in found.left_out]
-        self._pairs = [(volumes[first], volumes[second]) for first, second in found.pairs]
+        self._pairs = self._paired(files, pairs)
         if options.mean is not None and (options.ensemble or len(self._pairs) < 2):
             raise UsageError("--mean needs several pairs, each correlated by itself")
         if options.mean is not None and options.shard != ALL:
@@ -196,12 +182,12 @@ class Correlation(ByArguments):
         self._groups = [self._pairs] if options.ensemble else [[pair] for pair in self._pairs]
         self._common = given(config=options.config, mask=options.mask_volume)
         self._config = load_config(options.config) if options.config else None
-        self.inputs = [*volumes, *self._common.values()]
+        self.inputs = [*files, *self._common.values()]
         paths = output_paths(output, [group[0][0].stem for group in self._groups])
         self.names = [path.stem for path in paths]
         self.targets = [Target(path, partial(self._record, number)) for number, path in enumerate(paths)]
-        self._gone = gone or {}
-        self._first = volumes[0] if gone else _ensure_readable(volumes, options.keep_going)
+        self.order = range(len(paths))
+        self._first = files[0] if self._gone else _ensure_readable(files, options.keep_going)
 
     @property
     def outputs(self) -> list[Path]:
@@ -213,18 +199,25 @@ class Correlation(ByArguments):
         return fault_of(path for pair in self._groups[number] for path in pair)
 
     def expected(self) -> Expected:
-        """Return the bytes of a field's arrays; what is held in memory is not known."""
-        grid = vtkhdf.open_volume(self._first).grid
-        settings = self.settings.correlation_settings(grid.spacing_mm)
-        windows = math.prod(layout_windows(grid.shape_xyz, settings.windows[-1], settings.overlap).count)
-        numbers = NUMBERS_A_VECTOR + self._options.derived * NUMBERS_DERIVED
-        return Expected(NUMBER_BYTES * numbers * windows)
+        """Return the bytes of a field's arrays, and what a correlation holds."""
+        grid, settings = vtkhdf.read_grid(self._first), self.settings
+        held = held_bytes(grid.shape_xyz, settings.correlation_settings(grid.spacing_mm))
+        return Expected(field_bytes(settings, grid, self._options.derived), len(self._groups[0]) * held)
 
-    def begin(self, _numbers: Sequence[int], _console: Console) -> float:
-        """Refuse a mean that could not be written; pairs share nothing but the settings."""
+    def begin(self, numbers: Sequence[int], _console: Console) -> float:
+        """Refuse a mean that could not be written, and fields too large for the memory."""
         if self._options.mean is not None:
             ensure_writable(self._options.mean, self.overwrite or self._options.resume)
+        if numbers and not self._gone:
+            ensure_room(self._held(), self.label)
         return 1.0
+
+    def _held(self) -> float:
+        """Return what a field takes in memory; 0 where its volume cannot be read, which is told in its turn."""
+        try:
+            return self.expected().memory_bytes or 0.0
+        except LfpivError:
+            return 0.0
 
     def make(self, number: int, work: Frames) -> Outcome:
         """Correlate a pair, or all of them, and write the vectors."""
@@ -296,6 +289,13 @@ class Correlation(ByArguments):
         options, job = self._options, self._job(number)
         command = " ".join(["correlate", *["ensemble"] * options.ensemble, *["derived"] * options.derived])
         return record(command, job.settings.resolved(), self._common | job.inputs(), gone=self._gone)
+
+
+def field_bytes(settings: Config, grid: Grid, derived: bool = False) -> float:
+    """Return the bytes of the arrays of a field of vectors, between volumes on a grid."""
+    chosen = settings.correlation_settings(grid.spacing_mm)
+    windows = math.prod(layout_windows(grid.shape_xyz, chosen.windows[-1], chosen.overlap).count)
+    return NUMBER_BYTES * (NUMBERS_A_VECTOR + derived * NUMBERS_DERIVED) * windows
 
 
 def summary_of(worked: Worked[Outcome], pairs: int) -> dict[str, Any]:

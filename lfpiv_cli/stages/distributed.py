@@ -30,10 +30,11 @@ from distributed import Client, Future, KilledWorker, LocalCluster, Worker, Work
 import lfpiv_cli
 from lfpiv_cli.console import Console, Frames
 from lfpiv_cli.errors import InputError, LfpivError, StoppedEarlyError, UsageError
+from lfpiv_cli.files.claims import SECONDS_BETWEEN_LOOKS
 from lfpiv_cli.files.inputs import reason
 from lfpiv_cli.files.shares import Deadline, Runs
 from lfpiv_cli.notice import Notice
-from lfpiv_cli.stages.batches import SECONDS_BETWEEN_LOOKS, Attempts, Batch, Made, Stamp, Turn, attempt
+from lfpiv_cli.stages.batches import Attempts, Batch, Made, Stamp, Turn, attempt
 from lfpiv_cli.threads import told_threads, use_threads
 
 # Workers on this machine, as many as it has cores, or `local:4`.

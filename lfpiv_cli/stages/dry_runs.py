@@ -9,19 +9,20 @@ from __future__ import annotations
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from statistics import median
 from typing import Any, Protocol
 
 from lfpiv_cli.console import Console
-from lfpiv_cli.files.batch import pending
+from lfpiv_cli.files.batch import Target, pending
+from lfpiv_cli.files.memory import PROGRAM_BYTES
 from lfpiv_cli.files.places import ensure_apart
-from lfpiv_cli.stages.batches import Batch, BatchOptions, Made
+from lfpiv_cli.stages.batches import Failure, WorkOptions
 
 MB = 1e6
+AT_MOST = "at most, uncompressed"
 # What a file has besides its arrays: its record and those of its inputs, attributes, and space that HDF5 leaves free.
 RECORD_BYTES = 100e3
-# What the program takes with its libraries and compiled code.
-PROGRAM_BYTES = 300e6
 
 
 @dataclass(frozen=True)
@@ -38,8 +39,27 @@ class Expected:
     memory_bytes: float | None = None
 
 
-class PlannedBatch(Batch[Made], Protocol[Made]):
-    """A batch that can say beforehand what it takes."""
+class PlannedBatch(Protocol):
+    """A batch that can say beforehand what it takes; the rest is as of `Batch`."""
+
+    @property
+    def label(self) -> str: ...
+    @property
+    def unit(self) -> str: ...
+    @property
+    def targets(self) -> Sequence[Target]: ...
+    @property
+    def outputs(self) -> Sequence[Path]: ...
+    @property
+    def names(self) -> Sequence[str]: ...
+    @property
+    def order(self) -> Sequence[int]: ...
+    @property
+    def inputs(self) -> Sequence[Path]: ...
+    @property
+    def left_out(self) -> Sequence[Failure]: ...
+    @property
+    def overwrite(self) -> bool: ...
 
     def fault(self, number: int) -> str | None:
         """Return why an output cannot be made, as far as is known before its inputs are read."""
@@ -48,17 +68,21 @@ class PlannedBatch(Batch[Made], Protocol[Made]):
         """Return what an output takes."""
 
 
-def dry_run(batch: PlannedBatch[Made], options: BatchOptions, console: Console) -> dict[str, Any]:
+def dry_run(batch: PlannedBatch, options: WorkOptions, console: Console, folders: int = 1) -> dict[str, Any]:
     """Return what a batch would make, and what that takes; write nothing.
+
+    Parameters
+    ----------
+    folders : how many folders above an output the command itself would make
 
     Raises
     ------
     LfpivError : the batch would not begin
     """
     ensure_apart([*batch.outputs, *filter(None, (options.failures, console.log_file))], batch.inputs)
-    share = options.shard.numbers(len(batch.targets))
-    targets = batch.targets[share.start : share.stop]
-    needed = [share[k] for k in pending(targets, (), batch.overwrite, options.resume, dry=True)]
+    share = options.shard.of(batch.order)
+    targets = [batch.targets[number] for number in share]
+    needed = [share[k] for k in pending(targets, (), batch.overwrite, options.resume, dry=True, folders=folders)]
     faults = {number: fault for number in needed if (fault := batch.fault(number)) is not None}
     making, skipped = [number for number in needed if number not in faults], sorted(set(share) - set(needed))
     for number in making:
@@ -72,21 +96,22 @@ def dry_run(batch: PlannedBatch[Made], options: BatchOptions, console: Console) 
         "unreadable": len(faults) + len(batch.left_out),
     }
     expected = batch.expected() if making else Expected()
-    told |= _disk(batch, len(making), skipped, expected) | _time(batch, len(making), expected, console)
+    told |= _disk(batch, len(making), skipped, expected)
+    told |= time_and_memory(batch.label, len(making), expected, console)
     if console.only_warnings:
         told["would_make"] = [str(batch.targets[number].path) for number in making]
     return told
 
 
 def _disk(
-    batch: PlannedBatch[Made], count: int, complete: Sequence[int], expected: Expected
+    batch: PlannedBatch, count: int, complete: Sequence[int], expected: Expected
 ) -> dict[str, float | str | None]:
     """Return how much disk so many outputs take, by what that is known, and how much is free."""
     folder = next(path for path in batch.targets[0].path.absolute().parents if path.exists())
     known = [sum(path.stat().st_size for path in batch.targets[number].paths) for number in complete]
     each, known_by = median(known) if known else None, "those that are there"
     if each is None and expected.file_bytes is not None:
-        each, known_by = expected.file_bytes + RECORD_BYTES, "at most, uncompressed"
+        each, known_by = expected.file_bytes + RECORD_BYTES, AT_MOST
     return {
         "disk_mb": None if each is None else count * each / MB,
         "disk_by": None if each is None else known_by,
@@ -94,9 +119,9 @@ def _disk(
     }
 
 
-def _time(batch: PlannedBatch[Made], count: int, expected: Expected, console: Console) -> dict[str, float | str | None]:
+def time_and_memory(label: str, count: int, expected: Expected, console: Console) -> dict[str, float | str | None]:
     """Return how long so many outputs take and how much memory: by the log, memory without one by the arrays held."""
-    last = None if console.log is None else console.log.last("frame", step=batch.label)
+    last = None if console.log is None else console.log.last("frame", step=label)
     logged, held = last or {}, expected.memory_bytes
     seconds, memory = logged.get("seconds_each"), logged.get("memory_mb")
     by_log = f"the last run in {console.log_file}"

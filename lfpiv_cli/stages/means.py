@@ -41,7 +41,7 @@ class Mean:
     ) -> None:
         """Take where it goes, the files of vectors, and their settings."""
         self.inputs, self._resolved, self._derived, self.overwrite = fields, resolved, derived, overwrite
-        self.names, self.targets = [path.stem], [Target(path, self._record)]
+        self.names, self.targets, self.order = [path.stem], [Target(path, self._record)], range(1)
 
     @property
     def outputs(self) -> list[Path]:

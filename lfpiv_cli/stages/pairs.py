@@ -1,18 +1,21 @@
-"""Which frames of a command belong together, as its options have it."""
+"""Which frames of a command belong together, as its options have it, and the batches of what is made of them."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Generic, TypeVar
 
 from lfpiv_cli.errors import UsageError
 from lfpiv_cli.files.batch import Frame
 from lfpiv_cli.files.frame_sources import images_seen, results_seen
 from lfpiv_cli.files.pair_lists import pairs_listed
 from lfpiv_cli.files.pairing import Pairs, Seen, in_order, pair_frames
+from lfpiv_cli.files.provenance import Gone
 from lfpiv_cli.names import Pairing
 from lfpiv_cli.notice import Notice
+from lfpiv_cli.stages.batches import BatchOptions, ByArguments, Failure
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,6 +37,59 @@ class PairOptions:
     def are_told(self) -> bool:
         """True where any of them is given."""
         return any(each is not None for each in (self.pairing, self.pair_by, self.pairs))
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairBatchOptions(PairOptions, BatchOptions):
+    """What a batch of pairs is given."""
+
+
+Chosen = TypeVar("Chosen", bound=PairBatchOptions)
+
+
+class PairBatch(ByArguments, Generic[Chosen]):
+    """Results of volumes or files of particles that belong together: of two each, or of all."""
+
+    def __init__(
+        self,
+        files: Sequence[Path],
+        output: Path,
+        options: Chosen,
+        overwrite: bool,
+        pairs: Pairs | None = None,
+        gone: Mapping[Path, Gone] | None = None,
+    ) -> None:
+        """Take the arguments of a command; see which files belong together, and read no content.
+
+        Parameters
+        ----------
+        pairs : where they are known already
+        gone : of the files, those that are no longer there
+
+        Raises
+        ------
+        LfpivError : files or outputs do not go together, or a config is wrong
+        """
+        self._options, self.overwrite, self._gone = options, overwrite, gone or {}
+        self.inputs: Sequence[Path] = files
+        self.notices: Sequence[Notice] = ()
+        self.left_out: Sequence[Failure] = ()
+        self._arrange(files, output, pairs)
+
+    def _arrange(self, files: Sequence[Path], output: Path, pairs: Pairs | None) -> None:
+        """Say which files each result is made of, and where it goes."""
+        raise NotImplementedError
+
+    def _paired(self, files: Sequence[Path], pairs: Pairs | None) -> list[tuple[Path, Path]]:
+        """Return the files of each pair; note what is to be said of them, and those without a partner."""
+        found = result_pairs(files, self._options) if pairs is None else pairs
+        self.notices, self.left_out = found.settled(self._options.keep_going), failures_of(found)
+        return [(files[first], files[second]) for first, second in found.pairs]
+
+
+def failures_of(pairs: Pairs) -> list[Failure]:
+    """Return the frames that have no partner, as what has failed."""
+    return [Failure(each.name, each.why) for each in pairs.left_out]
 
 
 def image_pairs(frames: Sequence[Frame], options: PairOptions) -> Pairs:

@@ -6,7 +6,9 @@ from functools import lru_cache
 from pathlib import Path
 
 from lfpiv_cli.files.config import Config
+from lfpiv_cli.files.memory import ensure_room
 from lfpiv_cli.files.weights_file import WeightsFile, open_weights
+from lfpiv_cli.files.whole import unpacked_bytes
 from lfpiv_cli.interface.particles import searchable
 from lfpiv_cli.interface.reconstruction import Bench, bench_of
 from lfpiv_cli.reconstruction.images import Image
@@ -17,7 +19,7 @@ class Prepared:
 
     def __init__(self) -> None:
         """Begin with nothing."""
-        self._opened = lru_cache(maxsize=1)(lambda path, _size, _modified_ns: open_weights(path))
+        self._opened = lru_cache(maxsize=1)(lambda path, _size, _modified_ns: open_weights_that_fit(path))
         self._searchable: tuple[WeightsFile, WeightsFile] | None = None
         self._bench: Bench | None = None
 
@@ -42,3 +44,15 @@ class Prepared:
         """Return what all frames share, with the sums of the last one where these are the same."""
         self._bench = bench_of(content, settings, dark, mask, earlier=self._bench)
         return self._bench
+
+
+def open_weights_that_fit(path: Path) -> WeightsFile:
+    """Open weights, where there is memory for them.
+
+    Raises
+    ------
+    InputError : as `open_weights`
+    OutputError : there is too little
+    """
+    ensure_room(unpacked_bytes(path), f"reading {path}")
+    return open_weights(path)

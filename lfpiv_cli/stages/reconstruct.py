@@ -19,12 +19,14 @@ from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.batch import Target, frames_of, output_paths, prepare_folder
 from lfpiv_cli.files.config import carried_config
 from lfpiv_cli.files.inputs import given
+from lfpiv_cli.files.memory import ensure_room
 from lfpiv_cli.files.pairing import Pairs
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, write_points
 from lfpiv_cli.files.provenance import also_used_as, record, with_warnings
 from lfpiv_cli.files.weights_file import read_weights_record
 from lfpiv_cli.files.whole import unpacked_bytes
 from lfpiv_cli.interface import particles
+from lfpiv_cli.interface.particles import TracerSize
 from lfpiv_cli.interface.reconstruction import Bench, Progress, check_frame, frame_notices, volume_of
 from lfpiv_cli.interface.weights_cost import FLOAT_BYTES, columns_bytes, held_bytes, on_demand_told
 from lfpiv_cli.names import Start
@@ -38,16 +40,20 @@ from lfpiv_cli.stages.finding import Finder
 from lfpiv_cli.stages.frames import STILL, Ahead, Background, Read, beside_frames, mask_of, other_frames, reader
 from lfpiv_cli.stages.pairs import PairOptions, image_pairs
 from lfpiv_cli.stages.prepared import Prepared
-from lfpiv_cli.stages.watched import watched, work_as_they_come
+from lfpiv_cli.stages.watched import ensure_frames_alone, watched, work_as_they_come
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What is told of a frame: its relative residual, the number of pixels that took no part, and of particles."""
+    """What is told of a frame: its relative residual, the number of pixels that took no part, and of particles.
+
+    Of these also the size of the tracers, which all frames share: whoever makes a frame knows it.
+    """
 
     residual: float
     excluded_pixels: int
     particles: int | None = None
+    tracers: TracerSize | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,43 +93,26 @@ def reconstruct(
     console: Console = CONSOLE,
     pairs: Pairs | None = None,
     prepared: Prepared | None = None,
+    order: Sequence[int] | None = None,
 ) -> dict[str, Any]:
     """Reconstruct the volume behind each image, or find its particles.
 
-    `pairs` and `prepared`, where these are known already.
+    `pairs` and `prepared`, where these are known already; `order`, where only some frames are to be made.
     """
     if options.watch:
-        _ensure_frames_alone(weights, options)
+        settings = carried_config(read_weights_record(weights), weights).overridden_by("reconstruction", options)
+        ensure_frames_alone(settings, options.background, options.mask)
         prepare_folder([output / weights.name])
         groups = watched(images, "images", options, console)
         batch, worked = work_as_they_come(
             lambda group: Reconstruction(weights, group, output, options, overwrite), groups, options, console
         )
     else:
-        batch = Reconstruction(weights, images, output, options, overwrite, pairs, prepared)
+        batch = Reconstruction(weights, images, output, options, overwrite, pairs, prepared, order)
         if options.dry_run:
             return dry_run(batch, options, console)
         worked = work_through(batch, options, console)
     return worked.ensure_whole(batch.summary(worked), batch.unit)
-
-
-def _ensure_frames_alone(weights: Path, options: ReconstructOptions) -> None:
-    """Refuse what is made from other frames than a frame's own, where these are still coming.
-
-    Raises
-    ------
-    UsageError
-    """
-    settings = carried_config(read_weights_record(weights), weights).overridden_by("reconstruction", options)
-    if Background.parse(options.background).kind is not None:
-        refused = f"--background {options.background} is"
-    elif options.mask == STILL:
-        refused = f"--mask {STILL} is"
-    elif settings.reconstruction.solver == "particles":
-        refused = "the tracers' size, which --solver particles needs, is"
-    else:
-        return
-    raise UsageError(f"--watch: {refused} made from all frames, some of which have not come yet; wait for them")
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +122,7 @@ class _Ready:
     bench: Bench
     ahead: Ahead
     finder: Finder
-    size: particles.TracerSize | None
+    size: TracerSize | None
     said: Sequence[Notice]
 
 
@@ -152,6 +141,7 @@ class Reconstruction(ByArguments):
         overwrite: bool,
         pairs: Pairs | None = None,
         prepared: Prepared | None = None,
+        order: Sequence[int] | None = None,
     ) -> None:
         """Take the arguments of `reconstruct`; see which frames there are, and read no image.
 
@@ -172,6 +162,8 @@ class Reconstruction(ByArguments):
         self.notices = [] if pairs is None else pairs.settled(options.keep_going)
         self._beside = None if pairs is None else pairs.beside(len(frames))
         self._first_of = {} if pairs is None else pairs.first_of()
+        every = list(range(len(frames))) if pairs is None else pairs.order(len(frames))
+        self.order = every if order is None else order
         self.names = [frame.stem for frame in frames]
         self._paths = output_paths(output, self.names)
         self._settings = carried_config(read_weights_record(weights), weights).overridden_by("reconstruction", options)
@@ -217,6 +209,9 @@ class Reconstruction(ByArguments):
         if not self._as_particles and content.weights.on_demand:
             console.say(on_demand_told(math.prod(content.weights.padded.shape)))
         shape = content.image_shape
+        if not self._as_particles:
+            # The weights are in memory by now.
+            ensure_room(held_bytes(math.prod(content.weights.padded.shape), math.prod(shape)), self.label)
         dark = image_files.read_reference(options.dark, shape) if options.dark else None
         pitch_px = float(content.camera.micro_image_lattice_px().pitch.max())
         mask = mask_of(options.mask, frames, shape, pitch_px, options.keep_going)
@@ -265,7 +260,7 @@ class Reconstruction(ByArguments):
             "excluded_pixels": max((outcome.excluded_pixels for outcome in outcomes), default=None),
         }
         counts = {"particles": sum(found), "particles_fewest": min(found)} if found else {}
-        size = self._ready.size if self._ready else None
+        size = next((outcome.tracers for outcome in outcomes), None)
         return told | counts | (size.summary() if size else {})
 
     def _record(self, number: int) -> dict[str, Any]:
@@ -294,7 +289,7 @@ class Reconstruction(ByArguments):
         self,
         path: Path,
         made: Mapping[str, Any],
-        result: tuple[particles.Frame, Particles, particles.TracerSize],
+        result: tuple[particles.Frame, Particles, TracerSize],
         console: Console,
     ) -> Outcome:
         """Write the particles found behind a frame and, where it is asked for, what they leave of it."""
@@ -308,7 +303,8 @@ class Reconstruction(ByArguments):
             image_files.write_tiff(residual_path(path), left.astype(np.float32), overwrite=True)
         told = replace(points, provenance=with_warnings(made, notices))
         write_points(path, PARTICLES_FORMAT, told, overwrite=self._replace)
-        return Outcome(points.attributes["residual"], points.attributes["excluded_pixels"], len(points.position_mm))
+        residual, excluded = points.attributes["residual"], points.attributes["excluded_pixels"]
+        return Outcome(residual, excluded, len(points.position_mm), size)
 
     def _ensure_residuals(self, numbers: Sequence[int], console: Console) -> None:
         """Refuse residual images that could not be written; say of how many frames that are complete there is none."""
@@ -316,7 +312,8 @@ class Reconstruction(ByArguments):
             ensure_writable(residual_path(self._paths[number]), self._replace)
         coming = set(numbers)
         without = sum(
-            not residual_path(path).exists() for number, path in enumerate(self._paths) if number not in coming
+            number not in coming and path.exists() and not residual_path(path).exists()
+            for number, path in enumerate(self._paths)
         )
         if without:
             console.say(f"{without} frames that are complete have no residual image; --overwrite makes both anew")

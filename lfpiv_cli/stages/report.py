@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import yaml
 
-from lfpiv_cli.console import CONSOLE, Console
+from lfpiv_cli.console import CONSOLE, Console, readable
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files import calibration_file, weights_file
 from lfpiv_cli.files.atomic import ensure_writable
@@ -65,6 +65,8 @@ DEEPEST = 2
 LONGEST_TABLE, MOST_FIELDS = 100, 3
 # What is drawn of vectors beside the best ones: a figure takes a second.
 OF_OTHERS = ("planes", "profiles", "sigma")
+# A cell of a figure that is not known.
+UNKNOWN = "–"
 # Vectors by their files.
 Fields = Mapping[Path, VectorField]
 TITLE = "Velocity from light-field images"
@@ -301,7 +303,7 @@ def _volume_row(path: Path) -> Row:
     told = read_header(path).attributes
     residual = told.get("residual")
     return {
-        "light not explained": "–" if residual is None else f"{np.atleast_1d(residual)[-1]:.3g}",
+        "light not explained": UNKNOWN if residual is None else f"{np.atleast_1d(residual)[-1]:.3g}",
         "pixels left out": _cell(told.get("excluded_pixels")),
     }
 
@@ -315,7 +317,7 @@ def _particle_row(path: Path) -> Row:
         "particles": str(np.count_nonzero(inside)),
         "per microlens": _cell(told.get("particles_per_lens")),
         "light not explained": _cell(told.get("residual")),
-        "median sigma x, y, z (mm)": _cell(np.median(sigma, axis=0).tolist()) if inside.any() else "–",
+        "median sigma x, y, z (mm)": _cell(np.median(sigma, axis=0).tolist()) if inside.any() else UNKNOWN,
     }
 
 
@@ -324,8 +326,8 @@ def _field_row(vectors: VectorField) -> Row:
     moved = vectors.displacement_voxel[there]
     return {
         "vectors": str(quality.used),
-        "valid": f"{np.mean(vectors.flag[used] == VALID):.1%}" if used.any() else "–",
-        "median u, v, w (voxel)": _cell(np.median(moved, axis=0).tolist()) if len(moved) else "–",
+        "valid": f"{np.mean(vectors.flag[used] == VALID):.1%}" if used.any() else UNKNOWN,
+        "median u, v, w (voxel)": _cell(np.median(moved, axis=0).tolist()) if len(moved) else UNKNOWN,
         "median sigma (voxel)": _cell(quality.summary()["uncertainty_voxel_median"]),
     }
 
@@ -367,10 +369,4 @@ def _records(contents: Contents) -> Iterable[Section]:
 
 
 def _cell(value: Any) -> str:
-    if value is None:
-        return "–"
-    if isinstance(value, float):
-        return f"{value:.4g}"
-    if isinstance(value, (list, tuple)):
-        return ", ".join(_cell(each) for each in value)
-    return str(value)
+    return readable(value, digits=4, unknown=UNKNOWN)

@@ -32,13 +32,15 @@ from lfpiv_cli.interface import particles
 from lfpiv_cli.interface.calibration import ensure_pictures
 from lfpiv_cli.interface.following import SHORTEST, ensure_sequence
 from lfpiv_cli.names import FlowMethod
-from lfpiv_cli.stages.batches import Failure
+from lfpiv_cli.stages.batches import ALL, Failure
+from lfpiv_cli.stages.follow import SEQUENCE_IS_WHOLE
 from lfpiv_cli.stages.frames import STILL, Background, mask_of, other_frames, read_frame, reader
 from lfpiv_cli.stages.pairs import image_pairs
 from lfpiv_cli.stages.prepared import Prepared
 from lfpiv_cli.stages.report import ReportOptions, report
 from lfpiv_cli.stages.run_figures import figures_of
 from lfpiv_cli.stages.run_options import RunOptions
+from lfpiv_cli.stages.run_plan import planned
 from lfpiv_cli.stages.run_steps import Chain, Vectors
 from lfpiv_cli.stages.steps import KEPT, MADE, RECORD, Steps, earlier_run
 
@@ -75,11 +77,20 @@ def run(
     settings = load_config(config)
     frames, pairs = _ensure_possible(settings, options)
     console.warn(pairs.settled(options.keep_going))
-    prepare_folder([output / RECORD])
-    steps, prepared = Steps(output, console, earlier_run(output, overwrite)), Prepared()
+    whole, prepared = options.shard == ALL, Prepared()
+    steps = Steps(output, console, earlier_run(output, overwrite), options.deadline(), recorded=whole)
     chain = Chain(config, options, frames, pairs, steps, prepared, overwrite)
+
+    def choose(weights: Path) -> Choice:
+        return _chosen(settings, options, lambda: _counted(settings, options, weights, frames, prepared, steps))
+
+    if options.dry_run:
+        return planned(settings, chain, lambda weights: choose(weights).methods)
+    prepare_folder([output / RECORD])
     weights = chain.weights()
-    choice = _chosen(settings, options, lambda: _counted(settings, options, weights, frames, prepared, steps))
+    if not chain.share:
+        return _told_of_steps(steps)
+    choice = choose(weights)
     console.say(f"by {' and '.join(choice.methods)}: {choice.reason}")
     steps.told.update(choice.told())
     fields: dict[str, Vectors] = {method: chain.vectors_by(method, weights) for method in choice.methods}
@@ -88,11 +99,15 @@ def run(
     figures = figures_of({method: list(paths.values()) for method, paths in fields.items()})
     steps.told["figures"] = figures
     told = choice.told() | figures
-    if options.report:
+    if options.report and whole:
         told |= {"verdict": _reported(options, steps, overwrite).get("verdict"), "report": str(output / REPORT)}
     steps.write(whole=True)
-    told |= {"steps_made": steps.count(MADE), "steps_kept": steps.count(KEPT), "folder": str(output)}
-    return _ensure_whole(told, chain.failures, options.failures)
+    return _ensure_whole(told | _told_of_steps(steps), chain.failures, options.failures)
+
+
+def _told_of_steps(steps: Steps) -> dict[str, Any]:
+    """Return what is told of a run's steps."""
+    return {"steps_made": steps.count(MADE), "steps_kept": steps.count(KEPT), "folder": str(steps.output)}
 
 
 def _ensure_whole(told: dict[str, Any], failures: Sequence[Failure], listed: Path | None) -> dict[str, Any]:
@@ -170,14 +185,27 @@ def _first_readable(frames: Sequence[Frame], shape: tuple[int, int], keep_going:
     raise InputError("no images were given")
 
 
-def _tell_times(images: Sequence[Path]) -> bool:
-    """Return whether the recordings of the frames say when each was taken."""
-    return all(times_of(path) is not None for path in images)
+def _tell_times(images: Sequence[Path], keep_going: bool) -> bool:
+    """Return whether the recordings of the frames say when each was taken, of those that can be read.
+
+    Raises
+    ------
+    InputError : one cannot be read, and the others are not to go on
+    """
+    told = []
+    for path in images:
+        try:
+            told.append(times_of(path) is not None)
+        except InputError:
+            if not keep_going:
+                raise
+    return bool(told) and all(told)
 
 
 def _ensure_settings(settings: Config, options: RunOptions) -> None:
     """Raise where the config lacks what a later step needs."""
-    if options.dt_s is None and settings.correlation.dt_s is None and not _tell_times(options.images):
+    is_stated = options.dt_s is not None or settings.correlation.dt_s is not None
+    if not is_stated and not _tell_times(options.images, options.keep_going):
         raise ConfigError(
             f"{settings.source}: correlation.dt_s: is missing, and velocities need it; give it there, or --dt-s"
         )
@@ -196,6 +224,8 @@ def _ensure_methods(settings: Config, options: RunOptions) -> None:
         raise UsageError("--combine needs --method both")
     if options.follow and options.method == "volumes":
         raise UsageError("--follow finds particles, but --method is volumes")
+    if options.follow and options.shard != ALL:
+        raise UsageError(SEQUENCE_IS_WHOLE)
     if options.follow and options.combine:
         raise UsageError("--follow gives tracks, and --combine needs vectors")
     if by_volumes and settings.reconstruction.solver == "particles":

@@ -7,12 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lfpiv_cli.names import Kept, RunMethod
+from lfpiv_cli.stages.batches import WorkOptions
 from lfpiv_cli.stages.pairs import PairOptions
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunOptions(PairOptions):
-    """What `run` is given besides the config.
+class RunOptions(PairOptions, WorkOptions):
+    """What `run` is given besides the config; it resumes by itself.
 
     Attributes
     ----------
@@ -24,8 +25,6 @@ class RunOptions(PairOptions):
     combine : of both methods, also one field that weights their vectors by their uncertainties
     follow : find and track the particles of a time-resolved sequence together, as `follow_particles` does
     keep : `results`: volumes, and particles of separate pairs, are dropped as soon as their vectors stand
-    keep_going : go on with the next pair when an image cannot be read
-    failures : file to list those that failed in, as JSON
     report : make the page of all that the folder holds, too
     """
 
@@ -41,6 +40,4 @@ class RunOptions(PairOptions):
     combine: bool = False
     follow: bool = False
     keep: Kept = "all"
-    keep_going: bool = False
-    failures: Path | None = None
     report: bool = True

@@ -9,17 +9,19 @@ from typing import Any, TypeVar
 
 from lfpiv_cli.errors import InputError, PartialError
 from lfpiv_cli.files.batch import VTKHDF_SUFFIX, Frame, Target, prepare_folder
+from lfpiv_cli.files.claims import awaited
 from lfpiv_cli.files.pairing import Pairs
 from lfpiv_cli.names import FlowMethod
 from lfpiv_cli.stages import correlate as correlating
 from lfpiv_cli.stages import track as tracking
-from lfpiv_cli.stages.batches import BatchOptions, Failure, Worked, work_through
+from lfpiv_cli.stages.batches import ALL, BatchOptions, Failure, Worked, work_through
 from lfpiv_cli.stages.build_weights import BuildWeightsOptions, build_weights
 from lfpiv_cli.stages.calibrate import CalibrateOptions, calibrate_snapshot
 from lfpiv_cli.stages.combine import combine_vectors
 from lfpiv_cli.stages.correlate import CorrelateOptions, Correlation, correlate
 from lfpiv_cli.stages.follow import PLAYBACK, TRACKS, FollowOptions, follow_particles
 from lfpiv_cli.stages.pair_by_pair import PairByPair, joined_by
+from lfpiv_cli.stages.pairs import failures_of
 from lfpiv_cli.stages.prepared import Prepared
 from lfpiv_cli.stages.reconstruct import Reconstruction, ReconstructOptions, reconstruct
 from lfpiv_cli.stages.run_options import RunOptions
@@ -27,6 +29,8 @@ from lfpiv_cli.stages.steps import Steps
 from lfpiv_cli.stages.track import TrackOptions, Tracks, grid_paths, track_particles
 
 Outcome = TypeVar("Outcome")
+CALIBRATION, WEIGHTS, PICTURE = "calibration.h5", "weights.h5", "calibration.png"
+VOLUMES, PARTICLES = ReconstructOptions(), ReconstructOptions(solver="particles")
 # The files of vectors by the numbers of their pairs.
 Vectors = dict[int, Path]
 
@@ -37,6 +41,9 @@ class Chain:
     Attributes
     ----------
     failures : frames and pairs that could not be worked on
+    pairs : of all frames
+    share : the numbers of the pairs that are to be measured
+    order : those of the frames that this takes, and in the last share those without a partner
     """
 
     def __init__(
@@ -51,9 +58,15 @@ class Chain:
     ) -> None:
         """Take the frames and which of them belong together, and what steps share."""
         self.config, self.options, self.frames, self.steps = config, options, frames, steps
-        self.failures = [Failure(each.name, each.why) for each in pairs.left_out]
+        shard = options.shard
+        self.share = shard.of(range(len(pairs.pairs)))
+        ours = [pairs.pairs[number] for number in self.share]
+        alone = pairs.order(len(frames))[len({k for pair in pairs.pairs for k in pair}) :]
+        self.order = list(dict.fromkeys([*(k for pair in ours for k in pair), *(alone if shard.is_last else [])]))
+        # Of several shards the first one tells them.
+        self.failures = failures_of(pairs) if shard.number == 1 else []
         self._prepared, self._overwrite = prepared, overwrite
-        self._pairs = replace(pairs, left_out=())
+        self.pairs = replace(pairs, left_out=())
 
     @property
     def common(self) -> dict[str, Any]:
@@ -63,28 +76,41 @@ class Chain:
     @property
     def _resuming(self) -> dict[str, Any]:
         """The options of every batch."""
-        return {"resume": True, "keep_going": self.options.keep_going}
+        given = self.options
+        limit = {"time_limit_s": given.time_limit_s, "begun_s": given.begun_s}
+        return {"resume": True, "keep_going": given.keep_going} | limit
 
-    def weights(self) -> Path:
-        """Calibrate and build the weights; return their file."""
-        options, output = self.options, self.steps.output
-        calibration, weights, picture = (output / name for name in ("calibration.h5", "weights.h5", "calibration.png"))
-        photographs = CalibrateOptions(
+    @property
+    def photographs(self) -> CalibrateOptions:
+        """What the calibration is given."""
+        options = self.options
+        return CalibrateOptions(
             white=options.white,
             dark=options.dark,
             board=options.board,
             depth_mm=options.depth_mm,
-            picture=picture,
+            picture=self.steps.output / PICTURE,
             resume=True,
         )
-        made_with = BuildWeightsOptions(calibration=calibration, resume=True)
+
+    @property
+    def made_with(self) -> BuildWeightsOptions:
+        """What the weights are given."""
+        return BuildWeightsOptions(calibration=self.steps.output / CALIBRATION, resume=True)
+
+    def weights(self) -> Path:
+        """Calibrate and build the weights, or take those of another worker, shard or run; return their file."""
+        calibration, weights, picture = (self.steps.output / name for name in (CALIBRATION, WEIGHTS, PICTURE))
+        photographs, made_with = self.photographs, self.made_with
         self.steps.take(
             "calibrate-snapshot",
             [calibration, picture],
-            lambda: calibrate_snapshot(self.config, calibration, photographs, **self.common),
+            _alone(calibration, lambda: calibrate_snapshot(self.config, calibration, photographs, **self.common)),
         )
         self.steps.take(
-            "build-weights", [weights], lambda: build_weights(self.config, weights, made_with, **self.common)
+            "build-weights",
+            [weights],
+            _alone(weights, lambda: build_weights(self.config, weights, made_with, **self.common)),
         )
         return weights
 
@@ -96,7 +122,7 @@ class Chain:
 
     def combined(self, first: Vectors, second: Vectors) -> Vectors:
         """Weight the vectors of two methods by their uncertainties; return the files."""
-        every = self._of_pairs("combined")
+        every = self._prepared_for("combined")
         paths = {number: every[number] for number in first if number in second}
 
         def combine_all() -> dict[str, Any]:
@@ -109,68 +135,98 @@ class Chain:
         self.steps.take("combine", list(paths.values()), combine_all)
         return paths
 
+    def reconstruction(self, method: FlowMethod, weights: Path) -> Reconstruction:
+        """Return the batch of the frames of this share."""
+        by_particles = method == "particles"
+        chosen = replace(PARTICLES, residual=self.options.keep == "all") if by_particles else VOLUMES
+        given = (weights, self.options.images, self.steps.output / method, self._of_images(chosen), self._overwrite)
+        return Reconstruction(*given, self.pairs if by_particles else None, self._prepared, self.order)
+
+    def correlated(self, weights: Path, file_bytes: float | None = None) -> PairByPair[correlating.Outcome]:
+        """Return the batch of pairs, each from its images to its vectors, of so many bytes."""
+        join = joined_by(Correlation, self._correlating, self._overwrite)
+        targets = [Target(path, dict) for path in self.of_pairs("vectors")]
+        return PairByPair(self.reconstruction("volumes", weights), join, self.pairs, targets, file_bytes)
+
+    def tracked(self, weights: Path) -> PairByPair[tracking.Outcome]:
+        """Return the batch of separate pairs, each from its images to its tracks."""
+        join = joined_by(Tracks, self._tracking, self._overwrite)
+        targets = [Target(path, dict, grid_paths(path, 1)) for path in self.of_pairs("tracks")]
+        return PairByPair(self.reconstruction("particles", weights), join, self.pairs, targets)
+
+    @property
+    def _correlating(self) -> CorrelateOptions:
+        return CorrelateOptions(dt_s=self.options.dt_s, **self._resuming)
+
+    @property
+    def _tracking(self) -> TrackOptions:
+        return TrackOptions(dt_s=self.options.dt_s, grid=True, **self._resuming)
+
     def _by_volumes(self, weights: Path) -> Vectors:
-        paths = self._of_pairs("vectors")
-        options = CorrelateOptions(dt_s=self.options.dt_s, **self._resuming)
+        paths, options = self._prepared_for("vectors"), self._correlating
         if self.options.keep == "results":
-            found = self._reconstruction(weights, "volumes", self._of_images(ReconstructOptions()))
-            join = joined_by(Correlation, options, self._overwrite)
-            batch = PairByPair(found, join, self._pairs, [Target(path, dict) for path in paths])
-            self._take_pair_by_pair("correlate", batch, lambda worked: correlating.summary_of(worked, len(paths)))
-            return self._standing(paths, range(len(paths)))
-        volumes, failed = self._reconstructed("reconstruct", weights, "volumes", ReconstructOptions())
+            batch = self.correlated(weights)
+            self._take_pair_by_pair("correlate", batch, lambda worked: correlating.summary_of(worked, worked.total()))
+            return self._standing(paths, self.share)
+        volumes, failed = self._reconstructed("reconstruct", weights, "volumes", VOLUMES)
         whole = self._without(failed)
         output = paths[0] if len(paths) == 1 else paths[0].parent
-        ours = [paths[number] for number in whole]
+        given, pairs = self._only(volumes, whole)
         self._take(
-            "correlate", ours, lambda: correlate(volumes, output, options, **self.common, pairs=self._only(whole))
+            "correlate",
+            [paths[number] for number in whole],
+            lambda: correlate(given, output, options, **self.common, pairs=pairs),
         )
         return self._standing(paths, whole)
 
     def _by_particles(self, weights: Path) -> Vectors:
-        options = TrackOptions(dt_s=self.options.dt_s, grid=True, **self._resuming)
-        chosen = ReconstructOptions(solver="particles")
-        if not self._pairs.separate:
-            return self._tracked_in_time(weights, chosen, options)
-        tracks = self._of_pairs("tracks")
+        if not self.pairs.separate:
+            return self._tracked_in_time(weights)
+        tracks, options = self._prepared_for("tracks"), self._tracking
         grids = [grid_paths(path, 1)[0] for path in tracks]
         if self.options.keep == "results":
-            asked = self._of_images(replace(chosen, residual=False))
-            found = self._reconstruction(weights, "particles", asked, self._pairs)
-            join = joined_by(Tracks, options, self._overwrite)
-            targets = [Target(path, dict, [grid]) for path, grid in zip(tracks, grids, strict=True)]
-            batch = PairByPair(found, join, self._pairs, targets)
-            self._take_pair_by_pair("track", batch, lambda worked: tracking.summary_of(worked, tracks))
-            return {number: grids[number] for number in self._standing(tracks, range(len(tracks)))}
-        particles, failed = self._reconstructed("reconstruct particles", weights, "particles", chosen, self._pairs)
+            results = [tracks[number] for number in self.share]
+            batch = self.tracked(weights)
+            self._take_pair_by_pair("track", batch, lambda worked: tracking.summary_of(worked, results))
+            return {number: grids[number] for number in self._standing(tracks, self.share)}
+        particles, failed = self._reconstructed("reconstruct particles", weights, "particles", PARTICLES, self.pairs)
         whole = self._without(failed)
         output = tracks[0] if len(tracks) == 1 else tracks[0].parent
         ours = [each for number in whole for each in (tracks[number], grids[number])]
-        self._take(
-            "track", ours, lambda: track_particles(particles, output, options, **self.common, pairs=self._only(whole))
-        )
+        given, pairs = self._only(particles, whole)
+        self._take("track", ours, lambda: track_particles(given, output, options, **self.common, pairs=pairs))
         return {number: grids[number] for number in self._standing(tracks, whole)}
 
-    def _tracked_in_time(self, weights: Path, chosen: ReconstructOptions, options: TrackOptions) -> Vectors:
+    def _tracked_in_time(self, weights: Path) -> Vectors:
         """Track particles through all frames; return the vectors of each interval."""
-        found, failed = self._reconstructed("reconstruct particles", weights, "particles", chosen, self._pairs)
+        found, failed = self._reconstructed("reconstruct particles", weights, "particles", PARTICLES, self.pairs)
+        if self.options.shard != ALL:
+            self.steps.console.say("tracks go through all frames: the same command without --shard makes them")
+            return {}
         tracks = self.steps.output / TRACKS
         grids = grid_paths(tracks, len(found) - 1)
-        if failed or len(self._pairs.pairs) < len(grids):
+        if failed or len(self.pairs.pairs) < len(grids):
             error = "a frame of the sequence is missing, and tracks would take those beside it for neighbours in time"
             self.failures.append(Failure(TRACKS, error))
             return {}
-        self._take("track", [tracks, *grids], lambda: track_particles(found, tracks, options, **self.common))
+        self._take("track", [tracks, *grids], lambda: track_particles(found, tracks, self._tracking, **self.common))
         return dict(enumerate(grids))
 
     def _followed(self, weights: Path) -> Vectors:
-        given, output = self.options, self.steps.output
-        chosen = FollowOptions(
-            dark=given.dark, background=given.background, mask=given.mask, dt_s=given.dt_s, **self._resuming
-        )
+        given, output, chosen = self.options, self.steps.output, self.following()
         files = [*self._of_frames("particles"), output / TRACKS, output / PLAYBACK]
         self._take("follow", files, lambda: follow_particles(weights, given.images, output, chosen, **self.common))
         return {}
+
+    def following(self, dry_run: bool = False) -> FollowOptions:
+        """Return the options of a sequence that is followed."""
+        given = self.options
+        of_images: dict[str, Any] = {"dark": given.dark, "background": given.background, "mask": given.mask}
+        return FollowOptions(**of_images, dt_s=given.dt_s, dry_run=dry_run, **self._resuming)
+
+    def batch_options(self, shared: bool) -> BatchOptions:
+        """Return the options of a batch, `shared` where it is one of all pairs."""
+        return BatchOptions(**self._resuming, shard=self.options.shard if shared else ALL)
 
     def _take_pair_by_pair(
         self, name: str, batch: PairByPair[Outcome], summary: Callable[[Worked[Outcome]], dict[str, Any]]
@@ -178,30 +234,24 @@ class Chain:
         """Make the results of pairs one after the other, and drop what they are made of."""
 
         def make() -> dict[str, Any]:
-            worked = work_through(batch, BatchOptions(**self._resuming), self.steps.console)
+            worked = work_through(batch, self.batch_options(shared=True), self.steps.console)
             return worked.ensure_whole(summary(worked), batch.unit)
 
-        self._take(name, [path for target in batch.targets for path in target.paths], make)
+        self._take(name, [path for number in self.share for path in batch.targets[number].paths], make)
 
     def _reconstructed(
         self, name: str, weights: Path, folder: str, chosen: ReconstructOptions, pairs: Pairs | None = None
     ) -> tuple[list[Path], set[str]]:
         """Reconstruct all frames into a folder; return the files, and the names of frames that failed."""
         paths, options, before = self._of_frames(folder), self._of_images(chosen), len(self.failures)
-        given, output = (weights, self.options.images), paths[0].parent
+        images, output = self.options.images, paths[0].parent
+        known: dict[str, Any] = {"pairs": pairs, "prepared": self._prepared, "order": self.order}
         self._take(
             name,
-            paths,
-            lambda: reconstruct(*given, output, options, **self.common, pairs=pairs, prepared=self._prepared),
+            [paths[k] for k in self.order],
+            lambda: reconstruct(weights, images, output, options, **self.common, **known),
         )
         return paths, {failure.name for failure in self.failures[before:]}
-
-    def _reconstruction(
-        self, weights: Path, folder: str, options: ReconstructOptions, pairs: Pairs | None = None
-    ) -> Reconstruction:
-        """Return the batch of all frames."""
-        output = self.steps.output / folder
-        return Reconstruction(weights, self.options.images, output, options, self._overwrite, pairs, self._prepared)
 
     def _of_images(self, chosen: ReconstructOptions) -> ReconstructOptions:
         """Return options with what is given of the images."""
@@ -228,14 +278,17 @@ class Chain:
         InputError : there is none
         """
         broken = {number for number, frame in enumerate(self.frames) if frame.stem in failed}
-        whole = [number for number, pair in enumerate(self._pairs.pairs) if not broken & set(pair)]
+        whole = [number for number in self.share if not broken & set(self.pairs.pairs[number])]
         if not whole:
             raise InputError(f"of every pair a frame has failed, the first because {self.failures[0].error}")
         return whole
 
-    def _only(self, numbers: Sequence[int]) -> Pairs:
-        """Return these pairs alone."""
-        return replace(self._pairs, pairs=tuple(self._pairs.pairs[number] for number in numbers))
+    def _only(self, of_frames: Sequence[Path], numbers: Sequence[int]) -> tuple[list[Path], Pairs]:
+        """Return the files of the frames of these pairs alone, and how these belong together."""
+        pairs = [self.pairs.pairs[number] for number in numbers]
+        place = {k: place for place, k in enumerate(sorted({k for pair in pairs for k in pair}))}
+        ours = tuple((place[first], place[second]) for first, second in pairs)
+        return [of_frames[k] for k in place], replace(self.pairs, pairs=ours)
 
     def _standing(self, paths: Sequence[Path], numbers: Iterable[int]) -> Vectors:
         """Return those of the results that have not failed, by the numbers of their pairs."""
@@ -246,11 +299,25 @@ class Chain:
         """Return the file of each frame in a folder."""
         return [self.steps.output / folder / f"{frame.stem}{VTKHDF_SUFFIX}" for frame in self.frames]
 
-    def _of_pairs(self, name: str) -> list[Path]:
-        """Return the file of each pair, in a folder where there are several, which is made."""
+    def of_pairs(self, name: str) -> list[Path]:
+        """Return the file of each pair, in a folder where there are several."""
         if len(self.frames) == 2:
             return [self.steps.output / f"{name}{VTKHDF_SUFFIX}"]
         of_frames = self._of_frames(name)
-        paths = [of_frames[first] for first, _ in self._pairs.pairs]
+        return [of_frames[first] for first, _ in self.pairs.pairs]
+
+    def _prepared_for(self, name: str) -> list[Path]:
+        """Return the file of each pair, in a folder that is there."""
+        paths = self.of_pairs(name)
         prepare_folder(paths)
         return paths
+
+
+def _alone(output: Path, make: Callable[[], dict[str, Any]]) -> Callable[[], dict[str, Any]]:
+    """Return what makes an output after any other worker that makes it now: what that one has made is kept."""
+
+    def make_alone() -> dict[str, Any]:
+        with awaited(output):
+            return make()
+
+    return make_alone

@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from lfpiv_cli.console import Console
-from lfpiv_cli.errors import InputError, LfpivError, OutputExistsError
+from lfpiv_cli.errors import InputError, LfpivError, OutputExistsError, StoppedEarlyError
 from lfpiv_cli.files.atomic import write_json
 from lfpiv_cli.files.provenance import bear_alike, carried_record, sha256
+from lfpiv_cli.files.shares import Deadline
 
 RECORD = "run.json"
 # What becomes of a step: its files are made; complete and left as they are; or complete and their record is another, as
@@ -32,6 +33,8 @@ class Steps:
     ----------
     output : the run's folder
     earlier : what `run.json` said before
+    deadline : when all steps have to be done
+    recorded : whether they are written down; of several shards none can tell of all
     told : what it says now
     files : what all steps have made or kept
     """
@@ -39,6 +42,8 @@ class Steps:
     output: Path
     console: Console
     earlier: Mapping[str, Any]
+    deadline: Deadline = field(default_factory=Deadline)
+    recorded: bool = True
     told: dict[str, Any] = field(default_factory=lambda: {"steps": {}, "summaries": {}})
     files: list[Path] = field(default_factory=list)
 
@@ -48,8 +53,14 @@ class Steps:
         Raises
         ------
         LfpivError : as the step does, with its name and what becomes of the steps before
+        StoppedEarlyError : the time is over
         """
         number = len(self.told["steps"]) + 1
+        if not self.deadline.leaves_time():
+            raise StoppedEarlyError(
+                f"stopped before step {number}, {name}: the time limit of {self.deadline.limit_s:g} s is over; the "
+                "same command goes on from there"
+            )
         self.console.say(f"step {number}: {name}")
         before, times = [_recorded(path) for path in files], [_stamp(path) for path in files]
         hashes = self._hashes(files)
@@ -82,6 +93,8 @@ class Steps:
 
         What a step told would be lost where another one fails before it is found to be complete.
         """
+        if not self.recorded:
+            return
         told = dict(self.told)
         for part in () if whole else ("steps", "summaries"):
             told[part] = self.earlier.get(part, {}) | self.told[part]

@@ -11,12 +11,13 @@ from lfpiv_cli.console import Console
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files import vtkhdf
+from lfpiv_cli.files.config import Config
 from lfpiv_cli.files.listing import files_in
 from lfpiv_cli.files.pairing import Pairs
-from lfpiv_cli.files.shares import Deadline
 from lfpiv_cli.files.watching import as_they_come
 from lfpiv_cli.names import InputKind
 from lfpiv_cli.stages.batches import ALL, Batch, BatchOptions, Failure, Worked, work_through, write_failures
+from lfpiv_cli.stages.frames import STILL, Background
 
 OfBatch = TypeVar("OfBatch", bound=Batch)
 
@@ -44,7 +45,7 @@ def watched(
         if not folder.is_dir():
             raise UsageError(f"{folder}: --watch takes folders")
     read = _read_image if kind == "images" else vtkhdf.read_header
-    deadline, count = Deadline(options.time_limit_s, begun=options.begun_s), 0
+    deadline, count = options.deadline(), 0
     console.say(f"watches {', '.join(map(str, folders))}; ends {options.idle_s:g} s after the last change")
 
     def listed() -> list[Path]:
@@ -57,6 +58,24 @@ def watched(
         yield group
     if count == 0:
         raise InputError(f"{folders[0]}: no {kind} have come in {options.idle_s:g} s")
+
+
+def ensure_frames_alone(settings: Config, background: str | None, mask: str | Path | None) -> None:
+    """Refuse what is made from other frames than a frame's own, where these are still coming.
+
+    Raises
+    ------
+    UsageError
+    """
+    if Background.parse(background).kind is not None:
+        refused = f"--background {background} is"
+    elif mask == STILL:
+        refused = f"--mask {STILL} is"
+    elif settings.reconstruction.solver == "particles":
+        refused = "the tracers' size, which --solver particles needs, is"
+    else:
+        return
+    raise UsageError(f"--watch: {refused} made from all frames, some of which have not come yet; wait for them")
 
 
 def work_as_they_come(
