@@ -93,7 +93,7 @@ class Console:
             heads = list(dict.fromkeys(head for value in block.values() if _is_row(value) for head in value))
             table = {"": heads} if heads else {}
             for name, value in block.items():
-                table[name] = [_readable(value.get(head)) for head in heads] if _is_row(value) else [_readable(value)]
+                table[name] = [readable(value.get(head)) for head in heads] if _is_row(value) else [readable(value)]
             rows = [name for name, cells in table.items() if not name or _is_row(block[name])]
             widths = [max(map(len, column)) for column in zip(*(table[name] for name in rows), strict=True)]
             for name, cells in table.items():
@@ -248,7 +248,7 @@ def _unfolded(figures: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
     for name, value in figures.items():
         if isinstance(value, list) and value and all(isinstance(each, dict) for each in value):
             for first, *rest in (list(record.values()) for record in value):
-                yield _readable(first), "  ".join(map(_readable, rest))
+                yield readable(first), "  ".join(map(readable, rest))
         else:
             yield name, value
 
@@ -263,13 +263,14 @@ def _is_number(value: Any) -> bool:
     return value is None or isinstance(value, (int, float))
 
 
-def _readable(value: Any) -> str:
+def readable(value: Any, digits: int = 6, unknown: str = "unknown") -> str:
+    """Return a figure, or several, as a person reads them; `unknown` stands for one that is not known."""
     if value is None:
-        return "unknown"
+        return unknown
     if isinstance(value, float):
-        return f"{value:.6g}"
+        return f"{value:.{digits}g}"
     if isinstance(value, dict):
-        return ", ".join(f"{name} {_readable(each)}" for name, each in value.items())
+        return ", ".join(f"{name} {readable(each, digits, unknown)}" for name, each in value.items())
     if isinstance(value, (list, tuple)):
-        return ", ".join(_readable(each) for each in value)
+        return ", ".join(readable(each, digits, unknown) for each in value)
     return str(value)

@@ -301,6 +301,7 @@ def test_pivpy_reads_a_plane(tmp_path: Path, rng: np.random.Generator) -> None:
     assert found.attrs["delta_t"] == 0.002
 
 
+@pytest.mark.thorough
 def test_flowtracks_reads_the_tracks_of_a_sequence(tmp_path: Path, rng: np.random.Generator) -> None:
     flowtracks = pytest.importorskip("flowtracks.io")
     path, content = exported(write_kind("trajectories", tmp_path, rng), "mat")

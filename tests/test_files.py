@@ -22,6 +22,7 @@ import pytest
 import tifffile
 
 from lfpiv_cli.errors import InputError, OutputError, OutputExistsError, UsageError
+from lfpiv_cli.files import atomic
 from lfpiv_cli.files.atomic import ensure_writable, write_atomically, write_json
 from lfpiv_cli.files.hdf5 import read_tree, write_tree
 from lfpiv_cli.files.images import count_pages, read_image, read_page, write_tiff
@@ -32,6 +33,7 @@ from lfpiv_cli.grid import Grid
 from lfpiv_cli.reference import Reference
 from tests.hostile_files import edited
 
+ROOT = Path(__file__).parent.parent
 GRID = Grid.centred((4, 3, 2), (0.1, 0.2, 0.3), (1.0, 2.0, 3.0))
 REFERENCE = Reference("mid_plane", -0.3)
 TREE = {
@@ -470,24 +472,23 @@ def test_records_are_carried_along_and_say_nothing_of_time_or_place(tmp_path: Pa
 FRAMES = np.random.default_rng(1).integers(0, 4096, (3, 40, 50)).astype(np.uint16)
 
 
+TIFF_KINDS = [
+    {},
+    {"byteorder": ">"},
+    {"bigtiff": True},
+    {"tile": (16, 16)},
+    {"tile": (16, 16), "compression": "zlib"},
+    {"compression": "zlib", "predictor": True},
+    {"compression": "lzw", "predictor": True},
+    {"compression": "zstd"},
+    {"compression": "packbits"},
+    {"rowsperstrip": 7, "compression": "lzw", "byteorder": ">"},
+    {"imagej": True},
+]
+
+
 @pytest.mark.thorough
-@pytest.mark.parametrize(
-    "options",
-    [
-        {},
-        {"byteorder": ">"},
-        {"bigtiff": True},
-        {"tile": (16, 16)},
-        {"tile": (16, 16), "compression": "zlib"},
-        {"compression": "zlib", "predictor": True},
-        {"compression": "lzw", "predictor": True},
-        {"compression": "zstd"},
-        {"compression": "packbits"},
-        {"rowsperstrip": 7, "compression": "lzw", "byteorder": ">"},
-        {"imagej": True},
-    ],
-    ids=str,
-)
+@pytest.mark.parametrize("options", TIFF_KINDS, ids=str)
 def test_every_kind_of_tiff_gives_the_same_frames_and_none_is_lost(tmp_path: Path, options: dict) -> None:
     path = tmp_path / "t.tif"
     tifffile.imwrite(path, FRAMES, photometric="minisblack", **options)
@@ -611,30 +612,31 @@ def test_an_honest_tiff_of_that_kind_is_read(tmp_path: Path) -> None:
 NOTHING = zlib.compress(bytes(20_000))
 
 
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        (tiff(400_000, 400_000, NOTHING, 8), "declares 400000 x 400000"),
-        (tiff(12_000, 12_000, NOTHING, 8), "more than"),
-        (tiff(100, 100, zlib.compress(bytes(10**8)), 8), "cannot be decoded"),
-        (tiff(100, 100, imagecodecs.zstd_encode(bytes(10**8)), 50_000), "cannot be decoded"),
-        (tiff(100, 100, zlib.compress(bytes(100)), 8), "cannot be decoded"),
-        (tiff(100, 100, imagecodecs.lzw_encode(bytes(100)), 5), "cannot be decoded"),
-        (tiff(100, 100, bytes(100), 1), "cannot be decoded"),
-        (tiff(100, 100, NOTHING, 8, following=8), "circle"),
-        (tiff(100, 100, NOTHING, 8, following=10**9), "page 1 lies at byte"),
-        (tiff(100, 100, NOTHING, 8, software_at=10**9), "tag 305 of page 0 ends at byte 1000000008"),
-        (tiff(100, 100, b"", 1), "the data of page 0"),
-        (tiff(100, 0, NOTHING, 8), "declares 100 x 0"),
-        (b"II*\0\0\0\0\0", "no pages"),
-        (b"II*\0\x08\0", "header"),
-        (b"II+\0" + b"\xff" * 100, "t.img"),
-        (png(400_000, 400_000, NOTHING), "declares 400000 x 400000"),
-        (png(100, 100, zlib.compress(bytes(100))), "cannot be decoded"),
-        (b"\x89PNG\r\n\x1a\n", "cut off"),
-        (b"BM" + bytes(100), "neither a TIFF nor a PNG"),
-    ],
-)
+# What is no image that could be, and words of what is said of it.
+ABSURD_IMAGES = [
+    (tiff(400_000, 400_000, NOTHING, 8), "declares 400000 x 400000"),
+    (tiff(12_000, 12_000, NOTHING, 8), "more than"),
+    (tiff(100, 100, zlib.compress(bytes(10**8)), 8), "cannot be decoded"),
+    (tiff(100, 100, imagecodecs.zstd_encode(bytes(10**8)), 50_000), "cannot be decoded"),
+    (tiff(100, 100, zlib.compress(bytes(100)), 8), "cannot be decoded"),
+    (tiff(100, 100, imagecodecs.lzw_encode(bytes(100)), 5), "cannot be decoded"),
+    (tiff(100, 100, bytes(100), 1), "cannot be decoded"),
+    (tiff(100, 100, NOTHING, 8, following=8), "circle"),
+    (tiff(100, 100, NOTHING, 8, following=10**9), "page 1 lies at byte"),
+    (tiff(100, 100, NOTHING, 8, software_at=10**9), "tag 305 of page 0 ends at byte 1000000008"),
+    (tiff(100, 100, b"", 1), "the data of page 0"),
+    (tiff(100, 0, NOTHING, 8), "declares 100 x 0"),
+    (b"II*\0\0\0\0\0", "no pages"),
+    (b"II*\0\x08\0", "header"),
+    (b"II+\0" + b"\xff" * 100, "t.img"),
+    (png(400_000, 400_000, NOTHING), "declares 400000 x 400000"),
+    (png(100, 100, zlib.compress(bytes(100))), "cannot be decoded"),
+    (b"\x89PNG\r\n\x1a\n", "cut off"),
+    (b"BM" + bytes(100), "neither a TIFF nor a PNG"),
+]
+
+
+@pytest.mark.parametrize(("content", "words"), ABSURD_IMAGES)
 def test_absurd_images_are_refused_quickly(tmp_path: Path, content: bytes, words: str) -> None:
     path = tmp_path / "t.img"
     path.write_bytes(content)
@@ -675,3 +677,19 @@ def test_written_images_read_back_and_hold_no_time(tmp_path: Path) -> None:
 def test_the_experiments_images(data_folder: Path) -> None:
     image = read_image(data_folder / "channel" / "dark.tif", (1768, 2352))
     assert image.mean() == pytest.approx(96.0, abs=0.1)  # the dark level, read noise 6 over four million pixels
+
+
+def test_what_a_killed_process_had_begun_to_write_is_removed(tmp_path: Path) -> None:
+    killed = "import os, pathlib, signal, sys; from lfpiv_cli.files.atomic import write_atomically as write; " + (
+        "write(pathlib.Path(sys.argv[1]), lambda path: os.kill(os.getpid(), signal.SIGKILL), overwrite=False)"
+    )
+    subprocess.run([sys.executable, "-c", killed, tmp_path / "x.json"], cwd=ROOT, check=False)
+    (left,) = tmp_path.iterdir()
+    found = atomic.PARTIAL.fullmatch(left.name)
+    assert found is not None
+    of_another_host = left.with_name(left.name.replace(found["host"], "0" * 8))
+    of_a_living_one = left.with_name(left.name.replace(f"-{found['process']}-", f"-{os.getppid()}-"))
+    for path in (of_another_host, of_a_living_one):
+        path.write_bytes(b"")
+    write_json(tmp_path / "x.json", {}, overwrite=False)
+    assert sorted(tmp_path.iterdir()) == sorted([of_another_host, of_a_living_one, tmp_path / "x.json"])

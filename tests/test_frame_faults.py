@@ -11,9 +11,12 @@ import numpy as np
 import pytest
 import tifffile
 
+from lfpiv_cli.errors import InputError
+from lfpiv_cli.files.checksums import ensure_verified
 from lfpiv_cli.files.images import count_pages, read_image
 from lfpiv_cli.files.recordings import tiff_chain
 from lfpiv_cli.files.recordings.complaints import taken_complaints
+from tests import camera_files
 from tests.hostile_files import ended
 
 ROOT = Path(__file__).parent.parent
@@ -123,6 +126,15 @@ def test_a_list_of_sums_has_all_inputs(tmp_path: Path) -> None:
     listed = sums(tmp_path, "other")
     code, said = ended("build-weights", config, "--dry-run", "-o", tmp_path / "w.h5", "--verify", listed)
     assert "rig.yaml: is not in" in said
+
+
+def test_what_a_recording_is_read_with_is_verified_too(tmp_path: Path) -> None:
+    camera_files.write_set(tmp_path / "run.set", [np.zeros((1, 5, 7), np.uint16)] * 2)
+    listed = sums(tmp_path, "run.set", "run/B00001.im7", "run/B00002.im7")
+    assert ensure_verified(listed, [tmp_path / "run.set"]) == 3
+    camera_files.write_im7(tmp_path / "run" / "B00002.im7", np.ones((1, 5, 7), np.uint16))
+    with pytest.raises(InputError, match=r"B00002\.im7: has the SHA-256"):
+        ensure_verified(listed, [tmp_path / "run.set"])
 
 
 def test_what_a_decoder_complains_of_is_a_warning(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -157,3 +158,18 @@ def test_what_no_file_of_ours_has_is_refused(tmp_path: Path, whole: dict[str, by
     code, said = ended("info", path)
     assert code == 4
     assert "file: " in said
+
+
+def test_what_does_not_fit_into_memory_gives_7_and_its_size(
+    tmp_path: Path, whole: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(array: h5py.Dataset, _: object) -> None:
+        raise MemoryError
+
+    path = tmp_path / "file.h5"
+    path.write_bytes(whole["weights"])
+    monkeypatch.setattr(h5py.Dataset, "__getitem__", refused)
+    words = ("reconstruct", path, ROOT / "sample_data" / "pair_a.tif", "-o", tmp_path / "v.vtkhdf")
+    code, said = ended(*words)
+    assert code == 7
+    assert re.search(r"too little memory: /\S+ of \S+file\.h5 needs 0\.00 GB", said), said

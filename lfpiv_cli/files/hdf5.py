@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +42,6 @@ BROKEN_FILE_ERRORS = (
     ValueError,
     TypeError,
     RuntimeError,
-    MemoryError,
     OverflowError,
     AttributeError,
 )
@@ -119,12 +119,37 @@ def create(
 def write_array(group: h5py.Group, name: str, array: NDArray[Any], units: str | None = None) -> h5py.Dataset:
     """Write a numeric array with checksums; an array without elements has nothing to check."""
     array = np.ascontiguousarray(array)
-    if array.dtype.kind not in "fiu":
-        raise TypeError(f"{name}: arrays are floating point or integer, not {array.dtype}")
-    options: dict[str, Any] = {}
-    if array.size and array.ndim:
-        options = {"chunks": _chunk_shape(array.shape, array.itemsize), **FILTERS}
-    dataset = group.create_dataset(name, data=array, track_times=False, **options)
+    dataset = group.create_dataset(name, data=array, track_times=False, **_storage(name, array.shape, array.dtype))
+    return _with_units(dataset, units)
+
+
+def write_rows(
+    group: h5py.Group, name: str, count: int, pieces: Iterable[NDArray[Any]], units: str | None = None
+) -> h5py.Dataset:
+    """Write as `write_array` does an array of so many rows that comes in pieces of them, one at least."""
+    pieces = iter(pieces)
+    held = next(pieces)
+    shape, dtype = (count, *held.shape[1:]), held.dtype
+    dataset = group.create_dataset(name, shape, dtype, track_times=False, **_storage(name, shape, dtype))
+    done = 0
+    # Chunks are written whole: without a cache each part of one would be unpacked and packed again.
+    for piece in chain(pieces, [held[:0]]):
+        whole = len(held) if done + len(held) == count else len(held) // dataset.chunks[0] * dataset.chunks[0]
+        if whole:
+            dataset[done : done + whole] = held[:whole]
+        done += whole
+        held = np.concatenate([held[whole:], piece]) if whole < len(held) else piece
+    return _with_units(dataset, units)
+
+
+def _storage(name: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> dict[str, Any]:
+    """Return how an array is stored; one without elements has no chunks."""
+    if dtype.kind not in "fiu":
+        raise TypeError(f"{name}: arrays are floating point or integer, not {dtype}")
+    return {"chunks": _chunk_shape(shape, dtype.itemsize), **FILTERS} if shape and 0 not in shape else {}
+
+
+def _with_units(dataset: h5py.Dataset, units: str | None) -> h5py.Dataset:
     if units is not None:
         dataset.attrs["units"] = np.bytes_(units)
     return dataset
@@ -136,23 +161,41 @@ def read_array(dataset: h5py.Dataset, file_bytes: int) -> NDArray[Any]:
     Parameters
     ----------
     file_bytes : size of the file, the bound on what may be declared
+
+    Raises
+    ------
+    OutputError : an array that the file does hold does not fit into memory
     """
     ensure_array(dataset, file_bytes)
-    return dataset[()]
+    try:
+        return dataset[()]
+    except MemoryError as error:
+        size_gb = dataset.size * dataset.dtype.itemsize / 1e9
+        raise OutputError(
+            f"too little memory: {dataset.name} of {dataset.file.filename} needs {size_gb:.2f} GB"
+        ) from error
 
 
 @contextmanager
 def open_h5(path: Path) -> Iterator[h5py.File]:
-    """Open an HDF5 file for reading; whatever fails inside is an `InputError` that names the file."""
+    """Open an HDF5 file for reading; what fails inside, but for want of memory, is an `InputError` of it."""
     ensure_regular_file(path)
     try:
         with h5py.File(path, "r", locking="best-effort") as file:
             if "format" in file.attrs:
-                ensure_ours(file, path.stat().st_size)
+                _ensure_ours(path, file)
             yield file
     except LfpivError:
         raise
     except BROKEN_FILE_ERRORS as error:
+        raise InputError(f"{path}: not a readable HDF5 file of ours: {reason(error)}") from error
+
+
+def _ensure_ours(path: Path, file: h5py.File) -> None:
+    """Look at a file's objects; what takes more memory than there is says a size there that it cannot have."""
+    try:
+        ensure_ours(file, path.stat().st_size)
+    except MemoryError as error:
         raise InputError(f"{path}: not a readable HDF5 file of ours: {reason(error)}") from error
 
 

@@ -9,7 +9,8 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Iterator
-from typing import TypeAlias
+from functools import lru_cache
+from typing import Any, TypeAlias
 
 import h5py
 import numpy as np
@@ -22,7 +23,7 @@ LARGEST_RATIO = 1100
 # Our deepest tree has four levels, and some fifty objects; hard links can form circles.
 DEEPEST, MOST_OBJECTS, MOST_ATTRIBUTES = 12, 10_000, 1_000
 # netCDF's dimension scales refer to each other in these; nothing here reads them.
-OF_DIMENSION_SCALES = ("DIMENSION_LIST", "REFERENCE_LIST")
+OF_DIMENSION_SCALES = (b"DIMENSION_LIST", b"REFERENCE_LIST")
 
 Item: TypeAlias = h5py.Group | h5py.Dataset
 
@@ -51,18 +52,18 @@ def ensure_ours(file: h5py.File, file_bytes: int) -> None:
     ValueError : links, arrays or attributes that lead elsewhere, of other kinds, or larger than the file can hold; or
         attributes that are not those of the check sum
     """
-    objects = list(_objects(file))
+    objects, memory = list(_objects(file)), physical_memory()
     for path, item in objects:
         if isinstance(item, h5py.h5d.DatasetID):
-            _ensure_array(path.decode("utf-8", "replace"), item, file_bytes)
-    found = _digest(objects, file_bytes)
-    if DIGEST in file.attrs and file.attrs[DIGEST] != found:
+            _ensure_array(_text(path), item, file_bytes, memory)
+    found, written = _digest(objects, file_bytes)
+    if written not in (None, found):
         raise ValueError("its attributes are not those that were written: it is damaged, or was edited")
 
 
 def write_digest(file: h5py.File) -> None:
     """Write the check sum of all attributes; nothing may be written after it."""
-    file.attrs[DIGEST] = _digest(list(_objects(file)), None)
+    file.attrs[DIGEST] = np.bytes_(_digest(list(_objects(file)), None)[0])
 
 
 def ensure_array(dataset: h5py.Dataset, file_bytes: int) -> None:
@@ -72,13 +73,14 @@ def ensure_array(dataset: h5py.Dataset, file_bytes: int) -> None:
     ----------
     file_bytes : size of the file, the bound on what may be declared
     """
-    _ensure_array(dataset.name, dataset.id, file_bytes)
+    _ensure_array(dataset.name, dataset.id, file_bytes, physical_memory())
 
 
-# Below, h5py's plain handles: its groups and arrays take ten times as long to open.
+# Below, h5py's plain handles: its groups and arrays take ten times as long to open. A handle takes some 10 us, one of a
+# type or a shape, too: as few as possible are asked for.
 
 
-def _ensure_array(name: str, array: h5py.h5d.DatasetID, file_bytes: int) -> None:
+def _ensure_array(name: str, array: h5py.h5d.DatasetID, file_bytes: int, memory: int) -> None:
     # Asked of the list of properties alone: the shape of a virtual dataset would open the files that it leads to.
     properties = array.get_create_plist()
     layout = properties.get_layout()
@@ -88,7 +90,7 @@ def _ensure_array(name: str, array: h5py.h5d.DatasetID, file_bytes: int) -> None
     if dtype.kind not in "fiu" or shape is None:
         raise ValueError(f"{name} has type {dtype}, expected numbers")
     stored = min(array.get_storage_size(), file_bytes)
-    allowed = min(LARGEST_RATIO * stored, physical_memory())
+    allowed = min(LARGEST_RATIO * stored, memory)
     declared = math.prod(shape) * dtype.itemsize
     if declared > allowed:
         raise ValueError(f"{name} declares {declared} bytes, more than the {allowed} that are possible")
@@ -106,10 +108,11 @@ def _ensure_array(name: str, array: h5py.h5d.DatasetID, file_bytes: int) -> None
 
 def _objects(file: h5py.File) -> Iterator[tuple[bytes, h5py.h5g.GroupID | h5py.h5d.DatasetID]]:
     """Yield every group and array of a file once, by hard links alone, with its first path in the order of names."""
-    links: list[tuple[bytes, int]] = []
+    links: list[tuple[bytes, int, int]] = []
 
     def note(name: bytes, link: h5py.h5l.LinkInfo) -> bool | None:
-        links.append((name, link.type))
+        # Of a hard link, the last is where its object lies in the file.
+        links.append((name, link.type, link.u))
         return True if len(links) > MOST_OBJECTS else None
 
     root = h5py.h5g.open(file.id, b"/")
@@ -117,12 +120,11 @@ def _objects(file: h5py.File) -> Iterator[tuple[bytes, h5py.h5g.GroupID | h5py.h
         raise ValueError(f"it holds more than {MOST_OBJECTS} groups and arrays")
     yield b"", root
     seen = {h5py.h5o.get_info(root).addr}
-    for name, kind in sorted(links):
+    for name, kind, address in sorted(links):
         if kind != h5py.h5l.TYPE_HARD:
             raise ValueError(f"/{_text(name)} is not a hard link")
         if name.count(b"/") > DEEPEST:
             raise ValueError(f"/{_text(name)} lies deeper than {DEEPEST} groups")
-        address = h5py.h5o.get_info(root, name).addr
         if address in seen:
             continue
         seen.add(address)
@@ -132,38 +134,54 @@ def _objects(file: h5py.File) -> Iterator[tuple[bytes, h5py.h5g.GroupID | h5py.h
         yield b"/" + name, item
 
 
-def _digest(objects: list[tuple[bytes, h5py.h5g.GroupID | h5py.h5d.DatasetID]], file_bytes: int | None) -> np.bytes_:
-    """Return the SHA-256 of the names, types, shapes and bytes of all attributes, in hexadecimal digits.
+def _digest(
+    objects: list[tuple[bytes, h5py.h5g.GroupID | h5py.h5d.DatasetID]], file_bytes: int | None
+) -> tuple[bytes, bytes | None]:
+    """Return the SHA-256 of the names, types, shapes and bytes of all attributes, and the one that the file has.
 
-    Attributes that are neither numbers nor strings of fixed length, or larger than the file, are refused.
+    Both in hexadecimal digits. Attributes that are neither numbers nor strings of fixed length, or larger than the
+    file, are refused.
     """
-    found = hashlib.sha256()
+    found, written = hashlib.sha256(), None
     for path, item in objects:
         for name in _told(item):
             attribute = h5py.h5a.open(item, name)
+            stored = attribute.get_type()
             # An empty attribute has no shape, nor anything to read.
-            dtype, shape = attribute.dtype, attribute.shape
+            dtype, shape = _dtype(stored.encode()), attribute.shape
             if dtype.kind not in "biufS":
                 raise ValueError(f"the attribute {_text(name)} has type {dtype}, expected numbers or bytes")
             declared = math.prod(shape or ()) * dtype.itemsize
             if file_bytes is not None and declared > file_bytes:
                 raise ValueError(f"the attribute {_text(name)} declares {declared} bytes, the file has {file_bytes}")
-            if name == DIGEST.encode():
-                continue
             value = np.zeros(0 if shape is None else shape, dtype)
             if value.size:
-                attribute.read(value)
+                # As it is stored, where numpy has that very type: a type of the value's would be one more handle.
+                attribute.read(value, stored if stored.get_size() == dtype.itemsize else None)
+            if name == DIGEST.encode():
+                written = value.tobytes()
+                continue
             found.update(path + f"\0{_text(name)}\0{dtype.str}\0{shape}\0".encode() + value.tobytes())
-    return np.bytes_(found.hexdigest())
+    return found.hexdigest().encode(), written
+
+
+@lru_cache(maxsize=64)
+def _dtype(encoded: bytes) -> np.dtype[Any]:
+    """Return numpy's type for one of HDF5's, as this describes it in bytes."""
+    return h5py.h5t.decode(encoded).dtype
 
 
 def _told(item: h5py.h5g.GroupID | h5py.h5d.DatasetID) -> list[bytes]:
     """Return the names of an object's attributes, sorted, without those of dimension scales."""
-    if h5py.h5a.get_num_attrs(item) > MOST_ATTRIBUTES:
-        raise ValueError(f"an object has more than {MOST_ATTRIBUTES} attributes")
     names: list[bytes] = []
-    h5py.h5a.iterate(item, names.append)
-    return sorted(name for name in names if _text(name) not in OF_DIMENSION_SCALES)
+
+    def note(name: bytes) -> bool | None:
+        names.append(name)
+        return True if len(names) > MOST_ATTRIBUTES else None
+
+    if h5py.h5a.iterate(item, note):
+        raise ValueError(f"an object has more than {MOST_ATTRIBUTES} attributes")
+    return sorted(name for name in names if name not in OF_DIMENSION_SCALES)
 
 
 def _text(name: bytes) -> str:

@@ -7,8 +7,8 @@ import re
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import BufferedReader
 from pathlib import Path
-from typing import BinaryIO
 
 from lfpiv_cli.errors import InputError, OutputError
 
@@ -38,13 +38,25 @@ def split_page(part: str | None) -> tuple[str | None, int | None]:
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[BinaryIO]:
-    """Open a file for reading its bytes; what the system refuses, then or later, is an `InputError` that names it."""
+def reading_from(path: Path) -> Iterator[None]:
+    """Read from a file or folder; what the system refuses meanwhile is an `InputError` that names it."""
     try:
-        with open(path, "rb") as file:
-            yield file
+        yield
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {reason(error)}") from error
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[BufferedReader]:
+    """Open a file for reading its bytes; see `reading_from`."""
+    with reading_from(path), open(path, "rb") as file:
+        yield file
+
+
+def content_of(path: Path) -> bytes:
+    """Return all bytes of a file; see `reading_from`."""
+    with opened(path) as file:
+        return file.read()
 
 
 def given(**inputs: Path | str | None) -> dict[str, Path]:

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import platform
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from importlib.metadata import version
@@ -23,7 +24,7 @@ import lfpiv_cli
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.files.atomic import without_nan
 from lfpiv_cli.files.hdf5 import open_h5, read_provenance
-from lfpiv_cli.files.inputs import ensure_regular_file, reason, split_part
+from lfpiv_cli.files.inputs import ensure_regular_file, opened, reading_from, split_part
 from lfpiv_cli.files.recordings.formats import files_beside
 from lfpiv_cli.notice import Notice
 
@@ -73,8 +74,8 @@ def record(
     -------
     dict
         `program`, `version`, `libraries`, `command`, `config`, `inputs` (by role: name without folder and SHA-256; of
-        images that have them the time, and the SHA-256 of a header `beside`) and `made_from`: the records of those
-        inputs, and of what these were made from, that are results of this program, by SHA-256.
+        images that have them the time, and the SHA-256 of a header or folder `beside`) and `made_from`: the records of
+        those inputs, and of what these were made from, that are results of this program, by SHA-256.
 
     Raises
     ------
@@ -197,8 +198,13 @@ def calibrated_with(made: Mapping[str, Any]) -> str | None:
 
 
 def sha256(path: Path) -> str:
-    """Return the SHA-256 of a file, in hexadecimal digits; of the whole file where a part of it is named."""
+    """Return the SHA-256 of a file, in hexadecimal digits; of the whole file where a part of it is named.
+
+    Of a folder, that of the list of its files with the SHA-256 of each, as `sha256sum` prints it.
+    """
     file, _ = split_part(path)
+    if file.is_dir():
+        return _sha256_of_all(file, tuple(_states_in(file)))
     size = ensure_regular_file(file)
     return _sha256(file, size, file.stat().st_mtime_ns)
 
@@ -206,11 +212,24 @@ def sha256(path: Path) -> str:
 @lru_cache(maxsize=FILES_REMEMBERED)
 def _sha256(path: Path, size: int, modified_ns: int) -> str:
     """Hash a file once as long as it does not change: what all frames of a batch share is an input of each."""
-    try:
-        with open(path, "rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {reason(error)}") from error
+    with opened(path) as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _states_in(folder: Path) -> Iterator[tuple[str, int, int]]:
+    """Yield name, size and time of the files in a folder, by their names; not of hidden ones and of folders."""
+    with reading_from(folder), os.scandir(folder) as entries:
+        for entry in sorted(entries, key=lambda each: each.name):
+            if entry.is_file() and not entry.name.startswith("."):
+                status = entry.stat()
+                yield entry.name, status.st_size, status.st_mtime_ns
+
+
+@lru_cache(maxsize=FILES_REMEMBERED)
+def _sha256_of_all(folder: Path, states: Sequence[tuple[str, int, int]]) -> str:
+    """Hash the files of a folder once as long as none of them changes."""
+    lines = (f"{_sha256(folder / name, size, modified_ns)}  {name}\n" for name, size, modified_ns in states)
+    return hashlib.sha256(os.fsencode("".join(lines))).hexdigest()
 
 
 def bear_alike(first: Mapping[str, Any], second: Mapping[str, Any]) -> bool:
