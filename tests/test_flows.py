@@ -11,13 +11,16 @@ from lfpiv_cli.synthetic.flows import (
     FLOWS,
     STEADY,
     Pulsation,
+    abc,
     advect,
     random_modes,
     rigid_rotation,
     shear,
+    source,
     square_duct,
     taylor_green,
     uniform,
+    vortex_ring,
 )
 
 WIDTH = 10.0
@@ -31,6 +34,16 @@ EXAMPLES = {
     "shear": shear(4.0, "z", "x", CENTRE),
     "uniform": uniform((0.1, -0.02, 0.03)),
     "random_modes": random_modes(0.05, shortest_mm=8.0, centre_mm=CENTRE),
+    "abc": abc((0.05, 0.03, -0.02), 8.0, CENTRE),
+    "vortex_ring": vortex_ring(0.05, 3.0, 2.0, "y", CENTRE),
+    "source": source(40.0, 2.0, CENTRE, (0.0, 0.01, 0.0)),
+}
+CELLULAR = taylor_green(0.05, 8.0, CENTRE, "yz", third_amplitude_m_s=0.03)
+SOLENOIDAL = {name: flow for name, flow in EXAMPLES.items() if name != "source"} | {"cellular": CELLULAR}
+WITH_PRESSURE = {
+    "taylor_green": taylor_green(0.05, 8.0, CENTRE, "yz", velocity_m_s=(0.2, 0.0, 0.0)),
+    "rigid_rotation": EXAMPLES["rigid_rotation"],
+    "abc": EXAMPLES["abc"],
 }
 
 
@@ -53,12 +66,41 @@ def test_registry_holds_every_flow():
         assert flow(np.zeros((4, 3))).shape == (4, 3), name
 
 
-@pytest.mark.parametrize("name", EXAMPLES)
+@pytest.mark.parametrize("name", SOLENOIDAL)
 def test_flows_are_divergence_free(name, rng):
     points = CENTRE + rng.uniform(-4.0, 4.0, (50, 3))
     # central differences of smooth functions with a step of 1e-3 of the scale: 1e-6 relative, rounding 1e-11
-    trace = np.trace(gradient(EXAMPLES[name], points, 1e-3), axis1=1, axis2=2)
+    trace = np.trace(gradient(SOLENOIDAL[name], points, 1e-3), axis1=1, axis2=2)
     assert np.abs(trace).max() < 1e-5
+    assert np.abs(np.trace(SOLENOIDAL[name].gradient(points), axis1=1, axis2=2)).max() < 1e-11
+
+
+@pytest.mark.parametrize("name", [*EXAMPLES, "cellular"])
+def test_gradients_are_those_of_the_velocities(name, rng):
+    flow = CELLULAR if name == "cellular" else EXAMPLES[name]
+    # beyond the duct's walls, too, but not across them
+    points = CENTRE + np.concatenate([rng.uniform(-4.0, 4.0, (40, 3)), rng.uniform(6.0, 8.0, (5, 3))])
+    # up to 60 per second, of central differences 1e-6 of it
+    assert flow.gradient(points) == pytest.approx(gradient(flow, points, 1e-3), abs=1e-4)
+
+
+@pytest.mark.parametrize("name", WITH_PRESSURE)
+def test_pressure_accelerates_the_fluid_as_euler_demands(name, rng):
+    flow, points, density, step = WITH_PRESSURE[name], CENTRE + rng.uniform(-4.0, 4.0, (30, 3)), 998.0, 1e-3
+    slopes = [
+        (flow.pressure(points + step * e, density) - flow.pressure(points - step * e, density)) for e in np.eye(3)
+    ]
+    acceleration = np.einsum("nij,nj->ni", flow.gradient(points), flow(points))
+    # central differences over 2 um, in Pa/m; accelerations reach 1 m/s^2
+    assert np.stack(slopes, axis=1) / (2e-3 * step) == pytest.approx(-density * acceleration, abs=1e-2)
+    assert np.abs(acceleration).max() > 0.05
+
+
+def test_pressure_is_left_out_without_a_closed_form():
+    moved = {"velocity_m_s": (0.0, 0.0, 0.1)}
+    assert taylor_green(0.05, 8.0, **moved).pressure is None
+    assert abc((0.1, 0.1, 0.1), 8.0, **moved).pressure is None
+    assert CELLULAR.pressure is None
 
 
 def test_duct_mean_over_the_section_is_the_given_mean():
@@ -118,6 +160,49 @@ def test_taylor_green_and_shear_by_hand():
     assert flow(points) == pytest.approx(np.array([[0.05, 0.01, 0], [0.025, 0.01, -0.025]]), abs=1e-15)
     # 4 per second over 2 mm: 8 mm/s along z
     assert shear(4.0, "z", "x", CENTRE)(np.array([(2.0, 1.0, 1.0)]) + CENTRE) == pytest.approx(np.array([[0, 0, 8e-3]]))
+
+
+def test_taylor_green_in_three_dimensions_by_hand():
+    # an eighth along all axes: each amplitude / 2^(3/2), that of z, the second axis, less the sum of the others
+    expected = np.array([0.03, 0.05, -0.08]) / np.sqrt(8.0)
+    assert CELLULAR(np.array([(1.0, 1.0, 1.0)]) + CENTRE)[0] == pytest.approx(expected, abs=1e-15)
+    still = np.array([(1.0, 2.0, 2.0), (0.0, 0.0, 0.0)]) + CENTRE
+    assert CELLULAR(still) == pytest.approx(np.zeros((2, 3)), abs=1e-15)
+
+
+def test_abc_by_hand_and_its_vorticity_lies_along_its_velocity(rng):
+    flow, points = EXAMPLES["abc"], CENTRE + rng.uniform(-4.0, 4.0, (20, 3))
+    # a quarter wavelength along z: sin is 1, cos is 0
+    assert flow(np.array([(0.0, 0.0, 2.0)]) + CENTRE)[0] == pytest.approx([0.05 - 0.02, 0.0, 0.03])
+    slope = flow.gradient(points)
+    vorticity = np.stack([slope[:, k - 1, k - 2] - slope[:, k - 2, k - 1] for k in range(3)], axis=1)
+    assert vorticity == pytest.approx(1e3 * 2.0 * np.pi / 8.0 * flow(points))
+
+
+def test_vortex_ring_blows_through_its_middle_and_ends_a_few_cores_off():
+    flow, axis = vortex_ring(0.05, 4.0, 0.2, "y", CENTRE), np.eye(3)[[2, 0, 1]]
+    ring = CENTRE + 4.0 * axis[0]
+    # about a thin core the fluid turns, forwards inside, with the given speed
+    inside, outside, ahead, behind = flow(ring + 0.2 * np.stack([-axis[0], axis[0], axis[2], -axis[2]]))
+    assert inside == pytest.approx(0.05 * axis[2], rel=0.05, abs=1e-10)
+    assert outside == pytest.approx(-0.05 * axis[2], rel=0.2, abs=1e-10)
+    # in front and behind it moves forwards, too, by twice the core's share of the radius
+    assert ahead == pytest.approx(0.05 * axis[0] + 0.005 * axis[2], abs=1e-4)
+    assert behind == pytest.approx(-0.05 * axis[0] + 0.005 * axis[2], abs=1e-4)
+    thick = vortex_ring(0.05, centre_mm=CENTRE)
+    assert thick(np.array([CENTRE]))[0] == pytest.approx([0.0, 0.0, 0.05], abs=1e-12)
+    far = CENTRE + 12.0 * np.eye(3)
+    assert np.abs(thick(far)).max() < 1e-6
+
+
+def test_source_has_its_divergence_and_sinks_take_the_fluid_up():
+    flow = EXAMPLES["source"]
+    divergence = np.trace(flow.gradient(CENTRE + np.outer([0.0, 2.0, 4.0], (0.0, 0.6, 0.8))), axis1=1, axis2=2)
+    # 3 q (1 - r^2 / (3 radius^2)) exp(-r^2 / (2 radius^2))
+    assert divergence == pytest.approx([40.0, 40.0 * 2.0 / 3.0 * np.exp(-0.5), -40.0 / 3.0 * np.exp(-2.0)])
+    # at one radius q r exp(-1/2), in mm/s, plus the uniform velocity
+    moved = flow(np.array([(2.0, 0.0, 0.0)]) + CENTRE)[0]
+    assert moved == pytest.approx([1e-3 * 80.0 / 3.0 * np.exp(-0.5), 0.01, 0.0])
 
 
 def test_advection_follows_a_circle(rng):

@@ -37,6 +37,33 @@ def test_tracers_of_a_sequence_are_there_before_they_are_carried_in(tmp_path: Pa
     assert sorted(path.name for path in (tmp_path / "2").glob("*.tif")) == ["pair_a.tif", "pair_b.tif"]
 
 
+FLOWS_OF_FIELDS = {
+    "cellular": "kind: taylor_green, amplitude_m_s: 0.05, wavelength_mm: 4.0, third_amplitude_m_s: 0.05",
+    "abc": "kind: abc, amplitudes_m_s: [0.05, 0.04, 0.03], wavelength_mm: 4.0",
+    "ring": "kind: vortex_ring, speed_m_s: 0.05, radius_mm: 1.0, core_mm: 0.5, axis: x",
+    "source": "kind: source, rate_per_s: 60.0, radius_mm: 1.0, velocity_m_s: [0.02, 0.0, 0.0]",
+    "modes": "kind: random_modes, rms_m_s: 0.05, shortest_mm: 2.0, modes: 50",
+}
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("name", FLOWS_OF_FIELDS)
+def test_every_flow_is_rendered_with_its_velocities(tmp_path: Path, name: str) -> None:
+    rig, flow = tmp_path / "rig.yaml", f"  flow: {{{FLOWS_OF_FIELDS[name]}}}"
+    lines = [flow if line.startswith("  flow: {") else line for line in SAMPLE.read_text().splitlines()]
+    few = "particles: 40\n  rays: 1"
+    rig.write_text("\n".join(lines).replace("particles: 400", few))
+    cli.main(["simulate", "particles", str(rig), "-o", str(tmp_path / "out")], standalone_mode=False)
+    truth = read_particles(tmp_path / "out" / "particles.npz")
+    assert truth.frame_positions_mm is not None
+    moved = np.diff(truth.frame_positions_mm, axis=0)[0]
+    assert np.abs(moved).max() > 0.01
+    # 2 ms between frames; what the velocity changes on the way is of third order in time: some per cent
+    assert 1e3 * 0.002 * truth.velocities_m_s == pytest.approx(moved, abs=0.01)
+    image = read_image(tmp_path / "out" / "pair_b.tif")
+    assert image.max() > image.min()
+
+
 def sequence_of(folder: Path, keys: str, velocity_m_s: str = "[0, 0, 0.2]", layers: int = 40) -> Particles:
     """Simulate tracers that all move by 0.4 mm between six frames, with few rays; return their truth."""
     rig, output = folder / "rig.yaml", folder / "out"

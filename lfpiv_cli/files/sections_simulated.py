@@ -47,13 +47,17 @@ class RigidRotation(Section):
 
 
 class TaylorGreen(Section):
-    """Vortices of amplitude_m_s and wavelength_mm in a plane (xy, xz, yz), four around centre_mm, plus velocity_m_s."""
+    """Vortices of amplitude_m_s and wavelength_mm in a plane (xy, xz, yz), four around centre_mm, plus velocity_m_s.
+
+    third_amplitude_m_s: along the axis across the plane, for vortices in three dimensions (null: plane ones).
+    """
 
     kind: Literal["taylor_green"]
     amplitude_m_s: float
     wavelength_mm: Positive
     centre_mm: Vector = (0.0, 0.0, 0.0)
     plane: Literal["xy", "xz", "yz"] = "xz"
+    third_amplitude_m_s: float | None = None
     velocity_m_s: Vector = (0.0, 0.0, 0.0)
 
 
@@ -91,8 +95,51 @@ class RandomModes(Section):
     velocity_m_s: Vector = (0.0, 0.0, 0.0)
 
 
+class Abc(Section):
+    """The flow of Arnold, Beltrami and Childress, waves of amplitudes_m_s (A, B, C) and wavelength_mm.
+
+    A goes with z, B with x, C with y, counted from centre_mm; velocity_m_s: a uniform velocity that is added.
+    """
+
+    kind: Literal["abc"]
+    amplitudes_m_s: Vector
+    wavelength_mm: Positive
+    centre_mm: Vector = (0.0, 0.0, 0.0)
+    velocity_m_s: Vector = (0.0, 0.0, 0.0)
+
+
+class VortexRing(Section):
+    """A frozen vortex ring of radius_mm about an axis through centre_mm, its core core_mm thick, plus velocity_m_s.
+
+    speed_m_s: about a thin core, at its thickness from its middle; in the middle of a ring whose radius is twice as
+    large as its core is thick, along the axis.
+    """
+
+    kind: Literal["vortex_ring"]
+    speed_m_s: float
+    radius_mm: Positive = 3.0
+    core_mm: Positive = 1.5
+    axis: Literal["x", "y", "z"] = "z"
+    centre_mm: Vector = (0.0, 0.0, 0.0)
+    velocity_m_s: Vector = (0.0, 0.0, 0.0)
+
+
+class Source(Section):
+    """Fluid that comes out of a Gaussian cloud of radius_mm around centre_mm, plus velocity_m_s: not solenoidal.
+
+    rate_per_s: the divergence at the centre; further out sinks take the fluid up again.
+    """
+
+    kind: Literal["source"]
+    rate_per_s: float
+    radius_mm: Positive = 2.0
+    centre_mm: Vector = (0.0, 0.0, 0.0)
+    velocity_m_s: Vector = (0.0, 0.0, 0.0)
+
+
 FlowSection = Annotated[
-    SquareDuct | RigidRotation | TaylorGreen | Shear | Uniform | RandomModes, Field(discriminator="kind")
+    SquareDuct | RigidRotation | TaylorGreen | Shear | Uniform | RandomModes | Abc | VortexRing | Source,
+    Field(discriminator="kind"),
 ]
 
 

@@ -1,4 +1,4 @@
-"""Known flows: functions from points to velocities, made by small factories.
+"""Known flows, made by small factories, and the way of what they carry.
 
 Axes: world (x, y, z), z away from the camera, in the frame of the points that are passed in; each flow is placed by its
 `centre_mm` in that frame. Points in mm, velocities in m/s, rates per second. A new flow is one factory and one line of
@@ -14,12 +14,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Flow = Callable[[NDArray[np.float64]], NDArray[np.float64]]
-"""Velocities in m/s, (n, 3), at points in mm, (n, 3)."""
-
-Axis = Literal["x", "y", "z"]
-
-MM_PER_M = 1000.0
+from lfpiv_cli.synthetic.known_flow import MM_PER_M, ORIGIN, Axis, Flow, KnownFlow, axis_index, dynamic_pressure
+from lfpiv_cli.synthetic.vortices import abc, source, taylor_green, vortex_ring
 
 # The terms of the duct's series fall as n^-3 exp(-n pi (1/2 - |z|/D)): 40 odd ones leave 1e-6 of the peak at the wall
 # itself and nothing a window's width away from it.
@@ -29,16 +25,10 @@ DUCT_TERMS = 40
 # 5e-8 of its distance from the vortex's centre.
 ADVECTION_STEPS = 4
 
-ORIGIN = (0.0, 0.0, 0.0)
-
-
-def _axis_index(axis: Axis) -> int:
-    return "xyz".index(axis)
-
 
 def square_duct(
     width_mm: float, mean_velocity_m_s: float, centre_mm: Sequence[float] = ORIGIN, axis: Literal["x", "y"] = "x"
-) -> Flow:
+) -> KnownFlow:
     """Return the fully developed laminar flow along `axis` through a square duct, zero outside it.
 
     Notes
@@ -46,7 +36,7 @@ def square_duct(
     Solves u'' = const with u = 0 on the walls: a parabola across y (or x) less a Fourier series of functions that are
     harmonic, so that the equation holds exactly however few terms are kept. The mean over the section scales it.
     """
-    along = _axis_index(axis)
+    along = axis_index(axis)
     across = 1 - along
     scale = mean_velocity_m_s / _duct_section_mean()
 
@@ -56,7 +46,14 @@ def square_duct(
         velocity[:, along] = scale * _duct_profile(relative[:, across], relative[:, 2])
         return velocity
 
-    return flow
+    def gradient(points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        relative = (points_mm - np.asarray(centre_mm, dtype=np.float64)) / (0.5 * width_mm)
+        found = np.zeros((len(points_mm), 3, 3))
+        slopes = _duct_slopes(relative[:, across], relative[:, 2])
+        found[:, along, across], found[:, along, 2] = (scale * MM_PER_M / (0.5 * width_mm) * slope for slope in slopes)
+        return found
+
+    return KnownFlow(flow, gradient)
 
 
 def _duct_profile(across: NDArray[np.float64], depth: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -73,6 +70,22 @@ def _duct_profile(across: NDArray[np.float64], depth: NDArray[np.float64]) -> ND
     return np.where(outside, 0.0, profile)
 
 
+def _duct_slopes(
+    across: NDArray[np.float64], depth: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the derivatives of `_duct_profile` across and along the depth, zero on its edge and outside."""
+    by_across, by_depth = -2.0 * across, np.zeros_like(depth)
+    inside = (np.abs(across) < 1.0) & (np.abs(depth) < 1.0)
+    inner_depth = np.minimum(np.abs(depth), 1.0)
+    for order in _duct_orders():
+        wave = 0.5 * np.pi * order
+        grown, shrunk = np.exp(wave * (inner_depth - 1.0)), np.exp(-2.0 * wave * inner_depth)
+        factor = 4.0 * np.sin(wave) / wave**2 * grown / (1.0 + np.exp(-2.0 * wave))
+        by_across += factor * np.sin(wave * across) * (1.0 + shrunk)
+        by_depth -= factor * np.cos(wave * across) * (1.0 - shrunk)
+    return np.where(inside, by_across, 0.0), np.where(inside, np.sign(depth) * by_depth, 0.0)
+
+
 def _duct_section_mean() -> float:
     """Return the mean of `_duct_profile` over the square."""
     wave = 0.5 * np.pi * _duct_orders()
@@ -87,39 +100,22 @@ def rigid_rotation(
     angular_velocity_rad_s: Sequence[float],
     centre_mm: Sequence[float] = ORIGIN,
     velocity_m_s: Sequence[float] = ORIGIN,
-) -> Flow:
-    """Return omega x (r - centre) + velocity, omega in rad/s (right-handed about x, y, z)."""
+) -> KnownFlow:
+    """Return omega x (r - centre) + velocity, omega in rad/s (right-handed about x, y, z), and its pressure."""
     omega = np.asarray(angular_velocity_rad_s, dtype=np.float64)
 
     def flow(points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.cross(omega, points_mm - np.asarray(centre_mm)) / MM_PER_M + np.asarray(velocity_m_s)
 
-    return flow
+    def pressure(points_mm: NDArray[np.float64], density_kg_m3: float) -> NDArray[np.float64]:
+        return dynamic_pressure(flow(points_mm), density_kg_m3)
+
+    return KnownFlow(flow, _constant(np.cross(omega, np.eye(3)).T), pressure)
 
 
-def taylor_green(
-    amplitude_m_s: float,
-    wavelength_mm: float,
-    centre_mm: Sequence[float] = ORIGIN,
-    plane: Literal["xy", "xz", "yz"] = "xz",
-    velocity_m_s: Sequence[float] = ORIGIN,
-) -> Flow:
-    """Return plane Taylor-Green vortices plus a uniform velocity; the corner where four vortices meet is the centre.
-
-    In `plane` (a, b): v_a = A sin(k a) cos(k b), v_b = -A cos(k a) sin(k b), k = 2 pi / wavelength.
-    """
-    first, second = (_axis_index(axis) for axis in plane)  # type: ignore[arg-type]
-    wave = 2.0 * np.pi / wavelength_mm
-
-    def flow(points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        relative = wave * (points_mm - np.asarray(centre_mm, dtype=np.float64))
-        a, b = relative[:, first], relative[:, second]
-        velocity = np.tile(np.asarray(velocity_m_s, dtype=np.float64), (len(points_mm), 1))
-        velocity[:, first] += amplitude_m_s * np.sin(a) * np.cos(b)
-        velocity[:, second] -= amplitude_m_s * np.cos(a) * np.sin(b)
-        return velocity
-
-    return flow
+def _constant(gradient: NDArray[np.float64]) -> Flow:
+    """Return the same gradient (3, 3) everywhere."""
+    return lambda points_mm: np.tile(gradient, (len(points_mm), 1, 1))
 
 
 def shear(
@@ -128,25 +124,27 @@ def shear(
     across: Axis = "z",
     centre_mm: Sequence[float] = ORIGIN,
     velocity_m_s: Sequence[float] = ORIGIN,
-) -> Flow:
+) -> KnownFlow:
     """Return a velocity along one axis that grows by `rate_per_s` per length across, plus a uniform velocity."""
-    component, coordinate = _axis_index(along), _axis_index(across)
+    component, coordinate = axis_index(along), axis_index(across)
 
     def flow(points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
         velocity = np.tile(np.asarray(velocity_m_s, dtype=np.float64), (len(points_mm), 1))
         velocity[:, component] += rate_per_s * (points_mm[:, coordinate] - centre_mm[coordinate]) / MM_PER_M
         return velocity
 
-    return flow
+    gradient = np.zeros((3, 3))
+    gradient[component, coordinate] = rate_per_s
+    return KnownFlow(flow, _constant(gradient))
 
 
-def uniform(velocity_m_s: Sequence[float]) -> Flow:
+def uniform(velocity_m_s: Sequence[float]) -> KnownFlow:
     """Return the same velocity everywhere."""
 
     def flow(points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.tile(np.asarray(velocity_m_s, dtype=np.float64), (len(points_mm), 1))
 
-    return flow
+    return KnownFlow(flow, _constant(np.zeros((3, 3))))
 
 
 def random_modes(
@@ -157,7 +155,7 @@ def random_modes(
     seed: int = 0,
     centre_mm: Sequence[float] = ORIGIN,
     velocity_m_s: Sequence[float] = ORIGIN,
-) -> Flow:
+) -> KnownFlow:
     """Return a frozen picture of turbulence: solenoidal waves in random directions, plus a uniform velocity.
 
     Wave numbers are evenly spread in their logarithm and energies follow Kolmogorov's spectrum, E(k) ~ k^(-5/3);
@@ -177,20 +175,30 @@ def random_modes(
         waves = np.cos(relative @ (wave[:, np.newaxis] * direction).T + phase)
         return waves @ (amplitude[:, np.newaxis] * polarisation) + np.asarray(velocity_m_s, dtype=np.float64)
 
-    return flow
+    def gradient(points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        relative = points_mm - np.asarray(centre_mm, dtype=np.float64)
+        along = wave[:, np.newaxis] * direction
+        slopes = -np.sin(relative @ along.T + phase)
+        by_mode = amplitude[:, np.newaxis, np.newaxis] * polarisation[:, :, np.newaxis] * along[:, np.newaxis]
+        return np.asarray(MM_PER_M * np.tensordot(slopes, by_mode, axes=1))
+
+    return KnownFlow(flow, gradient)
 
 
 def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
-FLOWS: dict[str, Callable[..., Flow]] = {
+FLOWS: dict[str, Callable[..., KnownFlow]] = {
     "square_duct": square_duct,
     "rigid_rotation": rigid_rotation,
     "taylor_green": taylor_green,
     "shear": shear,
     "uniform": uniform,
     "random_modes": random_modes,
+    "abc": abc,
+    "vortex_ring": vortex_ring,
+    "source": source,
 }
 
 
