@@ -1,8 +1,8 @@
 """Run the benchmarks that are named, or all of them: `python -m benchmarks [NAME ...]`.
 
 To add one: a function that takes no arguments, prints its figures, and has a line in `BENCHMARKS`; it lives in a
-function of its own with a size, which the tests call with a tiny one. `rigs`, `faults` and `batches` have options of
-their own, and so has `fuzz`, which takes hours and is run by its name alone.
+function of its own with a size, which the tests call with a tiny one. `rigs`, `faults`, `batches` and `fields` have
+options of their own, and so has `fuzz`, which takes hours and is run by its name alone.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from benchmarks.calibration import bench_calibration
 from benchmarks.correlation import bench_correlation, bench_correlation_accuracy
 from benchmarks.depth import bench_depth
 from benchmarks.faults import bench_faults
+from benchmarks.fields import bench_fields
 from benchmarks.fuzz import bench_fuzz
 from benchmarks.links import bench_links
 from benchmarks.particles import bench_particles, bench_particles_thrice
@@ -31,6 +32,7 @@ BENCHMARKS: dict[str, Callable[[], None]] = {
     "correlation-accuracy": bench_correlation_accuracy,
     "depth": bench_depth,
     "faults": bench_faults,
+    "fields": bench_fields,
     "links": bench_links,
     "particles": bench_particles,
     "particles-thrice": bench_particles_thrice,
@@ -43,7 +45,13 @@ BENCHMARKS: dict[str, Callable[[], None]] = {
 
 
 def main(names: list[str]) -> None:
-    with_options = {"rigs": bench_rigs, "faults": bench_faults, "batches": bench_batches, "fuzz": bench_fuzz}
+    with_options = {
+        "rigs": bench_rigs,
+        "faults": bench_faults,
+        "batches": bench_batches,
+        "fields": bench_fields,
+        "fuzz": bench_fuzz,
+    }
     for name, bench in with_options.items():
         if names[:1] == [name]:
             bench(names[1:])

@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from lfpiv_cli.files.weights_file import open_weights
     from lfpiv_cli.flow.combining import combine
     from lfpiv_cli.interface.calibration import calibrate
+    from lfpiv_cli.interface.fields import fit_field
     from lfpiv_cli.interface.following import follow
     from lfpiv_cli.interface.notices import LfpivWarning
     from lfpiv_cli.interface.particles import find_particles
@@ -67,6 +68,7 @@ __all__ = [
     "combine",
     "correlate",
     "find_particles",
+    "fit_field",
     "follow",
     "load_rig",
     "open_calibration",
@@ -89,6 +91,7 @@ MODULES = {
     "combine": "flow.combining",
     "correlate": "interface.vectors",
     "find_particles": "interface.particles",
+    "fit_field": "interface.fields",
     "follow": "interface.following",
     "load_rig": "interface.readers",
     "open_calibration": "interface.readers",

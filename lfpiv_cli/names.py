@@ -47,7 +47,11 @@ Kept = Literal["all", "results"]
 # How `run` measures a flow.
 RunMethod = Literal["auto", "volumes", "particles", "both"]
 
+# What is known of a field's divergence: it is held down as far as the data ask for, there is none, or nothing.
+Divergence = Literal["penalised", "free", "off"]
+
 # What is validated: flows and boards by which methods, boards in which images, and volumes of which moment of a pair.
+GridMethod = Literal["polynomials", "spline"]
 FlowMethod = Literal["volumes", "particles"]
 BoardMethod = Literal["ert", "dlfc", "discs"]
 BoardImages = Literal["ideal", "recorded", "both"]

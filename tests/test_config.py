@@ -153,39 +153,40 @@ def test_contradictions_are_named(write, addition: str, words: str) -> None:
     assert words in refusal(write(RIG + addition + "\n"))
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "words"),
-    [
-        ("aperture_mm: 25.0", "aperture_mm: 25.0, f_number: 5.6", "focal_length_mm / aperture_mm is 4"),
-        (
-            "aperture_mm: 25.0",
-            "aperture_mm: 25.0, image_distance_mm: 210",
-            "focal_length_mm (1 - magnification) is 200",
-        ),
-        (
-            "aperture_mm: 25.0",
-            "aperture_mm: 25.0, image_distance_mm: 200, pupil_ratio: 1.3",
-            "focal_length_mm (1.3 - magnification) is 230",
-        ),
-        (
-            "aperture_mm: 25.0",
-            "aperture_mm: 25.0, image_distance_mm: 200, image_distance: infinite",
-            "main_lens.image_distance_mm: is 200, but image_distance is infinite",
-        ),
-        (
-            "aperture_mm: 25.0",
-            "aperture_mm: 25.0, pupil_ratio: 2, image_distance: infinite",
-            "main_lens.pupil_ratio: is 2, but image_distance is infinite",
-        ),
-        ("focal_length_mm: 100.0, aperture_mm", "image_distance: infinite, aperture_mm", "needs focal_length_mm"),
-        ("aperture_mm: 25.0", "f_number: null", "needs aperture_mm or f_number"),
-        ("pitch_mm: 0.1", "pitch_mm: 0.1, f_number: 4.0", "focal_length_mm / pitch_mm is 8"),
-        ("shape_xyz: [8, 6, 4]", "size_mm: [1, 1, 1]", "contradicts size_mm"),
-        ("shape_xyz: [8, 6, 4], ", "", "needs shape_xyz and voxel_mm, or size_mm"),
-        ("voxel_mm: 0.1", "voxel_mm: 0.1, reference: mid_plane", "needs the section channel"),
-        ("voxel_mm: 0.1", "voxel_mm: 0.1, centre_mm: [0, 0, -300]", "behind the lens, which is 200 mm away"),
-    ],
-)
+# What stands in the rig, what stands there instead, and words of what is said of it.
+IMPOSSIBLE = [
+    ("aperture_mm: 25.0", "aperture_mm: 25.0, f_number: 5.6", "focal_length_mm / aperture_mm is 4"),
+    (
+        "aperture_mm: 25.0",
+        "aperture_mm: 25.0, image_distance_mm: 210",
+        "focal_length_mm (1 - magnification) is 200",
+    ),
+    (
+        "aperture_mm: 25.0",
+        "aperture_mm: 25.0, image_distance_mm: 200, pupil_ratio: 1.3",
+        "focal_length_mm (1.3 - magnification) is 230",
+    ),
+    (
+        "aperture_mm: 25.0",
+        "aperture_mm: 25.0, image_distance_mm: 200, image_distance: infinite",
+        "main_lens.image_distance_mm: is 200, but image_distance is infinite",
+    ),
+    (
+        "aperture_mm: 25.0",
+        "aperture_mm: 25.0, pupil_ratio: 2, image_distance: infinite",
+        "main_lens.pupil_ratio: is 2, but image_distance is infinite",
+    ),
+    ("focal_length_mm: 100.0, aperture_mm", "image_distance: infinite, aperture_mm", "needs focal_length_mm"),
+    ("aperture_mm: 25.0", "f_number: null", "needs aperture_mm or f_number"),
+    ("pitch_mm: 0.1", "pitch_mm: 0.1, f_number: 4.0", "focal_length_mm / pitch_mm is 8"),
+    ("shape_xyz: [8, 6, 4]", "size_mm: [1, 1, 1]", "contradicts size_mm"),
+    ("shape_xyz: [8, 6, 4], ", "", "needs shape_xyz and voxel_mm, or size_mm"),
+    ("voxel_mm: 0.1", "voxel_mm: 0.1, reference: mid_plane", "needs the section channel"),
+    ("voxel_mm: 0.1", "voxel_mm: 0.1, centre_mm: [0, 0, -300]", "behind the lens, which is 200 mm away"),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "words"), IMPOSSIBLE)
 def test_impossible_physics_is_named_with_its_numbers(write, old: str, new: str, words: str) -> None:
     assert words in refusal(write(RIG.replace(old, new)))
 
@@ -199,24 +200,25 @@ def test_total_reflection_is_named_with_its_numbers(write) -> None:
     assert "n sin = 1.12" in message
 
 
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        (b"camera:\n\tmain_lens: 1\n", "2:1: is not YAML: a tab"),
-        (b"a: &x [1]\nb: [*x, *x]\n", "alias"),
-        (b"a: !!python/object:os.system {}\n", "tag"),
-        (b"a: " + b"[" * 5000 + b"]" * 5000, "deeper than 20"),
-        (b"a: " + b"{a: " * 5000, "deeper than 20"),
-        (b"a: 1 \0\n", "control character"),
-        (b"camera: \xff\xfe\n", "1:9: is not UTF-8"),
-        (b"# " + b"x" * 10_000_000, "expected at most 1048576"),
-        (b"- 1\n", "is not a mapping"),
-        (b"a: 1\n---\nb: 1\n", "second document"),
-        (b"a: [1, 2\n", "is not YAML"),
-        (b"a: " + b"9" * 5000 + b"\n", "too long a number"),
-        (b"".join(b"k%d: 1\n" % k for k in range(1000)), "more errors"),
-    ],
-)
+# What is no config, and words of what is said of it.
+HOSTILE_TEXT = [
+    (b"camera:\n\tmain_lens: 1\n", "2:1: is not YAML: a tab"),
+    (b"a: &x [1]\nb: [*x, *x]\n", "alias"),
+    (b"a: !!python/object:os.system {}\n", "tag"),
+    (b"a: " + b"[" * 5000 + b"]" * 5000, "deeper than 20"),
+    (b"a: " + b"{a: " * 5000, "deeper than 20"),
+    (b"a: 1 \0\n", "control character"),
+    (b"camera: \xff\xfe\n", "1:9: is not UTF-8"),
+    (b"# " + b"x" * 10_000_000, "expected at most 1048576"),
+    (b"- 1\n", "is not a mapping"),
+    (b"a: 1\n---\nb: 1\n", "second document"),
+    (b"a: [1, 2\n", "is not YAML"),
+    (b"a: " + b"9" * 5000 + b"\n", "too long a number"),
+    (b"".join(b"k%d: 1\n" % k for k in range(1000)), "more errors"),
+]
+
+
+@pytest.mark.parametrize(("content", "words"), HOSTILE_TEXT)
 def test_hostile_text_is_refused_quickly(write, content: bytes, words: str) -> None:
     message = refusal(write(content))
     assert words in message

@@ -15,6 +15,7 @@ LAYERS = (
     {"simd"},
     # knows points, not images: nothing of ours beyond the grid
     {"tracks"},
+    {"fields"},
     {"optics"},
     {"calibration"},
     {"weights"},

@@ -19,7 +19,9 @@ from lfpiv_cli.files.sections import CorrelationSection, Sections
 from lfpiv_cli.files.sections_simulated import FlowSection
 from lfpiv_cli.names import (
     BoardMethod,
+    Divergence,
     ExportFormat,
+    GridMethod,
     Kept,
     KnownCamera,
     Method,
@@ -52,6 +54,8 @@ OPTIONS = {
     ("reconstruct", "start"): names_in(Start),
     ("reconstruct", "pairing"): names_in(Pairing),
     ("correlate", "pairing"): names_in(Pairing),
+    ("field", "divergence"): names_in(Divergence),
+    ("track", "by"): names_in(GridMethod),
     ("track", "pairing"): names_in(Pairing),
     ("export", "to"): names_in(ExportFormat),
     ("validate", "frame"): names_in(Moment),

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.errors import ConfigError
@@ -218,3 +219,12 @@ def test_a_pair_is_decided_by_its_seed(small):
     ]
     assert np.array_equal(pairs[0].images[1], pairs[1].images[1])
     assert np.array_equal(pairs[0].positions_mm, pairs[1].positions_mm)
+
+
+def test_tracers_of_a_sequence_go_round_in_circles(rng):
+    """Their velocity turns along the path: 0.3 rad from frame to frame, against the rotation itself."""
+    omega, start = np.array([0.0, 180.0, 240.0]), rng.uniform(-3.0, 3.0, (10, 3))
+    motion = Motion(rigid_rotation(omega), 1e-3, 7)
+    for place, time_s in zip(motion.places_mm(start), motion.times_s(), strict=True):
+        # four steps of 0.075 rad a frame, (0.075)^5/120 of 5 mm each: 1e-6 mm over three frames
+        assert place == pytest.approx(Rotation.from_rotvec(omega * time_s).apply(start), abs=2e-6)

@@ -157,8 +157,8 @@ keep_going_option = click.option(
 failures_option = click.option("--failures", type=FILE, help="File to list what failed in, with the reason (JSON).")
 
 
-def batch_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Give a command the options of all batches."""
+def work_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Give a command the options of all that goes through many frames."""
     dry_run = click.option(
         "--dry-run",
         is_flag=True,
@@ -166,7 +166,6 @@ def batch_options(command: Callable[..., Any]) -> Callable[..., Any]:
     )
     for option in (
         dry_run,
-        dask_option,
         time_limit_option,
         shard_option,
         failures_option,
@@ -175,6 +174,11 @@ def batch_options(command: Callable[..., Any]) -> Callable[..., Any]:
     ):
         command = option(command)
     return command
+
+
+def batch_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Give a command the options of all batches, whose outputs workers elsewhere can make, too."""
+    return work_options(dask_option(command))
 
 
 def pairing_options(command: Callable[..., Any]) -> Callable[..., Any]:

@@ -15,16 +15,15 @@ from lfpiv_cli.cli.options import (
     common_options,
     dark_option,
     dt_option,
-    failures_option,
     inputs_argument,
-    keep_going_option,
     mask_option,
     output_option,
     pairing_options,
     raw_option,
-    resume_option,
+    work_options,
 )
 from lfpiv_cli.console import Console
+from lfpiv_cli.names import GridMethod, names_in
 
 
 @click.command("track")
@@ -39,6 +38,11 @@ from lfpiv_cli.console import Console
     help="Sequence: fewest frames of a track, shorter ones are ghosts; 3 when not given.",
 )
 @click.option("--grid", is_flag=True, help="Also write vectors on correlate's grid, as OUTPUT's name with _grid.")
+@click.option(
+    "--by",
+    type=click.Choice(names_in(GridMethod)),
+    help="With --grid: local polynomials (the default), or one field of splines, as of field.",
+)
 @pairing_options
 @batch_options
 @output_option("File of tracks to write (.vtkhdf), folder for several pairs.")
@@ -84,9 +88,7 @@ def track(
 )
 @click.option("--both-ways", is_flag=True, help="Go through the frames a second time, backwards: twice the time.")
 @click.option("--residuals", is_flag=True, help="Also write what the particles leave of each image.")
-@resume_option
-@keep_going_option
-@failures_option
+@work_options
 @output_option("Folder for the particles of each frame and the tracks.")
 @common_options
 @raw_option
@@ -107,6 +109,8 @@ def follow(
     \b
     Example: lfpiv follow weights.h5 run.tif --dark dark.tif -o run
              lfpiv follow weights.h5 frame_*.tif --dark dark.tif --both-ways -o run
+    before the limit of a job it stops, and the same command goes on:
+             lfpiv follow weights.h5 run.tif --dark dark.tif --time-limit 50m --resume -o run
     """
     from lfpiv_cli.stages import follow as stage
 

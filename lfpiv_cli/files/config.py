@@ -18,7 +18,7 @@ from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.files import bench
 from lfpiv_cli.files.checks import contradictions
 from lfpiv_cli.files.config_problems import place_of, problem_of, report, sentence
-from lfpiv_cli.files.inputs import ensure_regular_file, reason
+from lfpiv_cli.files.inputs import content_of, ensure_regular_file
 from lfpiv_cli.files.sections import (
     BoardSection,
     CameraSection,
@@ -180,6 +180,14 @@ class Config:
         """Return the refractive indices."""
         return bench.media_of(self.media)
 
+    def fluid_density_kg_m3(self) -> float:
+        """Return the fluid's density."""
+        return float(self._needed("media.fluid_density_kg_m3", self.media.fluid_density_kg_m3))
+
+    def fluid_viscosity_pa_s(self) -> float:
+        """Return the fluid's dynamic viscosity."""
+        return float(self._needed("media.fluid_viscosity_pa_s", self.media.fluid_viscosity_pa_s))
+
     def window_model(self, mid_plane_z_mm: float | None = None) -> Window:
         """Return the window: the channel's wall where its mid plane's depth is given, else the section `window`."""
         if self.channel is not None and mid_plane_z_mm is not None:
@@ -299,10 +307,7 @@ def load_config(path: Path) -> Config:
     size = ensure_regular_file(path)
     if size > LARGEST_BYTES:
         raise ConfigError(f"{path}: has {size} bytes, expected at most {LARGEST_BYTES}")
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {reason(error)}") from error
+    content = content_of(path)
     try:
         document = read_document(content)
     except YamlError as error:

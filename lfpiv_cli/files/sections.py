@@ -94,11 +94,16 @@ class CameraSection(Section):
 
 
 class MediaSection(Section):
-    """Refractive indices in front of the lens: of the air, the window and the fluid."""
+    """Refractive indices in front of the lens: of the air, the window and the fluid.
+
+    fluid_density_kg_m3, fluid_viscosity_pa_s: of the fluid; only pressure and dissipation read them.
+    """
 
     air: Index = 1.0
     window: Index = 1.0
     fluid: Index = 1.0
+    fluid_density_kg_m3: Positive | None = None
+    fluid_viscosity_pa_s: Positive | None = None
 
 
 class WindowSection(Section):
@@ -151,12 +156,14 @@ class ChannelSection(Section):
     """The channel of Eq. 21: inner width D, wall t_w, and the camera's move after the board (default: Eq. 21's d_m).
 
     board_from_mid_plane_mm: how far behind the mid plane a board in the fluid stood; one in air: on the wall.
+    no_slip: the fluid stands still at the walls across the depth (needs reference: mid_plane); `field` reads it.
     """
 
     width_mm: Positive
     wall_mm: NotNegative
     camera_move_mm: float | None = None
     board_from_mid_plane_mm: float | None = None
+    no_slip: bool = False
 
 
 class WeightsSection(Section):

@@ -39,7 +39,11 @@ class Derived:
 
 def derived_fields(field: VectorField) -> Derived:
     """Return the derived fields by central differences, one-sided at the faces and exact for quadratic flows there."""
-    gradient = velocity_gradient(field)
+    return derived_from(velocity_gradient(field))
+
+
+def derived_from(gradient: NDArray[np.float64]) -> Derived:
+    """Return what follows from gradients (nz, ny, nx, 3, 3) in 1/s: the component, then the direction."""
     turned = gradient.swapaxes(-1, -2)
     strain, rotation = 0.5 * (gradient + turned), 0.5 * (gradient - turned)
     strain_squared = np.sum(strain**2, axis=(-1, -2))

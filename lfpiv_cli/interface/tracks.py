@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files.config import Config, carried_config
-from lfpiv_cli.files.particle_file import TRACKS_FORMAT, TRAJECTORIES_FORMAT, Points
+from lfpiv_cli.files.particle_file import POSITION, TRACKS_FORMAT, TRAJECTORIES_FORMAT, PointRows, Points
 from lfpiv_cli.files.provenance import even_step_s, record
 from lfpiv_cli.flow.field import MM_TO_M, VectorField
 from lfpiv_cli.flow.from_tracks import Paths, WindowGrid, vectors_from_paths
 from lfpiv_cli.interface.notices import warn_of
+from lfpiv_cli.interface.sequence_tracks import SequenceTracks
 from lfpiv_cli.notice import Notice
+from lfpiv_cli.reference import Reference
 from lfpiv_cli.scale import Scale
 from lfpiv_cli.tracks.candidates import Seen
-from lfpiv_cli.tracks.sequences import SHORTEST, Trajectories, follow, long_ones, scatter_in, states_at
+from lfpiv_cli.tracks.sequences import SHORTEST, Trajectories, follow, long_ones
 from lfpiv_cli.tracks.tracking import FEWEST_OF_FIT, SEARCH_LENSES, Tracks, wrong_link_variance
 from lfpiv_cli.tracks.tracking import track as match
 
@@ -60,7 +62,8 @@ def track(
     -------
     Tracked
         `points` with `position_mm` (n, 3) and `arrays`: of two frames, for each link, `velocity` and `velocity_sigma`
-        (n, 3) m/s, `displacement_mm` (n, 3), `particle_a`, `particle_b` (n,) row numbers and `link_probability` (n,);
+        (n, 3) m/s, `displacement_mm` (n, 3), its `displacement_covariance_mm2` (n, 6),
+        `particle_a`, `particle_b` (n,) row numbers and `link_probability` (n,);
         of a sequence, for each place of a track, `velocity`, `velocity_sigma`, `track`, `frame`, `particle` and the
         `link_probability` (n,) by which the track has come there, NaN where it begins. `summary` has the counts;
         `vectors()` gives the fields on the grid of the interrogation windows, one for each interval.
@@ -105,10 +108,17 @@ class Tracking:
         told: dict[str, Any] = {"search_mm": self.search_mm}
         return told if self.shortest is None else told | {"shortest": self.shortest}
 
+    def attributes(self, reference: Reference) -> dict[str, Any]:
+        """Return what a file of tracks says of itself besides its provenance."""
+        return reference.attributes() | {"dt_s": self.dt_s}
+
+
+Rows = TypeVar("Rows", bound=PointRows)
+
 
 @dataclass(frozen=True, eq=False)
-class Tracked:
-    """Tracks and what is told of them.
+class TracksOf(Generic[Rows]):
+    """Tracks, in memory or not, and what is told of them.
 
     Attributes
     ----------
@@ -119,7 +129,7 @@ class Tracked:
     settings : the resolved config
     """
 
-    points: Points
+    points: Rows
     format_name: str
     paths: Sequence[Paths]
     summary: dict[str, Any]
@@ -127,6 +137,10 @@ class Tracked:
 
     def vectors(self) -> list[VectorField]:
         """Return the field of each interval between frames, on the grid of the interrogation windows."""
+        return list(self.fields())
+
+    def fields(self) -> Iterator[VectorField]:
+        """Yield what `vectors` returns, one at a time."""
         settings, volume = self.settings, self.settings.grid()
         windows = WindowGrid(
             volume,
@@ -134,7 +148,11 @@ class Tracked:
             settings.overlap(volume.spacing_mm),
             settings.channel_width_mm() if settings.correlation.mask == "channel" else None,
         )
-        return [vectors_from_paths(paths, windows, settings.correlation.dt_s) for paths in self.paths]
+        return (vectors_from_paths(paths, windows, settings.correlation.dt_s) for paths in self.paths)
+
+
+class Tracked(TracksOf[Points]):
+    """Tracks in memory."""
 
 
 def ensure_frames(frames: int, shortest: int | None) -> None:
@@ -162,7 +180,7 @@ def ensure_particles(counts: Sequence[int], names: Sequence[str]) -> None:
         raise InputError(f"{', '.join(empty)}: no particles; tracks need some in two frames at least")
 
 
-def few_notices(counts: Sequence[int], names: Sequence[str], found: Tracked) -> list[Notice]:
+def few_notices(counts: Sequence[int], names: Sequence[str], found: TracksOf[Any]) -> list[Notice]:
     """Return which frames hold few particles or none, and whether any could be followed."""
     fullest, named = max(counts), list(zip(names, counts, strict=True))
     notices = [
@@ -258,11 +276,14 @@ def doubt_notices(summary: Mapping[str, Any], name: str) -> list[Notice]:
     return notices
 
 
-def still_notices(tracks: Points, name: str) -> list[Notice]:
+def still_notices(tracks: PointRows, name: str) -> list[Notice]:
     """Return what is said where nothing moves, not even by the errors of the particles' places: of one image twice."""
-    velocity, sigma = tracks.arrays["velocity"], tracks.arrays["velocity_sigma"]
-    known = (sigma > 0.0).all(axis=1)
-    moved = float(np.median((np.abs(velocity[known]) / sigma[known]).max(axis=1))) if known.any() else STILL_SIGMAS
+    ratio, count = np.empty(tracks.count), 0
+    for velocity, sigma in zip(tracks.rows("velocity"), tracks.rows("velocity_sigma"), strict=True):
+        known = (sigma > 0.0).all(axis=1)
+        begin, count = count, count + int(np.count_nonzero(known))
+        ratio[begin:count] = (np.abs(velocity[known]) / sigma[known]).max(axis=1)
+    moved = float(np.median(ratio[:count], overwrite_input=True)) if count else STILL_SIGMAS
     if moved >= STILL_SIGMAS:
         return []
     return [
@@ -322,14 +343,15 @@ def tracked(
     found: Trajectories | None = None,
 ) -> Tracked:
     """Follow particles from frame to frame; where a sequence has been followed already, `found` says how."""
-    reference = frames[0].reference
-    told = reference.attributes() | {"dt_s": chosen.dt_s}
+    reference, told = frames[0].reference, chosen.attributes(frames[0].reference)
+    paths: Sequence[Paths]
     if chosen.shortest is None:
         position, arrays, summary, paths = _pair(frames[0], frames[1], chosen)
         name = TRACKS_FORMAT
     else:
-        position, arrays, summary, paths = _sequence(frames, chosen, chosen.shortest, found)
-        name = TRAJECTORIES_FORMAT
+        sequence = sequence_of([seen_in(frame) for frame in frames], chosen, found)
+        arrays, summary, paths = sequence.by_track(), sequence.summary(), sequence.paths
+        position, name = arrays.pop(POSITION), TRAJECTORIES_FORMAT
     return Tracked(Points(position, arrays, reference, told, provenance), name, paths, summary, settings)
 
 
@@ -339,11 +361,14 @@ Found = tuple[NDArray[np.float64], dict[str, NDArray[Any]], dict[str, Any], list
 def _pair(first: Points, second: Points, chosen: Tracking) -> Found:
     """Return places, arrays, summary and paths of particles followed from one frame to the next."""
     found = match(seen_in(first), seen_in(second), chosen.search_mm, chosen.scale)
-    paths = _paths(first, second, found, chosen.scale)
+    covariance = _covariance(first, second, found, chosen.scale)
+    start, end = first.position_mm[found.first], second.position_mm[found.second]
+    paths = Paths(0.5 * (start + end), end - start, np.sqrt(covariance[:, :3]))
     arrays = {
         "velocity": paths.displacement_mm * MM_TO_M / chosen.dt_s,
         "velocity_sigma": paths.sigma_mm * MM_TO_M / chosen.dt_s,
         "displacement_mm": paths.displacement_mm,
+        "displacement_covariance_mm2": covariance,
         "particle_a": found.first,
         "particle_b": found.second,
         "link_probability": found.probability,
@@ -357,46 +382,20 @@ def _pair(first: Points, second: Points, chosen: Tracking) -> Found:
     return paths.middle_mm, arrays, summary, [paths]
 
 
-def _sequence(frames: Sequence[Points], chosen: Tracking, shortest: int, found: Trajectories | None) -> Found:
-    """Return places, arrays, summary and paths of particles followed over many frames."""
-    seen = [seen_in(frame) for frame in frames]
+def sequence_of(frames: Sequence[Seen], chosen: Tracking, found: Trajectories | None) -> SequenceTracks:
+    """Return the tracks of particles over many frames; `found`, where they have been followed already.
+
+    Raises
+    ------
+    ValueError : these are two frames
+    """
+    if chosen.shortest is None:
+        raise ValueError("two frames are no sequence")
     if found is None:
-        found = follow(seen, chosen.search_mm, shortest, chosen.scale)
+        found = follow(frames, chosen.search_mm, chosen.shortest, chosen.scale)
     else:
-        found = long_ones(found, shortest)
-    scatter, half = scatter_in(found, seen)
-    rows: list[tuple[NDArray[Any], ...]] = []
-    for number in range(len(frames)):
-        tracks, state = states_at(found, seen, float(number), scatter, half)
-        frame = np.full(len(tracks), number)
-        particle = found.particles(number, tracks)
-        probability = found.probability[number][particle]
-        rows.append((state.position_mm, state.velocity, state.velocity_sigma, tracks, frame, particle, probability))
-    position, velocity, error, tracks, frame, particle, probability = (
-        np.concatenate(each) for each in zip(*rows, strict=True)
-    )
-    order = np.lexsort((frame, tracks))
-    arrays = {
-        "velocity": velocity[order] * MM_TO_M / chosen.dt_s,
-        "velocity_sigma": error[order] * MM_TO_M / chosen.dt_s,
-        "track": tracks[order],
-        "frame": frame[order],
-        "particle": particle[order],
-        "link_probability": probability[order],
-    }
-    between = [states_at(found, seen, number + 0.5, scatter, half)[1] for number in range(len(frames) - 1)]
-    paths = [Paths(state.position_mm, state.velocity, state.velocity_sigma) for state in between]
-    acceleration = np.sqrt(scatter.bending) * MM_TO_M / chosen.dt_s**2
-    summary = {
-        "frames": len(frames),
-        "particles": sum(len(each) for each in seen),
-        "tracked": len(tracks),
-        "tracks": found.count,
-        "expected_wrong_links": float(np.nansum(1.0 - probability)),
-        "noise_over_stated": scatter.noise.tolist() if scatter.noise_known else None,
-        "acceleration_m_s2": acceleration.tolist() if scatter.bending_known else None,
-    }
-    return position[order], arrays, summary, paths
+        found = long_ones(found, chosen.shortest)
+    return SequenceTracks.of(found, frames, chosen.dt_s)
 
 
 def seen_in(frame: Points) -> Seen:
@@ -404,9 +403,8 @@ def seen_in(frame: Points) -> Seen:
     return Seen(frame.position_mm, frame.arrays["covariance_mm2"], frame.arrays["intensity"])
 
 
-def _paths(first: Points, second: Points, tracks: Tracks, scale: Scale) -> Paths:
-    """Return the paths of a pair's tracks."""
-    start, end = first.position_mm[tracks.first], second.position_mm[tracks.second]
-    variance = first.arrays["covariance_mm2"][tracks.first, :3] + second.arrays["covariance_mm2"][tracks.second, :3]
-    variance = variance + wrong_link_variance(tracks.probability, scale)
-    return Paths(0.5 * (start + end), end - start, np.sqrt(variance))
+def _covariance(first: Points, second: Points, tracks: Tracks, scale: Scale) -> NDArray[np.float64]:
+    """Return the covariances (n, 6) of a pair's displacements, mm^2: xx, yy, zz, xy, yz, xz."""
+    covariance = first.arrays["covariance_mm2"][tracks.first] + second.arrays["covariance_mm2"][tracks.second]
+    covariance[:, :3] += wrong_link_variance(tracks.probability, scale)
+    return np.asarray(covariance)

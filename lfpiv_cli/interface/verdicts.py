@@ -18,6 +18,7 @@ from lfpiv_cli.flow.field import MASKED, REJECTED, VectorField
 
 Word = Literal["good", "look", "no"]
 Part = Literal["calibration", "images", "vectors"]
+# From the best to the worst.
 WORDS: tuple[Word, ...] = ("good", "look", "no")
 PARTS: tuple[Part, ...] = ("calibration", "images", "vectors")
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.files.atomic import ensure_writable
-from lfpiv_cli.files.batch import is_kept
+from lfpiv_cli.files.batch import Target, is_kept
 from lfpiv_cli.files.calibration_file import read_calibration
 from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.inputs import given
@@ -67,7 +68,7 @@ def build_weights(
         "method": settings.weights.method,
         "refraction": settings.weights.refraction,
     }
-    made = record("build-weights", settings.resolved(), inputs)
+    made = dict(target_of(config, output, options).record)
     if options.resume and is_kept([output], made, inputs.values(), overwrite, resume=True):
         return summary | {"frame": open_weights(output).frame, "file_bytes": output.stat().st_size}
     cost = cost_of(settings, plan.camera, plan.source, plan.grid.padded(plan.padding))
@@ -78,3 +79,10 @@ def build_weights(
     content = weights_of(plan, with_warnings(made, plan.notices), console)
     write_weights(output, content, overwrite)
     return summary | {"frame": content.weights.frame, "file_bytes": output.stat().st_size}
+
+
+def target_of(config: Path, output: Path, options: BuildWeightsOptions) -> Target:
+    """Return where weights go, with the record that they will carry."""
+    resolved = load_config(config).overridden_by("weights", options).resolved()
+    inputs = given(config=config, calibration=options.calibration)
+    return Target(output, partial(record, "build-weights", resolved, inputs))

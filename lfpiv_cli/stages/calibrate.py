@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from lfpiv_cli.calibration.white import by_aperture
 from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files.atomic import ensure_writable
-from lfpiv_cli.files.batch import is_kept
+from lfpiv_cli.files.batch import Target, is_kept
 from lfpiv_cli.files.calibration_file import read_calibration, write_calibration
 from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.inputs import given
@@ -61,15 +62,14 @@ def calibrate_snapshot(
     picture, views = options.picture, options.views
     ensure_pictures(len(white), len(board), len(depth_mm))
     whites, boards = _numbered("white", white), _numbered("board", board)
-    inputs = given(config=config, dark=options.dark) | whites | boards
+    inputs = _inputs(config, options)
     drawings = [path for path in (picture, views) if path]
     ensure_apart([output, *drawings], inputs.values())
     for target in (output, *drawings):
         ensure_writable(target, overwrite or options.resume)
     if drawings:
         ensure_drawing()
-    settings = load_config(config)
-    record = provenance_record("calibrate-snapshot", settings.resolved(), inputs)
+    settings, record = load_config(config), dict(target_of(config, output, options).record)
     if options.resume:
         kept = is_kept([output], record, inputs.values(), overwrite, resume=True)
         if kept and all(path.exists() for path in drawings):
@@ -98,6 +98,18 @@ def calibrate_snapshot(
         shown_image = light(frames["board" if board else "white"], frames.get("dark"), None)
         write_picture(views, views_figure(calibration, camera, medium, shown_image), overwrite)
     return calibration.summary()
+
+
+def target_of(config: Path, output: Path, options: CalibrateOptions) -> Target:
+    """Return where a calibration goes, with the record that it will carry."""
+    resolved = load_config(config).resolved()
+    return Target(output, partial(provenance_record, "calibrate-snapshot", resolved, _inputs(config, options)))
+
+
+def _inputs(config: Path, options: CalibrateOptions) -> dict[str, Path]:
+    """Return the files that a calibration is made from by their roles."""
+    photographs_of = _numbered("white", options.white) | _numbered("board", options.board)
+    return given(config=config, dark=options.dark) | photographs_of
 
 
 def _numbered(role: str, paths: Sequence[Path]) -> dict[str, Path]:

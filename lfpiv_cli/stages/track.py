@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -14,14 +15,17 @@ import numpy as np
 from lfpiv_cli.console import CONSOLE, Console, Frames
 from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.files.batch import Target, output_paths
+from lfpiv_cli.files.config import Config
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.pairing import Pairs
-from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, read_points, read_tracks, write_points
-from lfpiv_cli.files.provenance import Gone, carried_record, record, with_warnings
+from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, PointRows, Points, read_points, read_tracks, write_points
+from lfpiv_cli.files.provenance import carried_record, record, with_warnings
 from lfpiv_cli.files.whole import fault_of
-from lfpiv_cli.flow.field import REJECTED
+from lfpiv_cli.flow.field import REJECTED, VectorField
+from lfpiv_cli.interface.fields import fields_of
 from lfpiv_cli.interface.tracks import (
-    Tracked,
+    Tracking,
+    TracksOf,
     ensure_frames,
     ensure_particles,
     few_notices,
@@ -36,14 +40,16 @@ from lfpiv_cli.interface.vectors_checks import (
     quality_of,
     quality_of_all,
 )
-from lfpiv_cli.stages.batches import BatchOptions, ByArguments, Failure, Worked, work_through
+from lfpiv_cli.names import GridMethod
+from lfpiv_cli.stages.batches import Worked, work_through
 from lfpiv_cli.stages.dry_runs import Expected, dry_run
 from lfpiv_cli.stages.intervals import dt_notices
-from lfpiv_cli.stages.pairs import PairOptions, result_pairs, sequence_of
+from lfpiv_cli.stages.pairs import PairBatch, PairBatchOptions, sequence_of
+from lfpiv_cli.stages.stored_tracks import SeenFrames, stored_tracks
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrackOptions(PairOptions, BatchOptions):
+class TrackOptions(PairBatchOptions):
     """What `track_particles` is given besides the particles; where nothing says pairs, they are one sequence.
 
     Attributes
@@ -52,12 +58,14 @@ class TrackOptions(PairOptions, BatchOptions):
     search_voxel : displacements are sought up to this along each axis, six microlenses in the scene where None
     shortest : fewest frames of a track in a sequence, three where None
     grid : vectors on the grid of the correlation windows, too
+    by : local polynomials (kriging in rough flows), or one spline field as of `field`, for the grid
     """
 
     dt_s: float | None = None
     search_voxel: float | None = None
     shortest: int | None = None
     grid: bool = False
+    by: GridMethod = "polynomials"
 
 
 NO_OPTIONS = TrackOptions()
@@ -89,41 +97,25 @@ class Outcome:
     rejected: int
 
 
-class Tracks(ByArguments):
+class Tracks(PairBatch[TrackOptions]):
     """The batch of `track`: the tracks of each pair of files of particles, or those through all of them."""
 
     label = "track"
 
-    def __init__(
-        self,
-        particles: Sequence[Path],
-        output: Path,
-        options: TrackOptions,
-        overwrite: bool,
-        pairs: Pairs | None = None,
-        gone: Mapping[Path, Gone] | None = None,
-    ) -> None:
-        """Take the arguments of `track`; see which frames belong together, and read no particles.
-
-        Raises
-        ------
-        LfpivError : frames or outputs do not go together
-        """
-        self._options, self.overwrite, self.inputs, self._gone = options, overwrite, particles, gone or {}
+    def _arrange(self, files: Sequence[Path], output: Path, pairs: Pairs | None) -> None:
+        options = self._options
         in_pairs = pairs is not None or (options.are_told and options.pairing != "sequence")
-        self.unit, self.left_out = "pair" if in_pairs else "sequence", []
+        self.unit = "pair" if in_pairs else "sequence"
+        groups: Sequence[tuple[Path, ...]]
         if in_pairs:
-            found = result_pairs(particles, options) if pairs is None else pairs
-            self.notices = found.settled(options.keep_going)
-            self.left_out = [Failure(each.name, each.why) for each in found.left_out]
-            groups: list[tuple[Path, ...]] = [(particles[first], particles[second]) for first, second in found.pairs]
+            groups = self._paired(files, pairs)
             paths = output_paths(output, [group[0].stem for group in groups])
         else:
-            order, self.notices = sequence_of(particles)
-            groups, paths = [tuple(particles[number] for number in order)], [output]
+            order, self.notices = sequence_of(files)
+            groups, paths = [tuple(files[number] for number in order)], [output]
         ensure_frames(len(groups[0]), options.shortest)
         self._groups = groups
-        self.names = [path.stem for path in paths]
+        self.names, self.order = [path.stem for path in paths], range(len(paths))
         grids = [grid_paths(path, len(groups[0]) - 1) if options.grid else [] for path in paths]
         self.targets = [
             Target(path, partial(self._record, number), beside)
@@ -151,25 +143,28 @@ class Tracks(ByArguments):
         """Follow the particles of a pair, or of all frames; write tracks, and vectors where they are asked for."""
         target, paths = self.targets[number], self._groups[number]
         names = [str(path) for path in paths]
-        frames = [read_points(path, PARTICLES_FORMAT) for path in paths]
-        counts = [len(frame.position_mm) for frame in frames]
+        # A pair is read once; of a sequence all that is kept of a frame is its record.
+        read = lru_cache(maxsize=2)(partial(read_points, format_name=PARTICLES_FORMAT))
+        counts, records = zip(*((frame.count, frame.provenance) for frame in map(read, paths)), strict=True)
         ensure_particles(counts, names)
-        settings = settings_of([frame.provenance for frame in frames], names, self._options.dt_s)
-        chosen = tracking_of(settings, self._options.search_voxel, self._options.shortest, len(frames), names[0])
-        found = tracked(frames, settings, chosen, dict(target.record))
-        records = {
-            f"{role} {path.name}": frame.provenance
-            for (role, path), frame in zip(_roles(paths).items(), frames, strict=True)
-        }
-        doubts = dt_notices(chosen.dt_s, pairwise(frame.provenance for frame in frames), paths[0].name)
-        notices = [*doubts, *calibration_notices(records), *few_notices(counts, [path.name for path in paths], found)]
-        work.console.warn(notices)
-        provenance = with_warnings(found.points.provenance, notices)
-        # What is complete is skipped: in the place of what is made there is nothing, or something broken.
-        replacing = self.overwrite or self._options.resume
-        write_points(target.path, found.format_name, replace(found.points, provenance=provenance), overwrite=replacing)
-        qualities, rejected = _write_grids(target.beside, found, provenance, replacing, work.console)
-        return Outcome(found.summary | _sigmas(found), qualities, rejected)
+        settings = settings_of(records, names, self._options.dt_s)
+        chosen = tracking_of(settings, self._options.search_voxel, self._options.shortest, len(paths), names[0])
+        with _tracks(paths, read, settings, chosen, dict(target.record), target.path.parent) as found:
+            told = {
+                f"{role} {path.name}": made for (role, path), made in zip(_roles(paths).items(), records, strict=True)
+            }
+            doubts = dt_notices(chosen.dt_s, pairwise(records), paths[0].name)
+            few = few_notices(counts, [path.name for path in paths], found)
+            notices = [*doubts, *calibration_notices(told), *few]
+            work.console.warn(notices)
+            provenance = with_warnings(found.points.provenance, notices)
+            # What is complete is skipped: in the place of what is made there is nothing, or something broken.
+            replacing = self.overwrite or self._options.resume
+            points = replace(found.points, provenance=provenance)
+            write_points(target.path, found.format_name, points, overwrite=replacing)
+            fields = found.fields() if self._options.by == "polynomials" else _fitted(found, names[0])
+            qualities, rejected = _write_grids(target.beside, fields, points, replacing, work.console)
+            return Outcome(found.summary | _sigmas(found.points), qualities, rejected)
 
     def summary(self, worked: Worked[Outcome]) -> dict[str, Any]:
         """Return what is told of the batch: all figures of a single result, the sums of several."""
@@ -182,7 +177,8 @@ class Tracks(ByArguments):
         records = [self._gone[path].record if path in self._gone else carried_record(path) for path in paths]
         settings = settings_of(records, names, options.dt_s)
         chosen = tracking_of(settings, options.search_voxel, options.shortest, len(paths), names[0])
-        return record("track", settings.resolved() | chosen.told(), _roles(paths), gone=self._gone)
+        told = chosen.told() | ({"grid_by": options.by} if options.grid and options.by != "polynomials" else {})
+        return record("track", settings.resolved() | told, _roles(paths), gone=self._gone)
 
 
 def summary_of(worked: Worked[Outcome], paths: Sequence[Path]) -> dict[str, Any]:
@@ -221,27 +217,50 @@ def _roles(particles: Sequence[Path]) -> dict[str, Path]:
     return {f"particles_{number:04d}": path for number, path in enumerate(particles)}
 
 
-def _sigmas(found: Tracked) -> dict[str, Any]:
+@contextmanager
+def _tracks(
+    paths: Sequence[Path],
+    read: Callable[[Path], Points],
+    settings: Config,
+    chosen: Tracking,
+    made: dict[str, Any],
+    folder: Path,
+) -> Iterator[TracksOf[Any]]:
+    """Yield the tracks of a pair of files in memory, those of a sequence on a disk; `made` is their provenance."""
+    if chosen.shortest is None:
+        yield tracked([read(path) for path in paths], settings, chosen, made)
+        return
+    frames, reference = SeenFrames(len(paths), lambda number: read(paths[number])), read(paths[0]).reference
+    with stored_tracks(frames, reference, settings, chosen, made, folder) as found:
+        yield found
+
+
+def _sigmas(tracks: PointRows) -> dict[str, Any]:
     """Return the median of the tracks' standard deviations, and the share of those without one."""
-    sigma = found.points.arrays["velocity_sigma"]
-    known = np.isfinite(sigma).all(axis=1)
+    known = [sigma[np.isfinite(sigma).all(axis=1)] for sigma in tracks.rows("velocity_sigma")]
+    sigma = np.concatenate(known)
     return {
-        "velocity_sigma_m_s_median": np.median(sigma[known], axis=0).tolist() if known.any() else None,
-        "tracks_without_uncertainty_share": float(np.mean(~known)) if len(known) else None,
+        "velocity_sigma_m_s_median": np.median(sigma, axis=0).tolist() if len(sigma) else None,
+        "tracks_without_uncertainty_share": (tracks.count - len(sigma)) / tracks.count if tracks.count else None,
     }
 
 
+def _fitted(found: TracksOf[Any], name: str) -> Iterator[VectorField]:
+    """Yield the vectors of a field fitted to the tracks of each interval."""
+    return (each.vectors() for each in fields_of(found, name))
+
+
 def _write_grids(
-    grids: Sequence[Path], found: Tracked, provenance: Mapping[str, Any], overwrite: bool, console: Console
+    grids: Sequence[Path], fields: Iterable[VectorField], tracks: PointRows, overwrite: bool, console: Console
 ) -> tuple[list[Quality], int]:
     """Write the vectors of each interval; return how good they are, and how many are rejected."""
     qualities, rejected = [], 0
-    for target, field in zip(grids, found.vectors() if grids else (), strict=True):
+    for target, field in zip(grids, fields if grids else (), strict=True):
         quality = quality_of(field)
         notices = list(field_notices(quality, target.name))
         console.warn(notices)
-        made = with_warnings(provenance, notices)
-        vtkhdf.write_vectors(target, field, found.points.reference, provenance=made, overwrite=overwrite)
+        made = with_warnings(tracks.provenance, notices)
+        vtkhdf.write_vectors(target, field, tracks.reference, provenance=made, overwrite=overwrite)
         qualities.append(quality)
         rejected += int(np.count_nonzero(field.flag >= REJECTED))
     return qualities, rejected

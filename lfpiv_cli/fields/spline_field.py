@@ -1,0 +1,277 @@
+"""A velocity field of cubic B-splines, fitted to all samples at once.
+
+Each sample counts by its full covariance, penalties on derivatives and on the divergence by the weights that make the
+samples most probable. Samples that do not belong to the field, as wrong links, lose their weight.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lfpiv_cli.fields import stencils
+from lfpiv_cli.fields.blocks import Block, Factor, factorised
+from lfpiv_cli.fields.errors_of_samples import belonging, error_covariance, squares
+from lfpiv_cli.fields.evidence import FREE_DIVERGENCE, divergence_weight, first_expectation, most_probable
+from lfpiv_cli.fields.lattice import Lattice
+from lfpiv_cli.fields.penalties import DIVERGENCE, SECOND, THIRD, Expectation, expected_inverse
+from lfpiv_cli.fields.samples import Samples, with_places
+from lfpiv_cli.fields.stencils import Stencil, rows_of
+
+# Knots are so many times the samples' mean distance apart: a third as many knots as samples. Among factors of 1.2 to
+# 1.8, less adds noise where samples are few, and more holds divergence and values of small vortices further off.
+KNOTS_OF_DISTANCE = 1.4
+# A factorisation of so many unknowns, and what is needed of its inverse, takes seconds and 600 MB.
+MOST_UNKNOWNS = 9000
+# Knots that are too many are set apart by this factor until they are not.
+COARSER = 1.05
+# Rounds of weighing samples; the last change of their probabilities that matters, on the average.
+ROUNDS, LAST_CHANGE = 4, 0.002
+POINTS_AT_ONCE = 500
+# Knots so many times wider tell which samples are far off.
+WIDE = 1.6
+# What such a field leaves is larger in some places than in others; only what is far beyond is doubted.
+FAR_OFF = 2.0
+# So many samples for each unknown tell such a field.
+ENOUGH_OF_UNKNOWNS = 1
+# Walls hold the field to 0 within this share of the samples' spread at each of their points.
+STILL_SHARE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class SplineField:
+    """A fitted field.
+
+    Attributes
+    ----------
+    lattice : of the knots
+    coefficients : (nx, 3, ny, nz) mm
+    covariance : blocks of the coefficients' covariance: on the diagonal, and below it
+    mean_mm : displacement that is added everywhere
+    expected : the penalties' weights and the errors' scales
+    probability : (n,) of each sample to belong to the field
+    reduced_chi2 : mean square of the samples' errors over that of the stated ones
+    """
+
+    lattice: Lattice
+    coefficients: NDArray[np.float64]
+    covariance: tuple[list[Block], list[Block]]
+    mean_mm: NDArray[np.float64]
+    expected: Expectation
+    probability: NDArray[np.float64]
+    reduced_chi2: float
+
+    def value_at(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return displacements (m, 3) at points."""
+        return self.mean_mm + _field_at(points_mm, self.lattice, self.coefficients)
+
+    def gradient_at(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the gradients (m, 3, 3) per mm: the component, then the direction."""
+        parts = [_field_at(points_mm, self.lattice, self.coefficients, axis) for axis in range(3)]
+        return np.stack(parts, axis=2)
+
+    def estimate_at(self, points_mm: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return displacements and their variances (m, 3)."""
+        return self.value_at(points_mm), self.variance_at(points_mm)
+
+    def told(self) -> dict[str, Any]:
+        """Return how the field was fitted: figures with their units in their names."""
+        return {
+            "method": "splines",
+            "knots_mm": list(self.lattice.cell_mm),
+            "knots": list(self.lattice.shape),
+            "penalty_weights": dict(self.expected.weights),
+            "error_scale": self.expected.scale,
+            "unresolved_mm": self.expected.unresolved_mm,
+            "reduced_chi2": self.reduced_chi2,
+            "belonging": float(np.sum(self.probability)),
+        }
+
+    def variance_at(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the variances (m, 3), with that of what the splines leave unresolved."""
+        found = np.empty(points_mm.shape)
+        for start in range(0, len(points_mm), POINTS_AT_ONCE):
+            part = slice(start, start + POINTS_AT_ONCE)
+            found[part] = self._variance(points_mm[part])
+        return found + self.expected.unresolved_mm**2
+
+    def _variance(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        columns, values = rows_of(self.lattice, points_mm)
+        plane = int(np.prod(self.lattice.shape[1:]))
+        planes, within = columns // plane, columns % plane
+        diagonal, below = self.covariance
+        length = len(diagonal[0]) // (3 * plane)
+        found = np.zeros(points_mm.shape)
+        for first in np.unique(planes[:, 0]):
+            which = np.flatnonzero(planes[:, 0] == first)
+            found[which] = self._in_planes(int(first), length, within[which], values[which], diagonal, below)
+        return found
+
+    def _in_planes(
+        self,
+        first: int,
+        length: int,
+        within: NDArray[np.int64],
+        values: NDArray[np.float64],
+        diagonal: list[Block],
+        below: list[Block],
+    ) -> NDArray[np.float64]:
+        """Return variances at points whose splines begin in one plane of x."""
+        plane = int(np.prod(self.lattice.shape[1:]))
+        each = within.shape[1] // 4
+        found = np.zeros((len(within), 3))
+        for one in range(4):
+            for other in range(one + 1):
+                rows, columns = first + one, first + other
+                block = diagonal[rows // length] if rows // length == columns // length else below[columns // length]
+                left, right = slice(one * each, (one + 1) * each), slice(other * each, (other + 1) * each)
+                for axis in range(3):
+                    row = (rows % length * 3 + axis) * plane + within[:, left]
+                    column = (columns % length * 3 + axis) * plane + within[:, right]
+                    part = block[row[:, :, np.newaxis], column[:, np.newaxis]]
+                    term = np.einsum("ni,nij,nj->n", values[:, left], part, values[:, right])
+                    found[:, axis] += term if one == other else 2.0 * term
+        return found
+
+
+def penalties_of(divergence: str) -> tuple[str, ...]:
+    """Return the penalties' names."""
+    return (SECOND, THIRD) if divergence == "off" else (SECOND, THIRD, DIVERGENCE)
+
+
+def lattice_for(samples: int, low_mm: NDArray[np.float64], high_mm: NDArray[np.float64]) -> Lattice:
+    """Return the knots for so many samples in a box."""
+    distance = float(np.prod(np.subtract(high_mm, low_mm)) / max(samples, 1)) ** (1.0 / 3.0)
+    knot = KNOTS_OF_DISTANCE * distance
+    while (lattice := Lattice.over(low_mm, high_mm, knot)).unknowns > MOST_UNKNOWNS:
+        knot *= COARSER
+    return lattice
+
+
+def spline_field(
+    samples: Samples, lattice: Lattice, divergence: str, rng: np.random.Generator, still_mm: NDArray[np.float64]
+) -> SplineField:
+    """Fit a field.
+
+    Parameters
+    ----------
+    samples : what is known
+    lattice : the knots, over all samples
+    divergence : "penalised", "free" or "off"
+    rng : draws the boxes that tell the penalties' weights
+    still_mm : (k, 3) points where the displacement is 0: on walls
+    """
+    mean = np.median(samples.value_mm, axis=0) if not len(still_mm) else np.zeros(3)
+    about = replace(samples, value_mm=samples.value_mm - mean)
+    expected = first_expectation(about, lattice, penalties_of(divergence))
+    probability, gradient = _first_beliefs(about, lattice, still_mm, expected, rng)
+    about = with_places(about, gradient)
+    expected, by_others = most_probable(replace(about, probability=probability), lattice, expected, rng)
+    if divergence == "free":
+        expected = _without_divergence(expected, lattice)
+    factor, coefficients, probability, error = _weighed(about, lattice, still_mm, expected, by_others, probability)
+    chi2 = squares(error, about.covariance_mm2)
+    return SplineField(
+        lattice,
+        coefficients,
+        factor.inverse(),
+        mean,
+        expected,
+        probability,
+        float(np.sum(probability * chi2) / (3.0 * np.sum(probability))),
+    )
+
+
+def _first_beliefs(
+    samples: Samples,
+    lattice: Lattice,
+    still_mm: NDArray[np.float64],
+    expected: Expectation,
+    rng: np.random.Generator,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the probability (n,) of each sample to belong to a field of wide knots, and its gradients (n, 3, 3).
+
+    No single sample can bend such a field.
+    """
+    wide = Lattice.over(lattice.low_mm, lattice.high_mm, WIDE * max(lattice.cell_mm))
+    few = np.sort(rng.choice(len(samples), min(len(samples), ENOUGH_OF_UNKNOWNS * wide.unknowns), replace=False))
+    before = _before(wide, expected, still_mm)
+    unresolved, probability = expected.unresolved_mm, samples.probability
+    for _ in range(ROUNDS):
+        covariance = error_covariance(samples, 1.0, unresolved)
+        _, coefficients = _solved(samples.subset(few), wide, before, covariance[few], probability[few])
+        error = samples.value_mm - _field_at(samples.points_mm, wide, coefficients)
+        doubtful = error_covariance(samples, 1.0, FAR_OFF * unresolved)
+        last, probability = probability, belonging(samples, error, doubtful, expected.spread_mm)
+        unresolved = 1.4826 * float(np.median(np.abs(error).max(axis=1)))
+        if np.mean(np.abs(probability - last)) < LAST_CHANGE:
+            break
+    gradient = np.stack([_field_at(samples.points_mm, wide, coefficients, axis) for axis in range(3)], axis=2)
+    return probability, gradient
+
+
+def _weighed(
+    samples: Samples,
+    lattice: Lattice,
+    still_mm: NDArray[np.float64],
+    expected: Expectation,
+    by_others: NDArray[np.float64],
+    probability: NDArray[np.float64],
+) -> tuple[Factor, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Fit, and weigh samples anew; return factor, coefficients, probabilities and errors (n, 3).
+
+    `by_others` (3, 3) is the covariance of the field at a sample that takes no part, so that one left out may return.
+    """
+    before = _before(lattice, expected, still_mm)
+    covariance = error_covariance(samples, expected.scale, expected.unresolved_mm)
+    for _ in range(ROUNDS):
+        factor, coefficients = _solved(samples, lattice, before, covariance, probability)
+        error = samples.value_mm - _field_at(samples.points_mm, lattice, coefficients)
+        last, probability = probability, belonging(samples, error, covariance + by_others, expected.spread_mm)
+        if np.mean(np.abs(probability - last)) < LAST_CHANGE:
+            break
+    return factor, coefficients, probability, error
+
+
+def _solved(
+    samples: Samples,
+    lattice: Lattice,
+    before: Stencil,
+    covariance: NDArray[np.float64],
+    probability: NDArray[np.float64],
+) -> tuple[Factor, NDArray[np.float64]]:
+    """Return the factor of the normal equations and the coefficients (nx, 3, ny, nz)."""
+    weight = probability[:, np.newaxis, np.newaxis] * np.linalg.inv(covariance)
+    matrix = before.copy()
+    stencils.add_samples(matrix, lattice, samples.points_mm, weight)
+    weighted = np.einsum("nij,nj->ni", weight, samples.value_mm)
+    right = stencils.right_hand_side(lattice, samples.points_mm, weighted)
+    factor = factorised(matrix)
+    return factor, factor.solve(right.ravel()).reshape(right.shape)
+
+
+def _field_at(
+    points_mm: NDArray[np.float64], lattice: Lattice, coefficients: NDArray[np.float64], along: int | None = None
+) -> NDArray[np.float64]:
+    """Return the sum of splines (n, 3) at points, or its derivative along an axis."""
+    columns, values = rows_of(lattice, points_mm, along)
+    by_component = coefficients.transpose(1, 0, 2, 3).reshape(3, -1)
+    return np.stack([np.sum(values * part[columns], axis=1) for part in by_component], axis=1)
+
+
+def _before(lattice: Lattice, expected: Expectation, still_mm: NDArray[np.float64]) -> Stencil:
+    """Return the inverse covariance of the field before any sample, 0 at points that are still."""
+    before = expected_inverse(lattice, expected)
+    if len(still_mm):
+        weight = np.eye(3) / (STILL_SHARE * expected.spread_mm) ** 2
+        stencils.add_samples(before, lattice, still_mm, np.broadcast_to(weight, (len(still_mm), 3, 3)))
+    return before
+
+
+def _without_divergence(expected: Expectation, lattice: Lattice) -> Expectation:
+    """Return the expectation of a field that has next to none."""
+    weights = {**expected.weights, DIVERGENCE: divergence_weight(expected, lattice, FREE_DIVERGENCE)}
+    return replace(expected, weights=weights)

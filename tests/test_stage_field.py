@@ -1,0 +1,174 @@
+"""`field` as a command: tracks and vectors of a flow in, vectors on the grid of the windows out."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from lfpiv_cli.console import Console
+from lfpiv_cli.errors import InputError, UsageError
+from lfpiv_cli.files import vtkhdf
+from lfpiv_cli.files.config import load_config
+from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, Points, read_tracks, write_points
+from lfpiv_cli.interface.fields import fit_notices, samples_of_tracks
+from lfpiv_cli.names import Divergence
+from lfpiv_cli.reference import Reference
+from lfpiv_cli.stages.field import FieldOptions, fit_flow, read_places
+from tests.test_particle_stage import CONFIG, run
+
+
+def write_particles(path: Path, place: np.ndarray) -> None:
+    """Write particles that are all alike."""
+    count = len(place)
+    arrays = {
+        "intensity": np.full(count, 1000.0),
+        "covariance_mm2": np.tile([1e-8, 1e-8, 1e-6, 0.0, 0.0, 0.0], (count, 1)),
+        "chi2": np.ones(count),
+        "seen": np.ones(count),
+        "flag": np.zeros(count, np.uint8),
+    }
+    made = {"config": load_config(CONFIG).resolved()}
+    points = Points(place, arrays, Reference("mid_plane", 0.5), {}, made)
+    write_points(path, PARTICLES_FORMAT, points, overwrite=True)
+
+
+MOVED_MM = np.array([0.1, -0.05, 0.02])
+
+
+def write_tracks(path: Path, rng: np.random.Generator, count: int = 100, *, full: bool = True) -> None:
+    """Write tracks of a flow that moves as a whole, with errors as stated."""
+    sigma = np.array([1e-3, 1e-3, 1e-2])
+    moved = MOVED_MM + sigma * rng.standard_normal((count, 3))
+    dt_s = 2e-3
+    arrays = {
+        "velocity": moved * 1e-3 / dt_s,
+        "velocity_sigma": np.tile(sigma * 1e-3 / dt_s, (count, 1)),
+        "displacement_mm": moved,
+        "particle_a": np.arange(count),
+        "particle_b": np.arange(count),
+        "link_probability": np.full(count, 0.99),
+    }
+    if full:
+        arrays["displacement_covariance_mm2"] = np.tile([*sigma**2, 0.0, 0.0, 0.0], (count, 1))
+    place = rng.uniform((-1.5, -1.1, -2.0), (1.5, 1.1, 2.0), (count, 3))
+    provenance = {"config": load_config(CONFIG).overridden("correlation", dt_s=dt_s).resolved()}
+    points = Points(place, arrays, Reference("mid_plane", 0.5), {"dt_s": dt_s}, provenance)
+    write_points(path, TRACKS_FORMAT, points, overwrite=True)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("full", [True, False])
+def test_field_has_the_flow_of_its_tracks(tmp_path: Path, rng: np.random.Generator, capsys, full: bool) -> None:
+    write_tracks(tmp_path / "tracks.vtkhdf", rng, full=full)
+    run("field", tmp_path / "tracks.vtkhdf", "-o", tmp_path / "field.vtkhdf", "--json")
+    assert json.loads(capsys.readouterr().out)["samples"] == 100
+    field = vtkhdf.open_vectors(tmp_path / "field.vtkhdf")
+    found = field.displacement_voxel[field.flag == 0] * field.voxel_mm
+    np.testing.assert_allclose(found.mean(axis=0), MOVED_MM, atol=3e-3)
+    assert field.uncertainty_voxel is not None
+    # What it writes is samples again, of vectors.
+    run("field", tmp_path / "field.vtkhdf", tmp_path / "tracks.vtkhdf", "-o", tmp_path / "both.vtkhdf")
+
+
+def test_few_tracks_make_no_field(tmp_path: Path, rng: np.random.Generator) -> None:
+    write_tracks(tmp_path / "tracks.vtkhdf", rng, 5)
+    with pytest.raises(InputError, match="5 samples, expected at least 20"):
+        run("field", tmp_path / "tracks.vtkhdf", "-o", tmp_path / "field.vtkhdf")
+
+
+def test_velocities_at_points_and_gradients(tmp_path: Path, rng: np.random.Generator, capsys) -> None:
+    write_tracks(tmp_path / "tracks.vtkhdf", rng)
+    (tmp_path / "points.csv").write_text("x,y,z\n0.1, 0.2, 0.3\n\n-0.5,0,1e-1\n", encoding="utf-8")
+    output = tmp_path / "field.vtkhdf"
+    run("field", tmp_path / "tracks.vtkhdf", "--at", tmp_path / "points.csv", "--derived", "-o", output, "--json")
+    told = json.loads(capsys.readouterr().out)
+    # the flow moves as a whole: what is left is of the errors, 0.01 mm in 2 ms at most
+    assert 0.0 <= told["kinetic_energy_m2_s2"] < 0.5 * 0.005**2
+    assert "dissipation_m2_s3" not in told
+    header, *lines = (tmp_path / "field_at.csv").read_text(encoding="utf-8").splitlines()
+    rows = np.array([[float(word) for word in line.split(",")] for line in lines])
+    assert header.split(",")[3] == "u_m_s"
+    np.testing.assert_allclose(rows[:, :3], [[0.1, 0.2, 0.3], [-0.5, 0.0, 0.1]])
+    # a hundred tracks with errors of 0.001 and 0.01 mm in 2 ms: a third of one track's
+    np.testing.assert_allclose(rows[:, 3:6], np.tile(MOVED_MM / 2.0, (2, 1)), atol=2e-3)
+    assert np.all(np.abs(rows[:, 3:6] - MOVED_MM / 2.0) < 5.0 * rows[:, 6:])
+    with h5py.File(output) as file:
+        divergence = file["divergence"][()]
+        trace = sum(file[f"gradient_{name}"][..., axis] for axis, name in enumerate("uvw"))
+    np.testing.assert_allclose(trace, divergence, atol=1e-12)
+
+
+@pytest.mark.parametrize(("text", "found"), [("", "no points"), ("1,2\n", "line 1"), ("1,2,nan\n", "line 1")])
+def test_points_that_are_none_are_named(tmp_path: Path, text: str, found: str) -> None:
+    (tmp_path / "points.csv").write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match=found):
+        read_places(tmp_path / "points.csv")
+
+
+def test_pressure_needs_a_sequence(tmp_path: Path, rng: np.random.Generator) -> None:
+    write_tracks(tmp_path / "tracks.vtkhdf", rng, 30)
+    options = FieldOptions(pressure=[tmp_path / "tracks.vtkhdf"])
+    with pytest.raises(UsageError, match="one sequence"):
+        fit_flow([tmp_path / "tracks.vtkhdf"], tmp_path / "field.vtkhdf", options, console=Console(quiet=True))
+
+
+def test_a_pair_has_no_frames(rng: np.random.Generator, tmp_path: Path) -> None:
+    write_tracks(tmp_path / "tracks.vtkhdf", rng, 30)
+    with pytest.raises(UsageError, match="of a pair"):
+        samples_of_tracks(read_tracks(tmp_path / "tracks.vtkhdf"), 1)
+
+
+def test_a_sequence_s_samples_are_those_of_its_frame() -> None:
+    frame = np.array([0, 1, 2, 0, 1, 2])
+    arrays = {
+        "velocity": np.outer(frame, [0.1, 0.2, 0.3]),
+        "velocity_sigma": np.full((6, 3), 0.01),
+        "track": np.array([0, 0, 0, 1, 1, 1]),
+        "frame": frame,
+        "particle": np.zeros(6, int),
+        "link_probability": np.array([np.nan, 0.9, 0.8, np.nan, 0.7, 0.6]),
+    }
+    points = Points(np.arange(18.0).reshape(6, 3), arrays, Reference("mid_plane", 0.5), {"dt_s": 2e-3}, {})
+    found = samples_of_tracks(points)
+    np.testing.assert_array_equal(found.points_mm, points.position_mm[[1, 4]])
+    np.testing.assert_allclose(found.value_mm, np.tile([0.2, 0.4, 0.6], (2, 1)))
+    np.testing.assert_allclose(found.covariance_mm2, np.tile(4e-4 * np.eye(3), (2, 1, 1)))
+    np.testing.assert_array_equal(samples_of_tracks(points, 2).probability, [0.8, 0.6])
+    with pytest.raises(UsageError, match="frame 3 is none of 3"):
+        samples_of_tracks(points, 3)
+
+
+@pytest.mark.parametrize(
+    ("divergence", "share", "chi2", "belonging", "codes"),
+    [
+        ("penalised", 0.01, 0.9, 99, []),
+        ("penalised", 0.5, 0.9, 99, ["flow-with-sources"]),
+        ("free", 0.01, 3.0, 99, ["field-off-samples"]),
+        ("off", 0.5, 0.9, 60, ["samples-left-out"]),
+    ],
+)
+def test_doubts_are_told(divergence: Divergence, share: float, chi2: float, belonging: int, codes: list[str]) -> None:
+    summary = {
+        "divergence_rms_over_gradients_rms": share,
+        "reduced_chi2": chi2,
+        "samples": 100,
+        "samples_belonging": belonging,
+    }
+    assert [notice.code for notice in fit_notices(summary, divergence, "tracks.vtkhdf")] == codes
+
+
+@pytest.mark.thorough
+def test_the_grid_of_track_by_splines_is_the_field_of_its_tracks(tmp_path: Path, rng: np.random.Generator) -> None:
+    place = rng.uniform((-1.5, -1.1, -2.0), (1.5, 1.1, 2.0), (80, 3))
+    for name, moved in (("a", 0.0), ("b", MOVED_MM)):
+        write_particles(tmp_path / f"{name}.vtkhdf", place + moved + 1e-4 * rng.standard_normal((80, 3)))
+    pair = [tmp_path / "a.vtkhdf", tmp_path / "b.vtkhdf"]
+    run("track", *pair, "--grid", "--by", "spline", "--dt-s", "0.002", "-o", tmp_path / "tracks.vtkhdf", "-q")
+    run("field", tmp_path / "tracks.vtkhdf", "-o", tmp_path / "field.vtkhdf", "-q")
+    grids = [vtkhdf.open_vectors(tmp_path / name) for name in ("tracks_grid.vtkhdf", "field.vtkhdf")]
+    np.testing.assert_array_equal(grids[0].displacement_voxel, grids[1].displacement_voxel)
+    assert np.isfinite(grids[0].displacement_voxel).any()
