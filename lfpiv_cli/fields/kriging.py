@@ -129,18 +129,27 @@ class KrigedField:
         return np.maximum(everywhere, MAD_TO_SIGMA * np.median(self.off_by[near], axis=1))
 
 
+def not_outliers(samples: Samples) -> NDArray[np.bool_]:
+    """Return which samples (n,) are not far off what their neighbours let expect, in a flow of any roughness.
+
+    What is told of each by a dozen others can be bent by one or two of them, not by what is wrong elsewhere.
+    """
+    kept, _ = _first_without_outliers(samples, SHARES["free"][0])
+    structure = likeliest_structure(samples.subset(kept), SHARES["free"], FEW_NEIGHBOURHOODS)
+    return _without_outliers(samples, structure, kept, OUTLIER_ROUNDS)[0]
+
+
 def is_rough(samples: Samples) -> bool:
     """Tell whether the flow differs so much between neighbouring samples that kriging is to be used, not splines.
 
     The mean square difference grows with less than nearly the square of the distance there, and is more than errors.
+    The samples are without outliers.
     """
     if len(samples) < FEWEST_OF_STRUCTURE:
         return False
-    kept, _ = _first_without_outliers(samples, SHARES["free"][0])
-    inside = samples.subset(kept)
-    structure = likeliest_structure(inside, SHARES["free"], FEW_NEIGHBOURHOODS)
-    apart = SPACINGS_APART * spacing_of(inside.points_mm)
-    stated = np.median(np.einsum("nii->ni", inside.covariance_mm2), axis=0).min()
+    structure = likeliest_structure(samples, SHARES["free"], FEW_NEIGHBOURHOODS)
+    apart = SPACINGS_APART * spacing_of(samples.points_mm)
+    stated = np.median(np.einsum("nii->ni", samples.covariance_mm2), axis=0).min()
     by_errors = 2.0 * (structure.error_factor * float(stated) + structure.nugget_mm2)
     return structure.steepness(apart) < ROUGH_EXPONENT and structure.mean_at(apart) > by_errors
 

@@ -31,10 +31,8 @@ COARSER = 1.05
 # Rounds of weighing samples; the last change of their probabilities that matters, on the average.
 ROUNDS, LAST_CHANGE = 4, 0.002
 POINTS_AT_ONCE = 500
-# Knots so many times wider tell which samples are far off.
+# Knots so many times wider tell how the flow changes around each sample.
 WIDE = 1.6
-# What such a field leaves is larger in some places than in others; only what is far beyond is doubted.
-FAR_OFF = 2.0
 # So many samples for each unknown tell such a field.
 ENOUGH_OF_UNKNOWNS = 1
 # Walls hold the field to 0 within this share of the samples' spread at each of their points.
@@ -158,7 +156,7 @@ def spline_field(
 
     Parameters
     ----------
-    samples : what is known
+    samples : what is known, without gross outliers
     lattice : the knots, over all samples
     divergence : "penalised", "free" or "off"
     rng : draws the boxes that tell the penalties' weights
@@ -167,12 +165,11 @@ def spline_field(
     mean = np.median(samples.value_mm, axis=0) if not len(still_mm) else np.zeros(3)
     about = replace(samples, value_mm=samples.value_mm - mean)
     expected = first_expectation(about, lattice, penalties_of(divergence))
-    probability, gradient = _first_beliefs(about, lattice, still_mm, expected, rng)
-    about = with_places(about, gradient)
-    expected, by_others = most_probable(replace(about, probability=probability), lattice, expected, rng)
+    about = with_places(about, _first_gradients(about, lattice, still_mm, expected, rng))
+    expected, by_others = most_probable(about, lattice, expected, rng)
     if divergence == "free":
         expected = _without_divergence(expected, lattice)
-    factor, coefficients, probability, error = _weighed(about, lattice, still_mm, expected, by_others, probability)
+    factor, coefficients, probability, error = _weighed(about, lattice, still_mm, expected, by_others)
     chi2 = squares(error, about.covariance_mm2)
     return SplineField(
         lattice,
@@ -185,32 +182,20 @@ def spline_field(
     )
 
 
-def _first_beliefs(
+def _first_gradients(
     samples: Samples,
     lattice: Lattice,
     still_mm: NDArray[np.float64],
     expected: Expectation,
     rng: np.random.Generator,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the probability (n,) of each sample to belong to a field of wide knots, and its gradients (n, 3, 3).
-
-    No single sample can bend such a field.
-    """
+) -> NDArray[np.float64]:
+    """Return the gradients (n, 3, 3) of a field of wide knots at the samples."""
     wide = Lattice.over(lattice.low_mm, lattice.high_mm, WIDE * max(lattice.cell_mm))
     few = np.sort(rng.choice(len(samples), min(len(samples), ENOUGH_OF_UNKNOWNS * wide.unknowns), replace=False))
-    before = _before(wide, expected, still_mm)
-    unresolved, probability = expected.unresolved_mm, samples.probability
-    for _ in range(ROUNDS):
-        covariance = error_covariance(samples, 1.0, unresolved)
-        _, coefficients = _solved(samples.subset(few), wide, before, covariance[few], probability[few])
-        error = samples.value_mm - _field_at(samples.points_mm, wide, coefficients)
-        doubtful = error_covariance(samples, 1.0, FAR_OFF * unresolved)
-        last, probability = probability, belonging(samples, error, doubtful, expected.spread_mm)
-        unresolved = 1.4826 * float(np.median(np.abs(error).max(axis=1)))
-        if np.mean(np.abs(probability - last)) < LAST_CHANGE:
-            break
-    gradient = np.stack([_field_at(samples.points_mm, wide, coefficients, axis) for axis in range(3)], axis=2)
-    return probability, gradient
+    part = samples.subset(few)
+    covariance = error_covariance(part, 1.0, expected.unresolved_mm)
+    _, coefficients = _solved(part, wide, _before(wide, expected, still_mm), covariance, part.probability)
+    return np.stack([_field_at(samples.points_mm, wide, coefficients, axis) for axis in range(3)], axis=2)
 
 
 def _weighed(
@@ -219,13 +204,12 @@ def _weighed(
     still_mm: NDArray[np.float64],
     expected: Expectation,
     by_others: NDArray[np.float64],
-    probability: NDArray[np.float64],
 ) -> tuple[Factor, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Fit, and weigh samples anew; return factor, coefficients, probabilities and errors (n, 3).
 
     `by_others` (3, 3) is the covariance of the field at a sample that takes no part, so that one left out may return.
     """
-    before = _before(lattice, expected, still_mm)
+    before, probability = _before(lattice, expected, still_mm), samples.probability
     covariance = error_covariance(samples, expected.scale, expected.unresolved_mm)
     for _ in range(ROUNDS):
         factor, coefficients = _solved(samples, lattice, before, covariance, probability)
