@@ -87,6 +87,34 @@ def test_a_closed_pipe_is_quiet():
     assert done.stderr == ""
 
 
+IGNORED_FIRST = """
+import ctypes, signal, sys, time
+from lfpiv_cli.cli.interrupts import end_by_signals
+
+def called_back():
+    signal.raise_signal(getattr(signal, sys.argv[1]))
+
+end_by_signals()
+try:
+    ctypes.CFUNCTYPE(None)(called_back)()
+    print("ignored")
+    for _ in range(500):
+        time.sleep(0.01)
+except BaseException as error:
+    print(type(error).__name__)
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGTERM to send")
+@pytest.mark.parametrize(("sent", "name"), [("SIGTERM", "Terminated"), ("SIGINT", "KeyboardInterrupt")])
+def test_a_signal_during_a_call_back_is_not_lost(sent, name):
+    done = subprocess.run(
+        [sys.executable, "-c", IGNORED_FIRST, sent], capture_output=True, text=True, check=True, timeout=60
+    )
+    assert done.stdout.split() == ["ignored", name]
+    assert done.stderr == ""
+
+
 @pytest.mark.thorough
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGTERM to send")
 @pytest.mark.parametrize(("sent", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])

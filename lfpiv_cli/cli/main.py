@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import signal
 import sys
-from types import FrameType
 from typing import NoReturn
 
 import click
@@ -25,7 +23,8 @@ from lfpiv_cli.cli import (
     vectors,
     weights,
 )
-from lfpiv_cli.cli.outcome import Terminated, outcome_of, print_json_error, printable
+from lfpiv_cli.cli.interrupts import end_by_signals
+from lfpiv_cli.cli.outcome import outcome_of, print_json_error, printable
 from lfpiv_cli.cli.streams import ensure_said, open_streams
 from lfpiv_cli.files.inputs import ensure_address_space
 
@@ -83,7 +82,7 @@ def main() -> NoReturn:
     """Run the command line and leave with the exit code of the outcome."""
     # Asked of the words themselves: a command line that is not understood has no options yet.
     debug, as_json = ("--debug" in sys.argv[1:], "--json" in sys.argv[1:])
-    signal.signal(signal.SIGTERM, _terminate)
+    end_by_signals()
     stdout = open_streams()
     try:
         ensure_address_space()
@@ -103,7 +102,3 @@ def main() -> NoReturn:
                 raise
             click.echo(printable(f"lfpiv: {message}"), err=True)
     sys.exit(code)
-
-
-def _terminate(_signal: int, _frame: FrameType | None) -> None:
-    raise Terminated
