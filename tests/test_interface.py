@@ -6,6 +6,7 @@ import inspect
 import pydoc
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -108,6 +109,13 @@ def test_particles_and_tracks_are_those_of_the_commands(by_commands: Path) -> No
     np.testing.assert_array_equal(on_grid.velocity, written_grid.velocity)
     correlated = lf.open_vectors(by_commands / "vectors.vtkhdf")
     assert lf.combine(correlated, on_grid).field.flag.shape == correlated.flag.shape
+    field = lf.fit_field(tracks, correlated)
+    known = field.vectors().flag == 0
+    assert known.any()
+    nodes = on_grid.grid.centres_mm()[known]
+    np.testing.assert_allclose(field.at(nodes), field.vectors().velocity[known], rtol=1e-9)
+    with pytest.raises(InputError, match="times between frames differ: 0.002 and 0.005 s"):
+        lf.fit_field(tracks, replace(correlated, dt_s=0.005))
 
 
 @pytest.mark.thorough

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -14,7 +16,7 @@ from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, Points, read_tracks, write_points
-from lfpiv_cli.interface.fields import fit_notices, samples_of_tracks
+from lfpiv_cli.interface.fields import LARGEST_CHI2, fit_notices, samples_of_tracks
 from lfpiv_cli.names import Divergence
 from lfpiv_cli.reference import Reference
 from lfpiv_cli.stages.field import FieldOptions, fit_flow, read_places
@@ -39,10 +41,19 @@ def write_particles(path: Path, place: np.ndarray) -> None:
 MOVED_MM = np.array([0.1, -0.05, 0.02])
 
 
-def write_tracks(path: Path, rng: np.random.Generator, count: int = 100, *, full: bool = True) -> None:
-    """Write tracks of a flow that moves as a whole, with errors as stated."""
+def write_tracks(
+    path: Path,
+    rng: np.random.Generator,
+    count: int = 100,
+    *,
+    full: bool = True,
+    flow: Callable[[np.ndarray], np.ndarray] = np.zeros_like,
+    channel: dict[str, Any] | None = None,
+) -> None:
+    """Write tracks, with errors as stated, of a flow that is added to what moves as a whole."""
     sigma = np.array([1e-3, 1e-3, 1e-2])
-    moved = MOVED_MM + sigma * rng.standard_normal((count, 3))
+    place = rng.uniform((-1.5, -1.1, -2.0), (1.5, 1.1, 2.0), (count, 3))
+    moved = MOVED_MM + flow(place) + sigma * rng.standard_normal((count, 3))
     dt_s = 2e-3
     arrays = {
         "velocity": moved * 1e-3 / dt_s,
@@ -54,8 +65,8 @@ def write_tracks(path: Path, rng: np.random.Generator, count: int = 100, *, full
     }
     if full:
         arrays["displacement_covariance_mm2"] = np.tile([*sigma**2, 0.0, 0.0, 0.0], (count, 1))
-    place = rng.uniform((-1.5, -1.1, -2.0), (1.5, 1.1, 2.0), (count, 3))
-    provenance = {"config": load_config(CONFIG).overridden("correlation", dt_s=dt_s).resolved()}
+    settings = load_config(CONFIG).overridden("correlation", dt_s=dt_s).overridden("channel", **(channel or {}))
+    provenance = {"config": settings.resolved()}
     points = Points(place, arrays, Reference("mid_plane", 0.5), {"dt_s": dt_s}, provenance)
     write_points(path, TRACKS_FORMAT, points, overwrite=True)
 
@@ -72,6 +83,40 @@ def test_field_has_the_flow_of_its_tracks(tmp_path: Path, rng: np.random.Generat
     assert field.uncertainty_voxel is not None
     # What it writes is samples again, of vectors.
     run("field", tmp_path / "field.vtkhdf", tmp_path / "tracks.vtkhdf", "-o", tmp_path / "both.vtkhdf")
+
+
+@pytest.mark.thorough
+def test_walls_stand_still_by_command(tmp_path: Path, rng: np.random.Generator, capsys) -> None:
+    wall = 0.5 * (load_config(CONFIG).channel_width_mm() or 0.0)
+    write_tracks(
+        tmp_path / "tracks.vtkhdf",
+        rng,
+        flow=lambda place: -((place[:, 2:] / wall) ** 2) * MOVED_MM,
+        channel={"no_slip": True},
+    )
+    np.savetxt(tmp_path / "at.csv", [[0.0, 0.0, -wall], [0.3, 0.2, wall], [0.0, 0.0, 0.0]], delimiter=",")
+    run("field", tmp_path / "tracks.vtkhdf", "--at", tmp_path / "at.csv", "-o", tmp_path / "field.vtkhdf", "--json")
+    assert json.loads(capsys.readouterr().out)["method"] == "splines"
+    found = np.loadtxt(tmp_path / "field_at.csv", delimiter=",", skiprows=1)
+    speed = np.linalg.norm(found[:, 3:6], axis=1)
+    # walls hold the field within a thousandth of the displacements' spread
+    assert np.all(speed[:2] < 1e-3 * speed[2])
+    assert speed[2] == pytest.approx(np.linalg.norm(MOVED_MM) * 1e-3 / 2e-3, rel=0.03)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("divergence", ["penalised", "free", "off"])
+def test_what_is_known_of_the_divergence_is_chosen(
+    tmp_path: Path, rng: np.random.Generator, capsys, divergence: str
+) -> None:
+    write_tracks(tmp_path / "tracks.vtkhdf", rng, flow=lambda place: 0.05 * place)
+    run("field", tmp_path / "tracks.vtkhdf", "--divergence", divergence, "-o", tmp_path / "field.vtkhdf", "--json")
+    summary = json.loads(capsys.readouterr().out)
+    share = summary["divergence_rms_over_gradients_rms"]
+    # the divergence is three times each of three gradients, and their rms counts six that are none
+    assert share < 0.05 if divergence == "free" else share == pytest.approx(3.0 * np.sqrt(3.0), rel=0.05)
+    if divergence == "free":
+        assert summary["reduced_chi2"] > LARGEST_CHI2
 
 
 def test_few_tracks_make_no_field(tmp_path: Path, rng: np.random.Generator) -> None:

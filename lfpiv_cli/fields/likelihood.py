@@ -31,6 +31,8 @@ NEEDED_GROWTH = 3.0
 # the logit of half the power).
 POWER, INNER_SPACINGS, OUTER_SPACINGS, DIFFERENCE_SHARE, NUGGET_SHARE = 2.0 / 3.0, 0.3, 10.0, 0.5, 1e-3
 DEVIATIONS = np.array([3.0, 1.5, 1.0, 1.0, 3.0, 0.5])
+# No parameter is further from its first guess, in these deviations: a search that went on would leave what is a number.
+FARTHEST = 10.0
 STEPS, ENOUGH = 25, 1e-5
 # What stands for a likelihood of none.
 IMPOSSIBLE = 1e12
@@ -55,20 +57,22 @@ def likeliest_structure(
     size : number of neighbourhoods and of samples in each
     """
     spacing = spacing_of(samples.points_mm)
-    cost = _cost_of(samples, spacing, size)
-    found = _least(cost, _first_guess(samples, spacing), shares[0])
+    cost, guess = _cost_of(samples, spacing, size), _first_guess(samples, spacing)
+    found = _least(cost, guess, shares[0], guess)
     # what else is likeliest differs little from share to share
     other = min(shares, key=lambda share: cost(found, share))
     if other != shares[0]:
-        better = _least(cost, found, other)
+        better = _least(cost, found, other, guess)
         if cost(better, other) < cost(found, shares[0]) - NEEDED_GROWTH:
             return _structure(better, spacing, other)
     return _structure(found, spacing, shares[0])
 
 
-def _least(cost: Cost, start: NDArray[np.float64], share: float) -> NDArray[np.float64]:
-    """Return the parameters, near some, at which the cost is the smallest."""
-    found = minimize(cost, start, args=(share,), method="L-BFGS-B", options={"maxiter": STEPS, "ftol": ENOUGH})
+def _least(cost: Cost, start: NDArray[np.float64], share: float, guess: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the parameters, near some and not too far from the first guess, at which the cost is the smallest."""
+    bounds = list(zip(guess - FARTHEST * DEVIATIONS, guess + FARTHEST * DEVIATIONS, strict=True))
+    options = {"maxiter": STEPS, "ftol": ENOUGH}
+    found = minimize(cost, start, args=(share,), method="L-BFGS-B", bounds=bounds, options=options)
     return np.asarray(found.x)
 
 

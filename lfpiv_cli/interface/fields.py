@@ -167,16 +167,27 @@ def fit_field(
     Raises
     ------
     InputError
-        There are too few samples, or the time between frames is not known.
+        There are too few samples, the time between frames is not known, or they do not belong together.
     """
     settings = rig or next((each.settings for each in given if isinstance(each, Tracked)), None)
     if settings is None:
         raise InputError("vectors alone do not tell the grid: give the rig")
+    _ensure_one_flow(given, settings.correlation.dt_s)
     parts = [
         samples_of_tracks(each.points) if isinstance(each, Tracked) else samples_of_vectors(each, settings, "vectors")
         for each in given
     ]
     return fitted(parts, settings, divergence, "field")
+
+
+def _ensure_one_flow(given: Sequence[Tracked | VectorField], dt_s: float | None) -> None:
+    """Raise InputError where steps in time or origins of places differ."""
+    times = {each.settings.correlation.dt_s if isinstance(each, Tracked) else each.dt_s for each in given} | {dt_s}
+    known = sorted(time for time in times if time is not None)
+    if len(known) > 1:
+        raise InputError(f"the times between frames differ: {' and '.join(f'{time:g}' for time in known)} s")
+    if len({each.points.reference for each in given if isinstance(each, Tracked)}) > 1:
+        raise InputError("the tracks' coordinates have different origins")
 
 
 def fields_of(found: TracksOf[Any], name: str) -> Iterator[FittedField]:
