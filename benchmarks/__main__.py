@@ -19,6 +19,7 @@ from benchmarks.fields import bench_fields
 from benchmarks.fuzz import bench_fuzz
 from benchmarks.links import bench_links
 from benchmarks.particles import bench_particles, bench_particles_thrice
+from benchmarks.pressure import bench_pressure
 from benchmarks.rigs import bench_rigs
 from benchmarks.sequences import bench_sequences
 from benchmarks.simd import bench_simd
@@ -36,6 +37,7 @@ BENCHMARKS: dict[str, Callable[[], None]] = {
     "links": bench_links,
     "particles": bench_particles,
     "particles-thrice": bench_particles_thrice,
+    "pressure": bench_pressure,
     "rigs": bench_rigs,
     "sequences": bench_sequences,
     "simd": bench_simd,

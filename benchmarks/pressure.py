@@ -1,11 +1,10 @@
 """Pressure from simulated sequences of seven frames, beside the truth: places as `field_tracks` draws them.
 
-python -m benchmarks.pressure [TRACERS]
+    python -m benchmarks pressure
 """
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,7 +23,7 @@ SIZE_MM = np.array([13.0, 10.0, 10.0])
 FRAMES, MIDDLE = 7, 3
 DENSITY_KG_M3 = 998.2
 NODE_MM = 0.8
-SEEDS = 3
+TRACERS, SEEDS = 8000, 3
 # Rms displacements from frame to frame: one to four voxels of 0.1 mm.
 STEPS_MM = (0.1, 0.25, 0.4)
 
@@ -88,17 +87,12 @@ def nodes() -> Floats:
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
-def main() -> None:
+def bench_pressure() -> None:
     """Print a row for each flow, displacement and seed."""
-    count = int(sys.argv[1]) if len(sys.argv) > 1 else 8000
-    print(f"{count} tracers; shares of the pressure's rms")
+    print(f"{TRACERS} tracers; shares of the pressure's rms")
     for name, flow in (("Taylor-Green", taylor_green(0.1, 10.0)), ("ABC", abc((0.1, 0.1, 0.1), 10.0))):
         for step in STEPS_MM:
             for seed in range(SEEDS):
-                found = trial(flow, count, step, seed)
+                found = trial(flow, TRACERS, step, seed)
                 told = f"error {found.error_share:.3f}  stated {found.sigma_share:.3f}  covered {found.covered:.2f}"
                 print(f"{name:13s} {step:.2f} mm  seed {seed}  {told}", flush=True)
-
-
-if __name__ == "__main__":
-    main()
