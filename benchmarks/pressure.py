@@ -1,6 +1,6 @@
 """Pressure from simulated sequences of seven frames, beside the truth: places as `field_tracks` draws them.
 
-    python -m benchmarks pressure
+python -m benchmarks pressure
 """
 
 from __future__ import annotations
