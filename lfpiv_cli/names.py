@@ -20,6 +20,10 @@ Polarity = Literal["auto", "bright", "dark"]
 # The world axis that the sensor's columns follow.
 ColumnAxis = Literal["x", "y"]
 
+# The faces at which light is refracted; and how a round one faces the camera: bulging towards it, or hollow.
+SurfaceKind = Literal["plane", "tilted_plane", "cylinder", "sphere"]
+Facing = Literal["convex", "concave"]
+
 # Where the coordinates of volumes, vectors and points begin.
 ReferenceName = Literal["focal_point", "mid_plane"]
 

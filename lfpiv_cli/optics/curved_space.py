@@ -1,0 +1,201 @@
+"""What lies between the scene and the main lens where its faces are not plane: round pipes, spheres, tilted windows.
+
+The same questions as `object_space` answers for plane layers, by exact rays. There is no paraxial point in air that all
+rays of a point come from: behind a cylinder a pencil of rays is astigmatic, and its two apparent distances (see
+`equivalent`) differ by far more than the depth over which light spreads.
+
+Axes: image axes (x along the columns, see `camera`), z away from the camera from the nominal focal point, mm. Surfaces
+are given in world axes, and these lie along the rectified image: the camera's rotation, where a calibration has found
+one, is taken out of the images and turns no surface.
+
+Notes
+-----
+The two apparent distances on the optical axis, paraxially. Let the pencil in a plane through the axis meet, in the
+order of the light from the camera, faces of curvature c_k in that plane (1/R where they bulge towards the camera, 0
+along a cylinder's axis), with index n_(k-1) in front and n_k behind, t_k apart. To rays close to the axis a point u_k
+behind face k seems to lie, seen from in front of it, u'_k behind it. Snell's law for small angles from the normal,
+which at height h is tilted by h c, is n_(k-1) (h/u' - h c) = n_k (h/u - h c), so
+
+    n_(k-1) / u'_k = n_k / u_k - (n_k - n_(k-1)) c_k,     u_(k-1) = t_(k-1) + u'_k
+
+from the fluid to the first face; the apparent distance is d_1 + u'_1, and each face shows the image n_k u'_k /
+(n_(k-1) u_k) times as large. With c = 0 these are Eqs. 6 and 9 of plane layers. A point at the common centre of
+concentric cylinders stays where it is across them (u' = u = R), whatever the indices, where the planes along the axis
+lift it by sum t_k (1 - n_a / n_k): 1.9 mm for 5 mm of water behind 2 mm of acrylic.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lfpiv_cli.errors import ConfigError
+from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.face_tracing import aim_all, pencils, trace_all_in, trace_all_out
+from lfpiv_cli.optics.media import Media
+from lfpiv_cli.optics.surfaces import Faces, Shape, Surface
+
+
+@dataclass(frozen=True)
+class Face:
+    """A surface, and the refractive index behind it as seen from the camera."""
+
+    surface: Surface
+    index: float
+
+
+@dataclass(frozen=True, eq=False)
+class Equivalent:
+    """Where points seem to lie in air to rays close to the one through the middle of the lens.
+
+    Along each image axis k the slope of such a ray is (X_k - place_k) / distance_k.
+
+    Attributes
+    ----------
+    place_mm, distance_mm : (n, 2) along both image axes; NaN where not valid
+    valid : (n,) the point is in the fluid and seen from the middle of the lens
+    """
+
+    place_mm: NDArray[np.float64]
+    distance_mm: NDArray[np.float64]
+    valid: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class CurvedSpace:
+    """Refracting faces in front of the lens, in the order in which light from the camera would meet them.
+
+    Attributes
+    ----------
+    media : refractive indices; of these the air in front of the first face and the fluid behind the last count
+    faces : from the camera on
+
+    Raises
+    ------
+    ConfigError : no face, one that the optical axis misses, faces not in order, or no fluid behind the last
+    """
+
+    media: Media
+    faces: tuple[Face, ...]
+
+    def __post_init__(self) -> None:
+        """Refuse faces that light cannot cross one after another along the optical axis."""
+        if not self.faces:
+            raise ConfigError("a scene needs at least one face")
+        if self.faces[-1].index != self.media.fluid:
+            raise ConfigError(
+                f"behind the last face the index is {self.faces[-1].index:g}, not the fluid's {self.media.fluid:g}"
+            )
+        depths = [shape.vertex_mm[2] for shape in self.shapes()]
+        for k, (front, back) in enumerate(zip(depths, depths[1:], strict=False)):
+            if back <= front:
+                raise ConfigError(
+                    f"face {k + 2} meets the optical axis at z = {back:g} mm, face {k + 1} at {front:g}; expected them "
+                    "from the camera on"
+                )
+
+    def shapes(self) -> tuple[Shape, ...]:
+        """Return the faces near the optical axis.
+
+        Raises
+        ------
+        ConfigError : the optical axis misses one
+        """
+        return tuple(face.surface.shape() for face in self.faces)
+
+    def lens_z_mm(self, camera: Camera) -> float:
+        """Return z of the main lens, from which planes at the faces' vertices show the focal point in focus.
+
+        Raises
+        ------
+        ConfigError : the first face lies behind the lens
+        """
+        depths = np.array([*(shape.vertex_mm[2] for shape in self.shapes()), 0.0])
+        indices = np.array([face.index for face in self.faces])
+        in_front = camera.focus_distance_mm - self.media.air * float(np.sum(np.diff(depths) / indices))
+        if in_front <= 0.0:
+            raise ConfigError(f"the first face, at z = {depths[0]:g} mm, lies behind the lens")
+        return float(depths[0] - in_front)
+
+    def for_kernels(self, camera: Camera) -> Faces:
+        """Return the faces as compiled kernels take them, in image axes.
+
+        Raises
+        ------
+        ConfigError : the first face lies behind the lens
+        """
+        shapes = self.shapes()
+        indices = np.array([self.media.air, *(face.index for face in self.faces)])
+        return Faces(
+            lens_z_mm=self.lens_z_mm(camera),
+            focus_distance_mm=camera.focus_distance_mm,
+            depth_ratio=self.media.depth_ratio,
+            vertices_mm=camera.to_image_axes([shape.vertex_mm for shape in shapes]),
+            normals=camera.to_image_axes([shape.normal for shape in shapes]),
+            axes=camera.to_image_axes([shape.axis for shape in shapes]),
+            curvatures_per_mm=np.array([shape.curvature_per_mm for shape in shapes]),
+            ratios=indices[:-1] / indices[1:],
+        )
+
+    def distance(self, camera: Camera, z_mm: ArrayLike) -> NDArray[np.float64]:
+        """Return how far from the lens, in air, points on the optical axis would appear behind planes at the vertices.
+
+        What `ObjectSpace.distance` gives for planes; along a cylinder's axis it is the apparent distance.
+        """
+        return camera.focus_distance_mm + self.media.depth_ratio * np.asarray(z_mm, dtype=np.float64)
+
+    def rays_from_air(
+        self, camera: Camera, crossing_mm: ArrayLike, slopes: ArrayLike, z_mm: ArrayLike
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Follow rays from the lens to a depth in the fluid.
+
+        Parameters
+        ----------
+        crossing_mm, slopes : (n, 2) where they cross the main lens, and their slopes there
+        z_mm : (n,) or one for all
+
+        Returns
+        -------
+        Places (n, 2), and (n,) whether the ray is there and in the fluid; NaN where it misses a face.
+        """
+        crossing, tangents = _rows(crossing_mm, 2), _rows(slopes, 2)
+        return trace_all_in(self.for_kernels(camera), crossing, tangents, _depths(z_mm, len(crossing)))
+
+    def rays_to_air(
+        self, camera: Camera, points_mm: ArrayLike, directions: ArrayLike
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+        """Follow rays from points (n, 3) in directions (n, 3), towards the camera, to the main lens.
+
+        Returns
+        -------
+        Where they cross it (n, 2), their slopes there (n, 2), and (n,) whether they do; NaN where not.
+        """
+        return trace_all_out(self.for_kernels(camera), _rows(points_mm, 3), _rows(directions, 3))
+
+    def slopes(
+        self, camera: Camera, points_mm: ArrayLike, crossing_mm: ArrayLike
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Return the slopes (n, 2) at the lens of the rays from points (n, 3) that cross it at (n, 2), if they do."""
+        return aim_all(self.for_kernels(camera), _rows(points_mm, 3), _rows(crossing_mm, 2))
+
+    def equivalent(self, camera: Camera, points_mm: ArrayLike) -> Equivalent:
+        """Return where points (n, 3) seem to lie in air, along each image axis, to rays near the middle of the lens.
+
+        Away from a cylinder's two planes of symmetry the slope along one axis also changes with the crossing along the
+        other; that is left out.
+        """
+        slopes, growth, valid = pencils(self.for_kernels(camera), _rows(points_mm, 3))
+        distance = 1.0 / growth[:, [0, 1], [0, 1]]
+        return Equivalent(-slopes * distance, distance, valid)
+
+
+def _rows(values: ArrayLike, columns: int) -> NDArray[np.float64]:
+    """Return rows of so many coordinates."""
+    return np.ascontiguousarray(values, dtype=np.float64).reshape(-1, columns)
+
+
+def _depths(z_mm: ArrayLike, count: int) -> NDArray[np.float64]:
+    """Return a depth for each ray."""
+    return np.ascontiguousarray(np.broadcast_to(np.asarray(z_mm, dtype=np.float64), count))

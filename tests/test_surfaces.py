@@ -1,0 +1,165 @@
+"""Surfaces by what is known of them in closed form, and as kernels meet them."""
+
+from __future__ import annotations
+
+from typing import get_args
+
+import numpy as np
+import pytest
+
+from lfpiv_cli.errors import ConfigError
+from lfpiv_cli.names import Facing, SurfaceKind
+from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.curved_space import CurvedSpace, Face
+from lfpiv_cli.optics.media import Media
+from lfpiv_cli.optics.surfaces import (
+    SURFACES,
+    Cylinder,
+    Faces,
+    Plane,
+    Sphere,
+    Surface,
+    TiltedPlane,
+    height_behind,
+    meet,
+    normal_change,
+)
+
+PLANE = Plane(-3.0)
+TILTED = TiltedPlane((0.5, 0.2, -3.0), (0.1, -0.2, 1.5))
+# Each beside the optical axis, and the cylinder's axis along none of ours.
+CYLINDER = Cylinder((0.4, -0.7, 1.0), (1.0, 0.3, 0.2), 6.0)
+HOLLOW_CYLINDER = Cylinder((0.4, -0.7, -9.0), (0.2, -1.0, 0.1), 6.0, "concave")
+SPHERE = Sphere((0.5, 0.9, 2.0), 7.0)
+HOLLOW_SPHERE = Sphere((0.5, 0.9, -9.0), 7.0, "concave")
+ALL = (PLANE, TILTED, CYLINDER, HOLLOW_CYLINDER, SPHERE, HOLLOW_SPHERE)
+
+
+def distance_beyond(surface: Surface, point: np.ndarray) -> float:
+    """Return how far behind a surface a point lies, by school geometry."""
+    if isinstance(surface, Plane):
+        return float(point[2] - surface.z_mm)
+    if isinstance(surface, TiltedPlane):
+        return float((point - surface.point_mm) @ surface.normal / np.linalg.norm(surface.normal))
+    assert isinstance(surface, (Cylinder, Sphere))
+    offset = point - np.array(surface.centre_mm)
+    if isinstance(surface, Cylinder):
+        offset = np.cross(offset, surface.axis) / np.linalg.norm(surface.axis)
+    inside = surface.radius_mm - np.linalg.norm(offset)
+    return float(inside if surface.facing == "convex" else -inside)
+
+
+def one_face(surface: Surface, camera: Camera) -> Faces:
+    """Return a surface alone as kernels take it; the index behind it is of no matter."""
+    return CurvedSpace(Media(fluid=1.33), (Face(surface, 1.33),)).for_kernels(camera)
+
+
+def unit(vector: np.ndarray) -> np.ndarray:
+    return vector / np.linalg.norm(vector)
+
+
+def test_kinds_have_one_list() -> None:
+    assert list(SURFACES) == list(get_args(SurfaceKind))
+    assert {type(surface) for surface in ALL} == set(SURFACES.values())
+
+
+@pytest.mark.parametrize("surface", ALL)
+def test_the_optical_axis_meets_a_surface_at_its_vertex(surface: Surface) -> None:
+    vertex, normal, axis, _ = surface.shape()
+    # a few roundings of 10 mm
+    assert vertex[:2] == (0.0, 0.0)
+    assert distance_beyond(surface, np.array(vertex)) == pytest.approx(0.0, abs=1e-14)
+    gradient = [
+        distance_beyond(surface, np.array(vertex) + step) - distance_beyond(surface, np.array(vertex) - step)
+        for step in 1e-5 * np.eye(3)
+    ]
+    # third derivatives of at most 1/R^2 times 1e-10, and roundings over the step
+    np.testing.assert_allclose(normal, np.array(gradient) / 2e-5, atol=1e-9)
+    assert normal[2] > 0.0
+    assert np.dot(normal, axis) == pytest.approx(0.0, abs=1e-15)
+
+
+@pytest.mark.parametrize("surface", ALL)
+def test_a_line_meets_a_surface(surface: Surface, table2: Camera, rng: np.random.Generator) -> None:
+    """The place lies on it, the normal points there, and the cosine is that between line and normal."""
+    faces = one_face(surface, table2)
+    for _ in range(20):
+        start, direction = np.array([*rng.uniform(-3, 3, 2), -200.0]), unit(np.array([*rng.uniform(-0.01, 0.01, 2), 1]))
+        path, normal, cosine = meet(faces, 0, tuple(start), tuple(direction))
+        place = start + path * direction
+        # some ten roundings of 200 mm
+        assert distance_beyond(surface, place) == pytest.approx(0.0, abs=2e-13)
+        assert np.linalg.norm(normal) == pytest.approx(1.0, abs=1e-14)
+        assert np.dot(normal, direction) == pytest.approx(cosine, abs=1e-14)
+        assert distance_beyond(surface, place + 1e-3 * np.array(normal)) == pytest.approx(1e-3, abs=1e-12)
+
+
+@pytest.mark.parametrize("surface", ALL)
+def test_a_line_meets_a_surface_at_the_same_place_from_behind(
+    surface: Surface, table2: Camera, rng: np.random.Generator
+) -> None:
+    faces = one_face(surface, table2)
+    start, direction = np.array([1.0, -0.5, -30.0]), unit(np.array([0.02, 0.05, 1.0]))
+    path, normal, cosine = meet(faces, 0, tuple(start), tuple(direction))
+    back, normal_back, cosine_back = meet(faces, 0, tuple(start + (path + 1.5) * direction), tuple(direction))
+    assert back == pytest.approx(-1.5, abs=1e-13)
+    np.testing.assert_allclose([*normal_back, cosine_back], [*normal, cosine], atol=1e-13)
+
+
+@pytest.mark.parametrize("surface", ALL)
+def test_the_normal_changes_along_a_surface(surface: Surface, table2: Camera) -> None:
+    """Against the normals where lines half a step to either side meet the surface."""
+    faces, direction, step = one_face(surface, table2), (0.0, 0.0, 1.0), 1e-4
+    for towards in ((step, 0.0), (0.0, step)):
+        places, normals = [], []
+        for side in (-0.5, 0.5):
+            start = np.array([1.0 + side * towards[0], -0.5 + side * towards[1], -30.0])
+            path, normal, _ = meet(faces, 0, tuple(start), direction)
+            places.append(start + path * np.array(direction))
+            normals.append(np.array(normal))
+        shift = (places[1] - places[0]) / step
+        # of second order in a step of 1e-4 mm beside radii of 6 mm, and roundings of 1e-15 over it
+        np.testing.assert_allclose(normal_change(faces, 0, tuple(shift)), (normals[1] - normals[0]) / step, atol=3e-10)
+
+
+@pytest.mark.parametrize("surface", ALL)
+def test_points_are_in_front_of_a_surface_or_behind_it(
+    surface: Surface, table2: Camera, rng: np.random.Generator
+) -> None:
+    faces = one_face(surface, table2)
+    vertex = np.array(surface.shape().vertex_mm)
+    points = vertex + rng.uniform(-4, 4, (200, 3))
+    expected = [distance_beyond(surface, point) > 0.0 for point in points]
+    assert [height_behind(faces, 0, tuple(point)) > 0.0 for point in points] == expected
+    assert len(set(expected)) == 2
+
+
+def test_a_line_beside_a_surface_misses_it(table2: Camera) -> None:
+    along_axis = (0.0, 0.0, 1.0)
+    for surface in (Cylinder((0, 0, 0), (1, 0, 0), 5.0), Cylinder((0, 0, -9), (1, 0, 0), 5.0, "concave")):
+        faces = one_face(surface, table2)
+        assert meet(faces, 0, (0.0, 4.999, -20.0), along_axis)[2] > 0.0
+        assert meet(faces, 0, (0.0, 5.001, -20.0), along_axis)[2] == 0.0
+
+
+@pytest.mark.parametrize("facing", get_args(Facing))
+def test_the_side_that_refracts(facing: Facing) -> None:
+    expected = -4.0 if facing == "convex" else 6.0
+    for surface in (Cylinder((3, 0, 1), (1, 0, 0), 5.0, facing), Sphere((0, 0, 1), 5.0, facing)):
+        assert surface.shape().vertex_mm[2] == expected
+
+
+@pytest.mark.parametrize(
+    ("surface", "words"),
+    [
+        (TiltedPlane((0, 0, 0), (1, 0, 0)), "lies along the optical axis"),
+        (TiltedPlane((0, 0, 0), (0, 0, 0)), "expected a direction"),
+        (Cylinder((0, 0, 0), (0, 0, 0), 5.0), "expected a direction"),
+        (Cylinder((0, 5.1, 0), (1, 0, 0), 5.0), "misses the cylinder of radius 5 mm"),
+        (Cylinder((0, 0, 0), (0, 0, 2), 5.0), "misses the cylinder"),
+        (Sphere((0, 5.1, 0), 5.0), "misses the sphere"),
+    ],
+)
+def test_what_the_optical_axis_never_meets_is_refused(surface: Surface, words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        surface.shape()
