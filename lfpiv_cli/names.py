@@ -34,6 +34,9 @@ Method = Literal[TracedMethod, "dlfc"]
 Refraction = Literal["paraxial", "exact"]
 Sampling = Literal["exact", "rays"]
 
+# The section whose walls mask what lies beyond them.
+Mask = Literal["channel", "pipe"]
+
 # The wall of a channel that simulated bubbles stick to: across the depth the nearest or farthest one, across the other
 # axis that of its low or high end.
 BubbleWall = Literal["near", "far", "low", "high"]

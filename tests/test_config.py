@@ -13,6 +13,7 @@ import pytest
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.sections import Section, Sections
+from lfpiv_cli.flow.masks import ParallelWalls, RoundWall
 from lfpiv_cli.flow.windows import layout_windows
 from lfpiv_cli.optics.media import fluid_path_to_focus
 from lfpiv_cli.reference import Reference
@@ -137,6 +138,11 @@ def test_all_errors_come_in_one_run_in_the_order_of_the_file(write) -> None:
         ("correlation: {windows: [16], window_mm: 1.6}", "contradicts window_mm"),
         ("channel: {width_mm: 9, wall_mm: 2, board_from_mid_plane_mm: 1}", "is for a board in the fluid"),
         ("correlation: {windows: []}", "at least one window"),
+        ("correlation: {mask: pipe}", "correlation.mask: is pipe, which needs the section pipe"),
+        (
+            "pipe: {radius_mm: 5.0}\nchannel: {width_mm: 9, wall_mm: 2}",
+            "pipe.radius_mm: is 5, but channel.width_mm is 9",
+        ),
         ("correlation: {overlap: 1.0}", "less than 1"),
         ("simulation: {brightness: [2, 1]}", "expected a range"),
         ("simulation: {light_z_mm: [1, 1]}", "light_z_mm: is [1.0, 1.0], expected a range"),
@@ -348,6 +354,15 @@ def test_the_channels_wall_puts_the_focal_point_where_it_is(write) -> None:
     assert window.thickness_mm == 5.0
     path = fluid_path_to_focus(window, config.camera_model().focus_distance_mm, config.media_model())
     assert path == pytest.approx(5.4655)
+
+
+def test_walls_are_those_of_the_section_that_is_named(write) -> None:
+    sections = "channel: {width_mm: 10, wall_mm: 2, no_slip: true}\npipe: {radius_mm: 5.0, centre_mm: [0, 0, 0.1]}\n"
+    config = load_config(write(RIG + sections))
+    assert config.masking_walls() is None
+    assert config.still_walls() == ParallelWalls(10.0)
+    config = load_config(write(RIG + sections.replace("0.1]", "0.1], no_slip: true") + "correlation: {mask: pipe}\n"))
+    assert config.masking_walls() == config.still_walls() == RoundWall(5.0, (0.0, 0.0, 0.1), "x")
 
 
 def test_options_override_and_are_checked(write) -> None:

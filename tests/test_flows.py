@@ -13,6 +13,7 @@ from lfpiv_cli.synthetic.flows import (
     Pulsation,
     abc,
     advect,
+    pipe,
     random_modes,
     rigid_rotation,
     shear,
@@ -29,6 +30,7 @@ CENTRE = (0.3, -0.2, -0.4655)
 
 EXAMPLES = {
     "square_duct": square_duct(WIDTH, MEAN, CENTRE),
+    "pipe": pipe(WIDTH / 2, MEAN, CENTRE, "y"),
     "rigid_rotation": rigid_rotation((1.0, -2.0, 3.0), CENTRE, (0.1, 0.0, 0.0)),
     "taylor_green": taylor_green(0.05, 8.0, CENTRE),
     "shear": shear(4.0, "z", "x", CENTRE),
@@ -145,6 +147,34 @@ def test_duct_along_y_is_the_duct_along_x_with_axes_exchanged(rng):
     along_x = square_duct(WIDTH, MEAN)(points)
     along_y = square_duct(WIDTH, MEAN, axis="y")(points[:, [1, 0, 2]])
     assert np.array_equal(along_y[:, [1, 0, 2]], along_x)
+
+
+def test_pipe_mean_over_the_section_is_the_given_mean():
+    line = (np.arange(400) + 0.5) / 400 * WIDTH - WIDTH / 2
+    x, z = np.meshgrid(line, line)
+    points = np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1) + CENTRE
+    u = EXAMPLES["pipe"](points)[:, 1]
+    # a circle of 400 cells across: those that it cuts are slow
+    assert u.sum() / x.size == pytest.approx(MEAN * np.pi / 4, rel=1e-5)
+    assert u.max() == pytest.approx(2.0 * MEAN, rel=1e-4)
+
+
+def test_pipe_solves_poisson_equation_and_vanishes_outside(rng):
+    flow, step = EXAMPLES["pipe"], 0.02
+    points = CENTRE + rng.uniform(-3.4, 3.4, (100, 3))
+    around = [step * np.array(e) for e in [(1, 0, 0), (-1, 0, 0), (0, 0, 1), (0, 0, -1)]]
+    laplacian = (sum(flow(points + e)[:, 1] for e in around) - 4 * flow(points)[:, 1]) / step**2
+    # f Re = 64: u'' = -32 / D^2 of the mean; a parabola's differences are exact but for rounding, 1e-13
+    assert laplacian * WIDTH**2 / MEAN == pytest.approx(np.full(100, -32.0), rel=1e-8)
+    beyond = np.array([(5.0, 0.0, 0.0), (3.0, 9.0, 4.1), (-6.0, 1.0, 0.0)]) + CENTRE
+    assert np.all(np.abs(flow(beyond)) < 1e-15)
+    assert not flow.gradient(beyond[1:]).any()
+
+
+def test_pipe_along_y_is_the_pipe_along_x_with_axes_exchanged(rng):
+    points = rng.uniform(-5.0, 5.0, (20, 3))
+    along_y = pipe(WIDTH / 2, MEAN, axis="y")(points[:, [1, 0, 2]])
+    assert np.array_equal(along_y[:, [1, 0, 2]], pipe(WIDTH / 2, MEAN)(points))
 
 
 def test_rotation_has_the_given_rate_sense_and_centre():

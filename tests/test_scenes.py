@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.errors import ConfigError
+from lfpiv_cli.flow.masks import RoundWall
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.media import Media, channel_window, fluid_path_to_focus
 from lfpiv_cli.synthetic.board import BoardPlacement
@@ -22,6 +23,7 @@ from lfpiv_cli.synthetic.scenes import (
     RecordingCamera,
     Tracers,
     channel_walls,
+    pipe_bounds,
     simulate_board,
     simulate_particles,
     simulate_white,
@@ -198,6 +200,18 @@ def test_tracers_fill_the_box_and_the_brightness(small, rng):
         pytest.approx(0.6, abs=0.01),
         pytest.approx(1.4, abs=0.01),
     )
+
+
+def test_tracers_fill_a_pipe_and_nothing_else(rng):
+    pipe = RoundWall(2.0, (0.0, 0.5, -0.4), "x")
+    box = Box((-1.0, -9.0, -9.0), (1.0, 9.0, 9.0)).within(pipe_bounds(pipe))
+    places = Tracers(4000, box, walls=pipe).draw_places(rng)
+    assert places.shape == (4000, 3)
+    share = (pipe.distances_mm(places) / 2.0) ** 2
+    assert share.max() <= 1.0
+    # evenly spread over the section, squares of the distance are evenly spread: 1000 with a spread of 27
+    assert np.histogram(share, 4, (0.0, 1.0))[0] == pytest.approx([1000] * 4, abs=120)
+    assert box.volume_in_mm3(pipe) == pytest.approx(box.volume_mm3 * np.pi / 4)
 
 
 def test_brightness_can_be_log_normal(rng):

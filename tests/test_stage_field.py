@@ -13,13 +13,18 @@ import pytest
 
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import InputError, UsageError
+from lfpiv_cli.fields.samples import Samples
 from lfpiv_cli.files import vtkhdf
-from lfpiv_cli.files.config import load_config
+from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, Points, read_tracks, write_points
-from lfpiv_cli.interface.fields import LARGEST_CHI2, fit_notices, samples_of_tracks
+from lfpiv_cli.flow.correlation import SMALLEST_VALID_FRACTION
+from lfpiv_cli.flow.field import MASKED
+from lfpiv_cli.flow.masks import RoundWall
+from lfpiv_cli.interface.fields import LARGEST_CHI2, fit_notices, fitted, samples_of_tracks
 from lfpiv_cli.names import Divergence
 from lfpiv_cli.reference import Reference
 from lfpiv_cli.stages.field import FieldOptions, fit_flow, read_places
+from lfpiv_cli.synthetic.flows import pipe
 from tests.test_particle_stage import CONFIG, run
 
 
@@ -71,6 +76,32 @@ def write_tracks(
     write_points(path, TRACKS_FORMAT, points, overwrite=True)
 
 
+@pytest.mark.parametrize("no_slip", [True, False])
+def test_the_fluid_stands_still_at_a_pipes_wall(rng: np.random.Generator, no_slip: bool) -> None:
+    wall, flow, dt_s = RoundWall(1.0, axis="x"), pipe(1.0, 0.05), 2e-3
+    # few tracks, and none near the wall
+    place = rng.uniform((-1.5, -0.8, -0.8), (1.5, 0.8, 0.8), (400, 3))
+    place = place[wall.distances_mm(place) < 0.75]
+    covariance = np.tile(np.diag([1e-3, 1e-3, 1e-2]) ** 2, (len(place), 1, 1))
+    moved = flow(place) * dt_s * 1e3 + rng.normal(0.0, (1e-3, 1e-3, 1e-2), place.shape)
+    settings = Config.from_resolved(
+        {
+            "volume": {"shape_xyz": (30, 24, 24), "voxel_mm": (0.1, 0.1, 0.1)},
+            "correlation": {"dt_s": dt_s, "windows": ((8, 8, 8),), "mask": "pipe"},
+            "pipe": {"radius_mm": 1.0, "no_slip": no_slip},
+        }
+    )
+    found = fitted([Samples(place, moved, covariance, np.ones(len(place)))], settings, "penalised", "tracks")
+    at_wall = found.at(wall.points(np.array([-1.0, -1.1, -1.1]), np.array([1.0, 1.1, 1.1]), np.full(3, 0.3)))
+    largest = np.abs(at_wall[:, 0]).max() / 0.1
+    # of the velocity on the axis; without the wall the tracks do not tell it there
+    assert largest < 0.02 if no_slip else largest > 0.03
+    field = found.vectors()
+    away = wall.shares(field.grid.centres_mm(), np.full(3, 0.8))
+    np.testing.assert_array_equal(field.flag == MASKED, away < SMALLEST_VALID_FRACTION)
+    assert 0 < np.sum(field.flag == MASKED) < field.flag.size
+
+
 @pytest.mark.thorough
 @pytest.mark.parametrize("full", [True, False])
 def test_field_has_the_flow_of_its_tracks(tmp_path: Path, rng: np.random.Generator, capsys, full: bool) -> None:
@@ -87,7 +118,7 @@ def test_field_has_the_flow_of_its_tracks(tmp_path: Path, rng: np.random.Generat
 
 @pytest.mark.thorough
 def test_walls_stand_still_by_command(tmp_path: Path, rng: np.random.Generator, capsys) -> None:
-    wall = 0.5 * (load_config(CONFIG).channel_width_mm() or 0.0)
+    wall = 0.5 * load_config(CONFIG).resolved()["channel"]["width_mm"]
     write_tracks(
         tmp_path / "tracks.vtkhdf",
         rng,

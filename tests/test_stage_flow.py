@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from lfpiv_cli.cli import cli
-from lfpiv_cli.errors import OutputExistsError, UsageError
+from lfpiv_cli.errors import LimitMissedError, OutputExistsError, UsageError
 from lfpiv_cli.files.particles import Particles, write_particles
 from lfpiv_cli.files.vtkhdf import write_vectors
 from lfpiv_cli.flow.field import VectorField
@@ -98,6 +98,26 @@ def test_particles_are_the_truth_where_the_config_names_no_flow_or_another(
     told = judged(tmp_path / "rig.yaml", vectors, particles, tmp_path / "none")
     assert told["truth"] == "particles"
     assert json.loads(capsys.readouterr().out)["warnings"] == []
+
+
+@pytest.mark.thorough
+def test_a_pipes_flow_is_judged_by_radius(vectors: Path, tmp_path: Path, capsys) -> None:
+    pytest.importorskip("matplotlib")
+    sections = yaml.safe_load((CONFIGS / "sample.yaml").read_text())
+    sections["validation"] = {
+        "flow": {"kind": "pipe", "radius_mm": 0.9, "mean_velocity_m_s": 0.06},
+        "limits": {"within_25_percent_vector_inner": 0.99},
+    }
+    (tmp_path / "rig.yaml").write_text(yaml.safe_dump(sections))
+    # a shear is no pipe's flow
+    with pytest.raises(LimitMissedError, match="within_25_percent_vector_inner is"):
+        run("validate", "flow", tmp_path / "rig.yaml", "--vectors", vectors, "-o", tmp_path / "report")
+    figures = json.loads((tmp_path / "report" / "flow.json").read_text())["figures"]
+    # three along x, of y = 0.25 those at z = 0 and 0.5, of y = 0.75 those at z = 0: 0.28, 0.62 and 0.83 of the radius
+    assert [ring["vectors"] for ring in figures["rings"]] == [6, 0, 12, 0, 6, 0]
+    assert figures["rings"][1]["within_25_percent_vector"] is None
+    assert (tmp_path / "report" / "flow_radii.png").stat().st_size > 0
+    assert not (tmp_path / "report" / "flow_slices.png").exists()
 
 
 @pytest.mark.slow

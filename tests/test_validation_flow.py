@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.flow.field import REJECTED, VALID, VectorField
+from lfpiv_cli.flow.masks import RoundWall
 from lfpiv_cli.grid import Grid
-from lfpiv_cli.synthetic.flows import shear, square_duct
+from lfpiv_cli.synthetic.flows import pipe, shear, square_duct
 from lfpiv_cli.validation.channel import Duct, table_4
 from lfpiv_cli.validation.flow import (
     compare,
@@ -23,6 +24,7 @@ from lfpiv_cli.validation.flow import (
     truth_at_points,
 )
 from lfpiv_cli.validation.methods import Measured, lower_error
+from lfpiv_cli.validation.pipe import pipe_figures
 
 SHAPE = (4, 3, 5)
 VOXEL_MM = (0.1, 0.1, 0.2)
@@ -190,6 +192,40 @@ def test_table_4_takes_the_paper_s_slices_of_a_duct() -> None:
         line = next(line for line in panel.lines if line.get_label() == "true, analytic")
         assert np.abs(line.get_ydata()[[0, -1]]).max() < 1e-6
         assert line.get_xdata()[0] == -0.5 * other.width_mm
+
+
+def test_a_pipes_figures_go_by_the_distance_from_its_axis() -> None:
+    grid = Grid.centred((3, 21, 21), (1.0, 0.5, 0.5), (0.0, 0.0, 0.0))
+    wall, flow = RoundWall(5.0), pipe(5.0, 0.1)
+    truth = flow(grid.centres_mm().reshape(-1, 3)).reshape(*grid.shape_zyx, 3)
+    share = wall.distances_mm(grid.centres_mm()) / 5.0
+    # 2 % too fast near the axis, half as fast at the wall, and one vector missing of those in between
+    measured = truth * np.where(share > 0.9, 0.5, np.where(share <= 0.3, 1.02, 1.0))[..., np.newaxis]
+    measured[10, 16, 1] = np.nan
+    field = replace(field_of(truth), grid=grid, displacement_voxel=measured * DT_S / (np.array(VOXEL_MM) * 1e-3))
+    inside = truth.any(axis=-1)
+    found = pipe_figures(field, truth, inside, wall)
+    rings = {tuple(ring["radius_shares"]): ring for ring in found["rings"]}
+    assert rings[0.0, 0.3]["streamwise_mean_error"] == pytest.approx(0.02)
+    assert rings[0.3, 0.5]["streamwise_mean_error"] == pytest.approx(0.0)
+    assert rings[0.9, 1.0] == {
+        "radius_shares": [0.9, 1.0],
+        "vectors": int(np.sum(inside & (share > 0.9))),
+        "streamwise_mean_error": pytest.approx(-0.5),
+        "within_25_percent_vector": 0.0,
+    }
+    inner = int(np.sum(share <= 0.9))
+    assert found["within_25_percent_vector_inner"] == pytest.approx(1.0 - 1.0 / inner)
+    assert sum(ring["vectors"] for ring in found["rings"]) == inside.sum()
+    missing = next(ring for ring in found["rings"] if ring["radius_shares"] == [0.5, 0.7])
+    assert missing["within_25_percent_vector"] == pytest.approx(1.0 - 1.0 / missing["vectors"])
+    pytest.importorskip("matplotlib")
+    from lfpiv_cli.validation.pipe import radius_figure
+
+    panel = radius_figure({"measured": field}, wall, 0.1).axes[0]
+    told = {line.get_label(): line for line in panel.lines}
+    assert told["true, analytic"].get_ydata()[[0, -1]] == pytest.approx([0.2, 0.0])
+    assert len(told["measured"].get_xdata()) == inside.sum() - 1
 
 
 def test_cumulative_distribution_meets_the_share(

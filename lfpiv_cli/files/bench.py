@@ -15,9 +15,11 @@ from lfpiv_cli.files.sections import (
     MainLens,
     MediaSection,
     Microlenses,
+    PipeSection,
     VolumeSection,
 )
 from lfpiv_cli.files.sections_simulated import FlowSection, PulsationSection
+from lfpiv_cli.flow.masks import RoundWall
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
@@ -139,6 +141,11 @@ def board_of(section: BoardSection) -> BoardGeometry:
 def channel_of(section: ChannelSection) -> Channel:
     """Return the channel."""
     return Channel(section.width_mm, section.wall_mm, section.camera_move_mm, section.board_from_mid_plane_mm)
+
+
+def round_wall_of(section: PipeSection) -> RoundWall:
+    """Return the inside of the pipe, in the volume's coordinates."""
+    return RoundWall(section.radius_mm, section.centre_mm, section.axis)
 
 
 def grid_of(section: VolumeSection, scale: Scale | None, reference: Reference) -> Grid:

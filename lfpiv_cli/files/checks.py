@@ -199,13 +199,16 @@ def _board(sections: Sections) -> Found:
 
 
 def _scene(sections: Sections) -> Found:
-    """Yield a wall that is not the window, and a board's place in the fluid that is in air."""
+    """Yield walls that are not each other, and a board's place in the fluid that is in air."""
     board, window, channel = sections.board, sections.window, sections.channel
     in_fluid = board is not None and board.medium == "fluid"
     if channel is not None and channel.board_from_mid_plane_mm is not None and not in_fluid:
         yield ("channel", "board_from_mid_plane_mm"), "is for a board in the fluid; one in air stands on the outer wall"
     if window is not None and channel is not None and _disagree(window.thickness_mm, channel.wall_mm):
         yield ("window", "thickness_mm"), f"is {window.thickness_mm:g}, but channel.wall_mm is {channel.wall_mm:g}"
+    pipe = sections.pipe
+    if pipe is not None and channel is not None and _disagree(2.0 * pipe.radius_mm, channel.width_mm):
+        yield ("pipe", "radius_mm"), f"is {pipe.radius_mm:g}, but channel.width_mm is {channel.width_mm:g}"
 
 
 def _processing(sections: Sections) -> Found:
@@ -222,6 +225,8 @@ def _processing(sections: Sections) -> Found:
                 yield (*place, k + 1), f"is {list(fine)} after {list(coarse)}, expected coarse to fine"
     if correlation.mask == "channel" and (sections.volume is None or sections.volume.reference != "mid_plane"):
         yield ("correlation", "mask"), "is channel, which needs volume.reference: mid_plane"
+    if correlation.mask == "pipe" and sections.pipe is None:
+        yield ("correlation", "mask"), "is pipe, which needs the section pipe"
     if brightness[0] > brightness[1] or brightness[1] == 0.0:
         yield ("simulation", "brightness"), f"is {list(brightness)}, expected a range [smallest, largest]"
     light = sections.simulation.light_z_mm

@@ -25,6 +25,7 @@ from lfpiv_cli.files.sections import (
     ChannelSection,
     CorrelationSection,
     MediaSection,
+    PipeSection,
     ReconstructionSection,
     Sections,
     VolumeSection,
@@ -40,6 +41,7 @@ from lfpiv_cli.files.yaml_nodes import (
     read_document,
 )
 from lfpiv_cli.flow.correlation import CorrelationSettings
+from lfpiv_cli.flow.masks import ParallelWalls, Walls
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media, Window, channel_window
@@ -130,6 +132,11 @@ class Config:
     def channel(self) -> ChannelSection | None:
         """The section `channel`, None where there is none."""
         return self.sections.channel
+
+    @property
+    def pipe(self) -> PipeSection | None:
+        """The section `pipe`, None where there is none."""
+        return self.sections.pipe
 
     @property
     def weights(self) -> WeightsSection:
@@ -230,10 +237,19 @@ class Config:
         """Return the overlap of the correlation windows along x, y, z."""
         return bench.overlap_of(self.correlation, voxel_mm)
 
-    def channel_width_mm(self) -> float:
-        """Return the channel's inner width."""
-        section: ChannelSection = self._needed("channel", self.channel)
-        return section.width_mm
+    def masking_walls(self) -> Walls | None:
+        """Return the walls beyond which `correlation.mask` leaves voxels and vectors out, None where it does not."""
+        mask = self.correlation.mask
+        if mask is None:
+            return None
+        section = self._needed(mask, getattr(self.sections, mask))
+        return bench.round_wall_of(section) if isinstance(section, PipeSection) else ParallelWalls(section.width_mm)
+
+    def still_walls(self) -> Walls | None:
+        """Return the walls at which the fluid stands still, the pipe's or the channel's, None where neither is said."""
+        if self.pipe is not None and self.pipe.no_slip:
+            return bench.round_wall_of(self.pipe)
+        return ParallelWalls(self.channel.width_mm) if self.channel is not None and self.channel.no_slip else None
 
     def solver_settings(self) -> SolverSettings:
         """Return how volumes are reconstructed."""

@@ -27,6 +27,7 @@ from lfpiv_cli.files.sections_simulated import SimulationSection, ValidationSect
 from lfpiv_cli.names import (
     ColumnAxis,
     Layout,
+    Mask,
     Medium,
     Method,
     Pattern,
@@ -166,6 +167,18 @@ class ChannelSection(Section):
     no_slip: bool = False
 
 
+class PipeSection(Section):
+    """The inside of a round pipe along axis (x or y), of radius_mm, through centre_mm in the volume's coordinates.
+
+    no_slip: the fluid stands still at its wall; `field` reads it.
+    """
+
+    radius_mm: Positive
+    axis: Literal["x", "y"] = "x"
+    centre_mm: Vector = (0.0, 0.0, 0.0)
+    no_slip: bool = False
+
+
 class WeightsSection(Section):
     """How weights are made.
 
@@ -219,7 +232,8 @@ class CorrelationSection(Section):
     Default: 32 and 16 voxels, fewer where voxels are longer along an axis, but not below 16 and 8.
 
     overlap: of neighbouring windows, a number or [x, y, z]. dt_s: time between the volumes of a pair.
-    mask: channel leaves out what lies beyond the channel's walls across the depth (needs reference: mid_plane).
+    mask: channel leaves out what lies beyond the channel's walls across the depth (needs reference: mid_plane), pipe
+    what lies outside the section pipe.
     exponent: power of the intensities that is correlated (default: 0.5 for volumes of the solvers em, smart and mart;
     their brightest particles outweigh all others; and 1 for sart's).
     """
@@ -228,7 +242,7 @@ class CorrelationSection(Section):
     window_mm: PerAxis | None = None
     overlap: Overlaps = (0.5, 0.5, 0.5)
     dt_s: Positive | None = None
-    mask: Literal["channel"] | None = None
+    mask: Mask | None = None
     exponent: Annotated[float, Field(gt=0.0, le=1.0)] | None = None
 
 
@@ -241,6 +255,7 @@ class Sections(Section):
     volume: VolumeSection | None = None
     board: BoardSection | None = None
     channel: ChannelSection | None = None
+    pipe: PipeSection | None = None
     weights: WeightsSection = WeightsSection()
     reconstruction: ReconstructionSection = ReconstructionSection()
     correlation: CorrelationSection = CorrelationSection()

@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 
 from lfpiv_cli.flow.correlation import SMALLEST_VALID_FRACTION
 from lfpiv_cli.flow.field import MASKED, REJECTED, VALID, VectorField
-from lfpiv_cli.flow.masks import share_between_walls
+from lfpiv_cli.flow.masks import Walls
 from lfpiv_cli.flow.windows import Triple, layout_windows
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.tracks.gridding import on_grid
@@ -46,24 +46,29 @@ class WindowGrid:
     volume : the voxels
     size : of a window in voxels along x, y, z
     overlap : share of a window in common with the next one along x, y, z
-    channel_width_mm : between walls across z, beyond which windows are masked; None: nothing is
+    walls : beyond which windows are masked; None: nothing is
     """
 
     volume: Grid
     size: Triple
     overlap: tuple[float, float, float]
-    channel_width_mm: float | None = None
+    walls: Walls | None = None
 
     @property
     def centres(self) -> Grid:
         """The windows' centres."""
         return layout_windows(self.volume.shape_xyz, self.size, self.overlap).grid(self.volume)
 
+    @property
+    def sides_mm(self) -> NDArray[np.float64]:
+        """The sides of a window (3,), mm."""
+        return np.array(self.size) * self.volume.spacing_mm
+
     def inside(self) -> NDArray[np.float64]:
-        """Return the share of each window's depth (nz, ny, nx) between the walls; 1 where these mask nothing."""
-        if self.channel_width_mm is None:
+        """Return the share of each window (nz, ny, nx) between the walls; 1 where these mask nothing."""
+        if self.walls is None:
             return np.ones(self.centres.shape_zyx)
-        return share_between_walls(self.centres, self.channel_width_mm, self.size[2] * self.volume.spacing_mm[2])
+        return self.walls.shares(self.centres.centres_mm(), self.sides_mm)
 
 
 def vectors_from_paths(paths: Paths, windows: WindowGrid, dt_s: float | None) -> VectorField:
@@ -104,15 +109,15 @@ def without_tracks(
     if len(middle_mm) <= DENSITY_NEIGHBOURS:
         return np.ones(len(nodes_mm), dtype=np.bool_)
     low, high = np.array([windows.volume.bounds_mm(axis) for axis in range(3)]).T
-    if windows.channel_width_mm is not None:
-        low[2], high[2] = max(low[2], -0.5 * windows.channel_width_mm), min(high[2], 0.5 * windows.channel_width_mm)
-    side_mm = np.array(windows.size) * windows.volume.spacing_mm
+    side_mm, walls = windows.sides_mm, windows.walls
 
     def volume_around(points_mm: NDArray[np.float64], reach: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the volume, mm^3, of boxes that reach so many windows far to each side."""
         half = reach[:, np.newaxis] * side_mm
-        sides = np.minimum(points_mm + half, high) - np.maximum(points_mm - half, low)
-        return np.asarray(np.prod(np.maximum(sides, 0.0), axis=1))
+        first, last = np.maximum(points_mm - half, low), np.minimum(points_mm + half, high)
+        if walls is not None:
+            return walls.volumes_mm3(first, last)
+        return np.asarray(np.prod(np.maximum(last - first, 0.0), axis=1))
 
     tree = KDTree(middle_mm / side_mm)
     # Its own place is each track's nearest.

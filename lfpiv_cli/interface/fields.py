@@ -20,6 +20,7 @@ from lfpiv_cli.flow.correlation import SMALLEST_VALID_FRACTION
 from lfpiv_cli.flow.derived import Derived, derived_from
 from lfpiv_cli.flow.field import MASKED, MM_TO_M, REJECTED, VALID, VectorField
 from lfpiv_cli.flow.from_tracks import WindowGrid, without_tracks
+from lfpiv_cli.flow.masks import ParallelWalls
 from lfpiv_cli.interface.tracks import Tracked, TracksOf
 from lfpiv_cli.names import Divergence
 from lfpiv_cli.notice import Notice
@@ -297,18 +298,17 @@ def fitted(parts: Sequence[Samples], settings: Config, divergence: Divergence, n
     if len(samples) < FEWEST_SAMPLES:
         raise InputError(f"{name}: {len(samples)} samples, expected at least {FEWEST_SAMPLES}")
     volume = settings.grid()
-    section = settings.channel
-    still = section is not None and section.no_slip
-    walls = settings.channel_width_mm() if still or settings.correlation.mask == "channel" else None
+    still = settings.still_walls()
     windows = WindowGrid(
-        volume, settings.windows_voxel(volume.spacing_mm)[-1], settings.overlap(volume.spacing_mm), walls
+        volume,
+        settings.windows_voxel(volume.spacing_mm)[-1],
+        settings.overlap(volume.spacing_mm),
+        still or settings.masking_walls(),
     )
     low, high = np.array([volume.bounds_mm(axis) for axis in range(3)]).T
-    points = fit.NO_POINTS
-    if still and settings.volume.reference != "mid_plane":
+    if isinstance(still, ParallelWalls) and settings.volume.reference != "mid_plane":
         raise InputError(f"{name}: channel.no_slip needs volume.reference mid_plane, found {settings.volume.reference}")
-    if still and walls is not None:
-        points = wall_points(windows, walls, low, high)
+    points = fit.NO_POINTS if still is None else still.points(low, high, WALL_STEP * windows.sides_mm)
     field = fit.fit_field(samples, low, high, divergence, points)
     gradient = field.gradient_at(windows.centres.centres_mm().reshape(-1, 3))
     size = float(np.sqrt(np.mean(gradient**2)))
@@ -360,16 +360,3 @@ def fit_notices(summary: Mapping[str, Any], divergence: Divergence, name: str) -
             )
         )
     return notices
-
-
-def wall_points(
-    windows: WindowGrid, width_mm: float, low_mm: NDArray[np.float64], high_mm: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return points (k, 3) on those walls across z that the box holds."""
-    along = []
-    for axis in range(2):
-        step = WALL_STEP * windows.size[axis] * windows.volume.spacing_mm[axis]
-        along.append(np.linspace(low_mm[axis], high_mm[axis], int(np.ceil((high_mm[axis] - low_mm[axis]) / step)) + 1))
-    depths = [z for z in (-0.5 * width_mm, 0.5 * width_mm) if low_mm[2] <= z <= high_mm[2]]
-    grid = np.meshgrid(*along, np.asarray(depths), indexing="ij")
-    return np.stack(grid, axis=-1).reshape(-1, 3)

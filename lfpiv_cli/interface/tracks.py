@@ -146,7 +146,7 @@ class TracksOf(Generic[Rows]):
             volume,
             settings.windows_voxel(volume.spacing_mm)[-1],
             settings.overlap(volume.spacing_mm),
-            settings.channel_width_mm() if settings.correlation.mask == "channel" else None,
+            settings.masking_walls(),
         )
         return (vectors_from_paths(paths, windows, settings.correlation.dt_s) for paths in self.paths)
 

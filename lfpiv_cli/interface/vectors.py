@@ -13,7 +13,7 @@ from lfpiv_cli.files.vtkhdf import Volume
 from lfpiv_cli.flow import correlation
 from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.flow.locking import with_locking
-from lfpiv_cli.flow.masks import between_walls
+from lfpiv_cli.flow.masks import inside
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.interface.notices import warn_of
 from lfpiv_cli.interface.vectors_checks import field_notices, pair_notices, quality_of, window_notices
@@ -82,9 +82,8 @@ def scale_of(settings: Config) -> Scale:
 
 def usable_voxels(settings: Config, grid: Grid, mask: NDArray[Any] | None) -> NDArray[np.bool_] | None:
     """Return where volumes may be used (nz, ny, nx): between walls and where a mask is above 0; None: everywhere."""
-    usable = None
-    if settings.correlation.mask == "channel":
-        usable = between_walls(grid, settings.channel_width_mm())
+    walls = settings.masking_walls()
+    usable = None if walls is None else inside(grid, walls)
     if mask is not None:
         drawn = np.asarray(mask) > 0.0
         usable = drawn if usable is None else usable & drawn

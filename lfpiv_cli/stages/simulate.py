@@ -26,6 +26,7 @@ from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.images import write_tiff
 from lfpiv_cli.files.particles import Particles, write_particles
 from lfpiv_cli.files.provenance import record
+from lfpiv_cli.flow.masks import RoundWall
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.reference import FOCAL_POINT, Reference
@@ -266,8 +267,9 @@ def _tracers(settings: Config, camera: Camera, reference: Reference, motion: sce
     carried_s = max(abs(time_s) for time_s in carrying.carried_s())
     box, inside = seeded_boxes(lit, reach, motion.flow, carried_s, _walls(settings, reference))
     measured = inside.within(scenes.Box.around(volume, (0.0, 0.0, 0.0)))
+    pipe = _pipe(settings, reference)
     return scenes.Tracers(
-        round(scene.particles * box.volume_mm3 / measured.volume_mm3),
+        round(scene.particles * box.volume_in_mm3(pipe) / measured.volume_in_mm3(pipe)),
         box,
         scene.particle_diameter_mm,
         scene.particle_counts,
@@ -277,6 +279,7 @@ def _tracers(settings: Config, camera: Camera, reference: Reference, motion: sce
         scene.particle_diameter_log_sigma,
         scene.brightness_flicker,
         light,
+        pipe,
     )
 
 
@@ -304,11 +307,22 @@ def _between(volume: Grid, z_mm: tuple[float, float]) -> Grid:
 
 
 def _walls(settings: Config, reference: Reference) -> scenes.Box | None:
-    """Return the inside of the channel that the flow runs through, None where it is another flow."""
-    flow = settings.simulation.flow
+    """Return the inside of the channel, or the box around the pipe, that the flow runs through; None: neither is."""
+    flow, pipe = settings.simulation.flow, _pipe(settings, reference)
+    if pipe is not None:
+        return scenes.pipe_bounds(pipe)
     if flow is None or flow.kind != "square_duct":
         return None
     return scenes.channel_walls(flow.width_mm, reference.depth_to_focal_point(flow.centre_mm[2]), flow.axis)
+
+
+def _pipe(settings: Config, reference: Reference) -> RoundWall | None:
+    """Return the inside of the pipe that the flow runs through, z from the focal point; None: it is another flow."""
+    flow = settings.simulation.flow
+    if flow is None or flow.kind != "pipe":
+        return None
+    x, y, z = flow.centre_mm
+    return RoundWall(flow.radius_mm, (x, y, reference.depth_to_focal_point(z)), flow.axis)
 
 
 def _bubbles_walls(settings: Config, reference: Reference) -> scenes.Box | None:
@@ -318,10 +332,11 @@ def _bubbles_walls(settings: Config, reference: Reference) -> scenes.Box | None:
     ------
     ConfigError : there is no channel that they could stick to
     """
-    if settings.simulation.bubbles == 0:
+    scene = settings.simulation
+    if scene.bubbles == 0:
         return None
     walls = _walls(settings, reference)
-    if walls is None:
+    if walls is None or scene.flow is None or scene.flow.kind != "square_duct":
         raise ConfigError("simulation.bubbles: bubbles stick to a channel's wall; simulation.flow is no square_duct")
     return walls
 

@@ -21,6 +21,7 @@ from lfpiv_cli.files.pictures import ensure_drawing, write_picture
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.files.sections_simulated import FlowSection
 from lfpiv_cli.flow.field import VectorField
+from lfpiv_cli.flow.masks import RoundWall
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.reference import Reference
 from lfpiv_cli.stages.chain import run_chain
@@ -30,6 +31,7 @@ from lfpiv_cli.validation.channel import Duct
 from lfpiv_cli.validation.flow import limits_missed, truth_at_points
 from lfpiv_cli.validation.methods import Measured, lower_error
 from lfpiv_cli.validation.pictures import errors_figure, flow_figure, profiles_figure, slices_figure
+from lfpiv_cli.validation.pipe import radius_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -39,7 +41,8 @@ PICTURES: dict[str, Callable[[Mapping[str, Measured]], Figure]] = {
     "flow_errors.png": errors_figure,
     "flow_profiles.png": profiles_figure,
 }
-SLICES = "flow_slices.png"
+# Of a square duct, and of a round pipe.
+SLICES, RADII = "flow_slices.png", "flow_radii.png"
 # Particles follow a flow where they differ from it by less (rms over rms): a mid plane that is off by a tenth of a mm
 # makes 2 % in a channel of 10 mm.
 SAME_FLOW = 0.05
@@ -61,15 +64,18 @@ def validate_flow(
     is_simulated = vectors is None
     if is_simulated and particles is not None:
         raise UsageError("--particles needs --vectors: the flow of a simulation is known")
-    paths = {name: output / name for name in ("flow.json", *PICTURES, SLICES)}
+    paths = {name: output / name for name in ("flow.json", *PICTURES, SLICES, RADII)}
     prepare_folder(list(paths.values()))
     settings = load_config(config)
     if is_simulated:
         ensure_experiment(settings)
     named = settings.simulation.flow if is_simulated else settings.validation.flow or settings.simulation.flow
-    duct = duct_of(named)
+    duct, pipe = duct_of(named), named if named is not None and named.kind == "pipe" else None
+    walls = None if pipe is None else RoundWall(pipe.radius_mm, pipe.centre_mm, pipe.axis)
     if duct is None:
         del paths[SLICES]
+    if pipe is None:
+        del paths[RADII]
     for target in paths.values():
         ensure_writable(target, overwrite, given(config=config, vectors=vectors, particles=particles).values())
     ensure_drawing()
@@ -79,7 +85,7 @@ def validate_flow(
     if particles and named is not None and methods["measured"].flow is None:
         console.warn([_other_flow(config, particles)])
     truth = "analytic flow" if all(measured.flow for measured in methods.values()) else "particles"
-    figures = {name: measured.figures(duct) for name, measured in methods.items()}
+    figures = {name: measured.figures(duct, walls) for name, measured in methods.items()}
     limits = settings.validation.limits.model_dump()
     missed = [
         text if vectors else f"{name}: {text}"
@@ -99,6 +105,9 @@ def validate_flow(
         write_picture(paths[name], draw(methods), overwrite)
     if duct is not None:
         write_picture(paths[SLICES], slices_figure(methods, duct), overwrite)
+    if pipe is not None and walls is not None:
+        fields = {name: measured.field for name, measured in methods.items()}
+        write_picture(paths[RADII], radius_figure(fields, walls, pipe.mean_velocity_m_s), overwrite)
     summary = _summary(figures) if is_simulated else _scalars(figures["measured"])
     summary["truth"] = truth
     if len(methods) > 1:

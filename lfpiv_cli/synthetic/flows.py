@@ -96,6 +96,33 @@ def _duct_orders() -> NDArray[np.int64]:
     return 2 * np.arange(DUCT_TERMS) + 1
 
 
+def pipe(
+    radius_mm: float, mean_velocity_m_s: float, centre_mm: Sequence[float] = ORIGIN, axis: Literal["x", "y"] = "x"
+) -> KnownFlow:
+    """Return Poiseuille's flow along `axis` through a round pipe, u = 2 U (1 - r^2/R^2), zero outside it."""
+    along = axis_index(axis)
+
+    def across(points_mm: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return places over the radius, (n, 3), 0 along the pipe, and 1 - r^2/R^2, (n,)."""
+        relative = (points_mm - np.asarray(centre_mm, dtype=np.float64)) / radius_mm
+        relative[:, along] = 0.0
+        return relative, 1.0 - np.sum(relative**2, axis=1)
+
+    def flow(points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        velocity = np.zeros((len(points_mm), 3))
+        velocity[:, along] = 2.0 * mean_velocity_m_s * np.maximum(across(points_mm)[1], 0.0)
+        return velocity
+
+    def gradient(points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        relative, profile = across(points_mm)
+        found = np.zeros((len(points_mm), 3, 3))
+        slope = -4.0 * mean_velocity_m_s * MM_PER_M / radius_mm * relative
+        found[:, along] = np.where(profile[:, np.newaxis] > 0.0, slope, 0.0)
+        return found
+
+    return KnownFlow(flow, gradient)
+
+
 def rigid_rotation(
     angular_velocity_rad_s: Sequence[float],
     centre_mm: Sequence[float] = ORIGIN,
@@ -191,6 +218,7 @@ def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
 
 FLOWS: dict[str, Callable[..., KnownFlow]] = {
     "square_duct": square_duct,
+    "pipe": pipe,
     "rigid_rotation": rigid_rotation,
     "taylor_green": taylor_green,
     "shear": shear,

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.errors import ConfigError
+from lfpiv_cli.flow.masks import RoundWall, Walls
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.synthetic.board import BoardPlacement, dot_centres, render_board
@@ -73,6 +74,12 @@ class Box:
         """Volume in cubic millimetres."""
         return float(np.prod(np.subtract(self.high_mm, self.low_mm)))
 
+    def volume_in_mm3(self, walls: Walls | None) -> float:
+        """Return the volume between walls, all of it where there are none, in cubic millimetres."""
+        if walls is None:
+            return self.volume_mm3
+        return float(walls.volumes_mm3(np.asarray(self.low_mm), np.asarray(self.high_mm)))
+
     def within(self, other: Box) -> Box:
         """Return the part that lies in another box.
 
@@ -89,7 +96,7 @@ class Box:
 
 @dataclass(frozen=True)
 class Tracers:
-    """What is seeded: `count` tracers, evenly spread over the box at the middle of the sequence.
+    """What is seeded: `count` tracers, evenly spread over the box, or what walls leave of it, at the sequence's middle.
 
     Attributes
     ----------
@@ -101,6 +108,7 @@ class Tracers:
         logarithm; the light goes with their squares
     brightness_flicker : relative standard deviation of a tracer's light from frame to frame, log-normal
     light_z_mm : between these depths there is light; None: everywhere
+    walls : that the box goes beyond, in world axes; None: there are none
     """
 
     count: int
@@ -113,6 +121,16 @@ class Tracers:
     diameter_log_sigma: float = 0.0
     brightness_flicker: float = 0.0
     light_z_mm: tuple[float, float] | None = None
+    walls: Walls | None = None
+
+    def draw_places(self, rng: np.random.Generator) -> NDArray[np.float64]:
+        """Return where the tracers are at the sequence's middle (count, 3)."""
+        places = rng.uniform(self.box.low_mm, self.box.high_mm, (self.count, 3))
+        beyond = np.zeros(self.count, dtype=np.bool_) if self.walls is None else ~self.walls.contain(places)
+        while self.walls is not None and beyond.any():
+            places[beyond] = rng.uniform(self.box.low_mm, self.box.high_mm, (int(beyond.sum()), 3))
+            beyond = ~self.walls.contain(places)
+        return places
 
     def draw_brightness(self, rng: np.random.Generator) -> NDArray[np.float64]:
         """Return the brightness (count,) of each tracer."""
@@ -232,6 +250,14 @@ def channel_walls(width_mm: float, mid_plane_z_mm: float, axis: str = "x") -> Bo
     return Box((low[0], low[1], low[2]), (high[0], high[1], high[2]))
 
 
+def pipe_bounds(pipe: RoundWall) -> Box:
+    """Return the box around a round pipe, endless along it."""
+    reach = np.full(3, pipe.radius_mm)
+    reach[pipe.along] = np.inf
+    low, high = pipe.centre_mm - reach, pipe.centre_mm + reach
+    return Box((low[0], low[1], low[2]), (high[0], high[1], high[2]))
+
+
 def simulate_white(camera: RecordingCamera, level: float, rng: np.random.Generator) -> SimulatedStill:
     """Simulate an image of uniform light, `level` expected counts where a pixel sees nothing but the aperture."""
     image = camera.readout.record(render_white(camera.optics, level), rng)
@@ -276,7 +302,7 @@ def simulate_particles(
     still : expected counts (rows, columns) of light that does not move, in all frames
     progress : called with the number of tracers rendered, for each frame those that are lit
     """
-    positions = rng.uniform(tracers.box.low_mm, tracers.box.high_mm, (tracers.count, 3))
+    positions = tracers.draw_places(rng)
     brightness, sizes = tracers.draw_brightness(rng), tracers.draw_sizes(rng)
     brightness, diameters = brightness * sizes**2, tracers.diameter_mm * sizes
     places = motion.places_mm(positions)

@@ -10,14 +10,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.flow.field import VectorField
+from lfpiv_cli.flow.masks import RoundWall
 from lfpiv_cli.synthetic.flows import Flow
 from lfpiv_cli.validation.channel import Duct, table_4, worst_slice
 from lfpiv_cli.validation.flow import flow_figures
+from lfpiv_cli.validation.pipe import pipe_figures
 
 # Figures that are compared, by how their error follows from them.
 ERROR_OF = {
     "size": ("streamwise_mean_error", "slice_mean_error", "rms_u_voxel", "rms_v_voxel", "rms_w_voxel"),
-    "distance from one": ("within_25_percent_streamwise", "within_25_percent_vector", "slope_u", "slope_v", "slope_w"),
+    "distance from one": (
+        "within_25_percent_streamwise",
+        "within_25_percent_vector",
+        "within_25_percent_vector_inner",
+        "slope_u",
+        "slope_v",
+        "slope_w",
+    ),
 }
 
 
@@ -37,12 +46,14 @@ class Measured:
     inside: NDArray[np.bool_]
     flow: Flow | None = None
 
-    def figures(self, duct: Duct | None) -> dict[str, Any]:
-        """Return the figures of `flow_figures`, and Table 4's where the flow is a duct's."""
+    def figures(self, duct: Duct | None, pipe: RoundWall | None = None) -> dict[str, Any]:
+        """Return the figures of `flow_figures`, with Table 4's for a duct, or those by radius for a pipe."""
         figures = flow_figures(self.field, self.truth, self.inside)
         if duct is not None:
             figures["table_4"] = table_4(self.field, self.truth, self.inside, duct)
             figures["slice_mean_error"] = worst_slice(figures["table_4"])
+        if pipe is not None:
+            figures |= pipe_figures(self.field, self.truth, self.inside, pipe)
         return figures
 
 
