@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
 from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.optics.object_space import ObjectSpace
@@ -23,8 +24,10 @@ from lfpiv_cli.optics.tracing import disc_points
 from lfpiv_cli.weights.aperture import aperture_mask
 from lfpiv_cli.weights.axis import Bending, FittedBending, axis_weights, depth_nodes
 from lfpiv_cli.weights.axis_cells import AxisOptics
+from lfpiv_cli.weights.curved import StripPlan, factorise_strips, strip_plan
 from lfpiv_cli.weights.operators import BrickOperator, FactorisedOperator
 from lfpiv_cli.weights.scene import Source
+from lfpiv_cli.weights.strips import StripOperator
 
 # A lattice counts as aligned with the sensor when over its whole width it strays by less than a hundredth of a pixel.
 ALIGNED_PX = 0.01
@@ -47,7 +50,7 @@ def factorise(camera: Camera, media: Media, grid: Grid) -> FactorisedOperator:
     return factorise_through(camera, ObjectSpace(media, None, "paraxial"), grid)
 
 
-def factorise_through(camera: Camera, source: Source, grid: Grid) -> FactorisedOperator:
+def factorise_through(camera: Camera, source: ObjectSpace | PolynomialRays, grid: Grid) -> FactorisedOperator:
     """Return the weights of all voxels of a grid seen along traced or fitted rays, in factorised form.
 
     Exact refraction, and fitted rays, couple the axes; each axis takes the other's mean.
@@ -87,7 +90,7 @@ def factorise_bricks(camera: Camera, media: Media, grid: Grid) -> BrickOperator:
 
 
 def _factorised(
-    optics: tuple[AxisOptics, AxisOptics], camera: Camera, source: Source, grid: Grid
+    optics: tuple[AxisOptics, AxisOptics], camera: Camera, source: ObjectSpace | PolynomialRays, grid: Grid
 ) -> FactorisedOperator:
     """Return the weights of a grid through an array whose two axes are given."""
     columns, rows = optics
@@ -172,7 +175,27 @@ def separates(camera: Camera, source: Source, grid: Grid) -> bool:
         return False
     if isinstance(source, PolynomialRays):
         return coupling_mm(source, camera, grid) < LARGEST_COUPLING * float(camera.lattice.pitch.min())
-    return True
+    return not isinstance(source, CurvedSpace) or strips_of(camera, source, grid) is not None
+
+
+def strips_of(camera: Camera, space: CurvedSpace, grid: Grid) -> StripPlan | None:
+    """Return the strips of a volume within which array and rays separate into two axes; None where they do in none."""
+    if not aligned(camera):
+        return None
+    return strip_plan(camera, space, grid, LARGEST_COUPLING * float(camera.lattice.pitch.min()))
+
+
+def weights_in_axes(camera: Camera, source: Source, grid: Grid) -> FactorisedOperator | StripOperator | None:
+    """Return the weights of a grid in factorised form, whole or in strips; None where array or rays do not separate.
+
+    Raises
+    ------
+    ConfigError : a voxel lies where it cannot be
+    """
+    if isinstance(source, CurvedSpace):
+        plan = strips_of(camera, source, grid)
+        return factorise_strips(axis_optics(camera), camera, source, grid, plan) if plan is not None else None
+    return factorise_through(camera, source, grid) if separates(camera, source, grid) else None
 
 
 def aligned(camera: Camera) -> bool:

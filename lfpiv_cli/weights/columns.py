@@ -20,15 +20,18 @@ from lfpiv_cli.errors import InputError
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.neighbourhoods import with_neighbours
 from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.microlenses import nearest_point
 from lfpiv_cli.optics.tracing import struck_pixel
 from lfpiv_cli.robust import BRIGHTEST_PERCENTILE, LIT_SHARE
 from lfpiv_cli.threads import share_out
 from lfpiv_cli.weights.arguments import real_array, voxel_index
-from lfpiv_cli.weights.build import factorise_through, separates
+from lfpiv_cli.weights.build import weights_in_axes
+from lfpiv_cli.weights.curved import lit_voxels
 from lfpiv_cli.weights.operators import Column, FactorisedOperator
 from lfpiv_cli.weights.quadrature import DEPTH_NODES, TILES, Columns, integrate_columns
 from lfpiv_cli.weights.scene import Scene, Source, kernel_scene, on_array, on_sensor, rays_from
+from lfpiv_cli.weights.strips import StripOperator
 
 # Columns may take this much memory: two thirds of a machine with 24 GiB, the rest is for volumes and images.
 LARGEST_BYTES = 16 * 2**30
@@ -181,6 +184,11 @@ class OnDemandOperator:
         return result
 
     @cached_property
+    def lit(self) -> NDArray[np.bool_] | None:
+        """Which voxels (planes, row voxels, column voxels) lie in the fluid; None where there are no curved faces."""
+        return lit_voxels(self.camera, self.source, self.grid) if isinstance(self.source, CurvedSpace) else None
+
+    @cached_property
     def sides_mm(self) -> NDArray[np.float64]:
         """Sides (3,) of a voxel, image axes."""
         return self.camera.to_image_axes(np.asarray(self.grid.spacing_mm))
@@ -193,24 +201,32 @@ class OnDemandOperator:
         return np.stack(axes, axis=1)
 
 
-def operator_of(camera: Camera, source: Source, grid: Grid) -> FactorisedOperator | OnDemandOperator:
+def operator_of(camera: Camera, source: Source, grid: Grid) -> FactorisedOperator | StripOperator | OnDemandOperator:
     """Return the weights of a grid: factorised where array and rays separate into two axes, else made on demand.
+
+    Behind curved faces they separate in strips at most.
 
     Raises
     ------
     ConfigError : a voxel lies where it cannot be
     """
-    if separates(camera, source, grid):
-        return factorise_through(camera, source, grid)
-    return OnDemandOperator(camera, source, grid)
+    return weights_in_axes(camera, source, grid) or OnDemandOperator(camera, source, grid)
 
 
 def seen_share(camera: Camera, source: Source, grid: Grid) -> tuple[float, float]:
-    """Return the smallest and the largest share of a voxel's light that meets the sensor, over a sample of a grid."""
+    """Return the smallest and the largest share of a voxel's light that meets the sensor, over a sample of a grid.
+
+    Voxels outside the fluid do not count; where all are, both are 0.
+    """
     operator = OnDemandOperator(camera, source, grid)
     places = [np.unique(np.linspace(0, n - 1, SEEN_SAMPLES).round().astype(int)) for n in operator.shape]
     sample = np.ravel_multi_index(tuple(axis.ravel() for axis in np.meshgrid(*places)), operator.shape)
-    columns = integrate_columns(camera, source, operator.centres_mm(sample), operator.sides_mm, SIGHT_TILES, 1)
+    centres = operator.centres_mm(sample)
+    if isinstance(source, CurvedSpace):
+        centres = centres[source.slopes(camera, centres, np.zeros((len(centres), 2)))[1]]
+        if not len(centres):
+            return 0.0, 0.0
+    columns = integrate_columns(camera, source, centres, operator.sides_mm, SIGHT_TILES, 1)
     sums = np.array([columns.share[a:b].sum() for a, b in zip(columns.start, columns.start[1:], strict=False)])
     return float(sums.min()), float(sums.max())
 
@@ -294,6 +310,8 @@ def _lit_share(scene: Scene, point: NDArray[np.float64], plane: int, lit: NDArra
     camera, total, found = scene.camera, 0.0, 0.0
     middle = scene.depth_share.size // 2
     rays = rays_from(scene, point, plane, middle)
+    if rays.shape[1] == 0:
+        return 0.0
     for t in range(scene.tile_share.size):
         crossing = scene.tile_mm[t]
         x, y = on_array(scene, point, rays, crossing[0], crossing[1])

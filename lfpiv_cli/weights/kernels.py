@@ -171,6 +171,8 @@ def _project_tiles(part: tuple[int, int], volume: Floats, columns: CellBlocks, r
                         combine_turned(lines, to, flat_volume, block_voxel, terms, block_share, shares)
             for g in range(sums):
                 at = chunk * sums + g
+                if lit_chunks > 0 and start[at] == start[at + 1]:
+                    continue
                 to = (tile * sums + g) * GROUP * TILE
                 terms = (0, TILE, start[at], start[at + 1] - start[at])
                 combine_long(

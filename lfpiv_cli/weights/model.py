@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,11 +19,14 @@ from lfpiv_cli.names import ColumnAxis
 from lfpiv_cli.weights.arguments import real_array, voxel_index
 from lfpiv_cli.weights.columns import ColumnOperator, OnDemandOperator
 from lfpiv_cli.weights.operators import BrickOperator, Column, FactorisedOperator
+from lfpiv_cli.weights.strips import StripOperator
 
 if TYPE_CHECKING:
     from lfpiv_cli.calibration.model import Calibration
 
-WeightsOperator = FactorisedOperator | BrickOperator | ColumnOperator | OnDemandOperator
+Scalar = TypeVar("Scalar", bound=np.generic)
+
+WeightsOperator = FactorisedOperator | BrickOperator | StripOperator | ColumnOperator | OnDemandOperator
 
 
 def behind_transmission(operator: WeightsOperator, transmission: NDArray[np.float32]) -> WeightsOperator:
@@ -34,6 +37,9 @@ def behind_transmission(operator: WeightsOperator, transmission: NDArray[np.floa
         return replace(operator, columns=operator.columns.dimmed(transmission))
     if isinstance(operator, BrickOperator):
         return BrickOperator(*(_behind(each, transmission) for each in (operator.even, operator.odd)))
+    if isinstance(operator, StripOperator):
+        seen = np.ascontiguousarray(transmission.T) if operator.turned else transmission
+        return replace(operator, strips=_behind(operator.strips, seen))
     return _behind(operator, transmission)
 
 
@@ -73,6 +79,14 @@ class Weights:
     def image_shape(self) -> tuple[int, int]:
         """Shape (rows, columns) of the images, raw and prepared."""
         return self.solver_operator.image_shape
+
+    @cached_property
+    def voxels_outside_fluid(self) -> int:
+        """How many voxels of `grid` have no light since they lie outside the fluid, behind curved faces."""
+        lit = self.solver_operator.lit if isinstance(self.solver_operator, (StripOperator, OnDemandOperator)) else None
+        if lit is None:
+            return 0
+        return int(np.count_nonzero(~self._to_sensor_order(lit)[self._inner]))
 
     @property
     def frame(self) -> str:
@@ -159,6 +173,6 @@ class Weights:
         (px, py, pz), (nz, ny, nx) = self.padding_xyz, self.shape
         return slice(pz, pz + nz), slice(py, py + ny), slice(px, px + nx)
 
-    def _to_sensor_order(self, volume: NDArray[np.float32]) -> NDArray[np.float32]:
+    def _to_sensor_order(self, volume: NDArray[Scalar]) -> NDArray[Scalar]:
         """Exchange the lateral axes of a volume where the sensor's columns follow world y (its own inverse)."""
         return volume.swapaxes(1, 2) if self.column_axis == "y" else volume

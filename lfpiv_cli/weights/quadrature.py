@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.threads import share_out
 from lfpiv_cli.weights.lens_cells import MOST_CORNERS, shared_rectangle
-from lfpiv_cli.weights.scene import Scene, Source, kernel_scene, on_array, on_sensor, rays_from
+from lfpiv_cli.weights.scene import Scene, Source, kernel_scene, on_array, on_sensor, rays_at_depth, rays_from
 
 # Tiles across the aperture: with 32 a tile is seen as half a pixel of Table 2's camera and columns are off by 0.01 to
 # 0.02 in L1 (0.04 at 11 mm from focus), with 64 by 0.003 to 0.005, with 256 by 0.0002 (0.0008).
@@ -122,14 +122,29 @@ def _block_end(boxes: NDArray[np.int64], first: int) -> int:
 
 @njit(cache=True)
 def _half_face(scene: Scene, point: NDArray[np.float64], plane: int, node: int) -> tuple[float, float]:
-    """Return half the widths on the array of a voxel's face at the depth of `point`, seen from the lens's middle."""
-    ends = np.empty((2, 2))
+    """Return half the widths on the array of a voxel's face at the depth of `point`, seen from the lens's middle.
+
+    Of a side outside the fluid the other half is taken; of both, what the focal plane would show.
+    """
+    half = np.empty(2)
+    nominal = scene.camera.image_distance_mm / scene.camera.focus_distance_mm
     for axis in range(2):
+        ends, sides = np.zeros(2), 0
         for side in range(2):
             shifted = point.copy()
             shifted[axis] += (side - 0.5) * scene.sides_mm[axis]
-            ends[axis, side] = on_array(scene, shifted, rays_from(scene, shifted, plane, node), 0.0, 0.0)[axis]
-    return 0.5 * abs(ends[0, 1] - ends[0, 0]), 0.5 * abs(ends[1, 1] - ends[1, 0])
+            rays = rays_from(scene, shifted, plane, node)
+            if rays.shape[1] > 0:
+                ends[side] = on_array(scene, shifted, rays, 0.0, 0.0)[axis]
+                sides += side + 1
+        if sides == 3:
+            half[axis] = 0.5 * abs(ends[1] - ends[0])
+        elif sides > 0:
+            middle = on_array(scene, point, rays_from(scene, point, plane, node), 0.0, 0.0)[axis]
+            half[axis] = abs(ends[sides - 1] - middle)
+        else:
+            half[axis] = 0.5 * scene.sides_mm[axis] * nominal
+    return half[0], half[1]
 
 
 @njit(cache=True, nogil=True)
@@ -143,16 +158,19 @@ def _set_boxes(part: tuple[int, int], scene: Scene, boxes: NDArray[np.int64]) ->
 def _set_box(scene: Scene, centre: NDArray[np.float64], plane: int, box: NDArray[np.int64]) -> None:
     """Set the box (4,) of a voxel.
 
-    Found from the rays through the rim: light under a lens stays within the aperture's image about its centre.
+    Found from the rays through the rim: light under a lens stays within the aperture's image about its centre. That of
+    a voxel whose middle lies outside the fluid is empty.
     """
     camera = scene.camera
     radius, cell, pixel = camera.aperture_radius_mm, scene.cell_radius_mm, camera.pixel_mm
     tilt = camera.microlens_distance_mm / camera.image_distance_mm
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     point = centre.copy()
+    if rays_from(scene, centre, plane, 0).shape[1] == 0:
+        box[:] = 0
+        return
     for k in range(scene.depth_share.size):
-        point[2] = scene.depth_mm[plane, k]
-        rays = rays_from(scene, point, plane, k)
+        rays = rays_at_depth(scene, centre, plane, k, point)
         half = _half_face(scene, point, plane, k)
         for m in range(RIM_RAYS):
             angle = 2.0 * np.pi * m / RIM_RAYS
@@ -183,12 +201,13 @@ def _fill(
 @njit(cache=True)
 def _fill_picture(scene: Scene, voxel: int, box: NDArray[np.int64], picture: NDArray[np.float64]) -> None:
     """Add up the light of a voxel in a picture of its box."""
+    if box[0] == box[2] or box[1] == box[3]:
+        return
     plane, point = scene.plane[voxel], scene.centres_mm[voxel].copy()
     work = np.empty((2, MOST_CORNERS, 2))
     lines = np.empty((2, MOST_PIXELS))
     for k in range(scene.depth_share.size):
-        point[2] = scene.depth_mm[plane, k]
-        rays = rays_from(scene, point, plane, k)
+        rays = rays_at_depth(scene, scene.centres_mm[voxel], plane, k, point)
         half = _half_face(scene, point, plane, k)
         for t in range(scene.tile_share.size):
             x, y = on_array(scene, point, rays, scene.tile_mm[t, 0], scene.tile_mm[t, 1])

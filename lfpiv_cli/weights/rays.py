@@ -18,7 +18,10 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from lfpiv_cli.optics.camera import Camera, KernelCamera
+from lfpiv_cli.optics.curved_space import CurvedSpace
+from lfpiv_cli.optics.face_tracing import aim
 from lfpiv_cli.optics.object_space import ObjectSpace, slope_ratio
+from lfpiv_cli.optics.surfaces import Faces
 from lfpiv_cli.optics.tracing import struck_pixel, trace_ray
 from lfpiv_cli.threads import share_out
 from lfpiv_cli.weights.quadrature import Columns
@@ -29,6 +32,7 @@ PARTS = 8
 # splitmix64 (Steele, Lea and Flood 2014): a counter's step and two mixing factors; every ray has numbers of its own,
 # whoever computes it.
 STEP = np.uint64(0x9E3779B97F4A7C15)
+TWO_STEPS = np.uint64(0x3C6EF372FE94F82A)
 MIX_A = np.uint64(0xBF58476D1CE4E5B9)
 MIX_B = np.uint64(0x94D049BB133111EB)
 TO_UNIT = 2.0**-53
@@ -52,7 +56,7 @@ PAPERS_COUNT = RayCount()
 
 def count_rays(
     camera: Camera,
-    space: ObjectSpace,
+    space: ObjectSpace | CurvedSpace,
     centre_mm: ArrayLike,
     voxel_mm: ArrayLike,
     rng: np.random.Generator,
@@ -62,7 +66,7 @@ def count_rays(
 
     Parameters
     ----------
-    centre_mm, voxel_mm : (3,) its centre and its sides, image axes
+    centre_mm, voxel_mm : (3,) its centre and its sides, image axes; what of it lies outside the fluid sends no light
 
     Raises
     ------
@@ -71,17 +75,20 @@ def count_rays(
     centre, sides = np.asarray(centre_mm, dtype=np.float64), np.asarray(voxel_mm, dtype=np.float64)
     starts = centre + (rng.random((count.points, 3)) - 0.5) * sides
     seeds = rng.integers(0, 2**64, count.points, dtype=np.uint64)
-    reach = camera.aperture_radius_mm + float(np.hypot(*(np.abs(centre[:2]) + sides[:2])))
-    nodes, factors = space.slope_polynomials(camera, starts[:, 2], reach)
     counts = np.zeros((PARTS, camera.rows * camera.columns), np.int64)
     rays = (starts, seeds, count.rays_per_point)
+    if isinstance(space, CurvedSpace):
+        share_out(_count_curved, PARTS, rays, space.for_kernels(camera), camera.for_kernels(), counts)
+        return counts.sum(axis=0).reshape(camera.rows, camera.columns) / count.rays
+    reach = camera.aperture_radius_mm + float(np.hypot(*(np.abs(centre[:2]) + sides[:2])))
+    nodes, factors = space.slope_polynomials(camera, starts[:, 2], reach)
     share_out(_count, PARTS, rays, nodes, factors, camera.for_kernels(), counts)
     return counts.sum(axis=0).reshape(camera.rows, camera.columns) / count.rays
 
 
 def count_columns(
     camera: Camera,
-    space: ObjectSpace,
+    space: ObjectSpace | CurvedSpace,
     centres_mm: NDArray[np.float64],
     voxel_mm: ArrayLike,
     rng: np.random.Generator,
@@ -117,6 +124,38 @@ def unit_random(state: np.uint64) -> float:
     return float(z >> np.uint64(11)) * TO_UNIT
 
 
+@njit(cache=True)
+def random_crossing(state: np.uint64, radius: float) -> tuple[float, float]:
+    """Return a point of the main lens that belongs to a counter, which goes on by `TWO_STEPS`."""
+    r = radius * np.sqrt(unit_random(state + STEP))
+    angle = 2.0 * np.pi * unit_random(state + TWO_STEPS)
+    return r * np.cos(angle), r * np.sin(angle)
+
+
+@njit(cache=True, nogil=True)
+def _count_curved(
+    parts: tuple[int, int],
+    rays: tuple[NDArray[np.float64], NDArray[np.uint64], int],
+    faces: Faces,
+    camera: KernelCamera,
+    counts: NDArray[np.int64],
+) -> None:
+    """Add up the rays behind curved faces that strike each pixel; the arguments are those of `_count`."""
+    starts, seeds, rays_each = rays
+    for part in range(parts[0], parts[1]):
+        for n in range(part, starts.shape[0], PARTS):
+            state = seeds[n]
+            for _ in range(rays_each):
+                lens_x, lens_y = random_crossing(state, camera.aperture_radius_mm)
+                state += TWO_STEPS
+                slope_x, slope_y, seen = aim(faces, starts[n, 0], starts[n, 1], starts[n, 2], lens_x, lens_y)
+                if seen:
+                    x, y = trace_ray(camera, lens_x, lens_y, slope_x, slope_y)
+                    pixel = struck_pixel(camera, x, y)
+                    if pixel >= 0:
+                        counts[part, pixel] += 1
+
+
 @njit(cache=True, nogil=True)
 def _count(
     parts: tuple[int, int],
@@ -136,11 +175,8 @@ def _count(
         for n in range(part, starts.shape[0], PARTS):
             state = seeds[n]
             for _ in range(rays_each):
-                state += STEP
-                r = radius * np.sqrt(unit_random(state))
-                state += STEP
-                angle = 2.0 * np.pi * unit_random(state)
-                lens_x, lens_y = r * np.cos(angle), r * np.sin(angle)
+                lens_x, lens_y = random_crossing(state, radius)
+                state += TWO_STEPS
                 dx, dy = lens_x - starts[n, 0], lens_y - starts[n, 1]
                 ratio = slope_ratio(dx * dx + dy * dy, nodes[n], factors[n])
                 x, y = trace_ray(camera, lens_x, lens_y, ratio * dx, ratio * dy)

@@ -1,13 +1,14 @@
 """What the kernels that follow rays one by one need of camera, scene and voxels, and a ray's way to the sensor.
 
-Any lattice, any refraction, or rays as a polynomial has them.
+Any lattice, any refraction, or rays as a polynomial has them. Behind curved faces some rays are traced from each point,
+and a polynomial through them tells the others.
 
 Axes: everything here is in image axes (x along the columns), mm, z away from the camera from the nominal focal point.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -15,8 +16,11 @@ from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.optics.camera import Camera, KernelCamera
+from lfpiv_cli.optics.curved_space import CurvedSpace
+from lfpiv_cli.optics.face_tracing import aim
 from lfpiv_cli.optics.object_space import SLOPE_NODES, ObjectSpace, slope_ratio
 from lfpiv_cli.optics.polynomial_rays import PolynomialRays
+from lfpiv_cli.optics.surfaces import Faces
 from lfpiv_cli.optics.tracing import behind_microlens
 from lfpiv_cli.weights.aperture import disc_area_below
 from lfpiv_cli.weights.lens_cells import cell_radius, neighbours
@@ -24,8 +28,18 @@ from lfpiv_cli.weights.lens_cells import cell_radius, neighbours
 # Points per side by which the part of a tile inside the rim is averaged to find its middle.
 RIM_SAMPLES = 16
 
+# Behind curved faces rays from one point are traced on rings about the middle of the aperture, more than a polynomial
+# of this degree in X and Y needs. It is off by 1 nm on the array near the wall of a tube of 10 mm, one of degree 3 by
+# 10.
+AIMED_DEGREE = 4
+AIMED_RINGS = (0.4, 0.75, 1.0)
+AIMED_A_RING = 9
+
+# What scenes have that have no curved faces.
+NO_FACES = Faces(0.0, 1.0, 1.0, np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0))
+
 # Where rays meet the array: traced through the object space, or as fitted.
-Source = ObjectSpace | PolynomialRays
+Source = ObjectSpace | PolynomialRays | CurvedSpace
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +62,9 @@ class Scene(NamedTuple):
     depth_mm, depth_share : (planes, nodes) and (nodes,), the depths along a voxel and the share of light from each
     slopes : (planes, nodes, 2, SLOPE_NODES), nodes and factors of `slope_ratio` where rays are traced
     scale_mm, exponents, coefficients_mm : of `PolynomialRays` where they are fitted; no exponents where traced
-    degree : of the polynomial
+    degree : of the polynomial; 0 where there is none
+    faces, aimed_mm, aimed_fit : behind curved faces these, the crossings (m, 2) of the rays traced from each point, and
+        what takes their places on the array to the polynomial in X and Y, ((degree + 1)^2, m); else no rays
     tile_mm, tile_share, tile_side_mm : of `Tiles`
     cell_radius_mm, neighbours_mm : of a microlens's region, and (k, 2) the steps to the lenses around
     """
@@ -64,6 +80,9 @@ class Scene(NamedTuple):
     exponents: NDArray[np.int64]
     coefficients_mm: NDArray[np.float64]
     degree: int
+    faces: Faces
+    aimed_mm: NDArray[np.float64]
+    aimed_fit: NDArray[np.float64]
     tile_mm: NDArray[np.float64]
     tile_share: NDArray[np.float64]
     tile_side_mm: float
@@ -109,12 +128,17 @@ def kernel_scene(
     z = depth[:, np.newaxis] + 0.5 * sides[2] * place
     slopes = np.zeros((*z.shape, 2, SLOPE_NODES))
     fitted = PolynomialRays(np.ones(5), np.zeros((0, 5), np.int64), np.zeros((0, 2)))
-    seen = camera.for_kernels()
-    if isinstance(source, ObjectSpace):
+    seen, degree = camera.for_kernels(), 0
+    faces, aimed, aimed_fit = NO_FACES, np.zeros((0, 2)), np.zeros((0, 0))
+    if isinstance(source, CurvedSpace):
+        faces, degree = source.for_kernels(camera), AIMED_DEGREE
+        aimed, aimed_fit = aimed_rays(camera.aperture_radius_mm)
+        fitted = replace(fitted, scale_mm=np.full(5, camera.aperture_radius_mm))
+    elif isinstance(source, ObjectSpace):
         reach = camera.aperture_radius_mm + float(np.hypot(*(np.abs(centres[:, :2]) + sides[:2]).max(axis=0)))
         slopes = np.stack(source.slope_polynomials(camera, z.ravel(), reach), axis=1).reshape(slopes.shape)
     else:
-        fitted, seen = source, seen._replace(distortion_per_mm2=0.0)
+        fitted, seen, degree = source, seen._replace(distortion_per_mm2=0.0), source.degree
     return Scene(
         camera=seen,
         centres_mm=centres,
@@ -126,7 +150,10 @@ def kernel_scene(
         scale_mm=fitted.scale_mm,
         exponents=fitted.exponents,
         coefficients_mm=fitted.coefficients_mm,
-        degree=fitted.degree,
+        degree=degree,
+        faces=faces,
+        aimed_mm=aimed,
+        aimed_fit=aimed_fit,
         tile_mm=tiles.middle_mm,
         tile_share=tiles.share,
         tile_side_mm=tiles.side_mm,
@@ -135,14 +162,34 @@ def kernel_scene(
     )
 
 
+def aimed_rays(radius_mm: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return crossings (m, 2) of an aperture, and what gives the polynomial through values there, (powers, m).
+
+    Row a (AIMED_DEGREE + 1) + b belongs to the powers a of X and b of Y, both in radii.
+    """
+    rings = [
+        ring * np.exp(2j * np.pi * (np.arange(AIMED_A_RING) + 0.5 * k) / AIMED_A_RING)
+        for k, ring in enumerate(AIMED_RINGS)
+    ]
+    crossing = np.stack([np.concatenate(rings).real, np.concatenate(rings).imag], axis=1)
+    powers = [(a, b) for a in range(AIMED_DEGREE + 1) for b in range(AIMED_DEGREE + 1 - a)]
+    terms = np.stack([crossing[:, 0] ** a * crossing[:, 1] ** b for a, b in powers], axis=1)
+    fit = np.zeros(((AIMED_DEGREE + 1) ** 2, len(crossing)))
+    fit[[a * (AIMED_DEGREE + 1) + b for a, b in powers]] = np.linalg.pinv(terms)
+    return radius_mm * crossing, fit
+
+
 @njit(cache=True)
 def rays_from(scene: Scene, point: NDArray[np.float64], plane: int, node: int) -> NDArray[np.float64]:
     """Return what `on_array` needs of a point (3,) at one of its plane's depths.
 
-    Traced rays: nodes and factors of `slope_ratio`, (2, 1, SLOPE_NODES). Fitted ones: for both coordinates on the array
-    the polynomial in X and Y alone, (2, degree + 1, degree + 1) by the powers of X and Y.
+    Traced rays: nodes and factors of `slope_ratio`, (2, 1, SLOPE_NODES). Fitted ones, and those behind curved faces:
+    for both coordinates on the array the polynomial in X and Y alone, (2, degree + 1, degree + 1) by the powers of X
+    and Y; (2, 0, 0) for a point outside the fluid, or not seen through the whole aperture.
     """
-    if scene.exponents.shape[0] == 0:
+    if scene.aimed_mm.shape[0] > 0:
+        return _rays_traced_from(scene, point)
+    if scene.degree == 0:
         rays = np.empty((2, 1, SLOPE_NODES))
         for table in range(2):
             for k in range(SLOPE_NODES):
@@ -158,13 +205,50 @@ def rays_from(scene: Scene, point: NDArray[np.float64], plane: int, node: int) -
     return rays
 
 
+@njit(cache=True)
+def _rays_traced_from(scene: Scene, point: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the polynomial in X and Y of `rays_from` behind curved faces."""
+    size = scene.degree + 1
+    rays = np.zeros((2, size, size))
+    f_m, s_i = scene.camera.focal_length_mm, scene.camera.image_distance_mm
+    for m in range(scene.aimed_mm.shape[0]):
+        lens_x, lens_y = scene.aimed_mm[m, 0], scene.aimed_mm[m, 1]
+        slope_x, slope_y, seen = aim(scene.faces, point[0], point[1], point[2], lens_x, lens_y)
+        if not seen:
+            return np.zeros((2, 0, 0))
+        x, y = lens_x + s_i * (slope_x - lens_x / f_m), lens_y + s_i * (slope_y - lens_y / f_m)
+        for a in range(size):
+            for b in range(size - a):
+                share = scene.aimed_fit[a * size + b, m]
+                rays[0, a, b] += share * x
+                rays[1, a, b] += share * y
+    return rays
+
+
+@njit(cache=True)
+def rays_at_depth(
+    scene: Scene, voxel: NDArray[np.float64], plane: int, node: int, point: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Set a point (3,) to one of the depths of the voxel about `voxel` (3,), and return its rays.
+
+    A depth outside the fluid counts as the voxel's middle.
+    """
+    point[:] = voxel
+    point[2] = scene.depth_mm[plane, node]
+    rays = rays_from(scene, point, plane, node)
+    if rays.shape[1] == 0:
+        point[2] = voxel[2]
+        rays = rays_from(scene, point, plane, node)
+    return rays
+
+
 # Inlined: to hand over all of a scene at each ray costs as much as the ray itself.
 @njit(cache=True, inline="always")
 def on_array(
     scene: Scene, point: NDArray[np.float64], rays: NDArray[np.float64], lens_x: float, lens_y: float
 ) -> tuple[float, float]:
     """Return where the ray from a point through (lens_x, lens_y) meets the array, without the distortion."""
-    if scene.exponents.shape[0] == 0:
+    if scene.degree == 0:
         dx, dy = lens_x - point[0], lens_y - point[1]
         ratio = slope_ratio(dx * dx + dy * dy, rays[0, 0], rays[1, 0])
         f_m, s_i = scene.camera.focal_length_mm, scene.camera.image_distance_mm
