@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import asdict, fields
 from typing import Any
 
 import numpy as np
@@ -18,10 +19,12 @@ from lfpiv_cli.files.checks import (
 from lfpiv_cli.files.inputs import physical_memory
 from lfpiv_cli.files.section_types import MOST_PIXELS_PER_SIDE, MOST_VOXELS_PER_SIDE
 from lfpiv_cli.grid import Grid
-from lfpiv_cli.names import ColumnAxis, Layout, names_in
+from lfpiv_cli.names import ColumnAxis, Facing, Layout, names_in
 from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.curved_space import CurvedSpace, Face
 from lfpiv_cli.optics.media import Media, Window
 from lfpiv_cli.optics.microlenses import Lattice
+from lfpiv_cli.optics.surfaces import SURFACES
 
 # Of the camera, those above 0; what else there is of numbers may have any sign.
 POSITIVE = (
@@ -108,6 +111,53 @@ def read_window(tree: dict[str, Any]) -> Window:
     TypeError, ValueError
     """
     return Window(**{name: _number(name, value) for name, value in tree.items()})
+
+
+def faces_tree(space: CurvedSpace) -> dict[str, Any]:
+    """Return faces as a weights file has them: a group each, numbered from the camera on."""
+    kinds = {surface: kind for kind, surface in SURFACES.items()}
+    return {
+        str(k): {"kind": kinds[type(face.surface)], "index": face.index}
+        | {name: _plain(value) for name, value in asdict(face.surface).items()}  # type: ignore[call-overload]
+        for k, face in enumerate(space.faces)
+    }
+
+
+def read_faces(tree: dict[str, Any]) -> tuple[Face, ...]:
+    """Return the faces that rays cross.
+
+    Raises
+    ------
+    KeyError, TypeError, ValueError
+    """
+    return tuple(_face(tree[str(k)]) for k in range(len(tree)))
+
+
+def _face(tree: dict[str, Any]) -> Face:
+    if tree["kind"] not in SURFACES:
+        raise ValueError(f"a face is a {tree['kind']!r}, expected one of {', '.join(SURFACES)}")
+    kind = SURFACES[tree["kind"]]
+    values = {field.name: _of_surface(field.name, tree[field.name]) for field in fields(kind)}  # type: ignore[arg-type]
+    index = _number("index", tree["index"])
+    if not 1.0 <= index <= LARGEST_INDEX:
+        raise ValueError(f"the index behind a face is {index:g}, expected 1 to {LARGEST_INDEX:g}")
+    return Face(kind(**values), index)
+
+
+def _of_surface(name: str, value: Any) -> Any:
+    """Return a number, a point or a word that a surface has."""
+    if name == "facing":
+        if value not in names_in(Facing):
+            raise ValueError(f"facing is {value!r}, expected one of {', '.join(names_in(Facing))}")
+        return value
+    if isinstance(value, np.ndarray):
+        return _triple(name, value, _number)
+    return _positive(name, value) if name == "radius_mm" else _number(name, value)
+
+
+def _plain(value: Any) -> Any:
+    """Return a point as an array, anything else as it is."""
+    return np.asarray(value, dtype=np.float64) if isinstance(value, tuple) else value
 
 
 def _lattice(tree: dict[str, Any]) -> Lattice:

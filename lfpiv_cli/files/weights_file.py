@@ -1,6 +1,6 @@
 """The weights file: everything that a reconstruction needs besides the images.
 
-Layout, version 2 (HDF5; lengths in mm): `camera` (scalars of `optics.camera.Camera`, `lattice_origin_mm` (2,),
+Layout, version 3 (HDF5; lengths in mm): `camera` (scalars of `optics.camera.Camera`, `lattice_origin_mm` (2,),
 `lattice_basis_mm` (2, 2)), `grid` (`shape_xyz`, `spacing_mm`, `origin_mm`, `padding_xyz`, `reference`,
 `scene_distortion_per_mm2` of its planes), `columns` and
 `rows` (the per-axis weights: `start`, `cell`, `share`), and `calibration` where one was made. The cells and the
@@ -11,6 +11,10 @@ Where the axes do not separate there is, in place of `columns` and `rows`, `on_d
 are integrated when needed; where rays were counted, `counted` (`start`, `pixel`, `share` of each voxel in the order of
 the sensor's axes). `vignetting` (coefficients, see `calibration.transmission`) scales the pixels on reading. Version 1
 had none of these.
+
+Behind curved faces `columns` and `rows` are those of strips (`strips`: `lit` of the padded grid, `height` in voxels,
+`turned`, `coupling_mm`, see `weights.strips`), and `on_demand` holds the `faces`; `grid` says how many voxels lie
+outside the fluid. Version 2 had none of these.
 """
 
 from __future__ import annotations
@@ -26,10 +30,19 @@ from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.calibration.transmission import vignetting_surface
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.files.hdf5 import ensure_format, open_h5, read_provenance, read_tree, write_tree
-from lfpiv_cli.files.weights_fields import CAMERA_SCALARS, read_camera, read_grid, read_media, read_window
+from lfpiv_cli.files.weights_fields import (
+    CAMERA_SCALARS,
+    faces_tree,
+    read_camera,
+    read_faces,
+    read_grid,
+    read_media,
+    read_window,
+)
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import Refraction, TracedMethod, names_in
 from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.reference import Reference
 from lfpiv_cli.weights.aperture import aperture_mask
@@ -41,10 +54,11 @@ from lfpiv_cli.weights.model import Weights, WeightsOperator, behind_transmissio
 from lfpiv_cli.weights.operators import BrickOperator, Column, FactorisedOperator
 from lfpiv_cli.weights.quadrature import Columns
 from lfpiv_cli.weights.scene import Source
+from lfpiv_cli.weights.strips import StripOperator
 
 FORMAT = "lfpiv-weights"
-VERSION = 2
-READABLE_VERSIONS = (1, 2)
+VERSION = 3
+READABLE_VERSIONS = (1, 2, 3)
 # Coefficients of `transmission.vignetting_surface`.
 VIGNETTING_SHAPE = (5, 5)
 
@@ -125,6 +139,7 @@ def write_weights(path: Path, content: WeightsFile, overwrite: bool) -> None:
             "padding_xyz": np.asarray(weights.padding_xyz),
             **content.reference.attributes(),
             "scene_distortion_per_mm2": weights.scene_distortion_per_mm2,
+            "voxels_outside_fluid": weights.voxels_outside_fluid,
         },
         "vignetting": content.vignetting,
         "calibration": weights.calibration.to_tree() if weights.calibration else None,
@@ -192,9 +207,19 @@ def _operator_tree(operator: WeightsOperator) -> dict[str, Any]:
     if isinstance(operator, ColumnOperator):
         columns = operator.columns
         return {"counted": {"start": columns.start, "pixel": columns.pixel, "share": columns.share}}
+    if isinstance(operator, StripOperator):
+        strips = {
+            "lit": operator.lit.astype(np.uint8),
+            "height": operator.strips.shape[1],
+            "turned": operator.turned,
+            "coupling_mm": operator.coupling_mm,
+        }
+        return {"strips": strips} | _operator_tree(operator.strips)
     if isinstance(operator, BrickOperator):
         raise TypeError("bricks stand for hexagonal cells where particles are looked for, and are not stored")
     space = operator.source
+    if isinstance(space, CurvedSpace):
+        return {"on_demand": asdict(space.media) | {"method": "ert", "faces": faces_tree(space)}}
     if not isinstance(space, ObjectSpace):
         return {"on_demand": {"method": "dlfc"}}
     tracing = {"method": space.method, "refraction": space.refraction}
@@ -212,10 +237,31 @@ def _operator(tree: dict[str, Any], camera: Camera, grid: Grid, calibration: Cal
         columns = _counted(tree["counted"], nx * ny * nz, camera.rows * camera.columns)
         return ColumnOperator((nz, along, across), (camera.rows, camera.columns), np.arange(nx * ny * nz), columns)
     optics = axis_optics(camera)
+    if "strips" in tree:
+        return _strips(tree, (nz, along, across), camera, optics)
     column_axis = _axis_weights(tree["columns"], nz, across, optics[0])
     row_axis = _axis_weights(tree["rows"], nz, along, optics[1])
     mask = aperture_mask(column_axis.cells, row_axis.cells, camera.aperture_radius_mm)
     return FactorisedOperator(column_axis, row_axis, mask)
+
+
+def _strips(
+    tree: dict[str, Any], shape: tuple[int, int, int], camera: Camera, optics: tuple[AxisOptics, AxisOptics]
+) -> StripOperator:
+    """Return weights in strips of a volume of `shape` (planes, row voxels, column voxels)."""
+    strips = _group(tree, "strips")
+    lit, height, turned, coupling = (strips[name] for name in ("lit", "height", "turned", "coupling_mm"))
+    voxels, lines = shape[1:] if turned else shape[:0:-1]
+    if lit.shape != shape or lit.dtype != np.uint8 or type(turned) is not bool or not 0.0 <= coupling < np.inf:
+        raise ValueError(f"strips of a volume of {lit.shape}, expected {shape}")
+    if type(height) is not int or not 1 <= height <= lines:
+        raise ValueError(f"strips of {height} voxels of {lines}")
+    planes = -(-lines // height) * shape[0]
+    across, along = optics if turned else optics[::-1]
+    by_row = _axis_weights(tree["rows"], planes, height, across)
+    by_column = _axis_weights(tree["columns"], planes, voxels, along)
+    mask = aperture_mask(by_column.cells, by_row.cells, camera.aperture_radius_mm)
+    return StripOperator(FactorisedOperator(by_column, by_row, mask), lit.astype(bool), turned, float(coupling))
 
 
 def _source(tree: dict[str, Any], calibration: Calibration | None) -> Source:
@@ -225,6 +271,8 @@ def _source(tree: dict[str, Any], calibration: Calibration | None) -> Source:
             raise ValueError("fitted rays are missing")
         return calibration.ray_fit.rays
     media = read_media(tree)
+    if "faces" in tree:
+        return CurvedSpace(media, read_faces(_group(tree, "faces")))
     face = tree.get("window_face")
     if tree["method"] not in names_in(TracedMethod) or tree["refraction"] not in names_in(Refraction):
         raise ValueError(f"unknown tracing: {tree['method']}, {tree['refraction']}")

@@ -21,15 +21,18 @@ from lfpiv_cli.interface.weights_checks import check_rig, rig_notices
 from lfpiv_cli.interface.weights_cost import check_rays
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.optics.polynomial_rays import PolynomialRays
 from lfpiv_cli.reference import Reference
 from lfpiv_cli.weights.build import default_padding, scene_distortion
 from lfpiv_cli.weights.columns import ColumnOperator, OnDemandOperator, operator_of, seen_share
+from lfpiv_cli.weights.curved_reach import aimed_misfit_mm, curved_padding
 from lfpiv_cli.weights.model import Weights, WeightsOperator
 from lfpiv_cli.weights.operators import FactorisedOperator
 from lfpiv_cli.weights.rays import RayCount, count_columns
 from lfpiv_cli.weights.scene import Source
+from lfpiv_cli.weights.strips import StripOperator
 
 # Told where the voxels were left to the program, and where the axes do not separate.
 VOXELS_CHOSEN = (
@@ -113,8 +116,8 @@ def plan_of(settings: Config, found: Calibration | None) -> Plan:
         camera = found.camera(camera)
     reference = _reference(settings, found)
     grid = settings.grid(reference)
-    padding = settings.reconstruction.padding_voxel or default_padding(camera, settings.media_model(), grid)
     source = ray_source(settings, found)
+    padding = settings.reconstruction.padding_voxel or _padding(settings, camera, source, grid)
     check_rays(settings, source, grid.padded(padding))
     notices = [
         *rig_notices(settings, found, camera, source, grid),
@@ -135,6 +138,28 @@ def weights_of(plan: Plan, provenance: dict[str, Any], console: Console) -> Weig
     weights = Weights(grid, plan.padding, operator, camera.column_axis, found, bend)
     vignetting = found.vignetting() if found else None
     return WeightsFile(weights, camera, plan.reference, provenance, vignetting)
+
+
+def _padding(settings: Config, camera: Camera, source: Source, grid: Grid) -> tuple[int, int, int]:
+    """Return how many voxels to solve for beyond each side of a grid."""
+    if isinstance(source, CurvedSpace):
+        return curved_padding(camera, source, grid)
+    return default_padding(camera, settings.media_model(), grid)
+
+
+def curved_summary(content: WeightsFile) -> dict[str, Any]:
+    """Return what is to be told of weights behind curved faces: nothing where there are none.
+
+    That is how far rays are, rms on the array, from traced ones, and how many voxels lie outside the fluid.
+    """
+    operator, misfit_mm = content.weights.solver_operator, None
+    if isinstance(operator, StripOperator):
+        misfit_mm = operator.coupling_mm
+    elif isinstance(operator, OnDemandOperator) and isinstance(operator.source, CurvedSpace):
+        misfit_mm = aimed_misfit_mm(content.camera, operator.source, content.weights.grid)
+    if misfit_mm is None:
+        return {}
+    return {"ray_misfit_mm": misfit_mm, "voxels_outside_fluid": content.weights.voxels_outside_fluid}
 
 
 def ray_source(settings: Config, found: Calibration | None) -> Source:

@@ -14,9 +14,11 @@ from lfpiv_cli.files.config import Config
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.optics.paraxial import LARGEST_ERROR_PX, refraction_error_mm, rim_tangent, sine_error_mm
+from lfpiv_cli.weights.curved_reach import seen_depths_mm
 from lfpiv_cli.weights.scene import Source
 
 # Of the angle under which the rim of the lens is seen: beyond 45 degrees a thin lens is far from any real one.
@@ -48,9 +50,11 @@ def rig_notices(
 ) -> list[Notice]:
     """Return what speaks against the weights of a grid, z from the focal point, behind a camera."""
     notices = f_number_notices(settings.camera_model())
+    depths = np.linspace(*grid.bounds_mm(2), DEPTHS)
+    if isinstance(source, CurvedSpace):
+        return [*notices, *_of_sines(camera, source.media, seen_depths_mm(camera, source, grid))]
     if not isinstance(source, ObjectSpace):
         return notices
-    depths = np.linspace(*grid.bounds_mm(2), DEPTHS)
     return [
         *notices,
         *_of_refraction(settings, found, camera, source, depths),

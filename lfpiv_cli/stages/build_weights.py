@@ -15,7 +15,7 @@ from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.provenance import record, with_warnings
 from lfpiv_cli.files.weights_file import open_weights, write_weights
-from lfpiv_cli.interface.weights import plan_of, weights_of
+from lfpiv_cli.interface.weights import curved_summary, plan_of, weights_of
 from lfpiv_cli.interface.weights_cost import cost_notices, cost_of
 from lfpiv_cli.names import Method, Refraction, Sampling
 
@@ -78,7 +78,7 @@ def build_weights(
     console.detail(f"about {cost.weights_core_s:.2g} s of a core and {cost.weights_bytes / 1e9:.2g} GB")
     content = weights_of(plan, with_warnings(made, plan.notices), console)
     write_weights(output, content, overwrite)
-    return summary | {"frame": content.weights.frame, "file_bytes": output.stat().st_size}
+    return summary | curved_summary(content) | {"frame": content.weights.frame, "file_bytes": output.stat().st_size}
 
 
 def target_of(config: Path, output: Path, options: BuildWeightsOptions) -> Target:

@@ -1,0 +1,350 @@
+"""Weights behind curved faces: columns against counted rays, strips against columns, the fluid's end, files."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import tifffile
+import yaml
+
+from lfpiv_cli import open_volume
+from lfpiv_cli.errors import InputError
+from lfpiv_cli.files.config import Config
+from lfpiv_cli.files.hdf5 import read_tree, write_tree
+from lfpiv_cli.files.weights_file import FORMAT, VERSION, WeightsFile, open_weights, write_weights
+from lfpiv_cli.grid import Grid
+from lfpiv_cli.optics.curved_space import CurvedSpace, Face
+from lfpiv_cli.optics.media import Window, fluid_path_to_focus
+from lfpiv_cli.optics.microlenses import Lattice
+from lfpiv_cli.optics.object_space import ObjectSpace
+from lfpiv_cli.optics.surfaces import Cylinder, Plane, Sphere, TiltedPlane
+from lfpiv_cli.reconstruction.solvers import SolverSettings, reconstruct
+from lfpiv_cli.reference import Reference
+from lfpiv_cli.stages.build_weights import BuildWeightsOptions, build_weights
+from lfpiv_cli.stages.reconstruct import reconstruct as reconstruct_images
+from lfpiv_cli.weights.axis import depth_nodes
+from lfpiv_cli.weights.build import LARGEST_COUPLING, blur_radius_mm, factorise_through, strips_of
+from lfpiv_cli.weights.columns import OnDemandOperator, operator_of, seen_share
+from lfpiv_cli.weights.curved import lit_voxels
+from lfpiv_cli.weights.curved_reach import aimed_misfit_mm, curved_padding
+from lfpiv_cli.weights.model import Weights, behind_transmission
+from lfpiv_cli.weights.operators import forward_reference
+from lfpiv_cli.weights.quadrature import integrate_columns
+from lfpiv_cli.weights.rays import RayCount, count_rays, sampling_error
+from lfpiv_cli.weights.strips import StripOperator
+
+VOXEL = (0.1, 0.1, 0.1)
+# Tiles across the aperture: with as many a column's own error is far below what chance makes of a count.
+FINE = 64
+# All over the part of the tube that the sensor sees: near its middle, beside it, near both walls, off the focal plane.
+PLACES = [
+    (0.05, 0.05, 0.05),
+    (1.05, 0.55, 3.05),
+    (-2.05, 2.05, -4.05),
+    (3.05, -3.05, 2.05),
+    (2.55, 3.45, -2.55),
+    (1.05, -3.45, 0.05),
+    (-3.05, 3.05, 1.95),
+    (2.05, -3.35, -1.95),
+    (-1.05, -2.05, 4.35),
+    (0.55, 0.05, -4.85),
+]
+# Beside the axis of a tube along x, up to the wall and beyond it.
+BESIDE = Grid.centred((4, 20, 7), (0.1, 0.1, 0.4), (0.6, 2.6, 2.6))
+
+
+@pytest.fixture
+def tube(water):
+    """A tube of 10 mm with a wall of 2 mm, along x."""
+    return tube_along((1.0, 0.0, 0.0), water)
+
+
+def tube_along(axis, media):
+    return CurvedSpace(
+        media,
+        (
+            Face(Cylinder((0.0, 0.0, 0.0), axis, 7.0), media.window),
+            Face(Cylinder((0.0, 0.0, 0.0), axis, 5.0), media.fluid),
+        ),
+    )
+
+
+def column_of(operator, index):
+    image = np.zeros(operator.image_shape)
+    rows, columns, weights = operator.column(*index)
+    image[rows, columns] = weights
+    return image
+
+
+def differences_from_counts(camera, space, places, rays):
+    """L1 between columns and counted rays, and what chance makes of that."""
+    shape = camera.rows, camera.columns
+    for place in places:
+        counted = count_rays(camera, space, place, VOXEL, np.random.default_rng(7), RayCount(rays // 5, 5))
+        column = integrate_columns(camera, space, [place], VOXEL, FINE).image(0, shape)
+        yield np.abs(column - counted).sum(), sampling_error(column, rays)
+
+
+@pytest.mark.thorough
+def test_columns_are_those_of_counted_rays(table2, tube, water):
+    ((off, chance),) = differences_from_counts(table2, tube, [(3.05, -3.05, 2.05)], 500_000)
+    assert off < 0.01 + chance
+    plane = ObjectSpace(water, Window(180.0, 2.0), "exact")
+    shape = table2.rows, table2.columns
+    wrong = integrate_columns(table2, plane, [(3.05, -3.05, 2.05)], VOXEL).image(0, shape)
+    right = integrate_columns(table2, tube, [(3.05, -3.05, 2.05)], VOXEL).image(0, shape)
+    assert np.abs(wrong - right).sum() > 1.0  # of 2
+
+
+@pytest.mark.slow
+def test_columns_all_over_a_tube_are_those_of_counted_rays(table2, tube):
+    off = [found for found, _ in differences_from_counts(table2, tube, PLACES, 10_000_000)]
+    assert np.max(off) < 0.02  # half of it chance
+
+
+@pytest.fixture
+def planes(table2, water, window):
+    """Plane faces where `window` has them, and the window as plane layers have it."""
+    path = fluid_path_to_focus(window, table2.focus_distance_mm, water)
+    inner = Face(Plane(-path), water.fluid)
+    return CurvedSpace(water, (Face(Plane(-path - window.thickness_mm), water.window), inner))
+
+
+@pytest.mark.thorough
+def test_plane_faces_have_the_weights_of_plane_layers(table2, water, window, planes):
+    camera = replace(table2, columns=500, rows=420)
+    layers = ObjectSpace(water, window, "exact")
+    grid = Grid.centred((3, 3, 3), (0.1, 0.1, 2.0), (0.2, -0.3, 0.5))
+    shape = camera.rows, camera.columns
+    for place in [(0.3, -0.4, 2.5), (-0.2, 0.1, -3.0)]:
+        columns = [integrate_columns(camera, each, [place], VOXEL).image(0, shape) for each in (layers, planes)]
+        assert np.abs(columns[0] - columns[1]).sum() < 1e-4
+    strips, whole = operator_of(camera, planes, grid), factorise_through(camera, layers, grid)
+    assert isinstance(strips, StripOperator)
+    assert strips.strips.shape == whole.shape  # one strip
+    for index in np.ndindex(*whole.shape):
+        # Means over the aperture and the voxels against a fit through them.
+        assert np.abs(column_of(strips, index) - column_of(whole, index)).sum() < 0.005
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("column_axis", ["x", "y"])
+@pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0)])
+def test_strips_are_adjoint_and_light_what_columns_say(table2, water, rng, column_axis, axis):
+    camera = replace(table2, columns=2000, rows=2000, column_axis=column_axis)
+    grid = BESIDE if axis[0] else Grid(*((each[1], each[0], each[2]) for each in vars(BESIDE).values()))
+    operator = operator_of(camera, tube_along(axis, water), grid)
+    assert isinstance(operator, StripOperator)
+    assert operator.turned == ((column_axis == "x") != bool(axis[0]))
+    assert operator.strips.shape[1] < 20  # strips, not the whole
+    weights = Weights(grid, (0, 0, 0), operator, column_axis)
+    volume, image = rng.random(weights.shape, np.float32), rng.random(weights.image_shape, np.float32)
+    left = np.vdot(weights.forward(volume).astype(np.float64), image)
+    assert left == pytest.approx(np.vdot(volume.astype(np.float64), weights.adjoint(image)), rel=1e-5)
+    layout = OnDemandOperator(camera, tube_along(axis, water), grid)
+    errors = []
+    for index in list(np.ndindex(*operator.shape))[::41]:
+        alone = np.zeros(operator.shape, np.float32)
+        alone[index] = 1.0
+        column = column_of(operator, index)
+        np.testing.assert_allclose(operator.forward(alone), column, atol=1e-8)
+        centre = layout.centres_mm(np.array([np.ravel_multi_index(index, operator.shape)]))
+        converged = integrate_columns(camera, layout.source, centre, layout.sides_mm, 128, 5)
+        errors.append(np.abs(column - converged.image(0, operator.image_shape)).sum())
+    # Beside the axis, where rays are off by nearly all that is allowed; in the middle of the tube it is 0.005 to 0.02.
+    assert np.median(errors) < 0.04
+    assert np.max(errors) < 0.07
+
+
+def test_strips_are_a_sum_of_factorised_weights(table2, tube, rng):
+    camera = replace(table2, columns=400)
+    operator = operator_of(camera, tube, BESIDE)
+    volume = rng.random(operator.shape, np.float32)
+    strips, planes, height = operator.strips, operator.shape[0], operator.strips.shape[1]
+    whole = forward_reference(strips, operator.cut(volume * operator.lit))
+    np.testing.assert_allclose(operator.forward(volume), whole, rtol=1e-4, atol=1e-5)
+    one_by_one = 0.0
+    for first in range(0, operator.shape[1], height):
+        part = np.zeros_like(volume)
+        part[:, first : first + height] = volume[:, first : first + height]
+        one_by_one = one_by_one + operator.forward(part)
+    np.testing.assert_allclose(operator.forward(volume), one_by_one, rtol=1e-4, atol=1e-5)
+    assert strips.shape[0] == planes * -(-operator.shape[1] // height)
+
+
+def test_strips_meet_at_their_seams(table2, tube):
+    plan = strips_of(table2, tube, BESIDE)
+    rng = np.random.default_rng(3)
+    depths = depth_nodes(BESIDE.axis_mm(2), BESIDE.spacing_mm[2])[:4]  # in the fluid throughout
+    for k, (one, other) in enumerate(zip(plan.fits, plan.fits[1:], strict=False)):
+        seam = BESIDE.bounds_mm(1)[0] + (k + 1) * plan.height * BESIDE.spacing_mm[1]
+        for axis in (0, 1):
+            own, crossing = (0.6 if axis == 0 else seam), 12.5 * rng.uniform(-1.0, 1.0, 50)
+            places = [on_axis(fit, axis, depths, own, crossing) for fit in (one, other)]
+            step = np.sqrt(np.mean((places[0] - places[1]) ** 2))
+            # Along the tube each strip has its own mean depth: the seam's step is as wide as the misfit within them.
+            assert step < 3.0 * LARGEST_COUPLING * table2.lattice.pitch.min()
+
+
+def on_axis(fit, axis, depths, own, crossing):
+    """Where rays meet the array along one axis, as a strip has it."""
+    bent = fit.bending(axis, depths, 12.5)
+    x, across = (own - fit.middle_mm[axis]) / bent.scale_mm[0], crossing / bent.scale_mm[1]
+    powers = np.arange(bent.coefficients_mm.shape[-1])
+    return np.einsum("pnab,a,mb->pnm", bent.coefficients_mm, x**powers, across[:, np.newaxis] ** powers)
+
+
+@pytest.mark.thorough
+def test_voxels_outside_the_fluid_stay_dark(table2, tube, rng):
+    grid = Grid.centred((3, 10, 12), (0.1, 0.1, 1.0), (0.0, 3.0, 0.0))
+    camera = replace(table2, columns=400, rows=2200)
+    y, z = np.meshgrid(grid.axis_mm(1), grid.axis_mm(2))
+    inside = np.broadcast_to((y**2 + z**2 < 25.0)[:, :, np.newaxis], grid.shape_zyx)
+    assert 0 < inside.sum() < inside.size
+    np.testing.assert_array_equal(lit_voxels(camera, tube, grid), inside)
+    for operator in (operator_of(camera, tube, grid), OnDemandOperator(camera, tube, grid)):
+        assert Weights(grid, (0, 0, 0), operator, "x").voxels_outside_fluid == np.count_nonzero(~inside)
+        back = operator.adjoint(np.ones(operator.image_shape, np.float32))
+        assert not back[~inside].any()
+        assert (back[inside] > 0.9).all()
+        assert not operator.forward((~inside).astype(np.float32)).any()
+    strips = operator_of(camera, tube, grid)
+    for solver in ("sart", "em"):
+        found = reconstruct(
+            strips, strips.forward(rng.random(grid.shape_zyx, np.float32)), SolverSettings(solver, 3, 1.0)
+        )
+        assert np.isfinite(found.volume).all()
+        assert not found.volume[~inside].any()
+        assert found.volume[inside].any()
+
+
+def test_what_does_not_separate_is_made_on_demand(table2, tube, water):
+    grid = Grid.centred((2, 2, 2), VOXEL, (0.1, 0.2, 0.3))
+    turned = replace(table2, lattice=Lattice.regular(0.1, "hexagonal"))
+    assert isinstance(operator_of(turned, tube, grid), OnDemandOperator)
+    # The tube across the image, which no strips of rows or columns follow.
+    oblique = Grid.centred((30, 30, 5), (0.2, 0.2, 1.5), (0.0, 0.0, 0.0))
+    assert isinstance(operator_of(table2, tube_along((1.0, 1.0, 0.0), water), oblique), OnDemandOperator)
+
+
+@pytest.mark.parametrize("operator_kind", ["strips", "on demand"])
+def test_a_weights_file_holds_them(table2, tube, tmp_path, operator_kind):
+    camera = replace(table2, columns=300)
+    operator = (
+        operator_of(camera, tube, BESIDE) if operator_kind == "strips" else OnDemandOperator(camera, tube, BESIDE)
+    )
+    path = tmp_path / "weights.h5"
+    content = WeightsFile(Weights(BESIDE, (0, 0, 0), operator, "x"), camera, Reference("focal_point", 0.0), {})
+    write_weights(path, content, False)
+    found = open_weights(path)
+    for index in [(3, 5, 1), (6, 19, 0)]:
+        for one, other in zip(found.column(*index), content.column(*index), strict=True):
+            np.testing.assert_array_equal(one, other)
+    assert found.weights.voxels_outside_fluid == content.weights.voxels_outside_fluid > 0
+    assert read_tree(path, FORMAT, (VERSION,))[0]["grid"]["voxels_outside_fluid"] == found.weights.voxels_outside_fluid
+    if operator_kind == "on demand":
+        assert found.weights.solver_operator.source == tube
+
+
+@pytest.mark.parametrize(
+    ("group", "name", "value"),
+    [
+        ("strips", "height", 0),
+        ("strips", "height", 400),
+        ("strips", "turned", 3),
+        ("strips", "coupling_mm", float("nan")),
+        ("strips", "lit", np.ones((1, 2, 3), np.uint8)),
+    ],
+)
+def test_strips_that_contradict_themselves_are_refused(table2, tube, tmp_path, group, name, value):
+    path, edited = tmp_path / "weights.h5", tmp_path / "edited.h5"
+    camera = replace(table2, columns=300)
+    weights = Weights(BESIDE, (0, 0, 0), operator_of(camera, tube, BESIDE), "x")
+    write_weights(path, WeightsFile(weights, camera, Reference("focal_point", 0.0), {}), False)
+    tree, provenance = read_tree(path, FORMAT, (VERSION,))
+    tree[group][name] = value
+    write_tree(edited, tree, format_name=FORMAT, format_version=VERSION, provenance=provenance, overwrite=False)
+    with pytest.raises(InputError, match="not a whole weights file"):
+        open_weights(edited)
+
+
+@pytest.mark.parametrize(
+    "surface",
+    [Plane(-5.0), TiltedPlane((0.0, 0.0, -5.0), (0.1, 0.0, 1.0)), Sphere((0.0, 0.0, 1.0), 6.0)],
+    ids=["plane", "tilted", "sphere"],
+)
+def test_a_weights_file_holds_every_kind_of_face(table2, water, tmp_path, surface):
+    space = CurvedSpace(water, (Face(surface, water.fluid),))
+    grid = Grid.centred((2, 2, 2), VOXEL, (0.0, 0.0, 0.0))
+    path = tmp_path / "weights.h5"
+    weights = Weights(grid, (0, 0, 0), OnDemandOperator(table2, space, grid), "x")
+    write_weights(path, WeightsFile(weights, table2, Reference("focal_point", 0.0), {}), False)
+    assert open_weights(path).weights.solver_operator.source == space
+
+
+def test_transmission_scales_pixels_of_turned_strips(table2, water, rng):
+    camera = replace(table2, columns=1768, rows=300)
+    grid = Grid.centred((20, 4, 3), (0.1, 0.1, 1.0), (2.6, 0.1, 0.0))
+    operator = operator_of(camera, tube_along((0.0, 1.0, 0.0), water), grid)
+    assert operator.turned
+    passing, volume = rng.random(operator.image_shape, np.float32), rng.random(operator.shape, np.float32)
+    dimmed = behind_transmission(operator, passing).forward(volume)
+    np.testing.assert_allclose(dimmed, operator.forward(volume) * passing, rtol=1e-5, atol=1e-6)
+
+
+def test_padding_reaches_as_light_spreads_and_ends_with_the_fluid(table2, tube, water, planes):
+    grid = Grid.centred((20, 20, 40), VOXEL, (0.0, 0.0, 0.0))
+    radius = blur_radius_mm(table2, water, grid)
+    # The spread behind plane faces, which `blur_radius_mm` tells without Snell's law.
+    np.testing.assert_allclose(np.array(curved_padding(table2, planes, grid)[:2]), radius / 0.1, atol=1.0)
+    wide = Grid.centred((20, 100, 100), VOXEL, (0.0, 0.0, 0.0))
+    x, y, z = curved_padding(table2, tube, wide)
+    assert x >= 3
+    assert (y, z) == (0, 0)
+
+
+def test_rays_made_for_a_voxel_follow_the_traced_ones(table2, tube):
+    grid = Grid.centred((60, 100, 100), VOXEL, (0.0, 0.0, 0.0))
+    assert aimed_misfit_mm(table2, tube, grid) < 1e-5
+
+
+def test_what_is_out_of_the_fluid_does_not_count_as_out_of_view(table2, tube):
+    smallest, largest = seen_share(table2, tube, Grid.centred((20, 50, 100), VOXEL, (0.0, 0.0, 0.0)))
+    assert 0.9 < smallest <= largest < 1.01
+    assert seen_share(table2, tube, Grid.centred((2, 2, 2), VOXEL, (0.0, 6.0, 0.0))) == (0.0, 0.0)
+
+
+RIG = {
+    "camera": {
+        "main_lens": {"magnification": -1.0, "focal_length_mm": 100.0, "aperture_mm": 25.0},
+        "microlenses": {"pitch_mm": 0.1, "focal_length_mm": 0.8, "layout": "square"},
+        "sensor": {"pixel_um": 5.5, "columns": 360, "rows": 1200},
+    },
+    "media": {"air": 1.0, "window": 1.49, "fluid": 1.33},
+    "volume": {"shape_xyz": [6, 20, 6], "voxel_mm": [0.1, 0.1, 0.5], "centre_mm": [0.0, 1.5, 3.5]},
+    "reconstruction": {"solver": "em", "iterations": 30},
+}
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("layout", ["square", "hexagonal"])
+def test_a_volume_behind_a_tube_is_reconstructed(tube, tmp_path, monkeypatch, layout):
+    monkeypatch.setattr(Config, "object_space", lambda *_: tube)
+    rig, output = tmp_path / "rig.yaml", tmp_path / "weights.h5"
+    rig.write_text(yaml.safe_dump(RIG).replace("square", layout))
+    told = build_weights(rig, output)
+    weights = open_weights(output)
+    assert told["voxels_outside_fluid"] == weights.weights.voxels_outside_fluid > 0
+    assert told["ray_misfit_mm"] < (0.002 if layout == "square" else 1e-5)
+    assert isinstance(weights.weights.solver_operator, StripOperator if layout == "square" else OnDemandOperator)
+    volume = np.zeros(weights.shape, np.float32)
+    volume[2, 13, 3] = 1000.0
+    image, found = tmp_path / "image.tif", tmp_path / "volume.vtkhdf"
+    tifffile.imwrite(image, weights.forward(volume))
+    reconstruct_images(output, [image], found)
+    light = open_volume(found).array
+    assert np.unravel_index(np.argmax(light), light.shape) == (2, 13, 3)
+    dry = build_weights(rig, tmp_path / "dry.h5", BuildWeightsOptions(dry_run=True))
+    assert dry["estimated_weights_bytes"] >= 0.0
