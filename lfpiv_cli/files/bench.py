@@ -5,6 +5,8 @@ What a section leaves out and another of its keys implies (an aperture from an f
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.calibration.model import Channel
 from lfpiv_cli.files.sections import (
@@ -18,13 +20,16 @@ from lfpiv_cli.files.sections import (
     PipeSection,
     VolumeSection,
 )
+from lfpiv_cli.files.sections_scene import FaceSection, parameters_of
 from lfpiv_cli.files.sections_simulated import FlowSection, PulsationSection
 from lfpiv_cli.flow.masks import RoundWall
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.curved_space import CurvedSpace, Face
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.optics.pupils import thin_lens
+from lfpiv_cli.optics.surfaces import SURFACES
 from lfpiv_cli.reference import Reference
 from lfpiv_cli.scale import Scale
 from lfpiv_cli.synthetic.flows import FLOWS, STEADY, Flow, Pulsation
@@ -36,6 +41,7 @@ DEFAULT_WINDOW = 16
 # Along an axis with longer voxels, where particle images are long: two of them fit.
 SMALLEST_DEFAULT_WINDOW = 8
 SMALLEST_WINDOW = 4
+DIRECTIONS = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0)}
 # Voxels as wide as a microlens lock depth to the array's grid and swallow its velocity: of 0.6 mm EM volumes give 0.22
 # with them. With half of one laterally and two along the axis they give nine tenths, with a third 0.98 to 1.02 and a
 # third less spread; a quarter gains no more. Along the axis the depth over which light spreads by one lens counts: two
@@ -118,6 +124,25 @@ def micro_image_pitch_px(section: CameraSection) -> float:
 def media_of(section: MediaSection) -> Media:
     """Return the refractive indices."""
     return Media(section.air, section.window, section.fluid)
+
+
+def face_of(section: FaceSection, media: Media) -> Face:
+    """Return a face: its surface, and the index behind it."""
+    parameters = parameters_of(section)
+    if isinstance(parameters.get("axis"), str):
+        parameters["axis"] = DIRECTIONS[parameters["axis"]]
+    behind = getattr(media, section.behind) if isinstance(section.behind, str) else section.behind
+    return Face(SURFACES[section.kind](**parameters), behind)
+
+
+def scene_of(sections: Sequence[FaceSection], media: Media) -> CurvedSpace:
+    """Return what lies in front of the lens, face by face.
+
+    Raises
+    ------
+    ConfigError : light cannot cross the faces in this order
+    """
+    return CurvedSpace(media, tuple(face_of(section, media) for section in sections))
 
 
 def board_of(section: BoardSection) -> BoardGeometry:

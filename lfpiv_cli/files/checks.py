@@ -13,6 +13,7 @@ from lfpiv_cli.files.bench import (
     media_of,
     missing_for_camera,
 )
+from lfpiv_cli.files.checks_scene import scene_faults
 from lfpiv_cli.files.sections import MainLens, Sections
 from lfpiv_cli.files.sections_simulated import SimulationSection
 from lfpiv_cli.files.yaml_nodes import KeyPath
@@ -54,7 +55,8 @@ def contradictions(sections: Sections) -> Found:
     yield from _lens_images(sections)
     yield from _volume(sections)
     yield from _board(sections)
-    yield from _scene(sections)
+    yield from _walls(sections)
+    yield from scene_faults(sections)
     yield from _processing(sections)
     yield from _rays(sections)
     yield from _object_space(sections)
@@ -198,7 +200,7 @@ def _board(sections: Sections) -> Found:
             yield ("board", name), f"is {size:g}, expected less than the spacing of {board.spacing_mm:g}"
 
 
-def _scene(sections: Sections) -> Found:
+def _walls(sections: Sections) -> Found:
     """Yield walls that are not each other, and a board's place in the fluid that is in air."""
     board, window, channel = sections.board, sections.window, sections.channel
     in_fluid = board is not None and board.medium == "fluid"

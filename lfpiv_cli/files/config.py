@@ -44,6 +44,7 @@ from lfpiv_cli.flow.correlation import CorrelationSettings
 from lfpiv_cli.flow.masks import ParallelWalls, Walls
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.media import Media, Window, channel_window
 from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.reconstruction.registry import SOLVERS
@@ -196,27 +197,63 @@ class Config:
         return float(self._needed("media.fluid_viscosity_pa_s", self.media.fluid_viscosity_pa_s))
 
     def window_model(self, mid_plane_z_mm: float | None = None) -> Window:
-        """Return the window: the channel's wall where its mid plane's depth is given, else the section `window`."""
+        """Return the window: the channel's wall where its mid plane's depth is given, else the section `window`.
+
+        Raises
+        ------
+        ConfigError
+            If there is none, or a `scene` in its place.
+        """
+        self.ensure_plane_layers("this command")
         if self.channel is not None and mid_plane_z_mm is not None:
             wall = self.channel.width_mm, self.channel.wall_mm
             return channel_window(self.camera_model().focus_distance_mm, self.media_model(), *wall, mid_plane_z_mm)
         section = self._needed("window", self.sections.window)
         return Window(section.distance_mm, section.thickness_mm)
 
-    def object_space(self, mid_plane_z_mm: float | None = None) -> ObjectSpace:
-        """Return what rays cross on their way to the lens, as `weights` has it; the window only where it is read.
+    def object_space(self, mid_plane_z_mm: float | None = None) -> ObjectSpace | CurvedSpace:
+        """Return what rays cross on their way to the lens: the faces of `scene`, else what `plane_space` gives.
+
+        Through a scene rays are traced by Snell's law, whatever `weights` says of method (ert, drt) and refraction.
 
         Raises
         ------
         ConfigError
             If rays are fitted (dlfc), not traced.
         """
+        scene = self.sections.scene
+        if scene is not None and self.weights.method != "dlfc":
+            return bench.scene_of(scene, self.media_model())
+        return self.plane_space("tracing rays", mid_plane_z_mm)
+
+    def plane_space(self, what: str, mid_plane_z_mm: float | None = None) -> ObjectSpace:
+        """Return plane layers, as `weights` has them; the window only where it is read.
+
+        Raises
+        ------
+        ConfigError
+            If rays are fitted (dlfc), not traced; or if there is a `scene`, which `what` cannot be done through.
+        """
         chosen = self.weights
         if chosen.method == "dlfc":
             raise ConfigError(f"{self.source}: weights.method: is dlfc, which traces no rays; expected ert or drt")
+        self.ensure_plane_layers(what)
         reads_window = chosen.method == "drt" or chosen.refraction == "exact"
         window = self.window_model(mid_plane_z_mm) if reads_window else None
         return ObjectSpace(self.media_model(), window, chosen.refraction, chosen.method)
+
+    def ensure_plane_layers(self, what: str) -> None:
+        """Refuse what is worked out for plane windows alone where the config has a `scene`.
+
+        Raises
+        ------
+        ConfigError
+        """
+        if self.sections.scene is not None:
+            raise ConfigError(
+                f"{self.source}: scene: {what} is possible through plane windows (section window or channel) alone, "
+                "not through the faces of a scene"
+            )
 
     def grid(self, reference: Reference = FOCAL_POINT) -> Grid:
         """Return the volume's grid: z as in the config, or from the focal point where its reference is given."""

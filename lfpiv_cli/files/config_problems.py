@@ -92,6 +92,8 @@ def _known_keys(path: KeyPath) -> list[str]:
     """Return the keys of the section at a place."""
     models: list[Any] = [Sections]
     for part in path:
+        if isinstance(part, int):
+            continue
         fields = [model.model_fields[part] for model in models if part in model.model_fields]
         models = [inner for field in fields for inner in _models_in(field.annotation)]
     return list(dict.fromkeys(name for model in models for name in model.model_fields))

@@ -23,6 +23,7 @@ from lfpiv_cli.files.section_types import (
     Voxels,
     Windows,
 )
+from lfpiv_cli.files.sections_scene import FaceSection
 from lfpiv_cli.files.sections_simulated import SimulationSection, ValidationSection
 from lfpiv_cli.names import (
     ColumnAxis,
@@ -252,6 +253,7 @@ class Sections(Section):
     camera: CameraSection | None = None
     media: MediaSection | None = None
     window: WindowSection | None = None
+    scene: Annotated[tuple[FaceSection, ...], Field(min_length=1)] | None = None
     volume: VolumeSection | None = None
     board: BoardSection | None = None
     channel: ChannelSection | None = None

@@ -116,6 +116,8 @@ def calibration_of(rig: Config, pictures: Photographs) -> Calibration:
         check_f_numbers(camera)
     sheet = DataSheet(rig.camera.microlenses.layout, rig.micro_image_pitch_px(), camera)
     has_board = pictures.board is not None or len(pictures.depth_boards) > 0
+    if has_board and rig.board.medium == "fluid":
+        rig.ensure_plane_layers("calibrating by a board in the fluid")
     return model.calibrate(pictures, rig.rig() if has_board else None, sheet)
 
 

@@ -344,6 +344,7 @@ def what_is_left(frame: Frame, found: Particles) -> NDArray[np.float64]:
 
 def _space(content: WeightsFile, settings: Config) -> ObjectSpace:
     """Return what lies before the particles: by Snell's law where the window's thickness and place are known."""
+    settings.ensure_plane_layers("fitting particles")
     calibration = content.weights.calibration
     mid_plane = calibration.mid_plane_z_mm if calibration else None
     if (settings.channel is None or mid_plane is None) and settings.sections.window is None:

@@ -139,6 +139,7 @@ def bench_of(settings: Config, found: Calibration | None, velocity_m_s: float | 
     ConfigError, InputError
         The configuration lacks camera, media or volume, or the calibration is of another sensor.
     """
+    settings.ensure_plane_layers("planning an experiment")
     camera = settings.camera_model()
     if found is not None:
         camera = found.camera(camera)
@@ -282,7 +283,7 @@ def _source(bench: Bench) -> Source:
     """Return how rays are found; a channel's mid plane that is not known is where the camera is focused."""
     if bench.settings.weights.method == "dlfc":
         return ray_source(bench.settings, bench.found)
-    return bench.settings.object_space(bench.mid_plane_z_mm)
+    return bench.settings.plane_space("planning", bench.mid_plane_z_mm)
 
 
 def _precision(bench: Bench) -> Line:

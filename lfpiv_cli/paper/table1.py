@@ -43,7 +43,7 @@ def table1(work: Work) -> Findings:
     config = work.config("table1", sections(validation={"weights": {"seed": SEED, "long_count_rays": 100_000_000}}))
     settings = load_config(config)
     camera, grid, rng = settings.camera_model(), settings.grid(), np.random.default_rng(SEED)
-    space = replace(settings.object_space(), window=settings.window_model())
+    space = replace(settings.plane_space("comparing ways to make weights"), window=settings.window_model())
     paper = np.array(TABLE1_MM)[: work.by_size(1, 5, 5)]
     centres = np.concatenate([paper, sample_voxels(grid, work.by_size(0, 3, 20), rng)])
     long_count = np.zeros(len(centres), np.int64)

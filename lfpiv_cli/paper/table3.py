@@ -168,7 +168,10 @@ class _Boards:
         return {
             "ert": _Method(self.paper, lambda: bench_of(self.paper, self.half)),
             "best": _Method(
-                self.best, lambda: self.methods["ert"].bench.with_voxels(self.best.grid(), self.best.object_space())
+                self.best,
+                lambda: self.methods["ert"].bench.with_voxels(
+                    self.best.grid(), self.best.plane_space("validating boards")
+                ),
             ),
             "dlfc": _Method(
                 self.paper, lambda: self.methods["ert"].bench.with_fitted_rays(self.pictures, self.depths_mm)

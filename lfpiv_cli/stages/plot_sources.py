@@ -138,6 +138,7 @@ def _of_particles(path: Path, raw: Path | None) -> dict[str, Drawn]:
     }
     if raw is not None:
         config = carried_config(points.provenance, path)
+        config.ensure_plane_layers("showing particles on a raw image")
         focal_point = points.reference.points_to_focal_point(points.position_mm)
         places = of_particles.places_px(focal_point, config.camera_model(), config.media_model())
         image = read_image(raw, config.image_shape()).astype(np.float64)

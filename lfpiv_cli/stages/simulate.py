@@ -222,6 +222,7 @@ def _board_space(settings: Config) -> ObjectSpace:
 
 def _flow_space(settings: Config, reference: Reference) -> ObjectSpace:
     """Return what the tracers are seen through."""
+    settings.ensure_plane_layers("simulating what is in the fluid")
     media, refraction = settings.media_model(), settings.simulation.refraction
     if refraction == "paraxial" or media == media.in_air():
         return ObjectSpace(media, None, refraction)

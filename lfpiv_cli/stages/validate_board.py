@@ -104,12 +104,13 @@ def placement_of(settings: Config, depth_mm: float) -> BoardPlacement:
 def bench_of(settings: Config, half: str) -> BoardBench:
     """Return the camera before which the boards of a half of Table 3 are held."""
     scene = settings.simulation
+    settings.ensure_plane_layers("validating boards")
     rig, grid, rng = settings.rig(), settings.grid(), np.random.default_rng(scene.seed)
     if half == "ideal":
         return ideal_bench(rig, grid, scene.peak_counts, rng)
     true = ObjectSpace(rig.media, settings.window_model(), scene.refraction)
     reality = Reality(misalignment_of(settings), readout_of(settings), true)
-    return recorded_bench(rig, settings.object_space(), reality, grid, scene.peak_counts, rng)
+    return recorded_bench(rig, settings.plane_space("validating boards"), reality, grid, scene.peak_counts, rng)
 
 
 def _discs(

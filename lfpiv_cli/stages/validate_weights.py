@@ -57,6 +57,7 @@ def validate_weights(
 
 def _space(settings: Config) -> ObjectSpace:
     """Return media and window; without the section `window` there is nothing to trace directly."""
+    settings.ensure_plane_layers("validating weights")
     try:
         window = settings.window_model()
     except ConfigError:

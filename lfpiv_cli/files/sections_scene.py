@@ -1,0 +1,71 @@
+"""The section `scene`: the faces that refract light between the lens and the fluid, one entry each."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import Discriminator, Field, Tag
+
+from lfpiv_cli.files.section_types import Index, Positive, Section, Vector
+from lfpiv_cli.names import Facing
+
+# What is behind a face: named as in `media`, or its refractive index.
+Behind = Annotated[
+    Annotated[Literal["window", "fluid"], Tag("name")] | Annotated[Index, Tag("number")],
+    Discriminator(lambda value: "name" if isinstance(value, str) else "number"),
+]
+# A lateral world axis, or any direction.
+Direction = Annotated[
+    Annotated[Literal["x", "y"], Tag("name")] | Annotated[Vector, Tag("direction")],
+    Discriminator(lambda value: "name" if isinstance(value, str) else "direction"),
+]
+
+
+class PlaneFace(Section):
+    """A plane square to the optical axis at z_mm. behind: what is behind each face, window, fluid or an index."""
+
+    kind: Literal["plane"]
+    z_mm: float
+    behind: Behind
+
+
+class TiltedPlaneFace(Section):
+    """A plane through point_mm, square to the direction `normal` (x, y, z); behind as of every face."""
+
+    kind: Literal["tilted_plane"]
+    point_mm: Vector
+    normal: Vector
+    behind: Behind
+
+
+class CylinderFace(Section):
+    """A circular cylinder of radius_mm; its axis, x, y or a direction [x, y, z], goes through centre_mm.
+
+    facing: convex, the side nearer to the camera, behind which is the inside; or concave, the farther side, from inside
+    to outside. behind as of every face.
+    """
+
+    kind: Literal["cylinder"]
+    radius_mm: Positive
+    axis: Direction = "x"
+    centre_mm: Vector = (0.0, 0.0, 0.0)
+    facing: Facing = "convex"
+    behind: Behind
+
+
+class SphereFace(Section):
+    """A sphere of radius_mm about centre_mm; facing as of a cylinder, behind as of every face."""
+
+    kind: Literal["sphere"]
+    radius_mm: Positive
+    centre_mm: Vector = (0.0, 0.0, 0.0)
+    facing: Facing = "convex"
+    behind: Behind
+
+
+FaceSection = Annotated[PlaneFace | TiltedPlaneFace | CylinderFace | SphereFace, Field(discriminator="kind")]
+
+
+def parameters_of(face: FaceSection) -> dict[str, Any]:
+    """Return what the surface of a face is made of, by the names that `optics.surfaces` has."""
+    return {name: getattr(face, name) for name in type(face).model_fields if name not in ("kind", "behind")}

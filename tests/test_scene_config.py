@@ -1,0 +1,169 @@
+"""The section `scene`: what it becomes, what it cannot be, and who refuses it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import get_args
+
+import pytest
+
+from lfpiv_cli.errors import ConfigError
+from lfpiv_cli.files.config import Config, load_config
+from lfpiv_cli.files.sections_scene import FaceSection
+from lfpiv_cli.interface.planning import bench_of
+from lfpiv_cli.interface.weights import ray_source
+from lfpiv_cli.names import SurfaceKind
+from lfpiv_cli.optics.curved_space import CurvedSpace, Face
+from lfpiv_cli.optics.media import Media
+from lfpiv_cli.optics.object_space import ObjectSpace
+from lfpiv_cli.optics.surfaces import Cylinder, Plane, Sphere, TiltedPlane
+from lfpiv_cli.stages import simulate, validate_board, validate_weights
+
+RIG = """\
+camera:
+  main_lens: {magnification: -1.0, focal_length_mm: 100.0, aperture_mm: 25.0}
+  microlenses: {focal_length_mm: 0.8, pitch_mm: 0.1, layout: square}
+  sensor: {pixel_um: 5.5, columns: 235, rows: 177}
+media: {air: 1.0, window: 1.49, fluid: 1.33}
+volume: {shape_xyz: [8, 6, 4], voxel_mm: 0.1}
+board: {dots: [7, 7], spacing_mm: 1.0, dot_diameter_mm: 0.2, medium: fluid}
+"""
+TUBE = """\
+scene:
+  - {kind: cylinder, axis: x, radius_mm: 7.0, centre_mm: [0, 0, 0], behind: window}
+  - {kind: cylinder, axis: x, radius_mm: 5.0, behind: fluid}
+"""
+WATER = Media(1.0, 1.49, 1.33)
+
+
+@pytest.fixture
+def configured(tmp_path: Path) -> Callable[[str], Config]:
+    def config_of(text: str) -> Config:
+        path = tmp_path / "rig.yaml"
+        path.write_text(text)
+        return load_config(path)
+
+    return config_of
+
+
+def test_a_scene_becomes_faces(configured: Callable[[str], Config]) -> None:
+    scene = """\
+scene:
+  - {kind: plane, z_mm: -30, behind: 1.52}
+  - {kind: tilted_plane, point_mm: [0, 0, -20], normal: [0.1, 0, 1], behind: 1.4}
+  - {kind: sphere, radius_mm: 40, centre_mm: [0, 0, -50], facing: concave, behind: window}
+  - {kind: cylinder, axis: [1, 0.1, 0], radius_mm: 5.0, behind: fluid}
+"""
+    config = configured(RIG + scene)
+    expected = (
+        Face(Plane(-30.0), 1.52),
+        Face(TiltedPlane((0.0, 0.0, -20.0), (0.1, 0.0, 1.0)), 1.4),
+        Face(Sphere((0.0, 0.0, -50.0), 40.0, "concave"), 1.49),
+        Face(Cylinder((0.0, 0.0, 0.0), (1.0, 0.1, 0.0), 5.0), 1.33),
+    )
+    assert config.object_space() == CurvedSpace(WATER, expected)
+    # as files carry it
+    assert Config.from_resolved(config.resolved()).object_space() == CurvedSpace(WATER, expected)
+
+
+@pytest.mark.parametrize("axis", ["x", "y"])
+def test_an_axis_by_name(configured: Callable[[str], Config], axis: str) -> None:
+    space = configured(RIG + TUBE.replace("axis: x", f"axis: {axis}")).object_space()
+    assert isinstance(space, CurvedSpace)
+    assert space.faces[0].surface == Cylinder((0.0, 0.0, 0.0), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))[axis == "y"], 7.0)
+
+
+@pytest.mark.parametrize("weights", ["method: drt", "refraction: exact", "refraction: paraxial"])
+def test_rays_through_a_scene_are_exact_and_need_no_window(configured: Callable[[str], Config], weights: str) -> None:
+    assert isinstance(configured(RIG + TUBE + f"weights: {{{weights}}}\n").object_space(), CurvedSpace)
+
+
+def test_without_a_scene_layers_are_plane(configured: Callable[[str], Config]) -> None:
+    assert configured(RIG).object_space() == ObjectSpace(WATER, None, "paraxial")
+
+
+def test_the_kinds_are_those_of_the_registry() -> None:
+    kinds = [get_args(section.model_fields["kind"].annotation)[0] for section in get_args(get_args(FaceSection)[0])]
+    assert kinds == list(get_args(SurfaceKind))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("behind: fluid", "behind: glass", ":10:55: scene[1].behind: is 'glass', expected 'window' or 'fluid'"),
+        ("behind: fluid", "behind: 0.9", "scene[1].behind: is 0.9, expected at least 1"),
+        ("behind: fluid", "behind: window", ":10:55: scene[1].behind: is window, expected fluid behind the last face"),
+        ("behind: fluid", "behind: 1.34", "scene[1].behind: is 1.34, expected fluid"),
+        (", behind: fluid", "", "scene[1].behind: is missing"),
+        ("axis: x, radius_mm: 5.0", "axis: z, radius_mm: 5.0", "scene[1].axis: is 'z', expected 'x' or 'y'"),
+        ("axis: x, radius_mm: 5.0", "axis: 1, radius_mm: 5.0", "scene[1].axis: is 1, expected a list in brackets"),
+        (
+            "axis: x, radius_mm: 5.0",
+            "axis: [0, 0, 1], radius_mm: 5.0",
+            "scene[1]: the optical axis misses the cylinder",
+        ),
+        ("radius_mm: 5.0", "radius_mm: 5.0, centre_mm: [0, 6, 0]", ":10:5: scene[1]: the optical axis misses"),
+        ("radius_mm: 5.0", "radius_mm: 8.0", "scene: face 2 meets the optical axis at z = -8 mm, face 1 at -7"),
+        ("radius_mm: 5.0", "radius_mm: 5.0, facng: concave", "scene[1].facng: unknown key; did you mean 'facing'?"),
+        ("kind: cylinder, axis: x, radius_mm: 5.0", "kind: tube", "scene[1].kind: is 'tube', expected one of 'plane'"),
+        ("kind: cylinder, axis: x, radius_mm: 5.0", "z_mm: 5.0", "scene[1].kind: is missing"),
+        ("centre_mm: [0, 0, 0]", "centre_mm: [0, 0, -400]", "z = -407 mm, lies behind the lens"),
+    ],
+)
+def test_what_cannot_be_is_named(configured: Callable[[str], Config], old: str, new: str, words: str) -> None:
+    with pytest.raises(ConfigError) as refused:
+        configured(RIG + TUBE.replace(old, new))
+    assert words in str(refused.value)
+    assert len(str(refused.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("addition", "words"),
+    [
+        ("window: {distance_mm: 98.0, thickness_mm: 2.0}", "window: contradicts scene"),
+        ("channel: {width_mm: 10.0, wall_mm: 2.0}", "channel: contradicts scene"),
+        ("pipe: {radius_mm: 4.0}", "pipe.radius_mm: is 4, but that of the last face in scene is 5"),
+        ("pipe: {radius_mm: 5.0, axis: y}", "pipe.axis: is y, but that of the last face in scene is x"),
+        ("pipe: {radius_mm: 5.0, centre_mm: [0, 0, 1]}", "pipe.centre_mm: is [0.0, 0.0, 1.0], but that of the last"),
+    ],
+)
+def test_walls_that_contradict_a_scene(configured: Callable[[str], Config], addition: str, words: str) -> None:
+    with pytest.raises(ConfigError) as refused:
+        configured(RIG + TUBE + addition)
+    assert words in str(refused.value)
+
+
+def test_a_pipe_may_be_given_beside_its_faces(configured: Callable[[str], Config]) -> None:
+    assert configured(RIG + TUBE + "pipe: {radius_mm: 5.0, centre_mm: [3, 0, 0]}").pipe is not None
+
+
+def test_a_scene_needs_faces_and_media(configured: Callable[[str], Config]) -> None:
+    with pytest.raises(ConfigError, match="scene: has 0 entries, expected 1"):
+        configured(RIG + "scene: []")
+    with pytest.raises(ConfigError, match="scene: needs the section media"):
+        configured(RIG.replace("media: {air: 1.0, window: 1.49, fluid: 1.33}", "") + TUBE)
+
+
+# What is worked out for plane windows alone.
+PLANE_ONLY: dict[str, Callable[[Config], object]] = {
+    "making weights": lambda config: ray_source(config, None),
+    "planning an experiment": lambda config: bench_of(config, None),
+    "simulating what is in the fluid": simulate.ensure_experiment,
+    "validating boards": lambda config: validate_board.bench_of(config, "ideal"),
+    "this command": lambda config: config.window_model(),
+}
+
+
+@pytest.mark.parametrize("what", PLANE_ONLY)
+def test_what_knows_plane_windows_alone_refuses_a_scene(configured: Callable[[str], Config], what: str) -> None:
+    flow = "simulation: {flow: {kind: uniform, velocity_m_s: [0.1, 0, 0]}}\ncorrelation: {dt_s: 0.001}\n"
+    with pytest.raises(ConfigError) as refused:
+        PLANE_ONLY[what](configured(RIG + TUBE + flow))
+    assert f"rig.yaml: scene: {what} is possible through plane windows" in str(refused.value)
+
+
+def test_validating_weights_refuses_a_scene(configured: Callable[[str], Config], tmp_path: Path) -> None:
+    configured(RIG + TUBE)
+    with pytest.raises(ConfigError, match="validating weights is possible through plane windows"):
+        validate_weights.validate_weights(tmp_path / "rig.yaml", tmp_path / "report")
