@@ -79,6 +79,10 @@ def test_rays_through_a_scene_are_exact_and_need_no_window(configured: Callable[
     assert isinstance(configured(RIG + TUBE + f"weights: {{{weights}}}\n").object_space(), CurvedSpace)
 
 
+def test_weights_are_made_through_a_scene(configured: Callable[[str], Config]) -> None:
+    assert isinstance(ray_source(configured(RIG + TUBE), None), CurvedSpace)
+
+
 def test_without_a_scene_layers_are_plane(configured: Callable[[str], Config]) -> None:
     assert configured(RIG).object_space() == ObjectSpace(WATER, None, "paraxial")
 
@@ -147,7 +151,6 @@ def test_a_scene_needs_faces_and_media(configured: Callable[[str], Config]) -> N
 
 # What is worked out for plane windows alone.
 PLANE_ONLY: dict[str, Callable[[Config], object]] = {
-    "making weights": lambda config: ray_source(config, None),
     "planning an experiment": lambda config: bench_of(config, None),
     "simulating what is in the fluid": simulate.ensure_experiment,
     "validating boards": lambda config: validate_board.bench_of(config, "ideal"),

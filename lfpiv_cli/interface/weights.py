@@ -170,7 +170,7 @@ def ray_source(settings: Config, found: Calibration | None) -> Source:
     ConfigError : fitted rays are asked for and there are none
     """
     if settings.weights.method != "dlfc":
-        return settings.plane_space("making weights", found.mid_plane_z_mm if found else None)
+        return settings.object_space(found.mid_plane_z_mm if found else None)
     if found is None or found.ray_fit is None:
         raise ConfigError(
             "weights.method: dlfc needs a --calibration from boards at several depths: calibrate-snapshot with --board "
