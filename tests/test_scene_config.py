@@ -8,11 +8,13 @@ from typing import get_args
 
 import pytest
 
+from lfpiv_cli.console import CONSOLE
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.sections_scene import FaceSection
+from lfpiv_cli.interface.particles import searchable
 from lfpiv_cli.interface.planning import bench_of
-from lfpiv_cli.interface.weights import ray_source
+from lfpiv_cli.interface.weights import plan_of, ray_source, weights_of
 from lfpiv_cli.names import SurfaceKind
 from lfpiv_cli.optics.curved_space import CurvedSpace, Face
 from lfpiv_cli.optics.media import Media
@@ -76,7 +78,9 @@ def test_an_axis_by_name(configured: Callable[[str], Config], axis: str) -> None
 
 @pytest.mark.parametrize("weights", ["method: drt", "refraction: exact", "refraction: paraxial"])
 def test_rays_through_a_scene_are_exact_and_need_no_window(configured: Callable[[str], Config], weights: str) -> None:
-    assert isinstance(configured(RIG + TUBE + f"weights: {{{weights}}}\n").object_space(), CurvedSpace)
+    config = configured(RIG + TUBE + f"weights: {{{weights}}}\n")
+    assert isinstance(config.object_space(), CurvedSpace)
+    assert config.refraction() == "exact"
 
 
 def test_weights_are_made_through_a_scene(configured: Callable[[str], Config]) -> None:
@@ -164,6 +168,13 @@ def test_what_knows_plane_windows_alone_refuses_a_scene(configured: Callable[[st
     with pytest.raises(ConfigError) as refused:
         PLANE_ONLY[what](configured(RIG + TUBE + flow))
     assert f"rig.yaml: scene: {what} is possible through plane windows" in str(refused.value)
+
+
+def test_fitting_particles_refuses_a_scene_before_it_looks_at_images(configured: Callable[[str], Config]) -> None:
+    config = configured(RIG.replace("board:", "reconstruction: {padding_voxel: [0, 0, 0]}\nboard:") + TUBE)
+    weights = weights_of(plan_of(config, None), {}, CONSOLE)
+    with pytest.raises(ConfigError, match="fitting particles is possible through plane windows"):
+        searchable(weights, config)
 
 
 def test_validating_weights_refuses_a_scene(configured: Callable[[str], Config], tmp_path: Path) -> None:

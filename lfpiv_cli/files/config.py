@@ -43,6 +43,7 @@ from lfpiv_cli.files.yaml_nodes import (
 from lfpiv_cli.flow.correlation import CorrelationSettings
 from lfpiv_cli.flow.masks import ParallelWalls, Walls
 from lfpiv_cli.grid import Grid
+from lfpiv_cli.names import Refraction
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.media import Media, Window, channel_window
@@ -241,6 +242,10 @@ class Config:
         reads_window = chosen.method == "drt" or chosen.refraction == "exact"
         window = self.window_model(mid_plane_z_mm) if reads_window else None
         return ObjectSpace(self.media_model(), window, chosen.refraction, chosen.method)
+
+    def refraction(self) -> Refraction:
+        """Return how rays are refracted: through a scene exactly, else as `weights` has it."""
+        return self.weights.refraction if self.sections.scene is None else "exact"
 
     def ensure_plane_layers(self, what: str) -> None:
         """Refuse what is worked out for plane windows alone where the config has a `scene`.

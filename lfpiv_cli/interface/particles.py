@@ -135,8 +135,9 @@ def searchable(content: WeightsFile, settings: Config) -> WeightsFile:
     Raises
     ------
     ConfigError
-        Rays are fitted, or the array does not stand upright.
+        Rays are fitted or go through a scene, or the array does not stand upright.
     """
+    settings.ensure_plane_layers("fitting particles")
     if settings.weights.method == "dlfc":
         raise ConfigError("weights.method: particles are fitted with traced rays; build weights by ert for them")
     weights, operator = content.weights, content.weights.solver_operator
@@ -344,7 +345,6 @@ def what_is_left(frame: Frame, found: Particles) -> NDArray[np.float64]:
 
 def _space(content: WeightsFile, settings: Config) -> ObjectSpace:
     """Return what lies before the particles: by Snell's law where the window's thickness and place are known."""
-    settings.ensure_plane_layers("fitting particles")
     calibration = content.weights.calibration
     mid_plane = calibration.mid_plane_z_mm if calibration else None
     if (settings.channel is None or mid_plane is None) and settings.sections.window is None:

@@ -66,7 +66,7 @@ def build_weights(
         "padding_xyz": list(plan.padding),
         **plan.reference.attributes(),
         "method": settings.weights.method,
-        "refraction": settings.weights.refraction,
+        "refraction": settings.refraction(),
     }
     made = dict(target_of(config, output, options).record)
     if options.resume and is_kept([output], made, inputs.values(), overwrite, resume=True):
