@@ -188,6 +188,25 @@ def test_noise_that_is_not_as_stated_is_found(rng: np.random.Generator) -> None:
     assert np.std(state.velocity / state.velocity_sigma) == pytest.approx(1.0, abs=0.1)
 
 
+@pytest.mark.parametrize("frames", [4, 5, 7])
+def test_velocities_on_circles_are_within_their_errors(rng: np.random.Generator, frames: int) -> None:
+    """A parabola through seven places of circles that turn by 0.17 rad a frame is off by ten errors of the noise."""
+    time, sigma_mm = np.arange(frames) - (frames - 1) / 2.0, np.array([5e-4, 5e-4, 5e-3])
+    phase, radius = rng.uniform(0.0, 2.0 * np.pi, (2000, 1)), rng.uniform(0.2, 2.5, (2000, 1))
+    angle = phase + 0.17 * time
+    places = np.stack([radius * np.cos(angle), 0.0 * angle, radius * np.sin(angle)], axis=2)
+    noisy, sigma = places + sigma_mm * rng.normal(size=places.shape), np.broadcast_to(sigma_mm, places.shape)
+    scatter = scatter_of(noisy, sigma, time)
+    state = fit_in_time(noisy, sigma, time, scatter)
+    truth = 0.17 * radius * np.stack([-np.sin(phase), 0.0 * phase, np.cos(phase)], axis=2)[:, 0]
+    covered = np.mean(np.abs(state.velocity - truth) < 1.96 * state.velocity_sigma, axis=0)
+    # 0.005 by chance; the circles are not all of one size, whose spread stands for all
+    assert np.all(covered > 0.88)
+    # where nothing bends, nothing is allowed for
+    assert scatter.twisting[1] < 1e-9
+    assert np.median(state.velocity_sigma[:, 1]) < 1.3 * 5e-4 / np.sqrt(np.sum(time**2))
+
+
 def test_a_track_s_own_past_goes_before_its_neighbours(rng: np.random.Generator) -> None:
     """Each particle moves in its own way, as in a flow with vortices smaller than the particles' distance."""
     start = rng.uniform(0.0, BOX_MM, (400, 3))
