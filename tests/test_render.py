@@ -12,6 +12,7 @@ from lfpiv_cli.optics.media import Media, Window, fluid_path_to_focus
 from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.optics.tracing import disc_points, exact_slope, slopes_equivalent, slopes_exact, trace
 from lfpiv_cli.synthetic import render
+from lfpiv_cli.synthetic.ray_sequence import in_ball
 from lfpiv_cli.synthetic.render import Balls, ObjectSpace, render_points, render_white, slope_polynomial, slope_ratio
 
 
@@ -88,7 +89,7 @@ def test_slope_polynomial_against_exact_snell():
 
 
 def test_a_ball_seen_along_the_axis_has_a_fifth_of_the_squared_radius_per_axis(rng):
-    points = np.array([render._in_ball(2.0, *u) for u in rng.random((20000, 2))])
+    points = np.array([in_ball(2.0, *u) for u in rng.random((20000, 2))])
     assert np.hypot(*points.T).max() <= 2.0
     # 0.8 +- 0.8 sqrt(8/7)/sqrt(20000): three standard deviations are 0.02
     assert np.mean(points**2, axis=0) == pytest.approx([0.8, 0.8], abs=0.02)

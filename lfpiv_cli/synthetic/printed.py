@@ -21,7 +21,7 @@ from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import exact_lateral_mm
 from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.optics.object_space import ObjectSpace
-from lfpiv_cli.synthetic.render import SEQUENCE
+from lfpiv_cli.synthetic.ray_sequence import SEQUENCE
 
 # Samples along a square's side: a marker's side is known to a hundredth of it.
 SQUARE_SAMPLES = 120

@@ -19,16 +19,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.optics.camera import Camera, KernelCamera
+from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.media import Layers
 from lfpiv_cli.optics.microlenses import nearest_point
 from lfpiv_cli.optics.object_space import ObjectSpace, slope_polynomial, slope_ratio
 from lfpiv_cli.optics.tracing import struck_pixel, trace_ray
+from lfpiv_cli.synthetic.curved_rays import fit_of_slopes, trace_curved
+from lfpiv_cli.synthetic.ray_sequence import SEQUENCE, in_ball, on_disc, ray_places
 from lfpiv_cli.threads import share_out
 
-# Additive recurrence in four dimensions (aperture and ball): powers of the inverse of the root of x^5 = x + 1, whose
-# multiples fill the unit cube more evenly than random points do.
-SEQUENCE_ROOT = 1.1673039782614187
-SEQUENCE = SEQUENCE_ROOT ** -np.arange(1.0, 5.0)
+Space = ObjectSpace | CurvedSpace
+"""What lies in front of the lens: plane layers or curved faces."""
 
 # Rays that are held as pixel numbers before they are added up: 40 MB.
 RAYS_AT_ONCE = 10_000_000
@@ -59,7 +60,7 @@ class Balls:
 
 def render_points(
     camera: Camera,
-    space: ObjectSpace,
+    space: Space,
     balls: Balls,
     rng: np.random.Generator,
     *,
@@ -79,27 +80,51 @@ def render_points(
 
     Raises
     ------
-    ConfigError : a ball in front of the fluid, or no window for exact refraction
+    ConfigError : a ball in front of the fluid, or no window for exact refraction; through curved faces a ball that is
+        not in the fluid is dark
     """
     points = camera.to_image_axes(balls.points_mm).reshape(-1, 3)
     weights = np.broadcast_to(np.asarray(balls.light, dtype=np.float64), len(points)) / rays
     radii = np.broadcast_to(0.5 * np.asarray(balls.diameter_mm, dtype=np.float64), len(points))
-    last_layers = space.last_layers_mm(camera, points[:, 2])
-    _check_depths(points, last_layers)
-    shifts = rng.random((len(points), 4))
+    trace = _tracer_of(camera, space, points, radii.copy(), rng.random((len(points), 4)))
 
     image = np.zeros((camera.rows, camera.columns))
-    layers, seen = space.layers(camera), camera.for_kernels()
     batch = max(RAYS_AT_ONCE // rays, 1)
     for start in range(0, len(points), batch):
         part = slice(start, start + batch)
-        placed = (points[part], radii[part].copy(), last_layers[part], shifts[part])
         pixels = np.empty((len(points[part]), rays), dtype=np.int32)
-        share_out(_trace_points, len(pixels), placed, layers, seen, pixels)
+        trace(part, pixels)
         _add_light(image.ravel(), pixels, weights[part])
         if progress is not None:
             progress(len(pixels))
     return image
+
+
+def _tracer_of(
+    camera: Camera,
+    space: Space,
+    points: NDArray[np.float64],
+    radii: NDArray[np.float64],
+    shifts: NDArray[np.float64],
+) -> Callable[[slice, NDArray[np.int32]], None]:
+    """Return what writes the pixels (n, rays) that the rays of a part of the balls strike, image axes."""
+    seen = camera.for_kernels()
+    if isinstance(space, CurvedSpace):
+        faces, fit = space.for_kernels(camera), fit_of_slopes()
+
+        def trace(part: slice, pixels: NDArray[np.int32]) -> None:
+            placed = (points[part], radii[part], shifts[part])
+            share_out(trace_curved, len(pixels), placed, faces, seen, fit, pixels)
+
+        return trace
+    last_layers, layers = space.last_layers_mm(camera, points[:, 2]), space.layers(camera)
+    _check_depths(points, last_layers)
+
+    def trace_plane(part: slice, pixels: NDArray[np.int32]) -> None:
+        placed = (points[part], radii[part], last_layers[part], shifts[part])
+        share_out(_trace_points, len(pixels), placed, layers, seen, pixels)
+
+    return trace_plane
 
 
 def _check_depths(points: NDArray[np.float64], last_layers_mm: NDArray[np.float64]) -> None:
@@ -130,27 +155,14 @@ def _trace_points(
         reach = aperture_radius + ball_radius + np.sqrt(points[i, 0] ** 2 + points[i, 1] ** 2)
         nodes, factors = slope_polynomial(reach, thicknesses, layers.indices)
         for k in range(pixels.shape[1]):
-            lens_x, lens_y = _on_disc(aperture_radius, shifts[i, 0] + k * SEQUENCE[0], shifts[i, 1] + k * SEQUENCE[1])
-            ball_x, ball_y = _in_ball(ball_radius, shifts[i, 2] + k * SEQUENCE[2], shifts[i, 3] + k * SEQUENCE[3])
+            radial, turn, ball_radial, ball_turn = ray_places(shifts, i, k)
+            lens_x, lens_y = on_disc(aperture_radius, radial, turn)
+            ball_x, ball_y = in_ball(ball_radius, ball_radial, ball_turn)
             dx = lens_x - points[i, 0] - ball_x
             dy = lens_y - points[i, 1] - ball_y
             ratio = slope_ratio(dx * dx + dy * dy, nodes, factors)
             x, y = trace_ray(camera, lens_x, lens_y, ratio * dx, ratio * dy)
             pixels[i, k] = struck_pixel(camera, x, y)
-
-
-@njit(cache=True)
-def _on_disc(radius: float, radial: float, turn: float) -> tuple[float, float]:
-    """Return the point of an evenly filled disc for two numbers, evenly spread between any integers."""
-    r = radius * np.sqrt(radial % 1.0)
-    return r * np.cos(2.0 * np.pi * turn), r * np.sin(2.0 * np.pi * turn)
-
-
-@njit(cache=True)
-def _in_ball(radius: float, radial: float, turn: float) -> tuple[float, float]:
-    """Return a point of an evenly filled ball, seen along the axis: the share 1 - (1 - r^2/R^2)^(3/2) lies within r."""
-    r = radius * np.sqrt(1.0 - (radial % 1.0) ** (2.0 / 3.0))
-    return r * np.cos(2.0 * np.pi * turn), r * np.sin(2.0 * np.pi * turn)
 
 
 @njit(cache=True)
