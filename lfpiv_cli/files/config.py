@@ -222,10 +222,15 @@ class Config:
         ConfigError
             If rays are fitted (dlfc), not traced.
         """
-        scene = self.sections.scene
+        scene = self.scene_space()
         if scene is not None and self.weights.method != "dlfc":
-            return bench.scene_of(scene, self.media_model())
+            return scene
         return self.plane_space("tracing rays", mid_plane_z_mm)
+
+    def scene_space(self) -> CurvedSpace | None:
+        """Return the faces of `scene`, None where there is none."""
+        scene = self.sections.scene
+        return None if scene is None else bench.scene_of(scene, self.media_model())
 
     def plane_space(self, what: str, mid_plane_z_mm: float | None = None) -> ObjectSpace:
         """Return plane layers, as `weights` has them; the window only where it is read.

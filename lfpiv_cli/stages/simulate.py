@@ -26,17 +26,17 @@ from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.images import write_tiff
 from lfpiv_cli.files.particles import Particles, write_particles
 from lfpiv_cli.files.provenance import record
-from lfpiv_cli.flow.masks import RoundWall
-from lfpiv_cli.grid import Grid
+from lfpiv_cli.notice import Notice
 from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.reference import FOCAL_POINT, Reference
+from lfpiv_cli.stages.simulated_tracers import bubbles_of, bubbles_walls_of, light_z_mm_of, tracers_of
 from lfpiv_cli.synthetic import scenes
 from lfpiv_cli.synthetic.board import BoardPlacement
-from lfpiv_cli.synthetic.bubbles import Bubbles, bubbles_at_wall, render_bubbles
-from lfpiv_cli.synthetic.render import RAYS, ObjectSpace
-from lfpiv_cli.synthetic.seeding import seeded_boxes
+from lfpiv_cli.synthetic.bubbles import render_bubbles
+from lfpiv_cli.synthetic.curved_rays import unseen
+from lfpiv_cli.synthetic.render import ObjectSpace, Space
 from lfpiv_cli.synthetic.sensor import Readout
-from lfpiv_cli.weights.build import blur_radius_mm
 
 
 def simulate_white(
@@ -97,8 +97,8 @@ def simulate_particles(
     reference = simulated_reference(settings)
     camera, space = _recording(settings), _flow_space(settings, reference)
     motion = _motion(settings, reference)
-    tracers = _tracers(settings, camera.optics, reference, motion)
-    bubbles = _bubbles(settings, tracers.box, reference)
+    tracers = tracers_of(settings, camera.optics, reference, motion)
+    bubbles = bubbles_of(settings, tracers.box, reference, _generator(settings, 4))
     still: NDArray[np.float64] | float = 0.0
     if bubbles is not None:
         still = render_bubbles(camera.optics, space, bubbles, scene.bubble_counts, _generator(settings, 5))
@@ -116,9 +116,21 @@ def simulate_particles(
         write_tiff(paths[name], image, overwrite)
     write_particles(paths["particles.npz"], _particles(found), overwrite)
     truth = found.truth | {"reference_z_mm": reference.z_mm}
+    if isinstance(space, CurvedSpace):
+        dark = int(unseen(camera.optics, space, found.positions_mm).sum())
+        truth["particles_unseen"] = dark
+        console.warn(_unseen_notices(dark, tracers.count, config))
     if bubbles is not None:
         truth["bubbles_mm"] = bubbles.truth()
     return _write_truth(paths["particles.json"], "simulate particles", truth, settings, config, overwrite)
+
+
+def _unseen_notices(dark: int, count: int, config: Path) -> list[Notice]:
+    """Return what is said of tracers that no light comes from, nothing where there are none."""
+    if not dark:
+        return []
+    text = f"{dark} of {count} tracers send no light to the lens: outside the fluid, or hidden by a curved wall"
+    return [Notice("tracers-unseen", config.name, text, "scene, and where simulation.flow is seeded", dark)]
 
 
 def ensure_experiment(settings: Config) -> None:
@@ -131,8 +143,8 @@ def ensure_experiment(settings: Config) -> None:
     reference = simulated_reference(settings)
     _motion(settings, reference)
     _flow_space(settings, reference)
-    _light_z_mm(settings, reference)
-    _bubbles_walls(settings, reference)
+    light_z_mm_of(settings, reference)
+    bubbles_walls_of(settings, reference)
     _board_space(settings)
     settings.rig()
     settings.grid(reference)
@@ -178,7 +190,7 @@ def simulated_reference(settings: Config) -> Reference:
 
 
 def _board_still(
-    settings: Config, board: BoardGeometry, space: ObjectSpace, z_mm: float, rng: np.random.Generator
+    settings: Config, board: BoardGeometry, space: Space, z_mm: float, rng: np.random.Generator
 ) -> scenes.SimulatedStill:
     scene = settings.simulation
     placement = BoardPlacement(z_mm, scene.board_offset_mm, scene.board_tilt_deg, scene.board_rotation_deg)
@@ -212,7 +224,7 @@ def readout_of(settings: Config) -> Readout:
     return Readout(scene.photons_per_count, scene.read_noise_counts, scene.dark_level_counts, scene.bits)
 
 
-def _board_space(settings: Config) -> ObjectSpace:
+def _board_space(settings: Config) -> Space:
     """Return what the board is seen through: air, or window and fluid."""
     media = settings.media_model()
     if settings.board.medium == "air":
@@ -220,9 +232,20 @@ def _board_space(settings: Config) -> ObjectSpace:
     return _flow_space(settings, simulated_reference(settings))
 
 
-def _flow_space(settings: Config, reference: Reference) -> ObjectSpace:
-    """Return what the tracers are seen through."""
-    settings.ensure_plane_layers("simulating what is in the fluid")
+def _flow_space(settings: Config, reference: Reference) -> Space:
+    """Return what the tracers are seen through.
+
+    Raises
+    ------
+    ConfigError : paraxial rays through a scene
+    """
+    scene = settings.scene_space()
+    if scene is not None and settings.simulation.refraction == "paraxial":
+        raise ConfigError(
+            f"{settings.source}: simulation.refraction: is paraxial, but through a scene rays obey Snell's law (exact)"
+        )
+    if scene is not None:
+        return scene
     media, refraction = settings.media_model(), settings.simulation.refraction
     if refraction == "paraxial" or media == media.in_air():
         return ObjectSpace(media, None, refraction)
@@ -250,103 +273,4 @@ def _particles(found: scenes.SimulatedFrames) -> Particles:
         found.diameters_mm,
         found.frame_positions_mm,
         found.frame_brightness,
-    )
-
-
-def _tracers(settings: Config, camera: Camera, reference: Reference, motion: scenes.Motion) -> scenes.Tracers:
-    """Return the tracers: as many in the volume as configured, and as dense around it as their light reaches.
-
-    Those that are carried into the volume before a longer sequence ends, or out of it, are there too; where the light
-    ends, those that come into it from the first frame on.
-    """
-    scene, volume = settings.simulation, settings.grid(reference)
-    light = _light_z_mm(settings, reference)
-    lit = volume if light is None else _between(volume, light)
-    reach = blur_radius_mm(camera, settings.media_model(), lit)
-    # Laterally the reach covers half the time between two frames; an edge of the light is sharp.
-    carrying = motion if light is not None else replace(motion, frames=motion.frames - 1)
-    carried_s = max(abs(time_s) for time_s in carrying.carried_s())
-    box, inside = seeded_boxes(lit, reach, motion.flow, carried_s, _walls(settings, reference))
-    measured = inside.within(scenes.Box.around(volume, (0.0, 0.0, 0.0)))
-    pipe = _pipe(settings, reference)
-    return scenes.Tracers(
-        round(scene.particles * box.volume_in_mm3(pipe) / measured.volume_in_mm3(pipe)),
-        box,
-        scene.particle_diameter_mm,
-        scene.particle_counts,
-        scene.brightness,
-        scene.brightness_log_sigma,
-        scene.rays or RAYS,
-        scene.particle_diameter_log_sigma,
-        scene.brightness_flicker,
-        light,
-        pipe,
-    )
-
-
-def _light_z_mm(settings: Config, reference: Reference) -> tuple[float, float] | None:
-    """Return between which depths from the focal point there is light, not beyond a channel's walls; None: everywhere.
-
-    Raises
-    ------
-    ConfigError : the light lies beyond a wall
-    """
-    light, channel = settings.simulation.light_z_mm, settings.channel
-    if light is None:
-        return None
-    half = np.inf if channel is None else 0.5 * channel.width_mm
-    low, high = max(light[0], -half), min(light[1], half)
-    if low >= high:
-        raise ConfigError(f"simulation.light_z_mm: is {list(light)}, beyond a wall {half:g} mm from the mid plane")
-    return reference.depth_to_focal_point(low), reference.depth_to_focal_point(high)
-
-
-def _between(volume: Grid, z_mm: tuple[float, float]) -> Grid:
-    """Return the volume between other depths, one voxel deep."""
-    (nx, ny, _), (dx, dy, _), (x, y, _) = volume.shape_xyz, volume.spacing_mm, volume.origin_mm
-    return Grid((nx, ny, 1), (dx, dy, z_mm[1] - z_mm[0]), (x, y, 0.5 * (z_mm[0] + z_mm[1])))
-
-
-def _walls(settings: Config, reference: Reference) -> scenes.Box | None:
-    """Return the inside of the channel, or the box around the pipe, that the flow runs through; None: neither is."""
-    flow, pipe = settings.simulation.flow, _pipe(settings, reference)
-    if pipe is not None:
-        return scenes.pipe_bounds(pipe)
-    if flow is None or flow.kind != "square_duct":
-        return None
-    return scenes.channel_walls(flow.width_mm, reference.depth_to_focal_point(flow.centre_mm[2]), flow.axis)
-
-
-def _pipe(settings: Config, reference: Reference) -> RoundWall | None:
-    """Return the inside of the pipe that the flow runs through, z from the focal point; None: it is another flow."""
-    flow = settings.simulation.flow
-    if flow is None or flow.kind != "pipe":
-        return None
-    x, y, z = flow.centre_mm
-    return RoundWall(flow.radius_mm, (x, y, reference.depth_to_focal_point(z)), flow.axis)
-
-
-def _bubbles_walls(settings: Config, reference: Reference) -> scenes.Box | None:
-    """Return the walls that bubbles stick to, None where there are no bubbles.
-
-    Raises
-    ------
-    ConfigError : there is no channel that they could stick to
-    """
-    scene = settings.simulation
-    if scene.bubbles == 0:
-        return None
-    walls = _walls(settings, reference)
-    if walls is None or scene.flow is None or scene.flow.kind != "square_duct":
-        raise ConfigError("simulation.bubbles: bubbles stick to a channel's wall; simulation.flow is no square_duct")
-    return walls
-
-
-def _bubbles(settings: Config, seen: scenes.Box, reference: Reference) -> Bubbles | None:
-    """Return the bubbles at the channel's wall, None where there are none."""
-    scene, walls = settings.simulation, _bubbles_walls(settings, reference)
-    if walls is None:
-        return None
-    return bubbles_at_wall(
-        scene.bubbles, scene.bubble_diameter_mm, scene.bubble_wall, seen, walls, _generator(settings, 4)
     )

@@ -12,10 +12,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lfpiv_cli.calibration.board_pose import BoardGeometry
+from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
 from lfpiv_cli.synthetic.printed import printed_plate, render_plate
-from lfpiv_cli.synthetic.render import Balls, ObjectSpace, render_points, render_white
+from lfpiv_cli.synthetic.render import Balls, Space, render_points, render_white
 
 # A dot is made of this many points in a sunflower's order, small balls that close the gaps between them: 0.2 mm dots of
 # 0.0125 mm points, an eighth of a microlens.
@@ -71,7 +73,7 @@ def _plate_centres(board: BoardGeometry) -> NDArray[np.float64]:
 
 def render_board(
     camera: Camera,
-    space: ObjectSpace,
+    space: Space,
     board: BoardGeometry,
     placement: BoardPlacement,
     level: float,
@@ -87,9 +89,15 @@ def render_board(
 
     Returns
     -------
-    (rows, columns) float64, expected counts
+    (rows, columns) float64, expected counts; dots behind curved faces are as bright as behind plane ones
+
+    Raises
+    ------
+    ConfigError : a printed plate behind curved faces
     """
     if board.pattern != "dots":
+        if isinstance(space, CurvedSpace):
+            raise ConfigError(f"board.pattern: is {board.pattern}; behind the faces of a scene only dots are simulated")
         steps = placement.to_world([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
         return render_plate(camera, space, printed_plate(camera, board, steps), level)
     plate = _plate_centres(board)

@@ -17,7 +17,7 @@ from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.names import BubbleWall
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.synthetic.board import light_per_area, sunflower
-from lfpiv_cli.synthetic.render import Balls, ObjectSpace, render_points
+from lfpiv_cli.synthetic.render import Balls, Space, render_points
 from lfpiv_cli.synthetic.scenes import Box
 
 # A bubble is made of points this dense, as the dots of boards are; with so many rays each, those add less noise than
@@ -73,7 +73,7 @@ def bubbles_at_wall(
 
 
 def render_bubbles(
-    camera: Camera, space: ObjectSpace, bubbles: Bubbles, level: float, rng: np.random.Generator
+    camera: Camera, space: Space, bubbles: Bubbles, level: float, rng: np.random.Generator
 ) -> NDArray[np.float64]:
     """Render bubbles whose middle gives `level` expected counts in a pixel that sees nothing else, fading to the rim.
 

@@ -20,7 +20,7 @@ from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.synthetic.board import BoardPlacement, dot_centres, render_board
 from lfpiv_cli.synthetic.flows import STEADY, Flow, Pulsation, advect
-from lfpiv_cli.synthetic.render import RAYS, Balls, ObjectSpace, render_points, render_white
+from lfpiv_cli.synthetic.render import RAYS, Balls, ObjectSpace, Space, render_points, render_white
 from lfpiv_cli.synthetic.sensor import Readout
 
 Triple = tuple[float, float, float]
@@ -266,7 +266,7 @@ def simulate_white(camera: RecordingCamera, level: float, rng: np.random.Generat
 
 def simulate_board(
     camera: RecordingCamera,
-    space: ObjectSpace,
+    space: Space,
     board: BoardGeometry,
     placement: BoardPlacement,
     level: float,
@@ -287,7 +287,7 @@ def simulate_board(
 
 def simulate_particles(
     camera: RecordingCamera,
-    space: ObjectSpace,
+    space: Space,
     tracers: Tracers,
     motion: Motion,
     rng: np.random.Generator,
@@ -313,11 +313,12 @@ def simulate_particles(
         balls = Balls(place[seen], light[seen], diameters[seen])
         expected = render_points(camera.optics, space, balls, rng, rays=tracers.rays, progress=progress)
         images.append(camera.readout.record(expected + still, rng))
+    window = space.window if isinstance(space, ObjectSpace) else None
     truth = {
         **camera_truth(camera.optics),
         "dt_s": motion.dt_s,
         "particles": tracers.count,
-        "window_distance_mm": None if space.window is None else space.window.distance_mm,
+        "window_distance_mm": None if window is None else window.distance_mm,
     }
     dark, at_middle = camera.dark_frame(rng), brightness * tracers.lit(positions)
     velocities = motion.flow(positions)
