@@ -20,7 +20,7 @@ from lfpiv_cli.optics.curved_space import CurvedSpace, Face
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.optics.surfaces import Cylinder, Plane, Sphere, TiltedPlane
-from lfpiv_cli.stages import simulate, validate_board, validate_weights
+from lfpiv_cli.stages import validate_board, validate_weights
 
 RIG = """\
 camera:
@@ -156,7 +156,6 @@ def test_a_scene_needs_faces_and_media(configured: Callable[[str], Config]) -> N
 # What is worked out for plane windows alone.
 PLANE_ONLY: dict[str, Callable[[Config], object]] = {
     "planning an experiment": lambda config: bench_of(config, None),
-    "simulating what is in the fluid": simulate.ensure_experiment,
     "validating boards": lambda config: validate_board.bench_of(config, "ideal"),
     "this command": lambda config: config.window_model(),
 }

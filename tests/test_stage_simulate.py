@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +11,7 @@ import pytest
 
 from lfpiv_cli.cli import cli
 from lfpiv_cli.errors import ConfigError, InputError
+from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.images import read_image
 from lfpiv_cli.files.particles import Particles, read_particles, write_particles
 
@@ -132,3 +135,85 @@ def test_lists_of_particles_whose_arrays_disagree_are_refused(tmp_path: Path, na
     np.savez(path, **arrays | {name: arrays[name][..., :-1]})
     with pytest.raises(InputError, match=f"{name} .* for 3 particles"):
         read_particles(path)
+
+
+def simulated_pipe(folder: Path, name: str, **replaced: str) -> tuple[Particles, dict]:
+    """Simulate a shipped pipe with few tracers and rays; return the truth."""
+    text = (SAMPLE.parent / f"{name}.yaml").read_text()
+    few = re.sub(r"particles: \d+ .*", "particles: 60\n  rays: 200", text)
+    for old, new in replaced.values():
+        assert old in few
+        few = few.replace(old, new)
+    (folder / f"{name}.yaml").write_text(few)
+    cli.main(["simulate", "particles", str(folder / f"{name}.yaml"), "-o", str(folder / name)], standalone_mode=False)
+    return read_particles(folder / name / "particles.npz"), json.loads((folder / name / "particles.json").read_text())
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize(("name", "seen_as"), [("pipe", 1.33), ("pipe_box", 1.0)])
+def test_a_pipe_is_seeded_and_seen_through_its_walls(tmp_path: Path, name: str, seen_as: float) -> None:
+    truth, told = simulated_pipe(tmp_path, name)
+    distance = np.hypot(truth.positions_mm[:, 1], truth.positions_mm[:, 2])
+    assert distance.max() <= 5.0
+    # 60 in the volume's pipe, and some beside it along the pipe
+    assert 60 <= len(distance) <= 75
+    assert told["particles_unseen"] == 0
+    axis = 1.0 - (distance / 5.0) ** 2
+    # places are stored with seven digits
+    assert truth.velocities_m_s == pytest.approx(np.outer(2.0 * 0.1082 * axis, [1.0, 0.0, 0.0]), abs=1e-6)
+    # light across the pipe: a tube is a lens, in a box of water hardly
+    image = read_image(tmp_path / name / "pair_a.tif").astype(float)
+    assert image.max() > 1000.0
+    across = 1 if name == "pipe" else 0
+    camera = load_config(tmp_path / f"{name}.yaml").camera_model()
+    pixels = np.flatnonzero((image > 1000.0).any(axis=1 - across))
+    reach_mm = 0.5 * (pixels.max() - pixels.min()) * camera.pixel_mm
+    half_mm = 0.5 * image.shape[across] * camera.pixel_mm
+    farthest = np.abs(truth.positions_mm[:, 1]).max()
+    # at most a millimetre of blur beside what is seen
+    assert min(seen_as * farthest, half_mm) - 0.5 < reach_mm <= min(seen_as * farthest + 1.0, half_mm)
+
+
+@pytest.mark.thorough
+def test_tracers_that_no_light_comes_from_are_counted(tmp_path: Path, capsys) -> None:
+    """Behind a wall of half a millimetre water is hidden beyond R_out / n."""
+    thin = ("radius_mm: 7.0", "radius_mm: 5.5")
+    truth, told = simulated_pipe(tmp_path, "pipe", thin=thin)
+    distance = np.hypot(truth.positions_mm[:, 1], truth.positions_mm[:, 2])
+    assert 0 < told["particles_unseen"] <= np.sum(distance > 5.5 / 1.33)
+    assert "send no light to the lens" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("change", ["refraction", "charuco"])
+def test_what_is_not_simulated_through_a_scene_is_refused(tmp_path: Path, change: str) -> None:
+    text = (SAMPLE.parent / "pipe.yaml").read_text()
+    if change == "refraction":
+        text, what, match = text.replace("seed: 7", "refraction: paraxial"), "particles", "obey Snell's law"
+    else:
+        board = "board: {pattern: chessboard, squares: [5, 4], spacing_mm: 1.0, medium: fluid}\n"
+        text, what, match = text + board, "board", "only dots are simulated"
+    (tmp_path / "rig.yaml").write_text(text)
+    with pytest.raises(ConfigError, match=match):
+        cli.main(["simulate", what, str(tmp_path / "rig.yaml"), "-o", str(tmp_path / "out")], standalone_mode=False)
+
+
+@pytest.mark.thorough
+def test_a_board_of_dots_is_seen_in_a_pipe_and_in_front_of_it(tmp_path: Path) -> None:
+    """In the fluid its columns across the tube are seen 1.33 times as far apart, in air as they are."""
+    apart = {}
+    for medium in ("fluid", "air"):
+        board = f"board: {{dots: [3, 3], spacing_mm: 2.0, dot_diameter_mm: 0.3, medium: {medium}, polarity: bright}}\n"
+        text = (SAMPLE.parent / "pipe.yaml").read_text() + board
+        (tmp_path / f"{medium}.yaml").write_text(text)
+        cli.main(
+            ["simulate", "board", str(tmp_path / f"{medium}.yaml"), "-o", str(tmp_path / medium)], standalone_mode=False
+        )
+        light = np.maximum(read_image(tmp_path / medium / "board.tif").astype(float) - 150.0, 0.0)
+        # along the columns, which follow y across the tube: the outer two of three stripes
+        stripes = light.sum(axis=0)
+        place = (np.arange(stripes.size) - 0.5 * (stripes.size - 1)) * 0.0055
+        outer = np.abs(place) > 1.0
+        apart[medium] = 2.0 * float(np.sum(np.abs(place[outer]) * stripes[outer]) / stripes[outer].sum())
+    # the dots stand on the tube's axis, in the focal plane: a cylinder's centre is seen n_w times as large
+    assert apart["fluid"] == pytest.approx(2.0 * 2.0 * 1.33, rel=0.02)
+    assert apart["air"] == pytest.approx(2.0 * 2.0, rel=0.02)
