@@ -267,7 +267,7 @@ def doubt_notices(summary: Mapping[str, Any], name: str) -> list[Notice]:
             Notice(
                 "tracks-bend",
                 name,
-                f"places lie {max(noise):.1f} times their stated errors off parabolas in time, which velocities are of",
+                f"places lie {max(noise):.1f} times their stated errors off cubics in time, which velocities are of",
                 "a shorter time between the frames; or believe stated errors of velocities only where tracks are long",
                 max(noise),
                 f"at most {LARGEST_NOISE:g}",

@@ -26,7 +26,7 @@ from lfpiv_cli.tracks.tracking import NO_TRACKS, Forecast, Tracks, known_of, lin
 # A forecast takes a track's last four places: enough for a parabola and to see its noise.
 PAST_FRAMES = 4
 # A velocity takes the places of three frames on either side, or of two, if what three leave is larger than the noise
-# that two show by more than this: a parabola then no longer follows the tracks.
+# that two show by more than this: a cubic then no longer follows the tracks.
 HALVES_FRAMES = (3, 2)
 LARGEST_MISFIT = 1.1
 # Where a particle comes to is not known before how far it moves: the second guess is good enough.
