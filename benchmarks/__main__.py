@@ -24,6 +24,7 @@ from benchmarks.rigs import bench_rigs
 from benchmarks.sequences import bench_sequences
 from benchmarks.simd import bench_simd
 from benchmarks.solvers import bench_solvers
+from benchmarks.surfaces import bench_surfaces
 from benchmarks.weights import bench_weights
 
 BENCHMARKS: dict[str, Callable[[], None]] = {
@@ -42,6 +43,7 @@ BENCHMARKS: dict[str, Callable[[], None]] = {
     "sequences": bench_sequences,
     "simd": bench_simd,
     "solvers": bench_solvers,
+    "surfaces": bench_surfaces,
     "weights": bench_weights,
 }
 
