@@ -19,8 +19,9 @@ from lfpiv_cli.weights.scene import Source
 
 # Measured on one core. A voxel's factors along an axis have 2 to 2.6 entries for each pixel of a lens image; they take
 # 8 bytes and 1.2 us each, the aperture's mask 0.3 us a pixel of the sensor. A projection makes 5e9 multiplications a
-# second, one for each entry along the rows and pixel along the columns; those of strips take a fifth longer. A column
-# takes some 8 ms and 1,500 pixels of 8 bytes, behind curved faces 13 ms. A core counts some four million rays a second.
+# second, one for each entry along the rows and pixel along the columns; those of strips take half as long again. A
+# column takes some 8 ms and 1,500 pixels of 8 bytes, behind curved faces 13 ms. A core counts some four million rays a
+# second.
 ENTRIES_PER_PIXEL = 2.5
 ENTRY_BYTES, ENTRY_S, MASK_PIXEL_S = 8, 1.2e-6, 3e-7
 MULTIPLICATIONS_PER_S = 5e9
