@@ -18,7 +18,7 @@ from lfpiv_cli.particles.noise import Noise, pixel_weights
 from lfpiv_cli.particles.rim import rim_table
 from lfpiv_cli.particles.view import View, entry_capacity, raw_view
 from lfpiv_cli.simd import micro_images
-from lfpiv_cli.simd.micro_images import OF_ROW, PROFILE_ROWS, RIM_ROWS, STRIDE, WHOLE, JoinNumbers
+from lfpiv_cli.simd.micro_images import OF_ROW, PROFILE_ROWS, RIM_ROWS, STRIDE, WHOLE, CurvedNumbers, JoinNumbers
 
 # In, near and out of focus, on both sides, off the axis, and over the sensor's edge; one on the corner of four lenses.
 PLACES = [(0.31, -0.2, 3.0), (0.53, 0.21, 0.02), (-0.063, 0.07, 0.2), (0.2, 0.3, -4.0), (1.08, 0.2, 1.0)]
@@ -69,6 +69,11 @@ def joined(pixels, values, to, across, columns, down, row, rim, numbers):
     micro_images.join_row(pixels, values, to, across, columns, down, row, rim, numbers)
 
 
+@njit
+def joined_behind_faces(pixels, values, to, across, columns, down, row, rim, numbers):
+    micro_images.join_curved_row(pixels, values, to, across, columns, down, row, rim, numbers)
+
+
 def profile(first: float, offset: float) -> NDArray[np.float64]:
     """Return a profile's table of a lens that sees the ball in part."""
     numbers = (first, -1.4, 1.4, offset, 0.009, -0.7, 0.3, 0.002, 0.05, 40.0, -0.03, 0.4)
@@ -94,18 +99,22 @@ def test_rows_equal_their_references() -> None:
     ours, theirs = rims.reshape(2, 2, RIM_ROWS, STRIDE)[:, :, :, 1:COLUMNS]
     np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-12)
     assert np.ptp(theirs[1, 0]) > 0.1
-    # Bent rays change little.
-    numbers = np.linspace(0.1, 0.4, len(JoinNumbers._fields))
-    numbers[-4:] *= 1e-4
-    for left in (WHOLE, OF_ROW):
-        pixels, values = np.zeros((2, 40), np.int32), np.zeros((2, 4, 40))
-        arguments = ((5, 100), across, (1, COLUMNS - 1, left), down, 2, rims[1], numbers)
-        joined(pixels[0], values[0], *arguments)
-        micro_images.join_row_reference(pixels[1], values[1], *arguments)
-        written = slice(5, 5 + COLUMNS - 1)
-        np.testing.assert_array_equal(pixels[0, written], pixels[1, written])
-        np.testing.assert_allclose(values[0, :, written], values[1, :, written], rtol=1e-9, atol=1e-12)
-        assert np.count_nonzero(values[1, 0]) > 3
+    for kind, join, reference in (
+        (JoinNumbers, joined, micro_images.join_row_reference),
+        (CurvedNumbers, joined_behind_faces, micro_images.join_curved_row_reference),
+    ):
+        # Bent rays change little.
+        numbers = np.linspace(0.1, 0.4, len(kind._fields))
+        numbers[-4:] *= 1e-4
+        for left in (WHOLE, OF_ROW):
+            pixels, values = np.zeros((2, 40), np.int32), np.zeros((2, 4, 40))
+            arguments = ((5, 100), across, (1, COLUMNS - 1, left), down, 2, rims[1], numbers)
+            join(pixels[0], values[0], *arguments)
+            reference(pixels[1], values[1], *arguments)
+            written = slice(5, 5 + COLUMNS - 1)
+            np.testing.assert_array_equal(pixels[0, written], pixels[1, written])
+            np.testing.assert_allclose(values[0, :, written], values[1, :, written], rtol=1e-9, atol=1e-12)
+            assert np.count_nonzero(values[1, 0]) > 3
 
 
 def test_weights_of_pixels_are_those_of_the_noise(rng: np.random.Generator) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import get_args
 
@@ -18,6 +19,7 @@ from lfpiv_cli.interface.weights import plan_of, ray_source, weights_of
 from lfpiv_cli.names import SurfaceKind
 from lfpiv_cli.optics.curved_space import CurvedSpace, Face
 from lfpiv_cli.optics.media import Media
+from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.optics.surfaces import Cylinder, Plane, Sphere, TiltedPlane
 from lfpiv_cli.stages import validate_board, validate_weights
@@ -169,11 +171,13 @@ def test_what_knows_plane_windows_alone_refuses_a_scene(configured: Callable[[st
     assert f"rig.yaml: scene: {what} is possible through plane windows" in str(refused.value)
 
 
-def test_fitting_particles_refuses_a_scene_before_it_looks_at_images(configured: Callable[[str], Config]) -> None:
+def test_particles_are_fitted_through_a_scene_behind_square_lenses_alone(configured: Callable[[str], Config]) -> None:
     config = configured(RIG.replace("board:", "reconstruction: {padding_voxel: [0, 0, 0]}\nboard:") + TUBE)
     weights = weights_of(plan_of(config, None), {}, CONSOLE)
-    with pytest.raises(ConfigError, match="fitting particles is possible through plane windows"):
-        searchable(weights, config)
+    assert searchable(weights, config) is weights
+    camera = replace(weights.camera, lattice=Lattice.regular(0.1, "hexagonal"))
+    with pytest.raises(ConfigError, match="through a scene particles are fitted behind square microlenses alone"):
+        searchable(replace(weights, camera=camera), config)
 
 
 def test_validating_weights_refuses_a_scene(configured: Callable[[str], Config], tmp_path: Path) -> None:

@@ -27,6 +27,7 @@ from lfpiv_cli.interface.reconstruction import (
     picture_for,
 )
 from lfpiv_cli.notice import Notice
+from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.particles.counting import tracers_per_lens as counted
 from lfpiv_cli.particles.diameter import LIMIT_SIGMAS, UNKNOWN_LENSES, diameter_by
@@ -34,7 +35,7 @@ from lfpiv_cli.particles.neighbour_frames import second_pass
 from lfpiv_cli.particles.rounds import ROUNDS, first_pass
 from lfpiv_cli.particles.search import Particles, Task, result, task_of
 from lfpiv_cli.particles.second_frames import second_frame
-from lfpiv_cli.particles.view import raw_view
+from lfpiv_cli.particles.view import ensure_square_cells, raw_view
 from lfpiv_cli.reconstruction.equations import Normalisers
 from lfpiv_cli.reconstruction.images import Image, Mask, filled, light
 from lfpiv_cli.tracks.tracking import SEARCH_LENSES
@@ -135,13 +136,14 @@ def searchable(content: WeightsFile, settings: Config) -> WeightsFile:
     Raises
     ------
     ConfigError
-        Rays are fitted or go through a scene, or the array does not stand upright.
+        Rays are fitted, the array does not stand upright, or it is hexagonal and seen through a scene.
     """
-    settings.ensure_plane_layers("fitting particles")
     if settings.weights.method == "dlfc":
         raise ConfigError("weights.method: particles are fitted with traced rays; build weights by ert for them")
     weights, operator = content.weights, content.weights.solver_operator
-    if not isinstance(operator, OnDemandOperator):
+    space = _space(content, settings)
+    ensure_square_cells(content.camera, space)
+    if not isinstance(operator, OnDemandOperator) or isinstance(space, CurvedSpace):
         return content
     bricks = factorise_bricks(content.camera, settings.media_model(), weights.padded.grid)
     passing = bricks if operator.transmission is None else behind_transmission(bricks, operator.transmission)
@@ -289,7 +291,7 @@ def points_of(bench: Bench, frame: Frame, found: Particles, size: TracerSize, pr
         content.reference,
         attributes=content.reference.attributes()
         | {
-            "refraction": "paraxial" if space.straight else "exact",
+            "refraction": "paraxial" if isinstance(space, ObjectSpace) and space.straight else "exact",
             "residual": float(np.linalg.norm(left)) / norm if norm > 0.0 else 0.0,
             "residual_rms_counts": float(np.sqrt(np.mean(left[~frame.unusable] ** 2))),
             "excluded_pixels": int(np.count_nonzero(frame.unusable)),
@@ -343,8 +345,10 @@ def what_is_left(frame: Frame, found: Particles) -> NDArray[np.float64]:
     return np.where(frame.unusable, 0.0, found.residual)
 
 
-def _space(content: WeightsFile, settings: Config) -> ObjectSpace:
+def _space(content: WeightsFile, settings: Config) -> ObjectSpace | CurvedSpace:
     """Return what lies before the particles: by Snell's law where the window's thickness and place are known."""
+    if settings.sections.scene is not None:
+        return settings.object_space()
     calibration = content.weights.calibration
     mid_plane = calibration.mid_plane_z_mm if calibration else None
     if (settings.channel is None or mid_plane is None) and settings.sections.window is None:

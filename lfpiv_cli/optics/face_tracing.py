@@ -144,8 +144,8 @@ def trace_pencil(
     shifts: tuple[Vector, Vector],
     turns: tuple[Vector, Vector],
     z: float,
-) -> tuple[Vector, Vector, Vector, bool]:
-    """Return where a ray from the lens meets the plane of depth z and how two rays beside it are shifted there.
+) -> tuple[Vector, Vector, Vector, Vector, bool]:
+    """Return where a ray from the lens meets the plane of depth z, its direction, and how two beside it are shifted.
 
     The path may go backwards in the fluid, as Newton's iteration needs it.
 
@@ -159,11 +159,11 @@ def trace_pencil(
     for k in range(faces.ratios.size):
         path, normal, cosine = meet(faces, k, point, direction)
         if cosine == 0.0 or path < -ROUNDING_MM:
-            return point, first, second, False
+            return point, direction, first, second, False
         point = plus(point, path, direction)
         behind, cosine_behind = refracted(direction, normal, cosine, faces.ratios[k])
         if cosine_behind == 0.0 or behind[2] <= 0.0:
-            return point, first, second, False
+            return point, direction, first, second, False
         first, first_turn = _neighbour(faces, k, first, first_turn, path, direction, normal, cosine, cosine_behind)
         second, second_turn = _neighbour(faces, k, second, second_turn, path, direction, normal, cosine, cosine_behind)
         direction = behind
@@ -171,7 +171,7 @@ def trace_pencil(
     first, second = plus(first, path, first_turn), plus(second, path, second_turn)
     first = plus(first, -first[2] / direction[2], direction)
     second = plus(second, -second[2] / direction[2], direction)
-    return plus(point, path, direction), first, second, True
+    return plus(point, path, direction), direction, first, second, True
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
@@ -198,7 +198,7 @@ def aim(faces: Faces, x: float, y: float, z: float, X: float, Y: float) -> Place
     still = (0.0, 0.0, 0.0)
     for _ in range(MOST_STEPS):
         point, direction = start_at_lens(faces, X, Y, slope_x + share * step_x, slope_y + share * step_y)
-        end, first, second, met = trace_pencil(faces, point, direction, (still, still), slope_turns(direction), z)
+        end, _, first, second, met = trace_pencil(faces, point, direction, (still, still), slope_turns(direction), z)
         left_x, left_y = x - end[0], y - end[1]
         missed = np.sqrt(left_x * left_x + left_y * left_y)
         if not met or missed >= nearest:
@@ -271,8 +271,8 @@ def pencils(
             continue
         point, direction = start_at_lens(faces, 0.0, 0.0, slopes[i, 0], slopes[i, 1])
         turns, sideways = slope_turns(direction), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
-        _, a, b, _ = trace_pencil(faces, point, direction, (still, still), turns, points[i, 2])
-        _, c, d, _ = trace_pencil(faces, point, direction, sideways, (still, still), points[i, 2])
+        _, _, a, b, _ = trace_pencil(faces, point, direction, (still, still), turns, points[i, 2])
+        _, _, c, d, _ = trace_pencil(faces, point, direction, sideways, (still, still), points[i, 2])
         determinant = a[0] * b[1] - b[0] * a[1]
         # The place stays: [a b] growth + [c d] = 0.
         growth[i, 0, 0] = (b[0] * c[1] - b[1] * c[0]) / determinant

@@ -33,7 +33,7 @@ def overlaps_of(view: View, particles: NDArray[np.float64]) -> Overlaps:
     """Return which particles (n, 4) disturb each other: the more, the closer their middles and their radii are."""
     on_array = on_array_mm(view, particles)
     # Light that touches a lens's cell spreads over it.
-    radius = footprint_radius_mm(view, particles[:, 2]) + 2.0 * max(view.half_x_mm, view.half_y_mm)
+    radius = footprint_radius_mm(view, particles) + 2.0 * max(view.half_x_mm, view.half_y_mm)
     pairs = KDTree(on_array).query_pairs(2.0 * float(radius.max(initial=0.0)), output_type="ndarray")
     first, second = pairs[:, 0].astype(np.int64), pairs[:, 1].astype(np.int64)
     distance = np.hypot(*(on_array[first] - on_array[second]).T)

@@ -158,7 +158,7 @@ def _overlapping(view: View, particles: NDArray[np.float64]) -> Neighbours:
     """Return the particles whose footprints may overlap."""
     on_array = on_array_mm(view, particles)
     # Light that touches a lens's cell spreads over it.
-    reach = footprint_radius_mm(view, particles[:, 2]) + 2.0 * max(view.half_x_mm, view.half_y_mm)
+    reach = footprint_radius_mm(view, particles) + 2.0 * max(view.half_x_mm, view.half_y_mm)
     first, second = KDTree(on_array).query_pairs(2.0 * float(reach.max(initial=0.0)), p=np.inf, output_type="ndarray").T
     near = np.abs(on_array[first] - on_array[second]).max(axis=1) < reach[first] + reach[second]
     pairs = np.concatenate([np.stack([first, second]), np.stack([second, first])], axis=1)[:, np.tile(near, 2)]

@@ -250,7 +250,7 @@ def _light_around(task: Task, points: NDArray[np.float64]) -> NDArray[np.float64
     size = np.array([camera.columns, camera.rows])
     image = np.where(task.usable, task.image, 0.0).reshape(camera.rows, camera.columns)
     sums = np.pad(image.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
-    reach = footprint_radius_mm(view, points[:, 2]) + 2.0 * AROUND_LENSES * max(view.half_x_mm, view.half_y_mm)
+    reach = footprint_radius_mm(view, points) + 2.0 * AROUND_LENSES * max(view.half_x_mm, view.half_y_mm)
     middle, reach = on_array_mm(view, points) / camera.pixel_mm + 0.5 * size, reach[:, np.newaxis] / camera.pixel_mm
     left, top = np.clip(np.rint(middle - reach), 0, size).astype(np.int64).T
     right, bottom = np.clip(np.rint(middle + reach), 0, size).astype(np.int64).T

@@ -30,6 +30,7 @@ from lfpiv_cli.particles.least_squares import (
     respond_all,
     room_for,
 )
+from lfpiv_cli.particles.refraction import on_line_of_sight
 from lfpiv_cli.particles.tiles import over_tiles
 from lfpiv_cli.particles.view import View, entry_capacity
 from lfpiv_cli.threads import COUNT_NO_REFERENCES
@@ -183,10 +184,8 @@ def fit_from(
 
     It begins with the best light there.
     """
-    view, camera = observation.optics, observation.optics.camera
-    distance = camera.focus_distance_mm + view.depth_ratio * particle[2]
-    stretch = (camera.focus_distance_mm + view.depth_ratio * depth) / distance
-    trial[0, 0], trial[0, 1], trial[0, 2] = particle[0] * stretch, particle[1] * stretch, depth
+    trial[0, 0], trial[0, 1] = on_line_of_sight(observation.optics, particle[0], particle[1], particle[2], depth)
+    trial[0, 2] = depth
     respond_all(observation.optics, trial, responses)
     pixels, values = lit_by(responses, 0)
     trial[0, 3] = best_light(pixels, values, observation.residual, observation.weight)

@@ -9,6 +9,8 @@ least-squares line where it spreads to sqrt(2/3) of the radius), and with what t
 The same point is where a volume, which comes from paraxial rays, has the particle; `places_by_snell` turns such places
 into true ones.
 
+Behind curved faces the point in air is one along each image axis, see `pencil`.
+
 Axes: world or image axes, z away from the camera from the nominal focal point; lengths in mm.
 """
 
@@ -20,7 +22,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from lfpiv_cli.optics.face_tracing import aim, trace_in
 from lfpiv_cli.optics.object_space import slope_polynomial, slope_ratio
+from lfpiv_cli.particles.pencil import cubic_at, largest_of, pencil_of
 from lfpiv_cli.particles.view import View
 from lfpiv_cli.threads import COUNT_NO_REFERENCES
 
@@ -36,8 +40,11 @@ class Bend(NamedTuple):
     Attributes
     ----------
     x, y : the particle's lateral place
-    nodes, factors : of its rays' slopes, see `object_space.slope_ratio`; empty where these rays are straight
-    seen_x, seen_y, distance : the point in air, and its distance from the lens
+    nodes, factors : of its rays' slopes, see `object_space.slope_ratio`; empty where these rays are straight, and
+        behind curved faces
+    seen_x, seen_y, distance_x, distance_y : the point in air, and its distances from the lens along both image axes;
+        0 where the lens does not see the particle
+    line_moves, cubic : see `pencil.Pencil`; empty where no face is curved
     """
 
     x: float
@@ -46,7 +53,10 @@ class Bend(NamedTuple):
     factors: NDArray[np.float64]
     seen_x: float
     seen_y: float
-    distance: float
+    distance_x: float
+    distance_y: float
+    line_moves: NDArray[np.float64]
+    cubic: NDArray[np.float64]
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
@@ -61,32 +71,48 @@ def bend_of(view: View, x: float, y: float, z: float) -> Bend:
 
     The point in air has their slopes in the middle of the lens, and at sqrt(2/3) of its radius.
     """
-    camera = view.camera
-    if view.layers.indices.size < 2:
+    camera, faces, none = view.camera, view.faces, view.faces.ratios
+    if faces.ratios.size > 0:
+        line, line_moves, cubic = pencil_of(faces, camera.aperture_radius_mm, x, y, z)
         none = np.empty(0)
-        return Bend(x, y, none, none, x, y, camera.focus_distance_mm + view.depth_ratio * z)
+        return Bend(x, y, none, none, line[0, 0], line[1, 0], line[0, 1], line[1, 1], line_moves, cubic)
+    # Arrays of nothing that are there already.
+    straight, flat = faces.axes, np.empty((0, 2, 3))
+    if view.layers.indices.size < 2:
+        distance = camera.focus_distance_mm + view.depth_ratio * z
+        return Bend(x, y, none, none, x, y, distance, distance, flat, straight)
     thicknesses = view.layers.thicknesses_mm.copy()
     thicknesses[-1] += _in_fluid(view, z)
     lateral2, radius = x * x + y * y, camera.aperture_radius_mm
     nodes, factors = slope_polynomial(radius + np.sqrt(lateral2), thicknesses, view.layers.indices)
     distance = 1.0 / slope_ratio(lateral2 + radius * radius / 1.5, nodes, factors)
     middle = distance * slope_ratio(lateral2, nodes, factors)
-    return Bend(x, y, nodes, factors, middle * x, middle * y, distance)
+    return Bend(x, y, nodes, factors, middle * x, middle * y, distance, distance, flat, straight)
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def is_seen(bend: Bend) -> bool:
+    """Return whether the main lens sees the particle: not behind a pipe's wall."""
+    return bend.distance_x > 0.0
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
 def displaced(bend: Bend, at_x: float, at_y: float) -> tuple[float, float]:
     """Return by how much the real ray's slope (x, y) exceeds the straight one's where they cross the main lens."""
+    if bend.cubic.shape[0] > 0:
+        return cubic_at(bend.cubic[0], at_x, at_y), cubic_at(bend.cubic[1], at_x, at_y)
     if bend.nodes.size == 0:
         return 0.0, 0.0
     dx, dy = at_x - bend.x, at_y - bend.y
     ratio = slope_ratio(dx * dx + dy * dy, bend.nodes, bend.factors)
-    return ratio * dx - (at_x - bend.seen_x) / bend.distance, ratio * dy - (at_y - bend.seen_y) / bend.distance
+    return ratio * dx - (at_x - bend.seen_x) / bend.distance_x, ratio * dy - (at_y - bend.seen_y) / bend.distance_y
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
 def largest_displacement(bend: Bend, radius: float) -> float:
     """Return a bound of what `displaced` returns on a main lens of that radius."""
+    if bend.cubic.shape[0] > 0:
+        return max(largest_of(bend.cubic[0], radius), largest_of(bend.cubic[1], radius))
     if bend.nodes.size == 0:
         return 0.0
     reach = radius + np.sqrt(bend.x * bend.x + bend.y * bend.y)
@@ -94,8 +120,30 @@ def largest_displacement(bend: Bend, radius: float) -> float:
     return abs(slope_ratio(reach * reach, bend.nodes, bend.factors) - middle) * reach
 
 
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def on_line_of_sight(view: View, x: float, y: float, z: float, depth: float) -> tuple[float, float]:
+    """Return where the ray from a point through the middle of the lens is at another depth: x and y.
+
+    Where it is not in the fluid there, the point's own.
+    """
+    camera, faces = view.camera, view.faces
+    if faces.ratios.size == 0:
+        distance = camera.focus_distance_mm + view.depth_ratio * z
+        stretch = (camera.focus_distance_mm + view.depth_ratio * depth) / distance
+        return x * stretch, y * stretch
+    slope_x, slope_y, seen = aim(faces, x, y, z, 0.0, 0.0)
+    if seen:
+        at_x, at_y, seen = trace_in(faces, 0.0, 0.0, slope_x, slope_y, depth)
+        if seen:
+            return at_x, at_y
+    return x, y
+
+
 def places_by_snell(points_mm: NDArray[np.float64], view: View) -> NDArray[np.float64]:
-    """Return the points (n, 3) that paraxial rays see at the given ones, mm."""
+    """Return the points (n, 3) that paraxial rays see at the given ones, mm.
+
+    Behind curved faces volumes come from exact rays: there they are the given ones.
+    """
     places = points_mm
     for _ in range(REPEATS):
         places = points_mm - paraxial_shift(places, view)
@@ -111,6 +159,6 @@ def paraxial_shift(points_mm: NDArray[np.float64], view: View) -> NDArray[np.flo
     for n in range(points_mm.shape[0]):
         x, y, z = points_mm[n, 0], points_mm[n, 1], _in_fluid(view, points_mm[n, 2])
         bend = bend_of(view, x, y, z)
-        depth = (bend.distance - view.camera.focus_distance_mm) / view.depth_ratio
+        depth = (bend.distance_x - view.camera.focus_distance_mm) / view.depth_ratio
         shift[n, 0], shift[n, 1], shift[n, 2] = bend.seen_x - x, bend.seen_y - y, depth - z
     return shift

@@ -28,7 +28,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.particles.cells import BALL_VARIANCE, level_at, share_at
-from lfpiv_cli.particles.refraction import Bend, bend_of, displaced, largest_displacement
+from lfpiv_cli.particles.pencil import rises_at
+from lfpiv_cli.particles.refraction import Bend, bend_of, displaced, is_seen, largest_displacement
 from lfpiv_cli.particles.rim import covered_share
 from lfpiv_cli.particles.view import View
 from lfpiv_cli.simd.micro_images import GAUSS_AT, GAUSS_WEIGHT, LONGEST, SMALLEST_SHARE
@@ -42,42 +43,42 @@ PROFILE_ROWS = 8
 VALUES = 4
 
 
-class Projection(NamedTuple):
-    """How the main lens shows one particle on the array.
+class Along(NamedTuple):
+    """How the main lens shows one particle on the array along one image axis.
 
     Attributes
     ----------
-    x, y : the particle's centre
-    alpha, beta, slope : see above, and d alpha/dz = d beta/dz
-    at_x, at_y : where the middle of the main lens shows the centre
-    stretch_x, stretch_y : the distortion's local scale: array points are at + stretch alpha X
+    x : the particle's centre, as seen in air
+    alpha, beta, slope : see above, and d alpha/dz = d beta/dz, z the depth as seen through planes
+    at : where the middle of the main lens shows the centre
+    stretch : the distortion's local scale: array points are at + stretch alpha X
     scale, lever : x_s changes by `scale` with X, by -`lever` with beta x
+    ball : the ball's radius as seen in air
     radius, growth : the ball's on the array as a pixel sees it, and its relative change with z
+    half : half the rectangle that holds a lens's cell
+    pixels : of the sensor
     """
 
     x: float
-    y: float
     alpha: float
     beta: float
     slope: float
-    at_x: float
-    at_y: float
-    stretch_x: float
-    stretch_y: float
-    scale: float
-    lever: float
-    radius: float
-    growth: float
-
-
-class Axis(NamedTuple):
-    """One axis of a projection and of a lens: its part of `Projection`, half the cell and the sensor's pixels."""
-
-    x: float
     at: float
     stretch: float
+    scale: float
+    lever: float
+    ball: float
+    radius: float
+    growth: float
     half: float
     pixels: int
+
+
+class Projection(NamedTuple):
+    """How the main lens shows one particle on the array: along both image axes."""
+
+    x: Along
+    y: Along
 
 
 class Profile(NamedTuple):
@@ -88,13 +89,21 @@ class Profile(NamedTuple):
     values: NDArray[np.float64]
 
 
+class Bent(NamedTuple):
+    """What bent rays through one lens are moved by on the array along both axes, x + gain_x X: the tangent to it."""
+
+    x: float
+    y: float
+    gain_x: float
+    gain_y: float
+
+
 class Lens(NamedTuple):
     """What one lens shows along both axes, and what its profiles were moved by on the array for bent rays."""
 
     across: Profile
     down: Profile
-    bent_x: float
-    bent_y: float
+    bent: Bent
 
 
 @njit(cache=True)
@@ -130,8 +139,9 @@ def respond(view: View, x: float, y: float, z: float, pixels: NDArray[np.int32],
     pixels : (capacity,) flat pixel numbers, written
     values : (capacity, 4) light and its derivatives by x, y, z, written
     """
-    camera = view.camera
     bend = bend_of(view, x, y, z)
+    if not is_seen(bend):
+        return 0
     projection = project(view, bend)
     low_i, high_i, low_j, high_j = lenses_of(view, projection, bend)
     along_x = np.empty((PROFILE_ROWS, LONGEST))
@@ -143,15 +153,13 @@ def respond(view: View, x: float, y: float, z: float, pixels: NDArray[np.int32],
             if view.cell_table.shape[0] > 0:
                 count += join_cell(view, projection, bend, (s_x, s_y), pixels[count:], values[count:])
                 continue
-            bent_x, bent_y = bent_at(view, projection, bend, s_x, s_y)
-            axis_x = Axis(projection.x, projection.at_x + bent_x, projection.stretch_x, view.half_x_mm, camera.columns)
-            across = _profile(view, projection, axis_x, s_x, along_x)
+            bent = bent_at(view, projection, bend, s_x, s_y)
+            across = _profile(view, projection.x, (bent.x, bent.gain_x), s_x, along_x)
             if across.number == 0:
                 continue
-            axis_y = Axis(projection.y, projection.at_y + bent_y, projection.stretch_y, view.half_y_mm, camera.rows)
-            down = _profile(view, projection, axis_y, s_y, along_y)
+            down = _profile(view, projection.y, (bent.y, bent.gain_y), s_y, along_y)
             if down.number > 0:
-                lens = Lens(across, down, bent_x, bent_y)
+                lens = Lens(across, down, bent)
                 count += _join(view, projection, bend, lens, pixels[count:], values[count:])
     return count
 
@@ -160,45 +168,73 @@ def respond(view: View, x: float, y: float, z: float, pixels: NDArray[np.int32],
 def project(view: View, bend: Bend) -> Projection:
     """Return how the main lens shows a particle."""
     camera = view.camera
-    x, y, distance = bend.seen_x, bend.seen_y, bend.distance
-    beta = camera.image_distance_mm / distance
-    alpha = 1.0 + beta - camera.image_distance_mm / camera.focal_length_mm
-    x0, y0 = -beta * x, -beta * y
+    x, y = bend.seen_x, bend.seen_y
+    beta_x, beta_y = camera.image_distance_mm / bend.distance_x, camera.image_distance_mm / bend.distance_y
+    x0, y0 = -beta_x * x, -beta_y * y
     r2 = x0 * x0 + y0 * y0
-    tilt = camera.microlens_distance_mm / camera.image_distance_mm
-    scale, lever = camera.bend * alpha + tilt * (alpha - 1.0), camera.bend + tilt
-    slope = -beta * view.depth_ratio / distance
-    # Of rays that strike one place, those from one side of the ball crossed the main lens elsewhere than the others.
-    radius = abs(1.0 - alpha * lever / scale) * beta * view.particle_radius_mm
+    # Curved faces show a ball wider, by how its points move along an axis with their places, depths among them.
+    wide = tall = 1.0
+    if bend.line_moves.shape[0] > 0:
+        wide, tall = _length(bend.line_moves[0, 0]), _length(bend.line_moves[1, 0])
     return Projection(
-        x,
-        y,
-        alpha,
-        beta,
-        slope,
-        x0 * (1.0 + camera.distortion_per_mm2 * r2),
-        y0 * (1.0 + camera.distortion_per_mm2 * r2),
-        1.0 + camera.distortion_per_mm2 * (r2 + 2.0 * x0 * x0),
-        1.0 + camera.distortion_per_mm2 * (r2 + 2.0 * y0 * y0),
-        scale,
-        lever,
-        radius,
-        slope * (1.0 / beta - lever / scale),
+        _along(view, x, beta_x, bend.distance_x, x0, r2, wide, (view.half_x_mm, camera.columns)),
+        _along(view, y, beta_y, bend.distance_y, y0, r2, tall, (view.half_y_mm, camera.rows)),
     )
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def bent_at(view: View, projection: Projection, bend: Bend, s_x: float, s_y: float) -> tuple[float, float]:
-    """Return what bent rays are moved by (x, y) on the array in the middle of the patches of the lens at s."""
-    if bend.nodes.size == 0:
-        return 0.0, 0.0
-    radius, ball = view.camera.aperture_radius_mm, projection.radius
-    gain_x, gain_y = projection.stretch_x * projection.alpha, projection.stretch_y * projection.alpha
-    at_x = _middle_of_part(gain_x, projection.at_x - s_x, view.half_x_mm + ball, radius)
-    at_y = _middle_of_part(gain_y, projection.at_y - s_y, view.half_y_mm + ball, radius)
+def _length(vector: NDArray[np.float64]) -> float:
+    """Return the length of a vector (3,)."""
+    return float(np.sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2]))
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def _along(
+    view: View, x: float, beta: float, distance: float, x0: float, r2: float, wide: float, cell: tuple[float, int]
+) -> Along:
+    """Return `Along` of a particle that would be seen at x0 of r without distortion, its ball so many times as wide."""
+    camera = view.camera
+    alpha = 1.0 + beta - camera.image_distance_mm / camera.focal_length_mm
+    tilt = camera.microlens_distance_mm / camera.image_distance_mm
+    scale, lever = camera.bend * alpha + tilt * (alpha - 1.0), camera.bend + tilt
+    slope = -beta * view.depth_ratio / distance
+    ball = wide * view.particle_radius_mm
+    return Along(
+        x=x,
+        alpha=alpha,
+        beta=beta,
+        slope=slope,
+        at=x0 * (1.0 + camera.distortion_per_mm2 * r2),
+        stretch=1.0 + camera.distortion_per_mm2 * (r2 + 2.0 * x0 * x0),
+        scale=scale,
+        lever=lever,
+        ball=ball,
+        # Of rays that strike one place, those from one side of the ball crossed the lens elsewhere than the others.
+        radius=abs(1.0 - alpha * lever / scale) * beta * ball,
+        growth=slope * (1.0 / beta - lever / scale),
+        half=cell[0],
+        pixels=cell[1],
+    )
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def bent_at(view: View, projection: Projection, bend: Bend, s_x: float, s_y: float) -> Bent:
+    """Return what bent rays are moved by on the array through the lens at s: as in the middle of its patches.
+
+    Behind curved faces it changes enough over these patches for its slope to count.
+    """
+    if bend.nodes.size == 0 and bend.cubic.shape[0] == 0:
+        return Bent(0.0, 0.0, 0.0, 0.0)
+    radius, x, y = view.camera.aperture_radius_mm, projection.x, projection.y
+    at_x = _middle_of_part(x.stretch * x.alpha, x.at - s_x, x.half + x.radius, radius)
+    at_y = _middle_of_part(y.stretch * y.alpha, y.at - s_y, y.half + y.radius, radius)
     slope_x, slope_y = displaced(bend, at_x, at_y)
-    distance = view.camera.image_distance_mm
-    return projection.stretch_x * distance * slope_x, projection.stretch_y * distance * slope_y
+    rise_x = rise_y = 0.0
+    if bend.cubic.shape[0] > 0:
+        rise_x, rise_y = rises_at(bend.cubic, at_x, at_y)
+        slope_x, slope_y = slope_x - rise_x * at_x, slope_y - rise_y * at_y
+    far_x, far_y = x.stretch * view.camera.image_distance_mm, y.stretch * view.camera.image_distance_mm
+    return Bent(far_x * slope_x, far_y * slope_y, far_x * rise_x, far_y * rise_y)
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
@@ -225,17 +261,17 @@ def _part_of_lens(gain: float, offset: float, reach: float, radius: float) -> tu
 @njit(cache=True, **COUNT_NO_REFERENCES)
 def lenses_of(view: View, projection: Projection, bend: Bend) -> tuple[int, int, int, int]:
     """Return the ranges of lens indices, first and last along i and j, whose cells the light can reach."""
-    camera = view.camera
-    widest = max(projection.stretch_x, projection.stretch_y)
+    camera, x, y = view.camera, projection.x, projection.y
+    widest = max(x.stretch, y.stretch)
     bent = camera.image_distance_mm * largest_displacement(bend, camera.aperture_radius_mm)
-    spread = abs(projection.alpha) * camera.aperture_radius_mm + bent
-    reach = spread * widest + projection.radius
+    reach_x = (abs(x.alpha) * camera.aperture_radius_mm + bent) * widest + x.radius
+    reach_y = (abs(y.alpha) * camera.aperture_radius_mm + bent) * widest + y.radius
     basis = view.inverse_basis
-    dx, dy = projection.at_x - camera.origin_mm[0], projection.at_y - camera.origin_mm[1]
+    dx, dy = x.at - camera.origin_mm[0], y.at - camera.origin_mm[1]
     i = dx * basis[0, 0] + dy * basis[1, 0]
     j = dx * basis[0, 1] + dy * basis[1, 1]
-    reach_i = reach * (abs(basis[0, 0]) + abs(basis[1, 0]))
-    reach_j = reach * (abs(basis[0, 1]) + abs(basis[1, 1]))
+    reach_i = reach_x * abs(basis[0, 0]) + reach_y * abs(basis[1, 0])
+    reach_j = reach_x * abs(basis[0, 1]) + reach_y * abs(basis[1, 1])
     rows, columns = view.centres_mm.shape[0], view.centres_mm.shape[1]
     low_i = max(int(np.ceil(i - reach_i - view.cell_reach)) - view.first_i, 0)
     high_i = min(int(np.floor(i + reach_i + view.cell_reach)) - view.first_i, columns - 1)
@@ -265,14 +301,13 @@ def lit_pixels(
 
 
 @njit(cache=True)
-def _profile(view: View, projection: Projection, axis: Axis, s: float, out: NDArray[np.float64]) -> Profile:
-    """Fill the profile of the lens at s along one axis, and return it."""
+def _profile(view: View, along: Along, bent: tuple[float, float], s: float, out: NDArray[np.float64]) -> Profile:
+    """Fill the profile of the lens at s along one axis, and return it; bent rays are moved as in `Bent`."""
     camera = view.camera
-    alpha, beta, slope = projection.alpha, projection.beta, projection.slope
-    scale, lever = projection.scale, projection.lever
-    x, at, stretch, half, pixels = axis
-    radius, growth = projection.radius, projection.growth
-    gain = stretch * alpha
+    x, beta, slope, stretch = along.x, along.beta, along.slope, along.stretch
+    scale, lever = along.scale, along.lever
+    half, radius, growth, pixels = along.half, along.radius, along.growth, along.pixels
+    at, gain = along.at + bent[0], stretch * along.alpha + bent[1]
     shift = (1.0 - camera.bend) * s - lever * beta * x
     first, count = lit_pixels(view, gain, at - s, half + radius, scale, shift, pixels)
     width = camera.pixel_mm / scale
@@ -316,20 +351,21 @@ def _join(
     """Write the entries of one lens; return their number."""
     camera = view.camera
     count = 0
-    x, y, beta, slope = projection.x, projection.y, projection.beta, projection.slope
-    scale, lever = projection.scale, projection.lever
+    of_x, of_y = projection
     column, columns, along_x = lens.across
     row, rows, along_y = lens.down
-    width = camera.pixel_mm / scale
+    # Patches are a few per cent wider one way than the other at most.
+    width = mean_width(view, projection)
     norm = width * width / (np.pi * camera.aperture_radius_mm**2)
-    widen_z = -2.0 * lever * slope / scale
-    place_x = lever * beta / scale
-    away = place_x * view.particle_radius_mm
+    # The patch moves by these with x, y and by tilt (x - X) with z, and is widened with z.
+    place_x, place_y = of_x.lever * of_x.beta / of_x.scale, of_y.lever * of_y.beta / of_y.scale
+    tilt_x, tilt_y = of_x.lever * of_x.slope / of_x.scale, of_y.lever * of_y.slope / of_y.scale
     # What a profile changes by with x, over what the array point does.
-    per_x = 1.0 / (projection.stretch_x * (projection.alpha * place_x - beta))
-    per_y = 1.0 / (projection.stretch_y * (projection.alpha * place_x - beta))
-    inside = max(camera.aperture_radius_mm - 0.71 * abs(width), 0.0) ** 2
-    outside = (camera.aperture_radius_mm + 0.71 * abs(width)) ** 2
+    bent = lens.bent
+    per_x = 1.0 / (of_x.stretch * (of_x.alpha * place_x - of_x.beta) + bent.gain_x * place_x)
+    per_y = 1.0 / (of_y.stretch * (of_y.alpha * place_y - of_y.beta) + bent.gain_y * place_y)
+    inside = max(camera.aperture_radius_mm - 0.71 * width, 0.0) ** 2
+    outside = (camera.aperture_radius_mm + 0.71 * width) ** 2
     for m in range(rows):
         v0, v1 = along_y[MEAN, m], along_y[SLOPE, m]
         v0_y, v1_y, v0_z, v1_z = along_y[MEAN_X, m], along_y[SLOPE_X, m], along_y[MEAN_Z, m], along_y[SLOPE_Z, m]
@@ -342,35 +378,57 @@ def _join(
             h0, h0_x, h0_z = along_x[MEAN, n], along_x[MEAN_X, n], along_x[MEAN_Z, n]
             if r2 <= inside:
                 light, by_x, by_y = h0 * v0, h0_x * v0, h0 * v0_y
-                by_z = h0_z * v0 + h0 * v0_z
+                # Along each axis the depth is another one's change.
+                by_z_x, by_z_y = h0_z * v0, h0 * v0_z
             else:
                 h1, h1_x, h1_z = along_x[SLOPE, n], along_x[SLOPE_X, n], along_x[SLOPE_Z, n]
                 # Light from one side of the ball crossed the main lens elsewhere than light from its middle.
-                rim_x = patch_x + away * along_x[AWAY, n] / max(h0, SMALLEST_SHARE)
-                rim_y = patch_y + away * along_y[AWAY, m] / max(v0, SMALLEST_SHARE)
+                rim_x = patch_x + place_x * of_x.ball * along_x[AWAY, n] / max(h0, SMALLEST_SHARE)
+                rim_y = patch_y + place_y * of_y.ball * along_y[AWAY, m] / max(v0, SMALLEST_SHARE)
                 share, mean_x, mean_y, share_x, share_y = covered_share(
-                    rim_x, rim_y, abs(width), camera.aperture_radius_mm, view.table, view.table_step_mm
+                    rim_x, rim_y, width, camera.aperture_radius_mm, view.table, view.table_step_mm
                 )
                 light = share * h0 * v0 + mean_x * h1 * v0 + mean_y * h0 * v1
                 by_x = share * h0_x * v0 + mean_x * h1_x * v0 + mean_y * h0_x * v1 + share_x * place_x * h0 * v0
-                by_y = share * h0 * v0_y + mean_x * h1 * v0_y + mean_y * h0 * v1_y + share_y * place_x * h0 * v0
-                by_z = share * (h0_z * v0 + h0 * v0_z)
-                by_z += mean_x * (h1_z * v0 + h1 * v0_z) + mean_y * (h0_z * v1 + h0 * v1_z)
-                by_z += (share_x * (x - patch_x) + share_y * (y - patch_y)) * lever * slope / scale * h0 * v0
-            if bend.nodes.size > 0:
-                slope_x, slope_y = displaced(bend, patch_x, patch_y)
-                more_x = projection.stretch_x * camera.image_distance_mm * slope_x - lens.bent_x
-                more_y = projection.stretch_y * camera.image_distance_mm * slope_y - lens.bent_y
-                light += by_x * per_x * more_x + by_y * per_y * more_y
+                by_y = share * h0 * v0_y + mean_x * h1 * v0_y + mean_y * h0 * v1_y + share_y * place_y * h0 * v0
+                by_z_x = share * h0_z * v0 + mean_x * h1_z * v0 + mean_y * h0_z * v1
+                by_z_x += share_x * (of_x.x - patch_x) * tilt_x * h0 * v0
+                by_z_y = share * h0 * v0_z + mean_x * h1 * v0_z + mean_y * h0 * v1_z
+                by_z_y += share_y * (of_y.x - patch_y) * tilt_y * h0 * v0
+            slope_x, slope_y = displaced(bend, patch_x, patch_y)
+            more_x = of_x.stretch * camera.image_distance_mm * slope_x - bent.x - bent.gain_x * patch_x
+            more_y = of_y.stretch * camera.image_distance_mm * slope_y - bent.y - bent.gain_y * patch_y
+            light += by_x * per_x * more_x + by_y * per_y * more_y
             if light <= 0.0 or count >= pixels.size:
                 continue
+            by_z_x, by_z_y = by_z_x - tilt_x * light, by_z_y - tilt_y * light
             pixels[count] = (row + m) * camera.columns + column + n
             values[count, 0] = norm * light
-            values[count, 1] = norm * by_x
-            values[count, 2] = norm * by_y
-            values[count, 3] = norm * (by_z + widen_z * light)
+            for j in range(3):
+                to_x, to_y, to_z_x, to_z_y = seen_moves(view, bend, j)
+                values[count, 1 + j] = norm * (to_x * by_x + to_y * by_y + to_z_x * by_z_x + to_z_y * by_z_y)
             count += 1
     return count
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def mean_width(view: View, projection: Projection) -> float:
+    """Return the side of a square as large as a pixel's patch on the main lens."""
+    return float(view.camera.pixel_mm / np.sqrt(projection.x.scale * projection.y.scale))
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def seen_moves(view: View, bend: Bend, axis: int) -> tuple[float, float, float, float]:
+    """Return how the point in air moves with x, y or z: its places and its depths along both image axes.
+
+    These depths count as those behind planes do, where both are z.
+    """
+    moves, per_depth = bend.line_moves, 1.0 / view.depth_ratio
+    if moves.shape[0] > 0:
+        to_x, to_y = moves[0, 0, axis], moves[1, 0, axis]
+        return to_x, to_y, per_depth * moves[0, 1, axis], per_depth * moves[1, 1, axis]
+    deeper = 1.0 if axis == 2 else 0.0
+    return 1.0 if axis == 0 else 0.0, 1.0 if axis == 1 else 0.0, deeper, deeper
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
@@ -385,7 +443,9 @@ def join_cell(
     """Write the entries of one lens whose cell is no rectangle; return their number."""
     camera = view.camera
     count = 0
-    x, y, alpha, beta, slope, at_x, at_y, stretch_x, stretch_y, scale, whole_lever, radius, growth = projection
+    # Behind planes, where alone these cells are, the same along both axes but for places and the distortion.
+    x, alpha, beta, slope, at_x, stretch_x, scale, whole_lever, _, radius, growth, _, _ = projection.x
+    y, at_y, stretch_y = projection.y.x, projection.y.at, projection.y.stretch
     s_x, s_y = lens
     off_x, off_y = at_x - s_x, at_y - s_y
     lever = whole_lever / scale

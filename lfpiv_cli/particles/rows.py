@@ -15,12 +15,25 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from lfpiv_cli.particles.refraction import Bend
-from lfpiv_cli.particles.response import Projection, bent_at, join_cell, lenses_of, lit_pixels, project
+from lfpiv_cli.particles.pencil import in_row
+from lfpiv_cli.particles.refraction import Bend, is_seen
+from lfpiv_cli.particles.response import (
+    Along,
+    Projection,
+    bent_at,
+    join_cell,
+    lenses_of,
+    lit_pixels,
+    mean_width,
+    project,
+    seen_moves,
+)
 from lfpiv_cli.particles.rim import ENTRIES_PER_PATCH
 from lfpiv_cli.particles.view import View
 from lfpiv_cli.simd.micro_images import (
+    CURVED_NUMBERS,
     JOIN_NUMBERS,
+    OF_CUBIC,
     OF_ROW,
     PATCH,
     PROFILE_ROWS,
@@ -29,6 +42,7 @@ from lfpiv_cli.simd.micro_images import (
     WHOLE,
     cover_row,
     fill_profile,
+    join_curved_row,
     join_row,
 )
 from lfpiv_cli.threads import COUNT_NO_REFERENCES
@@ -53,7 +67,9 @@ def scratch(capacity: int) -> Scratch:
     rim = np.zeros(2 * RIM_ROWS * STRIDE)
     rim[WHOLE : WHOLE + STRIDE] = 1.0
     across, down = np.zeros(PROFILE_ROWS * STRIDE), np.zeros(PROFILE_ROWS * STRIDE)
-    return Scratch(across, down, rim, np.zeros(JOIN_NUMBERS), np.empty((capacity + 1, 5), np.int64))
+    return Scratch(
+        across, down, rim, np.zeros(max(JOIN_NUMBERS, CURVED_NUMBERS)), np.empty((capacity + 1, 5), np.int64)
+    )
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
@@ -72,8 +88,13 @@ def respond_rows(
     pixels : (capacity,) flat pixel numbers, written
     values : (4, capacity) light and its derivatives by x, y, z, written
     """
+    if not is_seen(bend):
+        return 0
     projection = project(view, bend)
-    _set_numbers(view, projection, bend, room.numbers)
+    if bend.cubic.shape[0] > 0:
+        _set_curved_numbers(view, projection, bend, room.numbers)
+    else:
+        _set_numbers(view, projection, bend, room.numbers)
     low_i, high_i, low_j, high_j = lenses_of(view, projection, bend)
     # Of each lens: end of its entries, first and last row, first and last column.
     ends = room.lenses
@@ -106,26 +127,45 @@ def respond_rows(
 @njit(cache=True, **COUNT_NO_REFERENCES)
 def _set_numbers(view: View, projection: Projection, bend: Bend, numbers: NDArray[np.float64]) -> None:
     """Set `JoinNumbers` of a particle, but for those that each lens has of its own."""
-    camera = view.camera
-    ratio = projection.lever / projection.scale
-    width = camera.pixel_mm / projection.scale
-    numbers[0] = ratio * projection.beta
-    numbers[1], numbers[2] = projection.x, projection.y
-    numbers[3] = ratio * projection.slope
+    camera, x, y = view.camera, projection.x, projection.y
+    ratio = x.lever / x.scale
+    width = mean_width(view, projection)
+    numbers[0] = ratio * x.beta
+    numbers[1], numbers[2] = x.x, y.x
+    numbers[3] = ratio * x.slope
     numbers[4] = width * width / (np.pi * camera.aperture_radius_mm**2)
-    numbers[5] = -2.0 * ratio * projection.slope
+    numbers[5] = -2.0 * ratio * x.slope
     for n in range(6, numbers.size):
         numbers[n] = 0.0
     if bend.nodes.size > 0:
         numbers[6], numbers[7], numbers[8], numbers[9] = bend.x, bend.y, bend.seen_x, bend.seen_y
-        numbers[10] = 1.0 / bend.distance
+        numbers[10] = 1.0 / bend.distance_x
         for n in range(4):
             numbers[11 + n] = bend.nodes[n]
         for n in range(5):
             numbers[15 + n] = bend.factors[n]
         # What a profile changes by with x, over what the array point does, times what that moves by.
-        more = camera.image_distance_mm / (projection.alpha * numbers[0] - projection.beta)
+        more = camera.image_distance_mm / (x.alpha * numbers[0] - x.beta)
         numbers[20] = numbers[21] = more
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def _set_curved_numbers(view: View, projection: Projection, bend: Bend, numbers: NDArray[np.float64]) -> None:
+    """Set `CurvedNumbers` of a particle, but for those that each lens and each row has of its own."""
+    camera, x, y = view.camera, projection.x, projection.y
+    width = mean_width(view, projection)
+    numbers[0], numbers[1] = x.x, y.x
+    for k in range(2):
+        along = x if k == 0 else y
+        ratio = along.lever / along.scale
+        numbers[2 + 3 * k] = ratio * along.beta
+        numbers[3 + 3 * k] = ratio * along.slope
+        numbers[4 + 3 * k] = -ratio * along.slope
+    numbers[8] = width * width / (np.pi * camera.aperture_radius_mm**2)
+    for j in range(3):
+        moves = seen_moves(view, bend, j)
+        for k in range(4):
+            numbers[9 + 4 * j + k] = moves[k]
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
@@ -144,35 +184,46 @@ def _write_lens(
 
     Sets the rectangle of pixels that they lie in: first and last row, first and last column, from the second number on.
     """
-    camera, numbers = view.camera, room.numbers
-    radius = projection.radius
-    bent_x, bent_y = bent_at(view, projection, bend, lens[0], lens[1])
-    gain_x, gain_y = projection.stretch_x * projection.alpha, projection.stretch_y * projection.alpha
-    offset_x, offset_y = projection.at_x + bent_x - lens[0], projection.at_y + bent_y - lens[1]
-    shift_x = (1.0 - camera.bend) * lens[0] - projection.lever * projection.beta * projection.x
-    shift_y = (1.0 - camera.bend) * lens[1] - projection.lever * projection.beta * projection.y
-    column, columns = lit_pixels(
-        view, gain_x, offset_x, view.half_x_mm + radius, projection.scale, shift_x, camera.columns
-    )
+    camera, numbers, x, y = view.camera, room.numbers, projection.x, projection.y
+    bent = bent_at(view, projection, bend, lens[0], lens[1])
+    gain_x, gain_y = x.stretch * x.alpha + bent.gain_x, y.stretch * y.alpha + bent.gain_y
+    offset_x, offset_y = x.at + bent.x - lens[0], y.at + bent.y - lens[1]
+    shift_x = (1.0 - camera.bend) * lens[0] - x.lever * x.beta * x.x
+    shift_y = (1.0 - camera.bend) * lens[1] - y.lever * y.beta * y.x
+    column, columns = lit_pixels(view, gain_x, offset_x, x.half + x.radius, x.scale, shift_x, camera.columns)
     if columns == 0:
         return 0
-    row, rows = lit_pixels(view, gain_y, offset_y, view.half_y_mm + radius, projection.scale, shift_y, camera.rows)
+    row, rows = lit_pixels(view, gain_y, offset_y, y.half + y.radius, y.scale, shift_y, camera.rows)
     if rows == 0:
         return 0
-    step = camera.pixel_mm / projection.scale
-    first_x = ((column + 0.5 - 0.5 * camera.columns) * camera.pixel_mm - shift_x) / projection.scale
-    first_y = ((row + 0.5 - 0.5 * camera.rows) * camera.pixel_mm - shift_y) / projection.scale
-    if _nearest(first_x, step, columns) + _nearest(first_y, step, rows) >= _far(view, step):
+    step_x, step_y = camera.pixel_mm / x.scale, camera.pixel_mm / y.scale
+    first_x = ((column + 0.5 - 0.5 * camera.columns) * camera.pixel_mm - shift_x) / x.scale
+    first_y = ((row + 0.5 - 0.5 * camera.rows) * camera.pixel_mm - shift_y) / y.scale
+    width = mean_width(view, projection)
+    if _nearest(first_x, step_x, columns) + _nearest(first_y, step_y, rows) >= _far(view, width):
         return 0
-    _fill(
-        view, projection, (first_x, offset_x, projection.stretch_x, view.half_x_mm, projection.x), columns, room.across
-    )
-    _fill(view, projection, (first_y, offset_y, projection.stretch_y, view.half_y_mm, projection.y), rows, room.down)
-    if bend.nodes.size > 0:
+    _fill(view, x, (first_x, offset_x, gain_x), columns, room.across)
+    _fill(view, y, (first_y, offset_y, gain_y), rows, room.down)
+    if bend.cubic.shape[0] > 0:
+        _set_bent(view, x, bent.x, bent.gain_x, numbers[CURVED_NUMBERS - 4 :])
+        _set_bent(view, y, bent.y, bent.gain_y, numbers[CURVED_NUMBERS - 3 :])
+    elif bend.nodes.size > 0:
         per_array = numbers[20] / camera.image_distance_mm
-        numbers[22] = per_array / projection.stretch_x * bent_x
-        numbers[23] = per_array / projection.stretch_y * bent_y
-    return _write_rows(view, (row, rows), (column, columns), step, begin, pixels, values, room, rectangle)
+        numbers[22] = per_array / x.stretch * bent.x
+        numbers[23] = per_array / y.stretch * bent.y
+    lit = (row, rows), (column, columns)
+    far = camera.image_distance_mm
+    rises = bent.gain_x / (x.stretch * far), bent.gain_y / (y.stretch * far)
+    return _write_rows(view, (bend.cubic, rises), lit, (step_x, width), begin, pixels, values, room, rectangle)
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def _set_bent(view: View, along: Along, bent: float, gain: float, numbers: NDArray[np.float64]) -> None:
+    """Set along one axis what profiles change by with rays' slopes, and did already; see `JoinNumbers`."""
+    place = along.lever / along.scale * along.beta
+    by_x = along.stretch * (along.alpha * place - along.beta) + gain * place
+    numbers[0] = along.stretch * view.camera.image_distance_mm / by_x
+    numbers[2] = bent / by_x
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
@@ -183,41 +234,34 @@ def _nearest(first: float, step: float, count: int) -> float:
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def _far(view: View, step: float) -> float:
+def _far(view: View, width: float) -> float:
     """Return the square of how far from the axis a patch is that the rim does not touch, from outside."""
-    return float((view.camera.aperture_radius_mm + 0.71 * abs(step)) ** 2)
+    return float((view.camera.aperture_radius_mm + 0.71 * width) ** 2)
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def _fill(
-    view: View,
-    projection: Projection,
-    axis: tuple[float, float, float, float, float],
-    count: int,
-    out: NDArray[np.float64],
-) -> None:
+def _fill(view: View, along: Along, patches: tuple[float, float, float], count: int, out: NDArray[np.float64]) -> None:
     """Fill the profile of one lens along an axis.
 
-    `axis` is its first patch, what the array is off by and stretched, half the cell, and the particle's place.
+    `patches` are the first patch, and what the array is off by and how that grows with X.
     """
-    first, offset, stretch, half, x = axis
+    first, offset, gain = patches
     camera = view.camera
-    step = camera.pixel_mm / projection.scale
-    ratio = projection.lever / projection.scale
-    gain = stretch * projection.alpha
+    step = camera.pixel_mm / along.scale
+    ratio = along.lever / along.scale
     numbers = (
         first,
         step,
         abs(step),
         offset,
         gain,
-        gain * ratio * projection.beta - projection.beta * stretch,
-        x,
-        projection.slope * (stretch - gain * ratio),
-        half,
-        1.0 / projection.radius,
-        projection.growth,
-        ratio * projection.beta * view.particle_radius_mm,
+        gain * ratio * along.beta - along.beta * along.stretch,
+        along.x,
+        along.slope * (along.stretch - gain * ratio),
+        along.half,
+        1.0 / along.radius,
+        along.growth,
+        ratio * along.beta * along.ball,
     )
     fill_profile(out, count, numbers)
 
@@ -225,20 +269,28 @@ def _fill(
 @njit(cache=True, **COUNT_NO_REFERENCES)
 def _write_rows(
     view: View,
-    down: tuple[int, int],
-    across: tuple[int, int],
-    step: float,
+    bent: tuple[NDArray[np.float64], tuple[float, float]],
+    lit: tuple[tuple[int, int], tuple[int, int]],
+    patches: tuple[float, float],
     begin: int,
     pixels: NDArray[np.int32],
     values: NDArray[np.float64],
     room: Scratch,
     rectangle: NDArray[np.int64],
 ) -> int:
-    """Write the entries of one lens whose profiles are known, row by row; see `_write_lens`."""
+    """Write the entries of one lens whose profiles are known, row by row; see `_write_lens`.
+
+    Parameters
+    ----------
+    bent : `Bend.cubic`, and the slopes of its tangents that profiles follow already
+    lit : first row and their number, first column and their number
+    patches : the step along x from one to the next, and their mean width
+    """
     camera = view.camera
-    (row, rows), (column, columns) = down, across
-    width = abs(step)
-    outside = _far(view, step)
+    (row, rows), (column, columns) = lit
+    cubic, tangent = bent
+    step, width = patches
+    outside = _far(view, width)
     inside = max(camera.aperture_radius_mm - 0.71 * width, 0.0) ** 2
     per_width = ENTRIES_PER_PATCH * view.table_step_mm / width
     rim_numbers = (
@@ -263,11 +315,25 @@ def _write_rows(
             cover_row(room.rim, room.across, (low, high - low), room.down, m, view.table, rim_numbers)
         to = (at, (row + m) * camera.columns + column + low)
         chosen = (low, high - low, WHOLE if whole else OF_ROW)
-        join_row(pixels, values, to, room.across, chosen, room.down, m, room.rim, room.numbers)
+        if cubic.shape[0] > 0:
+            _set_row(cubic, tangent, y, room.numbers)
+            join_curved_row(pixels, values, to, room.across, chosen, room.down, m, room.rim, room.numbers)
+        else:
+            join_row(pixels, values, to, room.across, chosen, room.down, m, room.rim, room.numbers)
         at += high - low
         rectangle[1], rectangle[2] = min(rectangle[1], row + m), row + m
         rectangle[3], rectangle[4] = min(rectangle[3], column + low), max(rectangle[4], column + high - 1)
     return at - begin
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def _set_row(cubic: NDArray[np.float64], tangent: tuple[float, float], y: float, numbers: NDArray[np.float64]) -> None:
+    """Set what a row has of its own of `CurvedNumbers`: cubics of X without the tangents that profiles follow."""
+    for k in range(2):
+        at = OF_CUBIC + 4 * k
+        numbers[at], numbers[at + 1], numbers[at + 2], numbers[at + 3] = in_row(cubic[k], y)
+    numbers[OF_CUBIC + 1] -= tangent[0]
+    numbers[OF_CUBIC + 4] -= tangent[1] * y
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)

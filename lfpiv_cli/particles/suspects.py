@@ -41,7 +41,7 @@ def with_depths_corrected(task: Task, state: State, unexplained: float) -> State
     observation = observed(task, state, unexplained)
     chi2, *_ = judge(observation, state.particles)
     good = good_chi2(chi2)
-    near_focus = footprint_radius_mm(task.view, state.particles[:, 2]) < NEAR_FOCUS_LENSES * 2.0 * task.view.half_x_mm
+    near_focus = footprint_radius_mm(task.view, state.particles) < NEAR_FOCUS_LENSES * 2.0 * task.view.half_x_mm
     signature = _signature(task.view.scale, state.particles, chi2)
     suspects = (near_focus | (chi2 > ELSEWHERE_CHI2 * good)) & ~_tried(state.unmoved, state, signature)
     light = SMALLEST_LIGHT * state.typical_light

@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from lfpiv_cli.particles.view import View, footprint_radius_mm, lens_on_array_mm, on_array_mm
+from lfpiv_cli.particles.view import View, largest_stretch, lens_on_array_mm, on_array_mm, widest_footprint_mm
 from lfpiv_cli.threads import in_threads
 
 # How far a particle may be moved within one sweep, in microlenses: footprints must not grow into other tiles.
@@ -50,9 +50,9 @@ def groups_of_tiles(
 
 def tile_side_mm(view: View, z_low_mm: float, z_high_mm: float) -> float:
     """Return the side of a tile, on the array: two footprints of particles that move in one sweep."""
-    widest = float(footprint_radius_mm(view, np.linspace(z_low_mm, z_high_mm, 11)).max())
+    widest = widest_footprint_mm(view, z_low_mm, z_high_mm)
     # Light that touches a lens's cell lands within its micro-image: two cells to each side.
-    move = LARGEST_MOVE_LENSES * lens_on_array_mm(view)
+    move = LARGEST_MOVE_LENSES * lens_on_array_mm(view) * largest_stretch(view, z_low_mm, z_high_mm)
     return 2.0 * (widest + 4.0 * max(view.half_x_mm, view.half_y_mm) + move)
 
 

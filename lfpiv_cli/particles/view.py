@@ -15,16 +15,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.calibration.model import Calibration
+from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.optics.camera import Camera, KernelCamera
+from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.media import Layers, Media
 from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.optics.object_space import ObjectSpace
+from lfpiv_cli.optics.surfaces import Faces
 from lfpiv_cli.particles.cells import cell_shares, hexagon_radius, no_shares, smallest_ball_mm
+from lfpiv_cli.particles.pencil import lines_of
 from lfpiv_cli.particles.rim import rim_table
 from lfpiv_cli.scale import Scale
+from lfpiv_cli.weights.scene import NO_FACES
 
 # Particles that are smaller are taken as this large, so that profiles have slopes: a thousandth of a lens.
 SMALLEST_RADIUS_LENSES = 1e-3
+# Depths between two others at which footprints are asked for; behind curved faces also places along each image axis.
+SAMPLED_DEPTHS, SAMPLED_PLACES = 101, 11
 # Tables of hexagonal cells serve balls that differ from theirs by this factor: only their blur's variance is changed.
 SAME_TABLE = 1.6
 
@@ -38,6 +45,7 @@ class View(NamedTuple):
     scale : its lengths in the scene
     depth_ratio : n_a/n_w (Eq. 9)
     layers : from the lens to the focal point, of plane faces that bend rays by Snell's law; one where rays are straight
+    faces : curved ones; none where all are plane
     half_x_mm, half_y_mm : half the rectangle that holds a lens's cell
     cell_reach : how far a cell reaches at most from its lens, in steps of the lattice
     cell_table, cell_side2_mm2, cell_step_mm, cell_ball_mm : of cells that are no rectangles, see `cells.CellShares`
@@ -51,6 +59,7 @@ class View(NamedTuple):
     scale: Scale
     depth_ratio: float
     layers: Layers
+    faces: Faces
     half_x_mm: float
     half_y_mm: float
     cell_reach: float
@@ -67,12 +76,23 @@ class View(NamedTuple):
     table_step_mm: float
 
 
+def ensure_square_cells(camera: Camera, space: ObjectSpace | CurvedSpace | None) -> None:
+    """Refuse hexagonal cells behind curved faces: their tables are of balls that are round and equally sharp all ways.
+
+    Raises
+    ------
+    ConfigError
+    """
+    if isinstance(space, CurvedSpace) and camera.lattice.layout != "square":
+        raise ConfigError("through a scene particles are fitted behind square microlenses alone; these are hexagonal")
+
+
 def raw_view(
     camera: Camera,
     media: Media,
     particle_radius_mm: float,
     calibration: Calibration | None = None,
-    space: ObjectSpace | None = None,
+    space: ObjectSpace | CurvedSpace | None = None,
 ) -> View:
     """Return the view of a camera on the raw image.
 
@@ -81,7 +101,13 @@ def raw_view(
     camera : as the weights have it; its lattice is used where there is no calibration
     calibration : gives the measured centres of the lens images
     space : what bends rays; None: they are straight from the equivalent points
+
+    Raises
+    ------
+    ConfigError : faces are curved and the array is hexagonal
     """
+    ensure_square_cells(camera, space)
+    plane = ObjectSpace(media, refraction="paraxial") if space is None or isinstance(space, CurvedSpace) else space
     lattice_px = camera.micro_image_lattice_px() if calibration is None else calibration.fit.lattice_px
     # One lens more than the sensor's corners: micro-images reach over its edge.
     corners = [(c, r) for c in (0, camera.columns - 1) for r in (0, camera.rows - 1)]
@@ -107,7 +133,8 @@ def raw_view(
         camera=camera.for_kernels(),
         scale=scale,
         depth_ratio=media.depth_ratio,
-        layers=(space or ObjectSpace(media, refraction="paraxial")).layers(camera),
+        layers=plane.layers(camera),
+        faces=space.for_kernels(camera) if isinstance(space, CurvedSpace) else NO_FACES,
         half_x_mm=float(half_x),
         half_y_mm=float(half_y),
         cell_reach=cell_reach,
@@ -146,8 +173,17 @@ def with_radius(view: View, particle_radius_mm: float) -> View:
 
 
 def on_array_mm(view: View, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return where the main lens's middle shows points (n, 3 or more) on the array (n, 2), without its distortion."""
-    return -points[:, :2] * _image_scale(view, points[:, 2])[:, np.newaxis]
+    """Return where the main lens's middle shows points (n, 3 or more) on the array (n, 2), without its distortion.
+
+    Of points that the lens does not see behind curved faces, where it would through planes.
+    """
+    places = -points[:, :2] * _image_scale(view, points[:, 2])[:, np.newaxis]
+    if view.faces.ratios.size == 0:
+        return places
+    lines, *_ = lines_of(view.faces, view.camera.aperture_radius_mm, points)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shown = -view.camera.image_distance_mm * lines[:, :, 0] / lines[:, :, 1]
+    return np.where(lines[:, :, 1] > 0.0, shown, places)
 
 
 def lens_on_array_mm(view: View) -> float:
@@ -163,11 +199,49 @@ def lens_pixels(view: View) -> float:
     return 4.0 * view.half_x_mm * view.half_y_mm / view.camera.pixel_mm**2
 
 
-def footprint_radius_mm(view: View, z_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return how far on the array the light of particles at depths z spreads from their centres."""
-    camera, beta = view.camera, _image_scale(view, z_mm)
+def footprint_radius_mm(view: View, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return how far (n,) on the array the light of particles (n, 3 or more) spreads from their centres."""
+    return np.asarray(_spreads_mm(view, points).max(axis=1))
+
+
+def widest_footprint_mm(view: View, z_low_mm: float, z_high_mm: float) -> float:
+    """Return how far on the array the light of particles between two depths spreads at most from their centres."""
+    return float(_spreads_mm(view, _between(view, z_low_mm, z_high_mm)).max())
+
+
+def largest_stretch(view: View, z_low_mm: float, z_high_mm: float) -> float:
+    """Return how far the main lens shows particles between two depths to move, over how far they do sideways."""
+    if view.faces.ratios.size == 0:
+        return 1.0
+    points = _between(view, z_low_mm, z_high_mm)
+    _, moves, _ = lines_of(view.faces, view.camera.aperture_radius_mm, points)
+    return max(float(np.linalg.norm(moves[:, :, 0], axis=-1).max()), 1.0)
+
+
+def _spreads_mm(view: View, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return `footprint_radius_mm` along both image axes (n, 2)."""
+    camera, radius = view.camera, view.camera.aperture_radius_mm
+    beta = np.repeat(_image_scale(view, points[:, 2])[:, np.newaxis], 2, axis=1)
+    ball, bent = np.full_like(beta, view.particle_radius_mm), np.zeros_like(beta)
+    if view.faces.ratios.size > 0:
+        lines, moves, bent = lines_of(view.faces, radius, points)
+        seen = lines[:, :, 1] > 0.0
+        beta[seen] = camera.image_distance_mm / lines[seen, 1]
+        ball[seen] *= np.linalg.norm(moves[:, :, 0], axis=-1)[seen]
     alpha = 1.0 + beta - camera.image_distance_mm / camera.focal_length_mm
-    return np.abs(alpha) * camera.aperture_radius_mm + beta * view.particle_radius_mm
+    return np.asarray(np.abs(alpha) * radius + beta * ball + camera.image_distance_mm * bent)
+
+
+def _between(view: View, z_low_mm: float, z_high_mm: float) -> NDArray[np.float64]:
+    """Return points (n, 3) that stand for all between two depths: plane faces show them alike wherever they are."""
+    if view.faces.ratios.size == 0:
+        depths = np.linspace(z_low_mm, z_high_mm, SAMPLED_DEPTHS)
+        return np.column_stack([np.zeros((depths.size, 2)), depths])
+    camera = view.camera
+    half = 0.5 * camera.pixel_mm * np.array([camera.columns, camera.rows]) * camera.focus_distance_mm
+    x, y = (np.linspace(-reach, reach, SAMPLED_PLACES) for reach in half / camera.image_distance_mm)
+    depths = np.linspace(z_low_mm, z_high_mm, SAMPLED_PLACES)
+    return np.stack(np.meshgrid(x, y, depths), axis=-1).reshape(-1, 3)
 
 
 def _image_scale(view: View, z_mm: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -179,10 +253,10 @@ def entry_capacity(view: View, z_low_mm: float, z_high_mm: float) -> int:
     """Return how many (lens, pixel) entries a particle between two depths can have at most."""
     camera, per_axis = view.camera, 0.0
     patch = camera.pixel_mm * camera.image_distance_mm / camera.microlens_distance_mm
+    spreads = _spreads_mm(view, _between(view, z_low_mm, z_high_mm))
     for half in (view.half_x_mm, view.half_y_mm):
-        radius = footprint_radius_mm(view, np.linspace(z_low_mm, z_high_mm, 101))
-        lenses = np.ceil(radius / half) + 2.0
+        lenses = np.ceil(spreads / half) + 2.0
         # A lens sees the part of the aperture whose light falls into its cell.
-        lit = np.minimum(2.0 * camera.aperture_radius_mm, 3.0 * half * 2.0 * camera.aperture_radius_mm / radius)
+        lit = np.minimum(2.0 * camera.aperture_radius_mm, 3.0 * half * 2.0 * camera.aperture_radius_mm / spreads)
         per_axis = max(per_axis, float(np.max(lenses * (lit / patch + 3.0))))
     return int(per_axis**2) + 1

@@ -6,7 +6,7 @@ apart; more than is asked for is written, up to a whole register.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -137,7 +137,60 @@ class RimNumbers(NamedTuple):
     inside: Any
 
 
+class CurvedNumbers(NamedTuple):
+    """What the pixels of one lens follow from behind curved faces; each a number, or `Lanes` of it.
+
+    Attributes
+    ----------
+    x, y : the place in air
+    place_x, tilt_x, widen_x : the place on the main lens that a pixel sees moves by place_x with x, and by tilt_x (x -
+        X) with the depth that is seen along x; what light of a whole patch changes by with that depth
+    place_y, tilt_y, widen_y : the same along y
+    norm : light of a whole patch that sees the whole ball
+    x_by_x ... depth_y_by_z : how the place in air and its two depths move with x, y and z
+    cubic_x_0 ... cubic_y_3 : what rays' slopes differ by from straight ones', in a row: cubics of X
+    more_x, more_y, bent_x, bent_y : see `JoinNumbers`
+    """
+
+    x: Any
+    y: Any
+    place_x: Any
+    tilt_x: Any
+    widen_x: Any
+    place_y: Any
+    tilt_y: Any
+    widen_y: Any
+    norm: Any
+    x_by_x: Any
+    y_by_x: Any
+    depth_x_by_x: Any
+    depth_y_by_x: Any
+    x_by_y: Any
+    y_by_y: Any
+    depth_x_by_y: Any
+    depth_y_by_y: Any
+    x_by_z: Any
+    y_by_z: Any
+    depth_x_by_z: Any
+    depth_y_by_z: Any
+    cubic_x_0: Any
+    cubic_x_1: Any
+    cubic_x_2: Any
+    cubic_x_3: Any
+    cubic_y_0: Any
+    cubic_y_1: Any
+    cubic_y_2: Any
+    cubic_y_3: Any
+    more_x: Any
+    more_y: Any
+    bent_x: Any
+    bent_y: Any
+
+
 JOIN_NUMBERS = len(JoinNumbers._fields)
+CURVED_NUMBERS = len(CurvedNumbers._fields)
+# Where the numbers that a row has of its own begin.
+OF_CUBIC = CurvedNumbers._fields.index("cubic_x_0")
 # What the rim leaves of patches: covered share, means of xi and eta, slopes of the share. Of whole ones first, then of
 # those of a row.
 RIM_ROWS = 5
@@ -215,6 +268,30 @@ def _join(x: Sequence[Any], y: Sequence[Any], rim: Sequence[Any], c: JoinNumbers
     more_y = c.more_y * (slope * dy - (patch_y - c.seen_y) * c.per_distance) - c.bent_y
     light = light + by_x * more_x + by_y * more_y
     return c.norm * light, c.norm * by_x, c.norm * by_y, c.norm * (by_z + c.widen * light)
+
+
+def _join_curved(x: Sequence[Any], y: Sequence[Any], rim: Sequence[Any], c: CurvedNumbers) -> tuple[Any, Any, Any, Any]:
+    """Return light and derivatives of a pixel behind curved faces; see `response._join`."""
+    h0, h1, h0_x, h1_x, h0_z, h1_z, patch_x = x
+    v0, v1, v0_y, v1_y, v0_z, v1_z, patch_y = y
+    share, mean_x, mean_y, share_x, share_y = rim
+    # Profiles with what the rim leaves of their slopes.
+    across, down = share * h0 + mean_x * h1, share * v0 + mean_y * v1
+    by_share_x, by_share_y = share_x * (h0 * v0), share_y * (h0 * v0)
+    light = across * v0 + mean_y * (h0 * v1)
+    by_x = h0_x * down + mean_x * (h1_x * v0) + by_share_x * c.place_x
+    by_y = v0_y * across + mean_y * (h0 * v1_y) + by_share_y * c.place_y
+    more_x = c.cubic_x_0 + patch_x * (c.cubic_x_1 + patch_x * (c.cubic_x_2 + patch_x * c.cubic_x_3))
+    more_y = c.cubic_y_0 + patch_x * (c.cubic_y_1 + patch_x * (c.cubic_y_2 + patch_x * c.cubic_y_3))
+    light = light + by_x * (c.more_x * more_x - c.bent_x) + by_y * (c.more_y * more_y - c.bent_y)
+    by_depth_x = h0_z * down + mean_x * (h1_z * v0) + by_share_x * ((c.x - patch_x) * c.tilt_x) + c.widen_x * light
+    by_depth_y = v0_z * across + mean_y * (h0 * v1_z) + by_share_y * ((c.y - patch_y) * c.tilt_y) + c.widen_y * light
+    return (
+        c.norm * light,
+        c.norm * (c.x_by_x * by_x + c.y_by_x * by_y + c.depth_x_by_x * by_depth_x + c.depth_y_by_x * by_depth_y),
+        c.norm * (c.x_by_y * by_x + c.y_by_y * by_y + c.depth_x_by_y * by_depth_x + c.depth_y_by_y * by_depth_y),
+        c.norm * (c.x_by_z * by_x + c.y_by_z * by_y + c.depth_x_by_z * by_depth_x + c.depth_y_by_z * by_depth_y),
+    )
 
 
 def fill_profile_reference(out: Doubles, count: int, numbers: tuple[float, ...]) -> None:
@@ -332,13 +409,48 @@ def join_row_reference(
     rim : see `cover_row_reference`
     numbers : `JoinNumbers`
     """
+    _write_row(_join, JoinNumbers, pixels, values, to, across, columns, down, row, rim, numbers)
+
+
+def join_curved_row_reference(
+    pixels: NDArray[np.int32],
+    values: Doubles,
+    to: tuple[int, int],
+    across: Doubles,
+    columns: tuple[int, int, int],
+    down: Doubles,
+    row: int,
+    rim: Doubles,
+    numbers: Doubles,
+) -> None:
+    """Write the entries of one row of a lens behind curved faces: readable twin of `join_curved_row`.
+
+    As `join_row_reference`, but `numbers` : `CurvedNumbers`
+    """
+    _write_row(_join_curved, CurvedNumbers, pixels, values, to, across, columns, down, row, rim, numbers)
+
+
+def _write_row(
+    join: Callable[..., tuple[Any, Any, Any, Any]],
+    kind: type[JoinNumbers | CurvedNumbers],
+    pixels: NDArray[np.int32],
+    values: Doubles,
+    to: tuple[int, int],
+    across: Doubles,
+    columns: tuple[int, int, int],
+    down: Doubles,
+    row: int,
+    rim: Doubles,
+    numbers: Doubles,
+) -> None:
+    """Write the entries of one row by a formula and the numbers that it takes; see `join_row_reference`."""
     at, pixel = to
     below = [float(down[k * STRIDE + row]) for k in range(PATCH + 1)]
     for n in range(columns[1]):
         column = columns[0] + n
         beside = [float(across[k * STRIDE + column]) for k in range(PATCH + 1)]
         covered = [float(rim[columns[2] + k * STRIDE + column]) for k in range(RIM_ROWS)]
-        joined = _join(beside, below, covered, JoinNumbers(*(float(number) for number in numbers[:JOIN_NUMBERS])))
+        joined = join(beside, below, covered, kind(*(float(number) for number in numbers[: len(kind._fields)])))
         pixels[at + n] = pixel + n
         for k in range(4):
             values[k, at + n] = where_above(joined[0], 0.0, joined[k], 0.0)
@@ -361,7 +473,33 @@ def join_row(
     return types.void(pixels, values, integers(2), across, integers(3), down, types.int64, rim, numbers), _generate_join
 
 
+@in_place_of(join_curved_row_reference)
+def join_curved_row(
+    typing_context: Any,
+    pixels: Any,
+    values: Any,
+    to: Any,
+    across: Any,
+    columns: Any,
+    down: Any,
+    row: Any,
+    rim: Any,
+    numbers: Any,
+) -> Any:
+    """Write the entries of one row of a lens behind curved faces; see `join_curved_row_reference`."""
+    arrays = (pixels, values, integers(2), across, integers(3), down, types.int64, rim, numbers)
+    return types.void(*arrays), _generate_curved_join
+
+
 def _generate_join(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Any) -> Any:
+    return _generate_row(context, builder, signature, arguments, _join, JoinNumbers)
+
+
+def _generate_curved_join(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Any) -> Any:
+    return _generate_row(context, builder, signature, arguments, _join_curved, CurvedNumbers)
+
+
+def _generate_row(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Any, join: Any, kind: Any) -> Any:
     pixels, values, across, down, rim, numbers = pointers(context, builder, signature, arguments, (0, 1, 3, 5, 7, 8))
     at, pixel = cgutils.unpack_tuple(builder, arguments[2], 2)
     rows = context.make_array(signature.args[1])(context, builder, arguments[1])
@@ -372,14 +510,14 @@ def _generate_join(context: Any, builder: ir.IRBuilder, signature: Any, argument
         return lanes(builder, load_one(builder, array, place))
 
     below = [everywhere(down, builder.add(arguments[6], index(k * STRIDE))) for k in range(PATCH + 1)]
-    known = JoinNumbers(*(everywhere(numbers, index(k)) for k in range(JOIN_NUMBERS)))
+    known = kind(*(everywhere(numbers, index(k)) for k in range(len(kind._fields))))
     with groups_of_lanes(builder, count) as group:
         done = builder.mul(group.index, index(DOUBLES))
         column = builder.add(first, done)
         beside = [load_lanes(builder, across, builder.add(column, index(k * STRIDE))) for k in range(PATCH + 1)]
         of_rim = builder.add(left, column)
         covered = [load_lanes(builder, rim, builder.add(of_rim, index(k * STRIDE))) for k in range(RIM_ROWS)]
-        joined = _join(beside, below, covered, known)
+        joined = join(beside, below, covered, known)
         place = builder.add(at, done)
         store_count(builder, builder.add(pixel, done), pixels, place)
         for k, value in enumerate(joined):
