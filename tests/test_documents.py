@@ -226,6 +226,15 @@ def write_configs(folder: Path) -> None:
     )
     for name in ("table2", "board"):
         (folder / "configs" / f"{name}.yaml").write_text(small)
+    pipe = changed(
+        (ROOT / "configs" / "pipe.yaml").read_text(),
+        ("columns: 2352, rows: 1768", "columns: 600, rows: 500"),
+        ("shape_xyz: [100, 100, 100]", "shape_xyz: [20, 24, 24]"),
+        ("windows: [32, 16]", "windows: [8]"),
+        ("particles: 5000 ", "particles: 80\n  rays: 2000 "),
+        ("iterations: 24", "iterations: 4"),
+    )
+    (folder / "configs" / "pipe.yaml").write_text(pipe)
 
 
 def write_third_frame(folder: Path) -> None:
