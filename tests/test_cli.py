@@ -87,6 +87,11 @@ def test_a_closed_pipe_is_quiet():
     assert done.stderr == ""
 
 
+def hear_interrupts():
+    """Have a new process hear SIGINT, which shells have their background jobs ignore."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 IGNORED_FIRST = """
 import ctypes, signal, sys, time
 from lfpiv_cli.cli.interrupts import end_by_signals
@@ -109,7 +114,12 @@ except BaseException as error:
 @pytest.mark.parametrize(("sent", "name"), [("SIGTERM", "Terminated"), ("SIGINT", "KeyboardInterrupt")])
 def test_a_signal_during_a_call_back_is_not_lost(sent, name):
     done = subprocess.run(
-        [sys.executable, "-c", IGNORED_FIRST, sent], capture_output=True, text=True, check=True, timeout=60
+        [sys.executable, "-c", IGNORED_FIRST, sent],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=60,
+        preexec_fn=hear_interrupts,
     )
     assert done.stdout.split() == ["ignored", name]
     assert done.stderr == ""
@@ -125,7 +135,7 @@ def test_signals_end_the_work_and_leave_nothing(tmp_path, sent, code):
     images = (tmp_path / "w.h5", SAMPLE / "pair_a.tif", "--iterations", "100000", "-o", tmp_path / "v.vtkhdf")
     command = [sys.executable, "-m", "lfpiv_cli", "reconstruct", *(str(part) for part in images)]
     for seconds in (4.0, 8.0, 16.0):
-        with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, preexec_fn=hear_interrupts) as process:
             try:
                 time.sleep(seconds)
                 process.send_signal(sent)

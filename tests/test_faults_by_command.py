@@ -19,6 +19,7 @@ from lfpiv_cli.files.vtkhdf import open_vectors, write_vectors
 from lfpiv_cli.reference import FOCAL_POINT
 from tests.hostile_files import ended
 from tests.test_batches import QUICK, pairs, raw, weights
+from tests.test_cli import hear_interrupts
 from tests.test_particle_stage import frames_of
 from tests.vector_fields import SHAPE, field_of
 
@@ -177,7 +178,8 @@ def test_signals_end_each_command_within_five_seconds(
     takes_s = os.times().elapsed - begun
     ends = []
     for share in (0.5, 0.7, 0.9):
-        with subprocess.Popen([*words, "-o", folder / f"made{end}"], cwd=ROOT, stderr=subprocess.PIPE) as process:
+        command = [*words, "-o", folder / f"made{end}"]
+        with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, preexec_fn=hear_interrupts) as process:
             with suppress(subprocess.TimeoutExpired):
                 process.wait(share * takes_s)
             process.send_signal(sent)
