@@ -79,8 +79,10 @@ def test_a_file_in_the_way_is_no_place(tmp_path: Path) -> None:
 
 
 @pytest.mark.thorough
-def test_kernels_compile_where_neither_package_nor_home_can_be_written() -> None:
+def test_kernels_compile_where_neither_package_nor_home_can_be_written(tmp_path: Path) -> None:
     surroundings = {name: value for name, value in os.environ.items() if name != kernel_cache.VARIABLE}
+    # A folder of its own: the package may itself lie in the one for temporary files.
+    surroundings["TMPDIR"] = str(tmp_path)
     done = subprocess.run(
         [sys.executable, "-c", READ_ONLY + USE], cwd=ROOT, env=surroundings, capture_output=True, text=True
     )
