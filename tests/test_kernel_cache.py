@@ -78,6 +78,19 @@ def test_a_file_in_the_way_is_no_place(tmp_path: Path) -> None:
     assert kernel_cache._is_writable(tmp_path / "cache")
 
 
+def test_kernels_of_other_files_are_not_kept(tmp_path: Path) -> None:
+    code, kernel = tmp_path / "optics" / "a.py", tmp_path / "optics" / "__pycache__" / "b.nbi"
+    kernel.parent.mkdir(parents=True)
+    code.write_text("1")
+    kernel_cache.forget_outdated(tmp_path)
+    kernel.write_text("compiled")
+    kernel_cache.forget_outdated(tmp_path)
+    assert kernel.exists()
+    os.utime(code, ns=(1, 1))
+    kernel_cache.forget_outdated(tmp_path)
+    assert not kernel.exists()
+
+
 @pytest.mark.thorough
 def test_kernels_compile_where_neither_package_nor_home_can_be_written(tmp_path: Path) -> None:
     surroundings = {name: value for name, value in os.environ.items() if name != kernel_cache.VARIABLE}

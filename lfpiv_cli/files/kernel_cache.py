@@ -3,19 +3,27 @@
 Numba keeps them beside the package, else in the user's folder for caches, or in the folder that `NUMBA_CACHE_DIR`
 names, and refuses to work where it can write to none of these, as in a container that is read-only. There a folder
 for this process alone takes their place, with a copy of what the folder that cannot be written holds.
+
+Numba takes compiled code for current while its own file is: what that code has in it of other files may be of before.
+So compiled code beside the package goes when any file of the package has changed.
 """
 
 from __future__ import annotations
 
 import atexit
+import hashlib
 import os
 import shutil
 import sys
 import tempfile
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 VARIABLE = "NUMBA_CACHE_DIR"
+PACKAGE = Path(__file__).parents[1]
+# In the package's folder for compiled code: of which files that is.
+STAMP = "kernels-of"
 HINT = (
     f"compiled code cannot be kept, each run compiles anew: set {VARIABLE} to a folder that can be written, or to one "
     "that `lfpiv warm-up --cache` has filled"
@@ -30,6 +38,8 @@ def ensure_place() -> None:
     """Give this process a folder for compiled kernels where numba would find none, before any is asked for."""
     global lost
     given = os.environ.get(VARIABLE)
+    if not given:
+        forget_outdated(PACKAGE)
     if any(map(_is_writable, [Path(given)] if given else _numbas_places())):
         return
     place = tempfile.mkdtemp(prefix="lfpiv-kernels-")
@@ -38,6 +48,20 @@ def ensure_place() -> None:
     if given and not lost:
         shutil.copytree(given, place, dirs_exist_ok=True)
     use(Path(place))
+
+
+def forget_outdated(package: Path) -> None:
+    """Remove the compiled kernels beside a package's files if any of these has changed since; as far as allowed."""
+    files = sorted(package.rglob("*.py"))
+    told = "".join(f"{path.relative_to(package)} {os.stat(path).st_mtime_ns}\n" for path in files)
+    digest, stamp = hashlib.sha256(told.encode()).hexdigest(), package / "__pycache__" / STAMP
+    with suppress(OSError):
+        if stamp.is_file() and stamp.read_text(encoding="ascii") == digest:
+            return
+        for kernel in [*package.rglob("*.nbi"), *package.rglob("*.nbc")]:
+            kernel.unlink(missing_ok=True)
+        stamp.parent.mkdir(exist_ok=True)
+        stamp.write_text(digest, encoding="ascii")
 
 
 def use(place: Path) -> None:
@@ -49,10 +73,9 @@ def use(place: Path) -> None:
 
 def _numbas_places() -> Iterator[Path]:
     """Yield where numba keeps compiled code of its own accord: beside the source, then with the user."""
-    package = Path(__file__).parents[1]
-    yield package / "__pycache__"
+    yield PACKAGE / "__pycache__"
     if sys.platform == "win32":
-        yield Path(os.environ.get("LOCALAPPDATA", package))
+        yield Path(os.environ.get("LOCALAPPDATA", PACKAGE))
     elif sys.platform == "darwin":
         yield Path(os.path.expanduser("~/Library/Caches"))
     else:
