@@ -12,6 +12,7 @@ Axes: points (m, 3) and displacements in mm.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,7 +21,13 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from scipy.special import gammaincinv
 
-from lfpiv_cli.fields.likelihood import FEW_NEIGHBOURHOODS, POTENTIAL_SHARES, likeliest_structure, spacing_of
+from lfpiv_cli.fields.likelihood import (
+    FEW_NEIGHBOURHOODS,
+    NEIGHBOURHOODS,
+    POTENTIAL_SHARES,
+    likeliest_structure,
+    spacing_of,
+)
 from lfpiv_cli.fields.neighbourhood_equations import (
     Estimates,
     estimated,
@@ -134,9 +141,7 @@ def not_outliers(samples: Samples) -> NDArray[np.bool_]:
 
     What is told of each by a dozen others can be bent by one or two of them, not by what is wrong elsewhere.
     """
-    kept, _ = _first_without_outliers(samples, SHARES["free"][0])
-    structure = likeliest_structure(samples.subset(kept), SHARES["free"], FEW_NEIGHBOURHOODS)
-    return _without_outliers(samples, structure, kept, OUTLIER_ROUNDS)[0]
+    return _told(samples, SHARES["free"], FEW_NEIGHBOURHOODS)[1]
 
 
 def is_rough(samples: Samples) -> bool:
@@ -162,17 +167,22 @@ def kriged_field(samples: Samples, divergence: str) -> KrigedField:
     samples : with outliers among them
     divergence : "free": none; "penalised": as much as makes the samples clearly likelier; "off": components apart
     """
-    shares = SHARES[divergence]
-    kept, _ = _first_without_outliers(samples, shares[0])
-    structure = likeliest_structure(samples.subset(kept), shares)
-    kept, off_by = _without_outliers(samples, structure, kept, OUTLIER_ROUNDS)
+    structure, kept, off_by = _told(samples, SHARES[divergence], NEIGHBOURHOODS)
     return KrigedField(samples.subset(kept), structure, off_by, kept)
 
 
-def _first_without_outliers(samples: Samples, potential_share: float) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-    """Return what `_without_outliers` does, by a structure function that the outliers make too rough: far ones go."""
-    structure = likeliest_structure(samples, (potential_share,), FEW_NEIGHBOURHOODS)
-    return _without_outliers(samples, structure, np.ones(len(samples), dtype=bool), rounds=1)
+def _told(
+    samples: Samples, shares: Sequence[float], size: tuple[int, int]
+) -> tuple[VectorStructure, NDArray[np.bool_], NDArray[np.float64]]:
+    """Return the structure function that samples tell, which (n,) are no outliers, and how far off these are.
+
+    Outliers make a first structure function too rough: by it the far ones go. Shares and size are those of
+    `likeliest_structure`.
+    """
+    rough = likeliest_structure(samples, shares[:1], FEW_NEIGHBOURHOODS)
+    kept, _ = _without_outliers(samples, rough, np.ones(len(samples), dtype=bool), rounds=1)
+    structure = likeliest_structure(samples.subset(kept), shares, size)
+    return structure, *_without_outliers(samples, structure, kept, OUTLIER_ROUNDS)
 
 
 def _without_outliers(
