@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -21,6 +22,18 @@ def ended(*arguments: object) -> tuple[int, str]:
         message, code = outcome_of(error)
         return code, message
     return 0, ""
+
+
+def make_no_file(path: Path, kind: str) -> None:
+    """Put at a path what is no file of ours: nothing (`missing`), a `folder`, a `pipe`, an `empty` file or `text`."""
+    if kind == "folder":
+        path.mkdir()
+    elif kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "empty":
+        path.touch()
+    elif kind == "text":
+        path.write_text("hello")
 
 
 @contextmanager

@@ -31,7 +31,7 @@ from lfpiv_cli.files.vtkhdf import open_vectors, open_volume, read_header, write
 from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.reference import Reference
-from tests.hostile_files import edited
+from tests.hostile_files import edited, make_no_file
 
 ROOT = Path(__file__).parent.parent
 GRID = Grid.centred((4, 3, 2), (0.1, 0.2, 0.3), (1.0, 2.0, 3.0))
@@ -305,14 +305,7 @@ def test_hostile_hdf5_is_refused(tmp_path: Path, kind: str) -> None:
 @pytest.mark.parametrize("read", [read_image, count_pages, load_tree, open_volume, open_vectors])
 def test_what_is_no_file_is_refused_without_waiting(tmp_path: Path, kind: str, read: Callable) -> None:
     path = tmp_path / "input"
-    if kind == "folder":
-        path.mkdir()
-    elif kind == "pipe":
-        os.mkfifo(path)
-    elif kind == "empty":
-        path.touch()
-    elif kind == "text":
-        path.write_text("hello")
+    make_no_file(path, kind)
     assert refused(lambda: read(path), "input: ")
 
 

@@ -18,7 +18,7 @@ from lfpiv_cli.files.vtkhdf import open_vectors, open_volume, write_volume
 from lfpiv_cli.files.weights_file import FORMAT, VERSION
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.reference import FOCAL_POINT
-from tests.hostile_files import edited, ended
+from tests.hostile_files import edited, ended, make_no_file
 from tests.test_config import HOSTILE_TEXT, IMPOSSIBLE, RIG
 from tests.test_files import ABSURD_IMAGES, TIFF_KINDS
 from tests.test_image_faults import COLUMNS, ROWS, weights
@@ -50,12 +50,7 @@ COMMANDS = {
 @pytest.mark.parametrize("what", COMMANDS)
 def test_what_is_no_file_is_refused_by_each_command(tmp_path: Path, what: str, kind: str) -> None:
     path = tmp_path / "input.tif"
-    if kind == "folder":
-        path.mkdir()
-    elif kind == "pipe":
-        os.mkfifo(path)
-    elif kind == "empty":
-        path.touch()
+    make_no_file(path, kind)
     words = [str(word).format(input=path) for word in COMMANDS[what]]
     output = tmp_path / ("output.vtkhdf" if what in ("weights", "volumes", "particles", "vectors") else "output")
     words += [] if words[0] == "check" else ["-o", str(output)]

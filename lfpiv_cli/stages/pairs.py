@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,7 +48,7 @@ class PairBatchOptions(PairOptions, BatchOptions):
 Chosen = TypeVar("Chosen", bound=PairBatchOptions)
 
 
-class PairBatch(ByArguments, Generic[Chosen]):
+class PairBatch(ByArguments, ABC, Generic[Chosen]):
     """Results of volumes or files of particles that belong together: of two each, or of all."""
 
     def __init__(
@@ -76,9 +77,9 @@ class PairBatch(ByArguments, Generic[Chosen]):
         self.left_out: Sequence[Failure] = ()
         self._arrange(files, output, pairs)
 
+    @abstractmethod
     def _arrange(self, files: Sequence[Path], output: Path, pairs: Pairs | None) -> None:
         """Say which files each result is made of, and where it goes."""
-        raise NotImplementedError
 
     def _paired(self, files: Sequence[Path], pairs: Pairs | None) -> list[tuple[Path, Path]]:
         """Return the files of each pair; note what is to be said of them, and those without a partner."""
