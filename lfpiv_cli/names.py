@@ -21,7 +21,7 @@ Polarity = Literal["auto", "bright", "dark"]
 ColumnAxis = Literal["x", "y"]
 
 # The faces at which light is refracted; and how a round one faces the camera: bulging towards it, or hollow.
-SurfaceKind = Literal["plane", "tilted_plane", "cylinder", "sphere"]
+SurfaceKind = Literal["plane", "tilted_plane", "cylinder", "sphere", "height_map"]
 Facing = Literal["convex", "concave"]
 
 # Where the coordinates of volumes, vectors and points begin.

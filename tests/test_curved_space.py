@@ -15,7 +15,8 @@ from lfpiv_cli.optics.curved_space import CurvedSpace, Face
 from lfpiv_cli.optics.face_tracing import aim, trace_in
 from lfpiv_cli.optics.media import Media, Window, fluid_path_to_focus
 from lfpiv_cli.optics.object_space import ObjectSpace
-from lfpiv_cli.optics.surfaces import Cylinder, Plane, Sphere, Surface, TiltedPlane, Vector
+from lfpiv_cli.optics.shapes import Vector
+from lfpiv_cli.optics.surfaces import Cylinder, Plane, Sphere, Surface, TiltedPlane
 from lfpiv_cli.optics.tracing import disc_points, slopes_exact
 
 WATER = Media(1.0, 1.49, 1.33)

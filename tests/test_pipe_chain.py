@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tifffile
 
-from lfpiv_cli import open_vectors
+from lfpiv_cli import open_particles, open_vectors, open_weights
 from lfpiv_cli.cli import cli
 from lfpiv_cli.flow.field import MASKED
 
@@ -56,3 +57,35 @@ def test_a_pipes_flow_is_measured_through_its_walls(tmp_path: Path, name: str) -
     assert figures["vectors_missing"] == 0
     assert abs(figures["streamwise_mean_error"]) < 0.1
     assert figures["within_25_percent_streamwise"] > 0.7
+
+
+@pytest.mark.slow
+def test_a_pipes_wall_may_be_given_by_its_heights(tmp_path: Path) -> None:
+    """Frames, weights and found particles are those of the cylinder that the heights were taken from."""
+    y = np.arange(-48, 49) / 10.0
+    np.savetxt(tmp_path / "wall.csv", np.repeat(-np.sqrt(49.0 - y[:, np.newaxis] ** 2), 20, axis=1), delimiter=",")
+    rig, heights = small(tmp_path, "pipe", 0.3), tmp_path / "heights.yaml"
+    wall = "kind: cylinder, axis: x, radius_mm: 7.0, centre_mm: [0, 0, 0]"
+    text = rig.read_text().replace("columns: 1000, rows: 1000", "columns: 500, rows: 400")
+    text = text.replace("shape_xyz: [24, 32, 32]", "shape_xyz: [8, 10, 8]").replace("particles: 220", "particles: 5")
+    rig.write_text(text)
+    assert wall in text
+    heights.write_text(text.replace(wall, "kind: height_map, file: wall.csv, spacing_mm: [0.5, 0.1]"))
+    images, light, places = [], [], []
+    for config in (rig, heights):
+        folder = tmp_path / config.stem
+        run("simulate", "particles", config, "-o", folder)
+        run("build-weights", config, "-o", folder / "weights.h5")
+        images.append(tifffile.imread(folder / "pair_a.tif").astype(float))
+        weights = open_weights(folder / "weights.h5")
+        volume = np.zeros(weights.shape, np.float32)
+        volume[4, 5, 4] = 1000.0
+        light.append(weights.forward(volume))
+        found = folder / "found.vtkhdf"
+        run("reconstruct", folder / "weights.h5", folder / "pair_a.tif", "-o", found, "--solver", "particles")
+        places.append(open_particles(found).position_mm)
+    # slopes differ by 1e-9: hardly a ray strikes the neighbouring pixel, none moves by a nanometre
+    assert np.abs(images[1] - images[0]).sum() < 1e-3 * images[0].sum()
+    np.testing.assert_allclose(light[1], light[0], atol=1e-4 * light[0].max())
+    assert len(places[0]) > 3
+    np.testing.assert_allclose(places[1], places[0], atol=1e-3)

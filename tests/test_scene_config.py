@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import get_args
 
+import numpy as np
 import pytest
+import tifffile
 
 from lfpiv_cli.console import CONSOLE
-from lfpiv_cli.errors import ConfigError
+from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.files.config import Config, load_config
+from lfpiv_cli.files.heights import read_heights
 from lfpiv_cli.files.sections_scene import FaceSection
 from lfpiv_cli.interface.particles import searchable
 from lfpiv_cli.interface.planning import bench_of
 from lfpiv_cli.interface.weights import plan_of, ray_source, weights_of
 from lfpiv_cli.names import SurfaceKind
 from lfpiv_cli.optics.curved_space import CurvedSpace, Face
+from lfpiv_cli.optics.height_map import HeightMap
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.optics.object_space import ObjectSpace
@@ -83,6 +88,87 @@ def test_rays_through_a_scene_are_exact_and_need_no_window(configured: Callable[
     config = configured(RIG + TUBE + f"weights: {{{weights}}}\n")
     assert isinstance(config.object_space(), CurvedSpace)
     assert config.refraction() == "exact"
+
+
+HEIGHTS = np.array([[-8.0, -7.75, -7.5, -7.75, -8.0]] * 4)
+MOULD = "scene:\n  - {kind: height_map, file: mould/FILE, spacing_mm: [2, 3], centre_mm: [0, 0, 1], behind: window}\n"
+
+
+def written_heights(folder: Path, file: str) -> Path:
+    """Write the heights in a folder beside the rig file, each format as people have it."""
+    path = folder / "mould" / file
+    path.parent.mkdir()
+    if file.endswith(".npy"):
+        np.save(path, HEIGHTS)
+    elif file.endswith(".tif"):
+        tifffile.imwrite(path, HEIGHTS.astype(np.float32))
+    else:
+        np.savetxt(
+            path, HEIGHTS + 1e-14, delimiter=", " if file.endswith(".csv") else "\t", header="mm from the flange"
+        )
+    return path
+
+
+@pytest.mark.parametrize("file", ["heights.csv", "heights.txt", "heights.npy", "heights.tif"])
+def test_heights_are_read_from_a_file_beside_the_rig_and_become_part_of_it(
+    configured: Callable[[str], Config], tmp_path: Path, file: str
+) -> None:
+    path = written_heights(tmp_path, file)
+    config = configured(RIG + MOULD.replace("FILE", file) + TUBE.replace("scene:\n", "").split("\n", 1)[1])
+    rows = tuple(map(tuple, HEIGHTS.tolist()))
+    expected = (
+        Face(HeightMap(rows, (2.0, 3.0), (0.0, 0.0, 1.0)), 1.49),
+        Face(Cylinder((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 5.0), 1.33),
+    )
+    assert config.object_space() == CurvedSpace(WATER, expected)
+    # as files carry it, wherever the heights have gone
+    path.unlink()
+    again = Config.from_resolved(json.loads(json.dumps(config.resolved(), allow_nan=False)))
+    assert again.object_space() == CurvedSpace(WATER, expected)
+    assert "mould" not in json.dumps(config.resolved())
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "words"),
+    [
+        ("a.csv", None, ":9:30: scene[0].file: {path}: no such file"),
+        ("a.csv", b"1, 2\n3, x", "scene[0].file: {path}: line 2: could not convert string to float: 'x'"),
+        ("a.csv", b"# nothing", "scene[0]: 0 rows of no heights are no grid"),
+        ("a.csv", b"1 2 3 4\n1 2 3\n1 2 3 4\n1 2 3 4", "scene[0]: 4 rows of 3 or 4 heights are no grid"),
+        (
+            "a.csv",
+            b"1;2;3;4\n" * 3 + b"1;2;nan;4",
+            "scene[0].file: {path}: 1 heights are no numbers, the first one in row 4, column 3",
+        ),
+        ("a.csv", b"1 " * 20_000, "scene[0].file: {path}: holds 20000 heights or more, expected at most 16384"),
+        ("a.npy", b"no array", "scene[0].file: {path}: is no NumPy array"),
+        ("a.tif", b"no image", "scene[0].file: {path}: "),
+    ],
+)
+def test_what_is_no_file_of_heights_is_named(
+    configured: Callable[[str], Config], tmp_path: Path, file: str, content: bytes | None, words: str
+) -> None:
+    path = tmp_path / "mould" / file
+    path.parent.mkdir()
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(ConfigError) as refused:
+        configured(RIG + MOULD.replace("FILE", file) + TUBE.replace("scene:\n", "").split("\n", 1)[1])
+    assert words.format(path=path) in str(refused.value)
+    assert len(str(refused.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize(("shape", "kind"), [((4,), "f8"), ((3, 4, 5), "f8"), ((4, 4), "c16"), ((200, 200), "f4")])
+def test_arrays_that_are_no_heights_are_named(tmp_path: Path, shape: tuple[int, ...], kind: str) -> None:
+    np.save(tmp_path / "a.npy", np.zeros(shape, kind))
+    with pytest.raises(InputError, match="expected numbers \\(rows, columns\\)|holds 40000 heights"):
+        read_heights(tmp_path / "a.npy")
+
+
+@pytest.mark.parametrize("keys", ["", "file: a.csv, heights_mm: [[1, 2], [3, 4]], "])
+def test_heights_are_given_once(configured: Callable[[str], Config], keys: str) -> None:
+    with pytest.raises(ConfigError, match=r"scene\[0\]: expected a file of heights, or heights_mm, and not both"):
+        configured(RIG + MOULD.replace("file: mould/FILE, ", keys).replace("behind: window", "behind: fluid"))
 
 
 def test_weights_are_made_through_a_scene(configured: Callable[[str], Config]) -> None:

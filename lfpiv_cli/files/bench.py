@@ -127,12 +127,21 @@ def media_of(section: MediaSection) -> Media:
 
 
 def face_of(section: FaceSection, media: Media) -> Face:
-    """Return a face: its surface, and the index behind it."""
+    """Return a face: its surface, and the index behind it.
+
+    Raises
+    ------
+    ConfigError : heights that are no grid
+    """
     parameters = parameters_of(section)
     if isinstance(parameters.get("axis"), str):
         parameters["axis"] = DIRECTIONS[parameters["axis"]]
-    behind = getattr(media, section.behind) if isinstance(section.behind, str) else section.behind
-    return Face(SURFACES[section.kind](**parameters), behind)
+    return Face(SURFACES[section.kind](**parameters), index_behind(section, media))
+
+
+def index_behind(section: FaceSection, media: Media) -> float:
+    """Return the refractive index behind a face."""
+    return getattr(media, section.behind) if isinstance(section.behind, str) else section.behind
 
 
 def scene_of(sections: Sequence[FaceSection], media: Media) -> CurvedSpace:

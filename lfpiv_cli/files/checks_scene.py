@@ -6,9 +6,9 @@ import math
 from collections.abc import Iterator
 
 from lfpiv_cli.errors import ConfigError
-from lfpiv_cli.files.bench import camera_of, face_of, media_of, missing_for_camera, scene_of
+from lfpiv_cli.files.bench import camera_of, face_of, index_behind, media_of, missing_for_camera, scene_of
 from lfpiv_cli.files.sections import Sections
-from lfpiv_cli.files.sections_scene import CylinderFace
+from lfpiv_cli.files.sections_scene import CylinderFace, HeightMapFace
 from lfpiv_cli.files.yaml_nodes import KeyPath
 
 Found = Iterator[tuple[KeyPath, str]]
@@ -30,11 +30,15 @@ def scene_faults(sections: Sections) -> Found:
         return
     media = media_of(sections.media)
     last = len(scene) - 1
-    if face_of(scene[last], media).index != media.fluid:
+    if index_behind(scene[last], media) != media.fluid:
         yield ("scene", last, "behind"), f"is {scene[last].behind}, expected fluid behind the last face"
         return
     missed = False
     for k, section in enumerate(scene):
+        if isinstance(section, HeightMapFace) and (section.file is None) == (section.heights_mm is None):
+            yield ("scene", k), "expected a file of heights, or heights_mm, and not both"
+            missed = True
+            continue
         try:
             face_of(section, media).surface.shape()
         except ConfigError as error:

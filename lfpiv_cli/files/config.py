@@ -18,6 +18,7 @@ from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.files import bench
 from lfpiv_cli.files.checks import contradictions
 from lfpiv_cli.files.config_problems import place_of, problem_of, report, sentence
+from lfpiv_cli.files.heights import with_heights
 from lfpiv_cli.files.inputs import content_of, ensure_regular_file
 from lfpiv_cli.files.sections import (
     BoardSection,
@@ -358,7 +359,7 @@ class Config:
 
 
 def load_config(path: Path) -> Config:
-    """Read a configuration.
+    """Read a configuration, and the heights of faces in files beside it.
 
     Raises
     ------
@@ -375,7 +376,7 @@ def load_config(path: Path) -> Config:
         document = read_document(content)
     except YamlError as error:
         raise ConfigError(sentence(str(path), error.problem)) from error
-    return _validated(document, str(path))
+    return _validated(with_heights(document, path), str(path))
 
 
 def carried_config(record: Mapping[str, Any], source: Path | str) -> Config:

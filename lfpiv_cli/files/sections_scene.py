@@ -63,9 +63,27 @@ class SphereFace(Section):
     behind: Behind
 
 
-FaceSection = Annotated[PlaneFace | TiltedPlaneFace | CylinderFace | SphereFace, Field(discriminator="kind")]
+class HeightMapFace(Section):
+    """A smooth surface through heights on a grid in a file: text, .npy or .tif, rows along y of heights along x, in mm.
+
+    The file's folder is the rig file's; results carry heights_mm in its place. spacing_mm (x, y) lies between heights;
+    centre_mm is the grid's middle, from whose z they count away from the camera. behind as of every face.
+    """
+
+    kind: Literal["height_map"]
+    file: str | None = None
+    heights_mm: tuple[tuple[float, ...], ...] | None = None
+    spacing_mm: tuple[Positive, Positive]
+    centre_mm: Vector = (0.0, 0.0, 0.0)
+    behind: Behind
+
+
+FaceSection = Annotated[
+    PlaneFace | TiltedPlaneFace | CylinderFace | SphereFace | HeightMapFace, Field(discriminator="kind")
+]
 
 
 def parameters_of(face: FaceSection) -> dict[str, Any]:
     """Return what the surface of a face is made of, by the names that `optics.surfaces` has."""
-    return {name: getattr(face, name) for name in type(face).model_fields if name not in ("kind", "behind")}
+    others = ("kind", "behind", "file")
+    return {name: getattr(face, name) for name in type(face).model_fields if name not in others}

@@ -145,11 +145,17 @@ def _face(tree: dict[str, Any]) -> Face:
 
 
 def _of_surface(name: str, value: Any) -> Any:
-    """Return a number, a point or a word that a surface has."""
+    """Return a number, a point, heights or a word that a surface has."""
     if name == "facing":
         if value not in names_in(Facing):
             raise ValueError(f"facing is {value!r}, expected one of {', '.join(names_in(Facing))}")
         return value
+    if name == "heights_mm":
+        heights = _array(name, {name: value}, np.shape(value) if np.ndim(value) == 2 else (0, 0))
+        return tuple(tuple(row) for row in heights.tolist())
+    if name == "spacing_mm":
+        x, y = _array(name, {name: value}, (2,)).tolist()
+        return _positive(name, x), _positive(name, y)
     if isinstance(value, np.ndarray):
         return _triple(name, value, _number)
     return _positive(name, value) if name == "radius_mm" else _number(name, value)

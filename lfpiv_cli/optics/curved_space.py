@@ -34,8 +34,10 @@ from numpy.typing import ArrayLike, NDArray
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.face_tracing import aim_all, pencils, trace_all_in, trace_all_out
+from lfpiv_cli.optics.height_map import Reliefs, reliefs_of, turned
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.optics.surfaces import Faces, Shape, Surface
+from lfpiv_cli.optics.shapes import Shape
+from lfpiv_cli.optics.surfaces import Faces, Surface
 
 
 @dataclass(frozen=True)
@@ -137,6 +139,7 @@ class CurvedSpace:
             axes=camera.to_image_axes([shape.axis for shape in shapes]),
             curvatures_per_mm=np.array([shape.curvature_per_mm for shape in shapes]),
             ratios=indices[:-1] / indices[1:],
+            reliefs=_reliefs(shapes, camera),
         )
 
     def distance(self, camera: Camera, z_mm: ArrayLike) -> NDArray[np.float64]:
@@ -189,6 +192,16 @@ class CurvedSpace:
         slopes, growth, valid = pencils(self.for_kernels(camera), _rows(points_mm, 3))
         distance = 1.0 / growth[:, [0, 1], [0, 1]]
         return Equivalent(-slopes * distance, distance, valid)
+
+
+def _reliefs(shapes: tuple[Shape, ...], camera: Camera) -> Reliefs | None:
+    """Return the heights of those faces that are given by them, in image axes; None where none is."""
+    reliefs = [shape.relief for shape in shapes]
+    if not any(reliefs):
+        return None
+    if camera.column_axis == "y":
+        reliefs = [None if relief is None else turned(relief) for relief in reliefs]
+    return reliefs_of(reliefs)
 
 
 def _rows(values: ArrayLike, columns: int) -> NDArray[np.float64]:

@@ -16,17 +16,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from lfpiv_cli.optics.surfaces import (
-    Faces,
-    Vector,
-    dot,
-    height_behind,
-    meet,
-    normal_change,
-    plus,
-    row,
-    scaled,
-)
+from lfpiv_cli.optics.shapes import Vector, dot, plus, row, scaled
+from lfpiv_cli.optics.surfaces import Faces, height_behind, meet, normal_change
 from lfpiv_cli.threads import COUNT_NO_REFERENCES
 
 # What a point may lie in front of the face that it touches, and a path go backwards, by rounding.
@@ -114,6 +105,7 @@ def _neighbour(
     shift: Vector,
     turn: Vector,
     path: float,
+    place: Vector,
     direction: Vector,
     normal: Vector,
     cosine: float,
@@ -124,12 +116,13 @@ def _neighbour(
     Parameters
     ----------
     shift, turn : how its point and direction differ before the face
-    path, direction, normal, cosine, cosine_behind : of the ray itself, the direction in front of the face
+    path, place, direction, normal, cosine, cosine_behind : of the ray itself: how far it went to which place on the
+        face, its direction in front of it, and what it met there
     """
     ratio = faces.ratios[k]
     shift = plus(shift, path, turn)
     shift = plus(shift, -dot(normal, shift) / cosine, direction)
-    tilt = normal_change(faces, k, shift)
+    tilt = normal_change(faces, k, place, shift)
     cosine_change = dot(tilt, direction) + dot(normal, turn)
     bend_change = ratio * (ratio * cosine / cosine_behind - 1.0) * cosine_change
     turned = plus(plus(scaled(ratio, turn), bend_change, normal), cosine_behind - ratio * cosine, tilt)
@@ -164,8 +157,12 @@ def trace_pencil(
         behind, cosine_behind = refracted(direction, normal, cosine, faces.ratios[k])
         if cosine_behind == 0.0 or behind[2] <= 0.0:
             return point, direction, first, second, False
-        first, first_turn = _neighbour(faces, k, first, first_turn, path, direction, normal, cosine, cosine_behind)
-        second, second_turn = _neighbour(faces, k, second, second_turn, path, direction, normal, cosine, cosine_behind)
+        first, first_turn = _neighbour(
+            faces, k, first, first_turn, path, point, direction, normal, cosine, cosine_behind
+        )
+        second, second_turn = _neighbour(
+            faces, k, second, second_turn, path, point, direction, normal, cosine, cosine_behind
+        )
         direction = behind
     path = (z - point[2]) / direction[2]
     first, second = plus(first, path, first_turn), plus(second, path, second_turn)

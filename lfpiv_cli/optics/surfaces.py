@@ -12,13 +12,13 @@ with n the unit normal at v away from the camera, k the curvature (0 of a plane,
 towards the camera) and a the unit vector along a cylinder's axis (0 of a sphere). F is negative in front of the surface
 and positive behind it; on the surface its gradient is the unit normal, and along a ray of unit direction its derivative
 there is the cosine of incidence, which the quadratic equation of the crossing gives with the crossing itself.
+Surfaces given by their heights are of another form (`height_map`).
 
 A new kind is one dataclass with `shape` and one line of `SURFACES`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -28,28 +28,9 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.names import Facing, SurfaceKind
+from lfpiv_cli.optics.height_map import HeightMap, Reliefs, height_at, meet_heights, normal_change_of_heights
+from lfpiv_cli.optics.shapes import NO_AXIS, Shape, Vector, dot, plus, row, scaled, unit
 from lfpiv_cli.threads import COUNT_NO_REFERENCES
-
-Vector = tuple[float, float, float]
-
-NO_AXIS: Vector = (0.0, 0.0, 0.0)
-
-
-class Shape(NamedTuple):
-    """A surface near the optical axis, world axes.
-
-    Attributes
-    ----------
-    vertex_mm : v, where the optical axis meets it
-    normal : n there, unit, away from the camera
-    axis : a, unit along a cylinder's axis, else 0
-    curvature_per_mm : k, negative where the surface bulges towards the camera
-    """
-
-    vertex_mm: Vector
-    normal: Vector
-    axis: Vector
-    curvature_per_mm: float
 
 
 class Surface(Protocol):
@@ -156,6 +137,7 @@ SURFACES: dict[SurfaceKind, type[Surface]] = {
     "tilted_plane": TiltedPlane,
     "cylinder": Cylinder,
     "sphere": Sphere,
+    "height_map": HeightMap,
 }
 
 
@@ -175,37 +157,6 @@ def _round_shape(centre: Vector, axis: Vector, radius: float, facing: Facing, na
     return Shape(vertex, scaled(side / radius, outwards), axis, side / radius)
 
 
-def unit(direction: Sequence[float], name: str) -> Vector:
-    """Return a direction with length 1.
-
-    Raises
-    ------
-    ConfigError : it has none
-    """
-    length = float(np.linalg.norm(direction))
-    if not length > 0.0:
-        raise ConfigError(f"{name} is {list(direction)}, expected a direction")
-    return direction[0] / length, direction[1] / length, direction[2] / length
-
-
-@njit(cache=True, **COUNT_NO_REFERENCES)
-def dot(a: Vector, b: Vector) -> float:
-    """Return the scalar product."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@njit(cache=True, **COUNT_NO_REFERENCES)
-def plus(a: Vector, factor: float, b: Vector) -> Vector:
-    """Return a + factor b."""
-    return a[0] + factor * b[0], a[1] + factor * b[1], a[2] + factor * b[2]
-
-
-@njit(cache=True, **COUNT_NO_REFERENCES)
-def scaled(factor: float, a: Vector) -> Vector:
-    """Return factor a."""
-    return factor * a[0], factor * a[1], factor * a[2]
-
-
 class Faces(NamedTuple):
     """The refracting faces from the lens on as compiled kernels take them, image axes.
 
@@ -216,6 +167,7 @@ class Faces(NamedTuple):
         through planes at the vertices
     vertices_mm, normals, axes : (m, 3), and curvatures_per_mm : (m,), see `Shape`
     ratios : (m,) refractive index in front of each face over that behind it
+    reliefs : the heights of those faces that are given by them; None where none is, and kernels are compiled without
     """
 
     lens_z_mm: float
@@ -226,12 +178,7 @@ class Faces(NamedTuple):
     axes: NDArray[np.float64]
     curvatures_per_mm: NDArray[np.float64]
     ratios: NDArray[np.float64]
-
-
-@njit(cache=True, **COUNT_NO_REFERENCES)
-def row(rows: NDArray[np.float64], k: int) -> Vector:
-    """Return row k of an array (n, 3)."""
-    return rows[k, 0], rows[k, 1], rows[k, 2]
+    reliefs: Reliefs | None = None
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
@@ -241,6 +188,58 @@ def meet(faces: Faces, k: int, point: Vector, direction: Vector) -> tuple[float,
     Of the crossings the one where the line goes from in front of the face to behind it. The direction has length 1 and
     points away from the camera. The cosine is 0 where the line misses the face.
     """
+    return _meet(faces.reliefs, faces, k, point, direction)
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def normal_change(faces: Faces, k: int, place: Vector, shift: Vector) -> Vector:
+    """Return how the unit normal of face k changes with a small shift along the face from a place on it."""
+    return _normal_change(faces.reliefs, faces, k, place, shift)
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def height_behind(faces: Faces, k: int, point: Vector) -> float:
+    """Return F, in mm near the face: positive behind face k, negative in front of it."""
+    return _height_behind(faces.reliefs, faces, k, point)
+
+
+# The functions below take the heights as an argument of their own: where it is None, the compiler leaves out what
+# follows the question, and other faces are met as fast as if there were no heights.
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def _meet(
+    reliefs: Reliefs | None, faces: Faces, k: int, point: Vector, direction: Vector
+) -> tuple[float, Vector, float]:
+    if reliefs is None:
+        return _meet_round(faces, k, point, direction)
+    if reliefs.starts[k] < 0:
+        return _meet_round(faces, k, point, direction)
+    return meet_heights(reliefs, k, faces.vertices_mm[k, 2], point, direction)
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def _normal_change(reliefs: Reliefs | None, faces: Faces, k: int, place: Vector, shift: Vector) -> Vector:
+    if reliefs is None:
+        return _normal_change_round(faces, k, shift)
+    if reliefs.starts[k] < 0:
+        return _normal_change_round(faces, k, shift)
+    return normal_change_of_heights(reliefs, k, place, shift)
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def _height_behind(reliefs: Reliefs | None, faces: Faces, k: int, point: Vector) -> float:
+    if reliefs is None:
+        return _height_behind_round(faces, k, point)
+    if reliefs.starts[k] < 0:
+        return _height_behind_round(faces, k, point)
+    z, _, _, _, _, _, on_grid = height_at(reliefs, k, point[0], point[1])
+    return point[2] - z if on_grid else -np.inf
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def _meet_round(faces: Faces, k: int, point: Vector, direction: Vector) -> tuple[float, Vector, float]:
+    """Return `meet` of a plane, cylinder or sphere."""
     vertex, axis, curvature = row(faces.vertices_mm, k), row(faces.axes, k), faces.curvatures_per_mm[k]
     # From the point at the vertex's depth on: seen from as far as the lens the crossing would lose digits.
     ahead = (vertex[2] - point[2]) / direction[2]
@@ -261,15 +260,15 @@ def meet(faces: Faces, k: int, point: Vector, direction: Vector) -> tuple[float,
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def normal_change(faces: Faces, k: int, shift: Vector) -> Vector:
-    """Return how the unit normal of face k changes with a small shift along the face."""
+def _normal_change_round(faces: Faces, k: int, shift: Vector) -> Vector:
+    """Return `normal_change` of a plane, cylinder or sphere, the same all along its lines of curvature."""
     axis = row(faces.axes, k)
     return scaled(faces.curvatures_per_mm[k], plus(shift, -dot(axis, shift), axis))
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def height_behind(faces: Faces, k: int, point: Vector) -> float:
-    """Return F, in mm near the face: positive behind face k, negative in front of it."""
+def _height_behind_round(faces: Faces, k: int, point: Vector) -> float:
+    """Return `height_behind` of a plane, cylinder or sphere."""
     axis = row(faces.axes, k)
     offset = plus(point, -1.0, row(faces.vertices_mm, k))
     along_axis = dot(axis, offset)

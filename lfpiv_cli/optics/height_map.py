@@ -1,0 +1,192 @@
+"""Surfaces given by their heights on a regular grid: lenses, moulds, blades.
+
+Between the nodes the height is a bicubic spline, whose slopes and curvatures are continuous, as Newton's iteration for
+rays needs them. A line p + t d meets it where z(x, y) = z, by Newton's iteration in t; there, with the slopes z_x and
+z_y, the normal away from the camera is (-z_x, -z_y, 1) / sqrt(1 + z_x^2 + z_y^2).
+
+Axes: z away from the camera, mm; world axes of a `HeightMap`, image axes of `Reliefs`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from lfpiv_cli.errors import ConfigError
+from lfpiv_cli.optics.shapes import NO_AXIS, Relief, Shape, Vector, dot, plus, scaled, unit
+from lfpiv_cli.threads import COUNT_NO_REFERENCES
+
+# Of a cubic spline along each axis whose ends are as smooth as its middle.
+FEWEST_NODES = 4
+# Newton's iteration converges quadratically: after a step of this length a line is on the surface to 1e-14 mm. It takes
+# three to five; the limit guards against lines that graze.
+CLOSE_MM = 1e-8
+MOST_STEPS = 30
+
+# The height, its two slopes, its second derivatives (xx, xy, yy), and whether the place is on the grid.
+Height = tuple[float, float, float, float, float, float, bool]
+
+
+@dataclass(frozen=True)
+class HeightMap:
+    """A smooth surface through heights on a regular grid; beyond the grid there is none.
+
+    Attributes
+    ----------
+    heights_mm : rows along y of heights along x, away from the camera from centre_mm
+    spacing_mm : between nodes along x and y
+    centre_mm : of the grid, of height 0
+
+    Raises
+    ------
+    ConfigError : rows of different length, or too few heights
+    """
+
+    heights_mm: tuple[tuple[float, ...], ...]
+    spacing_mm: tuple[float, float]
+    centre_mm: Vector = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        """Refuse what is no grid."""
+        lengths = {len(row) for row in self.heights_mm}
+        if len(lengths) != 1 or min(len(self.heights_mm), *lengths) < FEWEST_NODES:
+            raise ConfigError(
+                f"{len(self.heights_mm)} rows of {' or '.join(map(str, sorted(lengths))) or 'no'} heights are no grid; "
+                f"expected rows of the same length, and {FEWEST_NODES} or more heights along each axis"
+            )
+
+    @cached_property
+    def relief(self) -> Relief:
+        """The spline through the heights."""
+        heights, step = np.array(self.heights_mm, dtype=np.float64), np.array(self.spacing_mm)
+        rows, columns = (np.arange(length, dtype=np.float64) for length in heights.shape)
+        along_y = CubicSpline(rows, heights + self.centre_mm[2], axis=0).c[::-1]
+        # Powers of x, cells along x, powers of y, cells along y.
+        along_both = CubicSpline(columns, along_y, axis=2).c[::-1]
+        first = np.array(self.centre_mm[:2]) - 0.5 * (np.array(heights.shape[::-1]) - 1) * step
+        return Relief(first, step, np.ascontiguousarray(along_both.transpose(3, 1, 2, 0)))
+
+    def shape(self) -> Shape:
+        """Return the surface near the optical axis, with its heights.
+
+        Raises
+        ------
+        ConfigError : the optical axis goes past the grid
+        """
+        z, slope_x, slope_y, _, _, _, on_grid = height_at(reliefs_of([self.relief]), 0, 0.0, 0.0)
+        if not on_grid:
+            raise ConfigError(f"the optical axis goes past the grid of heights about {list(self.centre_mm)}")
+        return Shape((0.0, 0.0, z), unit((-slope_x, -slope_y, 1.0), "normal"), NO_AXIS, 0.0, self.relief)
+
+
+class Reliefs(NamedTuple):
+    """The heights of all faces that are given by them, as compiled kernels take them.
+
+    Attributes
+    ----------
+    starts : (m,) of each face, where its coefficients begin; -1 where it has no heights
+    cells : (m, 2) along x and y
+    firsts_mm, steps_mm : (m, 2), see `Relief`
+    coefficients : of all, flat
+    """
+
+    starts: NDArray[np.int64]
+    cells: NDArray[np.int64]
+    firsts_mm: NDArray[np.float64]
+    steps_mm: NDArray[np.float64]
+    coefficients: NDArray[np.float64]
+
+
+def turned(relief: Relief) -> Relief:
+    """Return heights with x and y exchanged."""
+    return Relief(relief.first_mm[::-1], relief.step_mm[::-1], relief.coefficients.transpose(1, 0, 3, 2))
+
+
+def reliefs_of(reliefs: Sequence[Relief | None]) -> Reliefs:
+    """Return the heights of faces, None where a face has none, for kernels."""
+    count = len(reliefs)
+    starts, cells = np.full(count, -1), np.zeros((count, 2), np.int64)
+    firsts, steps = np.zeros((count, 2)), np.ones((count, 2))
+    flat: list[NDArray[np.float64]] = []
+    for k, relief in enumerate(reliefs):
+        if relief is not None:
+            starts[k] = sum(part.size for part in flat)
+            cells[k] = relief.coefficients.shape[1::-1]
+            firsts[k], steps[k] = relief.first_mm, relief.step_mm
+            flat.append(relief.coefficients.ravel())
+    return Reliefs(starts, cells, firsts, steps, np.concatenate(flat))
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def height_at(reliefs: Reliefs, k: int, x: float, y: float) -> Height:
+    """Return the height of face k at (x, y), with its derivatives; beyond the grid its outermost cell goes on."""
+    u = (x - reliefs.firsts_mm[k, 0]) / reliefs.steps_mm[k, 0]
+    v = (y - reliefs.firsts_mm[k, 1]) / reliefs.steps_mm[k, 1]
+    wide, high = reliefs.cells[k, 0], reliefs.cells[k, 1]
+    on_grid = 0.0 <= u <= wide and 0.0 <= v <= high
+    column = int(min(max(np.floor(u), 0.0), wide - 1.0))
+    row = int(min(max(np.floor(v), 0.0), high - 1.0))
+    u -= column
+    v -= row
+    start = reliefs.starts[k] + 16 * (row * wide + column)
+    z, z_u, z_v, z_uu, z_uv, z_vv = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    # Horner's rule along v over polynomials of u.
+    for power in range(3, -1, -1):
+        place = start + 4 * power
+        a, b = reliefs.coefficients[place], reliefs.coefficients[place + 1]
+        c, d = reliefs.coefficients[place + 2], reliefs.coefficients[place + 3]
+        z_vv = 2.0 * z_v + v * z_vv
+        z_uv = z_u + v * z_uv
+        z_v = z + v * z_v
+        z = a + u * (b + u * (c + u * d)) + v * z
+        z_u = b + u * (2.0 * c + 3.0 * u * d) + v * z_u
+        z_uu = 2.0 * c + 6.0 * u * d + v * z_uu
+    step_x, step_y = reliefs.steps_mm[k, 0], reliefs.steps_mm[k, 1]
+    return (
+        z,
+        z_u / step_x,
+        z_v / step_y,
+        z_uu / (step_x * step_x),
+        z_uv / (step_x * step_y),
+        z_vv / (step_y * step_y),
+        on_grid,
+    )
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def meet_heights(
+    reliefs: Reliefs, k: int, vertex_z: float, point: Vector, direction: Vector
+) -> tuple[float, Vector, float]:
+    """Return `surfaces.meet` of a face that is given by its heights; Newton's iteration from the vertex's depth on."""
+    path = (vertex_z - point[2]) / direction[2]
+    normal = (0.0, 0.0, 1.0)
+    for _ in range(MOST_STEPS):
+        place = plus(point, path, direction)
+        z, slope_x, slope_y, _, _, _, on_grid = height_at(reliefs, k, place[0], place[1])
+        normal = (-slope_x, -slope_y, 1.0)
+        rise = dot(normal, direction)
+        if not rise > 0.0:
+            return 0.0, normal, 0.0
+        step = (z - place[2]) / rise
+        path += step
+        if abs(step) <= CLOSE_MM:
+            shortening = 1.0 / np.sqrt(dot(normal, normal))
+            return path, scaled(shortening, normal), rise * shortening if on_grid else 0.0
+    return 0.0, normal, 0.0
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def normal_change_of_heights(reliefs: Reliefs, k: int, place: Vector, shift: Vector) -> Vector:
+    """Return `surfaces.normal_change` of a face that is given by its heights."""
+    _, slope_x, slope_y, xx, xy, yy, _ = height_at(reliefs, k, place[0], place[1])
+    shortening = 1.0 / np.sqrt(1.0 + slope_x * slope_x + slope_y * slope_y)
+    normal = (-slope_x * shortening, -slope_y * shortening, shortening)
+    turn = (-shortening * (xx * shift[0] + xy * shift[1]), -shortening * (xy * shift[0] + yy * shift[1]), 0.0)
+    return plus(turn, -dot(normal, turn), normal)
