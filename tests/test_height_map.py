@@ -103,7 +103,8 @@ def test_rays_are_those_of_the_surface_that_heights_were_taken_from(
         found, seen = space.slopes(camera, points, crossing)
         assert seen.all()
         off.append(np.abs(found - expected).max())
-    # 0.2 um of a tracer's place, seen from 200 mm, by rays where the sphere is steep; and roughly 2^3: by chance, rays fall elsewhere in their cells
+    # 0.2 um of a tracer's place, seen from 200 mm, where the sphere is steep; and roughly 2^3: by chance, rays fall
+    # elsewhere in their cells
     assert off[0] < 1e-6
     assert off[1] < off[0] / 5.0
 
