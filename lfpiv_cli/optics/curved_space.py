@@ -33,9 +33,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.optics.camera import Camera
-from lfpiv_cli.optics.face_tracing import aim_all, pencils, trace_all_in, trace_all_out
 from lfpiv_cli.optics.height_map import Reliefs, reliefs_of, turned
 from lfpiv_cli.optics.media import Media
+from lfpiv_cli.optics.ray_bundles import aim_all, pencils, trace_all_in, trace_all_out
 from lfpiv_cli.optics.shapes import Shape
 from lfpiv_cli.optics.surfaces import Faces, Surface
 
@@ -134,9 +134,9 @@ class CurvedSpace:
             lens_z_mm=self.lens_z_mm(camera),
             focus_distance_mm=camera.focus_distance_mm,
             depth_ratio=self.media.depth_ratio,
-            vertices_mm=camera.to_image_axes([shape.vertex_mm for shape in shapes]),
-            normals=camera.to_image_axes([shape.normal for shape in shapes]),
-            axes=camera.to_image_axes([shape.axis for shape in shapes]),
+            vertices_mm=_rows(camera.to_image_axes([shape.vertex_mm for shape in shapes]), 3),
+            normals=_rows(camera.to_image_axes([shape.normal for shape in shapes]), 3),
+            axes=_rows(camera.to_image_axes([shape.axis for shape in shapes]), 3),
             curvatures_per_mm=np.array([shape.curvature_per_mm for shape in shapes]),
             ratios=indices[:-1] / indices[1:],
             reliefs=_reliefs(shapes, camera),

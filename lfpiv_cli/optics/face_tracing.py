@@ -14,14 +14,12 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from lfpiv_cli.optics.shapes import Vector, dot, plus, row, scaled
+from lfpiv_cli.optics.shapes import Vector, dot, plus, scaled
 from lfpiv_cli.optics.surfaces import Faces, height_behind, meet, normal_change
+from lfpiv_cli.simd.faces import ROUNDING_MM
 from lfpiv_cli.threads import COUNT_NO_REFERENCES
 
-# What a point may lie in front of the face that it touches, and a path go backwards, by rounding.
-ROUNDING_MM = 1e-9
 # Newton's iteration for the ray through a point converges quadratically: from this near a last step reaches 1e-13 mm.
 CLOSE_MM = 1e-6
 # It takes four steps, ten close to where light grazes; the limit guards against points that no ray reaches.
@@ -210,70 +208,3 @@ def aim(faces: Faces, x: float, y: float, z: float, X: float, Y: float) -> Place
         if missed <= CLOSE_MM:
             return slope_x + step_x, slope_y + step_y, True
     return NOWHERE
-
-
-@njit(cache=True)
-def trace_all_in(
-    faces: Faces, crossing: NDArray[np.float64], slopes: NDArray[np.float64], z: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Return `trace_in` of each ray: places (n, 2) and whether they are valid (n,)."""
-    places, valid = np.empty((len(z), 2)), np.empty(len(z), dtype=np.bool_)
-    for i in range(len(z)):
-        places[i, 0], places[i, 1], valid[i] = trace_in(
-            faces, crossing[i, 0], crossing[i, 1], slopes[i, 0], slopes[i, 1], z[i]
-        )
-    return places, valid
-
-
-@njit(cache=True)
-def trace_all_out(
-    faces: Faces, points: NDArray[np.float64], directions: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-    """Return `trace_out` of each ray: crossings (n, 2), slopes (n, 2) and whether they are valid (n,)."""
-    crossing, slopes, valid = np.empty((len(points), 2)), np.empty((len(points), 2)), np.empty(len(points), np.bool_)
-    for i in range(len(points)):
-        crossing[i, 0], crossing[i, 1], slopes[i, 0], slopes[i, 1], valid[i] = trace_out(
-            faces, row(points, i), row(directions, i)
-        )
-    return crossing, slopes, valid
-
-
-@njit(cache=True)
-def aim_all(
-    faces: Faces, points: NDArray[np.float64], crossing: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Return `aim` from each point through each crossing: slopes (n, 2) and whether they are valid (n,)."""
-    slopes, valid = np.empty((len(points), 2)), np.empty(len(points), dtype=np.bool_)
-    for i in range(len(points)):
-        slopes[i, 0], slopes[i, 1], valid[i] = aim(
-            faces, points[i, 0], points[i, 1], points[i, 2], crossing[i, 0], crossing[i, 1]
-        )
-    return slopes, valid
-
-
-@njit(cache=True)
-def pencils(
-    faces: Faces, points: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-    """Return, for the ray from each point through the lens' middle, its slopes (n, 2) and their growth (n, 2, 2).
-
-    The growth [k, l] is how slope k grows with the crossing along axis l.
-    """
-    slopes, growth = np.full((len(points), 2), np.nan), np.full((len(points), 2, 2), np.nan)
-    valid = np.empty(len(points), dtype=np.bool_)
-    still = (0.0, 0.0, 0.0)
-    for i in range(len(points)):
-        slopes[i, 0], slopes[i, 1], valid[i] = aim(faces, points[i, 0], points[i, 1], points[i, 2], 0.0, 0.0)
-        if not valid[i]:
-            continue
-        point, direction = start_at_lens(faces, 0.0, 0.0, slopes[i, 0], slopes[i, 1])
-        turns, sideways = slope_turns(direction), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
-        _, _, a, b, _ = trace_pencil(faces, point, direction, (still, still), turns, points[i, 2])
-        _, _, c, d, _ = trace_pencil(faces, point, direction, sideways, (still, still), points[i, 2])
-        determinant = a[0] * b[1] - b[0] * a[1]
-        # The place stays: [a b] growth + [c d] = 0.
-        growth[i, 0, 0] = (b[0] * c[1] - b[1] * c[0]) / determinant
-        growth[i, 0, 1] = (b[0] * d[1] - b[1] * d[0]) / determinant
-        growth[i, 1, 0] = (a[1] * c[0] - a[0] * c[1]) / determinant
-        growth[i, 1, 1] = (a[1] * d[0] - a[0] * d[1]) / determinant
-    return slopes, growth, valid

@@ -56,6 +56,9 @@ class Lanes:
     def __truediv__(self, other: Lanes | float) -> Lanes:
         return self._with("fdiv", self, other)
 
+    def __rtruediv__(self, other: float) -> Lanes:
+        return self._with("fdiv", other, self)
+
     def called(self, name: str, *others: Lanes | float) -> Lanes:
         """Return what one of LLVM's functions of whole vectors gives."""
         kind = ir.FunctionType(VECTOR, [VECTOR] * (1 + len(others)))
