@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from lfpiv_cli.optics.camera import Camera, KernelCamera
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.face_tracing import aim
+from lfpiv_cli.optics.ray_bundles import aim_all
 from lfpiv_cli.optics.surfaces import Faces
 from lfpiv_cli.optics.tracing import struck_pixel, trace_ray
 from lfpiv_cli.synthetic.ray_sequence import in_ball, on_disc, ray_places
@@ -89,21 +90,21 @@ def fitted_slopes(
     """Return the coefficients (TERMS, 2) of a ball's slopes, and whether they are right within the tolerance."""
     places, inverse = fit
     coefficients = np.zeros((TERMS, 2))
-    terms = np.empty(TERMS)
+    start, crossing = np.empty((FITTED + TRIED, 3)), camera.aperture_radius_mm * places[:, :2]
     for k in range(FITTED + TRIED):
-        lens_x, lens_y, ball_x, ball_y = places[k, 0], places[k, 1], places[k, 2], places[k, 3]
-        X, Y = camera.aperture_radius_mm * lens_x, camera.aperture_radius_mm * lens_y
-        slope_x, slope_y, leaves = aim(faces, x + radius * ball_x, y + radius * ball_y, z, X, Y)
-        if not leaves:
-            return coefficients, False
-        if k < FITTED:
-            for term in range(TERMS):
-                coefficients[term, 0] += inverse[term, k] * slope_x
-                coefficients[term, 1] += inverse[term, k] * slope_y
-            continue
-        write_terms(lens_x, lens_y, ball_x, ball_y, terms)
+        start[k, 0], start[k, 1], start[k, 2] = x + radius * places[k, 2], y + radius * places[k, 3], z
+    slopes, leaves = aim_all(faces, start, crossing)
+    if not leaves.all():
+        return coefficients, False
+    for term in range(TERMS):
+        for k in range(FITTED):
+            coefficients[term, 0] += inverse[term, k] * slopes[k, 0]
+            coefficients[term, 1] += inverse[term, k] * slopes[k, 1]
+    terms = np.empty(TERMS)
+    for k in range(FITTED, FITTED + TRIED):
+        write_terms(places[k, 0], places[k, 1], places[k, 2], places[k, 3], terms)
         fitted_x, fitted_y = _sum_of_terms(terms, coefficients)
-        error = max(abs(fitted_x - slope_x), abs(fitted_y - slope_y))
+        error = max(abs(fitted_x - slopes[k, 0]), abs(fitted_y - slopes[k, 1]))
         if error * camera.image_distance_mm > TOLERANCE_MM:
             return coefficients, False
     return coefficients, True

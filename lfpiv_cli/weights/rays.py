@@ -19,8 +19,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from lfpiv_cli.optics.camera import Camera, KernelCamera
 from lfpiv_cli.optics.curved_space import CurvedSpace
-from lfpiv_cli.optics.face_tracing import aim
 from lfpiv_cli.optics.object_space import ObjectSpace, slope_ratio
+from lfpiv_cli.optics.ray_bundles import aim_all
 from lfpiv_cli.optics.surfaces import Faces
 from lfpiv_cli.optics.tracing import struck_pixel, trace_ray
 from lfpiv_cli.threads import share_out
@@ -28,6 +28,8 @@ from lfpiv_cli.weights.quadrature import Columns
 
 # Points are counted in this many parts side by side, each into an image of its own.
 PARTS = 8
+# Rays of one point that are traced together behind curved faces: their arrays stay in the first-level cache.
+RAYS_AT_ONCE = 256
 
 # splitmix64 (Steele, Lea and Flood 2014): a counter's step and two mixing factors; every ray has numbers of its own,
 # whoever computes it.
@@ -145,15 +147,20 @@ def _count_curved(
     for part in range(parts[0], parts[1]):
         for n in range(part, starts.shape[0], PARTS):
             state = seeds[n]
-            for _ in range(rays_each):
-                lens_x, lens_y = random_crossing(state, camera.aperture_radius_mm)
-                state += TWO_STEPS
-                slope_x, slope_y, seen = aim(faces, starts[n, 0], starts[n, 1], starts[n, 2], lens_x, lens_y)
-                if seen:
-                    x, y = trace_ray(camera, lens_x, lens_y, slope_x, slope_y)
-                    pixel = struck_pixel(camera, x, y)
-                    if pixel >= 0:
-                        counts[part, pixel] += 1
+            for first in range(0, rays_each, RAYS_AT_ONCE):
+                count = min(RAYS_AT_ONCE, rays_each - first)
+                start, crossing = np.empty((count, 3)), np.empty((count, 2))
+                start[:] = starts[n]
+                for k in range(count):
+                    crossing[k, 0], crossing[k, 1] = random_crossing(state, camera.aperture_radius_mm)
+                    state += TWO_STEPS
+                slopes, seen = aim_all(faces, start, crossing)
+                for k in range(count):
+                    if seen[k]:
+                        x, y = trace_ray(camera, crossing[k, 0], crossing[k, 1], slopes[k, 0], slopes[k, 1])
+                        pixel = struck_pixel(camera, x, y)
+                        if pixel >= 0:
+                            counts[part, pixel] += 1
 
 
 @njit(cache=True, nogil=True)

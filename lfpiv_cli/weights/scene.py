@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.optics.camera import Camera, KernelCamera
 from lfpiv_cli.optics.curved_space import CurvedSpace
-from lfpiv_cli.optics.face_tracing import aim
 from lfpiv_cli.optics.object_space import SLOPE_NODES, ObjectSpace, slope_ratio
 from lfpiv_cli.optics.polynomial_rays import PolynomialRays
+from lfpiv_cli.optics.ray_bundles import aim_all
 from lfpiv_cli.optics.surfaces import Faces
 from lfpiv_cli.optics.tracing import behind_microlens
 from lfpiv_cli.weights.aperture import disc_area_below
@@ -211,12 +211,14 @@ def _rays_traced_from(scene: Scene, point: NDArray[np.float64]) -> NDArray[np.fl
     size = scene.degree + 1
     rays = np.zeros((2, size, size))
     f_m, s_i = scene.camera.focal_length_mm, scene.camera.image_distance_mm
+    start = np.empty((scene.aimed_mm.shape[0], 3))
+    start[:] = point
+    slopes, seen = aim_all(scene.faces, start, scene.aimed_mm)
+    if not seen.all():
+        return np.zeros((2, 0, 0))
     for m in range(scene.aimed_mm.shape[0]):
         lens_x, lens_y = scene.aimed_mm[m, 0], scene.aimed_mm[m, 1]
-        slope_x, slope_y, seen = aim(scene.faces, point[0], point[1], point[2], lens_x, lens_y)
-        if not seen:
-            return np.zeros((2, 0, 0))
-        x, y = lens_x + s_i * (slope_x - lens_x / f_m), lens_y + s_i * (slope_y - lens_y / f_m)
+        x, y = lens_x + s_i * (slopes[m, 0] - lens_x / f_m), lens_y + s_i * (slopes[m, 1] - lens_y / f_m)
         for a in range(size):
             for b in range(size - a):
                 share = scene.aimed_fit[a * size + b, m]
