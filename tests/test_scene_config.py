@@ -142,6 +142,7 @@ def test_heights_are_read_from_a_file_beside_the_rig_and_become_part_of_it(
         ),
         ("a.csv", b"1 " * 20_000, "scene[0].file: {path}: holds 20000 heights or more, expected at most 16384"),
         ("a.npy", b"no array", "scene[0].file: {path}: is no NumPy array"),
+        ("a.npy", b"\x93NUMPY\x01\x00\x10\x00{'shape': (4, 4\xa6\n", "scene[0].file: {path}: is no NumPy array: "),
         ("a.tif", b"no image", "scene[0].file: {path}: "),
     ],
 )
