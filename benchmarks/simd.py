@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 
 from benchmarks.timing import interleaved_medians_s
-from lfpiv_cli.simd import block_sums, combine, splines
+from lfpiv_cli.simd import block_sums, combine, combine_varying, splines
 from lfpiv_cli.simd.vectors import LANES
 
 # Elements of the volumes, and their strides along z and y: a window's share of the second-level cache.
@@ -71,6 +71,16 @@ def _rivals() -> dict[str, tuple[Any, Any, tuple[Any, ...]]]:
         found[name] = (intrinsic, twin, arguments)
     arguments = (out, (0, combine.TILE), a, line, (0, 80, 0, 3), b, 0)
     found["combine_turned"] = (combine.combine_turned, njit(combine.combine_turned_reference), arguments)
+    places = np.linspace(-1.0, 1.0, LANES).astype(np.float32)
+    turned = (out, (0, combine.TILE), a, line, (0, 80, 0, 3), b, 0, places, 0)
+    twin = njit(combine_varying.combine_turned_varying_reference)
+    found["combine_turned_varying"] = (combine_varying.combine_turned_varying, twin, turned)
+    summed = (out, 0, a, line, (0, 80, 0, 5), b, 0, places, 0)
+    found["combine_varying"] = (
+        combine_varying.combine_varying,
+        njit(combine_varying.combine_varying_reference),
+        summed,
+    )
     arguments = (out, (0, combine.TILE), a, (0, combine.TILE))
     found["turn"] = (combine.turn, njit(combine.turn_reference), arguments)
     for shifts in (block_sums.FEW_SHIFTS, block_sums.MANY_SHIFTS):

@@ -22,6 +22,13 @@ from lfpiv_cli.simd.combine import (
     turn,
     turn_reference,
 )
+from lfpiv_cli.simd.combine_varying import (
+    COEFFICIENTS,
+    combine_turned_varying,
+    combine_turned_varying_reference,
+    combine_varying,
+    combine_varying_reference,
+)
 from lfpiv_cli.simd.vectors import LANES, lanes_of
 from lfpiv_cli.weights.build import factorise
 
@@ -44,6 +51,16 @@ def one_vector(out, to, source, line, terms, share, shares):
 @njit
 def turned_lines(out, to, source, line, terms, share, share_at):
     combine_turned(out, to, source, line, terms, share, share_at)
+
+
+@njit
+def turned_varying(out, to, source, line, terms, share, share_at, places, places_at):
+    combine_turned_varying(out, to, source, line, terms, share, share_at, places, places_at)
+
+
+@njit
+def varying(out, at, source, line, terms, share, share_at, places, places_at):
+    combine_varying(out, at, source, line, terms, share, share_at, places, places_at)
 
 
 @njit
@@ -82,6 +99,24 @@ def test_combine_turned_equals_its_reference(rng, count):
     places = ((2, step), source, line, (1, step, 2, count), share, LANES)
     combine_turned_reference(expected, *places)
     turned_lines(found, *places)
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("count", [0, 1, 3])
+def test_sums_with_varying_shares_equal_their_references(rng, count):
+    step, places = LANES + 3, np.linspace(-1.0, 1.0, LANES + 5).astype(np.float32)
+    source = rng.standard_normal(12 * step, np.float32)
+    line = rng.integers(0, 8, LANES + 2).astype(np.int32)
+    share = rng.standard_normal(4 * COEFFICIENTS * LANES, np.float32)  # of either sign: some weights are cut to 0
+    expected = rng.standard_normal(step * LANES, np.float32)
+    found = expected.copy()
+    arguments = source, line, (1, step, 2, count), share, LANES, places, 3
+    combine_turned_varying_reference(expected, (2, step), *arguments)
+    turned_varying(found, (2, step), *arguments)
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+    combine_varying_reference(expected, 7, *arguments)
+    varying(found, 7, *arguments)
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
 
 

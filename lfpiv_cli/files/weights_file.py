@@ -1,6 +1,6 @@
 """The weights file: everything that a reconstruction needs besides the images.
 
-Layout, version 3 (HDF5; lengths in mm): `camera` (scalars of `optics.camera.Camera`, `lattice_origin_mm` (2,),
+Layout, version 4 (HDF5; lengths in mm): `camera` (scalars of `optics.camera.Camera`, `lattice_origin_mm` (2,),
 `lattice_basis_mm` (2, 2)), `grid` (`shape_xyz`, `spacing_mm`, `origin_mm`, `padding_xyz`, `reference`,
 `scene_distortion_per_mm2` of its planes), `columns` and
 `rows` (the per-axis weights: `start`, `cell`, `share`), and `calibration` where one was made. The cells and the
@@ -12,9 +12,10 @@ are integrated when needed; where rays were counted, `counted` (`start`, `pixel`
 the sensor's axes). `vignetting` (coefficients, see `calibration.transmission`) scales the pixels on reading. Version 1
 had none of these.
 
-Behind curved faces `columns` and `rows` are those of strips (`strips`: `lit` of the padded grid, `height` in voxels,
-`turned`, `coupling_mm`, see `weights.strips`), and `on_demand` holds the `faces`; `grid` says how many voxels lie
-outside the fluid. Version 2 had none of these.
+Behind curved faces `columns` and `rows` are those of strips (`strips`: `lit` of the padded grid, `turned`, `misfit_l1`,
+`order`, `block_plane`, `block_planes`, `block_line`, see `weights.strips`), and `on_demand` holds the `faces`; `grid`
+says how many voxels lie outside the fluid. Version 2 had none of these, and the strips of version 3 were others, which
+are not read.
 """
 
 from __future__ import annotations
@@ -45,6 +46,7 @@ from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.reference import Reference
+from lfpiv_cli.simd.combine_varying import COEFFICIENTS
 from lfpiv_cli.weights.aperture import aperture_mask
 from lfpiv_cli.weights.axis import AxisWeights
 from lfpiv_cli.weights.axis_cells import AxisOptics, micro_image_cells
@@ -54,11 +56,12 @@ from lfpiv_cli.weights.model import Weights, WeightsOperator, behind_transmissio
 from lfpiv_cli.weights.operators import BrickOperator, Column, FactorisedOperator
 from lfpiv_cli.weights.quadrature import Columns
 from lfpiv_cli.weights.scene import Source
+from lfpiv_cli.weights.strip_kernels import SLAB, STRIP, Blocks
 from lfpiv_cli.weights.strips import StripOperator
 
 FORMAT = "lfpiv-weights"
-VERSION = 3
-READABLE_VERSIONS = (1, 2, 3)
+VERSION = 4
+READABLE_VERSIONS = (1, 2, 3, 4)
 # Coefficients of `transmission.vignetting_surface`.
 VIGNETTING_SHAPE = (5, 5)
 
@@ -210,11 +213,12 @@ def _operator_tree(operator: WeightsOperator) -> dict[str, Any]:
     if isinstance(operator, StripOperator):
         strips = {
             "lit": operator.lit.astype(np.uint8),
-            "height": operator.strips.shape[1],
             "turned": operator.turned,
-            "coupling_mm": operator.coupling_mm,
+            "order": operator.order,
+            "misfit_l1": operator.misfit_l1,
         }
-        return {"strips": strips} | _operator_tree(operator.strips)
+        strips |= {f"block_{name}": table for name, table in operator.blocks._asdict().items()}
+        return {"strips": strips, "columns": _axis_tree(operator.columns), "rows": _axis_tree(operator.rows)}
     if isinstance(operator, BrickOperator):
         raise TypeError("bricks stand for hexagonal cells where particles are looked for, and are not stored")
     space = operator.source
@@ -250,18 +254,47 @@ def _strips(
 ) -> StripOperator:
     """Return weights in strips of a volume of `shape` (planes, row voxels, column voxels)."""
     strips = _group(tree, "strips")
-    lit, height, turned, coupling = (strips[name] for name in ("lit", "height", "turned", "coupling_mm"))
-    voxels, lines = shape[1:] if turned else shape[:0:-1]
-    if lit.shape != shape or lit.dtype != np.uint8 or type(turned) is not bool or not 0.0 <= coupling < np.inf:
+    lit, turned, misfit = (strips[name] for name in ("lit", "turned", "misfit_l1"))
+    if lit.shape != shape or lit.dtype != np.uint8 or type(turned) is not bool:
         raise ValueError(f"strips of a volume of {lit.shape}, expected {shape}")
-    if type(height) is not int or not 1 <= height <= lines:
-        raise ValueError(f"strips of {height} voxels of {lines}")
-    planes = -(-lines // height) * shape[0]
+    if misfit.ndim != 1 or not np.isfinite(misfit).all():
+        raise ValueError("the strips' misfit is not a list of numbers")
+    voxels, lines = shape[1:] if turned else shape[:0:-1]
+    blocks = _blocks(strips, shape[0], lines)
+    planes = int(blocks.planes.sum())
     across, along = optics if turned else optics[::-1]
-    by_row = _axis_weights(tree["rows"], planes, height, across)
-    by_column = _axis_weights(tree["columns"], planes, voxels, along)
+    by_row = _axis_weights(tree["rows"], planes, STRIP, across)
+    by_column = _axis_weights(tree["columns"], planes, voxels, along, COEFFICIENTS)
     mask = aperture_mask(by_column.cells, by_row.cells, camera.aperture_radius_mm)
-    return StripOperator(FactorisedOperator(by_column, by_row, mask), lit.astype(bool), turned, float(coupling))
+    order = _order_of_cells(strips, by_column)
+    return StripOperator(by_column, by_row, blocks, mask, order, lit.astype(bool), turned, misfit.astype(np.float64))
+
+
+def _order_of_cells(strips: dict[str, Any], columns: AxisWeights) -> NDArray[np.int32]:
+    """Return the order of the column cells, after checking that it has every cell that is lit, and none twice."""
+    order = strips["order"]
+    if order.ndim != 1 or order.dtype != np.int32 or np.unique(order).size != order.size:
+        raise ValueError("the order of the cells is none")
+    if (
+        not np.isin(columns.cell, order).all()
+        or order.min(initial=0) < 0
+        or order.max(initial=0) >= columns.cells.pixel.size
+    ):
+        raise ValueError("the order of the cells misses some")
+    return np.asarray(order)
+
+
+def _blocks(strips: dict[str, Any], planes: int, lines: int) -> Blocks:
+    """Return where the blocks of a volume lie, after checking that none leads outside it."""
+    blocks = Blocks(*(strips[f"block_{name}"] for name in Blocks._fields))
+    if any(each.shape != blocks.plane.shape or each.ndim != 1 or each.dtype != np.int64 for each in blocks):
+        raise ValueError("the blocks' tables differ")
+    last = blocks.plane + blocks.planes - 1
+    if np.any(blocks.plane < 0) or np.any(blocks.planes < 1) or np.any(last >= planes):
+        raise ValueError(f"blocks beyond {planes} planes")
+    if np.any(blocks.plane // SLAB != last // SLAB) or np.any(blocks.line < 0) or np.any(blocks.line >= lines):
+        raise ValueError(f"blocks across slabs, or beyond {lines} lines")
+    return blocks
 
 
 def _source(tree: dict[str, Any], calibration: Calibration | None) -> Source:
@@ -297,17 +330,20 @@ def _axis_tree(axis: AxisWeights) -> dict[str, Any]:
     return {"start": axis.start, "cell": axis.cell, "share": axis.share}
 
 
-def _axis_weights(tree: dict[str, Any], planes: int, voxels: int, optics: AxisOptics) -> AxisWeights:
-    """Return the per-axis weights after checking that no index leads outside its array."""
+def _axis_weights(
+    tree: dict[str, Any], planes: int, voxels: int, optics: AxisOptics, coefficients: int = 0
+) -> AxisWeights:
+    """Return the per-axis weights, or so many coefficients of each, after checking that no index leads outside."""
     cells = micro_image_cells(optics)
     start, cell, share = tree["start"], tree["cell"], tree["share"]
-    if start.shape != (planes * voxels + 1,) or cell.shape != share.shape or cell.ndim != 1:
+    shares = (*cell.shape, coefficients) if coefficients else cell.shape
+    if start.shape != (planes * voxels + 1,) or share.shape != shares or cell.ndim != 1:
         raise ValueError(f"tables of {start.shape} and {cell.shape} for {planes} planes of {voxels} voxels")
     if start[0] != 0 or start[-1] != cell.size or np.any(np.diff(start) < 0):
         raise ValueError("the table's rows do not follow each other")
     if cell.size and (cell.min() < 0 or cell.max() >= cells.pixel.size):
         raise ValueError(f"cell {cell.min()} or {cell.max()} of {cells.pixel.size}")
-    if not np.all(np.isfinite(share)) or share.min(initial=0.0) < 0.0:
+    if not np.all(np.isfinite(share)) or (not coefficients and share.min(initial=0.0) < 0.0):
         raise ValueError("a weight that is negative or not a number")
     return AxisWeights(
         planes,

@@ -67,7 +67,7 @@ def cost_of(settings: Config, camera: Camera, source: Source, grid: Grid) -> Cos
     held = held_bytes(voxels, pixels)
     projections = 2 * settings.reconstruction.iterations
     rays = _rays(settings, source, grid)
-    strips = 0 if rays else _strips(camera, source, grid)
+    strips = 0.0 if rays else _strips(camera, source, grid)
     if not strips:
         kept = columns_bytes(voxels)
         solving = projections * voxels * COLUMN_BYTES / ENTRY_BYTES / MULTIPLICATIONS_PER_S
@@ -85,12 +85,12 @@ def cost_of(settings: Config, camera: Camera, source: Source, grid: Grid) -> Cos
     )
 
 
-def _strips(camera: Camera, source: Source, grid: Grid) -> int:
-    """Return in how many strips weights factorise, 0 where they do in none."""
+def _strips(camera: Camera, source: Source, grid: Grid) -> float:
+    """Return in how many strips, and parts of strips, weights factorise, 0 where they do in none."""
     if isinstance(source, CurvedSpace):
-        plan = strips_of(camera, source, grid)
-        return len(plan.fits) if plan is not None else 0
-    return int(separates(camera, source, grid))
+        layout = strips_of(camera, source, grid)
+        return layout.strips * layout.parts if layout is not None else 0.0
+    return float(separates(camera, source, grid))
 
 
 def particles_core_s(tracers: float) -> float:

@@ -161,9 +161,9 @@ def _generate_turn(context: Any, builder: ir.IRBuilder, signature: Any, argument
     out, source = pointers(context, builder, signature, arguments, (0, 2))
     at, step = cgutils.unpack_tuple(builder, arguments[1], 2)
     source_at, source_step = cgutils.unpack_tuple(builder, arguments[3], 2)
-    lines = [load(builder, source, _step_on(builder, source_at, source_step, m)) for m in range(LANES)]
-    for n, line in enumerate(_transposed(builder, lines)):
-        store(builder, line, out, _step_on(builder, at, step, n))
+    lines = [load(builder, source, step_on(builder, source_at, source_step, m)) for m in range(LANES)]
+    for n, line in enumerate(transposed(builder, lines)):
+        store(builder, line, out, step_on(builder, at, step, n))
     return context.get_dummy_value()
 
 
@@ -219,16 +219,16 @@ def _generate_combine_turned(context: Any, builder: ir.IRBuilder, signature: Any
             taken = load(builder, source, builder.add(begin, builder.mul(numbers[m], source_step)))
             weight = splat(builder, load_one(builder, share, builder.add(shares, index(m))))
             add_product(builder, sums[m], taken, weight)
-    for n, row in enumerate(_transposed(builder, [builder.load(one) for one in sums])):
-        store(builder, row, out, _step_on(builder, at, step, n))
+    for n, row in enumerate(transposed(builder, [builder.load(one) for one in sums])):
+        store(builder, row, out, step_on(builder, at, step, n))
     return context.get_dummy_value()
 
 
-def _step_on(builder: ir.IRBuilder, at: Any, step: Any, times: int) -> Any:
+def step_on(builder: ir.IRBuilder, at: Any, step: Any, times: int) -> Any:
     return builder.add(at, builder.mul(step, index(times)))
 
 
-def _transposed(builder: ir.IRBuilder, lines: Sequence[Any]) -> list[Any]:
+def transposed(builder: ir.IRBuilder, lines: Sequence[Any]) -> list[Any]:
     """Return the columns of `LANES` vectors, exchanging halves, then quarters of these, down to single numbers."""
     rows, half = list(lines), LANES // 2
     while half:

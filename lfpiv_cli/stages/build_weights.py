@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.provenance import record, with_warnings
 from lfpiv_cli.files.weights_file import open_weights, write_weights
-from lfpiv_cli.interface.weights import curved_summary, plan_of, weights_of
+from lfpiv_cli.interface.weights import curved_summary, misfit_notices, plan_of, weights_of
 from lfpiv_cli.interface.weights_cost import cost_notices, cost_of
 from lfpiv_cli.names import Method, Refraction, Sampling
 
@@ -76,7 +76,10 @@ def build_weights(
     if options.dry_run:
         return summary | cost.summary()
     console.detail(f"about {cost.weights_core_s:.2g} s of a core and {cost.weights_bytes / 1e9:.2g} GB")
-    content = weights_of(plan, with_warnings(made, plan.notices), console)
+    content = weights_of(plan, made, console)
+    found_out = misfit_notices(content)
+    console.warn(found_out)
+    content = replace(content, provenance=with_warnings(made, [*plan.notices, *found_out]))
     write_weights(output, content, overwrite)
     return summary | curved_summary(content) | {"frame": content.weights.frame, "file_bytes": output.stat().st_size}
 

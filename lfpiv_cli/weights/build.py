@@ -24,9 +24,9 @@ from lfpiv_cli.optics.tracing import disc_points
 from lfpiv_cli.weights.aperture import aperture_mask
 from lfpiv_cli.weights.axis import Bending, FittedBending, axis_weights, depth_nodes
 from lfpiv_cli.weights.axis_cells import AxisOptics
-from lfpiv_cli.weights.curved import StripPlan, factorise_strips, strip_plan
 from lfpiv_cli.weights.operators import BrickOperator, FactorisedOperator
 from lfpiv_cli.weights.scene import Source
+from lfpiv_cli.weights.strip_making import StripLayout, factorise_strips, strip_layout
 from lfpiv_cli.weights.strips import StripOperator
 
 # A lattice counts as aligned with the sensor when over its whole width it strays by less than a hundredth of a pixel.
@@ -178,11 +178,9 @@ def separates(camera: Camera, source: Source, grid: Grid) -> bool:
     return not isinstance(source, CurvedSpace) or strips_of(camera, source, grid) is not None
 
 
-def strips_of(camera: Camera, space: CurvedSpace, grid: Grid) -> StripPlan | None:
+def strips_of(camera: Camera, space: CurvedSpace, grid: Grid) -> StripLayout | None:
     """Return the strips of a volume within which array and rays separate into two axes; None where they do in none."""
-    if not aligned(camera):
-        return None
-    return strip_plan(camera, space, grid, LARGEST_COUPLING * float(camera.lattice.pitch.min()))
+    return strip_layout(camera, space, grid, axis_optics(camera)) if aligned(camera) else None
 
 
 def weights_in_axes(camera: Camera, source: Source, grid: Grid) -> FactorisedOperator | StripOperator | None:
@@ -192,10 +190,12 @@ def weights_in_axes(camera: Camera, source: Source, grid: Grid) -> FactorisedOpe
     ------
     ConfigError : a voxel lies where it cannot be
     """
-    if isinstance(source, CurvedSpace):
-        plan = strips_of(camera, source, grid)
-        return factorise_strips(axis_optics(camera), camera, source, grid, plan) if plan is not None else None
-    return factorise_through(camera, source, grid) if separates(camera, source, grid) else None
+    if isinstance(source, CurvedSpace) and aligned(camera):
+        layout = strips_of(camera, source, grid)
+        return factorise_strips(camera, source, grid, axis_optics(camera), layout.turned) if layout else None
+    if isinstance(source, CurvedSpace) or not separates(camera, source, grid):
+        return None
+    return factorise_through(camera, source, grid)
 
 
 def aligned(camera: Camera) -> bool:

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from lfpiv_cli.calibration.model import Calibration
 
 Scalar = TypeVar("Scalar", bound=np.generic)
+Separated = TypeVar("Separated", FactorisedOperator, StripOperator)
 
 WeightsOperator = FactorisedOperator | BrickOperator | StripOperator | ColumnOperator | OnDemandOperator
 
@@ -38,12 +39,11 @@ def behind_transmission(operator: WeightsOperator, transmission: NDArray[np.floa
     if isinstance(operator, BrickOperator):
         return BrickOperator(*(_behind(each, transmission) for each in (operator.even, operator.odd)))
     if isinstance(operator, StripOperator):
-        seen = np.ascontiguousarray(transmission.T) if operator.turned else transmission
-        return replace(operator, strips=_behind(operator.strips, seen))
+        return _behind(operator, np.ascontiguousarray(transmission.T) if operator.turned else transmission)
     return _behind(operator, transmission)
 
 
-def _behind(operator: FactorisedOperator, transmission: NDArray[np.float32]) -> FactorisedOperator:
+def _behind(operator: Separated, transmission: NDArray[np.float32]) -> Separated:
     cells = np.ix_(operator.rows.cells.pixel, operator.columns.cells.pixel)
     return replace(operator, mask=operator.mask * transmission[cells])
 

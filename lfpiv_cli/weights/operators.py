@@ -63,9 +63,9 @@ class FactorisedOperator:
         ensure_own_threads()
         volume = real_array(volume, self.shape, "a volume")
         first, last = self._lit_columns
-        tiles = _filled(last - first, TILE) // TILE
+        tiles = filled(last - first, TILE) // TILE
         _, height, width = self.shape
-        turned = kernels.turned(volume, (width, _filled(height, LANES)))
+        turned = kernels.turned(volume, (width, filled(height, LANES)))
         by_cell = kernels.project(turned, self._columns_forward, self._rows_forward, tiles)
         return kernels.fold(by_cell, self.mask, self._runs, self._lines_of_rows, self.image_shape)
 
@@ -75,7 +75,7 @@ class FactorisedOperator:
         image = real_array(image, self.image_shape, "an image")
         by_cell = kernels.unfold(image, self.mask, self._runs, self._lit_rows, self.rows.cells.pixel)
         planes, height, width = self.shape
-        turned = (planes, width, _filled(height, LANES))
+        turned = (planes, width, filled(height, LANES))
         volume = kernels.back_project(by_cell, turned, self._rows_back, self._columns_back, get_num_threads())
         return kernels.turned(volume, (height, width))
 
@@ -95,12 +95,12 @@ class FactorisedOperator:
     @cached_property
     def _lit_rows(self) -> tuple[int, int]:
         """Range of row cells that any voxel reaches."""
-        return _range(self.rows.cell)
+        return lit_range(self.rows.cell)
 
     @cached_property
     def _lit_columns(self) -> tuple[int, int]:
         """Range of column cells that any voxel reaches."""
-        return _range(self.columns.cell)
+        return lit_range(self.columns.cell)
 
     @cached_property
     def _runs(self) -> NDArray[np.int64]:
@@ -108,11 +108,7 @@ class FactorisedOperator:
 
     @cached_property
     def _lines_of_rows(self) -> LitRows:
-        first, last = self._lit_rows
-        pixel = self.rows.cells.pixel[first:last]
-        order = np.argsort(pixel, kind="stable")
-        start = np.searchsorted(pixel[order], np.arange(self.rows.pixels + 1)).astype(np.int64)
-        return LitRows(start, first + order, lens_lines(self.rows, first, last)[order])
+        return rows_of_pixels(self.rows, *self._lit_rows)
 
     @cached_property
     def _columns_forward(self) -> CellBlocks:
@@ -199,11 +195,11 @@ def runs_of_cells(cells: Cells, first: int, last: int) -> NDArray[np.int64]:
 
 def blocks_of_cells(columns: AxisWeights, first: int, last: int) -> CellBlocks:
     """Return the columns' weights as blocks of `LANES` lit cells (from `first` to `last`), each with its voxels."""
-    pieces = _filled(last - first, TILE) // LANES
-    plane, voxel = np.divmod(_line_of(columns), columns.voxels)
+    pieces = filled(last - first, TILE) // LANES
+    plane, voxel = np.divmod(line_of(columns), columns.voxels)
     tile, cell = np.divmod(columns.cell.astype(np.int64) - first, TILE)
     at = (tile * columns.planes + plane) * TILE + cell
-    low, span = _spans(at, voxel, columns.planes * pieces * LANES)
+    low, span = spans(at, voxel, columns.planes * pieces * LANES)
     most = span.reshape(-1, LANES).max(axis=1)
     start = np.concatenate([[0], np.cumsum(most)]).astype(np.int64)
     block, lane = np.divmod(at, LANES)
@@ -215,18 +211,18 @@ def blocks_of_cells(columns: AxisWeights, first: int, last: int) -> CellBlocks:
 
 def sums_of_voxels(columns: AxisWeights, first: int, last: int) -> VoxelSums:
     """Return the columns' weights as sums over the cells of each tile of lit cells (from `first` to `last`)."""
-    tiles = _filled(last - first, TILE) // TILE
-    plane, voxel = np.divmod(_line_of(columns), columns.voxels)
+    tiles = filled(last - first, TILE) // TILE
+    plane, voxel = np.divmod(line_of(columns), columns.voxels)
     tile, cell = np.divmod(columns.cell.astype(np.int64) - first, TILE)
     owner = tile * columns.planes + plane
-    low, span = _spans(owner, voxel, columns.planes * tiles)
+    low, span = spans(owner, voxel, columns.planes * tiles)
     owned = np.concatenate([[0], np.cumsum(span)]).astype(np.int64)
     number = owned[owner] + voxel - low[owner]
-    terms = _pack(number, cell, np.zeros_like(cell), columns.share, (int(owned[-1]), 1))
+    terms = packed(number, cell, np.zeros_like(cell), columns.share, (int(owned[-1]), 1))
     return VoxelSums(owned, low.astype(np.int32), *terms)
 
 
-def _spans(
+def spans(
     owner: NDArray[np.int64], place: NDArray[np.int64], owners: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the lowest place of each owner and how far it is to the highest, one included; 0, 0 where it has none."""
@@ -243,8 +239,16 @@ def lens_lines(rows: AxisWeights, first: int, last: int) -> NDArray[np.int64]:
     lens = np.searchsorted(rows.cells.start, cell, side="right") - 1
     begin = np.maximum(rows.cells.start[lens], first)
     lenses, which = np.unique(lens, return_inverse=True)
-    start = np.concatenate([[0], np.cumsum(_filled(np.bincount(which, minlength=lenses.size), GROUP))])
+    start = np.concatenate([[0], np.cumsum(filled(np.bincount(which, minlength=lenses.size), GROUP))])
     return start[which] + cell - begin
+
+
+def rows_of_pixels(rows: AxisWeights, first: int, last: int) -> LitRows:
+    """Return the lit row cells (from `first` to `last`) in the order of their pixels."""
+    pixel = rows.cells.pixel[first:last]
+    order = np.argsort(pixel, kind="stable")
+    start = np.searchsorted(pixel[order], np.arange(rows.pixels + 1)).astype(np.int64)
+    return LitRows(start, first + order, lens_lines(rows, first, last)[order])
 
 
 def row_terms_of_cells(rows: AxisWeights, first: int, last: int) -> Terms:
@@ -256,23 +260,23 @@ def row_terms_of_cells(rows: AxisWeights, first: int, last: int) -> Terms:
     line_of_cell = lens_lines(rows, first, last)
     group, member = np.divmod(line_of_cell[rows.cell - first], GROUP)
     groups = int(line_of_cell[-1]) // GROUP + 1
-    plane, voxel = np.divmod(_line_of(rows), rows.voxels)
+    plane, voxel = np.divmod(line_of(rows), rows.voxels)
     chunk, plane = np.divmod(plane, PLANES_FORWARD)
-    line = plane * _filled(rows.voxels, LANES) + voxel
-    return _pack(chunk * groups + group, line, member, rows.share, (_chunks(rows, PLANES_FORWARD) * groups, GROUP))
+    line = plane * filled(rows.voxels, LANES) + voxel
+    return packed(chunk * groups + group, line, member, rows.share, (_chunks(rows, PLANES_FORWARD) * groups, GROUP))
 
 
 def row_terms_of_voxels(rows: AxisWeights, first: int) -> Terms:
     """Return, for each voxel of each `GROUP` planes, the lit row cells it reaches (from `first` on) and the shares."""
-    plane, voxel = np.divmod(_line_of(rows), rows.voxels)
+    plane, voxel = np.divmod(line_of(rows), rows.voxels)
     chunk, plane = np.divmod(plane, PLANES_BACK)
-    height, pairs = _filled(rows.voxels, LANES), PLANES_BACK // GROUP
+    height, pairs = filled(rows.voxels, LANES), PLANES_BACK // GROUP
     cell = rows.cell.astype(np.int64) - first
     group = (chunk * height + voxel) * pairs + plane // GROUP
-    return _pack(group, cell, plane % GROUP, rows.share, (_chunks(rows, PLANES_BACK) * height * pairs, GROUP))
+    return packed(group, cell, plane % GROUP, rows.share, (_chunks(rows, PLANES_BACK) * height * pairs, GROUP))
 
 
-def _pack(
+def packed(
     group: NDArray[np.int64],
     line: NDArray[np.int64],
     member: NDArray[np.int64],
@@ -290,18 +294,19 @@ def _pack(
 
 def _chunks(axis: AxisWeights, planes: int) -> int:
     """Return how many times so many planes there are, the last time perhaps fewer."""
-    return _filled(axis.planes, planes) // planes
+    return filled(axis.planes, planes) // planes
 
 
-def _filled(size: Any, multiple: int) -> Any:
+def filled(size: Any, multiple: int) -> Any:
     """Return a size, or an array of them, filled up to a multiple."""
     return -(-size // multiple) * multiple
 
 
-def _line_of(axis: AxisWeights) -> NDArray[np.int64]:
+def line_of(axis: AxisWeights) -> NDArray[np.int64]:
     """Return the row plane * voxels + voxel of each entry of a table."""
     return np.repeat(np.arange(axis.start.size - 1), np.diff(axis.start))
 
 
-def _range(cell: NDArray[np.int32]) -> tuple[int, int]:
+def lit_range(cell: NDArray[np.int32]) -> tuple[int, int]:
+    """Return the first of the cells that any voxel reaches, and the one behind the last."""
     return (int(cell.min()), int(cell.max()) + 1) if cell.size else (0, 0)

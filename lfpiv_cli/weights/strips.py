@@ -1,9 +1,14 @@
-"""Weights of a volume in strips of neighbouring voxels, each strip factorised on its own.
+"""Weights of a volume in strips of neighbouring lines of voxels, behind curved faces.
 
-Behind a curved window rays do not separate into two axes over the whole volume: along a tube's axis the apparent depth
-changes with the distance from it. Within a strip along the axis they do, nearly. The image of a volume is the sum of
-the images of its strips, and what an image is spread back to are the strips side by side. All strips together are one
-factorised operator whose planes are those of one strip after the other, so the compiled loops are the same.
+Behind a curved window rays do not separate into two axes over the whole volume: along a tube the apparent depth changes
+with the distance from its axis. Each voxel has a product of two factors even so, w = C a b:
+
+- a, along the strip, of the pixel's column, changes with the line within a strip as a polynomial of the second degree;
+- b, across the strips, of the pixel's row, is each line's own.
+
+Where the two axes know too much of each other, the light through different parts of the aperture has factors of its
+own. What has one pair of factors is a block: up to `SLAB` planes of a strip, a range of voxels along it, and the light
+through a rectangle of the aperture, told by which cells its factors have.
 
 Axes: volumes [plane, row voxel, column voxel] in the order of the sensor's axes, images [row, column].
 """
@@ -11,12 +16,30 @@ Axes: volumes [plane, row voxel, column voxel] in the order of the sensor's axes
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
+from numba import get_num_threads
 from numpy.typing import NDArray
 
+from lfpiv_cli.simd.combine import GROUP
+from lfpiv_cli.threads import ensure_own_threads
+from lfpiv_cli.weights import kernels, strip_kernels
 from lfpiv_cli.weights.arguments import real_array, voxel_index
-from lfpiv_cli.weights.operators import Column, FactorisedOperator
+from lfpiv_cli.weights.axis import AxisWeights
+from lfpiv_cli.weights.kernels import LitRows, Terms
+from lfpiv_cli.weights.operators import Column, lit_range, rows_of_pixels
+from lfpiv_cli.weights.strip_kernels import PLACES, STRIP, Blocks, RowSums, SortedCells, VisitsBack, VisitsForward
+from lfpiv_cli.weights.strip_tables import (
+    cells_in_order,
+    row_sums,
+    row_terms_back,
+    visits_back,
+    visits_forward,
+)
+
+Scalar = TypeVar("Scalar", bound=np.generic)
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,17 +48,24 @@ class StripOperator:
 
     Attributes
     ----------
-    strips : the weights of all strips; plane s * planes + k is plane k of strip s, the last strip filled up with voxels
-        without light
+    columns : a, of the planes of one block after the other; share (entries, COEFFICIENTS) by the powers of `PLACES`
+    rows : b, of the `STRIP` lines of each of these planes
+    blocks : where they lie; none crosses a multiple of `SLAB` planes
+    mask : (row cells, column cells) float32, C and whatever else scales the light
+    order : of the lit column cells, int32: a block may have those of some tiles only
     lit : (planes, row voxels, column voxels) which voxels have light: not those outside the fluid
-    turned : the strips are of columns of voxels, and rows and columns are exchanged in `strips`, of image and volume
-    coupling_mm : how far on the array, rms, traced rays are from those that separate within each strip
+    turned : the strips are of columns of voxels, and rows and columns of image and volume are exchanged but in `lit`
+    misfit_l1 : (samples,) how far columns of a sample of voxels are from those of traced rays, in L1
     """
 
-    strips: FactorisedOperator
+    columns: AxisWeights
+    rows: AxisWeights
+    blocks: Blocks
+    mask: NDArray[np.float32]
+    order: NDArray[np.int32]
     lit: NDArray[np.bool_]
     turned: bool
-    coupling_mm: float
+    misfit_l1: NDArray[np.float64]
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -46,51 +76,120 @@ class StripOperator:
     @property
     def image_shape(self) -> tuple[int, int]:
         """Shape of an image."""
-        rows, columns = self.strips.image_shape
+        rows, columns = self.rows.pixels, self.columns.pixels
         return (columns, rows) if self.turned else (rows, columns)
 
     def forward(self, volume: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the image (rows, columns) of a volume."""
-        volume = real_array(volume, self.shape, "a volume")
-        image = self.strips.forward(self.cut(volume * self.lit))
+        ensure_own_threads()
+        lines = self._as_lines(real_array(volume, self.shape, "a volume") * self.lit)
+        turned = kernels.turned(lines, (lines.shape[2], self._height))
+        by_cell = strip_kernels.project(turned, self.blocks, self._columns_forward, self._rows_forward, self._groups)
+        shape = self.rows.pixels, self.columns.pixels
+        image = strip_kernels.fold(by_cell, self.mask, self._cells, self._lines_of_rows, shape)
         return np.ascontiguousarray(image.T) if self.turned else image
 
     def adjoint(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the volume that an image is spread back to."""
+        ensure_own_threads()
         image = real_array(image, self.image_shape, "an image")
-        strips = self.strips.adjoint(np.ascontiguousarray(image.T) if self.turned else image)
-        volume = np.empty(self.shape, np.float32)
-        lines = self._in_strips_order(volume)
-        height = strips.shape[1]
-        for k, strip in enumerate(strips.reshape(-1, len(volume), *strips.shape[1:])):
-            part = lines[:, k * height : (k + 1) * height]
-            part[:] = strip[:, : part.shape[1]]
-        volume *= self.lit
-        return volume
+        seen = np.ascontiguousarray(image.T) if self.turned else image
+        by_cell = strip_kernels.unfold(seen, self._sorted_mask, self._cells, self._lit_rows, self.rows.cells.pixel)
+        lines, along = self._as_lines(self.lit).shape[1:]
+        shape = len(self.lit), along, self._height
+        volume = strip_kernels.back_project(
+            by_cell, shape, self.blocks, self._rows_back, self._columns_back, get_num_threads()
+        )
+        return np.ascontiguousarray(self._as_lines(kernels.turned(volume, (lines, along)))) * self.lit
 
     def column(self, plane: int, row_voxel: int, column_voxel: int) -> Column:
         """Return the rows, columns (int64) and weights (float32) of the pixels that one voxel lights."""
         plane, row_voxel, column_voxel = voxel_index((plane, row_voxel, column_voxel), self.shape)
-        if not self.lit[plane, row_voxel, column_voxel]:
-            return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.float32)
+        image = np.zeros(self.image_shape, np.float32)
+        seen = image.T if self.turned else image
         line, along = (column_voxel, row_voxel) if self.turned else (row_voxel, column_voxel)
-        strip, within = divmod(line, self.strips.shape[1])
-        row, column, weight = self.strips.column(strip * self.shape[0] + plane, within, along)
-        if not self.turned:
-            return row, column, weight
-        order = np.lexsort((row, column))
-        return column[order], row[order], weight[order]
+        if self.lit[plane, row_voxel, column_voxel]:
+            for virtual, within in self._planes_of(plane, line):
+                row, across = self.rows.row(virtual, within)
+                column, share = self.columns.row(virtual, along)
+                by_cell = np.outer(across, shares_of(share, within)) * self.mask[np.ix_(row, column)]
+                pixels = np.ix_(self.rows.cells.pixel[row], self.columns.cells.pixel[column])
+                np.add.at(seen, pixels, by_cell)
+        lit = np.nonzero(image)
+        return lit[0].astype(np.int64), lit[1].astype(np.int64), image[lit]
 
-    def cut(self, volume: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return a volume as `strips` takes it: (strips * planes, voxels across a strip, voxels along)."""
-        lines = self._in_strips_order(volume)
-        height, planes = self.strips.shape[1], len(volume)
-        found = np.zeros((self.strips.shape[0] // planes, planes, height, lines.shape[2]), np.float32)
-        for k, strip in enumerate(found):
-            part = lines[:, k * height : (k + 1) * height]
-            strip[:, : part.shape[1]] = part
-        return found.reshape(-1, *found.shape[2:])
+    def _planes_of(self, plane: int, line: int) -> list[tuple[int, int]]:
+        """Return the planes of blocks that a line of voxels has, and which of their lines it is."""
+        blocks, first = self.blocks, np.concatenate([[0], np.cumsum(self.blocks.planes)])
+        own = (blocks.plane <= plane) & (plane < blocks.plane + blocks.planes)
+        own &= (blocks.line <= line) & (line < blocks.line + STRIP)
+        return [(int(first[b] + plane - blocks.plane[b]), int(line - blocks.line[b])) for b in np.flatnonzero(own)]
 
-    def _in_strips_order(self, volume: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return a view of a volume whose second axis runs across the strips."""
+    def _as_lines(self, volume: NDArray[Scalar]) -> NDArray[Scalar]:
+        """Return a view of a volume whose second axis runs across the strips; its own inverse."""
         return volume.swapaxes(1, 2) if self.turned else volume
+
+    @cached_property
+    def _height(self) -> int:
+        """Lines with those that the last strip has beyond the volume."""
+        return int(max(self.blocks.line.max(initial=0) + STRIP, self._as_lines(self.lit).shape[1]))
+
+    @cached_property
+    def _lit_rows(self) -> tuple[int, int]:
+        return lit_range(self.rows.cell)
+
+    @cached_property
+    def _cells(self) -> SortedCells:
+        return cells_in_order(self.columns.cells, self.order)
+
+    @cached_property
+    def _sorted_mask(self) -> NDArray[np.float32]:
+        return np.ascontiguousarray(self.mask[:, self.order])
+
+    @cached_property
+    def _lines_of_rows(self) -> LitRows:
+        return rows_of_pixels(self.rows, *self._lit_rows)
+
+    @cached_property
+    def _groups(self) -> int:
+        return int(self._lines_of_rows.line.max(initial=-1)) // GROUP + 1
+
+    @cached_property
+    def _columns_forward(self) -> VisitsForward:
+        return visits_forward(self.columns, self.order, self.blocks)
+
+    @cached_property
+    def _columns_back(self) -> VisitsBack:
+        return visits_back(self.columns, self.order, self.blocks, len(self.lit))
+
+    @cached_property
+    def _rows_forward(self) -> RowSums:
+        return row_sums(self.rows, self.blocks, self._lit_rows)
+
+    @cached_property
+    def _rows_back(self) -> Terms:
+        return row_terms_back(self.rows, self.blocks, self._lit_rows[0])
+
+
+def shares_of(coefficients: NDArray[np.float32], line: int) -> NDArray[np.float32]:
+    """Return the shares (n,) that one line of a strip has, of coefficients (n, COEFFICIENTS)."""
+    t = PLACES[line]
+    return np.asarray(np.maximum(coefficients[:, 0] + t * (coefficients[:, 1] + t * coefficients[:, 2]), 0.0))
+
+
+def forward_reference(operator: StripOperator, volume: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return the image of a volume voxel by voxel: the readable twin of `StripOperator.forward`."""
+    image = np.zeros(operator.image_shape)
+    for index in np.ndindex(*operator.shape):
+        rows, columns, weights = operator.column(*index)
+        image[rows, columns] += weights * np.float64(volume[index])
+    return image
+
+
+def adjoint_reference(operator: StripOperator, image: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return the adjoint voxel by voxel: the readable twin of `StripOperator.adjoint`."""
+    volume = np.zeros(operator.shape)
+    for index in np.ndindex(*operator.shape):
+        rows, columns, weights = operator.column(*index)
+        volume[index] = np.sum(weights * image[rows, columns].astype(np.float64))
+    return volume

@@ -1,0 +1,394 @@
+"""The blocks of weights in strips: how the volume and the aperture are parted, and the factors of each part.
+
+For every part of a strip, `SLAB` planes deep, as many parts of the aperture and of the strip's length get factors of
+their own as it takes for the light that goes astray to be less than a stated share.
+
+Axes: image axes (x along the columns), mm, z away from the camera from the nominal focal point.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from lfpiv_cli.grid import Grid
+from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.curved_space import CurvedSpace
+from lfpiv_cli.simd.combine import TILE
+from lfpiv_cli.threads import share_out
+from lfpiv_cli.weights.axis import SMALLEST_SHARE, AxisWeights, axis_weights, depth_nodes
+from lfpiv_cli.weights.axis_cells import AxisOptics, Cells, micro_image_cells
+from lfpiv_cli.weights.curved import places_on_array
+from lfpiv_cli.weights.strip_fits import (
+    AxisFit,
+    StripRays,
+    evenly_spread,
+    fit_axis,
+    fit_part,
+    strip_rays,
+)
+from lfpiv_cli.weights.strip_kernels import PLACES, SLAB, STRIP, Blocks
+from lfpiv_cli.weights.strip_tables import FINE_PARTS, part_of_cells, sorted_cells
+
+# Rays of each part of a strip.
+RAYS = 8192
+# Into how many parts the aperture is cut across the strips, for the factors along them; and how many tiles of column
+# cells share a factor across them, all at first: in the order in which they are tried.
+PARTS_ACROSS = (1, 2, 3, 4, 6)
+TILES_SHARING = (10**6, 5, 2)
+# Share of a voxel's light that may go to wrong pixels since its rays are taken for those of their part, by the factors
+# along the strips and across them. Both together, and what a pixel's sharp part of the aperture is worth, make 0.03.
+# Parts of the aperture cost more time in each projection than tiles do.
+STRAY_ALONG, STRAY_ACROSS = 0.022, 0.014
+# Lenses beside those that rays were found to come to: more than a voxel's width and the rays' rarity make.
+LENSES_BESIDE = 4
+# Boxes along x, y and z of a part of a strip in each of which this holds.
+BOXES = (4, 2, 2)
+# Lines of a strip from which its factors along it are made, and by how much they may differ in L1 from what is made of
+# them: else half as many lines share factors, but at least so many.
+LINES_TAKEN = 4
+LARGEST_MISFIT, FEWEST_LINES = 0.015, 4
+
+
+@dataclass(frozen=True, eq=False)
+class StripScene:
+    """What the blocks are made of.
+
+    Attributes
+    ----------
+    camera, space, grid : the voxels' in world axes
+    optics : the camera's axes (columns, rows)
+    cells : of each of these
+    order, tile : along the strips, the cells sorted, and the tile of each cell; -1 where no light comes
+    part : across the strips, which part of the aperture each cell sees
+    lit : (planes, lines, voxels along) which voxels have light
+    across : image axis across the strips
+    """
+
+    camera: Camera
+    space: CurvedSpace
+    grid: Grid
+    optics: tuple[AxisOptics, AxisOptics]
+    cells: tuple[Cells, Cells]
+    order: NDArray[np.int32]
+    tile: NDArray[np.int64]
+    part: NDArray[np.int64]
+    lit: NDArray[np.bool_]
+    across: int
+
+    @property
+    def along(self) -> int:
+        """Image axis along the strips."""
+        return 1 - self.across
+
+    def centres_mm(self, axis: int) -> NDArray[np.float64]:
+        """Return the centres of the voxels along an image axis."""
+        return self.grid.axis_mm(self.world(axis))
+
+    def world(self, axis: int) -> int:
+        """Return the world axis that an image axis follows."""
+        return axis if axis == 2 or self.camera.column_axis == "x" else 1 - axis
+
+
+class Factor(NamedTuple):
+    """Weights along one axis: entries (planes, voxels) of each voxel, and cell and share of each."""
+
+    counts: NDArray[np.int64]
+    cell: NDArray[np.int32]
+    share: NDArray[np.float32]
+
+    def chosen(self, keep: NDArray[np.bool_]) -> Factor:
+        """Return the entries that are kept."""
+        first = np.concatenate([[0], np.cumsum(keep)])
+        ends = first[np.concatenate([[0], np.cumsum(self.counts)])]
+        return Factor(np.diff(ends).reshape(self.counts.shape), self.cell[keep], self.share[keep])
+
+
+class Block(NamedTuple):
+    """One block: where it lies and its two factors."""
+
+    plane: int
+    line: int
+    columns: Factor
+    rows: Factor
+
+
+def strip_scene(
+    camera: Camera,
+    space: CurvedSpace,
+    grid: Grid,
+    optics: tuple[AxisOptics, AxisOptics],
+    lit: NDArray[np.bool_],
+    turned: bool,
+) -> StripScene:
+    """Return what blocks are made of, strips being of rows of voxels, or of columns where `turned`."""
+    cells = micro_image_cells(optics[0]), micro_image_cells(optics[1])
+    lines, across = (lit.swapaxes(1, 2), 0) if turned else (lit, 1)
+    radius, along = camera.aperture_radius_mm, 1 - across
+    order = sorted_cells(cells[along], _lenses_reached(camera, space, grid, optics[along], along), radius)
+    tile = np.full(cells[along].pixel.size, -1)
+    tile[order] = np.arange(order.size) // TILE
+    part = part_of_cells(cells[across], radius, FINE_PARTS)
+    return StripScene(camera, space, grid, optics, cells, order, tile, part, lines, across)
+
+
+def _lenses_reached(camera: Camera, space: CurvedSpace, grid: Grid, optics: AxisOptics, axis: int) -> tuple[int, int]:
+    """Return the first and the last number of the lenses that light from a grid can come to along an image axis."""
+    even = evenly_spread(RAYS, 5)
+    bounds = camera.to_image_axes(np.array([grid.bounds_mm(k) for k in range(3)]).T)
+    angle, radius = 2.0 * np.pi * even[:, 3], camera.aperture_radius_mm * np.sqrt(even[:, 4])
+    crossing = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+    array, valid = places_on_array(camera, space, bounds[0] + even[:, :3] * (bounds[1] - bounds[0]), crossing)
+    if not valid.any():
+        return 0, -1
+    place = array[valid, axis] * (1.0 + camera.distortion_per_mm2 * np.sum(array[valid] ** 2, axis=1))
+    low, high = (np.array([place.min(), place.max()]) - optics.lens_origin_mm) / optics.lens_pitch_mm
+    return int(np.floor(low)) - LENSES_BESIDE, int(np.ceil(high)) + LENSES_BESIDE
+
+
+def make_blocks(scene: StripScene) -> list[Block]:
+    """Return the blocks of a volume; voxels that no rays were found for are taken out of `scene.lit`."""
+    planes, lines, _ = scene.lit.shape
+    blocks: list[Block] = []
+    for plane in range(0, planes, SLAB):
+        for line in range(0, lines, STRIP):
+            blocks += _blocks_of(scene, slice(plane, min(plane + SLAB, planes)), slice(line, min(line + STRIP, lines)))
+    return blocks
+
+
+def _blocks_of(scene: StripScene, planes: slice, lines: slice) -> list[Block]:
+    """Return the blocks of some lines of voxels in some planes, of fewer lines each where need be."""
+    lit = np.asarray(scene.lit[planes, lines].any(axis=2))
+    if not lit.any():
+        return []
+    seen = np.flatnonzero(np.any(lit, axis=1))
+    planes, lit = slice(planes.start + seen[0], planes.start + seen[-1] + 1), lit[seen[0] : seen[-1] + 1]
+    rays = rays_of(scene, planes, lines, RAYS)
+    if rays is None:
+        scene.lit[planes, lines] = False
+        return []
+    along, misfit = _factors_along(scene, rays, planes, lines, lit)
+    count = lines.stop - lines.start
+    if misfit > LARGEST_MISFIT and count > FEWEST_LINES:
+        middle = lines.start + count // 2
+        halves = slice(lines.start, middle), slice(middle, lines.stop)
+        return [block for half in halves for block in _blocks_of(scene, planes, half)]
+    found = []
+    tiles = [scene.tile[columns.cell] for columns in along]
+    for first, last, rows in _factors_across(scene, rays, planes, lines, lit):
+        row_part = scene.part[rows.cell] * len(along) // FINE_PARTS
+        for k, columns in enumerate(along):
+            held = columns.chosen((tiles[k] >= first) & (tiles[k] < last))
+            if held.cell.size:
+                found.append(Block(planes.start, lines.start, held, rows.chosen(row_part == k)))
+    return found
+
+
+def rays_of(scene: StripScene, planes: slice, lines: slice, rays: int) -> StripRays | None:
+    """Return rays from the lit lines of a part of a strip."""
+    plane, line = np.nonzero(scene.lit[planes, lines].any(axis=2))
+    centres = [scene.centres_mm(scene.across)[lines][line], scene.centres_mm(2)[planes][plane]]
+    sides = scene.camera.to_image_axes(np.asarray(scene.grid.spacing_mm))
+    ends = np.array(scene.grid.bounds_mm(scene.world(scene.along)))
+    return strip_rays(scene.camera, scene.space, np.stack(centres, axis=1), ends, sides, scene.across, rays)
+
+
+def part_of(places_mm: NDArray[np.float64], radius_mm: float, parts: int) -> NDArray[np.int64]:
+    """Return in which of so many parts of the aperture places on the main lens lie."""
+    return np.clip((places_mm + radius_mm) * parts / (2.0 * radius_mm), 0, parts - 1).astype(np.int64)
+
+
+def stray(rays: StripRays, left_mm: NDArray[np.float64], pitch_mm: float) -> float:
+    """Return the share of light that goes astray in the worst box of a part of a strip, by what a fit leaves (n,).
+
+    A ray that arrives d off is taken to another lens with the probability d / pitch, which two lenses notice.
+    """
+    start = (rays.start_mm - rays.middle_mm) / rays.half_mm
+    order = [rays.along, rays.across, 2]
+    places = [
+        np.clip(((start[:, axis] + 1.0) * 0.5 * boxes).astype(np.int64), 0, boxes - 1)
+        for axis, boxes in zip(order, BOXES, strict=True)
+    ]
+    box = np.ravel_multi_index(places, BOXES)
+    total = np.bincount(box, np.abs(left_mm), int(np.prod(BOXES)))
+    return float(np.max(2.0 * total / (np.maximum(np.bincount(box, minlength=total.size), 1) * pitch_mm)))
+
+
+def fits_along(scene: StripScene, rays: StripRays) -> tuple[list[AxisFit], float]:
+    """Return a fit along the strip for each part of the aperture across it, and the light that goes astray."""
+    whole, left = fit_axis(rays, scene.along)
+    crossing, pitch = rays.crossing_mm[:, scene.across], scene.optics[scene.along].lens_pitch_mm
+    for parts in PARTS_ACROSS:
+        which = part_of(crossing, rays.radius_mm, parts)
+        fits, off = _fits_of_parts(whole, left, which, parts, pitch)
+        if off < STRAY_ALONG:
+            break
+    return fits, off
+
+
+def fits_across(scene: StripScene, rays: StripRays) -> tuple[list[AxisFit], int, float]:
+    """Return a fit across the strip for each so many tiles of cells, how many, and the light that goes astray."""
+    whole, left = fit_axis(rays, scene.across)
+    tile, tiles = _tile_of_rays(scene, rays), -(-scene.order.size // TILE)
+    for sharing in TILES_SHARING:
+        fits, off = _fits_of_parts(
+            whole, left, tile // sharing, -(-tiles // sharing), scene.optics[scene.across].lens_pitch_mm
+        )
+        if off < STRAY_ACROSS:
+            break
+    return fits, sharing, off
+
+
+def _fits_of_parts(
+    whole: AxisFit, left_mm: NDArray[np.float64], which: NDArray[np.int64], parts: int, pitch_mm: float
+) -> tuple[list[AxisFit], float]:
+    """Return a fit for the rays (n,) of each part, and the light that goes astray."""
+    fits, left = [], left_mm.copy()
+    for k in range(parts):
+        fit, left[which == k] = fit_part(whole, left_mm, which == k)
+        fits.append(fit)
+    return fits, stray(whole.rays, left, pitch_mm)
+
+
+def _tile_of_rays(scene: StripScene, rays: StripRays) -> NDArray[np.int64]:
+    """Return the tile of the column cell that each ray comes to, or of one beside it."""
+    cells, optics = scene.cells[scene.along], scene.optics[scene.along]
+    number = np.rint((rays.array_mm[:, scene.along] - optics.lens_origin_mm) / optics.lens_pitch_mm).astype(np.int64)
+    lens = np.clip(number - cells.first_lens, 0, cells.start.size - 2)
+    first, count = cells.start[lens], np.maximum(cells.start[lens + 1] - cells.start[lens], 1)
+    # The first pixel of a lens sees the far end of the aperture.
+    within = 0.5 * (1.0 - rays.crossing_mm[:, scene.along] / rays.radius_mm) * count
+    cell = np.minimum(first + np.clip(within.astype(np.int64), 0, count - 1), scene.tile.size - 1)
+    return np.maximum(scene.tile[cell], 0)
+
+
+def _factors_along(
+    scene: StripScene, rays: StripRays, planes: slice, lines: slice, lit: NDArray[np.bool_]
+) -> tuple[list[Factor], float]:
+    """Return the factors along a strip, one a part of the aperture across it, and the worst misfit of their lines."""
+    axis, across = scene.along, scene.across
+    z, width = scene.centres_mm(2)[planes], scene.grid.spacing_mm[2]
+    own, line = scene.centres_mm(axis), scene.centres_mm(across)[lines]
+    side = scene.grid.spacing_mm[scene.world(across)]
+    # Lines within the fluid, where the roots of a polynomial that goes through them best would be.
+    nodes = -np.cos(np.pi * (np.arange(LINES_TAKEN) + 0.5) / LINES_TAKEN)
+    first, last = lit.argmax(axis=1), lit.shape[1] - 1 - lit[:, ::-1].argmax(axis=1)
+    dark = ~lit.any(axis=1)
+    first[dark], last[dark] = 0, lit.shape[1] - 1
+    middle, half = 0.5 * (line[first] + line[last]), 0.5 * (line[last] - line[first]) + 0.25 * side
+    taken = middle[:, np.newaxis] + half[:, np.newaxis] * nodes
+    places = PLACES[0] + (taken - line[0]) / side * (PLACES[1] - PLACES[0])
+    powers = places[..., np.newaxis] ** np.arange(3)
+    through = np.linalg.pinv(powers)
+    depths = np.repeat(depth_nodes(z, width), LINES_TAKEN, axis=0)
+    found, misfit = [], 0.0
+    for fit in fits_along(scene, rays)[0]:
+        bent = fit.bending(depths, taken.ravel())
+        weights = axis_weights(
+            scene.optics[axis], own - rays.middle_mm[axis], scene.grid.spacing_mm[scene.world(axis)], bent
+        )
+        factor, off = _through_lines(weights, powers, through)
+        found.append(factor)
+        misfit = max(misfit, float(np.percentile(off[~dark], 90)) if not dark.all() else 0.0)
+    return found, misfit
+
+
+def _factors_across(
+    scene: StripScene, rays: StripRays, planes: slice, lines: slice, lit: NDArray[np.bool_]
+) -> Iterator[tuple[int, int, Factor]]:
+    """Yield the first tile of column cells, the one behind the last, and the factor across the strip for these."""
+    axis = scene.across
+    depths = depth_nodes(scene.centres_mm(2)[planes], scene.grid.spacing_mm[2])
+    centres, side = scene.centres_mm(axis)[lines], scene.grid.spacing_mm[scene.world(axis)]
+    fits, sharing, _ = fits_across(scene, rays)
+    for k, fit in enumerate(fits):
+        own = axis_weights(scene.optics[axis], centres - rays.middle_mm[axis], side, fit.bending(depths))
+        entries = np.diff(own.start).reshape(lit.shape)
+        counts = np.zeros((len(lit), STRIP), np.int64)
+        counts[:, : lit.shape[1]] = entries * lit
+        kept = np.repeat(lit.ravel(), entries.ravel())
+        yield k * sharing, (k + 1) * sharing, Factor(counts, own.cell[kept], own.share[kept])
+
+
+def _through_lines(
+    weights: AxisWeights, powers: NDArray[np.float64], through: NDArray[np.float64]
+) -> tuple[Factor, NDArray[np.float64]]:
+    """Return the polynomials (planes, voxels) through the weights on some lines of each plane, and their misfit in L1.
+
+    Parameters
+    ----------
+    powers, through : (planes, lines, 3) of the lines' places, and (planes, 3, lines) what inverts them
+    """
+    planes = len(powers)
+    room = np.zeros((weights.cell.size, 3), np.float32)
+    cell, counts = np.zeros(weights.cell.size, np.int32), np.zeros((planes, weights.voxels), np.int64)
+    off = np.zeros((planes, weights.voxels))
+    first = weights.start[:: weights.voxels * powers.shape[1]]
+    arrays = (weights.start, weights.cell, weights.share, powers, through, cell, room, counts, off)
+    share_out(_write_polynomials, planes, first, weights.cells.pixel.size, *arrays)
+    kept = np.concatenate([np.arange(first[p], first[p] + counts[p].sum()) for p in range(planes)])
+    return Factor(counts, cell[kept], room[kept]), off
+
+
+@njit(cache=True, nogil=True)
+def _write_polynomials(
+    part: tuple[int, int],
+    first: NDArray[np.int64],
+    cells: int,
+    start: NDArray[np.int64],
+    cell: NDArray[np.int32],
+    share: NDArray[np.float32],
+    powers: NDArray[np.float64],
+    through: NDArray[np.float64],
+    found_cell: NDArray[np.int32],
+    found: NDArray[np.float32],
+    counts: NDArray[np.int64],
+    off: NDArray[np.float64],
+) -> None:
+    """Write what `_through_lines` returns for some planes, those of plane p from entry `first[p]` on."""
+    lines, voxels = powers.shape[1], counts.shape[1]
+    table = np.zeros((cells, lines))
+    for plane in range(part[0], part[1]):
+        at = first[plane]
+        for voxel in range(voxels):
+            low, high = cells, 0
+            for line in range(lines):
+                row = (plane * lines + line) * voxels + voxel
+                for k in range(start[row], start[row + 1]):
+                    table[cell[k], line] = share[k]
+                    low, high = min(low, cell[k]), max(high, cell[k] + 1)
+            for k in range(low, high):
+                largest = table[k].max()
+                if largest > SMALLEST_SHARE:
+                    for c in range(3):
+                        total = 0.0
+                        for line in range(lines):
+                            total += through[plane, c, line] * table[k, line]
+                        found[at, c] = total
+                    for line in range(lines):
+                        shown = 0.0
+                        for c in range(3):
+                            shown += powers[plane, line, c] * found[at, c]
+                        off[plane, voxel] += abs(max(shown, 0.0) - table[k, line]) / lines
+                    found_cell[at] = k
+                    at += 1
+                    counts[plane, voxel] += 1
+                table[k] = 0.0
+
+
+def joined(factors: Sequence[Factor], optics: AxisOptics, cells: Cells) -> AxisWeights:
+    """Return the weights of all blocks along one axis, the planes of one after the other."""
+    counts, cell, share = (np.concatenate([getattr(each, name) for each in factors]) for name in Factor._fields)
+    start = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    return AxisWeights(len(counts), counts.shape[1], optics.pixels, cells, start, cell, share)
+
+
+def places_of(blocks: Sequence[Block]) -> Blocks:
+    """Return where blocks lie."""
+    plane, line, planes = ([b.plane for b in blocks], [b.line for b in blocks], [len(b.rows.counts) for b in blocks])
+    return Blocks(np.array(plane, np.int64), np.array(planes, np.int64), np.array(line, np.int64))

@@ -1,0 +1,195 @@
+"""Where the rays of a part of a strip meet the array, as polynomials along each axis.
+
+Of each part rays are traced through the faces, and each coordinate of where they meet the array is fitted by a
+polynomial of what its factor of the weights may know: along the strip own coordinate and crossing, depth and line;
+across it own coordinate and crossing, and depth. What is left is what the other axis says. Where that is too much, rays
+through different parts of the aperture, or from different parts of the strip, have polynomials of their own.
+
+Axes: image axes (x along the columns), mm, z away from the camera from the nominal focal point.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.curved_space import CurvedSpace
+from lfpiv_cli.weights.axis import FittedBending
+from lfpiv_cli.weights.curved import places_on_array
+
+# Near the wall of a tube of 10 mm the polynomials are off by less than 0.2 um along it, where slabs are thin, and by
+# about 1 um across it, where the rays' places end with a root; in the middle by nothing.
+DEGREE_ALONG, DEGREE_ACROSS = 5, 7
+# What rays through a part of the aperture add to that is smooth: of this degree where there are so many of them.
+DEGREE_OF_PARTS = {3: 120, 1: 16}
+# Straight pieces of a ray's place on the array over X, as behind plane windows.
+PIECES = 8
+# Of the normal equations' diagonal; keeps them solvable where rays say nothing about a term.
+RIDGE = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class StripRays:
+    """Rays from a part of a strip.
+
+    Attributes
+    ----------
+    start_mm, crossing_mm, array_mm : (n, 3), (n, 2) on the main lens and (n, 2) on the array
+    along, across : which image axis runs along the strip, and which across it
+    middle_mm, half_mm : (3,) of the starts
+    radius_mm : of the aperture
+    """
+
+    start_mm: NDArray[np.float64]
+    crossing_mm: NDArray[np.float64]
+    array_mm: NDArray[np.float64]
+    along: int
+    across: int
+    middle_mm: NDArray[np.float64]
+    half_mm: NDArray[np.float64]
+    radius_mm: float
+
+    def variables(self, axis: int) -> NDArray[np.float64]:
+        """Return what the factor along an image axis knows of each ray, (n, 3) or (n, 4), each from -1 to 1.
+
+        Own coordinate, depth and crossing, and along the strip the coordinate across it.
+        """
+        start = (self.start_mm - self.middle_mm) / self.half_mm
+        known = [start[:, axis], start[:, 2], self.crossing_mm[:, axis] / self.radius_mm]
+        return np.stack([*known, start[:, self.across]] if axis == self.along else known, axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class AxisFit:
+    """The coordinate on the array along one axis, as a polynomial of `StripRays.variables`.
+
+    Attributes
+    ----------
+    exponents, coefficients_mm : (terms, variables), (terms,)
+    rays : what it was fitted to
+    axis : image axis
+    """
+
+    exponents: NDArray[np.int64]
+    coefficients_mm: NDArray[np.float64]
+    rays: StripRays
+    axis: int
+
+    def bending(self, depths_mm: NDArray[np.float64], lines_mm: NDArray[np.float64] | None = None) -> FittedBending:
+        """Return the polynomials in own coordinate, from the middle, and crossing, at depths (planes, nodes).
+
+        Along a strip also on one line of each plane, (planes,).
+        """
+        middle, half = self.rays.middle_mm, self.rays.half_mm
+        depth = (depths_mm - middle[2]) / half[2]
+        degree = int(self.exponents.max())
+        factors = [depth[..., np.newaxis] ** np.arange(degree + 1)]
+        if lines_mm is not None:
+            across = self.rays.across
+            line = (lines_mm - middle[across]) / half[across]
+            factors.append((line[:, np.newaxis] ** np.arange(degree + 1))[:, np.newaxis])
+        table = np.zeros((*depths_mm.shape, degree + 1, degree + 1))
+        for powers, coefficient in zip(self.exponents, self.coefficients_mm, strict=True):
+            part = coefficient * factors[0][..., powers[1]]
+            if lines_mm is not None:
+                part = part * factors[1][..., powers[3]]
+            table[..., powers[0], powers[2]] += part
+        return FittedBending(table, np.array([half[self.axis], self.rays.radius_mm]), PIECES)
+
+
+def strip_rays(
+    camera: Camera,
+    space: CurvedSpace,
+    lines_mm: NDArray[np.float64],
+    ends_mm: NDArray[np.float64],
+    sides_mm: NDArray[np.float64],
+    across: int,
+    rays: int,
+) -> StripRays | None:
+    """Return rays from the lines of voxels at (n, 2) across the strip and in depth, image axes; None if none are seen.
+
+    Parameters
+    ----------
+    ends_mm : (2,) of the lines
+    sides_mm : (3,) of a voxel
+    """
+    even = evenly_spread(rays, 6)
+    along, radius = 1 - across, camera.aperture_radius_mm
+    line = lines_mm[(even[:, 0] * len(lines_mm)).astype(np.int64)]
+    start = np.empty((rays, 3))
+    start[:, along] = ends_mm[0] + even[:, 1] * (ends_mm[1] - ends_mm[0])
+    start[:, across] = line[:, 0] + (even[:, 2] - 0.5) * sides_mm[across]
+    start[:, 2] = line[:, 1] + (even[:, 3] - 0.5) * sides_mm[2]
+    angle = 2.0 * np.pi * even[:, 4]
+    crossing = radius * np.sqrt(even[:, 5:]) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    array, valid = places_on_array(camera, space, start, crossing)
+    if np.count_nonzero(valid) < rays // 8:
+        return None
+    start, crossing, array = start[valid], crossing[valid], array[valid]
+    array *= 1.0 + camera.distortion_per_mm2 * np.sum(array**2, axis=1, keepdims=True)
+    low, high = start.min(axis=0), start.max(axis=0)
+    return StripRays(start, crossing, array, along, across, 0.5 * (low + high), 0.5 * (high - low), radius)
+
+
+def evenly_spread(count: int, dimensions: int) -> NDArray[np.float64]:
+    """Return points (count, dimensions) that fill the unit cube evenly: multiples of the roots of x^(d+1) = x + 1."""
+    root = 2.0
+    for _ in range(60):
+        root = (1.0 + root) ** (1.0 / (dimensions + 1))
+    steps = root ** -np.arange(1.0, dimensions + 1)
+    return np.asarray((0.5 + np.arange(1, count + 1)[:, np.newaxis] * steps) % 1.0)
+
+
+@cache
+def _exponents(variables: int, degree: int) -> NDArray[np.int64]:
+    powers = product(range(degree + 1), repeat=variables)
+    return np.array([each for each in powers if sum(each) <= degree])
+
+
+def _terms(variables: NDArray[np.float64], exponents: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return each term (n, terms) of variables (n, k)."""
+    powers = variables[:, :, np.newaxis] ** np.arange(exponents.max() + 1)
+    terms = powers[:, 0, exponents[:, 0]]
+    for k in range(1, variables.shape[1]):
+        terms = terms * powers[:, k, exponents[:, k]]
+    return terms
+
+
+def fit_axis(rays: StripRays, axis: int) -> tuple[AxisFit, NDArray[np.float64]]:
+    """Return the fit to all rays along an axis, and what it leaves of each (n,), mm."""
+    variables, place = rays.variables(axis), rays.array_mm[:, axis]
+    exponents = _exponents(variables.shape[1], DEGREE_ALONG if axis == rays.along else DEGREE_ACROSS)
+    coefficients, left = _solved(variables, exponents, place)
+    return AxisFit(exponents, coefficients, rays, axis), left
+
+
+def fit_part(
+    fit: AxisFit, left_mm: NDArray[np.float64], chosen: NDArray[np.bool_]
+) -> tuple[AxisFit, NDArray[np.float64]]:
+    """Return the fit that suits some of the rays (n,), and what it leaves of these, from what the fit to all leaves."""
+    degree = next((each for each, rays in DEGREE_OF_PARTS.items() if np.count_nonzero(chosen) >= rays), None)
+    if degree is None:
+        return fit, left_mm[chosen]
+    variables = fit.rays.variables(fit.axis)[chosen]
+    exponents = _exponents(variables.shape[1], degree)
+    further, left = _solved(variables, exponents, left_mm[chosen])
+    coefficients = fit.coefficients_mm.copy()
+    for powers, coefficient in zip(exponents, further, strict=True):
+        coefficients[np.all(fit.exponents == powers, axis=1)] += coefficient
+    return AxisFit(fit.exponents, coefficients, fit.rays, fit.axis), left
+
+
+def _solved(
+    variables: NDArray[np.float64], exponents: NDArray[np.int64], place: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the coefficients that follow places best, and what they leave."""
+    terms = _terms(variables, exponents)
+    normal = terms.T @ terms
+    normal[np.diag_indices_from(normal)] += RIDGE * len(terms)
+    coefficients = np.asarray(np.linalg.solve(normal, terms.T @ place), dtype=np.float64)
+    return coefficients, place - terms @ coefficients
