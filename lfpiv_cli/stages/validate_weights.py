@@ -15,14 +15,18 @@ from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.pictures import ensure_drawing, write_picture
 from lfpiv_cli.files.provenance import record as provenance_record
 from lfpiv_cli.optics.object_space import ObjectSpace
+from lfpiv_cli.validation.curved_weights import make_curved_columns, seen_voxels
 from lfpiv_cli.validation.weights import TABLE1_MM, in_view, limits_missed, make_columns, sample_voxels, weights_figures
-from lfpiv_cli.validation.weights_pictures import columns_figure, similarity_figure
+from lfpiv_cli.validation.weights_pictures import SHOWN, SHOWN_BEHIND_FACES, columns_figure, similarity_figure
 
 
 def validate_weights(
     config: Path, output: Path, *, overwrite: bool = False, console: Console = CONSOLE
 ) -> dict[str, Any]:
-    """Hold the weights of the paper's voxels and of a random sample against each other and against integrals."""
+    """Hold the weights of the paper's voxels and of a random sample against each other and against integrals.
+
+    Through a scene all voxels are random ones of the fluid.
+    """
     paths = {name: output / f"weights{name}" for name in (".json", "_columns.png", "_similarity.png")}
     prepare_folder(list(paths.values()))
     for target in paths.values():
@@ -32,17 +36,26 @@ def validate_weights(
     chosen = settings.validation.weights
     camera, grid = settings.camera_model(), settings.grid()
     rng = np.random.default_rng(chosen.seed)
-    known = [centre for centre in TABLE1_MM if in_view(camera, _space(settings), centre, grid.spacing_mm)]
-    centres = np.concatenate([np.array(known).reshape(-1, 3), sample_voxels(grid, chosen.sample, rng)])
-    long_count = np.where(np.arange(len(centres)) < len(known), chosen.long_count_rays, 0)
-    with console.progress(len(centres), "validate weights") as advance:
-        columns = make_columns(camera, _space(settings), centres, grid.spacing_mm, rng, long_count, advance)
+    scene = settings.scene_space()
+    if scene is not None:
+        voxels = seen_voxels(camera, scene, grid, len(TABLE1_MM) + chosen.sample, rng)
+        long_count = np.where(np.arange(len(voxels)) < len(TABLE1_MM), chosen.long_count_rays, 0)
+        with console.progress(len(voxels), "validate weights") as advance:
+            columns = make_curved_columns(camera, scene, grid, voxels, rng, long_count, advance)
+    else:
+        space = _space(settings)
+        known = [centre for centre in TABLE1_MM if in_view(camera, space, centre, grid.spacing_mm)]
+        centres = np.concatenate([np.array(known).reshape(-1, 3), sample_voxels(grid, chosen.sample, rng)])
+        long_count = np.where(np.arange(len(centres)) < len(known), chosen.long_count_rays, 0)
+        with console.progress(len(centres), "validate weights") as advance:
+            columns = make_columns(camera, space, centres, grid.spacing_mm, rng, long_count, advance)
     figures = weights_figures(columns, long_count)
     missed = limits_missed(figures, chosen.limits.model_dump())
     record = provenance_record("validate weights", settings.resolved(), {"config": config})
     write_json(paths[".json"], {"figures": figures, "limits_missed": missed, "provenance": record}, overwrite)
     shown = min(len(TABLE1_MM), len(columns))
-    write_picture(paths["_columns.png"], columns_figure(columns[:shown]), overwrite)
+    names = SHOWN if scene is None else SHOWN_BEHIND_FACES
+    write_picture(paths["_columns.png"], columns_figure(columns[:shown], names), overwrite)
     write_picture(paths["_similarity.png"], similarity_figure(figures, shown), overwrite)
     summary = {
         f"{name}.{figure}": each[figure]
@@ -57,7 +70,6 @@ def validate_weights(
 
 def _space(settings: Config) -> ObjectSpace:
     """Return media and window; without the section `window` there is nothing to trace directly."""
-    settings.ensure_plane_layers("validating weights")
     try:
         window = settings.window_model()
     except ConfigError:

@@ -63,6 +63,7 @@ COMPARISONS = {
     "factorised_to_converged": ("ert", "factorised"),
     "factorised_exact_to_converged": ("ert_exact", "factorised_exact"),
     "ray_count_to_converged": ("ert", "ray_count"),
+    "on_demand_to_converged": ("ert", "on_demand"),
     "coarser_to_converged": ("ert", "coarser"),
     "factorised_to_long_count": ("long_count", "factorised"),
     "ert_exact_to_long_count": ("long_count_exact", "ert_exact"),
@@ -144,7 +145,7 @@ def make_columns(
             if space.window is not None:
                 direct = replace(space, refraction="exact", method="drt")
                 images["long_count_exact"] = count_rays(camera, direct, point, sides, rng, number)
-        columns.append(Column((centre[0], centre[1], centre[2]), _cut(images)))
+        columns.append(Column((centre[0], centre[1], centre[2]), cut_to_lit(images)))
         if progress:
             progress(1)
     return columns
@@ -220,7 +221,7 @@ def _factorised(
     return images
 
 
-def _cut(images: dict[str, NDArray[np.float64]]) -> dict[str, NDArray[np.float64]]:
+def cut_to_lit(images: dict[str, NDArray[np.float64]]) -> dict[str, NDArray[np.float64]]:
     """Return the images cut to the rectangle that any of them lights."""
     lit = np.any([image > 0.0 for image in images.values()], axis=0)
     if not lit.any():

@@ -18,15 +18,21 @@ SHOWN = {
     "factorised": "ERT, factorised",
     "ray_count": "ERT, 500 x 10,000 rays",
 }
+SHOWN_BEHIND_FACES = {
+    "ert": "traced, converged",
+    "on_demand": "traced, on demand",
+    "factorised": "in strips",
+    "ray_count": "500 x 10,000 rays",
+}
 
 
 @styled
-def columns_figure(columns: list[Column]) -> Figure:
+def columns_figure(columns: list[Column], shown: dict[str, str] = SHOWN) -> Figure:
     """Return the columns of voxels, one row a voxel: direct tracing, equivalent points, factorised, counted.
 
-    A row has one scale: the brightest pixel by equivalent points.
+    Behind curved faces `SHOWN_BEHIND_FACES`. A row has one scale: the brightest pixel by equivalent points, or traced.
     """
-    names = [name for name in SHOWN if any(name in column.images for column in columns)]
+    names = [name for name in shown if any(name in column.images for column in columns)]
     figure = new_figure(2.8 * len(names) + 0.6, 2.9 * len(columns))
     axes = figure.subplots(len(columns), len(names), squeeze=False)
     for row, column in zip(axes, columns, strict=True):
@@ -35,10 +41,10 @@ def columns_figure(columns: list[Column]) -> Figure:
             if name not in column.images:
                 axis.set_axis_off()
                 continue
-            shown = axis.imshow(column.images[name], cmap="gray", vmin=0.0, vmax=brightest, interpolation="nearest")
-            axis.set_title(f"{SHOWN[name]}\n({', '.join(f'{value:.3g}' for value in column.centre_mm)}) mm", fontsize=7)
+            picture = axis.imshow(column.images[name], cmap="gray", vmin=0.0, vmax=brightest, interpolation="nearest")
+            axis.set_title(f"{shown[name]}\n({', '.join(f'{value:.3g}' for value in column.centre_mm)}) mm", fontsize=7)
             axis.set(xlabel="column (px)", ylabel="row (px)")
-        figure.colorbar(shown, ax=row.tolist(), label="weight (1)", shrink=0.8)
+        figure.colorbar(picture, ax=row.tolist(), label="weight (1)", shrink=0.8)
     return figure
 
 

@@ -108,14 +108,21 @@ def factorise_strips(camera: Camera, space: CurvedSpace, grid: Grid, optics: Opt
     rows = joined([each.rows for each in blocks], optics[scene.across], scene.cells[scene.across])
     mask = aperture_mask(columns.cells, rows.cells, camera.aperture_radius_mm)
     operator = StripOperator(columns, rows, places_of(blocks), mask, scene.order, lit, turned, np.zeros(0))
-    misfit = misfits_l1(operator, camera, space, grid, sample_lit(camera, space, grid, lit, SAMPLE))
-    return replace(operator, misfit_l1=misfit)
+    sample = sample_lit(camera, space, grid, lit, SAMPLE, np.random.default_rng(0))
+    return replace(operator, misfit_l1=misfits_l1(operator, camera, space, grid, sample))
 
 
-def sample_lit(camera: Camera, space: CurvedSpace, grid: Grid, lit: NDArray[np.bool_], count: int) -> NDArray[np.int64]:
+def sample_lit(
+    camera: Camera,
+    space: CurvedSpace,
+    grid: Grid,
+    lit: NDArray[np.bool_],
+    count: int,
+    rng: np.random.Generator,
+) -> NDArray[np.int64]:
     """Return (n, 3) random voxels [plane, row voxel, column voxel], at most so many, all corners of which are seen."""
     inside = np.argwhere(lit)
-    some = inside[np.random.default_rng(0).permutation(len(inside))[: 4 * count]]
+    some = inside[rng.permutation(len(inside))[: 4 * count]]
     corners = np.array(list(product((-0.5, 0.5), repeat=3))) * camera.to_image_axes(np.asarray(grid.spacing_mm))
     points = (voxel_centres(camera, grid, some)[:, np.newaxis] + corners).reshape(-1, 3)
     seen = space.slopes(camera, points, np.zeros((len(points), 2)))[1].reshape(-1, len(corners)).all(axis=1)
