@@ -17,6 +17,7 @@ from lfpiv_cli.files.config import Config
 from lfpiv_cli.files.hdf5 import read_tree, write_tree
 from lfpiv_cli.files.weights_file import FORMAT, VERSION, WeightsFile, open_weights, write_weights
 from lfpiv_cli.grid import Grid
+from lfpiv_cli.interface.weights import misfit_notices
 from lfpiv_cli.optics.curved_space import CurvedSpace, Face
 from lfpiv_cli.optics.height_map import HeightMap
 from lfpiv_cli.optics.media import Window, fluid_path_to_focus
@@ -280,6 +281,12 @@ def test_a_weights_file_holds_them(table2, tube, tmp_path, operator_kind):
     assert read_tree(path, FORMAT, (VERSION,))[0]["grid"]["voxels_outside_fluid"] == found.weights.voxels_outside_fluid
     if operator_kind == "on demand":
         assert found.weights.solver_operator.source == tube
+        return
+    np.testing.assert_array_equal(found.weights.solver_operator.misfit_l1, operator.misfit_l1)
+    assert misfit_notices(found) == []
+    worse = replace(content.weights, solver_operator=replace(operator, misfit_l1=np.array([0.01, 0.05])))
+    (notice,) = misfit_notices(replace(content, weights=worse))
+    assert (notice.code, notice.measured) == ("weights-inexact", 0.05)
 
 
 @pytest.mark.parametrize(

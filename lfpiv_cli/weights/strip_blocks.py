@@ -42,8 +42,8 @@ RAYS = 8192
 PARTS_ACROSS = (1, 2, 3, 4, 6)
 TILES_SHARING = (10**6, 5, 2)
 # Share of a voxel's light that may go to wrong pixels since its rays are taken for those of their part, by the factors
-# along the strips and across them. Both together, and what a pixel's sharp part of the aperture is worth, make 0.03.
-# Parts of the aperture cost more time in each projection than tiles do.
+# along the strips and across them. Both together, and what a pixel's sharp part of the aperture is worth, make some
+# 0.03. Parts of the aperture cost more time in each projection than tiles do.
 STRAY_ALONG, STRAY_ACROSS = 0.022, 0.014
 # Lenses beside those that rays were found to come to: more than a voxel's width and the rays' rarity make.
 LENSES_BESIDE = 4
