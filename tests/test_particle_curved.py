@@ -54,7 +54,7 @@ def images(view: View, point: NDArray[np.float64]) -> NDArray[np.float64]:
     respond_all(view, np.array([[*point, 1.0]]), responses)
     pixels, values = lit_by(responses, 0)
     result = np.zeros((view.camera.rows * view.camera.columns, 4))
-    np.add.at(result, pixels, values[: pixels.size])
+    np.add.at(result, pixels, values[:, : pixels.size].T)
     return result
 
 

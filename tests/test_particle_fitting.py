@@ -84,7 +84,8 @@ def test_a_pixel_between_micro_images_counts_once(view: View, rng: np.random.Gen
     pixels, values = np.empty(capacity, np.int32), np.empty((capacity, 4))
     count = respond_once(view, *particle[0, :3], pixels, values)
     assert np.unique(pixels[:count]).size == count
-    change = normal_equations(pixels[:count], values[:count], 5e5, residual, weight, np.empty((4, 4)), np.empty(4))
+    rows, picked = np.ascontiguousarray(values[:count].T), np.empty((2, count))
+    change = normal_equations(pixels[:count], rows, 5e5, residual, weight, picked, np.empty((4, 4)), np.empty(4))
     direct = np.sum(weight * ((residual - image_of(view, particle)) ** 2 - residual**2))
     assert change == pytest.approx(direct, rel=1e-9)
 
@@ -114,7 +115,7 @@ def test_a_ghost_is_not_accepted(view: View, rng: np.random.Generator) -> None:
 
 
 def test_a_claim_is_worth_the_light_that_is_there() -> None:
-    pixels, values = np.arange(10, dtype=np.int32), np.full((10, 4), 0.1)
+    pixels, values = np.arange(10, dtype=np.int32), np.full((4, 10), 0.1)
     residual = np.full(10, 100.0)
     weight = np.ones_like(residual)
     assert claimed_share(pixels, values, 1000.0, residual, weight, 0.0) == 1.0

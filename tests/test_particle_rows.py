@@ -43,7 +43,8 @@ def test_rows_are_the_pixels_one_by_one(view: View, place: tuple[float, float, f
     count = respond_once(view, *place, pixels, values)
     responses = room_for(1, capacity, 0)
     respond_all(view, np.array([[*place, 1.0]]), responses)
-    named, found = lit_by(responses, 0)
+    named, rows = lit_by(responses, 0)
+    found = rows.T
     images = np.zeros((2, view.camera.rows * view.camera.columns, 4))
     np.add.at(images[0], named, found[: named.size])
     np.add.at(images[1], pixels[:count], values[:count])

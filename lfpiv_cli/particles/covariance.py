@@ -143,12 +143,12 @@ def _slopes_of(
         pixels, values = lit_by(responses, 0)
         for k in range(pixels.size):
             # A pixel that is named again has no light.
-            if values[k, 0] > 0.0:
+            if values[0, k] > 0.0:
                 root = np.sqrt(observation.weight[pixels[k]])
                 pixel[end] = pixels[k]
                 for unknown in range(3):
-                    slope[end, unknown] = root * particles[n, 3] * values[k, 1 + unknown]
-                slope[end, 3] = root * values[k, 0]
+                    slope[end, unknown] = root * particles[n, 3] * values[1 + unknown, k]
+                slope[end, 3] = root * values[0, k]
                 counts[n] += 1
                 end += 1
     return counts, pixel[:end].copy(), slope[:end].copy()

@@ -61,9 +61,9 @@ def claimed_share(
     found = wanted = 0.0
     for k in range(pixels.size):
         if weight[pixels[k]] > 0.0:
-            claim = CLAIM * light * values[k, 0]
+            claim = CLAIM * light * values[0, k]
             wanted += claim
-            found += min(max(residual[pixels[k]] + own * values[k, 0], 0.0), claim)
+            found += min(max(residual[pixels[k]] + own * values[0, k], 0.0), claim)
     return found / wanted if wanted > 0.0 else 0.0
 
 
@@ -73,7 +73,7 @@ def seen_share(pixels: NDArray[np.int32], values: NDArray[np.float64], weight: N
     seen = 0.0
     for k in range(pixels.size):
         if weight[pixels[k]] > 0.0:
-            seen += values[k, 0]
+            seen += values[0, k]
     return seen
 
 
@@ -317,7 +317,7 @@ def _judge(
         pixels, values = lit_by(responses, 0)
         total = squares = 0.0
         for k in range(pixels.size):
-            f, w = values[k, 0], weight[pixels[k]]
+            f, w = values[0, k], weight[pixels[k]]
             if w > 0.0:
                 total += f
                 squares += f * w * residual[pixels[k]] * residual[pixels[k]]

@@ -90,6 +90,7 @@ class Responses(NamedTuple):
     place : zeros, one for each pixel of as many rows as a footprint spans where there are two particles; serves to
         find common pixels
     common : (2, 4, capacity) where there are two particles, room for what both do to common pixels
+    picked : (2, capacity), room for the residual and the weights of the pixels of one of them
     scratch : room for what one lens shows
     """
 
@@ -98,6 +99,7 @@ class Responses(NamedTuple):
     values: NDArray[np.float64]
     place: NDArray[np.int32]
     common: NDArray[np.float64]
+    picked: NDArray[np.float64]
     scratch: Scratch
 
 
@@ -107,7 +109,8 @@ def room_for(members: int, capacity: int, places: int) -> Responses:
     room = capacity + SLACK
     pixels, values = np.empty((members, room), np.int32), np.empty((members, VALUES, room))
     common = np.empty((2, UNKNOWNS, room if members == 2 else 0))
-    return Responses(np.zeros(members, np.int64), pixels, values, np.zeros(places, np.int32), common, scratch(capacity))
+    place, picked = np.zeros(places, np.int32), np.empty((2, room))
+    return Responses(np.zeros(members, np.int64), pixels, values, place, common, picked, scratch(capacity))
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
@@ -120,8 +123,8 @@ def copy_rows(source: NDArray[np.float64], target: NDArray[np.float64]) -> None:
 
 @njit(cache=True)
 def lit_by(responses: Responses, member: int) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
-    """Return the pixels (n,) that a particle lights, and values (n or more, 4), the first of which are theirs."""
-    return responses.pixels[member][: responses.counts[member]], responses.values[member].T
+    """Return the pixels (n,) that a particle lights, and values (4, n or more), the first of which are theirs."""
+    return responses.pixels[member][: responses.counts[member]], responses.values[member]
 
 
 @njit(cache=True)
@@ -164,6 +167,13 @@ def _row_and_column(pixel: int, columns: int) -> tuple[int, int]:
     return row, pixel - row * columns
 
 
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def pick(pixels: NDArray[np.int32], image: NDArray[np.float64], picked: NDArray[np.float64]) -> None:
+    """Fill in an image's values in some pixels: side by side, sums over them are taken many at once."""
+    for k in range(pixels.size):
+        picked[k] = image[pixels[k]]
+
+
 @njit(cache=True, fastmath=SUMS, **COUNT_NO_REFERENCES)
 def normal_equations(
     pixels: NDArray[np.int32],
@@ -171,20 +181,25 @@ def normal_equations(
     light: float,
     residual: NDArray[np.float64],
     weight: NDArray[np.float64],
+    picked: NDArray[np.float64],
     matrix: NDArray[np.float64],
     right: NDArray[np.float64],
 ) -> float:
-    """Fill J^T W J (4, 4) and J^T W (r - I f); return what the particle adds to chi-squared."""
+    """Fill J^T W J (4, 4) and J^T W (r - I f); return what the particle adds to chi-squared.
+
+    `picked` (2, n or more) is room.
+    """
+    pick(pixels, residual, picked[0])
+    pick(pixels, weight, picked[1])
     change = 0.0
     # Kept out of arrays, sums stay in registers.
     r0 = r1 = r2 = r3 = 0.0
     m00 = m01 = m02 = m03 = m11 = m12 = m13 = m22 = m23 = m33 = 0.0
     for k in range(pixels.size):
-        at = pixels[k]
-        w = weight[at]
-        f, r = light * values[k, 0], residual[at]
+        r, w, d = picked[0, k], picked[1, k], values[0, k]
+        f = light * d
         change += w * f * (f - 2.0 * r)
-        a, b, c, d = light * values[k, 1], light * values[k, 2], light * values[k, 3], values[k, 0]
+        a, b, c = light * values[1, k], light * values[2, k], light * values[3, k]
         left = w * (r - f)
         r0 += a * left
         r1 += b * left
@@ -235,10 +250,11 @@ def _pair_equations(
     block = np.empty((UNKNOWNS, UNKNOWNS))
     pixels_1, values_1 = lit_by(responses, 0)
     pixels_2, values_2 = lit_by(responses, 1)
-    change = normal_equations(pixels_1, values_1, pair[0, 3], residual, weight, block, right[:UNKNOWNS])
+    picked = responses.picked
+    change = normal_equations(pixels_1, values_1, pair[0, 3], residual, weight, picked, block, right[:UNKNOWNS])
     copy_rows(block, matrix[:UNKNOWNS, :UNKNOWNS])
     add_light(pixels_1, values_1, -pair[0, 3], residual)
-    change += normal_equations(pixels_2, values_2, pair[1, 3], residual, weight, block, right[UNKNOWNS:])
+    change += normal_equations(pixels_2, values_2, pair[1, 3], residual, weight, picked, block, right[UNKNOWNS:])
     copy_rows(block, matrix[UNKNOWNS:, UNKNOWNS:])
     add_light(pixels_1, values_1, pair[0, 3], residual)
     # What the first explains is off the second's side already; the first's side still lacks the second's light.
@@ -260,8 +276,8 @@ def _pair_equations(
         at = place[away] - 1
         w = weight[pixels_2[k]]
         for i in range(UNKNOWNS):
-            one[i, count] = w * values_1[at, i]
-            two[i, count] = values_2[k, i]
+            one[i, count] = w * values_1[i, at]
+            two[i, count] = values_2[i, k]
         count += 1
     for i in range(UNKNOWNS):
         # Values begin with light, unknowns end with it.
@@ -372,7 +388,9 @@ def _equations(
     if members.shape[0] == 2:
         return _pair_equations(observation, members, responses, matrix, right)
     pixels, values = lit_by(responses, 0)
-    return normal_equations(pixels, values, members[0, 3], observation.residual, observation.weight, matrix, right)
+    return normal_equations(
+        pixels, values, members[0, 3], observation.residual, observation.weight, responses.picked, matrix, right
+    )
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
@@ -416,8 +434,8 @@ def best_light(
     top = bottom = 0.0
     for k in range(pixels.size):
         w = weight[pixels[k]]
-        top += w * values[k, 0] * residual[pixels[k]]
-        bottom += w * values[k, 0] ** 2
+        top += w * values[0, k] * residual[pixels[k]]
+        bottom += w * values[0, k] ** 2
     return max(top / bottom, 0.0) if bottom > 0.0 else 0.0
 
 
@@ -432,7 +450,7 @@ def change_by(
     """Return what a particle of this light adds to chi-squared."""
     change = 0.0
     for k in range(pixels.size):
-        f = light * values[k, 0]
+        f = light * values[0, k]
         change += weight[pixels[k]] * f * (f - 2.0 * residual[pixels[k]])
     return change
 
@@ -441,4 +459,4 @@ def change_by(
 def add_light(pixels: NDArray[np.int32], values: NDArray[np.float64], light: float, image: NDArray[np.float64]) -> None:
     """Add light times the response to an image."""
     for k in range(pixels.size):
-        image[pixels[k]] += light * values[k, 0]
+        image[pixels[k]] += light * values[0, k]

@@ -297,7 +297,7 @@ def _write_rows(
         camera.aperture_radius_mm,
         per_width,
         view.table_step_mm,
-        view.table.shape[0] - 1.001,
+        view.table.shape[0] - 2.001,
         per_width / view.table_step_mm,
         inside,
     )

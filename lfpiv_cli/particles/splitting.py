@@ -90,7 +90,7 @@ def _split(
         respond_all(view, one, responses)
         pixels, values = lit_by(responses, 0)
         add_light(pixels, values, light, residual)
-        single = normal_equations(pixels, values, light, residual, observation.weight, matrix, right)
+        single = normal_equations(pixels, values, light, residual, observation.weight, responses.picked, matrix, right)
         lowest = single - least[0]
         promising = single - EARLY_GAIN * least[0]
         found = False

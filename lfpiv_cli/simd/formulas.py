@@ -14,7 +14,7 @@ from typing import Any
 from llvmlite import ir
 from numba.core import cgutils
 
-from lfpiv_cli.simd.vectors import LANES, index, load_one
+from lfpiv_cli.simd.vectors import LANES, index
 
 # A register holds half as many float64 numbers as float32.
 DOUBLES = LANES // 2
@@ -154,12 +154,43 @@ def integers_in_lanes(builder: ir.IRBuilder, number: Any) -> Any:
     return builder.shuffle_vector(one, undefined, order)
 
 
-def gather(builder: ir.IRBuilder, array: Any, places: Any, offsets: Sequence[Any]) -> list[Lanes]:
-    """Return for each offset the elements of an array that are so far from those at some places."""
-    found: list[Any] = [ir.Constant(VECTOR, ir.Undefined)] * len(offsets)
-    for lane in range(DOUBLES):
-        at = ir.Constant(ir.IntType(32), lane)
-        begin = builder.gep(array, [builder.extract_element(places, at)])
-        for k, offset in enumerate(offsets):
-            found[k] = builder.insert_element(found[k], load_one(builder, begin, offset), at)
-    return [Lanes(builder, value) for value in found]
+def gather(builder: ir.IRBuilder, array: Any, places: Any, count: int) -> list[Lanes]:
+    """Return the first, the second and so on of `count` neighbouring elements of an array from some places on.
+
+    Read are whole registers, beyond the last element too.
+    """
+    found: list[Lanes] = []
+    for begin in range(0, count, DOUBLES):
+        lines = []
+        for lane in range(DOUBLES):
+            place = builder.extract_element(places, ir.Constant(ir.IntType(32), lane))
+            lines.append(load_lanes(builder, array, builder.add(place, index(begin))).value)
+        found += [Lanes(builder, value) for value in _transposed(builder, lines)]
+    return found[:count]
+
+
+def _transposed(builder: ir.IRBuilder, lines: Sequence[Any]) -> Sequence[Any]:
+    """Return the columns of a square of numbers, a register for each of its lines."""
+    step = 1
+    while step < DOUBLES:
+        swapped = list(lines)
+        for one in range(DOUBLES):
+            if one & step:
+                continue
+            # Columns that have the step in their number change places with the lines that have.
+            pair, other = (lines[one], lines[one + step]), one + step
+            kept = [DOUBLES + k - step if k & step else k for k in range(DOUBLES)]
+            rest = [DOUBLES + k if k & step else k + step for k in range(DOUBLES)]
+            for line, order in ((one, kept), (other, rest)):
+                kind = ir.VectorType(ir.IntType(32), DOUBLES)
+                swapped[line] = builder.shuffle_vector(*pair, ir.Constant(kind, order))
+        lines, step = swapped, 2 * step
+    return lines
+
+
+def any_above(numbers: Lanes, limit: Lanes) -> Any:
+    """Return whether a number in any lane is above a limit."""
+    builder = numbers.builder
+    above = builder.fcmp_ordered(">", numbers.value, limit.value)
+    bits = builder.bitcast(above, ir.IntType(DOUBLES))
+    return builder.icmp_unsigned("!=", bits, ir.Constant(ir.IntType(DOUBLES), 0))

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from lfpiv_cli.simd.formulas import (
     DOUBLES,
     Lanes,
+    any_above,
     at_least,
     at_most,
     counted_from,
@@ -366,7 +367,6 @@ def _generate_cover(context: Any, builder: ir.IRBuilder, signature: Any, argumen
     known = RimNumbers(*(lanes(builder, member) for member in members))
     entries = context.make_array(signature.args[5])(context, builder, arguments[5])
     line = builder.mul(cgutils.unpack_tuple(builder, entries.shape, 3)[1], index(3))
-    offsets = [index(k) for k in range(6)] + [builder.add(line, index(k)) for k in range(6)]
     each, lines = (integers_in_lanes(builder, number) for number in (index(3), line))
     y, patch_y = (
         lanes(builder, load_one(builder, down, builder.add(arguments[4], index(k * STRIDE))))
@@ -374,15 +374,22 @@ def _generate_cover(context: Any, builder: ir.IRBuilder, signature: Any, argumen
     )
     with groups_of_lanes(builder, count) as group:
         column = builder.add(first, builder.mul(group.index, index(DOUBLES)))
-        x, patch_x = (load_lanes(builder, across, builder.add(column, index(k * STRIDE))) for k in (SEEN_FROM, PATCH))
-        p, q = _entry(x, y, known)
-        (whole_p, i), (whole_q, j) = whole_part(p), whole_part(q)
-        corners = gather(builder, table, builder.add(builder.mul(i, each), builder.mul(j, lines)), offsets)
-        left = _covered(x, y, known, corners, p - whole_p, q - whole_q)
+        patch_x = load_lanes(builder, across, builder.add(column, index(PATCH * STRIDE)))
         away2 = patch_x * patch_x + patch_y * patch_y
-        for k, (value, whole) in enumerate(zip(left, WHOLE_PATCH, strict=True)):
-            place = builder.add(column, index(OF_ROW + k * STRIDE))
-            store_lanes(builder, where_above(away2, known.inside, value, whole), rim, place)
+        to = [builder.add(column, index(OF_ROW + k * STRIDE)) for k in range(RIM_ROWS)]
+        with builder.if_else(any_above(away2, known.inside)) as (cut, whole_all):
+            with cut:
+                x = load_lanes(builder, across, builder.add(column, index(SEEN_FROM * STRIDE)))
+                p, q = _entry(x, y, known)
+                (whole_p, i), (whole_q, j) = whole_part(p), whole_part(q)
+                corner = builder.add(builder.mul(i, each), builder.mul(j, lines))
+                corners = [*gather(builder, table, corner, 6), *gather(builder, table, builder.add(corner, lines), 6)]
+                left = _covered(x, y, known, corners, p - whole_p, q - whole_q)
+                for value, whole, place in zip(left, WHOLE_PATCH, to, strict=True):
+                    store_lanes(builder, where_above(away2, known.inside, value, whole), rim, place)
+            with whole_all:
+                for whole, place in zip(WHOLE_PATCH, to, strict=True):
+                    store_lanes(builder, lanes(builder, whole), rim, place)
     return context.get_dummy_value()
 
 
