@@ -161,6 +161,7 @@ def open_weights(path: Path | str) -> WeightsFile:
     """
     path = Path(path)
     tree, provenance = read_tree(path, FORMAT, READABLE_VERSIONS)
+    _ensure_own_strips(path, tree)
     try:
         camera = read_camera(_group(tree, "camera"))
         grid, padding = read_grid(_group(tree, "grid"))
@@ -185,6 +186,15 @@ def read_weights_record(path: Path) -> dict[str, Any]:
     with open_h5(path) as file:
         ensure_format(path, file, FORMAT, READABLE_VERSIONS)
         return read_provenance(file)
+
+
+def _ensure_own_strips(path: Path, tree: dict[str, Any]) -> None:
+    """Refuse the strips of version 3, which had `height` where those of today have `order`."""
+    strips = tree.get("strips")
+    if isinstance(strips, dict) and "height" in strips and "order" not in strips:
+        raise InputError(
+            f"{path}: weights behind curved faces of an earlier lfpiv; build them again: lfpiv build-weights"
+        )
 
 
 def _group(tree: dict[str, Any], name: str) -> dict[str, Any]:
