@@ -177,6 +177,14 @@ def test_pipe_along_y_is_the_pipe_along_x_with_axes_exchanged(rng):
     assert np.array_equal(along_y[:, [1, 0, 2]], pipe(WIDTH / 2, MEAN)(points))
 
 
+def test_a_tilted_pipes_flow_is_one_along_x_turned(rng):
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    points = rng.uniform(-3.0, 3.0, (20, 3))
+    straight, tilted = pipe(WIDTH / 2, MEAN), pipe(WIDTH / 2, MEAN, axis=tuple(3.0 * turn[:, 0]))
+    assert tilted(points @ turn.T) == pytest.approx(straight(points) @ turn.T, abs=1e-12)
+    assert tilted.gradient(points @ turn.T) == pytest.approx(turn @ straight.gradient(points) @ turn.T, abs=1e-9)
+
+
 def test_rotation_has_the_given_rate_sense_and_centre():
     # omega = 3 rad/s about z: the point 1 mm along +x of the centre moves along +y with 3 mm/s
     flow = rigid_rotation((0.0, 0.0, 3.0), CENTRE, (0.1, 0.0, 0.0))

@@ -223,6 +223,9 @@ def test_what_cannot_be_is_named(configured: Callable[[str], Config], old: str, 
         ("pipe: {radius_mm: 4.0}", "pipe.radius_mm: is 4, but that of the last face in scene is 5"),
         ("pipe: {radius_mm: 5.0, axis: y}", "pipe.axis: is y, but that of the last face in scene is x"),
         ("pipe: {radius_mm: 5.0, centre_mm: [0, 0, 1]}", "pipe.centre_mm: is [0.0, 0.0, 1.0], but that of the last"),
+        ("pipe: {radius_mm: 5.0, axis: [1, 0.01, 0]}", "pipe.axis: is [1.0, 0.01, 0.0], but that of the last"),
+        ("pipe: {radius_mm: 5.0, axis: [1, 0.1, 0]}", "expected a direction within 5 degrees of x or y"),
+        ("pipe: {radius_mm: 5.0, axis: [0, 0, 0]}", "expected a direction within 5 degrees of x or y"),
     ],
 )
 def test_walls_that_contradict_a_scene(configured: Callable[[str], Config], addition: str, words: str) -> None:
@@ -233,6 +236,8 @@ def test_walls_that_contradict_a_scene(configured: Callable[[str], Config], addi
 
 def test_a_pipe_may_be_given_beside_its_faces(configured: Callable[[str], Config]) -> None:
     assert configured(RIG + TUBE + "pipe: {radius_mm: 5.0, centre_mm: [3, 0, 0]}").pipe is not None
+    tilted = TUBE.replace("axis: x", "axis: [1, 0.01, -0.02]")
+    assert configured(RIG + tilted + "pipe: {radius_mm: 5, centre_mm: [1, 0.01, -0.02], axis: [2, 0.02, -0.04]}").pipe
 
 
 def test_a_scene_needs_faces_and_media(configured: Callable[[str], Config]) -> None:

@@ -214,6 +214,16 @@ def test_tracers_fill_a_pipe_and_nothing_else(rng):
     assert box.volume_in_mm3(pipe) == pytest.approx(box.volume_mm3 * np.pi / 4)
 
 
+def test_tracers_fill_a_tilted_pipe(rng):
+    pipe = RoundWall(2.0, (0.0, 0.5, -0.4), (1.0, 0.05, 0.0))
+    box = Box((-4.0, -9.0, -9.0), (4.0, 9.0, 9.0)).within(pipe_bounds(pipe))
+    places = Tracers(4000, box, walls=pipe).draw_places(rng)
+    share = (pipe.distances_mm(places) / 2.0) ** 2
+    assert np.histogram(share, 4, (0.0, 1.0))[0] == pytest.approx([1000] * 4, abs=120)
+    # at the ends of the box the pipe is 0.2 mm beside its middle: nothing of it is cut off
+    assert places[places[:, 0] > 3.0, 1].max() > 0.5 + 2.0 + 0.1
+
+
 def test_brightness_can_be_log_normal(rng):
     brightness = Tracers(4000, Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), brightness_log_sigma=0.5).draw_brightness(rng)
     assert np.mean(np.log(brightness)) == pytest.approx(0.0, abs=0.03)  # 0.5/sqrt(4000) is 0.008

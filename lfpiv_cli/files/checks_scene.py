@@ -5,11 +5,22 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
+import numpy as np
+
 from lfpiv_cli.errors import ConfigError
-from lfpiv_cli.files.bench import camera_of, face_of, index_behind, media_of, missing_for_camera, scene_of
+from lfpiv_cli.files.bench import (
+    camera_of,
+    face_of,
+    index_behind,
+    media_of,
+    missing_for_camera,
+    round_wall_of,
+    scene_of,
+)
 from lfpiv_cli.files.sections import Sections
 from lfpiv_cli.files.sections_scene import CylinderFace, HeightMapFace
 from lfpiv_cli.files.yaml_nodes import KeyPath
+from lfpiv_cli.flow.masks import RoundWall
 
 Found = Iterator[tuple[KeyPath, str]]
 
@@ -63,13 +74,17 @@ def _pipe(sections: Sections) -> Found:
         return
     if not math.isclose(pipe.radius_mm, face.radius_mm, rel_tol=AGREEMENT):
         yield ("pipe", "radius_mm"), f"is {pipe.radius_mm:g}, but that of the last face in scene is {face.radius_mm:g}"
-    if isinstance(face.axis, str) and face.axis != pipe.axis:
-        yield ("pipe", "axis"), f"is {pipe.axis}, but that of the last face in scene is {face.axis}"
-    if sections.volume is None or sections.volume.reference != "focal_point" or not isinstance(face.axis, str):
-        return
-    across = (1 if pipe.axis == "x" else 0, 2)
-    if any(abs(pipe.centre_mm[k] - face.centre_mm[k]) > AGREEMENT_MM for k in across):
+    inside = round_wall_of(pipe)
+    axis = RoundWall(face.radius_mm, axis=face.axis).direction
+    if np.linalg.norm(np.cross(inside.direction, axis)) > AGREEMENT:
+        yield ("pipe", "axis"), f"is {_told(pipe.axis)}, but that of the last face in scene is {_told(face.axis)}"
+    from_focal_point = sections.volume is not None and sections.volume.reference == "focal_point"
+    if from_focal_point and inside.distances_mm(np.array(face.centre_mm)) > AGREEMENT_MM:
         yield (
             ("pipe", "centre_mm"),
             f"is {list(pipe.centre_mm)}, but that of the last face in scene is {list(face.centre_mm)}",
         )
+
+
+def _told(axis: str | tuple[float, ...]) -> str:
+    return axis if isinstance(axis, str) else str(list(axis))

@@ -23,7 +23,7 @@ from lfpiv_cli.files.section_types import (
     Voxels,
     Windows,
 )
-from lfpiv_cli.files.sections_scene import FaceSection
+from lfpiv_cli.files.sections_scene import FaceSection, PipeAxis
 from lfpiv_cli.files.sections_simulated import SimulationSection, ValidationSection
 from lfpiv_cli.names import (
     ColumnAxis,
@@ -169,13 +169,14 @@ class ChannelSection(Section):
 
 
 class PipeSection(Section):
-    """The inside of a round pipe along axis (x or y), of radius_mm, through centre_mm in the volume's coordinates.
+    """The inside of a round pipe along axis, of radius_mm, through centre_mm in the volume's coordinates.
 
-    no_slip: the fluid stands still at its wall; `field` reads it.
+    axis: x, y or a direction [x, y, z] within a few degrees of one of them. no_slip: the fluid stands still at its
+    wall; `field` reads it.
     """
 
     radius_mm: Positive
-    axis: Literal["x", "y"] = "x"
+    axis: PipeAxis = "x"
     centre_mm: Vector = (0.0, 0.0, 0.0)
     no_slip: bool = False
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import Discriminator, Field, Tag
+from pydantic import AfterValidator, Discriminator, Field, Tag
+from pydantic_core import PydanticCustomError
 
 from lfpiv_cli.files.section_types import Index, Positive, Section, Vector
+from lfpiv_cli.flow.masks import LARGEST_TILT_DEG, RoundWall
 from lfpiv_cli.names import Facing
 
 # What is behind a face: named as in `media`, or its refractive index.
@@ -19,6 +21,17 @@ Direction = Annotated[
     Annotated[Literal["x", "y"], Tag("name")] | Annotated[Vector, Tag("direction")],
     Discriminator(lambda value: "name" if isinstance(value, str) else "direction"),
 ]
+
+
+def _nearly_lateral(axis: str | tuple[float, float, float]) -> str | tuple[float, float, float]:
+    """Refuse a pipe's axis that is tilted too far from both lateral ones."""
+    if not isinstance(axis, str) and not (any(axis) and RoundWall(1.0, axis=axis).tilt_deg <= LARGEST_TILT_DEG):
+        raise PydanticCustomError("pipe_axis", f"a direction within {LARGEST_TILT_DEG:g} degrees of x or y")
+    return axis
+
+
+# Of a round pipe: x, y, or a direction that is tilted from one of them by a few degrees.
+PipeAxis = Annotated[Direction, AfterValidator(_nearly_lateral)]
 
 
 class PlaneFace(Section):

@@ -18,6 +18,7 @@ from lfpiv_cli.files.section_types import (
     Share,
     Vector,
 )
+from lfpiv_cli.files.sections_scene import PipeAxis
 from lfpiv_cli.names import BoardImages, BoardMethod, BubbleWall, FlowMethod, Refraction
 
 # Each point is carried by all of them: of more, a frame of many tracers takes gigabytes.
@@ -38,16 +39,16 @@ class SquareDuct(Section):
 
 
 class Pipe(Section):
-    """Poiseuille's flow along axis (x or y) through a round pipe of radius_mm about centre_mm, zero outside it.
+    """Poiseuille's flow along axis through a round pipe of radius_mm about centre_mm, zero outside it.
 
-    mean_velocity_m_s: the mean over its section, half of that on its axis.
+    axis: x, y or a direction [x, y, z]. mean_velocity_m_s: the mean over its section, half of that on its axis.
     """
 
     kind: Literal["pipe"]
     radius_mm: Positive
     mean_velocity_m_s: float
     centre_mm: Vector = (0.0, 0.0, 0.0)
-    axis: Literal["x", "y"] = "x"
+    axis: PipeAxis = "x"
 
 
 class RigidRotation(Section):

@@ -15,6 +15,9 @@ from lfpiv_cli.grid import Grid
 
 Floats = NDArray[np.float64]
 
+# Pipes that are tilted further from x or y are other pipes than `RoundWall` knows.
+LARGEST_TILT_DEG = 5.0
+
 
 class Walls(Protocol):
     """What bounds the fluid."""
@@ -61,20 +64,37 @@ class ParallelWalls:
 
 @dataclass(frozen=True)
 class RoundWall:
-    """The inside of a round pipe along `axis` through its centre (x, y, z)."""
+    """The inside of a round pipe along `axis` through its centre (x, y, z).
+
+    The axis is x, y or a direction of any length near one of them: sections across x or y are taken for circles, which
+    at `LARGEST_TILT_DEG` makes boxes 0.4 % too small.
+    """
 
     radius_mm: float
     centre_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    axis: Literal["x", "y"] = "x"
+    axis: Literal["x", "y"] | tuple[float, float, float] = "x"
+
+    @property
+    def direction(self) -> Floats:
+        """Unit vector (3,) along the pipe."""
+        if isinstance(self.axis, str):
+            return np.eye(3)["xy".index(self.axis)]
+        return np.asarray(np.array(self.axis) / np.linalg.norm(self.axis))
 
     @property
     def along(self) -> int:
-        """The axis that the pipe follows, 0 for x."""
-        return 0 if self.axis == "x" else 1
+        """The axis that the pipe follows, or nearly, 0 for x."""
+        return int(np.abs(self.direction[1]) > np.abs(self.direction[0]))
+
+    @property
+    def tilt_deg(self) -> float:
+        """How far the pipe is tilted from the axis that it nearly follows."""
+        return float(np.rad2deg(np.arccos(min(1.0, abs(self.direction[self.along])))))
 
     def distances_mm(self, points_mm: Floats) -> Floats:
         """Return the distance (...) of points (..., 3) from the pipe's axis."""
-        return np.asarray(np.linalg.norm(self._across(points_mm), axis=-1))
+        relative, direction = points_mm - np.asarray(self.centre_mm), self.direction
+        return np.asarray(np.linalg.norm(relative - (relative @ direction)[..., np.newaxis] * direction, axis=-1))
 
     def contain(self, points_mm: Floats) -> NDArray[np.bool_]:
         """Return which points (..., 3) lie in the pipe or on its wall."""
@@ -88,27 +108,36 @@ class RoundWall:
     def volumes_mm3(self, low_mm: Floats, high_mm: Floats) -> Floats:
         """Return the volume (...) in the pipe of boxes from one corner (..., 3) to the other, 0 of empty ones."""
         high = np.maximum(low_mm, high_mm)
-        first, second = (np.moveaxis(self._across(corner) / self.radius_mm, -1, 0) for corner in (low_mm, high))
+        middle = self._axis_at(0.5 * (low_mm + high)[..., self.along])
+        first, second = (
+            np.moveaxis((corner - middle)[..., self._across] / self.radius_mm, -1, 0) for corner in (low_mm, high)
+        )
         area = rectangle_in_circle(first[0], second[0], first[1], second[1]) * self.radius_mm**2
         return np.asarray(area * (high - low_mm)[..., self.along])
 
     def points(self, low_mm: Floats, high_mm: Floats, step_mm: Floats) -> Floats:
         """Return points (k, 3) on the wall that a box holds, at most a step (3,) apart."""
-        along, others = self.along, [1 - self.along, 2]
+        along, others = self.along, self._across
         turns = int(np.ceil(2.0 * np.pi * self.radius_mm / step_mm[others].min()))
         angle = 2.0 * np.pi * np.arange(turns) / turns
         ring = np.zeros((turns, 3))
         ring[:, others] = self.radius_mm * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        ring += self.centre_mm
-        ring = ring[np.all((ring >= low_mm) & (ring <= high_mm), axis=1, where=np.arange(3) != along)]
         places = spaced(low_mm[along], high_mm[along], step_mm[along])
-        found = np.tile(ring, (len(places), 1))
-        found[:, along] = np.repeat(places, len(ring))
-        return found
+        found = (self._axis_at(places)[:, np.newaxis] + ring).reshape(-1, 3)
+        return found[np.all((found >= low_mm) & (found <= high_mm), axis=1, where=np.arange(3) != along)]
 
-    def _across(self, points_mm: Floats) -> Floats:
-        """Return the places (..., 2) of points (..., 3) in the pipe's section, about its axis."""
-        return np.asarray((points_mm - np.asarray(self.centre_mm))[..., [1 - self.along, 2]])
+    @property
+    def _across(self) -> list[int]:
+        """The two axes across the pipe."""
+        return [1 - self.along, 2]
+
+    def _axis_at(self, along_mm: Floats) -> Floats:
+        """Return the points (..., 3) of the pipe's axis at places (...) along the axis that it nearly follows."""
+        centre, direction = np.asarray(self.centre_mm, dtype=np.float64), self.direction
+        share = (np.asarray(along_mm, dtype=np.float64) - centre[self.along]) / direction[self.along]
+        points = np.asarray(centre + share[..., np.newaxis] * direction)
+        points[..., self.along] = along_mm
+        return points
 
 
 def inside(grid: Grid, walls: Walls) -> NDArray[np.bool_]:

@@ -97,28 +97,32 @@ def _duct_orders() -> NDArray[np.int64]:
 
 
 def pipe(
-    radius_mm: float, mean_velocity_m_s: float, centre_mm: Sequence[float] = ORIGIN, axis: Literal["x", "y"] = "x"
+    radius_mm: float,
+    mean_velocity_m_s: float,
+    centre_mm: Sequence[float] = ORIGIN,
+    axis: Literal["x", "y"] | Sequence[float] = "x",
 ) -> KnownFlow:
-    """Return Poiseuille's flow along `axis` through a round pipe, u = 2 U (1 - r^2/R^2), zero outside it."""
-    along = axis_index(axis)
+    """Return Poiseuille's flow along `axis` through a round pipe, u = 2 U (1 - r^2/R^2), zero outside it.
+
+    The axis is x, y or a direction of any length, towards which the fluid flows.
+    """
+    along = np.eye(3)[axis_index(axis)] if axis in ("x", "y") else _unit(np.asarray([axis], dtype=np.float64))[0]
 
     def across(points_mm: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return places over the radius, (n, 3), 0 along the pipe, and 1 - r^2/R^2, (n,)."""
+        """Return places from the axis over the radius, (n, 3), and 1 - r^2/R^2, (n,)."""
         relative = (points_mm - np.asarray(centre_mm, dtype=np.float64)) / radius_mm
-        relative[:, along] = 0.0
+        relative -= (relative @ along)[:, np.newaxis] * along
         return relative, 1.0 - np.sum(relative**2, axis=1)
 
     def flow(points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        velocity = np.zeros((len(points_mm), 3))
-        velocity[:, along] = 2.0 * mean_velocity_m_s * np.maximum(across(points_mm)[1], 0.0)
-        return velocity
+        speed = 2.0 * mean_velocity_m_s * np.maximum(across(points_mm)[1], 0.0)
+        return np.asarray(speed[:, np.newaxis] * along)
 
     def gradient(points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
         relative, profile = across(points_mm)
-        found = np.zeros((len(points_mm), 3, 3))
         slope = -4.0 * mean_velocity_m_s * MM_PER_M / radius_mm * relative
-        found[:, along] = np.where(profile[:, np.newaxis] > 0.0, slope, 0.0)
-        return found
+        slope = np.where(profile[:, np.newaxis] > 0.0, slope, 0.0)
+        return np.asarray(along[:, np.newaxis] * slope[:, np.newaxis, :])
 
     return KnownFlow(flow, gradient)
 

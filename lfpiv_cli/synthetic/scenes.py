@@ -251,8 +251,8 @@ def channel_walls(width_mm: float, mid_plane_z_mm: float, axis: str = "x") -> Bo
 
 
 def pipe_bounds(pipe: RoundWall) -> Box:
-    """Return the box around a round pipe, endless along it."""
-    reach = np.full(3, pipe.radius_mm)
+    """Return the box around a round pipe, endless along it; without bounds around one that is tilted."""
+    reach = np.full(3, np.inf if pipe.tilt_deg > 0.0 else pipe.radius_mm)
     reach[pipe.along] = np.inf
     low, high = pipe.centre_mm - reach, pipe.centre_mm + reach
     return Box((low[0], low[1], low[2]), (high[0], high[1], high[2]))
