@@ -20,7 +20,7 @@ from lfpiv_cli.optics.polynomial_rays import PolynomialRays, complete_exponents,
 from lfpiv_cli.optics.tracing import disc_points, slopes_equivalent, trace
 from lfpiv_cli.weights import columns as columns_module
 from lfpiv_cli.weights.build import factorise, factorise_bricks
-from lfpiv_cli.weights.columns import OnDemandOperator, operator_of
+from lfpiv_cli.weights.columns import ColumnOperator, OnDemandOperator, operator_of
 from lfpiv_cli.weights.model import Weights
 from lfpiv_cli.weights.operators import FactorisedOperator
 from lfpiv_cli.weights.quadrature import integrate_columns
@@ -154,6 +154,17 @@ def test_too_many_columns_are_refused_with_their_size(turned, water, monkeypatch
     monkeypatch.setattr(columns_module, "LARGEST_BYTES", 1000)
     with pytest.raises(InputError, match="60 voxels"):
         operator.restricted(np.ones(operator.image_shape, np.float32))
+
+
+def test_columns_are_kept_for_many_steps_where_they_fit(turned, water, rng, monkeypatch):
+    operator = OnDemandOperator(turned, ObjectSpace(water, None, "paraxial"), GRID)
+    kept = operator.kept()
+    assert isinstance(kept, ColumnOperator)
+    volume = rng.random(operator.shape, dtype=np.float32)
+    # Sums in another order of float32.
+    np.testing.assert_allclose(kept.forward(volume), operator.forward(volume), atol=1e-6)
+    monkeypatch.setattr(columns_module, "LARGEST_BYTES", 1000)
+    assert operator.kept() is operator
 
 
 @pytest.mark.thorough

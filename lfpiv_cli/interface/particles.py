@@ -133,6 +133,8 @@ class Frame:
 def searchable(content: WeightsFile, settings: Config) -> WeightsFile:
     """Return weights to look for particles with: where an array is hexagonal, those of bricks for its cells.
 
+    Columns on demand behind curved faces are made once and kept, where they fit into memory.
+
     Raises
     ------
     ConfigError
@@ -143,8 +145,10 @@ def searchable(content: WeightsFile, settings: Config) -> WeightsFile:
     weights, operator = content.weights, content.weights.solver_operator
     space = _space(content, settings)
     ensure_square_cells(content.camera, space)
-    if not isinstance(operator, OnDemandOperator) or isinstance(space, CurvedSpace):
+    if not isinstance(operator, OnDemandOperator):
         return content
+    if isinstance(space, CurvedSpace):
+        return replace(content, weights=replace(weights, solver_operator=operator.kept()))
     bricks = factorise_bricks(content.camera, settings.media_model(), weights.padded.grid)
     passing = bricks if operator.transmission is None else behind_transmission(bricks, operator.transmission)
     return replace(content, weights=replace(weights, solver_operator=passing))

@@ -161,14 +161,25 @@ class OnDemandOperator:
         InputError : they would take more than `LARGEST_BYTES`
         """
         voxel = np.flatnonzero(self.can_be_lit(image))
-        sample = self.columns_of(voxel[:: max(1, voxel.size // 64)])
-        needed = BYTES_PER_SHARE * sample.pixel.size / max(1, sample.start.size - 1) * voxel.size
+        needed = self._bytes_of(voxel)
         if needed > LARGEST_BYTES:
             raise InputError(
                 f"the image can come from {voxel.size} voxels, whose columns would take {needed / 2**30:.0f} GiB, more "
                 f"than {LARGEST_BYTES // 2**30}; subtract the background, or take fewer voxels"
             )
         return ColumnOperator(self.shape, self.image_shape, voxel, self.columns_of(voxel))
+
+    def kept(self) -> OnDemandOperator | ColumnOperator:
+        """Return the columns of all voxels, made once, for many steps; these weights where those do not fit."""
+        voxel = np.arange(int(np.prod(self.shape)))
+        if self._bytes_of(voxel) > LARGEST_BYTES:
+            return self
+        return ColumnOperator(self.shape, self.image_shape, voxel, self.columns_of(voxel))
+
+    def _bytes_of(self, voxel: NDArray[np.int64]) -> float:
+        """Return what the columns of voxels take, from those of some of them."""
+        sample = self.columns_of(voxel[:: max(1, voxel.size // 64)])
+        return float(BYTES_PER_SHARE * sample.pixel.size / max(1, sample.start.size - 1) * voxel.size)
 
     def can_be_lit(self, image: NDArray[np.float32]) -> NDArray[np.bool_]:
         """Return which voxels (flat) see only lit pixels along nearly all their lines of sight."""
