@@ -12,8 +12,11 @@ import numpy as np
 import pytest
 import tifffile
 
+from lfpiv_cli.calibration import model
+from lfpiv_cli.calibration.scene_pose import ScenePose
 from lfpiv_cli.console import CONSOLE
 from lfpiv_cli.errors import ConfigError, InputError
+from lfpiv_cli.files.calibration_file import read_calibration, write_calibration
 from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.heights import read_heights
 from lfpiv_cli.files.sections_scene import FaceSection
@@ -286,3 +289,33 @@ def test_weights_are_validated_through_a_scene(configured: Callable[[str], Confi
     configured(RIG.replace("voxel_mm: 0.1", "voxel_mm: 0.1, centre_mm: [0, 20, 0]") + TUBE)
     with pytest.raises(ConfigError, match="no voxel of the volume lies wholly in the fluid"):
         validate_weights.validate_weights(tmp_path / "rig.yaml", tmp_path / "none")
+
+
+def test_a_calibration_moves_the_scene_and_the_pipe(configured: Callable[[str], Config], tmp_path: Path) -> None:
+    """Faces, and the pipe with them, lie in the resolved config where the calibration has them."""
+    told = configured(RIG + TUBE + "pipe: {radius_mm: 5.0}")
+    camera = told.camera_model()
+    still, turn = np.zeros(3), np.array([0.0, 0.2, 0.3])
+    pose = ScenePose(np.array([0.0, 0.15, -0.2]), turn, still, still, still, told.scene_fingerprint())
+    found = replace(model.calibrate(model.Photographs(), None, model.DataSheet(camera=camera)), scene=pose)
+    write_calibration(tmp_path / "refined.h5", found, {}, False)
+    read = read_calibration(tmp_path / "refined.h5")
+    assert read.scene is not None
+    assert read.summary()["scene_turn_deg"] == turn.tolist()
+    config = told.with_scene_of(read)
+    moved, before = config.scene_space(), told.scene_space()
+    assert moved is not None
+    assert before is not None
+    assert moved == before.moved(pose.motion)
+    assert config.pipe is not None
+    np.testing.assert_allclose(config.pipe.centre_mm, (0.0, 0.15, -0.2))
+    # to the right seen along the axis is towards +y, and nearer to the camera
+    axis = np.array(config.pipe.axis)
+    np.testing.assert_allclose(axis[1:], np.deg2rad((0.3, -0.2)), rtol=1e-4)
+    # what is moved is not moved again
+    with pytest.raises(ConfigError, match="is not the one whose place the calibration tells"):
+        config.with_scene_of(read)
+    with pytest.raises(ConfigError, match="scene: is missing"):
+        configured(RIG).with_scene_of(read)
+    assert told.with_scene_of(replace(read, scene=None)) is told
+    assert plan_of(config, None).source == moved

@@ -18,6 +18,7 @@ from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose
 from lfpiv_cli.calibration.dlfc import RayFit, fit_rays
 from lfpiv_cli.calibration.lattice import LatticeFit, fit_lattice
 from lfpiv_cli.calibration.rectification import Rectification
+from lfpiv_cli.calibration.scene_pose import ScenePose
 from lfpiv_cli.calibration.sheet import check_pitch, image_distance_mm, sheet_fit
 from lfpiv_cli.calibration.transmission import (
     NARROWEST_LENS_IMAGE,
@@ -92,6 +93,7 @@ class Calibration:
     mid_plane_given : that depth was told and not measured, its uncertainty is not known
     image_distance_mm, image_distance_sigma_mm : s_i by the pitch of the lens images, a check of the data sheet, or None
     ray_fit : polynomials of rays from boards at several depths, in the rectified frame, or None
+    scene : where the faces before the fluid lie, from where the config has them, or None
     """
 
     rectification: Rectification
@@ -104,6 +106,7 @@ class Calibration:
     image_distance_sigma_mm: float | None = None
     ray_fit: RayFit | None = None
     mid_plane_given: bool = False
+    scene: ScenePose | None = None
 
     @property
     def fit(self) -> LatticeFit:
@@ -181,7 +184,7 @@ class Calibration:
             "dlfc_degree": rays.rays.degree if rays else None,
             "dlfc_sightings": rays.sightings if rays else None,
             "dlfc_residual_mm": np.sqrt(np.mean(rays.residual_mm**2, axis=0)).tolist() if rays else None,
-        }
+        } | ({} if self.scene is None else self.scene.summary())
 
     def to_tree(self) -> dict[str, Any]:
         """Return everything as a nested dict of arrays, numbers, strings and None."""
@@ -195,6 +198,7 @@ class Calibration:
             "transmission": self.transmission,
             "board": {field.name: getattr(pose, field.name) for field in fields(BoardPose)} if pose else None,
             "dlfc": self.ray_fit.to_tree() if self.ray_fit else None,
+            "scene": self.scene.to_tree() if self.scene else None,
             "mid_plane_given": 1 if self.mid_plane_given else None,
         } | {name: getattr(self, name) for name in CARRIED}
 
@@ -218,6 +222,7 @@ class Calibration:
                 BoardPose(**tree["board"]) if tree.get("board") else None,
                 ray_fit=RayFit.from_tree(tree["dlfc"]) if tree.get("dlfc") else None,
                 mid_plane_given=bool(tree.get("mid_plane_given")),
+                scene=ScenePose.from_tree(tree["scene"]) if tree.get("scene") else None,
                 **{name: tree.get(name) for name in CARRIED},
             )
         except (KeyError, TypeError, ValueError) as error:

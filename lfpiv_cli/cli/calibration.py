@@ -57,7 +57,7 @@ def calibrate_snapshot(config: Path, output: Path, overwrite: bool, console: Con
 @dark_option
 @click.option("--background", type=FILE, help="Image without tracers to subtract, in place of the dark one.")
 @output_option("Corrected calibration to write (.h5); without it, only report.", required=False)
-@click.option("--picture", type=FILE, help="Picture of the particles' depths and the walls to write (.png).")
+@click.option("--picture", type=FILE, help="Picture of the particles and the walls they end at to write (.png).")
 @common_options
 @raw_option
 def refine_calibration(
@@ -66,7 +66,8 @@ def refine_calibration(
     """Correct a calibration by the tracers of a flow: volume self-calibration.
 
     The particles end at the channel's walls, which gives the mid plane, and their images say how far the lens images
-    have moved since the white image.
+    have moved since the white image. Behind the curved faces of a scene they tell where the pipe's axis lies and how it
+    is tilted; build-weights moves the scene so.
 
     \b
     Example: lfpiv refine-calibration rig.yaml a.tif b.tif --calibration calibration.h5 --dark dark.tif \\

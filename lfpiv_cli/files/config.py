@@ -13,13 +13,14 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from lfpiv_cli.calibration.model import Rig
+from lfpiv_cli.calibration.model import Calibration, Rig
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.files import bench
 from lfpiv_cli.files.checks import contradictions
 from lfpiv_cli.files.config_problems import place_of, problem_of, report, sentence
 from lfpiv_cli.files.heights import with_heights
 from lfpiv_cli.files.inputs import content_of, ensure_regular_file
+from lfpiv_cli.files.scene_place import ensure_same, fingerprint, moved_faces, moved_pipe
 from lfpiv_cli.files.sections import (
     BoardSection,
     CameraSection,
@@ -232,6 +233,33 @@ class Config:
         """Return the faces of `scene`, None where there is none."""
         scene = self.sections.scene
         return None if scene is None else bench.scene_of(scene, self.media_model())
+
+    def scene_fingerprint(self) -> str:
+        """Return what tells the scene from another one.
+
+        Raises
+        ------
+        ConfigError : there is none
+        """
+        return fingerprint(self._needed("scene", self.sections.scene))
+
+    def with_scene_of(self, found: Calibration | None) -> Config:
+        """Return the config with its scene, and the wall of its pipe, where a calibration has found them to lie.
+
+        Raises
+        ------
+        ConfigError
+            If the calibration's is another scene.
+        """
+        if found is None or found.scene is None:
+            return self
+        scene, motion = self.sections.scene, found.scene.motion
+        ensure_same(scene, found.scene.faces_sha256, self.source)
+        resolved = self.resolved()
+        resolved["scene"] = moved_faces(scene or (), self.media, motion)
+        if self.pipe is not None:
+            resolved["pipe"] = moved_pipe(self.pipe, motion)
+        return Config.from_resolved(resolved, f"{self.source} with the calibration's scene")
 
     def plane_space(self, what: str, mid_plane_z_mm: float | None = None) -> ObjectSpace:
         """Return plane layers, as `weights` has them; the window only where it is read.

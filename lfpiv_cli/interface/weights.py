@@ -74,7 +74,7 @@ def build_weights(rig: Config, calibration: Calibration | None = None, **setting
     ConfigError
         The rig or the settings are not possible, or need a calibration that is not there.
     """
-    chosen = rig.overridden("weights", **settings)
+    chosen = rig.overridden("weights", **settings).with_scene_of(calibration)
     plan = plan_of(chosen, calibration)
     found = weights_of(plan, record("build-weights", chosen.resolved(), {}), SILENT)
     warn_of(plan.notices)

@@ -36,6 +36,7 @@ from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.height_map import Reliefs, reliefs_of, turned
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.ray_bundles import aim_all, pencils, trace_all_in, trace_all_out
+from lfpiv_cli.optics.rigid_motion import RigidMotion
 from lfpiv_cli.optics.shapes import Shape
 from lfpiv_cli.optics.surfaces import Faces, Surface
 
@@ -97,6 +98,15 @@ class CurvedSpace:
                     f"face {k + 2} meets the optical axis at z = {back:g} mm, face {k + 1} at {front:g}; expected them "
                     "from the camera on"
                 )
+
+    def moved(self, motion: RigidMotion) -> CurvedSpace:
+        """Return the faces moved as one rigid body.
+
+        Raises
+        ------
+        ConfigError : the optical axis misses one then, or one cannot be turned
+        """
+        return CurvedSpace(self.media, tuple(Face(face.surface.moved(motion), face.index) for face in self.faces))
 
     def shapes(self) -> tuple[Shape, ...]:
         """Return the faces near the optical axis.

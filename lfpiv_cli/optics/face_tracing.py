@@ -48,8 +48,8 @@ def start_at_lens(faces: Faces, X: float, Y: float, slope_x: float, slope_y: flo
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
 def in_fluid(faces: Faces, point: Vector) -> bool:
-    """Return whether a point lies behind the last face."""
-    return height_behind(faces, faces.ratios.size - 1, point) >= -ROUNDING_MM
+    """Return whether a point lies behind the last face, or no further in front of it than may be."""
+    return height_behind(faces, faces.ratios.size - 1, point) >= -ROUNDING_MM - faces.beyond_mm
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)

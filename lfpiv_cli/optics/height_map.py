@@ -10,7 +10,7 @@ Axes: z away from the camera, mm; world axes of a `HeightMap`, image axes of `Re
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from lfpiv_cli.errors import ConfigError
+from lfpiv_cli.optics.rigid_motion import RigidMotion
 from lfpiv_cli.optics.shapes import NO_AXIS, Relief, Shape, Vector, dot, plus, scaled, unit
 from lfpiv_cli.threads import COUNT_NO_REFERENCES
 
@@ -72,6 +73,17 @@ class HeightMap:
         along_both = CubicSpline(columns, along_y, axis=2).c[::-1]
         first = np.array(self.centre_mm[:2]) - 0.5 * (np.array(heights.shape[::-1]) - 1) * step
         return Relief(first, step, np.ascontiguousarray(along_both.transpose(3, 1, 2, 0)))
+
+    def moved(self, motion: RigidMotion) -> HeightMap:
+        """Return the surface shifted.
+
+        Raises
+        ------
+        ConfigError : it is to be turned, but its grid lies along x and y
+        """
+        if motion.turns:
+            raise ConfigError("a face of kind height_map cannot be turned: its grid lies along x and y")
+        return replace(self, centre_mm=motion.point(self.centre_mm))
 
     def shape(self) -> Shape:
         """Return the surface near the optical axis, with its heights.

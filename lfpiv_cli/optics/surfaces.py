@@ -14,12 +14,12 @@ and positive behind it; on the surface its gradient is the unit normal, and alon
 there is the cosine of incidence, which the quadratic equation of the crossing gives with the crossing itself.
 Surfaces given by their heights are of another form (`height_map`).
 
-A new kind is one dataclass with `shape` and one line of `SURFACES`.
+A new kind is one dataclass with `shape` and `moved`, and one line of `SURFACES`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.names import Facing, SurfaceKind
 from lfpiv_cli.optics.height_map import HeightMap, Reliefs, height_at, meet_heights, normal_change_of_heights
+from lfpiv_cli.optics.rigid_motion import RigidMotion
 from lfpiv_cli.optics.shapes import NO_AXIS, Shape, Vector, dot, plus, row, scaled, unit
 from lfpiv_cli.threads import COUNT_NO_REFERENCES
 
@@ -44,6 +45,14 @@ class Surface(Protocol):
         ConfigError : the optical axis does not meet it
         """
 
+    def moved(self, motion: RigidMotion) -> Surface:
+        """Return the surface moved as a rigid body.
+
+        Raises
+        ------
+        ConfigError : it cannot be
+        """
+
 
 @dataclass(frozen=True)
 class Plane:
@@ -54,6 +63,11 @@ class Plane:
     def shape(self) -> Shape:
         """Return the plane near the optical axis."""
         return Shape((0.0, 0.0, self.z_mm), (0.0, 0.0, 1.0), NO_AXIS, 0.0)
+
+    def moved(self, motion: RigidMotion) -> Plane | TiltedPlane:
+        """Return the plane moved as a rigid body."""
+        point = motion.point((0.0, 0.0, self.z_mm))
+        return TiltedPlane(point, motion.direction((0.0, 0.0, 1.0))) if motion.turns else Plane(point[2])
 
 
 @dataclass(frozen=True)
@@ -77,6 +91,10 @@ class TiltedPlane:
             )
         away = normal if normal[2] > 0.0 else scaled(-1.0, normal)
         return Shape((0.0, 0.0, dot(away, self.point_mm) / away[2]), away, NO_AXIS, 0.0)
+
+    def moved(self, motion: RigidMotion) -> TiltedPlane:
+        """Return the plane moved as a rigid body."""
+        return TiltedPlane(motion.point(self.point_mm), motion.direction(self.normal))
 
 
 @dataclass(frozen=True)
@@ -106,6 +124,10 @@ class Cylinder:
         """
         return _round_shape(self.centre_mm, unit(self.axis, "axis"), self.radius_mm, self.facing, "cylinder")
 
+    def moved(self, motion: RigidMotion) -> Cylinder:
+        """Return the cylinder moved as a rigid body."""
+        return replace(self, centre_mm=motion.point(self.centre_mm), axis=motion.direction(self.axis))
+
 
 @dataclass(frozen=True)
 class Sphere:
@@ -130,6 +152,10 @@ class Sphere:
         ConfigError : the optical axis misses it
         """
         return _round_shape(self.centre_mm, NO_AXIS, self.radius_mm, self.facing, "sphere")
+
+    def moved(self, motion: RigidMotion) -> Sphere:
+        """Return the sphere moved as a rigid body."""
+        return replace(self, centre_mm=motion.point(self.centre_mm))
 
 
 SURFACES: dict[SurfaceKind, type[Surface]] = {
@@ -168,6 +194,8 @@ class Faces(NamedTuple):
     vertices_mm, normals, axes : (m, 3), and curvatures_per_mm : (m,), see `Shape`
     ratios : (m,) refractive index in front of each face over that behind it
     reliefs : the heights of those faces that are given by them; None where none is, and kernels are compiled without
+    beyond_mm : how far in front of the last face, or beyond its far side, points still count as in the fluid: the
+        fluid's straight rays go on there as if there were more of it
     """
 
     lens_z_mm: float
@@ -179,6 +207,7 @@ class Faces(NamedTuple):
     curvatures_per_mm: NDArray[np.float64]
     ratios: NDArray[np.float64]
     reliefs: Reliefs | None = None
+    beyond_mm: float = 0.0
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)

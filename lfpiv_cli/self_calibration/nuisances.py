@@ -4,7 +4,8 @@ The unknowns of the camera change the light of all particles, those of a particl
 the columns of the former freed of all that the latter can do (the Schur complement, by least squares with one sparse
 matrix), a small system is left. Found this way are the mean shift of the lens images against those of the white image,
 the main lens's aperture, the particles' size and the radial distortion. Focus and magnification are not: the particles'
-places make up for them.
+places make up for them. Where the particles lie in a pipe, its place is found, too: behind its wall their light is
+astigmatic by how they lie to its axis, which no place makes up for.
 
 Axes: image axes, mm; see `view`. Particles are rows (x, y, z, light), images flat.
 """
@@ -12,6 +13,7 @@ Axes: image axes, mm; see `view`. Particles are rows (x, y, z, light), images fl
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -25,6 +27,8 @@ from lfpiv_cli.particles.noise import Noise
 from lfpiv_cli.particles.response import entries_of
 from lfpiv_cli.particles.rim import rim_table
 from lfpiv_cli.particles.view import View, entry_capacity
+from lfpiv_cli.self_calibration.movable_scene import MovableScene
+from lfpiv_cli.self_calibration.moved_places import moved_places
 from lfpiv_cli.threads import blocks, in_threads
 
 # A round with this many sweeps over the particles leaves a sixth of an error, four leave 1e-3 of it. They end earlier
@@ -40,6 +44,11 @@ SHIFT_STEP, SHARE_STEP, STRETCH_STEP = 2.5e-3, 0.004, 1e-4
 # What the optics model itself gets wrong: on an image traced ray by ray by another program, true to 4e-5 of the pitch,
 # aperture, radius and distortion came out 0.05 %, 0.7 % and 8e-5 (of stretch at the corner) off.
 MODEL_SHARE_OF_PITCH, MODEL_SHARE_OF_APERTURE, MODEL_SHARE_OF_RADIUS, MODEL_STRETCH = 1e-4, 6e-4, 0.01, 1.5e-4
+# Of the scene in mm and rad: over a field of 10 mm both move light by a tenth of a pixel and less.
+SCENE_STEPS = (2e-3, 2e-3, 5e-4, 5e-4)
+MODEL_SCENE = (1e-3, 1e-3, 2e-4, 2e-4)
+# The camera's unknowns stand before those of the scene.
+OF_CAMERA = 5
 # Particles whose columns are made at a time.
 BLOCK = 64
 # Noise about zero is no light: pixels count as lit above this many standard deviations of the read noise.
@@ -55,6 +64,7 @@ class Nuisances:
     shift_x_mm, shift_y_mm : of all lens centres, on the array
     aperture_radius_mm, particle_radius_mm : of main lens and particles
     distortion_per_mm2 : k1
+    axis_across_mm, axis_away_mm, tilt_across_rad, tilt_away_rad : of a scene, see `movable_scene`
     """
 
     shift_x_mm: float = 0.0
@@ -62,10 +72,24 @@ class Nuisances:
     aperture_radius_mm: float = 0.0
     particle_radius_mm: float = 0.0
     distortion_per_mm2: float = 0.0
+    axis_across_mm: float = 0.0
+    axis_away_mm: float = 0.0
+    tilt_across_rad: float = 0.0
+    tilt_away_rad: float = 0.0
 
     @property
     def values(self) -> NDArray[np.float64]:
-        """All of them as an array, in the order of the attributes."""
+        """Those of camera and particles as an array (5,), in the order of the attributes."""
+        return self.whole[:OF_CAMERA]
+
+    @property
+    def scene(self) -> NDArray[np.float64]:
+        """Those of a scene (4,)."""
+        return self.whole[OF_CAMERA:]
+
+    @property
+    def whole(self) -> NDArray[np.float64]:
+        """All of them as an array (9,), in the order of the attributes."""
         return np.array([getattr(self, field.name) for field in fields(self)])
 
     @classmethod
@@ -73,8 +97,8 @@ class Nuisances:
         """Return them from an array in the order of the attributes."""
         return cls(*(float(value) for value in values))
 
-    def applied(self, view: View) -> View:
-        """Return the view with these changes."""
+    def applied(self, view: View, scene: MovableScene | None = None) -> View:
+        """Return the view with these changes; those of a scene where there is one, from where it is said to be."""
         camera, shift = view.camera, np.array([self.shift_x_mm, self.shift_y_mm])
         radius, table, step = camera.aperture_radius_mm, view.table, view.table_step_mm
         if self.aperture_radius_mm != 0.0:
@@ -91,6 +115,7 @@ class Nuisances:
             particle_radius_mm=view.particle_radius_mm + self.particle_radius_mm,
             table=table,
             table_step_mm=step,
+            faces=view.faces if scene is None else scene.faces(self.scene),
         )
 
 
@@ -117,6 +142,8 @@ def fit_nuisances(
     particles: NDArray[np.float64],
     noise: Noise,
     depths_mm: tuple[float, float],
+    scene: MovableScene | None = None,
+    start: Nuisances | None = None,
 ) -> NuisanceFit:
     """Find what explains an image better, the camera and all particles free.
 
@@ -125,25 +152,61 @@ def fit_nuisances(
     image : (rows * columns,) raw, dark and background taken off, counts
     particles : (n, 4) that explain it with the view as it is
     depths_mm : between which they may lie
+    scene : through whose faces the particles are seen, free as well; None: what is seen through is as it is
+    start : what is known before; the particles explain the image with it
     """
-    model = _model_errors(view)
-    particles, total, sigma = particles.copy(), np.zeros(model.size), model
+    model, known = _model_errors(view, scene), Nuisances() if start is None else start
+    particles, total, sigma = particles.copy(), known.whole, model
+    changed = known.applied(view, scene)
     for _ in range(ROUNDS):
-        changed = Nuisances.of(total).applied(view)
         residual, weight = _refined(image, changed, particles, noise, depths_mm)
         lit = image - residual > LIT_SIGMAS * noise.read_counts
-        step, sigma = _gauss_newton(changed, particles, residual, np.sqrt(weight), lit, depths_mm)
+        unknowns = _Unknowns(view, scene, total, depths_mm)
+        step, sigma = _gauss_newton(unknowns, particles, residual, np.sqrt(weight), lit)
         total = total + step
-        if np.all(np.abs(step) < model):
+        before, changed = changed, Nuisances.of(total).applied(view, scene)
+        if scene is not None:
+            particles = _moved(particles, before, changed)
+        if np.all(np.abs(step) <= model):
             break
     found = Nuisances.of(total)
-    changed = found.applied(view)
     _refined(image, changed, particles, noise, depths_mm)
     return NuisanceFit(found, Nuisances.of(np.hypot(sigma, model)), changed, particles)
 
 
-def _model_errors(view: View) -> NDArray[np.float64]:
-    """Return what the optics model gets wrong of the unknowns (5,)."""
+class _Unknowns(NamedTuple):
+    """What is sought of a view: all of `Nuisances`, but those of a scene only where there is one."""
+
+    view: View
+    scene: MovableScene | None
+    values: NDArray[np.float64]
+    depths_mm: tuple[float, float]
+
+    @property
+    def steps(self) -> NDArray[np.float64]:
+        """The steps (9,) of the differences, 0 of what is not sought."""
+        shares = SHARE_STEP * np.array([self.view.camera.aperture_radius_mm, self.view.particle_radius_mm])
+        shift = 2.0 * SHIFT_STEP * np.array([self.view.half_x_mm, self.view.half_y_mm])
+        scene = np.zeros(len(SCENE_STEPS)) if self.scene is None else np.array(SCENE_STEPS)
+        return np.array([*shift, *shares, STRETCH_STEP / _corner_mm(self.view) ** 2, *scene])
+
+    def with_change(self, change: NDArray[np.float64] | float) -> View:
+        """Return the view with the values, changed by (9,)."""
+        return Nuisances.of(self.values + change).applied(self.view, self.scene)
+
+
+def _model_errors(view: View, scene: MovableScene | None) -> NDArray[np.float64]:
+    """Return what the optics model gets wrong of the unknowns (9,)."""
+    return np.array(
+        [
+            *_model_errors_of_camera(view),
+            *(np.zeros(len(MODEL_SCENE)) if scene is None else MODEL_SCENE),
+        ]
+    )
+
+
+def _model_errors_of_camera(view: View) -> NDArray[np.float64]:
+    """Return what the optics model gets wrong of the camera's unknowns (5,)."""
     return np.array(
         [
             2.0 * MODEL_SHARE_OF_PITCH * view.half_x_mm,
@@ -180,29 +243,39 @@ def _light(
 
 
 def _gauss_newton(
-    view: View,
+    unknowns: _Unknowns,
     particles: NDArray[np.float64],
     residual: NDArray[np.float64],
     root_weight: NDArray[np.float64],
     lit: NDArray[np.bool_],
-    depths_mm: tuple[float, float],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the next step of the camera's unknowns and their standard errors, (5,) each."""
-    own = _columns(view, particles, root_weight, entry_capacity(view, *depths_mm))
-    unit = _steps(view)
-    free = []
-    for step in np.diag(unit):
-        ahead, behind = (Nuisances.of(sign * step).applied(view) for sign in (1.0, -1.0))
-        difference = _light(ahead, particles, residual.size, depths_mm)
-        difference -= _light(behind, particles, residual.size, depths_mm)
+    """Return the next step of the unknowns and their standard errors, (9,) each, 0 of what is not sought."""
+    view, depths, unit = unknowns.with_change(0.0), unknowns.depths_mm, unknowns.steps
+    own = _columns(view, particles, root_weight, entry_capacity(view, *depths))
+    sought, free = np.flatnonzero(unit), []
+    for step in np.diag(unit)[sought]:
+        difference = np.zeros(residual.size)
+        for sign in (1.0, -1.0):
+            changed = unknowns.with_change(sign * step)
+            # Least squares would take long to free a scene's motion of what the particles' places make up for.
+            seen = particles if unknowns.scene is None else _moved(particles, view, changed)
+            difference += sign * _light(changed, seen, residual.size, depths)
         free.append(_freed(own, 0.5 * root_weight * difference))
     left = _freed(own, root_weight * residual)
     design = np.stack(free, axis=1)
     covariance = np.linalg.inv(design.T @ design)
     # What neighbours leave unexplained is as large an error as noise: the scatter says how large.
     scatter = float(left[lit] @ left[lit]) / max(1, int(lit.sum()))
-    sigma = np.sqrt(np.diag(covariance) * max(scatter, 1.0))
-    return covariance @ (design.T @ left) * unit, sigma * unit
+    step, sigma = np.zeros(unit.size), np.zeros(unit.size)
+    step[sought] = covariance @ (design.T @ left)
+    sigma[sought] = np.sqrt(np.diag(covariance) * max(scatter, 1.0))
+    return step * unit, sigma * unit
+
+
+def _moved(particles: NDArray[np.float64], before: View, after: View) -> NDArray[np.float64]:
+    """Return particles (n, 4) where they lie behind the faces of another view, their rays being the same."""
+    places, _ = moved_places(particles[:, :3], before.faces, after.faces, before.camera.aperture_radius_mm)
+    return np.column_stack([places, particles[:, 3]])
 
 
 def _freed(own: csc_matrix, column: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -215,13 +288,6 @@ def _freed(own: csc_matrix, column: NDArray[np.float64]) -> NDArray[np.float64]:
         iter_lim=LEAST_SQUARES_STEPS,
     )[0]
     return np.asarray(column - own @ solution, dtype=np.float64)
-
-
-def _steps(view: View) -> NDArray[np.float64]:
-    """Return the steps (5,) of the differences."""
-    shares = SHARE_STEP * np.array([view.camera.aperture_radius_mm, view.particle_radius_mm])
-    shift = 2.0 * SHIFT_STEP * np.array([view.half_x_mm, view.half_y_mm])
-    return np.array([*shift, *shares, STRETCH_STEP / _corner_mm(view) ** 2])
 
 
 def _corner_mm(view: View) -> float:

@@ -27,6 +27,7 @@ from lfpiv_cli.particles.rounds import ROUNDS, find_particles
 from lfpiv_cli.particles.search import Particles, task_of
 from lfpiv_cli.particles.view import View, raw_view
 from lfpiv_cli.reconstruction.equations import normalisers
+from lfpiv_cli.self_calibration.camera_figures import camera_figures, shift_px
 from lfpiv_cli.self_calibration.nuisances import Nuisances, fit_nuisances
 from lfpiv_cli.self_calibration.walls import Walls, find_walls, refuse_few
 from lfpiv_cli.weights.build import default_padding, factorise
@@ -78,16 +79,6 @@ class Refinement:
     camera: Camera
 
     @property
-    def shift_px(self) -> NDArray[np.float64]:
-        """How far (2,) all lens images have moved since the white image, (columns, rows)."""
-        shift = np.array([self.nuisances.shift_x_mm, self.nuisances.shift_y_mm])
-        return np.asarray(shift * self._image_px_per_mm, dtype=np.float64)
-
-    @property
-    def _image_px_per_mm(self) -> float:
-        return self.camera.micro_image_scale / self.camera.pixel_mm
-
-    @property
     def middle_sigma_mm(self) -> float:
         """Standard error of the mid plane's depth, what all particles have in common included."""
         return float(np.hypot(self.walls.middle_sigma_mm, self.common_depth_mm))
@@ -101,7 +92,9 @@ class Refinement:
         """Return the calibration with mid plane and lens images where the particles have them."""
         return replace(
             calibration,
-            rectification=replace(calibration.rectification, fit=calibration.fit.shifted(self.shift_px)),
+            rectification=replace(
+                calibration.rectification, fit=calibration.fit.shifted(shift_px(self.camera, self.nuisances))
+            ),
             mid_plane_z_mm=self.walls.middle_mm,
             mid_plane_z_sigma_mm=self.middle_sigma_mm,
             mid_plane_given=False,
@@ -109,7 +102,7 @@ class Refinement:
 
     def summary(self) -> dict[str, Any]:
         """Return the figures as plain numbers and lists, units in their names; None where unknown."""
-        walls, change, error, camera = self.walls, self.nuisances, self.nuisances_sigma, self.camera
+        walls, camera = self.walls, self.camera
         half_span = np.sqrt(np.var(self.position_mm[:, :2], axis=0))
         slope_sigma = np.hypot(walls.slope_sigma, self.common_depth_mm / half_span)
         scale, before, before_sigma = walls.width_mm / self.width_mm, self.expected_z_mm, self.expected_sigma_mm
@@ -129,14 +122,7 @@ class Refinement:
             "apparent_width_mm_sigma": self.width_sigma_mm,
             "magnification": camera.magnification * float(np.sqrt(scale)),
             "magnification_sigma": 0.5 * abs(camera.magnification) * self.width_sigma_mm / self.width_mm,
-            "lattice_shift_px": self.shift_px.tolist(),
-            "lattice_shift_px_sigma": [self._image_px_per_mm * sigma for sigma in (error.shift_x_mm, error.shift_y_mm)],
-            "aperture_mm": camera.aperture_mm + 2.0 * change.aperture_radius_mm,
-            "aperture_mm_sigma": 2.0 * error.aperture_radius_mm,
-            "particle_diameter_mm": self.particle_diameter_mm + 2.0 * change.particle_radius_mm,
-            "particle_diameter_mm_sigma": 2.0 * error.particle_radius_mm,
-            "k1_per_mm2": camera.distortion_per_mm2 + change.distortion_per_mm2,
-            "k1_per_mm2_sigma": error.distortion_per_mm2,
+            **camera_figures(camera, self.particle_diameter_mm, self.nuisances, self.nuisances_sigma),
             "edge_blur_mm": walls.blur_mm,
             "stray_share": walls.stray_share,
         }

@@ -10,13 +10,14 @@ Axes: world axes of the raw sensor, z from the nominal focal point; lengths in m
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 from scipy.special import expit, ndtr
 
 from lfpiv_cli.errors import InputError
+from lfpiv_cli.self_calibration.likelihood import covariance_of, improved
 
 # Fewer particles leave gaps in depth that pass for walls.
 FEWEST_PARTICLES = 100
@@ -26,8 +27,6 @@ BLURS_PER_WIDTH = (0.03, 0.01, 0.003)
 FIRST_TAIL = 0.03
 # Between the walls the seeding may change by a parabola; it stays above this share of its mean.
 LEAST_DENSITY = 1e-3
-# Steps of the numerical slopes, in units of the parameters (see `_unpacked`).
-SLOPE_STEP = 1e-4
 # Widths that differ by more from the true one are something else's.
 WIDTH_TOLERANCE = 0.05
 # Walls this many blurs from where particles were sought may be the end of the search.
@@ -155,32 +154,11 @@ def _most_likely(
     best[HALF] = np.log((high - low) / (1.0 - 2.0 * FIRST_TAIL) / width)
     best[STRAY] = -4.0
     free = [MIDDLE, HALF, SLOPE_X, SLOPE_Y, STRAY]
+    likelihood = partial(_log_likelihood, position=position, sigma=sigma, searched=searched, width=width)
     for blur in BLURS_PER_WIDTH:
         best[BLUR] = np.log(blur)
-        best = _improved(best, free, position, sigma, searched, width)
-    return _improved(best, list(range(8)), position, sigma, searched, width)
-
-
-def _improved(
-    start: NDArray[np.float64],
-    free: list[int],
-    position: NDArray[np.float64],
-    sigma: NDArray[np.float64],
-    searched: float,
-    width: float,
-) -> NDArray[np.float64]:
-    """Return the parameters with the free ones made most likely."""
-    unit = _units(start)[free]
-
-    def cost(change: NDArray[np.float64]) -> float:
-        packed = start.copy()
-        packed[free] += change * unit
-        return -float(np.mean(_log_likelihood(packed, position, sigma, searched, width)))
-
-    found = minimize(cost, np.zeros(len(free)), method="BFGS")
-    best = start.copy()
-    best[free] += found.x * unit
-    return best
+        best = improved(best, free, _units(best), likelihood)
+    return improved(best, list(range(8)), _units(best), likelihood)
 
 
 def _units(packed: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -197,15 +175,8 @@ def _standard_errors(
     width: float,
 ) -> NDArray[np.float64]:
     """Return the standard errors (6,) of the unpacked parameters, from the scatter of the single particles' slopes."""
-    step = SLOPE_STEP * _units(best)
-    slopes = np.empty((len(position), 8))
-    for k in range(8):
-        ahead, behind = best.copy(), best.copy()
-        ahead[k] += step[k]
-        behind[k] -= step[k]
-        difference = _log_likelihood(ahead, position, sigma, searched, width)
-        slopes[:, k] = (difference - _log_likelihood(behind, position, sigma, searched, width)) / 2.0
-    covariance = np.linalg.pinv(slopes.T @ slopes) * np.outer(step, step)
+    likelihood = partial(_log_likelihood, position=position, sigma=sigma, searched=searched, width=width)
+    covariance = covariance_of(best, _units(best), likelihood)
     errors = np.sqrt(np.diag(covariance))[:6]
     errors[MIDDLE] *= width
     errors[HALF] *= _unpacked(best, width)[0][HALF]

@@ -57,8 +57,8 @@ def build_weights(
     """
     inputs = given(config=config, calibration=options.calibration)
     ensure_writable(output, overwrite or options.resume, inputs.values())
-    settings = load_config(config).overridden_by("weights", options)
     found = read_calibration(options.calibration) if options.calibration else None
+    settings = load_config(config).overridden_by("weights", options).with_scene_of(found)
     plan = plan_of(settings, found)
     summary = {
         "voxels_xyz": list(plan.grid.shape_xyz),
@@ -68,7 +68,7 @@ def build_weights(
         "method": settings.weights.method,
         "refraction": settings.refraction(),
     }
-    made = dict(target_of(config, output, options).record)
+    made = record("build-weights", settings.resolved(), inputs)
     if options.resume and is_kept([output], made, inputs.values(), overwrite, resume=True):
         return summary | {"frame": open_weights(output).frame, "file_bytes": output.stat().st_size}
     cost = cost_of(settings, plan.camera, plan.source, plan.grid.padded(plan.padding))
@@ -85,7 +85,7 @@ def build_weights(
 
 
 def target_of(config: Path, output: Path, options: BuildWeightsOptions) -> Target:
-    """Return where weights go, with the record that they will carry."""
+    """Return where weights go, with the record that they will carry by a calibration that knows of no scene's place."""
     resolved = load_config(config).overridden_by("weights", options).resolved()
     inputs = given(config=config, calibration=options.calibration)
     return Target(output, partial(record, "build-weights", resolved, inputs))

@@ -1,0 +1,118 @@
+"""A scene that lies a little elsewhere than it is said to, as one rigid body, known by the pipe's inner wall.
+
+Of the six ways to move a body the wall of a round pipe shows four: two shifts and two tilts of its axis. A shift along
+the axis and a turn about it leave the wall as it is, and are left alone.
+
+Axes: world axes, z away from the camera from the nominal focal point; lengths in mm. `along` runs along the pipe,
+`across` is square to it and to the optical axis, `away` square to both, away from the camera.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lfpiv_cli.errors import ConfigError
+from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.curved_space import CurvedSpace
+from lfpiv_cli.optics.rigid_motion import RigidMotion
+from lfpiv_cli.optics.surfaces import Cylinder, Faces
+
+# Seen from further along its axis, too little of a pipe's wall shows where it lies.
+LEAST_ANGLE_TO_VIEW_DEG = 45.0
+# Of a wall that is not where it was said to be particles may lie behind the said one: so much of its radius.
+BEYOND_SHARE = 0.08
+# The unknowns of a motion: the axis's place across the view and away from the camera, and its tilts towards both.
+ACROSS, AWAY, TILT_ACROSS, TILT_AWAY = range(4)
+
+
+@dataclass(frozen=True, eq=False)
+class MovableScene:
+    """A scene, and what of its place is not known.
+
+    Attributes
+    ----------
+    space, camera : as they are said to be
+    wall : the pipe's inner wall, the last face
+    pivot_mm : the point of its axis that is nearest to the optical axis, about which it is tilted
+    along, across, away : (3,) unit vectors
+    """
+
+    space: CurvedSpace
+    camera: Camera
+    wall: Cylinder
+    pivot_mm: NDArray[np.float64]
+    along: NDArray[np.float64]
+    across: NDArray[np.float64]
+    away: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, space: CurvedSpace, camera: Camera) -> MovableScene:
+        """Return the scene, to be moved.
+
+        Raises
+        ------
+        ConfigError : particles do not tell where its wall is
+        """
+        wall = space.faces[-1].surface
+        if not isinstance(wall, Cylinder) or wall.facing != "convex":
+            raise ConfigError(
+                "where particles end tells where a scene lies if its last face is a cylinder around the fluid, a "
+                "pipe's inner wall; this one is not"
+            )
+        along = np.array(wall.axis) / np.linalg.norm(wall.axis)
+        along = along if along[np.argmax(np.abs(along))] > 0.0 else -along
+        angle = float(np.rad2deg(np.arccos(min(1.0, abs(along[2])))))
+        if angle < LEAST_ANGLE_TO_VIEW_DEG:
+            raise ConfigError(
+                f"the pipe's axis lies {angle:.0f} degrees from the view; particles tell where its wall is from "
+                f"{LEAST_ANGLE_TO_VIEW_DEG:g} degrees on"
+            )
+        across = np.cross((0.0, 0.0, 1.0), along)
+        across /= np.linalg.norm(across)
+        centre = np.array(wall.centre_mm)
+        pivot = centre - (centre[:2] @ along[:2]) / (along[:2] @ along[:2]) * along
+        return cls(space, camera, wall, pivot, along, across, np.cross(along, across))
+
+    @property
+    def beyond_mm(self) -> float:
+        """How far beyond the wall particles are looked for."""
+        return BEYOND_SHARE * self.wall.radius_mm
+
+    def motion(self, values: NDArray[np.float64]) -> RigidMotion:
+        """Return the motion by unknowns (4,): mm across and away, rad towards across and away."""
+        shift = values[ACROSS] * self.across + values[AWAY] * self.away
+        turn = values[TILT_ACROSS] * self.away - values[TILT_AWAY] * self.across
+        return RigidMotion(_vector(shift), _vector(turn), _vector(self.pivot_mm))
+
+    def moved(self, values: NDArray[np.float64]) -> CurvedSpace:
+        """Return the scene moved by unknowns (4,).
+
+        Raises
+        ------
+        ConfigError : the optical axis misses a face then
+        """
+        return self.space.moved(self.motion(values))
+
+    def faces(self, values: NDArray[np.float64]) -> Faces:
+        """Return the faces moved by unknowns (4,), the fluid going on a little beyond its wall."""
+        return self.moved(values).for_kernels(self.camera)._replace(beyond_mm=self.beyond_mm)
+
+    def frame(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the directions along, across and away (3, 3) of the pipe moved by unknowns (4,)."""
+        return self.motion(values).directions(np.stack([self.along, self.across, self.away]))
+
+    def about_axis(self, points_mm: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return points (n, 3), world axes, in the moved pipe's frame (n, 3): along, across and away from the pivot."""
+        return np.asarray((points_mm - self.motion(values).points(self.pivot_mm)) @ self.frame(values).T)
+
+    def on_axis(self, along_mm: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the points (n, 3), world axes, of the moved pipe's axis at places (n,) along it."""
+        return self.motion(values).points(self.pivot_mm) + np.outer(along_mm, self.frame(values)[0])
+
+
+def _vector(values: NDArray[np.float64]) -> tuple[float, float, float]:
+    x, y, z = values.tolist()
+    return x, y, z
