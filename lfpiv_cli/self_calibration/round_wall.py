@@ -32,6 +32,9 @@ FEWEST_IN_RING = 200
 BLURS_PER_RADIUS = (0.02, 0.006)
 # Blurs that are so many times as large or small as the last are not expected (as a standard deviation, logarithm).
 BLUR_FACTOR = 0.5
+# Particles whose places along the pipe spread (rms) by less than this share of its radius say nothing of its tilt. It
+# is left as it is then, and known to so many rad, which any mount is better than.
+LEAST_SPAN_SHARE, UNKNOWN_TILT = 0.3, 0.1
 # An axis that is not known better than to this share of the radius is as good as not found.
 LARGEST_SIGMA_SHARE = 0.02
 
@@ -116,17 +119,23 @@ def find_round_wall(
     )
     best = np.zeros(PARAMETERS)
     best[STRAY] = -4.0
-    first = [*range(OF_AXIS), RADIUS, STRAY]
+    of_axis = list(range(OF_AXIS)) if span > LEAST_SPAN_SHARE * radius_mm else [0, 1]
+    first = [*of_axis, RADIUS, STRAY]
     for blur in BLURS_PER_RADIUS:
         best[BLUR] = np.log(blur)
         best = improved(best, first, _units(best), likelihood)
-    best = improved(best, list(range(PARAMETERS)), _units(best), likelihood)
-    covariance = covariance_of(best, _units(best), likelihood) * frames
+    free = [*of_axis, *range(OF_AXIS, PARAMETERS)]
+    best = improved(best, free, _units(best), likelihood)
+    covariance = covariance_of(best, np.where(np.isin(np.arange(PARAMETERS), free), _units(best), 0.0), likelihood)
+    covariance *= frames
     unit = radius_mm * np.array([1.0, 1.0, 1.0 / span, 1.0 / span])
     axis, radius, blur, stray = _unpacked(best, radius_mm, span)
+    of_place = covariance[:OF_AXIS, :OF_AXIS] * np.outer(unit, unit)
+    if len(of_axis) < OF_AXIS:
+        of_place[[2, 3], [2, 3]] = UNKNOWN_TILT**2
     found = RoundWallFit(
         axis=axis,
-        covariance=covariance[:OF_AXIS, :OF_AXIS] * np.outer(unit, unit),
+        covariance=of_place,
         radius_mm=radius,
         radius_sigma_mm=radius * float(np.sqrt(covariance[RADIUS, RADIUS])),
         blur_mm=float(np.hypot(blur, least)),
