@@ -29,8 +29,9 @@ from lfpiv_cli.tracks.votes import votes
 DEPTH_RATIO = 4.0 / 10.64
 # Displacements are sought up to this along each axis by default, in L.
 SEARCH_LENSES = 6.0
-# Around a forecast, particles are sought up to so many of its standard errors and no less than this, in L.
-FORECAST_SIGMAS, FORECAST_LENSES = 6.0, 1.2
+# Around a forecast, particles are sought up to so many standard errors of it and of both places, and no less than this,
+# in L. How badly a partner's place is known is not known before; nineteen in twenty are known better.
+FORECAST_SIGMAS, FORECAST_LENSES, PARTNERS_SIGMA = 6.0, 1.2, 0.95
 # No displacement is expected better than this, laterally, in L: fits have errors that they do not know of.
 SMALLEST_SIGMA_LENSES = 0.02
 # With fewer links than this their differences do not show how unlike displacements are; a share of the search, over the
@@ -108,7 +109,7 @@ def track(first: Seen, second: Seen, search_mm: float, scale: Scale, forecast: F
     """
     if not len(first) or not len(second):
         return NO_TRACKS
-    candidates = candidates_of(first, second, *_sought(first, search_mm, scale, forecast))
+    candidates = candidates_of(first, second, *_sought(first, second, search_mm, scale, forecast))
     density = density_per_mm3(first, second, search_mm)
     score = votes(first.position_mm, candidates, density, scale, of_equal_errors(scale))
     links, share = _exclusive(candidates, score + _log_near(candidates, search_mm, forecast)), PARTNERED
@@ -135,7 +136,7 @@ def link_some(
 ) -> Tracks:
     """Link those particles of two frames that are chosen (n,), where the displacements of others are known already."""
     (start, some), (end, free) = first, second
-    candidates = candidates_of(start, end, *_sought(start, search_mm, scale, forecast))
+    candidates = candidates_of(start, end, *_sought(start, end, search_mm, scale, forecast))
     candidates = candidates.part(some[candidates.first] & free[candidates.second])
     expected = _calibrated(expected_of(start.position_mm, known, search_mm, scale, forecast), known)
     density = density_per_mm3(start, end, search_mm)
@@ -233,7 +234,7 @@ def _variance_of(lenses: float, scale: Scale) -> NDArray[np.float64]:
 
 
 def _sought(
-    first: Seen, search_mm: float, scale: Scale, forecast: Forecast | None
+    first: Seen, second: Seen, search_mm: float, scale: Scale, forecast: Forecast | None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return around which displacement (n, 3) and how far along each axis (n,) partners are sought."""
     middle, reach = np.zeros(first.position_mm.shape), np.full(len(first), search_mm)
@@ -241,7 +242,9 @@ def _sought(
         return middle, reach
     has_past = np.isfinite(forecast.sigma_mm).all(axis=1) & np.isfinite(forecast.displacement_mm).all(axis=1)
     middle[has_past] = forecast.displacement_mm[has_past]
-    wide = FORECAST_SIGMAS * forecast.sigma_mm[has_past].max(axis=1)
+    own, partner = (np.sqrt(frame.covariance()[:, :3].max(axis=1)) for frame in (first, second))
+    sigma = np.hypot(forecast.sigma_mm[has_past].max(axis=1), own[has_past])
+    wide = FORECAST_SIGMAS * np.hypot(sigma, np.quantile(partner, PARTNERS_SIGMA))
     reach[has_past] = np.clip(wide, FORECAST_LENSES * scale.lens_mm, max(search_mm, FORECAST_LENSES * scale.lens_mm))
     return middle, reach
 
