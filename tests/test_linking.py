@@ -13,7 +13,7 @@ from lfpiv_cli.tracks.association import marginals
 from lfpiv_cli.tracks.candidates import Candidates, Seen, light_ratio
 from lfpiv_cli.tracks.gridding import on_grid
 from lfpiv_cli.tracks.kriging import Structure, kriged, structure_of
-from lfpiv_cli.tracks.tracking import track
+from lfpiv_cli.tracks.tracking import Forecast, track
 from lfpiv_cli.tracks.votes import ALONE, LEAST_LIGHT_RATIO, NEIGHBOURS, REACH, WIDTHS_LENSES, votes
 
 # The paper's seeding in a corner of its volume: particles half a millimetre apart.
@@ -38,6 +38,21 @@ def test_ambiguous_links_are_not_made() -> None:
     first, second = Seen(np.zeros((1, 3))), Seen(np.array([[0.1, 0.0, 0.0], [-0.1, 0.0, 0.0]]))
     assert len(track(first, second, 0.4, SCALE).first) == 0
     assert len(track(first, Seen(second.position_mm[:1]), 0.4, SCALE).first) == 1
+
+
+def test_partners_are_sought_as_far_as_places_are_uncertain(rng: np.random.Generator) -> None:
+    start = rng.uniform(-2.0, 2.0, (60, 3)) * (1.0, 1.0, 4.0)
+    moved = np.array([0.3, 0.1, -0.05])
+    # Near the focal plane: a depth is known to 0.15 mm where a well-known displacement is forecast.
+    depth_sigma = np.where(np.arange(60) % 5 == 0, 0.15, 0.005)
+    sigma = np.column_stack([np.full((60, 2), 0.002), depth_sigma])
+    covariance = np.column_stack([sigma**2, np.zeros((60, 3))])
+    end = start + moved
+    end[::5, 2] += 0.3
+    forecast = Forecast(np.tile(moved, (60, 1)), np.full((60, 3), 0.005))
+    links = track(Seen(start, covariance), Seen(end, covariance), 0.6, SCALE, forecast)
+    np.testing.assert_array_equal(links.first, np.arange(60))
+    np.testing.assert_array_equal(links.second, np.arange(60))
 
 
 def test_probabilities_are_those_of_all_exclusive_choices(rng: np.random.Generator) -> None:

@@ -249,3 +249,11 @@ def test_few_particles_are_followed_through_a_frame_that_lost_one(count: int, rn
     scatter, _ = scatter_in(found, frames)
     assert not scatter.noise_known
     assert not scatter.bending_known
+
+
+def test_tracks_go_on_over_a_frame_without_particles(rng: np.random.Generator) -> None:
+    start, nothing = rng.uniform(-2.0, 2.0, (100, 3)), Seen(np.zeros((0, 3)))
+    frames = [Seen(start + k * np.array([0.1, 0.0, 0.0])) for k in range(5)]
+    found = follow([*frames[:3], nothing, frames[4]], 0.4, 4, SCALE)
+    assert found.count == 100
+    assert found.lengths().tolist() == [4] * 100

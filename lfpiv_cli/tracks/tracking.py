@@ -136,6 +136,8 @@ def link_some(
 ) -> Tracks:
     """Link those particles of two frames that are chosen (n,), where the displacements of others are known already."""
     (start, some), (end, free) = first, second
+    if not len(start) or not len(end):
+        return NO_TRACKS
     candidates = candidates_of(start, end, *_sought(start, end, search_mm, scale, forecast))
     candidates = candidates.part(some[candidates.first] & free[candidates.second])
     expected = _calibrated(expected_of(start.position_mm, known, search_mm, scale, forecast), known)
