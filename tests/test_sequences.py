@@ -252,8 +252,8 @@ def test_few_particles_are_followed_through_a_frame_that_lost_one(count: int, rn
 
 
 def test_tracks_go_on_over_a_frame_without_particles(rng: np.random.Generator) -> None:
-    start, nothing = rng.uniform(-2.0, 2.0, (100, 3)), Seen(np.zeros((0, 3)))
-    frames = [Seen(start + k * np.array([0.1, 0.0, 0.0])) for k in range(5)]
-    found = follow([*frames[:3], nothing, frames[4]], 0.4, 4, SCALE)
+    start = rng.uniform(-2.0, 2.0, (100, 3))
+    frames = [seen(start + k * np.array([0.1, 0.0, 0.0]) + rng.normal(0.0, 0.001, start.shape)) for k in range(5)]
+    found = follow([*frames[:3], seen(np.zeros((0, 3))), frames[4]], 0.4, 4, SCALE)
     assert found.count == 100
     assert found.lengths().tolist() == [4] * 100
