@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from lfpiv_cli.scale import Scale
 from lfpiv_cli.synthetic.flows import advect, random_modes
 from lfpiv_cli.tracks.candidates import Seen
+from lfpiv_cli.tracks.light import Light
 from lfpiv_cli.tracks.tracking import track
 
 # Table 2's camera.
@@ -66,7 +67,7 @@ class Turbulence:
             order = rng.permutation(len(position))
             covariance = np.tile([*np.square(self.sigma_mm), 0.0, 0.0, 0.0], (len(position), 1))
             lights = bright * np.concatenate([own, rng.uniform(0.2, 0.8, false)])
-            seen.append(Seen(position[order], covariance, lights[order]))
+            seen.append(Seen(position[order], covariance, Light(lights[order])))
             numbers.append(np.concatenate([there, np.full(false, -1)])[order])
         return seen[0], seen[1], numbers[0], numbers[1]
 

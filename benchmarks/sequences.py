@@ -21,6 +21,7 @@ from lfpiv_cli.particles.rounds import first_pass
 from lfpiv_cli.particles.search import Particles, result
 from lfpiv_cli.synthetic.flows import Flow, advect, random_modes, square_duct, taylor_green
 from lfpiv_cli.tracks.candidates import Seen
+from lfpiv_cli.tracks.light import Light
 from lfpiv_cli.tracks.sequences import Ahead, SoFar, begun, followed_further, long_ones, scatter_in, states_at
 from lfpiv_cli.validation.particles import match
 
@@ -139,7 +140,7 @@ def track_figures(
 
 
 def _seen(found: Particles) -> Seen:
-    return Seen(found.position_mm, symmetric(found.covariance_mm2), found.light_counts)
+    return Seen(found.position_mm, symmetric(found.covariance_mm2), Light(found.light_counts, found.light_sigma_counts))
 
 
 def _predicted(bench: Bench, ahead: Ahead) -> Predicted:

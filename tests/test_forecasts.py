@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from lfpiv_cli.scale import Scale
 from lfpiv_cli.synthetic.flows import Flow, advect, random_modes, rigid_rotation
 from lfpiv_cli.tracks.candidates import Seen
+from lfpiv_cli.tracks.light import Light
 from lfpiv_cli.tracks.sequences import (
     NO_TRACK,
     PAST_FRAMES,
@@ -57,7 +58,7 @@ def record(flow: Flow) -> Recorded:
     for where in places:
         there = np.flatnonzero(within(where) & (rng.uniform(size=len(where)) > 0.05))
         noisy = where[there] + rng.normal(0.0, NOISE_MM, (len(there), 3))
-        frames.append(Seen(noisy, np.tile([*NOISE_MM**2, 0.0, 0.0, 0.0], (len(there), 1)), light[there]))
+        frames.append(Seen(noisy, np.tile([*NOISE_MM**2, 0.0, 0.0, 0.0], (len(there), 1)), Light(light[there])))
         numbers.append(there)
     so_far, steps = begun(frames), []
     for _ in frames[1:]:

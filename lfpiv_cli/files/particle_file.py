@@ -68,7 +68,10 @@ UNITS = {
     },
 }
 # Arrays that a file may have besides: those of earlier versions have them not.
-OPTIONAL = {TRACKS_FORMAT: {"displacement_covariance_mm2": "mm^2"}}
+OPTIONAL = {
+    PARTICLES_FORMAT: {"intensity_sigma": "count"},
+    TRACKS_FORMAT: {"displacement_covariance_mm2": "mm^2"},
+}
 # Arrays in which NaN stands for what is not known.
 MAY_BE_UNKNOWN = {"link_probability"}
 

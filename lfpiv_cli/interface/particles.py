@@ -84,9 +84,9 @@ def find_particles(
     Returns
     -------
     Points
-        `position_mm` (n, 3), z from the volume's reference, and in `arrays`: `intensity` (n,) counts, `covariance_mm2`
-        (n, 6) as xx, yy, zz, xy, yz, xz, `chi2` (n,) about 1 where all light is explained, `seen` (n,) share of the
-        light that meets the sensor, `flag` (n,) 1 outside the volume.
+        `position_mm` (n, 3), z from the volume's reference, and in `arrays`: `intensity` (n,) counts and its standard
+        error `intensity_sigma`, `covariance_mm2` (n, 6) as xx, yy, zz, xy, yz, xz, `chi2` (n,) about 1 where all light
+        is explained, `seen` (n,) share of the light that meets the sensor, `flag` (n,) 1 outside the volume.
 
     Raises
     ------
@@ -287,6 +287,7 @@ def points_of(bench: Bench, frame: Frame, found: Particles, size: TracerSize, pr
         content.reference.points_from_focal_point(found.position_mm),
         {
             "intensity": found.light_counts,
+            "intensity_sigma": found.light_sigma_counts,
             "covariance_mm2": symmetric(found.covariance_mm2),
             "chi2": found.chi2,
             "seen": found.seen,

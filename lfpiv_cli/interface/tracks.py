@@ -21,6 +21,7 @@ from lfpiv_cli.notice import Notice
 from lfpiv_cli.reference import Reference
 from lfpiv_cli.scale import Scale
 from lfpiv_cli.tracks.candidates import Seen
+from lfpiv_cli.tracks.light import Light
 from lfpiv_cli.tracks.sequences import SHORTEST, Trajectories, follow, long_ones
 from lfpiv_cli.tracks.tracking import FEWEST_OF_FIT, SEARCH_LENSES, Tracks, wrong_link_variance
 from lfpiv_cli.tracks.tracking import track as match
@@ -400,7 +401,8 @@ def sequence_of(frames: Sequence[Seen], chosen: Tracking, found: Trajectories | 
 
 def seen_in(frame: Points) -> Seen:
     """Return the particles of a file as tracking takes them."""
-    return Seen(frame.position_mm, frame.arrays["covariance_mm2"], frame.arrays["intensity"])
+    light = Light(frame.arrays["intensity"], frame.arrays.get("intensity_sigma"))
+    return Seen(frame.position_mm, frame.arrays["covariance_mm2"], light)
 
 
 def _covariance(first: Points, second: Points, tracks: Tracks, scale: Scale) -> NDArray[np.float64]:

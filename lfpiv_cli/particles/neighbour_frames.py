@@ -34,6 +34,7 @@ from lfpiv_cli.particles.search import (
 )
 from lfpiv_cli.scale import Scale
 from lfpiv_cli.tracks.candidates import Seen
+from lfpiv_cli.tracks.light import Light
 from lfpiv_cli.tracks.tracking import expected_of, known_of, track
 
 # A particle without a partner this near to where one is expected is that one, at another depth: near the focal plane
@@ -97,7 +98,7 @@ def _without_partner(
     """Return another frame's particles (m, 4) that were not tracked, where they are expected here, and which own ones
     were not.
     """
-    there, here = (Seen(each[:, :3], light=each[:, 3]) for each in (other, own))
+    there, here = (Seen(each[:, :3], light=Light(each[:, 3])) for each in (other, own))
     tracks = track(there, here, search_mm, scale)
     alone, partnerless = np.ones(len(other), np.bool_), np.ones(len(own), np.bool_)
     alone[tracks.first] = partnerless[tracks.second] = False

@@ -51,6 +51,7 @@ class Particles:
     ----------
     position_mm : (n, 3) world axes
     light_counts : (n,) all that passes the main lens
+    light_sigma_counts : (n,) its standard error
     covariance_mm2 : (n, 3, 3) of the position, the camera taken to be as calibrated
     chi2 : (n,) mean of residual^2 / variance over the particle's light, about 1 where all is explained
     seen : (n,) share of its light that meets the sensor
@@ -60,6 +61,7 @@ class Particles:
 
     position_mm: NDArray[np.float64]
     light_counts: NDArray[np.float64]
+    light_sigma_counts: NDArray[np.float64]
     covariance_mm2: NDArray[np.float64]
     chi2: NDArray[np.float64]
     seen: NDArray[np.float64]
@@ -263,6 +265,7 @@ def result(task: Task, state: State) -> Particles:
     return Particles(
         position_mm=task.camera.to_image_axes(particles[:, :3]),
         light_counts=particles[:, 3].copy(),
+        light_sigma_counts=np.sqrt(covariance[:, 3, 3]),
         covariance_mm2=to_world @ covariance[:, :3, :3] @ to_world.T,
         chi2=chi2,
         seen=seen,

@@ -30,6 +30,7 @@ from lfpiv_cli.particles.search import (
 from lfpiv_cli.particles.suspects import SUSPECT_CHI2, good_chi2
 from lfpiv_cli.scale import Scale
 from lfpiv_cli.tracks.candidates import Seen
+from lfpiv_cli.tracks.light import Light
 from lfpiv_cli.tracks.tracking import expected_of, known_of, track
 
 # A particle is beyond doubt that is no suspect and finds this share of the light that it claims.
@@ -84,7 +85,7 @@ def predicted_by(trusted: NDArray[np.float64], seen: NDArray[np.float64], search
 
     One that was seen there (m, 4) is expected where it was seen.
     """
-    first, second = (Seen(each[:, :3], light=each[:, 3]) for each in (trusted, seen))
+    first, second = (Seen(each[:, :3], light=Light(each[:, 3])) for each in (trusted, seen))
     tracks = track(first, second, search_mm, scale)
     known = known_of(first, second, tracks.first, tracks.second, scale)
     expected = expected_of(first.position_mm, known, search_mm, scale)

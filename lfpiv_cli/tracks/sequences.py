@@ -262,7 +262,7 @@ def _by_others(found: Trajectories, frames: Frames) -> Forecast | None:
 
 
 def _light_of(frame: Seen) -> NDArray[np.float64]:
-    return np.ones(len(frame)) if frame.light is None else frame.light
+    return np.ones(len(frame)) if frame.light is None else frame.light.value
 
 
 def _light_sigma(found: Trajectories, frames: Frames) -> float:
