@@ -193,11 +193,13 @@ def test_a_picture_that_was_given_before_is_known() -> None:
         return {"name": f"{digest}.tif", "sha256": digest}
 
     before = {"command": "calibrate-snapshot", "inputs": {"white": given("w"), "board": given("b")}}
+    refined = {"command": "refine-calibration", "inputs": {"image": given("a"), "image_2": given("a2")}}
 
     def made(image: str) -> dict[str, object]:
         inputs = {"image": given(image), "dark": given("d")}
-        return {"command": "reconstruct page 0", "inputs": inputs, "made_from": {"c": before}}
+        return {"command": "reconstruct page 0", "inputs": inputs, "made_from": {"c": before, "r": refined}}
 
     assert also_used_as(made("b"), "image") == "board of calibrate-snapshot"
     assert also_used_as(made("d"), "image") == "dark of reconstruct"
-    assert also_used_as(made("a"), "image") is None
+    # Images that a calibration was refined by show tracers.
+    assert all(also_used_as(made(each), "image") is None for each in ("a", "a2", "new"))

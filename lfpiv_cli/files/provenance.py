@@ -137,11 +137,14 @@ def recorded_warnings(made: Mapping[str, Any]) -> list[str]:
 
 
 def also_used_as(made: Mapping[str, Any], role: str) -> str | None:
-    """Return as what the input of a role was given besides, to this command or to one before; None if to none."""
+    """Return as what else the input of a role was given, to this command or to one before; None if as nothing else.
+
+    Of several inputs of a role the names end in a number: `image`, `image_2`.
+    """
     asked = _file_and_part(made["inputs"][role])
     for each in (made, *made["made_from"].values()):
         for name, given in each["inputs"].items():
-            if _file_and_part(given) == asked and (each is not made or name != role):
+            if _file_and_part(given) == asked and name.partition("_")[0] != role:
                 return f"{name} of {each['command'].split()[0]}"
     return None
 
