@@ -28,6 +28,7 @@ from lfpiv_cli.reconstruction.solvers import SolverSettings, reconstruct
 from lfpiv_cli.reference import Reference
 from lfpiv_cli.stages.build_weights import BuildWeightsOptions, build_weights
 from lfpiv_cli.stages.reconstruct import reconstruct as reconstruct_images
+from lfpiv_cli.weights import strip_blocks
 from lfpiv_cli.weights.build import blur_radius_mm, factorise_through
 from lfpiv_cli.weights.columns import OnDemandOperator, operator_of, seen_share
 from lfpiv_cli.weights.curved import lit_voxels, places_on_array
@@ -35,7 +36,8 @@ from lfpiv_cli.weights.curved_reach import aimed_misfit_mm, curved_padding
 from lfpiv_cli.weights.model import Weights, behind_transmission
 from lfpiv_cli.weights.quadrature import integrate_columns
 from lfpiv_cli.weights.rays import RayCount, count_rays, sampling_error
-from lfpiv_cli.weights.strip_fits import evenly_spread, fit_axis, fit_part, strip_rays
+from lfpiv_cli.weights.strip_factors import mixed_shares
+from lfpiv_cli.weights.strip_fits import DEGREE_ALONG, evenly_spread, fit_axis, fit_part, strip_rays
 from lfpiv_cli.weights.strip_kernels import STRIP
 from lfpiv_cli.weights.strips import StripOperator, adjoint_reference, forward_reference
 
@@ -193,6 +195,47 @@ def test_strips_are_the_sum_of_their_columns(table2, tube, rng):
         np.testing.assert_array_equal(one, other)
 
 
+# Half a degree beside x in the image, and a third of it away from the camera, as tubes are mounted.
+ASLANT = (1.0, np.tan(np.deg2rad(0.5)), np.tan(np.deg2rad(-0.3)))
+
+
+@pytest.mark.thorough
+def test_strips_follow_a_tube_that_runs_a_little_aslant(table2, water, rng, monkeypatch):
+    camera, tube = replace(table2, columns=1000, rows=2000), tube_along(ASLANT, water)
+    grid = Grid.centred((32, 20, 5), (0.1, 0.1, 0.4), (0.6, 2.6, 2.6))
+    operator = operator_of(camera, tube, grid)
+    assert isinstance(operator, StripOperator)
+    volume, image = rng.random(operator.shape, np.float32), rng.random(operator.image_shape, np.float32)
+    left = np.vdot(operator.forward(volume).astype(np.float64), image)
+    assert left == pytest.approx(np.vdot(volume.astype(np.float64), operator.adjoint(image)), rel=1e-5)
+    layout = OnDemandOperator(camera, tube, grid)
+    errors = []
+    for flat in np.flatnonzero(operator.lit)[::97]:
+        index = np.unravel_index(flat, operator.shape)
+        alone = np.zeros(operator.shape, np.float32)
+        alone[index] = 1.0
+        column = column_of(operator, [int(k) for k in index])
+        np.testing.assert_allclose(operator.forward(alone), column, atol=1e-8)
+        converged = integrate_columns(camera, tube, layout.centres_mm(np.array([flat])), layout.sides_mm, 128, 5)
+        errors.append(np.abs(column - converged.image(0, operator.image_shape)).sum())
+    straight = operator_of(camera, tube_along((1.0, 0.0, 0.0), water), grid)
+    for of in (np.median, np.max):
+        assert of(errors) < of(straight.misfit_l1) + 0.004  # what mixing may cost
+        assert of(operator.misfit_l1) == pytest.approx(of(errors), abs=0.01)  # what it says of itself
+    # One factor across each strip would not do: the light at its ends lies beside it.
+    monkeypatch.setattr(strip_blocks, "WORTH_DRIFT", 0.0)
+    assert isinstance(operator_of(camera, tube, grid), OnDemandOperator)
+
+
+def test_factors_are_mixed_linearly_between_their_places():
+    places, along = np.array([-1.0, 0.5, 2.0]), np.linspace(-1.0, 2.0, 13)
+    shares = mixed_shares(along, places)
+    assert shares.min() >= 0.0  # no factor takes light away
+    np.testing.assert_allclose(shares.sum(axis=1), 1.0)
+    np.testing.assert_allclose(shares @ (3.0 * places + 1.0), 3.0 * along + 1.0)
+    np.testing.assert_array_equal(mixed_shares(np.array([-9.0, 9.0]), places), [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+
 @pytest.mark.thorough
 def test_strips_meet_at_their_seams(table2, tube):
     operator = operator_of(table2, tube, BESIDE)
@@ -216,7 +259,7 @@ def test_fits_of_a_strip_follow_its_rays(table2, tube):
     centres = np.stack(np.meshgrid(np.arange(2.05, 3.6, 0.1), np.arange(1.05, 1.8, 0.1)), axis=-1).reshape(-1, 2)
     rays = strip_rays(table2, tube, centres, np.array([-2.0, 2.0]), np.array(VOXEL), 1, 4096)
     for axis in (0, 1):
-        fit, left = fit_axis(rays, axis)
+        fit, left = fit_axis(rays, axis, DEGREE_ALONG if axis == 0 else None)
         through = np.abs(rays.crossing_mm[:, 1 - axis]) < 1.0
         _, rest = fit_part(fit, left, through)
         assert np.sqrt(np.mean(rest**2)) < 0.7 * np.sqrt(np.mean(left**2))  # the other axis says less of these

@@ -13,18 +13,18 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.simd.combine import TILE
-from lfpiv_cli.threads import share_out
-from lfpiv_cli.weights.axis import SMALLEST_SHARE, AxisWeights, axis_weights, depth_nodes
+from lfpiv_cli.weights.axis import axis_weights, depth_nodes
 from lfpiv_cli.weights.axis_cells import AxisOptics, Cells, micro_image_cells
 from lfpiv_cli.weights.curved import places_on_array
+from lfpiv_cli.weights.strip_factors import Factor, mixed_shares, through_lines
 from lfpiv_cli.weights.strip_fits import (
+    DEGREE_ALONG,
     AxisFit,
     StripRays,
     evenly_spread,
@@ -45,6 +45,11 @@ TILES_SHARING = (10**6, 5, 2)
 # along the strips and across them. Both together, and what a pixel's sharp part of the aperture is worth, make some
 # 0.03. Parts of the aperture cost more time in each projection than tiles do.
 STRAY_ALONG, STRAY_ACROSS = 0.022, 0.014
+# Where a face runs aslant, light drifts across the strip as one goes along it. Factors across the strip are then made
+# at places along it, at most this share of a lens pitch apart in drift, and mixed in between: a trapezoid so moved is
+# off in L1 by a third of the share's square over the voxel's width in pitches, 0.004. Only where light goes astray
+# otherwise, and with this share of it left.
+LARGEST_DRIFT, DEGREE_OF_DRIFT, WORTH_DRIFT = 0.12, 2, 0.6
 # Lenses beside those that rays were found to come to: more than a voxel's width and the rays' rarity make.
 LENSES_BESIDE = 4
 # Boxes along x, y and z of a part of a strip in each of which this holds.
@@ -93,20 +98,6 @@ class StripScene:
     def world(self, axis: int) -> int:
         """Return the world axis that an image axis follows."""
         return axis if axis == 2 or self.camera.column_axis == "x" else 1 - axis
-
-
-class Factor(NamedTuple):
-    """Weights along one axis: entries (planes, voxels) of each voxel, and cell and share of each."""
-
-    counts: NDArray[np.int64]
-    cell: NDArray[np.int32]
-    share: NDArray[np.float32]
-
-    def chosen(self, keep: NDArray[np.bool_]) -> Factor:
-        """Return the entries that are kept."""
-        first = np.concatenate([[0], np.cumsum(keep)])
-        ends = first[np.concatenate([[0], np.cumsum(self.counts)])]
-        return Factor(np.diff(ends).reshape(self.counts.shape), self.cell[keep], self.share[keep])
 
 
 class Block(NamedTuple):
@@ -179,11 +170,11 @@ def _blocks_of(scene: StripScene, planes: slice, lines: slice) -> list[Block]:
         halves = slice(lines.start, middle), slice(middle, lines.stop)
         return [block for half in halves for block in _blocks_of(scene, planes, half)]
     found = []
-    tiles = [scene.tile[columns.cell] for columns in along]
-    for first, last, rows in _factors_across(scene, rays, planes, lines, lit):
+    for tiles, share, rows in _factors_across(scene, rays, planes, lines, lit):
         row_part = scene.part[rows.cell] * len(along) // FINE_PARTS
         for k, columns in enumerate(along):
-            held = columns.chosen((tiles[k] >= first) & (tiles[k] < last))
+            tile = scene.tile[columns.cell]
+            held = columns.chosen((tile >= tiles.start) & (tile < tiles.stop)).scaled(share)
             if held.cell.size:
                 found.append(Block(planes.start, lines.start, held, rows.chosen(row_part == k)))
     return found
@@ -221,7 +212,7 @@ def stray(rays: StripRays, left_mm: NDArray[np.float64], pitch_mm: float) -> flo
 
 def fits_along(scene: StripScene, rays: StripRays) -> tuple[list[AxisFit], float]:
     """Return a fit along the strip for each part of the aperture across it, and the light that goes astray."""
-    whole, left = fit_axis(rays, scene.along)
+    whole, left = fit_axis(rays, scene.along, DEGREE_ALONG)
     crossing, pitch = rays.crossing_mm[:, scene.across], scene.optics[scene.along].lens_pitch_mm
     for parts in PARTS_ACROSS:
         which = part_of(crossing, rays.radius_mm, parts)
@@ -231,17 +222,46 @@ def fits_along(scene: StripScene, rays: StripRays) -> tuple[list[AxisFit], float
     return fits, off
 
 
-def fits_across(scene: StripScene, rays: StripRays) -> tuple[list[AxisFit], int, float]:
-    """Return a fit across the strip for each so many tiles of cells, how many, and the light that goes astray."""
-    whole, left = fit_axis(rays, scene.across)
+class AcrossFits(NamedTuple):
+    """Fits across a strip.
+
+    Attributes
+    ----------
+    fits : one each so many tiles of cells
+    sharing : how many tiles
+    off : share of the light that goes astray
+    places_mm : along the strip, between which factors made at two of them are mixed; None: one factor is for all of it
+    """
+
+    fits: list[AxisFit]
+    sharing: int
+    off: float
+    places_mm: NDArray[np.float64] | None
+
+
+def fits_across(scene: StripScene, rays: StripRays) -> AcrossFits:
+    """Return fits across the strip: with what they know of the coordinate along it where that is worth it."""
+    found = _fits_across(scene, rays, None)
+    if found.off < STRAY_ACROSS:
+        return found
+    drifting = _fits_across(scene, rays, DEGREE_OF_DRIFT)
+    return drifting if drifting.off < WORTH_DRIFT * found.off else found
+
+
+def _fits_across(scene: StripScene, rays: StripRays, degree_beside: int | None) -> AcrossFits:
+    """Return the fits across the strip with as many tiles sharing one as let little light go astray."""
+    pitch = scene.optics[scene.across].lens_pitch_mm
+    whole, left = fit_axis(rays, scene.across, degree_beside)
+    places = None
+    if degree_beside is not None:
+        steps = int(np.ceil(whole.drift_mm() / (LARGEST_DRIFT * pitch)))
+        places = rays.middle_mm[scene.along] + rays.half_mm[scene.along] * np.linspace(-1.0, 1.0, max(steps, 1) + 1)
     tile, tiles = _tile_of_rays(scene, rays), -(-scene.order.size // TILE)
     for sharing in TILES_SHARING:
-        fits, off = _fits_of_parts(
-            whole, left, tile // sharing, -(-tiles // sharing), scene.optics[scene.across].lens_pitch_mm
-        )
+        fits, off = _fits_of_parts(whole, left, tile // sharing, -(-tiles // sharing), pitch)
         if off < STRAY_ACROSS:
             break
-    return fits, sharing, off
+    return AcrossFits(fits, sharing, off, places)
 
 
 def _fits_of_parts(
@@ -292,7 +312,7 @@ def _factors_along(
         weights = axis_weights(
             scene.optics[axis], own - rays.middle_mm[axis], scene.grid.spacing_mm[scene.world(axis)], bent
         )
-        factor, off = _through_lines(weights, powers, through)
+        factor, off = through_lines(weights, powers, through)
         found.append(factor)
         misfit = max(misfit, float(np.percentile(off[~dark], 90)) if not dark.all() else 0.0)
     return found, misfit
@@ -300,92 +320,24 @@ def _factors_along(
 
 def _factors_across(
     scene: StripScene, rays: StripRays, planes: slice, lines: slice, lit: NDArray[np.bool_]
-) -> Iterator[tuple[int, int, Factor]]:
-    """Yield the first tile of column cells, the one behind the last, and the factor across the strip for these."""
+) -> Iterator[tuple[range, NDArray[np.float64], Factor]]:
+    """Yield some tiles of column cells, the share (voxels,) of each voxel's light, and the factor across for these."""
     axis = scene.across
     depths = depth_nodes(scene.centres_mm(2)[planes], scene.grid.spacing_mm[2])
     centres, side = scene.centres_mm(axis)[lines], scene.grid.spacing_mm[scene.world(axis)]
-    fits, sharing, _ = fits_across(scene, rays)
-    for k, fit in enumerate(fits):
-        own = axis_weights(scene.optics[axis], centres - rays.middle_mm[axis], side, fit.bending(depths))
-        entries = np.diff(own.start).reshape(lit.shape)
-        counts = np.zeros((len(lit), STRIP), np.int64)
-        counts[:, : lit.shape[1]] = entries * lit
-        kept = np.repeat(lit.ravel(), entries.ravel())
-        yield k * sharing, (k + 1) * sharing, Factor(counts, own.cell[kept], own.share[kept])
-
-
-def _through_lines(
-    weights: AxisWeights, powers: NDArray[np.float64], through: NDArray[np.float64]
-) -> tuple[Factor, NDArray[np.float64]]:
-    """Return the polynomials (planes, voxels) through the weights on some lines of each plane, and their misfit in L1.
-
-    Parameters
-    ----------
-    powers, through : (planes, lines, 3) of the lines' places, and (planes, 3, lines) what inverts them
-    """
-    planes = len(powers)
-    room = np.zeros((weights.cell.size, 3), np.float32)
-    cell, counts = np.zeros(weights.cell.size, np.int32), np.zeros((planes, weights.voxels), np.int64)
-    off = np.zeros((planes, weights.voxels))
-    first = weights.start[:: weights.voxels * powers.shape[1]]
-    arrays = (weights.start, weights.cell, weights.share, powers, through, cell, room, counts, off)
-    share_out(_write_polynomials, planes, first, weights.cells.pixel.size, *arrays)
-    kept = np.concatenate([np.arange(first[p], first[p] + counts[p].sum()) for p in range(planes)])
-    return Factor(counts, cell[kept], room[kept]), off
-
-
-@njit(cache=True, nogil=True)
-def _write_polynomials(
-    part: tuple[int, int],
-    first: NDArray[np.int64],
-    cells: int,
-    start: NDArray[np.int64],
-    cell: NDArray[np.int32],
-    share: NDArray[np.float32],
-    powers: NDArray[np.float64],
-    through: NDArray[np.float64],
-    found_cell: NDArray[np.int32],
-    found: NDArray[np.float32],
-    counts: NDArray[np.int64],
-    off: NDArray[np.float64],
-) -> None:
-    """Write what `_through_lines` returns for some planes, those of plane p from entry `first[p]` on."""
-    lines, voxels = powers.shape[1], counts.shape[1]
-    table = np.zeros((cells, lines))
-    for plane in range(part[0], part[1]):
-        at = first[plane]
-        for voxel in range(voxels):
-            low, high = cells, 0
-            for line in range(lines):
-                row = (plane * lines + line) * voxels + voxel
-                for k in range(start[row], start[row + 1]):
-                    table[cell[k], line] = share[k]
-                    low, high = min(low, cell[k]), max(high, cell[k] + 1)
-            for k in range(low, high):
-                largest = table[k].max()
-                if largest > SMALLEST_SHARE:
-                    for c in range(3):
-                        total = 0.0
-                        for line in range(lines):
-                            total += through[plane, c, line] * table[k, line]
-                        found[at, c] = total
-                    for line in range(lines):
-                        shown = 0.0
-                        for c in range(3):
-                            shown += powers[plane, line, c] * found[at, c]
-                        off[plane, voxel] += abs(max(shown, 0.0) - table[k, line]) / lines
-                    found_cell[at] = k
-                    at += 1
-                    counts[plane, voxel] += 1
-                table[k] = 0.0
-
-
-def joined(factors: Sequence[Factor], optics: AxisOptics, cells: Cells) -> AxisWeights:
-    """Return the weights of all blocks along one axis, the planes of one after the other."""
-    counts, cell, share = (np.concatenate([getattr(each, name) for each in factors]) for name in Factor._fields)
-    start = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-    return AxisWeights(len(counts), counts.shape[1], optics.pixels, cells, start, cell, share)
+    along = scene.centres_mm(scene.along)
+    across = fits_across(scene, rays)
+    shares = np.ones((along.size, 1)) if across.places_mm is None else mixed_shares(along, across.places_mm)
+    for k, fit in enumerate(across.fits):
+        for place, share in enumerate(shares.T):
+            at = None if across.places_mm is None else np.full(len(depths), across.places_mm[place])
+            own = axis_weights(scene.optics[axis], centres - rays.middle_mm[axis], side, fit.bending(depths, at))
+            entries = np.diff(own.start).reshape(lit.shape)
+            counts = np.zeros((len(lit), STRIP), np.int64)
+            counts[:, : lit.shape[1]] = entries * lit
+            kept = np.repeat(lit.ravel(), entries.ravel())
+            tiles = range(k * across.sharing, (k + 1) * across.sharing)
+            yield tiles, share, Factor(counts, own.cell[kept], own.share[kept])
 
 
 def places_of(blocks: Sequence[Block]) -> Blocks:

@@ -2,15 +2,16 @@
 
 Of each part rays are traced through the faces, and each coordinate of where they meet the array is fitted by a
 polynomial of what its factor of the weights may know: along the strip own coordinate and crossing, depth and line;
-across it own coordinate and crossing, and depth. What is left is what the other axis says. Where that is too much, rays
-through different parts of the aperture, or from different parts of the strip, have polynomials of their own.
+across it own coordinate and crossing, and depth, and where faces run aslant the place along the strip. What is left is
+what the other axis says. Where that is too much, rays through different parts of the aperture, or from different parts
+of the strip, have polynomials of their own.
 
 Axes: image axes (x along the columns), mm, z away from the camera from the nominal focal point.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import product
 
@@ -54,14 +55,14 @@ class StripRays:
     half_mm: NDArray[np.float64]
     radius_mm: float
 
-    def variables(self, axis: int) -> NDArray[np.float64]:
+    def variables(self, axis: int, beside: bool) -> NDArray[np.float64]:
         """Return what the factor along an image axis knows of each ray, (n, 3) or (n, 4), each from -1 to 1.
 
-        Own coordinate, depth and crossing, and along the strip the coordinate across it.
+        Own coordinate, depth and crossing, and `beside`, where it is known, the coordinate along the other axis.
         """
         start = (self.start_mm - self.middle_mm) / self.half_mm
         known = [start[:, axis], start[:, 2], self.crossing_mm[:, axis] / self.radius_mm]
-        return np.stack([*known, start[:, self.across]] if axis == self.along else known, axis=1)
+        return np.stack([*known, start[:, 1 - axis]] if beside else known, axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,30 +74,41 @@ class AxisFit:
     exponents, coefficients_mm : (terms, variables), (terms,)
     rays : what it was fitted to
     axis : image axis
+    degree_beside : highest power of the coordinate along the other axis; None: it is not known
     """
 
     exponents: NDArray[np.int64]
     coefficients_mm: NDArray[np.float64]
     rays: StripRays
     axis: int
+    degree_beside: int | None
 
-    def bending(self, depths_mm: NDArray[np.float64], lines_mm: NDArray[np.float64] | None = None) -> FittedBending:
+    def drift_mm(self) -> float:
+        """Return how far places move from one end of the other axis to the other, for nine rays in ten at most."""
+        known = self.rays.variables(self.axis, True)
+        ends = []
+        for end in (-1.0, 1.0):
+            known[:, 3] = end
+            ends.append(_terms(known, self.exponents) @ self.coefficients_mm)
+        return float(np.percentile(np.abs(ends[1] - ends[0]), 90.0))
+
+    def bending(self, depths_mm: NDArray[np.float64], beside_mm: NDArray[np.float64] | None = None) -> FittedBending:
         """Return the polynomials in own coordinate, from the middle, and crossing, at depths (planes, nodes).
 
-        Along a strip also on one line of each plane, (planes,).
+        Where the coordinate along the other axis is known, at one place of it in each plane, (planes,).
         """
         middle, half = self.rays.middle_mm, self.rays.half_mm
         depth = (depths_mm - middle[2]) / half[2]
         degree = int(self.exponents.max())
         factors = [depth[..., np.newaxis] ** np.arange(degree + 1)]
-        if lines_mm is not None:
-            across = self.rays.across
-            line = (lines_mm - middle[across]) / half[across]
-            factors.append((line[:, np.newaxis] ** np.arange(degree + 1))[:, np.newaxis])
+        if beside_mm is not None:
+            other = 1 - self.axis
+            place = (beside_mm - middle[other]) / half[other]
+            factors.append((place[:, np.newaxis] ** np.arange(degree + 1))[:, np.newaxis])
         table = np.zeros((*depths_mm.shape, degree + 1, degree + 1))
         for powers, coefficient in zip(self.exponents, self.coefficients_mm, strict=True):
             part = coefficient * factors[0][..., powers[1]]
-            if lines_mm is not None:
+            if beside_mm is not None:
                 part = part * factors[1][..., powers[3]]
             table[..., powers[0], powers[2]] += part
         return FittedBending(table, np.array([half[self.axis], self.rays.radius_mm]), PIECES)
@@ -146,8 +158,10 @@ def evenly_spread(count: int, dimensions: int) -> NDArray[np.float64]:
 
 
 @cache
-def _exponents(variables: int, degree: int) -> NDArray[np.int64]:
-    powers = product(range(degree + 1), repeat=variables)
+def _exponents(degree: int, degree_beside: int | None) -> NDArray[np.int64]:
+    """Return the powers (terms, 3), with the other axis's coordinate (terms, 4), of polynomials of a degree."""
+    own = range(degree + 1)
+    powers = product(*[own] * 3, *([] if degree_beside is None else [range(min(degree_beside, degree) + 1)]))
     return np.array([each for each in powers if sum(each) <= degree])
 
 
@@ -160,12 +174,15 @@ def _terms(variables: NDArray[np.float64], exponents: NDArray[np.int64]) -> NDAr
     return terms
 
 
-def fit_axis(rays: StripRays, axis: int) -> tuple[AxisFit, NDArray[np.float64]]:
-    """Return the fit to all rays along an axis, and what it leaves of each (n,), mm."""
-    variables, place = rays.variables(axis), rays.array_mm[:, axis]
-    exponents = _exponents(variables.shape[1], DEGREE_ALONG if axis == rays.along else DEGREE_ACROSS)
+def fit_axis(rays: StripRays, axis: int, degree_beside: int | None) -> tuple[AxisFit, NDArray[np.float64]]:
+    """Return the fit to all rays along an axis, and what it leaves of each (n,), mm.
+
+    Of the coordinate along the other axis it knows powers up to `degree_beside`; None: nothing of it.
+    """
+    variables, place = rays.variables(axis, degree_beside is not None), rays.array_mm[:, axis]
+    exponents = _exponents(DEGREE_ALONG if axis == rays.along else DEGREE_ACROSS, degree_beside)
     coefficients, left = _solved(variables, exponents, place)
-    return AxisFit(exponents, coefficients, rays, axis), left
+    return AxisFit(exponents, coefficients, rays, axis, degree_beside), left
 
 
 def fit_part(
@@ -175,13 +192,13 @@ def fit_part(
     degree = next((each for each, rays in DEGREE_OF_PARTS.items() if np.count_nonzero(chosen) >= rays), None)
     if degree is None:
         return fit, left_mm[chosen]
-    variables = fit.rays.variables(fit.axis)[chosen]
-    exponents = _exponents(variables.shape[1], degree)
+    variables = fit.rays.variables(fit.axis, fit.degree_beside is not None)[chosen]
+    exponents = _exponents(degree, fit.degree_beside)
     further, left = _solved(variables, exponents, left_mm[chosen])
     coefficients = fit.coefficients_mm.copy()
     for powers, coefficient in zip(exponents, further, strict=True):
         coefficients[np.all(fit.exponents == powers, axis=1)] += coefficient
-    return AxisFit(fit.exponents, coefficients, fit.rays, fit.axis), left
+    return replace(fit, coefficients_mm=coefficients), left
 
 
 def _solved(

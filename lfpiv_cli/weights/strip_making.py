@@ -23,12 +23,12 @@ from lfpiv_cli.weights.strip_blocks import (
     StripScene,
     fits_across,
     fits_along,
-    joined,
     make_blocks,
     places_of,
     rays_of,
     strip_scene,
 )
+from lfpiv_cli.weights.strip_factors import joined
 from lfpiv_cli.weights.strip_kernels import SLAB, STRIP
 from lfpiv_cli.weights.strips import StripOperator
 
@@ -80,9 +80,10 @@ def _judged(scene: StripScene) -> tuple[float, float]:
         if rays is None:
             continue
         along, off_along = fits_along(scene, rays)
-        across, _, off_across = fits_across(scene, rays)
-        parts.append(len(along) * len(across))
-        off = max(off, off_along, off_across)
+        across = fits_across(scene, rays)
+        mixed = 1 if across.places_mm is None else 2  # places that a voxel's light is shared among
+        parts.append(len(along) * len(across.fits) * mixed)
+        off = max(off, off_along, across.off)
     return (off, float(np.mean(parts))) if parts else (np.inf, 0.0)
 
 

@@ -4,11 +4,12 @@ Behind a curved window rays do not separate into two axes over the whole volume:
 with the distance from its axis. Each voxel has a product of two factors even so, w = C a b:
 
 - a, along the strip, of the pixel's column, changes with the line within a strip as a polynomial of the second degree;
-- b, across the strips, of the pixel's row, is each line's own.
+- b, across the strips, of the pixel's row, is each line's own. Where faces run a little aslant, so that the light of a
+  line drifts across the strip, it is mixed linearly from those of two places along the strip, one on either side.
 
 Where the two axes know too much of each other, the light through different parts of the aperture has factors of its
-own. What has one pair of factors is a block: up to `SLAB` planes of a strip, a range of voxels along it, and the light
-through a rectangle of the aperture, told by which cells its factors have.
+own. What has one pair of factors is a block: up to `SLAB` planes of a strip, a range of voxels along it, or the share
+that one place has in them, and the light through a rectangle of the aperture, told by which cells its factors have.
 
 Axes: volumes [plane, row voxel, column voxel] in the order of the sensor's axes, images [row, column].
 """
