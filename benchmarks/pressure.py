@@ -17,7 +17,7 @@ from lfpiv_cli.synthetic.flows import MM_PER_M, advect
 from lfpiv_cli.synthetic.known_flow import KnownFlow
 from lfpiv_cli.synthetic.vortices import abc, taylor_green
 from lfpiv_cli.tracks.candidates import Seen
-from lfpiv_cli.tracks.sequences import Trajectories
+from lfpiv_cli.tracks.trajectories import Trajectories
 
 SIZE_MM = np.array([13.0, 10.0, 10.0])
 FRAMES, MIDDLE = 7, 3

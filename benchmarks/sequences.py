@@ -22,7 +22,8 @@ from lfpiv_cli.particles.search import Particles, result
 from lfpiv_cli.synthetic.flows import Flow, advect, random_modes, square_duct, taylor_green
 from lfpiv_cli.tracks.candidates import Seen
 from lfpiv_cli.tracks.light import Light
-from lfpiv_cli.tracks.sequences import Ahead, SoFar, begun, followed_further, long_ones, scatter_in, states_at
+from lfpiv_cli.tracks.sequences import Ahead, SoFar, begun, followed_further, scatter_in, states_at
+from lfpiv_cli.tracks.trajectories import long_ones
 from lfpiv_cli.validation.particles import match
 
 SHAPE, VOLUME_XYZ, COUNT, FRAMES = (880, 880), (36, 36, 100), 830, 12

@@ -12,15 +12,8 @@ from lfpiv_cli.scale import Scale
 from lfpiv_cli.synthetic.flows import Flow, advect, random_modes, rigid_rotation
 from lfpiv_cli.tracks.candidates import Seen
 from lfpiv_cli.tracks.light import Light
-from lfpiv_cli.tracks.sequences import (
-    NO_TRACK,
-    PAST_FRAMES,
-    SoFar,
-    begun,
-    follow,
-    followed_further,
-    long_ones,
-)
+from lfpiv_cli.tracks.sequences import PAST_FRAMES, SoFar, begun, follow, followed_further
+from lfpiv_cli.tracks.trajectories import NO_TRACK, long_ones
 
 BOX_MM, DT_S = 3.2, 0.002
 SEARCH_MM = 0.4

@@ -21,7 +21,7 @@ from scipy.special import gammaincinv
 
 from lfpiv_cli.robust import MAD_TO_SIGMA
 from lfpiv_cli.tracks.candidates import Seen
-from lfpiv_cli.tracks.sequences import NO_TRACK, Trajectories
+from lfpiv_cli.tracks.trajectories import NO_TRACK, Trajectories
 
 Floats = NDArray[np.float64]
 

@@ -47,7 +47,8 @@ from lfpiv_cli.particles.rounds import first_pass
 from lfpiv_cli.particles.search import Particles, blank, rebuilt, result
 from lfpiv_cli.reconstruction.images import Image, light
 from lfpiv_cli.tracks.candidates import Seen
-from lfpiv_cli.tracks.sequences import PAST_FRAMES, Ahead, SoFar, Trajectories, begun, followed_further
+from lfpiv_cli.tracks.sequences import PAST_FRAMES, Ahead, SoFar, begun, followed_further
+from lfpiv_cli.tracks.trajectories import Trajectories
 
 # A track is confirmed by four frames: a ghost finds light by chance in two, hardly ever in four.
 SHORTEST = 4

@@ -21,7 +21,7 @@ from lfpiv_cli.flow.field import MM_TO_M
 from lfpiv_cli.flow.from_tracks import WindowGrid
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.interface.tracks import seen_in
-from lfpiv_cli.tracks.sequences import NO_TRACK, Trajectories
+from lfpiv_cli.tracks.trajectories import NO_TRACK, Trajectories
 
 Floats = NDArray[np.float64]
 MM2_PER_M2 = 1e6

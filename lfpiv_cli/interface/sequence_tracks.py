@@ -14,7 +14,8 @@ from lfpiv_cli.flow.field import MM_TO_M
 from lfpiv_cli.flow.from_tracks import Paths
 from lfpiv_cli.tracks.candidates import Seen
 from lfpiv_cli.tracks.in_time import Scatter
-from lfpiv_cli.tracks.sequences import Trajectories, scatter_in, states_at
+from lfpiv_cli.tracks.sequences import scatter_in, states_at
+from lfpiv_cli.tracks.trajectories import Trajectories
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,9 +22,10 @@ from lfpiv_cli.reference import Reference
 from lfpiv_cli.scale import Scale
 from lfpiv_cli.tracks.candidates import Seen
 from lfpiv_cli.tracks.light import Light
-from lfpiv_cli.tracks.sequences import SHORTEST, Trajectories, follow, long_ones
+from lfpiv_cli.tracks.sequences import SHORTEST, follow
 from lfpiv_cli.tracks.tracking import FEWEST_OF_FIT, SEARCH_LENSES, Tracks, wrong_link_variance
 from lfpiv_cli.tracks.tracking import track as match
+from lfpiv_cli.tracks.trajectories import Trajectories, long_ones
 
 # A frame with less than this share of the fullest one's particles leaves most of those without a partner.
 ONE_SIDED = 0.5

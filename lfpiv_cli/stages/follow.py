@@ -55,7 +55,7 @@ from lfpiv_cli.stages.intervals import frames_dt_notices
 from lfpiv_cli.stages.prepared import open_weights_that_fit
 from lfpiv_cli.stages.reconstruct import file_notices, residual_path
 from lfpiv_cli.stages.stored_tracks import SeenFrames, stored_tracks
-from lfpiv_cli.tracks.sequences import Trajectories
+from lfpiv_cli.tracks.trajectories import Trajectories
 
 SEQUENCE_IS_WHOLE = "--shard: a sequence is followed from frame to frame and cannot be divided; leave out --shard"
 PARTICLES, FORWARDS = "particles", "forwards"

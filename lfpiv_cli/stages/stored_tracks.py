@@ -14,7 +14,8 @@ from lfpiv_cli.files.track_store import StoredTracks, TrackStore
 from lfpiv_cli.interface.tracks import Tracking, TracksOf, seen_in, sequence_of
 from lfpiv_cli.reference import Reference
 from lfpiv_cli.tracks.candidates import Seen
-from lfpiv_cli.tracks.sequences import HALVES_FRAMES, Trajectories
+from lfpiv_cli.tracks.sequences import HALVES_FRAMES
+from lfpiv_cli.tracks.trajectories import Trajectories
 
 # States look at so many frames, one after the other; forecasts at fewer.
 KEPT_FRAMES = 2 * max(HALVES_FRAMES) + 1

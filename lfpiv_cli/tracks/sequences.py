@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +21,15 @@ from lfpiv_cli.tracks.candidates import Seen
 from lfpiv_cli.tracks.in_time import FEWEST_TRACKS, Scatter, State, fit_in_time, scatter_of, scatter_of_pieces
 from lfpiv_cli.tracks.kriging import kriged, structure_of
 from lfpiv_cli.tracks.tracking import NO_TRACKS, Forecast, Tracks, known_of, link_some, track
+from lfpiv_cli.tracks.trajectories import (
+    NO_PARTICLE,
+    NO_TRACK,
+    Frames,
+    Trajectories,
+    long_ones,
+    places,
+    tracks_in,
+)
 
 # A forecast takes a track's last four places: enough for a parabola and to see its noise.
 PAST_FRAMES = 4
@@ -33,56 +41,6 @@ LARGEST_MISFIT = 1.1
 REPEATS = 2
 # A ghost finds a partner in the next frame by chance, hardly ever in two.
 SHORTEST = 3
-NO_TRACK = NO_PARTICLE = -1
-
-
-class Frames(Protocol):
-    """Particles of frames by their numbers; those that are not asked for need not be there."""
-
-    def __getitem__(self, number: int, /) -> Seen:
-        """Return the particles of a frame."""
-
-
-@dataclass(frozen=True, eq=False)
-class Trajectories:
-    """Which particles of a sequence belong together.
-
-    Attributes
-    ----------
-    labels : for each frame (n,) the number of each particle's track, `NO_TRACK` for none
-    count : of tracks
-    probability : for each frame (n,) that of the link by which a track has come to each particle; NaN where it begins
-    """
-
-    labels: tuple[NDArray[np.int64], ...]
-    count: int
-    probability: tuple[NDArray[np.float64], ...]
-
-    def particles(self, frame: int, tracks: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the numbers of the particles in a frame that tracks have there, `NO_PARTICLE` for none."""
-        labels = self.labels[frame]
-        place = np.full(self.count, NO_PARTICLE)
-        place[labels[labels != NO_TRACK]] = np.flatnonzero(labels != NO_TRACK)
-        return np.asarray(place[tracks])
-
-    def lengths(self) -> NDArray[np.int64]:
-        """Return how many places each track has."""
-        counts = np.zeros(self.count, dtype=np.int64)
-        for labels in self.labels:
-            counts += np.bincount(labels[labels != NO_TRACK], minlength=self.count)
-        return counts
-
-    def expected_wrong_links(self) -> float:
-        """Return how many links are wrong, by their probabilities."""
-        wrong = np.empty(int(self.lengths().sum()))
-        end = 0
-        for labels, probability in zip(self.labels, self.probability, strict=True):
-            tracked = np.flatnonzero(labels != NO_TRACK)
-            end += len(tracked)
-            # By track in each frame: the last bits of a sum are of the order.
-            wrong[end - len(tracked) : end] = 1.0 - probability[tracked[np.argsort(labels[tracked])]]
-        wrong[np.isnan(wrong)] = 0.0
-        return float(np.sum(wrong))
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,7 +123,7 @@ def followed_further(so_far: SoFar, frames: Frames, search_mm: float, scale: Sca
         earlier = _forecast(found, frames, number - 1, 2, so_far.scatter)
         found = _linked(found, number - 1, number + 1, _bridges(found, frames, number, earlier, search_mm, scale))
     window = _frames_before(number + 2, PAST_FRAMES)
-    position, sigma = _places(found, frames, window, _tracks_in(found, window))
+    position, sigma = places(found, frames, window, tracks_in(found, window))
     scatter = scatter_of(position, sigma, np.arange(len(window), dtype=np.float64))
     past_factor, others_factor = (_surprise(start, end, links, each) for each in (so_far.by_past, so_far.by_others))
     by_past, by_others = _forecast(found, frames, number + 1, 1, scatter), _by_others(found, frames)
@@ -247,11 +205,11 @@ def _ahead(found: Trajectories, frames: Frames, forecast: Forecast | None, over_
 def _by_others(found: Trajectories, frames: Frames) -> Forecast | None:
     """Return how the last frame's particles should move on: as those did just before that were where they come to."""
     last = len(found.labels) - 1
-    tracks = np.intersect1d(_tracks_in(found, [last - 1]), _tracks_in(found, [last]))
+    tracks = np.intersect1d(tracks_in(found, [last - 1]), tracks_in(found, [last]))
     if len(tracks) < 2:
         return None
     at = frames[last].position_mm
-    position, sigma = _places(found, frames, [last - 1, last], tracks)
+    position, sigma = places(found, frames, [last - 1, last], tracks)
     moved, noise2 = position[:, 1] - position[:, 0], np.nan_to_num(np.sum(sigma**2, axis=1))
     middle, structure = position.mean(axis=1), structure_of(position.mean(axis=1), moved, noise2)
     nobody, displacement = np.full(len(at), -1), np.zeros_like(at)
@@ -268,7 +226,7 @@ def _light_of(frame: Seen) -> NDArray[np.float64]:
 def _light_sigma(found: Trajectories, frames: Frames) -> float:
     """Return the spread of the logarithm of a particle's light from frame to frame, by tracks through the last two."""
     numbers = (len(found.labels) - 2, len(found.labels) - 1)
-    tracks = np.intersect1d(_tracks_in(found, [numbers[0]]), _tracks_in(found, [numbers[1]]))
+    tracks = np.intersect1d(tracks_in(found, [numbers[0]]), tracks_in(found, [numbers[1]]))
     if not len(tracks):
         return 0.0
     before, now = (_light_of(frames[k])[found.particles(k, tracks)] for k in numbers)
@@ -289,7 +247,7 @@ def scatter_in(found: Trajectories, frames: Sequence[Seen]) -> tuple[Scatter, in
 def _scatter_of_windows(found: Trajectories, frames: Sequence[Seen], width: int) -> Scatter:
     """Return noise and bending of the tracks in windows of so many frames that do not overlap."""
     windows = [_frames_before(end, width) for end in range(min(width, len(frames)), len(frames) + 1, width)]
-    pieces = (_places(found, frames, window, _tracks_in(found, window)) for window in windows)
+    pieces = (places(found, frames, window, tracks_in(found, window)) for window in windows)
     return scatter_of_pieces(pieces, np.arange(len(windows[0]), dtype=np.float64))
 
 
@@ -309,7 +267,7 @@ def states_at(
     passing = present[1] if before == after else (present[0] | present[1]) & (present[2] | present[3])
     numbers = np.array(sorted(passing), dtype=np.int64)
     window = [k for k in range(int(np.ceil(time - half_frames)), int(time + half_frames) + 1) if 0 <= k < len(frames)]
-    position, sigma = _places(found, frames, window, numbers)
+    position, sigma = places(found, frames, window, numbers)
     return numbers, fit_in_time(position, sigma, np.array(window) - time, scatter)
 
 
@@ -317,30 +275,11 @@ def _frames_before(end: int, count: int) -> list[int]:
     return list(range(max(0, end - count), end))
 
 
-def _tracks_in(found: Trajectories, window: Sequence[int]) -> NDArray[np.int64]:
-    """Return the numbers of the tracks that pass some frames."""
-    numbers = np.unique(np.concatenate([found.labels[k] for k in window]))
-    return numbers[numbers != NO_TRACK]
-
-
-def _places(
-    found: Trajectories, frames: Frames, window: Sequence[int], tracks: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return places and standard errors (n, m, 3) of tracks in the frames of a window; NaN where there are none."""
-    position, sigma = (np.full((len(tracks), len(window), 3), np.nan) for _ in range(2))
-    for column, frame in enumerate(window):
-        place = found.particles(frame, tracks)
-        there = place >= 0
-        position[there, column] = frames[frame].position_mm[place[there]]
-        sigma[there, column] = frames[frame].sigma_mm()[place[there]]
-    return position, sigma
-
-
 def _forecast(found: Trajectories, frames: Frames, number: int, ahead: int, scatter: Scatter) -> Forecast | None:
     """Return where the particles of a frame with a past will have moved so many frames later."""
     points, tracked = frames[number].position_mm, np.flatnonzero(found.labels[number] != NO_TRACK)
     window = _frames_before(number + 1, PAST_FRAMES)
-    position, sigma = _places(found, frames, window, found.labels[number][tracked])
+    position, sigma = places(found, frames, window, found.labels[number][tracked])
     has_past = np.isfinite(position[..., 0]).sum(axis=1) > 1
     if not has_past.any():
         return None
@@ -378,15 +317,3 @@ def _bridges(
     known = known_of(frames[start], frames[end], through, later[through], scale)
     free = found.labels[end] == NO_TRACK
     return link_some((frames[start], lost), (frames[end], free), known, search_mm, scale, forecast)
-
-
-def long_ones(found: Trajectories, shortest: int) -> Trajectories:
-    """Return the tracks with so many places at least, numbered anew in the order of their first frames."""
-    is_long = found.lengths() >= shortest
-    number = np.where(is_long, np.cumsum(is_long) - 1, NO_TRACK)
-    number = np.append(number, NO_TRACK)
-    labels = tuple(np.where(old == NO_TRACK, NO_TRACK, number[old]) for old in found.labels)
-    probability = tuple(
-        np.where(label == NO_TRACK, np.nan, each) for label, each in zip(labels, found.probability, strict=True)
-    )
-    return Trajectories(labels, int(is_long.sum()), probability)
