@@ -23,6 +23,7 @@ from lfpiv_cli.synthetic.flows import Flow, advect, random_modes, square_duct, t
 from lfpiv_cli.tracks.candidates import Seen
 from lfpiv_cli.tracks.light import Light
 from lfpiv_cli.tracks.sequences import Ahead, SoFar, begun, followed_further, scatter_in, states_at
+from lfpiv_cli.tracks.smoothing import expected_in
 from lfpiv_cli.tracks.trajectories import long_ones
 from lfpiv_cli.validation.particles import match
 
@@ -45,7 +46,7 @@ Points = NDArray[np.float64]
 
 
 def bench_sequences() -> None:
-    """Print recall, precision and errors of tracks in sequences of twelve frames, by the distance from focus."""
+    """Print recall, precision and errors of tracks in sequences, once and both ways, by the distance from focus."""
     bench = calibrated(SHAPE, VOLUME_XYZ, seed=0)
     for number, name in enumerate(FLOWS):
         print_sequence(bench, name, COUNT, FRAMES, seed=700 + number)
@@ -55,15 +56,23 @@ def print_sequence(bench: Bench, name: str, count: int, frames: int, seed: int) 
     """Render a sequence, follow it and print a line for each range of depths."""
     images, true = photographs(bench, FLOWS[name], count, frames, np.random.default_rng(seed))
     began = time.process_time()
-    found, so_far = followed(bench, images, SEARCH_MM.get(name, 0.6))
-    seconds = (time.process_time() - began) / frames
+    search_mm = SEARCH_MM.get(name, 0.6)
+    found, so_far = followed(bench, images, search_mm)
+    print_figures(f"{name}, {count}, forwards", bench, found, so_far, true, time.process_time() - began)
+    began = time.process_time()
+    found, so_far = followed_again(bench, images, found, so_far, search_mm)
+    print_figures(f"{name}, {count}, both ways", bench, found, so_far, true, time.process_time() - began)
+
+
+def print_figures(name: str, bench: Bench, found: list[Seen], so_far: SoFar, true: Points, seconds: float) -> None:
+    """Print a line for each range of depths."""
     for distances in DISTANCES_MM:
         figures = track_figures(bench, found, so_far, true, distances)
         if figures is None:
             continue
         text = "  ".join(f"{key} {value:.4f}" for key, value in figures.items())
         near, far = distances
-        print(f"{name}, {count}, {seconds:.1f} CPU s a frame, |z| {near:g} to {far:g} mm: {text}", flush=True)
+        print(f"{name}, {seconds / len(true):.1f} CPU s a frame, |z| {near:g} to {far:g} mm: {text}", flush=True)
 
 
 def photographs(
@@ -97,6 +106,21 @@ def followed(bench: Bench, images: list[NDArray[np.float32]], search_mm: float) 
         found.append(_seen(result(task, first_pass(task) if state is None else state)))
         so_far = followed_further(so_far, found, search_mm, scale)
     return found, so_far
+
+
+def followed_again(
+    bench: Bench, images: list[NDArray[np.float32]], found: list[Seen], so_far: SoFar, search_mm: float
+) -> tuple[list[Seen], SoFar]:
+    """Return the same after a second pass, in which each frame is expected by its tracks before and after it."""
+    confirmed, again = long_ones(so_far.found, SHORTEST), []
+    for number, image in enumerate(images):
+        task = bench.task(image)
+        state = find_predicted(task, _predicted(bench, expected_in(confirmed, found, number)))
+        again.append(_seen(result(task, first_pass(task) if state is None else state)))
+    so_far, scale = begun(again), bench.task(images[0]).view.scale
+    while so_far.last < len(again) - 1:
+        so_far = followed_further(so_far, again, search_mm, scale)
+    return again, so_far
 
 
 def track_figures(

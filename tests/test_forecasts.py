@@ -7,12 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from lfpiv_cli.scale import Scale
 from lfpiv_cli.synthetic.flows import Flow, advect, random_modes, rigid_rotation
 from lfpiv_cli.tracks.candidates import Seen
 from lfpiv_cli.tracks.light import Light
 from lfpiv_cli.tracks.sequences import PAST_FRAMES, SoFar, begun, follow, followed_further
+from lfpiv_cli.tracks.smoothing import REACH_FRAMES, expected_in
 from lfpiv_cli.tracks.trajectories import NO_TRACK, long_ones
 
 BOX_MM, DT_S = 3.2, 0.002
@@ -120,6 +122,32 @@ def test_what_one_frame_lost_is_still_ahead(vortex: Recorded) -> None:
     assert len(gone) > 30
     assert len(expected) > 0.9 * len(gone)
     assert np.mean(np.abs(np.concatenate(ratios)) < 3.0) > 0.95
+
+
+@pytest.mark.thorough
+def test_a_frame_is_expected_by_what_is_before_and_after_it(vortex: Recorded) -> None:
+    found = long_ones(vortex.steps[-1].found, 3)
+    lost, told, ratios, ends = 0, 0, [], 0
+    for number in range(FRAMES):
+        near = {k: vortex.frames[k] for k in range(FRAMES) if abs(k - number) <= REACH_FRAMES}
+        ahead = expected_in(found, near, number)
+        true, inside = vortex.places[number], within(vortex.places[number])
+        distance, who = KDTree(true[inside]).query(ahead.position_mm)
+        who = np.flatnonzero(inside)[who]
+        ratios.append(((ahead.position_mm - true[who]) / ahead.sigma_mm)[distance < 0.1])
+        # Those that the frame has lost, of which others of the track's places are seen.
+        tracked = np.concatenate([vortex.numbers[k][found.labels[k] != NO_TRACK] for k in near if k != number])
+        gone = np.setdiff1d(np.flatnonzero(inside & np.isin(np.arange(len(true)), tracked)), vortex.numbers[number])
+        lost, told = lost + len(gone), told + np.isin(gone, who[distance < 0.1]).sum()
+        ends += np.isin(gone, who[distance < 0.1]).sum() if number in (0, FRAMES - 1) else 0
+        # Light is that of the particle in other frames, here the same in all.
+        assert np.all(ahead.light > 0.0)
+        assert ahead.light_sigma == pytest.approx(0.0, abs=1e-12)
+    assert lost > 100
+    assert ends > 20  # Beyond the ends of tracks, too.
+    assert told > 0.85 * lost
+    covered = np.mean(np.abs(np.concatenate(ratios)) < 1.96, axis=0)
+    assert np.all((covered > 0.9) & (covered < 0.99))
 
 
 @pytest.mark.thorough

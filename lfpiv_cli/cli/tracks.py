@@ -86,7 +86,9 @@ def track(
 @click.option(
     "--shortest", type=click.IntRange(min=2), default=4, help="Fewest frames of a track, shorter ones are ghosts; 4."
 )
-@click.option("--both-ways", is_flag=True, help="Go through the frames a second time, backwards: twice the time.")
+@click.option(
+    "--both-ways", is_flag=True, help="Go a second time through the frames, each by its tracks before and after it."
+)
 @click.option("--residuals", is_flag=True, help="Also write what the particles leave of each image.")
 @work_options
 @output_option("Folder for the particles of each frame and the tracks.")

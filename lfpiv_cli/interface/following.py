@@ -48,7 +48,8 @@ from lfpiv_cli.particles.search import Particles, blank, rebuilt, result
 from lfpiv_cli.reconstruction.images import Image, light
 from lfpiv_cli.tracks.candidates import Seen
 from lfpiv_cli.tracks.sequences import PAST_FRAMES, Ahead, SoFar, begun, followed_further
-from lfpiv_cli.tracks.trajectories import Trajectories
+from lfpiv_cli.tracks.smoothing import REACH_FRAMES, expected_in
+from lfpiv_cli.tracks.trajectories import Trajectories, long_ones
 
 # A track is confirmed by four frames: a ghost finds light by chance in two, hardly ever in four.
 SHORTEST = 4
@@ -102,7 +103,7 @@ def follow(
     shortest : int
         Fewest frames of a track.
     both_ways : bool
-        Go through the sequence a second time, backwards, with what came later.
+        Go through the sequence a second time: each frame with the tracks before and after it.
     **settings
         Keys of the rig's section `reconstruction`, in their place, as of `find_particles`.
 
@@ -138,10 +139,11 @@ def follow(
     provenance = record("follow", chosen.resolved() | tracking.told(), {})
     sequence = Recorded(bench, size, tracking, frame, names, provenance)
     store = Memory()
-    found: Trajectories | None = forwards(sequence, store)
+    forward = forwards(sequence, store)
+    found: Trajectories | None = forward
     if both_ways:
-        forward, store, found = store, Memory(), None
-        backwards(sequence, forward.particles.__getitem__, store)
+        before, store, found = store, Memory(), None
+        go_both_ways(sequence, forward, before.particles.__getitem__, store)
     warn_of(store.notices)
     particles = [store.particles[number] for number in range(len(images))]
     tracks = tracked(particles, chosen, tracking, provenance, found)
@@ -149,9 +151,10 @@ def follow(
     return Followed(particles, tracks)
 
 
-def steps_of(needed: Collection[int]) -> int:
-    """Return the units of progress of frames with these numbers on the way forwards."""
-    return sum(STEPS if number < 2 else PREDICTED_STEPS for number in needed)
+def steps_of(passes: Sequence[Collection[int]]) -> int:
+    """Return the units of progress of frames with these numbers on the way forwards, and of those of a second pass."""
+    searched = sum(number < 2 for number in passes[0])
+    return searched * STEPS + (sum(map(len, passes)) - searched) * PREDICTED_STEPS
 
 
 class Store(Protocol):
@@ -245,31 +248,40 @@ def forwards(sequence: Recorded, store: Store, progress: Progress | None = None)
     return so_far.found
 
 
-def backwards(
-    sequence: Recorded, forward: Callable[[int], Points], store: Store, progress: Progress | None = None
+def go_both_ways(
+    sequence: Recorded,
+    found: Trajectories,
+    forward: Callable[[int], Points],
+    store: Store,
+    progress: Progress | None = None,
 ) -> None:
-    """Find the particles of each frame again, with those of the frames after it.
+    """Find the particles of each frame again, where their tracks before and after it let expect them.
+
+    Only the frames about the one that is made are held in memory.
 
     Parameters
     ----------
-    forward : gives the particles that were found in a frame on the way forwards; the last two frames' stay
+    found : how particles belong together on the way forwards
+    forward : gives the particles that were found in a frame then; those of a frame that no track comes near stay
     store : takes those that are found now
     """
+    confirmed = long_ones(found, sequence.tracking.shortest or SHORTEST)
     recent: dict[int, Seen] = {}
-    so_far: SoFar | None = None
     count = len(sequence.names)
-    for step in range(count):
-        number = count - 1 - step
-        points = store.made(number)
-        if points is None:
-            frame = sequence.frame(number)
-            if so_far is None or step < 2:
-                points = forward(number)
-                store.put(number, points, _left_by(sequence.bench, frame, points), [])
-            else:
-                found, notices = _next(sequence, number, frame, so_far.ahead, progress)
-                points = _put(sequence, store, number, frame, found, notices)
-        so_far = _linked_to(so_far, recent, step, points, sequence.tracking)
+    for number in range(count):
+        recent.pop(number - REACH_FRAMES - 1, None)
+        if store.made(number) is not None:
+            continue
+        for near in range(max(number - REACH_FRAMES, 0), min(number + REACH_FRAMES + 1, count)):
+            if near not in recent:
+                recent[near] = seen_in(forward(near))
+        frame, ahead = sequence.frame(number), expected_in(confirmed, recent, number)
+        if len(ahead.light):
+            particles, notices = _next(sequence, number, frame, ahead, progress)
+            _put(sequence, store, number, frame, particles, notices)
+        else:
+            points = forward(number)
+            store.put(number, points, _left_by(sequence.bench, frame, points), [])
 
 
 def _first_two(sequence: Recorded, progress: Progress | None) -> list[Particles]:

@@ -39,9 +39,9 @@ from lfpiv_cli.interface import particles
 from lfpiv_cli.interface.following import (
     SHORTEST,
     Recorded,
-    backwards,
     ensure_sequence,
     forwards,
+    go_both_ways,
     steps_of,
 )
 from lfpiv_cli.interface.reconstruction import bench_of, check_frame, frame_notices
@@ -72,7 +72,7 @@ class FollowOptions(WorkOptions):
     dt_s : time from one frame to the next, in place of the config's
     search_voxel : displacements from the first frame to the second are sought up to this along each axis
     shortest : fewest frames of a track
-    both_ways : go through the frames a second time, backwards
+    both_ways : go through the frames a second time, each with its tracks before and after it
     residuals : write what the particles leave of each image, too
     """
 
@@ -161,7 +161,7 @@ def follow_particles(
     sequence = Recorded(bench, size, tracking, frame_at, [frame.stem for frame in frames], {})
     found: Trajectories | None
     count, deadline = sum(map(len, needed)), options.deadline()
-    with console.frames(count, sum(map(steps_of, needed)) / max(count, 1), "follow") as work:
+    with console.frames(count, steps_of(needed) / max(count, 1), "follow") as work:
         stores = [
             FrameFiles(
                 targets,
@@ -178,7 +178,7 @@ def follow_particles(
         ]
         found = forwards(sequence, stores[0], work.advance)
         if options.both_ways:
-            backwards(sequence, stores[0].read, stores[1], work.advance)
+            go_both_ways(sequence, found, stores[0].read, stores[1], work.advance)
             found = None
     counts = {"frames": len(frames), "found": len(needed[-1]), "skipped": len(there) - len(needed[-1])}
     summary = _write_tracks(output, sequence, stores[-1], found, overwrite or options.resume, console)
@@ -256,8 +256,8 @@ def _passes(
 ) -> list[list[Target]]:
     """Return for each pass where the files of its frames go, and the records that they carry.
 
-    These say which frames each is made with: on the way forwards those before it (the first with the second), on the
-    way back all; `told` says what their background and mask are made of.
+    These say which frames each is made with: on the way forwards those before it (the first with the second), the
+    second time all; `told` says what their background and mask are made of.
     """
     every = ["left out\n" if frame.fault else f"{sha256(frame.path)} {frame.page}\n" for frame in frames]
     resolved = settings.resolved()
@@ -276,5 +276,5 @@ def _passes(
     passes = [[target(paths[k], k, "forwards", max(k + 1, 2)) for k in numbers]]
     if both_ways:
         paths = output_paths(output / PARTICLES, stems)
-        passes.append([target(paths[k], k, "backwards", len(frames)) for k in numbers])
+        passes.append([target(paths[k], k, "both ways", len(frames)) for k in numbers])
     return passes

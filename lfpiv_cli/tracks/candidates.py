@@ -33,6 +33,10 @@ class Seen:
         """Return how many particles there are."""
         return len(self.position_mm)
 
+    def light_value(self) -> NDArray[np.float64]:
+        """Return the light of each, 1 where it is not known."""
+        return np.ones(len(self)) if self.light is None else self.light.value
+
     def covariance(self) -> NDArray[np.float64]:
         """Return the covariances of the places, 0 where they are not known."""
         return np.zeros((len(self), 6)) if self.covariance_mm2 is None else np.nan_to_num(self.covariance_mm2)

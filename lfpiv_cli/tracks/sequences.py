@@ -45,12 +45,12 @@ SHORTEST = 3
 
 @dataclass(frozen=True, eq=False)
 class Ahead:
-    """Where the particles of a frame should be in the next one, then those that it alone has lost.
+    """Where particles should be in a frame.
 
     Attributes
     ----------
     position_mm, sigma_mm : (n, 3) places and their standard errors; these are NaN where nothing tells
-    light : (n,) as the last frames have it
+    light : (n,) as other frames have it
     light_sigma : of the logarithm of a particle's light from frame to frame
     """
 
@@ -69,7 +69,7 @@ class SoFar:
     found : the trajectories up to the last frame that was linked
     scatter : of those that pass the last frames
     by_past, by_others : how the last frame's particles should move on by their own pasts, and as others did before
-    ahead : where they should be by both
+    ahead : where they should be by both, and then those that the last frame alone has lost
     """
 
     found: Trajectories
@@ -103,7 +103,7 @@ def begun(frames: Frames) -> SoFar:
     first = frames[0]
     unlinked = Trajectories((np.full(len(first), NO_TRACK),), 0, (np.full(len(first), np.nan),))
     unknown = np.full(first.position_mm.shape, np.nan)
-    nothing = Ahead(first.position_mm, unknown, _light_of(first), 0.0)
+    nothing = Ahead(first.position_mm, unknown, first.light_value(), 0.0)
     return SoFar(unlinked, Scatter.unknown(), None, None, nothing)
 
 
@@ -188,7 +188,7 @@ def _ahead(found: Trajectories, frames: Frames, forecast: Forecast | None, over_
     over_two : of those of the frame before it, two frames later
     """
     last = len(found.labels) - 1
-    at, light = frames[last].position_mm, _light_of(frames[last])
+    at, light = frames[last].position_mm, frames[last].light_value()
     if forecast is None:
         forecast = Forecast(np.zeros(at.shape), np.full(at.shape, np.nan))
     at, sigma = at + np.nan_to_num(forecast.displacement_mm), forecast.sigma_mm
@@ -198,7 +198,7 @@ def _ahead(found: Trajectories, frames: Frames, forecast: Forecast | None, over_
         lost &= np.isfinite(over_two.sigma_mm).all(axis=1)
         at = np.concatenate([at, (frames[last - 1].position_mm + over_two.displacement_mm)[lost]])
         sigma = np.concatenate([sigma, over_two.sigma_mm[lost]])
-        light = np.concatenate([light, _light_of(frames[last - 1])[lost]])
+        light = np.concatenate([light, frames[last - 1].light_value()[lost]])
     return Ahead(at, sigma, light, _light_sigma(found, frames))
 
 
@@ -219,17 +219,13 @@ def _by_others(found: Trajectories, frames: Frames) -> Forecast | None:
     return Forecast(displacement, np.sqrt(variance + np.median(noise2, axis=0) + 0.5 * structure.nugget))
 
 
-def _light_of(frame: Seen) -> NDArray[np.float64]:
-    return np.ones(len(frame)) if frame.light is None else frame.light.value
-
-
 def _light_sigma(found: Trajectories, frames: Frames) -> float:
     """Return the spread of the logarithm of a particle's light from frame to frame, by tracks through the last two."""
     numbers = (len(found.labels) - 2, len(found.labels) - 1)
     tracks = np.intersect1d(tracks_in(found, [numbers[0]]), tracks_in(found, [numbers[1]]))
     if not len(tracks):
         return 0.0
-    before, now = (_light_of(frames[k])[found.particles(k, tracks)] for k in numbers)
+    before, now = (frames[k].light_value()[found.particles(k, tracks)] for k in numbers)
     lit = (before > 0.0) & (now > 0.0)
     if not lit.any():
         return 0.0
