@@ -42,10 +42,14 @@ def test_sweeps_end_where_those_over_all_particles_end(
     every, some, fitted = begun(task, true), begun(task, true), []
 
     def counted(
-        observation: Observation, particles: NDArray[np.float64], enough: float, chosen: NDArray[np.bool_]
+        observation: Observation,
+        particles: NDArray[np.float64],
+        enough: float,
+        chosen: NDArray[np.bool_],
+        prior: NDArray[np.float64],
     ) -> NDArray[np.float64]:
         fitted.append(np.count_nonzero(chosen))
-        return refine(observation, particles, enough, chosen)
+        return refine(observation, particles, enough, chosen, prior)
 
     for _ in range(SWEEPS):
         refine(observed(task, every, 0.05), every.particles, SMALLEST_GAIN)

@@ -74,6 +74,30 @@ def test_spread_is_the_least_possible(view: View, rng: np.random.Generator) -> N
     assert sigma[2] < 1e-2
 
 
+def test_image_and_what_is_expected_count_by_their_errors(view: View, rng: np.random.Generator) -> None:
+    """As for two measurements of one thing: each by the inverse of its covariance."""
+    particle = np.array([[0.21, -0.13, 2.3, 2.5e5]])
+    clean = image_of(view, particle)
+    weight = 1.0 / (clean + 36.0)
+    inverse = np.linalg.inv(joint_covariance(blind(view, weight), particle, WHITE, np.ones(1))[0])
+    noise = rng.normal(0.0, 1.0, clean.size) / np.sqrt(weight)
+    sigma = np.array([6e-4, 3e-4, 4e-3, np.inf])
+    prior = np.concatenate([particle[0] + np.array([1e-3, -5e-4, 8e-3, 0.0]), 1.0 / sigma**2])[np.newaxis]
+
+    def fitted(prior: NDArray[np.float64] | None) -> NDArray[np.float64]:
+        at, residual = particle.copy(), noise.copy()
+        for _ in range(3):
+            refine(observed(view, residual, weight), at, 1e-6, prior=prior)
+        return at[0]
+
+    by_image = fitted(None)
+    both = np.linalg.solve(inverse + np.diag(prior[0, 4:]), inverse @ by_image + np.diag(prior[0, 4:]) @ prior[0, :4])
+    # The response is not linear; over the two standard errors between both the difference is a percent of them.
+    error = np.sqrt(np.diagonal(np.linalg.inv(inverse)))
+    assert np.all(np.abs(both - by_image)[:3] > 0.3 * error[:3])
+    np.testing.assert_allclose((fitted(prior) - both) / error, 0.0, atol=0.02)
+
+
 @pytest.mark.parametrize("depth", [-0.1, 0.2, 2.0])
 def test_a_pixel_between_micro_images_counts_once(view: View, rng: np.random.Generator, depth: float) -> None:
     # On the corner of four lenses, where near the focal plane many pixels are lit through two of them.

@@ -27,6 +27,7 @@ def try_other_depths(
     suspects: NDArray[np.bool_],
     smallest_light: float,
     smallest_gain: float,
+    prior: NDArray[np.float64] | None = None,
 ) -> NDArray[np.bool_]:
     """Move suspects to another depth where that lowers chi-squared by `smallest_gain` more than refinement does.
 
@@ -36,4 +37,4 @@ def try_other_depths(
     starts = np.concatenate([depth + OTHER_DEPTHS * observation.optics.scale.depth_mm, -depth], axis=1)
     starts[(starts < observation.low_mm) | (starts > observation.high_mm)] = np.nan
     effort, least = Effort(STEPS, CHOICE_GAIN), (smallest_gain, smallest_light)
-    return fit_again(observation, particles, suspects, effort, starts, least).moved
+    return fit_again(observation, particles, suspects, effort, starts, least, prior).moved

@@ -349,14 +349,14 @@ def _fit_each(
     """Do the work of `_fitted` for the tracers of a tile."""
     residual = observation.residual
     own, responses = room_for(1, observation.capacity, 0), room_for(1, sized.capacity, 0)
-    trial = np.empty((1, UNKNOWNS))
+    trial, prior = np.empty((1, UNKNOWNS)), np.zeros((1, 2 * UNKNOWNS))
     for number in numbers:
         respond_all(observation.optics, tracers[number : number + 1], own)
         pixels, values = lit_by(own, 0)
         add_light(pixels, values, tracers[number, 3], residual)
         for depth in depths_mm[number]:
             depth = min(max(depth, sized.low_mm), sized.high_mm)
-            gained = fit_from(sized, tracers[number], depth, trial, responses, Effort(STEPS, SMALLEST_GAIN))
+            gained = fit_from(sized, tracers[number], prior, depth, trial, responses, Effort(STEPS, SMALLEST_GAIN))
             if gained < change[number]:
                 change[number] = gained
                 copy_rows(trial, fitted[number : number + 1])

@@ -29,6 +29,7 @@ from lfpiv_cli.particles.least_squares import (
     lit_by,
     respond_all,
     room_for,
+    surprise,
 )
 from lfpiv_cli.particles.refraction import on_line_of_sight
 from lfpiv_cli.particles.tiles import over_tiles
@@ -82,13 +83,15 @@ def refine(
     particles: NDArray[np.float64],
     enough: float = SMALLEST_GAIN,
     chosen: NDArray[np.bool_] | None = None,
+    prior: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float64]:
     """Refine all or the chosen ones of particles (n, 4) once, in place, and keep the residual up to date.
 
-    `enough` is what ends a fit, see `least_squares.Effort`. Returns what each fit lowered chi-squared by.
+    `enough` is what ends a fit, see `least_squares.Effort`, `prior` (n, 8) what is expected of particles, see
+    `least_squares.fit`. Returns what each fit lowered chi-squared by.
     """
     every = np.ones(len(particles), np.bool_) if chosen is None else chosen
-    return fit_again(observation, particles, every, Effort(SWEEP_STEPS, enough)).gain
+    return fit_again(observation, particles, every, Effort(SWEEP_STEPS, enough), prior=prior).gain
 
 
 class Refitted(NamedTuple):
@@ -111,6 +114,7 @@ def fit_again(
     effort: Effort,
     depths_mm: NDArray[np.float64] | None = None,
     least: tuple[float, float] = (0.0, 0.0),
+    prior: NDArray[np.float64] | None = None,
 ) -> Refitted:
     """Fit the chosen ones of particles (n, 4) in place, from where they are and from other depths.
 
@@ -120,12 +124,14 @@ def fit_again(
     ----------
     depths_mm : (n, k) where else to begin, NaN for nowhere; default: nowhere
     least : what another depth must gain in chi-squared, and the light that a particle must have there
+    prior : (n, 8) what is expected of the particles; default: nothing
     """
+    expected = nothing_expected(len(particles)) if prior is None else prior
     depths = np.empty((len(particles), 0)) if depths_mm is None else depths_mm
     refitted = Refitted(np.zeros(len(particles), np.bool_), np.zeros(len(particles)))
 
     def work(numbers: NDArray[np.int64]) -> None:
-        _fit_again(observation, particles, numbers[chosen[numbers]], effort, depths, least, refitted)
+        _fit_again(observation, particles, expected, numbers[chosen[numbers]], effort, depths, least, refitted)
 
     over_tiles(work, observation.optics, particles, observation.depths_mm)
     return refitted
@@ -135,6 +141,7 @@ def fit_again(
 def _fit_again(
     observation: Observation,
     particles: NDArray[np.float64],
+    prior: NDArray[np.float64],
     numbers: NDArray[np.int64],
     effort: Effort,
     depths: NDArray[np.float64],
@@ -147,16 +154,17 @@ def _fit_again(
     trial, best = np.empty((1, UNKNOWNS)), np.empty((1, UNKNOWNS))
     for number in numbers:
         copy_rows(particles[number : number + 1], best)
+        expected = prior[number : number + 1]
         respond_all(view, best, responses)
         pixels, values = lit_by(responses, 0)
         add_light(pixels, values, best[0, 3], residual)
-        before = change_by(pixels, values, best[0, 3], residual, observation.weight)
-        after = fit(observation, best, responses, effort, np.inf)
+        before = change_by(pixels, values, best[0, 3], residual, observation.weight) + surprise(best, expected)
+        after = fit(observation, best, expected, responses, effort, np.inf)
         lowest = after - least[0]
         for depth in depths[number]:
             if np.isnan(depth):
                 continue
-            change = fit_from(observation, particles[number], depth, trial, responses, effort)
+            change = fit_from(observation, particles[number], expected, depth, trial, responses, effort)
             if change < lowest and trial[0, 3] >= least[1]:
                 lowest = change
                 after = change
@@ -175,6 +183,7 @@ def _fit_again(
 def fit_from(
     observation: Observation,
     particle: NDArray[np.float64],
+    prior: NDArray[np.float64],
     depth: float,
     trial: NDArray[np.float64],
     responses: Responses,
@@ -189,7 +198,12 @@ def fit_from(
     respond_all(observation.optics, trial, responses)
     pixels, values = lit_by(responses, 0)
     trial[0, 3] = best_light(pixels, values, observation.residual, observation.weight)
-    return fit(observation, trial, responses, effort, np.inf)
+    return fit(observation, trial, prior, responses, effort, np.inf)
+
+
+def nothing_expected(count: int) -> NDArray[np.float64]:
+    """Return the prior (n, 8) of particles of which nothing is known but their image, see `least_squares.fit`."""
+    return np.zeros((count, 2 * UNKNOWNS))
 
 
 class Least(NamedTuple):
@@ -237,10 +251,11 @@ def _accept(
     residual, weight = observation.residual, observation.weight
     responses = room_for(1, observation.capacity, 0)
     trial, best = np.empty((1, UNKNOWNS)), np.empty((1, UNKNOWNS))
+    prior = np.zeros((1, 2 * UNKNOWNS))
     for number in numbers:
         lowest = 0.0
         for depth in depths[number]:
-            change = fit_from(observation, candidates[number], depth, trial, responses, effort)
+            change = fit_from(observation, candidates[number], prior, depth, trial, responses, effort)
             if change < lowest:
                 lowest = change
                 copy_rows(trial, best)

@@ -7,6 +7,8 @@ particle of light I by
 
 a sum over the pixels that it lights wherever it moves.
 
+What is expected of a particle before its image is looked at adds ((p - p_0) / sigma)^2 for each of its unknowns.
+
 Axes: image axes, mm; light in counts; residual and weights as flat images. A particle is a row (x, y, z, light).
 """
 
@@ -329,7 +331,12 @@ def substitute(lower: NDArray[np.float64], right: NDArray[np.float64], solution:
 
 @njit(cache=True)
 def fit(
-    observation: Observation, members: NDArray[np.float64], responses: Responses, effort: Effort, promising: float
+    observation: Observation,
+    members: NDArray[np.float64],
+    prior: NDArray[np.float64],
+    responses: Responses,
+    effort: Effort,
+    promising: float,
 ) -> float:
     """Improve one particle or two (k, 4) in place; return what they add to chi-squared (below 0 where they help).
 
@@ -337,6 +344,7 @@ def fit(
 
     Parameters
     ----------
+    prior : (k, 8) values and weights 1/sigma^2 of what is expected of them; weights of 0: nothing is
     responses : of the particles, on entry as on return
     promising : given up early where this is not undercut after a few steps
     """
@@ -344,7 +352,7 @@ def fit(
     matrix, trial_matrix, lower = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
     right, trial_right = np.empty(n), np.empty(n)
     step, trial, begin = np.zeros(n), np.empty_like(members), members.copy()
-    change = _equations(observation, members, responses, matrix, right)
+    change = _equations(observation, members, prior, responses, matrix, right)
     damping, last_failed = DAMPING, False
     for number in range(effort.steps):
         if number == EARLY_STEPS and change > promising:
@@ -359,7 +367,7 @@ def fit(
             break
         _move(observation, members, begin, step, trial)
         respond_all(observation.optics, trial, responses)
-        trial_change = _equations(observation, trial, responses, trial_matrix, trial_right)
+        trial_change = _equations(observation, trial, prior, responses, trial_matrix, trial_right)
         last_failed = not trial_change < change
         if last_failed:
             damping *= DAMPING_UP
@@ -380,17 +388,35 @@ def fit(
 def _equations(
     observation: Observation,
     members: NDArray[np.float64],
+    prior: NDArray[np.float64],
     responses: Responses,
     matrix: NDArray[np.float64],
     right: NDArray[np.float64],
 ) -> float:
     """Fill the normal equations of one particle or two; return what they add to chi-squared."""
     if members.shape[0] == 2:
-        return _pair_equations(observation, members, responses, matrix, right)
-    pixels, values = lit_by(responses, 0)
-    return normal_equations(
-        pixels, values, members[0, 3], observation.residual, observation.weight, responses.picked, matrix, right
-    )
+        change = _pair_equations(observation, members, responses, matrix, right)
+    else:
+        pixels, values = lit_by(responses, 0)
+        change = normal_equations(
+            pixels, values, members[0, 3], observation.residual, observation.weight, responses.picked, matrix, right
+        )
+    for m in range(members.shape[0]):
+        for i in range(UNKNOWNS):
+            expected, weight, row = prior[m, i], prior[m, UNKNOWNS + i], m * UNKNOWNS + i
+            right[row] += weight * (expected - members[m, i])
+            matrix[row, row] += weight
+    return change + surprise(members, prior)
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def surprise(members: NDArray[np.float64], prior: NDArray[np.float64]) -> float:
+    """Return what particles (k, 4) add to chi-squared by being other than expected (k, 8)."""
+    total = 0.0
+    for m in range(members.shape[0]):
+        for i in range(UNKNOWNS):
+            total += prior[m, UNKNOWNS + i] * (members[m, i] - prior[m, i]) ** 2
+    return total
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)

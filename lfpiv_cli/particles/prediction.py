@@ -1,7 +1,8 @@
 """Particles of a frame whose places the frames before predict, as in Shake-The-Box, and those that the rest shows.
 
-The predicted particles are refined on the image together; what finds no light is dropped. What they leave of the image
-is searched for the others: those that have come into the volume, and those that overlap.
+The predicted particles are refined on the image together, each held where it is expected as firmly as that is known:
+near the focal plane its past says more of its depth than the image. What finds no light is dropped. What they leave of
+the image is searched for the others: those that have come into the volume, and those that overlap.
 
 Axes: particles are rows (x, y, z, light) in image axes, mm and counts.
 """
@@ -100,6 +101,8 @@ def gone_on(task: Task, predicted: Predicted) -> State:
     typical = float(np.median(at[:, 3])) if len(at) else 0.0
     state = replace(rebuilt(task, blank(task), at.copy()), typical_light=typical, noise=noise_with(task, typical))
     sigma = np.hypot(predicted.sigma_mm, scale.box_mm(SURE_LENSES, SURE_DEPTHS))
+    # Their light is not held: what has none is to show it.
+    state = replace(state, expected=np.column_stack([at, 1.0 / sigma**2, np.zeros(len(at))]))
     spread = PREDICTED_SIGMAS * max(predicted.light_sigma, SURE_LIGHT)
     low, high = at[:, 3] * np.exp(-spread), at[:, 3] * np.exp(spread)
     for unexplained in HELD:

@@ -15,7 +15,7 @@ from scipy.spatial import KDTree
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.particles.active_set import DISTURBING, disturbance, overlaps_of
 from lfpiv_cli.particles.covariance import joint_covariance
-from lfpiv_cli.particles.fitting import add_all, judge, refine
+from lfpiv_cli.particles.fitting import add_all, judge, nothing_expected, refine
 from lfpiv_cli.particles.least_squares import SMALLEST_GAIN, Observation, observation_of
 from lfpiv_cli.particles.noise import (
     Noise,
@@ -106,6 +106,7 @@ class State:
     noise : of the image
     unsplit, unmoved : (m, 5) those that could not be split, and not be moved in depth, as `_signature` gives them
     settled : (m, 4) those that are suspected of neither, whatever their chi-squared; without it
+    expected : (m, 8) what is known beforehand of the first m particles, see `least_squares.fit`
     """
 
     particles: NDArray[np.float64]
@@ -115,6 +116,12 @@ class State:
     unsplit: NDArray[np.float64]
     unmoved: NDArray[np.float64]
     settled: NDArray[np.float64]
+    expected: NDArray[np.float64]
+
+    @property
+    def prior(self) -> NDArray[np.float64]:
+        """What is known beforehand of all particles (n, 8)."""
+        return np.concatenate([self.expected, nothing_expected(len(self.particles) - len(self.expected))])
 
 
 def task_of(
@@ -153,8 +160,8 @@ def task_of(
 
 def blank(task: Task) -> State:
     """Return the state in which nothing has been found."""
-    none = np.zeros((0, 5))
-    return State(np.zeros((0, 4)), task.image.copy(), 0.0, noise_with(task, 0.0), none, none, np.zeros((0, 4)))
+    nobody, none, noise = np.zeros((0, 4)), np.zeros((0, 5)), noise_with(task, 0.0)
+    return State(nobody, task.image.copy(), 0.0, noise, none, none, nobody, nothing_expected(0))
 
 
 def noise_with(task: Task, typical_light: float) -> Noise:
@@ -175,9 +182,9 @@ def sweep(task: Task, state: State, unexplained: float, sweeps: int, enough: flo
     The first sweep fits all, the others those whose last fit, or their neighbours' since, changed more than `enough`.
     """
     overlaps = overlaps_of(task.view, state.particles) if sweeps > 1 else None
-    active, disturbed = np.ones(len(state.particles), np.bool_), np.zeros(len(state.particles))
+    active, disturbed, prior = np.ones(len(state.particles), np.bool_), np.zeros(len(state.particles)), state.prior
     for _ in range(sweeps):
-        gain = refine(observed(task, state, unexplained), state.particles, enough, active)
+        gain = refine(observed(task, state, unexplained), state.particles, enough, active, prior)
         if overlaps is not None:
             disturbed = np.where(active, 0.0, disturbed) + disturbance(overlaps, gain)
             active = (gain > enough) | (disturbed > DISTURBING * enough)
@@ -198,7 +205,7 @@ def merge(task: Task, state: State, apart: NDArray[np.bool_] | None = None) -> S
             brighter, other = (a, b) if particles[a, 3] >= particles[b, 3] else (b, a)
             particles[brighter, 3] += particles[other, 3]
             merged[other] = True
-    return rebuilt(task, state, particles[~merged])
+    return rebuilt(task, replace(state, expected=state.prior[~merged]), particles[~merged])
 
 
 def prune(task: Task, state: State, claimed_share: float, unexplained: float) -> State:
@@ -213,7 +220,7 @@ def kept(task: Task, state: State, keep: NDArray[np.bool_]) -> State:
     """Return the state with some of its particles, the light of the others put back."""
     residual = state.residual.copy()
     add_all(task.view, state.particles[~keep], 1.0, residual, task.depths_mm)
-    return replace(state, particles=state.particles[keep], residual=residual)
+    return replace(state, particles=state.particles[keep], expected=state.prior[keep], residual=residual)
 
 
 def with_light(task: Task, state: State, light: NDArray[np.float64]) -> State:

@@ -84,6 +84,7 @@ def _split(
     responses = room_for(2, observation.capacity, places)
     matrix, right = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
     pair, best = np.empty((2, UNKNOWNS)), np.empty((2, UNKNOWNS))
+    prior = np.zeros((2, 2 * UNKNOWNS))
     for number in numbers:
         one = particles[number : number + 1]
         light = one[0, 3]
@@ -103,7 +104,7 @@ def _split(
                 pair[m, 2] = min(max(depth, observation.low_mm), observation.high_mm)
                 pair[m, 3] = 0.5 * light
             respond_all(view, pair, responses)
-            change = fit(observation, pair, responses, effort, promising)
+            change = fit(observation, pair, prior, responses, effort, promising)
             if change < lowest and min(pair[0, 3], pair[1, 3]) >= least[1]:
                 lowest, found = change, True
                 copy_rows(pair, best)

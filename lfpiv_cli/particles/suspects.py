@@ -45,7 +45,7 @@ def with_depths_corrected(task: Task, state: State, unexplained: float) -> State
     signature = _signature(task.view.scale, state.particles, chi2)
     suspects = (near_focus | (chi2 > ELSEWHERE_CHI2 * good)) & ~_tried(state.unmoved, state, signature)
     light = SMALLEST_LIGHT * state.typical_light
-    moved = try_other_depths(observation, state.particles, suspects, light, DEPTH_GAIN * good)
+    moved = try_other_depths(observation, state.particles, suspects, light, DEPTH_GAIN * good, state.prior)
     return replace(state, unmoved=np.concatenate([state.unmoved, signature[suspects & ~moved]]))
 
 
