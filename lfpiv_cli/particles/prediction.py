@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.particles.joining import with_twins_joined
 from lfpiv_cli.particles.least_squares import SEARCH_GAIN
 from lfpiv_cli.particles.rounds import (
     Round,
@@ -113,7 +114,7 @@ def gone_on(task: Task, predicted: Predicted) -> State:
     found = state.particles
     sure = (np.abs(found[:, :3] - at[:, :3]) <= PREDICTED_SIGMAS * sigma).all(axis=1)
     sure &= (found[:, 3] > low) & (found[:, 3] < high)
-    return kept(task, state, sure)
+    return with_twins_joined(task, kept(task, state, sure), FREE[-1])
 
 
 def _one_search(task: Task, state: State, settings: Round, progress: Callable[[int], None] | None) -> State:

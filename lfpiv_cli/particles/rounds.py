@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.particles.candidates import boxes_of, explain_rest, find_peaks, points_in_raw_frame
 from lfpiv_cli.particles.fitting import Least, accept, judge
+from lfpiv_cli.particles.joining import with_twins_joined
 from lfpiv_cli.particles.least_squares import SEARCH_GAIN
 from lfpiv_cli.particles.refraction import places_by_snell
 from lfpiv_cli.particles.search import (
@@ -113,6 +114,7 @@ def finished(task: Task, state: State, settings: Round) -> State:
     """Return the state refined with the noise that is left, without what does not hold then."""
     state = with_measured_noise(task, state)
     sweep(task, state, LAST_UNEXPLAINED, LAST_SWEEPS)
+    state = with_twins_joined(task, state, LAST_UNEXPLAINED)
     return pruned(task, state, settings)
 
 

@@ -1,0 +1,137 @@
+"""Two particles that the image does not tell from one: one tracer that was found twice.
+
+Near the focal plane a tracer lights one lens or two, and two particles beside each other share its light in any
+proportion: what was split once, or was expected from an earlier frame, would stay so. So one particle takes the place
+of two where chi-squared hardly rises. Two tracers that overlap so much look like one, too, but are as bright as two:
+what would be brighter than others stays two.
+
+Axes: image axes, mm; light in counts; residual and weights as flat images. A particle is a row (x, y, z, light).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from lfpiv_cli.particles.fitting import fit_from, judge, nothing_expected
+from lfpiv_cli.particles.least_squares import (
+    CHOICE_GAIN,
+    UNKNOWNS,
+    Effort,
+    Observation,
+    add_light,
+    change_by,
+    copy_rows,
+    lit_by,
+    respond_all,
+    room_for,
+)
+from lfpiv_cli.particles.search import State, Task, observed
+from lfpiv_cli.particles.suspects import good_chi2
+from lfpiv_cli.particles.tiles import over_tiles
+
+# Particles may be one tracer that are no further apart: laterally in microlenses, and in depths over which light
+# spreads by one lens (Table 2: 0.1 and 1 mm).
+APART_LENSES, APART_DEPTHS = 1.0, 1.0 / 1.064
+# What chi-squared may rise by, in units of a good particle's: five standard errors of the light of the second.
+LARGEST_LOSS = 25.0
+# One in twenty particles is brighter than what two may be joined to.
+BRIGHTEST_PERCENTILE = 95.0
+STEPS = 12
+
+
+def with_twins_joined(task: Task, state: State, unexplained: float) -> State:
+    """Return the state with one particle for two that the image does not tell from one."""
+    particles = state.particles.copy()
+    pairs, brightest = _twins(task, particles)
+    if not len(pairs):
+        return state
+    observation = observed(task, state, unexplained)
+    chi2, *_ = judge(observation, particles)
+    joined = join(observation, particles, pairs, LARGEST_LOSS * good_chi2(chi2), brightest)
+    stays, expected = np.ones(len(particles), np.bool_), state.prior
+    stays[pairs[joined, 1]], expected[pairs[joined, 0]] = False, nothing_expected(1)
+    return replace(state, particles=particles[stays], expected=expected[stays])
+
+
+def join(
+    observation: Observation,
+    particles: NDArray[np.float64],
+    pairs: NDArray[np.int64],
+    largest_loss: float,
+    brightest: float,
+) -> NDArray[np.bool_]:
+    """Put one particle in place of the first of two where chi-squared rises by less than `largest_loss`.
+
+    The light of the second goes from the residual, which is kept up to date; no particle becomes brighter than
+    `brightest`. Returns which of the pairs (m, 2) of particles (n, 4) are joined, each particle once at most.
+    """
+    joined, free = np.zeros(len(pairs), np.bool_), np.ones(len(particles), np.bool_)
+    light = particles[pairs, 3:]
+    middle = np.sum(particles[pairs] * light, axis=1) / np.maximum(light.sum(axis=1), np.finfo(np.float64).tiny)
+    most = (largest_loss, brightest)
+    # Starts lie in the middle: from there fits move no further than tiles allow.
+    over_tiles(
+        lambda numbers: _join(observation, particles, middle, pairs, numbers, most, joined, free),
+        observation.optics,
+        middle,
+        observation.depths_mm,
+    )
+    return joined
+
+
+@njit(cache=True, nogil=True)
+def _join(
+    observation: Observation,
+    particles: NDArray[np.float64],
+    middle: NDArray[np.float64],
+    pairs: NDArray[np.int64],
+    numbers: NDArray[np.int64],
+    most: tuple[float, float],
+    joined: NDArray[np.bool_],
+    free: NDArray[np.bool_],
+) -> None:
+    """Do the work of `join` for the pairs of a tile; `free` are particles that no pair has taken yet."""
+    view, residual, weight = observation.optics, observation.residual, observation.weight
+    responses, effort = room_for(1, observation.capacity, 0), Effort(STEPS, CHOICE_GAIN)
+    trial, best, prior = np.empty((1, UNKNOWNS)), np.empty((1, UNKNOWNS)), np.zeros((1, 2 * UNKNOWNS))
+    for number in numbers:
+        first, second = pairs[number]
+        if not (free[first] and free[second]):
+            continue
+        two = 0.0
+        for member in (second, first):
+            respond_all(view, particles[member : member + 1], responses)
+            pixels, values = lit_by(responses, 0)
+            add_light(pixels, values, particles[member, 3], residual)
+            two += change_by(pixels, values, particles[member, 3], residual, weight)
+        lowest = two + most[0]
+        for depth in (middle[number, 2], particles[first, 2], particles[second, 2]):
+            change = fit_from(observation, middle[number], prior, depth, trial, responses, effort)
+            if change < lowest and 0.0 < trial[0, 3] < most[1]:
+                lowest, joined[number] = change, True
+                copy_rows(trial, best)
+        if joined[number]:
+            copy_rows(best, particles[first : first + 1])
+            free[first] = free[second] = False
+        for member in (first, second):
+            if member == first or not joined[number]:
+                respond_all(view, particles[member : member + 1], responses)
+                pixels, values = lit_by(responses, 0)
+                add_light(pixels, values, -particles[member, 3], residual)
+
+
+def _twins(task: Task, particles: NDArray[np.float64]) -> tuple[NDArray[np.int64], float]:
+    """Return pairs (m, 2) of particles that may be one tracer, the nearest first, and the light of the brightest."""
+    if len(particles) < 2:
+        return np.zeros((0, 2), np.int64), 0.0
+    brightest = float(np.percentile(particles[:, 3], BRIGHTEST_PERCENTILE))
+    places = particles[:, :3] / task.view.scale.box_mm(APART_LENSES, APART_DEPTHS)
+    pairs = KDTree(places).query_pairs(1.0, output_type="ndarray").astype(np.int64)
+    pairs = pairs[particles[pairs, 3].sum(axis=1) < brightest]
+    distance = np.linalg.norm(places[pairs[:, 0]] - places[pairs[:, 1]], axis=1)
+    return pairs[np.lexsort((pairs[:, 1], pairs[:, 0], distance))], brightest
