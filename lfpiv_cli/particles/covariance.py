@@ -200,22 +200,25 @@ def _fill_blocks(
     Both from whole pixels: a pixel that two lenses light has one error, and with two it would be less than its
     neighbours' blocks ask for.
     """
-    room = np.empty(0)
+    # Footprints have holes, and hardly half of the neighbours share a pixel: first which, then what they do to them.
+    room = np.empty(0, np.int32)
     for k in range(alone.shape[0]):
         n = first + k
         top, left, rows, columns = _rectangle(slopes, n)
-        room = _at_least(room, rows * columns * UNKNOWNS)
-        own = room[: rows * columns * UNKNOWNS].reshape(rows, columns, UNKNOWNS)
-        own[:] = 0.0
+        if room.size < rows * columns:
+            room = np.empty(rows * columns, np.int32)
+        number = room[: rows * columns].reshape(rows, columns)
+        number[:] = -1
         for entry in range(slopes.start[n], slopes.start[n + 1]):
-            row, column = slopes.row[entry] - top, slopes.column[entry] - left
-            for a in range(UNKNOWNS):
-                own[row, column, a] += slopes.slope[entry, a]
-        _set_products(slopes, n, own, top, left, alone[k])
+            number[slopes.row[entry] - top, slopes.column[entry] - left] = entry - slopes.start[n]
+        # One more, as the last may be written in vain.
+        common = np.empty((2, slopes.start[n + 1] - slopes.start[n] + 1), np.int64)
+        _set_products(slopes, n, n, common[:, : _find_common(slopes, n, number, top, left, common)], alone[k])
         for at in range(neighbours.start[n], neighbours.start[n + 1]):
             m = neighbours.other[at]
             if m > n:
-                _set_products(slopes, m, own, top, left, block[at])
+                count = _find_common(slopes, m, number, top, left, common)
+                _set_products(slopes, n, m, common[:, :count], block[at])
                 back = neighbours.start[m]
                 while neighbours.other[back] != n:
                     back += 1
@@ -224,36 +227,54 @@ def _fill_blocks(
                         block[back, a, b] = block[at, b, a]
 
 
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def _find_common(
+    slopes: Slopes, m: int, number: NDArray[np.int32], top: int, left: int, common: NDArray[np.int64]
+) -> int:
+    """Fill in which entries of one particle and of m share a pixel; return how many.
+
+    `number` (rows, columns) are those of the first one's entries on a rectangle of pixels, -1 where it has none.
+    """
+    rows, columns = number.shape
+    count = 0
+    for k in range(slopes.start[m + 1] - slopes.start[m]):
+        i, j = slopes.row[slopes.start[m] + k] - top, slopes.column[slopes.start[m] + k] - left
+        if 0 <= i < rows and 0 <= j < columns:
+            # Written before it is known whether it counts: whether a pixel is lit is hard to foresee.
+            common[0, count], common[1, count] = number[i, j], k
+            count += int(number[i, j] >= 0)
+    return count
+
+
 @njit(cache=True, fastmath=SUMS, **COUNT_NO_REFERENCES)
-def _set_products(
-    slopes: Slopes, m: int, own: NDArray[np.float64], top: int, left: int, block: NDArray[np.float64]
-) -> None:
-    """Set a block (4, 4) to own^T J_m, with `own` on a rectangle of pixels."""
-    rows, columns = own.shape[0], own.shape[1]
+def _set_products(slopes: Slopes, n: int, m: int, common: NDArray[np.int64], block: NDArray[np.float64]) -> None:
+    """Set a block (4, 4) to J_n^T J_m, from the entries (2, k) that share a pixel."""
     # Kept out of arrays, sums stay in registers.
     m00 = m01 = m02 = m03 = m10 = m11 = m12 = m13 = 0.0
     m20 = m21 = m22 = m23 = m30 = m31 = m32 = m33 = 0.0
-    for k in range(slopes.start[m], slopes.start[m + 1]):
-        i, j = slopes.row[k] - top, slopes.column[k] - left
-        if 0 <= i < rows and 0 <= j < columns:
-            a, b, c, d = own[i, j, 0], own[i, j, 1], own[i, j, 2], own[i, j, 3]
-            e, f, g, h = slopes.slope[k, 0], slopes.slope[k, 1], slopes.slope[k, 2], slopes.slope[k, 3]
-            m00 += a * e
-            m01 += a * f
-            m02 += a * g
-            m03 += a * h
-            m10 += b * e
-            m11 += b * f
-            m12 += b * g
-            m13 += b * h
-            m20 += c * e
-            m21 += c * f
-            m22 += c * g
-            m23 += c * h
-            m30 += d * e
-            m31 += d * f
-            m32 += d * g
-            m33 += d * h
+    of_n, of_m = slopes.slope[slopes.start[n] :], slopes.slope[slopes.start[m] :]
+    for k in range(common.shape[1]):
+        at, other = common[0, k], common[1, k]
+        a, b = np.float64(of_n[at, 0]), np.float64(of_n[at, 1])
+        c, d = np.float64(of_n[at, 2]), np.float64(of_n[at, 3])
+        e, f = np.float64(of_m[other, 0]), np.float64(of_m[other, 1])
+        g, h = np.float64(of_m[other, 2]), np.float64(of_m[other, 3])
+        m00 += a * e
+        m01 += a * f
+        m02 += a * g
+        m03 += a * h
+        m10 += b * e
+        m11 += b * f
+        m12 += b * g
+        m13 += b * h
+        m20 += c * e
+        m21 += c * f
+        m22 += c * g
+        m23 += c * h
+        m30 += d * e
+        m31 += d * f
+        m32 += d * g
+        m33 += d * h
     block[0, 0], block[0, 1], block[0, 2], block[0, 3] = m00, m01, m02, m03
     block[1, 0], block[1, 1], block[1, 2], block[1, 3] = m10, m11, m12, m13
     block[2, 0], block[2, 1], block[2, 2], block[2, 3] = m20, m21, m22, m23
