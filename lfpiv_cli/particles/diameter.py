@@ -46,6 +46,7 @@ from lfpiv_cli.particles.search import (
     State,
     Task,
     blank,
+    judged,
     noise_with,
     observed,
     rebuilt,
@@ -285,7 +286,7 @@ def _tried(
     task = _of_diameter(task, diameters[len(diameters) // 2])
     state = rebuilt(task, state, state.particles)
     sweep(task, state, unexplained, SWEEPS_AFTER_SPLIT)
-    state = with_typical_light(task, state)
+    state = with_typical_light(task, state, judged(task, state, LAST_UNEXPLAINED))
     observation = observed(task, state, unexplained)
     chi2, _, seen = judge(observation, state.particles)
     bright = (state.particles[:, 3] > BRIGHT * state.typical_light) & (seen > WELL_SEEN)

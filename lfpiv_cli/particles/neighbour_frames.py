@@ -24,6 +24,7 @@ from lfpiv_cli.particles.search import (
     State,
     Task,
     blank,
+    judged,
     merge,
     noise_with,
     prune,
@@ -59,13 +60,16 @@ def second_pass(
     own, neighbours : (n, 4) what first passes found in it and in the frames beside it
     search_mm : largest displacement along each axis
     """
-    state = with_typical_light(task, rebuilt(task, blank(task), own))
+    state = rebuilt(task, blank(task), own)
+    state = with_typical_light(task, state, judged(task, state, LAST_UNEXPLAINED))
     state = with_measured_noise(task, replace(state, noise=noise_with(task, state.typical_light)))
     state = rebuilt(task, state, np.concatenate([own, _missing_particles(task, own, neighbours, search_mm)]))
     for sweeps, unexplained in REFINING:
         sweep(task, state, unexplained, sweeps)
-    state = prune(task, merge(task, state), CLAIMED_SHARE, LAST_UNEXPLAINED)
-    return finished(task, with_suspects_checked(task, state, ROUNDS[-1]), ROUNDS[-1])
+    state, _ = prune(task, merge(task, state), CLAIMED_SHARE, LAST_UNEXPLAINED)
+    fits = judged(task, state, ROUNDS[-1].unexplained)
+    state, _ = with_suspects_checked(task, state, fits, ROUNDS[-1])
+    return finished(task, state, ROUNDS[-1])
 
 
 def _missing_particles(

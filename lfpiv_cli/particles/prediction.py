@@ -29,6 +29,7 @@ from lfpiv_cli.particles.search import (
     State,
     Task,
     blank,
+    judged,
     kept,
     noise_with,
     rebuilt,
@@ -123,4 +124,5 @@ def _one_search(task: Task, state: State, settings: Round, progress: Callable[[i
     state, candidates = with_candidates(task, state, candidates, light)
     state = accepted(task, state, candidates, settings)
     sweep(task, state, settings.unexplained, SWEEPS, SEARCH_GAIN)
-    return with_suspects_checked(task, state, settings)
+    state, _ = with_suspects_checked(task, state, judged(task, state, settings.unexplained), settings)
+    return state

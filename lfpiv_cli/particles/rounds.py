@@ -26,10 +26,12 @@ from lfpiv_cli.particles.search import (
     LAST_UNEXPLAINED,
     SMALLEST_LIGHT,
     SMALLEST_SEEN,
+    Fits,
     Particles,
     State,
     Task,
     blank,
+    judged,
     merge,
     noise_with,
     observed,
@@ -115,11 +117,11 @@ def finished(task: Task, state: State, settings: Round) -> State:
     state = with_measured_noise(task, state)
     sweep(task, state, LAST_UNEXPLAINED, LAST_SWEEPS)
     state = with_twins_joined(task, state, LAST_UNEXPLAINED)
-    return pruned(task, state, settings)
+    return pruned(task, state, settings)[0]
 
 
-def pruned(task: Task, state: State, settings: Round) -> State:
-    """Return the state without particles that do not find their light, as a round asks for it."""
+def pruned(task: Task, state: State, settings: Round) -> tuple[State, Fits]:
+    """Return the state without particles that do not find their light, as a round asks for it, and how these fit."""
     return prune(task, state, settings.claimed_share - PRUNING_SLACK, settings.unexplained)
 
 
@@ -133,8 +135,9 @@ def explained(task: Task, state: State, candidates: NDArray[np.float64], setting
     """Return the state with what of the candidates holds, refined and checked."""
     state = accepted(task, state, candidates, settings)
     sweep(task, state, settings.unexplained, SWEEPS, SEARCH_GAIN)
-    state = with_typical_light(task, state)
-    return with_typical_light(task, with_suspects_checked(task, state, settings))
+    fits = judged(task, state, settings.unexplained)
+    state = with_typical_light(task, state, fits)
+    return with_typical_light(task, *with_suspects_checked(task, state, fits, settings))
 
 
 def with_candidates(
@@ -169,11 +172,14 @@ def first_typical_light(light: NDArray[np.float64], noise_counts: float) -> floa
     return float(np.percentile(light, FIRST_TYPICAL_PERCENTILE))
 
 
-def with_suspects_checked(task: Task, state: State, settings: Round) -> State:
-    """Return the state after particles that fit badly were tried at other depths or as two, as far as a round does."""
+def with_suspects_checked(task: Task, state: State, fits: Fits, settings: Round) -> tuple[State, Fits]:
+    """Return the state after particles that fit badly were tried at other depths or as two, as far as a round does.
+
+    `fits` says how well they fit; returned is how well those do that stay.
+    """
     if settings.thorough:
-        state = with_depths_corrected(task, state, settings.unexplained)
-    state = with_overlaps_split(task, state, settings.unexplained, settings.thorough)
+        state = with_depths_corrected(task, state, fits.chi2, settings.unexplained)
+    state = with_overlaps_split(task, state, fits.chi2, settings.unexplained, settings.thorough)
     sweep(task, state, settings.unexplained, SWEEPS_AFTER_SPLIT, SEARCH_GAIN)
     return pruned(task, merge(task, state, still_settled(task, state)), settings)
 

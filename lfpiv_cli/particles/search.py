@@ -7,6 +7,7 @@ axes of the raw sensor, z from the nominal focal point.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,6 +93,23 @@ class Task:
     prepared: NDArray[np.float32]
     depths_mm: tuple[float, float]
     photons_per_count: float | None = None
+
+
+class Fits(NamedTuple):
+    """How well particles fit, see `fitting.judge`.
+
+    Attributes
+    ----------
+    chi2, share, seen : (n,) local chi-squared, claimed share, share of the light that is seen
+    """
+
+    chi2: NDArray[np.float64]
+    share: NDArray[np.float64]
+    seen: NDArray[np.float64]
+
+    def of(self, chosen: NDArray[np.bool_]) -> Fits:
+        """Return those of some particles."""
+        return Fits(self.chi2[chosen], self.share[chosen], self.seen[chosen])
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,12 +226,15 @@ def merge(task: Task, state: State, apart: NDArray[np.bool_] | None = None) -> S
     return rebuilt(task, replace(state, expected=state.prior[~merged]), particles[~merged])
 
 
-def prune(task: Task, state: State, claimed_share: float, unexplained: float) -> State:
-    """Return the state without particles that are too faint, hardly seen, or do not find their light."""
-    _, share, seen = judge(observed(task, state, unexplained), state.particles)
-    keep = (state.particles[:, 3] > SMALLEST_LIGHT * state.typical_light) & (seen > SMALLEST_SEEN)
-    keep &= share > claimed_share
-    return kept(task, state, keep)
+def prune(task: Task, state: State, claimed_share: float, unexplained: float) -> tuple[State, Fits]:
+    """Return the state without particles that are too faint, hardly seen, or do not find their light.
+
+    And how well those that stay fitted beside them.
+    """
+    fits = judged(task, state, unexplained)
+    keep = (state.particles[:, 3] > SMALLEST_LIGHT * state.typical_light) & (fits.seen > SMALLEST_SEEN)
+    keep &= fits.share > claimed_share
+    return kept(task, state, keep), fits.of(keep)
 
 
 def kept(task: Task, state: State, keep: NDArray[np.bool_]) -> State:
@@ -240,13 +261,18 @@ def rebuilt(task: Task, state: State, particles: NDArray[np.float64]) -> State:
     return replace(state, particles=particles, residual=residual)
 
 
-def with_typical_light(task: Task, state: State) -> State:
+def judged(task: Task, state: State, unexplained: float) -> Fits:
+    """Return how well particles fit."""
+    return Fits(*judge(observed(task, state, unexplained), state.particles))
+
+
+def with_typical_light(task: Task, state: State, fits: Fits) -> State:
     """Return the state with the median light of the better fitting half, which holds fewer merged particles.
 
     Those that are hardly seen fit anything; where there are no others, the typical light is not known: 0.
     """
-    chi2, _, seen = judge(observed(task, state, LAST_UNEXPLAINED), state.particles)
-    light, chi2 = state.particles[seen > SMALLEST_SEEN, 3], chi2[seen > SMALLEST_SEEN]
+    seen = fits.seen > SMALLEST_SEEN
+    light, chi2 = state.particles[seen, 3], fits.chi2[seen]
     typical = float(np.median(light[chi2 <= np.median(chi2)])) if light.size else 0.0
     return replace(state, typical_light=typical, noise=noise_with(task, typical))
 

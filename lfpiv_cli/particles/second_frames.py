@@ -15,14 +15,13 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from lfpiv_cli.particles.fitting import judge
 from lfpiv_cli.particles.prediction import STEPS, Predicted, find_predicted
 from lfpiv_cli.particles.rounds import ROUNDS, after_rounds, finished
 from lfpiv_cli.particles.search import (
     LAST_UNEXPLAINED,
     Task,
     blank,
-    observed,
+    judged,
     rebuilt,
     with_measured_noise,
     with_typical_light,
@@ -75,9 +74,10 @@ def second_frame(
 
 def beyond_doubt(task: Task, particles: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return which particles (n, 4) fit well and find nearly all their light."""
-    state = with_measured_noise(task, with_typical_light(task, rebuilt(task, blank(task), particles)))
-    chi2, share, _ = judge(observed(task, state, LAST_UNEXPLAINED), particles)
-    return np.asarray((chi2 < SUSPECT_CHI2 * good_chi2(chi2)) & (share > TRUSTED_SHARE))
+    state = rebuilt(task, blank(task), particles)
+    state = with_measured_noise(task, with_typical_light(task, state, judged(task, state, LAST_UNEXPLAINED)))
+    fits = judged(task, state, LAST_UNEXPLAINED)
+    return np.asarray((fits.chi2 < SUSPECT_CHI2 * good_chi2(fits.chi2)) & (fits.share > TRUSTED_SHARE))
 
 
 def predicted_by(trusted: NDArray[np.float64], seen: NDArray[np.float64], search_mm: float, scale: Scale) -> Predicted:

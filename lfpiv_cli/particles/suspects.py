@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from lfpiv_cli.particles.alternative_depths import try_other_depths
-from lfpiv_cli.particles.fitting import judge
 from lfpiv_cli.particles.search import SMALLEST_LIGHT, State, Task, observed
 from lfpiv_cli.particles.splitting import split
 from lfpiv_cli.particles.view import footprint_radius_mm
@@ -36,10 +35,9 @@ CHANGED_LENSES, CHANGED_DEPTHS, CHANGED_SHARES = 0.05, 0.05 / 1.064, (0.05, 0.2)
 SETTLED = 4.0
 
 
-def with_depths_corrected(task: Task, state: State, unexplained: float) -> State:
+def with_depths_corrected(task: Task, state: State, chi2: NDArray[np.float64], unexplained: float) -> State:
     """Return the state with particles moved to depths that explain the light better, the residual in place."""
     observation = observed(task, state, unexplained)
-    chi2, *_ = judge(observation, state.particles)
     good = good_chi2(chi2)
     near_focus = footprint_radius_mm(task.view, state.particles) < NEAR_FOCUS_LENSES * 2.0 * task.view.half_x_mm
     signature = _signature(task.view.scale, state.particles, chi2)
@@ -55,10 +53,11 @@ def settled(task: Task, state: State) -> State:
     return replace(state, settled=_signature(task.view.scale, state.particles, chi2)[:, :-1])
 
 
-def with_overlaps_split(task: Task, state: State, unexplained: float, thorough: bool) -> State:
+def with_overlaps_split(
+    task: Task, state: State, chi2: NDArray[np.float64], unexplained: float, thorough: bool
+) -> State:
     """Return the state with overlapping particles separated; `thorough`: also those of usual brightness."""
     observation = observed(task, state, unexplained)
-    chi2, *_ = judge(observation, state.particles)
     good = good_chi2(chi2)
     bright = state.particles[:, 3] > (ENOUGH_FOR_TWO if thorough else BRIGHT) * state.typical_light
     signature = _signature(task.view.scale, state.particles, chi2)
