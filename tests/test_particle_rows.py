@@ -91,10 +91,10 @@ def profile(first: float, offset: float) -> NDArray[np.float64]:
 @pytest.mark.thorough
 def test_rows_equal_their_references() -> None:
     across, down = profile(9.0, 0.02), profile(13.4, -0.08)
-    table, step = rim_table(12.5, 1.375)
+    table, reach = rim_table(12.5, 1.375)
     rims = np.zeros((2, 2 * RIM_ROWS * STRIDE))
     rims[:, WHOLE : WHOLE + STRIDE] = 1.0
-    known = (12.5, 0.98, step, table.shape[0] - 1.001, 0.98 / step, 11.0**2)
+    known = (12.5, 1.4, 1.0 / 1.4, 16.0 / reach, 16.0 * 1.4, 16.0, 31.999, 15.999, 11.0**2)
     covered(rims[0], across, (1, COLUMNS - 1), down, 2, table, known)
     micro_images.cover_row_reference(rims[1], across, (1, COLUMNS - 1), down, 2, table, known)
     ours, theirs = rims.reshape(2, 2, RIM_ROWS, STRIDE)[:, :, :, 1:COLUMNS]

@@ -386,7 +386,7 @@ def _join(
                 rim_x = patch_x + place_x * of_x.ball * along_x[AWAY, n] / max(h0, SMALLEST_SHARE)
                 rim_y = patch_y + place_y * of_y.ball * along_y[AWAY, m] / max(v0, SMALLEST_SHARE)
                 share, mean_x, mean_y, share_x, share_y = covered_share(
-                    rim_x, rim_y, width, camera.aperture_radius_mm, view.table, view.table_step_mm
+                    rim_x, rim_y, width, camera.aperture_radius_mm, view.table, view.table_reach
                 )
                 light = share * h0 * v0 + mean_x * h1 * v0 + mean_y * h0 * v1
                 by_x = share * h0_x * v0 + mean_x * h1_x * v0 + mean_y * h0_x * v1 + share_x * place_x * h0 * v0
@@ -501,7 +501,7 @@ def join_cell(
                     width,
                     camera.aperture_radius_mm,
                     view.table,
-                    view.table_step_mm,
+                    view.table_reach,
                 )
                 lean_x, lean_y = mean_x * half_x, mean_y * half_y
                 light = share * part + lean_x * by_u + lean_y * by_v

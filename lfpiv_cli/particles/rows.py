@@ -28,7 +28,7 @@ from lfpiv_cli.particles.response import (
     project,
     seen_moves,
 )
-from lfpiv_cli.particles.rim import ENTRIES_PER_PATCH
+from lfpiv_cli.particles.rim import DIRECTIONS, DISTANCES
 from lfpiv_cli.particles.view import View
 from lfpiv_cli.simd.micro_images import (
     CURVED_NUMBERS,
@@ -292,13 +292,15 @@ def _write_rows(
     step, width = patches
     outside = _far(view, width)
     inside = max(camera.aperture_radius_mm - 0.71 * width, 0.0) ** 2
-    per_width = ENTRIES_PER_PATCH * view.table_step_mm / width
     rim_numbers = (
         camera.aperture_radius_mm,
-        per_width,
-        view.table_step_mm,
-        view.table.shape[0] - 2.001,
-        per_width / view.table_step_mm,
+        width,
+        1.0 / width,
+        0.5 * (DISTANCES - 1.0) / view.table_reach,
+        (DIRECTIONS - 1.0) * width,
+        0.5 * (DISTANCES - 1.0),
+        DISTANCES - 1.001,
+        DIRECTIONS - 1.001,
         inside,
     )
     first = room.across[PATCH * STRIDE]

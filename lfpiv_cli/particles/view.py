@@ -52,7 +52,7 @@ class View(NamedTuple):
     particle_radius_mm : of the balls
     centres_mm : (nj, ni, 2) lens centres on the array; entry [j, i] is lens (first_i + i, first_j + j)
     inverse_basis : (2, 2) of the plain lattice, to find lenses
-    table, table_step_mm : see `rim`
+    table, table_reach : see `rim`
     """
 
     camera: KernelCamera
@@ -73,7 +73,7 @@ class View(NamedTuple):
     first_j: int
     inverse_basis: NDArray[np.float64]
     table: NDArray[np.float64]
-    table_step_mm: float
+    table_reach: float
 
 
 def ensure_square_cells(camera: Camera, space: ObjectSpace | CurvedSpace | None) -> None:
@@ -126,7 +126,7 @@ def raw_view(
         half_x = half_y = hexagon_radius(lattice)
         cell_reach = 2.0 / 3.0
         shares = cell_shares(lattice, radius * camera.image_distance_mm / camera.focus_distance_mm)
-    table, step = rim_table(
+    table, reach = rim_table(
         camera.aperture_radius_mm, camera.pixel_mm * camera.image_distance_mm / camera.microlens_distance_mm
     )
     return View(
@@ -148,7 +148,7 @@ def raw_view(
         first_j=int(low_j),
         inverse_basis=np.ascontiguousarray(np.linalg.inv(lattice.basis)),
         table=table,
-        table_step_mm=step,
+        table_reach=reach,
     )
 
 

@@ -100,10 +100,10 @@ class Nuisances:
     def applied(self, view: View, scene: MovableScene | None = None) -> View:
         """Return the view with these changes; those of a scene where there is one, from where it is said to be."""
         camera, shift = view.camera, np.array([self.shift_x_mm, self.shift_y_mm])
-        radius, table, step = camera.aperture_radius_mm, view.table, view.table_step_mm
+        radius, table, reach = camera.aperture_radius_mm, view.table, view.table_reach
         if self.aperture_radius_mm != 0.0:
             radius += self.aperture_radius_mm
-            table, step = rim_table(radius, camera.pixel_mm * camera.image_distance_mm / camera.microlens_distance_mm)
+            table, reach = rim_table(radius, camera.pixel_mm * camera.image_distance_mm / camera.microlens_distance_mm)
         camera = camera._replace(
             origin_mm=camera.origin_mm + shift,
             aperture_radius_mm=radius,
@@ -114,7 +114,7 @@ class Nuisances:
             centres_mm=view.centres_mm + shift,
             particle_radius_mm=view.particle_radius_mm + self.particle_radius_mm,
             table=table,
-            table_step_mm=step,
+            table_reach=reach,
             faces=view.faces if scene is None else scene.faces(self.scene),
         )
 

@@ -49,6 +49,8 @@ MEAN, SLOPE, MEAN_X, SLOPE_X, MEAN_Z, SLOPE_Z, PATCH, SEEN_FROM = range(8)
 PROFILE_ROWS = 8
 # Of a ball; what sees less sees nothing.
 SMALLEST_SHARE = 1e-9
+# Of areas that divide, mm^2: a patch on the axis.
+TINY = 1e-12
 
 
 class ProfileNumbers(NamedTuple):
@@ -124,17 +126,21 @@ class RimNumbers(NamedTuple):
     Attributes
     ----------
     radius : of the main lens
-    per_width : width of the table's patches over that of these
-    step, last : distance of the table's entries, and a place just before the last of them
-    per_entry : per_width / step
+    width, per_width : of a patch, and 1/width
+    distances, directions : steps of the table to a patch's width, and to a quadrant times the width
+    middle : of the table's distances, in steps: the rim itself
+    last_distance, last_direction : places just before the last entries
     inside : square of how far from the axis patches are whole
     """
 
     radius: Any
+    width: Any
     per_width: Any
-    step: Any
-    last: Any
-    per_entry: Any
+    distances: Any
+    directions: Any
+    middle: Any
+    last_distance: Any
+    last_direction: Any
     inside: Any
 
 
@@ -226,25 +232,52 @@ def _clipped(t: Any) -> Any:
     return at_most(at_least(t, -1.0), 1.0)
 
 
-def _covered(x: Any, y: Any, c: RimNumbers, corners: Sequence[Any], p: Any, q: Any) -> tuple[Any, ...]:
+def _covered(x: Any, y: Any, c: RimNumbers, corners: Sequence[Any], place: RimPlace) -> tuple[Any, ...]:
     """Return what the rim leaves of a patch between four entries of the table; see `rim.covered_share`."""
+    p, q = place.p, place.q
     ka, kb, kc, kd = (1.0 - p) * (1.0 - q), p * (1.0 - q), (1.0 - p) * q, p * q
     share, mean_x, mean_y = (
         ka * corners[n] + kb * corners[n + 3] + kc * corners[n + 6] + kd * corners[n + 9] for n in range(3)
     )
-    slope_x = (1.0 - q) * (corners[3] - corners[0]) + q * (corners[9] - corners[6])
-    slope_y = (1.0 - p) * (corners[6] - corners[0]) + p * (corners[9] - corners[3])
+    outwards = ((1.0 - q) * (corners[3] - corners[0]) + q * (corners[9] - corners[6])) * place.outwards
+    turning = ((1.0 - p) * (corners[6] - corners[0]) + p * (corners[9] - corners[3])) * place.turning
     # Of the first quadrant; the others are its mirror images.
     left, above = where_above(0.0 - x, 0.0, -1.0, 1.0), where_above(0.0 - y, 0.0, -1.0, 1.0)
-    return share, left * mean_x, above * mean_y, left * c.per_entry * slope_x, above * c.per_entry * slope_y
+    right, down = left * x, above * y
+    slope_x, slope_y = outwards * right - turning * down, outwards * down + turning * right
+    return share, left * mean_x, above * mean_y, left * slope_x, above * slope_y
 
 
-def _entry(x: Any, y: Any, c: RimNumbers) -> tuple[Any, Any]:
+class RimPlace(NamedTuple):
+    """Where in the rim's table a patch is found, and what it moves by there; each a number, or `Lanes` of it.
+
+    Attributes
+    ----------
+    p, q : along distances and directions, in steps
+    outwards, turning : distances change by `outwards` x with x, directions by `turning` x with y
+    """
+
+    p: Any
+    q: Any
+    outwards: Any
+    turning: Any
+
+
+def _place(x: Any, y: Any, c: RimNumbers) -> RimPlace:
     """Return where in the rim's table a patch is found: what counts is how many of its widths it is from the rim."""
-    away = root(x * x + y * y)
-    place = (c.radius + (away - c.radius) * c.per_width) / (away * c.step)
-    # The last entries are dark.
-    return tuple(at_most(at_least(where_above(one, 0.0, one, 0.0 - one) * place, 0.0), c.last) for one in (x, y))
+    right, down = (where_above(one, 0.0, one, 0.0 - one) for one in (x, y))
+    away, around = root(x * x + y * y), right + down
+    # One division: widths over both.
+    per = c.per_width / at_least(away * around, TINY)
+    per_away, per_around = per * around, per * away
+    p = (away - c.radius) * c.per_width * c.distances + c.middle
+    q = down * per_around * c.directions
+    return RimPlace(
+        at_most(at_least(p, 0.0), c.last_distance),
+        at_most(q, c.last_direction),
+        per_away * c.distances,
+        per_around * per_around * c.directions * c.width,
+    )
 
 
 def _join(x: Sequence[Any], y: Sequence[Any], rim: Sequence[Any], c: JoinNumbers) -> tuple[Any, Any, Any, Any]:
@@ -342,11 +375,11 @@ def cover_row_reference(
     known = RimNumbers(*numbers)
     for n in range(columns[0], columns[0] + columns[1]):
         x, y = (float(of[SEEN_FROM * STRIDE + k]) for of, k in ((across, n), (down, row)))
-        p, q = _entry(x, y, known)
-        i, j = int(p), int(q)
-        corners = table[j : j + 2, i : i + 2].ravel().tolist()
+        place = _place(x, y, known)
+        i, j = int(place.p), int(place.q)
+        corners = table[j : j + 2, i : i + 2, :3].ravel().tolist()
         away2 = across[PATCH * STRIDE + n] ** 2 + down[PATCH * STRIDE + row] ** 2
-        left = _covered(x, y, known, corners, p - i, q - j)
+        left = _covered(x, y, known, corners, place._replace(p=place.p - i, q=place.q - j))
         for k, (value, whole) in enumerate(zip(left, WHOLE_PATCH, strict=True)):
             rim[OF_ROW + k * STRIDE + n] = value if away2 > known.inside else whole
 
@@ -366,8 +399,8 @@ def _generate_cover(context: Any, builder: ir.IRBuilder, signature: Any, argumen
     members = cgutils.unpack_tuple(builder, arguments[6], len(RimNumbers._fields))
     known = RimNumbers(*(lanes(builder, member) for member in members))
     entries = context.make_array(signature.args[5])(context, builder, arguments[5])
-    line = builder.mul(cgutils.unpack_tuple(builder, entries.shape, 3)[1], index(3))
-    each, lines = (integers_in_lanes(builder, number) for number in (index(3), line))
+    _, columns, entry = cgutils.unpack_tuple(builder, entries.shape, 3)
+    each, lines = (integers_in_lanes(builder, number) for number in (entry, builder.mul(columns, entry)))
     y, patch_y = (
         lanes(builder, load_one(builder, down, builder.add(arguments[4], index(k * STRIDE))))
         for k in (SEEN_FROM, PATCH)
@@ -380,16 +413,18 @@ def _generate_cover(context: Any, builder: ir.IRBuilder, signature: Any, argumen
         with builder.if_else(any_above(away2, known.inside)) as (cut, whole_all):
             with cut:
                 x = load_lanes(builder, across, builder.add(column, index(SEEN_FROM * STRIDE)))
-                p, q = _entry(x, y, known)
-                (whole_p, i), (whole_q, j) = whole_part(p), whole_part(q)
+                place = _place(x, y, known)
+                (whole_p, i), (whole_q, j) = whole_part(place.p), whole_part(place.q)
                 corner = builder.add(builder.mul(i, each), builder.mul(j, lines))
-                corners = [*gather(builder, table, corner, 6), *gather(builder, table, builder.add(corner, lines), 6)]
-                left = _covered(x, y, known, corners, p - whole_p, q - whole_q)
-                for value, whole, place in zip(left, WHOLE_PATCH, to, strict=True):
-                    store_lanes(builder, where_above(away2, known.inside, value, whole), rim, place)
+                # An entry is shares of three kinds and an empty one.
+                read = (gather(builder, table, at, 8) for at in (corner, builder.add(corner, lines)))
+                corners = [line[k] for line in read for k in (0, 1, 2, 4, 5, 6)]
+                left = _covered(x, y, known, corners, place._replace(p=place.p - whole_p, q=place.q - whole_q))
+                for value, whole, at in zip(left, WHOLE_PATCH, to, strict=True):
+                    store_lanes(builder, where_above(away2, known.inside, value, whole), rim, at)
             with whole_all:
-                for whole, place in zip(WHOLE_PATCH, to, strict=True):
-                    store_lanes(builder, lanes(builder, whole), rim, place)
+                for whole, at in zip(WHOLE_PATCH, to, strict=True):
+                    store_lanes(builder, lanes(builder, whole), rim, at)
     return context.get_dummy_value()
 
 
