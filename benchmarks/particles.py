@@ -53,6 +53,8 @@ ASTRAY = 10.0
 # Figures are also given for these distances from the focal plane, mm: light stays within one lens, few, many.
 DISTANCES_MM = ((0.0, 0.5), (0.5, 2.0), (2.0, np.inf))
 WALL_MM, CHANNEL_MM = 5.0, 10.0
+# Tracers so near to the sides of the view are not judged: two microlenses, and what the camera is shifted by.
+UNSEEN_MM = 0.25
 DIAMETER_MM, VOXEL_MM, LIGHT_COUNTS = 0.05, 0.1, 5e5
 MISALIGNMENT = Misalignment(-0.31, (2.2, -1.7), -2e-5)
 BOARD = BoardGeometry((7, 7), 1.0, 0.2)
@@ -84,6 +86,18 @@ class Bench:
     def bounds_mm(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the corners of the volume, lowest and highest."""
         low, high = np.array([self.grid.bounds_mm(axis) for axis in range(3)]).T
+        return low, high
+
+    def judged_mm(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the corners of the part of the volume that is judged.
+
+        At full size the volume is wider than the sensor: the light of tracers at its sides meets none.
+        """
+        low, high = self.bounds_mm()
+        camera = self.real
+        half = 0.5 * camera.pixel_mm * np.array([camera.columns, camera.rows]) / -camera.magnification - UNSEEN_MM
+        high[:2] = np.minimum(high[:2], half)
+        low[:2] = np.maximum(low[:2], -half)
         return low, high
 
     def photograph(
@@ -151,7 +165,7 @@ def print_figures(bench: Bench, count: int, seed: int, log_spread: float | None 
     sigma = np.sqrt(np.diagonal(found.covariance_mm2, axis1=1, axis2=2))
     what = f"{count} particles" if log_spread is None else f"{count} particles of log-normal brightness {log_spread:g}"
     for distances in ((0.0, np.inf), *DISTANCES_MM):
-        figures = particle_figures(found.position_mm, true, low, high, VOXEL_MM, sigma, distances)
+        figures = particle_figures(found.position_mm, true, *bench.judged_mm(), VOXEL_MM, sigma, distances)
         text = "  ".join(f"{name} {value:.4f}" for name, value in figures.items())
         print(f"{what}, {seconds:.1f} s, |z| {distances[0]:g} to {distances[1]:g} mm: {text}", flush=True)
 

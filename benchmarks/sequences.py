@@ -12,8 +12,9 @@ import time
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
-from benchmarks.particles import LIGHT_COUNTS, VOXEL_MM, Bench, calibrated
+from benchmarks.particles import DIAMETER_MM, LIGHT_COUNTS, VOXEL_MM, Bench, calibrated
 from lfpiv_cli.files.particle_file import symmetric
 from lfpiv_cli.particles.neighbour_frames import second_pass
 from lfpiv_cli.particles.prediction import Predicted, find_predicted
@@ -84,6 +85,9 @@ def photographs(
     wide = MARGIN_MM + 0.5 * frames * speed
     around = round(count * np.prod(high - low + 2.0 * wide) / np.prod(high - low))
     start, light = rng.uniform(low - wide, high + wide, (around, 3)), LIGHT_COUNTS * rng.uniform(0.6, 1.4, around)
+    # Tracers are solid.
+    within = KDTree(start).query_pairs(DIAMETER_MM, output_type="ndarray")[:, 1]
+    start, light = np.delete(start, within, axis=0), np.delete(light, within)
     images, true = [], []
     at = advect(flow, start, -0.5 * (frames - 1) * DT_S)
     for _ in range(frames):
@@ -130,7 +134,7 @@ def track_figures(
 
     Recall is of tracers that as many frames hold as a track must have. None where no track is.
     """
-    low, high = bench.bounds_mm()
+    low, high = bench.judged_mm()
 
     def counted(points: Points) -> NDArray[np.bool_]:
         depth = np.abs(points[:, 2])
