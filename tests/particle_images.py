@@ -19,8 +19,10 @@ from lfpiv_cli.weights.build import default_padding, factorise
 from lfpiv_cli.weights.model import Weights
 
 
-def task_with(table2: Camera, water: Media, true: NDArray[np.float64], rng: np.random.Generator) -> Task:
-    """Return the task that a noisy image of particles sets."""
+def task_with(
+    table2: Camera, water: Media, true: NDArray[np.float64], rng: np.random.Generator, noise: float = 6.0
+) -> Task:
+    """Return the task that a noisy image of particles sets; `noise` in counts."""
     camera = replace(table2, columns=500, rows=420)
     grid = Grid.centred((20, 16, 20), (0.1, 0.1, 0.1), (0.0, 0.0, 1.9))
     padding = default_padding(camera, water, grid)
@@ -28,7 +30,7 @@ def task_with(table2: Camera, water: Media, true: NDArray[np.float64], rng: np.r
     view, depths = raw_view(camera, water, 0.025), grid.bounds_mm(2)
     image = np.zeros(camera.rows * camera.columns)
     add_all(view, true, 1.0, image, depths)
-    image += rng.normal(0.0, 6.0, image.size)
+    image += rng.normal(0.0, noise, image.size)
     shaped = image.reshape(camera.rows, camera.columns).astype(np.float32)
     return task_of(shaped, view, weights, camera, normalisers(weights.padded), None)
 

@@ -1,9 +1,13 @@
 """Two particles that the image does not tell from one: one tracer that was found twice.
 
-Near the focal plane a tracer lights one lens or two, and two particles beside each other share its light in any
-proportion: what was split once, or was expected from an earlier frame, would stay so. So one particle takes the place
-of two where chi-squared hardly rises. Two tracers that overlap so much look like one, too, but are as bright as two:
-what would be brighter than others stays two.
+Two searches may find one tracer. Near the focal plane it lights one lens or two, and two particles beside each other
+share its light in any proportion: what was split once, or was expected from an earlier frame, would stay so. So one
+particle takes the place of two where chi-squared hardly rises. How near they are says little: at other depths two
+tracers a third of a microlens apart differ from one by thousands. Two that overlap so much that they look like one are
+as bright as two: what would be brighter than others stays two.
+
+In one place near the focal plane there is one particle, unless two are expected: what the model of the light of so few
+lenses lacks is as much as what tells two from one.
 
 Axes: image axes, mm; light in counts; residual and weights as flat images. A particle is a row (x, y, z, light).
 """
@@ -17,7 +21,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from lfpiv_cli.particles.fitting import fit_from, judge, nothing_expected
+from lfpiv_cli.particles.fitting import fit_from, nothing_expected
 from lfpiv_cli.particles.least_squares import (
     CHOICE_GAIN,
     UNKNOWNS,
@@ -30,13 +34,16 @@ from lfpiv_cli.particles.least_squares import (
     respond_all,
     room_for,
 )
-from lfpiv_cli.particles.search import State, Task, observed
+from lfpiv_cli.particles.search import SAME_DEPTHS, SAME_LENSES, State, Task, observed
 from lfpiv_cli.particles.suspects import good_chi2
 from lfpiv_cli.particles.tiles import over_tiles
+from lfpiv_cli.particles.view import footprint_radius_mm
 
 # Particles may be one tracer that are no further apart: laterally in microlenses, and in depths over which light
 # spreads by one lens (Table 2: 0.1 and 1 mm).
 APART_LENSES, APART_DEPTHS = 1.0, 1.0 / 1.064
+# Radii, in lenses, of footprints near the focal plane.
+NEAR_FOCUS_LENSES = 1.0
 # What chi-squared may rise by, in units of a good particle's: five standard errors of the light of the second.
 LARGEST_LOSS = 25.0
 # One in twenty particles is brighter than what two may be joined to.
@@ -44,15 +51,18 @@ BRIGHTEST_PERCENTILE = 95.0
 STEPS = 12
 
 
-def with_twins_joined(task: Task, state: State, unexplained: float) -> State:
-    """Return the state with one particle for two that the image does not tell from one."""
+def with_twins_joined(task: Task, state: State, unexplained: float, chi2: NDArray[np.float64]) -> State:
+    """Return the state with one particle for two that the image does not tell from one.
+
+    Parameters
+    ----------
+    chi2 : of its particles, see `judge`, to tell how large a good one's is
+    """
     particles = state.particles.copy()
-    pairs, brightest = _twins(task, particles)
+    pairs, loss, brightest = _twins(task, state)
     if not len(pairs):
         return state
-    observation = observed(task, state, unexplained)
-    chi2, *_ = judge(observation, particles)
-    joined = join(observation, particles, pairs, LARGEST_LOSS * good_chi2(chi2), brightest)
+    joined = join(observed(task, state, unexplained), particles, pairs, loss * good_chi2(chi2), brightest)
     stays, expected = np.ones(len(particles), np.bool_), state.prior
     stays[pairs[joined, 1]], expected[pairs[joined, 0]] = False, nothing_expected(1)
     return replace(state, particles=particles[stays], expected=expected[stays])
@@ -62,21 +72,20 @@ def join(
     observation: Observation,
     particles: NDArray[np.float64],
     pairs: NDArray[np.int64],
-    largest_loss: float,
-    brightest: float,
+    largest_loss: NDArray[np.float64],
+    brightest: NDArray[np.float64],
 ) -> NDArray[np.bool_]:
-    """Put one particle in place of the first of two where chi-squared rises by less than `largest_loss`.
+    """Put one particle in place of the first of two where chi-squared rises by less than `largest_loss` (m,).
 
-    The light of the second goes from the residual, which is kept up to date; no particle becomes brighter than
-    `brightest`. Returns which of the pairs (m, 2) of particles (n, 4) are joined, each particle once at most.
+    The residual is kept up to date; none becomes brighter than its pair's `brightest` (m,). Returns which of the pairs
+    (m, 2) of particles (n, 4) are joined, each particle once at most.
     """
     joined, free = np.zeros(len(pairs), np.bool_), np.ones(len(particles), np.bool_)
     light = particles[pairs, 3:]
     middle = np.sum(particles[pairs] * light, axis=1) / np.maximum(light.sum(axis=1), np.finfo(np.float64).tiny)
-    most = (largest_loss, brightest)
     # Starts lie in the middle: from there fits move no further than tiles allow.
     over_tiles(
-        lambda numbers: _join(observation, particles, middle, pairs, numbers, most, joined, free),
+        lambda numbers: _join(observation, particles, middle, pairs, numbers, largest_loss, brightest, joined, free),
         observation.optics,
         middle,
         observation.depths_mm,
@@ -91,7 +100,8 @@ def _join(
     middle: NDArray[np.float64],
     pairs: NDArray[np.int64],
     numbers: NDArray[np.int64],
-    most: tuple[float, float],
+    largest_loss: NDArray[np.float64],
+    brightest: NDArray[np.float64],
     joined: NDArray[np.bool_],
     free: NDArray[np.bool_],
 ) -> None:
@@ -109,10 +119,10 @@ def _join(
             pixels, values = lit_by(responses, 0)
             add_light(pixels, values, particles[member, 3], residual)
             two += change_by(pixels, values, particles[member, 3], residual, weight)
-        lowest = two + most[0]
+        lowest = two + largest_loss[number]
         for depth in (middle[number, 2], particles[first, 2], particles[second, 2]):
             change = fit_from(observation, middle[number], prior, depth, trial, responses, effort)
-            if change < lowest and 0.0 < trial[0, 3] < most[1]:
+            if change < lowest and 0.0 < trial[0, 3] < brightest[number]:
                 lowest, joined[number] = change, True
                 copy_rows(trial, best)
         if joined[number]:
@@ -125,13 +135,20 @@ def _join(
                 add_light(pixels, values, -particles[member, 3], residual)
 
 
-def _twins(task: Task, particles: NDArray[np.float64]) -> tuple[NDArray[np.int64], float]:
-    """Return pairs (m, 2) of particles that may be one tracer, the nearest first, and the light of the brightest."""
+def _twins(task: Task, state: State) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return pairs (m, 2) that may be one tracer, the nearest first; what one may lose and its most light (m,)."""
+    particles, scale = state.particles, task.view.scale
     if len(particles) < 2:
-        return np.zeros((0, 2), np.int64), 0.0
-    brightest = float(np.percentile(particles[:, 3], BRIGHTEST_PERCENTILE))
-    places = particles[:, :3] / task.view.scale.box_mm(APART_LENSES, APART_DEPTHS)
+        return np.zeros((0, 2), np.int64), np.zeros(0), np.zeros(0)
+    places = particles[:, :3] / scale.box_mm(APART_LENSES, APART_DEPTHS)
     pairs = KDTree(places).query_pairs(1.0, output_type="ndarray").astype(np.int64)
-    pairs = pairs[particles[pairs, 3].sum(axis=1) < brightest]
     distance = np.linalg.norm(places[pairs[:, 0]] - places[pairs[:, 1]], axis=1)
-    return pairs[np.lexsort((pairs[:, 1], pairs[:, 0], distance))], brightest
+    pairs = pairs[np.lexsort((pairs[:, 1], pairs[:, 0], distance))]
+
+    off = (particles[pairs[:, 0], :3] - particles[pairs[:, 1], :3]) / scale.box_mm(SAME_LENSES, SAME_DEPTHS)
+    radius = footprint_radius_mm(task.view, particles)[pairs].max(axis=1)
+    expected = np.asarray(state.prior[:, UNKNOWNS:].any(axis=1))[pairs].all(axis=1)
+    same = (np.linalg.norm(off, axis=1) < 1.0) & (radius < NEAR_FOCUS_LENSES * 2.0 * task.view.half_x_mm) & ~expected
+    brightest = np.where(same, np.inf, np.percentile(particles[:, 3], BRIGHTEST_PERCENTILE))
+    possible = particles[pairs, 3].sum(axis=1) < brightest
+    return pairs[possible], np.where(same, np.inf, LARGEST_LOSS)[possible], brightest[possible]

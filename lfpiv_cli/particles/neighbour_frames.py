@@ -66,10 +66,11 @@ def second_pass(
     state = rebuilt(task, state, np.concatenate([own, _missing_particles(task, own, neighbours, search_mm)]))
     for sweeps, unexplained in REFINING:
         sweep(task, state, unexplained, sweeps)
+    # Three may be where two are, one of them found here for both: with the third beside them chi-squared needs all.
     state, _ = prune(task, merge(task, state), CLAIMED_SHARE, LAST_UNEXPLAINED)
     fits = judged(task, state, ROUNDS[-1].unexplained)
     state, _ = with_suspects_checked(task, state, fits, ROUNDS[-1])
-    return finished(task, state, ROUNDS[-1])
+    return finished(task, merge(task, state), ROUNDS[-1])
 
 
 def _missing_particles(

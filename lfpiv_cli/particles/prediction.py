@@ -43,8 +43,8 @@ PREDICTED_SIGMAS = 4.0
 # Standard errors of what is predicted, at least: laterally in microlenses, in depth in depths over which light spreads
 # by one lens (Table 2: 0.005 and 0.05 mm), and of the logarithm of the light.
 SURE_LENSES, SURE_DEPTHS, SURE_LIGHT = 0.05, 0.05 / 1.064, 0.02
-# How little unexplained light counts in sweeps in which each light is held within these limits, and in those after.
-HELD, FREE = (0.3, 0.3, 0.1, 0.1), (0.1, 0.05)
+# How little unexplained light counts in sweeps in which each light is held within these limits, and in the one after.
+HELD, FREE = (0.3, 0.1, 0.1), 0.05
 # The search of what particles leave that go on.
 SEARCHES = (
     Round(12, 0.85, 0.1, thorough=True),
@@ -110,12 +110,12 @@ def gone_on(task: Task, predicted: Predicted) -> State:
     for unexplained in HELD:
         sweep(task, state, unexplained, 1, SEARCH_GAIN)
         state = with_light(task, state, np.clip(state.particles[:, 3], low, high))
-    for unexplained in FREE:
-        sweep(task, state, unexplained, 1, SEARCH_GAIN)
+    sweep(task, state, FREE, 1, SEARCH_GAIN)
     found = state.particles
     sure = (np.abs(found[:, :3] - at[:, :3]) <= PREDICTED_SIGMAS * sigma).all(axis=1)
     sure &= (found[:, 3] > low) & (found[:, 3] < high)
-    return with_twins_joined(task, kept(task, state, sure), FREE[-1])
+    state = kept(task, state, sure)
+    return with_twins_joined(task, state, FREE, judged(task, state, FREE).chi2)
 
 
 def _one_search(task: Task, state: State, settings: Round, progress: Callable[[int], None] | None) -> State:

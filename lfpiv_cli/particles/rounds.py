@@ -32,7 +32,6 @@ from lfpiv_cli.particles.search import (
     Task,
     blank,
     judged,
-    merge,
     noise_with,
     observed,
     prune,
@@ -41,7 +40,7 @@ from lfpiv_cli.particles.search import (
     with_measured_noise,
     with_typical_light,
 )
-from lfpiv_cli.particles.suspects import still_settled, with_depths_corrected, with_overlaps_split
+from lfpiv_cli.particles.suspects import with_depths_corrected, with_overlaps_split
 from lfpiv_cli.particles.view import lens_pixels
 
 
@@ -116,7 +115,7 @@ def finished(task: Task, state: State, settings: Round) -> State:
     """Return the state refined with the noise that is left, without what does not hold then."""
     state = with_measured_noise(task, state)
     sweep(task, state, LAST_UNEXPLAINED, LAST_SWEEPS)
-    state = with_twins_joined(task, state, LAST_UNEXPLAINED)
+    state = with_twins_joined(task, state, LAST_UNEXPLAINED, judged(task, state, LAST_UNEXPLAINED).chi2)
     return pruned(task, state, settings)[0]
 
 
@@ -181,7 +180,7 @@ def with_suspects_checked(task: Task, state: State, fits: Fits, settings: Round)
         state = with_depths_corrected(task, state, fits.chi2, settings.unexplained)
     state = with_overlaps_split(task, state, fits.chi2, settings.unexplained, settings.thorough)
     sweep(task, state, settings.unexplained, SWEEPS_AFTER_SPLIT, SEARCH_GAIN)
-    return pruned(task, merge(task, state, still_settled(task, state)), settings)
+    return pruned(task, with_twins_joined(task, state, settings.unexplained, fits.chi2), settings)
 
 
 def candidates_of(

@@ -38,8 +38,8 @@ SMALLEST_LIGHT = 0.3
 SMALLEST_SEEN = 0.1
 # Lengths are in the camera's own units (`scale`): microlenses laterally, depths over which light spreads by one lens
 # (Table 2: 0.04, 0.25 and 0.3 mm).
-# Two particles this close, laterally and in depth, are one.
-MERGE_LENSES, MERGE_DEPTHS = 0.4, 0.25 / 1.064
+# Two particles this close, laterally and in depth, are in one place.
+SAME_LENSES, SAME_DEPTHS = 0.4, 0.25 / 1.064
 # Particles this far in front of and behind the volume are kept: they light it.
 MARGIN_DEPTHS = 0.3 / 1.064
 
@@ -208,22 +208,21 @@ def sweep(task: Task, state: State, unexplained: float, sweeps: int, enough: flo
             active = (gain > enough) | (disturbed > DISTURBING * enough)
 
 
-def merge(task: Task, state: State, apart: NDArray[np.bool_] | None = None) -> State:
-    """Return the state with particles that have become one added up, and its residual computed anew.
-
-    Two of those that are known to be `apart` (n,) stay two.
-    """
+def merge(task: Task, state: State) -> State:
+    """Return the state with particles that are in one place added up, and its residual along with them."""
     particles = state.particles.copy()
-    merging = task.view.scale.box_mm(MERGE_LENSES, MERGE_DEPTHS)
+    merging = task.view.scale.box_mm(SAME_LENSES, SAME_DEPTHS)
     pairs = KDTree(particles[:, :3] / merging).query_pairs(1.0, output_type="ndarray")
-    merged = np.zeros(len(particles), dtype=bool)
+    merged, grown = np.zeros((2, len(particles)), dtype=bool)
     for a, b in pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]:
-        known = apart is not None and apart[a] and apart[b]
-        if not (known or merged[a] or merged[b]):
+        if not (merged[a] or merged[b]):
             brighter, other = (a, b) if particles[a, 3] >= particles[b, 3] else (b, a)
             particles[brighter, 3] += particles[other, 3]
-            merged[other] = True
-    return rebuilt(task, replace(state, expected=state.prior[~merged]), particles[~merged])
+            merged[other] = grown[brighter] = True
+    residual = state.residual.copy()
+    add_all(task.view, state.particles[merged | grown], 1.0, residual, task.depths_mm)
+    add_all(task.view, particles[grown & ~merged], -1.0, residual, task.depths_mm)
+    return replace(state, particles=particles[~merged], expected=state.prior[~merged], residual=residual)
 
 
 def prune(task: Task, state: State, claimed_share: float, unexplained: float) -> tuple[State, Fits]:

@@ -84,11 +84,6 @@ def _signature(scale: Scale, particles: NDArray[np.float64], chi2: NDArray[np.fl
     return np.column_stack([particles[:, :3] / scale.box_mm(CHANGED_LENSES, CHANGED_DEPTHS), shares])
 
 
-def still_settled(task: Task, state: State) -> NDArray[np.bool_]:
-    """Return which particles are settled and still there."""
-    return _settled(state, _signature(task.view.scale, state.particles, np.ones(len(state.particles))))
-
-
 def _settled(state: State, signature: NDArray[np.float64]) -> NDArray[np.bool_]:
     return _among(state.settled / SETTLED, signature[:, :-1] / SETTLED)
 
