@@ -110,7 +110,8 @@ def error_correlation(
     if usual == 0.0:
         return WHITE
     error = np.where(lit, np.clip(error / usual, -USUAL_SIGMAS, USUAL_SIGMAS), 0.0)
-    found = np.array([0.5 * (_at_lag(error, lit, lag) + _at_lag(error.T, lit.T, lag)) for lag in LAGS_PX])
+    variance = np.sum(error**2) / np.count_nonzero(lit)
+    found = np.array([0.5 * (_at_lag(error, lit, lag, 0) + _at_lag(error, lit, lag, 1)) for lag in LAGS_PX]) / variance
     decay = float(np.sum(found[1:] * found[:-1]) / np.sum(found[:-1] ** 2))
     if not 0.0 < decay < 1.0:
         return WHITE
@@ -118,11 +119,11 @@ def error_correlation(
     return Correlation(float(np.clip(np.sum(series * found) / np.sum(series**2), 0.0, 1.0)), decay)
 
 
-def _at_lag(error: NDArray[np.float64], lit: NDArray[np.bool_], lag: int) -> float:
-    """Return the correlation of errors `lag` pixels apart along the rows; `error` is 0 where not `lit`."""
-    pairs = np.count_nonzero(lit[:, lag:] & lit[:, :-lag])
-    variance = np.sum(error**2) / np.count_nonzero(lit)
-    return float(np.sum(error[:, lag:] * error[:, :-lag]) / pairs / variance) if pairs else 0.0
+def _at_lag(error: NDArray[np.float64], lit: NDArray[np.bool_], lag: int, axis: int) -> float:
+    """Return the mean product of errors `lag` pixels apart along an axis; `error` is 0 where not `lit`."""
+    ahead, behind = (slice(lag, None), slice(-lag)) if axis == 0 else (np.s_[:, lag:], np.s_[:, :-lag])
+    pairs = np.count_nonzero(lit[ahead] & lit[behind])
+    return float(np.einsum("ij,ij->", error[ahead], error[behind])) / pairs if pairs else 0.0
 
 
 def measured_noise(
@@ -153,16 +154,17 @@ def measured_noise(
     return Noise(noise.read_counts, float(gain), float(np.sqrt(error2)))
 
 
-def estimate_noise(image: NDArray[np.float64], typical_light: float, lens_pixels: float) -> Noise:
-    """Return the noise of a dark-subtracted image to seek particles with.
+def estimate_noise(read_counts: float, typical_light: float, lens_pixels: float) -> Noise:
+    """Return the noise of an image to seek particles with.
 
     Parameters
     ----------
+    read_counts : see `read_noise`
     typical_light : of a particle, counts; 0 where it is not known
     lens_pixels : pixels of a micro-image, over about as many of which a particle's light is spread
     """
     least = LEAST_SHARE_OF_LIT * typical_light / lens_pixels
-    return Noise(max(read_noise(image), least), typical_light / PHOTONS_PER_PARTICLE)
+    return Noise(max(read_counts, least), typical_light / PHOTONS_PER_PARTICLE)
 
 
 def read_noise(image: NDArray[np.float64]) -> float:

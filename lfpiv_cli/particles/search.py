@@ -7,6 +7,7 @@ axes of the raw sensor, z from the nominal focal point.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -93,6 +94,11 @@ class Task:
     prepared: NDArray[np.float32]
     depths_mm: tuple[float, float]
     photons_per_count: float | None = None
+
+    @cached_property
+    def read_counts(self) -> float:
+        """The image's read noise, which every step asks for."""
+        return read_noise(self.image)
 
 
 class Fits(NamedTuple):
@@ -184,7 +190,7 @@ def blank(task: Task) -> State:
 
 def noise_with(task: Task, typical_light: float) -> Noise:
     """Return the noise to seek particles with."""
-    noise = estimate_noise(task.image, typical_light, lens_pixels(task.view))
+    noise = estimate_noise(task.read_counts, typical_light, lens_pixels(task.view))
     return noise if task.photons_per_count is None else replace(noise, gain_counts=1.0 / task.photons_per_count)
 
 
@@ -278,7 +284,7 @@ def with_typical_light(task: Task, state: State, fits: Fits) -> State:
 
 def with_measured_noise(task: Task, state: State) -> State:
     """Return the state with the noise that its particles leave of the image."""
-    assumed = replace(state.noise, read_counts=read_noise(task.image))
+    assumed = replace(state.noise, read_counts=task.read_counts)
     return replace(state, noise=measured_noise(task.image - state.residual, state.residual, task.usable, assumed))
 
 
