@@ -317,6 +317,18 @@ def test_noise_is_what_a_fit_leaves(rng: np.random.Generator) -> None:
     assert few == Noise(6.0, 2.0)
 
 
+def test_rounding_does_not_tell_the_noise(rng: np.random.Generator) -> None:
+    """Light that fills micro-images makes many pixels alike: rounding must not tell in which class they are."""
+    model = np.repeat(rng.uniform(50.0, 500.0, 60), 90)
+    residual = rng.normal(size=model.size) * np.sqrt(36.0 + 2.0 * model)
+    noises = [
+        measured_noise(light, residual, np.ones(model.size, np.bool_), Noise(6.0, 1.0))
+        for light in (model, model * (1.0 + 1e-13 * rng.normal(size=model.size)))
+    ]
+    assert noises[1].gain_counts == pytest.approx(noises[0].gain_counts, rel=1e-9)
+    assert noises[1].model_error == pytest.approx(noises[0].model_error, rel=1e-9, abs=1e-12)
+
+
 def test_what_hardly_meets_the_sensor_is_no_particle(view: View) -> None:
     candidate = np.array([[2.02, 0.3, 2.0, 1e6]])
     residual = image_of(view, candidate)

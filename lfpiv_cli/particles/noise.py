@@ -35,6 +35,8 @@ LAGS_PX = range(1, 9)
 # Lit pixels are sorted by brightness into so many classes, of at least so many pixels, to see how their errors grow. A
 # single tracer lights enough for the fewest classes that tell light's own noise from the model's error.
 CLASSES, FEWEST_CLASSES, SMALLEST_CLASS = 32, 3, 100
+# Pixels whose brightness differs by a smaller share differ by rounding.
+ALIKE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -143,7 +145,9 @@ def measured_noise(
     if number < FEWEST_CLASSES:
         return noise
     light, left = model[lit], residual[lit]
-    classes = np.array_split(np.argsort(light, kind="stable"), number)
+    classes = _classes(light, number)
+    if len(classes) < FEWEST_CLASSES:
+        return noise
     brightness = np.array([np.mean(light[members]) for members in classes])
     variance = np.array([np.median(left[members] ** 2) for members in classes]) / HALF_NORMAL_MEDIAN**2
     if not np.all(variance > 0.0):
@@ -152,6 +156,20 @@ def measured_noise(
     # A variance is as sure as it is large.
     (gain, error2), _ = nnls(terms / variance[:, np.newaxis], 1.0 - noise.read_counts**2 / variance)
     return Noise(noise.read_counts, float(gain), float(np.sqrt(error2)))
+
+
+def _classes(light: NDArray[np.float64], number: int) -> list[NDArray[np.int64]]:
+    """Return the pixels of each class of brightness, as many in each as may be.
+
+    Where light fills a micro-image its pixels are alike but for rounding, which must not tell where they belong.
+    Classes that are left with few pixels by that say nothing.
+    """
+    ends = np.cumsum([len(part) for part in np.array_split(light, number)])[:-1]
+    edges = np.partition(light, ends)[ends] * (1.0 - ALIKE)
+    member = np.searchsorted(edges, light, side="right").astype(np.int16)
+    # Small integers are sorted in one pass.
+    parts = np.split(np.argsort(member, kind="stable"), np.cumsum(np.bincount(member, minlength=number))[:-1])
+    return [part for part in parts if 2 * part.size >= SMALLEST_CLASS]
 
 
 def estimate_noise(read_counts: float, typical_light: float, lens_pixels: float) -> Noise:
