@@ -3,6 +3,9 @@
 A pair of images of tracers that stand apart, in a flow with all three components, is measured: particles of both
 images, joined to tracks. Middles of tracks are held against true places, their displacements against true ones. Each
 figure may be off by `LIMIT_SIGMAS` standard errors of a measurement without a mistake, made with other tracers.
+
+The tracers stand off the focal plane: what lights a single microlens may lie anywhere in it, so that a few such tracers
+would be off by more than all others together, and their number would make the limits.
 """
 
 from __future__ import annotations
@@ -37,7 +40,7 @@ from lfpiv_cli.synthetic.sensor import Readout
 from lfpiv_cli.validation.fault_pictures import faults_figure
 from lfpiv_cli.validation.particles import Matches
 from lfpiv_cli.validation.place_errors import fit_errors, pairs_of
-from lfpiv_cli.validation.tracer_bench import Image, photograph
+from lfpiv_cli.validation.tracer_bench import Image, Tracers, photograph
 
 SEED_OF_LIMITS, SEED = 100, 1
 # Of some fifteen figures of a good measurement one is off by five standard errors once in a hundred thousand times.
@@ -45,6 +48,8 @@ LIMIT_SIGMAS = 5.0
 WRONG_INDEX = 1.30
 SHIFT_PX, TURN_DEG = 0.5, 0.02
 COMPONENTS = ("u", "v", "w")
+# From here on a tracer lights two microlenses or more, wherever it stands: its light widens by a tenth of the distance.
+OFF_FOCUS_MM = 0.7
 # Tracers that stand apart are found in the first round; the last one refines them.
 FEW_ROUNDS = (ROUNDS[0], ROUNDS[-1])
 
@@ -153,13 +158,20 @@ def measured(fault: Fault, seed: int) -> Figures:
     """Return the figures of a measurement with a mistake, `name` and `name_sigma`."""
     rng = np.random.default_rng([seed, 5])
     case = fault.case()
-    tracers = strewn_apart(rng, (-HALF_DEPTH_MM, HALF_DEPTH_MM), HALF_WIDTH_MM)
+    tracers = off_focus(strewn_apart(rng, (-HALF_DEPTH_MM, HALF_DEPTH_MM), HALF_WIDTH_MM))
     moves = displacement(tracers.position_mm)
     first, second = (photograph(case.true, tracers.moved(sign * moves), Readout(), rng) for sign in (-0.5, 0.5))
     search, signs = replace(search_of(case), rounds=FEW_ROUNDS), np.array(fault.signs)
     found = [search.particles(image) * signs for image in fault.images((first, second))]
     middle, moved = tracks_between(found[0], found[1], case.believed)
     return place_and_velocity_figures(middle, moved, tracers.position_mm, moves)
+
+
+def off_focus(tracers: Tracers) -> Tracers:
+    """Return tracers that fill the depths but those near the focal plane."""
+    x, y, z = tracers.position_mm.T
+    off = np.copysign(OFF_FOCUS_MM + (1.0 - OFF_FOCUS_MM / HALF_DEPTH_MM) * np.abs(z), z)
+    return replace(tracers, position_mm=np.column_stack([x, y, off]))
 
 
 def place_and_velocity_figures(middle: Points, moved: Points, true_places: Points, true_moves: Points) -> Figures:
@@ -285,9 +297,10 @@ def text_of(planted: int) -> tuple[str, ...]:
     """Return what was done."""
     return (
         f"{planted} mistakes are planted, each in a measurement that is good otherwise: a pair of images of some tens "
-        "of tracers that stand apart, taken by a corner of the paper's camera before its channel, with noise and "
-        "Snell's law. Particles of both images are found and joined to tracks. What the tracks say is held against "
-        "the truth: a map is fitted from true to measured places (offsets, scales, slants of the lateral axes over "
+        f"of tracers that stand apart and {OFF_FOCUS_MM:g} mm off the focal plane or more, taken by a corner of the "
+        "paper's camera before its channel, with noise and Snell's law. Particles of both images are found and joined "
+        "to tracks. What the tracks say is held against the truth: a map is fitted from true to measured places "
+        "(offsets, scales, slants of the lateral axes over "
         "depth, turn about the axis and its growth in depth, and what scatters about it), and a slope for each "
         "velocity component.",
         f"The limits are {LIMIT_SIGMAS:g} standard errors of the same figures in a good measurement of other tracers; "
