@@ -57,6 +57,15 @@ def test_a_tracer_found_twice_is_one(table2: Camera, water: Media, true: NDArray
     assert np.all(np.abs(one - true[0]) < (2e-3, 2e-3, 2e-2, 0.02 * TYPICAL))
 
 
+def test_a_bright_tracer_found_twice_is_one(table2: Camera, water: Media, true: NDArray[np.float64]) -> None:
+    """Two solid tracers cannot be in one place: that the one is brighter than all others says nothing."""
+    bright = np.concatenate([true[:1] * (1.0, 1.0, 1.0, 2.5), true[1:]])
+    task = task_with(table2, water, bright, np.random.default_rng(4))
+    particles = joined(task, np.concatenate([halves(bright[0], 0.5 * APART), bright[1:]]))
+    assert len(particles) == len(bright)
+    assert found(particles, bright).all()
+
+
 def test_what_was_expected_of_two_is_not_expected_of_one(
     table2: Camera, water: Media, true: NDArray[np.float64]
 ) -> None:

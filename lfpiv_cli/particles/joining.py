@@ -4,7 +4,8 @@ Two searches may find one tracer. Near the focal plane it lights one lens or two
 share its light in any proportion: what was split once, or was expected from an earlier frame, would stay so. So one
 particle takes the place of two where chi-squared hardly rises. How near they are says little: at other depths two
 tracers a third of a microlens apart differ from one by thousands. Two that overlap so much that they look like one are
-as bright as two: what would be brighter than others stays two.
+as bright as two: what would be brighter than others stays two, unless they are in one place, where no two solid tracers
+can be.
 
 In one place near the focal plane there is one particle, unless two are expected: what the model of the light of so few
 lenses lacks is as much as what tells two from one.
@@ -146,9 +147,12 @@ def _twins(task: Task, state: State) -> tuple[NDArray[np.int64], NDArray[np.floa
     pairs = pairs[np.lexsort((pairs[:, 1], pairs[:, 0], distance))]
 
     off = (particles[pairs[:, 0], :3] - particles[pairs[:, 1], :3]) / scale.box_mm(SAME_LENSES, SAME_DEPTHS)
+    close = np.linalg.norm(off, axis=1) < 1.0
     radius = footprint_radius_mm(task.view, particles)[pairs].max(axis=1)
+    near_focus = radius < NEAR_FOCUS_LENSES * 2.0 * task.view.half_x_mm
     expected = np.asarray(state.prior[:, UNKNOWNS:].any(axis=1))[pairs].all(axis=1)
-    same = (np.linalg.norm(off, axis=1) < 1.0) & (radius < NEAR_FOCUS_LENSES * 2.0 * task.view.half_x_mm) & ~expected
-    brightest = np.where(same, np.inf, np.percentile(particles[:, 3], BRIGHTEST_PERCENTILE))
+    largest_loss = np.where(close & near_focus & ~expected, np.inf, LARGEST_LOSS)
+    usual = np.percentile(particles[:, 3], BRIGHTEST_PERCENTILE)
+    brightest = np.where(close & ~(near_focus & expected), np.inf, usual)
     possible = particles[pairs, 3].sum(axis=1) < brightest
-    return pairs[possible], np.where(same, np.inf, LARGEST_LOSS)[possible], brightest[possible]
+    return pairs[possible], largest_loss[possible], brightest[possible]
