@@ -18,6 +18,7 @@ from scipy.optimize import nnls
 from scipy.spatial import KDTree
 
 from lfpiv_cli.robust import MAD_TO_SIGMA
+from lfpiv_cli.threads import blocks, in_threads
 
 # Neighbours whose differences show the structure function, and that let expect a displacement.
 PAIRED, USED = 12, 16
@@ -31,8 +32,8 @@ PLAIN_EXPONENT = 1.0
 FEWEST_OF_TREND = 12
 # The structure function is no smaller than this share of the noise: it keeps the equations solvable.
 SMALLEST_SHARE = 1e-6
-# Places that are worked on at a time, which bounds the memory to some 100 MB.
-PLACES_AT_ONCE = 4000
+# Places that each thread works on at a time: its equations stay in the second-level cache, nearly.
+PLACES_AT_ONCE = 500
 
 
 class Structure(NamedTuple):
@@ -104,11 +105,13 @@ def kriged(
     count = min(USED, len(points) - 1)
     tree = KDTree(points)
     value, variance = np.empty(at.shape), np.empty(at.shape)
-    for start in range(0, len(at), PLACES_AT_ONCE):
-        part = slice(start, start + PLACES_AT_ONCE)
+
+    def work(part: slice) -> None:
         near = tree.query(at[part], k=np.arange(1, count + 2))[1]
         near = _without(near, own[part])
         value[part], variance[part] = _solved(at[part], near, points, displacement, noise2, structure)
+
+    in_threads(work, blocks(len(at), PLACES_AT_ONCE))
     return value, variance
 
 
@@ -140,9 +143,10 @@ def _solved(
     terms = trend.shape[2]
     value, variance = np.empty(at.shape), np.empty(at.shape)
     each = np.arange(count)
+    apart, distance = apart**structure.exponent, distance**structure.exponent
     for axis in range(3):
         half = 0.5 * structure.factor[axis]
-        between, to = half * apart**structure.exponent, half * distance**structure.exponent
+        between, to = half * apart, half * distance
         noise = noise2[near, axis] + 0.5 * structure.nugget[axis]
         matrix = np.zeros((len(at), count + terms, count + terms))
         matrix[:, :count, :count] = -between

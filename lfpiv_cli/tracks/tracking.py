@@ -38,7 +38,9 @@ SMALLEST_SIGMA_LENSES = 0.02
 # root of their number, is added to what they let expect.
 FEWEST_OF_FIT = 6
 FEW_SHARE = 0.5
-ROUNDS = 6
+# What neighbours let expect is taken from the links, and these from it, until fewer than this share of them change: a
+# few in ten thousand go to and fro.
+ROUNDS, SETTLED_SHARE = 6, 1e-3
 # A tenth of all displacements is off by three times as much as expected.
 TAIL_SHARE, TAIL_WIDTH = 0.1, 3.0
 # How many particles have a partner, at first and within which limits.
@@ -121,7 +123,7 @@ def track(first: Seen, second: Seen, search_mm: float, scale: Scale, forecast: F
         probability = probability_of(candidates, expected, first, second, share, density)
         share = float(np.clip(probability.sum() / len(first), LEAST_PARTNERED, MOST_PARTNERED))
         before, links = links, np.flatnonzero(probability > LEAST_PROBABILITY)
-        if np.array_equal(before, links):
+        if len(np.setxor1d(before, links)) <= SETTLED_SHARE * len(links):
             break
     return Tracks(candidates.first[links], candidates.second[links], probability[links])
 
