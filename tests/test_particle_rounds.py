@@ -60,9 +60,11 @@ def test_particles_are_found_where_they_are(
     assert np.median(np.abs(error[:, 2])) < 0.02
     assert np.median(np.abs(found.light_counts[nearest[matched]] / light[matched] - 1.0)) < 0.02
     sigma = np.sqrt(np.diagonal(found.covariance_mm2, axis1=1, axis2=2))[nearest[matched]]
-    # The rays' own noise adds to the sensor's; a factor of two either way is what 27 particles can hold to.
-    assert np.all(np.median(np.abs(error / sigma), axis=0) < 2.0 * 0.6745)
-    assert np.all(np.median(np.abs(error / sigma), axis=0) > 0.5 * 0.6745)
+    # The rays' own noise adds to the sensor's; a factor of two either way is what 27 particles can hold to, x and y
+    # taken together: the median of 27 alone has a standard error of a quarter.
+    lateral, depth = np.abs(error / sigma)[:, :2], np.abs(error / sigma)[:, 2]
+    for typical in (np.median(lateral), np.median(depth)):
+        assert 0.5 * 0.6745 < typical < 2.0 * 0.6745
 
 
 def scaled(camera: Camera, factor: float) -> Camera:

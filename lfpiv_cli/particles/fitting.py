@@ -39,7 +39,8 @@ from lfpiv_cli.threads import COUNT_NO_REFERENCES
 # Candidates are brought into the fit from these depths beside their own, in depths over which light spreads by one lens
 # (Table 2: 0.4 mm).
 START_DEPTHS = np.array([-0.4, 0.0, 0.4]) / 1.064
-# Steps for a candidate, for a particle in a sweep.
+# Steps from each of these depths; from where that led in the best of them; for a particle in a sweep.
+FIRST_STEPS = 3
 CANDIDATE_STEPS = 12
 SWEEP_STEPS = 4
 # A particle claims its light where at least this share of it is found (the rest may be noise and neighbours).
@@ -159,7 +160,7 @@ def _fit_again(
         pixels, values = lit_by(responses, 0)
         add_light(pixels, values, best[0, 3], residual)
         before = change_by(pixels, values, best[0, 3], residual, observation.weight) + surprise(best, expected)
-        after = fit(observation, best, expected, responses, effort, np.inf)
+        after = fit(observation, best, expected, responses, effort)
         lowest = after - least[0]
         for depth in depths[number]:
             if np.isnan(depth):
@@ -198,7 +199,7 @@ def fit_from(
     respond_all(observation.optics, trial, responses)
     pixels, values = lit_by(responses, 0)
     trial[0, 3] = best_light(pixels, values, observation.residual, observation.weight)
-    return fit(observation, trial, prior, responses, effort, np.inf)
+    return fit(observation, trial, prior, responses, effort)
 
 
 def nothing_expected(count: int) -> NDArray[np.float64]:
@@ -226,12 +227,12 @@ def accept(observation: Observation, candidates: NDArray[np.float64], least: Lea
     """Fit candidates (n, 4) in place, one after the other; return which ones stay, their light off the residual."""
     accepted = np.zeros(len(candidates), np.bool_)
 
-    effort = Effort(CANDIDATE_STEPS, CHOICE_GAIN)
+    efforts = Effort(FIRST_STEPS, CHOICE_GAIN), Effort(CANDIDATE_STEPS, CHOICE_GAIN)
     depths = candidates[:, 2:3] + START_DEPTHS * observation.optics.scale.depth_mm
     depths = np.clip(depths, observation.low_mm, observation.high_mm)
 
     def work(numbers: NDArray[np.int64]) -> None:
-        _accept(observation, candidates, numbers, effort, depths, least, accepted)
+        _accept(observation, candidates, numbers, efforts, depths, least, accepted)
 
     over_tiles(work, observation.optics, candidates, observation.depths_mm)
     return accepted
@@ -242,12 +243,12 @@ def _accept(
     observation: Observation,
     candidates: NDArray[np.float64],
     numbers: NDArray[np.int64],
-    effort: Effort,
+    efforts: tuple[Effort, Effort],
     depths: NDArray[np.float64],
     least: Least,
     accepted: NDArray[np.bool_],
 ) -> None:
-    """Do the work of `accept` for the candidates of a tile."""
+    """Do the work of `accept` for the candidates of a tile; `efforts` are for each depth and for the best one."""
     residual, weight = observation.residual, observation.weight
     responses = room_for(1, observation.capacity, 0)
     trial, best = np.empty((1, UNKNOWNS)), np.empty((1, UNKNOWNS))
@@ -255,10 +256,13 @@ def _accept(
     for number in numbers:
         lowest = 0.0
         for depth in depths[number]:
-            change = fit_from(observation, candidates[number], prior, depth, trial, responses, effort)
+            change = fit_from(observation, candidates[number], prior, depth, trial, responses, efforts[0])
             if change < lowest:
                 lowest = change
                 copy_rows(trial, best)
+        if lowest < 0.0:
+            respond_all(observation.optics, best, responses)
+            lowest = fit(observation, best, prior, responses, efforts[1])
         if lowest > -least.gain or lowest == 0.0 or best[0, 3] < least.light:
             continue
         respond_all(observation.optics, best, responses)

@@ -33,15 +33,13 @@ DAMPING = 1e-3
 DAMPING_UP = 10.0
 DAMPING_DOWN = 0.2
 # A step that lowers chi-squared by less ends the fit: a hundredth of what one standard error costs where places are to
-# be final; as much as that where it is only asked which of several places is right, a tenth in between.
-SMALLEST_GAIN, CHOICE_GAIN, SEARCH_GAIN = 0.01, 1.0, 0.1
+# be final; as much as that where it is only asked which of several places is right, half of it in between.
+SMALLEST_GAIN, CHOICE_GAIN, SEARCH_GAIN = 0.01, 1.0, 0.5
 # Longest step in depth, in depths over which light spreads by one lens (Table 2: 0.5 mm): further away the response is
 # another one and its slope says nothing.
 LONGEST_STEP_DEPTHS = 0.5 / 1.064
 # What the compiler may do to sums: add many terms at once. The order is the same for any number of threads.
 SUMS = {"reassoc", "contract", "nsz"}
-# A fit that may be given up early is judged after so many steps.
-EARLY_STEPS = 4
 
 
 class Observation(NamedTuple):
@@ -336,7 +334,6 @@ def fit(
     prior: NDArray[np.float64],
     responses: Responses,
     effort: Effort,
-    promising: float,
 ) -> float:
     """Improve one particle or two (k, 4) in place; return what they add to chi-squared (below 0 where they help).
 
@@ -346,7 +343,6 @@ def fit(
     ----------
     prior : (k, 8) values and weights 1/sigma^2 of what is expected of them; weights of 0: nothing is
     responses : of the particles, on entry as on return
-    promising : given up early where this is not undercut after a few steps
     """
     n = UNKNOWNS * members.shape[0]
     matrix, trial_matrix, lower = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
@@ -354,9 +350,7 @@ def fit(
     step, trial, begin = np.zeros(n), np.empty_like(members), members.copy()
     change = _equations(observation, members, prior, responses, matrix, right)
     damping, last_failed = DAMPING, False
-    for number in range(effort.steps):
-        if number == EARLY_STEPS and change > promising:
-            break
+    for _ in range(effort.steps):
         if not factored(matrix, damping, lower):
             break
         substitute(lower, right, step)
