@@ -35,7 +35,6 @@ from lfpiv_cli.particles.least_squares import (
 from lfpiv_cli.particles.rounds import (
     CANDIDATE_GAIN,
     ROUNDS,
-    SWEEPS_AFTER_SPLIT,
     accepted,
     candidates_of,
     explained,
@@ -77,6 +76,8 @@ SEARCH = tuple(replace(settings, claimed_share=ROUNDS[-1].claimed_share) for set
 # Starts of the first fits beside a candidate's own depth, in depths over which light spreads by one lens.
 START_DEPTHS = (0.0, -0.4, 0.4)
 STEPS = 12
+# Sweeps of refinement with each diameter.
+SWEEPS = 2
 # What calibration and model get wrong of a diameter: a share of it, and microlenses.
 MODEL_SHARE, MODEL_LENSES = 0.01, 0.025
 # Of a diameter that is below so many of its standard errors only an upper limit is known.
@@ -285,7 +286,7 @@ def _tried(
     """
     task = _of_diameter(task, diameters[len(diameters) // 2])
     state = rebuilt(task, state, state.particles)
-    sweep(task, state, unexplained, SWEEPS_AFTER_SPLIT)
+    sweep(task, state, unexplained, SWEEPS)
     state = with_typical_light(task, state, judged(task, state, LAST_UNEXPLAINED))
     observation = observed(task, state, unexplained)
     chi2, _, seen = judge(observation, state.particles)

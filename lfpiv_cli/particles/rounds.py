@@ -73,7 +73,7 @@ ROUNDS = (
 )
 
 # Sweeps of refinement after candidates and after splitting.
-SWEEPS, SWEEPS_AFTER_SPLIT = 4, 2
+SWEEPS, SWEEPS_AFTER_SPLIT = 4, 1
 # Before any particle is known, its light is taken from the peaks: one in ten is brighter than a typical particle. Where
 # not even so many stand out of the noise, as with few tracers, most peaks are noise: then one in ten of those that do.
 FIRST_TYPICAL_PERCENTILE = 90.0
@@ -81,7 +81,7 @@ FIRST_TYPICAL_PERCENTILE = 90.0
 # thousands, and gather noise from more pixels than a particle lights.
 STANDING_OUT = 20.0
 # Share of a typical particle's light that a peak must have to be tried.
-CANDIDATE_LIGHT = 0.1
+CANDIDATE_LIGHT = 0.05
 # What a candidate must lower chi-squared by: among thousands of places noise alone gives some 30.
 CANDIDATE_GAIN = 50.0
 # A particle stays while it finds this much less of its light than a candidate had to.
