@@ -2,9 +2,10 @@
 
 A particle that was found in a neighbour frame and has no partner here is put where the displacements around it lead,
 whether its light seems free or not; then all particles are refined, and those that do not find their light are
-dropped. So overlapping particles that splitting did not find are separated. Only first passes serve as neighbours, and
-of a pair the second frame's first pass begins with the first frame's, never the other way round (`second_frames`): each
-frame's result depends on the images alone, not on the order in which frames are done.
+dropped. So overlapping particles that splitting did not find are separated; only those without a partner are suspected
+of being two, or elsewhere. Only first passes serve as neighbours, and of a pair the second frame's first pass begins
+with the first frame's, never the other way round (`second_frames`): each frame's result depends on the images alone,
+not on the order in which frames are done.
 
 Axes: particles are rows (x, y, z, light) in image axes, mm and counts.
 """
@@ -18,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from lfpiv_cli.particles.least_squares import SEARCH_GAIN
 from lfpiv_cli.particles.rounds import ROUNDS, finished, with_suspects_checked
 from lfpiv_cli.particles.search import (
     LAST_UNEXPLAINED,
@@ -33,6 +35,7 @@ from lfpiv_cli.particles.search import (
     with_measured_noise,
     with_typical_light,
 )
+from lfpiv_cli.particles.suspects import settled
 from lfpiv_cli.scale import Scale
 from lfpiv_cli.tracks.candidates import Seen
 from lfpiv_cli.tracks.light import Light
@@ -63,9 +66,10 @@ def second_pass(
     state = rebuilt(task, blank(task), own)
     state = with_typical_light(task, state, judged(task, state, LAST_UNEXPLAINED))
     state = with_measured_noise(task, replace(state, noise=noise_with(task, state.typical_light)))
-    state = rebuilt(task, state, np.concatenate([own, _missing_particles(task, own, neighbours, search_mm)]))
+    missing, partnered = _missing_particles(task, own, neighbours, search_mm)
+    state = settled(task, rebuilt(task, state, np.concatenate([own, missing])), own[partnered])
     for sweeps, unexplained in REFINING:
-        sweep(task, state, unexplained, sweeps)
+        sweep(task, state, unexplained, sweeps, SEARCH_GAIN)
     # Three may be where two are, one of them found here for both: with the third beside them chi-squared needs all.
     state, _ = prune(task, merge(task, state), CLAIMED_SHARE, LAST_UNEXPLAINED)
     fits = judged(task, state, ROUNDS[-1].unexplained)
@@ -75,9 +79,11 @@ def second_pass(
 
 def _missing_particles(
     task: Task, own: NDArray[np.float64], neighbours: Sequence[NDArray[np.float64]], search_mm: float
-) -> NDArray[np.float64]:
-    """Return the neighbours' particles (m, 4) that are missing here, where they are expected."""
-    scale, missing = task.view.scale, np.zeros((0, 4))
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return the neighbours' particles (m, 4) that are missing here, where they are expected, and which own ones (n,)
+    have partners among them.
+    """
+    scale, missing, partnered = task.view.scale, np.zeros((0, 4)), np.zeros(len(own), np.bool_)
     same = scale.box_mm(SAME_LENSES, SAME_DEPTHS)
     for other in neighbours:
         expected, partnerless = _without_partner(own, other, search_mm, scale)
@@ -85,7 +91,8 @@ def _missing_particles(
         seen = (expected[:, 2] >= task.depths_mm[0]) & (expected[:, 2] <= task.depths_mm[1])
         seen &= ~_same(expected[:, :3] / same, known / same)
         missing = np.concatenate([missing, expected[seen]])
-    return missing * (1.0, 1.0, 1.0, FIRST_SHARE)
+        partnered |= ~partnerless
+    return missing * (1.0, 1.0, 1.0, FIRST_SHARE), partnered
 
 
 def _same(points: NDArray[np.float64], known: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -89,7 +89,7 @@ def find_predicted(task: Task, predicted: Predicted, progress: Callable[[int], N
     state = gone_on(task, expected)
     if not len(expected.particles) or len(state.particles) < LEAST_FOUND * len(expected.particles):
         return None
-    state = settled(task, state)
+    state = settled(task, state, state.particles)
     for settings in SEARCHES:
         state = _one_search(task, state, settings, progress)
         if progress:

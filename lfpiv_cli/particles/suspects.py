@@ -47,10 +47,9 @@ def with_depths_corrected(task: Task, state: State, chi2: NDArray[np.float64], u
     return replace(state, unmoved=np.concatenate([state.unmoved, signature[suspects & ~moved]]))
 
 
-def settled(task: Task, state: State) -> State:
-    """Return the state whose particles are not suspected as long as they are where they are now: their pasts tell."""
-    chi2 = np.ones(len(state.particles))
-    return replace(state, settled=_signature(task.view.scale, state.particles, chi2)[:, :-1])
+def settled(task: Task, state: State, particles: NDArray[np.float64]) -> State:
+    """Return the state in which these particles (m, 4) are not suspected while they stay there: other frames tell."""
+    return replace(state, settled=_signature(task.view.scale, particles, np.ones(len(particles)))[:, :-1])
 
 
 def with_overlaps_split(
