@@ -10,7 +10,7 @@ import pytest
 import lfpiv_cli as lf
 from lfpiv_cli.files.config import carried_config
 from lfpiv_cli.files.weights_file import WeightsFile
-from lfpiv_cli.interface.particles import frame_of, tracers_per_lens
+from lfpiv_cli.interface.particles import TracerSize, find, frame_of, light_notices, points_of, tracers_per_lens
 from lfpiv_cli.interface.reconstruction import Bench, bench_of
 from lfpiv_cli.particles.fitting import add_all
 from lfpiv_cli.particles.view import raw_view
@@ -63,3 +63,13 @@ def test_light_that_does_not_tell_is_not_counted(bench: Bench) -> None:
     masked[:100, :100] = image[:100, :100]
     assert tracers_per_lens(bench, frame_of(bench, masked, np.nan_to_num(masked))) is None
     assert tracers_per_lens(bench, frame_of(bench, *[np.zeros_like(image)] * 2)) is None
+
+
+@pytest.mark.thorough
+def test_tracers_that_cannot_be_told_apart_are_counted(bench: Bench) -> None:
+    image = image_of(bench, 12.0, 0) - np.float32(100.0)
+    frame = frame_of(bench, image, image)
+    points = points_of(bench, frame, find(bench, frame), TracerSize(0.05), {})
+    (told,) = light_notices(points, "crowded")
+    assert told.code == "particles-crowded"
+    assert told.measured == pytest.approx(12.0, rel=0.5)

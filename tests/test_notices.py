@@ -419,6 +419,16 @@ def test_crowded_particles_are_told(crowd: float, codes: list[str]) -> None:
     assert [notice.code for notice in found] == codes
 
 
+@pytest.mark.parametrize(("counted", "codes"), [(1.29, []), (4.0, ["particles-crowded"])])
+def test_tracers_of_which_few_were_found_are_told(counted: float, codes: list[str]) -> None:
+    measured = {"residual": 0.15, "residual_rms_counts": 1.0, "read_noise_counts": 1.0, "particles_per_lens": 1.2}
+    measured["tracers_per_lens"] = counted
+    reference = Reference("focal_point", 0.0)
+    found = light_notices(Points(np.zeros((4, 3)), {}, reference, attributes=measured, provenance={}), "a.vtkhdf")
+    assert [notice.code for notice in found] == codes
+    assert all("1.2 found of 4" in notice.text for notice in found)
+
+
 @pytest.mark.thorough
 def test_without_a_board_the_data_sheet_is_believed() -> None:
     rig = lf.load_rig(ROOT / "configs" / "sample.yaml")

@@ -47,6 +47,9 @@ from lfpiv_cli.weights.model import behind_transmission
 LARGEST_UNEXPLAINED = 0.5
 # At so many found for each microlens, fewer than there are, stated errors begin to cover less than four fifths.
 LARGEST_CROWD = 1.3
+# Where particles leave this share of an image, more than at any crowd at which most are found, tracers are counted by
+# how uneven their light is: of four for each microlens only 1.3 are found, and few of them are right.
+MUCH_LEFT = 0.1
 # Frames that are looked at for the tracers' diameter, if the first do not hold enough.
 LOOKED_AT = 5
 # Beyond so many standard errors a given diameter contradicts the images.
@@ -283,6 +286,8 @@ def points_of(bench: Bench, frame: Frame, found: Particles, size: TracerSize, pr
     outside = _outside(found.position_mm, content.weights.grid)
     left = what_is_left(frame, found)
     norm = float(np.linalg.norm(np.where(frame.unusable, 0.0, frame.image)))
+    share_left = float(np.linalg.norm(left)) / norm if norm > 0.0 else 0.0
+    number = tracers_per_lens(bench, frame) if share_left > MUCH_LEFT else None
     return Points(
         content.reference.points_from_focal_point(found.position_mm),
         {
@@ -297,12 +302,13 @@ def points_of(bench: Bench, frame: Frame, found: Particles, size: TracerSize, pr
         attributes=content.reference.attributes()
         | {
             "refraction": "paraxial" if isinstance(space, ObjectSpace) and space.straight else "exact",
-            "residual": float(np.linalg.norm(left)) / norm if norm > 0.0 else 0.0,
+            "residual": share_left,
             "residual_rms_counts": float(np.sqrt(np.mean(left[~frame.unusable] ** 2))),
             "excluded_pixels": int(np.count_nonzero(frame.unusable)),
             "read_noise_counts": found.noise.read_counts,
             "particles_per_lens": float(np.count_nonzero(outside == 0)) / _lenses_before(bench),
         }
+        | ({} if number is None else {"tracers_per_lens": number})
         | size.attributes(),
         provenance=dict(provenance),
     )
@@ -326,14 +332,16 @@ def light_notices(points: Points, name: str) -> list[Notice]:
                 f"at most {LARGEST_UNEXPLAINED:g}",
             )
         ]
-    crowd = measured["particles_per_lens"]
+    found = measured["particles_per_lens"]
+    crowd = max(found, measured.get("tracers_per_lens", 0.0))
     if crowd > LARGEST_CROWD:
+        counted = f", {found:.3g} found of {crowd:.3g} by how unevenly they light them" if crowd > found else ""
         return [
             Notice(
                 "particles-crowded",
                 name,
-                f"{crowd:.3g} particles for each microlens, at most {LARGEST_CROWD:g}: beyond, neighbours are taken "
-                "for one another, and standard errors do not know of it",
+                f"{crowd:.3g} particles for each microlens{counted}, at most {LARGEST_CROWD:g}: beyond, neighbours are "
+                "taken for one another, and standard errors do not know of it",
                 "fewer tracers, or volumes and their correlation",
                 crowd,
                 f"at most {LARGEST_CROWD:g}",
