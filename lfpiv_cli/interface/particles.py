@@ -342,7 +342,7 @@ def light_notices(points: Points, name: str) -> list[Notice]:
                 name,
                 f"{crowd:.3g} particles for each microlens{counted}, at most {LARGEST_CROWD:g}: beyond, neighbours are "
                 "taken for one another, and standard errors do not know of it",
-                "fewer tracers, or volumes and their correlation",
+                "fewer tracers, or volumes and their correlation; --background, where other light is in the image",
                 crowd,
                 f"at most {LARGEST_CROWD:g}",
             )
