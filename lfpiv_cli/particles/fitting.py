@@ -260,12 +260,11 @@ def _accept(
             if change < lowest:
                 lowest = change
                 copy_rows(trial, best)
-        if lowest < 0.0:
-            respond_all(observation.optics, best, responses)
-            lowest = fit(observation, best, prior, responses, efforts[1])
-        if lowest > -least.gain or lowest == 0.0 or best[0, 3] < least.light:
+        if lowest == 0.0:
             continue
         respond_all(observation.optics, best, responses)
+        if fit(observation, best, prior, responses, efforts[1]) > -least.gain or best[0, 3] < least.light:
+            continue
         pixels, values = lit_by(responses, 0)
         if seen_share(pixels, values, weight) <= least.seen:
             continue

@@ -100,8 +100,7 @@ def _split(
         single = normal_equations(pixels, values, light, residual, observation.weight, responses.picked, matrix, right)
         lowest = single - least[0]
         promising = single - FIRST_GAIN * least[0]
-        for start in range(len(STARTS)):
-            offset = STARTS[start]
+        for start, offset in enumerate(STARTS):
             for m in range(2):
                 sign = 1.0 - 2.0 * m
                 pair[m, 0] = one[0, 0] + sign * offset[0] * scale.lens_mm
