@@ -72,4 +72,5 @@ def test_tracers_that_cannot_be_told_apart_are_counted(bench: Bench) -> None:
     points = points_of(bench, frame, find(bench, frame), TracerSize(0.05), {})
     (told,) = light_notices(points, "crowded")
     assert told.code == "particles-crowded"
-    assert told.measured == pytest.approx(12.0, rel=0.5)
+    # Two standard errors of what one image of so few microlenses tells.
+    assert told.measured == pytest.approx(12.0, rel=0.4)
