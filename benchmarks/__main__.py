@@ -25,6 +25,7 @@ from benchmarks.sequences import bench_sequences
 from benchmarks.simd import bench_simd
 from benchmarks.solvers import bench_solvers
 from benchmarks.surfaces import bench_surfaces
+from benchmarks.tracer_sizes import bench_tracer_sizes
 from benchmarks.weights import bench_weights
 
 BENCHMARKS: dict[str, Callable[[], None]] = {
@@ -44,6 +45,7 @@ BENCHMARKS: dict[str, Callable[[], None]] = {
     "simd": bench_simd,
     "solvers": bench_solvers,
     "surfaces": bench_surfaces,
+    "tracer-sizes": bench_tracer_sizes,
     "weights": bench_weights,
 }
 

@@ -73,6 +73,20 @@ def test_the_diameter_is_found_whatever_was_assumed(
 
 
 @pytest.mark.thorough
+@pytest.mark.parametrize("number", [60, 400])
+def test_the_diameter_of_crowded_tracers_is_right_or_none(
+    table2: Camera, water: Media, rng: np.random.Generator, number: int
+) -> None:
+    # Some .9 and 6 tracers for each microlens.
+    camera = replace(table2, columns=260, rows=240)
+    tracers = rng.uniform((-0.7, -0.65, 0.5, 3e5), (0.7, 0.65, 2.0, 7e5), (number, 4))
+    found = diameter_by(tasks_of(camera, water, [image_of(camera, water, tracers, 0.5)], rng))
+    assert (found is None) == (number > 100)
+    if found is not None:
+        assert found.lenses == pytest.approx(0.5, abs=2.0 * found.sigma_lenses)
+
+
+@pytest.mark.thorough
 def test_frames_are_taken_until_they_hold_enough_tracers(
     table2: Camera, water: Media, rng: np.random.Generator
 ) -> None:

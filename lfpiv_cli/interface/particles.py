@@ -44,7 +44,7 @@ from lfpiv_cli.weights.columns import OnDemandOperator
 from lfpiv_cli.weights.model import behind_transmission
 
 # More than this share of an image's light, its noise taken off, is too much to leave unexplained.
-LARGEST_UNEXPLAINED = 0.5
+LARGEST_UNEXPLAINED = 0.2
 # At so many found for each microlens, fewer than there are, stated errors begin to cover less than four fifths.
 LARGEST_CROWD = 1.3
 # Where particles leave this share of an image, more than at any crowd at which most are found, tracers are counted by
@@ -222,8 +222,11 @@ def size_notices(settings: Config, size: TracerSize) -> list[Notice]:
     if size.measured_mm is None or size.sigma_mm is None:
         if given is not None:
             return []
-        text = f"no image shows the tracers' size; {size.diameter_mm:.3g} mm is taken, half a microlens in the scene"
-        return [Notice("particle-diameter-unknown", key, text, "give it", None, "bright tracers")]
+        text = (
+            "too few tracers stand alone for the images to show their size; "
+            f"{size.diameter_mm:.3g} mm is taken, half a microlens in the scene"
+        )
+        return [Notice("particle-diameter-unknown", key, text, "give it", None, "tracers that stand alone")]
     if given is not None and abs(given - size.measured_mm) > CONTRADICTING_SIGMAS * size.sigma_mm:
         text = f"{given:g} mm, but by the images it is {size.measured_mm:.3g} ± {size.sigma_mm:.2g} mm"
         remedy = "leave it out, and it is taken from the images; or check calibration and focus"
@@ -319,9 +322,9 @@ def light_notices(points: Points, name: str) -> list[Notice]:
     measured = points.attributes
     noise_share = measured["read_noise_counts"] / max(measured["residual_rms_counts"], measured["read_noise_counts"])
     unexplained = measured["residual"] * float(np.sqrt(1.0 - min(noise_share, 1.0) ** 2))
-    count = len(points.position_mm)
+    count, notices = len(points.position_mm), []
     if unexplained > LARGEST_UNEXPLAINED:
-        return [
+        notices.append(
             Notice(
                 "light-unexplained",
                 name,
@@ -331,12 +334,12 @@ def light_notices(points: Points, name: str) -> list[Notice]:
                 unexplained,
                 f"at most {LARGEST_UNEXPLAINED:g}",
             )
-        ]
+        )
     found = measured["particles_per_lens"]
     crowd = max(found, measured.get("tracers_per_lens", 0.0))
     if crowd > LARGEST_CROWD:
         counted = f", {found:.3g} found of {crowd:.3g} by how unevenly they light them" if crowd > found else ""
-        return [
+        notices.append(
             Notice(
                 "particles-crowded",
                 name,
@@ -346,11 +349,11 @@ def light_notices(points: Points, name: str) -> list[Notice]:
                 crowd,
                 f"at most {LARGEST_CROWD:g}",
             )
-        ]
-    if count:
-        return []
-    text = "no particles found: nothing stands out of the noise"
-    return [Notice("no-particles", name, text, "check exposure, --dark and --mask", 0.0, "some")]
+        )
+    if not count and not notices:
+        text = "no particles found: nothing stands out of the noise"
+        notices.append(Notice("no-particles", name, text, "check exposure, --dark and --mask", 0.0, "some"))
+    return notices
 
 
 def what_is_left(frame: Frame, found: Particles) -> NDArray[np.float64]:
@@ -372,9 +375,11 @@ def _space(content: WeightsFile, settings: Config) -> ObjectSpace | CurvedSpace:
 def tracers_per_lens(bench: Bench, frame: Frame) -> float | None:
     """Return the tracers for each microlens, counted by how uneven their light is.
 
-    None where too little is seen of the volume to tell.
+    None where too little of the volume is seen. Their size hardly matters to it, and what crowded tracers seem to have
+    would: it is taken as half a microlens.
     """
-    return counted(task_for(bench, frame), bench.lens_images.lattice_px)
+    settings = bench.settings.overridden("reconstruction", particle_diameter_mm=UNKNOWN_LENSES * _lens_mm(bench))
+    return counted(task_for(replace(bench, settings=settings), frame), bench.lens_images.lattice_px)
 
 
 def _lenses_before(bench: Bench) -> float:

@@ -6,6 +6,10 @@ light is explained is nearly quadratic in the square of the diameter, which is w
 curvature are the tracer's squared diameter and its standard error. Their median is taken, so that a few that are two,
 or larger than the others, do not matter.
 
+Tracers that overlap others which were not found look larger than they are. So only those count around which noise is
+all that is left, as it is around one that stands alone; an image that has too few of them shows no size, nor does one
+that half or twice the size explains as well.
+
 Axes: see `search`. Diameters in this module are in microlenses as the scene shows them.
 """
 
@@ -35,6 +39,7 @@ from lfpiv_cli.particles.least_squares import (
 from lfpiv_cli.particles.rounds import (
     CANDIDATE_GAIN,
     ROUNDS,
+    Round,
     accepted,
     candidates_of,
     explained,
@@ -73,6 +78,10 @@ AROUND_LENSES = 2.0
 BRIGHT, WELL_SEEN = 0.3, 0.9
 # The rounds of the search. A wrong size finds less of its light, so that less is asked for.
 SEARCH = tuple(replace(settings, claimed_share=ROUNDS[-1].claimed_share) for settings in ROUNDS[:2])
+# It is made anew, at most so many times, with the diameter that its tracers show until that stays.
+SEARCHES = 6
+# Where they crowd, the first diameter is one of these: the unknown one times powers of `LADDER`, at most so many.
+LADDER, MOST_STEPS = 1.6, 5
 # Starts of the first fits beside a candidate's own depth, in depths over which light spreads by one lens.
 START_DEPTHS = (0.0, -0.4, 0.4)
 STEPS = 12
@@ -84,6 +93,9 @@ MODEL_SHARE, MODEL_LENSES = 0.01, 0.025
 LIMIT_SIGMAS = 3.0
 # Tracers that are enough, and where there are none, the diameter that is taken.
 ENOUGH, UNKNOWN_LENSES = 10, 0.5
+# Only noise is left around a tracer whose chi-squared per pixel is at most this: 1 to 2.3 with the right size and the
+# neighbours found, 4 to 500 where neighbours are missing.
+NOISE_ALONE = 3.0
 # Standard error of a median over that of a mean.
 MEDIAN_TO_MEAN = 1.25
 
@@ -149,27 +161,97 @@ def diameter_of(frames: Sequence[Sizes]) -> Diameter | None:
 
 def measured_sizes(task: Task) -> Sizes:
     """Return what the tracers of an image show of their sizes; `task` may be of any size."""
-    candidates, light = candidates_of(task, blank(task), SEARCH[0].iterations, None)
+    candidates, light = candidates_of(task, blank(task), ROUNDS[0].iterations, None)
     region = _middle_region(candidates)
     candidates = candidates[region.holds(candidates)]
     state = _with_light(task, blank(task), candidates)
     diameter, apart = _first_diameter(task, state, _apart(task, state, candidates))
     if not len(apart):
         return NO_SIZES
-    candidates = np.concatenate([apart, candidates])
+    sought = Sought(task, state, np.concatenate([apart, candidates]), region)
     for share in WIDE:
         task = _of_diameter(task, diameter)
-        found = accepted(task, _begun(task, state), candidates.copy(), SEARCH[0])
-        diameter, _ = _tried(task, found, _steps(diameter, share), SEARCH[0].unexplained)
-    task = _of_diameter(task, diameter)
-    found = explained(task, _begun(task, state), candidates.copy(), SEARCH[0])
-    more, light = candidates_of(task, found, SEARCH[1].iterations, None)
-    inside = region.holds(more)
-    found = explained(task, *with_candidates(task, found, more[inside], light[inside]), SEARCH[1])
-    for share in NARROW:
-        diameters = _steps(diameter, share)
-        diameter, losses = _tried(task, found, diameters, LAST_UNEXPLAINED)
-    return _vertices(np.square(diameters), losses)
+        found = accepted(task, _begun(task, state), sought.candidates.copy(), SEARCH[0])
+        diameter = _tried(task, found, _steps(diameter, share), SEARCH[0].unexplained).diameter
+    sizes = _settled_sizes(sought, diameter, SEARCH)
+    return sizes if sizes.square.size else _settled_sizes(sought, _least_misfit(sought), ROUNDS)
+
+
+class Region(NamedTuple):
+    """The part of the image that is looked at, about a point (x, y), mm in image axes."""
+
+    middle_mm: NDArray[np.float64]
+    radius_mm: float
+
+    def holds(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return which points (n, 2 or more) lie in it."""
+        return np.asarray(np.linalg.norm(points[:, :2] - self.middle_mm, axis=1) <= self.radius_mm)
+
+
+class Sought(NamedTuple):
+    """What the search of a part of an image begins with.
+
+    Attributes
+    ----------
+    state : without particles
+    candidates : (n, 4) of the first round
+    """
+
+    task: Task
+    state: State
+    candidates: NDArray[np.float64]
+    region: Region
+
+
+def _found(sought: Sought, diameter: float, rounds: Sequence[Round]) -> tuple[Task, State]:
+    """Return what rounds of the search find in the region with a diameter."""
+    task = _of_diameter(sought.task, diameter)
+    state = explained(task, _begun(task, sought.state), sought.candidates.copy(), rounds[0])
+    for settings in rounds[1:]:
+        more, light = candidates_of(task, state, settings.iterations, None)
+        inside = sought.region.holds(more)
+        state = explained(task, *with_candidates(task, state, more[inside], light[inside]), settings)
+    return task, state
+
+
+def _least_misfit(sought: Sought) -> float:
+    """Return the diameter with which all rounds explain the image best, to half of `LADDER`: for crowded tracers.
+
+    With a wrong one neighbours are not found, and chi-squared is several times as large.
+    """
+
+    def misfit(step: int) -> float:
+        task, state = _found(sought, UNKNOWN_LENSES * LADDER**step, ROUNDS)
+        fits = judged(task, state, 0.0)
+        bright = _bright(state, fits.seen)
+        return float(np.median(fits.chi2[bright])) if bright.any() else np.inf
+
+    best, least = 0, misfit(0)
+    for way in (-1, 1):
+        while abs(best) < MOST_STEPS and (trial := misfit(best + way)) < least:
+            best, least = best + way, trial
+        if best != 0:
+            break
+    return UNKNOWN_LENSES * LADDER**best
+
+
+def _settled_sizes(sought: Sought, diameter: float, rounds: Sequence[Round]) -> Sizes:
+    """Return the sizes of tracers that stand alone, with the search made anew until the diameter stays."""
+    for _ in range(SEARCHES):
+        searched_with = diameter
+        task, found = _found(sought, diameter, rounds)
+        for share in NARROW:
+            diameters = _steps(diameter, share)
+            diameter, losses, alone = _tried(task, found, diameters, LAST_UNEXPLAINED)
+        if abs(diameter - searched_with) < max(NARROW[0] * searched_with, SMALLEST_STEP):
+            break
+    if np.count_nonzero(alone) < min(ENOUGH, 0.5 * alone.size):
+        return NO_SIZES
+    sizes = _vertices(np.square(diameters), losses[:, alone])
+    best = _tried(task, found, diameter * np.array([0.5, 1.0, 2.0]), LAST_UNEXPLAINED).diameter
+    # Half of what is too small to be seen looks the same.
+    unseen = best < diameter and (pooled := diameter_of([sizes])) is not None and not pooled.resolved
+    return sizes if best == diameter or unseen else NO_SIZES
 
 
 def _begun(task: Task, state: State) -> State:
@@ -183,17 +265,6 @@ def _with_light(task: Task, state: State, candidates: NDArray[np.float64]) -> St
     light = candidates[seen > WELL_SEEN, 3]
     typical = of_half_the_sum(light) if light.size else 0.0
     return replace(state, typical_light=typical, noise=noise_with(task, typical))
-
-
-class Region(NamedTuple):
-    """The part of the image that is looked at, about a point (x, y), mm in image axes."""
-
-    middle_mm: NDArray[np.float64]
-    radius_mm: float
-
-    def holds(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which points (n, 2 or more) lie in it."""
-        return np.asarray(np.linalg.norm(points[:, :2] - self.middle_mm, axis=1) <= self.radius_mm)
 
 
 def _middle_region(candidates: NDArray[np.float64]) -> Region:
@@ -277,27 +348,43 @@ def _first_diameter(task: Task, state: State, apart: NDArray[np.float64]) -> tup
     return diameter, fits[FIRST_DIAMETERS.index(diameter)][1][real]
 
 
-def _tried(
-    task: Task, state: State, diameters: NDArray[np.float64], unexplained: float
-) -> tuple[float, NDArray[np.float64]]:
-    """Return the diameter that bright tracers agree on, and what they lose with each that is tried, (m, n).
+class Trial(NamedTuple):
+    """What bright tracers say of some diameters.
 
-    The losses are in chi-squared, in units of what is left of a tracer's own, at least 1.
+    Attributes
+    ----------
+    diameter : the one that they agree on
+    losses : (m, n) of each with each, in chi-squared, in units of what is left of a tracer's own, at least 1
+    alone : (n,) whether noise is all that is left around a tracer
     """
+
+    diameter: float
+    losses: NDArray[np.float64]
+    alone: NDArray[np.bool_]
+
+
+def _tried(task: Task, state: State, diameters: NDArray[np.float64], unexplained: float) -> Trial:
+    """Return what bright tracers say of diameters (m,)."""
     task = _of_diameter(task, diameters[len(diameters) // 2])
     state = rebuilt(task, state, state.particles)
     sweep(task, state, unexplained, SWEEPS)
     state = with_typical_light(task, state, judged(task, state, LAST_UNEXPLAINED))
     observation = observed(task, state, unexplained)
     chi2, _, seen = judge(observation, state.particles)
-    bright = (state.particles[:, 3] > BRIGHT * state.typical_light) & (seen > WELL_SEEN)
+    bright = _bright(state, seen)
     good = np.flatnonzero(bright)[np.argsort(chi2[bright], kind="stable")[:MOST_TRACERS]]
     tracers, change = state.particles[good], np.zeros((len(diameters), good.size))
     for number, diameter in enumerate(diameters):
         sized = observed(_of_diameter(task, diameter), state, unexplained)._replace(residual=observation.residual)
         change[number], _ = _fitted(observation, sized, tracers, tracers[:, 2:3])
     losses = (change - change.min(axis=0)) / np.maximum(chi2[good], 1.0)
-    return _common(diameters, losses), losses
+    noise_alone, *_ = judge(observed(task, state, 0.0), tracers)
+    return Trial(_common(diameters, losses), losses, noise_alone <= NOISE_ALONE)
+
+
+def _bright(state: State, seen: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which particles are as bright as tracers and wholly seen, by the shares (n,) of their light that are."""
+    return np.asarray((state.particles[:, 3] > BRIGHT * state.typical_light) & (seen > WELL_SEEN))
 
 
 def _vertices(square: NDArray[np.float64], losses: NDArray[np.float64]) -> Sizes:
