@@ -19,6 +19,7 @@ from lfpiv_cli.files.exports.content import Content, columns_of, read_content
 from lfpiv_cli.files.exports.formats import FORMATS
 from lfpiv_cli.files.hdf5 import write_tree
 from lfpiv_cli.files.particle_file import (
+    OPTIONAL,
     PARTICLES_FORMAT,
     TRACKS_FORMAT,
     TRAJECTORIES_FORMAT,
@@ -52,11 +53,12 @@ def write_field(path: Path, rng: np.random.Generator, grid: Grid = GRID, dt_s: f
 
 def points_of(name: str, rng: np.random.Generator) -> Points:
     """Return five points; in a sequence a track of three frames and one of two, and no light in frame 1."""
-    shapes = {"covariance_mm2": (5, 6), "velocity": (5, 3), "velocity_sigma": (5, 3), "displacement_mm": (5, 3)}
+    shapes = dict.fromkeys(("velocity", "velocity_sigma", "displacement_mm"), (5, 3))
+    shapes |= dict.fromkeys(("covariance_mm2", "displacement_covariance_mm2"), (5, 6))
     integers = {"particle", "particle_a", "particle_b"}
     arrays: dict[str, Any] = {
         each: rng.integers(0, 9, 5) if each in integers else rng.normal(size=shapes.get(each, (5,)))
-        for each in UNITS[name]
+        for each in (*UNITS[name], *OPTIONAL.get(name, {}))
     }
     if name == PARTICLES_FORMAT:
         arrays["flag"] = np.array([0, 1, 0, 0, 1], np.uint8)

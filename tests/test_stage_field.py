@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +54,7 @@ def write_tracks(
     *,
     full: bool = True,
     flow: Callable[[np.ndarray], np.ndarray] = np.zeros_like,
-    channel: dict[str, Any] | None = None,
+    changes: dict[str, dict[str, Any]] | None = None,
 ) -> None:
     """Write tracks, with errors as stated, of a flow that is added to what moves as a whole."""
     sigma = np.array([1e-3, 1e-3, 1e-2])
@@ -70,9 +71,11 @@ def write_tracks(
     }
     if full:
         arrays["displacement_covariance_mm2"] = np.tile([*sigma**2, 0.0, 0.0, 0.0], (count, 1))
-    settings = load_config(CONFIG).overridden("correlation", dt_s=dt_s).overridden("channel", **(channel or {}))
+    settings = load_config(CONFIG).overridden("correlation", dt_s=dt_s)
+    for section, keys in (changes or {}).items():
+        settings = settings.overridden(section, **keys)
     provenance = {"config": settings.resolved()}
-    points = Points(place, arrays, Reference("mid_plane", 0.5), {"dt_s": dt_s}, provenance)
+    points = Points(place, arrays, Reference("mid_plane", 0.5), {"dt_s": settings.correlation.dt_s}, provenance)
     write_points(path, TRACKS_FORMAT, points, overwrite=True)
 
 
@@ -123,7 +126,7 @@ def test_walls_stand_still_by_command(tmp_path: Path, rng: np.random.Generator, 
         tmp_path / "tracks.vtkhdf",
         rng,
         flow=lambda place: -((place[:, 2:] / wall) ** 2) * MOVED_MM,
-        channel={"no_slip": True},
+        changes={"channel": {"no_slip": True}},
     )
     np.savetxt(tmp_path / "at.csv", [[0.0, 0.0, -wall], [0.3, 0.2, wall], [0.0, 0.0, 0.0]], delimiter=",")
     run("field", tmp_path / "tracks.vtkhdf", "--at", tmp_path / "at.csv", "-o", tmp_path / "field.vtkhdf", "--json")
@@ -154,6 +157,29 @@ def test_few_tracks_make_no_field(tmp_path: Path, rng: np.random.Generator) -> N
     write_tracks(tmp_path / "tracks.vtkhdf", rng, 5)
     with pytest.raises(InputError, match="5 samples, expected at least 20"):
         run("field", tmp_path / "tracks.vtkhdf", "-o", tmp_path / "field.vtkhdf")
+
+
+# What two ways of measuring one flow differ in, and what makes their coordinates or displacements others.
+@pytest.mark.parametrize(
+    ("section", "key", "value", "found"),
+    [
+        ("reconstruction", "solver", "particles", None),
+        ("weights", "sampling", "rays", None),
+        ("correlation", "windows", ((8, 8, 8),), None),
+        ("weights", "refraction", "exact", "weights.refraction is exact, expected paraxial"),
+        ("media", "fluid", 1.4, "media.fluid is 1.4, expected 1.33"),
+        ("correlation", "dt_s", 0.003, "0.002 and 0.003 s"),
+    ],
+)
+def test_measurements_of_one_flow_need_the_same_coordinates_alone(
+    section: str, key: str, value: Any, found: str | None, tmp_path: Path, rng: np.random.Generator
+) -> None:
+    paths = [tmp_path / "a.vtkhdf", tmp_path / "b.vtkhdf"]
+    write_tracks(paths[0], rng)
+    write_tracks(paths[1], rng, changes={section: {key: value}})
+    refused = nullcontext() if found is None else pytest.raises(InputError, match=found)
+    with refused:
+        fit_flow(paths, tmp_path / "field.vtkhdf", console=Console(quiet=True))
 
 
 def test_velocities_at_points_and_gradients(tmp_path: Path, rng: np.random.Generator, capsys) -> None:

@@ -163,7 +163,7 @@ def write_points(path: Path, format_name: str, points: PointRows, *, overwrite: 
     """
     units = UNITS[format_name]
     if isinstance(points, Points):
-        units = units | _optional(points.arrays, format_name)
+        units = units_of(format_name, points.arrays)
         _ensure_whole(points, units, format_name)
 
     def fill(file: h5py.File) -> None:
@@ -186,9 +186,9 @@ def write_points(path: Path, format_name: str, points: PointRows, *, overwrite: 
     create(path, fill, overwrite=overwrite, check=check)
 
 
-def _optional(names: Container[str], format_name: str) -> dict[str, str]:
-    """Return the units of those arrays that a format may have and that are there."""
-    return {name: unit for name, unit in OPTIONAL.get(format_name, {}).items() if name in names}
+def units_of(format_name: str, names: Container[str]) -> dict[str, str]:
+    """Return the units of the arrays that a format has, and of those among the names that it may have besides."""
+    return UNITS[format_name] | {name: unit for name, unit in OPTIONAL.get(format_name, {}).items() if name in names}
 
 
 def _ensure_whole(points: Points, units: Mapping[str, str], format_name: str) -> None:
@@ -221,7 +221,7 @@ def _opened(path: Path, format_name: str) -> Iterator[tuple[h5py.File, dict[str,
     """Open a file of points; its arrays, positions first, have as many rows each."""
     with open_h5(path) as file:
         ensure_format(path, file, format_name, (FORMAT_VERSION,))
-        names = [POSITION, *UNITS[format_name], *_optional(file, format_name)]
+        names = [POSITION, *units_of(format_name, file)]
         datasets = {name: array_member(file, name) for name in names}
         shape = datasets[POSITION].shape
         if len(shape) != 2 or shape[1] != 3:

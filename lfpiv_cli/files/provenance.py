@@ -43,6 +43,13 @@ UNREAD = {
     "build-weights": AFTER_VOLUMES,
     "reconstruct": AFTER_VOLUMES,
 }
+# What coordinates follow from: results of one flow agree in these, in whatever ways they were measured.
+OF_COORDINATES = ("camera", "media", "window", "scene", "weights.method", "weights.refraction")
+# What frames agree in that are measured together: all but what says nothing of them.
+OF_FRAMES = (
+    *("camera", "media", "window", "scene", "volume", "board", "channel", "pipe"),
+    *("weights", "reconstruction", "correlation"),
+)
 
 
 @dataclass(frozen=True)
@@ -254,6 +261,37 @@ def _bearing(made: Mapping[str, Any], earlier: Mapping[str, Any]) -> dict[str, A
     config = {name: value for name, value in (made["config"] or {}).items() if name not in unread}
     same = {name: made[name] for name in ("program", "version", "libraries", "command")}
     return same | {"config": config, "inputs": inputs}
+
+
+def ensure_agreement(records: Sequence[Mapping[str, Any]], names: Sequence[str], keys: Sequence[str]) -> None:
+    """Refuse results whose configs differ in sections, or in keys of them, as far as their records have a config.
+
+    Parameters
+    ----------
+    names : of the results, for messages
+    keys : `OF_COORDINATES` or `OF_FRAMES`
+
+    Raises
+    ------
+    InputError
+    """
+    known = [(_values(made["config"]), name) for made, name in zip(records, names, strict=True) if made.get("config")]
+    for (first, first_name), (config, name) in ((known[0], each) for each in known[1:]):
+        for key in sorted(config.keys() | first.keys()):
+            ours, theirs = config.get(key), first.get(key)
+            if ours != theirs and any(key == part or key.startswith(f"{part}.") for part in keys):
+                raise InputError(
+                    f"{name}: was made with another config than {first_name}: {key} is {ours}, expected {theirs}"
+                )
+
+
+def _values(config: Mapping[str, Any], place: str = "") -> dict[str, Any]:
+    """Return the values of a config by their keys, `camera.sensor.rows`; lists are values."""
+    values: dict[str, Any] = {}
+    for name, value in config.items():
+        key = f"{place}{name}"
+        values |= _values(value, f"{key}.") if isinstance(value, dict) else {key: value}
+    return values
 
 
 def carried_record(path: Path) -> dict[str, Any]:

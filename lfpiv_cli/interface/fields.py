@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -175,7 +175,7 @@ def fit_field(
         raise InputError("vectors alone do not tell the grid: give the rig")
     _ensure_one_flow(given, settings.correlation.dt_s)
     parts = [
-        samples_of_tracks(each.points) if isinstance(each, Tracked) else samples_of_vectors(each, settings, "vectors")
+        samples_of_tracks(each.points) if isinstance(each, Tracked) else samples_of_vectors(each, "vectors")
         for each in given
     ]
     return fitted(parts, settings, divergence, "field")
@@ -183,12 +183,17 @@ def fit_field(
 
 def _ensure_one_flow(given: Sequence[Tracked | VectorField], dt_s: float | None) -> None:
     """Raise InputError where steps in time or origins of places differ."""
-    times = {each.settings.correlation.dt_s if isinstance(each, Tracked) else each.dt_s for each in given} | {dt_s}
-    known = sorted(time for time in times if time is not None)
-    if len(known) > 1:
-        raise InputError(f"the times between frames differ: {' and '.join(f'{time:g}' for time in known)} s")
+    times = (each.settings.correlation.dt_s if isinstance(each, Tracked) else each.dt_s for each in given)
+    ensure_one_time([*times, dt_s])
     if len({each.points.reference for each in given if isinstance(each, Tracked)}) > 1:
         raise InputError("the tracks' coordinates have different origins")
+
+
+def ensure_one_time(times_s: Iterable[float | None]) -> None:
+    """Raise InputError where times between frames differ, as far as they are known: displacements in them do, too."""
+    known = sorted({time for time in times_s if time is not None})
+    if len(known) > 1:
+        raise InputError(f"the times between frames differ: {' and '.join(f'{time:g}' for time in known)} s")
 
 
 def fields_of(found: TracksOf[Any], name: str) -> Iterator[FittedField]:
@@ -254,11 +259,11 @@ def _samples_in(points: Points, frame: int | None) -> Samples:
     )
 
 
-def samples_of_vectors(field: VectorField, settings: Config, name: str) -> Samples:
+def samples_of_vectors(field: VectorField, name: str) -> Samples:
     """Return the vectors that are valid as samples at their windows' centres.
 
     Windows that overlap share tracers, so that their errors are alike: variances are enlarged by as many windows as
-    share the tracers of one, 1 / (1 - overlap) along each axis.
+    share the tracers of one, along each axis a window's length over its distance from the next.
 
     Raises
     ------
@@ -270,8 +275,8 @@ def samples_of_vectors(field: VectorField, settings: Config, name: str) -> Sampl
             f"{name}: has no uncertainty_voxel, which weighs its vectors; make it by correlate or track --grid"
         )
     known = (field.flag < REJECTED) & np.isfinite(field.uncertainty_voxel).all(axis=-1)
-    shared = float(np.prod([1.0 / (1.0 - share) for share in settings.overlap(field.voxel_mm)]))
     voxel = np.asarray(field.voxel_mm)
+    shared = float(np.prod(voxel * field.window_voxel / field.grid.spacing_mm))
     variance = shared * (field.uncertainty_voxel[known] * voxel) ** 2
     points = field.grid.centres_mm()[known]
     return Samples(

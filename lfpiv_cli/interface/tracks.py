@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files.config import Config, carried_config
 from lfpiv_cli.files.particle_file import POSITION, TRACKS_FORMAT, TRAJECTORIES_FORMAT, PointRows, Points
-from lfpiv_cli.files.provenance import even_step_s, record
+from lfpiv_cli.files.provenance import OF_FRAMES, ensure_agreement, even_step_s, record
 from lfpiv_cli.flow.field import MM_TO_M, VectorField
 from lfpiv_cli.flow.from_tracks import Paths, WindowGrid, vectors_from_paths
 from lfpiv_cli.interface.notices import warn_of
@@ -300,19 +300,26 @@ def still_notices(tracks: PointRows, name: str) -> list[Notice]:
     ]
 
 
-def settings_of(records: Sequence[Mapping[str, Any]], names: Sequence[str], dt_s: float | None = None) -> Config:
-    """Return the config that all frames were made with, by the records that they carry.
+def settings_of(
+    records: Sequence[Mapping[str, Any]],
+    names: Sequence[str],
+    dt_s: float | None = None,
+    agreeing: Sequence[str] = OF_FRAMES,
+) -> Config:
+    """Return the first one's config, by the records that frames, or results of one flow, carry.
 
     The time between frames is the one given here, else the config's, else what the recording of the frames tells.
+
+    Parameters
+    ----------
+    agreeing : what of their configs has to agree, see `ensure_agreement`
 
     Raises
     ------
     InputError
-        They were made with different ones, or were not taken at an even rate.
+        Their configs differ there, or frames were not taken at an even rate.
     """
-    for name, made in zip(names[1:], records[1:], strict=True):
-        if made.get("config") != records[0].get("config"):
-            raise InputError(f"{name}: was made with another config than {names[0]}")
+    ensure_agreement(records, names, agreeing)
     settings = carried_config(records[0], names[0]).overridden("correlation", dt_s=dt_s)
     if settings.correlation.dt_s is None:
         settings = settings.overridden("correlation", dt_s=even_step_s(records, names))

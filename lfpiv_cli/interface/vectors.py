@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files.config import Config, carried_config
+from lfpiv_cli.files.provenance import OF_FRAMES, ensure_agreement
 from lfpiv_cli.files.vtkhdf import Volume
 from lfpiv_cli.flow import correlation
 from lfpiv_cli.flow.field import VectorField
@@ -101,8 +102,7 @@ def ensure_alike(first: Volume, second: Volume, names: tuple[str, str]) -> None:
         raise InputError(f"{names[1]}: its grid {second.grid} differs from that of {names[0]}, {first.grid}")
     if first.reference.name != second.reference.name:
         raise InputError(f"{names[1]}: its coordinates have another origin than those of {names[0]}")
-    if first.provenance.get("config") != second.provenance.get("config"):
-        raise InputError(f"{names[1]}: was made with another config than {names[0]}")
+    ensure_agreement([first.provenance, second.provenance], names, OF_FRAMES)
 
 
 def _as_volume(volume: Volume | NDArray[Any], voxel_mm: tuple[float, float, float] | None) -> Volume:

@@ -12,7 +12,7 @@ from lfpiv_cli.errors import InputError
 from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.batch import is_kept
-from lfpiv_cli.files.provenance import record
+from lfpiv_cli.files.provenance import OF_COORDINATES, ensure_agreement, record
 from lfpiv_cli.flow.combining import combine
 from lfpiv_cli.flow.field import MASKED, REJECTED
 
@@ -32,6 +32,7 @@ def combine_vectors(
     headers = [vtkhdf.read_header(path) for path in inputs.values()]
     if headers[0].reference != headers[1].reference:
         raise InputError(f"{vectors_b}: its coordinates have another origin than those of {vectors_a}")
+    ensure_agreement([header.provenance for header in headers], [str(path) for path in inputs.values()], OF_COORDINATES)
     made = record("combine", headers[0].provenance.get("config"), inputs)
     if resume:
         if is_kept([output], made, inputs.values(), overwrite, resume=True):

@@ -19,16 +19,20 @@ from lfpiv_cli.files.config import Config
 from lfpiv_cli.files.hdf5 import format_of
 from lfpiv_cli.files.inputs import content_of
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRAJECTORIES_FORMAT, read_points, read_tracks
-from lfpiv_cli.files.provenance import record, with_warnings
+from lfpiv_cli.files.provenance import OF_COORDINATES, record, with_warnings
 from lfpiv_cli.flow.field import MASKED, REJECTED, VectorField
-from lfpiv_cli.interface.fields import FittedField, fit_notices, fitted, samples_of_tracks, samples_of_vectors
+from lfpiv_cli.interface.fields import (
+    FittedField,
+    ensure_one_time,
+    fit_notices,
+    fitted,
+    samples_of_tracks,
+    samples_of_vectors,
+)
 from lfpiv_cli.interface.pressure import PressureResult, pressure_of
 from lfpiv_cli.interface.tracks import settings_of
 from lfpiv_cli.names import Divergence
 from lfpiv_cli.stages.means import Extra, arrays_of
-
-# What commands add to the sections of the config in their records: how far they sought, and the like.
-BESIDE_SECTIONS = ("search_mm", "shortest", "grid_by", "field")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,9 +78,10 @@ def fit_flow(
     for header, name in zip(headers, names, strict=True):
         if header.reference != headers[0].reference:
             raise InputError(f"{name}: its coordinates have another origin than those of {names[0]}")
-    settings = settings_of([_sections_alone(header.provenance) for header in headers], names, options.dt_s)
+    ensure_one_time(header.attributes.get("dt_s") for header in headers)
+    settings = settings_of([header.provenance for header in headers], names, options.dt_s, OF_COORDINATES)
     pressed = _pressure(paths, settings, options)
-    found = fitted(_samples(paths, settings, options), settings, options.divergence, names[0])
+    found = fitted(_samples(paths, options), settings, options.divergence, names[0])
     notices = fit_notices(found.summary, options.divergence, paths[0].name)
     console.warn(notices)
     inputs = {f"samples_{number:04d}": path for number, path in enumerate(paths)}
@@ -104,12 +109,12 @@ def _viscosity_m2_s(settings: Config) -> float | None:
     return media.fluid_viscosity_pa_s / media.fluid_density_kg_m3
 
 
-def _samples(paths: Sequence[Path], settings: Config, options: FieldOptions) -> list[Samples]:
+def _samples(paths: Sequence[Path], options: FieldOptions) -> list[Samples]:
     """Return the samples of each file."""
     parts = []
     for path in paths:
         if format_of(path) == vtkhdf.VECTORS_FORMAT:
-            parts.append(samples_of_vectors(vtkhdf.open_vectors(path), settings, str(path)))
+            parts.append(samples_of_vectors(vtkhdf.open_vectors(path), str(path)))
         else:
             parts.append(samples_of_tracks(read_tracks(path), options.frame))
     return parts
@@ -174,9 +179,3 @@ def _table(points: NDArray[np.float64], found: FittedField) -> str:
     rows = np.concatenate([points, found.at(points), found.sigma(points)], axis=1)
     lines = [",".join(repr(float(value)) for value in row) for row in rows]
     return "\n".join(["x_mm,y_mm,z_mm,u_m_s,v_m_s,w_m_s,u_sigma_m_s,v_sigma_m_s,w_sigma_m_s", *lines, ""])
-
-
-def _sections_alone(made: dict[str, Any]) -> dict[str, Any]:
-    """Return a record whose config holds the sections alone: the rest does not bear on the field."""
-    config = made.get("config") or {}
-    return made | {"config": {name: part for name, part in config.items() if name not in BESIDE_SECTIONS}}

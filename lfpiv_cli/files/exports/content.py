@@ -18,8 +18,8 @@ from lfpiv_cli.files.particle_file import (
     POSITION,
     TRACKS_FORMAT,
     TRAJECTORIES_FORMAT,
-    UNITS,
     read_points,
+    units_of,
 )
 from lfpiv_cli.files.vtkhdf import VECTORS_FORMAT, VOLUME_FORMAT, open_vectors, open_volume, read_arrays, read_header
 from lfpiv_cli.grid import Grid
@@ -99,7 +99,8 @@ def read_content(path: Path) -> Content:
         return Content(name, grid, arrays, units, header.attributes, header.provenance)
     points = read_points(path, name)
     arrays = {POSITION: points.position_mm, **points.arrays}
-    return Content(name, None, arrays, {POSITION: "mm", **UNITS[name]}, points.attributes, points.provenance)
+    units = {POSITION: "mm", **units_of(name, arrays)}
+    return Content(name, None, arrays, units, points.attributes, points.provenance)
 
 
 def plane_of(content: Content, number: int) -> Content:
