@@ -92,6 +92,17 @@ def test_colour_is_refused(tmp_path: Path) -> None:
         assert (code, f"{name}: " in said, "greyscale" in said) == (4, True, True), said
 
 
+@pytest.mark.parametrize("layout", [{}, {"rowsperstrip": 64}, {"tile": (64, 64)}], ids=str)
+def test_bytes_after_what_is_too_short_are_no_pixels(tmp_path: Path, layout: dict) -> None:
+    path = tmp_path / "short.tif"
+    tifffile.imwrite(path, np.full((ROWS, COLUMNS), 100, np.uint16), photometric="minisblack", **layout)
+    with tifffile.TiffFile(path, mode="r+") as file:
+        lengths = file.pages[0].tags["TileByteCounts" if "tile" in layout else "StripByteCounts"]
+        lengths.overwrite([lengths.value[0] // 2, *lengths.value[1:]])
+    code, said = ended("check", CONFIG, path)
+    assert (code, "short.tif: strip or tile 0 of page 0 has" in said) == (4, True), said
+
+
 @pytest.mark.thorough
 @pytest.mark.parametrize("percent", [1, 20, 40, 60, 80, 99])
 def test_no_page_of_a_cut_recording_is_lost_in_silence(tmp_path: Path, weights: Path, percent: int) -> None:

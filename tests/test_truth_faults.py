@@ -61,6 +61,13 @@ def encrypted() -> bytes:
     return bytes(content)
 
 
+def misnamed() -> bytes:
+    """Return a list in which a bit of an optional array's name is flipped, in the archive's list of names."""
+    content = bytearray(packed(arrays() | {"diameter_mm": np.ones(20)}))
+    content[content.rfind(b"diameter_mm")] ^= 1
+    return bytes(content)
+
+
 HARM: dict[str, Callable[[], bytes]] = {
     "no dimensions": lambda: packed({name: np.array(1.0) for name in arrays()}),
     "frames of no dimensions": lambda: packed(arrays() | {"frame_position_mm": np.array(1.0)}),
@@ -71,6 +78,7 @@ HARM: dict[str, Callable[[], bytes]] = {
     "objects": lambda: packed(arrays() | {"position_mm": np.full((20, 3), None)}),
     "one array": lambda: header("(20, 3)") + bytes(480),
     "encrypted": encrypted,
+    "misnamed": misnamed,
     "bomb": lambda: with_member("position_mm", header("(2500000, 3)") + bytes(60_000_000)),
     "bomb beside": lambda: with_member("frame_brightness", header("(375000, 20)") + bytes(60_000_000)),
     "declares a terabyte": lambda: with_member("position_mm", header("(50000000000, 3)") + bytes(480)),

@@ -86,7 +86,13 @@ def read_particles(path: Path) -> Particles:
 
 
 def _wanted(stored: zipfile.ZipFile) -> list[str]:
-    """Return the names of the arrays that are read, places first; those that are not optional must be there."""
+    """Return the names of the arrays that are read, places first; those that are not optional must be there.
+
+    A name in the archive's list must be that before the array itself, of arrays that are not read, too: one that is
+    damaged would be an array that is not told.
+    """
+    for entry in stored.infolist():
+        stored.open(entry).close()
     names = set(stored.namelist())
     told = [name for name in OPTIONAL if f"{name}.npy" in names]
     return sorted(["position_mm", "velocity_mm_s", *told], key=lambda name: not name.endswith(PLACES))

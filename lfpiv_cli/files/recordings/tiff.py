@@ -24,6 +24,8 @@ STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 BLACK_IS_ZERO, RGB, PALETTE = 1, 2, 3
 # TIFF's palettes hold 16-bit colours for indices of 8 bits.
 PALETTE_SHIFT = 8
+# Of the compressions, none.
+NOT_PACKED = 1
 # Compressions of faxes: CCITT's three, and the first of them with lines of whole words.
 BLACK_AND_WHITE = (2, 3, 4, 32771)
 # How a TIFF says that its channels lie apart.
@@ -100,12 +102,7 @@ def _decode_page(page: tifffile.TiffPage, number: int, shape: Shape | None) -> I
     size = page.parent.filehandle.size
     pixel_bytes = page.dtype.itemsize * page.samplesperpixel
     ensure_size(f"page {number}", (page.imagelength, page.imagewidth), pixel_bytes, shape, size)
-    segments = math.prod(page.chunked)
-    if not len(page.dataoffsets) == len(page.databytecounts) == segments:
-        raise InputError(f"page {number} has {len(page.dataoffsets)} of its {segments} strips or tiles: {CUT}")
-    for place, length in zip(page.dataoffsets, page.databytecounts, strict=True):
-        if length == 0 or place + length > size:
-            raise InputError(f"the data of page {number} ends at byte {place + length} of {size}: {CUT}")
+    _ensure_segments(page, number, size)
     array = page.asarray(maxworkers=1)
     if page.samplesperpixel > 1 and page.planarconfig == SEPARATE:
         array = np.moveaxis(array, 0, -1)
@@ -114,6 +111,31 @@ def _decode_page(page: tifffile.TiffPage, number: int, shape: Shape | None) -> I
     if page.colormap is not None:
         array = np.moveaxis(page.colormap[:, array] >> PALETTE_SHIFT, 0, -1)
     return as_counts(one_channel(array, f"page {number}"))
+
+
+def _ensure_segments(page: tifffile.TiffPage, number: int, file_bytes: int) -> None:
+    """Refuse strips or tiles that are missing, lie beyond the file's end, or are shorter than their pixels.
+
+    The decoder asks none of these: of a strip that is too short and not packed it takes the bytes after it as pixels.
+    """
+    segments = math.prod(page.chunked)
+    if not len(page.dataoffsets) == len(page.databytecounts) == segments:
+        raise InputError(f"page {number} has {len(page.dataoffsets)} of its {segments} strips or tiles: {CUT}")
+    for segment, (place, length) in enumerate(zip(page.dataoffsets, page.databytecounts, strict=True)):
+        if length == 0 or place + length > file_bytes:
+            raise InputError(f"the data of page {number} ends at byte {place + length} of {file_bytes}: {CUT}")
+        if page.compression == NOT_PACKED and length < (pixels := _bytes_of(page, segment)):
+            raise InputError(
+                f"strip or tile {segment} of page {number} has {length} bytes, its pixels take {pixels}: {CUT}"
+            )
+
+
+def _bytes_of(page: tifffile.TiffPage, segment: int) -> int:
+    """Return how many bytes a strip or tile takes that is not packed; each of its rows takes whole bytes."""
+    rows, columns, *samples = page.chunks
+    if not page.is_tiled:  # whose last ones are filled up, where the last strip is shorter
+        rows = min(rows, page.imagelength - segment % -(-page.imagelength // rows) * rows)
+    return rows * -(-columns * math.prod(samples) * page.bitspersample // 8)
 
 
 def _has_palette(page: tifffile.TiffPage) -> bool:
