@@ -83,6 +83,11 @@ def test_two_without_options_are_taken_as_given(tmp_path: Path) -> None:
     backwards = result_pairs(paths[::-1], PairOptions())
     assert backwards.pairs == ((0, 1),)
     assert [notice.code for notice in backwards.notices] == ["pair-backwards"]
+    apart = [tmp_path / "1a.vtkhdf", tmp_path / "2b.vtkhdf"]
+    (tmp_path / "2b.vtkhdf").write_bytes(b"")
+    (notice,) = result_pairs(apart, PairOptions()).notices
+    assert notice.code == "pair-contradicted"
+    assert all(str(path) in str(notice) for path in apart)
     for count in (1, 3):
         with pytest.raises(UsageError, match=r"pairs"):
             result_pairs([paths[0]] * count, PairOptions())

@@ -10,7 +10,7 @@ import pytest
 
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files.frame_names import places_by
-from lfpiv_cli.files.pairing import Pairs, Seen, in_order, pair_names
+from lfpiv_cli.files.pairing import Pairs, Seen, contradiction, in_order, pair_names
 
 # What a camera calls the frames of pair `k`, first and second.
 SEPARATE: dict[str, Callable[[int], tuple[str, str]]] = {
@@ -23,6 +23,8 @@ SEPARATE: dict[str, Callable[[int], tuple[str, str]]] = {
     "letter after a word": lambda k: (f"imgA_{k}", f"imgB_{k}"),
     "lasers": lambda k: (f"B{k:05d}_LA", f"B{k:05d}_LB"),
     "buffers from 0": lambda k: (f"B{k:05d}_0", f"B{k:05d}_1"),
+    "buffers of four digits": lambda k: (f"B{k:04d}_0", f"B{k:04d}_1"),
+    "buffers of four digits, from 1": lambda k: (f"B{k:04d}_1", f"B{k:04d}_2"),
     "frames from 1": lambda k: (f"B{k:05d}_1", f"B{k:05d}_2"),
     "a word behind": lambda k: (f"img_{k:04d}_a_8bit", f"img_{k:04d}_b_8bit"),
     "time stamps": lambda k: (f"{k:03d}_a_20240131_120000.{k:03d}", f"{k:03d}_b_20240131_120000.{k:03d}"),
@@ -88,9 +90,9 @@ def test_whatever_of_running_numbers_is_lost_no_pair_is_wrong(form: str) -> None
             assert named(left, found) == {(names[k], names[k + 1]) for k in range(0, 9, 2) if {k, k + 1} <= {*numbers}}
             assert len(found.left_out) + 2 * len(found.pairs) == len(left)
         elif found.pairs:
-            # Only frames without a gap are taken from the first that is there, and it is said where that is no 1.
-            assert numbers == list(range(numbers[0], numbers[0] + 2 * len(found.pairs)))
-            assert bool(found.notices) == (numbers[0] > 1)
+            # Only frames without a gap, that count from 1.
+            assert numbers == list(range(1, 1 + 2 * len(found.pairs)))
+            assert not found.notices
 
 
 @pytest.mark.thorough
@@ -144,10 +146,51 @@ def test_where_pairs_begin_is_open_with_a_gap_and_without_a_zero() -> None:
     assert named(names, pair_names(names, "ab", "run_{number}")) == {("run_2", "run_3")}
 
 
-def test_numbers_that_begin_later_are_said() -> None:
-    (notice,) = pair_names(["run_7", "run_8"], "ab").notices
-    assert notice.code == "pair-assumed"
-    assert not pair_names(["run_1", "run_2"], "ab").notices
+@pytest.mark.parametrize("numbers", [range(2, 6), range(7, 9), range(1000, 1010)])
+def test_numbers_that_begin_later_leave_open_where_pairs_begin(numbers: range) -> None:
+    names = [f"img_{n:04d}" for n in numbers]
+    found = pair_names(names, "ab")
+    assert not found.pairs
+    assert len(found.left_out) == len(names)
+    with pytest.raises(InputError, match=rf"{names[0]}: .* {numbers[0]} to {numbers[-1]} none is 0 or 1.*even or odd"):
+        found.settled(keep_going=True)
+    begins = numbers[0] % 2
+    assert pair_names(names, "ab", f"img_{{number:{begins}}}").pairs == tuple(
+        (k, k + 1) for k in range(0, len(names), 2)
+    )
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "why"),
+    [
+        ("img_0001a", "img_0001b", None),
+        ("img_0001b", "img_0001a", None),  # the other way round, which is another matter
+        ("img_0001a", "img_0002b", "different pairs"),
+        ("img_0001b", "img_0002a", "different pairs"),
+        ("img_0001a", "img_0002a", None),  # a letter that all have
+        ("img_0001a", "img_0003a", "numbers are 1 and 3"),
+        ("img_a", "img_b", None),
+        ("jet_a", "shot_b", "different pairs"),
+        ("img_0001", "img_0002", None),
+        ("img_0001", "img_0003", "numbers are 1 and 3"),
+        ("img_0010", "img_0001", "numbers are 10 and 1"),
+        ("B0001_0", "B0001_1", None),
+        ("B0001_0", "B0002_1", "different pairs"),
+        ("jet_0001", "shot_0003", None),
+        ("20240131_120000", "20240131_120005", None),
+        ("still", "moved", None),
+    ],
+)
+def test_what_names_contradict_of_two_frames(first: str, second: str, why: str | None) -> None:
+    found = contradiction(*seen(first, second))
+    assert (found is None) == (why is None)
+    assert why is None or why in (found or "")
+
+
+def test_pages_apart_contradict_that_they_are_a_pair() -> None:
+    pages = [Seen(f"run {page}", "run", "run", page) for page in (0, 1, 3)]
+    assert contradiction(*pages[:2]) is None
+    assert "numbers are 1 and 3" in (contradiction(*pages[1:]) or "")
 
 
 def test_a_repeated_frame_is_left_out_with_its_pair() -> None:
@@ -174,6 +217,7 @@ def test_a_letter_that_all_have_is_one_frame_of_pairs_but_no_matter_in_a_sequenc
     assert not in_time.notices
     # LaVision's buffers begin with a letter.
     assert len(pair_names(["B00001", "B00002"], "ab").pairs) == 1
+    assert len(pair_names(["B0001_0", "B0001_1"], "ab").pairs) == 1
 
 
 def test_a_sequence_has_no_pair_across_a_gap() -> None:

@@ -20,7 +20,8 @@ from lfpiv_cli.names import Pairing
 MARKS = {"a": 0, "b": 1, "la": 0, "lb": 1}
 # A pair's frames count from 0 or from 1.
 FIRST_AND_SECOND = ({0, 1}, {1, 2})
-# The buffer's letter of LaVision's exports stands before so many digits, and is no frame's.
+# The buffer's letter of LaVision's exports stands before so many digits, or before any where the last number is the
+# frame's, and is no frame's itself.
 BUFFER, BUFFER_DIGITS = "b", 5
 # Words, at capitals within them too; numbers; what is between.
 TOKEN = re.compile(r"\d+|[A-Z]+(?![a-z])|[A-Z]?[a-z]+|[^A-Za-z\d]+", re.ASCII)
@@ -167,9 +168,14 @@ def _letter(group: Sequence[list[str]], how: Pairing) -> int | None:
     both = [k for k in letters if len({MARKS[tokens[k]] for tokens in group}) == 2]
     if both or how == "sequence":
         return both[-1] if both else None
-    buffers = len(group[0]) > 1 and group[0][0] == BUFFER and len(group[0][1]) == BUFFER_DIGITS
-    single = [k for k in letters if not (buffers and k == 0)]
+    single = [k for k in letters if not (k == 0 and _are_buffers(group))]
     return single[-1] if single else None
+
+
+def _are_buffers(group: Sequence[list[str]]) -> bool:
+    """Return whether names begin with the number of a buffer, as `B00001` and `B0001_0` do."""
+    letter, number, *_ = [*group[0], "", ""]
+    return letter == BUFFER and _is_number(number) and (len(number) == BUFFER_DIGITS or _ends_in_frame(group))
 
 
 def _ends_in_frame(group: Sequence[list[str]]) -> bool:

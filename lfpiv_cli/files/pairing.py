@@ -9,7 +9,7 @@ from itertools import pairwise
 from pathlib import PurePath
 
 from lfpiv_cli.errors import InputError, UsageError
-from lfpiv_cli.files.frame_names import Place, places_by, places_of
+from lfpiv_cli.files.frame_names import STAMP, Place, places_by, places_of
 from lfpiv_cli.names import Pairing
 from lfpiv_cli.notice import Notice
 
@@ -174,6 +174,20 @@ def in_order(frames: Sequence[Seen]) -> tuple[list[int], list[Notice]]:
     return order, [*found.notices, *notices]
 
 
+def contradiction(first: Seen, second: Seen) -> str | None:
+    """Return how names contradict that two frames are a pair as they are given, or the other way round.
+
+    Names of different series, without numbers or with times in their place contradict nothing.
+    """
+    a, b = _places([first, second], "ab", None)
+    if a and b and {a.frame, b.frame} == {0, 1}:
+        return None if (a.series, a.number) == (b.series, b.number) else "by their names they are of different pairs"
+    a, b = _places([first, second], "sequence", None)
+    if not a or not b or a.series != b.series or STAMP in a.series or abs(_position(a) - _position(b)) <= 1:
+        return None
+    return f"their numbers are {a.number} and {b.number}, and frames between them are not given"
+
+
 def _places(frames: Sequence[Seen], how: Pairing, by: str | None) -> list[Place | None]:
     """Return where each frame belongs."""
     if by is not None:
@@ -231,8 +245,6 @@ def _pair(places: Mapping[int, Place], found: _Found) -> None:
         if begins is None:
             found.leave_out(members, _unknown_beginning([places[k].number for k in members]))
             continue
-        if begins > 1 and series in open_ones:
-            found.notices.append(_assumed(found.names[members[0]], found.names[members[1]]))
         for k in members:
             pair, frame = divmod(places[k].number - begins, 2)
             slots[series, pair][frame].append(k)
@@ -268,17 +280,19 @@ def _beginning(numbers: Sequence[int]) -> int | None:
     """Return where running numbers begin that are those of whole pairs; None where a lost frame leaves it open.
 
     Frames count from 0 or from 1. With 0 there, it is known; without it, 0 may be what is missing, and where any number
-    is missing all others might stand in the wrong halves of pairs.
+    is missing all others might stand in the wrong halves of pairs. Where neither is there, the first may be a second.
     """
     if numbers[0] == 0:
         return 0
-    whole = len(numbers) % 2 == 0 and list(numbers) == list(range(numbers[0], numbers[0] + len(numbers)))
-    return numbers[0] if whole else None
+    whole = len(numbers) % 2 == 0 and list(numbers) == list(range(1, 1 + len(numbers)))
+    return 1 if whole else None
 
 
 def _unknown_beginning(numbers: Sequence[int]) -> str:
     missing = next((before + 1 for before, after in pairwise(numbers) if after > before + 1), None)
     lost = "not all make pairs" if missing is None else f"{missing} is missing"
+    if missing is None and numbers[0] > 1:
+        lost = "none is 0 or 1"
     return (
         f"of the running numbers {numbers[0]} to {numbers[-1]} {lost}, so it is open whether even or odd ones begin "
         f"pairs (--pair-by with {{number}} for even, {{number:1}} for odd)"
@@ -288,11 +302,6 @@ def _unknown_beginning(numbers: Sequence[int]) -> str:
 def _several(series: Sequence[str]) -> str:
     names = ", ".join(series[:3])
     return f"running numbers are of {len(series)} series ({names}), so it is open what is first and second of a pair"
-
-
-def _assumed(first: str, second: str) -> Notice:
-    text = f"its number is taken to begin a pair, with {second} as the second frame, as no earlier frame is there"
-    return Notice("pair-assumed", first, text, "say it with --pair-by if that is wrong")
 
 
 def _follow(places: Mapping[int, Place], found: _Found) -> None:

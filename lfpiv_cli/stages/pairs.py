@@ -12,7 +12,7 @@ from lfpiv_cli.errors import UsageError
 from lfpiv_cli.files.batch import Frame
 from lfpiv_cli.files.frame_sources import images_seen, results_seen
 from lfpiv_cli.files.pair_lists import pairs_listed
-from lfpiv_cli.files.pairing import Pairs, Seen, in_order, pair_frames
+from lfpiv_cli.files.pairing import Pairs, Seen, contradiction, in_order, pair_frames
 from lfpiv_cli.files.provenance import Gone
 from lfpiv_cli.names import Pairing
 from lfpiv_cli.notice import Notice
@@ -109,7 +109,7 @@ def sequence_of(paths: Sequence[Path]) -> tuple[list[int], list[Notice]]:
     Two are taken as they are given.
     """
     frames = results_seen(paths)
-    return ([0, 1], _backwards(frames)) if len(frames) == 2 else in_order(frames)
+    return ([0, 1], _doubts(frames)) if len(frames) == 2 else in_order(frames)
 
 
 def _found(frames: Sequence[Seen], options: PairOptions) -> Pairs:
@@ -131,13 +131,18 @@ def _found(frames: Sequence[Seen], options: PairOptions) -> Pairs:
         raise UsageError(
             f"{len(frames)} frames need --pairing: ab for separate pairs or sequence for each with the next"
         )
-    return Pairs(((0, 1),), notices=tuple(_backwards(frames)))
+    return Pairs(((0, 1),), notices=tuple(_doubts(frames)))
 
 
-def _backwards(frames: Sequence[Seen]) -> list[Notice]:
-    """Say of two frames that are taken as they are given where their names say that the second is the first."""
-    order, _ = in_order(frames)
-    if order == [0, 1]:
+def _doubts(frames: Sequence[Seen]) -> list[Notice]:
+    """Say of two frames that are taken as they are given where their names contradict it."""
+    first, second = frames
+    if (why := contradiction(first, second)) is not None:
+        text = f"is taken as the second frame of {first.name}'s pair, but {why}"
+        return [
+            Notice("pair-contradicted", second.name, text, "give frames that belong together, or list them in --pairs")
+        ]
+    if in_order(frames)[0] == [0, 1]:
         return []
-    text = f"is the second of the pair, and {frames[0].name} the first; by their names they are the other way round"
-    return [Notice("pair-backwards", frames[1].name, text, "give the earlier frame first")]
+    text = f"is the second of the pair, and {first.name} the first; by their names they are the other way round"
+    return [Notice("pair-backwards", second.name, text, "give the earlier frame first")]
