@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import hashlib
+import io
 import json
 import shutil
 import signal
@@ -142,7 +143,8 @@ def small_experiment(folder: Path, pairs: int) -> Experiment:
         text = text.replace(old, new)
     (folder / "rig.yaml").write_text(text, encoding="utf-8")
     weights = folder / "weights.h5"
-    cli.main(["build-weights", str(folder / "rig.yaml"), "-o", str(weights), "-q"], standalone_mode=False)
+    with contextlib.redirect_stdout(io.StringIO()):
+        cli.main(["build-weights", str(folder / "rig.yaml"), "-o", str(weights), "-q"], standalone_mode=False)
     images = folder / "images"
     images.mkdir()
     rng, kinds = np.random.default_rng(SEED), []
@@ -199,7 +201,7 @@ def command(experiment: Experiment, output: Path, *options: str, images: Sequenc
 def seconds_of(*commands: Sequence[str]) -> float:
     """Run commands at once; return the seconds until all have ended."""
     begun = time.perf_counter()
-    processes = [subprocess.Popen(words, cwd=ROOT) for words in commands]
+    processes = [subprocess.Popen(words, cwd=ROOT, stdout=subprocess.DEVNULL) for words in commands]
     for process in processes:
         assert process.wait() == 0
     return time.perf_counter() - begun
@@ -263,7 +265,7 @@ def killed(experiment: Experiment, folder: Path, kills: int, rng: np.random.Gene
 
 def is_complete(experiment: Experiment, output: Path, after_s: float) -> bool:
     """Run a batch and kill it after a time; return whether it was complete before."""
-    process = subprocess.Popen(command(experiment, output, "--resume"), cwd=ROOT)
+    process = subprocess.Popen(command(experiment, output, "--resume"), cwd=ROOT, stdout=subprocess.DEVNULL)
     with contextlib.suppress(subprocess.TimeoutExpired):
         return process.wait(after_s) == 0
     process.send_signal(signal.SIGKILL)

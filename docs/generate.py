@@ -17,6 +17,7 @@ import sys
 import typing
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import click_commands
 import drawing
@@ -79,10 +80,12 @@ def run_sample() -> None:
     environment = os.environ | {"PYTHONPATH": str(ROOT), "NO_COLOR": "1"}
     for name, arguments in CHAIN.items():
         command = [sys.executable, "-m", "lfpiv_cli", *arguments.split()]
-        done = subprocess.run(command, cwd=SAMPLE, env=environment, capture_output=True, text=True, check=False)
+        # As a terminal shows it: words at work and the answer in their order.
+        heard: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+        done = subprocess.run(command, cwd=SAMPLE, env=environment, check=False, **heard)
         if done.returncode:
-            raise RuntimeError(f"lfpiv {arguments}: exit code {done.returncode}: {done.stderr}")
-        (SAMPLE / f"{name}.txt").write_text(f"$ lfpiv {arguments}\n{done.stderr}", encoding="utf-8")
+            raise RuntimeError(f"lfpiv {arguments}: exit code {done.returncode}: {done.stdout}")
+        (SAMPLE / f"{name}.txt").write_text(f"$ lfpiv {arguments}\n{done.stdout}", encoding="utf-8")
     stamp.write_text(made_from)
 
 

@@ -1,4 +1,4 @@
-"""What a person sees while a command runs: how far it is, what speaks against it, a summary, all of it on stderr.
+"""What a person sees of a command: its answer on stdout; how far it is and what it warns of on stderr.
 
 On a terminal how far it is shows as a bar; elsewhere a line is printed for each frame, and for work of one piece every
 ten seconds. The log, where one is asked for, gets the same as events.
@@ -35,8 +35,8 @@ class Console:
     Attributes
     ----------
     verbose : say more
-    quiet : say nothing but errors
-    only_warnings : say nothing but errors and warnings: the summary goes elsewhere
+    quiet : say nothing but errors on stderr; the answer on stdout stays
+    only_warnings : say nothing but errors and warnings: the answer goes elsewhere
     warned : where it is given, all warnings are added to it, and none is printed twice
     log : where it is given, what happens is added to it, whatever else is silent
     """
@@ -60,9 +60,14 @@ class Console:
         return None if self.log is None else self.log.path
 
     def say(self, text: str) -> None:
-        """Print a line that everybody should see."""
+        """Print a line that everybody should see, on stderr."""
         if not self._silent:
             click.echo(text, err=True)
+
+    def answer(self, text: str) -> None:
+        """Print a line of what the command was asked for, on stdout."""
+        if not self.only_warnings:
+            click.echo(text)
 
     def warn(self, notices: Iterable[Notice]) -> None:
         """Print what speaks against a result and does not keep the command from going on, a line each."""
@@ -82,7 +87,7 @@ class Console:
             self.say(text)
 
     def summary(self, figures: Mapping[str, Any]) -> None:
-        """Print the figures of a command, one a line.
+        """Print the figures of a command on stdout, one a line.
 
         What there is for several things, as a figure with a value for each or under names like `recorded.ert.error`,
         stands in a table. Of a list of records each has a line, which begins with its first entry.
@@ -98,7 +103,7 @@ class Console:
             widths = [max(map(len, column)) for column in zip(*(table[name] for name in rows), strict=True)]
             for name, cells in table.items():
                 columns = map(str.rjust, cells, widths) if name in rows else cells
-                self.say(f"{name:>{first}}  {'  '.join(columns)}")
+                self.answer(f"{name:>{first}}  {'  '.join(columns)}")
 
     @contextmanager
     def progress(self, total: int, label: str) -> Iterator[Callable[[int], None]]:

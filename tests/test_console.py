@@ -151,21 +151,21 @@ def test_figures_of_several_methods_stand_in_columns(capsys) -> None:
     Console().summary(
         {"rms_u_voxel": {"volumes": 0.58, "particles": 0.049}, "bias": {"volumes": None, "particles": 1}, "pairs": 12}
     )
-    assert [line.split() for line in capsys.readouterr().err.splitlines()] == [
+    assert [line.split() for line in capsys.readouterr().out.splitlines()] == [
         ["volumes", "particles"],
         ["rms_u_voxel", "0.58", "0.049"],
         ["bias", "unknown", "1"],
         ["pairs", "12"],
     ]
     Console().summary({"frames": 2, "sizes": [1, 2], "inputs": {"a": "x.tif"}})
-    assert [line.split(maxsplit=1)[1] for line in capsys.readouterr().err.splitlines()] == ["2", "1, 2", "a x.tif"]
+    assert [line.split(maxsplit=1)[1] for line in capsys.readouterr().out.splitlines()] == ["2", "1, 2", "a x.tif"]
 
 
 def test_figures_of_several_things_stand_in_a_table_that_is_longer_than_wide(capsys) -> None:
     Console().summary(
         {"voxels": 25, "a.ssim": 0.9, "a.l1": 0.1, "b.ssim": 0.8, "b.l1": None, "c.ssim": 1.0, "c.l1": 0.0}
     )
-    assert [line.split() for line in capsys.readouterr().err.splitlines()] == [
+    assert [line.split() for line in capsys.readouterr().out.splitlines()] == [
         ["voxels", "25"],
         ["ssim", "l1"],
         ["a", "0.9", "0.1"],
@@ -173,7 +173,7 @@ def test_figures_of_several_things_stand_in_a_table_that_is_longer_than_wide(cap
         ["c", "1", "0"],
     ]
     Console().summary({"ideal.ert.x": 1.0, "ideal.ert.y": 2.0, "ideal.ert.z": 3.0, "flow.slope": 4.0})
-    assert [line.split() for line in capsys.readouterr().err.splitlines()] == [
+    assert [line.split() for line in capsys.readouterr().out.splitlines()] == [
         ["ideal.ert"],
         ["x", "1"],
         ["y", "2"],
@@ -211,6 +211,38 @@ def test_the_log_tells_how_a_command_began_and_ended(tmp_path: Path) -> None:
     assert (found[1]["exit_code"], found[4]["exit_code"], found[6]["exit_code"]) == (0, 8, 4)
     assert found[4]["error"] == "too large"
     assert found[6]["error"] == "a.tif: no such file"
+
+
+def talking(console: Console) -> dict[str, Any]:
+    console.say("at work")
+    console.detail("at this step")
+    console.warn([NOTICE])
+    return {"frames": 2}
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ((), ["at work", f"lfpiv: warning: {NOTICE}"]),
+        (("-v",), ["at work", "at this step", f"lfpiv: warning: {NOTICE}"]),
+        (("-q",), []),
+    ],
+)
+def test_the_answer_goes_to_stdout_and_words_to_stderr(options: tuple[str, ...], words: list[str]) -> None:
+    done = CliRunner().invoke(command_that(talking), options)
+    assert done.stdout.split() == ["frames", "2"]
+    assert done.stderr.splitlines() == words
+
+
+@pytest.mark.parametrize("option", ["-v", "--verbose", "-q", "--quiet", "--json", "--debug"])
+def test_options_of_what_is_printed_stand_before_or_after_the_command(tmp_path: Path, option: str) -> None:
+    rig = str(tmp_path / "rig.yaml")
+    after, before = ([*words, "--overwrite"] for words in (["init", rig, option], [option, "init", rig]))
+    said = [CliRunner().invoke(cli, [*words, "--camera", "table2"]) for words in (after, before, before[1:])]
+    assert [done.exit_code for done in said] == [0, 0, 0]
+    assert (said[0].stdout, said[0].stderr) == (said[1].stdout, said[1].stderr)
+    if option in ("-q", "--quiet", "--json"):
+        assert (said[0].stdout, said[0].stderr) != (said[2].stdout, said[2].stderr)
 
 
 def ended(monkeypatch, capsys, act: Any, *options: str) -> tuple[int, list[dict[str, Any]], str]:

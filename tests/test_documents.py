@@ -26,7 +26,17 @@ from click.testing import CliRunner
 import lfpiv_cli
 from lfpiv_cli.cli import cli
 from lfpiv_cli.errors import LimitMissedError
-from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, read_points, write_points
+from lfpiv_cli.files import calibration_file, particle_file, vtkhdf, weights_file
+from lfpiv_cli.files.exports.series import SERIES_FORMAT, SERIES_VERSION
+from lfpiv_cli.files.particle_file import (
+    PARTICLES_FORMAT,
+    TRACKS_FORMAT,
+    TRAJECTORIES_FORMAT,
+    read_points,
+    write_points,
+)
+from lfpiv_cli.files.playback import PLAYBACK_FORMAT, PLAYBACK_VERSION
+from lfpiv_cli.files.vtkhdf import VECTORS_FORMAT, VOLUME_FORMAT
 from tests import camera_files
 
 ROOT = Path(__file__).parent.parent
@@ -304,6 +314,27 @@ SPECIFIED = {
     "particles/a.vtkhdf": (1, 6),
     "tracks.vtkhdf": (1, 6, 7),
 }
+# The formats with the version that is written, and those that are read.
+VERSIONS = {
+    calibration_file.FORMAT: (calibration_file.VERSION,),
+    weights_file.FORMAT: (weights_file.VERSION, *weights_file.READABLE_VERSIONS),
+    **dict.fromkeys((VOLUME_FORMAT, VECTORS_FORMAT), (vtkhdf.FORMAT_VERSION,)),
+    **dict.fromkeys((PARTICLES_FORMAT, TRACKS_FORMAT, TRAJECTORIES_FORMAT), (particle_file.FORMAT_VERSION,)),
+    PLAYBACK_FORMAT: (PLAYBACK_VERSION,),
+    SERIES_FORMAT: (SERIES_VERSION,),
+}
+
+
+def test_versions_of_formats_are_those_that_are_written_and_read():
+    page = (ROOT / "docs" / "files.md").read_text(encoding="utf-8")
+    found = re.findall(r"`(lfpiv-\w+)`, version (\d+)(?: \(([\d, and]+) are read\))?", page)
+    named = {name: [int(number), *map(int, re.findall(r"\d+", others))] for name, number, others in found}
+    # Of several the written one comes first.
+    assert named.keys() == VERSIONS.keys()
+    for name, versions in VERSIONS.items():
+        assert (named[name][0], set(named[name])) == (versions[0], set(versions)), name
+
+
 # What HDF5 itself keeps beside dimension scales, and the datasets of VTK's cells, are named once for all.
 GENERIC = {"CLASS", "NAME", "REFERENCE_LIST", "DIMENSION_LIST", "units"}
 

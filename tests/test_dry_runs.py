@@ -50,7 +50,7 @@ def test_a_dry_run_believes_what_is_there_and_the_log(weights, images, tmp_path,
     assert summary["seconds"] == frames[-1]["seconds_each"]
     assert summary["memory_mb"] == frames[-1]["memory_mb"] > 50.0
     run(*command[:-1], "--dry-run", "--overwrite", "-v")
-    said = capsys.readouterr().err
+    said = capsys.readouterr().out
     assert said.count("would make") == 3
     assert "would_make" not in said
 

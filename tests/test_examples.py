@@ -201,4 +201,4 @@ def test_the_image_tests_itself_and_runs_commands(experiment: Path) -> None:
     for command in found["test"]:
         run(command, experiment)
     script(experiment, "runscript", "#!/bin/sh\n" + "\n".join(found["runscript"]) + "\n")
-    assert "lfpiv-weights" in run("./runscript info weights.h5", experiment).stderr
+    assert "lfpiv-weights" in run("./runscript info weights.h5", experiment).stdout

@@ -173,7 +173,7 @@ def test_of_all_but_the_best_vectors_a_few_figures_are_drawn(
 def test_the_command_prints_the_verdict(results: Path, tmp_path: Path) -> None:
     outcome = CliRunner().invoke(cli, ["report", str(results), "-o", str(tmp_path / "page.html")])
     assert outcome.exit_code == 0, outcome.output
-    assert re.search(r"verdict +calibration look, images look, vectors look", outcome.stderr)
+    assert re.search(r"verdict +calibration look, images look, vectors look", outcome.stdout)
 
 
 def test_a_view_shows_some_of_many_lines() -> None:

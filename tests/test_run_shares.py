@@ -142,6 +142,7 @@ def test_it_stops_before_its_time_limit_and_goes_on(
 
 
 def planned(rig: Path, output: Path, capsys: pytest.CaptureFixture[str], *options: object) -> dict[str, Any]:
+    capsys.readouterr()
     run(rig, output, "--dry-run", "--json", *options)
     return json.loads(capsys.readouterr().out)
 

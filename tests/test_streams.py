@@ -21,7 +21,7 @@ def shell(line: str) -> subprocess.CompletedProcess[str]:
 @pytest.mark.thorough
 @pytest.mark.parametrize("closed", ["2>/dev/full", "<&- >&- 2>&-"])
 def test_a_rig_file_is_written_though_nothing_can_be_said(tmp_path: Path, closed: str) -> None:
-    done = shell(f"{LFPIV} init --camera table2 -o '{tmp_path}/rig.yaml' {closed}")
+    done = shell(f"{LFPIV} init --camera table2 -o '{tmp_path}/rig.yaml' {closed} >&-")
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
     assert (tmp_path / "rig.yaml").stat().st_size > 100
 
@@ -36,6 +36,14 @@ def test_an_answer_that_is_lost_is_a_failure_but_for_a_reader_that_has_gone(
     assert ("stdout: cannot be written: No space left on device" in done.stderr) == (code == 7)
     assert "Traceback" not in done.stderr
     assert "Exception" not in done.stderr
+
+
+@pytest.mark.thorough
+def test_an_answer_goes_through_a_pipe() -> None:
+    done = shell(f"{LFPIV} check '{SAMPLE}' 2>/dev/null | head -1")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith(" ")
+    assert done.stdout.count("\n") == 1
 
 
 @pytest.mark.thorough

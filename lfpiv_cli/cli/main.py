@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import click
 
@@ -24,6 +24,7 @@ from lfpiv_cli.cli import (
     weights,
 )
 from lfpiv_cli.cli.interrupts import end_by_signals
+from lfpiv_cli.cli.options import voice_options
 from lfpiv_cli.cli.outcome import outcome_of, print_json_error, printable
 from lfpiv_cli.cli.streams import ensure_said, open_streams
 from lfpiv_cli.files.inputs import ensure_address_space
@@ -53,7 +54,9 @@ COMMANDS = (
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="lfpiv")
-def cli() -> None:
+@voice_options
+@click.pass_context
+def cli(context: click.Context, **before: Any) -> None:
     """From raw light-field camera images to three-dimensional velocity fields (PIV and PTV).
 
     \b
@@ -64,7 +67,10 @@ def cli() -> None:
     lfpiv reconstruct weights.h5 a.tif b.tif --dark dark.tif -o volumes
     lfpiv correlate volumes/a.vtkhdf volumes/b.vtkhdf -o vectors.vtkhdf
     lfpiv validate flow rig.yaml --vectors vectors.vtkhdf -o report
+
+    Options that stand before a command hold for it as those after it do.
     """
+    context.default_map = {str(context.invoked_subcommand): {name: value for name, value in before.items() if value}}
 
 
 def first_sentence(text: str) -> str:

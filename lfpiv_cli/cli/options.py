@@ -211,6 +211,18 @@ def _inputs(arguments: Mapping[str, Any]) -> list[Path]:
     return [Path(each) for each in flat if isinstance(each, Path) or (isinstance(each, str) and Path(each).exists())]
 
 
+def voice_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Give a command, or the program before its commands, the options that say what it prints, and where."""
+    for option in (
+        click.option("--debug", is_flag=True, expose_value=False, help="Show the traceback of an error."),
+        click.option("-q", "--quiet", is_flag=True, help="Say nothing on stderr but errors."),
+        click.option("-v", "--verbose", is_flag=True, help="Say more on stderr."),
+        click.option("--json", "as_json", is_flag=True, help="Print one JSON object to stdout, warnings to stderr."),
+    ):
+        command = option(command)
+    return command
+
+
 def common_options(command: Callable[..., dict[str, Any]]) -> Callable[..., None]:
     """Give a command the options that all share, and print the summary it returns.
 
@@ -221,15 +233,10 @@ def common_options(command: Callable[..., dict[str, Any]]) -> Callable[..., None
     @click.option("--overwrite", is_flag=True, help="Replace outputs that exist.")
     @click.option("--threads", type=click.IntRange(min=1), help="Threads to use; all cores when not given.")
     @click.option(
-        "--json", "as_json", is_flag=True, help="Print one JSON object to stdout, and only warnings to stderr."
-    )
-    @click.option(
         "--log", type=FILE, help="Add a line of JSON to this file for each event: start, frame, warning, end, error."
     )
     @click.option("--verify", type=FILE, help="Check all inputs by this list of sha256sum before any work.")
-    @click.option("-v", "--verbose", is_flag=True, help="Say more on stderr.")
-    @click.option("-q", "--quiet", is_flag=True, help="Say nothing on stderr but errors.")
-    @click.option("--debug", is_flag=True, expose_value=False, help="Show the traceback of an error.")
+    @voice_options
     @wraps(command)
     def run(
         threads: int | None,

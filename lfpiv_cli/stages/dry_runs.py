@@ -86,9 +86,10 @@ def dry_run(batch: PlannedBatch, options: WorkOptions, console: Console, folders
     faults = {number: fault for number in needed if (fault := batch.fault(number)) is not None}
     making, skipped = [number for number in needed if number not in faults], sorted(set(share) - set(needed))
     for number in making:
-        console.detail(f"would make {batch.targets[number].path}")
+        if console.verbose:
+            console.answer(f"would make {batch.targets[number].path}")
     for number, fault in faults.items():
-        console.say(f"would leave out {batch.names[number]}: {fault}")
+        console.answer(f"would leave out {batch.names[number]}: {fault}")
     told: dict[str, Any] = {
         f"{batch.unit}s": len(share),
         "to_make": len(making),
