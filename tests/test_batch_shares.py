@@ -240,6 +240,30 @@ def test_pairs_of_a_folder_that_is_being_filled(
     assert bytes_of(tmp_path / "v") == bytes_of(tmp_path / "one")
 
 
+@pytest.mark.thorough
+def test_a_lost_frame_of_a_folder_that_is_being_filled_is_told_at_once(
+    volumes: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    named = [tmp_path / f"{name}.vtkhdf" for name in ("1a", "1b", "2a", "3a", "3b")]
+    for path, volume in zip(named, volumes, strict=True):
+        path.write_bytes(volume.read_bytes())
+    folder = Filling(tmp_path / "volumes", dict(zip((1.0, 1.5, 2.0, 9.0, 10.0), named, strict=True)))
+    monkeypatch.setattr(watching, "time", folder)
+    with pytest.raises(PartialError, match="1 of 3 pairs failed, the first because the second frame of its pair"):
+        run("correlate", folder.folder, "--pair-by", "{pair}{frame}", "--windows", 4, "--watch", "-o", tmp_path / "v")
+    assert sorted(bytes_of(tmp_path / "v")) == ["1a.vtkhdf", "3a.vtkhdf"]
+    assert capsys.readouterr().err.count("2a.vtkhdf: the second frame of its pair is missing") == 1
+
+
+def test_a_frame_that_stays_alone_in_a_folder_is_told(
+    volumes: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = Filling(tmp_path / "volumes", {1.0: volumes[0]})
+    monkeypatch.setattr(watching, "time", folder)
+    with pytest.raises(InputError, match="no other frame has come"):
+        run("correlate", folder.folder, "--pairing", "ab", "--watch", "--idle-s", 5, "-o", tmp_path / "v")
+
+
 @pytest.mark.parametrize(
     ("options", "told"),
     [

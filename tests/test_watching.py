@@ -1,8 +1,8 @@
-"""Folders that are being filled: files are taken when they are complete, in order, and pairs when both are there."""
+"""Folders that are being filled: files are taken when they are complete, in order."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -37,9 +37,9 @@ class Camera:
     def listed(self) -> list[Path]:
         return sorted(self.folder.iterdir())
 
-    def groups(self, idle_s: float, whole: Callable[[Sequence[Path]], int] = len) -> Iterator[list[str]]:
+    def groups(self, idle_s: float) -> Iterator[list[str]]:
         self.write()
-        for group in as_they_come(self.listed, read, idle_s, whole):
+        for group in as_they_come(self.listed, read, idle_s):
             yield [path.name for path in group]
 
 
@@ -76,11 +76,6 @@ def test_a_file_is_not_taken_while_it_grows_though_it_can_be_read(camera: Camera
 
 def len_of(path: Path) -> int:
     return path.stat().st_size
-
-
-def test_pairs_come_when_both_are_there(camera: Camera) -> None:
-    camera.plan = [(0.0, "1a", WHOLE), (0.0, "1b", WHOLE), (0.0, "2a", WHOLE), (6.0, "2b", WHOLE)]
-    assert list(camera.groups(10.0, lambda group: len(group) - len(group) % 2)) == [["1a", "1b"], ["2a", "2b"]]
 
 
 def test_what_never_becomes_complete_comes_last(camera: Camera) -> None:

@@ -74,6 +74,10 @@ class Pairs:
             first, *others = self.left_out
             more = f", and {len(others)} more" if others else ""
             raise InputError(f"{first.name}: {first.why}{more}; {REMEDY}")
+        return self.said()
+
+    def said(self) -> list[Notice]:
+        """Return what was taken for granted, and which frames are left out."""
         skipped = [Notice("frame-unpaired", each.name, each.why, REMEDY) for each in self.left_out]
         return [*self.notices, *skipped]
 

@@ -20,24 +20,21 @@ def as_they_come(
     listed: Callable[[], Sequence[Path]],
     read: Callable[[Path], object],
     idle_s: float,
-    whole: Callable[[Sequence[Path]], int] = len,
 ) -> Iterator[list[Path]]:
     """Yield the files that are complete, in groups, until nothing has changed for `idle_s` seconds.
 
     The order is that of the list: a file waits for those before it. One that is there after the idle time and still
-    cannot be read, or has no partner, comes in the last group, for whoever takes it to say what it lacks.
+    cannot be read comes in the last group, for whoever takes it to say what it lacks.
 
     Parameters
     ----------
     listed : returns the files that are there now, in order
     read : raises `InputError` where a file cannot be read yet
-    whole : returns how many of a group's files, from its first, can be worked on: complete pairs, say
     """
     folder, idle_s = _Filling(listed, read), max(idle_s, SETTLED_S)
     while True:
         folder.look()
-        complete = folder.complete()
-        if ready := complete[: whole(complete)]:
+        if ready := folder.complete():
             folder.take(ready)
             yield ready
         elif time.monotonic() - folder.changed_at >= idle_s:

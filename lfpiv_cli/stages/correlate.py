@@ -48,7 +48,7 @@ from lfpiv_cli.stages.dry_runs import Expected, dry_run
 from lfpiv_cli.stages.intervals import dt_notices
 from lfpiv_cli.stages.means import Mean, arrays_of
 from lfpiv_cli.stages.pairs import PairBatch, PairBatchOptions, result_pairs
-from lfpiv_cli.stages.watched import paired_from_first, watched, work_as_they_come
+from lfpiv_cli.stages.watched import ComingPairs, watched, work_as_they_come
 
 # Numbers of eight bytes that a file has of each vector at most, and derived ones besides.
 NUMBERS_A_VECTOR, NUMBERS_DERIVED, NUMBER_BYTES = 16, 6, 8
@@ -139,19 +139,14 @@ def _as_they_come(
     if not options.are_told:
         raise UsageError("--watch needs --pairing: ab or sequence")
     prepare_folder([output / folders[0].name])
-    sequence = options.pairing == "sequence"
+    coming = ComingPairs(lambda files: result_pairs(files, options), console)
 
-    def pairs_in(paths: Sequence[Path]) -> int:
-        return len(paths) if sequence else paired_from_first(lambda some: result_pairs(some, options), paths)
+    def of_pairs(files: Sequence[Path]) -> Correlation:
+        two_by_two = tuple((number, number + 1) for number in range(0, len(files), 2))
+        return Correlation(files, output, options, overwrite, Pairs(two_by_two))
 
-    def groups() -> Iterator[Sequence[Path]]:
-        last: list[Path] = []
-        for group in watched(folders, "results", options, console, pairs_in):
-            if len(last) + len(group) > 1 or not sequence:
-                yield [*last, *group]
-            last = group[-1:] if sequence else []
-
-    return work_as_they_come(lambda group: Correlation(group, output, options, overwrite), groups(), options, console)
+    groups = coming.groups(watched(folders, "results", options, console))
+    return work_as_they_come(of_pairs, groups, options, console, lambda: coming.left_out)
 
 
 @dataclass(frozen=True)

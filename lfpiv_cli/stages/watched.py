@@ -16,8 +16,10 @@ from lfpiv_cli.files.listing import files_in
 from lfpiv_cli.files.pairing import Pairs
 from lfpiv_cli.files.watching import as_they_come
 from lfpiv_cli.names import InputKind
+from lfpiv_cli.notice import Notice
 from lfpiv_cli.stages.batches import ALL, Batch, BatchOptions, Failure, Worked, work_through, write_failures
 from lfpiv_cli.stages.frames import STILL, Background
+from lfpiv_cli.stages.pairs import failures_of
 
 OfBatch = TypeVar("OfBatch", bound=Batch)
 
@@ -27,7 +29,6 @@ def watched(
     kind: InputKind,
     options: BatchOptions,
     console: Console,
-    whole: Callable[[Sequence[Path]], int] = len,
 ) -> Iterator[list[Path]]:
     """Yield the files of folders in groups, as they become complete: see `as_they_come`.
 
@@ -53,7 +54,7 @@ def watched(
             raise deadline.error(count, count, "frame")
         return [path for folder in folders for path in files_in(folder, kind)]
 
-    for group in as_they_come(listed, read, options.idle_s, whole):
+    for group in as_they_come(listed, read, options.idle_s):
         count += len(group)
         yield group
     if count == 0:
@@ -79,13 +80,22 @@ def ensure_frames_alone(settings: Config, background: str | None, mask: str | Pa
 
 
 def work_as_they_come(
-    make: Callable[[Sequence[Path]], OfBatch], groups: Iterable[Sequence[Path]], options: BatchOptions, console: Console
+    make: Callable[[Sequence[Path]], OfBatch],
+    groups: Iterable[Sequence[Path]],
+    options: BatchOptions,
+    console: Console,
+    left_out: Callable[[], Sequence[Failure]] = tuple,
 ) -> tuple[OfBatch, Worked]:
     """Work through a batch for each group of files; return the last one, and what became of all.
+
+    Parameters
+    ----------
+    left_out : returns, at the end, the files that were in no group
 
     Raises
     ------
     LfpivError : as `work_through`
+    InputError : there was no group
     """
     alone = replace(options, failures=None)
     together: Worked = Worked()
@@ -99,26 +109,52 @@ def work_as_they_come(
             together.failures.append(Failure(group[0].stem, str(error)))
         else:
             together.add(work_through(batch, alone, console))
-    assert batch is not None
+    together.failures[:0] = left_out()
+    if batch is None:
+        raise InputError(f"{together.failures[0].name}: {together.failures[0].error}")
     write_failures(options, together)
     return batch, together
 
 
-def paired_from_first(pair: Callable[[Sequence[Path]], Pairs], paths: Sequence[Path]) -> int:
-    """Return how many files, from the first one, are pairs that are complete."""
-    if len(paths) < 2:
-        return 0
-    partner: dict[int, int] = {}
-    for first, second in pair(paths).pairs:
-        partner |= {first: second, second: first}
-    complete, farthest = 0, 0
-    for number in range(len(paths)):
-        if number not in partner:
-            break
-        farthest = max(farthest, partner[number])
-        if farthest == number:
-            complete = number + 1
-    return complete
+class ComingPairs:
+    """The pairs of files that come one after the other.
+
+    Attributes
+    ----------
+    left_out : the files of which no partner has come so far
+    """
+
+    def __init__(self, pair: Callable[[Sequence[Path]], Pairs], console: Console) -> None:
+        """Take which of some files are pairs, and where it is told of those that are passed over."""
+        self._pair, self._console = pair, console
+        self._seen: list[Path] = []
+        self._made: set[tuple[int, int]] = set()
+        self._told: set[Notice] = set()
+        self.left_out: Sequence[Failure] = ()
+
+    def groups(self, coming: Iterable[Sequence[Path]]) -> Iterator[list[Path]]:
+        """Yield the files of pairs that are complete, two by two, as they come."""
+        for files in coming:
+            self._seen += files
+            if len(self._seen) < 2:
+                self.left_out = [Failure(str(self._seen[0]), "no other frame has come")]
+                continue
+            found = self._pair(self._seen)
+            fresh = [pair for pair in found.pairs if pair not in self._made]
+            self._made.update(fresh)
+            self.left_out = failures_of(found)
+            self._tell(found)
+            if fresh:
+                yield [self._seen[number] for pair in fresh for number in pair]
+
+    def _tell(self, found: Pairs) -> None:
+        """Say once what is taken for granted, and which files have no partner though later pairs are complete."""
+        last = max((second for _, second in self._made), default=0)
+        before = {str(path) for path in self._seen[:last]}
+        passed = Pairs((), tuple(each for each in found.left_out if each.name in before), found.notices)
+        fresh = [notice for notice in passed.said() if notice not in self._told]
+        self._told.update(fresh)
+        self._console.warn(fresh)
 
 
 def _read_image(path: Path) -> None:
