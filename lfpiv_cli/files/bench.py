@@ -21,7 +21,7 @@ from lfpiv_cli.files.sections import (
     VolumeSection,
 )
 from lfpiv_cli.files.sections_scene import FaceSection, parameters_of
-from lfpiv_cli.files.sections_simulated import FlowSection, PulsationSection
+from lfpiv_cli.files.sections_simulated import FlowSection, LightSection, PulsationSection
 from lfpiv_cli.flow.masks import RoundWall
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
@@ -30,11 +30,12 @@ from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.optics.pupils import thin_lens
 from lfpiv_cli.optics.surfaces import SURFACES
+from lfpiv_cli.optics.waves import Waves
 from lfpiv_cli.reference import Reference
 from lfpiv_cli.scale import Scale
 from lfpiv_cli.synthetic.flows import FLOWS, STEADY, Flow, Pulsation
 
-UM_TO_MM = 1e-3
+UM_TO_MM, NM_TO_MM = 1e-3, 1e-6
 # Of the paper's final window along the axis with the smallest voxels; the coarse one is twice as large: a displacement
 # of a quarter of its side does not leave it.
 DEFAULT_WINDOW = 16
@@ -110,6 +111,7 @@ def camera_of(section: CameraSection) -> Camera:
         columns=sensor.columns,
         rows=sensor.rows,
         column_axis=sensor.column_axis,
+        diffusion_px=sensor.diffusion_px,
     )
     return thin_lens(real, entrance_over_exit(lens))
 
@@ -251,3 +253,8 @@ def flow_of(section: FlowSection, reference: Reference) -> Flow:
 def pulsation_of(section: PulsationSection | None) -> Pulsation:
     """Return how a flow changes in time."""
     return STEADY if section is None else Pulsation(section.amplitude, section.frequency_hz)
+
+
+def waves_of(section: LightSection) -> Waves | None:
+    """Return the waves that light is made of, None where it is made of rays."""
+    return None if section.kind == "rays" else Waves(section.wavelength_nm * NM_TO_MM, section.points)

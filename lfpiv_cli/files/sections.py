@@ -12,6 +12,7 @@ from pydantic import Field
 
 from lfpiv_cli.files.section_types import (
     Count,
+    Diffusion,
     Index,
     NotNegative,
     Overlaps,
@@ -78,12 +79,15 @@ class Sensor(Section):
     """The sensor: pixel pitch, size, and the world axis that its columns follow.
 
     microlens_distance_mm: s_mu, how far it lies behind the array (default: the microlenses' focal length).
+    diffusion_px: standard deviation of the Gaussian that charge diffuses by before a pixel collects it, 0.2 to 0.4 in
+    many sensors; only `simulate` reads it.
     """
 
     pixel_um: Positive
     columns: Pixels
     rows: Pixels
     microlens_distance_mm: Positive | None = None
+    diffusion_px: Diffusion = 0.0
     column_axis: ColumnAxis = "x"
 
 

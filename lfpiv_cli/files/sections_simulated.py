@@ -167,6 +167,26 @@ class PulsationSection(Section):
     frequency_hz: Positive
 
 
+class RaysSection(Section):
+    """Light as rays, which geometry alone leads."""
+
+    kind: Literal["rays"] = "rays"
+
+
+class WavesSection(Section):
+    """Light of one wavelength_nm (in air) as scalar waves, which main lens and microlenses diffract.
+
+    points: of each tracer, which shine for themselves, evenly spread over its ball; one where its diameter is 0.
+    """
+
+    kind: Literal["waves"]
+    wavelength_nm: Annotated[float, Field(ge=200.0, le=20_000.0)] = 532.0
+    points: Annotated[int, Field(ge=3, le=1000)] = 16
+
+
+LightSection = Annotated[RaysSection | WavesSection, Field(discriminator="kind")]
+
+
 class SimulationSection(Section):
     """What `simulate` renders.
 
@@ -187,7 +207,8 @@ class SimulationSection(Section):
     distortion_per_mm2.
     Sensor: peak_counts (of a pixel that sees only light, in white and board images), photons_per_count (null: no shot
     noise), read_noise_counts, dark_level_counts, bits.
-    Tracing: refraction (exact or paraxial), rays per particle (null: as many as the noise needs), seed.
+    Tracing: light (made of rays, or of waves), refraction (exact or paraxial), rays per particle (null: as many as the
+    noise needs), seed.
     """
 
     flow: FlowSection | None = None
@@ -218,6 +239,7 @@ class SimulationSection(Section):
     read_noise_counts: NotNegative = 6.0
     dark_level_counts: NotNegative = 96.0
     bits: Annotated[int, Field(ge=1, le=16)] = 16
+    light: LightSection = RaysSection()
     refraction: Refraction = "exact"
     rays: Annotated[int, Field(ge=1)] | None = None
     seed: Annotated[int, Field(ge=0)] = 0

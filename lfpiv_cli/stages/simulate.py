@@ -21,7 +21,7 @@ from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files.atomic import ensure_writable, write_json
 from lfpiv_cli.files.batch import prepare_folder
-from lfpiv_cli.files.bench import pulsation_of
+from lfpiv_cli.files.bench import pulsation_of, waves_of
 from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.images import write_tiff
 from lfpiv_cli.files.particles import Particles, write_particles
@@ -167,7 +167,7 @@ def real_camera(settings: Config) -> Camera:
 
 
 def _recording(settings: Config) -> scenes.RecordingCamera:
-    return scenes.RecordingCamera(real_camera(settings), readout_of(settings))
+    return scenes.RecordingCamera(real_camera(settings), readout_of(settings), waves_of(settings.simulation.light))
 
 
 def misalignment_of(settings: Config) -> scenes.Misalignment:

@@ -18,10 +18,12 @@ from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.flow.masks import RoundWall, Walls
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.waves import Waves
 from lfpiv_cli.synthetic.board import BoardPlacement, dot_centres, render_board
 from lfpiv_cli.synthetic.flows import STEADY, Flow, Pulsation, advect
 from lfpiv_cli.synthetic.render import RAYS, Balls, ObjectSpace, Space, render_points, render_white
 from lfpiv_cli.synthetic.sensor import Readout
+from lfpiv_cli.synthetic.wave_images import points_by_waves, white_by_waves
 
 Triple = tuple[float, float, float]
 
@@ -161,10 +163,11 @@ class Tracers:
 
 @dataclass(frozen=True, eq=False)
 class RecordingCamera:
-    """A camera with the sensor that records what it sees."""
+    """A camera with the sensor that records what it sees, by light of rays, or of waves where they are given."""
 
     optics: Camera
     readout: Readout
+    waves: Waves | None = None
 
     def dark_frame(self, rng: np.random.Generator) -> NDArray[np.uint16]:
         """Return an image recorded without light."""
@@ -260,7 +263,9 @@ def pipe_bounds(pipe: RoundWall) -> Box:
 
 def simulate_white(camera: RecordingCamera, level: float, rng: np.random.Generator) -> SimulatedStill:
     """Simulate an image of uniform light, `level` expected counts where a pixel sees nothing but the aperture."""
-    image = camera.readout.record(render_white(camera.optics, level), rng)
+    optics, waves = camera.optics, camera.waves
+    expected = render_white(optics, level) if waves is None else white_by_waves(optics, waves, level)
+    image = camera.readout.record(expected, rng)
     return SimulatedStill(image, camera.dark_frame(rng), camera_truth(camera.optics))
 
 
@@ -311,7 +316,10 @@ def simulate_particles(
     images = []
     for place, seen, light in zip(places, lit, tracers.light_counts * shown, strict=True):
         balls = Balls(place[seen], light[seen], diameters[seen])
-        expected = render_points(camera.optics, space, balls, rng, rays=tracers.rays, progress=progress)
+        if camera.waves is None:
+            expected = render_points(camera.optics, space, balls, rng, rays=tracers.rays, progress=progress)
+        else:
+            expected = points_by_waves(camera.optics, space, balls, camera.waves, progress=progress)
         images.append(camera.readout.record(expected + still, rng))
     window = space.window if isinstance(space, ObjectSpace) else None
     truth = {

@@ -1,0 +1,424 @@
+"""Light as waves: scalar Fresnel diffraction of a point's light through main lens, microlenses and sensor.
+
+The field on the array is the Fourier transform of the pupil, whose phase has the traced rays for normals; each
+microlens adds its own phase; a transfer function leads to the sensor, where the intensities of a tracer's points, which
+do not interfere, are added up and summed over pixels.
+
+Axes: image axes, mm about the optical axis (see `camera`). Samples are fractions of a pixel, aligned with the pixels.
+
+Notes
+-----
+A ray through X of the main lens meets the array at x(X), distortion included. With k = 2 pi / wavelength the wave has
+there, but for factors of size 1,
+
+    u(x) = exp(i k |x|^2 / 2 s_i)  integral over the pupil of  exp(i phi(X) - i k x X / s_i),   grad phi = k x(X) / s_i
+
+so that the phase is stationary where the ray crosses. Lengths on the array count from the middle c of the light: phi
+has k (x(X) - c) / s_i for gradient, and of the first factor exp(i k |x - c|^2 / 2 s_i) is left and a tilt, which moves
+the light on the sensor outwards by s_mu c / s_i. The microlens at s adds exp(-i k |x - s|^2 / 2 f_m), the way s_mu to
+the sensor exp(-i pi wavelength s_mu nu^2) at the frequency nu.
+
+References
+----------
+Goodman, Introduction to Fourier Optics, chapters 4 and 5; Broxton et al., Optics Express 21, 25418 (2013).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+from scipy import fft
+from scipy.special import ndtr
+
+from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.curved_space import CurvedSpace
+from lfpiv_cli.optics.microlenses import nearest_point
+from lfpiv_cli.optics.object_space import ObjectSpace, slope_ratio
+
+# The pupil's phase is a polynomial of this degree in both coordinates together: what refraction and distortion leave
+# of it is below a thousandth of a wavelength for lenses up to f/2.
+DEGREE = 8
+# Places on the pupil that it is fitted to: the polynomial has 44 coefficients, each place tells two of its slopes.
+PUPIL_PLACES = 160
+# The samples follow a wave that is so much steeper than the steepest ray: what edges diffract further is weak.
+STEEPNESS = 1.4
+# Around what rays light, so many microlenses are left for what edges diffract; what goes further comes back on the
+# other side, some 0.5 % of the light in focus.
+MARGIN_PITCHES = 1.0
+UNDISTORT_ROUNDS = 20
+# Charge is followed for so many standard deviations of its diffusion.
+DIFFUSION_REACH = 5.0
+
+_TERMS = np.array([(i, j) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i) if i + j > 0])
+
+Complex = NDArray[np.complex64]
+
+
+@dataclass(frozen=True)
+class Waves:
+    """Light of one wavelength.
+
+    Attributes
+    ----------
+    wavelength_mm : in air
+    points : of a tracer, which glow independently of each other; of a tracer without a size one is taken
+    """
+
+    wavelength_mm: float
+    points: int = 16
+
+
+@dataclass(frozen=True, eq=False)
+class Patch:
+    """Light on a part of the sensor; `first` is its (row, column) on the sensor, which may lie beyond it."""
+
+    first: tuple[int, int]
+    light: NDArray[np.float64]
+
+    def add_to(self, image: NDArray[np.float64], counts: float) -> None:
+        """Add `counts` times the light to what lies on the sensor."""
+        (row, column), (height, width) = self.first, self.light.shape
+        top, bottom = np.clip([row, row + height], 0, image.shape[0])
+        left, right = np.clip([column, column + width], 0, image.shape[1])
+        image[top:bottom, left:right] += counts * self.light[top - row : bottom - row, left - column : right - column]
+
+
+class WavesInCamera:
+    """What waves of points in the scene make of the sensor; may be asked by several threads."""
+
+    def __init__(self, camera: Camera, space: ObjectSpace | CurvedSpace, waves: Waves) -> None:
+        """Take the camera, what lies in front of it, and the light."""
+        self.camera, self.space, self.waves = camera, space, waves
+        self.samples = samples_per_pixel(camera, waves)
+        self.step_mm = camera.pixel_mm / self.samples
+        self._wave_number = 2.0 * np.pi / waves.wavelength_mm
+        self._pupil_places = camera.aperture_radius_mm * _even_disc(PUPIL_PLACES)
+        self._to_pixels = pixel_response(self.samples, camera.diffusion_px)
+        self._windows: dict[int, _Window] = {}
+
+    def patch(self, points_mm: ArrayLike) -> Patch | None:
+        """Return the light of points that glow alike and do not interfere: 1 in all, less what faces hide.
+
+        Parameters
+        ----------
+        points_mm : (n, 3), close to each other, image axes
+
+        Returns
+        -------
+        None where no light reaches the lens, or none the sensor.
+
+        Raises
+        ------
+        ConfigError : a point in front of the fluid
+        """
+        points = np.asarray(points_mm, dtype=np.float64).reshape(-1, 3)
+        rays = [(point, *self._rays(point)) for point in points]
+        lit = [ray for ray in rays if ray[2].any()]
+        if not lit:
+            return None
+        spot = np.concatenate([array[seen] for _, array, seen in lit])
+        window = self._window(0.5 * float(np.ptp(spot, axis=0).max()))
+        first, middle = self._place(0.5 * (spot.min(axis=0) + spot.max(axis=0)), window)
+        if not self._meets_sensor(first, window):
+            return None
+        lenses = window.lenses(self.camera, middle, self._wave_number)
+        light = np.zeros((window.size, window.size), dtype=np.float32)
+        for point, array, seen in lit:
+            amplitude = window.amplitude if seen.all() else window.amplitude * self._seen(point, window.pupil)
+            field = window.on_array(amplitude, self._phase(array - middle, seen), self.camera.aperture_radius_mm)
+            field *= lenses
+            _add_intensity(window.on_sensor(field), light)
+        pixels = np.zeros((window.size // self.samples, window.size // self.samples))
+        _write_pixels(light, self.samples, self._to_pixels, pixels)
+        return Patch(first, pixels / len(points))
+
+    def _rays(self, point_mm: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Return where a point's rays through places of the pupil meet the array (places, 2), and which there are."""
+        crossing = self._pupil_places
+        slopes, seen = _slopes(self.camera, self.space, point_mm, crossing)
+        array = crossing + self.camera.image_distance_mm * (slopes - crossing / self.camera.focal_length_mm)
+        return array * (1.0 + self.camera.distortion_per_mm2 * np.sum(array**2, axis=1, keepdims=True)), seen
+
+    def _seen(self, point_mm: NDArray[np.float64], pupil_mm: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return which of the pupil's samples (y, x) a ray of the point reaches."""
+        places = np.stack(np.meshgrid(pupil_mm, pupil_mm), axis=-1).reshape(-1, 2)
+        return _slopes(self.camera, self.space, point_mm, places)[1].reshape(len(pupil_mm), -1)
+
+    @cached_property
+    def _terms(self) -> NDArray[np.float64]:
+        """Slopes (2 places, terms) that each term of the phase has on the pupil of radius 1, along x and then y."""
+        x, y = (self._pupil_places / self.camera.aperture_radius_mm).T
+        i, j = _TERMS[:, 0], _TERMS[:, 1]
+        along_x = i * x[:, None] ** np.maximum(i - 1, 0) * y[:, None] ** j
+        along_y = j * y[:, None] ** np.maximum(j - 1, 0) * x[:, None] ** i
+        return np.concatenate([along_x, along_y])
+
+    @cached_property
+    def _slope_fit(self) -> NDArray[np.float64]:
+        """What makes terms of slopes, where there are all."""
+        return np.asarray(np.linalg.pinv(self._terms), dtype=np.float64)
+
+    def _phase(self, array_mm: NDArray[np.float64], seen: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """Return the coefficients (y, x) of the phase, on the pupil of radius 1, whose normals meet the array there."""
+        slopes = self._wave_number * self.camera.aperture_radius_mm / self.camera.image_distance_mm * array_mm
+        if seen.all():
+            terms = self._slope_fit @ slopes.T.ravel()
+        else:
+            rows = np.concatenate([seen, seen])
+            terms = np.linalg.lstsq(self._terms[rows], slopes[seen].T.ravel(), rcond=None)[0]
+        coefficients = np.zeros((DEGREE + 1, DEGREE + 1))
+        coefficients[_TERMS[:, 1], _TERMS[:, 0]] = terms
+        return coefficients
+
+    def _window(self, radius_mm: float) -> _Window:
+        """Return the samples that hold the light of rays that meet the array within a square of this half side."""
+        camera, pitch = self.camera, float(self.camera.lattice.pitch.max())
+        behind = camera.microlens_distance_mm * steepest(camera) + MARGIN_PITCHES * pitch
+        pixels = int(np.ceil((radius_mm + behind) / camera.pixel_mm)) + 1
+        size = 2 * self.samples * fft.next_fast_len(pixels)
+        if size not in self._windows:
+            self._windows[size] = _Window.of(camera, self.waves, size, self.step_mm)
+        return self._windows[size]
+
+    def _place(self, spot_mm: NDArray[np.float64], window: _Window) -> tuple[tuple[int, int], NDArray[np.float64]]:
+        """Return the window's first (row, column) on the sensor, and the place on the array of its middle sample.
+
+        The middle is seen at the corner of pixels that is nearest to the spot, half a sample beside it.
+        """
+        camera, lever = self.camera, self.camera.microlens_distance_mm / self.camera.image_distance_mm
+        axis_px = camera.sensor_centre_px + 0.5
+        ideal = _undistorted(spot_mm, 1.0, camera.distortion_per_mm2)
+        corner = np.rint((spot_mm + lever * ideal) / camera.pixel_mm + axis_px).astype(np.int64)
+        on_sensor = (corner - axis_px) * camera.pixel_mm + 0.5 * self.step_mm
+        tilt = _undistorted(on_sensor, 1.0 + lever, camera.distortion_per_mm2)
+        half = window.size // (2 * self.samples)
+        return (int(corner[1]) - half, int(corner[0]) - half), on_sensor - lever * tilt
+
+    def _meets_sensor(self, first: tuple[int, int], window: _Window) -> bool:
+        side = window.size // self.samples
+        sensor = self.camera.rows, self.camera.columns
+        return all(-side < low < full for low, full in zip(first, sensor, strict=True))
+
+
+def steepest(camera: Camera) -> float:
+    """Return the steepest slope of a ray behind the array: from the main lens's rim through a microlens's corner."""
+    (a, b), area = camera.lattice.basis, camera.lattice.cell_area
+    corner = float(np.linalg.norm(a) * np.linalg.norm(b) * np.linalg.norm(a - b)) / (2.0 * area)
+    return corner / camera.microlens_focal_length_mm + camera.aperture_radius_mm / camera.image_distance_mm
+
+
+def samples_per_pixel(camera: Camera, waves: Waves) -> int:
+    """Return how many samples along a pixel follow the phase of the steepest wave, two to a turn."""
+    return int(np.ceil(2.0 * STEEPNESS * steepest(camera) * camera.pixel_mm / waves.wavelength_mm))
+
+
+def pixel_response(samples: int, diffusion_px: float) -> NDArray[np.float64]:
+    """Return the share of the charge of samples about a pixel that it collects; `samples` of them lie on the pixel.
+
+    Charge diffuses as a Gaussian before the pixel adds it up.
+    """
+    if diffusion_px == 0.0:
+        return np.ones(samples)
+    beside = int(np.ceil(DIFFUSION_REACH * diffusion_px * samples))
+    places = (np.arange(-beside, samples + beside) + 0.5) / samples - 0.5
+    return np.asarray(ndtr((places + 0.5) / diffusion_px) - ndtr((places - 0.5) / diffusion_px), dtype=np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class _Window:
+    """Samples of the array and of the sensor, and those of the pupil that belong to them.
+
+    Attributes
+    ----------
+    size : samples along each axis
+    pupil : (n,) places of the pupil's samples along each axis, mm
+    amplitude : (n, n) of the light on them, whose squares sum to 1 over `size`^2, alternating in sign as the middle of
+        the array's samples asks for
+    beside : (size,) places of the samples from the window's middle, mm
+    transfer : (size,) phases of the way to the sensor along each axis, by frequency
+    """
+
+    size: int
+    pupil: NDArray[np.float64]
+    amplitude: NDArray[np.float64]
+    beside: NDArray[np.float64]
+    transfer: Complex
+
+    @classmethod
+    def of(cls, camera: Camera, waves: Waves, size: int, step_mm: float) -> _Window:
+        """Return the window of so many samples."""
+        radius = camera.aperture_radius_mm
+        pupil_step = waves.wavelength_mm * camera.image_distance_mm / (size * step_mm)
+        half = int(np.ceil(radius / pupil_step)) + 1
+        number = np.arange(-half, half + 1)
+        pupil = np.asarray(pupil_step * number, dtype=np.float64)
+        inside = np.clip((radius - np.hypot(pupil[:, None], pupil)) / pupil_step + 0.5, 0.0, 1.0)
+        sign = 1.0 - 2.0 * (number % 2)
+        return cls(
+            size,
+            pupil,
+            inside * sign[:, None] * sign / (size * np.sqrt(np.sum(inside**2))),
+            np.asarray(step_mm * (np.arange(size) - size // 2), dtype=np.float64),
+            np.exp(
+                -1j * np.pi * waves.wavelength_mm * camera.microlens_distance_mm * fft.fftfreq(size, step_mm) ** 2
+            ).astype(np.complex64),
+        )
+
+    def on_array(self, amplitude: NDArray[np.float64], phase: NDArray[np.float64], radius_mm: float) -> Complex:
+        """Return the field on the array (y, x), without the lenses, of this amplitude and phase on the pupil."""
+        half = len(self.pupil) // 2
+        numbers = np.arange(-half, half + 1) % self.size
+        field = np.zeros((len(self.pupil), self.size), dtype=np.complex64)
+        _write_pupil(amplitude, phase, self.pupil / radius_mm, field)
+        whole = np.zeros((self.size, self.size), dtype=np.complex64)
+        whole[numbers] = fft.fft(field, axis=1, overwrite_x=True)
+        return np.asarray(fft.fft(whole, axis=0, overwrite_x=True), dtype=np.complex64)
+
+    def lenses(self, camera: Camera, middle_mm: NDArray[np.float64], wave_number: float) -> Complex:
+        """Return what the array does to the light (y, x), with the curvature of light from the main lens."""
+        found = np.empty((self.size, self.size), dtype=np.complex64)
+        curvatures = 0.5 * wave_number / camera.image_distance_mm, 0.5 * wave_number / camera.microlens_focal_length_mm
+        _write_lenses(self.beside, middle_mm, curvatures, camera.lattice.origin, camera.lattice.basis, found)
+        return found
+
+    def on_sensor(self, field: Complex) -> Complex:
+        """Return the field on the sensor of one behind the array, which is overwritten."""
+        spectrum = fft.fft2(field, overwrite_x=True)
+        spectrum *= self.transfer[:, None]
+        spectrum *= self.transfer
+        return np.asarray(fft.ifft2(spectrum, overwrite_x=True), dtype=np.complex64)
+
+
+@njit(cache=True, nogil=True)
+def _write_pupil(
+    amplitude: NDArray[np.float64], phase: NDArray[np.float64], places: NDArray[np.float64], field: Complex
+) -> None:
+    """Write the field of each sample of the pupil (n, size), those left of the middle at the end, by frequency."""
+    count, degree = places.size, phase.shape[0] - 1
+    along_x = np.empty(degree + 1)
+    for row in range(count):
+        for i in range(degree + 1):
+            value = 0.0
+            for j in range(degree, -1, -1):
+                value = value * places[row] + phase[j, i]
+            along_x[i] = value
+        for column in range(count):
+            if amplitude[row, column] != 0.0:
+                turn = 0.0
+                for i in range(degree, -1, -1):
+                    turn = turn * places[column] + along_x[i]
+                place = column - count // 2
+                light = amplitude[row, column] * complex(np.cos(turn), np.sin(turn))
+                field[row, place if place >= 0 else place + field.shape[1]] = light
+
+
+@njit(cache=True, nogil=True)
+def _write_lenses(
+    beside: NDArray[np.float64],
+    middle: NDArray[np.float64],
+    curvatures: tuple[float, float],
+    origin: NDArray[np.float64],
+    basis: NDArray[np.float64],
+    found: Complex,
+) -> None:
+    """Write the phase factor of each sample on the array: the converging light's, less that of the nearest lens.
+
+    Along the part of a row that lies under one lens the phase is a square, so that each factor follows from the last.
+    """
+    of_camera, of_lens = curvatures
+    step = beside[1] - beside[0]
+    bend = np.exp(2.0j * (of_camera - of_lens) * step**2)
+    for row in range(beside.size):
+        y, first = middle[1] + beside[row], 0
+        while first < beside.size:
+            lens_x, lens_y = nearest_point(middle[0] + beside[first], y, origin, basis)
+            last, beyond = first, beside.size
+            while beyond - last > 1:
+                column = (last + beyond) // 2
+                if nearest_point(middle[0] + beside[column], y, origin, basis) == (lens_x, lens_y):
+                    last = column
+                else:
+                    beyond = column
+            x = beside[first]
+            off_x, off_y = middle[0] + x - lens_x, y - lens_y
+            factor = np.exp(1j * (of_camera * (x**2 + beside[row] ** 2) - of_lens * (off_x**2 + off_y**2)))
+            turn = np.exp(1j * step * (of_camera * (2.0 * x + step) - of_lens * (2.0 * off_x + step)))
+            for column in range(first, beyond):
+                found[row, column] = factor
+                factor *= turn
+                turn *= bend
+            first = beyond
+
+
+@njit(cache=True, nogil=True)
+def _add_intensity(field: Complex, light: NDArray[np.float32]) -> None:
+    """Add the light of a field."""
+    for row in range(field.shape[0]):
+        for column in range(field.shape[1]):
+            light[row, column] += field[row, column].real ** 2 + field[row, column].imag ** 2
+
+
+@njit(cache=True, nogil=True)
+def _write_pixels(
+    light: NDArray[np.float32], samples: int, response: NDArray[np.float64], pixels: NDArray[np.float64]
+) -> None:
+    """Add up what pixels collect of the light of samples, those of `pixel_response`."""
+    size, beside = light.shape[0], (response.size - samples) // 2
+    of_rows = np.zeros(size)
+    for row in range(pixels.shape[0]):
+        of_rows[:] = 0.0
+        first = row * samples - beside
+        for k in range(max(-first, 0), min(response.size, size - first)):
+            for column in range(size):
+                of_rows[column] += response[k] * light[first + k, column]
+        for column in range(pixels.shape[1]):
+            first = column * samples - beside
+            for k in range(max(-first, 0), min(response.size, size - first)):
+                pixels[row, column] += response[k] * of_rows[first + k]
+
+
+def _slopes(
+    camera: Camera, space: ObjectSpace | CurvedSpace, point_mm: NDArray[np.float64], crossing_mm: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return the slopes (n, 2) at the main lens of a point's rays that cross it at (n, 2), and which there are.
+
+    Raises
+    ------
+    ConfigError : the point lies in front of the fluid behind plane windows
+    """
+    if isinstance(space, CurvedSpace):
+        return space.slopes(camera, np.broadcast_to(point_mm, (len(crossing_mm), 3)), crossing_mm)
+    reach = camera.aperture_radius_mm + float(np.hypot(*point_mm[:2]))
+    nodes, factors = space.slope_polynomials(camera, point_mm[2:], reach)
+    return _plane_slopes(crossing_mm - point_mm[:2], nodes[0], factors[0]), np.ones(len(crossing_mm), dtype=np.bool_)
+
+
+@njit(cache=True, nogil=True)
+def _plane_slopes(
+    lateral: NDArray[np.float64], nodes: NDArray[np.float64], factors: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the slopes of rays that move sideways by (n, 2) from `slope_polynomial`."""
+    slopes = np.empty_like(lateral)
+    for k in range(lateral.shape[0]):
+        ratio = slope_ratio(lateral[k, 0] ** 2 + lateral[k, 1] ** 2, nodes, factors)
+        slopes[k] = ratio * lateral[k]
+    return slopes
+
+
+def _undistorted(place_mm: NDArray[np.float64], scale: float, distortion_per_mm2: float) -> NDArray[np.float64]:
+    """Return the x (2,) for which x (scale + k1 |x|^2) is a place; each round gains three times the distortion."""
+    ideal = place_mm / scale
+    for _ in range(UNDISTORT_ROUNDS if distortion_per_mm2 else 0):
+        ideal = place_mm / (scale + distortion_per_mm2 * np.sum(ideal**2))
+    return ideal
+
+
+def _even_disc(count: int) -> NDArray[np.float64]:
+    """Return points that fill a disc of radius 1 evenly, its rim included, in a sunflower's order."""
+    turn = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(count)
+    radius = np.sqrt(np.arange(count) / (count - 1.0))
+    return np.stack([radius * np.cos(turn), radius * np.sin(turn)], axis=-1)
