@@ -13,6 +13,8 @@ Index = Annotated[float, Field(ge=1.0, le=5.0)]
 Angle = Annotated[float, Field(gt=-90.0, lt=90.0)]
 # Of charge in a sensor: beyond this pixels would tell nothing apart.
 Diffusion = Annotated[float, Field(ge=0.0, le=3.0)]
+# Of light in air, nm.
+Wavelength = Annotated[float, Field(ge=200.0, le=20_000.0)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Pair = tuple[float, float]
 Vector = tuple[float, float, float]

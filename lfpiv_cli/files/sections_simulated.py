@@ -17,6 +17,7 @@ from lfpiv_cli.files.section_types import (
     Section,
     Share,
     Vector,
+    Wavelength,
 )
 from lfpiv_cli.files.sections_scene import PipeAxis
 from lfpiv_cli.names import BoardImages, BoardMethod, BubbleWall, FlowMethod, Refraction
@@ -180,7 +181,7 @@ class WavesSection(Section):
     """
 
     kind: Literal["waves"]
-    wavelength_nm: Annotated[float, Field(ge=200.0, le=20_000.0)] = 532.0
+    wavelength_nm: Wavelength = 532.0
     points: Annotated[int, Field(ge=3, le=1000)] = 16
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.errors import ConfigError
+from lfpiv_cli.files.bench import NM_TO_MM
 from lfpiv_cli.files.config import Config, carried_config
 from lfpiv_cli.files.particle_file import Points, symmetric
 from lfpiv_cli.files.provenance import record
@@ -35,7 +36,7 @@ from lfpiv_cli.particles.neighbour_frames import second_pass
 from lfpiv_cli.particles.rounds import ROUNDS, first_pass
 from lfpiv_cli.particles.search import Particles, Task, result, task_of
 from lfpiv_cli.particles.second_frames import second_frame
-from lfpiv_cli.particles.view import ensure_square_cells, raw_view
+from lfpiv_cli.particles.view import Light, ensure_square_cells, raw_view
 from lfpiv_cli.reconstruction.equations import Normalisers
 from lfpiv_cli.reconstruction.images import Image, Mask, filled, light
 from lfpiv_cli.tracks.tracking import SEARCH_LENSES
@@ -54,6 +55,8 @@ MUCH_LEFT = 0.1
 LOOKED_AT = 5
 # Beyond so many standard errors a given diameter contradicts the images.
 CONTRADICTING_SIGMAS = 4.0
+# Depths beyond the volume in which particles are fitted, too, in depths over which light spreads by one lens.
+BEYOND_DEPTHS = 0.5
 # Units of progress that `find`, `find_first` and `find_second` report.
 STEPS = sum(settings.iterations + 1 for settings in ROUNDS)
 
@@ -277,9 +280,20 @@ def task_for(bench: Bench, frame: Frame) -> Task:
     content, settings = bench.content, bench.settings
     radius = 0.5 * (settings.reconstruction.particle_diameter_mm or UNKNOWN_LENSES * _lens_mm(bench))
     space = _space(content, settings)
-    view = raw_view(content.camera, settings.media_model(), radius, content.weights.calibration, space)
+    light = _light(content, settings)
+    view = raw_view(content.camera, settings.media_model(), radius, content.weights.calibration, space, light)
     photons = settings.reconstruction.photons_per_count
     return task_of(frame.image, view, content.weights, content.camera, frame.sums, frame.unusable, photons)
+
+
+def _light(content: WeightsFile, settings: Config) -> Light | None:
+    """Return the light as waves where its wavelength is given; None: by rays."""
+    chosen = settings.reconstruction
+    if chosen.wavelength_nm is None:
+        return None
+    margin = BEYOND_DEPTHS * content.camera.scale(settings.media_model()).depth_mm
+    low, high = content.weights.padded.grid.bounds_mm(2)
+    return Light(chosen.wavelength_nm * NM_TO_MM, chosen.diffusion_px, (low - margin, high + margin))
 
 
 def points_of(bench: Bench, frame: Frame, found: Particles, size: TracerSize, provenance: Mapping[str, Any]) -> Points:

@@ -20,6 +20,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from lfpiv_cli.particles.line_light import respond_by_lines
 from lfpiv_cli.particles.refraction import bend_of
 from lfpiv_cli.particles.response import VALUES, respond
 from lfpiv_cli.particles.rows import SLACK, Scratch, respond_rows, scratch
@@ -440,7 +441,11 @@ def respond_all(view: View, members: NDArray[np.float64], responses: Responses) 
     for m in range(members.shape[0]):
         x, y, z = members[m, 0], members[m, 1], members[m, 2]
         pixels, values = responses.pixels[m], responses.values[m]
-        responses.counts[m] = respond_rows(view, bend_of(view, x, y, z), pixels, values, responses.scratch)
+        bend = bend_of(view, x, y, z)
+        if view.lines.table.shape[0] > 0:
+            responses.counts[m] = respond_by_lines(view, bend, z, pixels, values)
+        else:
+            responses.counts[m] = respond_rows(view, bend, pixels, values, responses.scratch)
 
 
 @njit(cache=True, fastmath=SUMS, **COUNT_NO_REFERENCES)

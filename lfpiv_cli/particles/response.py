@@ -210,7 +210,7 @@ def _along(
         lever=lever,
         ball=ball,
         # Of rays that strike one place, those from one side of the ball crossed the lens elsewhere than the others.
-        radius=abs(1.0 - alpha * lever / scale) * beta * ball,
+        radius=abs(1.0 - alpha * lever / scale) * beta * ball + view.lines.margin_mm,
         growth=slope * (1.0 / beta - lever / scale),
         half=cell[0],
         pixels=cell[1],

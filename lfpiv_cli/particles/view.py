@@ -9,6 +9,8 @@ focal point; lengths in mm about the optical axis.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +20,7 @@ from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.optics.camera import Camera, KernelCamera
 from lfpiv_cli.optics.curved_space import CurvedSpace
+from lfpiv_cli.optics.line_responses import NO_LINES, LineResponses, diffused, line_responses, of_balls
 from lfpiv_cli.optics.media import Layers, Media
 from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.optics.object_space import ObjectSpace
@@ -30,6 +33,8 @@ from lfpiv_cli.weights.scene import NO_FACES
 
 # Particles that are smaller are taken as this large, so that profiles have slopes: a thousandth of a lens.
 SMALLEST_RADIUS_LENSES = 1e-3
+# Pixels on either side of those that rays light, for what diffraction spreads.
+BESIDE = 2
 # Depths between two others at which footprints are asked for; behind curved faces also places along each image axis.
 SAMPLED_DEPTHS, SAMPLED_PLACES = 101, 11
 # Tables of hexagonal cells serve balls that differ from theirs by this factor: only their blur's variance is changed.
@@ -53,6 +58,8 @@ class View(NamedTuple):
     centres_mm : (nj, ni, 2) lens centres on the array; entry [j, i] is lens (first_i + i, first_j + j)
     inverse_basis : (2, 2) of the plain lattice, to find lenses
     table, table_reach : see `rim`
+    lines : of light as waves, by which all light goes then; empty: light goes by rays
+    points : the same of points of light
     """
 
     camera: KernelCamera
@@ -74,6 +81,24 @@ class View(NamedTuple):
     inverse_basis: NDArray[np.float64]
     table: NDArray[np.float64]
     table_reach: float
+    lines: LineResponses
+    points: LineResponses
+
+
+@dataclass(frozen=True)
+class Light:
+    """Light as waves, as particles are fitted with it.
+
+    Attributes
+    ----------
+    wavelength_mm : in air
+    diffusion_px : standard deviation of the sensor's charge diffusion
+    depths_mm : between which particles lie
+    """
+
+    wavelength_mm: float
+    diffusion_px: float
+    depths_mm: tuple[float, float]
 
 
 def ensure_square_cells(camera: Camera, space: ObjectSpace | CurvedSpace | None) -> None:
@@ -93,6 +118,7 @@ def raw_view(
     particle_radius_mm: float,
     calibration: Calibration | None = None,
     space: ObjectSpace | CurvedSpace | None = None,
+    light: Light | None = None,
 ) -> View:
     """Return the view of a camera on the raw image.
 
@@ -101,12 +127,18 @@ def raw_view(
     camera : as the weights have it; its lattice is used where there is no calibration
     calibration : gives the measured centres of the lens images
     space : what bends rays; None: they are straight from the equivalent points
+    light : as waves; None: it goes by rays
 
     Raises
     ------
-    ConfigError : faces are curved and the array is hexagonal
+    ConfigError : faces are curved and the array is hexagonal, or either and light is waves
     """
     ensure_square_cells(camera, space)
+    if light is not None and (isinstance(space, CurvedSpace) or camera.lattice.layout != "square"):
+        raise ConfigError(
+            "reconstruction.wavelength_nm: by waves particles are fitted behind plane faces and square lenses alone; "
+            "leave it out"
+        )
     plane = ObjectSpace(media, refraction="paraxial") if space is None or isinstance(space, CurvedSpace) else space
     lattice_px = camera.micro_image_lattice_px() if calibration is None else calibration.fit.lattice_px
     # One lens more than the sensor's corners: micro-images reach over its edge.
@@ -129,7 +161,7 @@ def raw_view(
     table, reach = rim_table(
         camera.aperture_radius_mm, camera.pixel_mm * camera.image_distance_mm / camera.microlens_distance_mm
     )
-    return View(
+    view = View(
         camera=camera.for_kernels(),
         scale=scale,
         depth_ratio=media.depth_ratio,
@@ -149,12 +181,46 @@ def raw_view(
         inverse_basis=np.ascontiguousarray(np.linalg.inv(lattice.basis)),
         table=table,
         table_reach=reach,
+        lines=NO_LINES,
+        points=NO_LINES,
     )
+    return view if light is None else with_waves(view, _points(_numbers(camera), plane, light))
+
+
+def _numbers(camera: Camera) -> tuple[float, ...]:
+    """Return what the light of a point depends on of a camera."""
+    return (
+        camera.magnification,
+        camera.focal_length_mm,
+        camera.aperture_mm,
+        camera.microlens_focal_length_mm,
+        camera.microlens_distance_mm,
+        float(camera.lattice.pitch.mean()),
+        camera.pixel_mm,
+    )
+
+
+@lru_cache(maxsize=4)
+def _points(numbers: tuple[float, ...], space: ObjectSpace, light: Light) -> LineResponses:
+    """Return the line responses of points, charge diffused."""
+    return diffused(_sharp_points(numbers, space, light.wavelength_mm, light.depths_mm), light.diffusion_px)
+
+
+@lru_cache(maxsize=2)
+def _sharp_points(
+    numbers: tuple[float, ...], space: ObjectSpace, wavelength_mm: float, depths_mm: tuple[float, float]
+) -> LineResponses:
+    magnification, focal_length, aperture, of_lens, distance, pitch, pixel = numbers
+    lattice = Lattice(np.zeros(2), pitch * np.eye(2), "square")
+    camera = Camera(magnification, focal_length, aperture, of_lens, distance, lattice, pixel, 1, 1)
+    return line_responses(camera, space, wavelength_mm, depths_mm)
 
 
 def with_radius(view: View, particle_radius_mm: float) -> View:
     """Return the view of balls of another size."""
     view = view._replace(particle_radius_mm=max(particle_radius_mm, SMALLEST_RADIUS_LENSES * view.scale.lens_mm))
+    if view.points.table.shape[0] > 0:
+        return with_waves(view, view.points)
     if view.cell_table.shape[0] == 0:
         return view
     basis = np.asarray(np.linalg.inv(view.inverse_basis), np.float64)
@@ -170,6 +236,13 @@ def with_radius(view: View, particle_radius_mm: float) -> View:
         cell_step_mm=shares.step_mm,
         cell_ball_mm=shares.radius_mm,
     )
+
+
+def with_waves(view: View, points: LineResponses) -> View:
+    """Return the view of light as waves, by the responses of points."""
+    camera = view.camera
+    radius = view.particle_radius_mm * camera.image_distance_mm / camera.focus_distance_mm
+    return view._replace(points=points, lines=of_balls(points, radius))
 
 
 def on_array_mm(view: View, points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -229,7 +302,7 @@ def _spreads_mm(view: View, points: NDArray[np.float64]) -> NDArray[np.float64]:
         beta[seen] = camera.image_distance_mm / lines[seen, 1]
         ball[seen] *= np.linalg.norm(moves[:, :, 0], axis=-1)[seen]
     alpha = 1.0 + beta - camera.image_distance_mm / camera.focal_length_mm
-    return np.asarray(np.abs(alpha) * radius + beta * ball + camera.image_distance_mm * bent)
+    return np.asarray(np.abs(alpha) * radius + beta * ball + camera.image_distance_mm * bent + view.lines.margin_mm)
 
 
 def _between(view: View, z_low_mm: float, z_high_mm: float) -> NDArray[np.float64]:
@@ -254,9 +327,10 @@ def entry_capacity(view: View, z_low_mm: float, z_high_mm: float) -> int:
     camera, per_axis = view.camera, 0.0
     patch = camera.pixel_mm * camera.image_distance_mm / camera.microlens_distance_mm
     spreads = _spreads_mm(view, _between(view, z_low_mm, z_high_mm))
+    beside = 2.0 * BESIDE if view.lines.table.shape[0] > 0 else 0.0
     for half in (view.half_x_mm, view.half_y_mm):
         lenses = np.ceil(spreads / half) + 2.0
         # A lens sees the part of the aperture whose light falls into its cell.
         lit = np.minimum(2.0 * camera.aperture_radius_mm, 3.0 * half * 2.0 * camera.aperture_radius_mm / spreads)
-        per_axis = max(per_axis, float(np.max(lenses * (lit / patch + 3.0))))
+        per_axis = max(per_axis, float(np.max(lenses * (lit / patch + 3.0 + beside))))
     return int(per_axis**2) + 1

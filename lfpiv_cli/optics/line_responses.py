@@ -1,0 +1,291 @@
+"""The light of a point under a lens, by waves, as a sum of products of two line responses.
+
+It depends on where the spot on the array lies about the lens (xi, eta), on the point's depth and on the place (u, v)
+under the lens, nothing else. In a square array the field on the sensor is a bilinear form of the field on the array, U,
+so that a decomposition into products, U(x, y) = sum_k g_k(x) g_k(y), makes the field a sum of products, too, each
+factor a one-dimensional diffraction integral over three neighbouring lenses:
+
+    G_k(xi, u) = int g_k(x) exp i k [x^2 / 2 s_i - (x - s(x))^2 / 2 f + (u - x)^2 / 2 s_mu] dx
+
+with s(x) the lens before x. The light of a pixel is sum_kl H_kl(xi, u) H_kl(eta, v) with H_kl the integral of
+G_k conj(G_l) over the pixel. A few eigenvectors of that form hold all but a hundredth of it:
+
+    light(xi, eta; u, v) = sum_r sign_r A_r(xi, u) A_r(eta, v).
+
+Within the spot one of them would do; the others are its round rim, where the axes are not independent. They are turned
+so that they change smoothly with depth, and can be interpolated. What spreads light along each axis by itself, a
+tracer's extent and charge diffusion, is a convolution of A.
+
+Axes: image axes. xi, eta: the spot's middle from the lens; u, v: from the middle of the lens image; mm or pixels.
+
+References
+----------
+Goodman, Introduction to Fourier Optics, chapter 5. Broxton et al., Optics Express 21, 25418 (2013).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from scipy.special import j0
+
+from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.object_space import ObjectSpace
+
+# Spots' places per pitch at which responses are known, and samples of the array between two of them: lenses' edges lie
+# between samples. With half as many places tracers within half a depth unit of focus are off by three times as much.
+OFFSETS, SAMPLES = 64, 2
+# Samples of the sensor per pixel that are added up, and responses per pixel that are kept.
+FINE, PHASES = 4, 2
+# Depths between which responses are interpolated, in depths over which light spreads by one lens.
+DEPTH_STEP = 0.12
+# Products of the field, and of the light.
+FIELD_TERMS, TERMS = 20, 10
+# Beyond the geometric spot the field is followed for so many Fresnel lengths, and so many widths of a point in focus.
+FRESNEL_LENGTHS, FOCUS_WIDTHS = 3.0, 6.0
+# Places along the spot's radius per period of the steepest phase, for a spline through them.
+PER_PERIOD = 17.0
+
+Lines = NDArray[np.float32]
+
+
+class LineResponses(NamedTuple):
+    """Line responses of a camera, as kernels take them.
+
+    Attributes
+    ----------
+    table : (depths, offsets, PHASES, terms, pixels) A, float32; pixel n of phase p lies n + p / PHASES - pixels / 2
+        from the middle of the lens image; no depths where light goes by rays
+    signs : (terms,)
+    first_depth_mm, depth_step_mm, offset_step_mm : of the table; its offsets are symmetric about 0
+    margin_mm : by how much a spot on the array is larger than by rays
+    """
+
+    table: Lines
+    signs: NDArray[np.float32]
+    first_depth_mm: float
+    depth_step_mm: float
+    offset_step_mm: float
+    margin_mm: float
+
+
+NO_LINES = LineResponses(np.zeros((0, 0, PHASES, 0, 0), np.float32), np.zeros(0, np.float32), 0.0, 1.0, 1.0, 0.0)
+
+
+def line_responses(
+    camera: Camera, space: ObjectSpace, wavelength_mm: float, depths_mm: tuple[float, float]
+) -> LineResponses:
+    """Return the line responses of points between two depths.
+
+    Parameters
+    ----------
+    space : of plane faces; its aberration is that of points on the axis
+    """
+    step = DEPTH_STEP * camera.scale(space.media).depth_mm
+    low, high = int(np.floor(depths_mm[0] / step)) - 1, int(np.ceil(depths_mm[1] / step)) + 1
+    pupil = _Pupil(camera, space, wavelength_mm, step * np.arange(low, high + 1, dtype=np.float64))
+    planes: list[Lines] = []
+    for number in range(len(pupil.depths_mm)):
+        lines = _compressed(_pixel_products(pupil, number))
+        planes.append(_turned(lines, planes[-1]) if planes else lines)
+    widest = max(len(plane) for plane in planes)
+    half = np.stack([np.pad(plane, ((0, widest - len(plane)), (0, 0), (0, 0))) for plane in planes])
+    # The field is the same on both sides of the axis, so that light at (-xi, -u) is that at (xi, u).
+    whole = np.concatenate([half[:, :0:-1, ::-1], half], axis=1)[:, :, :-1]
+    positive = np.arange(TERMS) < (TERMS + 1) // 2
+    return LineResponses(
+        _by_phases(whole),
+        np.where(positive, 1.0, -1.0).astype(np.float32),
+        float(pupil.depths_mm[0]),
+        step,
+        float(camera.lattice.pitch.mean()) / OFFSETS,
+        pupil.margin_mm,
+    )
+
+
+def of_balls(points: LineResponses, radius_mm: float) -> LineResponses:
+    """Return the responses of balls of this radius on the array, their light a product of both axes' distributions."""
+    count = int(np.ceil(radius_mm / points.offset_step_mm))
+    edges = np.clip((np.arange(-count, count + 2) - 0.5) * points.offset_step_mm / max(radius_mm, 1e-9), -1.0, 1.0)
+    share = np.diff(0.25 * (2.0 + 3.0 * edges - edges**3)).astype(np.float32)
+    found = np.empty_like(points.table)
+    _average(points.table, share, found)
+    return points._replace(table=found)
+
+
+@njit(cache=True, nogil=True)
+def _average(table: Lines, share: Lines, found: Lines) -> None:
+    """Fill in the means over neighbouring offsets, of these shares."""
+    depths, offsets = table.shape[:2]
+    half = share.size // 2
+    for depth in range(depths):
+        for offset in range(offsets):
+            target = found[depth, offset]
+            target[:] = np.float32(0.0)
+            for n in range(max(0, half - offset), min(share.size, offsets + half - offset)):
+                source, weight = table[depth, offset + n - half], share[n]
+                for phase in range(target.shape[0]):
+                    for term in range(target.shape[1]):
+                        for pixel in range(target.shape[2]):
+                            target[phase, term, pixel] += weight * source[phase, term, pixel]
+
+
+def diffused(points: LineResponses, diffusion_px: float) -> LineResponses:
+    """Return responses after charge has diffused by a Gaussian: nothing in them is finer than two values tell."""
+    table = points.table
+    depths, offsets, phases, terms, pixels = table.shape
+    along = table.transpose(0, 1, 3, 4, 2).reshape(depths, offsets, terms, pixels * phases)
+    frequency = np.fft.rfftfreq(2 * pixels * phases, 1.0 / phases)
+    damping = np.exp(-2.0 * (np.pi * diffusion_px * frequency) ** 2).astype(np.float32)
+    blurred = np.fft.irfft(np.fft.rfft(along, 2 * pixels * phases, axis=-1) * damping, axis=-1)[..., : pixels * phases]
+    by_phase = blurred.reshape(depths, offsets, terms, pixels, phases).transpose(0, 1, 4, 2, 3)
+    return points._replace(table=np.ascontiguousarray(by_phase, np.float32))
+
+
+class _Pupil:
+    """What all depths have in common: the aperture's nodes, samples of array and sensor, and the way between them."""
+
+    def __init__(
+        self, camera: Camera, space: ObjectSpace, wavelength_mm: float, depths_mm: NDArray[np.float64]
+    ) -> None:
+        s_i, s_mu, radius = camera.image_distance_mm, camera.microlens_distance_mm, camera.aperture_radius_mm
+        pitch, wave_number = float(camera.lattice.pitch.mean()), 2.0 * np.pi / wavelength_mm
+        self.camera, self.depths_mm, self.pitch_mm = camera, depths_mm, pitch
+        self.step_mm = pitch / (OFFSETS * SAMPLES)
+        self.spots_mm = np.abs(_on_array(camera, space, depths_mm, np.array([radius]))[:, 0])
+        focus = 0.5 * wavelength_mm * s_i / radius
+        fresnel = np.sqrt(wavelength_mm * s_i * self.spots_mm / radius)
+        self.reaches_mm = self.spots_mm + FRESNEL_LENGTHS * fresnel + FOCUS_WIDTHS * focus
+        self.margin_mm = float(FOCUS_WIDTHS * focus)
+        # Of half the phase's range, and what a polynomial lacks.
+        furthest = float(self.reaches_mm.max()) * np.sqrt(2.0)
+        count = int(200 + wave_number * radius * furthest / s_i)
+        nodes, weights = np.polynomial.legendre.leggauss(count)
+        nodes, weights = 0.5 * radius * (nodes + 1.0), 0.5 * radius * weights
+        self.amplitude = np.exp(1j * _phases(camera, space, depths_mm, nodes, wave_number)) * nodes * weights
+        self.amplitude *= wave_number / s_i / (np.sqrt(np.pi) * radius)
+        self.radii_mm = np.arange(0.0, furthest + 4.0 * self.step_mm, wavelength_mm * s_i / (radius * PER_PERIOD))
+        self.bessel = j0(wave_number / s_i * np.outer(self.radii_mm, nodes))
+        # Pixels of a cell, and one more on either side.
+        self.pixels = int(np.ceil(pitch * camera.micro_image_scale / camera.pixel_mm)) + 3
+        across = self.step_mm * (np.arange(3 * OFFSETS * SAMPLES) - 0.5 * (3 * OFFSETS * SAMPLES - 1))
+        beside = across - pitch * np.rint(across / pitch)
+        u = camera.pixel_mm / FINE * (np.arange((self.pixels + 1) * FINE) - 0.5 * ((self.pixels + 1) * FINE - 1))
+        lens = across**2 / s_i - beside**2 / camera.microlens_focal_length_mm
+        phase = 0.5 * wave_number * (lens + (u[:, np.newaxis] - across) ** 2 / s_mu)
+        scale = self.step_mm / np.sqrt(wavelength_mm * s_mu)
+        self.to_sensor = (scale * np.exp(1j * phase)).astype(np.complex64)
+
+    def field(self, number: int) -> NDArray[np.complex128]:
+        """Return factors g_k (terms, n) of the field on the array at a depth, on samples x >= 0; it is even."""
+        x = self.step_mm * (np.arange(int(np.ceil(self.reaches_mm[number] / self.step_mm))) + 0.5)
+        along = CubicSpline(self.radii_mm, self.bessel @ self.amplitude[number])
+        field = along(np.hypot(x[:, np.newaxis], x))
+        # The range of a symmetric matrix by a few products, then the small one's own factors (Takagi's).
+        basis = np.random.default_rng(0).standard_normal((len(x), min(FIELD_TERMS + 10, len(x)))) + 0j
+        for _ in range(3):
+            basis, _ = np.linalg.qr(field @ basis.conj())
+        small = basis.conj().T @ field @ basis.conj()
+        left, values, right = np.linalg.svd(small)
+        turn = np.einsum("ij,ij->j", left.conj(), right.T)
+        return np.asarray(((basis @ left) * np.sqrt(turn * values))[:, :FIELD_TERMS].T)
+
+
+def _on_array(
+    camera: Camera, space: ObjectSpace, depths_mm: NDArray[np.float64], pupil_mm: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return where rays of points on the axis through places of the pupil meet the array (depths, places)."""
+    nodes, factors = space.slope_polynomials(camera, depths_mm, camera.aperture_radius_mm)
+    ratio = np.zeros((len(depths_mm), len(pupil_mm))) + factors[:, -1:]
+    for order in range(factors.shape[1] - 2, -1, -1):
+        ratio = factors[:, order, np.newaxis] + (pupil_mm**2 - nodes[:, order, np.newaxis]) * ratio
+    s_i = camera.image_distance_mm
+    return np.asarray(pupil_mm * (1.0 - s_i / camera.focal_length_mm + s_i * ratio))
+
+
+def _phases(
+    camera: Camera,
+    space: ObjectSpace,
+    depths_mm: NDArray[np.float64],
+    pupil_mm: NDArray[np.float64],
+    wave_number: float,
+) -> NDArray[np.float64]:
+    """Return the phase on the pupil (depths, places) whose normals are the rays: its slope is k x_m / s_i."""
+    nodes, weights = np.polynomial.legendre.leggauss(6)
+    # The integral from the axis on; x_m is an odd polynomial of degree 9.
+    places = np.outer(0.5 * (nodes + 1.0), pupil_mm)
+    array = _on_array(camera, space, depths_mm, places.ravel()).reshape(len(depths_mm), len(nodes), -1)
+    integral = 0.5 * pupil_mm * np.einsum("n,dnp->dp", weights, array)
+    return np.asarray(wave_number / camera.image_distance_mm * integral)
+
+
+def _pixel_products(pupil: _Pupil, number: int) -> NDArray[np.float32]:
+    """Return H (offsets >= 0, responses along u, 2 products) at a depth, real: sums of squares, then differences.
+
+    The light is the sum of products of the first half's columns at (xi, u) and (eta, v), less that of the second's.
+    """
+    half = pupil.field(number).astype(np.complex64)
+    whole = np.concatenate([half[:, ::-1], half], axis=1)
+    lenses = int(np.ceil(pupil.reaches_mm[number] / pupil.pitch_mm + 0.5))
+    per_pitch, pixels = OFFSETS * SAMPLES, pupil.pixels
+    # Room for three lenses about each place, the spot in the middle.
+    room = (lenses + 2) * per_pitch
+    short = room - half.shape[1]
+    field = np.pad(whole, ((0, 0), (short, short)))
+    first, second = np.triu_indices(len(half))
+    mixed = first != second
+    responses = PHASES * pixels + 1
+    found = np.zeros((lenses * OFFSETS + 1, responses, 2, len(first)), np.float32)
+    for offset in range(len(found)):
+        # The lens lies at -xi from the spot.
+        begin = room - SAMPLES * offset - 3 * per_pitch // 2
+        at_sensor = pupil.to_sensor @ field[:, begin : begin + 3 * per_pitch].T
+        product = at_sensor[:, first] * at_sensor[:, second].conj()
+        sums = np.cumsum(np.pad(product, ((1, 0), (0, 0))), axis=0)
+        of_pixels = (sums[FINE:] - sums[:-FINE])[:: FINE // PHASES][:responses]
+        found[offset, :, 0] = of_pixels.real
+        found[offset, :, 1] = of_pixels.imag
+    found *= pupil.camera.pixel_mm / FINE
+    found[..., mixed] *= np.float32(np.sqrt(2.0))
+    return found
+
+
+def _compressed(products: NDArray[np.float32]) -> Lines:
+    """Return the A (offsets >= 0, responses, TERMS) closest to the whole form: half of them count positive."""
+    offsets, responses, _, terms = products.shape
+    columns = products.reshape(offsets * responses, 2 * terms)
+    signs = np.repeat([1.0, -1.0], terms)
+    # Offsets beside 0 stand for their mirror images, too.
+    weight = np.repeat(np.where(np.arange(offsets) > 0, 2.0, 1.0), responses)[:, np.newaxis].astype(np.float32)
+    gram = ((columns * weight).T @ columns).astype(np.float64)
+    values, vectors = np.linalg.eigh(gram)
+    kept = values > 1e-7 * values[-1]
+    roots, vectors = np.sqrt(values[kept]), vectors[:, kept]
+    core = (vectors * roots).T @ (signs[:, np.newaxis] * (vectors * roots))
+    strengths, turned = np.linalg.eigh(core)
+    positive = (TERMS + 1) // 2
+    chosen = np.r_[np.argsort(-strengths)[:positive], np.argsort(strengths)[: TERMS - positive]]
+    to_lines = (vectors / roots) @ turned[:, chosen] * np.sqrt(np.abs(strengths[chosen]))
+    return (columns @ to_lines.astype(np.float32)).reshape(offsets, responses, TERMS)
+
+
+def _turned(lines: Lines, before: Lines) -> Lines:
+    """Return the lines of one depth, turned among those of a sign to be closest to those of the depth before."""
+    found = np.empty_like(lines)
+    both = min(len(lines), len(before))
+    for chosen in (slice(None, (TERMS + 1) // 2), slice((TERMS + 1) // 2, None)):
+        here, there = (np.asarray(each[:both, :, chosen], np.float64) for each in (lines, before))
+        left, _, right = np.linalg.svd(np.einsum("ouk,oul->kl", here, there))
+        found[..., chosen] = lines[..., chosen] @ (left @ right).astype(np.float32)
+    return found
+
+
+def _by_phases(lines: Lines) -> Lines:
+    """Return lines (depths, offsets, responses, TERMS) as `LineResponses.table`."""
+    depths, offsets, responses, terms = lines.shape
+    by_phase = lines.reshape(depths, offsets, responses // PHASES, PHASES, terms).transpose(0, 1, 3, 4, 2)
+    return np.ascontiguousarray(by_phase, dtype=np.float32)
