@@ -13,6 +13,7 @@ from lfpiv_cli import open_volume
 from lfpiv_cli.cli import cli
 from lfpiv_cli.errors import InputError, OutputExistsError
 from lfpiv_cli.files.images import read_image
+from lfpiv_cli.interface.verdicts import word_of
 from lfpiv_cli.stages.frames import Background
 
 ROOT = Path(__file__).parent.parent
@@ -202,3 +203,20 @@ def test_a_frame_of_noise_or_half_saturated_is_told(weights, frame, fault, tmp_p
     told = [each["code"] for each in json.loads(capsys.readouterr().out)["warnings"]]
     assert told == TOLD[fault]
     assert [each["code"] for each in open_volume(tmp_path / "v.vtkhdf").provenance.get("warnings", [])] == told
+
+
+# Of the sample's pixels three in five are lit.
+@pytest.mark.thorough
+@pytest.mark.parametrize(("percent", "word"), [(0, "good"), (0.3, "good"), (2, "look"), (15, "look"), (28, "no")])
+def test_saturated_pixels_count_as_much_before_the_work_as_after_it(weights, frame, percent, word, tmp_path, capsys):
+    dark = read_image(SAMPLE / "dark.tif").astype(float)
+    light = frame - dark
+    recorded = dark + light * 4000.0 / np.percentile(light, 100.0 - percent)
+    tifffile.imwrite(tmp_path / "a.tif", np.clip(np.rint(recorded), 0, 4095).astype(np.uint16))
+    options = tmp_path / "a.tif", "--dark", SAMPLE / "dark.tif"
+    run("check", weights.parent / "rig.yaml", *options, "--json")
+    before = {line["about"]: line["verdict"] for line in json.loads(capsys.readouterr().out)["verdicts"]}
+    volume_of(weights, options[0], tmp_path / "v.vtkhdf", *options[1:])
+    warnings = open_volume(tmp_path / "v.vtkhdf").provenance["warnings"]
+    after = [word_of(each) for each in warnings if each["code"] == "frame-saturated"]
+    assert [before["exposure"]] == (after or ["good"]) == [word]

@@ -13,28 +13,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.calibration.lens_light import LensImages, dark_level
-from lfpiv_cli.calibration.light_checks import CERTAIN_SIGMAS, level_notices, position_notices, uniform_notices
+from lfpiv_cli.calibration.light_checks import (
+    CERTAIN_SIGMAS,
+    LIT_SIGMAS,
+    exposure_notices,
+    level_notices,
+    position_notices,
+    saturated_share,
+    uniform_notices,
+)
 from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.files.config import Config
 from lfpiv_cli.interface.calibration import NO_BOARD, calibration_notices, calibration_of, photographs
 from lfpiv_cli.interface.planning import Bench, Line, Verdict, error_verdict, graded, seeding_line, worst
+from lfpiv_cli.interface.verdicts import word_of
 from lfpiv_cli.particles.counting import Seeded, tracers_in_image
 from lfpiv_cli.particles.noise import read_noise
 from lfpiv_cli.particles.view import raw_view
-from lfpiv_cli.reconstruction.images import FULL_SCALES, defects, light, saturated
+from lfpiv_cli.reconstruction.images import FULL_SCALES, Mask, defects, light, saturated
 from lfpiv_cli.validation import planning
 from lfpiv_cli.validation.light_beyond import share_beyond
 from lfpiv_cli.weights.build import aligned, default_padding
 
 Image = NDArray[np.float32]
 
-# A pixel is lit so many standard deviations of the noise above the background: of a million dark ones two hundred.
-LIT_SIGMAS = 3.5
 # The brightest pixels but so many show what tracers' light is; noise alone reaches five standard deviations there.
 BRIGHTEST, GOOD_SIGNAL, LEAST_SIGNAL = 200, 20.0, 7.0
-# Shares of the lit pixels that are saturated.
-GOOD_SATURATED, MOST_SATURATED = 0.01, 0.1
 # Shares of the pitch by which lens images may have moved since the white image: beyond, light is given to other lenses.
 MOST_MOVED = 0.1
 # Of the light in the middle of an image, so much may be put before and behind the volume.
@@ -55,10 +60,14 @@ class Pictures:
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """One image: raw, less its dark one, its background's level and noise, and the lens images where they are known."""
+    """One image: raw, less its dark one, its background's level and noise, and the lens images where they are known.
+
+    Of the raw one `saturated` pixels are as bright as they can be; defects of the dark image are none of them.
+    """
 
     name: str
     raw: Image
+    saturated: Mask
     less_dark: Image
     level: float
     noise: float
@@ -119,14 +128,17 @@ def full_scale(image: Image, settings: Config) -> float:
 
 
 def _seen(bench: Bench, name: str, raw: Image, dark: Image | None, lattice: Calibration | None) -> Seen:
-    less_dark = light(raw, dark)
+    less_dark, too_bright = light(raw, dark), saturated(raw, bench.settings.reconstruction.saturation_counts)
     if dark is not None:
-        less_dark = np.where(defects(dark), np.float32(0.0), less_dark)
+        hot = defects(dark)
+        less_dark, too_bright = np.where(hot, np.float32(0.0), less_dark), too_bright & ~hot
     lens_images = None
     if lattice is not None:
         width = bench.camera.lens_image_width
         lens_images = LensImages.of(lattice.rectification, lattice.transmission, width)
-    return Seen(name, raw, less_dark, *_background_of(less_dark, dark is not None, lens_images), lens_images)
+    return Seen(
+        name, raw, too_bright, less_dark, *_background_of(less_dark, dark is not None, lens_images), lens_images
+    )
 
 
 def _background_of(less_dark: Image, has_dark: bool, lens_images: LensImages | None) -> tuple[float, float]:
@@ -169,9 +181,7 @@ def _crowded(bench: Bench, seen: Seen) -> float | None:
 
 
 def _exposure(bench: Bench, seen: Seen) -> Line:
-    lit = seen.above > 0.0
-    at_end = saturated(seen.raw, bench.settings.reconstruction.saturation_counts)
-    share = float(np.count_nonzero(at_end & lit)) / max(int(np.count_nonzero(lit)), 1)
+    share = saturated_share(seen.less_dark, seen.saturated, (seen.level, seen.noise))
     is_known = np.isfinite(seen.raw)
     if not is_known.any():
         return Line("exposure", "no", f"{seen.name}: none of its pixels is a number")
@@ -180,8 +190,10 @@ def _exposure(bench: Bench, seen: Seen) -> Line:
         f"{seen.name}: the brightest pixel is at {float(seen.raw[is_known].max()) / scale:.0%} of {scale:g} counts, "
         f"{share:.2%} of the lit ones are saturated"
     )
-    verdict = graded(share, GOOD_SATURATED, MOST_SATURATED)
-    return Line("exposure", verdict, reason + ("" if verdict == "good" else ": less light"))
+    notices = exposure_notices(share, seen.name)
+    if not notices:
+        return Line("exposure", "good", reason)
+    return Line("exposure", word_of(notices[0].record()), f"{reason}: {notices[0].remedy}")
 
 
 def _light(_bench: Bench, seen: Seen) -> Line:

@@ -10,7 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.calibration.lens_light import LensImages
-from lfpiv_cli.calibration.light_checks import level_notices, position_notices, uniform_notices
+from lfpiv_cli.calibration.light_checks import (
+    exposure_notices,
+    level_notices,
+    position_notices,
+    saturated_share,
+    uniform_notices,
+)
 from lfpiv_cli.calibration.rectification import Rectification
 from lfpiv_cli.calibration.sheet import sheet_fit
 from lfpiv_cli.errors import InputError, UsageError
@@ -28,8 +34,6 @@ from lfpiv_cli.robust import HALF_NORMAL_MEDIAN, MAD_TO_SIGMA
 
 Progress = Callable[[int], None]
 
-# A share of an image that reflections do not reach.
-LARGEST_SATURATED = 0.05
 # The brightest of some millions of pixels stands 5.2 standard deviations out of normal noise.
 NOISE_SIGMAS = 6.0
 # The name of one in memory.
@@ -204,20 +208,9 @@ def check_frame(bench: Bench, raw: Image, place: str) -> None:
 def frame_notices(bench: Bench, raw: Image, lit: Image, name: str) -> list[Notice]:
     """Return what speaks against a raw frame, given also with dark or background taken off (`lit`)."""
     unusable = bench.unusable(raw)
-    saturated_share, notices = float(np.mean(unusable & ~bench.lasting)), []
-    if saturated_share > LARGEST_SATURATED:
-        notices.append(
-            Notice(
-                "frame-saturated",
-                name,
-                f"{saturated_share:.0%} of its pixels are saturated and left out, at most {LARGEST_SATURATED:.0%} of a "
-                "good image's",
-                "less light or a shorter exposure; or correct reconstruction.saturation_counts",
-                saturated_share,
-                f"at most {LARGEST_SATURATED:g}",
-            )
-        )
-    used = lit[~unusable]
+    seen, used = np.where(unusable, np.float32(np.nan), lit), lit[~unusable]
+    share = saturated_share(seen, unusable & ~bench.lasting, bench.lens_images.background(seen))
+    notices = exposure_notices(share, name)
     brightest, noise = float(used.max() - np.median(used)), _noise(used)
     if brightest <= NOISE_SIGMAS * noise:
         notices.append(
@@ -231,7 +224,7 @@ def frame_notices(bench: Bench, raw: Image, lit: Image, name: str) -> list[Notic
                 f"above {NOISE_SIGMAS * noise:.3g}",
             )
         )
-    return [*notices, *_light_notices(bench, np.where(unusable, np.float32(np.nan), lit), name)]
+    return [*notices, *_light_notices(bench, seen, name)]
 
 
 def _light_notices(bench: Bench, lit: Image, name: str) -> list[Notice]:

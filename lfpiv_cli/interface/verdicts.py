@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.calibration.light_checks import MOST_SATURATED
 from lfpiv_cli.flow.consistency import difference_over_stated, divergence_over_stated
 from lfpiv_cli.flow.field import MASKED, REJECTED, VectorField
 
@@ -37,6 +38,8 @@ WORTHLESS = {
     "volumes-unlike",
 }
 FOR_INFORMATION = {"heavy-work", "particle-diameter-limit"}
+# What does so where it measures more than this.
+WORTHLESS_BEYOND = {"frame-saturated": MOST_SATURATED}
 # The commands whose warnings are of the calibration, and of the images; those of all others are of the vectors.
 OF_CALIBRATION = ("calibrate-snapshot", "build-weights", "refine-calibration")
 OF_IMAGES = ("reconstruct", "find_particles", "follow")
@@ -84,8 +87,9 @@ def of_warnings(records: Mapping[str, Mapping[str, Any]]) -> list[Reason]:
         for warning in made.get("warnings", ()):
             seen.setdefault((_part_of(str(made.get("command"))), warning["code"]), []).append((name, warning))
     return [
-        Reason(part, _word_of(code), _told([warning for _, warning in those], len({n for n, _ in those})))
-        for (part, code), those in seen.items()
+        Reason(part, _worst_of(warnings), _told(warnings, len({name for name, _ in those})))
+        for (part, _), those in seen.items()
+        if (warnings := [warning for _, warning in those])
     ]
 
 
@@ -102,8 +106,16 @@ def _part_of(command: str) -> Part:
     return "images" if verb in OF_IMAGES else "vectors"
 
 
-def _word_of(code: str) -> Word:
-    return "no" if code in WORTHLESS else "good" if code in FOR_INFORMATION else "look"
+def _worst_of(warnings: Iterable[Mapping[str, Any]]) -> Word:
+    return max((word_of(each) for each in warnings), key=WORDS.index)
+
+
+def word_of(warning: Mapping[str, Any]) -> Word:
+    """Return what is thought of a result by one warning's record alone."""
+    code, measured = warning["code"], warning.get("measured")
+    if code in WORTHLESS or (code in WORTHLESS_BEYOND and measured is not None and measured > WORTHLESS_BEYOND[code]):
+        return "no"
+    return "good" if code in FOR_INFORMATION else "look"
 
 
 def of_vectors(field: VectorField, name: str) -> list[Reason]:
