@@ -8,14 +8,18 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+import numpy as np
 import pytest
+import tifffile
 
 from lfpiv_cli.cli import cli
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import ConfigError, InputError, LfpivError, OutputExistsError, PartialError, UsageError
 from lfpiv_cli.files.provenance import carried_record
 from lfpiv_cli.stages import prepared
+from lfpiv_cli.stages import report as report_stage
 from lfpiv_cli.stages import run as stage
+from lfpiv_cli.stages.report import report
 from lfpiv_cli.stages.run import RunOptions
 
 ROOT = Path(__file__).parent.parent
@@ -223,6 +227,25 @@ def test_results_are_kept_without_their_volumes_and_whatever_fails(again: Path, 
     assert set(states(again).values()) == {"kept"}
     assert (out / "vectors" / "pair_a.vtkhdf").stat().st_mtime_ns == first
     assert not (out / "volumes").exists()
+
+
+@pytest.mark.thorough
+def test_the_verdict_is_the_same_whether_volumes_are_kept_or_not(again: Path, monkeypatch) -> None:
+    monkeypatch.setattr(report_stage, "figures_of", lambda *_given: {})
+    rig, out, images = again / "rig.yaml", again / "out", (again / "a.tif", again / "b.tif")
+    for path, source in zip(images, PAIR, strict=True):
+        frame = tifffile.imread(source)
+        # 2 % of the pixels are clipped, which makes a warning in the records of volumes alone.
+        tifffile.imwrite(path, np.minimum(frame * (4095.0 / np.percentile(frame, 98.0)), 4095.0).astype(np.uint16))
+    shutil.rmtree(out / "volumes")
+    told = []
+    for keep in ("results", "all"):
+        run(rig, out, "--keep", keep, "--overwrite", images=images)
+        assert (out / "volumes").exists() == (keep == "all")
+        summary = report(out, out / "page.html", overwrite=True, console=Console(quiet=True))
+        told.append((summary["verdict"], (out / "page.html").read_text().count("of its lit pixels are saturated")))
+    assert told == [({"calibration": "good", "images": "look", "vectors": "look"}, told[0][1])] * 2
+    assert told[0][1] > 0
 
 
 @pytest.mark.thorough

@@ -41,7 +41,8 @@ FOR_INFORMATION = {"heavy-work", "particle-diameter-limit"}
 # What does so where it measures more than this.
 WORTHLESS_BEYOND = {"frame-saturated": MOST_SATURATED}
 # The commands whose warnings are of the calibration, and of the images; those of all others are of the vectors.
-OF_CALIBRATION = ("calibrate-snapshot", "build-weights", "refine-calibration")
+CALIBRATES = ("calibrate-snapshot", "refine-calibration")
+OF_CALIBRATION = (*CALIBRATES, "build-weights")
 OF_IMAGES = ("reconstruct", "find_particles", "follow")
 # Errors are taken for larger than stated from here on: the ratios scatter by some tenths where windows share tracers.
 LARGEST_OVER_STATED = 3.0
@@ -85,7 +86,7 @@ def of_warnings(records: Mapping[str, Mapping[str, Any]]) -> list[Reason]:
     seen: dict[tuple[Part, str], list[tuple[str, Mapping[str, Any]]]] = {}
     for name, made in records.items():
         for warning in made.get("warnings", ()):
-            seen.setdefault((_part_of(str(made.get("command"))), warning["code"]), []).append((name, warning))
+            seen.setdefault((_part_of(verb_of(made)), warning["code"]), []).append((name, warning))
     return [
         Reason(part, _worst_of(warnings), _told(warnings, len({name for name, _ in those})))
         for (part, _), those in seen.items()
@@ -99,8 +100,12 @@ def _told(warnings: Sequence[Mapping[str, Any]], files: int) -> str:
     return f"{first['about']}: {first['text']}{more}; {first['remedy']}"
 
 
-def _part_of(command: str) -> Part:
-    verb = command.split(" ")[0]
+def verb_of(made: Mapping[str, Any]) -> str:
+    """Return the command of a record without its options."""
+    return str(made.get("command")).split(" ")[0]
+
+
+def _part_of(verb: str) -> Part:
     if verb in OF_CALIBRATION:
         return "calibration"
     return "images" if verb in OF_IMAGES else "vectors"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -33,12 +34,15 @@ from lfpiv_cli.files.vtkhdf import VECTORS_FORMAT, VOLUME_FORMAT, open_vectors, 
 from lfpiv_cli.flow.field import MASKED, REJECTED, VALID, VectorField
 from lfpiv_cli.interface.vectors_checks import quality_of
 from lfpiv_cli.interface.verdicts import (
+    CALIBRATES,
+    OF_IMAGES,
     Part,
     Reason,
     Verdict,
     of_two_ways,
     of_vectors,
     of_warnings,
+    verb_of,
     verdicts,
 )
 from lfpiv_cli.pictures.interactive import MOST_LINES, has_views, lines_view
@@ -84,11 +88,15 @@ NO_OPTIONS = ReportOptions()
 
 @dataclass(frozen=True)
 class Contents:
-    """The files of ours in a folder by what they are, and the record of each by its name in the folder."""
+    """The files of ours in a folder by what they are, and the record of each by its name in the folder.
+
+    `earlier` are the records of what they were made from that is not in the folder, as volumes that were not kept.
+    """
 
     folder: Path
     files: Mapping[str, list[Path]]
     records: Mapping[str, Mapping[str, Any]]
+    earlier: Mapping[str, Mapping[str, Any]]
 
     def of(self, kind: str) -> list[Path]:
         """Return the files of a kind, in the order of their names."""
@@ -97,6 +105,11 @@ class Contents:
     def record(self, path: Path) -> Mapping[str, Any]:
         """Return the record of a file."""
         return self.records[path.relative_to(self.folder).as_posix()]
+
+    @property
+    def all_records(self) -> Mapping[str, Mapping[str, Any]]:
+        """The records of all that the results come from, whether it is in the folder or not."""
+        return {**self.earlier, **self.records}
 
     @property
     def last(self) -> Mapping[str, Any]:
@@ -161,7 +174,21 @@ def contents_of(folder: Path) -> Contents:
     order = list(dict.fromkeys(KINDS.values()))
     in_order = {kind: files[kind] for kind in order if kind in files}
     names = [path.relative_to(folder).as_posix() for kind in in_order.values() for path in kind]
-    return Contents(folder, in_order, {name: records[name] for name in names})
+    return Contents(folder, in_order, {name: records[name] for name in names}, _earlier(records.values()))
+
+
+def _earlier(records: Iterable[Mapping[str, Any]]) -> dict[str, Mapping[str, Any]]:
+    """Return the records of what files were made from, by name and hash, but for those that are among these files'."""
+    there = [{name: value for name, value in made.items() if name != "made_from"} for made in records]
+    behind = {digest: made for each in records for digest, made in each.get("made_from", {}).items()}
+    inputs = [given for made in (*there, *behind.values()) for given in made.get("inputs", {}).values()]
+    names = {given["sha256"]: given["name"] for given in inputs}
+    known = {json.dumps(made, sort_keys=True) for made in there}
+    return {
+        f"{names.get(digest, '')} ({digest[:8]}, not in the folder)": made
+        for digest, made in behind.items()
+        if json.dumps(made, sort_keys=True) not in known
+    }
 
 
 @dataclass
@@ -191,10 +218,11 @@ class Drawer:
 
 def _verdicts(contents: Contents, fields: Fields) -> list[Verdict]:
     """Return what is thought of each part of the chain."""
-    reasons = [*of_warnings(contents.records), *_of_all_vectors(contents, fields)]
+    reasons = [*of_warnings(contents.all_records), *_of_all_vectors(contents, fields)]
+    made = {verb_of(record) for record in contents.all_records.values()}
     counted: list[tuple[Part, bool, str]] = [
-        ("calibration", bool(contents.of("calibration")), "no calibration: lengths are as the data sheet has them"),
-        ("images", bool(contents.of("volumes") or contents.of("particles")), "no volumes and no particles"),
+        ("calibration", not made.isdisjoint(CALIBRATES), "no calibration: lengths are as the data sheet has them"),
+        ("images", not made.isdisjoint(OF_IMAGES), "no volumes and no particles"),
         ("vectors", bool(contents.of("vectors") or contents.of("tracks")), "no vectors and no tracks"),
     ]
     reasons += [Reason(part, "look", text) for part, there, text in counted if not there]
@@ -208,7 +236,7 @@ def _of_all_vectors(contents: Contents, fields: Fields) -> list[Reason]:
     """
     by_command: dict[str, list[Path]] = {}
     for path in fields:
-        by_command.setdefault(str(contents.record(path).get("command")).split(" ")[0], []).append(path)
+        by_command.setdefault(verb_of(contents.record(path)), []).append(path)
     reasons: list[Reason] = []
     for number, paths in enumerate(by_command.values()):
         found = [each for path in paths for each in of_vectors(fields[path], path.name)]
@@ -348,7 +376,7 @@ def _records(contents: Contents) -> Iterable[Section]:
     """Yield the sections of warnings, settings and where the files come from."""
     warned = [
         (name, str(made.get("command")), warning["code"], f"{warning['about']}: {warning['text']}")
-        for name, made in contents.records.items()
+        for name, made in contents.all_records.items()
         for warning in made.get("warnings", ())
     ]
     if warned:
@@ -360,7 +388,7 @@ def _records(contents: Contents) -> Iterable[Section]:
         yield Section("Settings", "settings", commands=tuple(settings.splitlines()))
     inputs = [
         (name, str(made.get("command")), f"{role} {given['name']}", given["sha256"][:16])
-        for name, made in contents.records.items()
+        for name, made in contents.all_records.items()
         for role, given in made.get("inputs", {}).items()
     ]
     libraries = ", ".join(f"{name} {version}" for name, version in last.get("libraries", {}).items())
