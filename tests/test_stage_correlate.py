@@ -110,12 +110,19 @@ def test_an_ensemble_is_one_field_and_a_batch_has_a_mean(volumes: list[Path], tm
         assert file["vorticity"].shape == (*each[0].flag.shape, 3)
         assert summary["divergence_rms_per_s"] > 0.0
         assert "q_criterion" in file["VTKHDF/PointData"]
+    # The fields are there: their mean is the same, with and without the options that pairs need.
+    for number, extra in enumerate(((), ("--pairing", "ab", "-o", tmp_path / "unused"))):
+        run("correlate", folder, "--derived", "--mean", tmp_path / f"{number}.vtkhdf", *extra)
+        assert (tmp_path / f"{number}.vtkhdf").read_bytes() == mean.read_bytes()
+    assert not (tmp_path / "unused").exists()
 
 
 def test_a_mean_needs_pairs_of_their_own(volumes: list[Path], tmp_path: Path) -> None:
     for extra in ((*volumes[:2],), (*volumes[:4], "--pairing", "ab", "--ensemble")):
         with pytest.raises(UsageError, match="--mean"):
             run("correlate", *extra, "--mean", tmp_path / "m.vtkhdf", "-o", tmp_path / "v.vtkhdf")
+    with pytest.raises(UsageError, match="-o: is missing"):
+        run("correlate", *volumes[:2])
 
 
 def told(capsys, *arguments: object) -> tuple[dict, list[str]]:

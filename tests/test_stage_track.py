@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lfpiv_cli.errors import InputError, OutputExistsError, PartialError
+from lfpiv_cli.errors import InputError, OutputExistsError, PartialError, UsageError
 from lfpiv_cli.files.particle_file import TRACKS_FORMAT, TRAJECTORIES_FORMAT, read_points
+from lfpiv_cli.files.vtkhdf import open_vectors
 from tests.test_particle_stage import run, write_frame
 
 MOVED_MM = np.array([0.1, -0.05, 0.0])
@@ -70,6 +71,26 @@ def test_what_is_complete_with_its_vectors_is_skipped(particles: Path, tmp_path:
     assert len(list(folder.iterdir())) == 6
 
 
+@pytest.mark.thorough
+def test_tracks_have_the_mean_of_their_vectors(particles: Path, tmp_path: Path) -> None:
+    folder, alone = tmp_path / "tracks", tmp_path / "alone"
+    run("track", particles, "--pairing", "ab", "--grid", "-o", folder)
+    run("track", particles, "--pairing", "ab", "-o", alone)
+    means = [tmp_path / f"{source.name}_mean.vtkhdf" for source in (folder, alone)]
+    for source, mean in zip((folder, alone), means, strict=True):
+        run("correlate", source, "--mean", mean)
+    of_grids, of_tracks = map(open_vectors, means)
+    np.testing.assert_array_equal(of_tracks.displacement_voxel, of_grids.displacement_voxel)
+    np.testing.assert_array_equal(of_tracks.uncertainty_voxel, of_grids.uncertainty_voxel)
+    np.testing.assert_allclose(np.nanmedian(of_grids.displacement_voxel, axis=(0, 1, 2)), MOVED_MM / 0.1, atol=1e-9)
+    mixed = (folder / "a0.vtkhdf", means[0])
+    with pytest.raises(InputError, match="was made by correlate mean, but .* by track; a mean is of one kind"):
+        run("correlate", *mixed, "--mean", tmp_path / "mixed.vtkhdf")
+    with pytest.raises(UsageError, match="--windows: is for volumes"):
+        run("correlate", folder, "--windows", "8", "--mean", tmp_path / "mixed.vtkhdf")
+    assert not (tmp_path / "mixed.vtkhdf").exists()
+
+
 def test_one_pair_is_one_file(particles: Path, tmp_path: Path, capsys) -> None:
     pair = particles / "b0.vtkhdf", particles / "a0.vtkhdf"
     run("track", *pair, "--pairing", "ab", "-o", tmp_path / "tracks.vtkhdf")
@@ -92,3 +113,6 @@ def test_a_sequence_is_in_the_order_of_its_numbers(tmp_path: Path, rng: np.rando
     assert [each["code"] for each in told["warnings"]] == ["frames-missing", "frames-reordered"]
     tracks = read_points(tmp_path / "tracks.vtkhdf", TRAJECTORIES_FORMAT)
     np.testing.assert_allclose(tracks.arrays["velocity"], np.tile(MOVED_MM / 2.0, (160, 1)), atol=1e-9)
+    run("correlate", tmp_path / "tracks.vtkhdf", "--mean", tmp_path / "mean.vtkhdf")
+    mean = open_vectors(tmp_path / "mean.vtkhdf").velocity
+    np.testing.assert_allclose(np.nanmedian(mean, axis=(0, 1, 2)), MOVED_MM / 2.0, atol=1e-9)

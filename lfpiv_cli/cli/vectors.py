@@ -46,23 +46,29 @@ def _window(text: str) -> int | tuple[int, ...]:
 @click.option("--mask", "mask_volume", type=FILE, help="Volume on the same grid: voxels of 0 are left out.")
 @click.option("--ensemble", is_flag=True, help="One field of all pairs together, for a flow that does not change.")
 @click.option("--derived", is_flag=True, help="Also write vorticity, divergence, strain rate and Q criterion.")
-@click.option("--mean", type=FILE, help="File of the pairs' mean and fluctuations to write (.vtkhdf).")
+@click.option(
+    "--mean",
+    type=FILE,
+    help="File of the pairs' mean and fluctuations to write (.vtkhdf); of vectors or tracks that are there, too.",
+)
 @batch_options
 @watch_options
-@output_option("File for one pair, folder for several.")
+@output_option("File for one pair, folder for several.", required=False)
 @common_options
 def correlate(
-    volumes: tuple[Path, ...], output: Path, overwrite: bool, console: Console, **chosen: Any
+    volumes: tuple[Path, ...], overwrite: bool, console: Console, output: Path | None = None, **chosen: Any
 ) -> dict[str, Any]:
     """Measure the displacements between two volumes by multi-pass three-dimensional cross-correlation.
 
     From pass to pass interrogation windows get finer and the volumes are deformed by what was found; false vectors are
     detected by a median test and replaced. More than two volumes need --pairing: ab pairs them by their names (img_1_a
-    with img_1_b, or by numbers), sequence takes each with the next, none across a gap.
+    with img_1_b, or by numbers), sequence takes each with the next, none across a gap. Of vectors or tracks in place of
+    volumes --mean is made, and nothing else.
 
     \b
     Example: lfpiv correlate volumes/a.vtkhdf volumes/b.vtkhdf -o vectors.vtkhdf
              lfpiv correlate volumes --pairing sequence --mean mean.vtkhdf -o vectors
+             lfpiv correlate vectors --mean mean.vtkhdf
     """
     from lfpiv_cli.stages import correlate as stage
 

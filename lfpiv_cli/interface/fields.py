@@ -19,7 +19,7 @@ from lfpiv_cli.files.particle_file import Points, matrices
 from lfpiv_cli.flow.correlation import SMALLEST_VALID_FRACTION
 from lfpiv_cli.flow.derived import Derived, derived_from
 from lfpiv_cli.flow.field import MASKED, MM_TO_M, REJECTED, VALID, VectorField
-from lfpiv_cli.flow.from_tracks import WindowGrid, without_tracks
+from lfpiv_cli.flow.from_tracks import Paths, WindowGrid, without_tracks
 from lfpiv_cli.flow.masks import ParallelWalls
 from lfpiv_cli.interface.tracks import Tracked, TracksOf
 from lfpiv_cli.names import Divergence
@@ -238,6 +238,16 @@ def samples_of_tracks(points: Points, frame: int | None = None) -> Samples:
         covariance = sigma_mm[:, :, np.newaxis] ** 2 * np.eye(3)
     probability = np.nan_to_num(arrays["link_probability"], nan=1.0)
     return Samples(points.position_mm, displacement, covariance, probability)
+
+
+def paths_of(tracks: Points) -> list[Paths]:
+    """Return the tracks of a pair, or those in each frame of a sequence, as paths from one frame to the next."""
+    frames = range(int(tracks.arrays["frame"].max(initial=-1)) + 1) if "frame" in tracks.arrays else [None]
+    every = [samples_of_tracks(tracks, frame) for frame in frames]
+    return [
+        Paths(each.points_mm, each.value_mm, np.sqrt(np.diagonal(each.covariance_mm2, axis1=1, axis2=2)))
+        for each in every
+    ]
 
 
 def _samples_in(points: Points, frame: int | None) -> Samples:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -45,7 +45,7 @@ from lfpiv_cli.reference import Reference
 from lfpiv_cli.stages.batches import ALL, BatchOptions, Worked, work_through
 from lfpiv_cli.stages.dry_runs import Expected, dry_run
 from lfpiv_cli.stages.intervals import dt_notices
-from lfpiv_cli.stages.means import Mean, arrays_of
+from lfpiv_cli.stages.means import Mean, are_measured, arrays_of, mean_of_measured
 from lfpiv_cli.stages.pairs import PairBatch, PairBatchOptions, result_pairs
 from lfpiv_cli.stages.watched import ComingPairs, watched, work_as_they_come
 
@@ -82,7 +82,7 @@ class CorrelateOptions(PairBatchOptions):
     mask_volume : volume on the same grid, 0 where the volumes are left out
     ensemble : one field of all pairs together
     derived : vorticity, divergence, strain rate and Q criterion, too
-    mean : file of the pairs' mean and fluctuations, to write
+    mean : file of the pairs' mean and fluctuations, to write; of vectors or tracks, in place of volumes, it is all
     """
 
     config: Path | None = None
@@ -96,18 +96,28 @@ class CorrelateOptions(PairBatchOptions):
 
 
 NO_OPTIONS = CorrelateOptions()
+# What the mean of vectors that are there may be asked with; which belong together is then known.
+FOR_MEANS = {"mean", "derived", "resume", "pairing", "pair_by", "pairs"}
 
 
 def correlate(
     volumes: Sequence[Path],
-    output: Path,
+    output: Path | None,
     options: CorrelateOptions = NO_OPTIONS,
     *,
     overwrite: bool = False,
     console: Console = CONSOLE,
     pairs: Pairs | None = None,
 ) -> dict[str, Any]:
-    """Measure the displacements between pairs of volumes; `pairs`, where they are known already."""
+    """Measure the displacements between pairs of volumes; `pairs`, where they are known already.
+
+    Of vectors and tracks that are there, in place of volumes, only the `mean` is made.
+    """
+    if options.mean is not None and not options.watch and are_measured(volumes):
+        _ensure_for_mean(options, volumes[0])
+        return mean_of_measured(volumes, options.mean, options, options.derived, overwrite, console)
+    if output is None:
+        raise UsageError("-o: is missing, the file or folder of the vectors; only the --mean of vectors needs none")
     if options.watch:
         batch, worked = _as_they_come(volumes, output, options, overwrite, console)
         return worked.ensure_whole(batch.summary(worked), batch.unit)
@@ -121,6 +131,19 @@ def correlate(
         # What another worker made of the same fields in the meantime is as good.
         work_through(mean, BatchOptions(resume=True), console)
     return worked.ensure_whole(batch.summary(worked), batch.unit)
+
+
+def _ensure_for_mean(options: CorrelateOptions, first: Path) -> None:
+    """Refuse options that the mean of vectors that are there has no use for.
+
+    Raises
+    ------
+    UsageError
+    """
+    for each in fields(options):
+        if each.compare and each.name not in FOR_MEANS and getattr(options, each.name) != each.default:
+            name = each.name.removesuffix("_volume").replace("_", "-")
+            raise UsageError(f"--{name}: is for volumes; the mean of {first} and those beside it has no use for it")
 
 
 def _as_they_come(
