@@ -93,6 +93,38 @@ def test_a_magnification_is_negative_with_or_without_its_minus(answer: str, expe
     assert load_config(tmp_path / "rig.yaml").sections.camera.main_lens.magnification == expected
 
 
+# Magnification, focal length, pitch, microlenses, aperture, pixels, columns, rows, fluid, wall, its thickness, channel,
+# volume and velocity, in other units and as plain numbers.
+SPELLED = {
+    "no units": "-0.7 105 0.125 1 18.75 5.5 3000 2000 1.33 1.49 5 12 10,10,12 0.2",
+    "millimetres": "0.7|105 mm|0.125mm|1 mm|18.75 mm|0.0055 mm|3000|2000|1.33|1.49|5 mm|12 mm|10 x 10 x 12 mm|0.2 m/s",
+    "others": "-0.7|10.5 cm|125 um|0.1 cm|1.875cm|5.5 µm|3000|2000|1.33|1.49|.005 m|1.2 cm|1 cm, 10 mm 12 mm|20 cm/s",
+}
+
+
+@pytest.mark.parametrize("spelled", SPELLED)
+def test_lengths_are_understood_with_their_units_and_a_turned_sign_is_said(spelled: str, tmp_path: Path) -> None:
+    path, words = tmp_path / "rig.yaml", SPELLED[spelled]
+    done = typed("\n".join(words.split("|") if "|" in words else words.split()) + "\n", str(path))
+    assert done.exit_code == 0, done.output
+    told = yaml.safe_load(path.read_text())
+    assert told["camera"]["main_lens"] == {"magnification": -0.7, "focal_length_mm": 105.0, "f_number": 105.0 / 18.75}
+    assert told["camera"]["microlenses"] == {"focal_length_mm": 1.0, "pitch_mm": 0.125}
+    assert told["camera"]["sensor"]["pixel_um"] == 5.5
+    assert told["channel"] == {"width_mm": 12.0, "wall_mm": 5.0}
+    assert told["volume"]["size_mm"] == [10.0, 10.0, 12.0]
+    assert told["simulation"]["flow"]["velocity_m_s"] == [0.2, 0.0, 0.0]
+    assert ("magnification: taken as -0.7, because the image is inverted" in done.stderr) == (words[0] != "-")
+
+
+@pytest.mark.parametrize("answer", ["105 furlongs", "0 mm", "mm", "-5 cm", "1e400 m"])
+def test_what_is_no_length_is_asked_again(answer: str, tmp_path: Path) -> None:
+    done = typed(f"\n{answer}\n10.5 cm\n" + 14 * "\n", str(tmp_path / "rig.yaml"))
+    assert done.exit_code == 0, done.output
+    assert "expected a number above 0" in done.stderr or "is no number" in done.stderr
+    assert load_config(tmp_path / "rig.yaml").sections.camera.main_lens.focal_length_mm == 105.0
+
+
 def test_nothing_is_asked_before_an_existing_file_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "rig.yaml"
     path.write_text("mine")

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
@@ -15,6 +17,9 @@ if TYPE_CHECKING:
     from lfpiv_cli.files.rig_numbers import RigNumbers
 
 RIG = Path("rig.yaml")
+# What a length may be answered in.
+UNITS_MM = {"m": 1e3, "cm": 10.0, "mm": 1.0, "um": 1e-3, "µm": 1e-3, "μm": 1e-3}
+Answer = TypeVar("Answer")
 
 
 @click.command("init")
@@ -35,8 +40,9 @@ def init(
 ) -> dict[str, Any]:
     """Write a rig file to begin with, from a few numbers that are asked for.
 
-    An answer of nothing takes the default in brackets; defaults follow from the answers before. The file can be
-    simulated and run as it is. It names the schema where rig.schema.json lies beside it.
+    An answer of nothing takes the default in brackets; defaults follow from the answers before. Lengths may have a
+    unit, as 10.5 cm or 5.5 um. The file can be simulated and run as it is. It names the schema where rig.schema.json
+    lies beside it.
 
     \b
     Example: lfpiv init rig.yaml
@@ -93,80 +99,111 @@ def _asked() -> RigNumbers:
     plain = RigNumbers()
     answers: dict[str, Any] = {
         "magnification": _magnification(plain.magnification),
-        "focal_length_mm": _number("focal length of the main lens, mm", plain.focal_length_mm),
-        "pitch_mm": (pitch := _number("pitch of the microlenses, mm", plain.pitch_mm)),
+        "focal_length_mm": _length("focal length of the main lens, mm", plain.focal_length_mm),
+        "pitch_mm": (pitch := _length("pitch of the microlenses, mm", plain.pitch_mm)),
     }
     guess = RigNumbers(**answers).complete()
-    focal = _length(
+    focal = _length_or_f_number(
         "focal length of the microlenses, mm, or their f-number as f/8", f"{guess.microlens_focal_length_mm:g}"
     )
     answers["microlens_focal_length_mm"] = focal[0] or focal[1] * pitch
     guess = RigNumbers(**answers).complete()
-    aperture = _length("f-number of the main lens as f/4, or its aperture, mm", f"f/{guess.f_number:g}")
+    aperture = _length_or_f_number("f-number of the main lens as f/4, or its aperture, mm", f"f/{guess.f_number:g}")
     answers["f_number"] = aperture[1] or answers["focal_length_mm"] / aperture[0]
     answers |= {
-        "pixel_um": _number("size of the pixels, um", plain.pixel_um),
+        "pixel_um": _length("size of the pixels, um", plain.pixel_um, "um"),
         "columns": _count("columns of the images", plain.columns),
         "rows": _count("rows of the images", plain.rows),
-        "fluid": (fluid := _number("refractive index of the fluid", plain.fluid)),
+        "fluid": (fluid := _asked_for("refractive index of the fluid", plain.fluid, _above_zero)),
     }
     if fluid != 1.0:
-        answers["wall"] = _number("refractive index of the wall or window", plain.wall)
-        answers["wall_mm"] = click.prompt("its thickness, mm", plain.wall_mm, type=click.FloatRange(min=0.0), err=True)
-        width = click.prompt(
-            "inner width of the channel along the optical axis, mm, 0 without one",
-            0.0,
-            type=click.FloatRange(min=0.0),
-            err=True,
-        )
+        answers["wall"] = _asked_for("refractive index of the wall or window", plain.wall, _above_zero)
+        answers["wall_mm"] = _length_or_none("its thickness, mm", plain.wall_mm)
+        width = _length_or_none("inner width of the channel along the optical axis, mm, 0 without one", 0.0)
         answers["channel_mm"] = width or None
     guess = RigNumbers(**answers).complete()
     answers["size_mm"] = _sides("size of the volume, mm", guess.size_mm or (1.0, 1.0, 1.0))
-    answers["velocity_m_s"] = _number("velocity to expect, m/s", plain.velocity_m_s)
+    answers["velocity_m_s"] = _asked_for(
+        "velocity to expect, m/s", plain.velocity_m_s, lambda answer: _in_unit(answer.removesuffix("/s"), "m")
+    )
     return RigNumbers(**answers)
 
 
 def _magnification(default: float) -> float:
-    """Ask for the magnification; images are inverted, whether the answer has its minus or not."""
+    """Ask for the magnification; images are inverted, whether the answer has its minus or not, and that is said."""
 
     def parsed(answer: str) -> float:
-        return -_above_zero(answer.strip().removeprefix("-"))
+        value = -_above_zero(answer.removeprefix("-"))
+        if not answer.startswith("-"):
+            click.echo(f"magnification: taken as {value:g}, because the image is inverted", err=True)
+        return value
 
-    text = "magnification, image over object, negative because the image is inverted"
-    return float(click.prompt(text, f"{default:g}", value_proc=parsed, err=True))
+    return _asked_for("magnification, image over object, negative because the image is inverted", default, parsed)
 
 
-def _number(text: str, default: float) -> float:
-    return float(click.prompt(text, default, type=click.FloatRange(min=0.0, min_open=True), err=True))
+def _asked_for(text: str, default: float | str, parse: Callable[[str], Answer]) -> Answer:
+    """Ask for what a function makes of an answer; where it raises click asks again."""
+    shown = default if isinstance(default, str) else f"{default:g}"
+    return click.prompt(text, shown, value_proc=lambda answer: parse(answer.strip()), err=True)
+
+
+def _length(text: str, default: float, unit: str = "mm") -> float:
+    return _asked_for(text, default, lambda answer: _in_unit(answer, unit))
+
+
+def _length_or_none(text: str, default: float) -> float:
+    """Ask for a length in mm that may be 0."""
+    return _asked_for(text, default, lambda answer: 0.0 if _split_unit(answer)[0] == "0" else _in_unit(answer, "mm"))
 
 
 def _count(text: str, default: int) -> int:
     return int(click.prompt(text, default, type=click.IntRange(min=1), err=True))
 
 
-def _length(text: str, default: str) -> tuple[float, float]:
+def _length_or_f_number(text: str, default: str) -> tuple[float, float]:
     """Ask for a length or an f-number; the other one of the two is 0."""
 
     def parsed(answer: str) -> tuple[float, float]:
-        word = answer.lower().removesuffix("mm").strip()
-        value = _above_zero(word.removeprefix("f/"))
-        return (0.0, value) if word.startswith("f/") else (value, 0.0)
+        word = answer.lower()
+        return (0.0, _above_zero(word.removeprefix("f/"))) if word.startswith("f/") else (_in_unit(word, "mm"), 0.0)
 
-    length, f_number = click.prompt(text, default, value_proc=parsed, err=True)
-    return length, f_number
+    return _asked_for(text, default, parsed)
 
 
 def _sides(text: str, default: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Ask for three lengths."""
+    """Ask for three lengths; a unit behind the last one alone is that of all."""
 
-    def parsed(answer: str) -> list[float]:
-        sides = [_above_zero(word) for word in answer.replace(",", " ").split()]
-        if len(sides) != 3:
+    def parsed(answer: str) -> tuple[float, float, float]:
+        apart = re.sub(r"[,x×]", " ", answer)
+        words = re.sub(rf"\s+(?=({'|'.join(UNITS_MM)})\b)", "", apart).split()
+        units = [_split_unit(word)[1] for word in words]
+        if len(words) == 3 and not any(units[:2]):
+            words = [f"{_split_unit(word)[0]}{units[2]}" for word in words]
+        if len(words) != 3:
             raise click.UsageError(f"{answer}: expected three lengths, x y z")
-        return sides
+        x, y, z = (_in_unit(word, "mm") for word in words)
+        return x, y, z
 
-    x, y, z = click.prompt(text, " ".join(f"{side:g}" for side in default), value_proc=parsed, err=True)
-    return x, y, z
+    return _asked_for(text, " ".join(f"{side:g}" for side in default), parsed)
+
+
+def _split_unit(word: str) -> tuple[str, str]:
+    """Return the number of an answer, and the unit of length behind it, or nothing."""
+    found = re.fullmatch(rf"(.*?)\s*({'|'.join(UNITS_MM)})?", word, re.DOTALL)
+    return (word, "") if found is None else (found[1], found[2] or "")
+
+
+def _in_unit(answer: str, unit: str) -> float:
+    """Return a length in a unit, which the answer is in where it names no other one.
+
+    Raises
+    ------
+    UsageError : it says none above 0
+    """
+    number, named = _split_unit(answer)
+    value = _above_zero(number)
+    # Not 0.0055 mm as 5.499999999999999 um.
+    return value if named in ("", unit) else float(f"{value * UNITS_MM[named] / UNITS_MM[unit]:.12g}")
 
 
 def _above_zero(word: str) -> float:
