@@ -56,9 +56,44 @@ def test_what_is_no_file_is_refused_by_each_command(tmp_path: Path, what: str, k
     words += [] if words[0] == "check" else ["-o", str(output)]
     code, said = ended(*words)
     assert (code, "input.tif" in said) == (4, True), said
-    assert not output.is_file()
-    # The folder of a report may have been made, but with nothing in it.
-    assert not output.is_dir() or not os.listdir(output)
+    assert not output.exists()
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("check", "{input}"),
+        ("build-weights", "{input}", "-o", "{output}"),
+        ("calibrate-snapshot", "{input}", "--white", SAMPLE / "white.tif", "-o", "{output}"),
+        (
+            "run",
+            "{input}",
+            SAMPLE / "pair_a.tif",
+            SAMPLE / "pair_b.tif",
+            "--white",
+            SAMPLE / "white.tif",
+            "-o",
+            "{output}",
+        ),
+        ("simulate", "white", "{input}", "-o", "{output}"),
+        ("validate", "board", "{input}", "-o", "{output}"),
+        ("correlate", "{volume}", "{copy}", "--config", "{input}", "-o", "{output}.vtkhdf"),
+    ],
+    ids=lambda command: command[0],
+)
+def test_an_image_or_a_result_in_place_of_a_config_is_told(tmp_path: Path, command: tuple[object, ...]) -> None:
+    volume, copy, png = tmp_path / "v.vtkhdf", tmp_path / "copy.vtkhdf", tmp_path / "rig.png"
+    grid = Grid.centred((3, 3, 3), (0.1,) * 3, (0.0,) * 3)
+    write_volume(volume, np.ones((3, 3, 3)), grid, FOCAL_POINT, provenance={}, attributes={}, overwrite=False)
+    copy.write_bytes(volume.read_bytes())
+    png.write_bytes(imagecodecs.png_encode(np.ones((9, 9), np.uint8)))
+    kinds = {SAMPLE / "white.tif": "an image (TIFF)", png: "an image (PNG)", volume: "an HDF5 file"}
+    for given, kind in kinds.items():
+        words = [
+            str(word).format(input=given, output=tmp_path / "output", volume=volume, copy=copy) for word in command
+        ]
+        assert ended(*words) == (3, f"{given}: is {kind}; expected a rig file")
+    assert sorted(os.listdir(tmp_path)) == ["copy.vtkhdf", "rig.png", "v.vtkhdf"]
 
 
 # Images

@@ -19,7 +19,7 @@ from lfpiv_cli.files import bench
 from lfpiv_cli.files.checks import contradictions
 from lfpiv_cli.files.config_problems import place_of, problem_of, report, sentence
 from lfpiv_cli.files.heights import with_heights
-from lfpiv_cli.files.inputs import content_of, ensure_regular_file
+from lfpiv_cli.files.inputs import content_of, ensure_regular_file, opened
 from lfpiv_cli.files.scene_place import ensure_same, fingerprint, moved_faces, moved_pipe
 from lfpiv_cli.files.sections import (
     BoardSection,
@@ -54,6 +54,9 @@ from lfpiv_cli.reconstruction.registry import SOLVERS
 from lfpiv_cli.reconstruction.solvers import SolverSettings, Stopping
 from lfpiv_cli.reference import FOCAL_POINT, Reference
 from lfpiv_cli.synthetic.flows import Flow
+
+# Images and HDF5 files have a zero byte among their first ones, and no text has.
+BEGINNING_BYTES = 512
 
 
 @dataclass(frozen=True)
@@ -397,6 +400,7 @@ def load_config(path: Path) -> Config:
         If the file is missing or not a file.
     """
     size = ensure_regular_file(path)
+    _ensure_text(path)
     if size > LARGEST_BYTES:
         raise ConfigError(f"{path}: has {size} bytes, expected at most {LARGEST_BYTES}")
     content = content_of(path)
@@ -405,6 +409,25 @@ def load_config(path: Path) -> Config:
     except YamlError as error:
         raise ConfigError(sentence(str(path), error.problem)) from error
     return _validated(with_heights(document, path), str(path))
+
+
+def _ensure_text(path: Path) -> None:
+    """Refuse an image, or another binary file of a kind that commands take in other places, by what it is.
+
+    Raises
+    ------
+    ConfigError
+    """
+    with opened(path) as file:
+        if b"\0" not in file.read(BEGINNING_BYTES):
+            return
+    from lfpiv_cli.files.recordings.formats import format_of
+
+    try:
+        kind = format_of(path).name
+    except InputError:
+        return  # what is no text is told where it is read
+    raise ConfigError(f"{path}: is {'an HDF5 file' if kind == 'HDF5' else f'an image ({kind})'}; expected a rig file")
 
 
 def carried_config(record: Mapping[str, Any], source: Path | str) -> Config:
