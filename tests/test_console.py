@@ -143,8 +143,8 @@ def test_a_log_is_added_to_and_nothing_else_is(tmp_path: Path) -> None:
     (tmp_path / "a.tif").write_bytes(b"II*\0")
     with pytest.raises(UsageError, match="is no log"):
         EventLog(tmp_path / "a.tif", "track")
-    with pytest.raises(OutputError, match="No such file"):
-        EventLog(tmp_path / "no" / "run.log", "track").write("start", {})
+    with pytest.raises(OutputError, match="Not a directory"):
+        EventLog(tmp_path / "a.tif" / "run.log", "track").write("start", {})
 
 
 def test_figures_of_several_methods_stand_in_columns(capsys) -> None:

@@ -23,7 +23,7 @@ import tifffile
 
 from lfpiv_cli.errors import InputError, OutputError, OutputExistsError, UsageError
 from lfpiv_cli.files import atomic
-from lfpiv_cli.files.atomic import ensure_writable, write_atomically, write_json
+from lfpiv_cli.files.atomic import ensure_writable, folder_of, write_atomically, write_json
 from lfpiv_cli.files.hdf5 import read_tree, write_tree
 from lfpiv_cli.files.images import count_pages, read_image, read_page, write_tiff
 from lfpiv_cli.files.provenance import record
@@ -130,10 +130,43 @@ def test_early_refusals(tmp_path: Path) -> None:
     ensure_writable(old, overwrite=True)
     with pytest.raises(UsageError, match="also an input"):
         ensure_writable(old, overwrite=True, inputs=[tmp_path / "other", link])
-    with pytest.raises(OutputError, match="does not exist"):
-        ensure_writable(tmp_path / "missing" / "out", overwrite=False)
     with pytest.raises(OutputError, match="folder"):
         ensure_writable(tmp_path, overwrite=True)
+
+
+def test_missing_folders_are_made_with_the_first_file_in_them_and_not_before(tmp_path: Path) -> None:
+    target = tmp_path / "new" / "deep" / "out"
+    ensure_writable(target, overwrite=False)
+    assert os.listdir(tmp_path) == []
+    with pytest.raises(OutputError, match="does not read back"):
+        write_atomically(target, lambda _: None, overwrite=False, check=lambda _: fail_as_wrong())
+    assert os.listdir(tmp_path) == []
+    with folder_of(target), folder_of(target.with_name("other")):
+        assert target.parent.is_dir()
+        (target.parent / "kept").touch()
+    assert os.listdir(target.parent) == ["kept"]
+    (tmp_path / "before").mkdir()
+    with folder_of(tmp_path / "before" / "after" / "out"):
+        pass
+    assert os.listdir(tmp_path / "before") == []
+
+
+def fail_as_wrong() -> None:
+    raise InputError("wrong")
+
+
+@pytest.mark.parametrize("place", ["file/new/out", f"new/{'x' * 300}/out", "shut/new/out"])
+def test_folders_that_cannot_be_made_are_refused_early(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str
+) -> None:
+    (tmp_path / "file").touch()
+    (tmp_path / "shut").mkdir()
+    allowed = os.access
+    # Root may write everywhere, and tests often run as root.
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path).name != "shut" and allowed(path, mode))
+    with pytest.raises(OutputError, match="is not a folder|is read-only|name too long"):
+        ensure_writable(tmp_path / place, overwrite=False)
+    assert sorted(os.listdir(tmp_path)) == ["file", "shut"]
 
 
 @pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write everywhere")

@@ -17,6 +17,7 @@ from tests.vector_fields import SHAPE, field_of
 
 ROOT = Path(__file__).parent.parent
 CONFIG, SAMPLE = ROOT / "configs" / "sample.yaml", ROOT / "sample_data"
+PAIR = SAMPLE / "pair_a.tif", SAMPLE / "pair_b.tif"
 
 
 @pytest.fixture(scope="module")
@@ -63,6 +64,71 @@ def test_a_place_where_nothing_can_be_made_gives_7(
     assert code == 7
     assert len(said) < 400
     assert os.listdir(tmp_path) == ["file"]
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("simulate", "white", CONFIG, "-o", "{place}"),
+        ("plot", "{vectors}", "-o", "{place}/p.pdf", "--only", "planes"),
+        ("export", "{vectors}", "--to", "csv", "-o", "{place}/v.csv"),
+        ("combine", "{vectors}", "{vectors}", "-o", "{place}/c.vtkhdf"),
+        ("correlate", "{vectors}", "--mean", "{place}/m.vtkhdf"),
+        ("init", "--camera", "table2", "-o", "{place}/r.yaml"),
+        ("init", "--camera", "table2", "-o", "{folder}/r.yaml", "--overwrite", "--log", "{place}/log.json"),
+    ],
+    ids=lambda command: " ".join(map(str, command[:2])),
+)
+def test_missing_folders_of_an_output_are_made(tmp_path: Path, vectors: Path, command: tuple[object, ...]) -> None:
+    place = tmp_path / "new" / "deep"
+    words = [str(word).format(place=place, vectors=vectors, folder=vectors.parent) for word in command]
+    assert ended(*words) == (0, "")
+    assert list(place.iterdir())
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("validate", "flow", CONFIG, "--vectors", "{broken}", "-o", "{place}"),
+        (
+            "validate",
+            "volume",
+            CONFIG,
+            "--volume",
+            "{vectors}",
+            "--particles",
+            "{broken}",
+            "--frame",
+            "a",
+            "-o",
+            "{place}",
+        ),
+        ("validate", "weights", "{broken}", "-o", "{place}"),
+        ("validate", "board", "{broken}", "-o", "{place}"),
+        ("validate", "all", "{broken}", "-o", "{place}"),
+        ("simulate", "particles", "{broken}", "-o", "{place}"),
+        ("run", CONFIG, "{broken}", "{broken}", "--white", SAMPLE / "white.tif", "-o", "{place}"),
+        ("run", CONFIG, *PAIR, "--white", "{broken}", "-o", "{place}"),
+        ("reconstruct", "{broken}", *PAIR, "-o", "{place}"),
+        ("follow", "{broken}", *PAIR, SAMPLE / "white.tif", SAMPLE / "dark.tif", "-o", "{place}"),
+        ("correlate", "{vectors}", "{copy}", "-o", "{place}/v.vtkhdf"),
+        ("track", "{vectors}", "{copy}", "-o", "{place}/t.vtkhdf"),
+        ("report", "{empty}", "-o", "{place}/r.html"),
+    ],
+    ids=lambda command: " ".join(map(str, command[:2])),
+)
+def test_a_command_that_fails_leaves_no_folder(tmp_path: Path, vectors: Path, command: tuple[object, ...]) -> None:
+    broken, copy, empty = tmp_path / "broken", tmp_path / "copy.vtkhdf", tmp_path / "empty"
+    broken.write_bytes(b"{")
+    copy.write_bytes(vectors.read_bytes())
+    empty.mkdir()
+    files = {"broken": broken, "copy": copy, "empty": empty, "vectors": vectors}
+    words = [str(word).format(place=tmp_path / "new" / "deep", **files) for word in command]
+    code, _ = ended(*words)
+    assert code in (3, 4)
+    assert sorted(os.listdir(tmp_path)) == ["broken", "copy.vtkhdf", "empty"]
 
 
 @pytest.mark.parametrize("option", [(), ("--white",), ("--dark",)])

@@ -14,7 +14,7 @@ from lfpiv_cli.cli import cli
 from lfpiv_cli.errors import StoppedEarlyError, UsageError
 from lfpiv_cli.files import claims
 from lfpiv_cli.files.shares import Deadline
-from lfpiv_cli.stages import pair_by_pair, run_steps
+from lfpiv_cli.stages import run_steps
 from tests.test_run import PAIR, PHOTOGRAPHS, rig_in
 
 SMALL = (
@@ -238,14 +238,14 @@ def test_a_volume_that_another_worker_makes_is_waited_for(
 def test_the_folder_of_volumes_may_go_with_another_workers_last_pair(
     rig: Path, with_weights: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    prepare, removed = pair_by_pair.prepare_folder, []
+    create, removed = claims.create_alone, []
 
-    def prepared(paths: list[Path]) -> None:
-        prepare(paths)
-        if len(removed) < 1:
-            paths[0].parent.rmdir()
+    def created(path: Path) -> int:
+        if path.parent.name == "volumes" and not removed:
+            path.parent.rmdir()
             removed.append(True)
+        return create(path)
 
-    monkeypatch.setattr(pair_by_pair, "prepare_folder", prepared)
+    monkeypatch.setattr(claims, "create_alone", created)
     run(rig, with_weights, "--shard", "1/2", "--keep", "results", images="in_time")
     assert (with_weights / "vectors" / "f0.vtkhdf").exists()

@@ -1,6 +1,7 @@
 """The one way in which files are written: beside the target, checked, flushed, then renamed onto it.
 
-A file under its final name is therefore always complete: a fault leaves the old one, or none.
+A file under its final name is therefore always complete: a fault leaves the old one, or none. Folders of outputs that
+are missing are made, all of them, when the first file in them begins, and gone again where none came to stand in them.
 """
 
 from __future__ import annotations
@@ -11,7 +12,8 @@ import math
 import os
 import re
 import secrets
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -27,6 +29,8 @@ KEPT_CHARACTERS = 40
 PARTIAL = re.compile(r"\..*\.(?P<host>[0-9a-f]{8})-(?P<process>\d{1,10})-[0-9a-f]{8}\.partial(\..*)?", re.DOTALL)
 # Of a path in a message: a line or two.
 LONGEST_SHOWN = 200
+# Another process may remove a folder that is empty just before a file begins in it.
+MOST_ATTEMPTS = 20
 
 
 def ensure_writable(target: Path, overwrite: bool, inputs: Iterable[Path] = ()) -> None:
@@ -39,7 +43,7 @@ def ensure_writable(target: Path, overwrite: bool, inputs: Iterable[Path] = ()) 
     OutputExistsError
         If it exists and `overwrite` is false.
     OutputError
-        If it is not a regular file, or its folder is missing or read-only.
+        If it is not a regular file, or its folder is read-only or cannot be made.
     """
     for path in inputs:
         if _same_file(target, split_part(path)[0]):
@@ -52,21 +56,77 @@ def ensure_writable(target: Path, overwrite: bool, inputs: Iterable[Path] = ()) 
             raise OutputExistsError(f"{target}: exists already (use --overwrite to replace it)")
         if not target.is_file():
             raise OutputError(f"{target}: cannot be replaced: it is not a regular file")
-    folder = target.parent
-    if not folder.is_dir():
-        raise OutputError(f"{target}: cannot be written: the folder {folder} does not exist")
-    if not os.access(folder, os.W_OK | os.X_OK):
-        raise OutputError(f"{target}: cannot be written: the folder {folder} is read-only")
+    _ensure_folder(target)
+
+
+def _ensure_folder(target: Path) -> None:
+    """Refuse a target whose folder takes no file, or cannot be made in the last one on the way there that exists."""
+    folder = next(each for each in target.parents if os.path.lexists(each))
+    if folder.is_dir() and os.access(folder, os.W_OK | os.X_OK):
+        return
+    if not os.path.lexists(folder):  # another process has just removed it, empty
+        _ensure_folder(target)
+        return
+    why = f"the folder {folder} is read-only" if folder.is_dir() else f"{folder} is not a folder"
+    raise OutputError(f"{target}: cannot be written: {why}")
+
+
+@contextmanager
+def folder_of(target: Path) -> Iterator[None]:
+    """Make the folders of an output that are missing; in the end, remove those of them in which nothing stands.
+
+    Raises
+    ------
+    OutputError : they cannot be made
+    """
+    missing = [folder for folder in target.absolute().parents if not folder.exists()]
+    try:
+        try:
+            target.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"{target}: cannot be written: {reason(error)}") from error
+        yield
+    finally:
+        for folder in missing:
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+
+
+def create_alone(path: Path) -> int:
+    """Create a file that must not be there, and its folder where that has gone; return its descriptor, for writing.
+
+    Raises
+    ------
+    OSError : FileExistsError where it is there
+    """
+    for _ in range(MOST_ATTEMPTS):
+        with contextlib.suppress(FileNotFoundError):
+            return os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666)
+        path.parent.mkdir(parents=True, exist_ok=True)
+    return os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666)
 
 
 def _ensure_possible(target: Path) -> None:
-    """Refuse a name that no file can have: the system would raise wherever it is asked of it."""
+    """Refuse a name that no file or folder can have: the system would raise wherever it is asked of it."""
+    there = next((folder for folder in target.parents if _exists(folder, target)), Path())
+    for part in target.relative_to(there).parts:
+        _exists(there / part, target)
+
+
+def _exists(path: Path, target: Path) -> bool:
+    """Return whether a part of a target's path exists.
+
+    Raises
+    ------
+    OutputError : nothing can
+    """
     try:
-        os.lstat(target)
+        os.lstat(path)
     except (FileNotFoundError, NotADirectoryError):
-        return
+        return False
     except (OSError, ValueError) as error:
         raise OutputError(f"{shown(target)}: cannot be written: {reason(error)}") from error
+    return True
 
 
 def shown(path: Path) -> str:
@@ -95,6 +155,12 @@ def write_atomically(
         As `ensure_writable`, and where the system refuses (no space, file too large, no permission).
     """
     ensure_writable(target, overwrite)
+    with folder_of(target):
+        _write(target, write, overwrite, check)
+
+
+def _write(target: Path, write: Callable[[Path], None], overwrite: bool, check: Callable[[Path], None] | None) -> None:
+    """Do the work of `write_atomically` in a folder that is there."""
     temporary: Path | None = None
     try:
         temporary = _reserve(target)
@@ -155,7 +221,7 @@ def _reserve(target: Path) -> Path:
     _clear(target.parent.absolute(), os.getpid())
     begun_by = f"{host_digest()}-{os.getpid()}-{secrets.token_hex(4)}"
     temporary = target.with_name(f".{target.stem[:KEPT_CHARACTERS]}.{begun_by}.partial{target.suffix}")
-    os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+    os.close(create_alone(temporary))
     return temporary
 
 

@@ -152,14 +152,6 @@ def output_paths(output: Path, stems: Sequence[str]) -> list[Path]:
     return [output / f"{stem}{VTKHDF_SUFFIX}" for stem in stems]
 
 
-def prepare_folder(paths: Sequence[Path]) -> None:
-    """Make the folder of a batch where only its last part is missing."""
-    folder = paths[0].parent
-    if not folder.exists() and folder.parent.is_dir():
-        ensure_writable(folder, overwrite=False)
-        folder.mkdir(exist_ok=True)
-
-
 def state_of(target: Target) -> State:
     """Return what is there in a target's place; what is called complete has been read back, all of it.
 
@@ -198,14 +190,12 @@ def pending(
     overwrite: bool,
     resume: bool,
     dry: bool = False,
-    folders: int = 1,
 ) -> list[int]:
     """Return the numbers of the targets that have to be made.
 
     With `resume`, a target that is complete and carries the very record that it would get is left as it is, and a
     broken one is made anew; with `overwrite` besides, one whose record differs in nothing that it depends on gets the
-    new record, and keeps its data. Where it is `dry`, nothing is written, and so many `folders` above a target may be
-    missing that could be made.
+    new record, and keeps its data. Where it is `dry`, nothing is written.
 
     Raises
     ------
@@ -213,11 +203,7 @@ def pending(
     OutputExistsError : a target is there and neither `overwrite` nor a matching `resume` covers it.
     """
     ensure_apart((path for target in targets for path in target.paths), inputs)
-    return [
-        number
-        for number, target in enumerate(targets)
-        if not _is_kept(target, overwrite, resume, folders if dry else 0)
-    ]
+    return [number for number, target in enumerate(targets) if not _is_kept(target, overwrite, resume, dry)]
 
 
 def is_kept(
@@ -232,11 +218,8 @@ def is_kept(
     return not pending([Target(path, lambda: made) for path in paths], inputs, overwrite, resume)
 
 
-def _is_kept(target: Target, overwrite: bool, resume: bool, dry: int) -> bool:
-    """Return whether a target is left as it is, after it is known that it could be written if not.
-
-    Nothing is written where it is `dry`, by the number of folders that may be missing.
-    """
+def _is_kept(target: Target, overwrite: bool, resume: bool, dry: bool) -> bool:
+    """Return whether a target is left as it is, after it is known that it could be written if not."""
     found = state_or_none(target) if resume else None
     if found is State.COMPLETE:
         return True
@@ -248,10 +231,6 @@ def _is_kept(target: Target, overwrite: bool, resume: bool, dry: int) -> bool:
         raise OutputExistsError(
             f"{target.path}: exists and was made from other inputs or settings; --overwrite makes it anew"
         )
-    if dry and not target.path.parent.exists():
-        above = [target.path.parent, *target.path.parent.parents][:dry]
-        ensure_writable([folder for folder in above if not folder.exists()][-1], overwrite=False)
-        return False
     for path in target.paths:
         ensure_writable(path, overwrite or resume)
     return False

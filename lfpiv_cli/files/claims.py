@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from lfpiv_cli.errors import OutputError
-from lfpiv_cli.files.atomic import KEPT_CHARACTERS
+from lfpiv_cli.files.atomic import KEPT_CHARACTERS, create_alone, folder_of
 from lfpiv_cli.files.inputs import reason
 from lfpiv_cli.files.processes import is_running
 
@@ -35,18 +35,19 @@ def claimed(target: Path) -> Iterator[bool]:
 
     Raises
     ------
-    OutputError : the folder takes no file
+    OutputError : the folder takes no file, or cannot be made
     """
     claim, granted, ended = claim_path(target), False, threading.Event()
-    try:
-        granted = _create(claim) or (_is_dead(claim) and _take_over(claim))
-        if granted:
-            threading.Thread(target=_keep_touching, args=(claim, ended), daemon=True).start()
-        yield granted
-    finally:
-        ended.set()
-        if granted:
-            claim.unlink(missing_ok=True)
+    with folder_of(target):
+        try:
+            granted = _create(claim) or (_is_dead(claim) and _take_over(claim))
+            if granted:
+                threading.Thread(target=_keep_touching, args=(claim, ended), daemon=True).start()
+            yield granted
+        finally:
+            ended.set()
+            if granted:
+                claim.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -74,7 +75,7 @@ def claim_path(target: Path) -> Path:
 def _create(claim: Path) -> bool:
     """Create a claim; return whether there was none."""
     try:
-        descriptor = os.open(claim, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666)
+        descriptor = create_alone(claim)
     except FileExistsError:
         return False
     except OSError as error:

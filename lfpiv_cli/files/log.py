@@ -50,6 +50,8 @@ class EventLog:
         }
         line = json.dumps(head | without_nan(fields), allow_nan=False) + "\n"
         try:
+            if not self.path.parent.exists():
+                self.path.parent.mkdir(parents=True, exist_ok=True)
             descriptor = os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
             try:
                 os.write(descriptor, line.encode())

@@ -125,7 +125,6 @@ def _measured(name: str, case: Case, work: Work) -> dict[str, Any]:
     """Measure the flow in one way and return its figures near the wall."""
     # images that are spoilt on purpose: the page says how badly, the terminal need not
     folder, quiet = work.folder / f"measured_{name}", Console(quiet=True)
-    folder.mkdir(exist_ok=True)
     pair = [work.folder / case.images / image for image in frame_names(2)]
     options = ReconstructOptions(dark=work.folder / "still" / "dark.tif", **case.options)
     told = reconstruct(work.folder / "weights.h5", pair, folder, options, overwrite=True, console=quiet)

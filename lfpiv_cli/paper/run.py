@@ -12,7 +12,6 @@ from typing import Any
 from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import LimitMissedError
 from lfpiv_cli.files.atomic import ensure_writable, write_json
-from lfpiv_cli.files.batch import prepare_folder
 from lfpiv_cli.files.pages import ensure_pages, write_pages
 from lfpiv_cli.files.pictures import ensure_drawing, write_picture
 from lfpiv_cli.files.provenance import record
@@ -47,15 +46,11 @@ def validate_paper(
     LimitMissedError : a row's verdict is missed or unknown
     """
     paths = {name: output / name for name in ("index.html", "report.md", "report.json")}
-    folders = {name: output / name for name in ("pictures", "parts", "work")}
-    prepare_folder(list(paths.values()))
     again = overwrite or options.resume
     for path in paths.values():
         ensure_writable(path, again)
     ensure_drawing()
     ensure_pages()
-    for folder in folders.values():
-        folder.mkdir(exist_ok=True)
     made = record(f"validate paper, {options.size}", None, {})
     _make_parts(output, options, made, console)
     parts = _parts_there(output, made)
@@ -76,7 +71,6 @@ def _make_parts(output: Path, options: PaperOptions, made: Mapping[str, Any], co
         pace = (time.monotonic() - begun) / 60.0 / expected if expected > 1.0 else 1.0
         console.say(f"{name} ({number + 1} of {len(chosen)}): {PARTS[name].title}; about {pace * left:.0f} min left")
         work = Work(output / "work" / name, options.size, console, made, options.resume)
-        work.folder.mkdir(exist_ok=True)
         kept(output / "parts" / f"{name}.json", made, options.resume, partial(_made, name, work))
         expected += minutes[name]
 

@@ -112,7 +112,6 @@ def _simulated(configs: Mapping[str, Path], images: Path, console: Console) -> d
 
 def _measured(config: Path, images: Path, folder: Path, console: Console) -> dict[str, Any]:
     """Measure the flow and return its figures."""
-    folder.mkdir(exist_ok=True)
     measure_images(config, images, folder, overwrite=True, console=console)
     measured = _read(config, folder)
     figures = measured.figures(duct_of(load_config(config).simulation.flow))

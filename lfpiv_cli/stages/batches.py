@@ -19,7 +19,7 @@ from typing import Any, Generic, Protocol, Self, TypeVar
 from lfpiv_cli.console import Console, Frames
 from lfpiv_cli.errors import InputError, PartialError, UsageError
 from lfpiv_cli.files.atomic import ensure_writable, write_text
-from lfpiv_cli.files.batch import State, Target, pending, prepare_folder, state_of
+from lfpiv_cli.files.batch import State, Target, pending, state_of
 from lfpiv_cli.files.claims import SECONDS_BETWEEN_LOOKS, claimed
 from lfpiv_cli.files.places import ensure_apart
 from lfpiv_cli.files.shares import Deadline, Shard
@@ -221,7 +221,6 @@ def work_through(batch: Batch[Made], options: BatchOptions, console: Console) ->
     StoppedEarlyError : the time is over
     """
     ensure_apart([*batch.outputs, *filter(None, (options.failures, console.log_file))], batch.inputs)
-    prepare_folder([target.path for target in batch.targets])
     if options.failures is not None:
         ensure_writable(options.failures, batch.overwrite or options.resume)
     share = options.shard.of(batch.order)

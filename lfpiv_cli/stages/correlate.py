@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from lfpiv_cli.console import CONSOLE, Console, Frames
 from lfpiv_cli.errors import InputError, LfpivError, UsageError
 from lfpiv_cli.files import vtkhdf
-from lfpiv_cli.files.atomic import ensure_writable
-from lfpiv_cli.files.batch import Target, output_paths, prepare_folder
+from lfpiv_cli.files.atomic import ensure_writable, folder_of
+from lfpiv_cli.files.batch import Target, output_paths
 from lfpiv_cli.files.config import Config, carried_config, load_config
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.memory import ensure_room
@@ -160,7 +160,6 @@ def _as_they_come(
         raise UsageError(f"--watch: {refused} is made from all pairs, some of which have not come yet; wait for them")
     if not options.are_told:
         raise UsageError("--watch needs --pairing: ab or sequence")
-    prepare_folder([output / folders[0].name])
     coming = ComingPairs(lambda files: result_pairs(files, options), console)
 
     def of_pairs(files: Sequence[Path]) -> Correlation:
@@ -168,7 +167,8 @@ def _as_they_come(
         return Correlation(files, output, options, overwrite, Pairs(two_by_two))
 
     groups = coming.groups(watched(folders, "results", options, console))
-    return work_as_they_come(of_pairs, groups, options, console, lambda: coming.left_out)
+    with folder_of(output / folders[0].name):
+        return work_as_they_come(of_pairs, groups, options, console, lambda: coming.left_out)
 
 
 @dataclass(frozen=True)

@@ -68,12 +68,8 @@ class PlannedBatch(Protocol):
         """Return what an output takes."""
 
 
-def dry_run(batch: PlannedBatch, options: WorkOptions, console: Console, folders: int = 1) -> dict[str, Any]:
+def dry_run(batch: PlannedBatch, options: WorkOptions, console: Console) -> dict[str, Any]:
     """Return what a batch would make, and what that takes; write nothing.
-
-    Parameters
-    ----------
-    folders : how many folders above an output the command itself would make
 
     Raises
     ------
@@ -82,7 +78,7 @@ def dry_run(batch: PlannedBatch, options: WorkOptions, console: Console, folders
     ensure_apart([*batch.outputs, *filter(None, (options.failures, console.log_file))], batch.inputs)
     share = options.shard.of(batch.order)
     targets = [batch.targets[number] for number in share]
-    needed = [share[k] for k in pending(targets, (), batch.overwrite, options.resume, dry=True, folders=folders)]
+    needed = [share[k] for k in pending(targets, (), batch.overwrite, options.resume, dry=True)]
     faults = {number: fault for number in needed if (fault := batch.fault(number)) is not None}
     making, skipped = [number for number in needed if number not in faults], sorted(set(share) - set(needed))
     for number in making:

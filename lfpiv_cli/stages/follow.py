@@ -25,7 +25,6 @@ from lfpiv_cli.files.batch import (
     frames_of,
     output_paths,
     pending,
-    prepare_folder,
     step_between,
 )
 from lfpiv_cli.files.config import Config, carried_config
@@ -137,8 +136,7 @@ def follow_particles(
     if options.dry_run:
         beside = [output / TRACKS, output / PLAYBACK, *(target.path for targets in passes[:-1] for target in targets)]
         here = [target for target, frame in zip(passes[-1], frames, strict=True) if frame.fault is None]
-        return dry_run(PlannedFrames(here, beside, inputs, left_out, overwrite), options, console, folders=2)
-    prepare_folder([output / TRACKS])
+        return dry_run(PlannedFrames(here, beside, inputs, left_out, overwrite), options, console)
     content = particles.searchable(content, settings)
     there = [number for number, frame in enumerate(frames) if frame.fault is None]
     needed = [_needed(targets, there, inputs, options, overwrite, targets is passes[-1]) for targets in passes]
@@ -218,7 +216,6 @@ def _needed(
     last: bool,
 ) -> list[int]:
     """Return which of the frames that are there have to be made, after it is known that they can be written."""
-    prepare_folder([target.path for target in targets])
     needed = [there[k] for k in pending([targets[k] for k in there], inputs, overwrite, options.resume)]
     for number in needed if options.residuals and last else []:
         ensure_writable(residual_path(targets[number].path), overwrite or options.resume, inputs)

@@ -15,8 +15,7 @@ from pathlib import Path
 from typing import Any, Generic, Protocol
 
 from lfpiv_cli.console import Console, Frames
-from lfpiv_cli.errors import OutputError
-from lfpiv_cli.files.batch import State, Target, pending, prepare_folder, state_or_none
+from lfpiv_cli.files.batch import State, Target, pending, state_or_none
 from lfpiv_cli.files.claims import awaited
 from lfpiv_cli.files.pairing import Pairs
 from lfpiv_cli.files.provenance import Gone, carried_record
@@ -73,16 +72,9 @@ class PairByPair(Generic[Made]):
         return steps * len(left) / max(len(numbers), 1)
 
     def _left_of(self, every: Sequence[int]) -> list[int]:
-        """Return the frames that have to be made, in a folder that another worker may remove after its last pair."""
+        """Return the frames that have to be made."""
         frames = [self._found.targets[k] for k in every]
-        folder = frames[0].path.parent
-        while True:
-            prepare_folder([frames[0].path])
-            try:
-                return [every[k] for k in pending(frames, self.inputs, self.overwrite, resume=True)]
-            except OutputError:
-                if folder.exists() or not folder.parent.is_dir():
-                    raise
+        return [every[k] for k in pending(frames, self.inputs, self.overwrite, resume=True)]
 
     def make(self, number: int, work: Frames) -> Made:
         """Make the files of two frames, where they are not there, and of these the result."""
@@ -101,7 +93,6 @@ class PairByPair(Generic[Made]):
         stamp = stamp_of(target.path)
         if stamp is not None and self._whole.get(k) == stamp:
             return
-        prepare_folder([target.path])
         with awaited(target.path):
             if state_or_none(target) is not State.COMPLETE:
                 self._found.make(k, work)

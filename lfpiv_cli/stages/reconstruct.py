@@ -15,8 +15,8 @@ from lfpiv_cli.console import CONSOLE, Console, Frames
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files import vtkhdf
-from lfpiv_cli.files.atomic import ensure_writable
-from lfpiv_cli.files.batch import Target, frames_of, output_paths, prepare_folder
+from lfpiv_cli.files.atomic import ensure_writable, folder_of
+from lfpiv_cli.files.batch import Target, frames_of, output_paths
 from lfpiv_cli.files.config import carried_config
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.memory import ensure_room
@@ -102,11 +102,11 @@ def reconstruct(
     if options.watch:
         settings = carried_config(read_weights_record(weights), weights).overridden_by("reconstruction", options)
         ensure_frames_alone(settings, options.background, options.mask)
-        prepare_folder([output / weights.name])
         groups = watched(images, "images", options, console)
-        batch, worked = work_as_they_come(
-            lambda group: Reconstruction(weights, group, output, options, overwrite), groups, options, console
-        )
+        with folder_of(output / weights.name):
+            batch, worked = work_as_they_come(
+                lambda group: Reconstruction(weights, group, output, options, overwrite), groups, options, console
+            )
     else:
         batch = Reconstruction(weights, images, output, options, overwrite, pairs, prepared, order)
         if options.dry_run:

@@ -20,7 +20,7 @@ from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import ConfigError, InputError, PartialError, UsageError
 from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files.atomic import ensure_writable, write_text
-from lfpiv_cli.files.batch import Frame, frames_of, output_paths, prepare_folder
+from lfpiv_cli.files.batch import Frame, frames_of, output_paths
 from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.images import times_of
 from lfpiv_cli.files.inputs import ensure_regular_file, split_part
@@ -86,7 +86,7 @@ def run(
 
     if options.dry_run:
         return planned(settings, chain, lambda weights: choose(weights).methods)
-    prepare_folder([output / RECORD])
+    ensure_writable(output / RECORD, overwrite=True)
     weights = chain.weights()
     if not chain.share:
         return _told_of_steps(steps)

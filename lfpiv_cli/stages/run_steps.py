@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from lfpiv_cli.errors import InputError, PartialError
-from lfpiv_cli.files.batch import VTKHDF_SUFFIX, Frame, Target, prepare_folder
+from lfpiv_cli.files.batch import VTKHDF_SUFFIX, Frame, Target
 from lfpiv_cli.files.claims import awaited
 from lfpiv_cli.files.pairing import Pairs
 from lfpiv_cli.names import FlowMethod
@@ -122,7 +122,7 @@ class Chain:
 
     def combined(self, first: Vectors, second: Vectors) -> Vectors:
         """Weight the vectors of two methods by their uncertainties; return the files."""
-        every = self._prepared_for("combined")
+        every = self.of_pairs("combined")
         paths = {number: every[number] for number in first if number in second}
 
         def combine_all() -> dict[str, Any]:
@@ -163,14 +163,14 @@ class Chain:
         return TrackOptions(dt_s=self.options.dt_s, grid=True, **self._resuming)
 
     def _by_volumes(self, weights: Path) -> Vectors:
-        paths, options = self._prepared_for("vectors"), self._correlating
+        paths, options = self.of_pairs("vectors"), self._correlating
         if self.options.keep == "results":
             batch = self.correlated(weights)
             self._take_pair_by_pair("correlate", batch, lambda worked: correlating.summary_of(worked, worked.total()))
             return self._standing(paths, self.share)
         volumes, failed = self._reconstructed("reconstruct", weights, "volumes", VOLUMES)
         whole = self._without(failed)
-        output = paths[0] if len(paths) == 1 else paths[0].parent
+        output = paths[whole[0]] if len(whole) == 1 else paths[0].parent
         given, pairs = self._only(volumes, whole)
         self._take(
             "correlate",
@@ -182,7 +182,7 @@ class Chain:
     def _by_particles(self, weights: Path) -> Vectors:
         if not self.pairs.separate:
             return self._tracked_in_time(weights)
-        tracks, options = self._prepared_for("tracks"), self._tracking
+        tracks, options = self.of_pairs("tracks"), self._tracking
         grids = [grid_paths(path, 1)[0] for path in tracks]
         if self.options.keep == "results":
             results = [tracks[number] for number in self.share]
@@ -191,7 +191,7 @@ class Chain:
             return {number: grids[number] for number in self._standing(tracks, self.share)}
         particles, failed = self._reconstructed("reconstruct particles", weights, "particles", PARTICLES, self.pairs)
         whole = self._without(failed)
-        output = tracks[0] if len(tracks) == 1 else tracks[0].parent
+        output = tracks[whole[0]] if len(whole) == 1 else tracks[0].parent
         ours = [each for number in whole for each in (tracks[number], grids[number])]
         given, pairs = self._only(particles, whole)
         self._take("track", ours, lambda: track_particles(given, output, options, **self.common, pairs=pairs))
@@ -305,12 +305,6 @@ class Chain:
             return [self.steps.output / f"{name}{VTKHDF_SUFFIX}"]
         of_frames = self._of_frames(name)
         return [of_frames[first] for first, _ in self.pairs.pairs]
-
-    def _prepared_for(self, name: str) -> list[Path]:
-        """Return the file of each pair, in a folder that is there."""
-        paths = self.of_pairs(name)
-        prepare_folder(paths)
-        return paths
 
 
 def _alone(output: Path, make: Callable[[], dict[str, Any]]) -> Callable[[], dict[str, Any]]:

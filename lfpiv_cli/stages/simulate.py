@@ -20,7 +20,6 @@ from lfpiv_cli.calibration.model import mid_plane_z_mm
 from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files.atomic import ensure_writable, write_json
-from lfpiv_cli.files.batch import prepare_folder
 from lfpiv_cli.files.bench import pulsation_of, waves_of
 from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.images import write_tiff
@@ -200,7 +199,6 @@ def _board_still(
 def _begin(config: Path, output: Path, names: tuple[str, ...], overwrite: bool) -> tuple[Config, dict[str, Path]]:
     """Read the config and make sure that the outputs can be written."""
     paths = {name: output / name for name in names}
-    prepare_folder(list(paths.values()))
     for path in paths.values():
         ensure_writable(path, overwrite, [config])
     return load_config(config), paths

@@ -14,7 +14,6 @@ from lfpiv_cli.calibration.board import dots_in_world
 from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files.atomic import ensure_writable, write_json
-from lfpiv_cli.files.batch import prepare_folder
 from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.pictures import ensure_drawing, write_picture
 from lfpiv_cli.files.provenance import record
@@ -48,7 +47,6 @@ def validate_board(
     solved = [method for method in chosen.methods if method != "discs"]
     report = output / "board.json"
     drawings = {(half, method): output / f"board_{half}_{method}.png" for half in halves for method in solved}
-    prepare_folder([report])
     for path in (report, *drawings.values()):
         ensure_writable(path, overwrite, [config])
     ensure_drawing()

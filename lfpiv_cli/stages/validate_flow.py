@@ -13,7 +13,6 @@ from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import InputError, LimitMissedError, UsageError
 from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.files.atomic import ensure_writable, write_json
-from lfpiv_cli.files.batch import prepare_folder
 from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.particles import read_particles
@@ -65,7 +64,6 @@ def validate_flow(
     if is_simulated and particles is not None:
         raise UsageError("--particles needs --vectors: the flow of a simulation is known")
     paths = {name: output / name for name in ("flow.json", *PICTURES, SLICES, RADII)}
-    prepare_folder(list(paths.values()))
     settings = load_config(config)
     if is_simulated:
         ensure_experiment(settings)

@@ -9,7 +9,6 @@ from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.files.atomic import ensure_writable, write_json
-from lfpiv_cli.files.batch import prepare_folder
 from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.particles import MM_PER_M, read_particles
@@ -34,7 +33,6 @@ def validate_volume(
     """Judge a volume by the true particles, which are known at the middle of a pair."""
     inputs = given(config=config, volume=volume, particles=particles)
     report = output / "volume.json"
-    prepare_folder([report])
     ensure_writable(report, overwrite, inputs.values())
     settings = load_config(config)
     found, true = vtkhdf.open_volume(volume), read_particles(particles)

@@ -10,7 +10,6 @@ import numpy as np
 from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import ConfigError, LimitMissedError
 from lfpiv_cli.files.atomic import ensure_writable, write_json
-from lfpiv_cli.files.batch import prepare_folder
 from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.pictures import ensure_drawing, write_picture
 from lfpiv_cli.files.provenance import record as provenance_record
@@ -28,7 +27,6 @@ def validate_weights(
     Through a scene all voxels are random ones of the fluid.
     """
     paths = {name: output / f"weights{name}" for name in (".json", "_columns.png", "_similarity.png")}
-    prepare_folder(list(paths.values()))
     for target in paths.values():
         ensure_writable(target, overwrite, [config])
     ensure_drawing()
