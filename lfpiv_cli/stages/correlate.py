@@ -115,6 +115,8 @@ def correlate(
     """
     if options.mean is not None and not options.watch and are_measured(volumes):
         _ensure_for_mean(options, volumes[0])
+        if output is not None:
+            console.say(f"{output}: is not written: the vectors are there, and --mean alone is made of them")
         return mean_of_measured(volumes, options.mean, options, options.derived, overwrite, console)
     if output is None:
         raise UsageError("-o: is missing, the file or folder of the vectors; only the --mean of vectors needs none")
