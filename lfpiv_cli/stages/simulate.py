@@ -100,7 +100,9 @@ def simulate_particles(
     bubbles = bubbles_of(settings, tracers.box, reference, _generator(settings, 4))
     still: NDArray[np.float64] | float = 0.0
     if bubbles is not None:
-        still = render_bubbles(camera.optics, space, bubbles, scene.bubble_counts, _generator(settings, 5))
+        still = render_bubbles(
+            camera.optics, space, bubbles, scene.bubble_counts, _generator(settings, 5), camera.waves
+        )
     with console.progress(scene.frames * tracers.count, "simulate") as advance:
         found = scenes.simulate_particles(
             camera,

@@ -16,11 +16,13 @@ from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
+from lfpiv_cli.optics.waves import Waves
 from lfpiv_cli.synthetic.printed import printed_plate, render_plate
-from lfpiv_cli.synthetic.render import Balls, Space, render_points, render_white
+from lfpiv_cli.synthetic.render import Balls, Space
+from lfpiv_cli.synthetic.wave_images import lens_blur_mm, render_balls, white_image
 
 # A dot is made of this many points in a sunflower's order, small balls that close the gaps between them: 0.2 mm dots of
-# 0.0125 mm points, an eighth of a microlens.
+# 0.0125 mm points, an eighth of a microlens. By waves they are points: 1 % of their light (L1) is astray.
 POINTS_PER_DOT = 256
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 
@@ -79,6 +81,7 @@ def render_board(
     level: float,
     rng: np.random.Generator,
     shown: ArrayLike | None = None,
+    waves: Waves | None = None,
 ) -> NDArray[np.float64]:
     """Render bright dots on dark ground, dark dots on ground that fills the view, or a lit print.
 
@@ -86,6 +89,7 @@ def render_board(
     ----------
     level : expected counts of a pixel that sees only what is bright, as in a white image
     shown : (n,) bool, which dots there are, the first index along x running fastest; default: all
+    waves : what light is made of; default: rays. A print is then shown by rays that are blurred by what lenses diffract
 
     Returns
     -------
@@ -99,7 +103,8 @@ def render_board(
         if isinstance(space, CurvedSpace):
             raise ConfigError(f"board.pattern: is {board.pattern}; behind the faces of a scene only dots are simulated")
         steps = placement.to_world([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-        return render_plate(camera, space, printed_plate(camera, board, steps), level)
+        blur = None if waves is None else lens_blur_mm(camera, waves) / camera.pixel_mm
+        return render_plate(camera, space, printed_plate(camera, board, steps), level, blur)
     plate = _plate_centres(board)
     if shown is not None:
         plate = plate[np.asarray(shown, dtype=bool)]
@@ -107,12 +112,12 @@ def render_board(
     points = placement.to_world(plate[:, np.newaxis, :] + inside).reshape(-1, 3)
     area = 0.25 * np.pi * board.dot_diameter_mm**2 / POINTS_PER_DOT
     light = area * light_per_area(camera, space.media, points[:, 2], level)
-    size = board.dot_diameter_mm / np.sqrt(POINTS_PER_DOT)
-    dots = render_points(camera, space, Balls(points, light, size), rng, rays=RAYS_PER_POINT)
+    size = board.dot_diameter_mm / np.sqrt(POINTS_PER_DOT) if waves is None else 0.0
+    dots = render_balls(camera, space, Balls(points, light, size), rng, waves, rays=RAYS_PER_POINT)
     if board.polarity != "dark":
         return dots
     # the rays' noise may ask for more than there is
-    return np.maximum(render_white(camera, level) - dots, 0.0)
+    return np.maximum(white_image(camera, waves, level) - dots, 0.0)
 
 
 def light_per_area(camera: Camera, media: Media, z_mm: ArrayLike, level: float) -> NDArray[np.float64]:

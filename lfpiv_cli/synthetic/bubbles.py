@@ -16,9 +16,11 @@ from numpy.typing import NDArray
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.names import BubbleWall
 from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.waves import Waves
 from lfpiv_cli.synthetic.board import light_per_area, sunflower
-from lfpiv_cli.synthetic.render import Balls, Space, render_points
+from lfpiv_cli.synthetic.render import Balls, Space
 from lfpiv_cli.synthetic.scenes import Box
+from lfpiv_cli.synthetic.wave_images import render_balls
 
 # A bubble is made of points this dense, as the dots of boards are; with so many rays each, those add less noise than
 # light does.
@@ -73,7 +75,12 @@ def bubbles_at_wall(
 
 
 def render_bubbles(
-    camera: Camera, space: Space, bubbles: Bubbles, level: float, rng: np.random.Generator
+    camera: Camera,
+    space: Space,
+    bubbles: Bubbles,
+    level: float,
+    rng: np.random.Generator,
+    waves: Waves | None = None,
 ) -> NDArray[np.float64]:
     """Render bubbles whose middle gives `level` expected counts in a pixel that sees nothing else, fading to the rim.
 
@@ -90,5 +97,5 @@ def render_bubbles(
         area = 0.25 * np.pi * diameter**2 / len(inside)
         points.append(placed)
         light.append(area * share * light_per_area(camera, space.media, placed[:, 2], level))
-    balls = Balls(np.concatenate(points), np.concatenate(light), spacing)
-    return render_points(camera, space, balls, rng, rays=RAYS_PER_POINT)
+    balls = Balls(np.concatenate(points), np.concatenate(light), spacing if waves is None else 0.0)
+    return render_balls(camera, space, balls, rng, waves, rays=RAYS_PER_POINT)

@@ -21,7 +21,7 @@ from lfpiv_cli.optics.face_tracing import aim
 from lfpiv_cli.optics.ray_bundles import aim_all
 from lfpiv_cli.optics.surfaces import Faces
 from lfpiv_cli.optics.tracing import struck_pixel, trace_ray
-from lfpiv_cli.synthetic.ray_sequence import in_ball, on_disc, ray_places
+from lfpiv_cli.synthetic.ray_sequence import blur_place, in_ball, on_disc, ray_places
 from lfpiv_cli.threads import COUNT_NO_REFERENCES
 
 # Balls are small, the lens is not: degree of the polynomial in the place on the lens, by that in the place in the ball.
@@ -45,6 +45,7 @@ def trace_curved(
     faces: Faces,
     camera: KernelCamera,
     fit: tuple[NDArray[np.float64], NDArray[np.float64]],
+    blur_mm: NDArray[np.float64],
     pixels: NDArray[np.int32],
 ) -> None:
     """Write the flat pixel number that each ray of the balls `part` strikes, (n, rays), -1 off the sensor or lost.
@@ -53,6 +54,7 @@ def trace_curved(
     ----------
     placed : all balls' centres, their radii, and the shifts of their rays
     fit : from `fit_of_slopes`
+    blur_mm : (m, 2) what rays take in turn to end beside where they would
     """
     points, radii, shifts = placed
     aperture_radius = camera.aperture_radius_mm
@@ -74,7 +76,8 @@ def trace_curved(
                     pixels[i, k] = -1
                     continue
             on_x, on_y = trace_ray(camera, X, Y, slope_x, slope_y)
-            pixels[i, k] = struck_pixel(camera, on_x, on_y)
+            beside = blur_place(shifts, i, k, blur_mm.shape[0])
+            pixels[i, k] = struck_pixel(camera, on_x + blur_mm[beside, 0], on_y + blur_mm[beside, 1])
 
 
 @njit(cache=True)

@@ -21,7 +21,7 @@ from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import exact_lateral_mm
 from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.optics.object_space import ObjectSpace
-from lfpiv_cli.synthetic.ray_sequence import SEQUENCE
+from lfpiv_cli.synthetic.ray_sequence import SEQUENCE, diffused_mm
 
 # Samples along a square's side: a marker's side is known to a hundredth of it.
 SQUARE_SAMPLES = 120
@@ -29,6 +29,8 @@ SQUARE_SAMPLES = 120
 MARGIN_SQUARES = 1.0
 # A pixel is sampled on a grid this wide: an edge is known to a few per cent of a pixel's light, unlike in each.
 SAMPLES_PER_SIDE = 4
+# Where light is blurred, it comes from further around, and evenly: more of them.
+BLURRED_SAMPLES_PER_SIDE = 8
 # Each pixel starts its places on the microlens elsewhere (the same sequence in two more dimensions, by column and row):
 # with the same few for all, an edge in focus would be drawn to them.
 PIXEL_STEPS = np.array([[SEQUENCE[2], SEQUENCE[3]], [SEQUENCE[0], SEQUENCE[1]]])
@@ -76,29 +78,40 @@ def target_picture(board: BoardGeometry) -> NDArray[np.uint8]:
     return np.asarray(cv2.copyMakeBorder(picture, margin, margin, margin, margin, cv2.BORDER_CONSTANT, value=255))
 
 
-def render_plate(camera: Camera, space: ObjectSpace, plate: Plate, level: float) -> NDArray[np.float64]:
+def render_plate(
+    camera: Camera, space: ObjectSpace, plate: Plate, level: float, blur_px: NDArray[np.float64] | None = None
+) -> NDArray[np.float64]:
     """Render a lit plate, (rows, columns) float64 expected counts; light outside a pixel's own micro-image is left out.
 
     Parameters
     ----------
     level : expected counts of a pixel that sees only what is bright
+    blur_px : (n, 2) places beside where rays would end on the sensor, which they take in turn; default: as charge
+        diffuses
 
     Raises
     ------
     ConfigError : no window for exact refraction
     """
+    blur = diffused_mm(camera) / camera.pixel_mm if blur_px is None else blur_px
+    samples = SAMPLES_PER_SIDE if len(blur) == 1 else BLURRED_SAMPLES_PER_SIDE
+    line = (np.arange(samples) + 0.5) / samples - 0.5
+    places = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2) - blur[np.arange(samples**2) % len(blur)]
     image = np.empty((camera.rows, camera.columns))
     for top in range(0, camera.rows, ROWS_AT_ONCE):
         row, column = np.mgrid[top : min(top + ROWS_AT_ONCE, camera.rows), : camera.columns]
         px = np.stack([column, row], axis=-1).astype(np.float64)
-        image[top : top + len(px)] = level * _bright_share(px, camera, space, plate)
+        image[top : top + len(px)] = level * _bright_share(px, places, camera, space, plate)
     return image
 
 
-def _bright_share(px: NDArray[np.float64], camera: Camera, space: ObjectSpace, plate: Plate) -> NDArray[np.float64]:
-    """Return the share (rows, columns) of the rays to pixels, (rows, columns, 2), that start on something bright."""
-    line = (np.arange(SAMPLES_PER_SIDE) + 0.5) / SAMPLES_PER_SIDE - 0.5
-    places = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+def _bright_share(
+    px: NDArray[np.float64], places: NDArray[np.float64], camera: Camera, space: ObjectSpace, plate: Plate
+) -> NDArray[np.float64]:
+    """Return the share (rows, columns) of the rays to pixels, (rows, columns, 2), that start on something bright.
+
+    `places` (n, 2) are those about the middle of a pixel where rays would end but for the blur.
+    """
     centred = Lattice(np.zeros(2), camera.lattice.basis, camera.lattice.layout)
     first = (px @ PIXEL_STEPS).reshape(-1, 2)
     total = np.zeros(px.shape[:2])

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import ndtr
 
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.optics.camera import Camera, KernelCamera
@@ -24,8 +25,9 @@ from lfpiv_cli.optics.media import Layers
 from lfpiv_cli.optics.microlenses import nearest_point
 from lfpiv_cli.optics.object_space import ObjectSpace, slope_polynomial, slope_ratio
 from lfpiv_cli.optics.tracing import struck_pixel, trace_ray
+from lfpiv_cli.optics.waves import DIFFUSION_REACH
 from lfpiv_cli.synthetic.curved_rays import fit_of_slopes, trace_curved
-from lfpiv_cli.synthetic.ray_sequence import SEQUENCE, in_ball, on_disc, ray_places
+from lfpiv_cli.synthetic.ray_sequence import SEQUENCE, blur_place, diffused_mm, in_ball, on_disc, ray_places
 from lfpiv_cli.threads import share_out
 
 Space = ObjectSpace | CurvedSpace
@@ -40,6 +42,9 @@ RAYS = 40_000
 # A pixel of a white image is sampled on a grid this wide: a micro-image's edge is known to 1 % of a pixel's light, and
 # the grid's symmetry keeps its centre in place.
 WHITE_SAMPLES_PER_SIDE = 8
+
+# Places along an axis that tell from where a pixel collects charge.
+QUANTILE_PLACES = 2001
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +70,7 @@ def render_points(
     rng: np.random.Generator,
     *,
     rays: int = RAYS,
+    blur_mm: NDArray[np.float64] | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> NDArray[np.float64]:
     """Render small glowing balls.
@@ -72,6 +78,8 @@ def render_points(
     Parameters
     ----------
     rays : rays per ball
+    blur_mm : (n, 2) places beside where rays would end on the sensor, which they take in turn; default: as charge
+        diffuses
     progress : called with the number of balls done
 
     Returns
@@ -86,7 +94,8 @@ def render_points(
     points = camera.to_image_axes(balls.points_mm).reshape(-1, 3)
     weights = np.broadcast_to(np.asarray(balls.light, dtype=np.float64), len(points)) / rays
     radii = np.broadcast_to(0.5 * np.asarray(balls.diameter_mm, dtype=np.float64), len(points))
-    trace = _tracer_of(camera, space, points, radii.copy(), rng.random((len(points), 4)))
+    blur = diffused_mm(camera) if blur_mm is None else blur_mm
+    trace = _tracer_of(camera, space, points, radii.copy(), rng.random((len(points), 4)), blur)
 
     image = np.zeros((camera.rows, camera.columns))
     batch = max(RAYS_AT_ONCE // rays, 1)
@@ -106,6 +115,7 @@ def _tracer_of(
     points: NDArray[np.float64],
     radii: NDArray[np.float64],
     shifts: NDArray[np.float64],
+    blur_mm: NDArray[np.float64],
 ) -> Callable[[slice, NDArray[np.int32]], None]:
     """Return what writes the pixels (n, rays) that the rays of a part of the balls strike, image axes."""
     seen = camera.for_kernels()
@@ -114,7 +124,7 @@ def _tracer_of(
 
         def trace(part: slice, pixels: NDArray[np.int32]) -> None:
             placed = (points[part], radii[part], shifts[part])
-            share_out(trace_curved, len(pixels), placed, faces, seen, fit, pixels)
+            share_out(trace_curved, len(pixels), placed, faces, seen, fit, blur_mm, pixels)
 
         return trace
     last_layers, layers = space.last_layers_mm(camera, points[:, 2]), space.layers(camera)
@@ -122,7 +132,7 @@ def _tracer_of(
 
     def trace_plane(part: slice, pixels: NDArray[np.int32]) -> None:
         placed = (points[part], radii[part], last_layers[part], shifts[part])
-        share_out(_trace_points, len(pixels), placed, layers, seen, pixels)
+        share_out(_trace_points, len(pixels), placed, layers, seen, blur_mm, pixels)
 
     return trace_plane
 
@@ -140,11 +150,13 @@ def _trace_points(
     placed: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
     layers: Layers,
     camera: KernelCamera,
+    blur_mm: NDArray[np.float64],
     pixels: NDArray[np.int32],
 ) -> None:
     """Write the flat pixel number that each ray of the points `part` strikes, (n, rays), -1 off the sensor.
 
-    `placed` holds all points, the balls' radii, their last layers' thicknesses and the shifts of their rays.
+    `placed` holds all points, the balls' radii, their last layers' thicknesses and the shifts of their rays; rays end
+    beside where they would by each of `blur_mm` (m, 2) in turn.
     """
     points, radii, last_layers, shifts = placed
     aperture_radius = camera.aperture_radius_mm
@@ -162,7 +174,8 @@ def _trace_points(
             dy = lens_y - points[i, 1] - ball_y
             ratio = slope_ratio(dx * dx + dy * dy, nodes, factors)
             x, y = trace_ray(camera, lens_x, lens_y, ratio * dx, ratio * dy)
-            pixels[i, k] = struck_pixel(camera, x, y)
+            beside = blur_place(shifts, i, k, blur_mm.shape[0])
+            pixels[i, k] = struck_pixel(camera, x + blur_mm[beside, 0], y + blur_mm[beside, 1])
 
 
 @njit(cache=True)
@@ -189,8 +202,10 @@ def render_white(camera: Camera, level: float, samples_per_side: int = WHITE_SAM
     -------
     (rows, columns) float64, expected counts
     """
-    samples = samples_per_side**2
-    line = (np.arange(samples_per_side) + 0.5) / samples_per_side - 0.5
+    # charge comes from further around, and less evenly
+    across = samples_per_side if camera.diffusion_px == 0.0 else 2 * samples_per_side
+    samples = across**2
+    line = pixel_places(across, camera.diffusion_px)
     positions = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
     # offsets within a lens's cell: points of the basis cell, moved to the lens that they are nearest to
     lattice = camera.lattice
@@ -204,6 +219,18 @@ def render_white(camera: Camera, level: float, samples_per_side: int = WHITE_SAM
         _backtrack_white, camera.rows, positions, offsets, camera.for_kernels(), centres.origin, centres.basis, lit
     )
     return lit * np.float64(level / samples)
+
+
+def pixel_places(count: int, diffusion_px: float) -> NDArray[np.float64]:
+    """Return places along an axis about a pixel's middle, in pixels, each of which sends it as much charge."""
+    share = (np.arange(count) + 0.5) / count
+    if diffusion_px == 0.0:
+        return share - 0.5
+    reach = 0.5 + DIFFUSION_REACH * diffusion_px
+    places = np.linspace(-reach, reach, QUANTILE_PLACES)
+    from_pixel = ndtr((places + 0.5) / diffusion_px) - ndtr((places - 0.5) / diffusion_px)
+    below = np.cumsum(from_pixel) - 0.5 * from_pixel
+    return np.interp(share, below / from_pixel.sum(), places)
 
 
 @njit(cache=True, nogil=True)

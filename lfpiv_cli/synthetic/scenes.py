@@ -21,9 +21,9 @@ from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.waves import Waves
 from lfpiv_cli.synthetic.board import BoardPlacement, dot_centres, render_board
 from lfpiv_cli.synthetic.flows import STEADY, Flow, Pulsation, advect
-from lfpiv_cli.synthetic.render import RAYS, Balls, ObjectSpace, Space, render_points, render_white
+from lfpiv_cli.synthetic.render import RAYS, Balls, ObjectSpace, Space
 from lfpiv_cli.synthetic.sensor import Readout
-from lfpiv_cli.synthetic.wave_images import points_by_waves, white_by_waves
+from lfpiv_cli.synthetic.wave_images import render_balls, white_image
 
 Triple = tuple[float, float, float]
 
@@ -263,9 +263,7 @@ def pipe_bounds(pipe: RoundWall) -> Box:
 
 def simulate_white(camera: RecordingCamera, level: float, rng: np.random.Generator) -> SimulatedStill:
     """Simulate an image of uniform light, `level` expected counts where a pixel sees nothing but the aperture."""
-    optics, waves = camera.optics, camera.waves
-    expected = render_white(optics, level) if waves is None else white_by_waves(optics, waves, level)
-    image = camera.readout.record(expected, rng)
+    image = camera.readout.record(white_image(camera.optics, camera.waves, level), rng)
     return SimulatedStill(image, camera.dark_frame(rng), camera_truth(camera.optics))
 
 
@@ -278,7 +276,8 @@ def simulate_board(
     rng: np.random.Generator,
 ) -> SimulatedStill:
     """Simulate an image of a board, `level` expected counts in a pixel that sees only what is bright."""
-    image = camera.readout.record(render_board(camera.optics, space, board, placement, level, rng), rng)
+    expected = render_board(camera.optics, space, board, placement, level, rng, waves=camera.waves)
+    image = camera.readout.record(expected, rng)
     truth = {
         **camera_truth(camera.optics),
         "board_z_mm": placement.z_mm,
@@ -316,10 +315,7 @@ def simulate_particles(
     images = []
     for place, seen, light in zip(places, lit, tracers.light_counts * shown, strict=True):
         balls = Balls(place[seen], light[seen], diameters[seen])
-        if camera.waves is None:
-            expected = render_points(camera.optics, space, balls, rng, rays=tracers.rays, progress=progress)
-        else:
-            expected = points_by_waves(camera.optics, space, balls, camera.waves, progress=progress)
+        expected = render_balls(camera.optics, space, balls, rng, camera.waves, rays=tracers.rays, progress=progress)
         images.append(camera.readout.record(expected + still, rng))
     window = space.window if isinstance(space, ObjectSpace) else None
     truth = {
