@@ -45,7 +45,7 @@ DEGREE = 8
 # Places on the pupil that it is fitted to: the polynomial has 44 coefficients, each place tells two of its slopes.
 PUPIL_PLACES = 160
 # The samples follow a wave that is so much steeper than the steepest ray: what edges diffract further is weak.
-STEEPNESS = 1.4
+STEEPNESS = 1.5
 # Around what rays light, so many microlenses are left for what edges diffract; what goes further comes back on the
 # other side, some 0.5 % of the light in focus.
 MARGIN_PITCHES = 1.0
@@ -129,7 +129,9 @@ class WavesInCamera:
         light = np.zeros((window.size, window.size), dtype=np.float32)
         for point, array, seen in lit:
             amplitude = window.amplitude if seen.all() else window.amplitude * self._seen(point, window.pupil)
-            field = window.on_array(amplitude, self._phase(array - middle, seen), self.camera.aperture_radius_mm)
+            field = window.on_array(
+                amplitude, self._phase(array - middle - 0.5 * self.step_mm, seen), self.camera.aperture_radius_mm
+            )
             field *= lenses
             _add_intensity(window.on_sensor(field), light)
         pixels = np.zeros((window.size // self.samples, window.size // self.samples))
@@ -185,15 +187,15 @@ class WavesInCamera:
         return self._windows[size]
 
     def _place(self, spot_mm: NDArray[np.float64], window: _Window) -> tuple[tuple[int, int], NDArray[np.float64]]:
-        """Return the window's first (row, column) on the sensor, and the place on the array of its middle sample.
+        """Return the window's first (row, column) on the sensor, and its middle on the array.
 
-        The middle is seen at the corner of pixels that is nearest to the spot, half a sample beside it.
+        The middle is seen at the corner of pixels that is nearest to the spot, with as many samples on either side.
         """
         camera, lever = self.camera, self.camera.microlens_distance_mm / self.camera.image_distance_mm
         axis_px = camera.sensor_centre_px + 0.5
         ideal = _undistorted(spot_mm, 1.0, camera.distortion_per_mm2)
         corner = np.rint((spot_mm + lever * ideal) / camera.pixel_mm + axis_px).astype(np.int64)
-        on_sensor = (corner - axis_px) * camera.pixel_mm + 0.5 * self.step_mm
+        on_sensor = (corner - axis_px) * camera.pixel_mm
         tilt = _undistorted(on_sensor, 1.0 + lever, camera.distortion_per_mm2)
         half = window.size // (2 * self.samples)
         return (int(corner[1]) - half, int(corner[0]) - half), on_sensor - lever * tilt
@@ -238,7 +240,7 @@ class _Window:
     pupil : (n,) places of the pupil's samples along each axis, mm
     amplitude : (n, n) of the light on them, whose squares sum to 1 over `size`^2, alternating in sign as the middle of
         the array's samples asks for
-    beside : (size,) places of the samples from the window's middle, mm
+    beside : (size,) places of the samples from the window's middle, half a sample beside it and further out, mm
     transfer : (size,) phases of the way to the sensor along each axis, by frequency
     """
 
@@ -262,7 +264,7 @@ class _Window:
             size,
             pupil,
             inside * sign[:, None] * sign / (size * np.sqrt(np.sum(inside**2))),
-            np.asarray(step_mm * (np.arange(size) - size // 2), dtype=np.float64),
+            np.asarray(step_mm * (np.arange(size) - size // 2 + 0.5), dtype=np.float64),
             np.exp(
                 -1j * np.pi * waves.wavelength_mm * camera.microlens_distance_mm * fft.fftfreq(size, step_mm) ** 2
             ).astype(np.complex64),
