@@ -7,7 +7,7 @@ particles.npz.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -31,7 +31,7 @@ from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.reference import FOCAL_POINT, Reference
 from lfpiv_cli.stages.simulated_tracers import bubbles_of, bubbles_walls_of, light_z_mm_of, tracers_of
 from lfpiv_cli.synthetic import scenes
-from lfpiv_cli.synthetic.board import BoardPlacement
+from lfpiv_cli.synthetic.board import BoardPlacement, points_of
 from lfpiv_cli.synthetic.bubbles import render_bubbles
 from lfpiv_cli.synthetic.curved_rays import unseen
 from lfpiv_cli.synthetic.render import ObjectSpace, Space
@@ -54,9 +54,9 @@ def simulate_board(
 ) -> dict[str, Any]:
     """Render the snapshot of the board."""
     settings, paths = _begin(config, output, ("board.tif", "board.json"), overwrite)
-    still = _board_still(
-        settings, settings.rig().board, _board_space(settings), settings.simulation.board_z_mm, _generator(settings, 1)
-    )
+    board, z_mm = settings.rig().board, settings.simulation.board_z_mm
+    with console.progress(points_of(board), "simulate") as advance:
+        still = _board_still(settings, board, _board_space(settings), z_mm, _generator(settings, 1), advance)
     write_tiff(paths["board.tif"], still.image, overwrite)
     return _write_truth(paths["board.json"], "simulate board", still.truth, settings, config, overwrite)
 
@@ -70,11 +70,11 @@ def simulate_boards(
     reference = simulated_reference(settings)
     rng, space = _generator(settings, 3), _flow_space(settings, reference)
     board = replace(settings.rig().board, medium="fluid")
-    with console.frames(len(names), 1.0, "simulate", "board") as work:
+    with console.frames(len(names), points_of(board), "simulate", "board") as work:
         for depth, name in names.items():
             write_tiff(
                 paths[name],
-                _board_still(settings, board, space, reference.depth_to_focal_point(depth), rng).image,
+                _board_still(settings, board, space, reference.depth_to_focal_point(depth), rng, work.advance).image,
                 overwrite,
             )
             work.done(name)
@@ -191,11 +191,16 @@ def simulated_reference(settings: Config) -> Reference:
 
 
 def _board_still(
-    settings: Config, board: BoardGeometry, space: Space, z_mm: float, rng: np.random.Generator
+    settings: Config,
+    board: BoardGeometry,
+    space: Space,
+    z_mm: float,
+    rng: np.random.Generator,
+    progress: Callable[[int], None],
 ) -> scenes.SimulatedStill:
     scene = settings.simulation
     placement = BoardPlacement(z_mm, scene.board_offset_mm, scene.board_tilt_deg, scene.board_rotation_deg)
-    return scenes.simulate_board(_recording(settings), space, board, placement, scene.peak_counts, rng)
+    return scenes.simulate_board(_recording(settings), space, board, placement, scene.peak_counts, rng, progress)
 
 
 def _begin(config: Path, output: Path, names: tuple[str, ...], overwrite: bool) -> tuple[Config, dict[str, Path]]:

@@ -14,6 +14,7 @@ from lfpiv_cli.calibration.board import dots_in_world
 from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files.atomic import ensure_writable, write_json
+from lfpiv_cli.files.bench import waves_of
 from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.pictures import ensure_drawing, write_picture
 from lfpiv_cli.files.provenance import record
@@ -107,7 +108,7 @@ def bench_of(settings: Config, half: str) -> BoardBench:
     if half == "ideal":
         return ideal_bench(rig, grid, scene.peak_counts, rng)
     true = ObjectSpace(rig.media, settings.window_model(), scene.refraction)
-    reality = Reality(misalignment_of(settings), readout_of(settings), true)
+    reality = Reality(misalignment_of(settings), readout_of(settings), true, waves_of(scene.light))
     return recorded_bench(rig, settings.plane_space("validating boards"), reality, grid, scene.peak_counts, rng)
 
 

@@ -6,6 +6,7 @@ y), tilted, and moved to its place, in this order, as a rigid plate.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -73,6 +74,11 @@ def _plate_centres(board: BoardGeometry) -> NDArray[np.float64]:
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
 
+def points_of(board: BoardGeometry) -> int:
+    """Return of how many points a board's picture is made, 0 of a print."""
+    return POINTS_PER_DOT * board.dots[0] * board.dots[1] if board.pattern == "dots" else 0
+
+
 def render_board(
     camera: Camera,
     space: Space,
@@ -81,7 +87,9 @@ def render_board(
     level: float,
     rng: np.random.Generator,
     shown: ArrayLike | None = None,
+    *,
     waves: Waves | None = None,
+    progress: Callable[[int], None] | None = None,
 ) -> NDArray[np.float64]:
     """Render bright dots on dark ground, dark dots on ground that fills the view, or a lit print.
 
@@ -90,6 +98,7 @@ def render_board(
     level : expected counts of a pixel that sees only what is bright, as in a white image
     shown : (n,) bool, which dots there are, the first index along x running fastest; default: all
     waves : what light is made of; default: rays. A print is then shown by rays that are blurred by what lenses diffract
+    progress : called with the number of `points_of` that are done
 
     Returns
     -------
@@ -113,7 +122,7 @@ def render_board(
     area = 0.25 * np.pi * board.dot_diameter_mm**2 / POINTS_PER_DOT
     light = area * light_per_area(camera, space.media, points[:, 2], level)
     size = board.dot_diameter_mm / np.sqrt(POINTS_PER_DOT) if waves is None else 0.0
-    dots = render_balls(camera, space, Balls(points, light, size), rng, waves, rays=RAYS_PER_POINT)
+    dots = render_balls(camera, space, Balls(points, light, size), rng, waves, rays=RAYS_PER_POINT, progress=progress)
     if board.polarity != "dark":
         return dots
     # the rays' noise may ask for more than there is

@@ -274,9 +274,10 @@ def simulate_board(
     placement: BoardPlacement,
     level: float,
     rng: np.random.Generator,
+    progress: Callable[[int], None] | None = None,
 ) -> SimulatedStill:
     """Simulate an image of a board, `level` expected counts in a pixel that sees only what is bright."""
-    expected = render_board(camera.optics, space, board, placement, level, rng, waves=camera.waves)
+    expected = render_board(camera.optics, space, board, placement, level, rng, waves=camera.waves, progress=progress)
     image = camera.readout.record(expected, rng)
     truth = {
         **camera_truth(camera.optics),

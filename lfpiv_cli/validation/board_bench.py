@@ -17,6 +17,7 @@ from lfpiv_cli.calibration.dlfc import fit_rays
 from lfpiv_cli.calibration.model import Photographs, Rig, calibrate
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.object_space import ObjectSpace
+from lfpiv_cli.optics.waves import Waves
 from lfpiv_cli.reconstruction.images import Image, Mask, light
 from lfpiv_cli.synthetic.board import BoardPlacement, render_board
 from lfpiv_cli.synthetic.scenes import Misalignment, RecordingCamera, simulate_board, simulate_white
@@ -81,11 +82,13 @@ class Reality:
     misalignment : of the camera
     readout : of its sensor, with noise
     space : what lies before the lens
+    waves : what light is made of; rays where there are none
     """
 
     misalignment: Misalignment
     readout: Readout
     space: ObjectSpace
+    waves: Waves | None = None
 
 
 def recorded_bench(
@@ -99,7 +102,7 @@ def recorded_bench(
     assumed : what is taken to lie before the lens, for the weights
     level : expected counts in a pixel that sees only what is bright
     """
-    real = RecordingCamera(reality.misalignment.apply(rig.camera), reality.readout)
+    real = RecordingCamera(reality.misalignment.apply(rig.camera), reality.readout, reality.waves)
     dark = real.dark_frame(rng)
     white = simulate_white(real, level, rng).image
     board = replace(rig.board, medium="air")
