@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.optics.media import Media, Window, fluid_path_to_focus
@@ -13,7 +14,15 @@ from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.optics.tracing import disc_points, exact_slope, slopes_equivalent, slopes_exact, trace
 from lfpiv_cli.synthetic import render
 from lfpiv_cli.synthetic.ray_sequence import in_ball
-from lfpiv_cli.synthetic.render import Balls, ObjectSpace, render_points, render_white, slope_polynomial, slope_ratio
+from lfpiv_cli.synthetic.render import (
+    Balls,
+    ObjectSpace,
+    pixel_places,
+    render_points,
+    render_white,
+    slope_polynomial,
+    slope_ratio,
+)
 
 
 @pytest.fixture
@@ -169,3 +178,31 @@ def test_paraxial_rays_ignore_the_window(small, water):
     thicknesses, indices = ObjectSpace(water, Window(50.0, 9.0), "paraxial").layers(small)
     assert (thicknesses.tolist(), indices.tolist()) == ([200.0], [1.0])
     assert ObjectSpace(Media()).layers(small)[0].tolist() == [200.0]
+
+
+@pytest.mark.parametrize("point", [(0.05, -0.1, 1.0), (0.0, 0.03, 0.0)])
+def test_charge_diffuses_as_a_gaussian(small, media, window, rng, point):
+    """Rays on a sensor of eight times as many pixels, and the Gaussian on these."""
+    camera, space, fine = replace(small, diffusion_px=0.5), ObjectSpace(media, window), 8
+    finer = replace(small, pixel_mm=small.pixel_mm / fine, columns=fine * small.columns, rows=fine * small.rows)
+    ball = Balls(np.array([point]), 1.0, 0.01)
+    found = render_points(camera, space, ball, rng, rays=100_000)
+    expected = gaussian_filter(render_points(finer, space, ball, rng, rays=100_000), 0.5 * fine, mode="constant")
+    expected = expected.reshape(small.rows, fine, small.columns, fine).sum(axis=(1, 3))
+    assert found.sum() == pytest.approx(1.0, abs=1e-3)
+    # of 100,000 rays on some 300 pixels
+    sharp = render_points(small, space, ball, rng, rays=100_000)
+    assert np.abs(found - expected).sum() < 0.05
+    assert np.abs(found - expected).sum() < 0.6 * np.abs(sharp - expected).sum()
+    row, column = np.indices(found.shape)
+    for axis in (row, column):
+        # places on either side of a ray's end are as many
+        assert (found * axis).sum() == pytest.approx((expected * axis).sum(), abs=0.03)
+
+
+def test_places_of_a_pixel_collect_even_shares_of_its_charge():
+    assert np.array_equal(pixel_places(8, 0.0), (np.arange(8) + 0.5) / 8 - 0.5)
+    places = pixel_places(400, 0.5)
+    # the variances of the pixel and of the Gaussian; the outermost places stand for what lies beyond them
+    assert places.var() == pytest.approx(1.0 / 12.0 + 0.25, rel=0.01)
+    assert places == pytest.approx(-places[::-1], abs=1e-9)

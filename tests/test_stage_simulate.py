@@ -217,3 +217,39 @@ def test_a_board_of_dots_is_seen_in_a_pipe_and_in_front_of_it(tmp_path: Path) ->
     # the dots stand on the tube's axis, in the focal plane: a cylinder's centre is seen n_w times as large
     assert apart["fluid"] == pytest.approx(2.0 * 2.0 * 1.33, rel=0.02)
     assert apart["air"] == pytest.approx(2.0 * 2.0, rel=0.02)
+
+
+@pytest.mark.thorough
+def test_light_of_waves_shows_the_same_scene(tmp_path: Path) -> None:
+    """What is seeded and how it moves does not go with what light is made of; the images do, their light does not."""
+    text = SAMPLE.read_text().replace("particles: 400", "particles: 4").replace("dots: [5, 4]", "dots: [2, 2]")
+    images: dict[str, np.ndarray] = {}
+    for light in ("rays", "waves"):
+        rig, out = tmp_path / f"{light}.yaml", tmp_path / light
+        rig.write_text(text.replace("simulation:\n", f"simulation:\n  light: {{kind: {light}}}\n"))
+        for what in ("white", "board", "particles"):
+            cli.main(["simulate", what, str(rig), "-o", str(out)], standalone_mode=False)
+        for name in ("white", "board", "pair_b"):
+            images[f"{light} {name}"] = read_image(out / f"{name}.tif").astype(float) - 96.0
+    truths = [read_particles(tmp_path / light / "particles.npz") for light in ("rays", "waves")]
+    assert np.array_equal(truths[0].positions_mm, truths[1].positions_mm)
+    assert np.array_equal(truths[0].brightness, truths[1].brightness)
+    # 2e5 pixels of 6 counts of noise; lenses lose no light but at the sensor's rims
+    for name in ("white", "board", "pair_b"):
+        rays, waves = images[f"rays {name}"], images[f"waves {name}"]
+        assert waves.sum() == pytest.approx(rays.sum(), rel=0.01), name
+        assert 0.03 < np.abs(waves - rays)[rays + waves > 200.0].sum() / rays.sum() < 0.6, name
+
+
+@pytest.mark.parametrize(
+    ("light", "match"),
+    [
+        ("{kind: rays, points: 3}", "light.points: unknown key"),
+        ("{kind: beams}", "light.kind: is 'beams', expected one of 'rays', 'waves'"),
+        ("{kind: waves, wavelength_nm: 0.532}", "light.wavelength_nm: .* 200"),
+    ],
+)
+def test_light_that_cannot_be_is_refused(tmp_path: Path, light: str, match: str) -> None:
+    (tmp_path / "rig.yaml").write_text(SAMPLE.read_text().replace("simulation:\n", f"simulation:\n  light: {light}\n"))
+    with pytest.raises(ConfigError, match=match):
+        load_config(tmp_path / "rig.yaml")
