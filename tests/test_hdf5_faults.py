@@ -130,6 +130,8 @@ HOSTILE: dict[str, Callable[[h5py.File, Path], object]] = {
     "strings": lambda file, other: file.create_dataset("extra", (3,), h5py.string_dtype()),
     "compound": lambda file, other: file.create_dataset("extra", (3,), [("a", "f8"), ("b", "i4")]),
     "complex": lambda file, other: file.create_dataset("extra", data=np.array([1j])),
+    "long doubles": lambda file, other: file.create_dataset("extra", data=np.ones(3, np.longdouble)),
+    "long doubles as attribute": lambda file, other: file.attrs.__setitem__("extra", np.ones(3, np.longdouble)),
     "a type": lambda file, other: file.__setitem__("extra", np.dtype("f8")),
     "never written": lambda file, other: file.create_dataset("extra", (10**9,), "f8"),
     "chunks of a gigabyte": lambda file, other: file.create_dataset(

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import imagecodecs
@@ -14,7 +15,7 @@ import pytest
 import tifffile
 
 from lfpiv_cli.files.hdf5 import read_tree, write_tree
-from lfpiv_cli.files.vtkhdf import open_vectors, open_volume, write_volume
+from lfpiv_cli.files.vtkhdf import open_vectors, open_volume, write_vectors, write_volume
 from lfpiv_cli.files.weights_file import FORMAT, VERSION
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.reference import FOCAL_POINT
@@ -22,6 +23,7 @@ from tests.hostile_files import edited, ended, make_no_file
 from tests.test_config import HOSTILE_TEXT, IMPOSSIBLE, RIG
 from tests.test_files import ABSURD_IMAGES, TIFF_KINDS
 from tests.test_image_faults import COLUMNS, ROWS, weights
+from tests.vector_fields import SHAPE, field_of
 
 __all__ = ["weights"]
 
@@ -230,6 +232,22 @@ def test_volumes_that_hold_no_numbers_are_refused(tmp_path: Path, value: float) 
     code, said = correlated(tmp_path, 1.0, value)
     assert (code, "b.vtkhdf" in said) == (4, True), said
     assert not (tmp_path / "v.vtkhdf").exists()
+
+
+# Vectors
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("dt_s", [0.1, None])
+def test_displacements_that_are_no_numbers_are_refused(tmp_path: Path, value: float, dt_s: float | None) -> None:
+    path = tmp_path / "v.vtkhdf"
+    field = replace(field_of(np.ones((*SHAPE, 3)), None), dt_s=dt_s)
+    write_vectors(path, field, FOCAL_POINT, provenance={}, overwrite=False)
+    with edited(path) as file:
+        file["displacement_voxel"][1, 2, 3, 0] = value
+    for words in (("combine", path, path, "-o", tmp_path / "c.vtkhdf"), ("export", path, "--to", "csv")):
+        code, said = ended(*words)
+        assert (code, "v.vtkhdf: a vector that counts as valid is not a finite number" in said) == (4, True), said
 
 
 # Configs

@@ -16,6 +16,9 @@ from tests.hostile_files import edited, ended
 ROOT = Path(__file__).parent.parent
 
 
+SAMPLE = ROOT / "sample_data"
+
+
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """The bytes of factorised weights of a few voxels."""
@@ -26,6 +29,23 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     (folder / "rig.yaml").write_text(yaml.safe_dump(config))
     assert ended("build-weights", folder / "rig.yaml", "-o", folder / "w.h5") == (0, "")
     return (folder / "w.h5").read_bytes()
+
+
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[bytes, tuple[object, ...]]]:
+    """The bytes of a calibration, and of weights made with it, each with the command that takes it as {file}."""
+    folder = tmp_path_factory.mktemp("calibrated")
+    config = yaml.safe_load((ROOT / "configs" / "sample.yaml").read_text())
+    config["volume"] |= {"shape_xyz": [3, 2, 2]}
+    config["reconstruction"]["padding_voxel"] = [0, 0, 0]
+    rig, calibration = folder / "rig.yaml", folder / "c.h5"
+    rig.write_text(yaml.safe_dump(config))
+    pictures = ("--white", SAMPLE / "white.tif", "--board", SAMPLE / "board.tif")
+    assert ended("calibrate-snapshot", rig, *pictures, "-o", calibration) == (0, "")
+    assert ended("build-weights", rig, "--calibration", calibration, "-o", folder / "w.h5") == (0, "")
+    build = ("build-weights", rig, "--calibration", "{file}", "-o", "{folder}/out.h5")
+    use = ("reconstruct", "{file}", SAMPLE / "pair_a.tif", "--iterations", 1, "-o", "{folder}/out.vtkhdf")
+    return {"calibration": (calibration.read_bytes(), build), "weights": ((folder / "w.h5").read_bytes(), use)}
 
 
 def put(file: h5py.File, name: str, value: Any) -> None:
@@ -132,3 +152,52 @@ def test_tracing_through_what_cannot_be_is_named(
     code, said = wrong(weights, tmp_path, trace)
     assert code == 4
     assert "not a whole weights file" in said
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("factor", [1e-40, 1e-20, 1e20])
+def test_shares_whose_sums_have_no_inverse_are_named(tmp_path: Path, weights: bytes, factor: float) -> None:
+    def dim(file: h5py.File) -> None:
+        for axis in ("columns", "rows"):
+            file[f"{axis}/share"][...] = file[f"{axis}/share"][()] * np.float32(factor)
+
+    code, said = wrong(weights, tmp_path, dim)
+    assert (code, "w.h5: not a whole weights file: the largest weight is" in said) == (4, True), said
+
+
+def grouped(file: h5py.File, name: str) -> None:
+    """Put a group in the place of an array."""
+    del file[name]
+    file.create_group(name).create_dataset("part", data=np.ones(3))
+
+
+# In a calibration, and by what; in that of weights they lie in the group `calibration`.
+CALIBRATION_EDITS: list[tuple[str, Callable[[h5py.File, str], object]]] = [
+    ("image_shape", lambda file, name: put(file, name, [10, 10])),
+    *(
+        (name, lambda file, name: put(file, name, 0.5))
+        for name in ("transmission", "lattice/basis_px", "board/dots_mm")
+    ),
+    *((name, grouped) for name in ("transmission", "lattice/centres_px")),
+    ("transmission", lambda file, name: file[name].__setitem__((3, 4), np.nan)),
+]
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("kind", ["calibration", "weights"])
+@pytest.mark.parametrize(("name", "edit"), CALIBRATION_EDITS)
+def test_a_calibration_with_other_shapes_is_refused(
+    tmp_path: Path,
+    calibrated: dict[str, tuple[bytes, tuple[object, ...]]],
+    kind: str,
+    name: str,
+    edit: Callable[[h5py.File, str], object],
+) -> None:
+    content, command = calibrated[kind]
+    path = tmp_path / "file.h5"
+    path.write_bytes(content)
+    with edited(path) as file:
+        edit(file, name if kind == "calibration" else f"calibration/{name}")
+    code, said = ended(*(str(word).format(file=path, folder=tmp_path) for word in command))
+    assert (code, "file.h5: " in said, "calibration" in said) == (4, True, True), said
+    assert [path.name] == [each.name for each in tmp_path.iterdir()]

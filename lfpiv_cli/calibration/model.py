@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_limits
 from lfpiv_cli.calibration.board import locate_board
 from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose
 from lfpiv_cli.calibration.dlfc import RayFit, fit_rays
-from lfpiv_cli.calibration.lattice import LatticeFit, fit_lattice
+from lfpiv_cli.calibration.lattice import EXPONENTS, LatticeFit, fit_lattice
 from lfpiv_cli.calibration.rectification import Rectification
 from lfpiv_cli.calibration.scene_pose import ScenePose
 from lfpiv_cli.calibration.sheet import check_pitch, image_distance_mm, sheet_fit
@@ -45,6 +45,18 @@ CARRIED = (
     "image_distance_mm",
     "image_distance_sigma_mm",
 )
+# Shapes of the arrays that the file keeps, None for any length.
+OF_RAYS: Mapping[str, tuple[int | None, ...]] = {"depths_mm": (None,), "reach_mm": (2, 2), "residual_mm": (None, 2)}
+SHAPES: Mapping[str, tuple[int | None, ...]] = {
+    **dict.fromkeys(("indices", "centres_px", "dots_px"), (None, 2)),
+    **dict.fromkeys(("dots_mm", "dots_sigma_mm", "residual_mm"), (None, 3)),
+    **dict.fromkeys(("residual_px", "residual_affine_px", "pitch_sigma_px", "origin_sigma_px", "origin_px"), (2,)),
+    **dict.fromkeys(("tilt_deg", "tilt_sigma_deg", "offset_mm", "offset_sigma_mm"), (2,)),
+    "basis_px": (2, 2),
+    "cubic_px": (len(EXPONENTS), 2),
+}
+# What may not be known.
+UNKNOWN = (*CARRIED, "k1_per_mm2", "k1_sigma_per_mm2", "entrance_pupil_mm", "entrance_pupil_sigma_mm")
 
 
 @dataclass(frozen=True)
@@ -126,11 +138,7 @@ class Calibration:
         InputError
             when the calibration was made with another sensor
         """
-        if self.image_shape != (camera.rows, camera.columns):
-            raise InputError(
-                f"the calibration was made with images of {self.image_shape[0]} x {self.image_shape[1]} pixels (rows x "
-                f"columns) and the configured sensor has {camera.rows} x {camera.columns}"
-            )
+        self.ensure_images_of(camera)
         if self.pose is not None:
             difference = abs(self.pose.magnification - camera.magnification)
             if difference > MAGNIFICATION_SIGMAS * self.pose.magnification_sigma:
@@ -139,6 +147,19 @@ class Calibration:
         if self.ray_fit is not None:
             camera = self.ray_fit.behind_its_pupil(camera)
         return camera.with_micro_images(self.rectification.lattice_px)
+
+    def ensure_images_of(self, camera: Camera) -> None:
+        """Refuse a camera with another sensor.
+
+        Raises
+        ------
+        InputError
+        """
+        if self.image_shape != (camera.rows, camera.columns):
+            raise InputError(
+                f"the calibration was made with images of {self.image_shape[0]} x {self.image_shape[1]} pixels (rows x "
+                f"columns) and the configured sensor has {camera.rows} x {camera.columns}"
+            )
 
     def vignetting(self) -> NDArray[np.float64] | None:
         """Return the slow part of the transmission as coefficients; None where it was not measured."""
@@ -209,24 +230,50 @@ class Calibration:
         Raises
         ------
         InputError
-            when something is missing
+            when something is missing, or of another shape
         """
         try:
-            fit = dict(tree["lattice"])
+            rows, columns = (int(n) for n in tree["image_shape"])
+            fit, rays = dict(tree["lattice"]), tree.get("dlfc") or {}
+            _ensure_shapes({name: value for name, value in fit.items() if name != "layout"})
+            _ensure_shapes(tree.get("board") or {})
+            _ensure_shapes({name: value for name, value in rays.items() if name != "rays"}, OF_RAYS)
+            _ensure_shapes({name: tree.get(name) for name in CARRIED})
+            if tree.get("transmission") is not None:
+                _ensure_shapes({"transmission": tree["transmission"]}, {"transmission": (rows, columns)})
+                if not np.isfinite(tree["transmission"]).all():
+                    raise ValueError("a transmission is not a finite number")
             lattice = Lattice(fit.pop("origin_px"), fit.pop("basis_px"), fit.pop("layout"))
             fit["cubic_used"] = bool(fit["cubic_used"])
-            rows, columns = (int(n) for n in tree["image_shape"])
             return cls(
                 Rectification(LatticeFit(lattice_px=lattice, **fit), (rows, columns)),
                 tree.get("transmission"),
                 BoardPose(**tree["board"]) if tree.get("board") else None,
-                ray_fit=RayFit.from_tree(tree["dlfc"]) if tree.get("dlfc") else None,
+                ray_fit=RayFit.from_tree(rays) if rays else None,
                 mid_plane_given=bool(tree.get("mid_plane_given")),
                 scene=ScenePose.from_tree(tree["scene"]) if tree.get("scene") else None,
                 **{name: tree.get(name) for name in CARRIED},
             )
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise InputError(f"the calibration is not complete ({error}); make it again") from error
+
+
+def _ensure_shapes(tree: Mapping[str, Any], shapes: Mapping[str, tuple[int | None, ...]] = SHAPES) -> None:
+    """Refuse numbers of other shapes than these, single ones where there is none; groups and texts are no numbers.
+
+    Raises
+    ------
+    ValueError
+    """
+    for name, value in tree.items():
+        if value is None and name in UNKNOWN:
+            continue
+        found, expected = np.asarray(value), shapes.get(name, ())
+        fits = found.ndim == len(expected) and all(n in (None, m) for n, m in zip(expected, found.shape, strict=True))
+        if not fits or found.dtype.kind not in "biuf":
+            kind = f"numbers of the shape {found.shape}" if found.dtype.kind in "biuf" else "no numbers"
+            words = " x ".join("n" if n is None else str(n) for n in expected)
+            raise ValueError(f"{name} holds {kind}, expected {words + ' numbers' if expected else 'a number'}")
 
 
 @dataclass(frozen=True, eq=False)

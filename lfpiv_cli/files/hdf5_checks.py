@@ -22,6 +22,8 @@ DIGEST = "attributes_sha256"
 LARGEST_RATIO = 1100
 # Our deepest tree has four levels, and some fifty objects; hard links can form circles.
 DEEPEST, MOST_OBJECTS, MOST_ATTRIBUTES = 12, 10_000, 1_000
+# Bytes; numerical libraries take no long doubles.
+WIDEST_NUMBER = 8
 # netCDF's dimension scales refer to each other in these; nothing here reads them.
 OF_DIMENSION_SCALES = (b"DIMENSION_LIST", b"REFERENCE_LIST")
 
@@ -87,8 +89,8 @@ def _ensure_array(name: str, array: h5py.h5d.DatasetID, file_bytes: int, memory:
     if layout == h5py.h5d.VIRTUAL or properties.get_external_count():
         raise ValueError(f"{name} lies in another file")
     dtype, shape = array.dtype, array.shape
-    if dtype.kind not in "fiu" or shape is None:
-        raise ValueError(f"{name} has type {dtype}, expected numbers")
+    if dtype.kind not in "fiu" or dtype.itemsize > WIDEST_NUMBER or shape is None:
+        raise ValueError(f"{name} has type {dtype}, expected numbers of at most {8 * WIDEST_NUMBER} bits")
     stored = min(array.get_storage_size(), file_bytes)
     allowed = min(LARGEST_RATIO * stored, memory)
     declared = math.prod(shape) * dtype.itemsize
@@ -149,7 +151,7 @@ def _digest(
             stored = attribute.get_type()
             # An empty attribute has no shape, nor anything to read.
             dtype, shape = _dtype(stored.encode()), attribute.shape
-            if dtype.kind not in "biufS":
+            if dtype.kind not in "biufS" or (dtype.kind != "S" and dtype.itemsize > WIDEST_NUMBER):
                 raise ValueError(f"the attribute {_text(name)} has type {dtype}, expected numbers or bytes")
             declared = math.prod(shape or ()) * dtype.itemsize
             if file_bytes is not None and declared > file_bytes:

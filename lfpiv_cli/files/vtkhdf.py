@@ -26,7 +26,7 @@ from lfpiv_cli.files.hdf5 import (
 )
 from lfpiv_cli.files.hdf5_checks import array_member, member
 from lfpiv_cli.files.vtk import Header, create_vtk_group, place_image, read_root, write_root
-from lfpiv_cli.flow.field import VectorField
+from lfpiv_cli.flow.field import REJECTED, VectorField
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.reference import Reference
 
@@ -192,7 +192,7 @@ def open_vectors(path: Path | str) -> VectorField:
         window_voxel=(window[0], window[1], window[2]),
         **arrays,
     )
-    if dt_s is not None and np.isnan(field.velocity[field.flag <= 2]).any():
+    if not np.isfinite(field.displacement_voxel[field.flag < REJECTED]).all():
         raise InputError(f"{path}: a vector that counts as valid is not a finite number")
     return field
 

@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.calibration.transmission import vignetting_surface
 from lfpiv_cli.errors import InputError
+from lfpiv_cli.files.checks import LARGEST_NUMBER, SMALLEST_NUMBER
 from lfpiv_cli.files.hdf5 import ensure_format, open_h5, read_provenance, read_tree, write_tree
 from lfpiv_cli.files.weights_fields import (
     CAMERA_SCALARS,
@@ -166,11 +167,13 @@ def open_weights(path: Path | str) -> WeightsFile:
         camera = read_camera(_group(tree, "camera"))
         grid, padding = read_grid(_group(tree, "grid"))
         calibration = Calibration.from_tree(tree["calibration"]) if tree.get("calibration") else None
+        if calibration:
+            calibration.ensure_images_of(camera)
         operator = _operator(tree, camera, grid.padded(padding), calibration)
         vignetting = _numbers(tree, "vignetting", VIGNETTING_SHAPE)
         bend = _numbers(tree["grid"], "scene_distortion_per_mm2", (grid.shape_xyz[2],))
         reference = Reference.from_attributes(tree["grid"])
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError, np.linalg.LinAlgError, MemoryError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError, MemoryError, InputError) as error:
         raise InputError(f"{path}: not a whole weights file: {error}") from error
     weights = Weights(grid, padding, operator, camera.column_axis, calibration, bend)
     return WeightsFile(weights, camera, reference, provenance, vignetting).behind_vignetting()
@@ -331,8 +334,7 @@ def _counted(tree: dict[str, Any], voxels: int, pixels: int) -> Columns:
         raise ValueError("the table's columns do not follow each other")
     if pixel.size and (pixel.min() < 0 or pixel.max() >= pixels):
         raise ValueError(f"pixel {pixel.min()} or {pixel.max()} of {pixels}")
-    if not np.all(np.isfinite(share)) or share.min(initial=0.0) < 0.0:
-        raise ValueError("a weight that is negative or not a number")
+    _ensure_shares(share, signed=False)
     return Columns(start.astype(np.int64), pixel.astype(np.int32), share.astype(np.float32))
 
 
@@ -353,8 +355,7 @@ def _axis_weights(
         raise ValueError("the table's rows do not follow each other")
     if cell.size and (cell.min() < 0 or cell.max() >= cells.pixel.size):
         raise ValueError(f"cell {cell.min()} or {cell.max()} of {cells.pixel.size}")
-    if not np.all(np.isfinite(share)) or (not coefficients and share.min(initial=0.0) < 0.0):
-        raise ValueError("a weight that is negative or not a number")
+    _ensure_shares(share, signed=coefficients > 0)
     return AxisWeights(
         planes,
         voxels,
@@ -364,3 +365,12 @@ def _axis_weights(
         cell.astype(np.int32),
         share.astype(np.float32),
     )
+
+
+def _ensure_shares(share: NDArray[Any], signed: bool) -> None:
+    """Refuse weights that are no numbers, negative where they may not be, or whose sums have no inverse in float32."""
+    if not np.all(np.isfinite(share)) or (not signed and share.min(initial=0.0) < 0.0):
+        raise ValueError("a weight that is negative or not a number")
+    largest = float(np.abs(share).max(initial=0.0))
+    if share.size and not SMALLEST_NUMBER <= largest <= LARGEST_NUMBER:
+        raise ValueError(f"the largest weight is {largest:.3g}, expected {SMALLEST_NUMBER:g} to {LARGEST_NUMBER:g}")
