@@ -14,6 +14,7 @@ import pytest
 import yaml
 
 from lfpiv_cli.files.hdf5_checks import DIGEST
+from lfpiv_cli.files.images import count_pages
 from lfpiv_cli.files.particle_file import (
     PARTICLES_FORMAT,
     TRACKS_FORMAT,
@@ -120,6 +121,15 @@ def virtual(file: h5py.File, other: Path) -> None:
     file.create_virtual_dataset("extra", layout)
 
 
+def grown(group: h5py.Group) -> None:
+    """Add groups ten deep, each with ten names for the next one: a path has ten billion ends."""
+    for _ in range(10):
+        below = group.create_group("0")
+        for number in range(1, 10):
+            group[str(number)] = below
+        group = below
+
+
 HOSTILE: dict[str, Callable[[h5py.File, Path], object]] = {
     "external storage": lambda file, other: file.create_dataset(
         "extra", (3,), "f8", external=[(str(other), 0, h5py.h5f.UNLIMITED)]
@@ -132,6 +142,10 @@ HOSTILE: dict[str, Callable[[h5py.File, Path], object]] = {
     "complex": lambda file, other: file.create_dataset("extra", data=np.array([1j])),
     "long doubles": lambda file, other: file.create_dataset("extra", data=np.ones(3, np.longdouble)),
     "long doubles as attribute": lambda file, other: file.attrs.__setitem__("extra", np.ones(3, np.longdouble)),
+    "many links": lambda file, other: grown(file.create_group("extra")),
+    "three names of an array": lambda file, other: [
+        file.__setitem__(f"extra{number}", file["extra"] if number else np.ones(3)) for number in ("", 1, 2)
+    ],
     "a type": lambda file, other: file.__setitem__("extra", np.dtype("f8")),
     "never written": lambda file, other: file.create_dataset("extra", (10**9,), "f8"),
     "chunks of a gigabyte": lambda file, other: file.create_dataset(
@@ -175,3 +189,11 @@ def test_what_does_not_fit_into_memory_gives_7_and_its_size(
     code, said = ended(*words)
     assert code == 7
     assert re.search(r"too little memory: /\S+ of \S+file\.h5 needs 0\.00 GB", said), said
+
+
+def test_each_array_of_a_camera_s_file_is_met_once(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "frames.h5", "w") as file:
+        file["frames"] = np.ones((2, 448, 600), np.uint16)
+        file["again"] = file["frames"]
+        grown(file.create_group("extra"))
+    assert count_pages(tmp_path / "frames.h5") == 2

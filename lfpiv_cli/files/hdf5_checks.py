@@ -121,16 +121,20 @@ def _objects(file: h5py.File) -> Iterator[tuple[bytes, h5py.h5g.GroupID | h5py.h
     if root.links.visit(note, info=True):
         raise ValueError(f"it holds more than {MOST_OBJECTS} groups and arrays")
     yield b"", root
-    seen = {h5py.h5o.get_info(root).addr}
+    # How many more links may lead to an object: our arrays have two at most, and a group that has two is read twice.
+    further = {h5py.h5o.get_info(root).addr: 0}
     for name, kind, address in sorted(links):
         if kind != h5py.h5l.TYPE_HARD:
             raise ValueError(f"/{_text(name)} is not a hard link")
         if name.count(b"/") > DEEPEST:
             raise ValueError(f"/{_text(name)} lies deeper than {DEEPEST} groups")
-        if address in seen:
+        if address in further:
+            further[address] -= 1
+            if further[address] < 0:
+                raise ValueError(f"/{_text(name)} leads to a group or an array that other names lead to, too")
             continue
-        seen.add(address)
         item = h5py.h5o.open(root, name)
+        further[address] = 1 if isinstance(item, h5py.h5d.DatasetID) else 0
         if not isinstance(item, (h5py.h5g.GroupID, h5py.h5d.DatasetID)):
             raise ValueError(f"/{_text(name)} is neither a group nor an array")
         yield b"/" + name, item

@@ -37,7 +37,7 @@ def frames(path: Path) -> Recording:
     with open_h5(path) as file:
         if "format" in file.attrs and "provenance" in file.attrs:
             raise InputError(f"{path}: is a result of this program, expected images")
-        names = [dataset.name for dataset in _datasets(file, DEEPEST) if dataset.ndim == 3]
+        names = [dataset.name for dataset in _datasets(file, DEEPEST, set()) if dataset.ndim == 3]
         if len(names) != 1:
             listed = ", ".join(f"{path.name}:{name}" for name in names[:MOST_LISTED])
             raise InputError(
@@ -58,14 +58,18 @@ def frames_named(path: Path, name: str) -> Recording:
         return _frames_in(path, _dataset(path, file, name))
 
 
-def _datasets(group: h5py.Group, levels: int) -> Iterator[h5py.Dataset]:
-    """Yield the numeric datasets of a group and of those in it."""
+def _datasets(group: h5py.Group, levels: int, seen: set[int]) -> Iterator[h5py.Dataset]:
+    """Yield the numeric datasets of a group and of those in it, whose places in the file are not among those seen."""
     for name in group:
         if not isinstance(group.get(name, getlink=True), h5py.HardLink):
             continue
         item = group[name]
+        place = h5py.h5o.get_info(item.id).addr
+        if place in seen:
+            continue
+        seen.add(place)
         if isinstance(item, h5py.Group) and levels:
-            yield from _datasets(item, levels - 1)
+            yield from _datasets(item, levels - 1, seen)
         elif isinstance(item, h5py.Dataset) and item.dtype.kind in "uif":
             yield item
 
