@@ -111,8 +111,15 @@ except BaseException as error:
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGTERM to send")
-@pytest.mark.parametrize(("sent", "name"), [("SIGTERM", "Terminated"), ("SIGINT", "KeyboardInterrupt")])
-def test_a_signal_during_a_call_back_is_not_lost(sent, name):
+@pytest.mark.parametrize(
+    ("sent", "name", "said"),
+    [
+        ("SIGTERM", "Terminated", "terminated"),
+        ("SIGINT", "KeyboardInterrupt", "interrupted"),
+        ("SIGHUP", "HungUp", "hung up"),
+    ],
+)
+def test_a_signal_during_a_call_back_is_not_lost(sent, name, said):
     done = subprocess.run(
         [sys.executable, "-c", IGNORED_FIRST, sent],
         capture_output=True,
@@ -122,13 +129,51 @@ def test_a_signal_during_a_call_back_is_not_lost(sent, name):
         preexec_fn=hear_interrupts,
     )
     assert done.stdout.split() == ["ignored", name]
-    assert done.stderr == ""
+    assert done.stderr == f"lfpiv: {said}\n"
+
+
+IN_A_LONG_CALL = """
+import hashlib
+from lfpiv_cli.cli.interrupts import end_by_signals
+
+end_by_signals()
+print("begun", flush=True)
+hashlib.pbkdf2_hmac("sha256", b"", b"", 100_000_000)  # half a minute without Python's lock, as compiled loops are
+"""
 
 
 @pytest.mark.thorough
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGTERM to send")
-@pytest.mark.parametrize(("sent", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
-def test_signals_end_the_work_and_leave_nothing(tmp_path, sent, code):
+def test_a_signal_is_answered_while_a_compiled_call_goes_on():
+    words = [sys.executable, "-c", IN_A_LONG_CALL]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout.readline() == "begun\n"
+        process.send_signal(signal.SIGTERM)
+        assert process.stderr.readline() == "lfpiv: terminated\n"
+        assert process.poll() is None
+        process.kill()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGHUP")
+def test_what_nohup_has_ignored_stays_so():
+    script = "import signal; from lfpiv_cli.cli.interrupts import end_by_signals; end_by_signals(); "
+    script += "signal.raise_signal(signal.SIGHUP); print('here')"
+    done = subprocess.run(
+        [sys.executable, "-c", script],
+        capture_output=True,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN),
+    )
+    assert (done.stdout, done.stderr) == ("here\n", "")
+
+
+@pytest.mark.thorough
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGTERM to send")
+@pytest.mark.parametrize(
+    ("sent", "code", "said"),
+    [("SIGTERM", 143, "terminated"), ("SIGINT", 130, "interrupted"), ("SIGHUP", 129, "hung up")],
+)
+def test_signals_end_the_work_and_leave_nothing(tmp_path, sent, code, said):
     config = tmp_path / "air.yaml"
     config.write_text(CONFIG.read_text().replace("reference: mid_plane", "reference: focal_point"))
     assert lfpiv("build-weights", config, "-o", tmp_path / "w.h5").returncode == 0
@@ -138,14 +183,38 @@ def test_signals_end_the_work_and_leave_nothing(tmp_path, sent, code):
         with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, preexec_fn=hear_interrupts) as process:
             try:
                 time.sleep(seconds)
-                process.send_signal(sent)
+                process.send_signal(getattr(signal, sent))
                 _, words = process.communicate(timeout=5.0)
             finally:
                 # A work that goes on would keep the test from failing.
                 process.kill()
         # On a busy machine Python may still be reading the program, which then cannot answer.
-        if process.returncode != -sent:
+        if process.returncode != -getattr(signal, sent):
             break
     assert process.returncode == code
+    assert f"lfpiv: {said}\n" in words
     assert "Traceback" not in words
     assert sorted(path.name for path in tmp_path.iterdir()) == ["air.yaml", "w.h5"]
+
+
+A_BROKEN_LIBRARY = """
+import signal, sys
+from lfpiv_cli.cli import main
+from lfpiv_cli.stages import warm_up
+
+def broken(*_, **__):
+    try:
+        signal.raise_signal(signal.SIGTERM)
+    except BaseException:
+        raise RuntimeError("no compiled object yet")
+
+warm_up.warm_up = broken
+sys.argv = ["lfpiv", "warm-up"]
+main()
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGTERM to send")
+def test_what_a_library_makes_of_a_signal_is_no_bug():
+    done = subprocess.run([sys.executable, "-c", A_BROKEN_LIBRARY], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (143, "lfpiv: terminated\n")

@@ -39,6 +39,8 @@ COMMANDS = {
     "an image": ("check", CONFIG, "{input}"),
     "a white image": ("calibrate-snapshot", CONFIG, "--white", "{input}"),
     "weights": ("reconstruct", "{input}", SAMPLE / "pair_a.tif"),
+    "a page": ("report", "{input}"),
+    "frames": ("reconstruct", SAMPLE / "no.h5", "{input}"),
     "volumes": ("correlate", "{input}", "{input}"),
     "particles": ("track", "{input}", "{input}"),
     "vectors": ("combine", "{input}", "{input}"),
@@ -48,13 +50,13 @@ COMMANDS = {
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no named pipes in folders")
-@pytest.mark.parametrize("kind", ["missing", "folder", "pipe", "empty"])
+@pytest.mark.parametrize("kind", ["missing", "folder", "pipe", "empty", "name too long"])
 @pytest.mark.parametrize("what", COMMANDS)
 def test_what_is_no_file_is_refused_by_each_command(tmp_path: Path, what: str, kind: str) -> None:
-    path = tmp_path / "input.tif"
+    path = tmp_path / f"{'x' * 300 if kind == 'name too long' else ''}input.tif"
     make_no_file(path, kind)
     words = [str(word).format(input=path) for word in COMMANDS[what]]
-    output = tmp_path / ("output.vtkhdf" if what in ("weights", "volumes", "particles", "vectors") else "output")
+    output = tmp_path / ("output.vtkhdf" if what in ("weights", "volumes", "particles", "vectors") else "output.html")
     words += [] if words[0] == "check" else ["-o", str(output)]
     code, said = ended(*words)
     assert (code, "input.tif" in said) == (4, True), said

@@ -164,3 +164,14 @@ def test_too_little_memory_is_no_bug(monkeypatch: pytest.MonkeyPatch, error: Exc
     code, said = ended("check", CONFIG)
     assert code == 7
     assert said.startswith("too little memory: ")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no named pipes in folders")
+def test_a_log_that_nobody_reads_is_refused_at_once(tmp_path: Path) -> None:
+    pipe, words = tmp_path / "log", ("check", tmp_path / "no.yaml", "--log", tmp_path / "log")
+    os.mkfifo(pipe)
+    assert ended(*words) == (7, f"{pipe}: cannot be written: is a pipe that nobody reads")
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    assert ended(*words)[0] == 4
+    assert b"no.yaml: no such file" in os.read(reader, 10_000)
+    os.close(reader)

@@ -23,7 +23,8 @@ from lfpiv_cli.cli import (
     vectors,
     weights,
 )
-from lfpiv_cli.cli.interrupts import end_by_signals
+from lfpiv_cli.cli.environment import settle_environment
+from lfpiv_cli.cli.interrupts import end_by_signals, ended_by
 from lfpiv_cli.cli.options import voice_options
 from lfpiv_cli.cli.outcome import outcome_of, print_json_error, printable
 from lfpiv_cli.cli.streams import ensure_said, open_streams
@@ -70,6 +71,7 @@ def cli(context: click.Context, **before: Any) -> None:
 
     Options that stand before a command hold for it as those after it do.
     """
+    settle_environment()
     context.default_map = {str(context.invoked_subcommand): {name: value for name, value in before.items() if value}}
 
 
@@ -97,7 +99,8 @@ def main() -> NoReturn:
         code = 0
     except SystemExit:
         raise
-    except BaseException as error:
+    except BaseException as raised:
+        error = ended_by(raised)
         message, code = outcome_of(error)
         if as_json:
             print_json_error(error)

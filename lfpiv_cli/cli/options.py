@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Mapping
 from functools import wraps
@@ -208,7 +209,7 @@ def _inputs(arguments: Mapping[str, Any]) -> list[Path]:
     """Return the files and folders that a command is given to read; a text may be one, too."""
     given = [value for name, value in arguments.items() if name not in OUTPUTS]
     flat = [each for value in given for each in (value if isinstance(value, tuple) else (value,))]
-    return [Path(each) for each in flat if isinstance(each, Path) or (isinstance(each, str) and Path(each).exists())]
+    return [Path(each) for each in flat if isinstance(each, Path) or (isinstance(each, str) and os.path.exists(each))]
 
 
 def voice_options(command: Callable[..., Any]) -> Callable[..., Any]:

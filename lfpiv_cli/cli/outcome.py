@@ -14,12 +14,17 @@ from lfpiv_cli.files.atomic import shown, without_nan
 from lfpiv_cli.files.inputs import reason
 
 EXIT_BUG = 1
+EXIT_HUNG_UP = 129
 EXIT_INTERRUPTED = 130
 EXIT_TERMINATED = 143
 
 
 class Terminated(BaseException):
     """SIGTERM arrived; unwinds like KeyboardInterrupt so that temporary files are removed."""
+
+
+class HungUp(BaseException):
+    """SIGHUP arrived, as the terminal has closed; unwinds like that, too."""
 
 
 def outcome_of(error: BaseException) -> tuple[str, int]:
@@ -30,6 +35,8 @@ def outcome_of(error: BaseException) -> tuple[str, int]:
         return "interrupted", EXIT_INTERRUPTED
     if isinstance(error, Terminated):
         return "terminated", EXIT_TERMINATED
+    if isinstance(error, HungUp):
+        return "hung up", EXIT_HUNG_UP
     if isinstance(error, LfpivError):
         return str(error), error.exit_code
     if isinstance(error, MemoryError) or "can't start new thread" in str(error):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -42,13 +43,13 @@ def ensure_verified(listed: Path, inputs: Iterable[Path]) -> int:
 
 def _with_those_beside(path: Path) -> tuple[Path, ...]:
     """Return a file, and those that it is read with."""
-    return (path,) if path.is_dir() else (path, *files_beside(path))
+    return (path,) if os.path.isdir(path) else (path, *files_beside(path))
 
 
 def _files(path: Path, listed: Path, expected: dict[Path, str]) -> Iterator[tuple[Path, Path]]:
     """Yield the resolved name of each file that an input is, with the one that it was given under."""
     resolved = path.resolve()
-    inside = [file for file in expected if resolved in file.parents] if resolved.is_dir() else [resolved]
+    inside = [file for file in expected if resolved in file.parents] if os.path.isdir(resolved) else [resolved]
     if not inside or (inside == [resolved] and resolved not in expected):
         raise InputError(f"{path}: is not in {listed}, which lists {len(expected)} files")
     for file in inside:

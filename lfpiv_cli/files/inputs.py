@@ -18,6 +18,9 @@ MEMORY_WHERE_UNKNOWN = 16 * 1024**3
 # With 0.8 GiB numerical libraries end by SIGSEGV as they are loaded, with 1.2 GiB small work is done.
 LEAST_ADDRESS_SPACE = 5 * 2**28
 
+# How HDF5 tells the system's number of an error, among words of its own.
+NUMBER_IN_HDF5 = re.compile(r"\berrno = (\d+)")
+
 # A file, and what of it is meant: a dataset in it, or how its frames are laid out; and which of these, counted from 0.
 PART = re.compile(r"(.+?\.[A-Za-z][A-Za-z0-9]*):(.+)", re.DOTALL)
 PAGE = re.compile(r"(?:(.+):)?page=(\d{1,9})", re.DOTALL)
@@ -94,6 +97,8 @@ def reason(error: BaseException) -> str:
     """Return the cause of an error in one line: the system's words where it has a number, else its first line."""
     if isinstance(error, OSError) and error.errno:
         return os.strerror(error.errno)
+    if (told := NUMBER_IN_HDF5.search(str(error))) is not None:
+        return os.strerror(int(told[1]))
     lines = str(error).strip().splitlines()
     return lines[0] if lines else type(error).__name__
 

@@ -47,7 +47,7 @@ def expanded(paths: Iterable[Path], kind: InputKind) -> list[Path]:
     ------
     InputError : a folder cannot be read, or holds none
     """
-    return [path for given in paths for path in (_some_in(given, kind) if given.is_dir() else [given])]
+    return [path for given in paths for path in (_some_in(given, kind) if os.path.isdir(given) else [given])]
 
 
 def in_natural_order(paths: Sequence[Path]) -> list[Path]:

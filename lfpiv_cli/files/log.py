@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import sys
@@ -13,6 +14,9 @@ from typing import Any
 from lfpiv_cli.errors import OutputError, UsageError
 from lfpiv_cli.files.atomic import without_nan
 from lfpiv_cli.files.inputs import reason
+
+# Opens a pipe that nobody reads with an error, where it would wait for a reader; of Unix alone.
+AT_ONCE = getattr(os, "O_NONBLOCK", 0)
 
 
 class EventLog:
@@ -52,13 +56,16 @@ class EventLog:
         try:
             if not self.path.parent.exists():
                 self.path.parent.mkdir(parents=True, exist_ok=True)
-            descriptor = os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
+            descriptor = os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | AT_ONCE, 0o666)
             try:
+                if AT_ONCE:
+                    os.set_blocking(descriptor, True)
                 os.write(descriptor, line.encode())
             finally:
                 os.close(descriptor)
         except OSError as error:
-            raise OutputError(f"{self.path}: cannot be written: {reason(error)}") from error
+            words = "is a pipe that nobody reads" if error.errno == errno.ENXIO else reason(error)
+            raise OutputError(f"{self.path}: cannot be written: {words}") from error
 
     def last(self, event: str, **fields: Any) -> dict[str, Any] | None:
         """Return the last event of this command with this name and these fields; None where there is none."""

@@ -213,7 +213,7 @@ def sha256(path: Path) -> str:
     Of a folder, that of the list of its files with the SHA-256 of each, as `sha256sum` prints it.
     """
     file, _ = split_part(path)
-    if file.is_dir():
+    if os.path.isdir(file):
         return _sha256_of_all(file, tuple(_states_in(file)))
     size = ensure_regular_file(file)
     return _sha256(file, size, file.stat().st_mtime_ns)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -154,7 +155,7 @@ def contents_of(folder: Path) -> Contents:
     ------
     InputError : it is no folder, holds nothing of ours, or a broken file
     """
-    if not folder.is_dir():
+    if not os.path.isdir(folder):
         raise InputError(f"{folder}: is no folder of results")
     files: dict[str, list[Path]] = {}
     records: dict[str, Mapping[str, Any]] = {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -43,7 +44,7 @@ def watched(
     if options.dry_run:
         raise UsageError("--watch waits for what is not there, and --dry-run tells what is: leave out one of them")
     for folder in folders:
-        if not folder.is_dir():
+        if not os.path.isdir(folder):
             raise UsageError(f"{folder}: --watch takes folders")
     read = _read_image if kind == "images" else vtkhdf.read_header
     deadline, count = options.deadline(), 0
