@@ -142,6 +142,26 @@ def test_bytes_after_what_is_too_short_are_no_pixels(tmp_path: Path, layout: dic
     assert (code, "short.tif: strip or tile 0 of page 0 has" in said) == (4, True), said
 
 
+@pytest.mark.parametrize("kind", ["a strip that is too long", "a PNG that is too long", "no image"])
+def test_gigabytes_that_are_no_image_are_refused_unread(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    path = tmp_path / ("big.png" if "PNG" in kind else "big.tif")
+    image = np.full((ROWS, COLUMNS), 100, np.uint16)
+    if kind == "a strip that is too long":
+        tifffile.imwrite(path, image, photometric="minisblack", compression="zlib", rowsperstrip=ROWS)
+        with tifffile.TiffFile(path, mode="r+") as file:
+            file.pages[0].tags["StripByteCounts"].overwrite([3_000_000_000])
+    else:
+        path.write_bytes(imagecodecs.png_encode(image) if "PNG" in kind else b"II*\0\x08\0\0\0")
+    os.truncate(path, 3 * 2**30)  # sparse
+    # Neither its bytes nor, for a record that nobody will get, their SHA-256.
+    monkeypatch.setattr(Path, "read_bytes", lambda path: pytest.fail(f"{path} is read"))
+    monkeypatch.setattr("lfpiv_cli.files.provenance._sha256", lambda path, *_: pytest.fail(f"{path} is hashed"))
+    code, said = ended("calibrate-snapshot", CONFIG, "--white", path, "-o", tmp_path / "c.h5")
+    assert (code, f"{path.name}: " in said) == (4, True), said
+
+
 @pytest.mark.thorough
 @pytest.mark.parametrize("percent", [1, 20, 40, 60, 80, 99])
 def test_no_page_of_a_cut_recording_is_lost_in_silence(tmp_path: Path, weights: Path, percent: int) -> None:

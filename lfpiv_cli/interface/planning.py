@@ -52,6 +52,8 @@ FEWEST_VECTORS, FEWEST_TRACERS = 3, 5.0
 # Of the coarse window's side: up to the one displacements are measured well, beyond the other hardly at all.
 GOOD_SHARE_OF_WINDOW, LARGEST_SHARE_OF_WINDOW = 0.25, 0.5
 DEPTHS = 21
+# Beyond so many depths of field a tracer's light covers the sensor, and its errors would take minutes to tell.
+FARTHEST_FIELDS = 2.0
 # Points along each axis at which a configured flow is asked for its speed, and the percentile that counts.
 FLOW_POINTS, FAST_PERCENTILE = 9, 95.0
 # Bytes of a raw image's pixel, and of a volume's voxel.
@@ -127,8 +129,9 @@ class Bench:
 
     @cached_property
     def errors_mm(self) -> NDArray[np.float64]:
-        """Smallest errors (n, 3) of simulated tracers at `depths_mm`."""
-        return planning.errors_by_depth_mm(self.camera, self.media, self.depths_mm, self.tracer())
+        """Smallest errors (n, 3) of simulated tracers at `depths_mm`, beyond what can be refocused those of its end."""
+        far = FARTHEST_FIELDS * planning.depth_of_field_mm(self.camera, self.media)
+        return planning.errors_by_depth_mm(self.camera, self.media, np.clip(self.depths_mm, -far, far), self.tracer())
 
     def tracer(self) -> Tracer:
         """Return a tracer as the config simulates it."""

@@ -69,14 +69,16 @@ def calibrate_snapshot(
         ensure_writable(target, overwrite or options.resume)
     if drawings:
         ensure_drawing()
-    settings, record = load_config(config), dict(target_of(config, output, options).record)
+    settings = load_config(config)
+    shape = settings.image_shape()
+    # Before the record, for which whole files are read: what is no image is so at once.
+    frames = {name: image_files.read_reference(path, shape) for name, path in inputs.items() if name != "config"}
+    record = dict(target_of(config, output, options).record)
     if options.resume:
         kept = is_kept([output], record, inputs.values(), overwrite, resume=True)
         if kept and all(path.exists() for path in drawings):
             return read_calibration(output).summary()
         overwrite = True
-    shape = settings.image_shape()
-    frames = {name: image_files.read_reference(path, shape) for name, path in inputs.items() if name != "config"}
     camera = settings.camera_model() if views else None
     pictures = photographs(
         [frames[name] for name in whites], [frames[name] for name in boards], frames.get("dark"), depth_mm

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 import zlib
 from functools import partial
@@ -11,7 +12,7 @@ import imagecodecs
 
 from lfpiv_cli.errors import InputError, LfpivError
 from lfpiv_cli.files.inputs import reason
-from lfpiv_cli.files.recordings.pixels import CUT, GREY_HINT, as_counts, ensure_size, one_channel
+from lfpiv_cli.files.recordings.pixels import CUT, GREY_HINT, HARMLESS_BYTES, as_counts, ensure_size, one_channel
 from lfpiv_cli.files.recordings.recording import Image, Recording, Shape
 
 START = b"\x89PNG\r\n\x1a\n"
@@ -19,6 +20,8 @@ START = b"\x89PNG\r\n\x1a\n"
 PNG_SAMPLES = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}
 # Where the header's width, height and bit depth stand, in the part that comes first.
 HEADER_AT, HEADER = 16, ">IIB"
+# Four samples of two bytes, and as much again: what a file has beyond that, and what is said besides, is no image.
+MOST_BYTES_A_PIXEL = 16
 
 
 def frames(path: Path) -> Recording:
@@ -40,6 +43,10 @@ def frames(path: Path) -> Recording:
 def _read_page(path: Path, page: int, shape: Shape | None) -> Image:
     """Read a PNG file after checking its header and the check sums of all its parts."""
     try:
+        declared, size = frames(path).shape, path.stat().st_size
+        ensure_size("the image", declared, 1, shape, size)
+        if size > HARMLESS_BYTES + MOST_BYTES_A_PIXEL * math.prod(declared):
+            raise InputError(f"has {size} bytes, more than a PNG of {declared[1]} x {declared[0]} pixels takes: {CUT}")
         content = path.read_bytes()
         columns, rows, bits, colour = _png_header(content)
         if colour not in PNG_SAMPLES:

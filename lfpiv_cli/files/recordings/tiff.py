@@ -15,7 +15,7 @@ import tifffile
 from lfpiv_cli.errors import InputError, LfpivError
 from lfpiv_cli.files.inputs import reason
 from lfpiv_cli.files.recordings.complaints import keep_complaints, reading
-from lfpiv_cli.files.recordings.pixels import CUT, GREY_HINT, as_counts, ensure_size, one_channel
+from lfpiv_cli.files.recordings.pixels import CUT, GREY_HINT, HARMLESS_BYTES, as_counts, ensure_size, one_channel
 from lfpiv_cli.files.recordings.recording import Image, Recording, Shape
 from lfpiv_cli.files.recordings.tiff_chain import directories
 
@@ -116,7 +116,8 @@ def _decode_page(page: tifffile.TiffPage, number: int, shape: Shape | None) -> I
 def _ensure_segments(page: tifffile.TiffPage, number: int, file_bytes: int) -> None:
     """Refuse strips or tiles that are missing, lie beyond the file's end, or are shorter than their pixels.
 
-    The decoder asks none of these: of a strip that is too short and not packed it takes the bytes after it as pixels.
+    The decoder asks none of these: of a strip that is too short and not packed it takes the bytes after it as pixels,
+    and of one that is far too long it reads all.
     """
     segments = math.prod(page.chunked)
     if not len(page.dataoffsets) == len(page.databytecounts) == segments:
@@ -124,7 +125,9 @@ def _ensure_segments(page: tifffile.TiffPage, number: int, file_bytes: int) -> N
     for segment, (place, length) in enumerate(zip(page.dataoffsets, page.databytecounts, strict=True)):
         if length == 0 or place + length > file_bytes:
             raise InputError(f"the data of page {number} ends at byte {place + length} of {file_bytes}: {CUT}")
-        if page.compression == NOT_PACKED and length < (pixels := _bytes_of(page, segment)):
+        pixels = _bytes_of(page, segment)
+        least, most = pixels if page.compression == NOT_PACKED else 1, HARMLESS_BYTES + 2 * pixels
+        if not least <= length <= most:
             raise InputError(
                 f"strip or tile {segment} of page {number} has {length} bytes, its pixels take {pixels}: {CUT}"
             )
