@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -9,16 +10,20 @@ import pytest
 
 from lfpiv_cli.errors import OutputError
 from lfpiv_cli.files import memory
+from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.vtkhdf import write_volume
 from lfpiv_cli.flow.correlation import CorrelationSettings
 from lfpiv_cli.flow.footprint import held_bytes
 from lfpiv_cli.grid import Grid
+from lfpiv_cli.interface import planning
 from lfpiv_cli.reference import FOCAL_POINT
+from lfpiv_cli.validation.planning import depth_of_field_mm
 from tests.hostile_files import ended
 from tests.test_batches import QUICK, images, raw, weights
 
 __all__ = ["images", "raw", "weights"]
 
+SAMPLE_RIG = Path(__file__).parent.parent / "configs" / "sample.yaml"
 STATUS = "Name:\tpython\nVmSize:\t 1000000 kB\nVmRSS:\t 500000 kB\n"
 
 
@@ -115,3 +120,63 @@ def test_a_correlation_takes_what_was_measured(
 ) -> None:
     settings = CorrelationSettings([(n, n, n) for n in windows], (overlap, overlap, overlap))
     assert 1 / 1.3 < held_bytes(shape, settings) / 1e6 / measured_mb < 1.3
+
+
+def rig_of(folder: Path, old: str, new: str) -> Path:
+    """Write the sample's rig with another volume or sensor."""
+    rig = folder / "rig.yaml"
+    text = SAMPLE_RIG.read_text().replace("reference: mid_plane", "reference: focal_point")
+    assert old in text
+    rig.write_text(text.replace(old, new))
+    return rig
+
+
+PICTURES = [SAMPLE_RIG.parent.parent / "sample_data" / name for name in ("pair_a.tif", "pair_b.tif", "white.tif")]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words", "said_of"),
+    [
+        ("[30, 22, 40]", "[4000, 4000, 4000]", ("build-weights", "{rig}"), "4000 x 4000 x 4000 voxels needs 512.30 GB"),
+        (
+            "[30, 22, 40]",
+            "[4000, 4000, 4000]",
+            ("run", "{rig}", *PICTURES[:2]),
+            "4000 x 4000 x 4000 voxels needs 512.30",
+        ),
+        ("[30, 22, 40]", "[800, 800, 800]", ("run", "{rig}", *PICTURES[:2], "--method", "volumes"), "needs 16.70 GB"),
+        ("columns: 600, rows: 448", "columns: 20000, rows: 20000", ("simulate", "white", "{rig}"), "needs 13.90 GB"),
+        ("columns: 600, rows: 448", "columns: 20000, rows: 20000", ("simulate", "board", "{rig}"), "needs 13.90 GB"),
+    ],
+)
+def test_work_that_does_not_fit_is_refused_before_any(
+    system: Path, tmp_path: Path, old: str, new: str, words: tuple[object, ...], said_of: str
+) -> None:
+    rig, output = rig_of(tmp_path, old, new), tmp_path / "output"
+    white = ("--white", PICTURES[2]) if words[0] == "run" else ()
+    code, said = ended(*(str(word).format(rig=rig) for word in words), *white, "-o", output)
+    assert (code, said_of in said, "10.24 GB are left of this machine" in said) == (7, True, True), said
+    assert not output.exists()
+
+
+@pytest.mark.thorough
+def test_weights_that_the_disk_has_no_room_for_are_not_begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(memory.shutil, "disk_usage", lambda _: usage._replace(free=1_000))
+    rig = rig_of(tmp_path, "fluid: 1.33}", "fluid: 1.33}")
+    code, said = ended("build-weights", rig, "-o", tmp_path / "w.h5")
+    assert (code, "w.h5: needs 0.00 GB, and 0.00 GB are free on the disk" in said) == (7, True), said
+
+
+def test_a_volume_far_beyond_what_can_be_refocused_is_judged_at_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+    monkeypatch.setattr(
+        planning.planning,
+        "errors_by_depth_mm",
+        lambda _camera, _media, depths_mm, _tracer: asked.append(depths_mm) or np.ones((len(depths_mm), 3)),
+    )
+    settings = load_config(SAMPLE_RIG).overridden("volume", reference="focal_point", shape_xyz=(4000, 4000, 4000))
+    bench = planning.bench_of(settings, None)
+    assert bench.errors_mm.shape == (planning.DEPTHS, 3)
+    far = planning.FARTHEST_FIELDS * depth_of_field_mm(bench.camera, bench.media)
+    assert bench.bounds_mm[2, 1] > far == pytest.approx(asked[0].max())

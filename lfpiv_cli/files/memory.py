@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,13 +16,14 @@ GB, KILO = 1e9, 1024
 PROCESS, MACHINE, CONTROL_GROUPS = Path("/proc/self"), Path("/proc/meminfo"), Path("/sys/fs/cgroup")
 
 
-def ensure_room(held_bytes: float, work: str) -> None:
+def ensure_room(held_bytes: float, work: str, remedy: str = "a smaller volume, or fewer windows, need less") -> None:
     """Refuse to begin what holds more in memory than this process can still get.
 
     Parameters
     ----------
     held_bytes : arrays that are yet to be made
     work : what makes them
+    remedy : what needs less
 
     Raises
     ------
@@ -31,8 +33,20 @@ def ensure_room(held_bytes: float, work: str) -> None:
         if held_bytes > left:
             raise OutputError(
                 f"too little memory: {work} needs {_gb(PROGRAM_BYTES + held_bytes)} GB, {_gb(held_bytes)} of them for "
-                f"its arrays, and {_gb(left)} GB are left of {by}; a smaller volume, or fewer windows, need less"
+                f"its arrays, and {_gb(left)} GB are left of {by}; {remedy}"
             )
+
+
+def ensure_disk(file_bytes: float, target: Path) -> None:
+    """Refuse to begin what makes a file that the disk has no room for.
+
+    Raises
+    ------
+    OutputError
+    """
+    left = shutil.disk_usage(target.parent).free
+    if file_bytes > left:
+        raise OutputError(f"{target}: needs {_gb(file_bytes)} GB, and {_gb(left)} GB are free on the disk")
 
 
 def _rooms() -> Iterator[tuple[float, str]]:

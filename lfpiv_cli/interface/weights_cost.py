@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass
+from pathlib import Path
 
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files.config import Config
+from lfpiv_cli.files.memory import ensure_disk, ensure_room
+from lfpiv_cli.files.weights_fields import BYTES_A_VOXEL
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.optics.camera import Camera
@@ -34,6 +37,9 @@ TRACER_S = 0.02
 MOST_RAYS = 3e10
 # Volumes and images of float32 that a solver holds.
 VOLUMES_HELD, IMAGES_HELD, FLOAT_BYTES = 8, 12, 4
+# Estimates may be too large by this.
+WRONG_BY = 3.0
+SMALLER = "a smaller volume, or larger voxels, need less"
 # More than this is worth a word before it begins.
 LONG_S, MUCH_BYTES = 600.0, 8e9
 
@@ -83,6 +89,35 @@ def cost_of(settings: Config, camera: Camera, source: Source, grid: Grid) -> Cos
         held + both_axes * ENTRY_BYTES + pixel_bytes,
         projections * products / MULTIPLICATIONS_PER_S,
     )
+
+
+def ensure_fits(cost: Cost, output: Path) -> None:
+    """Refuse weights that cannot be made here, or whose volume could not be held: no command could use them.
+
+    Raises
+    ------
+    OutputError
+    """
+    made, volume = cost.weights_bytes / WRONG_BY, float(BYTES_A_VOXEL * cost.voxels)
+    ensure_room(max(made, volume), f"a volume of {cost.voxels:.3g} voxels (padding included), or its weights,", SMALLER)
+    ensure_disk(made, output)
+
+
+def ensure_volume_fits(settings: Config, by_volumes: bool) -> None:
+    """Refuse a volume that could not be held, before there are weights to know its padding by.
+
+    Parameters
+    ----------
+    by_volumes : whether it will be solved for, which takes several of it
+
+    Raises
+    ------
+    OutputError
+    """
+    shape = settings.grid().shape_xyz
+    voxels, pixels = math.prod(shape), math.prod(settings.image_shape())
+    held = held_bytes(voxels, pixels) if by_volumes else float(BYTES_A_VOXEL * voxels)
+    ensure_room(held, f"a volume of {shape[0]} x {shape[1]} x {shape[2]} voxels", SMALLER)
 
 
 def _strips(camera: Camera, source: Source, grid: Grid) -> float:

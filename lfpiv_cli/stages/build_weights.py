@@ -16,7 +16,7 @@ from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.provenance import record, with_warnings
 from lfpiv_cli.files.weights_file import open_weights, write_weights
 from lfpiv_cli.interface.weights import curved_summary, misfit_notices, plan_of, weights_of
-from lfpiv_cli.interface.weights_cost import cost_notices, cost_of
+from lfpiv_cli.interface.weights_cost import cost_notices, cost_of, ensure_fits, ensure_volume_fits
 from lfpiv_cli.names import Method, Refraction, Sampling
 
 
@@ -59,6 +59,8 @@ def build_weights(
     ensure_writable(output, overwrite or options.resume, inputs.values())
     found = read_calibration(options.calibration) if options.calibration else None
     settings = load_config(config).overridden_by("weights", options).with_scene_of(found)
+    if not options.dry_run:
+        ensure_volume_fits(settings, by_volumes=False)
     plan = plan_of(settings, found)
     summary = {
         "voxels_xyz": list(plan.grid.shape_xyz),
@@ -75,6 +77,7 @@ def build_weights(
     console.warn([*plan.notices, *cost_notices(cost)])
     if options.dry_run:
         return summary | cost.summary()
+    ensure_fits(cost, output)
     console.detail(f"about {cost.weights_core_s:.2g} s of a core and {cost.weights_bytes / 1e9:.2g} GB")
     content = weights_of(plan, made, console)
     found_out = misfit_notices(content)

@@ -31,6 +31,7 @@ from lfpiv_cli.files.provenance import sha256
 from lfpiv_cli.interface import particles
 from lfpiv_cli.interface.calibration import ensure_pictures
 from lfpiv_cli.interface.following import SHORTEST, ensure_sequence
+from lfpiv_cli.interface.weights_cost import ensure_volume_fits
 from lfpiv_cli.names import FlowMethod
 from lfpiv_cli.stages.batches import ALL, Failure
 from lfpiv_cli.stages.follow import SEQUENCE_IS_WHOLE
@@ -86,6 +87,7 @@ def run(
 
     if options.dry_run:
         return planned(settings, chain, lambda weights: choose(weights).methods)
+    ensure_volume_fits(settings, options.method in ("volumes", "both"))
     ensure_writable(output / RECORD, overwrite=True)
     weights = chain.weights()
     if not chain.share:

@@ -7,6 +7,7 @@ particles.npz.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -23,8 +24,10 @@ from lfpiv_cli.files.atomic import ensure_writable, write_json
 from lfpiv_cli.files.bench import pulsation_of, waves_of
 from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.images import write_tiff
+from lfpiv_cli.files.memory import ensure_room
 from lfpiv_cli.files.particles import Particles, write_particles
 from lfpiv_cli.files.provenance import record
+from lfpiv_cli.interface.weights_cost import LONG_S, MUCH_BYTES
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace
@@ -37,12 +40,15 @@ from lfpiv_cli.synthetic.curved_rays import unseen
 from lfpiv_cli.synthetic.render import ObjectSpace, Space
 from lfpiv_cli.synthetic.sensor import Readout
 
+# Measured on one core: a white image, of 0.1 to 6 million pixels. An image of tracers takes longer with their number.
+PIXEL_S, HELD_BYTES_A_PIXEL = 0.9e-6, 34
+
 
 def simulate_white(
     config: Path, output: Path, *, overwrite: bool = False, console: Console = CONSOLE
 ) -> dict[str, Any]:
     """Render a white image and a dark one."""
-    settings, paths = _begin(config, output, ("white.tif", "dark.tif", "white.json"), overwrite)
+    settings, paths = _begin(config, output, ("white.tif", "dark.tif", "white.json"), overwrite, console)
     still = scenes.simulate_white(_recording(settings), settings.simulation.peak_counts, _generator(settings, 0))
     write_tiff(paths["white.tif"], still.image, overwrite)
     write_tiff(paths["dark.tif"], still.dark, overwrite)
@@ -53,7 +59,7 @@ def simulate_board(
     config: Path, output: Path, *, overwrite: bool = False, console: Console = CONSOLE
 ) -> dict[str, Any]:
     """Render the snapshot of the board."""
-    settings, paths = _begin(config, output, ("board.tif", "board.json"), overwrite)
+    settings, paths = _begin(config, output, ("board.tif", "board.json"), overwrite, console)
     board, z_mm = settings.rig().board, settings.simulation.board_z_mm
     with console.progress(points_of(board), "simulate") as advance:
         still = _board_still(settings, board, _board_space(settings), z_mm, _generator(settings, 1), advance)
@@ -66,7 +72,7 @@ def simulate_boards(
 ) -> dict[str, Any]:
     """Render the board moved through the fluid, at depths from the origin of the volume's coordinates."""
     names = {depth: board_at(depth) for depth in depth_mm}
-    settings, paths = _begin(config, output, tuple(names.values()), overwrite)
+    settings, paths = _begin(config, output, tuple(names.values()), overwrite, console)
     reference = simulated_reference(settings)
     rng, space = _generator(settings, 3), _flow_space(settings, reference)
     board = replace(settings.rig().board, medium="fluid")
@@ -91,7 +97,7 @@ def simulate_particles(
 ) -> dict[str, Any]:
     """Render images of tracers that follow the configured flow: a pair, or a longer sequence."""
     images = frame_names(load_config(config).simulation.frames)
-    settings, paths = _begin(config, output, (*images, "particles.npz", "particles.json"), overwrite)
+    settings, paths = _begin(config, output, (*images, "particles.npz", "particles.json"), overwrite, console)
     scene = settings.simulation
     reference = simulated_reference(settings)
     camera, space = _recording(settings), _flow_space(settings, reference)
@@ -203,12 +209,27 @@ def _board_still(
     return scenes.simulate_board(_recording(settings), space, board, placement, scene.peak_counts, rng, progress)
 
 
-def _begin(config: Path, output: Path, names: tuple[str, ...], overwrite: bool) -> tuple[Config, dict[str, Path]]:
-    """Read the config and make sure that the outputs can be written."""
-    paths = {name: output / name for name in names}
+def _begin(
+    config: Path, output: Path, names: tuple[str, ...], overwrite: bool, console: Console
+) -> tuple[Config, dict[str, Path]]:
+    """Read the config and make sure that the outputs can be made and written."""
+    settings, paths = load_config(config), {name: output / name for name in names}
+    pixels = math.prod(settings.image_shape())
+    seconds, held = PIXEL_S * pixels * sum(name.endswith(".tif") for name in names), float(HELD_BYTES_A_PIXEL * pixels)
+    ensure_room(held, f"simulate, for images of {pixels:.3g} pixels,", "a sensor with fewer pixels needs less")
+    console.warn(_work_notices(seconds, held))
     for path in paths.values():
         ensure_writable(path, overwrite, [config])
-    return load_config(config), paths
+    return settings, paths
+
+
+def _work_notices(seconds: float, held: float) -> list[Notice]:
+    """Return whether images take more time or memory than one would expect."""
+    if seconds <= LONG_S and held <= MUCH_BYTES:
+        return []
+    text = f"its images will take about {seconds / 60.0:.2g} minutes of a core at least, and {held / 1e9:.2g} GB"
+    share = max(seconds / LONG_S, held / MUCH_BYTES)
+    return [Notice("heavy-work", "camera.sensor", text, "fewer columns and rows", share)]
 
 
 def _write_truth(
