@@ -131,7 +131,8 @@ class Bench:
     def errors_mm(self) -> NDArray[np.float64]:
         """Smallest errors (n, 3) of simulated tracers at `depths_mm`, beyond what can be refocused those of its end."""
         far = FARTHEST_FIELDS * planning.depth_of_field_mm(self.camera, self.media)
-        return planning.errors_by_depth_mm(self.camera, self.media, np.clip(self.depths_mm, -far, far), self.tracer())
+        depths_mm, places = np.unique(np.clip(self.depths_mm, -far, far), return_inverse=True)
+        return planning.errors_by_depth_mm(self.camera, self.media, depths_mm, self.tracer())[places]
 
     def tracer(self) -> Tracer:
         """Return a tracer as the config simulates it."""
