@@ -28,7 +28,8 @@ def write_series(
     path: Path,
     first: Content,
     read: Callable[[int], Content],
-    times: Sequence[float],
+    count: int,
+    times_s: Sequence[float] | None,
     provenance: Mapping[str, Any],
     *,
     overwrite: bool,
@@ -39,7 +40,8 @@ def write_series(
     ----------
     first : the one that the grid, the names of the arrays and the attributes are taken from
     read : gives that of each number, which has the same; one at a time is held in memory
-    times : of each
+    count : how many there are
+    times_s : of each, None where only their order is known
 
     Raises
     ------
@@ -48,6 +50,7 @@ def write_series(
     if first.grid is None:
         raise ValueError("points are no image")
     grid = first.grid
+    times, unit = (list(map(float, range(count))), "frame") if times_s is None else (times_s, "s")
 
     def fill(file: h5py.File) -> None:
         told = {name: np.asarray(value) if isinstance(value, list) else value for name, value in _others(first).items()}
@@ -60,10 +63,10 @@ def write_series(
         for name, array in first.arrays.items():
             shape = array.shape[array.shape[0] == 1 :]
             options = {"chunks": (1, *shape), "track_times": False, **FILTERS}
-            dataset = points.create_dataset(name, (len(times), *shape), array.dtype, **options)
+            dataset = points.create_dataset(name, (count, *shape), array.dtype, **options)
             dataset.attrs["units"] = np.bytes_(first.units[name])
-        write_steps(vtk, times, dict.fromkeys(first.arrays, np.arange(len(times), dtype=np.int64)))
-        for number in range(len(times)):
+        write_steps(vtk, times, unit, dict.fromkeys(first.arrays, np.arange(count, dtype=np.int64)))
+        for number in range(count):
             for name, array in read(number).arrays.items():
                 points[name][number] = array[0] if array.shape[0] == 1 else array
 
