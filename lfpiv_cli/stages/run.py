@@ -166,6 +166,8 @@ def _ensure_possible(settings: Config, options: RunOptions) -> tuple[list[Frame]
     if options.failures is not None:
         ensure_writable(options.failures, overwrite=True)
     _first_readable(frames, settings.image_shape(), options.keep_going)
+    if not options.keep_going:
+        image_files.ensure_shape(dict.fromkeys(frame.path for frame in frames), settings.image_shape())
     return frames, pairs
 
 
