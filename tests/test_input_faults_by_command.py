@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 import time
@@ -18,7 +17,7 @@ from lfpiv_cli.files.vtkhdf import open_vectors, open_volume, write_volume
 from lfpiv_cli.files.weights_file import FORMAT, VERSION
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.reference import FOCAL_POINT
-from tests.hostile_files import edited, ended, make_no_file
+from tests.hostile_files import edited, ended
 from tests.test_config import HOSTILE_TEXT, IMPOSSIBLE, RIG
 from tests.test_files import ABSURD_IMAGES, TIFF_KINDS
 from tests.test_image_faults import COLUMNS, ROWS, weights
@@ -27,38 +26,6 @@ __all__ = ["weights"]
 
 ROOT = Path(__file__).parent.parent
 CONFIG, SAMPLE = ROOT / "configs" / "sample.yaml", ROOT / "sample_data"
-
-
-# Inputs that are no file of the kind
-
-
-COMMANDS = {
-    "a config": ("build-weights", "{input}"),
-    "an image": ("check", CONFIG, "{input}"),
-    "a white image": ("calibrate-snapshot", CONFIG, "--white", "{input}"),
-    "weights": ("reconstruct", "{input}", SAMPLE / "pair_a.tif"),
-    "volumes": ("correlate", "{input}", "{input}"),
-    "particles": ("track", "{input}", "{input}"),
-    "vectors": ("combine", "{input}", "{input}"),
-    "vectors to judge": ("validate", "flow", CONFIG, "--vectors", "{input}"),
-    "what is exported": ("export", "{input}", "--to", "csv"),
-}
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="no named pipes in folders")
-@pytest.mark.parametrize("kind", ["missing", "folder", "pipe", "empty"])
-@pytest.mark.parametrize("what", COMMANDS)
-def test_what_is_no_file_is_refused_by_each_command(tmp_path: Path, what: str, kind: str) -> None:
-    path = tmp_path / "input.tif"
-    make_no_file(path, kind)
-    words = [str(word).format(input=path) for word in COMMANDS[what]]
-    output = tmp_path / ("output.vtkhdf" if what in ("weights", "volumes", "particles", "vectors") else "output")
-    words += [] if words[0] == "check" else ["-o", str(output)]
-    code, said = ended(*words)
-    assert (code, "input.tif" in said) == (4, True), said
-    assert not output.is_file()
-    # The folder of a report may have been made, but with nothing in it.
-    assert not output.is_dir() or not os.listdir(output)
 
 
 # Images
