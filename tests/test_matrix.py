@@ -136,7 +136,8 @@ PLACES = {
     "field SAMPLES": Place("field {} -o {out}/f.vtkhdf", VECTORS | TRACKS),
     "field --at": Place("field {tracks} --at {} -o {out}/f.vtkhdf", {"points"}),
     "field --pressure": Place("field {tracks of a sequence} --pressure {} -o {out}/f.vtkhdf", set(), in_folder=True),
-    "follow WEIGHTS": Place(FOLLOW.replace("{weights}", "{}"), WEIGHTS),
+    # Particles are fitted with traced rays, which these have not.
+    "follow WEIGHTS": Place(FOLLOW.replace("{weights}", "{}"), WEIGHTS - {"weights on demand"}),
     "follow FRAMES": image(FOLLOW.replace("{frame}", "{}"), "frame"),
     "follow --dark": image(FOLLOW + "--dark {}", "dark image"),
     "follow --background": image(FOLLOW + "--background {}", "dark image"),
@@ -145,7 +146,7 @@ PLACES = {
     "plot FILE": Place("plot {} -o {out}/p.pdf", DRAWN),
     "plot --raw": image("plot {particles} --raw {} -o {out}/p.pdf", "frame"),
     "report FOLDER": Place("report {} -o {out}/page.html", DRAWN, in_folder=True),
-    "report --raw": image("report {followed/particles} --raw {} -o {out}/page.html", "frame"),
+    "report --raw": Place("report {followed/particles} --raw {} -o {out}/page.html", {*IMAGES, "picture"}),
     "validate CONFIG": rig("validate flow {} --vectors {vectors} -o {out}/r"),
     "validate --vectors": Place("validate flow {rig} --vectors {} -o {out}/r", VECTORS),
     "validate --volume": Place(
