@@ -37,7 +37,8 @@ def listed(path: Path) -> list[Path]:
     if b"\0" in content:
         raise InputError(f"{path}: is no list of files: it holds a zero byte")
     found = [Path(os.fsdecode(line)) for line in content.splitlines() if line.strip()]
-    if found and not any(os.path.exists(split_part(each)[0]) for each in found):
+    # A comment of code, //, is the root.
+    if found and not any(str(each) != each.anchor and os.path.exists(split_part(each)[0]) for each in found):
         raise InputError(f"{path}: is no list of files: of its {len(found)} lines none names one")
     return found
 
