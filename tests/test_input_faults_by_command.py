@@ -14,7 +14,7 @@ import tifffile
 
 from lfpiv_cli.files.hdf5 import read_tree, write_tree
 from lfpiv_cli.files.vtkhdf import open_vectors, open_volume, write_volume
-from lfpiv_cli.files.weights_file import FORMAT, VERSION
+from lfpiv_cli.files.weights_file import FORMAT, UNITS, VERSION
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.reference import FOCAL_POINT
 from tests.hostile_files import edited, ended
@@ -215,7 +215,9 @@ def damage(path: Path, kind: str) -> None:
     elif kind == "index":
         tree, provenance = read_tree(path, FORMAT, (VERSION,))
         tree["rows"]["cell"][7] = 10**6
-        write_tree(path, tree, format_name=FORMAT, format_version=VERSION, provenance=provenance, overwrite=True)
+        write_tree(
+            path, tree, format_name=FORMAT, format_version=VERSION, provenance=provenance, overwrite=True, units=UNITS
+        )
 
 
 @pytest.mark.thorough
