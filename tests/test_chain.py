@@ -193,12 +193,14 @@ def test_volumes_that_do_not_belong_together_are_refused(chain, tmp_path):
 
 def test_weights_with_an_index_out_of_range_are_refused(chain, tmp_path):
     from lfpiv_cli.files.hdf5 import write_tree
-    from lfpiv_cli.files.weights_file import FORMAT, VERSION, open_weights
+    from lfpiv_cli.files.weights_file import FORMAT, UNITS, VERSION, open_weights
 
     tree, provenance = read_tree(chain / "weights.h5", FORMAT, (VERSION,))
     tree["rows"]["cell"][7] = 10**6
     broken = tmp_path / "broken.h5"
-    write_tree(broken, tree, format_name=FORMAT, format_version=VERSION, provenance=provenance, overwrite=False)
+    write_tree(
+        broken, tree, format_name=FORMAT, format_version=VERSION, provenance=provenance, overwrite=False, units=UNITS
+    )
     with pytest.raises(InputError, match="broken.h5.*1000000"):
         open_weights(broken)
 

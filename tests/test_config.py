@@ -220,7 +220,8 @@ HOSTILE_TEXT = [
     (b"a: 1\n---\nb: 1\n", "second document"),
     (b"a: [1, 2\n", "is not YAML"),
     (b"a: " + b"9" * 5000 + b"\n", "too long a number"),
-    (b"".join(b"k%d: 1\n" % k for k in range(1000)), "more errors"),
+    (b"camera: {}\n" + b"".join(b"k%d: 1\n" % k for k in range(1000)), "more errors"),
+    (b"steps: {}\nfigures: {}\n", "is no rig file: it has steps, figures, expected camera, "),
 ]
 
 

@@ -140,11 +140,12 @@ def test_a_log_is_added_to_and_nothing_else_is(tmp_path: Path) -> None:
     EventLog(tmp_path / "run.log", "track").write("start", {})
     EventLog(tmp_path / "run.log", "track").write("end", {"residual": float("nan")})
     assert [event["event"] for event in events(tmp_path / "run.log")] == ["start", "end"]
-    (tmp_path / "a.tif").write_bytes(b"II*\0")
-    with pytest.raises(UsageError, match="is no log"):
-        EventLog(tmp_path / "a.tif", "track")
+    for content in (b"II*\0", b'{\n  "steps": {}\n}\n'):  # an image, and what `run` writes
+        (tmp_path / "other").write_bytes(content)
+        with pytest.raises(UsageError, match="is no log"):
+            EventLog(tmp_path / "other", "track")
     with pytest.raises(OutputError, match="Not a directory"):
-        EventLog(tmp_path / "a.tif" / "run.log", "track").write("start", {})
+        EventLog(tmp_path / "other" / "run.log", "track").write("start", {})
 
 
 def test_figures_of_several_methods_stand_in_columns(capsys) -> None:

@@ -15,7 +15,7 @@ from lfpiv_cli import open_volume
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.files.config import Config
 from lfpiv_cli.files.hdf5 import read_tree, write_tree
-from lfpiv_cli.files.weights_file import FORMAT, VERSION, WeightsFile, open_weights, write_weights
+from lfpiv_cli.files.weights_file import FORMAT, UNITS, VERSION, WeightsFile, open_weights, write_weights
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.interface.weights import misfit_notices
 from lfpiv_cli.optics.curved_space import CurvedSpace, Face
@@ -353,7 +353,9 @@ def test_strips_that_contradict_themselves_are_refused(table2, tube, tmp_path, g
     write_weights(path, WeightsFile(weights, camera, Reference("focal_point", 0.0), {}), False)
     tree, provenance = read_tree(path, FORMAT, (VERSION,))
     tree[group][name] = tree[group][name] + int(value.split()[-1]) if isinstance(value, str) else value
-    write_tree(edited, tree, format_name=FORMAT, format_version=VERSION, provenance=provenance, overwrite=False)
+    write_tree(
+        edited, tree, format_name=FORMAT, format_version=VERSION, provenance=provenance, overwrite=False, units=UNITS
+    )
     with pytest.raises(InputError, match="not a whole weights file"):
         open_weights(edited)
 

@@ -59,7 +59,7 @@ def save_tree(path: Path, overwrite: bool = False) -> Path:
         format_version=2,
         provenance={"command": "test"},
         overwrite=overwrite,
-        units={"array": "mm"},
+        units={"array": "mm", "index": "1", "none_left": "1"},
     )
     return path
 
@@ -83,6 +83,13 @@ def refused(read: Callable[[], object], *words: str) -> bool:
         return False
     assert all(word in message for word in words), message
     return True
+
+
+def test_an_array_without_a_unit_is_not_written(tmp_path: Path) -> None:
+    made = {"format_name": "lfpiv-test", "format_version": 1, "provenance": {}, "overwrite": False}
+    with pytest.raises(ValueError, match="array has no unit"):
+        write_tree(tmp_path / "t.h5", {"group": {"array": np.zeros(3)}}, **made)
+    assert not os.listdir(tmp_path)
 
 
 # Atomic writing
@@ -198,7 +205,7 @@ def write_under_limits(path: Path) -> None:
     array = np.random.default_rng(0).random((3, 60, 60))
 
     def write() -> None:
-        write_tree(path, {"a": array}, format_name="t", format_version=1, provenance={}, overwrite=True)
+        write_tree(path, {"a_mm": array}, format_name="t", format_version=1, provenance={}, overwrite=True)
 
     write()
     old = path.read_bytes()

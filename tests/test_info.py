@@ -137,5 +137,5 @@ def test_info_refuses_what_is_not_ours(tmp_path):
     path.write_bytes(b"no HDF5")
     with pytest.raises(InputError, match="other.h5"):
         run("info", str(path))
-    write_tree(path, {"a": np.zeros(9)}, format_name="x", format_version=1, provenance={}, overwrite=True)
-    assert json.loads(run("info", str(path), "--json"))["a"] == "float64 [9]"
+    write_tree(path, {"a_mm": np.zeros(9)}, format_name="x", format_version=1, provenance={}, overwrite=True)
+    assert json.loads(run("info", str(path), "--json"))["a_mm"] == "float64 [9]"

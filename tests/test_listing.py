@@ -23,12 +23,19 @@ def test_numbers_in_names_count_by_their_value() -> None:
 def test_a_list_names_a_file_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     content = b"a b.tif\n\nodd\xff.tif\r\n/x/c.tif"
     (tmp_path / "list").write_bytes(content)
+    (tmp_path / "a b.tif").touch()
+    monkeypatch.chdir(tmp_path)
     expected = [Path("a b.tif"), Path("odd\udcff.tif"), Path("/x/c.tif")]
     assert listed(tmp_path / "list") == expected
     monkeypatch.setattr("sys.stdin", SimpleNamespace(buffer=io.BytesIO(content)))
     assert listed(Path("-")) == expected
     (tmp_path / "list").write_bytes(b"II*\0\0")
-    for path, said in ((tmp_path / "list", "zero byte"), (tmp_path / "none", "no such file"), (tmp_path, "a folder")):
+    (tmp_path / "rig.yaml").write_bytes(b"camera:\n  magnification: -1\n")
+    no_lists = (
+        (tmp_path / "list", "zero byte"),
+        (tmp_path / "rig.yaml", "rig.yaml: is no list of files: of its 2 lines"),
+    )
+    for path, said in (*no_lists, (tmp_path / "none", "no such file"), (tmp_path, "a folder")):
         with pytest.raises(InputError, match=said):
             listed(path)
 

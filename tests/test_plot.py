@@ -97,7 +97,7 @@ def test_wrong_names_outputs_and_images_are_refused_before_drawing(volume, tmp_p
     with pytest.raises(UsageError, match="--raw"):
         run("plot", str(volume), "-o", str(tmp_path / "p.png"), "--raw", str(volume))
     other = tmp_path / "other.h5"
-    write_tree(other, {"a": np.zeros(9)}, format_name="x", format_version=1, provenance={}, overwrite=True)
+    write_tree(other, {"a_mm": np.zeros(9)}, format_name="x", format_version=1, provenance={}, overwrite=True)
     with pytest.raises(InputError, match="x has no figures"):
         figures_of(other)
 

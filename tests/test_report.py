@@ -13,6 +13,7 @@ from click.testing import CliRunner
 from lfpiv_cli.cli import cli
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import InputError, OutputExistsError, UsageError
+from lfpiv_cli.files.images import write_tiff
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, Points, write_points
 from lfpiv_cli.files.provenance import sha256
 from lfpiv_cli.files.vtkhdf import write_vectors
@@ -112,8 +113,8 @@ def test_pictures_are_drawn_on_the_raw_image_that_a_file_was_made_from(
     results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     image, other = results / "image.tif", results / "other.tif"
-    image.write_bytes(b"this one")
-    other.write_bytes(b"another")
+    for counts, path in enumerate((image, other)):
+        write_tiff(path, np.full((2, 3), counts, np.uint8), overwrite=False)
     made = {"inputs": {"image": {"name": "image.tif", "sha256": sha256(image)}}}
     arrays = {"intensity": np.ones(3), "covariance_mm2": np.ones((3, 6)), "chi2": np.ones(3), "seen": np.ones(3)}
     points = Points(np.zeros((3, 3)), arrays | {"flag": np.zeros(3, np.uint8)}, REFERENCE, {}, made)

@@ -16,6 +16,8 @@ from lfpiv_cli.files.hdf5 import read_tree, write_tree
 
 FORMAT = "lfpiv-calibration"
 VERSION = 1
+# Of the arrays whose names do not say them.
+UNITS = {"image_shape": "pixel", "transmission": "1", "indices": "1", "exponents": "1"}
 
 
 def write_calibration(path: Path, calibration: Calibration, provenance: Mapping[str, Any], overwrite: bool) -> None:
@@ -27,6 +29,7 @@ def write_calibration(path: Path, calibration: Calibration, provenance: Mapping[
         format_version=VERSION,
         provenance=provenance,
         overwrite=overwrite,
+        units=UNITS,
     )
 
 

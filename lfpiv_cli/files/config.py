@@ -448,6 +448,9 @@ def carried_config(record: Mapping[str, Any], source: Path | str) -> Config:
 
 def _validated(document: Document, source: str) -> Config:
     """Return the configuration of a document, or raise all that is wrong with it."""
+    if document.data and not document.problems and not document.data.keys() & Sections.model_fields.keys():
+        first = ", ".join(map(str, list(document.data)[:3]))
+        raise ConfigError(f"{source}: is no rig file: it has {first}, expected {', '.join(Sections.model_fields)}")
     problems = list(document.problems)
     sections = None
     try:

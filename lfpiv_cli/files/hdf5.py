@@ -1,7 +1,7 @@
 """HDF5, written so that a full disk raises and read so that a broken or hostile file does no harm.
 
-A tree is a nested dict of numpy arrays, scalars, strings and None: dicts are groups, arrays datasets (their unit is the
-attribute `units`), all else attributes. The root says `format`, `format_version` and `provenance` (JSON).
+A tree is a nested dict of numpy arrays, scalars, strings and None: dicts are groups, arrays datasets (each with
+its unit, the attribute `units`), all else attributes. The root says `format`, `format_version` and `provenance` (JSON).
 """
 
 from __future__ import annotations
@@ -35,6 +35,8 @@ LIBRARY_VERSIONS = ("v110", "v110")
 FILTERS = {"compression": "gzip", "compression_opts": 1, "shuffle": True, "fletcher32": True}
 # A chunk of 1 MiB is read in one piece and compresses as well as a larger one.
 CHUNK_BYTES = 2**20
+# The units of arrays whose names end so; longer ends come before those that end them.
+UNITS_IN_NAMES = {"_per_mm2": "1/mm^2", "_mm2": "mm^2", "_mm": "mm", "_px": "pixel", "_deg": "degree"}
 # What h5py raises on a broken file, depending on where it breaks.
 BROKEN_FILE_ERRORS = (
     OSError,
@@ -62,7 +64,7 @@ def write_tree(
     Parameters
     ----------
     tree : nested dict of arrays (float, int, uint8), scalars, strings and None
-    units : unit of each array that has one, by its path (`lattice/basis`)
+    units : of arrays by their names, where these do not say them (`UNITS_IN_NAMES`); 1 of pure numbers
 
     Raises
     ------
@@ -71,7 +73,7 @@ def write_tree(
 
     def fill(file: h5py.File) -> None:
         write_header(file, format_name, format_version, provenance)
-        _write_group(file, tree, "", units or {})
+        _write_group(file, tree, units or {})
 
     def check(temporary: Path) -> None:
         read_tree(temporary, format_name, (format_version,))
@@ -284,16 +286,29 @@ def _are_texts(entry: Any, *names: str) -> bool:
     return isinstance(entry, dict) and all(isinstance(entry.get(name), str) for name in names)
 
 
-def _write_group(group: h5py.Group, tree: Tree, prefix: str, units: Mapping[str, str]) -> None:
+def _write_group(group: h5py.Group, tree: Tree, units: Mapping[str, str]) -> None:
     for name, value in tree.items():
-        if not prefix and name in RESERVED:
+        if group.name == "/" and name in RESERVED:
             raise ValueError(f"{name} is a name that every file uses for itself")
         if isinstance(value, Mapping):
-            _write_group(group.create_group(name), value, f"{prefix}{name}/", units)
+            _write_group(group.create_group(name), value, units)
         elif isinstance(value, np.ndarray):
-            write_array(group, name, value, units.get(prefix + name))
+            write_array(group, name, value, _unit_of(name, units))
         else:
             group.attrs[name] = to_attribute(value)
+
+
+def _unit_of(name: str, units: Mapping[str, str]) -> str:
+    """Return the unit of a tree's array.
+
+    Raises
+    ------
+    ValueError : nothing says it
+    """
+    said = [unit for end, unit in UNITS_IN_NAMES.items() if name.endswith(end)]
+    if not said and name not in units:
+        raise ValueError(f"{name} has no unit: its name ends in none, and none is given")
+    return said[0] if said else units[name]
 
 
 def _read_group(group: h5py.Group, file_bytes: int, levels: int) -> dict[str, Any]:

@@ -5,6 +5,7 @@ Images are float32 arrays `[row, column]` in counts. Colour is read where its ch
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -123,6 +124,18 @@ def read_page(path: Path, page: int, shape: Shape | None = None) -> Image:
     if not 0 <= page < recording.pages:
         raise InputError(f"{path}: has no page {page}, it holds {recording.pages}")
     return recording.read_page(page, shape)
+
+
+def ensure_shape(paths: Iterable[Path], shape: Shape) -> None:
+    """Refuse files whose headers say frames of another shape, before any of them is read.
+
+    Raises
+    ------
+    InputError : as `read_page`
+    """
+    for path in paths:
+        if frames(path).shape != shape:
+            read_page(path, 0, shape)  # says what is wrong
 
 
 def write_tiff(path: Path, array: NDArray[Any], overwrite: bool) -> None:

@@ -57,7 +57,13 @@ def opened(path: Path) -> Iterator[BufferedReader]:
 
 
 def content_of(path: Path) -> bytes:
-    """Return all bytes of a file; see `reading_from`."""
+    """Return all bytes of a regular file.
+
+    Raises
+    ------
+    InputError : see `ensure_regular_file`
+    """
+    ensure_regular_file(path)
     with opened(path) as file:
         return file.read()
 

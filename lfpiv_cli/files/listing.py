@@ -10,7 +10,7 @@ from pathlib import Path
 
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.files.batch import VTKHDF_SUFFIX
-from lfpiv_cli.files.inputs import content_of, ensure_regular_file, reading_from
+from lfpiv_cli.files.inputs import content_of, reading_from, split_part
 from lfpiv_cli.files.recordings.formats import format_of
 from lfpiv_cli.names import InputKind
 
@@ -27,17 +27,20 @@ def listed(path: Path) -> list[Path]:
 
     Raises
     ------
-    InputError : the list cannot be read
+    InputError : the list cannot be read, or nothing that it names is there
     """
     if str(path) == STANDARD_INPUT:
         with reading_from(path):
             content = sys.stdin.buffer.read()
     else:
-        ensure_regular_file(path)
         content = content_of(path)
     if b"\0" in content:
         raise InputError(f"{path}: is no list of files: it holds a zero byte")
-    return [Path(os.fsdecode(line)) for line in content.splitlines() if line.strip()]
+    found = [Path(os.fsdecode(line)) for line in content.splitlines() if line.strip()]
+    # A comment of code, //, is the root.
+    if found and not any(str(each) != each.anchor and os.path.exists(split_part(each)[0]) for each in found):
+        raise InputError(f"{path}: is no list of files: of its {len(found)} lines none names one")
+    return found
 
 
 def expanded(paths: Iterable[Path], kind: InputKind) -> list[Path]:

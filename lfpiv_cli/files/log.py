@@ -17,6 +17,8 @@ from lfpiv_cli.files.inputs import reason
 
 # Opens a pipe that nobody reads with an error, where it would wait for a reader; of Unix alone.
 AT_ONCE = getattr(os, "O_NONBLOCK", 0)
+# How each line begins.
+BEGINS = b'{"time": '
 
 
 class EventLog:
@@ -35,7 +37,7 @@ class EventLog:
         """
         self.path, self._command, self._read_only = path, command, read_only
         if path.is_file() and path.stat().st_size and not _begins_as_log(path):
-            raise UsageError(f"{path}: is no log: its first line is no JSON object; --log would add to it")
+            raise UsageError(f"{path}: is no log: its first line is no event with its time; --log would add to it")
 
     def write(self, event: str, fields: Mapping[str, Any]) -> None:
         """Add an event.
@@ -98,6 +100,6 @@ def largest_memory_mb() -> float | None:
 
 
 def _begins_as_log(path: Path) -> bool:
-    """Return whether a file's first byte is that of a JSON object."""
+    """Return whether a file begins as a log does."""
     with open(path, "rb") as file:
-        return file.read(1) == b"{"
+        return file.read(len(BEGINS)) == BEGINS

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path, PurePath
 
 from lfpiv_cli.errors import InputError
-from lfpiv_cli.files.inputs import content_of, ensure_regular_file
+from lfpiv_cli.files.inputs import content_of
 from lfpiv_cli.files.pairing import LeftOut, Pairs, Seen
 from lfpiv_cli.notice import Notice
 
@@ -42,7 +42,6 @@ def pairs_listed(path: Path, frames: Sequence[Seen]) -> Pairs:
 
 def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
     """Yield the number of each line and the two names on it."""
-    ensure_regular_file(path)
     text = content_of(path).decode("utf-8", errors="surrogateescape")
     for number, line in enumerate(text.splitlines(), start=1):
         words = line.partition("#")[0].strip()

@@ -51,7 +51,7 @@ def write_playback(path: Path, tracks: PointRows, frames: int, dt_s: float, *, o
         data = vtk.create_group("PointData")
         for name in SHOWN:
             write_rows(data, name, count, rows(name), units[name])
-        steps = write_steps(vtk, (dt_s * np.arange(frames)).tolist(), dict.fromkeys(SHOWN, before))
+        steps = write_steps(vtk, (dt_s * np.arange(frames)).tolist(), "s", dict.fromkeys(SHOWN, before))
         write_array(steps, "PartOffsets", np.arange(frames, dtype=np.int64))
         write_array(steps, "NumberOfParts", np.ones(frames, np.int64))
         write_array(steps, "PointOffsets", before)

@@ -45,11 +45,13 @@ def place_image(vtk: h5py.Group, grid: Grid) -> None:
     vtk.attrs["Direction"] = np.eye(3).ravel()
 
 
-def write_steps(vtk: h5py.Group, times: Sequence[float], begins: Mapping[str, NDArray[np.int64]]) -> h5py.Group:
+def write_steps(
+    vtk: h5py.Group, times: Sequence[float], unit: str, begins: Mapping[str, NDArray[np.int64]]
+) -> h5py.Group:
     """Write the steps of what changes in time, and where the rows of each point array begin in each; return them."""
     steps = vtk.create_group("Steps")
     steps.attrs["NSteps"] = np.int64(len(times))
-    write_array(steps, "Values", np.asarray(times, dtype=np.float64))
+    write_array(steps, "Values", np.asarray(times, dtype=np.float64), unit)
     offsets = steps.create_group("PointDataOffsets")
     for name, of_steps in begins.items():
         write_array(offsets, name, of_steps)

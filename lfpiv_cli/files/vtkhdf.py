@@ -257,7 +257,7 @@ def _write_frame(file: h5py.File, grid: Grid, with_component: bool) -> h5py.Grou
     for axis, name in enumerate("xyz"):
         write_array(file, name, grid.axis_mm(axis), "mm").make_scale(name)
     if with_component:
-        write_array(file, "component", np.arange(3)).make_scale("component")
+        write_array(file, "component", np.arange(3), "1").make_scale("component")
     vtk = create_vtk_group(file, "ImageData")
     place_image(vtk, grid)
     return vtk.create_group("PointData")

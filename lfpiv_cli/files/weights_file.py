@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.calibration.transmission import vignetting_surface
 from lfpiv_cli.errors import InputError
+from lfpiv_cli.files import calibration_file
 from lfpiv_cli.files.checks import LARGEST_NUMBER, SMALLEST_NUMBER
 from lfpiv_cli.files.hdf5 import ensure_format, open_h5, read_provenance, read_tree, write_tree
 from lfpiv_cli.files.weights_fields import (
@@ -63,6 +64,11 @@ from lfpiv_cli.weights.strips import StripOperator
 FORMAT = "lfpiv-weights"
 VERSION = 4
 READABLE_VERSIONS = (1, 2, 3, 4)
+# Of the arrays whose names do not say them.
+NUMBERS = ("start", "cell", "share", "pixel", "vignetting", "lit", "order", "misfit_l1", "normal", "axis")
+BLOCKS = [f"block_{name}" for name in Blocks._fields]
+UNITS = calibration_file.UNITS | dict.fromkeys((*NUMBERS, *BLOCKS), "1")
+UNITS |= dict.fromkeys(("shape_xyz", "padding_xyz"), "voxel")
 # Coefficients of `transmission.vignetting_surface`.
 VIGNETTING_SHAPE = (5, 5)
 
@@ -148,8 +154,9 @@ def write_weights(path: Path, content: WeightsFile, overwrite: bool) -> None:
         "vignetting": content.vignetting,
         "calibration": weights.calibration.to_tree() if weights.calibration else None,
     } | _operator_tree(weights.solver_operator)
+    made = content.provenance
     write_tree(
-        path, tree, format_name=FORMAT, format_version=VERSION, provenance=content.provenance, overwrite=overwrite
+        path, tree, format_name=FORMAT, format_version=VERSION, provenance=made, overwrite=overwrite, units=UNITS
     )
 
 

@@ -68,7 +68,7 @@ def export(
     if to == "vtkhdf-series" and first.grid is None:
         write_tracks_series(target, first, made, overwrite=overwrite)
     elif to == "vtkhdf-series":
-        write_series(target, first, read, times or [float(k) for k in range(len(files))], made, overwrite=overwrite)
+        write_series(target, first, read, len(files), times, made, overwrite=overwrite)
     elif write is None:
         contents = [read(number) for number in range(len(files))]
         write_atomically(target, lambda path: write_netcdf(path, contents, times), overwrite=overwrite)

@@ -127,7 +127,10 @@ def _pressure(paths: Sequence[Path], settings: Config, options: FieldOptions) ->
     if len(paths) != 1 or format_of(paths[0]) != TRAJECTORIES_FORMAT:
         raise UsageError("--pressure is for the tracks of one sequence, from follow or track")
     particles = [read_points(path, PARTICLES_FORMAT) for path in options.pressure]
-    return pressure_of(read_tracks(paths[0]), particles, settings, options.frame)
+    try:
+        return pressure_of(read_tracks(paths[0]), particles, settings, options.frame)
+    except InputError as error:
+        raise InputError(f"{paths[0]} with {options.pressure[0].parent}: {error}") from error
 
 
 def _derived(found: FittedField) -> Extra:

@@ -51,7 +51,7 @@ from lfpiv_cli.stages.dry_runs import dry_run
 from lfpiv_cli.stages.followed_files import FrameFiles, PlannedFrames
 from lfpiv_cli.stages.frames import STILL, Background, mask_of, read_frame, reader, sequence_digests
 from lfpiv_cli.stages.intervals import frames_dt_notices
-from lfpiv_cli.stages.prepared import open_weights_that_fit
+from lfpiv_cli.stages.prepared import open_weights_that_fit, searchable_weights
 from lfpiv_cli.stages.reconstruct import file_notices, residual_path
 from lfpiv_cli.stages.stored_tracks import SeenFrames, stored_tracks
 from lfpiv_cli.tracks.trajectories import Trajectories
@@ -137,7 +137,7 @@ def follow_particles(
         beside = [output / TRACKS, output / PLAYBACK, *(target.path for targets in passes[:-1] for target in targets)]
         here = [target for target, frame in zip(passes[-1], frames, strict=True) if frame.fault is None]
         return dry_run(PlannedFrames(here, beside, inputs, left_out, overwrite), options, console)
-    content = particles.searchable(content, settings)
+    content = searchable_weights(weights, content, settings)
     there = [number for number, frame in enumerate(frames) if frame.fault is None]
     needed = [_needed(targets, there, inputs, options, overwrite, targets is passes[-1]) for targets in passes]
     for name in (TRACKS, PLAYBACK):

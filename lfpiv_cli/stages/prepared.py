@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import lru_cache
 from pathlib import Path
 
+from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.files.config import Config
 from lfpiv_cli.files.memory import ensure_room
 from lfpiv_cli.files.weights_file import WeightsFile, open_weights
@@ -37,13 +38,26 @@ class Prepared:
         """Return the weights of a file to look for particles with, see `interface.particles.searchable`."""
         content = self.weights(path)
         if self._searchable is None or self._searchable[0] is not content:
-            self._searchable = content, searchable(content, settings)
+            self._searchable = content, searchable_weights(path, content, settings)
         return self._searchable[1]
 
     def bench(self, content: WeightsFile, settings: Config, dark: Image | None, mask: Image | None) -> Bench:
         """Return what all frames share, with the sums of the last one where these are the same."""
         self._bench = bench_of(content, settings, dark, mask, earlier=self._bench)
         return self._bench
+
+
+def searchable_weights(path: Path, content: WeightsFile, settings: Config) -> WeightsFile:
+    """Return the weights of a file to look for particles with.
+
+    Raises
+    ------
+    InputError : they are none for that, see `interface.particles.searchable`
+    """
+    try:
+        return searchable(content, settings)
+    except ConfigError as error:
+        raise InputError(f"{path}: {error}") from error
 
 
 def open_weights_that_fit(path: Path) -> WeightsFile:

@@ -20,6 +20,7 @@ from lfpiv_cli.files import calibration_file, weights_file
 from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.calibration_file import read_calibration
 from lfpiv_cli.files.hdf5 import open_h5, read_provenance
+from lfpiv_cli.files.images import count_pages
 from lfpiv_cli.files.pages import Page, Picture, Section, Table, ensure_pages, write_page
 from lfpiv_cli.files.particle_file import (
     PARTICLES_FORMAT,
@@ -130,6 +131,8 @@ def report(
     if output.suffix != ".html":
         raise UsageError(f"{output}: a report is a page, its name ends in .html")
     ensure_writable(output, overwrite, options.raw)
+    for path in options.raw:
+        count_pages(path)  # for its checks
     ensure_pages()
     ensure_drawing()
     contents = contents_of(folder)

@@ -102,7 +102,8 @@ def run(
     steps.told["figures"] = figures
     told = choice.told() | figures
     if options.report and whole:
-        told |= {"verdict": _reported(options, steps, overwrite).get("verdict"), "report": str(output / REPORT)}
+        raw = (*dict.fromkeys(frame.path for frame in frames if frame.fault is None), *options.white, *options.board)
+        told |= {"verdict": _reported(raw, steps, overwrite).get("verdict"), "report": str(output / REPORT)}
     steps.write(whole=True)
     return _ensure_whole(told | _told_of_steps(steps), chain.failures, options.failures)
 
@@ -129,11 +130,10 @@ def _ensure_whole(told: dict[str, Any], failures: Sequence[Failure], listed: Pat
     return told
 
 
-def _reported(options: RunOptions, steps: Steps, overwrite: bool) -> dict[str, Any]:
+def _reported(raw: Sequence[Path], steps: Steps, overwrite: bool) -> dict[str, Any]:
     """Make the page of all that the folder holds, where a step has made anything; return what it tells."""
     page = steps.output / REPORT
     is_kept = page.exists() and not steps.count(MADE)
-    raw = (*options.images, *options.white, *options.board)
 
     def make() -> dict[str, Any]:
         if is_kept:
@@ -152,9 +152,11 @@ def _ensure_possible(settings: Config, options: RunOptions) -> tuple[list[Frame]
     if options.report:
         ensure_pages()
     ensure_pictures(len(options.white), len(options.board), len(options.depth_mm))
-    background = Background.parse(options.background).path
-    for path in (*options.white, *options.board, *filter(None, (options.dark, background))):
+    for path in (*options.white, *options.board):
         ensure_regular_file(split_part(path)[0])
+    mask = None if options.mask in (None, STILL) else Path(options.mask)
+    for path in filter(None, (options.dark, Background.parse(options.background).path, mask)):
+        image_files.read_reference(path, settings.image_shape())
     frames = frames_of(options.images, options.keep_going)
     if options.follow:
         ensure_sequence(len(frames), SHORTEST)
@@ -166,6 +168,8 @@ def _ensure_possible(settings: Config, options: RunOptions) -> tuple[list[Frame]
     if options.failures is not None:
         ensure_writable(options.failures, overwrite=True)
     _first_readable(frames, settings.image_shape(), options.keep_going)
+    if not options.keep_going:
+        image_files.ensure_shape(dict.fromkeys(frame.path for frame in frames), settings.image_shape())
     return frames, pairs
 
 

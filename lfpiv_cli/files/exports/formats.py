@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from lfpiv_cli.errors import UsageError
+from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files.exports import mat, text, vtk_xml
 from lfpiv_cli.files.exports.content import KINDS, OF_POINTS, ON_GRIDS, Content
 from lfpiv_cli.files.particle_file import TRAJECTORIES_FORMAT
@@ -54,11 +54,12 @@ def ensure_fits(path: Path, format_name: str, to: ExportFormat, count: int) -> N
 
     Raises
     ------
-    UsageError
+    InputError : the format takes no such file
+    UsageError : it takes one at a time
     """
     kind, fitting = KINDS[format_name], [name for name, each in FORMATS.items() if format_name in each.takes]
     if to not in fitting:
-        raise UsageError(f"{path}: holds {kind}, which {to} does not take; {', '.join(fitting)} do")
+        raise InputError(f"{path}: holds {kind}, which {to} does not take; {', '.join(fitting)} do")
     if count > 1 and format_name not in FORMATS[to].several:
         fitting = [name for name, each in FORMATS.items() if format_name in each.several]
         where = f"several go into {', '.join(fitting)}" if fitting else "give one file at a time"

@@ -1,4 +1,5 @@
-"""Matlab's MAT files, version 5: a variable for each array and for what the file says about itself.
+"""Matlab's MAT files, version 5: a variable for each array and for what the file says about itself; the structure
+`units` has the unit of each array.
 
 Tracks of a sequence come a second time as the list `tracks` of records, one for each track, which flowtracks reads:
 places `xf`, `yf`, `zf` (mm), velocities `uf`, `vf`, `wf` (mm/s), accelerations `axf`, `ayf`, `azf` (NaN, as they are
@@ -43,7 +44,7 @@ def write_mat(path: Path, content: Content) -> None:
         variables["tracks"] = _tracks(content)
     if content.grid is not None:
         variables |= {axis: content.grid.axis_mm(k) for k, axis in enumerate("xyz")}
-    variables |= content.arrays | content.told()
+    variables |= content.arrays | content.told() | {"units": content.units}
     savemat(path, variables, appendmat=False, format="5", long_field_names=True, oned_as="column")
     with open(path, "rb+") as file:
         file.write(WORDS)

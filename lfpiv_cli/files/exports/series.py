@@ -1,8 +1,9 @@
 """What changes in time in one file, which ParaView plays: VTKHDF with a step for each time.
 
 Volumes or vectors are VTK's temporal ImageData: `/VTKHDF` with the grid's attributes and `Steps`, and in `PointData`
-the arrays [t, z, y, x], components last; of a single plane [t, y, x], as VTK reads it. What is measured is in the files
-of the single times; this one is for the eye. Tracks of a sequence are what `playback` writes.
+the arrays [t, z, y, x], components last; of a single plane [t, y, x], and of a single time without t and `Steps`, as
+VTK reads them. What is measured is in the files of the single times; this one is for the eye. Tracks of a sequence are
+what `playback` writes.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ def write_series(
     path: Path,
     first: Content,
     read: Callable[[int], Content],
-    times: Sequence[float],
+    count: int,
+    times_s: Sequence[float] | None,
     provenance: Mapping[str, Any],
     *,
     overwrite: bool,
@@ -39,7 +41,8 @@ def write_series(
     ----------
     first : the one that the grid, the names of the arrays and the attributes are taken from
     read : gives that of each number, which has the same; one at a time is held in memory
-    times : of each
+    count : how many there are
+    times_s : of each, None where only their order is known
 
     Raises
     ------
@@ -48,6 +51,8 @@ def write_series(
     if first.grid is None:
         raise ValueError("points are no image")
     grid = first.grid
+    of_one = count == 1  # VTK takes one step for none, and its axis for one of the place
+    times, unit = (list(map(float, range(count))), "frame") if times_s is None else (times_s, "s")
 
     def fill(file: h5py.File) -> None:
         told = {name: np.asarray(value) if isinstance(value, list) else value for name, value in _others(first).items()}
@@ -59,13 +64,14 @@ def write_series(
             points.attrs["Vectors"] = np.bytes_("velocity")
         for name, array in first.arrays.items():
             shape = array.shape[array.shape[0] == 1 :]
-            options = {"chunks": (1, *shape), "track_times": False, **FILTERS}
-            dataset = points.create_dataset(name, (len(times), *shape), array.dtype, **options)
+            options = {"chunks": (1, *shape)[of_one:], "track_times": False, **FILTERS}
+            dataset = points.create_dataset(name, (count, *shape)[of_one:], array.dtype, **options)
             dataset.attrs["units"] = np.bytes_(first.units[name])
-        write_steps(vtk, times, dict.fromkeys(first.arrays, np.arange(len(times), dtype=np.int64)))
-        for number in range(len(times)):
+        if not of_one:
+            write_steps(vtk, times, unit, dict.fromkeys(first.arrays, np.arange(count, dtype=np.int64)))
+        for number in range(count):
             for name, array in read(number).arrays.items():
-                points[name][number] = array[0] if array.shape[0] == 1 else array
+                points[name][... if of_one else number] = array[0] if array.shape[0] == 1 else array
 
     def check(temporary: Path) -> None:
         with open_h5(temporary) as file:
