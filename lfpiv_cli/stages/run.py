@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from lfpiv_cli.console import CONSOLE, Console
-from lfpiv_cli.errors import ConfigError, InputError, PartialError, UsageError
+from lfpiv_cli.errors import ConfigError, InputError, OutputExistsError, PartialError, UsageError
 from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files.atomic import ensure_writable, write_text
 from lfpiv_cli.files.batch import Frame, frames_of, output_paths, prepare_folder
@@ -40,7 +40,7 @@ from lfpiv_cli.stages.prepared import Prepared
 from lfpiv_cli.stages.report import ReportOptions, report
 from lfpiv_cli.stages.run_figures import figures_of
 from lfpiv_cli.stages.run_options import RunOptions
-from lfpiv_cli.stages.run_plan import planned
+from lfpiv_cli.stages.run_plan import planned, with_overwrite
 from lfpiv_cli.stages.run_steps import Chain, Vectors
 from lfpiv_cli.stages.steps import KEPT, MADE, RECORD, Steps, earlier_run
 
@@ -77,21 +77,32 @@ def run(
     settings = load_config(config)
     frames, pairs = _ensure_possible(settings, options)
     console.warn(pairs.settled(options.keep_going))
-    whole, prepared = options.shard == ALL, Prepared()
-    steps = Steps(output, console, earlier_run(output, overwrite), options.deadline(), recorded=whole)
+    prepared = Prepared()
+    steps = Steps(output, console, earlier_run(output, overwrite), options.deadline(), options.shard == ALL)
     chain = Chain(config, options, frames, pairs, steps, prepared, overwrite)
 
     def choose(weights: Path) -> Choice:
         return _chosen(settings, options, lambda: _counted(settings, options, weights, frames, prepared, steps))
 
-    if options.dry_run:
-        return planned(settings, chain, lambda weights: choose(weights).methods)
+    def methods(weights: Path) -> tuple[FlowMethod, ...]:
+        return choose(weights).methods
+
+    try:
+        return planned(settings, chain, methods) if options.dry_run else _made(chain, choose, overwrite)
+    except OutputExistsError as error:
+        replacing = Chain(config, options, frames, pairs, steps, prepared, overwrite=True)
+        raise OutputExistsError(f"{error}{with_overwrite(settings, replacing, methods)}") from error
+
+
+def _made(chain: Chain, choose: Callable[[Path], Choice], overwrite: bool) -> dict[str, Any]:
+    """Take all steps; return what is told of them."""
+    steps, options, output = chain.steps, chain.options, chain.steps.output
     prepare_folder([output / RECORD])
     weights = chain.weights()
     if not chain.share:
         return _told_of_steps(steps)
     choice = choose(weights)
-    console.say(f"by {' and '.join(choice.methods)}: {choice.reason}")
+    steps.console.say(f"by {' and '.join(choice.methods)}: {choice.reason}")
     steps.told.update(choice.told())
     fields: dict[str, Vectors] = {method: chain.vectors_by(method, weights) for method in choice.methods}
     if options.combine:
@@ -99,7 +110,7 @@ def run(
     figures = figures_of({method: list(paths.values()) for method, paths in fields.items()})
     steps.told["figures"] = figures
     told = choice.told() | figures
-    if options.report and whole:
+    if options.report and options.shard == ALL:
         told |= {"verdict": _reported(options, steps, overwrite).get("verdict"), "report": str(output / REPORT)}
     steps.write(whole=True)
     return _ensure_whole(told | _told_of_steps(steps), chain.failures, options.failures)
