@@ -15,6 +15,7 @@ import pytest
 from click.testing import CliRunner
 from numpy.typing import NDArray
 
+from lfpiv_cli import correlate
 from lfpiv_cli.calibration.model import Calibration, Channel
 from lfpiv_cli.cli import cli
 from lfpiv_cli.errors import ConfigError
@@ -112,6 +113,25 @@ def test_bad_rigs_are_told(tree: Tree, about: str, verdict: str) -> None:
 def test_what_cannot_be_is_refused_by_its_key(tree: Tree, key: str) -> None:
     with pytest.raises(ConfigError, match=key):
         settings_of(tree)
+
+
+# Volume and windows in voxels of 0.1 mm: the shipped sample's, and others that cells do not fill.
+WINDOWS: list[tuple[tuple[int, int, int], Tree]] = [
+    ((30, 22, 40), {"windows": (24, 12), "overlap": 0.5}),
+    ((30, 22, 40), {"window_mm": 0.9, "overlap": 0.6}),
+    ((21, 13, 40), {"windows": (14, (9, 14, 12)), "overlap": 0.75}),
+]
+
+
+@pytest.mark.parametrize(("shape", "keys"), WINDOWS)
+def test_vectors_are_counted_as_they_are_made(shape: tuple[int, int, int], keys: Tree) -> None:
+    tree = changed(PLAIN, volume={"shape_xyz": list(shape), "voxel_mm": 0.1}, correlation=keys)
+    bench, light = bench_of(settings_of(tree), None), np.random.default_rng(1).random(shape[::-1])
+    made = list(correlate(light, light, voxel_mm=bench.grid.spacing_mm, **keys).grid.shape_xyz)
+    assert rig_figures(bench)["vectors_xyz"] == made
+    (told,) = (line for line in rig_lines(bench) if line.about == "windows")
+    assert f"give {made[0]} x {made[1]} x {made[2]} vectors" in told.reason
+    assert (told.verdict == "no") == ("do not fit" in told.reason) == (shape[1] == 13)
 
 
 # A corner of Table 2's sensor; the whole chain of figures on it takes seconds.

@@ -72,6 +72,10 @@ class CorrelationSettings:
     dt_s: float | None = None
     exponent: float = 1.0
 
+    def layout(self, shape_xyz: Triple) -> WindowLayout:
+        """Return the final windows in a volume of so many voxels, each of which gives a vector."""
+        return layout_windows(shape_xyz, self.windows[-1], self.overlap)
+
 
 @dataclass(frozen=True)
 class Pass:

@@ -17,6 +17,7 @@ from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.calibration.sheet import LARGE_F_RATIO, LARGEST_F_RATIO
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.files.config import Config
+from lfpiv_cli.flow.windows import WindowLayout
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.interface.verdicts import WORDS, Word
 from lfpiv_cli.interface.weights import ray_source
@@ -119,6 +120,11 @@ class Bench:
         """(3,) of the volume."""
         return np.diff(self.bounds_mm)[:, 0]
 
+    @property
+    def window_layout(self) -> WindowLayout:
+        """The final interrogation windows."""
+        return self.settings.correlation_settings(self.grid.spacing_mm).layout(self.grid.shape_xyz)
+
     @cached_property
     def errors_mm(self) -> NDArray[np.float64]:
         """Smallest errors (n, 3) of simulated tracers at `depths_mm`."""
@@ -191,6 +197,7 @@ def rig_figures(bench: Bench) -> dict[str, Any]:
         "voxels_xyz": list(bench.grid.shape_xyz),
         "voxel_mm": list(bench.grid.spacing_mm),
         "windows_voxel": [list(window) for window in bench.settings.windows_voxel(bench.grid.spacing_mm)],
+        "vectors_xyz": list(bench.window_layout.count),
         "expected_velocity_m_s": bench.velocity_m_s,
         "best_dt_s": _best_time_s(bench),
     }
@@ -340,19 +347,16 @@ def _voxels(bench: Bench) -> Line:
 
 
 def _windows(bench: Bench) -> Line:
-    voxel, shape = np.array(bench.grid.spacing_mm), np.array(bench.grid.shape_xyz)
-    final = np.array(bench.settings.windows_voxel(bench.grid.spacing_mm)[-1])
-    step = np.maximum(final * (1.0 - np.array(bench.settings.overlap(bench.grid.spacing_mm))), 1.0)
-    vectors = np.maximum((shape - final) // step + 1, 0).astype(int)
+    final, vectors = bench.window_layout.size, bench.window_layout.count
     density = planning.tracers_in(bench.camera, planning.BEST_PER_LENS, bench.sides_mm) / float(np.prod(bench.sides_mm))
-    tracers = density * float(np.prod(final * voxel))
+    tracers = density * float(np.prod(np.multiply(final, bench.grid.spacing_mm)))
     reason = (
         f"{final[0]} x {final[1]} x {final[2]} voxels give {vectors[0]} x {vectors[1]} x {vectors[2]} vectors, with "
         f"{tracers:.2g} tracers each at the best seeding"
     )
-    if vectors.min() == 0:
+    if any(size > voxels for size, voxels in zip(final, bench.grid.shape_xyz, strict=True)):
         return Line("windows", "no", reason + ": they do not fit into the volume")
-    few = vectors.min() < FEWEST_VECTORS or tracers < FEWEST_TRACERS
+    few = min(vectors) < FEWEST_VECTORS or tracers < FEWEST_TRACERS
     return Line("windows", "look" if few else "good", reason + (": set correlation.window_mm" if few else ""))
 
 

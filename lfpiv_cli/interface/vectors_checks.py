@@ -15,7 +15,7 @@ from lfpiv_cli.files.vtkhdf import Volume
 from lfpiv_cli.flow.correlation import CorrelationSettings
 from lfpiv_cli.flow.field import MASKED, REJECTED, VALID, VectorField
 from lfpiv_cli.flow.maps import margins, valid_shares
-from lfpiv_cli.flow.windows import WindowLayout, layout_windows
+from lfpiv_cli.flow.windows import WindowLayout
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.robust import of_half_the_sum
 
@@ -143,7 +143,7 @@ def pair_notices(field: VectorField, quality: Quality, name: str) -> Iterator[No
 def window_notices(volume: Volume, settings: CorrelationSettings, name: str) -> Iterator[Notice]:
     """Yield what speaks against correlating a volume in such windows."""
     size, shape = settings.windows[-1], volume.grid.shape_xyz
-    layout = layout_windows(shape, size, settings.overlap)
+    layout = settings.layout(shape)
     few = [axis for axis in range(3) if layout.count[axis] < FEWEST_ALONG_AXIS and shape[axis] > 1]
     if few:
         fewest = min(few, key=lambda axis: layout.count[axis])

@@ -29,7 +29,6 @@ from lfpiv_cli.flow.derived import derived_fields
 from lfpiv_cli.flow.field import REJECTED, VectorField
 from lfpiv_cli.flow.footprint import held_bytes
 from lfpiv_cli.flow.locking import with_locking
-from lfpiv_cli.flow.windows import layout_windows
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.interface.vectors import ensure_alike, scale_of, usable_voxels
 from lfpiv_cli.interface.vectors_checks import (
@@ -288,8 +287,7 @@ class Correlation(PairBatch[CorrelateOptions]):
 
 def field_bytes(settings: Config, grid: Grid, derived: bool = False) -> float:
     """Return the bytes of the arrays of a field of vectors, between volumes on a grid."""
-    chosen = settings.correlation_settings(grid.spacing_mm)
-    windows = math.prod(layout_windows(grid.shape_xyz, chosen.windows[-1], chosen.overlap).count)
+    windows = math.prod(settings.correlation_settings(grid.spacing_mm).layout(grid.shape_xyz).count)
     return NUMBER_BYTES * (NUMBERS_A_VECTOR + derived * NUMBERS_DERIVED) * windows
 
 
