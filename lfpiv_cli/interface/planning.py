@@ -47,8 +47,8 @@ GOOD_PIXELS, LEAST_PIXELS = 8.0, 5.0
 GOOD_ERROR, LARGEST_ERROR = 0.05, 0.25
 # Voxels in microlenses and in depths of one lens: particles lock to wider ones.
 GOOD_VOXEL, LARGEST_VOXEL = 0.55, 1.05
-# Vectors along each axis, and tracers in a window.
-FEWEST_VECTORS, FEWEST_TRACERS = 3, 5.0
+# Sides of windows that differ by less are alike: they are written with few digits.
+WINDOWS_ALIKE = 0.02
 # Of the coarse window's side: up to the one displacements are measured well, beyond the other hardly at all.
 GOOD_SHARE_OF_WINDOW, LARGEST_SHARE_OF_WINDOW = 0.25, 0.5
 DEPTHS = 21
@@ -167,7 +167,7 @@ def rig_lines(bench: Bench) -> list[Line]:
         _precision,
         _seeding,
         _voxels,
-        _windows,
+        windows_line,
         _time_step,
         _cost,
     )
@@ -346,7 +346,8 @@ def _voxels(bench: Bench) -> Line:
     return Line("voxels", verdict, reason)
 
 
-def _windows(bench: Bench) -> Line:
+def windows_line(bench: Bench) -> Line:
+    """Return whether windows give a field that is worth looking at, or which would."""
     final, vectors = bench.window_layout.size, bench.window_layout.count
     density = planning.tracers_in(bench.camera, planning.BEST_PER_LENS, bench.sides_mm) / float(np.prod(bench.sides_mm))
     tracers = density * float(np.prod(np.multiply(final, bench.grid.spacing_mm)))
@@ -355,9 +356,29 @@ def _windows(bench: Bench) -> Line:
         f"{tracers:.2g} tracers each at the best seeding"
     )
     if any(size > voxels for size, voxels in zip(final, bench.grid.shape_xyz, strict=True)):
-        return Line("windows", "no", reason + ": they do not fit into the volume")
-    few = min(vectors) < FEWEST_VECTORS or tracers < FEWEST_TRACERS
-    return Line("windows", "look" if few else "good", reason + (": set correlation.window_mm" if few else ""))
+        return Line("windows", "no", f"{reason}: they do not fit into the volume; {_better_windows(bench)}")
+    few = min(vectors) < planning.WORTH_VECTORS
+    if not few and tracers >= planning.FEWEST_TRACERS:
+        return Line("windows", "good", reason)
+    return Line("windows", "look", f"{reason}: {_better_windows(bench)}")
+
+
+def _better_windows(bench: Bench) -> str:
+    """Return in words which windows suit volume and tracers, and why even they give few vectors if they do."""
+    chosen, sides = bench.settings.correlation, bench.sides_mm
+    window = planning.proposed_window_mm(bench.camera, bench.media, sides, chosen.overlap)
+    vectors = planning.vectors_along(sides, window, chosen.overlap)
+    told = []
+    if chosen.window_mm is None or not np.allclose(chosen.window_mm, window, rtol=WINDOWS_ALIKE):
+        instead = " in place of correlation.windows" if chosen.windows is not None else ""
+        told.append(f"set correlation.window_mm: {window.tolist()}{instead}, for {' x '.join(map(str, vectors))}")
+    few = [axis for axis, count in zip("xyz", vectors, strict=True) if count < planning.WORTH_VECTORS]
+    if few:
+        limit = f"smaller windows hold fewer than {planning.FEWEST_TRACERS:g}"
+        if few == ["z"] and window[2] <= bench.scale.depth_mm:
+            limit = f"they are about {bench.scale.depth_mm:.3g} mm long in a volume"
+        told.append(f"tracers allow fewer than {planning.WORTH_VECTORS} along {', '.join(few)}: {limit}")
+    return "; ".join(told)
 
 
 def _best_time_s(bench: Bench) -> float | None:
