@@ -17,6 +17,7 @@ from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files.bench import LATERAL_VOXELS_PER_MICROLENS, UM_TO_MM
 from lfpiv_cli.files.sections import CorrelationSection
 from lfpiv_cli.names import KnownCamera
+from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media, Window, channel_window
 from lfpiv_cli.optics.microlenses import Lattice
@@ -120,7 +121,8 @@ def proposed_size_mm(numbers: RigNumbers) -> Sides:
     if half.min() <= 0.0:
         raise ConfigError(
             f"the sensor ({numbers.columns} x {numbers.rows} pixels of {numbers.pixel_um:g} um) sees no point of a "
-            f"volume {depth:.3g} mm deep with all of its light; check pixels, pitch, f-numbers and the channel's width"
+            f"volume {written(depth)} mm deep with all of its light; check pixels, pitch, f-numbers and the channel's "
+            "width"
         )
     width, height = (_rounded_down(2.0 * SHARE_OF_VIEW * side) for side in half)
     return width, height, depth if numbers.channel_mm else _rounded(depth)

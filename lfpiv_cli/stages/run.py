@@ -32,6 +32,7 @@ from lfpiv_cli.interface import particles
 from lfpiv_cli.interface.calibration import ensure_pictures
 from lfpiv_cli.interface.following import SHORTEST, ensure_sequence
 from lfpiv_cli.names import FlowMethod
+from lfpiv_cli.notice import written
 from lfpiv_cli.stages.batches import ALL, Failure
 from lfpiv_cli.stages.follow import SEQUENCE_IS_WHOLE
 from lfpiv_cli.stages.frames import STILL, Background, mask_of, other_frames, read_frame, reader
@@ -261,7 +262,9 @@ def _chosen(settings: Config, options: RunOptions, count_tracers: Callable[[], f
         return Choice((asked or "particles",), "too little is seen of the volume to count tracers by their light")
     better: FlowMethod = "particles" if count <= MOST_FOR_PARTICLES else "volumes"
     side = "up to" if better == "particles" else "beyond"
-    reason = f"{count:.2g} tracers for each microlens, and {better} err less {side} about {MOST_FOR_PARTICLES:g}"
+    reason = (
+        f"{written(count, 2)} tracers for each microlens, and {better} err less {side} about {MOST_FOR_PARTICLES:g}"
+    )
     if asked is None or asked == better:
         return Choice((better,), reason, count)
     return Choice((asked,), f"as asked for; but there are {reason}", count)
