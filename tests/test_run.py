@@ -13,7 +13,7 @@ import pytest
 from lfpiv_cli.cli import cli
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import ConfigError, InputError, LfpivError, OutputExistsError, PartialError, UsageError
-from lfpiv_cli.files.provenance import carried_record
+from lfpiv_cli.files.provenance import carried_record, differences
 from lfpiv_cli.stages import prepared
 from lfpiv_cli.stages import run as stage
 from lfpiv_cli.stages.run import RunOptions
@@ -159,6 +159,37 @@ def test_what_a_change_makes_again_is_said_before(again: Path, change: tuple[str
     with pytest.raises(OutputExistsError) as caught:
         run(again / "rig.yaml", again / "out")
     assert str(caught.value).endswith(f"with it the run makes {again_and_kept}")
+
+
+def test_what_has_changed_since_a_result_was_made_is_named() -> None:
+    config: dict[str, Any] = {"name": "rig.yaml", "sha256": "1"}
+    image = {"name": "a.tif", "sha256": "2"}
+    carried = {
+        "program": "lfpiv",
+        "version": "1",
+        "libraries": {"numpy": "2"},
+        "command": "reconstruct page 0",
+        "config": {"media": {"fluid": 1.33}, "window": None},
+        "inputs": {"config": config, "image": image},
+        "made_from": {},
+    }
+    changes: list[tuple[dict[str, Any], str]] = [
+        ({"config": {"media": {"fluid": 1.4}, "window": None}}, "media.fluid was 1.33, is 1.4"),
+        ({"config": {"media": {"fluid": 1.33}, "window": 2.0}}, "window was not given, is 2.0"),
+        ({"config": {"media": {"fluid": list(range(60))}, "window": None}}, "media.fluid has changed"),
+        ({"inputs": {"config": config, "image": {"name": "b.tif", "sha256": "3"}}}, "image is another file"),
+        (
+            {"inputs": {"config": {"name": "rig.yaml", "sha256": "4"}, "image": image}},
+            "the config is another file, which",
+        ),
+        ({"libraries": {"numpy": "3"}}, "numpy was 2, is 3"),
+        ({"version": "2"}, "lfpiv was 1, is 2"),
+        ({"command": "reconstruct page 1"}, "the command was reconstruct page 0, is reconstruct page 1"),
+    ]
+    assert differences(carried, carried) == []
+    for change, words in changes:
+        (told,) = differences(carried, carried | change)
+        assert told.startswith(words)
 
 
 @pytest.mark.thorough

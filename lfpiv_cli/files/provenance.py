@@ -269,7 +269,9 @@ def differences(carried: Mapping[str, Any], made: Mapping[str, Any]) -> list[str
     """Return in words what has changed since a result was made, by the record that it carries and that it would get."""
     before, now = _facts(carried), _facts(made)
     changed = [name for name in dict.fromkeys([*now, *before]) if before.get(name) != now.get(name)]
-    return [_change(name, before.get(name), now.get(name)) for name in changed]
+    told = [_change(name, before.get(name), now.get(name)) for name in changed]
+    configs = [made.get("inputs", {}).get("config") for made in (carried, made)]
+    return told or (["the config is another file, which says the same"] if configs[0] != configs[1] else [])
 
 
 def _facts(made: Mapping[str, Any]) -> dict[str, Any]:
