@@ -18,7 +18,7 @@ from typing import Any
 import click
 
 from lfpiv_cli.files.log import EventLog, largest_memory_mb
-from lfpiv_cli.notice import Notice
+from lfpiv_cli.notice import Notice, written
 
 # Without a terminal, lines of work that is one piece are this far apart, and those within a frame that takes long.
 SECONDS_BETWEEN_LINES, SECONDS_WITHIN_FRAME = 10.0, 60.0
@@ -186,7 +186,7 @@ class Frames:
             self._draw(self._done)
         else:
             count = f"{self._done} of {self._total} {self._unit}s"
-            self.console.say(f"{self._label}: {name}, {count}, {each:.3g} s each, {_duration(left)} left")
+            self.console.say(f"{self._label}: {name}, {count}, {written(each)} s each, {_duration(left)} left")
 
 
 class _Lines:
@@ -207,7 +207,7 @@ class _Lines:
         self._told = now
         rate = self._done / (now - self._begun)
         left = _duration(max(self._total - self._done, 0) / rate)
-        self._console.say(f"{self._label}: {self._done} of {self._total} steps, {rate:.3g} a second, {left} left")
+        self._console.say(f"{self._label}: {self._done} of {self._total} steps, {written(rate)} a second, {left} left")
 
 
 # For those who call a stage from Python and say nothing of it.
@@ -273,7 +273,7 @@ def readable(value: Any, digits: int = 6, unknown: str = "unknown") -> str:
     if value is None:
         return unknown
     if isinstance(value, float):
-        return f"{value:.{digits}g}"
+        return written(value, digits)
     if isinstance(value, dict):
         return ", ".join(f"{name} {readable(each, digits, unknown)}" for name, each in value.items())
     if isinstance(value, (list, tuple)):

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass
 from typing import Any
+
+# Numbers from the first on are so many of a word; beyond the second, and below the third, they are powers of ten.
+WORDS = ((1e12, "trillion"), (1e9, "billion"), (1e6, "million"))
+LARGEST_WRITTEN, SMALLEST_WRITTEN = 1e15, 1e-6
 
 
 @dataclass(frozen=True)
@@ -34,3 +39,19 @@ class Notice:
     def record(self) -> dict[str, Any]:
         """Return it as plain data, as JSON and provenance have it."""
         return asdict(self)
+
+
+def written(value: float, digits: int = 3) -> str:
+    """Return a number of so many digits as people write it: 110 and 0.00002, where a computer has 1.1e+02 and 2e-05."""
+    rounded = float(f"{value:.{digits}g}")
+    size = abs(rounded)
+    if size == 0.0 or not math.isfinite(size):
+        return f"{size if size == 0.0 else rounded:g}"
+    if not SMALLEST_WRITTEN <= size < LARGEST_WRITTEN:
+        mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
+        return f"{float(mantissa):g} x 10^{int(exponent)}"
+    for unit, word in WORDS:
+        if size >= unit:
+            return f"{written(rounded / unit, digits)} {word}"
+    text = f"{rounded:.{max(digits - 1 - math.floor(math.log10(size)), 0)}f}"
+    return text.rstrip("0").rstrip(".") if "." in text else text

@@ -24,7 +24,7 @@ from lfpiv_cli.files.images import write_tiff
 from lfpiv_cli.files.rig_numbers import RigNumbers, tree_of
 from lfpiv_cli.files.rig_text import rig_text
 from lfpiv_cli.interface.image_planning import Pictures, image_lines, lattice_of
-from lfpiv_cli.interface.planning import Line, bench_of, rig_figures, rig_lines, worst
+from lfpiv_cli.interface.planning import Line, bench_of, rig_figures, rig_lines, windows_line, worst
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.microlenses import Lattice
@@ -151,6 +151,21 @@ def test_the_work_by_particles_goes_with_the_tracers_and_is_told_beside_that_by_
     (work,) = (line.reason for line in rig_lines(bench) if line.about == "work")
     assert f"{figures['estimated_image_core_s']:.2g} s by volumes, " in work
     assert f"{figures['estimated_particles_core_s']:.2g} s by particles" in work
+
+
+@pytest.mark.parametrize("windows", [{"windows": [24, 12]}, {"window_mm": 1.6}, {"window_mm": [0.1, 0.1, 1.2]}])
+def test_windows_are_named_that_suit_volume_and_tracers(windows: Tree) -> None:
+    tree = changed(PLAIN, volume__size_mm=[3.0, 2.2, 4.0], correlation=windows)
+    line = windows_line(bench_of(settings_of(tree), None))
+    named = re.search(
+        r"set correlation.window_mm: (\[.*?\])( in place of correlation.windows)?, for (\d+ x \d+ x \d+)", line.reason
+    )
+    assert (line.verdict, named is not None) == ("look", True)
+    assert named is not None
+    assert bool(named[2]) == ("windows" in windows)
+    better = windows_line(bench_of(settings_of(changed(tree, correlation={"window_mm": json.loads(named[1])})), None))
+    assert f"give {named[3]} vectors" in better.reason
+    assert "set correlation.window_mm" not in better.reason
 
 
 class Photographer:

@@ -18,9 +18,11 @@ from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.rig_numbers import LATTICES, RigNumbers, tree_of
 from lfpiv_cli.files.rig_text import rig_text, schema
 from lfpiv_cli.grid import Grid
+from lfpiv_cli.interface.planning import bench_of, windows_line
 from lfpiv_cli.interface.weights import plan_of
 from lfpiv_cli.stages.calibrate import CalibrateOptions, calibrate_snapshot
 from lfpiv_cli.stages.init import SCHEMA_NAME, InitOptions, init
+from lfpiv_cli.validation import planning
 from lfpiv_cli.validation.planning import half_view_mm
 from lfpiv_cli.weights.columns import seen_share
 
@@ -58,6 +60,26 @@ def test_a_rig_of_few_numbers_has_no_contradictions_and_sees_its_volume(numbers:
     grid = settings.grid()
     half = half_view_mm(camera, settings.media_model(), grid.bounds_mm(2)).min(axis=0)
     assert all(grid.bounds_mm(axis)[1] <= half[axis] for axis in (0, 1))
+
+
+@pytest.mark.parametrize("numbers", [*RIGS.values(), RigNumbers(channel_mm=3.0)], ids=[*RIGS, "shallow channel"])
+def test_windows_give_ten_vectors_along_each_axis_where_tracers_allow_it(
+    numbers: RigNumbers, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "rig.yaml"
+    init(path, InitOptions(numbers=numbers))
+    bench = bench_of(load_config(path), None)
+    window, vectors = np.array(bench.settings.correlation.window_mm), np.array(bench.window_layout.count)
+    tracers = bench.settings.simulation.particles * np.prod(window / bench.sides_mm)
+    # Windows are written in three digits, and rounded down.
+    assert tracers >= 0.97 * planning.TRACERS_AIMED_AT
+    few = [axis for axis in range(3) if vectors[axis] < 10]
+    shallow = few == [2] and window[2] <= 1.001 * bench.scale.depth_mm
+    assert not few or shallow or tracers <= planning.TRACERS_AIMED_AT
+    told, line = capsys.readouterr().err, windows_line(bench)
+    assert line.verdict == ("look" if few else "good")
+    assert ("tracers allow fewer than 10 along" in told) == bool(few)
+    assert "set correlation.window_mm" not in line.reason
 
 
 def test_full_view_is_what_the_weights_see() -> None:

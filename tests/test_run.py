@@ -15,7 +15,7 @@ import tifffile
 from lfpiv_cli.cli import cli
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import ConfigError, InputError, LfpivError, OutputExistsError, PartialError, UsageError
-from lfpiv_cli.files.provenance import carried_record
+from lfpiv_cli.files.provenance import carried_record, differences
 from lfpiv_cli.stages import prepared
 from lfpiv_cli.stages import report as report_stage
 from lfpiv_cli.stages import run as stage
@@ -109,8 +109,11 @@ def test_what_is_done_is_kept_with_its_summary(again: Path) -> None:
 
 @pytest.mark.thorough
 def test_only_what_depends_on_a_change_is_made_anew(again: Path) -> None:
-    with pytest.raises(OutputExistsError, match=r"step 4, correlate: .*vectors.vtkhdf"):
+    with pytest.raises(OutputExistsError, match=r"step 4, correlate: .*vectors.vtkhdf") as caught:
         run(again / "rig.yaml", again / "out", "--dt-s", 0.001)
+    assert "(correlation.dt_s was 0.002, is 0.001); --overwrite makes it anew; with it the run makes" in str(
+        caught.value
+    )
     before = stamps(again)
     run(again / "rig.yaml", again / "out", "--dt-s", 0.001, "--overwrite")
     after = stamps(again)
@@ -118,12 +121,21 @@ def test_only_what_depends_on_a_change_is_made_anew(again: Path) -> None:
 
 
 @pytest.mark.thorough
-def test_settings_of_a_later_step_leave_what_was_made_before(again: Path) -> None:
+def test_settings_of_a_later_step_leave_what_was_made_before(again: Path, capsys) -> None:
     names = [name for name in FILES if name.endswith(("h5", "vtkhdf"))]
     text = (again / "rig.yaml").read_text()
     (again / "rig.yaml").write_text(text.replace("windows: [24, 12]", "windows: [24, 10]"))
     before = {name: data_of(again / "out" / name) for name in names}
     earlier = json.loads((again / "out" / "run.json").read_text())["summaries"]
+    with pytest.raises(OutputExistsError) as caught:
+        run(again / "rig.yaml", again / "out")
+    told = str(caught.value)
+    assert "calibration.h5: exists and was made from other inputs or settings (correlation.windows was [[24, 24" in told
+    assert told.endswith(
+        "--overwrite keeps it, as it depends on none of that; with it the run makes vectors again and keeps "
+        "calibration.h5, weights.h5 and volumes"
+    )
+    assert planned(again, capsys)["to_make"] == {"volumes": 0, "vectors": 1}
     run(again / "rig.yaml", again / "out", "--overwrite")
     assert list(states(again).values()) == ["recorded anew"] * 3 + ["made"]
     assert {name: data_of(again / "out" / name) for name in names} == before
@@ -134,6 +146,70 @@ def test_settings_of_a_later_step_leave_what_was_made_before(again: Path) -> Non
     assert {made["config"]["correlation"]["windows"][1][0] for made in carried["made_from"].values()} == {10}
     run(again / "rig.yaml", again / "out")
     assert set(states(again).values()) == {"kept"}
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize(
+    ("change", "again_and_kept"),
+    [
+        (("iterations: 2", "iterations: 3"), "weights.h5 and what depends on it again and keeps calibration.h5"),
+        (("pixel_um: 5.5", "pixel_um: 5.6"), "calibration.h5, weights.h5 and what depends on it again"),
+    ],
+)
+def test_what_a_change_makes_again_is_said_before(again: Path, change: tuple[str, str], again_and_kept: str) -> None:
+    text = (again / "rig.yaml").read_text()
+    assert change[0] in text
+    (again / "rig.yaml").write_text(text.replace(*change))
+    with pytest.raises(OutputExistsError) as caught:
+        run(again / "rig.yaml", again / "out")
+    assert str(caught.value).endswith(f"with it the run makes {again_and_kept}")
+
+
+def test_what_has_changed_since_a_result_was_made_is_named() -> None:
+    config: dict[str, Any] = {"name": "rig.yaml", "sha256": "1"}
+    image = {"name": "a.tif", "sha256": "2"}
+    carried = {
+        "program": "lfpiv",
+        "version": "1",
+        "libraries": {"numpy": "2"},
+        "command": "reconstruct page 0",
+        "config": {"media": {"fluid": 1.33}, "window": None},
+        "inputs": {"config": config, "image": image},
+        "made_from": {},
+    }
+    changes: list[tuple[dict[str, Any], str]] = [
+        ({"config": {"media": {"fluid": 1.4}, "window": None}}, "media.fluid was 1.33, is 1.4"),
+        ({"config": {"media": {"fluid": 1.33}, "window": 2.0}}, "window was not given, is 2.0"),
+        ({"config": {"media": {"fluid": list(range(60))}, "window": None}}, "media.fluid has changed"),
+        ({"inputs": {"config": config, "image": {"name": "b.tif", "sha256": "3"}}}, "image is another file"),
+        (
+            {"inputs": {"config": {"name": "rig.yaml", "sha256": "4"}, "image": image}},
+            "the config is another file, which",
+        ),
+        ({"libraries": {"numpy": "3"}}, "numpy was 2, is 3"),
+        ({"version": "2"}, "lfpiv was 1, is 2"),
+        ({"command": "reconstruct page 1"}, "the command was reconstruct page 0, is reconstruct page 1"),
+    ]
+    assert differences(carried, carried) == []
+    for change, words in changes:
+        (told,) = differences(carried, carried | change)
+        assert told.startswith(words)
+
+
+@pytest.mark.thorough
+def test_volumes_of_other_settings_are_not_taken_for_those_of_a_result(again: Path) -> None:
+    text = (again / "rig.yaml").read_text()
+    (again / "rig.yaml").write_text(text.replace("windows: [24, 12]", "windows: [24, 10]"))
+    run(again / "rig.yaml", again / "out", "--keep", "results", "--overwrite")
+    assert states(again)["correlate"] == "made"
+
+
+def planned(folder: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
+    """Return what a run that may overwrite says that it would do."""
+    capsys.readouterr()
+    run(folder / "rig.yaml", folder / "out", "--overwrite", "--dry-run", "--json")
+    told: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return told
 
 
 def data_of(path: Path) -> dict[str, bytes]:

@@ -16,6 +16,7 @@ from lfpiv_cli.calibration.board_fit import FlatFit, bent_fit, flat_fit, outlier
 from lfpiv_cli.calibration.spots import first_of_each
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.names import Medium, Pattern, Polarity
+from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera
 
 # The plane, the spacing and their errors need more than their own unknowns.
@@ -279,16 +280,16 @@ def refuse_scattered(fit: FlatFit, board: BoardGeometry, camera: Camera) -> None
     sideways = float(np.sqrt(2.0 * np.sum(fit.residual_mm[:, :2] ** 2) / max(1, freedom)))
     if sideways > LARGEST_SCATTER * board.spacing_mm:
         raise InputError(
-            f"what was found lies {sideways:.3g} mm rms off a grid of {board.spacing_mm:g} mm, at most "
-            f"{LARGEST_SCATTER * board.spacing_mm:.3g} mm is a board's; check board.spacing_mm and that the picture "
-            "shows the board"
+            f"what was found lies {written(sideways)} mm rms off a grid of {board.spacing_mm:g} mm, at most "
+            f"{written(LARGEST_SCATTER * board.spacing_mm)} mm is a board's; check board.spacing_mm and that the "
+            "picture shows the board"
         )
     deep = float(np.sqrt(np.sum(fit.residual_mm[:, 2] ** 2) / max(1, len(fit.residual_mm) - 3)))
     flat = LARGEST_SCATTER_OF_LENS_DEPTH * lens_in_scene_mm(camera)[1]
     if deep > flat:
         raise InputError(
-            f"what was found lies {deep:.3g} mm rms in front of and behind one plane, at most {flat:.3g} mm is a "
-            "board's; check the section board and that the picture shows the board"
+            f"what was found lies {written(deep)} mm rms in front of and behind one plane, at most {written(flat)} mm "
+            "is a board's; check the section board and that the picture shows the board"
         )
 
 

@@ -29,6 +29,7 @@ from lfpiv_cli.calibration.target_detection import (
 )
 from lfpiv_cli.calibration.views import lens_table, sub_aperture_view, view_crossings
 from lfpiv_cli.errors import InputError
+from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.robust import MAD_TO_SIGMA
@@ -301,8 +302,8 @@ def refuse_small(board: BoardGeometry, camera: Camera) -> None:
     for what, (width, least) in widths.items():
         if width * per_mm < least:
             raise InputError(
-                f"{what} are {width * per_mm:.3g} microlenses wide on the array, less than {least:g}; use a board with "
-                "larger ones"
+                f"{what} are {written(width * per_mm)} microlenses wide on the array, less than {least:g}; use a board "
+                "with larger ones"
             )
 
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.calibration.shape_fit import ShapeFit, SharesAndSlopes, fit_shape
 from lfpiv_cli.errors import InputError
+from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
 from lfpiv_cli.optics.microlenses import Lattice, nearest_point
@@ -287,7 +288,7 @@ def checked_disc_radius(radius_mm: float, camera: Camera) -> float:
     seen = abs(camera.magnification) * radius_mm
     if seen < 0.25 * float(camera.lattice.pitch.min()):
         raise InputError(
-            f"the board's dots are {2 * seen:.3g} mm wide on the microlens array, less than half a microlens "
-            f"({float(camera.lattice.pitch.min()):.3g} mm); use a board with larger dots"
+            f"the board's dots are {written(2 * seen)} mm wide on the microlens array, less than half a microlens "
+            f"({written(float(camera.lattice.pitch.min()))} mm); use a board with larger dots"
         )
     return radius_mm

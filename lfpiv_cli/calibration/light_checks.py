@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from lfpiv_cli.calibration.lattice import LatticeFit
 from lfpiv_cli.calibration.lens_light import LensImages
 from lfpiv_cli.calibration.white_checks import LARGEST_DIFFERENCE, neighbours_difference
-from lfpiv_cli.notice import Notice
+from lfpiv_cli.notice import Notice, written
 from lfpiv_cli.robust import MAD_TO_SIGMA
 
 # Lens images that have moved by less do no harm: a share of the pitch, and what pixels themselves make of small ones.
@@ -80,10 +80,10 @@ def position_notices(images: LensImages, picture: NDArray[np.floating], name: st
             "lens-images-moved",
             name,
             f"its lens images lie up to {size:.2f} +- {place.sigma_px:.2f} px beside those of the calibration "
-            f"({place.shift_px[0]:+.2f} columns, {place.shift_px[1]:+.2f} rows), at most {largest:.2f} do no harm",
+            f"({place.shift_px[0]:+z.2f} columns, {place.shift_px[1]:+z.2f} rows), at most {largest:.2f} do no harm",
             remedy,
             size,
-            f"at most {largest:.2g} px",
+            f"at most {written(largest, 2)} px",
         )
     ]
 
@@ -104,11 +104,11 @@ def level_notices(images: LensImages, picture: NDArray[np.floating], name: str) 
         Notice(
             "dark-level",
             name,
-            f"where no light falls, between the lens images, it is {abs(level):.3g} counts "
-            f"{'brighter' if level > 0.0 else 'darker'} than without light, at most {largest:.2g} may be",
+            f"where no light falls, between the lens images, it is {written(abs(level))} counts "
+            f"{'brighter' if level > 0.0 else 'darker'} than without light, at most {written(largest, 2)} may be",
             "give a --dark with the exposure, the gain and the bits of the images",
             level,
-            f"within {largest:.2g} counts",
+            f"within {written(largest, 2)} counts",
         )
     ]
 
@@ -159,8 +159,8 @@ def uniform_notices(images: LensImages, fit: LatticeFit, picture: NDArray[np.flo
         yield Notice(
             "frame-uniform",
             name,
-            f"nine in ten lens images differ by less than {100 * difference:.1f} % in brightness from those around, as "
-            "under uniform light: it shows no tracers",
+            f"nine in ten lens images differ by less than {100 * difference:.1f} % in brightness from those around, "
+            "as under uniform light: it shows no tracers",
             "is it a white image?",
             difference,
             f"above {LARGEST_DIFFERENCE:g}",

@@ -10,7 +10,7 @@ import numpy as np
 
 from lfpiv_cli.calibration.lattice import EXPONENTS, LatticeFit
 from lfpiv_cli.errors import ConfigError, InputError
-from lfpiv_cli.notice import Notice
+from lfpiv_cli.notice import Notice, written
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.pupils import real_lens, with_entrance_pupil
 
@@ -47,7 +47,7 @@ def check_pitch(fit: LatticeFit, sheet_pitch_px: float) -> None:
     pitch = float(fit.lattice_px.pitch.mean())
     if abs(pitch / sheet_pitch_px - 1.0) > LARGEST_DIFFERENCE:
         raise InputError(
-            f"the lens images are {pitch:.4g} px apart and {sheet_pitch_px:.4g} px by the data sheet, "
+            f"the lens images are {written(pitch, 4)} px apart and {written(sheet_pitch_px, 4)} px by the data sheet, "
             f"{100 * abs(pitch / sheet_pitch_px - 1.0):.0f} % off, at most {100 * LARGEST_DIFFERENCE:.0f} % may be; "
             "check camera.microlenses.pitch_mm, camera.sensor.pixel_um and that the sensor is not binned"
         )
@@ -101,16 +101,16 @@ def image_distance_notices(fit: LatticeFit, camera: Camera) -> list[Notice]:
         difference = abs(found[0] - sheet)
         if difference <= max(IMAGE_DISTANCE_TOLERANCE * sheet, IMAGE_DISTANCE_SIGMAS * found[1]):
             return []
-    told = "no image distance" if found is None else f"an image distance of {found[0]:.4g} mm"
+    told = "no image distance" if found is None else f"an image distance of {written(found[0], 4)} mm"
     ratio = None if found is None else found[0] / real_lens(camera).focal_length_mm + camera.magnification
-    expected = "an infinite one" if telecentric else f"{sheet:.4g} mm"
+    expected = "an infinite one" if telecentric else f"{written(sheet, 4)} mm"
     return [
         Notice(
             "image-distance",
             "camera.main_lens",
             f"the pitch of the lens images tells {told}, the data sheet {expected}",
             "correct what is off of microlenses.pitch_mm, sensor.pixel_um, sensor.microlens_distance_mm and main_lens"
-            + (f" (pupil_ratio {ratio:.3g} if all else is right)" if ratio is not None and ratio > 0.0 else ""),
+            + (f" (pupil_ratio {written(ratio)} if all else is right)" if ratio is not None and ratio > 0.0 else ""),
             None if found is None else found[0],
             expected,
         )
@@ -126,10 +126,10 @@ def magnification_notices(measured: float, camera: Camera) -> list[Notice]:
         Notice(
             "magnification",
             "board.spacing_mm",
-            f"the board shows a magnification of {measured:.4g}, the data sheet {sheet:.4g}",
+            f"the board shows a magnification of {written(measured, 4)}, the data sheet {written(sheet, 4)}",
             "correct what is off of board.spacing_mm, board.medium and main_lens.magnification",
             measured,
-            f"{sheet:.4g} within {MAGNIFICATION_TOLERANCE:.0%}",
+            f"{written(sheet, 4)} within {MAGNIFICATION_TOLERANCE:.0%}",
         )
     ]
 
@@ -142,16 +142,17 @@ def entrance_pupil_notices(found_mm: float | None, sigma_mm: float | None, camer
     if abs(found_mm - sheet) <= max(IMAGE_DISTANCE_SIGMAS * sigma_mm, ENTRANCE_PUPIL_TOLERANCE * sheet):
         return []
     inverse = with_entrance_pupil(camera, found_mm).entrance_over_exit
-    ratio = f"{1.0 / inverse:.3g}" if inverse > 0.0 else "image_distance: infinite"
+    ratio = written(1.0 / inverse) if inverse > 0.0 else "image_distance: infinite"
     return [
         Notice(
             "entrance-pupil",
             "camera.main_lens.pupil_ratio",
-            f"the boards show the entrance pupil {found_mm:.4g} mm from the focal plane, the data sheet {sheet:.4g} mm",
+            f"the boards show the entrance pupil {written(found_mm, 4)} mm from the focal plane, the data sheet "
+            f"{written(sheet, 4)} mm",
             "correct what is off of main_lens.focal_length_mm, media.fluid, the boards' depths and pupil_ratio "
             f"({ratio} if all else is right)",
             found_mm,
-            f"{sheet:.4g} mm within {ENTRANCE_PUPIL_TOLERANCE:.0%}",
+            f"{written(sheet, 4)} mm within {ENTRANCE_PUPIL_TOLERANCE:.0%}",
         )
     ]
 
@@ -230,7 +231,7 @@ def _f_numbers(camera: Camera) -> str:
     """Return what becomes of lens images by the f-numbers, in words."""
     width, main = camera.lens_image_width, camera.image_distance_mm / camera.aperture_mm
     what = f"overlap, {width:.2f} of their pitch wide" if width > 1.0 else f"fill only {width:.2f} of their pitch"
-    numbers = f"the main lens is f/{main:.3g} towards the array and the microlenses are f/{main * width:.3g}"
+    numbers = f"the main lens is f/{written(main)} towards the array and the microlenses are f/{written(main * width)}"
     return f"{numbers}: lens images {what}"
 
 

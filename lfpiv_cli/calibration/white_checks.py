@@ -18,7 +18,7 @@ from scipy.spatial import KDTree
 from lfpiv_cli.calibration.lattice import LatticeFit
 from lfpiv_cli.calibration.transmission import MIDDLE_PER_PITCH, NARROWEST_LENS_IMAGE
 from lfpiv_cli.errors import InputError
-from lfpiv_cli.notice import Notice
+from lfpiv_cli.notice import Notice, written
 
 # Shares of the pitch: twice the worst white image's, and half of what pictures of scenes leave at their worst.
 LARGE_RESIDUAL, LARGEST_RESIDUAL = 0.02, 0.06
@@ -139,5 +139,5 @@ def _of_width(width: float, sheet_width: float | None) -> Iterator[Notice]:
             "data sheet's apertures",
             "correct aperture_mm or f_number, or take the white image with the aperture of the measurements",
             width,
-            f"{min(sheet_width, 1.0):.3g} within a factor of {WIDTH_TOLERANCE:g}",
+            f"{written(min(sheet_width, 1.0))} within a factor of {WIDTH_TOLERANCE:g}",
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum, auto
 from itertools import pairwise
 from pathlib import Path
@@ -15,10 +15,12 @@ from lfpiv_cli.files.hdf5 import replace_provenance
 from lfpiv_cli.files.images import count_pages, times_of
 from lfpiv_cli.files.inputs import split_part
 from lfpiv_cli.files.places import ensure_apart, folded
-from lfpiv_cli.files.provenance import bear_alike, ensure_even, without_warnings
+from lfpiv_cli.files.provenance import bear_alike, differences, ensure_even, without_warnings
 from lfpiv_cli.files.whole import read_whole
 
 VTKHDF_SUFFIX = ".vtkhdf"
+# So many things that have changed are named, and all others counted.
+MOST_DIFFERENCES = 4
 
 
 @dataclass(frozen=True)
@@ -228,12 +230,24 @@ def _is_kept(target: Target, overwrite: bool, resume: bool, dry: bool) -> bool:
             _record_anew(target)
         return True
     if found in (State.BEARS_ALIKE, State.OTHER) and not overwrite:
-        raise OutputExistsError(
-            f"{target.path}: exists and was made from other inputs or settings; --overwrite makes it anew"
-        )
+        raise OutputExistsError(_made_otherwise(target, found))
     for path in target.paths:
         ensure_writable(path, overwrite or resume)
     return False
+
+
+def _made_otherwise(target: Target, found: State) -> str:
+    """Return the sentence on a target that is there, and bears alike or is another: what has changed since then."""
+    made = target.record
+    path = next(
+        path for path in target.paths if path.exists() and state_of(replace(target, path=path, beside=())) is found
+    )
+    told = differences(read_whole(path) or {}, made)
+    if len(told) > MOST_DIFFERENCES:
+        told[MOST_DIFFERENCES:] = [f"{len(told) - MOST_DIFFERENCES} more"]
+    changed = f" ({'; '.join(told)})" if told else ""
+    what = "keeps it, as it depends on none of that" if found is State.BEARS_ALIKE else "makes it anew"
+    return f"{path}: exists and was made from other inputs or settings{changed}; --overwrite {what}"
 
 
 def state_or_none(target: Target) -> State | None:

@@ -17,6 +17,7 @@ from lfpiv_cli.files.checks_scene import scene_faults
 from lfpiv_cli.files.sections import MainLens, Sections
 from lfpiv_cli.files.sections_simulated import SimulationSection
 from lfpiv_cli.files.yaml_nodes import KeyPath
+from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Window, equivalent_object_distance, fluid_path_to_focus
 from lfpiv_cli.reference import FOCAL_POINT
@@ -71,7 +72,10 @@ def _beyond_numbers(value: Any, path: KeyPath) -> Found:
         for place, item in enumerate(value):
             yield from _beyond_numbers(item, (*path, place))
     elif isinstance(value, float) and value and not SMALLEST_NUMBER <= abs(value) <= LARGEST_NUMBER:
-        yield path, f"is {value:g}, expected a size of {SMALLEST_NUMBER:g} to {LARGEST_NUMBER:g}"
+        yield (
+            path,
+            f"is {written(value, 6)}, expected a size of {written(SMALLEST_NUMBER)} to {written(LARGEST_NUMBER)}",
+        )
 
 
 def _disagree(first: float, second: float) -> bool:
@@ -133,7 +137,7 @@ def _sensor(sections: Sections) -> Found:
     if not FEWEST_PIXELS_A_LENS <= pitch_px <= MOST_PIXELS_A_LENS:
         yield (
             ("camera", "sensor", "pixel_um"),
-            f"is {sensor.pixel_um:g}: lens images would be {pitch_px:.4g} px apart (pitch_mm is {pitch_mm:g}), "
+            f"is {sensor.pixel_um:g}: lens images would be {written(pitch_px, 4)} px apart (pitch_mm is {pitch_mm:g}), "
             f"expected {FEWEST_PIXELS_A_LENS:g} to {MOST_PIXELS_A_LENS:g}: pixels in um, the pitch in mm",
         )
 
@@ -153,14 +157,14 @@ def lens_image_faults(camera: Camera) -> Found:
     if not 1.0 / MOST_FOCAL_LENGTHS <= ratio <= MOST_FOCAL_LENGTHS:
         yield (
             ("sensor", "microlens_distance_mm"),
-            f"is {camera.microlens_distance_mm:g}, {ratio:.4g} times the microlenses' focal length of "
+            f"is {camera.microlens_distance_mm:g}, {written(ratio, 4)} times the microlenses' focal length of "
             f"{camera.microlens_focal_length_mm:g}, expected {1.0 / MOST_FOCAL_LENGTHS:g} to {MOST_FOCAL_LENGTHS:g}",
         )
     if camera.lens_image_width > MOST_PITCHES:
         yield (
             ("main_lens",),
-            f"is open {camera.aperture_mm:g} mm wide: lens images would be {camera.lens_image_width:.4g} of their "
-            f"pitch wide, expected at most {MOST_PITCHES:g}, and best 1",
+            f"is open {camera.aperture_mm:g} mm wide: lens images would be {written(camera.lens_image_width, 4)} of "
+            f"their pitch wide, expected at most {MOST_PITCHES:g}, and best 1",
         )
 
 
@@ -288,5 +292,6 @@ def _object_space(sections: Sections) -> Found:
         if path + nearest < 0.0:
             yield (
                 ("window", "distance_mm"),
-                f"puts the window's far face at z = {-path:.4g} mm, inside the volume that begins at {nearest:.4g}",
+                f"puts the window's far face at z = {written(-path, 4)} mm, inside the volume that begins at "
+                f"{written(nearest, 4)}",
             )

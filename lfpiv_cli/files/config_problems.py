@@ -10,6 +10,7 @@ from pydantic_core import ErrorDetails
 
 from lfpiv_cli.files.sections import Sections
 from lfpiv_cli.files.yaml_nodes import Document, KeyPath, Problem, key_name
+from lfpiv_cli.notice import written
 
 # More than this many errors at once are one mistake repeated.
 MOST_PROBLEMS = 20
@@ -75,7 +76,7 @@ def problem_of(document: Document, details: ErrorDetails) -> Problem:
         text = f"is '{context['tag']}', expected one of {context['expected_tags']}"
     elif kind in COMPARISONS:
         limit, words = COMPARISONS[kind]
-        text = f"is {_shown(value)}, expected {words} {context[limit]:g}"
+        text = f"is {_shown(value)}, expected {words} {written(context[limit], 6)}"
     else:
         text = f"is {_shown(value)}, expected {KINDS.get(kind, details['msg'])}"
     return Problem(*place, key_name(path), text)

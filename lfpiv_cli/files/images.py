@@ -21,6 +21,7 @@ from lfpiv_cli.files.inputs import ensure_regular_file, split_page, split_part
 from lfpiv_cli.files.recordings import tiff
 from lfpiv_cli.files.recordings.formats import files_beside, open_recording
 from lfpiv_cli.files.recordings.recording import Image, Recording, Shape
+from lfpiv_cli.notice import written
 
 # Files whose headers are kept, so that a recording of thousands of frames is not looked through again for each. A batch
 # reads one recording after the other, beside a white and a dark image; long ones have some megabytes of places.
@@ -114,7 +115,9 @@ def read_reference(path: Path, shape: Shape | None = None) -> Image:
     image = read_image(path, shape)
     bad = int(np.count_nonzero(~(np.abs(image) <= MOST_COUNTS)))
     if bad:
-        raise InputError(f"{path}: {bad} of its {image.size} pixels are not counts, numbers below {MOST_COUNTS:g}")
+        raise InputError(
+            f"{path}: {bad} of its {image.size} pixels are not counts, numbers below {written(MOST_COUNTS)}"
+        )
     return image
 
 

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.files.atomic import write_atomically
 from lfpiv_cli.files.inputs import ensure_regular_file, reason
+from lfpiv_cli.notice import written
 
 MM_PER_M = 1000.0
 
@@ -80,7 +81,8 @@ def read_particles(path: Path) -> Particles:
             raise InputError(f"{path}: {name} {array.shape} for {len(position)} particles, expected {expected}")
     if not all((np.abs(values) < LARGEST_VALUE).all() for values in (position, velocity, *told.values())):
         raise InputError(
-            f"{path}: a position, velocity, brightness or diameter is not a finite number below {LARGEST_VALUE:g}"
+            f"{path}: a position, velocity, brightness or diameter is not a finite number below "
+            f"{written(LARGEST_VALUE)}"
         )
     return Particles(position, velocity / MM_PER_M, told["brightness"], *(told.get(name) for name in OPTIONAL[1:]))
 

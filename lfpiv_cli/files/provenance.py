@@ -28,6 +28,8 @@ from lfpiv_cli.files.inputs import ensure_regular_file, opened, reading_from, sp
 from lfpiv_cli.files.recordings.formats import files_beside
 from lfpiv_cli.notice import Notice
 
+# What has changed is not written out where it takes more characters.
+LONGEST_CHANGE = 150
 # Files whose hash is remembered: those that a batch has in common are few.
 FILES_REMEMBERED = 64
 # The libraries that the figures pass through.
@@ -54,7 +56,7 @@ OF_FRAMES = (
 
 @dataclass(frozen=True)
 class Gone:
-    """An input that is no longer there: its SHA-256 and the record that it carried."""
+    """An input that is no longer there, or will carry another record: its SHA-256 and that record."""
 
     sha256: str
     record: Mapping[str, Any]
@@ -75,7 +77,7 @@ def record(
     config : the resolved config, as plain data, or None where there is none
     inputs : the files that the result is made from, by their role
     taken_s : when images among these were taken, in s from a moment of their file's own, where it tells
-    gone : of these, those that are no longer there
+    gone : of these, those that are no longer there, or will carry another record
 
     Returns
     -------
@@ -261,6 +263,30 @@ def _bearing(made: Mapping[str, Any], earlier: Mapping[str, Any]) -> dict[str, A
     config = {name: value for name, value in (made["config"] or {}).items() if name not in unread}
     same = {name: made[name] for name in ("program", "version", "libraries", "command")}
     return same | {"config": config, "inputs": inputs}
+
+
+def differences(carried: Mapping[str, Any], made: Mapping[str, Any]) -> list[str]:
+    """Return in words what has changed since a result was made, by the record that it carries and that it would get."""
+    before, now = _facts(carried), _facts(made)
+    changed = [name for name in dict.fromkeys([*now, *before]) if before.get(name) != now.get(name)]
+    told = [_change(name, before.get(name), now.get(name)) for name in changed]
+    configs = [made.get("inputs", {}).get("config") for made in (carried, made)]
+    return told or (["the config is another file, which says the same"] if configs[0] != configs[1] else [])
+
+
+def _facts(made: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what of a record can change, by its name: keys of the config, inputs, the command and all versions."""
+    inputs = _bearing(made, made["made_from"])["inputs"] if "made_from" in made else {}
+    versions = {"lfpiv": made.get("version"), **made.get("libraries", {})}
+    return {**_values(made.get("config") or {}), **inputs, "the command": made.get("command"), **versions}
+
+
+def _change(name: str, before: Any, now: Any) -> str:
+    """Return in words that something has changed; of an input, which is no plain value, no more than that."""
+    if isinstance(before, dict) or isinstance(now, dict):
+        return f"{name} is another file"
+    words = f"{name} was {before}, is {now}".replace("None", "not given")
+    return words if len(words) <= LONGEST_CHANGE else f"{name} has changed"
 
 
 def ensure_agreement(records: Sequence[Mapping[str, Any]], names: Sequence[str], keys: Sequence[str]) -> None:

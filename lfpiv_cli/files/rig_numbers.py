@@ -15,7 +15,9 @@ import numpy as np
 
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files.bench import LATERAL_VOXELS_PER_MICROLENS, UM_TO_MM
+from lfpiv_cli.files.sections import CorrelationSection
 from lfpiv_cli.names import KnownCamera
+from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media, Window, channel_window
 from lfpiv_cli.optics.microlenses import Lattice
@@ -25,6 +27,7 @@ from lfpiv_cli.validation.planning import (
     depth_of_field_mm,
     half_view_mm,
     matched_f_number,
+    proposed_window_mm,
     time_step_s,
     tracers_in,
 )
@@ -36,9 +39,6 @@ Sides = tuple[float, float, float]
 DEPTHS_IN_VOLUME, SHARE_OF_DISTANCE = 10.0, 0.2
 # Of the full field of view a volume takes so much, and a board.
 SHARE_OF_VIEW, BOARD_SHARE = 0.98, 0.8
-# Interrogation windows of the paper's channel, in microlenses and depths of one lens: at the best seeding some twenty
-# tracers.
-WINDOW_LENSES, WINDOW_DEPTHS = 16.0, 1.5
 # Dots three microlenses wide and five times that apart are found and placed best; five by four of them are enough. A
 # small sensor needs smaller ones, nearer to each other, as the sample's.
 DOT_LENSES, DOTS_APART, FEWEST_DOTS, MOST_DOTS = 3.0, 5.0, 4, 7
@@ -121,7 +121,8 @@ def proposed_size_mm(numbers: RigNumbers) -> Sides:
     if half.min() <= 0.0:
         raise ConfigError(
             f"the sensor ({numbers.columns} x {numbers.rows} pixels of {numbers.pixel_um:g} um) sees no point of a "
-            f"volume {depth:.3g} mm deep with all of its light; check pixels, pitch, f-numbers and the channel's width"
+            f"volume {written(depth)} mm deep with all of its light; check pixels, pitch, f-numbers and the channel's "
+            "width"
         )
     width, height = (_rounded_down(2.0 * SHARE_OF_VIEW * side) for side in half)
     return width, height, depth if numbers.channel_mm else _rounded(depth)
@@ -135,7 +136,8 @@ def tree_of(numbers: RigNumbers) -> dict[str, Any]:
         raise ValueError("the numbers are not complete")
     camera, media = known.camera(), known.media()
     scale = camera.scale(media)
-    window = [_rounded(WINDOW_LENSES * scale.lens_mm)] * 2 + [_rounded(WINDOW_DEPTHS * scale.depth_mm)]
+    overlap = CorrelationSection().overlap
+    window = [float(side) for side in proposed_window_mm(camera, media, size, overlap)]
     tree: dict[str, Any] = {
         "camera": {
             "main_lens": {

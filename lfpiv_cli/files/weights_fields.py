@@ -20,6 +20,7 @@ from lfpiv_cli.files.inputs import physical_memory
 from lfpiv_cli.files.section_types import MOST_PIXELS_PER_SIDE, MOST_VOXELS_PER_SIDE
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import ColumnAxis, Facing, Layout, names_in
+from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace, Face
 from lfpiv_cli.optics.media import Media, Window
@@ -200,7 +201,7 @@ def _number(name: str, value: Any) -> float:
 
 def _positive(name: str, value: Any) -> float:
     if not _number(name, value) >= SMALLEST_NUMBER:
-        raise ValueError(f"{name} is {value!r}, expected {SMALLEST_NUMBER:g} or more")
+        raise ValueError(f"{name} is {value!r}, expected {written(SMALLEST_NUMBER)} or more")
     return float(value)
 
 

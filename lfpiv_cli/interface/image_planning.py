@@ -28,6 +28,7 @@ from lfpiv_cli.files.config import Config
 from lfpiv_cli.interface.calibration import NO_BOARD, calibration_notices, calibration_of, photographs
 from lfpiv_cli.interface.planning import Bench, Line, Verdict, error_verdict, graded, seeding_line, worst
 from lfpiv_cli.interface.verdicts import word_of
+from lfpiv_cli.notice import written
 from lfpiv_cli.particles.counting import Seeded, tracers_in_image
 from lfpiv_cli.particles.noise import read_noise
 from lfpiv_cli.particles.view import raw_view
@@ -92,7 +93,7 @@ def lattice_of(settings: Config, pictures: Pictures) -> tuple[Calibration | None
     told = [each for each in calibration_notices(settings, photographed, found) if each not in (NO_BOARD,)]
     told = [each for each in told if each.code != "f-numbers"]
     share = float(np.nanmax(pictures.white)) / full_scale(pictures.white, settings)
-    reason = f"{found.fit.lenses} lens images {float(found.fit.lattice_px.pitch.mean()):.4g} px apart"
+    reason = f"{found.fit.lenses} lens images {written(float(found.fit.lattice_px.pitch.mean()), 4)} px apart"
     verdict: Verdict = "good"
     if share > BRIGHTEST_WHITE:
         verdict, reason = "look", f"{reason}; it reaches {share:.0%} of full scale, two thirds are good"
@@ -199,7 +200,8 @@ def _exposure(bench: Bench, seen: Seen) -> Line:
 def _light(_bench: Bench, seen: Seen) -> Line:
     signal = _signal(seen)
     reason = (
-        f"{seen.name}: bright pixels stand {signal:.0f} times the noise of {seen.noise:.2g} counts above the background"
+        f"{seen.name}: bright pixels stand {signal:.0f} times the noise of {written(seen.noise, 2)} counts above the "
+        "background"
     )
     verdict = graded(signal, GOOD_SIGNAL, LEAST_SIGNAL)
     return Line("light", verdict, reason + {"look": ": more light", "no": ": no tracers are seen"}.get(verdict, ""))
@@ -233,12 +235,14 @@ def _lens_images(_bench: Bench, seen: Seen) -> Line:
 def _background(_bench: Bench, seen: Seen) -> Line:
     """Say whether it is dark between the lens images, and tracers are on the lens images."""
     if seen.lens_images is None:
-        reason = f"{seen.name}: {seen.level:.3g} counts, with noise of {seen.noise:.2g}; --white tells more"
+        reason = (
+            f"{seen.name}: {written(seen.level)} counts, with noise of {written(seen.noise, 2)}; --white tells more"
+        )
         return Line("background", "unknown", reason)
     notices = level_notices(seen.lens_images, seen.less_dark, seen.name)
     if notices:
         return Line("background", "look", f"{seen.name}: {notices[0].text}; {notices[0].remedy}")
-    return Line("background", "good", f"{seen.name}: {seen.level:.2g} counts beside the dark image")
+    return Line("background", "good", f"{seen.name}: {written(seen.level, 2)} counts beside the dark image")
 
 
 def _beyond(bench: Bench, seen: Seen) -> Line:
@@ -274,8 +278,8 @@ def _precision(bench: Bench, seen: Seen, tracer_light: float) -> Line:
         return Line(about, "unknown", f"{seen.name}: no tracer could be told from others")
     errors = _errors(bench, seen, tracer_light)
     reason = (
-        f"{seen.name}: a tracer alone of {tracer_light:.2g} counts, as here, is placed to {1e3 * errors[0]:.2g} um "
-        f"across and {1e3 * errors[2]:.2g} um in depth at best"
+        f"{seen.name}: a tracer alone of {written(tracer_light, 2)} counts, as here, is placed to "
+        f"{written(1e3 * errors[0], 2)} um across and {written(1e3 * errors[2], 2)} um in depth at best"
     )
     return Line(about, error_verdict(bench, errors[2]), reason)
 

@@ -27,7 +27,7 @@ from lfpiv_cli.interface.reconstruction import (
     given_picture,
     picture_for,
 )
-from lfpiv_cli.notice import Notice
+from lfpiv_cli.notice import Notice, written
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.particles.counting import tracers_per_lens as counted
@@ -227,16 +227,16 @@ def size_notices(settings: Config, size: TracerSize) -> list[Notice]:
             return []
         text = (
             "too few tracers stand alone for the images to show their size; "
-            f"{size.diameter_mm:.3g} mm is taken, half a microlens in the scene"
+            f"{written(size.diameter_mm)} mm is taken, half a microlens in the scene"
         )
         return [Notice("particle-diameter-unknown", key, text, "give it", None, "tracers that stand alone")]
     if given is not None and abs(given - size.measured_mm) > CONTRADICTING_SIGMAS * size.sigma_mm:
-        text = f"{given:g} mm, but by the images it is {size.measured_mm:.3g} ± {size.sigma_mm:.2g} mm"
+        text = f"{given:g} mm, but by the images it is {written(size.measured_mm)} ± {written(size.sigma_mm, 2)} mm"
         remedy = "leave it out, and it is taken from the images; or check calibration and focus"
-        return [Notice("particle-diameter", key, text, remedy, given, f"{size.measured_mm:.3g} mm")]
-    if given is None and not size.resolved:
-        text = f"tracers are smaller than the images show: at most {size.at_most_mm:.2g} mm"
-        return [Notice("particle-diameter-limit", key, text, "give it, if it is known", size.at_most_mm, None)]
+        return [Notice("particle-diameter", key, text, remedy, given, f"{written(size.measured_mm)} mm")]
+    if given is None and not size.resolved and (at_most_mm := size.at_most_mm) is not None:
+        text = f"tracers are smaller than the images show: at most {written(at_most_mm, 2)} mm"
+        return [Notice("particle-diameter-limit", key, text, "give it, if it is known", at_most_mm, None)]
     return []
 
 
@@ -352,13 +352,15 @@ def light_notices(points: Points, name: str) -> list[Notice]:
     found = measured["particles_per_lens"]
     crowd = max(found, measured.get("tracers_per_lens", 0.0))
     if crowd > LARGEST_CROWD:
-        counted = f", {found:.3g} found of {crowd:.3g} by how unevenly they light them" if crowd > found else ""
+        counted = (
+            f", {written(found)} found of {written(crowd)} by how unevenly they light them" if crowd > found else ""
+        )
         notices.append(
             Notice(
                 "particles-crowded",
                 name,
-                f"{crowd:.3g} particles for each microlens{counted}, at most {LARGEST_CROWD:g}: beyond, neighbours are "
-                "taken for one another, and standard errors do not know of it",
+                f"{written(crowd)} particles for each microlens{counted}, at most {LARGEST_CROWD:g}: beyond, "
+                "neighbours are taken for one another, and standard errors do not know of it",
                 "fewer tracers, or volumes and their correlation; --background, where other light is in the image",
                 crowd,
                 f"at most {LARGEST_CROWD:g}",

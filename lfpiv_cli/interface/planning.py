@@ -23,6 +23,7 @@ from lfpiv_cli.interface.verdicts import WORDS, Word
 from lfpiv_cli.interface.weights import ray_source
 from lfpiv_cli.interface.weights_checks import check_rig, rig_notices
 from lfpiv_cli.interface.weights_cost import cost_notices, cost_of, particles_core_s
+from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.reference import Reference
@@ -47,8 +48,8 @@ GOOD_PIXELS, LEAST_PIXELS = 8.0, 5.0
 GOOD_ERROR, LARGEST_ERROR = 0.05, 0.25
 # Voxels in microlenses and in depths of one lens: particles lock to wider ones.
 GOOD_VOXEL, LARGEST_VOXEL = 0.55, 1.05
-# Vectors along each axis, and tracers in a window.
-FEWEST_VECTORS, FEWEST_TRACERS = 3, 5.0
+# Sides of windows that differ by less are alike: they are written with few digits.
+WINDOWS_ALIKE = 0.02
 # Of the coarse window's side: up to the one displacements are measured well, beyond the other hardly at all.
 GOOD_SHARE_OF_WINDOW, LARGEST_SHARE_OF_WINDOW = 0.25, 0.5
 DEPTHS = 21
@@ -171,7 +172,7 @@ def rig_lines(bench: Bench) -> list[Line]:
         _precision,
         _seeding,
         _voxels,
-        _windows,
+        windows_line,
         _time_step,
         _cost,
     )
@@ -243,10 +244,10 @@ def _field_of_view(bench: Bench) -> Line:
     share = planning.share_in_view(bench.camera, bench.media, bench.bounds_mm)
     width, height = 2.0 * planning.half_view_mm(bench.camera, bench.media, [0.0])[0]
     ends = planning.half_view_mm(bench.camera, bench.media, bench.bounds_mm[2]).min(axis=0)
-    reason = f"{width:.3g} x {height:.3g} mm at the focal plane; {share:.0%} of the volume is in full view"
+    reason = f"{written(width)} x {written(height)} mm at the focal plane; {share:.0%} of the volume is in full view"
     verdict = graded(share, GOOD_VIEW, LEAST_VIEW)
     if verdict != "good":
-        reason += f", {2.0 * ends[0]:.3g} x {2.0 * ends[1]:.3g} mm would be at all of its depths"
+        reason += f", {written(2.0 * ends[0])} x {written(2.0 * ends[1])} mm would be at all of its depths"
     return Line("field of view", verdict, reason)
 
 
@@ -254,14 +255,17 @@ def _depth_of_field(bench: Bench) -> Line:
     reach = planning.depth_of_field_mm(bench.camera, bench.media)
     (low, high), inside = bench.bounds_mm[2], np.clip(bench.bounds_mm[2], -reach, reach)
     share = float(inside[1] - inside[0]) / float(high - low)
-    reason = f"points can be refocused within {reach:.3g} mm of the focal plane; the volume is {low:.3g} to {high:.3g}"
-    return Line("depth of field", graded(share, GOOD_DEPTH, LEAST_DEPTH), reason + " mm from it")
+    reason = (
+        f"points can be refocused within {written(reach)} mm of the focal plane; the volume is {written(low)} to "
+        f"{written(high)} mm from it"
+    )
+    return Line("depth of field", graded(share, GOOD_DEPTH, LEAST_DEPTH), reason)
 
 
 def _f_numbers(bench: Bench) -> Line:
     width = bench.camera.lens_image_width
     main = bench.camera.image_distance_mm / bench.camera.aperture_mm
-    reason = f"f/{main:.3g} towards the array and f/{main * width:.3g} of the microlenses: lens images "
+    reason = f"f/{written(main)} towards the array and f/{written(main * width)} of the microlenses: lens images "
     if width > LARGE_F_RATIO:
         reason += f"overlap, {width:.2f} of their pitch wide; stop the main lens down"
     elif width < 1.0 / LARGE_F_RATIO:
@@ -273,7 +277,7 @@ def _f_numbers(bench: Bench) -> Line:
 
 def _lens_images(bench: Bench) -> Line:
     pixels = planning.pixels_per_lens(bench.camera)
-    reason = f"{pixels:.3g} pixels across, as many views tell depths apart; {GOOD_PIXELS:g} or more are good"
+    reason = f"{written(pixels)} pixels across, as many views tell depths apart; {GOOD_PIXELS:g} or more are good"
     return Line("lens images", graded(pixels, GOOD_PIXELS, LEAST_PIXELS), reason)
 
 
@@ -302,8 +306,8 @@ def _precision(bench: Bench) -> Line:
     lateral, depth = float(np.median(errors[:, :2])), float(np.median(errors[:, 2]))
     usable = float(np.mean(errors[:, 2] <= LARGEST_ERROR * bench.scale.depth_mm))
     reason = (
-        f"a tracer alone of {bench.tracer().light_counts:.3g} counts is placed to {1e3 * lateral:.2g} um across and "
-        f"{1e3 * depth:.2g} um in depth; depths are told in {usable:.0%} of the volume"
+        f"a tracer alone of {written(bench.tracer().light_counts)} counts is placed to {written(1e3 * lateral, 2)} um "
+        f"across and {written(1e3 * depth, 2)} um in depth; depths are told in {usable:.0%} of the volume"
     )
     return Line("precision", error_verdict(bench, depth), reason)
 
@@ -321,9 +325,9 @@ def seeding_line(bench: Bench, per_lens: float, what: str) -> Line:
     """Return the verdict on tracers for each microlens, `what` says whose they are."""
     best = planning.tracers_in(bench.camera, planning.BEST_PER_LENS, bench.sides_mm)
     reason = (
-        f"{per_lens:.2g} tracers per microlens are {what}; {planning.BEST_PER_LENS:g} are best, {best:.0f} in the "
-        f"volume, {best / float(np.prod(bench.sides_mm)):.2g} per mm3, "
-        f"{planning.BEST_PER_LENS / bench.camera.micro_image_lattice_px().cell_area:.2g} per pixel"
+        f"{written(per_lens, 2)} tracers per microlens are {what}; {planning.BEST_PER_LENS:g} are best, {best:.0f} in "
+        f"the volume, {written(best / float(np.prod(bench.sides_mm)), 2)} per mm3, "
+        f"{written(planning.BEST_PER_LENS / bench.camera.micro_image_lattice_px().cell_area, 2)} per pixel"
     )
     if per_lens < planning.SPARSE_PER_LENS:
         return Line("seeding", "look", reason + ": few vectors")
@@ -341,8 +345,8 @@ def _voxels(bench: Bench) -> Line:
     shape, voxel, scale = bench.grid.shape_xyz, bench.grid.spacing_mm, bench.scale
     share = max(max(voxel[:2]) / scale.lens_mm, voxel[2] / scale.depth_mm)
     reason = (
-        f"{shape[0]} x {shape[1]} x {shape[2]} of {voxel[0]:.3g} x {voxel[1]:.3g} x {voxel[2]:.3g} mm; a microlens is "
-        f"{scale.lens_mm:.3g} mm wide and {scale.depth_mm:.3g} mm deep"
+        f"{shape[0]} x {shape[1]} x {shape[2]} of {written(voxel[0])} x {written(voxel[1])} x {written(voxel[2])} mm; "
+        f"a microlens is {written(scale.lens_mm)} mm wide and {written(scale.depth_mm)} mm deep"
     )
     verdict = graded(share, GOOD_VOXEL, LARGEST_VOXEL)
     if verdict != "good":
@@ -350,18 +354,39 @@ def _voxels(bench: Bench) -> Line:
     return Line("voxels", verdict, reason)
 
 
-def _windows(bench: Bench) -> Line:
+def windows_line(bench: Bench) -> Line:
+    """Return whether windows give a field that is worth looking at, or which would."""
     final, vectors = bench.window_layout.size, bench.window_layout.count
     density = planning.tracers_in(bench.camera, planning.BEST_PER_LENS, bench.sides_mm) / float(np.prod(bench.sides_mm))
     tracers = density * float(np.prod(np.multiply(final, bench.grid.spacing_mm)))
     reason = (
         f"{final[0]} x {final[1]} x {final[2]} voxels give {vectors[0]} x {vectors[1]} x {vectors[2]} vectors, with "
-        f"{tracers:.2g} tracers each at the best seeding"
+        f"{written(tracers, 2)} tracers each at the best seeding"
     )
     if any(size > voxels for size, voxels in zip(final, bench.grid.shape_xyz, strict=True)):
-        return Line("windows", "no", reason + ": they do not fit into the volume")
-    few = min(vectors) < FEWEST_VECTORS or tracers < FEWEST_TRACERS
-    return Line("windows", "look" if few else "good", reason + (": set correlation.window_mm" if few else ""))
+        return Line("windows", "no", f"{reason}: they do not fit into the volume; {_better_windows(bench)}")
+    few = min(vectors) < planning.WORTH_VECTORS
+    if not few and tracers >= planning.FEWEST_TRACERS:
+        return Line("windows", "good", reason)
+    return Line("windows", "look", f"{reason}: {_better_windows(bench)}")
+
+
+def _better_windows(bench: Bench) -> str:
+    """Return in words which windows suit volume and tracers, and why even they give few vectors if they do."""
+    chosen, sides = bench.settings.correlation, bench.sides_mm
+    window = planning.proposed_window_mm(bench.camera, bench.media, sides, chosen.overlap)
+    vectors = planning.vectors_along(sides, window, chosen.overlap)
+    told = []
+    if chosen.window_mm is None or not np.allclose(chosen.window_mm, window, rtol=WINDOWS_ALIKE):
+        instead = " in place of correlation.windows" if chosen.windows is not None else ""
+        told.append(f"set correlation.window_mm: {window.tolist()}{instead}, for {' x '.join(map(str, vectors))}")
+    few = [axis for axis, count in zip("xyz", vectors, strict=True) if count < planning.WORTH_VECTORS]
+    if few:
+        limit = f"smaller windows hold fewer than {planning.FEWEST_TRACERS:g}"
+        if few == ["z"] and window[2] <= bench.scale.depth_mm:
+            limit = f"they are about {written(bench.scale.depth_mm)} mm long in a volume"
+        told.append(f"tracers allow fewer than {planning.WORTH_VECTORS} along {', '.join(few)}: {limit}")
+    return "; ".join(told)
 
 
 def _best_time_s(bench: Bench) -> float | None:
@@ -374,14 +399,15 @@ def _time_step(bench: Bench) -> Line:
     about, given, best = "time step", bench.settings.correlation.dt_s, _best_time_s(bench)
     if bench.velocity_m_s is None or best is None:
         return Line(about, "unknown", "no flow is configured; --velocity-m-s tells what to expect")
-    advice = f"{best:.2g} s let {bench.velocity_m_s:.3g} m/s cross {planning.BEST_STEP:g} voxels"
+    advice = f"{written(best, 2)} s let {written(bench.velocity_m_s)} m/s cross {planning.BEST_STEP:g} voxels"
     if given is None:
         return Line(about, "unknown", f"{advice}; correlation.dt_s is not set")
     voxel = min(bench.grid.spacing_mm[:2])
     crossed = bench.velocity_m_s * MM_PER_M * given / voxel
     coarse = min(bench.settings.windows_voxel(bench.grid.spacing_mm)[0][:2])
     reason = (
-        f"{given:.3g} s cross {crossed:.2g} voxels, {planning.SMALLEST_STEP:g} to {planning.LARGEST_STEP:g} are good"
+        f"{written(given)} s cross {written(crossed, 2)} voxels, {planning.SMALLEST_STEP:g} to "
+        f"{planning.LARGEST_STEP:g} are good"
     )
     if planning.SMALLEST_STEP <= crossed <= planning.LARGEST_STEP:
         return Line(about, "good", reason)
@@ -414,8 +440,9 @@ def _cost(bench: Bench) -> Line:
     best = planning.tracers_in(bench.camera, planning.BEST_PER_LENS, bench.sides_mm)
     files = PIXEL_BYTES * bench.camera.columns * bench.camera.rows + VOXEL_BYTES * int(np.prod(bench.grid.shape_xyz))
     reason = (
-        f"weights {cost.weights_core_s:.2g} s of a core, each image {cost.image_core_s:.2g} s by volumes, "
-        f"{particles_core_s(best):.2g} s by particles at the best seeding; "
-        f"{max(cost.weights_bytes, cost.image_bytes) / 1e9:.2g} GB of memory, {files / 1e6:.2g} MB of disk an image"
+        f"weights {written(cost.weights_core_s, 2)} s of a core, each image {written(cost.image_core_s, 2)} s by "
+        f"volumes, {written(particles_core_s(best), 2)} s by particles at the best seeding; "
+        f"{written(max(cost.weights_bytes, cost.image_bytes) / 1e9, 2)} GB of memory, {written(files / 1e6, 2)} MB of "
+        "disk an image"
     )
     return Line("work", "look" if cost_notices(cost) else "good", reason)

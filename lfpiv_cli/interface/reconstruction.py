@@ -25,7 +25,7 @@ from lfpiv_cli.files.provenance import record
 from lfpiv_cli.files.vtkhdf import Volume
 from lfpiv_cli.files.weights_file import WeightsFile
 from lfpiv_cli.interface.notices import warn_of
-from lfpiv_cli.notice import Notice
+from lfpiv_cli.notice import Notice, written
 from lfpiv_cli.reconstruction.equations import Normalisers, Operator, normalisers
 from lfpiv_cli.reconstruction.images import Image, Mask, as_if_lit, defects, filled, light, saturated, touched
 from lfpiv_cli.reconstruction.solvers import Reconstruction
@@ -217,11 +217,11 @@ def frame_notices(bench: Bench, raw: Image, lit: Image, name: str) -> list[Notic
             Notice(
                 "frame-dark",
                 name,
-                f"its brightest pixel is {brightest:.3g} counts above the others, with a noise of {noise:.3g}: no more "
-                "than noise makes",
+                f"its brightest pixel is {written(brightest)} counts above the others, with a noise of "
+                f"{written(noise)}: no more than noise makes",
                 "check light, exposure and the order of the frames",
                 brightest,
-                f"above {NOISE_SIGMAS * noise:.3g}",
+                f"above {written(NOISE_SIGMAS * noise)}",
             )
         )
     return [*notices, *_light_notices(bench, seen, name)]

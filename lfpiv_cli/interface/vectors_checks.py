@@ -16,7 +16,7 @@ from lfpiv_cli.flow.correlation import CorrelationSettings
 from lfpiv_cli.flow.field import MASKED, REJECTED, VALID, VectorField
 from lfpiv_cli.flow.maps import margins, valid_shares
 from lfpiv_cli.flow.windows import WindowLayout
-from lfpiv_cli.notice import Notice
+from lfpiv_cli.notice import Notice, written
 from lfpiv_cli.robust import of_half_the_sum
 
 # Two vectors along an axis show no profile, and each is half about the volume's face.
@@ -132,8 +132,8 @@ def pair_notices(field: VectorField, quality: Quality, name: str) -> Iterator[No
         yield Notice(
             "volumes-unlike",
             name,
-            f"half of the vectors have an uncertainty above {largest:.2g} voxels sideways: the volumes have few "
-            "tracers in common",
+            f"half of the vectors have an uncertainty above {written(largest, 2)} voxels sideways: the volumes have "
+            "few tracers in common",
             "check that both images are of one pair, and the time between them; larger windows, more tracers",
             largest,
             f"at most {LARGEST_MEDIAN_SIGMA:g}",
@@ -151,7 +151,7 @@ def window_notices(volume: Volume, settings: CorrelationSettings, name: str) -> 
         yield Notice(
             "windows-too-large",
             WINDOWS,
-            f"the final windows are {size[fewest]} voxels ({length:.3g} mm) along {axis}, where the volume has "
+            f"the final windows are {size[fewest]} voxels ({written(length)} mm) along {axis}, where the volume has "
             f"{shape[fewest]}: vectors along that axis: {layout.count[fewest]}",
             f"windows as [x, y, z] with fewer voxels along {axis}, or window_mm",
             float(layout.count[fewest]),
@@ -162,8 +162,8 @@ def window_notices(volume: Volume, settings: CorrelationSettings, name: str) -> 
         yield Notice(
             "few-tracers",
             name,
-            f"half of the final windows hold {tracers:.2g} bright spots or fewer: below {FEWEST_TRACERS:g} vectors are "
-            "often false",
+            f"half of the final windows hold {written(tracers, 2)} bright spots or fewer: below {FEWEST_TRACERS:g} "
+            "vectors are often false",
             "larger correlation.windows, more tracers, or particle tracking (reconstruct --solver particles, track)",
             tracers,
             f"at least {FEWEST_TRACERS:g}",

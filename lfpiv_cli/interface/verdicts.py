@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from lfpiv_cli.calibration.light_checks import MOST_SATURATED
 from lfpiv_cli.flow.consistency import difference_over_stated, divergence_over_stated
 from lfpiv_cli.flow.field import MASKED, REJECTED, VectorField
+from lfpiv_cli.notice import written
 
 Word = Literal["good", "look", "no"]
 Part = Literal["calibration", "images", "vectors"]
@@ -159,8 +160,8 @@ def _components(
         Reason(
             "vectors",
             "look",
-            f"{name}: {component} is known to {sigma:.2g} mm, {sigma / usual_mm:.0%} of the usual displacement; "
-            "particles in place of volumes, or a longer time between the images, tell more",
+            f"{name}: {component} is known to {written(sigma, 2)} mm, {sigma / usual_mm:.0%} of the usual "
+            "displacement; particles in place of volumes, or a longer time between the images, tell more",
         )
         for component, sigma in zip("uvw", sigma_mm, strict=True)
         if sigma > LARGEST_SHARE * usual_mm > 0.0

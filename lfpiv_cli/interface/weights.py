@@ -20,7 +20,7 @@ from lfpiv_cli.grid import Grid
 from lfpiv_cli.interface.notices import SILENT, warn_of
 from lfpiv_cli.interface.weights_checks import check_rig, rig_notices
 from lfpiv_cli.interface.weights_cost import check_rays
-from lfpiv_cli.notice import Notice
+from lfpiv_cli.notice import Notice, written
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.object_space import ObjectSpace
@@ -37,7 +37,7 @@ from lfpiv_cli.weights.strips import StripOperator
 
 # Told where the voxels were left to the program, and where the axes do not separate.
 VOXELS_CHOSEN = (
-    "voxels of {:.3g} x {:.3g} x {:.3g} mm were chosen: a third of a microlens wide, because particles lock to "
+    "voxels of {} x {} x {} mm were chosen: a third of a microlens wide, because particles lock to "
     "wider ones and their motion in depth is lost, and six times as deep, as fine as the views tell depths apart"
 )
 ON_DEMAND = "array or rays do not separate into axes; columns are made on demand, for what is lit"
@@ -134,7 +134,7 @@ def weights_of(plan: Plan, provenance: dict[str, Any], console: Console) -> Weig
     """Return the weights of a plan."""
     settings, camera, grid, found = plan.settings, plan.camera, plan.grid, plan.found
     if settings.volume.size_mm is not None:
-        console.say(VOXELS_CHOSEN.format(*grid.spacing_mm))
+        console.say(VOXELS_CHOSEN.format(*map(written, grid.spacing_mm)))
     operator = make_operator(settings.weights, camera, plan.source, grid.padded(plan.padding), console)
     traced = isinstance(plan.source, ObjectSpace) and isinstance(operator, FactorisedOperator)
     bend = scene_distortion(camera, settings.media_model(), grid) if traced else None
@@ -227,11 +227,11 @@ def _reach_notices(settings: Config, found: Calibration | None, grid: Grid) -> l
                 Notice(
                     "beyond-boards",
                     "volume",
-                    f"reaches {beyond:.3g} mm beyond the dots along {'xyz'[axis]}, at most {most:.3g} mm without harm: "
-                    "the fitted rays are a guess there",
+                    f"reaches {written(beyond)} mm beyond the dots along {'xyz'[axis]}, at most {written(most)} mm "
+                    "without harm: the fitted rays are a guess there",
                     "a smaller volume, or boards that reach further",
                     float(beyond),
-                    f"at most {most:.3g} mm",
+                    f"at most {written(most)} mm",
                 )
             )
     return notices
@@ -285,7 +285,9 @@ def _view_notices(smallest: float, largest: float, grid: Grid) -> list[Notice]:
     """
     if largest < LEAST_SEEN:
         bounds = [grid.bounds_mm(axis) for axis in range(3)]
-        spans = ", ".join(f"{axis} {low:.4g} to {high:.4g}" for axis, (low, high) in zip("xyz", bounds, strict=True))
+        spans = ", ".join(
+            f"{axis} {written(low, 4)} to {written(high, 4)}" for axis, (low, high) in zip("xyz", bounds, strict=True)
+        )
         raise ConfigError(f"volume: none of it ({spans} mm) lies in the camera's view")
     if smallest >= LEAST_SEEN:
         return []

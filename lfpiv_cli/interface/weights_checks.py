@@ -12,7 +12,7 @@ from lfpiv_cli.calibration.sheet import check_f_numbers, check_pitch, f_number_n
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files.config import Config
 from lfpiv_cli.grid import Grid
-from lfpiv_cli.notice import Notice
+from lfpiv_cli.notice import Notice, written
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.media import Media
@@ -79,8 +79,8 @@ def _of_refraction(
     yield Notice(
         "paraxial-refraction",
         "weights.refraction",
-        f"is paraxial, and Snell's law moves light at the rim of the aperture by {least}{error_px:.2g} px on the "
-        f"array, at most {LARGEST_ERROR_PX:g} px without harm",
+        f"is paraxial, and Snell's law moves light at the rim of the aperture by {least}{written(error_px, 2)} px on "
+        f"the array, at most {LARGEST_ERROR_PX:g} px without harm",
         remedy,
         error_px,
         f"at most {LARGEST_ERROR_PX:g} px",
@@ -94,8 +94,8 @@ def _of_sines(camera: Camera, media: Media, depths: NDArray[np.float64]) -> Iter
     yield Notice(
         "paraxial-lens",
         "camera.main_lens.aperture_mm",
-        f"NA {_na(camera):.2f}: the rays of a thin lens are off by {error_px:.2g} px on the array at the volume's "
-        f"faces, at most {LARGEST_ERROR_PX:g} px without harm; depths will be wrong",
+        f"NA {_na(camera):.2f}: the rays of a thin lens are off by {written(error_px, 2)} px on the array at the "
+        f"volume's faces, at most {LARGEST_ERROR_PX:g} px without harm; depths will be wrong",
         "a smaller aperture or a thinner volume, or boards at several depths and weights.method: dlfc",
         error_px,
         f"at most {LARGEST_ERROR_PX:g} px",

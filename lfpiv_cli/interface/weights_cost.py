@@ -11,7 +11,7 @@ from lfpiv_cli.files.config import Config
 from lfpiv_cli.files.memory import ensure_disk, ensure_room
 from lfpiv_cli.files.weights_fields import BYTES_A_VOXEL
 from lfpiv_cli.grid import Grid
-from lfpiv_cli.notice import Notice
+from lfpiv_cli.notice import Notice, written
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.polynomial_rays import PolynomialRays
@@ -146,8 +146,8 @@ def columns_bytes(voxels: int) -> float:
 def on_demand_told(voxels: int) -> str:
     """Return what volumes will take whose columns are made on demand, in words."""
     return (
-        f"columns are made on demand: up to {voxels * COLUMN_S / 60.0:.2g} minutes of a core for each image, where all "
-        f"{voxels:.3g} voxels can be lit"
+        f"columns are made on demand: up to {written(voxels * COLUMN_S / 60.0, 2)} minutes of a core for each image, "
+        f"where all {written(voxels)} voxels can be lit"
     )
 
 
@@ -161,9 +161,9 @@ def check_rays(settings: Config, source: Source, grid: Grid) -> None:
     rays, voxels = _rays(settings, source, grid), math.prod(grid.shape_xyz)
     if rays > MOST_RAYS:
         raise ConfigError(
-            f"weights.sampling: counting {rays:.3g} rays for {voxels} voxels (padding included) would take about "
-            f"{rays / RAYS_PER_CORE_HOUR:.2g} core hours and {voxels * COLUMN_BYTES / 1e9:.2g} GB; at most "
-            f"{MOST_RAYS:.3g} are counted, use sampling: exact"
+            f"weights.sampling: counting {written(rays)} rays for {voxels} voxels (padding included) would take about "
+            f"{written(rays / RAYS_PER_CORE_HOUR, 2)} core hours and {written(voxels * COLUMN_BYTES / 1e9, 2)} GB; at "
+            f"most {written(MOST_RAYS)} are counted, use sampling: exact"
         )
 
 
@@ -184,8 +184,9 @@ def cost_notices(cost: Cost) -> list[Notice]:
         Notice(
             "heavy-work",
             "volume",
-            f"weights of {cost.voxels:.3g} voxels will take about {cost.weights_core_s / 60.0:.2g} minutes of a core, "
-            f"and a volume of one image up to {most / 1e9:.2g} GB and {cost.image_core_s / 60.0:.2g} minutes of a core",
+            f"weights of {written(cost.voxels)} voxels will take about {written(cost.weights_core_s / 60.0, 2)} "
+            f"minutes of a core, and a volume of one image up to {written(most / 1e9, 2)} GB and "
+            f"{written(cost.image_core_s / 60.0, 2)} minutes of a core",
             "a smaller volume or larger voxels; --dry-run tells what others will take",
             max(cost.weights_core_s / LONG_S, most / MUCH_BYTES),
             f"at most {LONG_S / 60.0:g} minutes for the weights and {MUCH_BYTES / 1e9:g} GB",

@@ -170,7 +170,7 @@ def _table(cases: Mapping[str, Case], found: Mapping[str, Mapping[str, Any]]) ->
     rows = tuple(
         (
             case.words,
-            f"{100.0 * found[name]['mean_error']:+.1f} ± {100.0 * found[name]['mean_sigma']:.1f}",
+            f"{100.0 * found[name]['mean_error']:+z.1f} ± {100.0 * found[name]['mean_sigma']:.1f}",
             f"{100.0 * found[name]['within_25']:.0f} ± {100.0 * found[name]['within_sigma']:.0f}",
             f"{found[name]['excluded_pixels']}",
         )

@@ -18,6 +18,7 @@ import numpy as np
 
 from lfpiv_cli.errors import LimitMissedError
 from lfpiv_cli.files.pages import Table
+from lfpiv_cli.notice import written
 from lfpiv_cli.paper.parts import Drawing, Findings, Row, Work
 from lfpiv_cli.paper.small_rig import (
     GATE_MM,
@@ -67,10 +68,9 @@ class Words:
     factor: float
     unit: str
 
-    def shown(self, value: float, signed: bool = True) -> str:
+    def shown(self, value: float) -> str:
         """Return a value with its unit."""
-        number = f"{self.factor * value:+.3g}" if signed and value < 0.0 else f"{self.factor * value:.3g}"
-        return f"{number} {self.unit}"
+        return f"{written(self.factor * value)} {self.unit}"
 
 
 WORDS = {
@@ -242,7 +242,7 @@ def allowed(name: str, limits: Mapping[str, Limit]) -> str:
     limit, words = limits[name], WORDS[name]
     if limit.only_above:
         return f"up to {words.shown(limit.centre + limit.half_width)}"
-    return f"\N{PLUS-MINUS SIGN}{words.shown(limit.half_width, signed=False)}"
+    return f"\N{PLUS-MINUS SIGN}{words.shown(limit.half_width)}"
 
 
 def said_to(figures: Figures, limits: Mapping[str, Limit]) -> str:

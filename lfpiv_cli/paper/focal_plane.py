@@ -120,7 +120,7 @@ def _table(
     return Table(
         "Mid plane from the focal plane (mm)",
         ("board behind the focal plane", "true", "measured", "stated standard error"),
-        tuple((f"{a:+.2f}", f"{b:+.3f}", f"{c:+.3f}", f"{d:.4f}") for a, b, c, d in rows),
+        tuple((f"{a:+z.2f}", f"{b:+z.3f}", f"{c:+z.3f}", f"{d:.4f}") for a, b, c, d in rows),
     )
 
 

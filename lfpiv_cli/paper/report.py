@@ -8,6 +8,7 @@ from typing import Any
 
 from lfpiv_cli.files.pages import Page, Picture, Section, Table
 from lfpiv_cli.names import PaperPart, Size
+from lfpiv_cli.notice import written
 from lfpiv_cli.paper.parts import Row, rows_of
 
 TITLE = "Equivalent ray tracing for light-field PIV: the paper's tables and figures, computed"
@@ -77,11 +78,11 @@ def _section(name: PaperPart, title: str, part: Mapping[str, Any], folder: Path,
 def _cells(row: Row) -> tuple[str, ...]:
     values = (row.paper_dlfc, row.paper_ert, row.dlfc, row.ert, row.best)
     sense = "≤" if row.sense == "at most" else "≥"
-    return (row.quantity, *map(_number, values), f"{sense} {row.limit:.4g}", row.verdict, row.source)
+    return (row.quantity, *map(_number, values), f"{sense} {written(row.limit, 4)}", row.verdict, row.source)
 
 
 def _number(value: float | None) -> str:
-    return "–" if value is None else f"{value:.3g}"
+    return "–" if value is None else written(value)
 
 
 def _duration(seconds: float) -> str:

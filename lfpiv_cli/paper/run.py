@@ -16,6 +16,7 @@ from lfpiv_cli.files.pages import ensure_pages, write_pages
 from lfpiv_cli.files.pictures import ensure_drawing, write_picture
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.names import PaperPart, Size
+from lfpiv_cli.notice import written
 from lfpiv_cli.paper.parts import Findings, Row, Work, kept, plain, read_json, rows_of
 from lfpiv_cli.paper.registry import PARTS
 from lfpiv_cli.paper.report import page_of
@@ -128,5 +129,5 @@ def _judged(report: Path, parts: Mapping[PaperPart, Mapping[str, Any]]) -> dict[
 def _short(row: Row) -> str:
     """Return in words what a row that is not met has."""
     value = getattr(row, row.judged)
-    told = "unknown" if value is None else f"{value:.3g}"
+    told = "unknown" if value is None else written(value)
     return f"{row.quantity} ({row.source}) is {told}, expected {row.sense} {row.limit:g}"

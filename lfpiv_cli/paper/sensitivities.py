@@ -10,6 +10,7 @@ from functools import partial
 import numpy as np
 
 from lfpiv_cli.files.pages import Table
+from lfpiv_cli.notice import written
 from lfpiv_cli.paper.influences import Influence, Sensitivity
 from lfpiv_cli.paper.parts import Drawing, Findings, Row, Work
 from lfpiv_cli.paper.scatter import (
@@ -70,7 +71,7 @@ class Measured:
     def told(self, of: Sensitivity) -> str:
         """Return a sensitivity with its unit."""
         place = f", {of.reach_text}" if of.at is not None and of.reach_text != "everywhere" else ""
-        return f"{of.text}{place}: {of.factor * self.value(of):.3g} {of.unit}"
+        return f"{of.text}{place}: {written(of.factor * self.value(of))} {of.unit}"
 
 
 def sensitivities(work: Work) -> Findings:
@@ -179,11 +180,11 @@ def table_of(found: Sequence[Measured]) -> Table:
             (
                 one.influence.name,
                 of.text,
-                f"{of.factor * one.value(of):.3g}",
-                "" if of.expected is None else f"{of.factor * of.expected:.3g}",
+                written(of.factor * one.value(of)),
+                "" if of.expected is None else written(of.factor * of.expected),
                 of.unit,
                 of.typical_text,
-                f"{one.error_mm(of):.2g}",
+                written(one.error_mm(of), 2),
                 of.reach_text,
             )
             for one, of in each
@@ -194,7 +195,7 @@ def table_of(found: Sequence[Measured]) -> Table:
 def care(found: Sequence[Measured]) -> tuple[str, ...]:
     """Return what to take care of: a sentence for each of the influences that harm most."""
     ordered = sorted(found, key=lambda each: -each.largest_error_mm())[:SENTENCES]
-    sentences = [each.influence.advice.format(error=f"{each.largest_error_mm():.2g} mm") for each in ordered]
+    sentences = [each.influence.advice.format(error=f"{written(each.largest_error_mm(), 2)} mm") for each in ordered]
     return ("What to take care of, the most harmful first. " + " ".join(sentences),)
 
 
@@ -227,9 +228,9 @@ def crowding(found: Measured) -> str:
     return (
         f"The paper seeds {PAPER_PER_PIXEL:g} tracers for each pixel, which are {PAPER_PER_LENS:.2f} for each "
         f"microlens, over the 10 mm of its channel. There {found.at('recall', PAPER_PER_LENS):.0%} of the tracers are "
-        f"found, and a displacement in depth is wrong by {rms['tracks']:.2g} mm rms by particles and by "
-        f"{rms['volumes']:.2g} mm by volumes. Of the seedings tried, fewer than {SEEN_SHARE:.0%} are found {told}: "
-        "neighbours are taken for one another, and the error of a particle's displacement in depth rises from "
-        f"{few:.2g} mm at {values[0]:g} for each microlens to {many:.2g} mm at {values[-1]:g}{turned}. That of volumes "
-        "is not one of neighbours: light is smeared over millimetres of depth at any seeding."
+        f"found, and a displacement in depth is wrong by {written(rms['tracks'], 2)} mm rms by particles and by "
+        f"{written(rms['volumes'], 2)} mm by volumes. Of the seedings tried, fewer than {SEEN_SHARE:.0%} are found "
+        f"{told}: neighbours are taken for one another, and the error of a particle's displacement in depth rises from "
+        f"{written(few, 2)} mm at {values[0]:g} for each microlens to {written(many, 2)} mm at {values[-1]:g}{turned}. "
+        "That of volumes is not one of neighbours: light is smeared over millimetres of depth at any seeding."
     )

@@ -9,6 +9,7 @@ import numpy as np
 
 from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.pages import Table
+from lfpiv_cli.notice import written
 from lfpiv_cli.paper.parts import Drawing, Findings, Row, Work
 from lfpiv_cli.paper.rig import sections
 from lfpiv_cli.validation.weights import (
@@ -131,9 +132,9 @@ def _table(figures: dict[str, Any]) -> Table:
         (
             words,
             f"{each['ssim_smallest']:.5f}",
-            f"{each['rmse_grey_largest']:.3g}",
-            f"{each['l1_mean']:.2g}",
-            f"{each['l1_largest']:.2g}",
+            written(each["rmse_grey_largest"]),
+            written(each["l1_mean"], 2),
+            written(each["l1_largest"], 2),
         )
         for name, words in COMPARED.items()
         if (each := figures[name]) is not None

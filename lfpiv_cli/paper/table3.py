@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.pages import Table
+from lfpiv_cli.notice import written
 from lfpiv_cli.paper.parts import Drawing, Findings, Row, Work
 from lfpiv_cli.paper.rig import AS_PAPER, BOARD, merged, sections
 from lfpiv_cli.stages.validate_board import BoardSolver, bench_of, board_solver, placement_of
@@ -271,9 +272,8 @@ def _where(measure: str, figures: dict[str, Any], spacing_mm: float) -> str:
     values, unit = (off, "%") if measure == "lateral_error" else (np.array(table[measure]), "mm")
     worst = int(np.argmax(values))
     middle = np.median(values)
-    return (
-        f"largest at z = {depth[worst]:+.0f} mm, {values[worst]:.3g} {unit}; median over the depths {middle:.3g} {unit}"
-    )
+    largest = f"largest at z = {depth[worst]:+.0f} mm, {written(values[worst])} {unit}"
+    return f"{largest}; median over the depths {written(middle)} {unit}"
 
 
 def _drawings(
@@ -353,8 +353,8 @@ def _text(work: Work, boards: _Boards, figures: Figures) -> tuple[str, ...]:
         f"mm, {SCENES[boards.half]} As the paper did it: {solver.solver.upper()}, {solver.iterations} iterations, "
         f"{' x '.join(str(n) for n in volume.shape_xyz)} voxels of 0.1 mm, with equivalent points (ERT) and with rays "
         f"fitted to the boards' own pictures (DLFC). At its best: {best.solver.upper()}, {best.iterations} accelerated "
-        f"iterations, voxels of {' x '.join(f'{mm:.3g}' for mm in boards.best.grid().spacing_mm)} mm with equivalent "
-        f"points.{'' if work.size == 'full' else REDUCED}",
+        f"iterations, voxels of {' x '.join(written(mm) for mm in boards.best.grid().spacing_mm)} mm with "
+        f"equivalent points.{'' if work.size == 'full' else REDUCED}",
         "The paper says that depths are those of Gaussian peak fittings, not of what, nor where its voxels lie among "
         "the dots. Both matter next to the focal plane, where a voxel is as wide as a microlens and the depth profile "
         "of a dot is not even. Taken here: a Gaussian through the sum of each plane of a dot's column, over all "

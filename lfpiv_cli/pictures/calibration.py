@@ -38,7 +38,7 @@ def summary_figure(calibration: Calibration) -> Figure:
 def lattice_words(fit: LatticeFit) -> str:
     """Return how many lenses the lattice has, its pitch and its rotation."""
     pitch, turn = fit.lattice_px.pitch, np.rad2deg(fit.lattice_px.rotation_rad)
-    return f"{fit.lenses} lenses, pitch {pitch[0]:.4f} and {pitch[1]:.4f} px, rotation {turn:.4f} degrees"
+    return f"{fit.lenses} lenses, pitch {pitch[0]:.4f} and {pitch[1]:.4f} px, rotation {turn:z.4f} degrees"
 
 
 @styled
@@ -127,8 +127,8 @@ def draw_board(figure: Any, axis: Any, calibration: Calibration, board: ArrayLik
         axis.imshow(image, cmap="gray", vmin=np.percentile(image, 1.0), vmax=np.percentile(image, 99.9))
     dots = axis.scatter(*pose.dots_px.T, c=pose.dots_mm[:, 2], s=120, cmap=SEQUENTIAL, marker="+", linewidths=2)
     figure.colorbar(dots, ax=axis, label="depth (mm)", shrink=0.8)
-    tilt = " and ".join(f"{angle:.2f}" for angle in pose.tilt_deg)
-    axis.set_title(f"board: z = {pose.z0_mm:.3f} mm, M = {pose.magnification:.4f},\ntilt {tilt} degrees")
+    tilt = " and ".join(f"{angle:z.2f}" for angle in pose.tilt_deg)
+    axis.set_title(f"board: z = {pose.z0_mm:z.3f} mm, M = {pose.magnification:.4f},\ntilt {tilt} degrees")
     rows, columns = calibration.image_shape
     axis.set(xlabel="column (px)", ylabel="row (px)", xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5))
     axis.set_aspect("equal")

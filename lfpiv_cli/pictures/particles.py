@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
 from lfpiv_cli.pictures.depths import DEPTH_LABEL, draw_medians, percentiles_by_depth, slab_edges
@@ -98,7 +99,7 @@ def residual_figure(residual: NDArray[np.float64]) -> Figure:
     limit = _bright(residual)
     shown = axes.imshow(residual, cmap=DIVERGING, vmin=-limit, vmax=limit, interpolation="nearest")
     figure.colorbar(shown, ax=axes, label="image less particles (counts)", shrink=0.7)
-    axes.set_title(f"residual, rms {np.sqrt(np.mean(residual**2)):.3g} counts")
+    axes.set_title(f"residual, rms {written(np.sqrt(np.mean(residual**2)))} counts")
     return figure
 
 

@@ -69,7 +69,7 @@ def plane_panels(grid: Grid, rows: int = 1) -> tuple[Figure, NDArray[Any]]:
 
 def label_plane(axes: Axes, grid: Grid, plane: Plane, what: str = "") -> None:
     """Name a panel's axes, and in its title what it shows and where the plane lies."""
-    place = f"{plane.name} at {AXIS_NAMES[plane.normal]} = {plane.place_mm(grid):.2f} mm"
+    place = f"{plane.name} at {AXIS_NAMES[plane.normal]} = {plane.place_mm(grid):z.2f} mm"
     left, right, bottom, top = plane.extent(grid)
     axes.set(
         xlabel=f"{AXIS_NAMES[plane.right]} (mm)",

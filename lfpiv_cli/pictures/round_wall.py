@@ -50,8 +50,8 @@ def round_wall_figure(refinement: SceneRefinement) -> Figure:
     along.set(xlabel="place along the axis (mm)", ylabel="distance from the axis found (mm)", ylim=limits)
     _draw_counted(counted, moved, refinement, limits)
     sigma = np.sqrt(np.diag(refinement.covariance))
-    shift = " and ".join(f"{1e3 * refinement.axis[k]:.1f} +- {1e3 * sigma[k]:.1f}" for k in (0, 1))
-    tilt = " and ".join(f"{np.rad2deg(refinement.axis[k]):.3f} +- {np.rad2deg(sigma[k]):.3f}" for k in (2, 3))
+    shift = " and ".join(f"{1e3 * refinement.axis[k]:z.1f} +- {1e3 * sigma[k]:.1f}" for k in (0, 1))
+    tilt = " and ".join(f"{np.rad2deg(refinement.axis[k]):z.3f} +- {np.rad2deg(sigma[k]):.3f}" for k in (2, 3))
     figure.suptitle(f"axis {shift} um across and away from the camera beside the one before, tilted by {tilt} degrees")
     return figure
 

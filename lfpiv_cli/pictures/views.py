@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.calibration.views import refocused_stack, views_across
+from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.pictures.style import new_figure, styled
@@ -42,12 +43,12 @@ def views_figure(calibration: Calibration, camera: Camera, media: Media, image: 
     for (row, column), (point, view) in views.items():
         axis = figure.add_subplot(grid[row, column])
         axis.imshow(view, cmap="gray", vmin=0.0, vmax=brightest, interpolation="nearest")
-        axis.set_title(f"X = {point[0]:.2g}, Y = {point[1]:.2g} mm")
+        axis.set_title(f"X = {written(point[0], 2)}, Y = {written(point[1], 2)} mm")
         axis.set_axis_off()
     for k, (depth, picture) in enumerate(zip(depths, stack, strict=True)):
         axis = figure.add_subplot(grid[-1, k])
         axis.imshow(picture, cmap="gray", interpolation="nearest", vmin=0.0, vmax=float(stack.max()))
-        axis.set_title(f"refocused at z = {depth:.2f} mm")
+        axis.set_title(f"refocused at z = {depth:z.2f} mm")
         axis.set_axis_off()
     figure.suptitle("views from points (X, Y) of the main lens, one sample per microlens; below, refocused")
     return figure

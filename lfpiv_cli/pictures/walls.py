@@ -42,11 +42,11 @@ def walls_figure(refinement: Refinement) -> Figure:
     for axes, side, name in ((near, -1.0, "near"), (far, 1.0, "far")):
         zoom = ZOOM_PER_WIDTH * refinement.width_mm
         _draw_depths(axes, refinement, depth, (side * half - zoom, side * half + zoom), BARS_AT_WALL)
-        axes.set_title(f"{name} wall, at z = {walls.middle_mm + side * half:.3f} mm on the axis")
+        axes.set_title(f"{name} wall, at z = {walls.middle_mm + side * half:z.3f} mm on the axis")
     _draw_across(across, refinement)
     middle, sigma = walls.middle_mm, refinement.middle_sigma_mm
-    tilt = " and ".join(f"{angle:.2f}" for angle in np.rad2deg(np.arctan(walls.slope)))
-    figure.suptitle(f"mid plane at z = {middle:.3f} +- {sigma:.3f} mm, walls tilted by {tilt} degrees")
+    tilt = " and ".join(f"{angle:z.2f}" for angle in np.rad2deg(np.arctan(walls.slope)))
+    figure.suptitle(f"mid plane at z = {middle:z.3f} +- {sigma:.3f} mm, walls tilted by {tilt} degrees")
     return figure
 
 

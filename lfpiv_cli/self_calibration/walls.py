@@ -131,12 +131,12 @@ def refuse_few(count: int) -> None:
 def _ensure_walls(walls: Walls, depths_mm: tuple[float, float], width_mm: float) -> None:
     """Raise where what was found is not the channel."""
     near, far = (walls.middle_mm + side * 0.5 * walls.width_mm for side in (-1.0, 1.0))
-    found = f"the particles end at z = {near:.3f} and {far:.3f} mm"
+    found = f"the particles end at z = {near:z.3f} and {far:z.3f} mm"
     margin = LIMIT_BLURS * walls.blur_mm
     if near < depths_mm[0] + margin or far > depths_mm[1] - margin:
         raise InputError(
-            f"{found}, where the search ended ({depths_mm[0]:.3f} to {depths_mm[1]:.3f} mm); the channel lies further "
-            "from the calibrated mid plane than this can mend: check channel.camera_move_mm, or calibrate again"
+            f"{found}, where the search ended ({depths_mm[0]:z.3f} to {depths_mm[1]:z.3f} mm); the channel lies "
+            "further from the calibrated mid plane than this can mend: check channel.camera_move_mm, or calibrate again"
         )
     if abs(walls.width_mm / width_mm - 1.0) > WIDTH_TOLERANCE:
         raise InputError(

@@ -18,6 +18,7 @@ from lfpiv_cli.files.weights_file import open_weights, write_weights
 from lfpiv_cli.interface.weights import curved_summary, misfit_notices, plan_of, weights_of
 from lfpiv_cli.interface.weights_cost import cost_notices, cost_of, ensure_fits, ensure_volume_fits
 from lfpiv_cli.names import Method, Refraction, Sampling
+from lfpiv_cli.notice import written
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,7 +79,7 @@ def build_weights(
     if options.dry_run:
         return summary | cost.summary()
     ensure_fits(cost, output)
-    console.detail(f"about {cost.weights_core_s:.2g} s of a core and {cost.weights_bytes / 1e9:.2g} GB")
+    console.detail(f"about {written(cost.weights_core_s, 2)} s of a core and {written(cost.weights_bytes / 1e9, 2)} GB")
     content = weights_of(plan, made, console)
     found_out = misfit_notices(content)
     console.warn(found_out)

@@ -16,6 +16,7 @@ from lfpiv_cli.files.config import Config, carried_config
 from lfpiv_cli.files.hdf5 import read_tree
 from lfpiv_cli.files.rig_numbers import RigNumbers, known_camera, tree_of
 from lfpiv_cli.files.rig_text import rig_text, schema
+from lfpiv_cli.interface.planning import bench_of, windows_line
 from lfpiv_cli.names import KnownCamera
 
 SCHEMA_NAME = "rig.schema.json"
@@ -42,9 +43,11 @@ def init(output: Path, options: InitOptions, *, overwrite: bool = False, console
     inputs = [] if options.calibration is None else [options.calibration]
     ensure_writable(output, overwrite, inputs)
     title, tree = _described(options)
-    Config.from_resolved(tree, "the numbers given")
+    settings = Config.from_resolved(tree, "the numbers given")
     beside = SCHEMA_NAME if (output.parent / SCHEMA_NAME).exists() else None
     write_text(output, rig_text(tree, title, beside), overwrite)
+    if options.numbers is not None and (windows := windows_line(bench_of(settings, None))).verdict != "good":
+        console.say(f"windows: {windows.reason}")
     console.say(f"next: lfpiv check {output}")
     return {"config": output.name, "sections": list(tree), "schema": beside}
 

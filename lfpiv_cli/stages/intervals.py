@@ -8,7 +8,7 @@ from typing import Any
 
 from lfpiv_cli.files.batch import Frame
 from lfpiv_cli.files.provenance import seconds_between
-from lfpiv_cli.notice import Notice
+from lfpiv_cli.notice import Notice, written
 
 # Beyond so much the two are not the same.
 CONTRADICTING_SHARE = 0.01
@@ -33,6 +33,6 @@ def _notices(stated_s: float | None, recorded_s: Sequence[float | None], name: s
     worst = max(known, key=lambda step: abs(step - stated_s))
     if abs(worst - stated_s) <= CONTRADICTING_SHARE * stated_s:
         return []
-    text = f"its frames were recorded {worst:.6g} s apart, and {stated_s:.6g} s are stated"
+    text = f"its frames were recorded {written(worst, 6)} s apart, and {written(stated_s, 6)} s are stated"
     remedy = "correct correlation.dt_s, or leave it out: then the recorded time is taken"
     return [Notice("time-between-frames", name, text, remedy, worst, f"{stated_s:g}")]

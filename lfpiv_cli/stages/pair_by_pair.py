@@ -18,7 +18,7 @@ from lfpiv_cli.console import Console, Frames
 from lfpiv_cli.files.batch import State, Target, pending, state_or_none
 from lfpiv_cli.files.claims import awaited
 from lfpiv_cli.files.pairing import Pairs
-from lfpiv_cli.files.provenance import Gone, carried_record
+from lfpiv_cli.files.provenance import Gone, carried_record, sha256, without_warnings
 from lfpiv_cli.stages.batches import Batch, Made, Stamp, stamp_of
 from lfpiv_cli.stages.dry_runs import Expected
 from lfpiv_cli.stages.pairs import failures_of
@@ -69,7 +69,8 @@ class PairByPair(Generic[Made]):
         self._whole = {k: stamp_of(self._found.targets[k].path) for k in set(every) - set(left)}
         steps = self._found.begin(left, console)
         self._drop(range(len(self._found.targets)))
-        return steps * len(left) / max(len(numbers), 1)
+        # Where all frames are there, what joins them is a step.
+        return max(steps * len(left) / max(len(numbers), 1), 1.0)
 
     def _left_of(self, every: Sequence[int]) -> list[int]:
         """Return the frames that have to be made."""
@@ -129,17 +130,27 @@ class PairByPair(Generic[Made]):
         return self._join(paths, self.targets[number].path, gone)
 
     def _record(self, number: int) -> Mapping[str, Any]:
-        """Return the record of a result; where the files of its frames are gone, with the hashes that it carries."""
-        targets, gone = [self._found.targets[k] for k in self._pairs[number]], {}
-        if not all(target.path.exists() for target in targets):
-            carried = carried_record(self.targets[number].path)
-            hashes = {given["name"]: given["sha256"] for given in carried["inputs"].values()}
-            for target in targets:
-                digest = hashes.get(target.path.name, "")
-                warned = carried["made_from"].get(digest, {}).get("warnings")
-                made = target.record if warned is None else {**target.record, "warnings": warned}
-                gone[target.path] = Gone(digest, made)
+        """Return the record of a result, of its frames' files as they will be."""
+        targets = [self._found.targets[k] for k in self._pairs[number]]
+        to_come = {target.path: self._to_come(target, self.targets[number].path) for target in targets}
+        gone = {path: file for path, file in to_come.items() if file is not None}
         return self._joined(number, gone).targets[0].record
+
+    def _to_come(self, frame: Target, result: Path) -> Gone | None:
+        """Return a frame's file where it is gone, with the hash that the result carries, or is to carry another record.
+
+        None where it is there and stays as it is.
+        """
+        carried: Mapping[str, Any]
+        if frame.path.exists():
+            carried, digest = carried_record(frame.path), sha256(frame.path)
+            if without_warnings(carried) == frame.record:
+                return None
+        else:
+            made = carried_record(result)
+            digest = {each["name"]: each["sha256"] for each in made["inputs"].values()}.get(frame.path.name, "")
+            carried = made["made_from"].get(digest, {})
+        return Gone(digest, {**frame.record, **{name: carried[name] for name in ("warnings",) if name in carried}})
 
 
 def joined_by(make: Callable[..., Batch[Made]], *options: Any) -> Join[Made]:

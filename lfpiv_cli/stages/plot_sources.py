@@ -27,6 +27,7 @@ from lfpiv_cli.files.particle_file import (
 )
 from lfpiv_cli.files.weights_file import WeightsFile, open_weights
 from lfpiv_cli.flow.field import VectorField
+from lfpiv_cli.notice import written
 from lfpiv_cli.pictures import calibration as of_calibration
 from lfpiv_cli.pictures import particles as of_particles
 from lfpiv_cli.pictures import tracks as of_tracks
@@ -168,11 +169,12 @@ def _of_tracks(path: Path) -> dict[str, Drawn]:
     tracks = read_points(path, TRACKS_FORMAT)
     arrays = tracks.arrays
     lines, stretch = of_tracks.displacement_lines(tracks.position_mm, arrays["displacement_mm"])
-    words = f"{len(lines)} displacements, drawn {stretch:.3g} times as long"
+    words = f"{len(lines)} displacements, drawn {written(stretch)} times as long"
     speeds = np.linalg.norm(arrays["velocity"], axis=1)
     figures = {
         "space": Drawn(
-            f"The displacements in space, coloured by speed; they are drawn {stretch:.3g} times as long as they are.",
+            f"The displacements in space, coloured by speed; they are drawn {written(stretch)} times as long as they "
+            "are.",
             partial(of_tracks.space_figure, lines, speeds, words),
         )
     }
@@ -271,7 +273,7 @@ def column_of(content: WeightsFile, voxel: tuple[int, int, int]) -> Figure:
     if not shares.size:
         raise InputError(f"voxel {ix} {iy} {iz} lights no pixel")
     grid = content.reference.grid_from_focal_point(content.weights.grid)
-    place = ", ".join(f"{axis:.4g}" for axis in grid.voxel_to_mm(np.array(voxel, dtype=np.float64)))
+    place = ", ".join(written(axis, 4) for axis in grid.voxel_to_mm(np.array(voxel, dtype=np.float64)))
     title = f"voxel {ix}, {iy}, {iz} at ({place}) mm: {shares.size} pixels, sum {shares.sum():.4f}"
     return of_weights.column_figure((rows, columns), shares, content.camera.pixel_mm, title)
 

@@ -22,7 +22,7 @@ from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.memory import ensure_room
 from lfpiv_cli.files.pairing import Pairs
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, write_points
-from lfpiv_cli.files.provenance import also_used_as, record, with_warnings
+from lfpiv_cli.files.provenance import Gone, also_used_as, record, with_warnings
 from lfpiv_cli.files.weights_file import read_weights_record
 from lfpiv_cli.files.whole import unpacked_bytes
 from lfpiv_cli.interface import particles
@@ -142,8 +142,11 @@ class Reconstruction(ByArguments):
         pairs: Pairs | None = None,
         prepared: Prepared | None = None,
         order: Sequence[int] | None = None,
+        weights_to_come: Gone | None = None,
     ) -> None:
         """Take the arguments of `reconstruct`; see which frames there are, and read no image.
+
+        `weights_to_come`, where the weights are to carry another record before anything is made.
 
         Raises
         ------
@@ -166,7 +169,9 @@ class Reconstruction(ByArguments):
         self.order = every if order is None else order
         self.names = [frame.stem for frame in frames]
         self._paths = output_paths(output, self.names)
-        self._settings = carried_config(read_weights_record(weights), weights).overridden_by("reconstruction", options)
+        self._gone = {} if weights_to_come is None else {weights: weights_to_come}
+        carried = read_weights_record(weights) if weights_to_come is None else weights_to_come.record
+        self._settings = carried_config(carried, weights).overridden_by("reconstruction", options)
         solver = self._settings.reconstruction.solver
         self._as_particles = solver == "particles"
         if self._beside is not None and not self._as_particles:
@@ -269,7 +274,8 @@ class Reconstruction(ByArguments):
         if frame.fault is not None:
             raise InputError(frame.fault)
         command = f"reconstruct page {frame.page}{self._words(number)}"
-        return record(command, self._resolved, {**self._common, "image": frame.path}, {"image": frame.time_s})
+        inputs = {**self._common, "image": frame.path}
+        return record(command, self._resolved, inputs, {"image": frame.time_s}, self._gone)
 
     def _begun(self) -> _Ready:
         if self._ready is None:

@@ -47,6 +47,7 @@ from lfpiv_cli.interface.verdicts import (
     verb_of,
     verdicts,
 )
+from lfpiv_cli.notice import written
 from lfpiv_cli.pictures.interactive import MOST_LINES, has_views, lines_view
 from lfpiv_cli.pictures.tracks import trajectory_lines
 from lfpiv_cli.stages.plot import figures_of
@@ -335,7 +336,7 @@ def _volume_row(path: Path) -> Row:
     told = read_header(path).attributes
     residual = told.get("residual")
     return {
-        "light not explained": UNKNOWN if residual is None else f"{np.atleast_1d(residual)[-1]:.3g}",
+        "light not explained": UNKNOWN if residual is None else written(np.atleast_1d(residual)[-1]),
         "pixels left out": _cell(told.get("excluded_pixels")),
     }
 

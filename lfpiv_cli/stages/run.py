@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from lfpiv_cli.console import CONSOLE, Console
-from lfpiv_cli.errors import ConfigError, InputError, PartialError, UsageError
+from lfpiv_cli.errors import ConfigError, InputError, OutputExistsError, PartialError, UsageError
 from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files.atomic import ensure_writable, write_text
 from lfpiv_cli.files.batch import Frame, frames_of, output_paths
@@ -33,6 +33,7 @@ from lfpiv_cli.interface.calibration import ensure_pictures
 from lfpiv_cli.interface.following import SHORTEST, ensure_sequence
 from lfpiv_cli.interface.weights_cost import ensure_volume_fits
 from lfpiv_cli.names import FlowMethod
+from lfpiv_cli.notice import written
 from lfpiv_cli.stages.batches import ALL, Failure
 from lfpiv_cli.stages.follow import SEQUENCE_IS_WHOLE
 from lfpiv_cli.stages.frames import STILL, Background, mask_of, other_frames, read_frame, reader
@@ -41,7 +42,7 @@ from lfpiv_cli.stages.prepared import Prepared
 from lfpiv_cli.stages.report import ReportOptions, report
 from lfpiv_cli.stages.run_figures import figures_of
 from lfpiv_cli.stages.run_options import RunOptions
-from lfpiv_cli.stages.run_plan import planned
+from lfpiv_cli.stages.run_plan import planned, with_overwrite
 from lfpiv_cli.stages.run_steps import Chain, Vectors
 from lfpiv_cli.stages.steps import KEPT, MADE, RECORD, Steps, earlier_run
 
@@ -78,22 +79,34 @@ def run(
     settings = load_config(config)
     frames, pairs = _ensure_possible(settings, options)
     console.warn(pairs.settled(options.keep_going))
-    whole, prepared = options.shard == ALL, Prepared()
-    steps = Steps(output, console, earlier_run(output, overwrite), options.deadline(), recorded=whole)
+    prepared = Prepared()
+    steps = Steps(output, console, earlier_run(output, overwrite), options.deadline(), options.shard == ALL)
     chain = Chain(config, options, frames, pairs, steps, prepared, overwrite)
 
     def choose(weights: Path) -> Choice:
         return _chosen(settings, options, lambda: _counted(settings, options, weights, frames, prepared, steps))
 
-    if options.dry_run:
-        return planned(settings, chain, lambda weights: choose(weights).methods)
-    ensure_volume_fits(settings, options.method in ("volumes", "both"))
+    def methods(weights: Path) -> tuple[FlowMethod, ...]:
+        return choose(weights).methods
+
+    if not options.dry_run:
+        ensure_volume_fits(settings, options.method in ("volumes", "both"))
+    try:
+        return planned(settings, chain, methods) if options.dry_run else _made(chain, choose, overwrite)
+    except OutputExistsError as error:
+        replacing = Chain(config, options, frames, pairs, steps, prepared, overwrite=True)
+        raise OutputExistsError(f"{error}{with_overwrite(settings, replacing, methods)}") from error
+
+
+def _made(chain: Chain, choose: Callable[[Path], Choice], overwrite: bool) -> dict[str, Any]:
+    """Take all steps; return what is told of them."""
+    steps, options, output = chain.steps, chain.options, chain.steps.output
     ensure_writable(output / RECORD, overwrite=True)
     weights = chain.weights()
     if not chain.share:
         return _told_of_steps(steps)
     choice = choose(weights)
-    console.say(f"by {' and '.join(choice.methods)}: {choice.reason}")
+    steps.console.say(f"by {' and '.join(choice.methods)}: {choice.reason}")
     steps.told.update(choice.told())
     fields: dict[str, Vectors] = {method: chain.vectors_by(method, weights) for method in choice.methods}
     if options.combine:
@@ -101,8 +114,12 @@ def run(
     figures = figures_of({method: list(paths.values()) for method, paths in fields.items()})
     steps.told["figures"] = figures
     told = choice.told() | figures
-    if options.report and whole:
-        raw = (*dict.fromkeys(frame.path for frame in frames if frame.fault is None), *options.white, *options.board)
+    if options.report and options.shard == ALL:
+        raw = (
+            *dict.fromkeys(frame.path for frame in chain.frames if frame.fault is None),
+            *options.white,
+            *options.board,
+        )
         told |= {"verdict": _reported(raw, steps, overwrite).get("verdict"), "report": str(output / REPORT)}
     steps.write(whole=True)
     return _ensure_whole(told | _told_of_steps(steps), chain.failures, options.failures)
@@ -256,7 +273,9 @@ def _chosen(settings: Config, options: RunOptions, count_tracers: Callable[[], f
         return Choice((asked or "particles",), "too little is seen of the volume to count tracers by their light")
     better: FlowMethod = "particles" if count <= MOST_FOR_PARTICLES else "volumes"
     side = "up to" if better == "particles" else "beyond"
-    reason = f"{count:.2g} tracers for each microlens, and {better} err less {side} about {MOST_FOR_PARTICLES:g}"
+    reason = (
+        f"{written(count, 2)} tracers for each microlens, and {better} err less {side} about {MOST_FOR_PARTICLES:g}"
+    )
     if asked is None or asked == better:
         return Choice((better,), reason, count)
     return Choice((asked,), f"as asked for; but there are {reason}", count)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import shutil
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from lfpiv_cli.errors import LfpivError
 from lfpiv_cli.files.batch import Target, pending
 from lfpiv_cli.files.calibration_file import read_calibration
 from lfpiv_cli.files.config import Config
+from lfpiv_cli.files.provenance import Gone, carried_record, sha256, without_warnings
 from lfpiv_cli.interface.weights import plan_of
 from lfpiv_cli.interface.weights_cost import FLOAT_BYTES, Cost, cost_of
 from lfpiv_cli.names import FlowMethod
@@ -47,12 +49,46 @@ def planned(settings: Config, chain: Chain, choose: Callable[[Path], Sequence[Fl
     counts = {"frames": len(chain.order), "pairs": len(chain.share), "steps_to_make": before}
     if before:
         return counts | _from_nothing(settings, chain)
-    weights = chain.steps.output / WEIGHTS
+    weights, to_come = chain.steps.output / WEIGHTS, _weights_to_come(chain)
     methods = choose(weights)
     told: dict[str, dict[str, Any]] = {}
     for method in methods:
-        told |= _of_method(settings, chain, method, weights)
+        told |= _of_method(settings, chain, method, weights, to_come)
     return counts | {"method": " and ".join(methods)} | _together(told, chain.steps.output)
+
+
+def with_overwrite(settings: Config, chain: Chain, choose: Callable[[Path], Sequence[FlowMethod]]) -> str:
+    """Return in words what a run that may overwrite makes again and what it keeps; nothing where that is not known."""
+    try:
+        told = planned(settings, chain, choose)
+    except LfpivError:
+        return ""
+    before = {"calibrate-snapshot": CALIBRATION, "build-weights": WEIGHTS}
+    again = [before[step] for step in told["steps_to_make"]]
+    kept = [name for name in before.values() if name not in again]
+    if again:
+        again.append("what depends on it")
+    else:
+        for folder, number in told["to_make"].items():
+            again += [_of_all(folder, number, told["skipped"][folder])] if number else []
+            kept += [_of_all(folder, told["skipped"][folder], number)] if told["skipped"][folder] else []
+        in_time = "particles" in told["to_make"] and not chain.pairs.separate
+        if in_time and (told["to_make"]["particles"] or _weights_to_come(chain) is not None):
+            again.append("tracks")
+        if again and chain.options.combine:
+            again.append("combined")
+    if not again:
+        return ""
+    return f"; with it the run makes {_listed(again)} again" + (f" and keeps {_listed(kept)}" if kept else "")
+
+
+def _of_all(folder: str, number: int, others: int) -> str:
+    """Return a folder's name, with how many of its files are meant unless all are."""
+    return f"{number} of {number + others} {folder}" if others else folder
+
+
+def _listed(names: Sequence[str]) -> str:
+    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
 
 
 def _steps_before_frames(chain: Chain) -> list[str]:
@@ -79,22 +115,32 @@ def _is_pending(target: Target, chain: Chain) -> bool:
     return bool(pending([target], (), chain.common["overwrite"], resume=True, dry=True))
 
 
-def _of_method(settings: Config, chain: Chain, method: FlowMethod, weights: Path) -> dict[str, dict[str, Any]]:
+def _weights_to_come(chain: Chain) -> Gone | None:
+    """Return the weights with the record that they will carry; None where it is the one that they have."""
+    weights = chain.steps.output / WEIGHTS
+    made = build_weights.target_of(chain.config, weights, chain.made_with).record
+    return None if without_warnings(carried_record(weights)) == made else Gone(sha256(weights), made)
+
+
+def _of_method(
+    settings: Config, chain: Chain, method: FlowMethod, weights: Path, to_come: Gone | None
+) -> dict[str, dict[str, Any]]:
     """Return what each batch of a method tells of itself, by its folder."""
     (frames, _), (results, _) = NAMES[method]
     console = chain.steps.console
     if chain.options.follow:
-        chosen = chain.following(dry_run=True)
+        # The frames of a sequence depend on the whole config.
+        chosen = replace(chain.following(dry_run=True), resume=to_come is None)
         return {frames: follow_particles(weights, chain.options.images, chain.steps.output, chosen, **chain.common)}
-    told = {}
+    told, found = {}, chain.reconstruction(method, weights, to_come)
     in_time = method == "particles" and not chain.pairs.separate
     if chain.options.keep == "all" or in_time:
-        told[frames] = dry_run(chain.reconstruction(method, weights), chain.batch_options(shared=False), console)
+        told[frames] = dry_run(found, chain.batch_options(shared=False), console)
     if method == "volumes":
-        batch = chain.correlated(weights, field_bytes(settings, settings.grid()))
+        batch = chain.correlated(found, field_bytes(settings, settings.grid()))
         told[results] = dry_run(batch, chain.batch_options(shared=True), console)
     elif not in_time:
-        told[results] = dry_run(chain.tracked(weights), chain.batch_options(shared=True), console)
+        told[results] = dry_run(chain.tracked(found), chain.batch_options(shared=True), console)
     return told
 
 

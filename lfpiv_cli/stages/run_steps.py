@@ -11,6 +11,7 @@ from lfpiv_cli.errors import InputError, PartialError
 from lfpiv_cli.files.batch import VTKHDF_SUFFIX, Frame, Target
 from lfpiv_cli.files.claims import awaited
 from lfpiv_cli.files.pairing import Pairs
+from lfpiv_cli.files.provenance import Gone
 from lfpiv_cli.names import FlowMethod
 from lfpiv_cli.stages import correlate as correlating
 from lfpiv_cli.stages import track as tracking
@@ -135,24 +136,24 @@ class Chain:
         self.steps.take("combine", list(paths.values()), combine_all)
         return paths
 
-    def reconstruction(self, method: FlowMethod, weights: Path) -> Reconstruction:
-        """Return the batch of the frames of this share."""
+    def reconstruction(self, method: FlowMethod, weights: Path, to_come: Gone | None = None) -> Reconstruction:
+        """Return the batch of the frames of this share, of weights as they are `to_come` if they change."""
         by_particles = method == "particles"
         chosen = replace(PARTICLES, residual=self.options.keep == "all") if by_particles else VOLUMES
         given = (weights, self.options.images, self.steps.output / method, self._of_images(chosen), self._overwrite)
-        return Reconstruction(*given, self.pairs if by_particles else None, self._prepared, self.order)
+        return Reconstruction(*given, self.pairs if by_particles else None, self._prepared, self.order, to_come)
 
-    def correlated(self, weights: Path, file_bytes: float | None = None) -> PairByPair[correlating.Outcome]:
+    def correlated(self, found: Reconstruction, file_bytes: float | None = None) -> PairByPair[correlating.Outcome]:
         """Return the batch of pairs, each from its images to its vectors, of so many bytes."""
         join = joined_by(Correlation, self._correlating, self._overwrite)
         targets = [Target(path, dict) for path in self.of_pairs("vectors")]
-        return PairByPair(self.reconstruction("volumes", weights), join, self.pairs, targets, file_bytes)
+        return PairByPair(found, join, self.pairs, targets, file_bytes)
 
-    def tracked(self, weights: Path) -> PairByPair[tracking.Outcome]:
+    def tracked(self, found: Reconstruction) -> PairByPair[tracking.Outcome]:
         """Return the batch of separate pairs, each from its images to its tracks."""
         join = joined_by(Tracks, self._tracking, self._overwrite)
         targets = [Target(path, dict, grid_paths(path, 1)) for path in self.of_pairs("tracks")]
-        return PairByPair(self.reconstruction("particles", weights), join, self.pairs, targets)
+        return PairByPair(found, join, self.pairs, targets)
 
     @property
     def _correlating(self) -> CorrelateOptions:
@@ -165,7 +166,7 @@ class Chain:
     def _by_volumes(self, weights: Path) -> Vectors:
         paths, options = self.of_pairs("vectors"), self._correlating
         if self.options.keep == "results":
-            batch = self.correlated(weights)
+            batch = self.correlated(self.reconstruction("volumes", weights))
             self._take_pair_by_pair("correlate", batch, lambda worked: correlating.summary_of(worked, worked.total()))
             return self._standing(paths, self.share)
         volumes, failed = self._reconstructed("reconstruct", weights, "volumes", VOLUMES)
@@ -186,7 +187,7 @@ class Chain:
         grids = [grid_paths(path, 1)[0] for path in tracks]
         if self.options.keep == "results":
             results = [tracks[number] for number in self.share]
-            batch = self.tracked(weights)
+            batch = self.tracked(self.reconstruction("particles", weights))
             self._take_pair_by_pair("track", batch, lambda worked: tracking.summary_of(worked, results))
             return {number: grids[number] for number in self._standing(tracks, self.share)}
         particles, failed = self._reconstructed("reconstruct particles", weights, "particles", PARTICLES, self.pairs)

@@ -67,11 +67,13 @@ class Steps:
         try:
             summary = make()
         except LfpivError as error:
-            done = "; what is done stays, and the same command goes on from there" if number > 1 else ""
+            goes_on = number > 1 and not isinstance(error, OutputExistsError)
+            done = "; what is done stays, and the same command goes on from there" if goes_on else ""
             raise type(error)(f"step {number}, {name}: {error}{done}") from error
         state = _state(files, before, times)
         if state != MADE:
-            self.console.say(f"step {number}: {state}, complete and made alike")
+            why = "complete and made alike" if state == KEPT else "as it depends on nothing that has changed"
+            self.console.say(f"step {number}: {state}, {why}")
             if self.earlier.get("steps", {}).get(name, {}).get("files") == hashes:
                 summary = self.earlier.get("summaries", {}).get(name, summary)
         self.told["steps"][name] = {"state": state, "files": self._hashes(files)}

@@ -147,7 +147,7 @@ def _boards(
         centres = dot_centres(board, placement_of(settings, depth))[:, :2]
         dots.append(measure_dots(volume, bench.weights.grid, centres, 0.5 * board.spacing_mm))
         drawn = volume if depth == 0.0 else drawn
-        console.detail(f"board at {depth:+.0f} mm: residual {result.residual[-1]:.3f}")
+        console.detail(f"board at {depth:+z.0f} mm: residual {result.residual[-1]:z.3f}")
     return dots, drawn
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.grid import Grid
+from lfpiv_cli.notice import written
 from lfpiv_cli.validation.board_depths import DEPTH_DEFINITIONS, THE_PAPERS, width_ends_mm
 
 # The paper's boards: seventeen depths, a millimetre apart.
@@ -84,7 +85,7 @@ def _measure_dot(
     part = volume[column].astype(np.float64)
     if not part.size or part.max() <= 0.0:
         raise InputError(
-            f"no light was reconstructed within {reach_mm} mm of the dot at {centre[0]:.3g}, {centre[1]:.3g}"
+            f"no light was reconstructed within {reach_mm} mm of the dot at {written(centre[0])}, {written(centre[1])}"
         )
     profiles = {"sum": part.sum(axis=(1, 2)), "maximum": part.max(axis=(1, 2))}
     plane = part[profiles["sum"] > profiles["sum"].max() / np.e].sum(axis=0)

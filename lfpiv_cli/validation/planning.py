@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lfpiv_cli.flow.windows import ROUNDING
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
 from lfpiv_cli.particles.response import VALUES, respond
@@ -21,6 +22,13 @@ from lfpiv_cli.validation.bounds import errors_alone_mm
 # that with one of them the pixels of neighbours overlap, and particles go wrong from two on.
 BEST_PER_LENS = 0.5
 SPARSE_PER_LENS, CROWDED_PER_LENS, MOST_PER_LENS = 0.05, 1.3, 3.0
+# Interrogation windows of the paper's channel, in microlenses and depths of one lens: at the best seeding some twenty
+# tracers.
+WINDOW_LENSES, WINDOW_DEPTHS = 16.0, 1.5
+# A field is worth looking at from so many vectors along each axis on. Windows are smaller for them as long as they hold
+# so many tracers, and a fifth more as they come in whole voxels; and no shallower than tracers are in a volume, about a
+# depth of one lens.
+WORTH_VECTORS, FEWEST_TRACERS, TRACERS_AIMED_AT, LEAST_WINDOW_DEPTHS = 10, 5.0, 6.0, 1.0
 # Displacements in voxels that are large against the errors and small against a coarse window.
 SMALLEST_STEP, BEST_STEP, LARGEST_STEP = 3.0, 5.0, 8.0
 # Places in front of a lens that stand for all: multiples of two irrational numbers lie evenly. In the middle of the
@@ -110,6 +118,31 @@ def tracers_in(camera: Camera, per_lens: float, sides_mm: ArrayLike) -> float:
     """Return the tracers in a box of sides (2 or 3,) for so many in front of each microlens that looks into it."""
     width, height = np.asarray(sides_mm, dtype=np.float64)[:2] * abs(camera.magnification)
     return float(per_lens * width * height / camera.lattice.cell_area)
+
+
+def proposed_window_mm(camera: Camera, media: Media, sides_mm: ArrayLike, overlap: ArrayLike) -> NDArray[np.float64]:
+    """Return the sides (3,) of the final interrogation windows in a volume of sides (3,), at the best seeding.
+
+    They are the paper's, or smaller where these give fewer than ten vectors along an axis, as far as tracers allow it;
+    in three digits.
+    """
+    scale, sides = camera.scale(media), np.asarray(sides_mm, dtype=np.float64)
+    papers = np.array([WINDOW_LENSES * scale.lens_mm] * 2 + [WINDOW_DEPTHS * scale.depth_mm])
+    for_ten = sides / (WORTH_VECTORS * (1.0 - np.asarray(overlap)))
+    least = np.array([0.0, 0.0, LEAST_WINDOW_DEPTHS * scale.depth_mm])
+    share = np.minimum(np.maximum(np.minimum(papers, for_ten), least) / sides, 1.0)
+    needed = TRACERS_AIMED_AT / tracers_in(camera, BEST_PER_LENS, sides)
+    for free in range(3, 0, -1):  # along one axis after the other they may reach the whole volume
+        if (missing := needed / float(np.prod(share))) > 1.0:
+            share = np.where(share < 1.0, np.minimum(share * missing ** (1.0 / free), 1.0), 1.0)
+    digit = 10.0 ** (np.floor(np.log10(share * sides)) - 2.0)
+    return np.asarray(np.round(np.floor(share * sides / digit + ROUNDING) * digit, 9))
+
+
+def vectors_along(sides_mm: ArrayLike, window_mm: ArrayLike, overlap: ArrayLike) -> NDArray[np.int64]:
+    """Return how many vectors (3,) windows of sides in mm give along each axis of a volume."""
+    steps = np.asarray(window_mm) * (1.0 - np.asarray(overlap))
+    return np.maximum(np.floor(np.asarray(sides_mm) / steps + ROUNDING), 1.0).astype(np.int64)
 
 
 def time_step_s(velocity_m_s: float, voxel_mm: float, voxels: float = BEST_STEP) -> float:

@@ -18,6 +18,7 @@ from scipy import ndimage
 
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.grid import Grid
+from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.weights.build import factorise_through
@@ -180,7 +181,7 @@ def limits_missed(figures: dict[str, Any], limits: dict[str, dict[str, float | N
             if value is None:
                 missed.append(f"{comparison}.{figure} could not be judged")
             elif (value < limit) if figure.startswith("ssim") else (value > limit):
-                missed.append(f"{comparison}.{figure} is {value:.4g}, the limit {limit:g}")
+                missed.append(f"{comparison}.{figure} is {written(value, 4)}, the limit {limit:g}")
     return missed
 
 

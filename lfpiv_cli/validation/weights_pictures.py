@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from lfpiv_cli.notice import written
 from lfpiv_cli.pictures.style import COLOURS, MARKERS, new_figure, styled
 from lfpiv_cli.validation.weights import Column
 
@@ -42,7 +43,7 @@ def columns_figure(columns: list[Column], shown: dict[str, str] = SHOWN) -> Figu
                 axis.set_axis_off()
                 continue
             picture = axis.imshow(column.images[name], cmap="gray", vmin=0.0, vmax=brightest, interpolation="nearest")
-            axis.set_title(f"{shown[name]}\n({', '.join(f'{value:.3g}' for value in column.centre_mm)}) mm", fontsize=7)
+            axis.set_title(f"{shown[name]}\n({', '.join(written(value) for value in column.centre_mm)}) mm", fontsize=7)
             axis.set(xlabel="column (px)", ylabel="row (px)")
         figure.colorbar(picture, ax=row.tolist(), label="weight (1)", shrink=0.8)
     return figure

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.grid import Grid
+from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
@@ -76,7 +77,7 @@ def factorise_bricks(camera: Camera, media: Media, grid: Grid) -> BrickOperator:
     (pitch, slant), (side, height) = lattice.basis
     if lattice.layout != "hexagonal" or not np.allclose([slant, side], [0.0, 0.5 * pitch], atol=1e-4 * pitch):
         raise ConfigError(
-            f"camera.microlenses: a {lattice.layout} array turned by {np.degrees(lattice.rotation_rad):.4f} degrees; "
+            f"camera.microlenses: a {lattice.layout} array turned by {np.degrees(lattice.rotation_rad):z.4f} degrees; "
             "a hexagonal one with rows along the sensor's is needed (a calibration aligns it)"
         )
     space = ObjectSpace(media, None, "paraxial")
@@ -111,7 +112,8 @@ def traced_bending(space: ObjectSpace, camera: Camera, grid: Grid, axes: tuple[i
     depths = depth_nodes(grid.axis_mm(2), grid.spacing_mm[2])
     if equivalent_object_distance(depths.min(), camera.focus_distance_mm, space.media) <= 0.0:
         raise ConfigError(
-            f"volume: its nearest point lies {grid.bounds_mm(2)[0]:.4g} mm from the focal point, behind the main lens"
+            f"volume: its nearest point lies {written(grid.bounds_mm(2)[0], 4)} mm from the focal point, behind the "
+            "main lens"
         )
     reach = camera.aperture_radius_mm + float(np.hypot(*(np.abs(grid.bounds_mm(axis)).max() for axis in (0, 1))))
     nodes, factors = (
@@ -212,7 +214,7 @@ def axis_optics(camera: Camera, widths_mm: tuple[float, float] | None = None) ->
     if not aligned(camera):
         raise ConfigError(
             f"camera.microlenses: a {camera.lattice.layout} array turned by "
-            f"{np.degrees(camera.lattice.rotation_rad):.4f} degrees against the sensor does not separate into columns "
+            f"{np.degrees(camera.lattice.rotation_rad):z.4f} degrees against the sensor does not separate into columns "
             "and rows; a square one aligned with it is needed (a calibration aligns it)"
         )
     widths = widths_mm or (float(basis[0, 0]), float(basis[1, 1]))
