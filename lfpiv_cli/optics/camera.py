@@ -64,7 +64,7 @@ class Camera:
     column_axis : world axis that the sensor's columns follow
     distortion_per_mm2 : k1 of r' = r (1 + k1 r^2), about the axis, on where rays meet the array
     entrance_over_exit : 1/P of the lens that the thin one stands for, see `pupils`; nothing here needs it
-    diffusion_px : standard deviation of the Gaussian that charge diffuses by in the sensor; rays leave it out
+    diffusion_px : standard deviation of the Gaussian by which charge diffuses; only what `synthetic` renders has it
     """
 
     magnification: float
