@@ -204,7 +204,9 @@ def test_velocities_at_points_and_gradients(tmp_path: Path, rng: np.random.Gener
     np.testing.assert_allclose(trace, divergence, atol=1e-12)
 
 
-@pytest.mark.parametrize(("text", "found"), [("", "no points"), ("1,2\n", "line 1"), ("1,2,nan\n", "line 1")])
+@pytest.mark.parametrize(
+    ("text", "found"), [("", "is empty"), ("\n", "no points"), ("1,2\n", "line 1"), ("1,2,nan\n", "line 1")]
+)
 def test_points_that_are_none_are_named(tmp_path: Path, text: str, found: str) -> None:
     (tmp_path / "points.csv").write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match=found):

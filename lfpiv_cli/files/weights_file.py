@@ -44,6 +44,7 @@ from lfpiv_cli.files.weights_fields import (
 )
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import Refraction, TracedMethod, names_in
+from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.object_space import ObjectSpace
@@ -380,4 +381,6 @@ def _ensure_shares(share: NDArray[Any], signed: bool) -> None:
         raise ValueError("a weight that is negative or not a number")
     largest = float(np.abs(share).max(initial=0.0))
     if share.size and not SMALLEST_NUMBER <= largest <= LARGEST_NUMBER:
-        raise ValueError(f"the largest weight is {largest:.3g}, expected {SMALLEST_NUMBER:g} to {LARGEST_NUMBER:g}")
+        raise ValueError(
+            f"the largest weight is {written(largest)}, expected {SMALLEST_NUMBER:g} to {LARGEST_NUMBER:g}"
+        )

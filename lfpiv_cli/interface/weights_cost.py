@@ -99,7 +99,9 @@ def ensure_fits(cost: Cost, output: Path) -> None:
     OutputError
     """
     made, volume = cost.weights_bytes / WRONG_BY, float(BYTES_A_VOXEL * cost.voxels)
-    ensure_room(max(made, volume), f"a volume of {cost.voxels:.3g} voxels (padding included), or its weights,", SMALLER)
+    ensure_room(
+        max(made, volume), f"a volume of {written(cost.voxels)} voxels (padding included), or its weights,", SMALLER
+    )
     ensure_disk(made, output)
 
 

@@ -44,9 +44,10 @@ FINE, PHASES = 4, 2
 # Depths between which responses are interpolated, in depths over which light spreads by one lens.
 DEPTH_STEP = 0.12
 # Products of the field, and of the light.
-FIELD_TERMS, TERMS = 20, 10
+FIELD_TERMS, TERMS = 20, 14
 # Beyond the geometric spot the field is followed for so many Fresnel lengths, and so many widths of a point in focus.
-FRESNEL_LENGTHS, FOCUS_WIDTHS = 3.0, 6.0
+# Where it ends sooner, by half of these widths, what is left of many tracers doubles the errors of each.
+FRESNEL_LENGTHS, FOCUS_WIDTHS = 3.0, 12.0
 # Places along the spot's radius per period of the steepest phase, for a spline through them.
 PER_PERIOD = 17.0
 

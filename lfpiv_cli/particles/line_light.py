@@ -16,8 +16,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.particles.refraction import Bend
-from lfpiv_cli.particles.response import Along, lenses_of, lit_pixels, project
-from lfpiv_cli.particles.view import BESIDE, View
+from lfpiv_cli.particles.response import Along, lenses_of, project
+from lfpiv_cli.particles.view import View
 from lfpiv_cli.threads import COUNT_NO_REFERENCES
 
 # Responses along one axis: the light's, and its derivatives by the spot's place and by depth.
@@ -29,7 +29,7 @@ Lines = NDArray[np.float32]
 
 
 class Cell(NamedTuple):
-    """Pixels of a lens's cell that a particle lights along one axis.
+    """Pixels of a lens's cell along one axis.
 
     Attributes
     ----------
@@ -67,10 +67,10 @@ def respond_by_lines(view: View, bend: Bend, z: float, pixels: NDArray[np.int32]
     for j in range(low_j, high_j + 1):
         for i in range(low_i, high_i + 1):
             s_x, s_y = centres[j, i, 0], centres[j, i, 1]
-            of_x = _cell(view, x, centres[j, i - 1, 0], s_x, centres[j, i + 1, 0])
+            of_x = _cell(view, centres[j, i - 1, 0], s_x, centres[j, i + 1, 0], x.pixels)
             if of_x.number <= 0:
                 continue
-            of_y = _cell(view, y, centres[j - 1, i, 1], s_y, centres[j + 1, i, 1])
+            of_y = _cell(view, centres[j - 1, i, 1], s_y, centres[j + 1, i, 1], y.pixels)
             if of_y.number <= 0 or count + of_x.number * of_y.number > pixels.size:
                 continue
             _place(of_columns[i - low_i], of_x, centres[middle_j, i, 0] - s_x, across)
@@ -81,26 +81,16 @@ def respond_by_lines(view: View, bend: Bend, z: float, pixels: NDArray[np.int32]
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def _cell(view: View, along: Along, before: float, lens: float, behind: float) -> Cell:
-    """Return the pixels of a lens's cell that are lit along one axis, by the places of three lenses on the array."""
-    camera = view.camera
-    offset = along.at - lens
-    gain, reach = along.stretch * along.alpha, along.half + along.radius
-    shift = (1.0 - camera.bend) * lens - along.lever * along.beta * along.x
-    first, count = lit_pixels(view, gain, offset, reach, along.scale, shift, along.pixels)
-    if count == 0:
-        return Cell(0, 0, 0.0)
+def _cell(view: View, before: float, lens: float, behind: float, pixels: int) -> Cell:
+    """Return the pixels of a lens's cell along one axis of the sensor, by the places of three lenses on the array."""
+    camera, middle = view.camera, 0.5 * (pixels - 1)
     to_px = (1.0 + camera.microlens_distance_mm / camera.image_distance_mm) / camera.pixel_mm
-    middle = 0.5 * (along.pixels - 1)
     # Cubics need a value more on either side.
-    reach = 0.5 * view.lines.table.shape[4] - 1.0
-    low, high = (
-        max(0.5 * (before + lens) * to_px, lens * to_px - reach),
-        min(0.5 * (lens + behind) * to_px, lens * to_px + reach),
-    )
-    begin = max(first - BESIDE, int(np.ceil(low + middle)), 0)
-    end = min(first + count + BESIDE, int(np.ceil(high + middle)), along.pixels)
-    return Cell(begin, end - begin, begin - middle - lens * to_px)
+    centre, reach = lens * to_px + middle, 0.5 * view.lines.table.shape[4] - 1.0
+    low = max(0.5 * (before + lens) * to_px + middle, centre - reach)
+    high = min(0.5 * (lens + behind) * to_px + middle, centre + reach)
+    first = max(int(np.ceil(low)), 0)
+    return Cell(first, min(int(np.ceil(high)), pixels) - first, first - centre)
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)

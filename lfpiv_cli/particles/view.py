@@ -33,8 +33,6 @@ from lfpiv_cli.weights.scene import NO_FACES
 
 # Particles that are smaller are taken as this large, so that profiles have slopes: a thousandth of a lens.
 SMALLEST_RADIUS_LENSES = 1e-3
-# Pixels on either side of those that rays light, for what diffraction spreads.
-BESIDE = 2
 # Depths between two others at which footprints are asked for; behind curved faces also places along each image axis.
 SAMPLED_DEPTHS, SAMPLED_PLACES = 101, 11
 # Tables of hexagonal cells serve balls that differ from theirs by this factor: only their blur's variance is changed.
@@ -325,12 +323,14 @@ def _image_scale(view: View, z_mm: NDArray[np.float64]) -> NDArray[np.float64]:
 def entry_capacity(view: View, z_low_mm: float, z_high_mm: float) -> int:
     """Return how many (lens, pixel) entries a particle between two depths can have at most."""
     camera, per_axis = view.camera, 0.0
+    whole = view.lines.table.shape[0] > 0
     patch = camera.pixel_mm * camera.image_distance_mm / camera.microlens_distance_mm
     spreads = _spreads_mm(view, _between(view, z_low_mm, z_high_mm))
-    beside = 2.0 * BESIDE if view.lines.table.shape[0] > 0 else 0.0
     for half in (view.half_x_mm, view.half_y_mm):
         lenses = np.ceil(spreads / half) + 2.0
         # A lens sees the part of the aperture whose light falls into its cell.
         lit = np.minimum(2.0 * camera.aperture_radius_mm, 3.0 * half * 2.0 * camera.aperture_radius_mm / spreads)
-        per_axis = max(per_axis, float(np.max(lenses * (lit / patch + 3.0 + beside))))
+        # Waves light whole cells.
+        pixels = 2.0 * half / camera.pixel_mm + 3.0 if whole else lit / patch + 3.0
+        per_axis = max(per_axis, float(np.max(lenses * pixels)))
     return int(per_axis**2) + 1

@@ -28,7 +28,7 @@ from lfpiv_cli.files.memory import ensure_room
 from lfpiv_cli.files.particles import Particles, write_particles
 from lfpiv_cli.files.provenance import record
 from lfpiv_cli.interface.weights_cost import LONG_S, MUCH_BYTES
-from lfpiv_cli.notice import Notice
+from lfpiv_cli.notice import Notice, written
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.reference import FOCAL_POINT, Reference
@@ -216,7 +216,7 @@ def _begin(
     settings, paths = load_config(config), {name: output / name for name in names}
     pixels = math.prod(settings.image_shape())
     seconds, held = PIXEL_S * pixels * sum(name.endswith(".tif") for name in names), float(HELD_BYTES_A_PIXEL * pixels)
-    ensure_room(held, f"simulate, for images of {pixels:.3g} pixels,", "a sensor with fewer pixels needs less")
+    ensure_room(held, f"simulate, for images of {written(pixels)} pixels,", "a sensor with fewer pixels needs less")
     console.warn(_work_notices(seconds, held))
     for path in paths.values():
         ensure_writable(path, overwrite, [config])
@@ -227,7 +227,7 @@ def _work_notices(seconds: float, held: float) -> list[Notice]:
     """Return whether images take more time or memory than one would expect."""
     if seconds <= LONG_S and held <= MUCH_BYTES:
         return []
-    text = f"its images will take about {seconds / 60.0:.2g} minutes of a core at least, and {held / 1e9:.2g} GB"
+    text = f"its images will take about {written(seconds / 60.0, 2)} minutes of a core at least, and {written(held / 1e9, 2)} GB"
     share = max(seconds / LONG_S, held / MUCH_BYTES)
     return [Notice("heavy-work", "camera.sensor", text, "fewer columns and rows", share)]
 
