@@ -411,11 +411,17 @@ def test_a_board_in_part_or_of_another_size_is_told(table2: Camera) -> None:
     assert [each.code for each in magnification_notices(-0.836, table2)] == ["magnification"]
 
 
-@pytest.mark.parametrize(("residual", "codes"), [(0.19, []), (0.21, ["light-unexplained"])])
-def test_a_fifth_of_the_light_unexplained_is_reported(residual: float, codes: list[str]) -> None:
+@pytest.mark.parametrize(
+    ("residual", "codes"), [(0.09, []), (0.11, ["light-model"]), (0.19, ["light-model"]), (0.21, ["light-unexplained"])]
+)
+def test_light_that_particles_do_not_explain_is_reported(residual: float, codes: list[str]) -> None:
     measured = {"residual": residual, "residual_rms_counts": 100.0, "read_noise_counts": 1.0, "particles_per_lens": 0.1}
-    points = Points(np.zeros((4, 3)), {}, Reference("focal_point", 0.0), attributes=measured, provenance={})
-    assert [notice.code for notice in light_notices(points, "a.vtkhdf")] == codes
+    for light, remedy in (("rays", "give reconstruction.wavelength_nm"), ("waves", "wavelength_nm and diffusion_px")):
+        attributes = measured | {"light": light}
+        points = Points(np.zeros((4, 3)), {}, Reference("focal_point", 0.0), attributes=attributes, provenance={})
+        notices = light_notices(points, "a.vtkhdf")
+        assert [notice.code for notice in notices] == codes
+        assert all(remedy in notice.remedy for notice in notices if notice.code == "light-model")
 
 
 @pytest.mark.parametrize(

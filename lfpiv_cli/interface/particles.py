@@ -319,6 +319,7 @@ def points_of(bench: Bench, frame: Frame, found: Particles, size: TracerSize, pr
         attributes=content.reference.attributes()
         | {
             "refraction": "paraxial" if isinstance(space, ObjectSpace) and space.straight else "exact",
+            "light": "rays" if bench.settings.reconstruction.wavelength_nm is None else "waves",
             "residual": share_left,
             "residual_rms_counts": float(np.sqrt(np.mean(left[~frame.unusable] ** 2))),
             "excluded_pixels": int(np.count_nonzero(frame.unusable)),
@@ -347,6 +348,20 @@ def light_notices(points: Points, name: str) -> list[Notice]:
                 "check the calibration (refine-calibration), particle_diameter_mm, --dark, --background and the volume",
                 unexplained,
                 f"at most {LARGEST_UNEXPLAINED:g}",
+            )
+        )
+    elif unexplained > MUCH_LEFT:
+        notices.append(
+            Notice(
+                "light-model",
+                name,
+                f"{unexplained:.0%} of the light is not that of the particles found by {measured['light']}, at most "
+                f"{MUCH_LEFT:.0%} where the model is right: stated errors of places are too small",
+                "give reconstruction.wavelength_nm, as lenses diffract"
+                if measured["light"] == "rays"
+                else "check the calibration, wavelength_nm and diffusion_px",
+                unexplained,
+                f"at most {MUCH_LEFT:g}",
             )
         )
     found = measured["particles_per_lens"]

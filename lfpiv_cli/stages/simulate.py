@@ -227,7 +227,8 @@ def _work_notices(seconds: float, held: float) -> list[Notice]:
     """Return whether images take more time or memory than one would expect."""
     if seconds <= LONG_S and held <= MUCH_BYTES:
         return []
-    text = f"its images will take about {written(seconds / 60.0, 2)} minutes of a core at least, and {written(held / 1e9, 2)} GB"
+    minutes, size = written(seconds / 60.0, 2), written(held / 1e9, 2)
+    text = f"its images will take about {minutes} minutes of a core at least, and {size} GB"
     share = max(seconds / LONG_S, held / MUCH_BYTES)
     return [Notice("heavy-work", "camera.sensor", text, "fewer columns and rows", share)]
 
