@@ -64,7 +64,8 @@ def test_existing_output_gives_6_and_is_untouched(tmp_path):
 
 @pytest.mark.thorough
 def test_unwritable_output_gives_7_before_computing(tmp_path):
-    assert lfpiv("build-weights", CONFIG, "-o", tmp_path / "no" / "such" / "w.h5").returncode == 7
+    (tmp_path / "file").write_text("no folder", encoding="utf-8")
+    assert lfpiv("build-weights", CONFIG, "-o", tmp_path / "file" / "such" / "w.h5").returncode == 7
 
 
 @pytest.mark.thorough
@@ -88,8 +89,9 @@ def test_a_closed_pipe_is_quiet():
 
 
 def hear_interrupts():
-    """Have a new process hear SIGINT, which shells have their background jobs ignore."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    """Have a new process hear SIGINT, which shells have their background jobs ignore, and SIGHUP, as nohup has it."""
+    for sent in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(sent, signal.SIG_DFL)
 
 
 IGNORED_FIRST = """
@@ -148,6 +150,7 @@ def test_a_signal_is_answered_while_a_compiled_call_goes_on():
     words = [sys.executable, "-c", IN_A_LONG_CALL]
     with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout.readline() == "begun\n"
+        time.sleep(1.0)  # from these words to within the call
         process.send_signal(signal.SIGTERM)
         assert process.stderr.readline() == "lfpiv: terminated\n"
         assert process.poll() is None
@@ -177,6 +180,9 @@ def test_signals_end_the_work_and_leave_nothing(tmp_path, sent, code, said):
     config = tmp_path / "air.yaml"
     config.write_text(CONFIG.read_text().replace("reference: mid_plane", "reference: focal_point"))
     assert lfpiv("build-weights", config, "-o", tmp_path / "w.h5").returncode == 0
+    # Compilation, which answers late, is over then.
+    assert lfpiv("reconstruct", tmp_path / "w.h5", SAMPLE / "pair_a.tif", "-o", tmp_path / "v.vtkhdf").returncode == 0
+    (tmp_path / "v.vtkhdf").unlink()
     images = (tmp_path / "w.h5", SAMPLE / "pair_a.tif", "--iterations", "100000", "-o", tmp_path / "v.vtkhdf")
     command = [sys.executable, "-m", "lfpiv_cli", "reconstruct", *(str(part) for part in images)]
     for seconds in (4.0, 8.0, 16.0):

@@ -90,8 +90,9 @@ def main() -> NoReturn:
     """Run the command line and leave with the exit code of the outcome."""
     # Asked of the words themselves: a command line that is not understood has no options yet.
     debug, as_json = ("--debug" in sys.argv[1:], "--json" in sys.argv[1:])
-    end_by_signals()
+    # First: a pipe for signals would take the number of a stdout that is closed.
     stdout = open_streams()
+    end_by_signals()
     try:
         ensure_address_space()
         cli.main(standalone_mode=False)
