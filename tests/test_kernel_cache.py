@@ -78,17 +78,26 @@ def test_a_file_in_the_way_is_no_place(tmp_path: Path) -> None:
     assert kernel_cache._is_writable(tmp_path / "cache")
 
 
-def test_kernels_of_other_files_are_not_kept(tmp_path: Path) -> None:
-    code, kernel = tmp_path / "optics" / "a.py", tmp_path / "optics" / "__pycache__" / "b.nbi"
-    kernel.parent.mkdir(parents=True)
-    code.write_text("1")
-    kernel_cache.forget_outdated(tmp_path)
-    kernel.write_text("compiled")
-    kernel_cache.forget_outdated(tmp_path)
-    assert kernel.exists()
-    os.utime(code, ns=(1, 1))
-    kernel_cache.forget_outdated(tmp_path)
-    assert not kernel.exists()
+def test_kernels_of_changed_files_and_of_those_that_import_them_go(tmp_path: Path) -> None:
+    package = tmp_path / "made"
+    (package / "optics" / "__pycache__").mkdir(parents=True)
+    code = {
+        "base": "HALF = 0.5",
+        "lens": "from made.optics.base import HALF",
+        "camera": "from made.optics import lens",
+        "wall": "import numpy",
+    }
+    for name, text in code.items():
+        (package / "optics" / f"{name}.py").write_text(text)
+    kernel_cache.forget_outdated(package)
+    kernels = {name: package / "optics" / "__pycache__" / f"{name}.trace-1.py311.nbi" for name in [*code, "removed"]}
+    for kernel in kernels.values():
+        kernel.write_text("compiled")
+    kernel_cache.forget_outdated(package)
+    assert all(kernel.exists() for kernel in kernels.values())
+    os.utime(package / "optics" / "base.py", ns=(1, 1))
+    kernel_cache.forget_outdated(package)
+    assert [name for name, kernel in kernels.items() if kernel.exists()] == ["wall"]
 
 
 @pytest.mark.thorough

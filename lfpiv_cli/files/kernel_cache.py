@@ -5,13 +5,13 @@ names, and refuses to work where it can write to none of these, as in a containe
 for this process alone takes their place, with a copy of what the folder that cannot be written holds.
 
 Numba takes compiled code for current while its own file is: what that code has in it of other files may be of before.
-So compiled code beside the package goes when any file of the package has changed.
+So compiled code beside the package goes when its file, or one that this imports, directly or not, has changed.
 """
 
 from __future__ import annotations
 
+import ast
 import atexit
-import hashlib
 import os
 import shutil
 import sys
@@ -51,17 +51,46 @@ def ensure_place() -> None:
 
 
 def forget_outdated(package: Path) -> None:
-    """Remove the compiled kernels beside a package's files if any of these has changed since; as far as allowed."""
-    files = sorted(package.rglob("*.py"))
-    told = "".join(f"{path.relative_to(package)} {os.stat(path).st_mtime_ns}\n" for path in files)
-    digest, stamp = hashlib.sha256(told.encode()).hexdigest(), package / "__pycache__" / STAMP
-    with suppress(OSError):
-        if stamp.is_file() and stamp.read_text(encoding="ascii") == digest:
+    """Remove the compiled kernels beside a package's files if these, or what they import, have changed; if allowed."""
+    times = {path: path.stat().st_mtime_ns for path in sorted(package.rglob("*.py"))}
+    stamp = package / "__pycache__" / STAMP
+    current = "".join(f"{path.relative_to(package)} {time}\n" for path, time in times.items())
+    with suppress(OSError, SyntaxError):
+        before = stamp.read_text(encoding="utf-8") if stamp.is_file() else ""
+        if before == current:
             return
+        lines = set(before.splitlines())
+        changed = {path for path, time in times.items() if f"{path.relative_to(package)} {time}" not in lines}
+        outdated = _importing(changed, _imports(package, list(times)))
         for kernel in [*package.rglob("*.nbi"), *package.rglob("*.nbc")]:
-            kernel.unlink(missing_ok=True)
+            source = kernel.parents[1] / f"{kernel.name.split('.')[0]}.py"
+            if source in outdated or source not in times:
+                kernel.unlink(missing_ok=True)
         stamp.parent.mkdir(exist_ok=True)
-        stamp.write_text(digest, encoding="ascii")
+        stamp.write_text(current, encoding="utf-8")
+
+
+def _imports(package: Path, files: list[Path]) -> dict[Path, set[Path]]:
+    """Return which of the package's files each one imports by name."""
+    found: dict[Path, set[Path]] = {}
+    for path in files:
+        nodes = list(ast.walk(ast.parse(path.read_bytes())))
+        names = [
+            f"{node.module}.{each.name}" for node in nodes if isinstance(node, ast.ImportFrom) for each in node.names
+        ]
+        names += [node.module or "" for node in nodes if isinstance(node, ast.ImportFrom)]
+        found[path] = {package.parent.joinpath(*name.split(".")).with_suffix(".py") for name in names}
+    return found
+
+
+def _importing(changed: set[Path], imports: dict[Path, set[Path]]) -> set[Path]:
+    """Return files that have changed, and those that import such ones."""
+    reached: set[Path] = set()
+    more = changed
+    while more:
+        reached |= more
+        more = {path for path, imported in imports.items() if path not in reached and imported & reached}
+    return reached
 
 
 def use(place: Path) -> None:
