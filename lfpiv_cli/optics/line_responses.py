@@ -29,8 +29,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
+from scipy.ndimage import spline_filter1d
 from scipy.special import j0
 
 from lfpiv_cli.optics.camera import Camera
@@ -41,13 +43,17 @@ from lfpiv_cli.optics.object_space import ObjectSpace
 OFFSETS, SAMPLES = 64, 2
 # Samples of the sensor per pixel that are added up, and responses per pixel that are kept.
 FINE, PHASES = 4, 2
+# Offsets that are worked on together, and of so many one tells what all are like.
+BATCH, ALIKE = 32, 4
+# Lenses about a pixel whose light reaches it: one further away still adds a hundredth of its field.
+LENSES = 5
 # Depths between which responses are interpolated, in depths over which light spreads by one lens.
 DEPTH_STEP = 0.12
 # Products of the field, and of the light.
-FIELD_TERMS, TERMS = 20, 14
+FIELD_TERMS, TERMS = 16, 24
 # Beyond the geometric spot the field is followed for so many Fresnel lengths, and so many widths of a point in focus.
 # Where it ends sooner, by half of these widths, what is left of many tracers doubles the errors of each.
-FRESNEL_LENGTHS, FOCUS_WIDTHS = 3.0, 12.0
+FRESNEL_LENGTHS, FOCUS_WIDTHS = 3.0, 36.0
 # Places along the spot's radius per period of the steepest phase, for a spline through them.
 PER_PERIOD = 17.0
 
@@ -61,20 +67,23 @@ class LineResponses(NamedTuple):
     ----------
     table : (depths, offsets, PHASES, terms, pixels) A, float32; pixel n of phase p lies n + p / PHASES - pixels / 2
         from the middle of the lens image; no depths where light goes by rays
-    signs : (terms,)
+    signs, ones : (terms,) of the products; ones
     first_depth_mm, depth_step_mm, offset_step_mm : of the table; its offsets are symmetric about 0
     margin_mm : by how much a spot on the array is larger than by rays
     """
 
     table: Lines
     signs: NDArray[np.float32]
+    ones: NDArray[np.float32]
     first_depth_mm: float
     depth_step_mm: float
     offset_step_mm: float
     margin_mm: float
 
 
-NO_LINES = LineResponses(np.zeros((0, 0, PHASES, 0, 0), np.float32), np.zeros(0, np.float32), 0.0, 1.0, 1.0, 0.0)
+NO_LINES = LineResponses(
+    np.zeros((0, 0, PHASES, 0, 0), np.float32), np.zeros(0, np.float32), np.zeros(0, np.float32), 0.0, 1.0, 1.0, 0.0
+)
 
 
 def line_responses(
@@ -99,8 +108,9 @@ def line_responses(
     whole = np.concatenate([half[:, :0:-1, ::-1], half], axis=1)[:, :, :-1]
     positive = np.arange(TERMS) < (TERMS + 1) // 2
     return LineResponses(
-        _by_phases(whole),
+        _of_phases(whole.transpose(0, 1, 3, 2), PHASES),
         np.where(positive, 1.0, -1.0).astype(np.float32),
+        np.ones(TERMS, np.float32),
         float(pupil.depths_mm[0]),
         step,
         float(camera.lattice.pitch.mean()) / OFFSETS,
@@ -135,16 +145,35 @@ def _average(table: Lines, share: Lines, found: Lines) -> None:
                             target[phase, term, pixel] += weight * source[phase, term, pixel]
 
 
-def diffused(points: LineResponses, diffusion_px: float) -> LineResponses:
-    """Return responses after charge has diffused by a Gaussian: nothing in them is finer than two values tell."""
+def on_pixels(points: LineResponses, diffusion_px: float) -> LineResponses:
+    """Return responses after charge has diffused by a Gaussian, of pixels that integrate where samples were summed."""
     table = points.table
     depths, offsets, phases, terms, pixels = table.shape
-    along = table.transpose(0, 1, 3, 4, 2).reshape(depths, offsets, terms, pixels * phases)
     frequency = np.fft.rfftfreq(2 * pixels * phases, 1.0 / phases)
-    damping = np.exp(-2.0 * (np.pi * diffusion_px * frequency) ** 2).astype(np.float32)
-    blurred = np.fft.irfft(np.fft.rfft(along, 2 * pixels * phases, axis=-1) * damping, axis=-1)[..., : pixels * phases]
-    by_phase = blurred.reshape(depths, offsets, terms, pixels, phases).transpose(0, 1, 4, 2, 3)
-    return points._replace(table=np.ascontiguousarray(by_phase, np.float32))
+    damping = np.sinc(frequency / FINE) * np.exp(-2.0 * (np.pi * diffusion_px * frequency) ** 2)
+    blurred = np.fft.irfft(np.fft.rfft(np.eye(pixels * phases), 2 * pixels * phases) * damping)[:, : pixels * phases]
+    return points._replace(table=_of_phases(_along_pixels(table) @ blurred.astype(np.float32), phases))
+
+
+def splines(lines: LineResponses) -> LineResponses:
+    """Return the coefficients of the cubic splines through responses along depth, offset and place under the lens."""
+    phases = lines.table.shape[2]
+    table = _of_phases(spline_filter1d(_along_pixels(lines.table), output=np.float32), phases)
+    for axis in (0, 1):
+        spline_filter1d(table, axis=axis, output=table)
+    return lines._replace(table=table)
+
+
+def _along_pixels(table: Lines) -> Lines:
+    """Return responses (depths, offsets, terms, places under the lens) of a table."""
+    depths, offsets, phases, terms, pixels = table.shape
+    return table.transpose(0, 1, 3, 4, 2).reshape(depths, offsets, terms, pixels * phases)
+
+
+def _of_phases(along: Lines, phases: int) -> Lines:
+    """Return a table of responses (depths, offsets, terms, places under the lens)."""
+    by_phase = along.reshape(*along.shape[:3], -1, phases).transpose(0, 1, 4, 2, 3)
+    return np.ascontiguousarray(by_phase, np.float32)
 
 
 class _Pupil:
@@ -173,7 +202,7 @@ class _Pupil:
         self.bessel = j0(wave_number / s_i * np.outer(self.radii_mm, nodes))
         # Pixels of a cell, and one more on either side.
         self.pixels = int(np.ceil(pitch * camera.micro_image_scale / camera.pixel_mm)) + 3
-        across = self.step_mm * (np.arange(3 * OFFSETS * SAMPLES) - 0.5 * (3 * OFFSETS * SAMPLES - 1))
+        across = self.step_mm * (np.arange(LENSES * OFFSETS * SAMPLES) - 0.5 * (LENSES * OFFSETS * SAMPLES - 1))
         beside = across - pitch * np.rint(across / pitch)
         u = camera.pixel_mm / FINE * (np.arange((self.pixels + 1) * FINE) - 0.5 * ((self.pixels + 1) * FINE - 1))
         lens = across**2 / s_i - beside**2 / camera.microlens_focal_length_mm
@@ -232,37 +261,38 @@ def _pixel_products(pupil: _Pupil, number: int) -> NDArray[np.float32]:
     half = pupil.field(number).astype(np.complex64)
     whole = np.concatenate([half[:, ::-1], half], axis=1)
     lenses = int(np.ceil(pupil.reaches_mm[number] / pupil.pitch_mm + 0.5))
-    per_pitch, pixels = OFFSETS * SAMPLES, pupil.pixels
-    # Room for three lenses about each place, the spot in the middle.
-    room = (lenses + 2) * per_pitch
+    per_pitch = OFFSETS * SAMPLES
+    # Room for the lenses about each place, the spot in the middle.
+    room = (lenses + (LENSES + 1) // 2) * per_pitch
     short = room - half.shape[1]
     field = np.pad(whole, ((0, 0), (short, short)))
     first, second = np.triu_indices(len(half))
-    mixed = first != second
-    responses = PHASES * pixels + 1
-    found = np.zeros((lenses * OFFSETS + 1, responses, 2, len(first)), np.float32)
-    for offset in range(len(found)):
+    twice = np.where(first == second, 1.0, np.sqrt(2.0)).astype(np.float32)
+    width, places = LENSES * per_pitch, lenses * OFFSETS + 1
+    responses, step = PHASES * pupil.pixels + 1, FINE // PHASES
+    found = np.empty((places, responses, 2, len(first)), np.float32)
+    windows = sliding_window_view(field, width, axis=1)
+    for begin in range(0, places, BATCH):
         # The lens lies at -xi from the spot.
-        begin = room - SAMPLES * offset - 3 * per_pitch // 2
-        at_sensor = pupil.to_sensor @ field[:, begin : begin + 3 * per_pitch].T
-        product = at_sensor[:, first] * at_sensor[:, second].conj()
-        sums = np.cumsum(np.pad(product, ((1, 0), (0, 0))), axis=0)
-        of_pixels = (sums[FINE:] - sums[:-FINE])[:: FINE // PHASES][:responses]
-        found[offset, :, 0] = of_pixels.real
-        found[offset, :, 1] = of_pixels.imag
+        starts = room - width // 2 - SAMPLES * np.arange(begin, min(begin + BATCH, places))
+        at_sensor = (windows[:, starts].reshape(-1, width) @ pupil.to_sensor.T).reshape(len(half), len(starts), -1)
+        product = at_sensor[first] * at_sensor[second].conj()
+        parts = product.reshape(*product.shape[:2], -1, step).sum(axis=-1)
+        of_pixels = sum(parts[..., n : n + responses] for n in range(PHASES)).transpose(1, 2, 0) * twice
+        found[begin : begin + BATCH, :, 0] = of_pixels.real
+        found[begin : begin + BATCH, :, 1] = of_pixels.imag
     found *= pupil.camera.pixel_mm / FINE
-    found[..., mixed] *= np.float32(np.sqrt(2.0))
     return found
 
 
 def _compressed(products: NDArray[np.float32]) -> Lines:
     """Return the A (offsets >= 0, responses, TERMS) closest to the whole form: half of them count positive."""
     offsets, responses, _, terms = products.shape
-    columns = products.reshape(offsets * responses, 2 * terms)
     signs = np.repeat([1.0, -1.0], terms)
-    # Offsets beside 0 stand for their mirror images, too.
-    weight = np.repeat(np.where(np.arange(offsets) > 0, 2.0, 1.0), responses)[:, np.newaxis].astype(np.float32)
-    gram = ((columns * weight).T @ columns).astype(np.float64)
+    # Neighbouring offsets are alike; those beside 0 stand for their mirror images, too.
+    some = products[::ALIKE].reshape(-1, 2 * terms)
+    weight = np.repeat(np.where(np.arange(0, offsets, ALIKE) > 0, 2.0, 1.0), responses)[:, np.newaxis]
+    gram = ((some * weight.astype(np.float32)).T @ some).astype(np.float64)
     values, vectors = np.linalg.eigh(gram)
     kept = values > 1e-7 * values[-1]
     roots, vectors = np.sqrt(values[kept]), vectors[:, kept]
@@ -271,7 +301,8 @@ def _compressed(products: NDArray[np.float32]) -> Lines:
     positive = (TERMS + 1) // 2
     chosen = np.r_[np.argsort(-strengths)[:positive], np.argsort(strengths)[: TERMS - positive]]
     to_lines = (vectors / roots) @ turned[:, chosen] * np.sqrt(np.abs(strengths[chosen]))
-    return (columns @ to_lines.astype(np.float32)).reshape(offsets, responses, TERMS)
+    lines = products.reshape(-1, 2 * terms) @ to_lines.astype(np.float32)
+    return lines.reshape(offsets, responses, TERMS)
 
 
 def _turned(lines: Lines, before: Lines) -> Lines:
@@ -283,10 +314,3 @@ def _turned(lines: Lines, before: Lines) -> Lines:
         left, _, right = np.linalg.svd(np.einsum("ouk,oul->kl", here, there))
         found[..., chosen] = lines[..., chosen] @ (left @ right).astype(np.float32)
     return found
-
-
-def _by_phases(lines: Lines) -> Lines:
-    """Return lines (depths, offsets, responses, TERMS) as `LineResponses.table`."""
-    depths, offsets, responses, terms = lines.shape
-    by_phase = lines.reshape(depths, offsets, responses // PHASES, PHASES, terms).transpose(0, 1, 3, 4, 2)
-    return np.ascontiguousarray(by_phase, dtype=np.float32)

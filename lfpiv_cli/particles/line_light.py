@@ -1,8 +1,8 @@
 """The light of one particle by line responses: under each lens a sum of products of a row's and a column's.
 
 Each pixel belongs to one lens's cell, whose light is that of all lenses, so that no pixel is lit twice. Along each axis
-the responses are interpolated by cubics in the spot's place about the lens, in depth and in the pixel's place under the
-lens; derivatives are those of the same cubics.
+the responses are cubic splines of the spot's place about the lens, of depth and of the pixel's place under the lens;
+derivatives are those of the same splines.
 
 Axes and values: see `response`; `optics.line_responses` has the theory.
 """
@@ -16,15 +16,22 @@ from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.particles.refraction import Bend
-from lfpiv_cli.particles.response import Along, lenses_of, project
+from lfpiv_cli.particles.response import Along, Projection, lenses_of, project
 from lfpiv_cli.particles.view import View
+from lfpiv_cli.simd.combine import ROWS, combine_rows
+from lfpiv_cli.simd.vectors import LANES
 from lfpiv_cli.threads import COUNT_NO_REFERENCES
 
 # Responses along one axis: the light's, and its derivatives by the spot's place and by depth.
 LIGHT, BY_OFFSET, BY_DEPTH = range(3)
 KINDS = 3
-# Pixels of a row that are worked on side by side.
-LANES = 8
+# What is written of a pixel: light and its derivatives by x, y and z.
+VALUES = 4
+# Pixels are left out that get less than this share of the light, a count or two of a bright particle beside a noise of
+# several: a thousandth of all, which disturbs no neighbour.
+DARK = 1.5e-6
+# Lenses that show less than this share tell nothing of where the particle is.
+FAINT = 1e-5
 Lines = NDArray[np.float32]
 
 
@@ -35,11 +42,33 @@ class Cell(NamedTuple):
     ----------
     first, number : the first one, and how many
     place : of the first from the middle of the lens image, pixels
+    moved_mm : how much further the spot lies from the lens than from the one whose responses are known
     """
 
     first: int
     number: int
     place: float
+    moved_mm: float
+
+
+class Room(NamedTuple):
+    """Room for one lens, each flat.
+
+    Attributes
+    ----------
+    across, down : (KINDS, terms, length) responses of its columns and its rows; beyond its pixels, of no meaning
+    light : (VALUES, length, length) its pixels' light, and this by the spot's place along x, along y, and by depth
+    lit : (length, 2) of each row the first pixel that is lit, and their number
+    terms : (terms,) numbers of the products
+    length : of a line, a multiple of `LANES`
+    """
+
+    across: Lines
+    down: Lines
+    light: Lines
+    lit: NDArray[np.int64]
+    terms: NDArray[np.int32]
+    length: int
 
 
 @njit(cache=True)
@@ -56,63 +85,70 @@ def respond_by_lines(view: View, bend: Bend, z: float, pixels: NDArray[np.int32]
         return 0
     # Lenses of a column, and of a row, have nearly the same place along one axis: that of the middle one.
     middle_i, middle_j = (low_i + high_i) // 2, (low_j + high_j) // 2
-    room = np.empty((KINDS, view.lines.table.shape[3], LANES * (view.lines.table.shape[4] // LANES + 1)), np.float32)
-    across, down = np.empty_like(room), np.empty_like(room)
     of_columns = _responses(view, x, z, centres[middle_j, low_i : high_i + 1, 0])
     of_rows = _responses(view, y, z, centres[low_j : high_j + 1, middle_i, 1])
-    # What lies between a cell's last pixel and the end of its lanes is worked on, and not written.
-    across[:] = np.float32(0.0)
-    row = np.empty((4, room.shape[2]), np.float32)
+    reach_x, reach_y = _reach(view, x), _reach(view, y)
+    room = _room_for(view)
     count = 0
     for j in range(low_j, high_j + 1):
         for i in range(low_i, high_i + 1):
             s_x, s_y = centres[j, i, 0], centres[j, i, 1]
-            of_x = _cell(view, centres[j, i - 1, 0], s_x, centres[j, i + 1, 0], x.pixels)
-            if of_x.number <= 0:
+            beside_x = max(abs(s_x - x.at) - x.half, 0.0) / reach_x
+            beside_y = max(abs(s_y - y.at) - y.half, 0.0) / reach_y
+            if beside_x * beside_x + beside_y * beside_y > 1.0:
                 continue
-            of_y = _cell(view, centres[j - 1, i, 1], s_y, centres[j + 1, i, 1], y.pixels)
-            if of_y.number <= 0 or count + of_x.number * of_y.number > pixels.size:
-                continue
-            _place(of_columns[i - low_i], of_x, centres[middle_j, i, 0] - s_x, across)
-            _place(of_rows[j - low_j], of_y, centres[j, middle_i, 1] - s_y, down)
-            _join(view, x, y, of_x, of_y, across, down, row, pixels[count:], values[:, count:])
-            count += of_x.number * of_y.number
+            before, behind = centres[j, i - 1, 0], centres[j, i + 1, 0]
+            of_x = _cell(view, (before, s_x, behind), x.pixels, centres[middle_j, i, 0] - s_x)
+            before, behind = centres[j - 1, i, 1], centres[j + 1, i, 1]
+            of_y = _cell(view, (before, s_y, behind), y.pixels, centres[j, middle_i, 1] - s_y)
+            if of_x.number > 0 and of_y.number > 0 and count + of_x.number * of_y.number <= pixels.size:
+                responses = of_columns[i - low_i], of_rows[j - low_j]
+                count += _write_lens(view, projection, of_x, of_y, responses, room, pixels[count:], values[:, count:])
     return count
 
 
+@njit(cache=True)
+def _room_for(view: View) -> Room:
+    """Return the room for a lens."""
+    terms, width = view.lines.table.shape[3], view.lines.table.shape[4]
+    length = LANES * ((width + ROWS) // LANES + 1)
+    across, down = np.zeros(KINDS * terms * length, np.float32), np.zeros(KINDS * terms * length, np.float32)
+    light, lit = np.empty(VALUES * length * length, np.float32), np.empty((length, 2), np.int64)
+    return Room(across, down, light, lit, np.arange(terms).astype(np.int32), length)
+
+
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def _cell(view: View, before: float, lens: float, behind: float, pixels: int) -> Cell:
-    """Return the pixels of a lens's cell along one axis of the sensor, by the places of three lenses on the array."""
+def _reach(view: View, along: Along) -> float:
+    """Return how far from the spot's middle on the array there is light, along one axis."""
+    return abs(along.alpha) * view.camera.aperture_radius_mm * along.stretch + along.radius
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def _cell(view: View, lenses_mm: tuple[float, float, float], pixels: int, moved_mm: float) -> Cell:
+    """Return the pixels of a lens's cell along one axis of the sensor; it is the second of three on the array."""
     camera, middle = view.camera, 0.5 * (pixels - 1)
     to_px = (1.0 + camera.microlens_distance_mm / camera.image_distance_mm) / camera.pixel_mm
-    # Cubics need a value more on either side.
+    before, lens, behind = lenses_mm
+    # Splines need a value more on either side.
     centre, reach = lens * to_px + middle, 0.5 * view.lines.table.shape[4] - 1.0
     low = max(0.5 * (before + lens) * to_px + middle, centre - reach)
     high = min(0.5 * (lens + behind) * to_px + middle, centre + reach)
     first = max(int(np.ceil(low)), 0)
-    return Cell(first, min(int(np.ceil(high)), pixels) - first, first - centre)
+    return Cell(first, min(int(np.ceil(high)), pixels) - first, first - centre, moved_mm)
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def _cubic(t: float) -> tuple[float, float, float, float]:
-    """Return the weights of four neighbouring values for one that lies t, 0 to 1, behind the second (Catmull-Rom)."""
-    return (
-        t * (-0.5 + t * (1.0 - 0.5 * t)),
-        1.0 + t * t * (-2.5 + 1.5 * t),
-        t * (0.5 + t * (2.0 - 1.5 * t)),
-        t * t * (-0.5 + 0.5 * t),
-    )
+def _spline(t: float) -> tuple[float, float, float, float]:
+    """Return the weights of four coefficients of a cubic spline at t, 0 to 1, behind the second's place."""
+    u = 1.0 - t
+    return u * u * u / 6.0, 2.0 / 3.0 - t * t * (1.0 - 0.5 * t), 2.0 / 3.0 - u * u * (1.0 - 0.5 * u), t * t * t / 6.0
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
 def _slopes(t: float) -> tuple[float, float, float, float]:
-    """Return the derivatives of `_cubic`."""
-    return (
-        -0.5 + t * (2.0 - 1.5 * t),
-        t * (-5.0 + 4.5 * t),
-        0.5 + t * (4.0 - 4.5 * t),
-        t * (-1.0 + 1.5 * t),
-    )
+    """Return the derivatives of `_spline`."""
+    u = 1.0 - t
+    return -0.5 * u * u, t * (1.5 * t - 2.0), u * (2.0 - 1.5 * u), 0.5 * t * t
 
 
 @njit(cache=True, fastmath=True)
@@ -123,94 +159,138 @@ def _responses(view: View, along: Along, z: float, lenses_mm: NDArray[np.float64
     """
     lines = view.lines
     depths, offsets, phases, terms, width = lines.table.shape
-    found = np.zeros((lenses_mm.size, KINDS, phases * terms * width), np.float32)
+    size = phases * terms * width
+    found = np.zeros((lenses_mm.size, KINDS, size), np.float32)
     deep = (along.stretch * z - lines.first_depth_mm) / lines.depth_step_mm
     deep = min(max(deep, 1.0), depths - 2.001)
     first_z = int(deep)
-    by_z, d_z = _cubic(deep - first_z), _slopes(deep - first_z)
+    by_z, d_z = _spline(deep - first_z), _slopes(deep - first_z)
+    per_mm, per_depth = 1.0 / lines.offset_step_mm, along.stretch / lines.depth_step_mm
     for lens in range(lenses_mm.size):
-        beside = (along.at - lenses_mm[lens]) / lines.offset_step_mm + 0.5 * (offsets - 1)
+        beside = (along.at - lenses_mm[lens]) * per_mm + 0.5 * (offsets - 1)
         if beside < 1.0 or beside >= offsets - 2.0:
             continue
         first_x = int(beside)
-        by_x, d_x = _cubic(beside - first_x), _slopes(beside - first_x)
+        p, q, r, t = _spline(beside - first_x)
+        a, b, c, d = np.float32(p), np.float32(q), np.float32(r), np.float32(t)
+        p, q, r, t = _slopes(beside - first_x)
+        e, f, g, h = np.float32(p * per_mm), np.float32(q * per_mm), np.float32(r * per_mm), np.float32(t * per_mm)
         light, by_offset, by_depth = found[lens, LIGHT], found[lens, BY_OFFSET], found[lens, BY_DEPTH]
-        for a in range(4):
-            for b in range(4):
-                source = lines.table[first_z - 1 + a, first_x - 1 + b].ravel()
-                w = np.float32(by_z[a] * by_x[b])
-                w_x = np.float32(by_z[a] * d_x[b] / lines.offset_step_mm)
-                w_z = np.float32(d_z[a] * by_x[b] * along.stretch / lines.depth_step_mm)
-                for n in range(source.size):
-                    light[n] += w * source[n]
-                    by_offset[n] += w_x * source[n]
-                    by_depth[n] += w_z * source[n]
+        for plane in range(4):
+            source = lines.table[first_z - 1 + plane, first_x - 1 : first_x + 3].reshape(4 * size)
+            one, two, three, four = (
+                source[:size],
+                source[size : 2 * size],
+                source[2 * size : 3 * size],
+                source[3 * size :],
+            )
+            w, w_z = np.float32(by_z[plane]), np.float32(d_z[plane] * per_depth)
+            for n in range(size):
+                here = a * one[n] + b * two[n] + c * three[n] + d * four[n]
+                light[n] += w * here
+                by_depth[n] += w_z * here
+                by_offset[n] += w * (e * one[n] + f * two[n] + g * three[n] + h * four[n])
     return found.reshape((lenses_mm.size, KINDS, phases, terms, width))
 
 
 @njit(cache=True, fastmath=True, **COUNT_NO_REFERENCES)
-def _place(responses: Lines, cell: Cell, moved_mm: float, out: Lines) -> None:
-    """Fill in the responses of a cell's pixels (KINDS, terms, pixels), of a lens from which the spot lies further."""
+def _place(responses: Lines, kind: int, cell: Cell, signs: Lines, out: Lines, length: int) -> None:
+    """Fill in the responses of a kind (KINDS, terms, length) of a cell's pixels, each term with a sign."""
     _, phases, terms, width = responses.shape
     place = (cell.place + 0.5 * width) * phases
     first = int(np.floor(place))
-    p, q, r, t = _cubic(place - first)
-    a, b, c, d = np.float32(p), np.float32(q), np.float32(r), np.float32(t)
-    moved = np.float32(moved_mm)
+    p, q, r, t = _spline(place - first)
+    moved = np.float32(cell.moved_mm if kind == LIGHT else 0.0)
     # Of two phases, the first of the four values belongs to the one, the next to the other.
     one, other = (first - 1) % phases, first % phases
     from_one, from_other = (first - 1) // phases, first // phases
     for k in range(terms):
-        for kind in range(KINDS):
-            target = out[kind, k]
-            before, behind = responses[kind, one, k, from_one:], responses[kind, other, k, from_other:]
-            for n in range(cell.number):
-                target[n] = a * before[n] + b * behind[n] + c * before[n + 1] + d * behind[n + 1]
-        target = out[LIGHT, k]
+        sign = signs[k]
+        a, b, c, d = sign * np.float32(p), sign * np.float32(q), sign * np.float32(r), sign * np.float32(t)
+        target = out[(kind * terms + k) * length : (kind * terms + k + 1) * length]
+        before, behind = responses[kind, one, k, from_one:], responses[kind, other, k, from_other:]
         for n in range(cell.number):
-            target[n] += moved * out[BY_OFFSET, k, n]
+            target[n] = a * before[n] + b * behind[n] + c * before[n + 1] + d * behind[n + 1]
+        if moved != 0.0:
+            before, behind = responses[BY_OFFSET, one, k, from_one:], responses[BY_OFFSET, other, k, from_other:]
+            for n in range(cell.number):
+                target[n] += moved * (a * before[n] + b * behind[n] + c * before[n + 1] + d * behind[n + 1])
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def _multiply(room: Room, size: tuple[int, int], kinds: tuple[int, int], value: int, added: int) -> None:
+    """Write or add the sums of products of a kind of response of columns and one of rows (columns, rows `size`)."""
+    terms, length = room.terms.size, room.length
+    for row in range(0, size[1], ROWS):
+        for column in range(0, size[0], LANES):
+            combine_rows(
+                room.light,
+                ((value * length + row) * length + column, length, added),
+                room.across,
+                room.terms,
+                (kinds[0] * terms * length + column, length, 0, terms),
+                room.down,
+                (kinds[1] * terms * length + row, length, 1),
+            )
 
 
 @njit(cache=True, fastmath=True, **COUNT_NO_REFERENCES)
-def _join(
+def _write_lens(
     view: View,
-    x: Along,
-    y: Along,
+    projection: Projection,
     of_x: Cell,
     of_y: Cell,
-    across: Lines,
-    down: Lines,
-    row: Lines,
+    responses: tuple[Lines, Lines],
+    room: Room,
     pixels: NDArray[np.int32],
     values: NDArray[np.float64],
-) -> None:
-    """Write the entries of one lens from its responses along both axes."""
-    terms, columns = across.shape[1], of_x.number
+) -> int:
+    """Write the entries of one lens from its responses along both axes; return their number."""
+    x, y, (columns, rows), length = projection.x, projection.y, responses, room.length
+    size, dark = (of_x.number, of_y.number), np.float32(DARK)
+    _place(columns, LIGHT, of_x, view.lines.ones, room.across, length)
+    _place(rows, LIGHT, of_y, view.lines.signs, room.down, length)
+    _multiply(room, size, (LIGHT, LIGHT), 0, 0)
+    # Of each row the pixels from the first that is lit to the last.
+    count, shown = 0, np.float32(0.0)
+    for m in range(of_y.number):
+        light = room.light[m * length : m * length + of_x.number]
+        first, last = 0, of_x.number
+        while first < last and light[first] < dark:
+            first += 1
+        while last > first and light[last - 1] < dark:
+            last -= 1
+        room.lit[m, 0], room.lit[m, 1] = first, last - first
+        begin = (of_y.first + m) * view.camera.columns + of_x.first + first
+        # A few sums of products are below 0 beside the light.
+        for n in range(last - first):
+            pixels[count + n] = begin + n
+            values[0, count + n] = max(light[first + n], np.float32(0.0))
+            shown += light[first + n]
+        count += last - first
+    if shown < FAINT:
+        for value in range(1, VALUES):
+            values[value, :count] = 0.0
+        return count
+    for kind in (BY_OFFSET, BY_DEPTH):
+        _place(columns, kind, of_x, view.lines.ones, room.across, length)
+        _place(rows, kind, of_y, view.lines.signs, room.down, length)
+    _multiply(room, size, (BY_OFFSET, LIGHT), 1, 0)
+    _multiply(room, size, (LIGHT, BY_OFFSET), 2, 0)
+    _multiply(room, size, (LIGHT, BY_DEPTH), 3, 0)
+    _multiply(room, size, (BY_DEPTH, LIGHT), 3, 1)
     # The spot moves by these with x and y, and by these with z.
     move_x, move_y = -x.beta * x.stretch, -y.beta * y.stretch
     drift_x, drift_y = -x.slope * x.x * x.stretch, -y.slope * y.x * y.stretch
-    groups = (columns + LANES - 1) // LANES
-    at = 0
+    at, area = 0, length * length
     for m in range(of_y.number):
-        row[:] = np.float32(0.0)
-        for k in range(terms):
-            sign = view.lines.signs[k]
-            b, b_y, b_z = sign * down[LIGHT, k, m], sign * down[BY_OFFSET, k, m], sign * down[BY_DEPTH, k, m]
-            for group in range(groups):
-                for lane in range(LANES):
-                    n = LANES * group + lane
-                    a = across[LIGHT, k, n]
-                    row[0, n] += a * b
-                    row[1, n] += across[BY_OFFSET, k, n] * b
-                    row[2, n] += a * b_y
-                    row[3, n] += a * b_z + across[BY_DEPTH, k, n] * b
-        first = (of_y.first + m) * view.camera.columns + of_x.first
-        for n in range(columns):
-            pixels[at + n] = first + n
-            by_x, by_y = float(row[1, n]), float(row[2, n])
-            # A few products are below 0 beside the light.
-            values[0, at + n] = max(row[0, n], np.float32(0.0))
-            values[1, at + n] = move_x * by_x
-            values[2, at + n] = move_y * by_y
-            values[3, at + n] = row[3, n] + drift_x * by_x + drift_y * by_y
-        at += columns
+        begin, number = m * length + room.lit[m, 0], room.lit[m, 1]
+        by_x = room.light[area + begin : area + begin + number]
+        by_y = room.light[2 * area + begin : 2 * area + begin + number]
+        by_z = room.light[3 * area + begin : 3 * area + begin + number]
+        for n in range(number):
+            values[1, at + n] = move_x * by_x[n]
+            values[2, at + n] = move_y * by_y[n]
+            values[3, at + n] = by_z[n] + drift_x * by_x[n] + drift_y * by_y[n]
+        at += number
+    return count

@@ -20,7 +20,7 @@ from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.optics.camera import Camera, KernelCamera
 from lfpiv_cli.optics.curved_space import CurvedSpace
-from lfpiv_cli.optics.line_responses import NO_LINES, LineResponses, diffused, line_responses, of_balls
+from lfpiv_cli.optics.line_responses import NO_LINES, LineResponses, line_responses, of_balls, on_pixels, splines
 from lfpiv_cli.optics.media import Layers, Media
 from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.optics.object_space import ObjectSpace
@@ -201,7 +201,7 @@ def _numbers(camera: Camera) -> tuple[float, ...]:
 @lru_cache(maxsize=4)
 def _points(numbers: tuple[float, ...], space: ObjectSpace, light: Light) -> LineResponses:
     """Return the line responses of points, charge diffused."""
-    return diffused(_sharp_points(numbers, space, light.wavelength_mm, light.depths_mm), light.diffusion_px)
+    return on_pixels(_sharp_points(numbers, space, light.wavelength_mm, light.depths_mm), light.diffusion_px)
 
 
 @lru_cache(maxsize=2)
@@ -240,7 +240,7 @@ def with_waves(view: View, points: LineResponses) -> View:
     """Return the view of light as waves, by the responses of points."""
     camera = view.camera
     radius = view.particle_radius_mm * camera.image_distance_mm / camera.focus_distance_mm
-    return view._replace(points=points, lines=of_balls(points, radius))
+    return view._replace(points=points, lines=splines(of_balls(points, radius)))
 
 
 def on_array_mm(view: View, points: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -134,6 +134,9 @@ combine_long = _combine(GROUP, VECTORS)
 combine_line = _combine(1, VECTORS)
 # 9 and 7 times.
 combine_vector = _combine(1, 1)
+# Rows of a lens's pixels: as many as a lens of 18 has, in three steps.
+ROWS = 6
+combine_rows = _combine(ROWS, 1)
 
 
 def turn_reference(out: Floats, to: tuple[int, int], source: Floats, lines: tuple[int, int]) -> None:
