@@ -31,7 +31,14 @@ from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.synthetic.render import Balls, ObjectSpace, render_points, render_white
 from lfpiv_cli.synthetic.sensor import Readout
 from lfpiv_cli.validation.place_errors import pairs_of
-from lfpiv_cli.validation.planning import Tracer, errors_by_depth_mm, half_view_mm, part_in_front, share_in_view
+from lfpiv_cli.validation.planning import (
+    Tracer,
+    errors_by_depth_mm,
+    half_view_mm,
+    in_miniature,
+    part_in_front,
+    share_in_view,
+)
 from lfpiv_cli.validation.tracer_bench import Rig, Search
 
 WATER = Media(1.0, 1.49, 1.33)
@@ -315,7 +322,8 @@ def test_errors_are_those_that_are_measured() -> None:
     rig = Rig(camera, WATER, Channel(12.0, 2.0), refraction="paraxial")
     search, rng = Search(rig, (2.6, 2.6, 8.4)), np.random.default_rng(3)
     depths, rays = np.array([-4.0, -2.5, 1.5, 3.0]), 400_000
-    told = errors_by_depth_mm(camera, WATER, depths, Tracer(5e5, 0.025, READOUT), 5e5 / rays)
+    seen = in_miniature(camera, WATER, depths, 0.025)
+    told = errors_by_depth_mm(seen, Tracer(5e5, 0.025, READOUT), 5e5 / rays)
     ratios = []
     for _ in range(4):
         x, y = (each.ravel() for each in np.meshgrid([-0.85, 0.0, 0.85], [-0.85, 0.0, 0.85]))
