@@ -187,7 +187,7 @@ def rig_lines(bench: Bench) -> list[Line]:
         _f_numbers,
         _lens_images,
         _rays,
-        _diffraction,
+        diffraction_line,
         _precision,
         _seeding,
         _voxels,
@@ -313,7 +313,7 @@ def _rays(bench: Bench) -> Line:
     return Line("rays", "look", "; ".join(f"{notice.about} {notice.text}: {notice.remedy}" for notice in told))
 
 
-def _diffraction(bench: Bench) -> Line:
+def diffraction_line(bench: Bench) -> Line:
     """Say what microlenses do to light that tracers are fitted without."""
     about, given_nm = "diffraction", bench.settings.reconstruction.wavelength_nm
     wavelength_nm, camera = given_nm or GREEN_NM, bench.camera
