@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.microlenses import Lattice
-from lfpiv_cli.particles.view import View, raw_view
+from lfpiv_cli.particles.view import Light, View, raw_view
 from lfpiv_cli.synthetic.sensor import Readout
 from lfpiv_cli.validation.bounds import (
     ROUNDING_VARIANCE,
@@ -30,12 +30,14 @@ IMAGES = 150
 STEPS = 2
 
 
-@pytest.fixture(scope="module", params=["square", "hexagonal"])
+@pytest.fixture(scope="module", params=["square", "hexagonal", "waves"])
 def view(request: pytest.FixtureRequest) -> View:
-    """The paper's camera with a small sensor, either kind of array, seen through distortion."""
-    lattice = Lattice.regular(0.1, request.param)
+    """The paper's camera with a small sensor, either kind of array, seen through distortion; and by waves."""
+    by_waves = request.param == "waves"
+    lattice = Lattice.regular(0.1, "square" if by_waves else request.param)
     camera = Camera(-1.0, 100.0, 25.0, 0.8, 0.8, lattice, 0.0055, 290, 260, distortion_per_mm2=2e-4)
-    return raw_view(camera, Media(1.0, 1.49, 1.33), 0.025)
+    light = Light(532e-6, 0.3, (-1.6, 2.2)) if by_waves else None
+    return raw_view(camera, Media(1.0, 1.49, 1.33), 0.025, light=light)
 
 
 def model(view: View, particles: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -24,14 +24,32 @@ from lfpiv_cli.files.images import write_tiff
 from lfpiv_cli.files.rig_numbers import RigNumbers, tree_of
 from lfpiv_cli.files.rig_text import rig_text
 from lfpiv_cli.interface.image_planning import Pictures, image_lines, lattice_of
-from lfpiv_cli.interface.planning import Line, bench_of, rig_figures, rig_lines, windows_line, worst
+from lfpiv_cli.interface.particles import light_of
+from lfpiv_cli.interface.planning import (
+    Line,
+    bench_of,
+    diffraction_line,
+    rig_figures,
+    rig_lines,
+    windows_line,
+    worst,
+)
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.microlenses import Lattice
+from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.synthetic.render import Balls, ObjectSpace, render_points, render_white
 from lfpiv_cli.synthetic.sensor import Readout
+from lfpiv_cli.validation.bounds import errors_alone_mm
 from lfpiv_cli.validation.place_errors import pairs_of
-from lfpiv_cli.validation.planning import Tracer, errors_by_depth_mm, half_view_mm, part_in_front, share_in_view
+from lfpiv_cli.validation.planning import (
+    Tracer,
+    errors_by_depth_mm,
+    half_view_mm,
+    in_miniature,
+    part_in_front,
+    share_in_view,
+)
 from lfpiv_cli.validation.tracer_bench import Rig, Search
 
 WATER = Media(1.0, 1.49, 1.33)
@@ -98,7 +116,43 @@ REFUSED = {
 @pytest.mark.parametrize("tree", GOOD_RIGS.values(), ids=GOOD_RIGS)
 def test_good_rigs_are_good(tree: Tree) -> None:
     lines = rig_lines(bench_of(settings_of(tree), None))
-    assert worst(lines) == "good", [line for line in lines if line.verdict != "good"]
+    # These are by rays.
+    found = [line for line in lines if line.verdict != "good"]
+    assert [(line.about, line.verdict) for line in found] == [("diffraction", "look")], found
+
+
+@pytest.mark.parametrize(
+    ("keys", "verdict", "words"),
+    [
+        ({}, "look", "532 nm over 4.3 um, 0.77 pixel; rays leave that out"),
+        (
+            {"reconstruction": {"wavelength_nm": 633.0}},
+            "good",
+            "633 nm over 5.1 um, 0.92 pixel; tracers are fitted by waves",
+        ),
+        ({"camera__sensor__pixel_um": 25.0}, "good", "0.17 pixel; rays are sharp enough"),
+    ],
+)
+def test_what_rays_leave_out_is_said(keys: Tree, verdict: str, words: str) -> None:
+    line = diffraction_line(bench_of(settings_of(changed(PLAIN, **keys)), None))
+    assert line.verdict == verdict
+    assert words in line.reason
+
+
+@pytest.mark.thorough
+def test_errors_by_waves_are_those_of_the_whole_camera() -> None:
+    """A view of each depth alone tells what one of all depths does, and more than by rays: light is less sharp."""
+    tree = changed(SMALL, reconstruction={"wavelength_nm": 532.0}, volume__size_mm=[1.5, 1.3, 2.0])
+    bench = bench_of(settings_of(tree), None)
+    light = light_of(bench.settings, (-1.0, 1.0))
+    view = raw_view(bench.camera, WATER, 0.025, light=light)
+    (seen, *_), _ = bench.seen
+    at = np.array([[0.003, -0.004, seen.depths_mm[0], 5e5]])
+    alone, whole = (errors_alone_mm(each, at, bench.tracer().readout) for each in (seen.view, view))
+    np.testing.assert_allclose(alone, whole, rtol=2e-2)
+    by_rays = bench_of(settings_of(changed(tree, reconstruction__wavelength_nm=None)), None)
+    # At the volume's ends; about the focal plane waves tell depths that rays do not.
+    assert np.all(bench.errors_mm[[0, -1]] > 1.05 * by_rays.errors_mm[[0, -1]])
 
 
 @pytest.mark.thorough
@@ -315,7 +369,8 @@ def test_errors_are_those_that_are_measured() -> None:
     rig = Rig(camera, WATER, Channel(12.0, 2.0), refraction="paraxial")
     search, rng = Search(rig, (2.6, 2.6, 8.4)), np.random.default_rng(3)
     depths, rays = np.array([-4.0, -2.5, 1.5, 3.0]), 400_000
-    told = errors_by_depth_mm(camera, WATER, depths, Tracer(5e5, 0.025, READOUT), 5e5 / rays)
+    seen = in_miniature(camera, WATER, depths, 0.025)
+    told = errors_by_depth_mm(seen, Tracer(5e5, 0.025, READOUT), 5e5 / rays)
     ratios = []
     for _ in range(4):
         x, y = (each.ravel() for each in np.meshgrid([-0.85, 0.0, 0.85], [-0.85, 0.0, 0.85]))
@@ -341,8 +396,8 @@ def test_the_command_tells_all(tmp_path: Path) -> None:
     done = CliRunner().invoke(cli, ["check", str(rig), str(image), "--picture", str(picture), "--json"])
     assert done.exit_code == 0, done.output
     told = json.loads(done.stdout)
-    # Windows that fit into so small a volume hold few tracers.
-    assert {line["about"] for line in told["verdicts"] if line["verdict"] == "look"} == {"windows"}
+    # Windows that fit into so small a volume hold few tracers, and the rig is by rays.
+    assert {line["about"] for line in told["verdicts"] if line["verdict"] == "look"} == {"windows", "diffraction"}
     assert told["verdict"] == "look"
     assert {line["about"] for line in told["verdicts"]} >= {"field of view", "time step", "exposure", "tracers"}
     assert told["best_dt_s"] == pytest.approx(5 * 0.1 / 3 / told["expected_velocity_m_s"] / 1e3, rel=0.05)

@@ -97,7 +97,7 @@ def test_full_view_is_what_the_weights_see() -> None:
 
 def test_answers_are_asked_for_and_followed(tmp_path: Path) -> None:
     path = tmp_path / "rig.yaml"
-    answers = "0.5\n\n0.125\nf/8\n18.75 mm\n\n3000\n2000\n\n\n\n\n10, 10 10\nfast\n0.2\n"
+    answers = "0.5\n\n0.125\nf/8\n18.75 mm\n\n3000\n2000\n\n\n\n\n10, 10 10\nfast\n0.2\n633 nm\n"
     done = typed(answers, str(path))
     assert done.exit_code == 0, done.output
     told = yaml.safe_load(path.read_text())
@@ -106,11 +106,13 @@ def test_answers_are_asked_for_and_followed(tmp_path: Path) -> None:
     assert told["volume"]["size_mm"] == [10.0, 10.0, 10.0]
     # Five voxels, a third of a microlens wide each, at 0.2 m/s.
     assert told["correlation"]["dt_s"] == pytest.approx(5 * 0.25 / 3 / 200, rel=5e-3)
+    # Simulated and fitted by the same light.
+    assert told["reconstruction"]["wavelength_nm"] == told["simulation"]["light"]["wavelength_nm"] == 633.0
 
 
 @pytest.mark.parametrize(("answer", "expected"), [("-0.5", -0.5), ("0.5", -0.5), ("0\n2", -2.0)])
 def test_a_magnification_is_negative_with_or_without_its_minus(answer: str, expected: float, tmp_path: Path) -> None:
-    done = typed(answer + 14 * "\n", str(tmp_path / "rig.yaml"))
+    done = typed(answer + 15 * "\n", str(tmp_path / "rig.yaml"))
     assert done.exit_code == 0, done.output
     assert load_config(tmp_path / "rig.yaml").sections.camera.main_lens.magnification == expected
 
@@ -118,9 +120,11 @@ def test_a_magnification_is_negative_with_or_without_its_minus(answer: str, expe
 # Magnification, focal length, pitch, microlenses, aperture, pixels, columns, rows, fluid, wall, its thickness, channel,
 # volume and velocity, in other units and as plain numbers.
 SPELLED = {
-    "no units": "-0.7 105 0.125 1 18.75 5.5 3000 2000 1.33 1.49 5 12 10,10,12 0.2",
-    "millimetres": "0.7|105 mm|0.125mm|1 mm|18.75 mm|0.0055 mm|3000|2000|1.33|1.49|5 mm|12 mm|10 x 10 x 12 mm|0.2 m/s",
-    "others": "-0.7|10.5 cm|125 um|0.1 cm|1.875cm|5.5 µm|3000|2000|1.33|1.49|.005 m|1.2 cm|1 cm, 10 mm 12 mm|20 cm/s",
+    "no units": "-0.7 105 0.125 1 18.75 5.5 3000 2000 1.33 1.49 5 12 10,10,12 0.2 633",
+    "millimetres": "0.7|105 mm|0.125mm|1 mm|18.75 mm|0.0055 mm|3000|2000|"
+    "1.33|1.49|5 mm|12 mm|10 x 10 x 12 mm|0.2 m/s|633 nm",
+    "others": "-0.7|10.5 cm|125 um|0.1 cm|1.875cm|5.5 µm|3000|2000|"
+    "1.33|1.49|.005 m|1.2 cm|1 cm, 10 mm 12 mm|20 cm/s|.633 µm",
 }
 
 
@@ -136,12 +140,13 @@ def test_lengths_are_understood_with_their_units_and_a_turned_sign_is_said(spell
     assert told["channel"] == {"width_mm": 12.0, "wall_mm": 5.0}
     assert told["volume"]["size_mm"] == [10.0, 10.0, 12.0]
     assert told["simulation"]["flow"]["velocity_m_s"] == [0.2, 0.0, 0.0]
+    assert told["reconstruction"]["wavelength_nm"] == 633.0
     assert ("magnification: taken as -0.7, because the image is inverted" in done.stderr) == (words[0] != "-")
 
 
 @pytest.mark.parametrize("answer", ["105 furlongs", "0 mm", "mm", "-5 cm", "1e400 m"])
 def test_what_is_no_length_is_asked_again(answer: str, tmp_path: Path) -> None:
-    done = typed(f"\n{answer}\n10.5 cm\n" + 14 * "\n", str(tmp_path / "rig.yaml"))
+    done = typed(f"\n{answer}\n10.5 cm\n" + 15 * "\n", str(tmp_path / "rig.yaml"))
     assert done.exit_code == 0, done.output
     assert "expected a number above 0" in done.stderr or "is no number" in done.stderr
     assert load_config(tmp_path / "rig.yaml").sections.camera.main_lens.focal_length_mm == 105.0

@@ -171,10 +171,9 @@ def test_weights_that_the_disk_has_no_room_for_are_not_begun(tmp_path: Path, mon
 def test_a_volume_far_beyond_what_can_be_refocused_is_judged_at_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
     monkeypatch.setattr(
-        planning.planning,
-        "errors_by_depth_mm",
-        lambda _camera, _media, depths_mm, _tracer: asked.append(depths_mm) or np.ones((len(depths_mm), 3)),
+        planning.planning, "in_miniature", lambda _camera, _media, depths_mm, *_: asked.append(depths_mm)
     )
+    monkeypatch.setattr(planning.planning, "errors_by_depth_mm", lambda *_: np.ones((len(asked[0]), 3)))
     settings = load_config(SAMPLE_RIG).overridden("volume", reference="focal_point", shape_xyz=(4000, 4000, 4000))
     bench = planning.bench_of(settings, None)
     assert bench.errors_mm.shape == (planning.DEPTHS, 3)

@@ -11,12 +11,13 @@ import yaml
 
 from lfpiv_cli.cli import cli
 from lfpiv_cli.errors import LimitMissedError, OutputExistsError, UsageError
+from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.particles import Particles, write_particles
 from lfpiv_cli.files.vtkhdf import write_vectors
 from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.reference import Reference
-from lfpiv_cli.stages.validate_flow import _truth_of_particles
+from lfpiv_cli.stages.validate_flow import _truth_of_particles, light_notices
 from lfpiv_cli.synthetic.flows import shear
 
 CONFIGS = Path(__file__).parent.parent / "configs"
@@ -29,6 +30,17 @@ def run(*arguments: object) -> None:
 def test_particles_are_no_truth_for_what_is_simulated(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="--vectors"):
         run("validate", "flow", CONFIGS / "sample.yaml", "--particles", "p.npz", "-o", tmp_path / "report")
+
+
+def test_light_that_is_fitted_otherwise_than_simulated_is_said() -> None:
+    rays, waves = {"kind": "rays"}, {"kind": "waves", "wavelength_nm": 532.0}
+    cases = [(rays, None), (waves, 532.0), (rays, 532.0), (waves, None), (waves, 633.0)]
+    found = []
+    for light, wavelength_nm in cases:
+        settings = load_config(CONFIGS / "sample.yaml").overridden("simulation", light=light)
+        notices = light_notices(settings.overridden("reconstruction", wavelength_nm=wavelength_nm))
+        found.append([notice.code for notice in notices])
+    assert found == [[], []] + 3 * [["light-differs"]]
 
 
 def test_windows_beyond_the_light_have_no_truth_of_particles(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 RIG = Path("rig.yaml")
 # What a length may be answered in.
-UNITS_MM = {"m": 1e3, "cm": 10.0, "mm": 1.0, "um": 1e-3, "µm": 1e-3, "μm": 1e-3}
+UNITS_MM = {"m": 1e3, "cm": 10.0, "mm": 1.0, "nm": 1e-6, "um": 1e-3, "µm": 1e-3, "μm": 1e-3}
 Answer = TypeVar("Answer")
 
 
@@ -126,6 +126,10 @@ def _asked() -> RigNumbers:
     answers["velocity_m_s"] = _asked_for(
         "velocity to expect, m/s", plain.velocity_m_s, lambda answer: _in_unit(answer.removesuffix("/s"), "m")
     )
+    wavelength = _length_or_none(
+        "wavelength of the light, nm, 0 for rays, with which no camera's images agree", 532.0, "nm"
+    )
+    answers["wavelength_nm"] = wavelength or None
     return RigNumbers(**answers)
 
 
@@ -151,9 +155,9 @@ def _length(text: str, default: float, unit: str = "mm") -> float:
     return _asked_for(text, default, lambda answer: _in_unit(answer, unit))
 
 
-def _length_or_none(text: str, default: float) -> float:
-    """Ask for a length in mm that may be 0."""
-    return _asked_for(text, default, lambda answer: 0.0 if _split_unit(answer)[0] == "0" else _in_unit(answer, "mm"))
+def _length_or_none(text: str, default: float, unit: str = "mm") -> float:
+    """Ask for a length that may be 0."""
+    return _asked_for(text, default, lambda answer: 0.0 if _split_unit(answer)[0] == "0" else _in_unit(answer, unit))
 
 
 def _count(text: str, default: int) -> int:

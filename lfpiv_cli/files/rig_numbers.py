@@ -15,7 +15,7 @@ import numpy as np
 
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files.bench import LATERAL_VOXELS_PER_MICROLENS, UM_TO_MM
-from lfpiv_cli.files.sections import CorrelationSection
+from lfpiv_cli.files.sections import CorrelationSection, ReconstructionSection
 from lfpiv_cli.names import KnownCamera
 from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera
@@ -64,6 +64,7 @@ class RigNumbers:
     channel_mm : inner width of the channel along the optical axis; None where there is none
     size_mm : of the volume
     velocity_m_s : expected
+    wavelength_nm : of the light, which lenses diffract; None: all is by rays
     """
 
     magnification: float = -1.0
@@ -80,6 +81,7 @@ class RigNumbers:
     channel_mm: float | None = None
     size_mm: Sides | None = None
     velocity_m_s: float = 0.1
+    wavelength_nm: float | None = None
 
     def complete(self) -> RigNumbers:
         """Return the numbers with what follows from others filled in."""
@@ -163,6 +165,8 @@ def tree_of(numbers: RigNumbers) -> dict[str, Any]:
     if _bends(known, camera, size[2]):
         tree["weights"] = {"refraction": "exact"}
     tree["board"] = _board(known, scale.lens_mm)
+    if known.wavelength_nm is not None:
+        tree["reconstruction"] = {"wavelength_nm": known.wavelength_nm}
     voxel_mm = scale.lens_mm / LATERAL_VOXELS_PER_MICROLENS
     tree["correlation"] = {"window_mm": window, "dt_s": _rounded(time_step_s(known.velocity_m_s, voxel_mm))}
     tree["simulation"] = {
@@ -175,6 +179,9 @@ def tree_of(numbers: RigNumbers) -> dict[str, Any]:
         },
         "particles": round(tracers_in(camera, BEST_PER_LENS, size)),
     }
+    if known.wavelength_nm is not None:
+        tree["camera"]["sensor"]["diffusion_px"] = ReconstructionSection().diffusion_px
+        tree["simulation"]["light"] = {"kind": "waves", "wavelength_nm": known.wavelength_nm}
     return tree
 
 

@@ -28,6 +28,7 @@ COMMENTS = {
     "camera.microlenses.layout": "or hexagonal; without it as the white image shows",
     "camera.sensor.pixel_um": "binned pixels are as large as they are together",
     "camera.sensor.columns": "of the images",
+    "camera.sensor.diffusion_px": "of charge, a standard deviation; only what is simulated has it",
     "camera.sensor.column_axis": "world axis that the image's columns follow",
     "media": "refractive indices",
     "media.window": "acrylic 1.49, glass 1.46 to 1.52",
@@ -43,10 +44,12 @@ COMMENTS = {
     "board": "calibration target",
     "board.dots": "along x and y",
     "board.medium": "air, on the channel's outer wall; or fluid",
+    "reconstruction.wavelength_nm": "of the light, which lenses diffract: tracers are fitted by waves",
     "correlation.window_mm": "final interrogation window",
     "correlation.dt_s": "time between the two images of a pair",
     "simulation": "for `lfpiv simulate` and `lfpiv validate` alone",
     "simulation.particles": "tracers in the volume",
+    "simulation.light": "a tracer takes 0.1 s of a core in each image",
 }
 
 

@@ -26,7 +26,16 @@ from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.files.config import Config
 from lfpiv_cli.interface.calibration import NO_BOARD, calibration_notices, calibration_of, photographs
-from lfpiv_cli.interface.planning import Bench, Line, Verdict, error_verdict, graded, seeding_line, worst
+from lfpiv_cli.interface.planning import (
+    Bench,
+    Line,
+    Verdict,
+    by_which_light,
+    error_verdict,
+    graded,
+    seeding_line,
+    worst,
+)
 from lfpiv_cli.interface.verdicts import word_of
 from lfpiv_cli.notice import written
 from lfpiv_cli.particles.counting import Seeded, tracers_in_image
@@ -47,7 +56,6 @@ MOST_MOVED = 0.1
 GOOD_BEYOND, MOST_BEYOND = 0.25, 0.6
 # Of full scale, for a white image.
 BRIGHTEST_WHITE = 0.95
-DEPTHS = 7
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,9 +169,8 @@ def _counted(bench: Bench, seen: Seen) -> tuple[float, float]:
     part = planning.part_in_front(bench.camera, bench.media, bench.bounds_mm)
     rest = seen.less_dark[part] - np.float32(seen.level)
     lit = float(np.mean(rest > level)), level, float(np.mean(rest, dtype=np.float64))
-    depths = np.linspace(bench.bounds_mm[2, 0], bench.bounds_mm[2, 1], DEPTHS)
     # Dark pixels count tracers of any light, up to where all are lit; unevenness any number, of tracers that are alike.
-    number, tracer_light = planning.tracers_per_lens(bench.camera, bench.media, depths, bench.tracer().radius_mm, lit)
+    number, tracer_light = planning.tracers_per_lens(bench.camera, bench.seen[0], lit)
     if np.isfinite(number):
         return number, tracer_light
     crowded = _crowded(bench, seen)
@@ -279,7 +286,8 @@ def _precision(bench: Bench, seen: Seen, tracer_light: float) -> Line:
     errors = _errors(bench, seen, tracer_light)
     reason = (
         f"{seen.name}: a tracer alone of {written(tracer_light, 2)} counts, as here, is placed to "
-        f"{written(1e3 * errors[0], 2)} um across and {written(1e3 * errors[2], 2)} um in depth at best"
+        f"{written(1e3 * errors[0], 2)} um across and {written(1e3 * errors[2], 2)} um in depth at best, "
+        f"{by_which_light(bench)}"
     )
     return Line(about, error_verdict(bench, errors[2]), reason)
 
@@ -288,8 +296,7 @@ def _errors(bench: Bench, seen: Seen, tracer_light: float) -> NDArray[np.float64
     """Return the median smallest errors (3,) of tracers of a light, with the noise of an image."""
     plain = bench.tracer()
     tracer = replace(plain, light_counts=tracer_light, readout=replace(plain.readout, read_noise_counts=seen.noise))
-    depths = np.linspace(bench.bounds_mm[2, 0], bench.bounds_mm[2, 1], DEPTHS)
-    return np.asarray(np.median(planning.errors_by_depth_mm(bench.camera, bench.media, depths, tracer), axis=0))
+    return np.asarray(np.median(bench.errors_of(tracer), axis=0))
 
 
 def _figures(seen: Seen, number: float, tracer_light: float) -> dict[str, Any]:

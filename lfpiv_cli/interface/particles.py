@@ -287,13 +287,18 @@ def task_for(bench: Bench, frame: Frame) -> Task:
 
 
 def _light(content: WeightsFile, settings: Config) -> Light | None:
-    """Return the light as waves where its wavelength is given; None: by rays."""
+    """Return the light as waves where its wavelength is given, for all depths of the weights; None: by rays."""
+    margin = BEYOND_DEPTHS * content.camera.scale(settings.media_model()).depth_mm
+    low, high = content.weights.padded.grid.bounds_mm(2)
+    return light_of(settings, (low - margin, high + margin))
+
+
+def light_of(settings: Config, depths_mm: tuple[float, float]) -> Light | None:
+    """Return the light as waves, as it is fitted between two depths; None: by rays."""
     chosen = settings.reconstruction
     if chosen.wavelength_nm is None:
         return None
-    margin = BEYOND_DEPTHS * content.camera.scale(settings.media_model()).depth_mm
-    low, high = content.weights.padded.grid.bounds_mm(2)
-    return Light(chosen.wavelength_nm * NM_TO_MM, chosen.diffusion_px, (low - margin, high + margin))
+    return Light(chosen.wavelength_nm * NM_TO_MM, chosen.diffusion_px, depths_mm)
 
 
 def points_of(bench: Bench, frame: Frame, found: Particles, size: TracerSize, provenance: Mapping[str, Any]) -> Points:

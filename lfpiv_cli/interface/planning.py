@@ -16,9 +16,11 @@ from numpy.typing import NDArray
 from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.calibration.sheet import LARGE_F_RATIO, LARGEST_F_RATIO
 from lfpiv_cli.errors import ConfigError, InputError
+from lfpiv_cli.files.bench import NM_TO_MM, UM_TO_MM
 from lfpiv_cli.files.config import Config
 from lfpiv_cli.flow.windows import WindowLayout
 from lfpiv_cli.grid import Grid
+from lfpiv_cli.interface.particles import light_of
 from lfpiv_cli.interface.verdicts import WORDS, Word
 from lfpiv_cli.interface.weights import ray_source
 from lfpiv_cli.interface.weights_checks import check_rig, rig_notices
@@ -31,7 +33,7 @@ from lfpiv_cli.scale import Scale
 from lfpiv_cli.synthetic.flows import MM_PER_M
 from lfpiv_cli.synthetic.sensor import Readout
 from lfpiv_cli.validation import planning
-from lfpiv_cli.validation.planning import Tracer
+from lfpiv_cli.validation.planning import Miniature, Tracer
 from lfpiv_cli.weights.build import default_padding
 from lfpiv_cli.weights.scene import Source
 
@@ -52,7 +54,11 @@ GOOD_VOXEL, LARGEST_VOXEL = 0.55, 1.05
 WINDOWS_ALIKE = 0.02
 # Of the coarse window's side: up to the one displacements are measured well, beyond the other hardly at all.
 GOOD_SHARE_OF_WINDOW, LARGEST_SHARE_OF_WINDOW = 0.25, 0.5
-DEPTHS = 21
+# By waves each depth takes about a second.
+DEPTHS, DEPTHS_BY_WAVES = 21, 11
+# Light of frequency-doubled lasers, where no wavelength is given. A microlens that spreads it over less of a pixel than
+# charge diffuses may be taken for sharp.
+GREEN_NM, SHARP_PX = 532.0, 0.2
 # Beyond so many depths of field a tracer's light covers the sensor, and its errors would take minutes to tell.
 FARTHEST_FIELDS = 2.0
 # Points along each axis at which a configured flow is asked for its speed, and the percentile that counts.
@@ -116,7 +122,8 @@ class Bench:
     @property
     def depths_mm(self) -> NDArray[np.float64]:
         """Depths of the volume, from the focal point."""
-        return np.linspace(self.bounds_mm[2, 0], self.bounds_mm[2, 1], DEPTHS)
+        count = DEPTHS if self.settings.reconstruction.wavelength_nm is None else DEPTHS_BY_WAVES
+        return np.linspace(self.bounds_mm[2, 0], self.bounds_mm[2, 1], count)
 
     @property
     def sides_mm(self) -> NDArray[np.float64]:
@@ -130,10 +137,21 @@ class Bench:
 
     @cached_property
     def errors_mm(self) -> NDArray[np.float64]:
-        """Smallest errors (n, 3) of simulated tracers at `depths_mm`, beyond what can be refocused those of its end."""
+        """Smallest errors (n, 3) of simulated tracers at `depths_mm`."""
+        return self.errors_of(self.tracer())
+
+    def errors_of(self, tracer: Tracer) -> NDArray[np.float64]:
+        """Return the smallest errors (n, 3) of a tracer at `depths_mm`, beyond what can be refocused of its end."""
+        seen, places = self.seen
+        return planning.errors_by_depth_mm(seen, tracer)[places]
+
+    @cached_property
+    def seen(self) -> tuple[list[Miniature], NDArray[np.int64]]:
+        """How tracers look at `depths_mm`, by the light they are fitted with, and which of those depths each is."""
         far = FARTHEST_FIELDS * planning.depth_of_field_mm(self.camera, self.media)
         depths_mm, places = np.unique(np.clip(self.depths_mm, -far, far), return_inverse=True)
-        return planning.errors_by_depth_mm(self.camera, self.media, depths_mm, self.tracer())[places]
+        light = light_of(self.settings, (-far, far))
+        return planning.in_miniature(self.camera, self.media, depths_mm, self.tracer().radius_mm, light), places
 
     def tracer(self) -> Tracer:
         """Return a tracer as the config simulates it."""
@@ -169,6 +187,7 @@ def rig_lines(bench: Bench) -> list[Line]:
         _f_numbers,
         _lens_images,
         _rays,
+        diffraction_line,
         _precision,
         _seeding,
         _voxels,
@@ -294,6 +313,27 @@ def _rays(bench: Bench) -> Line:
     return Line("rays", "look", "; ".join(f"{notice.about} {notice.text}: {notice.remedy}" for notice in told))
 
 
+def diffraction_line(bench: Bench) -> Line:
+    """Say what microlenses do to light that tracers are fitted without."""
+    about, given_nm = "diffraction", bench.settings.reconstruction.wavelength_nm
+    wavelength_nm, camera = given_nm or GREEN_NM, bench.camera
+    width_mm = wavelength_nm * NM_TO_MM * camera.microlens_distance_mm / float(camera.lattice.pitch.mean())
+    width_px = width_mm / camera.pixel_mm
+    reason = (
+        f"a microlens spreads light of {wavelength_nm:g} nm over {written(width_mm / UM_TO_MM, 2)} um, "
+        f"{written(width_px, 2)} pixel"
+    )
+    if given_nm is not None:
+        return Line(about, "good", f"{reason}; tracers are fitted by waves")
+    if width_px <= SHARP_PX:
+        return Line(about, "good", f"{reason}; rays are sharp enough")
+    reason += (
+        "; rays leave that out: tracers in a camera's images then err several times as much as told here; "
+        "set reconstruction.wavelength_nm (simulated images are by rays unless simulation.light is waves)"
+    )
+    return Line(about, "look", reason)
+
+
 def _source(bench: Bench) -> Source:
     """Return how rays are found; a channel's mid plane that is not known is where the camera is focused."""
     if bench.settings.weights.method == "dlfc":
@@ -306,10 +346,16 @@ def _precision(bench: Bench) -> Line:
     lateral, depth = float(np.median(errors[:, :2])), float(np.median(errors[:, 2]))
     usable = float(np.mean(errors[:, 2] <= LARGEST_ERROR * bench.scale.depth_mm))
     reason = (
-        f"a tracer alone of {written(bench.tracer().light_counts)} counts is placed to {written(1e3 * lateral, 2)} um "
-        f"across and {written(1e3 * depth, 2)} um in depth; depths are told in {usable:.0%} of the volume"
+        f"{by_which_light(bench)} a tracer alone of {written(bench.tracer().light_counts)} counts is placed to "
+        f"{written(1e3 * lateral, 2)} um across and {written(1e3 * depth, 2)} um in depth; depths are told in "
+        f"{usable:.0%} of the volume"
     )
     return Line("precision", error_verdict(bench, depth), reason)
+
+
+def by_which_light(bench: Bench) -> str:
+    """Return in words by which light errors are told."""
+    return "by rays" if bench.settings.reconstruction.wavelength_nm is None else "by waves"
 
 
 def error_verdict(bench: Bench, depth_error_mm: float) -> Verdict:

@@ -67,6 +67,7 @@ def validate_flow(
     settings = load_config(config)
     if is_simulated:
         ensure_experiment(settings)
+        console.warn(light_notices(settings))
     named = settings.simulation.flow if is_simulated else settings.validation.flow or settings.simulation.flow
     duct, pipe = duct_of(named), named if named is not None and named.kind == "pipe" else None
     walls = None if pipe is None else RoundWall(pipe.radius_mm, pipe.centre_mm, pipe.axis)
@@ -160,6 +161,18 @@ def _other_flow(config: Path, particles: Path) -> Notice:
         f"the particles of {particles.name} do not move as the flow that it names, and are taken for the truth",
         "validation.flow of this experiment, or none",
     )
+
+
+def light_notices(settings: Config) -> list[Notice]:
+    """Return where tracers are fitted with other light than they are simulated with."""
+    simulated, fitted_nm = settings.simulation.light, settings.reconstruction.wavelength_nm
+    simulated_nm = None if simulated.kind == "rays" else simulated.wavelength_nm
+    if simulated_nm == fitted_nm:
+        return []
+    made, fitted = ("by rays" if each is None else f"by waves of {each:g} nm" for each in (simulated_nm, fitted_nm))
+    text = f"images are simulated {made}, and tracers are fitted {fitted}: particles err more than with the same light"
+    remedy = "reconstruction.wavelength_nm as simulation.light has it, or neither"
+    return [Notice("light-differs", "simulation.light", text, remedy)]
 
 
 def _scalars(figures: Mapping[str, Any]) -> dict[str, Any]:

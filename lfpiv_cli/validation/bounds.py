@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve
 
-from lfpiv_cli.particles.response import VALUES, respond
+from lfpiv_cli.particles.least_squares import lit_by, respond_all, room_for
 from lfpiv_cli.particles.view import View, entry_capacity
 from lfpiv_cli.synthetic.sensor import Readout
 
@@ -52,17 +52,19 @@ class Bound:
 def slopes(view: View, particles: NDArray[np.float64]) -> sparse.csc_array:
     """Return J (pixels, 4 n): what each particle's x, y, z and light do to the expected image."""
     capacity = entry_capacity(view, *_depths(particles))
-    pixels, values = np.empty(capacity, np.int32), np.empty((capacity, VALUES))
+    room = room_for(1, capacity, 0)
     rows, columns, entries = [], [], []
-    for number, (x, y, z, light) in enumerate(particles):
-        count = respond(view, x, y, z, pixels, values)
-        rows.append(np.tile(pixels[:count], UNKNOWNS))
+    for number, particle in enumerate(particles):
+        respond_all(view, particle[np.newaxis], room)
+        pixels, values = lit_by(room, 0)
+        light, count = particle[3], pixels.size
+        rows.append(np.tile(pixels, UNKNOWNS))
         columns.append(np.repeat(UNKNOWNS * number + np.arange(UNKNOWNS), count))
-        entries.append((values[:count, [1, 2, 3, 0]] * (light, light, light, 1.0)).T.ravel())
+        entries.append((values[[1, 2, 3, 0], :count] * [[light], [light], [light], [1.0]]).ravel())
     shape = (view.camera.rows * view.camera.columns, UNKNOWNS * len(particles))
     if not rows:
         return sparse.csc_array(shape)
-    # A pixel that is lit through two lenses is named twice and added up here.
+    # A pixel that is lit through two lenses may be named twice and is added up here.
     indices = (np.concatenate(rows), np.concatenate(columns))
     return sparse.csc_array(sparse.coo_array((np.concatenate(entries), indices), shape=shape))
 

@@ -5,7 +5,9 @@ Axes: world x, y, z in mm, z away from the camera from the nominal focal point; 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,8 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 from lfpiv_cli.flow.windows import ROUNDING
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
-from lfpiv_cli.particles.response import VALUES, respond
-from lfpiv_cli.particles.view import View, entry_capacity, raw_view
+from lfpiv_cli.particles.least_squares import lit_by, respond_all, room_for
+from lfpiv_cli.particles.view import Light, View, entry_capacity, raw_view
 from lfpiv_cli.synthetic.sensor import Readout
 from lfpiv_cli.validation.bounds import errors_alone_mm
 
@@ -36,6 +38,8 @@ SMALLEST_STEP, BEST_STEP, LARGEST_STEP = 3.0, 5.0, 8.0
 PLACES, STEPS = 8, np.array([0.7548776662466927, 0.5698402909980532])
 # Beyond the light of a tracer a camera in miniature has so many lenses.
 LENSES_AROUND = 3
+# Before and behind a depth alone, in depths over which light spreads by one lens: waves are computed about it.
+ABOUT_DEPTH = 1e-3
 # Rounds in which light and number of an image's tracers are told from each other.
 ROUNDS = 4
 # Pixels are lit that a lens image's rim only touches.
@@ -51,6 +55,13 @@ class Tracer:
     light_counts: float
     radius_mm: float
     readout: Readout
+
+
+class Miniature(NamedTuple):
+    """The view of a sensor just large enough for the light of tracers in its middle, at depths (n,)."""
+
+    view: View
+    depths_mm: NDArray[np.float64]
 
 
 def half_view_mm(camera: Camera, media: Media, z_mm: ArrayLike, rim: float = -1.0) -> NDArray[np.float64]:
@@ -150,34 +161,31 @@ def time_step_s(velocity_m_s: float, voxel_mm: float, voxels: float = BEST_STEP)
     return voxels * voxel_mm / (abs(velocity_m_s) * 1e3)
 
 
-def errors_by_depth_mm(
-    camera: Camera, media: Media, depths_mm: ArrayLike, tracer: Tracer, counts_per_ray: float = 0.0
-) -> NDArray[np.float64]:
+def errors_by_depth_mm(seen: Sequence[Miniature], tracer: Tracer, counts_per_ray: float = 0.0) -> NDArray[np.float64]:
     """Return the smallest errors (n, 3) of x, y and z, rms over places, of a tracer alone at depths (n,).
 
     The Cramer-Rao bound; no image tells more. `counts_per_ray` is of images that are rendered ray by ray.
     """
-    depths = np.asarray(depths_mm, dtype=np.float64)
-    view = _in_miniature(camera, media, depths, tracer.radius_mm)
-    errors = errors_alone_mm(view, _particles(view, depths, tracer.light_counts), tracer.readout, counts_per_ray)
-    return np.asarray(np.sqrt(np.mean(errors.reshape(depths.size, PLACES, 3) ** 2, axis=1)))
+    errors = [
+        errors_alone_mm(each.view, _particles(each, tracer.light_counts), tracer.readout, counts_per_ray)
+        for each in seen
+    ]
+    return np.asarray(np.sqrt(np.mean(np.concatenate(errors).reshape(-1, PLACES, 3) ** 2, axis=1)))
 
 
-def lit_pixels(view: View, depths_mm: NDArray[np.float64], light_counts: float, level_counts: float) -> float:
-    """Return how many pixels a tracer of so much light lights above a level, on average over places and depths."""
-    capacity = entry_capacity(view, float(depths_mm.min()), float(depths_mm.max()))
-    pixels, values = np.empty(capacity, np.int32), np.empty((capacity, VALUES))
+def _lit_pixels(seen: Miniature, light_counts: float, level_counts: float) -> list[int]:
+    """Return how many pixels a tracer of so much light lights above a level, at each of its places and depths."""
+    room = room_for(1, entry_capacity(seen.view, float(seen.depths_mm.min()), float(seen.depths_mm.max())), 0)
     lit = []
-    for x, y, z, light in _particles(view, depths_mm, light_counts):
-        count = respond(view, x, y, z, pixels, values)
-        image = np.bincount(pixels[:count], light * values[:count, 0])
-        lit.append(np.count_nonzero(image > level_counts))
-    return float(np.mean(lit))
+    for particle in _particles(seen, light_counts):
+        respond_all(seen.view, particle[np.newaxis], room)
+        pixels, values = lit_by(room, 0)
+        image = np.bincount(pixels, light_counts * values[0, : pixels.size])
+        lit.append(int(np.count_nonzero(image > level_counts)))
+    return lit
 
 
-def tracers_per_lens(
-    camera: Camera, media: Media, depths_mm: ArrayLike, radius_mm: float, lit: tuple[float, float, float]
-) -> tuple[float, float]:
+def tracers_per_lens(camera: Camera, seen: Sequence[Miniature], lit: tuple[float, float, float]) -> tuple[float, float]:
     """Return how many tracers for each lens lit an image, and the light of one; infinitely many where all is lit.
 
     Unlike the unevenness of the light (`particles.counting`) this needs few lenses and tracers, which may differ in
@@ -186,7 +194,7 @@ def tracers_per_lens(
 
     Parameters
     ----------
-    radius_mm : of the tracers
+    seen : of tracers as they are
     lit : share of the pixels above a level, that level in counts, mean counts of a pixel above the background
     """
     share, level, mean = lit
@@ -198,28 +206,48 @@ def tracers_per_lens(
     number, light = -np.log(1.0 - share / most), 0.0
     if number <= 0.0:
         return 0.0, 0.0
-    depths = np.asarray(depths_mm, dtype=np.float64)
-    view = _in_miniature(camera, media, depths, radius_mm)
     for _ in range(ROUNDS):
         light = mean * cell / number
-        each = lit_pixels(view, depths, light, level)
+        each = float(np.mean([count for one in seen for count in _lit_pixels(one, light, level)]))
         number = -np.log(1.0 - share / most) * most * cell / max(each, 1.0)
     return float(number), float(light)
 
 
-def _in_miniature(camera: Camera, media: Media, depths_mm: NDArray[np.float64], radius_mm: float) -> View:
-    """Return the view of a sensor just large enough for the light of tracers in its middle."""
+def in_miniature(
+    camera: Camera, media: Media, depths_mm: ArrayLike, radius_mm: float, light: Light | None = None
+) -> list[Miniature]:
+    """Return how tracers at depths (n,) are seen: by rays by one view, by waves by a view of each depth.
+
+    Parameters
+    ----------
+    light : as waves, whatever its depths; None: by rays
+    """
+    depths = np.asarray(depths_mm, dtype=np.float64)
+    if light is None:
+        return [_at_depths(camera, media, depths, radius_mm, None)]
+    about = ABOUT_DEPTH * camera.scale(media).depth_mm
+    lights = [replace(light, depths_mm=(float(depth) - about, float(depth) + about)) for depth in depths]
+    return [
+        _at_depths(camera, media, depths[n : n + 1], radius_mm, light_there) for n, light_there in enumerate(lights)
+    ]
+
+
+def _at_depths(
+    camera: Camera, media: Media, depths_mm: NDArray[np.float64], radius_mm: float, light: Light | None
+) -> Miniature:
     distance = equivalent_object_distance(depths_mm, camera.focus_distance_mm, media)
     blur = np.abs(camera.defocus(distance)) * camera.aperture_radius_mm
     reach = float(np.max(blur + radius_mm * camera.image_distance_mm / distance))
     reach += LENSES_AROUND * float(camera.lattice.pitch.max())
     # As many more as there are fewer on the other side: lenses stay where they are.
     columns, rows = (2 * int(np.ceil(reach / camera.pixel_mm)) + side % 2 for side in (camera.columns, camera.rows))
-    return raw_view(replace(camera, columns=columns, rows=rows), media, radius_mm)
+    view = raw_view(replace(camera, columns=columns, rows=rows), media, radius_mm, light=light)
+    return Miniature(view, depths_mm)
 
 
-def _particles(view: View, depths_mm: NDArray[np.float64], light: float) -> NDArray[np.float64]:
+def _particles(seen: Miniature, light: float) -> NDArray[np.float64]:
     """Return particles (depths * PLACES, 4) whose light is at places all over a lens."""
+    view, depths_mm = seen
     cell = (np.outer(np.arange(PLACES) + 0.5, STEPS) % 1.0 - 0.5) @ np.linalg.inv(view.inverse_basis)
     beta = view.camera.image_distance_mm / (view.camera.focus_distance_mm + view.depth_ratio * depths_mm)
     lateral = -cell[np.newaxis] / beta[:, np.newaxis, np.newaxis]
