@@ -121,7 +121,8 @@ def test_white_light_backwards_equals_forwards(
     ("strengths", "code"),
     [
         ({}, None),
-        ({"vignetting": 0.03}, None),
+        ({"vignetting": 0.01}, None),
+        ({"vignetting": 0.04}, "aperture-cut"),
         ({"falloff": 0.4}, None),
         ({"vignetting": 0.2}, "aperture-cut"),
         ({"vignetting": 0.5, "falloff": 0.3}, "aperture-cut"),
