@@ -128,7 +128,8 @@ def field_notices(pose: BoardPose, camera: Camera) -> Iterator[Notice]:
         f"a flat board seems {written(abs(depth.value))} mm {'further' if depth.value > 0.0 else 'nearer'} in the "
         f"corners than in the middle (field curvature, or a bent board), at most {written(largest, 2)} mm may be: "
         "depths are off by it, as the square of the image height",
-        "boards at several --depth-mm and method dlfc, another objective or a smaller aperture, or a flat board",
+        "a flat board, a volume near the axis, another objective; for volumes boards at several --depth-mm and "
+        "method dlfc",
         depth.value,
         f"within {written(largest, 2)} mm",
     )
