@@ -14,6 +14,13 @@ from scipy.special import fdtrc
 
 from lfpiv_cli.calibration.spectrum import lattice_vectors
 from lfpiv_cli.calibration.spots import find_spots, index_spots
+from lfpiv_cli.calibration.transmission import (
+    NARROWEST_LENS_IMAGE,
+    fit_vignetting,
+    lens_image_width,
+    relative_transmission,
+    vignetting_surface,
+)
 from lfpiv_cli.calibration.white import checked_white
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.names import Layout
@@ -24,6 +31,8 @@ FEWEST_LENSES = 30
 # Of the spots found, the walk must reach this share; else it started on dirt and another start is tried.
 REACHED_SHARE = 0.5
 STARTS = 20
+# Light that varies by less over a white image moves the pitch by less than its standard error, some 2e-6.
+EVEN_LIGHT = 0.01
 # Tukey's biweight: the usual constant for 95 % efficiency on a normal distribution, and enough rounds to settle.
 TUKEY = 4.685
 TUKEY_ROUNDS = 10
@@ -116,6 +125,13 @@ def fit_lattice(
         when the image is too dark, saturated or shows no lattice
     """
     image = checked_white(white, dark, saturation)
+    fit = _lattice_of(image, layout)
+    falloff = _falloff(image, fit.lattice_px)
+    return fit if falloff is None else _lattice_of(image / falloff, layout)
+
+
+def _lattice_of(image: NDArray[np.float64], layout: Layout | None) -> LatticeFit:
+    """Return the lattice through the centroids of the lens images of a white image less the dark one."""
     basis, seen = lattice_vectors(image)
     if layout is not None and seen != layout:
         raise InputError(
@@ -126,6 +142,22 @@ def fit_lattice(
     indices, points = indexed_from_centre(points, basis, centre)
     indices, points = without_strays(indices, points, float(np.hypot(*basis[0])))
     return lattice_through(indices, points, centre, seen)
+
+
+def _falloff(image: NDArray[np.float64], lattice_px: Lattice) -> NDArray[np.float32] | None:
+    """Return the share (rows, columns) of light that passes, smooth over the lenses; None where that moves no centroid.
+
+    Light that falls towards the corners pulls the centroids of lens images to the middle, in proportion to the image
+    height: as another pitch would.
+    """
+    white = image.astype(np.float32)
+    if lens_image_width(white, lattice_px) < NARROWEST_LENS_IMAGE:
+        return None
+    coefficients = fit_vignetting(relative_transmission(white, lattice_px), lattice_px)
+    if coefficients is None:
+        return None
+    passed = vignetting_surface(coefficients, image.shape)
+    return passed if np.ptp(passed) > EVEN_LIGHT else None
 
 
 def indexed_from_centre(

@@ -271,9 +271,9 @@ def _system(
     """Return the normal equations about the shift that `unknowns` (2,) or (6,) tell."""
     parts, bins = len(light), light.shape[-1]
     inverse = np.linalg.inv(lattice.basis)
-    lever = _levers(_middles())[..., : len(unknowns)]
+    lever = _levers(part_middles())[..., : len(unknowns)]
     moved, slope = _moved(pattern, lever @ unknowns @ inverse)
-    across = (_cell(bins) @ lattice.basis - unknowns[:2]) / lattice.pitch.mean()
+    across = (cell_places(bins) @ lattice.basis - unknowns[:2]) / lattice.pitch.mean()
     cell = Lattice(np.zeros(2), lattice.basis / lattice.pitch.mean(), lattice.layout)
     across -= cell.points(cell.nearest(across))
     free = np.stack([moved, moved * across[..., 0], moved * across[..., 1], np.ones_like(moved)], axis=-1)
@@ -318,7 +318,7 @@ def _nearest_bin(light: NDArray[np.float64], pattern: NDArray[np.float64], latti
 def _places(unknowns: NDArray[np.float64], system: System) -> tuple[Place, ...]:
     """Return shifts in the middles of parts that tell of them, with the standard errors along them."""
     places, covariance, known = [], system.covariance, system.alike > FEWEST_PARTS
-    for lever in _levers(_middles()[system.told >= WELL_LIT * system.told.max()])[..., : len(unknowns)]:
+    for lever in _levers(part_middles()[system.told >= WELL_LIT * system.told.max()])[..., : len(unknowns)]:
         shift, spread = lever @ unknowns, lever @ covariance @ lever.T
         along = shift / max(float(np.hypot(*shift)), np.finfo(np.float64).tiny)
         places.append(Place(shift, float(np.sqrt(along @ spread @ along)) if known else np.inf))
@@ -331,13 +331,13 @@ def _levers(places: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(np.einsum("nk,ab->nakb", terms, np.eye(2)).reshape(len(places), 2, 6))
 
 
-def _middles() -> NDArray[np.float64]:
+def part_middles() -> NDArray[np.float64]:
     """Return the middles (parts, 2) of the parts, from -1 to 1 along each side."""
     side = (2.0 * np.arange(PARTS) + 1.0) / PARTS - 1.0
     return np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
 
 
-def _cell(bins: int) -> NDArray[np.float64]:
+def cell_places(bins: int) -> NDArray[np.float64]:
     """Return the places (bins, bins, 2) of the bins in shares of the basis."""
     share = np.arange(bins) / bins
     return np.stack(np.meshgrid(share, share), axis=-1)
@@ -345,7 +345,7 @@ def _cell(bins: int) -> NDArray[np.float64]:
 
 def _discs(lattice: Lattice, bins: int, width: float) -> NDArray[np.float64]:
     """Return discs of a width in pitches on the cell (bins, bins), a pixel's rim soft."""
-    place, radius = _cell(bins), 0.5 * width * float(lattice.pitch.mean())
+    place, radius = cell_places(bins), 0.5 * width * float(lattice.pitch.mean())
     steps = range(-2, 4)
     distances = (np.linalg.norm((place - (i, j)) @ lattice.basis, axis=-1) for i in steps for j in steps)
     return np.asarray(sum(np.clip(radius + 0.5 - distance, 0.0, 1.0) for distance in distances))

@@ -24,6 +24,8 @@ from lfpiv_cli.names import BoardImages, BoardMethod, BubbleWall, FlowMethod, Re
 
 # Each point is carried by all of them: of more, a frame of many tracers takes gigabytes.
 MOST_MODES = 2000
+# Of the aperture: beyond this the corners see next to nothing.
+MOST_VIGNETTING = 0.9
 
 
 class SquareDuct(Section):
@@ -185,6 +187,23 @@ class WavesSection(Section):
     points: Annotated[int, Field(ge=3, le=1000)] = 16
 
 
+class ObjectiveSection(Section):
+    """How the simulated camera departs from a thin lens before an array that is parallel to the sensor.
+
+    In the corners of the sensor: vignetting (share of the aperture that the barrel cuts off, which begins in the
+    middle), falloff (share of the light that is lost besides, as the square of the image height), field_curvature_mm
+    (how far behind the array the image lies, as the square of the image height) and astigmatism_mm (how much further
+    that of the aperture's radial diameter). array_tilt_deg: by which the array's distance from the sensor grows along
+    the columns and along the rows, about the sensor's middle.
+    """
+
+    vignetting: Annotated[float, Field(ge=0.0, le=MOST_VIGNETTING)] = 0.0
+    falloff: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0
+    field_curvature_mm: float = 0.0
+    astigmatism_mm: float = 0.0
+    array_tilt_deg: tuple[Angle, Angle] = (0.0, 0.0)
+
+
 LightSection = Annotated[RaysSection | WavesSection, Field(discriminator="kind")]
 
 
@@ -204,8 +223,8 @@ class SimulationSection(Section):
     a pixel that sees only the middle of one), bubble_wall (near or far across the depth, low or high across the other
     axis).
     Board: board_z_mm, board_tilt_deg, board_offset_mm, board_rotation_deg.
-    Camera as it really is: rotation_deg of the array (from the columns towards the rows), shift_px (columns, rows) and
-    distortion_per_mm2.
+    Camera as it really is: rotation_deg of the array (from the columns towards the rows), shift_px (columns, rows),
+    distortion_per_mm2 and objective.
     Sensor: peak_counts (of a pixel that sees only light, in white and board images), photons_per_count (null: no shot
     noise), read_noise_counts, dark_level_counts, bits.
     Tracing: light (made of rays, or of waves), refraction (exact or paraxial), rays per particle (null: as many as the
@@ -235,6 +254,7 @@ class SimulationSection(Section):
     rotation_deg: Angle = 0.0
     shift_px: Pair = (0.0, 0.0)
     distortion_per_mm2: float = 0.0
+    objective: ObjectiveSection = ObjectiveSection()
     peak_counts: Positive = 28_000.0
     photons_per_count: Positive | None = 0.5
     read_noise_counts: NotNegative = 6.0

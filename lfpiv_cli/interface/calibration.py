@@ -12,6 +12,7 @@ from lfpiv_cli.calibration import model
 from lfpiv_cli.calibration.lens_light import LensImages
 from lfpiv_cli.calibration.light_checks import dark_notices, position_notices
 from lfpiv_cli.calibration.model import Calibration, DataSheet, Photographs
+from lfpiv_cli.calibration.objective_checks import field_notices, shape_notices, shapes_of
 from lfpiv_cli.calibration.sheet import (
     board_notices,
     check_f_numbers,
@@ -130,7 +131,7 @@ def calibration_notices(rig: Config, pictures: Photographs, found: Calibration) 
     if found.pose is not None:
         notices += points_notices(found.pose.dots_found)
     if found.pose is not None and camera is not None:
-        notices += magnification_notices(found.pose.magnification, camera)
+        notices += [*magnification_notices(found.pose.magnification, camera), *field_notices(found.pose, camera)]
     if found.ray_fit is not None and camera is not None:
         rays = found.ray_fit
         notices += entrance_pupil_notices(rays.entrance_pupil_mm, rays.entrance_pupil_sigma_mm, camera)
@@ -147,7 +148,7 @@ def calibration_notices(rig: Config, pictures: Photographs, found: Calibration) 
 
 
 def light_notices(rig: Config, pictures: Photographs, found: Calibration) -> list[Notice]:
-    """Return what the light of boards and of the dark image says against the lens images that were found."""
+    """Return what the light of boards and of the dark image says against the lens images, and what these say."""
     camera = rig.complete_camera()
     boards = [*([] if pictures.board is None else [pictures.board]), *pictures.depth_boards]
     if found.transmission is None and camera is None:
@@ -155,6 +156,8 @@ def light_notices(rig: Config, pictures: Photographs, found: Calibration) -> lis
     width = 1.0 if camera is None else camera.lens_image_width
     images = LensImages.of(found.rectification, found.transmission, width)
     notices = [] if pictures.dark is None else dark_notices(images, np.asarray(pictures.dark, dtype=np.float64))
+    if found.transmission is not None:
+        notices += shape_notices(shapes_of(images, found.rectification.image_shape))
     for number, board in enumerate(boards, 1):
         name = "board image" if len(boards) == 1 else f"board image {number}"
         notices += position_notices(images, pictures.less_dark(board), name, MOVED_SINCE_WHITE)

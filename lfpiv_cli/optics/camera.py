@@ -48,6 +48,31 @@ class KernelCamera(NamedTuple):
     basis_mm: NDArray[np.float64]
 
 
+class Objective(NamedTuple):
+    """How light departs from a thin lens before an array that is parallel to the sensor; h is the place on the array.
+
+    Attributes
+    ----------
+    stop_shift : the aperture is cut by one as large, this times -h beside it on the main lens: the rim of a barrel
+    falloff_per_mm2 : share of the light that is lost, times h^2
+    curvature_per_mm2 : spread on the array per unit of main-lens position, times h^2
+    astigmatism_per_mm2 : the same, besides, of the part of the main-lens position along h
+    tilt : (along the columns, along the rows) growth of the microlenses' distance from the sensor, mm per mm
+    """
+
+    stop_shift: float = 0.0
+    falloff_per_mm2: float = 0.0
+    curvature_per_mm2: float = 0.0
+    astigmatism_per_mm2: float = 0.0
+    tilt: tuple[float, float] = (0.0, 0.0)
+
+    def aberration(self, lens_mm: NDArray[np.float64], array_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how far (n, 2) beside `array_mm`, where a thin lens leads, rays through `lens_mm` meet the array."""
+        along = self.astigmatism_per_mm2 * np.sum(lens_mm * array_mm, axis=-1, keepdims=True)
+        height2 = np.sum(array_mm**2, axis=-1, keepdims=True)
+        return np.asarray(self.curvature_per_mm2 * height2 * lens_mm + along * array_mm)
+
+
 @dataclass(frozen=True, eq=False)
 class Camera:
     """Everything between the scene and the pixels, with a thin main lens; see `pupils` for one that is not thin.
@@ -65,6 +90,7 @@ class Camera:
     distortion_per_mm2 : k1 of r' = r (1 + k1 r^2), about the axis, on where rays meet the array
     entrance_over_exit : 1/P of the lens that the thin one stands for, see `pupils`; nothing here needs it
     diffusion_px : standard deviation of the Gaussian by which charge diffuses; only what `synthetic` renders has it
+    objective : how it departs from this; only what `synthetic` renders does
     """
 
     magnification: float
@@ -80,6 +106,7 @@ class Camera:
     distortion_per_mm2: float = 0.0
     entrance_over_exit: float = 1.0
     diffusion_px: float = 0.0
+    objective: Objective = Objective()
 
     @property
     def image_distance_mm(self) -> float:

@@ -143,6 +143,7 @@ class WavesInCamera:
         crossing = self._pupil_places
         slopes, seen = _slopes(self.camera, self.space, point_mm, crossing)
         array = crossing + self.camera.image_distance_mm * (slopes - crossing / self.camera.focal_length_mm)
+        array = array + self.camera.objective.aberration(crossing, array)
         return array * (1.0 + self.camera.distortion_per_mm2 * np.sum(array**2, axis=1, keepdims=True)), seen
 
     def _seen(self, point_mm: NDArray[np.float64], pupil_mm: NDArray[np.float64]) -> NDArray[np.bool_]:

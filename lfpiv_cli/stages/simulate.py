@@ -37,6 +37,7 @@ from lfpiv_cli.synthetic import scenes
 from lfpiv_cli.synthetic.board import BoardPlacement, points_of
 from lfpiv_cli.synthetic.bubbles import render_bubbles
 from lfpiv_cli.synthetic.curved_rays import unseen
+from lfpiv_cli.synthetic.objective import objective_of
 from lfpiv_cli.synthetic.render import ObjectSpace, Space
 from lfpiv_cli.synthetic.sensor import Readout
 
@@ -169,8 +170,21 @@ def frame_names(frames: int) -> tuple[str, ...]:
 
 
 def real_camera(settings: Config) -> Camera:
-    """Return the data sheet's camera with the imperfections that are simulated."""
-    return misalignment_of(settings).apply(settings.camera_model())
+    """Return the data sheet's camera with the imperfections that are simulated.
+
+    Raises
+    ------
+    ConfigError : waves through an objective that is rendered by rays alone
+    """
+    section = settings.simulation.objective
+    by_rays = section.vignetting > 0.0 or section.array_tilt_deg != (0.0, 0.0)
+    if by_rays and settings.simulation.light.kind == "waves":
+        raise ConfigError(
+            f"{settings.source}: simulation.objective: vignetting and array_tilt_deg are simulated with "
+            "simulation.light: {kind: rays} alone"
+        )
+    camera = misalignment_of(settings).apply(settings.camera_model())
+    return replace(camera, objective=objective_of(camera, **section.model_dump()))
 
 
 def _recording(settings: Config) -> scenes.RecordingCamera:

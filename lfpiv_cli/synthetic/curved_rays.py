@@ -15,12 +15,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from lfpiv_cli.optics.camera import Camera, KernelCamera
+from lfpiv_cli.optics.camera import Camera, KernelCamera, Objective
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.face_tracing import aim
 from lfpiv_cli.optics.ray_bundles import aim_all
 from lfpiv_cli.optics.surfaces import Faces
-from lfpiv_cli.optics.tracing import struck_pixel, trace_ray
+from lfpiv_cli.optics.tracing import struck_pixel
+from lfpiv_cli.synthetic.objective import trace_real_ray
 from lfpiv_cli.synthetic.ray_sequence import blur_place, in_ball, on_disc, ray_places
 from lfpiv_cli.threads import COUNT_NO_REFERENCES
 
@@ -44,6 +45,7 @@ def trace_curved(
     placed: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
     faces: Faces,
     camera: KernelCamera,
+    objective: Objective,
     fit: tuple[NDArray[np.float64], NDArray[np.float64]],
     blur_mm: NDArray[np.float64],
     pixels: NDArray[np.int32],
@@ -75,9 +77,10 @@ def trace_curved(
                 if not leaves:
                     pixels[i, k] = -1
                     continue
-            on_x, on_y = trace_ray(camera, X, Y, slope_x, slope_y)
+            on_x, on_y, passes = trace_real_ray(camera, objective, X, Y, slope_x, slope_y)
             beside = blur_place(shifts, i, k, blur_mm.shape[0])
-            pixels[i, k] = struck_pixel(camera, on_x + blur_mm[beside, 0], on_y + blur_mm[beside, 1])
+            struck = struck_pixel(camera, on_x + blur_mm[beside, 0], on_y + blur_mm[beside, 1])
+            pixels[i, k] = struck if passes else -1
 
 
 @njit(cache=True)

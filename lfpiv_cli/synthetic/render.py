@@ -19,14 +19,15 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtr
 
 from lfpiv_cli.errors import ConfigError
-from lfpiv_cli.optics.camera import Camera, KernelCamera
+from lfpiv_cli.optics.camera import Camera, KernelCamera, Objective
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.media import Layers
 from lfpiv_cli.optics.microlenses import nearest_point
 from lfpiv_cli.optics.object_space import ObjectSpace, slope_polynomial, slope_ratio
-from lfpiv_cli.optics.tracing import struck_pixel, trace_ray
+from lfpiv_cli.optics.tracing import struck_pixel
 from lfpiv_cli.optics.waves import DIFFUSION_REACH
 from lfpiv_cli.synthetic.curved_rays import fit_of_slopes, trace_curved
+from lfpiv_cli.synthetic.objective import passes_barrel, trace_real_ray
 from lfpiv_cli.synthetic.ray_sequence import SEQUENCE, blur_place, diffused_mm, in_ball, on_disc, ray_places
 from lfpiv_cli.threads import share_out
 
@@ -124,7 +125,7 @@ def _tracer_of(
 
         def trace(part: slice, pixels: NDArray[np.int32]) -> None:
             placed = (points[part], radii[part], shifts[part])
-            share_out(trace_curved, len(pixels), placed, faces, seen, fit, blur_mm, pixels)
+            share_out(trace_curved, len(pixels), placed, faces, seen, camera.objective, fit, blur_mm, pixels)
 
         return trace
     last_layers, layers = space.last_layers_mm(camera, points[:, 2]), space.layers(camera)
@@ -132,7 +133,7 @@ def _tracer_of(
 
     def trace_plane(part: slice, pixels: NDArray[np.int32]) -> None:
         placed = (points[part], radii[part], last_layers[part], shifts[part])
-        share_out(_trace_points, len(pixels), placed, layers, seen, blur_mm, pixels)
+        share_out(_trace_points, len(pixels), placed, layers, seen, camera.objective, blur_mm, pixels)
 
     return trace_plane
 
@@ -150,10 +151,11 @@ def _trace_points(
     placed: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
     layers: Layers,
     camera: KernelCamera,
+    objective: Objective,
     blur_mm: NDArray[np.float64],
     pixels: NDArray[np.int32],
 ) -> None:
-    """Write the flat pixel number that each ray of the points `part` strikes, (n, rays), -1 off the sensor.
+    """Write the flat pixel number that each ray of the points `part` strikes, (n, rays), -1 where it strikes none.
 
     `placed` holds all points, the balls' radii, their last layers' thicknesses and the shifts of their rays; rays end
     beside where they would by each of `blur_mm` (m, 2) in turn.
@@ -173,9 +175,10 @@ def _trace_points(
             dx = lens_x - points[i, 0] - ball_x
             dy = lens_y - points[i, 1] - ball_y
             ratio = slope_ratio(dx * dx + dy * dy, nodes, factors)
-            x, y = trace_ray(camera, lens_x, lens_y, ratio * dx, ratio * dy)
+            x, y, passes = trace_real_ray(camera, objective, lens_x, lens_y, ratio * dx, ratio * dy)
             beside = blur_place(shifts, i, k, blur_mm.shape[0])
-            pixels[i, k] = struck_pixel(camera, x + blur_mm[beside, 0], y + blur_mm[beside, 1])
+            struck = struck_pixel(camera, x + blur_mm[beside, 0], y + blur_mm[beside, 1])
+            pixels[i, k] = struck if passes else -1
 
 
 @njit(cache=True)
@@ -216,7 +219,15 @@ def render_white(camera: Camera, level: float, samples_per_side: int = WHITE_SAM
     centres = camera.micro_image_lattice_px()
     lit = np.empty((camera.rows, camera.columns), dtype=np.int64)
     share_out(
-        _backtrack_white, camera.rows, positions, offsets, camera.for_kernels(), centres.origin, centres.basis, lit
+        _backtrack_white,
+        camera.rows,
+        positions,
+        offsets,
+        camera.for_kernels(),
+        camera.objective,
+        centres.origin,
+        centres.basis,
+        lit,
     )
     return lit * np.float64(level / samples)
 
@@ -239,16 +250,17 @@ def _backtrack_white(
     positions_px: NDArray[np.float64],
     offsets: NDArray[np.float64],
     camera: KernelCamera,
+    objective: Objective,
     origin_px: NDArray[np.float64],
     basis_px: NDArray[np.float64],
     lit: NDArray[np.int64],
 ) -> None:
     """Write how many samples of each pixel, rows `part`, come from the aperture, summed over the lenses."""
-    columns, pixel, straight = camera.columns, camera.pixel_mm, camera.bend
-    aperture_radius = camera.aperture_radius_mm
+    columns, pixel = camera.columns, camera.pixel_mm
+    middle_x, middle_y = 0.5 * (columns - 1.0), 0.5 * (camera.rows - 1.0)
+    to_lens = pixel / (1.0 + camera.microlens_distance_mm / camera.image_distance_mm)
     # Eq. 1 for a ray that meets the array q beside the centre s_u of a lens, solved for X:
     # x_s = s_u + q (1 - s_mu/f_m) + s_mu (s_u + q - X)/s_i
-    lever = camera.image_distance_mm / camera.microlens_distance_mm
     for row in range(part[0], part[1]):
         for column in range(columns):
             near_x, near_y = nearest_point(float(column), float(row), origin_px, basis_px)
@@ -257,12 +269,17 @@ def _backtrack_white(
                 for j in (-1, 0, 1):
                     centre_x = near_x + i * basis_px[0, 0] + j * basis_px[1, 0]
                     centre_y = near_y + i * basis_px[0, 1] + j * basis_px[1, 1]
+                    s_x, s_y = (centre_x - middle_x) * to_lens, (centre_y - middle_y) * to_lens
+                    further = objective.tilt[0] * s_x + objective.tilt[1] * s_y
+                    distance, moved = camera.microlens_distance_mm + further, further / camera.image_distance_mm
+                    lever = camera.image_distance_mm / distance
+                    straight = 1.0 - distance / camera.microlens_focal_length_mm
                     for k in range(offsets.shape[0]):
-                        beside_x = (column + positions_px[k, 0] - centre_x) * pixel
-                        beside_y = (row + positions_px[k, 1] - centre_y) * pixel
+                        beside_x = (column + positions_px[k, 0] - centre_x) * pixel - moved * s_x
+                        beside_y = (row + positions_px[k, 1] - centre_y) * pixel - moved * s_y
                         q_x, q_y = offsets[k, 0], offsets[k, 1]
                         x = q_x - lever * (beside_x - q_x * straight)
                         y = q_y - lever * (beside_y - q_y * straight)
-                        if x * x + y * y <= aperture_radius * aperture_radius:
+                        if passes_barrel(camera, objective, x, y, s_x + q_x, s_y + q_y):
                             count += 1
             lit[row, column] = count

@@ -21,6 +21,7 @@ from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.waves import Waves
 from lfpiv_cli.synthetic.board import BoardPlacement, dot_centres, render_board
 from lfpiv_cli.synthetic.flows import STEADY, Flow, Pulsation, advect
+from lfpiv_cli.synthetic.objective import passed_light
 from lfpiv_cli.synthetic.render import RAYS, Balls, ObjectSpace, Space
 from lfpiv_cli.synthetic.sensor import Readout
 from lfpiv_cli.synthetic.wave_images import render_balls, white_image
@@ -169,6 +170,10 @@ class RecordingCamera:
     readout: Readout
     waves: Waves | None = None
 
+    def record(self, expected: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.uint16]:
+        """Return an image recorded of the counts (rows, columns) that an objective without falloff would make."""
+        return self.readout.record(expected * passed_light(self.optics), rng)
+
     def dark_frame(self, rng: np.random.Generator) -> NDArray[np.uint16]:
         """Return an image recorded without light."""
         return self.readout.record(np.zeros((self.optics.rows, self.optics.columns)), rng)
@@ -263,7 +268,7 @@ def pipe_bounds(pipe: RoundWall) -> Box:
 
 def simulate_white(camera: RecordingCamera, level: float, rng: np.random.Generator) -> SimulatedStill:
     """Simulate an image of uniform light, `level` expected counts where a pixel sees nothing but the aperture."""
-    image = camera.readout.record(white_image(camera.optics, camera.waves, level), rng)
+    image = camera.record(white_image(camera.optics, camera.waves, level), rng)
     return SimulatedStill(image, camera.dark_frame(rng), camera_truth(camera.optics))
 
 
@@ -278,7 +283,7 @@ def simulate_board(
 ) -> SimulatedStill:
     """Simulate an image of a board, `level` expected counts in a pixel that sees only what is bright."""
     expected = render_board(camera.optics, space, board, placement, level, rng, waves=camera.waves, progress=progress)
-    image = camera.readout.record(expected, rng)
+    image = camera.record(expected, rng)
     truth = {
         **camera_truth(camera.optics),
         "board_z_mm": placement.z_mm,
@@ -317,7 +322,7 @@ def simulate_particles(
     for place, seen, light in zip(places, lit, tracers.light_counts * shown, strict=True):
         balls = Balls(place[seen], light[seen], diameters[seen])
         expected = render_balls(camera.optics, space, balls, rng, camera.waves, rays=tracers.rays, progress=progress)
-        images.append(camera.readout.record(expected + still, rng))
+        images.append(camera.record(expected + still, rng))
     window = space.window if isinstance(space, ObjectSpace) else None
     truth = {
         **camera_truth(camera.optics),
