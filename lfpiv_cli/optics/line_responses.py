@@ -137,14 +137,16 @@ def _average(table: Lines, share: Lines, found: Lines) -> None:
 
 def diffused(points: LineResponses, diffusion_px: float) -> LineResponses:
     """Return responses after charge has diffused by a Gaussian: nothing in them is finer than two values tell."""
-    table = points.table
-    depths, offsets, phases, terms, pixels = table.shape
-    along = table.transpose(0, 1, 3, 4, 2).reshape(depths, offsets, terms, pixels * phases)
-    frequency = np.fft.rfftfreq(2 * pixels * phases, 1.0 / phases)
-    damping = np.exp(-2.0 * (np.pi * diffusion_px * frequency) ** 2).astype(np.float32)
-    blurred = np.fft.irfft(np.fft.rfft(along, 2 * pixels * phases, axis=-1) * damping, axis=-1)[..., : pixels * phases]
-    by_phase = blurred.reshape(depths, offsets, terms, pixels, phases).transpose(0, 1, 4, 2, 3)
-    return points._replace(table=np.ascontiguousarray(by_phase, np.float32))
+    pixels = points.table.shape[-1]
+    frequency = np.fft.rfftfreq(2 * pixels * PHASES, 1.0 / PHASES)
+    damping = np.exp(-2.0 * (np.pi * diffusion_px * frequency) ** 2)
+    blur = np.fft.irfft(np.fft.rfft(np.eye(pixels * PHASES), 2 * pixels * PHASES) * damping)[:, : pixels * PHASES]
+    # From each phase to each, pixel by pixel.
+    found = np.zeros_like(points.table)
+    for before in range(PHASES):
+        for behind in range(PHASES):
+            found[:, :, behind] += points.table[:, :, before] @ blur[before::PHASES, behind::PHASES].astype(np.float32)
+    return points._replace(table=found)
 
 
 class _Pupil:
