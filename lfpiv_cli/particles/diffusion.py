@@ -36,7 +36,8 @@ CONTRADICTING, REWEIGHTINGS = 4.0, 20
 MEDIAN_OF_TWO = 1.386
 # A form that opens downwards is taken as this much of its size.
 LEAST_CURVATURE = 1e-3
-# What the model of light gets wrong: a share of the diameter, and of the squares, which take up what it lacks.
+# What the model of light gets wrong: a share of the diameter, and of the squares, which take up what it lacks. On five
+# images by waves, of 10 and 50 um and of .2 and .3 px, these were .003 to .008 and .004 to .014 too large.
 MODEL_SHARE, MODEL_SQUARES = 0.01, (0.006, 0.01)
 
 
