@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from lfpiv_cli.interface.particles import Diffusion, TracerSize
+from lfpiv_cli.files.config import load_config
+from lfpiv_cli.interface.particles import Diffusion, TracerSize, size_notices
 from lfpiv_cli.particles.diffusion import MODEL_SHARE, MODEL_SQUARES, USUAL_PX, Forms, forms_of, together_of
 
+ROOT = Path(__file__).parent.parent
 SIZE, BLUR_PX = 0.5, 0.25
 SQUARES = np.square([SIZE, BLUR_PX])
 
@@ -86,3 +90,21 @@ def test_files_state_diffusion_and_its_error_where_it_is_not_given() -> None:
     size = TracerSize(0.05, 0.051, 0.002, True, by_images)
     assert size.attributes() == {"particle_diameter_mm": 0.05, **by_images.attributes()}
     assert size.summary()["diffusion_measured_px"] == 0.31
+
+
+@pytest.mark.parametrize(
+    ("diffusion", "codes"),
+    [
+        (Diffusion(0.2, 0.21, 0.02, given=True, told=True), []),
+        (Diffusion(0.2, 0.31, 0.02, given=True, told=True), ["diffusion"]),
+        (Diffusion(0.31, 0.31, 0.02, told=True), []),
+        (Diffusion(0.31, 0.31, 0.09), ["diffusion-unknown"]),
+        (Diffusion(USUAL_PX), ["diffusion-unknown"]),
+        # What is given is used where the images do not tell.
+        (Diffusion(0.2, given=True), []),
+    ],
+)
+def test_notices_of_diffusion(diffusion: Diffusion, codes: list[str]) -> None:
+    settings = load_config(ROOT / "configs" / "table2.yaml")
+    size = TracerSize(0.05, 0.05, 0.002, True, diffusion)
+    assert [notice.code for notice in size_notices(settings, size)] == codes
