@@ -86,20 +86,13 @@ def test_by_waves_diffusion_is_found_along_with_the_diameter(
     camera = replace(table2, columns=260, rows=240)
     tracers = rng.uniform((-0.5, -0.45, 0.5, 2e5), (0.5, 0.45, 2.0, 6e5), (14, 4))
     image = image_of(camera, water, tracers, 0.6, Light(532e-6, 0.42, DEPTHS_MM))
-    tasks = tasks_of(camera, water, [image], rng, 0.3, Light(532e-6, 0.3, DEPTHS_MM))
-    found = diameter_by(tasks)
+    found = diameter_by(tasks_of(camera, water, [image], rng, 0.3, Light(532e-6, 0.3, DEPTHS_MM)))
     assert found is not None
     assert found.held is not None
     # Of so many tracers, by the model that made them; what a model gets wrong is in the stated errors alone.
     assert found.lenses == pytest.approx(0.6, abs=0.01)
     assert found.held.diffusion_px == pytest.approx(0.42, abs=0.01)
     assert found.held.told
-    given = diameter_by(tasks, diffusion_px=0.3)
-    assert given is not None
-    assert given.shown is not None
-    assert given.shown.diffusion_px == pytest.approx(found.held.diffusion_px)
-    # What diffusion lacks is taken for size.
-    assert given.lenses > 0.62
 
 
 @pytest.mark.thorough
