@@ -19,7 +19,7 @@ from lfpiv_cli.particles.diameter import NO_SIZES, Diameter, Sizes, diameter_by,
 from lfpiv_cli.particles.fitting import add_all
 from lfpiv_cli.particles.response import entries_of
 from lfpiv_cli.particles.search import Task, task_of
-from lfpiv_cli.particles.view import entry_capacity, raw_view, with_radius
+from lfpiv_cli.particles.view import Light, entry_capacity, raw_view, with_radius
 from lfpiv_cli.reconstruction.equations import normalisers
 from lfpiv_cli.weights.build import default_padding, factorise
 from lfpiv_cli.weights.model import Weights
@@ -34,22 +34,29 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(5)
 
 
-def image_of(camera: Camera, media: Media, tracers: NDArray[np.float64], lenses: float) -> NDArray[np.float64]:
+def image_of(
+    camera: Camera, media: Media, tracers: NDArray[np.float64], lenses: float, waves: Light | None = None
+) -> NDArray[np.float64]:
     """Return what tracers (n, 4) of a diameter in microlenses show, without noise."""
     image = np.zeros(camera.rows * camera.columns)
-    add_all(raw_view(camera, media, 0.5 * lenses * LENS_MM), tracers, 1.0, image, DEPTHS_MM)
+    add_all(raw_view(camera, media, 0.5 * lenses * LENS_MM, light=waves), tracers, 1.0, image, DEPTHS_MM)
     return image.reshape(camera.rows, camera.columns)
 
 
 def tasks_of(
-    camera: Camera, media: Media, images: list[NDArray[np.float64]], rng: np.random.Generator, assumed: float = 0.5
+    camera: Camera,
+    media: Media,
+    images: list[NDArray[np.float64]],
+    rng: np.random.Generator,
+    assumed: float = 0.5,
+    waves: Light | None = None,
 ) -> list[Task]:
     """Return the tasks that images set whose tracers are taken to be so many microlenses wide."""
     grid = Grid.centred((11, 10, 9), (0.1, 0.1, 0.2), (0.0, 0.0, 1.25))
     padding = default_padding(camera, media, grid)
     operator = factorise(camera, media, grid.padded(padding))
     weights = Weights(grid, padding, operator, camera.column_axis)
-    view, sums = raw_view(camera, media, 0.5 * assumed * LENS_MM), normalisers(weights.padded)
+    view, sums = raw_view(camera, media, 0.5 * assumed * LENS_MM, light=waves), normalisers(weights.padded)
     noisy = [rng.poisson(0.5 * image) / 0.5 + rng.normal(0.0, 6.0, image.shape) for image in images]
     return [task_of(image.astype(np.float32), view, weights, camera, sums) for image in noisy]
 
@@ -70,6 +77,22 @@ def test_the_diameter_is_found_whatever_was_assumed(
     assert found.resolved
     assert found.lenses == pytest.approx(lenses, abs=3.0 * found.sigma_lenses)
     assert found.lenses == pytest.approx(lenses, rel=0.02, abs=0.01)
+
+
+@pytest.mark.thorough
+def test_by_waves_diffusion_is_found_along_with_the_diameter(
+    table2: Camera, water: Media, rng: np.random.Generator
+) -> None:
+    camera = replace(table2, columns=260, rows=240)
+    tracers = rng.uniform((-0.5, -0.45, 0.5, 2e5), (0.5, 0.45, 2.0, 6e5), (14, 4))
+    image = image_of(camera, water, tracers, 0.6, Light(532e-6, 0.42, DEPTHS_MM))
+    found = diameter_by(tasks_of(camera, water, [image], rng, 0.3, Light(532e-6, 0.3, DEPTHS_MM)))
+    assert found is not None
+    assert found.held is not None
+    # Of so many tracers, by the model that made them; what a model gets wrong is in the stated errors alone.
+    assert found.lenses == pytest.approx(0.6, abs=0.01)
+    assert found.held.diffusion_px == pytest.approx(0.42, abs=0.01)
+    assert found.held.told
 
 
 @pytest.mark.thorough

@@ -20,7 +20,7 @@ from lfpiv_cli.particles.least_squares import Observation, normal_equations, obs
 from lfpiv_cli.particles.noise import WHITE, Correlation, Noise, error_correlation, measured_noise
 from lfpiv_cli.particles.splitting import split
 from lfpiv_cli.particles.tiles import groups_of_tiles
-from lfpiv_cli.particles.view import View, entry_capacity, raw_view
+from lfpiv_cli.particles.view import View, entry_capacity, raw_view, with_radius
 
 # The fits take half a minute to compile.
 pytestmark = pytest.mark.thorough
@@ -179,6 +179,26 @@ def test_neighbours_that_are_free_widen_the_errors(view: View) -> None:
         np.testing.assert_allclose(np.sqrt(np.diag(found[number])), np.sqrt(np.diag(whole[part, part])), rtol=2e-3)
     alone = joint_covariance(blind(view, weight), particles[[0]], WHITE, np.ones(1))
     assert found[0, 2, 2] > 1.1 * alone[0, 2, 2]
+
+
+def test_what_all_particles_share_moves_them_as_a_fit_would(view: View) -> None:
+    particles = np.array([[0.20, 0.10, 2.0, 5e5], [0.23, 0.09, 2.2, 4e5], [-1.0, 0.9, 1.0, 4e5]])
+    clean = image_of(view, particles)
+    weight = 1.0 / (clean + 36.0)
+    # A hundredth of their radius.
+    change = image_of(with_radius(view, 0.02525), particles) - clean
+    seen, none = blind(view, weight), np.ones(len(particles))
+    added = joint_covariance(seen, particles, WHITE, none, change[np.newaxis]) - joint_covariance(
+        seen, particles, WHITE, none
+    )
+    fitted, residual = particles.copy(), change.copy()
+    for _ in range(30):
+        refine(observed(view, residual, weight), fitted, 1e-6)
+    moved = fitted - particles
+    assert np.abs(moved[:, 2]).max() > 1e-3
+    # Fits are not quite linear in the change.
+    np.testing.assert_allclose(np.sqrt(added[:, 2, 2]), np.abs(moved[:, 2]), rtol=0.1)
+    np.testing.assert_allclose(np.sqrt(added[:, 3, 3]), np.abs(moved[:, 3]), rtol=0.1, atol=10.0)
 
 
 def test_particles_that_nearly_coincide_have_errors(view: View) -> None:

@@ -214,7 +214,7 @@ class ReconstructionSection(Section):
     saturation_counts: pixels as bright as this are left out (default: those at the end of 8 to 16 bits).
     particle_diameter_mm: of the tracers (default: by their images); only the solver `particles` reads it.
     wavelength_nm: of the light, which lenses diffract: the solver `particles` fits waves (default: rays).
-    diffusion_px: of charge in the sensor, as fits by waves take it (default: 0.3).
+    diffusion_px: of charge in the sensor, as fits by waves take it (default: by the tracers' images).
     accelerate: step from points extrapolated by Nesterov's momentum; a quarter of the iterations will do.
     padding_voxel: voxels [x, y, z] solved for beyond each side of the volume and cropped on writing (default: derived
     from how far light spreads).
@@ -228,7 +228,7 @@ class ReconstructionSection(Section):
     saturation_counts: Positive | None = None
     particle_diameter_mm: Positive | None = None
     wavelength_nm: Wavelength | None = None
-    diffusion_px: Diffusion = 0.3
+    diffusion_px: Diffusion | None = None
     iterations: Annotated[int, Field(ge=1, le=100_000)] = 24
     relaxation: Annotated[float, Field(gt=0.0, le=2.0)] = 1.0
     accelerate: bool = True

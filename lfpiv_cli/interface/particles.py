@@ -31,7 +31,9 @@ from lfpiv_cli.notice import Notice, written
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.particles.counting import tracers_per_lens as counted
-from lfpiv_cli.particles.diameter import LIMIT_SIGMAS, UNKNOWN_LENSES, diameter_by
+from lfpiv_cli.particles.diameter import LIMIT_SIGMAS, UNKNOWN_LENSES, Diameter, diameter_by
+from lfpiv_cli.particles.diffusion import USUAL_PX, USUAL_SIGMA_PX
+from lfpiv_cli.particles.light_errors import MUCH_LEFT
 from lfpiv_cli.particles.neighbour_frames import second_pass
 from lfpiv_cli.particles.rounds import ROUNDS, first_pass
 from lfpiv_cli.particles.search import Particles, Task, result, task_of
@@ -48,9 +50,6 @@ from lfpiv_cli.weights.model import behind_transmission
 LARGEST_UNEXPLAINED = 0.2
 # At so many found for each microlens, fewer than there are, stated errors begin to cover less than four fifths.
 LARGEST_CROWD = 1.3
-# Where particles leave this share of an image, more than at any crowd at which most are found, tracers are counted by
-# how uneven their light is: of four for each microlens only 1.3 are found, and few of them are right.
-MUCH_LEFT = 0.1
 # Frames that are looked at for the tracers' diameter, if the first do not hold enough.
 LOOKED_AT = 5
 # Beyond so many standard errors a given diameter contradicts the images.
@@ -168,6 +167,38 @@ def frame_of(bench: Bench, raw: Image, lit: Image) -> Frame:
 
 
 @dataclass(frozen=True)
+class Diffusion:
+    """The sensor's charge diffusion.
+
+    Attributes
+    ----------
+    px : that particles are fitted with by waves
+    measured_px, sigma_px : by the tracers' images, and its standard error; None where no image shows it
+    given : whether it is given
+    told : whether the images tell it, not what is usual
+    """
+
+    px: float
+    measured_px: float | None = None
+    sigma_px: float | None = None
+    given: bool = False
+    told: bool = False
+
+    def attributes(self) -> dict[str, float]:
+        """Return what files say of it: its standard error where it is not given."""
+        usual = USUAL_SIGMA_PX if self.sigma_px is None else self.sigma_px
+        return {"diffusion_px": self.px} | ({} if self.given else {"diffusion_sigma_px": usual})
+
+    def summary(self) -> dict[str, float | None]:
+        """Return what is told of it; None where it is not known."""
+        return {
+            "diffusion_px": self.px,
+            "diffusion_measured_px": self.measured_px,
+            "diffusion_sigma_px": self.sigma_px,
+        }
+
+
+@dataclass(frozen=True)
 class TracerSize:
     """The tracers' diameter.
 
@@ -176,12 +207,14 @@ class TracerSize:
     diameter_mm : that they are fitted with
     measured_mm, sigma_mm : by their images, and its standard error; None where no image shows it
     resolved : whether more than an upper limit is known by the images
+    diffusion : by waves, how far charge diffuses in the sensor
     """
 
     diameter_mm: float
     measured_mm: float | None = None
     sigma_mm: float | None = None
     resolved: bool = False
+    diffusion: Diffusion | None = None
 
     @property
     def at_most_mm(self) -> float | None:
@@ -195,7 +228,7 @@ class TracerSize:
         told = {"particle_diameter_mm": self.diameter_mm}
         if self.sigma_mm is not None and self.diameter_mm == self.measured_mm:
             told["particle_diameter_sigma_mm"] = self.sigma_mm
-        return told
+        return told | (self.diffusion.attributes() if self.diffusion else {})
 
     def summary(self) -> dict[str, float | None]:
         """Return what is told of it; None where it is not known."""
@@ -203,24 +236,68 @@ class TracerSize:
             "particle_diameter_mm": self.diameter_mm,
             "particle_diameter_measured_mm": self.measured_mm,
             "particle_diameter_sigma_mm": self.sigma_mm,
-        }
+        } | (self.diffusion.summary() if self.diffusion else {})
 
 
 def sized(bench: Bench, frames: Iterable[Frame]) -> tuple[Bench, TracerSize]:
-    """Return the bench with the tracers' diameter, from the first of its frames where it is not given."""
-    given, lens_mm = bench.settings.reconstruction.particle_diameter_mm, _lens_mm(bench)
-    found = diameter_by(task_for(bench, frame) for frame in islice(frames, LOOKED_AT))
+    """Return the bench with the tracers' diameter, from the first of its frames where it is not given.
+
+    By waves with the sensor's charge diffusion.
+    """
+    chosen, lens_mm = bench.settings.reconstruction, _lens_mm(bench)
+    given, given_px = chosen.particle_diameter_mm, chosen.diffusion_px
+    found = diameter_by(
+        (task_for(bench, frame) for frame in islice(frames, LOOKED_AT)), given and given / lens_mm, given_px
+    )
     if found is None:
         size = TracerSize(given or UNKNOWN_LENSES * lens_mm)
     else:
         measured = lens_mm * found.lenses
         size = TracerSize(given or measured, measured, lens_mm * found.sigma_lenses, found.resolved)
-    settings = bench.settings.overridden("reconstruction", particle_diameter_mm=size.diameter_mm)
-    return replace(bench, settings=settings), size
+    if chosen.wavelength_nm is None:
+        settings, covariance = bench.settings.overridden("reconstruction", particle_diameter_mm=size.diameter_mm), None
+    else:
+        diffusion = _diffusion(found, given_px)
+        size = replace(size, diffusion=diffusion)
+        settings = bench.settings.overridden(
+            "reconstruction", particle_diameter_mm=size.diameter_mm, diffusion_px=diffusion.px
+        )
+        covariance = None if found is None or found.held is None else found.held.covariance
+    return replace(bench, settings=settings, light_covariance=covariance), size
+
+
+def _diffusion(found: Diameter | None, given_px: float | None) -> Diffusion:
+    """Return the sensor's charge diffusion: as given, by the images, or as is usual."""
+    given = given_px is not None
+    shown = None if found is None else found.shown if given else found.held
+    px = given_px if given_px is not None else USUAL_PX if shown is None else shown.diffusion_px
+    if shown is None:
+        return Diffusion(px, given=given)
+    return Diffusion(px, shown.diffusion_px, shown.sigma_px, given, shown.told)
 
 
 def size_notices(settings: Config, size: TracerSize) -> list[Notice]:
-    """Return where the given diameter contradicts the images, or where they do not tell it."""
+    """Return where what is given of diameter and diffusion contradicts the images, or where they do not tell it."""
+    return _diameter_notices(settings, size) + ([] if size.diffusion is None else _diffusion_notices(size.diffusion))
+
+
+def _diffusion_notices(found: Diffusion) -> list[Notice]:
+    """Return where a given diffusion contradicts the images, or where they do not tell it."""
+    key = "reconstruction.diffusion_px"
+    if found.measured_px is None or found.sigma_px is None or not found.told:
+        text = f"the images do not tell how far charge diffuses: {written(found.px)} px is taken"
+        remedy = "give it, or tracers that stand alone at several depths"
+        return [] if found.given else [Notice("diffusion-unknown", key, text, remedy, found.sigma_px, None)]
+    if found.given and abs(found.px - found.measured_px) > CONTRADICTING_SIGMAS * found.sigma_px:
+        text = (
+            f"{found.px:g} px, but by the images it is {written(found.measured_px)} ± {written(found.sigma_px, 2)} px"
+        )
+        remedy = "leave it out, and it is taken from the images; or check wavelength_nm and calibration"
+        return [Notice("diffusion", key, text, remedy, found.px, f"{written(found.measured_px)} px")]
+    return []
+
+
+def _diameter_notices(settings: Config, size: TracerSize) -> list[Notice]:
     given, key = settings.reconstruction.particle_diameter_mm, "reconstruction.particle_diameter_mm"
     if size.measured_mm is None or size.sigma_mm is None:
         if given is not None:
@@ -283,7 +360,9 @@ def task_for(bench: Bench, frame: Frame) -> Task:
     light = _light(content, settings)
     view = raw_view(content.camera, settings.media_model(), radius, content.weights.calibration, space, light)
     photons = settings.reconstruction.photons_per_count
-    return task_of(frame.image, view, content.weights, content.camera, frame.sums, frame.unusable, photons)
+    return task_of(
+        frame.image, view, content.weights, content.camera, frame.sums, frame.unusable, photons, bench.light_covariance
+    )
 
 
 def _light(content: WeightsFile, settings: Config) -> Light | None:
@@ -298,7 +377,8 @@ def light_of(settings: Config, depths_mm: tuple[float, float]) -> Light | None:
     chosen = settings.reconstruction
     if chosen.wavelength_nm is None:
         return None
-    return Light(chosen.wavelength_nm * NM_TO_MM, chosen.diffusion_px, depths_mm)
+    diffusion_px = USUAL_PX if chosen.diffusion_px is None else chosen.diffusion_px
+    return Light(chosen.wavelength_nm * NM_TO_MM, diffusion_px, depths_mm)
 
 
 def points_of(bench: Bench, frame: Frame, found: Particles, size: TracerSize, provenance: Mapping[str, Any]) -> Points:
@@ -309,6 +389,7 @@ def points_of(bench: Bench, frame: Frame, found: Particles, size: TracerSize, pr
     left = what_is_left(frame, found)
     norm = float(np.linalg.norm(np.where(frame.unusable, 0.0, frame.image)))
     share_left = float(np.linalg.norm(left)) / norm if norm > 0.0 else 0.0
+    # Of four tracers for each microlens only 1.3 are found, and few of them are right.
     number = tracers_per_lens(bench, frame) if share_left > MUCH_LEFT else None
     return Points(
         content.reference.points_from_focal_point(found.position_mm),
@@ -361,7 +442,7 @@ def light_notices(points: Points, name: str) -> list[Notice]:
                 "light-model",
                 name,
                 f"{unexplained:.0%} of the light is not that of the particles found by {measured['light']}, at most "
-                f"{MUCH_LEFT:.0%} where the model is right: stated errors of places are too small",
+                f"{MUCH_LEFT:.0%} where the model is right: stated errors are larger for it, and may be too small",
                 "give reconstruction.wavelength_nm, as lenses diffract"
                 if measured["light"] == "rays"
                 else "check the calibration, wavelength_nm and diffusion_px",

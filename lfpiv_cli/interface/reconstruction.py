@@ -106,6 +106,7 @@ class Bench:
     excluded : pixels in the weights' frame that never take part: off the sensor, or touched by `lasting`
     sums : of the weights without `excluded`; None where weights are made for each image
     lens_images : what the light of frames is held against
+    light_covariance : of the tracers' size and of diffusion, see `particles.diffusion`; None: not measured
     """
 
     content: WeightsFile
@@ -115,6 +116,7 @@ class Bench:
     excluded: Mask
     sums: Normalisers | None
     lens_images: LensImages
+    light_covariance: NDArray[np.float64] | None = None
 
     def unusable(self, raw: Image) -> Mask:
         """Return which pixels of a raw frame take no part."""

@@ -108,7 +108,7 @@ def line_responses(
     whole = np.concatenate([half[:, :0:-1, ::-1], half], axis=1)[:, :, :-1]
     positive = np.arange(TERMS) < (TERMS + 1) // 2
     return LineResponses(
-        _of_phases(whole.transpose(0, 1, 3, 2), PHASES),
+        _by_phases(whole),
         np.where(positive, 1.0, -1.0).astype(np.float32),
         np.ones(TERMS, np.float32),
         float(pupil.depths_mm[0]),
@@ -147,33 +147,35 @@ def _average(table: Lines, share: Lines, found: Lines) -> None:
 
 def on_pixels(points: LineResponses, diffusion_px: float) -> LineResponses:
     """Return responses after charge has diffused by a Gaussian, of pixels that integrate where samples were summed."""
-    table = points.table
-    depths, offsets, phases, terms, pixels = table.shape
-    frequency = np.fft.rfftfreq(2 * pixels * phases, 1.0 / phases)
+    places = PHASES * points.table.shape[-1]
+    frequency = np.fft.rfftfreq(2 * places, 1.0 / PHASES)
     damping = np.sinc(frequency / FINE) * np.exp(-2.0 * (np.pi * diffusion_px * frequency) ** 2)
-    blurred = np.fft.irfft(np.fft.rfft(np.eye(pixels * phases), 2 * pixels * phases) * damping)[:, : pixels * phases]
-    return points._replace(table=_of_phases(_along_pixels(table) @ blurred.astype(np.float32), phases))
+    blur = np.fft.irfft(np.fft.rfft(np.eye(places), 2 * places) * damping)[:, :places]
+    return points._replace(table=_mixed(points.table, blur))
 
 
 def splines(lines: LineResponses) -> LineResponses:
     """Return the coefficients of the cubic splines through responses along depth, offset and place under the lens."""
-    phases = lines.table.shape[2]
-    table = _of_phases(spline_filter1d(_along_pixels(lines.table), output=np.float32), phases)
+    table = _mixed(lines.table, spline_filter1d(np.eye(PHASES * lines.table.shape[-1])))
     for axis in (0, 1):
         spline_filter1d(table, axis=axis, output=table)
     return lines._replace(table=table)
 
 
-def _along_pixels(table: Lines) -> Lines:
-    """Return responses (depths, offsets, terms, places under the lens) of a table."""
-    depths, offsets, phases, terms, pixels = table.shape
-    return table.transpose(0, 1, 3, 4, 2).reshape(depths, offsets, terms, pixels * phases)
+def _mixed(table: Lines, shares: NDArray[np.float64]) -> Lines:
+    """Return the table with each place under the lens replaced by a sum of all, `shares` (from, to)."""
+    found = np.zeros_like(table)
+    for before in range(PHASES):
+        for behind in range(PHASES):
+            found[:, :, behind] += table[:, :, before] @ shares[before::PHASES, behind::PHASES].astype(np.float32)
+    return found
 
 
-def _of_phases(along: Lines, phases: int) -> Lines:
-    """Return a table of responses (depths, offsets, terms, places under the lens)."""
-    by_phase = along.reshape(*along.shape[:3], -1, phases).transpose(0, 1, 4, 2, 3)
-    return np.ascontiguousarray(by_phase, np.float32)
+def _by_phases(lines: Lines) -> Lines:
+    """Return lines (depths, offsets, responses, TERMS) as `LineResponses.table`."""
+    depths, offsets, responses, terms = lines.shape
+    by_phase = lines.reshape(depths, offsets, responses // PHASES, PHASES, terms).transpose(0, 1, 3, 4, 2)
+    return np.ascontiguousarray(by_phase, dtype=np.float32)
 
 
 class _Pupil:

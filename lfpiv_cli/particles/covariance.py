@@ -9,6 +9,9 @@ pixels side by side. With H the normal matrix, K = H^-1 J^T W^(1/2) is how far e
 and errors with the correlation R move it by the covariance K R K^T. What a particle's chi-squared exceeds 1 by is not
 noise but such a sign: it counts as errors that are all alike.
 
+What is wrong with the light of all particles together, as their size is, moves each by -H^-1 J^T W d with d what the
+image changes by.
+
 Axes: image axes, mm; see `fitting`. A particle's unknowns are x, y, z and light.
 """
 
@@ -88,7 +91,11 @@ class Equations(NamedTuple):
 
 
 def joint_covariance(
-    observation: Observation, particles: NDArray[np.float64], correlation: Correlation, chi2: NDArray[np.float64]
+    observation: Observation,
+    particles: NDArray[np.float64],
+    correlation: Correlation,
+    chi2: NDArray[np.float64],
+    changes: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float64]:
     """Return the covariance (n, 4, 4) of each particle with its neighbours free.
 
@@ -97,11 +104,15 @@ def joint_covariance(
     particles : (n, 4)
     correlation : of the pixels' errors, and how it falls with distance for errors that are alike
     chi2 : (n,) local chi-squared, 1 where the weights say all
+    changes : (k, pixels) what the image changes by with each independent error that all particles share; None: there
+        are none
     """
     equations = _equations(observation, particles)
+    shared = np.zeros((0, observation.weight.size)) if changes is None else np.sqrt(observation.weight) * changes
+    pulls = _pulls(equations.slopes, shared, observation.optics.camera.columns)
     result = np.empty_like(equations.alone)
     in_threads(
-        lambda part: _covariances(equations, correlation, chi2, part.start, result[part]),
+        lambda part: _covariances(equations, correlation, chi2, pulls, part.start, result[part]),
         blocks(len(particles), BLOCK),
     )
     return result
@@ -152,6 +163,19 @@ def _slopes_of(
                 counts[n] += 1
                 end += 1
     return counts, pixel[:end].copy(), slope[:end].copy()
+
+
+@njit(cache=True)
+def _pulls(slopes: Slopes, changes: NDArray[np.float64], columns: int) -> NDArray[np.float64]:
+    """Return J_n^T W^(1/2) d (n, 4, k) of each particle and each of the changes d (k, pixels), in standard errors."""
+    pulls = np.zeros((slopes.start.size - 1, UNKNOWNS, changes.shape[0]))
+    for n in range(pulls.shape[0]):
+        for entry in range(slopes.start[n], slopes.start[n + 1]):
+            pixel = np.int64(slopes.row[entry]) * columns + slopes.column[entry]
+            for i in range(UNKNOWNS):
+                for k in range(changes.shape[0]):
+                    pulls[n, i, k] += slopes.slope[entry, i] * changes[k, pixel]
+    return pulls
 
 
 def _overlapping(view: View, particles: NDArray[np.float64]) -> Neighbours:
@@ -283,7 +307,12 @@ def _set_products(slopes: Slopes, n: int, m: int, common: NDArray[np.int64], blo
 
 @njit(cache=True, nogil=True)
 def _covariances(
-    equations: Equations, correlation: Correlation, chi2: NDArray[np.float64], first: int, result: NDArray[np.float64]
+    equations: Equations,
+    correlation: Correlation,
+    chi2: NDArray[np.float64],
+    pulls: NDArray[np.float64],
+    first: int,
+    result: NDArray[np.float64],
 ) -> None:
     """Fill in the covariances of the particles from `first` on.
 
@@ -314,6 +343,24 @@ def _covariances(
                 of_m = inverse[:, UNKNOWNS * m : UNKNOWNS * (m + 1)]
                 _add_moves(equations.slopes, members[m], of_m, top, left, moved_by)
             _add_excess(moved_by, correlation.decay, correlation.share + excess, result[k])
+        _add_shared(inverse, members, pulls, result[k])
+
+
+@njit(cache=True)
+def _add_shared(
+    inverse: NDArray[np.float64], members: NDArray[np.int64], pulls: NDArray[np.float64], result: NDArray[np.float64]
+) -> None:
+    """Add what errors that all particles share move the first of some members by, with the inverse's rows (4, n)."""
+    moved = np.empty(UNKNOWNS)
+    for k in range(pulls.shape[2]):
+        moved[:] = 0.0
+        for m in range(members.size):
+            for a in range(UNKNOWNS):
+                for b in range(UNKNOWNS):
+                    moved[a] += inverse[a, UNKNOWNS * m + b] * pulls[members[m], b, k]
+        for a in range(UNKNOWNS):
+            for b in range(UNKNOWNS):
+                result[a, b] += moved[a] * moved[b]
 
 
 @njit(cache=True)

@@ -10,6 +10,8 @@ Tracers that overlap others which were not found look larger than they are. So o
 all that is left, as it is around one that stands alone; an image that has too few of them shows no size, nor does one
 that half or twice the size explains as well.
 
+By waves charge diffusion is measured along with it, see `diffusion`.
+
 Axes: see `search`. Diameters in this module are in microlenses as the scene shows them.
 """
 
@@ -23,6 +25,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from lfpiv_cli.particles.diffusion import NO_FORMS, Forms, Together, forms_of, together_of
 from lfpiv_cli.particles.fitting import fit_from, judge
 from lfpiv_cli.particles.least_squares import (
     SMALLEST_GAIN,
@@ -58,7 +61,7 @@ from lfpiv_cli.particles.search import (
     with_typical_light,
 )
 from lfpiv_cli.particles.tiles import over_tiles
-from lfpiv_cli.particles.view import footprint_radius_mm, on_array_mm, with_radius
+from lfpiv_cli.particles.view import by_waves, footprint_radius_mm, on_array_mm, with_radius
 from lfpiv_cli.robust import MAD_TO_SIGMA, of_half_the_sum
 
 # Sizes that are tried first, in microlenses: each about twice the one before, from what no camera resolves on.
@@ -96,6 +99,10 @@ ENOUGH, UNKNOWN_LENSES = 10, 0.5
 # Only noise is left around a tracer whose chi-squared per pixel is at most this: 1 to 2.3 with the right size and the
 # neighbours found, 4 to 500 where neighbours are missing.
 NOISE_ALONE = 3.0
+# By waves: squares of diffusion that are tried beside the best, px^2, and of the diameter, as a share and
+# microlenses^2; and how often they are tried anew about a better one.
+DIFFUSION_STEP, SQUARE_STEPS, TRIALS = 0.035, (0.15, 0.01), 4
+NINE = np.array([(a, b) for a in (-1.0, 0.0, 1.0) for b in (-1.0, 0.0, 1.0)])
 # Standard error of a median over that of a mean.
 MEDIAN_TO_MEAN = 1.25
 
@@ -107,10 +114,12 @@ class Sizes(NamedTuple):
     ----------
     square : (n,) squared diameters in microlenses, below 0 where noise makes an image sharper than a point's
     sigma : (n,) their standard errors
+    forms : (m,) what tracers show of size and diffusion together, by waves
     """
 
     square: NDArray[np.float64]
     sigma: NDArray[np.float64]
+    forms: Forms = NO_FORMS
 
 
 NO_SIZES = Sizes(np.zeros(0), np.zeros(0))
@@ -124,11 +133,15 @@ class Diameter:
     ----------
     lenses, sigma_lenses : in microlenses as the scene shows them, and its standard error
     tracers : by how many
+    shown : by waves, with diffusion, by the images alone
+    held : the same with what is given
     """
 
     lenses: float
     sigma_lenses: float
     tracers: int
+    shown: Together | None = None
+    held: Together | None = None
 
     @property
     def resolved(self) -> bool:
@@ -136,22 +149,32 @@ class Diameter:
         return self.lenses > LIMIT_SIGMAS * self.sigma_lenses
 
 
-def diameter_by(tasks: Iterable[Task]) -> Diameter | None:
-    """Return the diameter that the tracers of the first images show, of as many as are needed; None without tracers."""
+def diameter_by(
+    tasks: Iterable[Task], lenses: float | None = None, diffusion_px: float | None = None
+) -> Diameter | None:
+    """Return the diameter that the tracers of the first images show, of as many as are needed; None without tracers.
+
+    By waves with diffusion, either as it is given where it is.
+    """
     frames: list[Sizes] = []
     for task in tasks:
         frames.append(measured_sizes(task))
         if sum(sizes.square.size for sizes in frames) >= ENOUGH:
             break
-    return diameter_of(frames)
+    found, forms = diameter_of(frames), [sizes.forms for sizes in frames]
+    if found is None or not sum(len(each.matrix) for each in forms):
+        return found
+    shown, held = together_of(forms), together_of(forms, lenses, diffusion_px)
+    size = held if lenses is None else shown
+    return Diameter(size.lenses, size.sigma_lenses, found.tracers, shown, held)
 
 
 def diameter_of(frames: Sequence[Sizes]) -> Diameter | None:
-    """Return the diameter that the tracers of some frames show together; None where there are none."""
-    square, sigma = (np.concatenate(parts) for parts in zip(*frames, strict=True)) if frames else (np.zeros(0),) * 2
+    """Return the diameter that the tracers of some frames show by their squares; None where there are none."""
+    square = np.concatenate([sizes.square for sizes in frames]) if frames else np.zeros(0)
     if not square.size:
         return None
-    middle, error = _middle(Sizes(square, sigma))
+    middle, error = _middle(Sizes(square, np.concatenate([sizes.sigma for sizes in frames])))
     diameter = float(np.sqrt(max(middle, 0.0)))
     # From squares to diameters, also where the diameter is 0: half of how far up the square may be.
     spread = float(np.sqrt(max(middle, 0.0) + LIMIT_SIGMAS * error)) - diameter
@@ -245,13 +268,40 @@ def _settled_sizes(sought: Sought, diameter: float, rounds: Sequence[Round]) -> 
             diameter, losses, alone = _tried(task, found, diameters, LAST_UNEXPLAINED)
         if abs(diameter - searched_with) < max(NARROW[0] * searched_with, SMALLEST_STEP):
             break
-    if np.count_nonzero(alone) < min(ENOUGH, 0.5 * alone.size):
+    if not _enough(alone):
         return NO_SIZES
     sizes = _vertices(np.square(diameters), losses[:, alone])
     best = _tried(task, found, diameter * np.array([0.5, 1.0, 2.0]), LAST_UNEXPLAINED).diameter
     # Half of what is too small to be seen looks the same.
     unseen = best < diameter and (pooled := diameter_of([sizes])) is not None and not pooled.resolved
-    return sizes if best == diameter or unseen else NO_SIZES
+    if best != diameter and not unseen:
+        return NO_SIZES
+    return sizes._replace(forms=_forms(task, found, diameter)) if by_waves(task.view) else sizes
+
+
+def _enough(alone: NDArray[np.bool_]) -> bool:
+    """Return whether noise is all that is left around enough of the tracers (n,)."""
+    return bool(np.count_nonzero(alone) >= min(ENOUGH, 0.5 * alone.size))
+
+
+def _forms(task: Task, found: State, diameter: float) -> Forms:
+    """Return what tracers that stand alone lose with squares of diameter and diffusion about those that are best."""
+    middle = np.square([diameter, task.view.diffusion_px])
+    forms = NO_FORMS
+    for _ in range(TRIALS):
+        steps = np.array([SQUARE_STEPS[0] * middle[0] + SQUARE_STEPS[1], DIFFUSION_STEP])
+        middle = np.maximum(middle, steps)
+        squares = middle + steps * NINE
+        _, losses, alone = _tried(task, found, np.sqrt(squares), LAST_UNEXPLAINED)
+        if not _enough(alone):
+            break
+        forms = forms_of(squares, losses[:, alone])
+        best = together_of([forms])
+        moved = (np.square([best.lenses, best.diffusion_px]) - middle) / steps
+        if np.all(np.abs(moved) < 1.0):
+            break
+        middle = middle + steps * np.clip(moved, -2.0, 2.0)
+    return forms
 
 
 def _begun(task: Task, state: State) -> State:
@@ -304,9 +354,10 @@ def _middle(sizes: Sizes) -> tuple[float, float]:
     return middle, float(max(scattered, 1.0 / np.sqrt(np.sum(1.0 / sizes.sigma**2))))
 
 
-def _of_diameter(task: Task, diameter: float) -> Task:
-    """Return the task with tracers of a diameter."""
-    return replace(task, view=with_radius(task.view, 0.5 * diameter * task.view.scale.lens_mm))
+def _of_diameter(task: Task, diameter: float, diffusion_px: float | None = None) -> Task:
+    """Return the task with tracers of a diameter, and with another diffusion by waves."""
+    view = task.view if diffusion_px is None else task.view._replace(diffusion_px=diffusion_px)
+    return replace(task, view=with_radius(view, 0.5 * diameter * view.scale.lens_mm))
 
 
 def _apart(task: Task, state: State, candidates: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -364,8 +415,9 @@ class Trial(NamedTuple):
 
 
 def _tried(task: Task, state: State, diameters: NDArray[np.float64], unexplained: float) -> Trial:
-    """Return what bright tracers say of diameters (m,)."""
-    task = _of_diameter(task, diameters[len(diameters) // 2])
+    """Return what bright tracers say of diameters (m,), or of diameters and diffusions (m, 2), the middle ones best."""
+    trials = diameters.reshape(len(diameters), -1)
+    task = _of_diameter(task, *trials[len(trials) // 2])
     state = rebuilt(task, state, state.particles)
     sweep(task, state, unexplained, SWEEPS)
     state = with_typical_light(task, state, judged(task, state, LAST_UNEXPLAINED))
@@ -373,13 +425,13 @@ def _tried(task: Task, state: State, diameters: NDArray[np.float64], unexplained
     chi2, _, seen = judge(observation, state.particles)
     bright = _bright(state, seen)
     good = np.flatnonzero(bright)[np.argsort(chi2[bright], kind="stable")[:MOST_TRACERS]]
-    tracers, change = state.particles[good], np.zeros((len(diameters), good.size))
-    for number, diameter in enumerate(diameters):
-        sized = observed(_of_diameter(task, diameter), state, unexplained)._replace(residual=observation.residual)
+    tracers, change = state.particles[good], np.zeros((len(trials), good.size))
+    for number, trial in enumerate(trials):
+        sized = observed(_of_diameter(task, *trial), state, unexplained)._replace(residual=observation.residual)
         change[number], _ = _fitted(observation, sized, tracers, tracers[:, 2:3])
     losses = (change - change.min(axis=0)) / np.maximum(chi2[good], 1.0)
     noise_alone, *_ = judge(observed(task, state, 0.0), tracers)
-    return Trial(_common(diameters, losses), losses, noise_alone <= NOISE_ALONE)
+    return Trial(_common(trials[:, 0], losses), losses, noise_alone <= NOISE_ALONE)
 
 
 def _bright(state: State, seen: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -19,6 +19,7 @@ from lfpiv_cli.particles.active_set import DISTURBING, disturbance, overlaps_of
 from lfpiv_cli.particles.covariance import joint_covariance
 from lfpiv_cli.particles.fitting import add_all, judge, nothing_expected, refine
 from lfpiv_cli.particles.least_squares import SMALLEST_GAIN, Observation, observation_of
+from lfpiv_cli.particles.light_errors import changes_of_light, grown, light_left
 from lfpiv_cli.particles.noise import (
     Noise,
     error_correlation,
@@ -83,6 +84,7 @@ class Task:
     prepared : (rows, columns) the same in the weights' frame
     depths_mm : between which particles may lie
     photons_per_count : of the camera; None: not known
+    light_covariance : (2, 2) of the squares of size and diffusion, see `diffusion`; None: both are right
     """
 
     view: View
@@ -94,6 +96,7 @@ class Task:
     prepared: NDArray[np.float32]
     depths_mm: tuple[float, float]
     photons_per_count: float | None = None
+    light_covariance: NDArray[np.float64] | None = None
 
     @cached_property
     def read_counts(self) -> float:
@@ -156,6 +159,7 @@ def task_of(
     sums: Normalisers,
     excluded: NDArray[np.bool_] | None = None,
     photons_per_count: float | None = None,
+    light_covariance: NDArray[np.float64] | None = None,
 ) -> Task:
     """Return the task that an image sets.
 
@@ -166,6 +170,7 @@ def task_of(
     camera : says which world axis the columns follow
     excluded : (rows, columns) raw pixels that take no part; `sums` must leave out what they touch; None: none
     photons_per_count : of the camera; None: taken from how bright particles are, until the fit shows it
+    light_covariance : see `Task`
     """
     low, high = weights.grid.bounds_mm(2)
     margin = MARGIN_DEPTHS * view.scale.depth_mm
@@ -179,6 +184,7 @@ def task_of(
         weights.prepare(image.astype(np.float32)),
         (low - margin, high + margin),
         photons_per_count,
+        light_covariance,
     )
 
 
@@ -298,7 +304,12 @@ def result(task: Task, state: State) -> Particles:
     images = (task.image - state.residual, state.residual, observation.weight)
     model, left, trust = (values.reshape(shape) for values in images)
     correlation = error_correlation(model, left, trust, state.noise)
-    covariance = joint_covariance(observation, particles, correlation, chi2)
+    changes = None
+    if task.light_covariance is not None:
+        changes = changes_of_light(task.view, particles, task.light_covariance, task.depths_mm)
+    covariance = joint_covariance(observation, particles, correlation, chi2, changes)
+    share = light_left(task.image[task.usable], state.residual[task.usable], state.noise.read_counts)
+    covariance = grown(task.view, particles, covariance, share)
     to_world = task.camera.to_image_axes(np.eye(3))
     return Particles(
         position_mm=task.camera.to_image_axes(particles[:, :3]),

@@ -57,7 +57,7 @@ class View(NamedTuple):
     inverse_basis : (2, 2) of the plain lattice, to find lenses
     table, table_reach : see `rim`
     lines : of light as waves, by which all light goes then; empty: light goes by rays
-    points : the same of points of light
+    points, diffusion_px : the same of points of light before charge diffuses, and how far it does
     """
 
     camera: KernelCamera
@@ -81,6 +81,7 @@ class View(NamedTuple):
     table_reach: float
     lines: LineResponses
     points: LineResponses
+    diffusion_px: float
 
 
 @dataclass(frozen=True)
@@ -181,8 +182,12 @@ def raw_view(
         table_reach=reach,
         lines=NO_LINES,
         points=NO_LINES,
+        diffusion_px=0.0,
     )
-    return view if light is None else with_waves(view, _points(_numbers(camera), plane, light))
+    if light is None:
+        return view
+    points = _points(_numbers(camera), plane, light.wavelength_mm, light.depths_mm)
+    return with_diffusion(view._replace(points=points), light.diffusion_px)
 
 
 def _numbers(camera: Camera) -> tuple[float, ...]:
@@ -198,16 +203,11 @@ def _numbers(camera: Camera) -> tuple[float, ...]:
     )
 
 
-@lru_cache(maxsize=4)
-def _points(numbers: tuple[float, ...], space: ObjectSpace, light: Light) -> LineResponses:
-    """Return the line responses of points, charge diffused."""
-    return on_pixels(_sharp_points(numbers, space, light.wavelength_mm, light.depths_mm), light.diffusion_px)
-
-
 @lru_cache(maxsize=2)
-def _sharp_points(
+def _points(
     numbers: tuple[float, ...], space: ObjectSpace, wavelength_mm: float, depths_mm: tuple[float, float]
 ) -> LineResponses:
+    """Return the line responses of points, before charge diffuses."""
     magnification, focal_length, aperture, of_lens, distance, pitch, pixel = numbers
     lattice = Lattice(np.zeros(2), pitch * np.eye(2), "square")
     camera = Camera(magnification, focal_length, aperture, of_lens, distance, lattice, pixel, 1, 1)
@@ -217,8 +217,8 @@ def _sharp_points(
 def with_radius(view: View, particle_radius_mm: float) -> View:
     """Return the view of balls of another size."""
     view = view._replace(particle_radius_mm=max(particle_radius_mm, SMALLEST_RADIUS_LENSES * view.scale.lens_mm))
-    if view.points.table.shape[0] > 0:
-        return with_waves(view, view.points)
+    if by_waves(view):
+        return with_diffusion(view, view.diffusion_px)
     if view.cell_table.shape[0] == 0:
         return view
     basis = np.asarray(np.linalg.inv(view.inverse_basis), np.float64)
@@ -236,11 +236,17 @@ def with_radius(view: View, particle_radius_mm: float) -> View:
     )
 
 
-def with_waves(view: View, points: LineResponses) -> View:
-    """Return the view of light as waves, by the responses of points."""
+def with_diffusion(view: View, diffusion_px: float) -> View:
+    """Return the view by waves with charge that diffuses by another Gaussian."""
     camera = view.camera
     radius = view.particle_radius_mm * camera.image_distance_mm / camera.focus_distance_mm
-    return view._replace(points=points, lines=splines(of_balls(points, radius)))
+    lines = splines(of_balls(on_pixels(view.points, diffusion_px), radius))
+    return view._replace(lines=lines, diffusion_px=float(diffusion_px))
+
+
+def by_waves(view: View) -> bool:
+    """Return whether light goes by waves, not by rays."""
+    return view.points.table.shape[0] > 0
 
 
 def on_array_mm(view: View, points: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -351,7 +351,15 @@ def _particle_row(path: Path) -> Row:
         "per microlens": _cell(told.get("particles_per_lens")),
         "light not explained": _cell(told.get("residual")),
         "median sigma x, y, z (mm)": _cell(np.median(sigma, axis=0).tolist()) if inside.any() else UNKNOWN,
+        "diameter (mm)": _with_error(told, "particle_diameter", "mm"),
+        "diffusion (px)": _with_error(told, "diffusion", "px"),
     }
+
+
+def _with_error(told: Mapping[str, Any], name: str, unit: str) -> str:
+    """Return what a file tells of a number, with its standard error where it has one."""
+    value, error = told.get(f"{name}_{unit}"), told.get(f"{name}_sigma_{unit}")
+    return _cell(value) if value is None or error is None else f"{written(value)} ± {written(error, 2)}"
 
 
 def _field_row(vectors: VectorField) -> Row:
