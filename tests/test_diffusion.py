@@ -9,7 +9,7 @@ import pytest
 
 from lfpiv_cli.files.config import load_config
 from lfpiv_cli.interface.particles import Diffusion, TracerSize, size_notices
-from lfpiv_cli.particles.diffusion import MODEL_SHARE, MODEL_SQUARES, USUAL_PX, Forms, forms_of, together_of
+from lfpiv_cli.particles.diffusion import MODEL_SHARE, MODEL_SQUARES, USUAL_DIFFUSION_PX, Forms, forms_of, together_of
 
 ROOT = Path(__file__).parent.parent
 SIZE, BLUR_PX = 0.5, 0.25
@@ -65,7 +65,7 @@ def test_what_images_do_not_tell_is_taken_as_usual(rng: np.random.Generator) -> 
     told, untold = together_of([forms(20, rng)]), together_of([forms(20, rng, sure=1e-3)])
     assert told.told
     assert not untold.told
-    assert untold.diffusion_px == pytest.approx(USUAL_PX, abs=0.05)
+    assert untold.diffusion_px == pytest.approx(USUAL_DIFFUSION_PX, abs=0.05)
     # Sizes of points are not below 0, and diffusion is then that of points.
     point = Forms(np.tile(1e4 * np.eye(2), (5, 1, 1)), np.tile(1e4 * np.array([-0.01, 0.04]), (5, 1)))
     found = together_of([point])
@@ -86,7 +86,7 @@ def test_files_state_diffusion_and_its_error_where_it_is_not_given() -> None:
     assert Diffusion(0.2, 0.31, 0.02, given=True, told=True).attributes() == {"diffusion_px": 0.2}
     by_images = Diffusion(0.31, 0.31, 0.02, told=True)
     assert by_images.attributes() == {"diffusion_px": 0.31, "diffusion_sigma_px": 0.02}
-    assert Diffusion(USUAL_PX).attributes()["diffusion_sigma_px"] == 0.1
+    assert Diffusion(USUAL_DIFFUSION_PX).attributes()["diffusion_sigma_px"] == 0.1
     size = TracerSize(0.05, 0.051, 0.002, True, by_images)
     assert size.attributes() == {"particle_diameter_mm": 0.05, **by_images.attributes()}
     assert size.summary()["diffusion_measured_px"] == 0.31
@@ -99,7 +99,7 @@ def test_files_state_diffusion_and_its_error_where_it_is_not_given() -> None:
         (Diffusion(0.2, 0.31, 0.02, given=True, told=True), ["diffusion"]),
         (Diffusion(0.31, 0.31, 0.02, told=True), []),
         (Diffusion(0.31, 0.31, 0.09), ["diffusion-unknown"]),
-        (Diffusion(USUAL_PX), ["diffusion-unknown"]),
+        (Diffusion(USUAL_DIFFUSION_PX), ["diffusion-unknown"]),
         # What is given is used where the images do not tell.
         (Diffusion(0.2, given=True), []),
     ],

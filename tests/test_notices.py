@@ -20,6 +20,7 @@ from lfpiv_cli.calibration.sheet import (
     f_number_notices,
     image_distance_notices,
     magnification_notices,
+    narrow_notices,
     points_notices,
     sheet_fit,
 )
@@ -401,6 +402,17 @@ def test_few_points_of_a_board_are_told() -> None:
     (told,) = points_notices(6)
     assert told.code == "board-few-points"
     assert told.measured == 6.0
+
+
+def test_dots_within_single_lenses_are_told(table2: Camera, water: Media) -> None:
+    scale = table2.scale(water.in_air())
+    (told,) = narrow_notices(0.7 * scale.lens_mm, -0.1 * scale.depth_mm, scale)
+    assert told.code == "board-within-lenses"
+    assert told.measured == pytest.approx(0.8)
+    # To where light spreads over two lenses.
+    assert "by 1 mm" in told.remedy
+    assert narrow_notices(0.7 * scale.lens_mm, -0.4 * scale.depth_mm, scale) == []
+    assert narrow_notices(1.1 * scale.lens_mm, 0.0, scale) == []
 
 
 def test_a_board_in_part_or_of_another_size_is_told(table2: Camera) -> None:

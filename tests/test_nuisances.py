@@ -12,7 +12,7 @@ from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.particles.fitting import add_all
 from lfpiv_cli.particles.noise import Noise
-from lfpiv_cli.particles.view import View, raw_view
+from lfpiv_cli.particles.view import Light, View, raw_view
 from lfpiv_cli.self_calibration.nuisances import Nuisances, fit_nuisances
 
 DEPTHS = (-4.0, 4.0)
@@ -53,3 +53,21 @@ def test_a_camera_that_is_right_is_left_as_it_is(view: View, rng: np.random.Gene
     true = rng.uniform((-1.0, -0.9, -3.5, 4e5), (1.0, 0.9, 3.5, 6e5), (30, 4))
     fit = fit_nuisances(picture(view, true, rng), view, true, NOISE, DEPTHS)
     assert np.all(np.abs(fit.found.values) < 4.0 * fit.sigma.values)
+
+
+@pytest.mark.thorough
+def test_by_waves_the_aperture_is_believed(table2: Camera, water: Media, rng: np.random.Generator) -> None:
+    """All else is found, by the light and the derivatives of line responses."""
+    small, depths = replace(table2, columns=300, rows=280), (1.0, 1.6)
+    view = raw_view(small, water, 0.025, light=Light(532e-6, 0.3, depths))
+    true = rng.uniform((-0.6, -0.5, 1.1, 4e5), (0.6, 0.5, 1.5, 6e5), (20, 4))
+    # So near focus four rounds do not settle what half a pixel and a fifth of the radius spoil.
+    planted = Nuisances(9e-4, -6e-4, 0.0, 3e-3)
+    image = picture(planted.applied(view), true, rng)
+    start = true + rng.normal(0.0, (2e-3, 2e-3, 0.03, 1e4), true.shape)
+    fit = fit_nuisances(image, view, start, NOISE, depths)
+    off, sigma = fit.found.values - planted.values, fit.sigma.values
+    assert fit.found.aperture_radius_mm == 0.0
+    assert np.isnan(sigma[2])
+    assert np.all(np.abs(off[[0, 1, 3]]) < 4.0 * sigma[[0, 1, 3]])
+    assert np.all(np.abs(planted.values[[0, 1, 3]]) > 8.0 * sigma[[0, 1, 3]])

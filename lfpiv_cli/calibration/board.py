@@ -26,7 +26,8 @@ from lfpiv_cli.calibration.refocusing import Refocusing
 from lfpiv_cli.calibration.shape_fit import ShapeFit
 from lfpiv_cli.calibration.spots import find_spots
 from lfpiv_cli.calibration.target_kinds import another_kind
-from lfpiv_cli.errors import InputError
+from lfpiv_cli.calibration.wave_shapes import WaveLight, WaveShapes, disc_strips, together
+from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.names import Pattern
 from lfpiv_cli.neighbourhoods import opened
 from lfpiv_cli.optics.camera import Camera
@@ -67,6 +68,9 @@ class Look(Protocol):
     def moved(self, scale: float, depth_mm: float) -> Look:
         """Return the look with its points nearer the axis by a scale, at another depth."""
 
+    def by_waves(self, light: WaveLight) -> Look:
+        """Return the look with points that are measured by waves."""
+
     def measured(self, camera: Camera, board: BoardGeometry) -> MeasuredPoints:
         """Measure the points."""
 
@@ -83,6 +87,7 @@ class FirstLook:
     radius_mm : of the dots
     start_mm : (n, 2) their lateral places, image axes
     depth_mm : of all of them
+    light : waves that the dots send; None: rays
     """
 
     signal: NDArray[np.float64]
@@ -91,15 +96,31 @@ class FirstLook:
     radius_mm: float
     start_mm: NDArray[np.float64]
     depth_mm: float
+    light: WaveLight | None = None
 
     def moved(self, scale: float, depth_mm: float) -> FirstLook:
         """Return the look with its dots nearer the axis by a scale, at another depth."""
         return replace(self, start_mm=self.start_mm / scale, depth_mm=depth_mm)
 
+    def by_waves(self, light: WaveLight) -> FirstLook:
+        """Return the look with dots that are fitted by waves, from where rays have them."""
+        return replace(self, light=light)
+
     def measured(self, camera: Camera, board: BoardGeometry) -> MeasuredPoints:
         """Fit a disc to each dot."""
+        start = np.column_stack([self.start_mm, np.full(len(self.start_mm), self.depth_mm)])
+        found = self._fitted(start, camera, board)
+        if self.light is None or not len(found.places_mm):
+            return found
+        start = found.places_mm[together(found.places_mm[:, 2], camera, self.medium)]
+        return self._fitted(start, camera, board, WaveShapes.of(camera, self.medium, self.light, start[:, 2]))
+
+    def _fitted(
+        self, start_mm: NDArray[np.float64], camera: Camera, board: BoardGeometry, waves: WaveShapes | None = None
+    ) -> MeasuredPoints:
+        """Fit discs from first guesses (n, 3), by rays or by waves."""
         scene = (self.signal, self.passed, camera, board, self.medium)
-        fits = [fit_one_dot(*scene, (x, y, self.depth_mm), self.radius_mm) for x, y in self.start_mm]
+        fits = [fit_one_dot(*scene, (x, y, z), self.radius_mm, waves) for x, y, z in start_mm]
         return measured_points([fit if fit is not None and fit.brightness > 0.0 else None for fit in fits])
 
 
@@ -127,6 +148,7 @@ def locate_board(
     media: Media,
     rotation_rad: float = 0.0,
     transmission: NDArray[np.float32] | None = None,
+    light: WaveLight | None = None,
 ) -> BoardPose:
     """Find the dots of a board in depth by fitting each one's rendering, and the board through them.
 
@@ -136,28 +158,39 @@ def locate_board(
     camera : with the lattice of the rectified frame
     rotation_rad : angle that rectification took out
     transmission : (rows, columns) share of light that pixels pass, rectified; default: all the same
+    light : waves, behind square microlenses; default: rays
 
     Raises
     ------
     InputError
         when too few dots are found to make a board
+    ConfigError
+        light is waves and the array is hexagonal
     """
+    if light is not None and camera.lattice.layout != "square":
+        raise ConfigError(
+            "reconstruction.wavelength_nm: by waves targets are fitted behind square lenses alone; leave it out"
+        )
     try:
-        return _pose(LOOKS[board.pattern](image, camera, board, media, transmission), camera, board, rotation_rad)
+        return _pose(
+            LOOKS[board.pattern](image, camera, board, media, transmission), camera, board, rotation_rad, light
+        )
     except InputError as error:
         if named := another_kind(image, camera, board, transmission):
             raise InputError(f"{named}; correct the section board") from error
         raise
 
 
-def _pose(look: Look, camera: Camera, board: BoardGeometry, rotation_rad: float) -> BoardPose:
-    """Return the pose of a target, again with the magnification and the distortion that the first one tells."""
+def _pose(
+    look: Look, camera: Camera, board: BoardGeometry, rotation_rad: float, light: WaveLight | None = None
+) -> BoardPose:
+    """Return the pose of a target, again with the magnification and the distortion that the first one tells.
+
+    Rays are near enough for these; waves then take one look more.
+    """
     micro_images = camera.micro_image_lattice_px()
     for _ in range(LENS_ROUNDS):
-        found = look.measured(camera, board)
-        places, sigmas = world_places(found, camera, rotation_rad)
-        array = array_places(places, camera, look.medium)
-        pose = pose_of_dots(places, sigmas, array, camera, board, found.numbers)
+        pose, array = _seen(look, camera, board, rotation_rad)
         ratio = pose.magnification / camera.magnification
         bend = pose.distortion_per_mm2 - camera.distortion_per_mm2
         if max(abs(ratio - 1.0), abs(bend) * float(np.sum(array**2, axis=1).max())) < SCALE_TOLERANCE:
@@ -165,7 +198,17 @@ def _pose(look: Look, camera: Camera, board: BoardGeometry, rotation_rad: float)
         camera = replace(refocused(camera, pose.magnification), distortion_per_mm2=pose.distortion_per_mm2)
         camera = camera.with_micro_images(micro_images)
         look = look.moved(ratio, pose.z0_mm)
-    return pose
+    return pose if light is None else _seen(look.by_waves(light), camera, board, rotation_rad)[0]
+
+
+def _seen(
+    look: Look, camera: Camera, board: BoardGeometry, rotation_rad: float
+) -> tuple[BoardPose, NDArray[np.float64]]:
+    """Return the pose as a camera sees it, and where an ideal one has the points on the array (n, 2)."""
+    found = look.measured(camera, board)
+    places, sigmas = world_places(found, camera, rotation_rad)
+    array = array_places(places, camera, look.medium)
+    return pose_of_dots(places, sigmas, array, camera, board, found.numbers), array
 
 
 def dots_in_world(
@@ -257,6 +300,7 @@ def fit_one_dot(
     media: Media,
     start_mm: tuple[float, float, float],
     radius_mm: float,
+    waves: WaveShapes | None = None,
 ) -> ShapeFit | None:
     """Fit a disc to the pixels that see the surroundings of its first guess, in image axes; None off the sensor."""
     distance = float(equivalent_object_distance(start_mm[2], camera.focus_distance_mm, media))
@@ -267,7 +311,9 @@ def fit_one_dot(
     if near is None:
         return None
     start = np.array(start_mm, dtype=np.float64)
-    return fit_disc(near.signal, near.passed, near.rays, start, radius_mm, camera, media)
+    if waves is None:
+        return fit_disc(near.signal, near.passed, near.rays, start, radius_mm, camera, media)
+    return waves.fit(near, start, radius_mm, disc_strips(radius_mm, waves.lens_mm))
 
 
 # How the points of each pattern are found, by `board.pattern`.

@@ -45,13 +45,18 @@ def fit_corner(
     start_mm : (3,) first guess, in image axes, within about half a microlens
     edges_mm : (2, 2) rows: the squares' sides that meet in the corner, x and y
     """
-    size = STEP_SHARE * float(np.hypot(edges_mm[:, 0], edges_mm[:, 1]).mean())
+    size = step_mm(edges_mm)
 
     def shares_at(position: NDArray[np.float64]) -> SharesAndSlopes:
         return corner_shares(pixels.rays, position, edges_mm, camera, media)
 
     beside = scene_points(pixels.rays, camera, media, float(start_mm[2])) - start_mm[:2]
     return fit_shape(pixels.signal, pixels.passed, beside, start_mm, fit_steps(size, camera, media), shares_at)
+
+
+def step_mm(edges_mm: NDArray[np.float64]) -> float:
+    """Return in what steps a fit moves a corner, by the squares' sides (2, 2)."""
+    return STEP_SHARE * float(np.hypot(edges_mm[:, 0], edges_mm[:, 1]).mean())
 
 
 def corner_shares(

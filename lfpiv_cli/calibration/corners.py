@@ -8,14 +8,14 @@ Axes: image axes (x along the columns, y along the rows), mm; rectified pictures
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.calibration.board_pose import BoardGeometry
-from lfpiv_cli.calibration.corner_model import fit_corner
+from lfpiv_cli.calibration.corner_model import fit_corner, step_mm
 from lfpiv_cli.calibration.dot_model import undistorted
 from lfpiv_cli.calibration.measured_points import MeasuredPoints, measured_points
 from lfpiv_cli.calibration.near_pixels import pixels_near
@@ -28,6 +28,7 @@ from lfpiv_cli.calibration.target_detection import (
     marker_modules,
 )
 from lfpiv_cli.calibration.views import lens_table, sub_aperture_view, view_crossings
+from lfpiv_cli.calibration.wave_shapes import WaveLight, WaveShapes, corner_strips, together
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera
@@ -75,6 +76,7 @@ class CornerLook:
     medium : what the target stands in
     numbers : (n, 2) which corner of the target, along its columns and rows
     sample : (n, 2) where, in samples (column, row) of the upright view
+    light : waves that the target sends; None: rays
     """
 
     image: NDArray[np.float64]
@@ -82,10 +84,15 @@ class CornerLook:
     medium: Media
     numbers: NDArray[np.int64]
     sample: NDArray[np.float64]
+    light: WaveLight | None = None
 
     def moved(self, scale: float, depth_mm: float) -> CornerLook:
         """Return what is seen under another magnification: the same."""
         return self
+
+    def by_waves(self, light: WaveLight) -> CornerLook:
+        """Return the look with corners that are fitted by waves, from where rays have them."""
+        return replace(self, light=light)
 
     def measured(self, camera: Camera, board: BoardGeometry) -> MeasuredPoints:
         """Fit a corner to the pixels that see each one's surroundings, from where its line has it."""
@@ -101,15 +108,28 @@ class CornerLook:
         edges = np.asarray(np.linalg.lstsq(terms, start[:, :2], rcond=None)[0][1:], dtype=np.float64)
         reach = clear_mm(board) - 0.5 * float(camera.lattice.pitch.max()) / abs(camera.magnification)
         fits = [self._fit(place, edges, reach, camera) for place in start]
-        return measured_points(fits, numbers)
+        found = measured_points(fits, numbers)
+        if self.light is None or not len(found.places_mm) or found.numbers is None:
+            return found
+        near = together(found.places_mm[:, 2], camera, self.medium)
+        numbers, start = found.numbers[near], found.places_mm[near]
+        waves = WaveShapes.of(camera, self.medium, self.light, start[:, 2])
+        return measured_points([self._fit(place, edges, reach, camera, waves) for place in start], numbers)
 
     def _fit(
-        self, start_mm: NDArray[np.float64], edges_mm: NDArray[np.float64], reach_mm: float, camera: Camera
+        self,
+        start_mm: NDArray[np.float64],
+        edges_mm: NDArray[np.float64],
+        reach_mm: float,
+        camera: Camera,
+        waves: WaveShapes | None = None,
     ) -> ShapeFit | None:
         """Fit one corner to the pixels that see its surroundings; None where the sensor ends."""
         x, y, z = (float(value) for value in start_mm)
         near = pixels_near((self.image, self.passed), camera, self.medium, (x, y, z), reach_mm, MOST_PIXELS)
-        return None if near is None else fit_corner(near, start_mm, edges_mm, camera, self.medium)
+        if near is None or waves is None:
+            return None if near is None else fit_corner(near, start_mm, edges_mm, camera, self.medium)
+        return waves.fit(near, start_mm, step_mm(edges_mm), corner_strips(edges_mm, waves.lens_mm))
 
     def sightings(self, camera: Camera, board: BoardGeometry) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return points of the main lens (views, 2) and where on the array each shows the corners (views, n, 2)."""

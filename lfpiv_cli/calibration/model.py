@@ -26,6 +26,7 @@ from lfpiv_cli.calibration.transmission import (
     lens_image_width,
     relative_transmission,
 )
+from lfpiv_cli.calibration.wave_shapes import WaveLight
 from lfpiv_cli.calibration.white import by_aperture
 from lfpiv_cli.calibration.white_checks import check_residual
 from lfpiv_cli.errors import InputError
@@ -83,12 +84,14 @@ class Rig:
     media : refractive indices in front of it
     board : the dots
     channel : to tell its mid plane; None where there is none
+    light : waves that a single board's dots send; None: rays
     """
 
     camera: Camera
     media: Media
     board: BoardGeometry
     channel: Channel | None = None
+    light: WaveLight | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -395,9 +398,8 @@ def board_pose(image: NDArray[np.float64], calibration: Calibration, rig: Rig) -
     """Return the pose of the board in its raw picture less the dark frame."""
     rectification = calibration.rectification
     camera = calibration.camera(rig.camera)
-    return locate_board(
-        rectification.apply(image), camera, rig.board, rig.media, rectification.rotation_rad, calibration.transmission
-    )
+    picture, turn = rectification.apply(image), rectification.rotation_rad
+    return locate_board(picture, camera, rig.board, rig.media, turn, calibration.transmission, rig.light)
 
 
 def ray_fit(

@@ -13,6 +13,7 @@ from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.notice import Notice, written
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.pupils import real_lens, with_entrance_pupil
+from lfpiv_cli.scale import Scale
 
 # A lattice further from the data sheet than this is another camera, a binned sensor or a slip in the sheet: the
 # projection itself makes up to 4 % where the main lens is not known.
@@ -170,6 +171,25 @@ def board_notices(found: int, dots: tuple[int, int]) -> list[Notice]:
             "correct board.dots, or bring all of the board into view",
             float(found),
             f"{count}",
+        )
+    ]
+
+
+def narrow_notices(dot_mm: float, z_mm: float, scale: Scale) -> list[Notice]:
+    """Return what speaks against dots whose light is no wider than a microlens at their depth from the focal plane."""
+    dot, spread = dot_mm / scale.lens_mm, abs(z_mm) / scale.depth_mm
+    if dot + spread >= 1.0:
+        return []
+    return [
+        Notice(
+            "board-within-lenses",
+            "board.dot_diameter_mm",
+            f"at its depth a dot's light is {written(dot + spread, 2)} microlenses wide: where it falls into one it "
+            "may lie anywhere in it, and the magnification is up to 2 % off, several of its standard errors",
+            f"move the board by {written((2.0 - dot) * scale.depth_mm, 2)} mm off the focal plane, or take dots of two "
+            "microlenses",
+            dot + spread,
+            "at least 1",
         )
     ]
 

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.calibration.model import Channel
+from lfpiv_cli.calibration.wave_shapes import WaveLight
 from lfpiv_cli.files.sections import (
     BoardSection,
     CameraSection,
@@ -18,6 +19,7 @@ from lfpiv_cli.files.sections import (
     MediaSection,
     Microlenses,
     PipeSection,
+    ReconstructionSection,
     VolumeSection,
 )
 from lfpiv_cli.files.sections_scene import FaceSection, parameters_of
@@ -26,6 +28,7 @@ from lfpiv_cli.flow.masks import RoundWall
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace, Face
+from lfpiv_cli.optics.line_responses import USUAL_DIFFUSION_PX
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.optics.pupils import thin_lens
@@ -258,3 +261,11 @@ def pulsation_of(section: PulsationSection | None) -> Pulsation:
 def waves_of(section: LightSection) -> Waves | None:
     """Return the waves that light is made of, None where it is made of rays."""
     return None if section.kind == "rays" else Waves(section.wavelength_nm * NM_TO_MM, section.points)
+
+
+def wave_light_of(section: ReconstructionSection) -> WaveLight | None:
+    """Return the waves that images are read by, None where they are read by rays."""
+    if section.wavelength_nm is None:
+        return None
+    diffusion_px = USUAL_DIFFUSION_PX if section.diffusion_px is None else section.diffusion_px
+    return WaveLight(section.wavelength_nm * NM_TO_MM, diffusion_px)

@@ -306,7 +306,8 @@ class Config:
     def rig(self) -> Rig:
         """Return what must be known to read the picture of a board."""
         channel = None if self.channel is None else bench.channel_of(self.channel)
-        return Rig(self.camera_model(), self.media_model(), bench.board_of(self.board), channel)
+        light = bench.wave_light_of(self.reconstruction)
+        return Rig(self.camera_model(), self.media_model(), bench.board_of(self.board), channel, light)
 
     def windows_voxel(self, voxel_mm: tuple[float, float, float]) -> tuple[tuple[int, int, int], ...]:
         """Return the correlation windows (x, y, z) in voxels, coarse to fine."""

@@ -15,10 +15,11 @@ import numpy as np
 
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files.bench import LATERAL_VOXELS_PER_MICROLENS, UM_TO_MM
-from lfpiv_cli.files.sections import CorrelationSection, ReconstructionSection
+from lfpiv_cli.files.sections import CorrelationSection
 from lfpiv_cli.names import KnownCamera
 from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.line_responses import USUAL_DIFFUSION_PX
 from lfpiv_cli.optics.media import Media, Window, channel_window
 from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.optics.paraxial import LARGEST_ERROR_PX, refraction_error_mm
@@ -180,7 +181,7 @@ def tree_of(numbers: RigNumbers) -> dict[str, Any]:
         "particles": round(tracers_in(camera, BEST_PER_LENS, size)),
     }
     if known.wavelength_nm is not None:
-        tree["camera"]["sensor"]["diffusion_px"] = ReconstructionSection().diffusion_px
+        tree["camera"]["sensor"]["diffusion_px"] = USUAL_DIFFUSION_PX
         tree["simulation"]["light"] = {"kind": "waves", "wavelength_nm": known.wavelength_nm}
     return tree
 

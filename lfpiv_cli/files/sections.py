@@ -213,8 +213,10 @@ class ReconstructionSection(Section):
     photons_per_count, light's own; the solver `particles` begins with it.
     saturation_counts: pixels as bright as this are left out (default: those at the end of 8 to 16 bits).
     particle_diameter_mm: of the tracers (default: by their images); only the solver `particles` reads it.
-    wavelength_nm: of the light, which lenses diffract: the solver `particles` fits waves (default: rays).
-    diffusion_px: of charge in the sensor, as fits by waves take it (default: by the tracers' images).
+    wavelength_nm: of the light, which lenses diffract: the solver `particles` and the fits of a target take waves
+    (default: rays).
+    diffusion_px: of charge in the sensor, as fits by waves take it (default: by the tracers' images,
+    0.3 for a target's).
     accelerate: step from points extrapolated by Nesterov's momentum; a quarter of the iterations will do.
     padding_voxel: voxels [x, y, z] solved for beyond each side of the volume and cropped on writing (default: derived
     from how far light spreads).

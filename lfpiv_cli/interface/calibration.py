@@ -20,6 +20,7 @@ from lfpiv_cli.calibration.sheet import (
     f_number_notices,
     image_distance_notices,
     magnification_notices,
+    narrow_notices,
     points_notices,
 )
 from lfpiv_cli.calibration.transmission import lens_image_width
@@ -132,6 +133,10 @@ def calibration_notices(rig: Config, pictures: Photographs, found: Calibration) 
         notices += points_notices(found.pose.dots_found)
     if found.pose is not None and camera is not None:
         notices += [*magnification_notices(found.pose.magnification, camera), *field_notices(found.pose, camera)]
+        geometry, media = rig.rig().board, rig.media_model()
+        if geometry.pattern == "dots":
+            medium = media.in_air() if geometry.medium == "air" else media
+            notices += narrow_notices(geometry.dot_diameter_mm, found.pose.z0_mm, camera.scale(medium))
     if found.ray_fit is not None and camera is not None:
         rays = found.ray_fit
         notices += entrance_pupil_notices(rays.entrance_pupil_mm, rays.entrance_pupil_sigma_mm, camera)

@@ -29,10 +29,11 @@ from lfpiv_cli.interface.reconstruction import (
 )
 from lfpiv_cli.notice import Notice, written
 from lfpiv_cli.optics.curved_space import CurvedSpace
+from lfpiv_cli.optics.line_responses import USUAL_DIFFUSION_PX
 from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.particles.counting import tracers_per_lens as counted
 from lfpiv_cli.particles.diameter import LIMIT_SIGMAS, UNKNOWN_LENSES, Diameter, diameter_by
-from lfpiv_cli.particles.diffusion import USUAL_PX, USUAL_SIGMA_PX
+from lfpiv_cli.particles.diffusion import USUAL_SIGMA_PX
 from lfpiv_cli.particles.light_errors import MUCH_LEFT
 from lfpiv_cli.particles.neighbour_frames import second_pass
 from lfpiv_cli.particles.rounds import ROUNDS, first_pass
@@ -270,7 +271,7 @@ def _diffusion(found: Diameter | None, given_px: float | None) -> Diffusion:
     """Return the sensor's charge diffusion: as given, by the images, or as is usual."""
     given = given_px is not None
     shown = None if found is None else found.shown if given else found.held
-    px = given_px if given_px is not None else USUAL_PX if shown is None else shown.diffusion_px
+    px = given_px if given_px is not None else USUAL_DIFFUSION_PX if shown is None else shown.diffusion_px
     if shown is None:
         return Diffusion(px, given=given)
     return Diffusion(px, shown.diffusion_px, shown.sigma_px, given, shown.told)
@@ -377,7 +378,7 @@ def light_of(settings: Config, depths_mm: tuple[float, float]) -> Light | None:
     chosen = settings.reconstruction
     if chosen.wavelength_nm is None:
         return None
-    diffusion_px = USUAL_PX if chosen.diffusion_px is None else chosen.diffusion_px
+    diffusion_px = USUAL_DIFFUSION_PX if chosen.diffusion_px is None else chosen.diffusion_px
     return Light(chosen.wavelength_nm * NM_TO_MM, diffusion_px, depths_mm)
 
 

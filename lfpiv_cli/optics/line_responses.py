@@ -54,6 +54,8 @@ FIELD_TERMS, TERMS = 16, 24
 # Beyond the geometric spot the field is followed for so many Fresnel lengths, and so many widths of a point in focus.
 # Where it ends sooner, by half of these widths, what is left of many tracers doubles the errors of each.
 FRESNEL_LENGTHS, FOCUS_WIDTHS = 3.0, 36.0
+# How far charge diffuses in many sensors, .2 to .4 pixel.
+USUAL_DIFFUSION_PX = 0.3
 # Places along the spot's radius per period of the steepest phase, for a spline through them.
 PER_PERIOD = 17.0
 

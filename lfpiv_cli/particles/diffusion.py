@@ -24,8 +24,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-# Charge diffuses by .2 to .4 pixel in many sensors.
-USUAL_PX, USUAL_SIGMA_PX = 0.3, 0.1
+from lfpiv_cli.optics.line_responses import USUAL_DIFFUSION_PX
+
+# How far charge diffuses in a sensor may differ from what is usual.
+USUAL_SIGMA_PX = 0.1
 # Where the images leave this much of that uncertainty, they hardly tell diffusion.
 TOLD = 0.7
 # What is given is held by so small a standard error.
@@ -84,11 +86,11 @@ class Together:
 def together_of(frames: Sequence[Forms], lenses: float | None = None, diffusion_px: float | None = None) -> Together:
     """Return what the tracers of some frames show together, with the diameter or diffusion held where it is given."""
     matrix, right = (np.concatenate(parts) for parts in zip(*frames, strict=True))
-    expected = np.array([lenses or 0.0, USUAL_PX if diffusion_px is None else diffusion_px]) ** 2
+    expected = np.array([lenses or 0.0, USUAL_DIFFUSION_PX if diffusion_px is None else diffusion_px]) ** 2
     sure = np.array(
         [
             0.0 if lenses is None else HELD**-2,
-            (2.0 * USUAL_PX * USUAL_SIGMA_PX) ** -2 if diffusion_px is None else HELD**-2,
+            (2.0 * USUAL_DIFFUSION_PX * USUAL_SIGMA_PX) ** -2 if diffusion_px is None else HELD**-2,
         ]
     )
     weight, spread = np.ones(len(matrix)), 1.0

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.calibration.model import known
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.self_calibration.nuisances import Nuisances
 
@@ -23,7 +24,7 @@ def camera_figures(camera: Camera, particle_diameter_mm: float, change: Nuisance
         "lattice_shift_px": shift_px(camera, change).tolist(),
         "lattice_shift_px_sigma": shift_px(camera, error).tolist(),
         "aperture_mm": camera.aperture_mm + 2.0 * change.aperture_radius_mm,
-        "aperture_mm_sigma": 2.0 * error.aperture_radius_mm,
+        "aperture_mm_sigma": known(2.0 * error.aperture_radius_mm),
         "particle_diameter_mm": particle_diameter_mm + 2.0 * change.particle_radius_mm,
         "particle_diameter_mm_sigma": 2.0 * error.particle_radius_mm,
         "k1_per_mm2": camera.distortion_per_mm2 + change.distortion_per_mm2,

@@ -12,7 +12,7 @@ Axes: image axes, mm; see `view`. Particles are rows (x, y, z, light), images fl
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -22,11 +22,10 @@ from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import lsqr
 
 from lfpiv_cli.particles.fitting import add_all, refine
-from lfpiv_cli.particles.least_squares import UNKNOWNS, observation_of
+from lfpiv_cli.particles.least_squares import UNKNOWNS, lit_by, observation_of, respond_all, room_for
 from lfpiv_cli.particles.noise import Noise
-from lfpiv_cli.particles.response import entries_of
 from lfpiv_cli.particles.rim import rim_table
-from lfpiv_cli.particles.view import View, entry_capacity
+from lfpiv_cli.particles.view import View, entry_capacity, with_radius
 from lfpiv_cli.self_calibration.movable_scene import MovableScene
 from lfpiv_cli.self_calibration.moved_places import moved_places
 from lfpiv_cli.threads import blocks, in_threads
@@ -109,10 +108,11 @@ class Nuisances:
             aperture_radius_mm=radius,
             distortion_per_mm2=camera.distortion_per_mm2 + self.distortion_per_mm2,
         )
+        if self.particle_radius_mm != 0.0:
+            view = with_radius(view, view.particle_radius_mm + self.particle_radius_mm)
         return view._replace(
             camera=camera,
             centres_mm=view.centres_mm + shift,
-            particle_radius_mm=view.particle_radius_mm + self.particle_radius_mm,
             table=table,
             table_reach=reach,
             faces=view.faces if scene is None else scene.faces(self.scene),
@@ -125,7 +125,8 @@ class NuisanceFit:
 
     Attributes
     ----------
-    found, sigma : changes of the view that was given, and their standard errors
+    found, sigma : changes of the view that was given, and their standard errors; by waves that of the aperture, which
+        is not sought, is NaN
     view : with these changes
     particles : (n, 4) refined with it
     """
@@ -169,9 +170,11 @@ def fit_nuisances(
             particles = _moved(particles, before, changed)
         if np.all(np.abs(step) <= model):
             break
-    found = Nuisances.of(total)
+    found, error = Nuisances.of(total), Nuisances.of(np.hypot(sigma, model))
+    if view.lines.table.shape[0] > 0:
+        error = replace(error, aperture_radius_mm=float("nan"))
     _refined(image, changed, particles, noise, depths_mm)
-    return NuisanceFit(found, Nuisances.of(np.hypot(sigma, model)), changed, particles)
+    return NuisanceFit(found, error, changed, particles)
 
 
 class _Unknowns(NamedTuple):
@@ -184,8 +187,10 @@ class _Unknowns(NamedTuple):
 
     @property
     def steps(self) -> NDArray[np.float64]:
-        """The steps (9,) of the differences, 0 of what is not sought."""
+        """The steps (9,) of the differences, 0 of what is not sought: line responses are of one aperture."""
         shares = SHARE_STEP * np.array([self.view.camera.aperture_radius_mm, self.view.particle_radius_mm])
+        if self.view.lines.table.shape[0] > 0:
+            shares[0] = 0.0
         shift = 2.0 * SHIFT_STEP * np.array([self.view.half_x_mm, self.view.half_y_mm])
         scene = np.zeros(len(SCENE_STEPS)) if self.scene is None else np.array(SCENE_STEPS)
         return np.array([*shift, *shares, STRETCH_STEP / _corner_mm(self.view) ** 2, *scene])
@@ -299,13 +304,33 @@ def _columns(view: View, particles: NDArray[np.float64], root_weight: NDArray[np
     """Return the weighted derivatives by x, y, z and light of each particle, scaled to length 1, as sparse columns."""
 
     def of(part: slice) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]:
-        counts, pixels, values = entries_of(view, particles[part], capacity)
+        counts, pixels, values = _entries(view, particles[part], capacity)
         return counts, *_scaled(counts, pixels, values, root_weight)
 
     parts = in_threads(of, blocks(len(particles), BLOCK))
     counts, rows, data = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     starts = np.concatenate([[0], np.cumsum(np.repeat(counts, UNKNOWNS))])
     return csc_matrix((data, rows, starts), shape=(root_weight.size, UNKNOWNS * len(particles)))
+
+
+@njit(cache=True, nogil=True)
+def _entries(
+    view: View, particles: NDArray[np.float64], capacity: int
+) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float64]]:
+    """Return of particles (n, 4) how many pixels each lights, which, and the values (pixels, 4) of unit light."""
+    counts, end = np.zeros(len(particles), np.int64), 0
+    pixels, values = np.empty(len(particles) * capacity, np.int32), np.empty((len(particles) * capacity, UNKNOWNS))
+    responses = room_for(1, capacity, 0)
+    for n in range(len(particles)):
+        respond_all(view, particles[n : n + 1], responses)
+        lit, light = lit_by(responses, 0)
+        counts[n] = lit.size
+        for k in range(lit.size):
+            pixels[end + k] = lit[k]
+            for m in range(UNKNOWNS):
+                values[end + k, m] = light[m, k]
+        end += lit.size
+    return counts, pixels[:end].copy(), values[:end].copy()
 
 
 @njit(cache=True, nogil=True)

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.calibration.model import Calibration
+from lfpiv_cli.calibration.wave_shapes import WaveLight
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
@@ -25,7 +26,7 @@ from lfpiv_cli.particles.diameter import UNKNOWN_LENSES, diameter_by
 from lfpiv_cli.particles.refraction import places_by_snell
 from lfpiv_cli.particles.rounds import ROUNDS, find_particles
 from lfpiv_cli.particles.search import Particles, task_of
-from lfpiv_cli.particles.view import View, raw_view
+from lfpiv_cli.particles.view import Light, View, raw_view, with_radius
 from lfpiv_cli.reconstruction.equations import normalisers
 from lfpiv_cli.self_calibration.camera_figures import camera_figures, shift_px
 from lfpiv_cli.self_calibration.nuisances import Nuisances, fit_nuisances
@@ -137,11 +138,13 @@ class ChannelFlow:
     volume : says where particles are looked for laterally, and how fine
     width_mm : of the channel
     particle_diameter_mm : of the tracers; None: by their images
+    light : waves that tracers send; None: rays
     """
 
     volume: Grid
     width_mm: float
     particle_diameter_mm: float | None
+    light: WaveLight | None = None
 
 
 def refine_calibration(
@@ -169,10 +172,12 @@ def refine_calibration(
     """
     camera = calibration.camera(sheet)
     media = space.media
-    given, lens_mm = flow.particle_diameter_mm, camera.scale(media).lens_mm
-    view = raw_view(camera, media, 0.5 * (given or UNKNOWN_LENSES * lens_mm), calibration)
+    given, scale = flow.particle_diameter_mm, camera.scale(media)
     expected = 0.0 if calibration.mid_plane_z_mm is None else calibration.mid_plane_z_mm
-    grid = _deep_grid(flow.volume, expected, flow.width_mm, PLANES_APART * view.scale.depth_mm)
+    grid = _deep_grid(flow.volume, expected, flow.width_mm, PLANES_APART * scale.depth_mm)
+    told = flow.light
+    waves = None if told is None else Light(told.wavelength_mm, told.diffusion_px, grid.bounds_mm(2))
+    view = raw_view(camera, media, 0.5 * (given or UNKNOWN_LENSES * scale.lens_mm), calibration, light=waves)
     padding = default_padding(camera, media, grid)
     operator = factorise(camera, media, grid.padded(padding))
     weights = Weights(grid, padding, operator, camera.column_axis, calibration)
@@ -182,7 +187,7 @@ def refine_calibration(
         return find_particles(task_of(image, seen, weights, camera, sums), REFINING_ROUNDS, progress)
 
     if given is None and (measured := diameter_by([task_of(images[0], view, weights, camera, sums)])):
-        view = raw_view(camera, media, 0.5 * lens_mm * measured.lenses, calibration)
+        view = with_radius(view, 0.5 * scale.lens_mm * measured.lenses)
     first = search(images[0], view)
     refuse_few(len(first.position_mm))
     rows = np.column_stack([camera.to_image_axes(first.position_mm), first.light_counts])

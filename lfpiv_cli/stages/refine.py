@@ -15,6 +15,7 @@ from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files.atomic import ensure_writable
 from lfpiv_cli.files.batch import frames_of
+from lfpiv_cli.files.bench import wave_light_of
 from lfpiv_cli.files.calibration_file import read_calibration, write_calibration
 from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.inputs import given
@@ -114,13 +115,15 @@ def _walls(settings: Config, lit: Sequence[Image], before: Calibration, console:
     if settings.channel is None:
         raise ConfigError(f"{settings.source}: channel: is missing")
     window = settings.window_model(before.mid_plane_z_mm or 0.0)
+    chosen = settings.reconstruction
+    flow = ChannelFlow(settings.grid(), settings.channel.width_mm, chosen.particle_diameter_mm, wave_light_of(chosen))
     with console.progress(len(lit) * STEPS + 1, "refine") as advance:
         found = refine(
             lit,
             before,
             settings.camera_model(),
             ObjectSpace(settings.media_model(), window, "exact"),
-            ChannelFlow(settings.grid(), settings.channel.width_mm, settings.reconstruction.particle_diameter_mm),
+            flow,
             advance,
         )
 

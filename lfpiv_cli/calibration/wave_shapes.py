@@ -1,0 +1,221 @@
+"""What a small bright shape in the scene looks like on the sensor by waves, which lenses diffract and cut off.
+
+A shape is a stack of strips. Under a lens the light of a point is a sum of products of line responses (see
+`optics.line_responses`), and so is that of a strip: along either axis the response is a difference of its integral. Of
+light that fills the scene it is the whole integral, which is what a white image shows: a pixel's share is the shape's
+light over that one. By rays (`dot_model`) a disc near the focal plane is taken for one that lies 0.02 mm nearer, as
+lenses beside it are lit on one side.
+
+Axes: image axes (x along the columns, y along the rows), mm, z away from the camera from the focal plane.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from lfpiv_cli.calibration.dot_model import PixelRays, fit_steps, scene_points
+from lfpiv_cli.calibration.near_pixels import NearPixels
+from lfpiv_cli.calibration.shape_fit import ShapeFit, SharesAndSlopes, fit_shape
+from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.line_responses import PHASES, LineResponses, line_responses, on_pixels
+from lfpiv_cli.optics.media import Media, equivalent_object_distance
+from lfpiv_cli.optics.object_space import ObjectSpace
+
+# Strips of a shape per lens that it is wide.
+STRIPS_PER_LENS = 24
+# Slopes are differences over this share of the fit's steps, a hundredth of how well it settles.
+DIFFERENCE = 1e-3
+# Shapes lie up to a fiftieth of the depth over which light spreads by a lens from where rays have them; with room for
+# as much again and more.
+BY_RAYS = 0.05
+# Below this slope a strip is parallel to an edge.
+PARALLEL = 1e-9
+
+Values = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class WaveLight:
+    """Light of one wavelength in air, and by how many pixels charge diffuses in the sensor."""
+
+    wavelength_mm: float
+    diffusion_px: float
+
+
+class Strips(NamedTuple):
+    """Strips (n,) of a shape: where along x they begin and end, how far aside they lie, and how wide they are.
+
+    Lengths in the scene, mm, from the shape's place.
+    """
+
+    begin_mm: Values
+    end_mm: Values
+    aside_mm: Values
+    width_mm: Values
+
+
+def together(depths_mm: Values, camera: Camera, medium: Media) -> NDArray[np.bool_]:
+    """Return which depths (n,) lie within the one over which light spreads by a lens from the middle one of them.
+
+    The others are no points of a board, and line responses over all depths take long to compute.
+    """
+    return np.asarray(np.abs(depths_mm - np.median(depths_mm)) < camera.scale(medium).depth_mm)
+
+
+def disc_strips(radius_mm: float, lens_mm: float) -> Strips:
+    """Return the strips of a disc where a lens sees so many mm of the scene, each as large as its part of the disc."""
+    count = int(np.ceil(STRIPS_PER_LENS * 2.0 * radius_mm / lens_mm))
+    turn = np.pi * (np.arange(count + 1) / count - 0.5)
+    edges, below = radius_mm * np.sin(turn), 0.5 * radius_mm**2 * (turn + 0.5 * np.sin(2.0 * turn))
+    width = np.diff(edges)
+    half = np.asarray(np.diff(below) / width, dtype=np.float64)
+    return Strips(-half, half, edges[:-1] + 0.5 * width, width)
+
+
+def corner_strips(edges_mm: Values, lens_mm: float) -> Strips:
+    """Return the strips of two squares that meet in a corner, those where both of u and v have one sign.
+
+    Parameters
+    ----------
+    edges_mm : (2, 2) rows: the squares' sides, x and y, along which u and v are counted
+    """
+    side = float(np.hypot(edges_mm[:, 0], edges_mm[:, 1]).mean())
+    half = int(np.ceil(STRIPS_PER_LENS * side / lens_mm))
+    width = np.full(2 * half, side / half)
+    aside = width * (np.arange(2 * half) + 0.5 - half)
+    to_edges = np.linalg.inv(edges_mm)
+    # Each of u and v is 0 in one place of a strip; a strip along an edge meets it far away.
+    slope = np.where(np.abs(to_edges[0]) * side < PARALLEL, PARALLEL / side, to_edges[0])
+    cuts = np.sort(np.clip(-aside[:, np.newaxis] * to_edges[1] / slope, -side, side), axis=1)
+    if slope.prod() < 0.0:
+        return Strips(cuts[:, 0], cuts[:, 1], aside, width)
+    end = np.full(2 * half, side)
+    begins, ends = np.concatenate([-end, cuts[:, 1]]), np.concatenate([cuts[:, 0], end])
+    return Strips(begins, ends, np.tile(aside, 2), np.tile(width, 2))
+
+
+@dataclass(frozen=True, eq=False)
+class WaveShapes:
+    """Shapes between two depths, as square microlenses that stand upright show them.
+
+    Attributes
+    ----------
+    camera, medium : with the lattice of the rectified frame; what the shapes stand in
+    lines : responses of points
+    """
+
+    camera: Camera
+    medium: Media
+    lines: LineResponses
+
+    @classmethod
+    def of(cls, camera: Camera, medium: Media, light: WaveLight, depths_mm: Values) -> WaveShapes:
+        """Compute the line responses about depths (n,) that rays tell, some seconds' work."""
+        space, beyond = ObjectSpace(medium, refraction="paraxial"), BY_RAYS * camera.scale(medium).depth_mm
+        ends = float(depths_mm.min()) - beyond, float(depths_mm.max()) + beyond
+        return cls(
+            camera, medium, on_pixels(line_responses(camera, space, light.wavelength_mm, ends), light.diffusion_px)
+        )
+
+    @property
+    def lens_mm(self) -> float:
+        """What a lens sees of the focal plane."""
+        return float(self.camera.lattice.pitch.mean()) / abs(self.camera.magnification)
+
+    def fit(self, near: NearPixels, start_mm: Values, size_mm: float, strips: Strips) -> ShapeFit:
+        """Fit a shape of about this size to pixels, from a first guess (3,)."""
+        steps = fit_steps(size_mm, self.camera, self.medium)
+
+        def shares_at(position: Values) -> SharesAndSlopes:
+            shares = self.shares(near.rays, position, strips)
+            moved = [self.shares(near.rays, position + step, strips) for step in DIFFERENCE * np.diag(steps)]
+            return shares, (np.stack(moved, axis=1) - shares[:, np.newaxis]) / (DIFFERENCE * steps)
+
+        beside = scene_points(near.rays, self.camera, self.medium, float(start_mm[2])) - start_mm[:2]
+        return fit_shape(near.signal, near.passed, beside, start_mm, steps, shares_at)
+
+    def shares(self, rays: PixelRays, position_mm: Values, strips: Strips) -> Values:
+        """Return for each pixel the light (n,) of a shape over that of light that fills the scene."""
+        camera, lines, z = self.camera, self.lines, float(position_mm[2])
+        back = camera.image_distance_mm / float(equivalent_object_distance(z, camera.focus_distance_mm, self.medium))
+        (of_column, x, u), (of_row, y, v) = (self._lines_of(rays, -back * position_mm[:2], axis) for axis in (0, 1))
+        sums = np.cumsum(_by_place(_at_depth(lines, z)), axis=0)
+        begin, end = (self._read(sums, x - back * at, u) for at in (strips.begin_mm, strips.end_mm))
+        half = 0.5 * strips.width_mm
+        low, high = (self._read(sums, y - back * at, v) for at in (strips.aside_mm - half, strips.aside_mm + half))
+        light = ((begin - end) * lines.signs).reshape(len(x), -1) @ (low - high).reshape(len(y), -1).T
+        along, across = (self._read(sums[-1:], np.zeros_like(at), px)[:, 0] for at, px in ((x, u), (y, v)))
+        filled = (along * lines.signs) @ across.T
+        return np.asarray((light / filled)[of_column, of_row])
+
+    def _lines_of(self, rays: PixelRays, spot_mm: Values, axis: int) -> tuple[NDArray[np.int64], Values, Values]:
+        """Return the column or row of each pixel (n,), and of each of these where spot (m, 1) and pixels (m,) lie.
+
+        The spot from the lens, mm, and the pixels from the middle of the lens image. Distortion moves the lenses of one
+        column apart by less than a thousandth of their width.
+        """
+        _, first, number = np.unique(rays.place_mm[:, axis], return_index=True, return_inverse=True)
+        beside = spot_mm[axis] - np.bincount(number, rays.ideal_mm[:, axis]) / np.bincount(number)
+        under = rays.place_mm[first, axis] - self.camera.micro_image_scale * rays.lens_mm[first, axis]
+        return number, beside[:, np.newaxis], under / self.camera.pixel_mm
+
+    def _read(self, sums: Values, beside_mm: Values, under_px: Values) -> Values:
+        """Return sums (offsets, terms, responses) up to where spots (n, m) light pixels (n,): (n, m, terms).
+
+        They end halfway between the offsets of the responses.
+        """
+        offset = beside_mm / self.lines.offset_step_mm + 0.5 * len(sums) - 1.0
+        found = np.empty((*beside_mm.shape, sums.shape[1]))
+        _interpolate(sums, offset, PHASES * under_px + 0.5 * sums.shape[2], found)
+        return found
+
+
+def _by_place(plane: NDArray[np.float32] | Values) -> Values:
+    """Return responses (offsets, terms, responses) of those by phases (offsets, phases, terms, pixels)."""
+    offsets, _, terms, _ = plane.shape
+    return np.ascontiguousarray(plane.transpose(0, 2, 3, 1).reshape(offsets, terms, -1), dtype=np.float64)
+
+
+def _at_depth(lines: LineResponses, z_mm: float) -> Values:
+    """Return the responses at a depth, by phases."""
+    first, weights = _cubic((z_mm - lines.first_depth_mm) / lines.depth_step_mm, len(lines.table))
+    return np.asarray(np.tensordot(np.array(weights), lines.table[first : first + 4], 1))
+
+
+@njit(cache=True)
+def _cubic(place: float, count: int) -> tuple[int, tuple[float, float, float, float]]:
+    """Return the first of four neighbours of a place among so many values, and their weights (Catmull-Rom)."""
+    inside = min(max(place, 1.0), count - 2.001)
+    first = int(inside)
+    t = inside - first
+    return first - 1, (
+        t * (-0.5 + t * (1.0 - 0.5 * t)),
+        1.0 + t * t * (-2.5 + 1.5 * t),
+        t * (0.5 + t * (2.0 - 1.5 * t)),
+        t * t * (-0.5 + 0.5 * t),
+    )
+
+
+@njit(cache=True)
+def _interpolate(table: Values, offset: Values, response: Values, found: Values) -> None:
+    """Write a table (offsets, terms, responses) at places (n, m) and (n,): (n, m, terms).
+
+    A table of one offset is that of all.
+    """
+    few = min(len(table), 4)
+    for n in range(offset.shape[0]):
+        first_response, of_response = _cubic(response[n], table.shape[2])
+        for m in range(offset.shape[1]):
+            first, of_offset = _cubic(offset[n, m], len(table)) if few == 4 else (0, (1.0, 0.0, 0.0, 0.0))
+            for term in range(table.shape[1]):
+                total = 0.0
+                for a in range(few):
+                    line = table[first + a, term]
+                    for b in range(4):
+                        total += of_offset[a] * of_response[b] * line[first_response + b]
+                found[n, m, term] = total
