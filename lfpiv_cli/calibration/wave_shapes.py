@@ -22,7 +22,7 @@ from lfpiv_cli.calibration.dot_model import PixelRays, fit_steps, scene_points
 from lfpiv_cli.calibration.near_pixels import NearPixels
 from lfpiv_cli.calibration.shape_fit import ShapeFit, SharesAndSlopes, fit_shape
 from lfpiv_cli.optics.camera import Camera
-from lfpiv_cli.optics.line_responses import PHASES, LineResponses, line_responses, on_pixels
+from lfpiv_cli.optics.line_responses import PHASES, LineResponses, line_responses, on_pixels, spline_weights
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
 from lfpiv_cli.optics.object_space import ObjectSpace
 
@@ -183,22 +183,15 @@ def _by_place(plane: NDArray[np.float32] | Values) -> Values:
 
 def _at_depth(lines: LineResponses, z_mm: float) -> Values:
     """Return the responses at a depth, by phases."""
-    first, weights = _cubic((z_mm - lines.first_depth_mm) / lines.depth_step_mm, len(lines.table))
+    first, weights = _about((z_mm - lines.first_depth_mm) / lines.depth_step_mm, len(lines.table))
     return np.asarray(np.tensordot(np.array(weights), lines.table[first : first + 4], 1))
 
 
 @njit(cache=True)
-def _cubic(place: float, count: int) -> tuple[int, tuple[float, float, float, float]]:
-    """Return the first of four neighbours of a place among so many values, and their weights (Catmull-Rom)."""
+def _about(place: float, count: int) -> tuple[int, tuple[float, float, float, float]]:
+    """Return the first of four coefficients about a place among so many, and their weights."""
     inside = min(max(place, 1.0), count - 2.001)
-    first = int(inside)
-    t = inside - first
-    return first - 1, (
-        t * (-0.5 + t * (1.0 - 0.5 * t)),
-        1.0 + t * t * (-2.5 + 1.5 * t),
-        t * (0.5 + t * (2.0 - 1.5 * t)),
-        t * t * (-0.5 + 0.5 * t),
-    )
+    return int(inside) - 1, spline_weights(inside - int(inside))
 
 
 @njit(cache=True)
@@ -209,9 +202,9 @@ def _interpolate(table: Values, offset: Values, response: Values, found: Values)
     """
     few = min(len(table), 4)
     for n in range(offset.shape[0]):
-        first_response, of_response = _cubic(response[n], table.shape[2])
+        first_response, of_response = _about(response[n], table.shape[2])
         for m in range(offset.shape[1]):
-            first, of_offset = _cubic(offset[n, m], len(table)) if few == 4 else (0, (1.0, 0.0, 0.0, 0.0))
+            first, of_offset = _about(offset[n, m], len(table)) if few == 4 else (0, (1.0, 0.0, 0.0, 0.0))
             for term in range(table.shape[1]):
                 total = 0.0
                 for a in range(few):

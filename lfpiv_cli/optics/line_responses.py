@@ -37,6 +37,7 @@ from scipy.special import j0
 
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.object_space import ObjectSpace
+from lfpiv_cli.threads import COUNT_NO_REFERENCES
 
 # Spots' places per pitch at which responses are known, and samples of the array between two of them: lenses' edges lie
 # between samples. With half as many places tracers within half a depth unit of focus are off by three times as much.
@@ -67,8 +68,9 @@ class LineResponses(NamedTuple):
 
     Attributes
     ----------
-    table : (depths, offsets, PHASES, terms, pixels) A, float32; pixel n of phase p lies n + p / PHASES - pixels / 2
-        from the middle of the lens image; no depths where light goes by rays
+    table : (depths, offsets, PHASES, terms, pixels) coefficients of cubic splines through A along depth, offset and
+        place under the lens, float32; pixel n of phase p lies n + p / PHASES - pixels / 2 from the middle of the lens
+        image; no depths where light goes by rays
     signs, ones : (terms,) of the products; ones
     first_depth_mm, depth_step_mm, offset_step_mm : of the table; its offsets are symmetric about 0
     margin_mm : by how much a spot on the array is larger than by rays
@@ -109,8 +111,11 @@ def line_responses(
     # The field is the same on both sides of the axis, so that light at (-xi, -u) is that at (xi, u).
     whole = np.concatenate([half[:, :0:-1, ::-1], half], axis=1)[:, :, :-1]
     positive = np.arange(TERMS) < (TERMS + 1) // 2
+    table = _mixed(_by_phases(whole), _spline_of_places(pupil.pixels))
+    for axis in (0, 1):
+        spline_filter1d(table, axis=axis, output=table)
     return LineResponses(
-        _by_phases(whole),
+        table,
         np.where(positive, 1.0, -1.0).astype(np.float32),
         np.ones(TERMS, np.float32),
         float(pupil.depths_mm[0]),
@@ -149,19 +154,32 @@ def _average(table: Lines, share: Lines, found: Lines) -> None:
 
 def on_pixels(points: LineResponses, diffusion_px: float) -> LineResponses:
     """Return responses after charge has diffused by a Gaussian, of pixels that integrate where samples were summed."""
-    places = PHASES * points.table.shape[-1]
+    pixels = points.table.shape[-1]
+    places = PHASES * pixels
     frequency = np.fft.rfftfreq(2 * places, 1.0 / PHASES)
     damping = np.sinc(frequency / FINE) * np.exp(-2.0 * (np.pi * diffusion_px * frequency) ** 2)
     blur = np.fft.irfft(np.fft.rfft(np.eye(places), 2 * places) * damping)[:, :places]
-    return points._replace(table=_mixed(points.table, blur))
+    spline = _spline_of_places(pixels)
+    return points._replace(table=_mixed(points.table, np.asarray(np.linalg.solve(spline, blur @ spline))))
 
 
-def splines(lines: LineResponses) -> LineResponses:
-    """Return the coefficients of the cubic splines through responses along depth, offset and place under the lens."""
-    table = _mixed(lines.table, spline_filter1d(np.eye(PHASES * lines.table.shape[-1])))
-    for axis in (0, 1):
-        spline_filter1d(table, axis=axis, output=table)
-    return lines._replace(table=table)
+def _spline_of_places(pixels: int) -> NDArray[np.float64]:
+    """Return what makes coefficients of a spline of values at places under the lens, (from, to)."""
+    return np.asarray(spline_filter1d(np.eye(PHASES * pixels)), dtype=np.float64)
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def spline_weights(t: float) -> tuple[float, float, float, float]:
+    """Return the weights of four coefficients of a cubic spline at t, 0 to 1, behind the second's place."""
+    u = 1.0 - t
+    return u * u * u / 6.0, 2.0 / 3.0 - t * t * (1.0 - 0.5 * t), 2.0 / 3.0 - u * u * (1.0 - 0.5 * u), t * t * t / 6.0
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def spline_slopes(t: float) -> tuple[float, float, float, float]:
+    """Return the derivatives of `spline_weights`."""
+    u = 1.0 - t
+    return -0.5 * u * u, t * (1.5 * t - 2.0), u * (2.0 - 1.5 * u), 0.5 * t * t
 
 
 def _mixed(table: Lines, shares: NDArray[np.float64]) -> Lines:

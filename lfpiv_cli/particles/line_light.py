@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from lfpiv_cli.optics.line_responses import spline_slopes, spline_weights
 from lfpiv_cli.particles.refraction import Bend
 from lfpiv_cli.particles.response import Along, Projection, lenses_of, project
 from lfpiv_cli.particles.view import View
@@ -137,20 +138,6 @@ def _cell(view: View, lenses_mm: tuple[float, float, float], pixels: int, moved_
     return Cell(first, min(int(np.ceil(high)), pixels) - first, first - centre, moved_mm)
 
 
-@njit(cache=True, **COUNT_NO_REFERENCES)
-def _spline(t: float) -> tuple[float, float, float, float]:
-    """Return the weights of four coefficients of a cubic spline at t, 0 to 1, behind the second's place."""
-    u = 1.0 - t
-    return u * u * u / 6.0, 2.0 / 3.0 - t * t * (1.0 - 0.5 * t), 2.0 / 3.0 - u * u * (1.0 - 0.5 * u), t * t * t / 6.0
-
-
-@njit(cache=True, **COUNT_NO_REFERENCES)
-def _slopes(t: float) -> tuple[float, float, float, float]:
-    """Return the derivatives of `_spline`."""
-    u = 1.0 - t
-    return -0.5 * u * u, t * (1.5 * t - 2.0), u * (2.0 - 1.5 * u), 0.5 * t * t
-
-
 @njit(cache=True, fastmath=True)
 def _responses(view: View, along: Along, z: float, lenses_mm: NDArray[np.float64]) -> Lines:
     """Return responses (lenses, KINDS, phases, terms, pixels) under lenses at these places along one axis.
@@ -164,16 +151,16 @@ def _responses(view: View, along: Along, z: float, lenses_mm: NDArray[np.float64
     deep = (along.stretch * z - lines.first_depth_mm) / lines.depth_step_mm
     deep = min(max(deep, 1.0), depths - 2.001)
     first_z = int(deep)
-    by_z, d_z = _spline(deep - first_z), _slopes(deep - first_z)
+    by_z, d_z = spline_weights(deep - first_z), spline_slopes(deep - first_z)
     per_mm, per_depth = 1.0 / lines.offset_step_mm, along.stretch / lines.depth_step_mm
     for lens in range(lenses_mm.size):
         beside = (along.at - lenses_mm[lens]) * per_mm + 0.5 * (offsets - 1)
         if beside < 1.0 or beside >= offsets - 2.0:
             continue
         first_x = int(beside)
-        p, q, r, t = _spline(beside - first_x)
+        p, q, r, t = spline_weights(beside - first_x)
         a, b, c, d = np.float32(p), np.float32(q), np.float32(r), np.float32(t)
-        p, q, r, t = _slopes(beside - first_x)
+        p, q, r, t = spline_slopes(beside - first_x)
         e, f, g, h = np.float32(p * per_mm), np.float32(q * per_mm), np.float32(r * per_mm), np.float32(t * per_mm)
         light, by_offset, by_depth = found[lens, LIGHT], found[lens, BY_OFFSET], found[lens, BY_DEPTH]
         for plane in range(4):
@@ -199,7 +186,7 @@ def _place(responses: Lines, kind: int, cell: Cell, signs: Lines, out: Lines, le
     _, phases, terms, width = responses.shape
     place = (cell.place + 0.5 * width) * phases
     first = int(np.floor(place))
-    p, q, r, t = _spline(place - first)
+    p, q, r, t = spline_weights(place - first)
     moved = np.float32(cell.moved_mm if kind == LIGHT else 0.0)
     # Of two phases, the first of the four values belongs to the one, the next to the other.
     one, other = (first - 1) % phases, first % phases

@@ -20,7 +20,7 @@ from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.optics.camera import Camera, KernelCamera
 from lfpiv_cli.optics.curved_space import CurvedSpace
-from lfpiv_cli.optics.line_responses import NO_LINES, LineResponses, line_responses, of_balls, on_pixels, splines
+from lfpiv_cli.optics.line_responses import NO_LINES, LineResponses, line_responses, of_balls, on_pixels
 from lfpiv_cli.optics.media import Layers, Media
 from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.optics.object_space import ObjectSpace
@@ -240,7 +240,7 @@ def with_diffusion(view: View, diffusion_px: float) -> View:
     """Return the view by waves with charge that diffuses by another Gaussian."""
     camera = view.camera
     radius = view.particle_radius_mm * camera.image_distance_mm / camera.focus_distance_mm
-    lines = splines(of_balls(on_pixels(view.points, diffusion_px), radius))
+    lines = of_balls(on_pixels(view.points, diffusion_px), radius)
     return view._replace(lines=lines, diffusion_px=float(diffusion_px))
 
 
