@@ -61,6 +61,16 @@ def test_what_is_given_is_held_and_the_other_found_with_it(rng: np.random.Genera
     assert wrong.covariance[1, 1] < 1e-9
 
 
+def test_what_the_model_gets_wrong_of_the_size_is_in_the_diffusion_s_error_where_the_size_is_given() -> None:
+    matrix = np.tile(np.array([[1e4, 9e3], [9e3, 1e4]]), (20, 1, 1))
+    shown = Forms(matrix, matrix @ (SQUARES + (MODEL_SQUARES[0], 0.0)))
+    found = together_of([shown], lenses=SIZE)
+    away = 0.9 * np.hypot(2.0 * MODEL_SHARE * SIZE**2, MODEL_SQUARES[0])
+    assert found.diffusion_px**2 - BLUR_PX**2 == pytest.approx(0.9 * MODEL_SQUARES[0], rel=0.05)
+    assert found.covariance[1, 1] == pytest.approx(away**2 + MODEL_SQUARES[1] ** 2, rel=0.1)
+    assert found.covariance[0, 0] < 1e-9
+
+
 def test_what_images_do_not_tell_is_taken_as_usual(rng: np.random.Generator) -> None:
     told, untold = together_of([forms(20, rng)]), together_of([forms(20, rng, sure=1e-3)])
     assert told.told

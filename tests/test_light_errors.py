@@ -12,7 +12,9 @@ from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.particles import light_errors
 from lfpiv_cli.particles.light_errors import MUCH_LEFT, changes_of_light, grown, light_left
+from lfpiv_cli.particles.search import blank, noise_with, rebuilt, result
 from lfpiv_cli.particles.view import View, raw_view
+from tests.particle_images import task_with
 
 
 @pytest.fixture
@@ -43,6 +45,20 @@ def test_errors_grow_where_light_is_left_and_most_in_depth(view: View) -> None:
     assert growth[1, 2] == pytest.approx(4.0, abs=0.5)
     assert growth[1, 0] == pytest.approx(2.2, abs=0.3)
     assert np.all(growth[1] > growth[0])
+
+
+@pytest.mark.thorough
+def test_errors_do_not_grow_for_tracers_elsewhere_that_were_not_found(
+    table2: Camera, water: Media, rng: np.random.Generator
+) -> None:
+    true = np.array([[-0.6, 0.0, 1.5, 5e5], [0.6, 0.0, 1.5, 5e5]])
+    task = task_with(table2, water, true, rng)
+    covariance = [
+        result(task, replace(rebuilt(task, blank(task), found), noise=noise_with(task, 5e5))).covariance_mm2[0]
+        for found in (true, true[:1])
+    ]
+    # Left alone 0.7 of the light is.
+    np.testing.assert_allclose(np.diag(covariance[1]), np.diag(covariance[0]), rtol=0.1)
 
 
 def test_changes_are_those_of_independent_errors(view: View, monkeypatch: pytest.MonkeyPatch) -> None:

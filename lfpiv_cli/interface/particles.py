@@ -443,7 +443,7 @@ def light_notices(points: Points, name: str) -> list[Notice]:
                 "light-model",
                 name,
                 f"{unexplained:.0%} of the light is not that of the particles found by {measured['light']}, at most "
-                f"{MUCH_LEFT:.0%} where the model is right: stated errors are larger for it, and may be too small",
+                f"{MUCH_LEFT:.0%} where the model is right and few are missing: stated errors may be too small",
                 "give reconstruction.wavelength_nm, as lenses diffract"
                 if measured["light"] == "rays"
                 else "check the calibration, wavelength_nm and diffusion_px",

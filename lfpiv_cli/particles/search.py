@@ -21,6 +21,7 @@ from lfpiv_cli.particles.fitting import add_all, judge, nothing_expected, refine
 from lfpiv_cli.particles.least_squares import SMALLEST_GAIN, Observation, observation_of
 from lfpiv_cli.particles.light_errors import changes_of_light, grown, light_left
 from lfpiv_cli.particles.noise import (
+    LIT_SIGMAS,
     Noise,
     error_correlation,
     estimate_noise,
@@ -308,7 +309,9 @@ def result(task: Task, state: State) -> Particles:
     if task.light_covariance is not None:
         changes = changes_of_light(task.view, particles, task.light_covariance, task.depths_mm)
     covariance = joint_covariance(observation, particles, correlation, chi2, changes)
-    share = light_left(task.image[task.usable], state.residual[task.usable], state.noise.read_counts)
+    # Where there is a model: elsewhere is the light of particles that were not found.
+    lit = task.usable & (task.image - state.residual > LIT_SIGMAS * state.noise.read_counts)
+    share = light_left(task.image[lit], state.residual[lit], state.noise.read_counts)
     covariance = grown(task.view, particles, covariance, share)
     to_world = task.camera.to_image_axes(np.eye(3))
     return Particles(
