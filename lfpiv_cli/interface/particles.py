@@ -39,7 +39,7 @@ from lfpiv_cli.particles.neighbour_frames import second_pass
 from lfpiv_cli.particles.rounds import ROUNDS, first_pass
 from lfpiv_cli.particles.search import Particles, Task, result, task_of
 from lfpiv_cli.particles.second_frames import second_frame
-from lfpiv_cli.particles.view import Light, ensure_square_cells, raw_view
+from lfpiv_cli.particles.view import Light, View, ensure_square_cells, raw_view
 from lfpiv_cli.reconstruction.equations import Normalisers
 from lfpiv_cli.reconstruction.images import Image, Mask, filled, light
 from lfpiv_cli.tracks.tracking import SEARCH_LENSES
@@ -355,15 +355,20 @@ def _lens_mm(bench: Bench) -> float:
 
 def task_for(bench: Bench, frame: Frame) -> Task:
     """Return the task that a frame sets."""
-    content, settings = bench.content, bench.settings
-    radius = 0.5 * (settings.reconstruction.particle_diameter_mm or UNKNOWN_LENSES * _lens_mm(bench))
-    space = _space(content, settings)
-    light = _light(content, settings)
-    view = raw_view(content.camera, settings.media_model(), radius, content.weights.calibration, space, light)
-    photons = settings.reconstruction.photons_per_count
+    content, photons = bench.content, bench.settings.reconstruction.photons_per_count
+    view = _view(bench, _light(content, bench.settings))
     return task_of(
         frame.image, view, content.weights, content.camera, frame.sums, frame.unusable, photons, bench.light_covariance
     )
+
+
+def _view(bench: Bench, waves: Light | None) -> View:
+    """Return how particles are seen, by waves or by rays."""
+    content, settings = bench.content, bench.settings
+    radius = 0.5 * (settings.reconstruction.particle_diameter_mm or UNKNOWN_LENSES * _lens_mm(bench))
+    calibration, space = content.weights.calibration, _space(content, settings)
+    # Particles are fitted behind arrays that stand upright, as in the weights' frame.
+    return raw_view(content.camera, settings.media_model(), radius, calibration, space, waves, content.passed)
 
 
 def _light(content: WeightsFile, settings: Config) -> Light | None:
