@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import lfpiv_cli as lf
+from lfpiv_cli.calibration.transmission import vignetting_surface
 from lfpiv_cli.files.config import carried_config
 from lfpiv_cli.files.weights_file import WeightsFile
-from lfpiv_cli.interface.particles import TracerSize, find, frame_of, light_notices, points_of, tracers_per_lens
+from lfpiv_cli.interface.particles import (
+    TracerSize,
+    find,
+    frame_of,
+    light_notices,
+    points_of,
+    task_for,
+    tracers_per_lens,
+)
 from lfpiv_cli.interface.reconstruction import Bench, bench_of
 from lfpiv_cli.particles.fitting import add_all
 from lfpiv_cli.particles.view import raw_view
@@ -46,6 +56,20 @@ def image_of(bench: Bench, number: float, seed: int) -> np.ndarray:
     particles = np.column_stack([places, rng.uniform(3e5, 7e5, count)])
     add_all(view, particles, 1.0, image, content.weights.grid.bounds_mm(2))
     return image.reshape(content.image_shape).astype(np.float32)
+
+
+def test_tracers_are_fitted_behind_the_vignetting_of_the_white_image(bench: Bench) -> None:
+    vignetting = np.zeros((5, 5))
+    vignetting[0, 0], vignetting[0, 2], vignetting[2, 0] = 1.0, -0.2, -0.3
+    image, content = image_of(bench, 0.1, 0), replace(bench.content, vignetting=vignetting)
+    frame = frame_of(bench, image, image)
+    view, plain = (task_for(replace(bench, content=each), frame).view for each in (content, bench.content))
+    particles, lit = np.array([[0.6, -0.5, 1.8, 1e5]]), np.zeros((2, image.size))
+    for each, light in zip((view, plain), lit, strict=True):
+        add_all(each, particles, 1.0, light, (1.4, 2.4))
+    surface = vignetting_surface(vignetting, content.image_shape).ravel()
+    np.testing.assert_allclose(lit[0], surface * lit[1], atol=1e-6 * lit[1].max())
+    assert surface[lit[1] > 0.0].max() < 0.95
 
 
 @pytest.mark.thorough

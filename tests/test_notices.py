@@ -455,6 +455,25 @@ def test_crowded_particles_are_told(crowd: dict[str, float], words: list[str]) -
     assert all(notice.text.startswith(text) for notice, text in zip(found, words, strict=True))
 
 
+@pytest.mark.parametrize(
+    ("off", "sigma", "words"),
+    [
+        (0.004, 0.0001, []),
+        (0.02, 0.005, []),
+        (0.02, 0.001, ["2.0% longer than the rig says"]),
+        (-0.02, 0.001, ["2.0% shorter than the rig says"]),
+        (-0.006, 0.001, ["at most 0.5%"]),
+    ],
+)
+def test_microlenses_of_another_focal_length_are_told(off: float, sigma: float, words: list[str]) -> None:
+    measured = {"residual": 0.05, "residual_rms_counts": 1.0, "read_noise_counts": 1.0, "particles_per_lens": 0.1}
+    measured |= {"microlens_focus": off, "microlens_focus_sigma": sigma}
+    points = Points(np.zeros((4, 3)), {}, Reference("focal_point", 0.0), attributes=measured, provenance={})
+    found = light_notices(points, "a.vtkhdf")
+    assert [notice.code for notice in found] == ["microlens-focus"] * len(words)
+    assert all(text in notice.text for notice, text in zip(found, words, strict=True))
+
+
 @pytest.mark.thorough
 def test_without_a_board_the_data_sheet_is_believed() -> None:
     rig = lf.load_rig(ROOT / "configs" / "sample.yaml")

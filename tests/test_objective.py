@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.optics.tracing import disc_points
 from lfpiv_cli.optics.waves import Waves, WavesInCamera
 from lfpiv_cli.stages.simulate import real_camera
+from lfpiv_cli.synthetic.board import BoardPlacement, render_board
 from lfpiv_cli.synthetic.objective import objective_of, passed_light, passes_barrel, trace_real_ray
 from lfpiv_cli.synthetic.render import Balls, render_points, render_white
 
@@ -180,6 +182,14 @@ def test_a_board_tells_of_a_curved_field(small: Camera, rng: np.random.Generator
 
 def test_an_ideal_objective_does_nothing(small: Camera) -> None:
     assert objective_of(small) == Objective()
+
+
+@pytest.mark.parametrize(("strengths", "refused"), [({"falloff": 0.3}, False), ({"astigmatism_mm": 0.1}, True)])
+def test_prints_are_shown_by_falloff_alone(small: Camera, strengths: dict[str, float], refused: bool) -> None:
+    camera = with_objective(replace(small, columns=40, rows=30), **strengths)
+    board, rng = BoardGeometry((5, 4), 0.5, 0.2, 3.0, "air", pattern="chessboard"), np.random.default_rng(1)
+    with pytest.raises(ConfigError, match="more than falloff only dots") if refused else nullcontext():
+        render_board(camera, AIR, board, BoardPlacement(0.0), 1e3, rng)
 
 
 @pytest.mark.parametrize("strength", ["vignetting: 0.2", "array_tilt_deg: [0.1, 0.0]"])

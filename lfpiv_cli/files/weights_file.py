@@ -21,6 +21,7 @@ are not read.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -124,12 +125,16 @@ class WeightsFile:
         """Return the rows, columns and weights of the pixels that voxel (iz, iy, ix) lights."""
         return self.weights.column(iz, iy, ix)
 
+    @cached_property
+    def passed(self) -> NDArray[np.float32] | None:
+        """Share (rows, columns) of the middle's light that reaches each pixel; None where it was not measured."""
+        return None if self.vignetting is None else vignetting_surface(self.vignetting, self.image_shape)
+
     def behind_vignetting(self) -> WeightsFile:
         """Return the same with the vignetting in the weights, as a file has it once it is read."""
-        if self.vignetting is None:
+        if self.passed is None:
             return self
-        surface = vignetting_surface(self.vignetting, self.image_shape)
-        operator = behind_transmission(self.weights.solver_operator, surface)
+        operator = behind_transmission(self.weights.solver_operator, self.passed)
         return replace(self, weights=replace(self.weights, solver_operator=operator))
 
 

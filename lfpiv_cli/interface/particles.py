@@ -35,11 +35,12 @@ from lfpiv_cli.particles.counting import tracers_per_lens as counted
 from lfpiv_cli.particles.diameter import LIMIT_SIGMAS, UNKNOWN_LENSES, Diameter, diameter_by
 from lfpiv_cli.particles.diffusion import USUAL_SIGMA_PX
 from lfpiv_cli.particles.light_errors import MUCH_LEFT
+from lfpiv_cli.particles.microlens_focus import FocalLength, focal_length_of
 from lfpiv_cli.particles.neighbour_frames import second_pass
 from lfpiv_cli.particles.rounds import ROUNDS, first_pass
-from lfpiv_cli.particles.search import Particles, Task, result, task_of
+from lfpiv_cli.particles.search import LAST_UNEXPLAINED, Particles, Task, result, task_of
 from lfpiv_cli.particles.second_frames import second_frame
-from lfpiv_cli.particles.view import Light, ensure_square_cells, raw_view
+from lfpiv_cli.particles.view import Light, View, ensure_square_cells, raw_view
 from lfpiv_cli.reconstruction.equations import Normalisers
 from lfpiv_cli.reconstruction.images import Image, Mask, filled, light
 from lfpiv_cli.tracks.tracking import SEARCH_LENSES
@@ -51,8 +52,13 @@ from lfpiv_cli.weights.model import behind_transmission
 LARGEST_UNEXPLAINED = 0.2
 # At so many found for each microlens, fewer than there are, stated errors begin to cover less than four fifths.
 LARGEST_CROWD = 1.3
+# Microlenses whose focal length is off by a larger share are told: depths are off by some three stated errors for each
+# per cent. Good ones seem up to 0.002 off, and more the more light is left.
+LARGEST_FOCUS_ERROR = 0.005
 # Frames that are looked at for the tracers' diameter, if the first do not hold enough.
 LOOKED_AT = 5
+# Beyond so many standard errors what is seen is not by chance.
+CERTAIN_SIGMAS = 5.0
 # Beyond so many standard errors a given diameter contradicts the images.
 CONTRADICTING_SIGMAS = 4.0
 # Depths beyond the volume in which particles are fitted, too, in depths over which light spreads by one lens.
@@ -355,15 +361,20 @@ def _lens_mm(bench: Bench) -> float:
 
 def task_for(bench: Bench, frame: Frame) -> Task:
     """Return the task that a frame sets."""
-    content, settings = bench.content, bench.settings
-    radius = 0.5 * (settings.reconstruction.particle_diameter_mm or UNKNOWN_LENSES * _lens_mm(bench))
-    space = _space(content, settings)
-    light = _light(content, settings)
-    view = raw_view(content.camera, settings.media_model(), radius, content.weights.calibration, space, light)
-    photons = settings.reconstruction.photons_per_count
+    content, photons = bench.content, bench.settings.reconstruction.photons_per_count
+    view = _view(bench, _light(content, bench.settings))
     return task_of(
         frame.image, view, content.weights, content.camera, frame.sums, frame.unusable, photons, bench.light_covariance
     )
+
+
+def _view(bench: Bench, waves: Light | None) -> View:
+    """Return how particles are seen, by waves or by rays."""
+    content, settings = bench.content, bench.settings
+    radius = 0.5 * (settings.reconstruction.particle_diameter_mm or UNKNOWN_LENSES * _lens_mm(bench))
+    calibration, space = content.weights.calibration, _space(content, settings)
+    # Particles are fitted behind arrays that stand upright, as in the weights' frame.
+    return raw_view(content.camera, settings.media_model(), radius, calibration, space, waves, content.passed)
 
 
 def _light(content: WeightsFile, settings: Config) -> Light | None:
@@ -392,6 +403,7 @@ def points_of(bench: Bench, frame: Frame, found: Particles, size: TracerSize, pr
     share_left = float(np.linalg.norm(left)) / norm if norm > 0.0 else 0.0
     # Of four tracers for each microlens only 1.3 are found, and few of them are right.
     number = tracers_per_lens(bench, frame) if share_left > MUCH_LEFT else None
+    focus = _focal_length(bench, frame, found)
     return Points(
         content.reference.points_from_focal_point(found.position_mm),
         {
@@ -414,6 +426,7 @@ def points_of(bench: Bench, frame: Frame, found: Particles, size: TracerSize, pr
             "particles_per_lens": float(np.count_nonzero(outside == 0)) / _lenses_before(bench),
         }
         | ({} if number is None else {"tracers_per_lens": number})
+        | ({} if focus is None else {"microlens_focus": focus.off, "microlens_focus_sigma": focus.sigma})
         | size.attributes(),
         provenance=dict(provenance),
     )
@@ -468,10 +481,37 @@ def light_notices(points: Points, name: str) -> list[Notice]:
                 f"at most {LARGEST_CROWD:g}",
             )
         )
+    off, largest = measured.get("microlens_focus", 0.0), LARGEST_FOCUS_ERROR * max(unexplained / MUCH_LEFT, 1.0)
+    if abs(off) > max(largest, CERTAIN_SIGMAS * measured.get("microlens_focus_sigma", 0.0)):
+        least = "at least " if measured.get("light") == "waves" else ""
+        notices.append(
+            Notice(
+                "microlens-focus",
+                name,
+                f"by the tracers' light under single microlenses their focal length is {least}{abs(off):.1%} "
+                f"{'longer' if off > 0.0 else 'shorter'} than the rig says, at most {largest:.1%} of a good one, or "
+                "microlens_distance_mm is as much off the other way: depths are off, and stated errors too small",
+                f"microlenses.focal_length_mm {written(1.0 + off, 4)} times as large, and build the weights again "
+                "until it stays",
+                off,
+                f"within {largest:g}",
+            )
+        )
     if not count and not notices:
         text = "no particles found: nothing stands out of the noise"
         notices.append(Notice("no-particles", name, text, "check exposure, --dark and --mask", 0.0, "some"))
     return notices
+
+
+def _focal_length(bench: Bench, frame: Frame, found: Particles) -> FocalLength | None:
+    """Return the microlenses' focal length by the particles of an image; None where too few tell it."""
+    # By rays also where particles are fitted by waves, of which no second table is made: rays tell half of it.
+    view = _view(bench, None)
+    particles = np.column_stack([bench.content.camera.to_image_axes(found.position_mm), found.light_counts])
+    residual = found.residual.ravel()
+    weight = found.noise.weights(frame.image.ravel() - residual, residual, LAST_UNEXPLAINED)
+    weight[frame.unusable.ravel()] = 0.0
+    return focal_length_of(view, particles, residual, weight)
 
 
 def what_is_left(frame: Frame, found: Particles) -> NDArray[np.float64]:

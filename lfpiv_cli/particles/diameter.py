@@ -174,7 +174,7 @@ def diameter_of(frames: Sequence[Sizes]) -> Diameter | None:
     square = np.concatenate([sizes.square for sizes in frames]) if frames else np.zeros(0)
     if not square.size:
         return None
-    middle, error = _middle(Sizes(square, np.concatenate([sizes.sigma for sizes in frames])))
+    middle, error = middle_of(Sizes(square, np.concatenate([sizes.sigma for sizes in frames])))
     diameter = float(np.sqrt(max(middle, 0.0)))
     # From squares to diameters, also where the diameter is 0: half of how far up the square may be.
     spread = float(np.sqrt(max(middle, 0.0) + LIMIT_SIGMAS * error)) - diameter
@@ -343,7 +343,7 @@ def _common(diameters: NDArray[np.float64], losses: NDArray[np.float64]) -> floa
     return float(diameters[np.argmin(np.sum(np.log1p(losses), axis=1))])
 
 
-def _middle(sizes: Sizes) -> tuple[float, float]:
+def middle_of(sizes: Sizes) -> tuple[float, float]:
     """Return a weighted median and its standard error, from the scatter or from what each one states."""
     scatter = MAD_TO_SIGMA * float(np.median(np.abs(sizes.square - np.median(sizes.square))))
     weight = 1.0 / (sizes.sigma**2 + scatter**2)

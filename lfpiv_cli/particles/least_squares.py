@@ -446,6 +446,17 @@ def respond_all(view: View, members: NDArray[np.float64], responses: Responses) 
             responses.counts[m] = respond_by_lines(view, bend, z, pixels, values)
         else:
             responses.counts[m] = respond_rows(view, bend, pixels, values, responses.scratch)
+        if view.passed.size > 0:
+            _pass(view.passed, pixels[: responses.counts[m]], values)
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def _pass(passed: NDArray[np.float32], pixels: NDArray[np.int32], values: NDArray[np.float64]) -> None:
+    """Leave of light and its derivatives what reaches the pixels."""
+    for k in range(pixels.size):
+        share = passed[pixels[k]]
+        for m in range(UNKNOWNS):
+            values[m, k] *= share
 
 
 @njit(cache=True, fastmath=SUMS, **COUNT_NO_REFERENCES)

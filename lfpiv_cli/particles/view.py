@@ -58,6 +58,7 @@ class View(NamedTuple):
     table, table_reach : see `rim`
     lines : of light as waves, by which all light goes then; empty: light goes by rays
     points, diffusion_px : the same of points of light before charge diffuses, and how far it does
+    passed : (pixels,) share of the middle's light that reaches each pixel; empty: all of it
     """
 
     camera: KernelCamera
@@ -82,6 +83,7 @@ class View(NamedTuple):
     lines: LineResponses
     points: LineResponses
     diffusion_px: float
+    passed: NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -118,6 +120,7 @@ def raw_view(
     calibration: Calibration | None = None,
     space: ObjectSpace | CurvedSpace | None = None,
     light: Light | None = None,
+    passed: NDArray[np.float32] | None = None,
 ) -> View:
     """Return the view of a camera on the raw image.
 
@@ -127,6 +130,7 @@ def raw_view(
     calibration : gives the measured centres of the lens images
     space : what bends rays; None: they are straight from the equivalent points
     light : as waves; None: it goes by rays
+    passed : (rows, columns) share of the middle's light that reaches each pixel; None: all of it
 
     Raises
     ------
@@ -183,6 +187,7 @@ def raw_view(
         lines=NO_LINES,
         points=NO_LINES,
         diffusion_px=0.0,
+        passed=np.zeros(0, np.float32) if passed is None else np.ascontiguousarray(passed.ravel()),
     )
     if light is None:
         return view

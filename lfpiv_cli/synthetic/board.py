@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.errors import ConfigError
-from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.camera import Camera, Objective
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
 from lfpiv_cli.optics.waves import Waves
@@ -106,9 +106,14 @@ def render_board(
 
     Raises
     ------
-    ConfigError : a printed plate behind curved faces
+    ConfigError : a printed plate behind curved faces, or by an objective that does more than lose light
     """
     if board.pattern != "dots":
+        if camera.objective != Objective(falloff_per_mm2=camera.objective.falloff_per_mm2):
+            raise ConfigError(
+                f"board.pattern: is {board.pattern}; by a simulation.objective with more than falloff only dots are "
+                "simulated"
+            )
         if isinstance(space, CurvedSpace):
             raise ConfigError(f"board.pattern: is {board.pattern}; behind the faces of a scene only dots are simulated")
         steps = placement.to_world([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
