@@ -100,7 +100,8 @@ def line_responses(
     space : of plane faces; its aberration is that of points on the axis
     """
     step = DEPTH_STEP * camera.scale(space.media).depth_mm
-    low, high = int(np.floor(depths_mm[0] / step)) - 1, int(np.ceil(depths_mm[1] / step)) + 1
+    # A spline's ends, where its slopes are not known, reach half so far.
+    low, high = int(np.floor(depths_mm[0] / step)) - 2, int(np.ceil(depths_mm[1] / step)) + 2
     pupil = _Pupil(camera, space, wavelength_mm, step * np.arange(low, high + 1, dtype=np.float64))
     planes: list[Lines] = []
     for number in range(len(pupil.depths_mm)):
