@@ -155,9 +155,9 @@ def test_oblique_rays_are_bent_more() -> None:
     light[room.pixels[0, :count]], by_z[room.pixels[0, :count]] = room.values[0, [0, 3], :count]
     left = whole.ravel() - light
     weight = 1.0 / (1e-5 + whole.ravel())
-    # One step of a fit of depth alone: 0.007 mm without coma, as much again where depths are taken for those on the axis.
+    # One step of a fit of depth alone: 0.007 mm without coma.
     assert abs(np.sum(weight * by_z * left) / np.sum(weight * by_z**2)) < 0.002
-    assert np.abs(left).sum() < 0.02
+    assert np.abs(left).sum() < 0.025
 
 
 def test_hexagons_are_refused() -> None:
