@@ -39,6 +39,16 @@ def test_vignetting_is_found_under_the_rims_of_the_lens_images(small):
     np.testing.assert_allclose(surface, shading(), atol=0.01)
 
 
+@pytest.mark.parametrize("pitch_mm", [0.055, 0.1])
+def test_even_light_on_a_small_sensor_stays_even_up_to_its_border(pitch_mm, table2, layout, rng):
+    camera = replace(table2, rows=180, columns=210, lattice=Lattice.regular(pitch_mm, layout))
+    lattice = camera.micro_image_lattice_px()
+    white = rng.poisson(render_white(camera, 400.0)).astype(np.float32)
+    coefficients = fit_vignetting(relative_transmission(white, lattice), lattice)
+    # Medians of some twenty pixels with a twentieth of noise each, and some six times their error in the corners.
+    np.testing.assert_allclose(vignetting_surface(coefficients, (180, 210)), 1.0, atol=0.09)
+
+
 def test_too_few_lit_pixels_say_nothing():
     assert fit_vignetting(np.zeros((60, 60), np.float32), Lattice.regular(18.0)) is None
 

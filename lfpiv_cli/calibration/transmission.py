@@ -14,9 +14,12 @@ TRANSMISSION_FLOOR = 0.05
 MIDDLE_PER_PITCH = 0.25
 MIDDLE_SIDE_PX = 512
 # Vignetting is smooth over the sensor: a polynomial of degree four holds cos^4 and the shadow of a barrel. It is
-# fitted to the medians of this many blocks along each side, which dust and dead pixels do not move.
+# fitted to the medians of this many blocks along each side, which dust and dead pixels do not move; of fewer, where a
+# block would be narrower than this many lenses: some would hold no middle of a lens image, and what they border on is
+# extrapolated.
 VIGNETTING_DEGREE = 4
 VIGNETTING_BLOCKS = 24
+LENSES_PER_BLOCK = 1.5
 # In narrower lens images, shares of the pitch, the middles reach the dark around: a quarter of the pitch on either side
 # and a pixel's blur.
 NARROWEST_LENS_IMAGE = 0.6
@@ -111,8 +114,11 @@ def _block_levels(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return places (n, 2) as (column, row) and medians (n,) of the middles of lens images, block by block."""
     rows, columns = transmission.shape
-    row_edges = np.linspace(0, rows, VIGNETTING_BLOCKS + 1).astype(int)
-    column_edges = np.linspace(0, columns, VIGNETTING_BLOCKS + 1).astype(int)
+    width = LENSES_PER_BLOCK * float(lattice_px.pitch.max())
+    row_edges, column_edges = (
+        np.linspace(0, side, max(1, min(VIGNETTING_BLOCKS, int(side / width))) + 1).astype(int)
+        for side in (rows, columns)
+    )
     places, levels = [], []
     for top, bottom in zip(row_edges, row_edges[1:], strict=False):
         for left, right in zip(column_edges, column_edges[1:], strict=False):
