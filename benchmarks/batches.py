@@ -29,13 +29,13 @@ import numpy as np
 import psutil
 import tifffile
 
-from lfpiv_cli.cli import cli
+from lfpiv_cli.cli.main import cli
 from lfpiv_cli.console import Console, Frames
 from lfpiv_cli.files.images import read_image
 from lfpiv_cli.files.listing import expanded
-from lfpiv_cli.stages.batches import Batch, BatchOptions, work_through
-from lfpiv_cli.stages.correlate import CorrelateOptions, Correlation
-from lfpiv_cli.stages.reconstruct import Reconstruction, ReconstructOptions
+from lfpiv_cli.verbs.batches import Batch, BatchOptions, work_through
+from lfpiv_cli.verbs.correlate import CorrelateOptions, Correlation
+from lfpiv_cli.verbs.reconstruct import Reconstruction, ReconstructOptions
 
 ROOT = Path(__file__).parents[1]
 SMALL = {

@@ -17,11 +17,11 @@ from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.calibration.model import Calibration, DataSheet, Photographs, Rig, calibrate
 from lfpiv_cli.errors import LfpivError
 from lfpiv_cli.names import Layout
-from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.optics.microlenses import Lattice
+from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.synthetic.board import BoardPlacement, dot_centres, render_board
-from lfpiv_cli.synthetic.render import ObjectSpace, render_white
+from lfpiv_cli.synthetic.render import render_white
 from lfpiv_cli.synthetic.scenes import Misalignment
 from lfpiv_cli.synthetic.sensor import Readout
 

@@ -9,11 +9,11 @@ import numpy as np
 from lfpiv_cli.flow.correlation import CorrelationSettings, correlate
 from lfpiv_cli.flow.field import REJECTED
 from lfpiv_cli.grid import Grid
-from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.optics.microlenses import Lattice
+from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.reconstruction.solvers import SolverSettings, reconstruct
-from lfpiv_cli.synthetic.render import Balls, ObjectSpace, render_points
+from lfpiv_cli.synthetic.render import Balls, render_points
 from lfpiv_cli.synthetic.sensor import Readout
 from lfpiv_cli.weights.build import default_padding, factorise
 

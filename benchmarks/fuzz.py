@@ -40,8 +40,8 @@ from lfpiv_cli.files.vtkhdf import open_volume, write_volume
 from lfpiv_cli.files.weights_file import open_weights
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.reference import FOCAL_POINT
-from lfpiv_cli.stages.build_weights import build_weights
-from lfpiv_cli.stages.info import info
+from lfpiv_cli.verbs.build_weights import build_weights_file
+from lfpiv_cli.verbs.plot import info
 
 CASES = 1_000_000
 # A reader of a small file takes milliseconds.
@@ -268,7 +268,7 @@ def whole_results() -> dict[str, bytes]:
         rig["volume"] |= {"shape_xyz": [3, 2, 2], "reference": "focal_point"}
         rig["camera"]["sensor"] |= {"columns": 80, "rows": 64}
         (Path(name) / "rig.yaml").write_text(yaml.safe_dump(rig))
-        build_weights(Path(name) / "rig.yaml", paths["weights"])
+        build_weights_file(Path(name) / "rig.yaml", paths["weights"])
         return {kind: path.read_bytes() for kind, path in paths.items()}
 
 

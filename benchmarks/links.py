@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.scale import Scale
 from lfpiv_cli.synthetic.flows import advect, random_modes
-from lfpiv_cli.tracks.candidates import Seen
-from lfpiv_cli.tracks.light import Light
+from lfpiv_cli.tracks.candidates import Light, Seen
 from lfpiv_cli.tracks.tracking import track
 
 # Table 2's camera.

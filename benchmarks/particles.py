@@ -19,20 +19,20 @@ from numpy.typing import NDArray
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.calibration.model import Calibration, Photographs, Rig, calibrate
 from lfpiv_cli.grid import Grid
-from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media, channel_window
-from lfpiv_cli.optics.microlenses import Lattice
+from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.particles.rounds import find_particles
 from lfpiv_cli.particles.search import Task, task_of
 from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.reconstruction.equations import Normalisers, normalisers
 from lfpiv_cli.robust import MAD_TO_SIGMA
 from lfpiv_cli.synthetic.board import BoardPlacement, render_board
-from lfpiv_cli.synthetic.render import Balls, ObjectSpace, render_points, render_white
+from lfpiv_cli.synthetic.render import Balls, render_points, render_white
 from lfpiv_cli.synthetic.scenes import Misalignment
 from lfpiv_cli.synthetic.sensor import Readout
-from lfpiv_cli.validation.bounds import cramer_rao_bound, expected_image, pixel_variance, slopes
-from lfpiv_cli.validation.particles import match, particle_figures
+from lfpiv_cli.validation.planning import cramer_rao_bound, expected_image, pixel_variance, slopes
+from lfpiv_cli.validation.volume import match, particle_figures
 from lfpiv_cli.weights.build import default_padding, factorise
 from lfpiv_cli.weights.model import Weights
 

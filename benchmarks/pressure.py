@@ -10,14 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.field_tracks import Floats, stated_covariance
-from lfpiv_cli.fields.acceleration import bends_in, motions_at, six_of
 from lfpiv_cli.fields.pressure import knots_for, lattice_over, pressure_field, pressure_gradients
-from lfpiv_cli.interface.pressure import neglected_share
-from lfpiv_cli.synthetic.flows import MM_PER_M, advect
-from lfpiv_cli.synthetic.known_flow import KnownFlow
-from lfpiv_cli.synthetic.vortices import abc, taylor_green
-from lfpiv_cli.tracks.candidates import Seen
-from lfpiv_cli.tracks.trajectories import Trajectories
+from lfpiv_cli.synthetic.flows import advect
+from lfpiv_cli.synthetic.vortices import MM_PER_M, KnownFlow, abc, taylor_green
+from lfpiv_cli.tracks.candidates import Seen, Trajectories
+from lfpiv_cli.tracks.in_time import high_derivatives_in, motions_at
+from lfpiv_cli.verbs.field import neglected_share
 
 SIZE_MM = np.array([13.0, 10.0, 10.0])
 FRAMES, MIDDLE = 7, 3
@@ -56,7 +54,12 @@ def sequence_of(flow: KnownFlow, count: int, rng: np.random.Generator, step_mm: 
     seen = []
     for frame in range(FRAMES):
         noise = np.einsum("nij,nj->ni", root, rng.normal(size=(count, 3)))
-        seen.append(Seen(advect(flow, middle, (frame - MIDDLE) * dt_s) + noise, six_of(covariance)))
+        seen.append(
+            Seen(
+                advect(flow, middle, (frame - MIDDLE) * dt_s) + noise,
+                covariance[:, [0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2]],
+            )
+        )
     labels = tuple(np.arange(count) for _ in range(FRAMES))
     return Sequence(seen, Trajectories(labels, count, tuple(np.ones(count) for _ in range(FRAMES))), dt_s)
 
@@ -64,10 +67,10 @@ def sequence_of(flow: KnownFlow, count: int, rng: np.random.Generator, step_mm: 
 def trial(flow: KnownFlow, count: int, step_mm: float, seed: int) -> Outcome:
     """Return how good the pressure of a flow is at nodes within the box."""
     sequence = sequence_of(flow, count, np.random.default_rng(seed), step_mm)
-    bends = bends_in(sequence.found, sequence.seen)
-    if bends is None or flow.pressure is None:
+    derivatives = high_derivatives_in(sequence.found, sequence.seen)
+    if derivatives is None or flow.pressure is None:
         raise ValueError("too few tracers, or a flow without a known pressure")
-    _, motion = motions_at(sequence.found, sequence.seen, MIDDLE, bends)
+    _, motion = motions_at(sequence.found, sequence.seen, MIDDLE, derivatives)
     to_m_s2 = 1.0 / (MM_PER_M * sequence.dt_s**2)
     samples = pressure_gradients(
         motion.position_mm, to_m_s2 * motion.acceleration, to_m_s2**2 * motion.covariance, DENSITY_KG_M3

@@ -31,12 +31,12 @@ from click.testing import CliRunner
 
 from benchmarks.rig_drawing import DrawnRig, draw
 from benchmarks.rig_judging import Figures, judge_particles, judge_tracks, judge_vectors, truth_of
-from lfpiv_cli.cli import cli
+from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import LfpivError
 from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.images import read_image, write_tiff
-from lfpiv_cli.stages.simulate import readout_of, real_camera
 from lfpiv_cli.synthetic.render import render_white
+from lfpiv_cli.verbs.simulate import readout_of, real_camera
 
 RIGS, SEED = 40, 20261122
 # Samples along each side of a white image's pixel.

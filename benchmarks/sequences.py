@@ -16,17 +16,14 @@ from scipy.spatial import KDTree
 
 from benchmarks.particles import DIAMETER_MM, LIGHT_COUNTS, VOXEL_MM, Bench, calibrated
 from lfpiv_cli.files.particle_file import symmetric
-from lfpiv_cli.particles.neighbour_frames import second_pass
-from lfpiv_cli.particles.prediction import Predicted, find_predicted
+from lfpiv_cli.particles.neighbour_frames import Predicted, find_predicted, second_pass
 from lfpiv_cli.particles.rounds import first_pass
 from lfpiv_cli.particles.search import Particles, result
-from lfpiv_cli.synthetic.flows import Flow, advect, random_modes, square_duct, taylor_green
-from lfpiv_cli.tracks.candidates import Seen
-from lfpiv_cli.tracks.light import Light
-from lfpiv_cli.tracks.sequences import Ahead, SoFar, begun, followed_further, scatter_in, states_at
-from lfpiv_cli.tracks.smoothing import expected_in
-from lfpiv_cli.tracks.trajectories import long_ones
-from lfpiv_cli.validation.particles import match
+from lfpiv_cli.synthetic.flows import advect, random_modes, square_duct
+from lfpiv_cli.synthetic.vortices import Flow, taylor_green
+from lfpiv_cli.tracks.candidates import Light, Seen, long_ones
+from lfpiv_cli.tracks.sequences import Ahead, SoFar, begun, expected_in, followed_further, scatter_in, states_at
+from lfpiv_cli.validation.volume import match
 
 SHAPE, VOLUME_XYZ, COUNT, FRAMES = (880, 880), (36, 36, 100), 830, 12
 # Light beside the volume that its pixels see, mm.

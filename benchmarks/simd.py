@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 
 from benchmarks.timing import interleaved_medians_s
-from lfpiv_cli.simd import block_sums, combine, combine_varying, splines
+from lfpiv_cli.simd import block_sums, combine
 from lfpiv_cli.simd.vectors import LANES
 
 # Elements of the volumes, and their strides along z and y: a window's share of the second-level cache.
@@ -58,7 +58,7 @@ def _rivals() -> dict[str, tuple[Any, Any, tuple[Any, ...]]]:
     a, b, out = rng.random((3, SIZE), np.float32)
     valid = np.ones(SIZE, np.uint8)
     line = np.arange(40).astype(np.int32)
-    weights = rng.random(3 * splines.MOST_TAPS * splines.NEIGHBOURS, np.float32)
+    weights = rng.random(3 * block_sums.MOST_TAPS * block_sums.NEIGHBOURS, np.float32)
     place = (MIDDLE, PLANE, ROW)
     found = {}
     for name, lines, length, intrinsic in (
@@ -73,12 +73,12 @@ def _rivals() -> dict[str, tuple[Any, Any, tuple[Any, ...]]]:
     found["combine_turned"] = (combine.combine_turned, njit(combine.combine_turned_reference), arguments)
     places = np.linspace(-1.0, 1.0, LANES).astype(np.float32)
     turned = (out, (0, combine.TILE), a, line, (0, 80, 0, 3), b, 0, places, 0)
-    twin = njit(combine_varying.combine_turned_varying_reference)
-    found["combine_turned_varying"] = (combine_varying.combine_turned_varying, twin, turned)
+    twin = njit(combine.combine_turned_varying_reference)
+    found["combine_turned_varying"] = (combine.combine_turned_varying, twin, turned)
     summed = (out, 0, a, line, (0, 80, 0, 5), b, 0, places, 0)
     found["combine_varying"] = (
-        combine_varying.combine_varying,
-        njit(combine_varying.combine_varying_reference),
+        combine.combine_varying,
+        njit(combine.combine_varying_reference),
         summed,
     )
     arguments = (out, (0, combine.TILE), a, (0, combine.TILE))
@@ -88,18 +88,18 @@ def _rivals() -> dict[str, tuple[Any, Any, tuple[Any, ...]]]:
         found[f"products of {shifts} shifts"] = (block_sums.products, njit(block_sums.products_reference), arguments)
     arguments = (out, (0, LANES), a, b, valid, place, (4, 4))
     found["moments"] = (block_sums.moments, njit(block_sums.moments_reference), arguments)
-    arguments = (out, (0, splines.NEIGHBOURS), a, b, place, weights, (-1, -1, -1, 4, 4, 4))
-    found["interpolate"] = (splines.interpolate, njit(splines.interpolate_reference), arguments)
+    arguments = (out, (0, block_sums.NEIGHBOURS), a, b, place, weights, (-1, -1, -1, 4, 4, 4))
+    found["interpolate"] = (block_sums.interpolate, njit(block_sums.interpolate_reference), arguments)
     for taps in (4, 5):
-        twin, arguments = njit(splines.spline_weights_reference), (weights, 0, a, 7, -1, taps)
-        found[f"spline_weights of {taps} taps"] = (splines.spline_weights, twin, arguments)
+        twin, arguments = njit(block_sums.spline_weights_reference), (weights, 0, a, 7, -1, taps)
+        found[f"spline_weights of {taps} taps"] = (block_sums.spline_weights, twin, arguments)
     twin = njit(_range_of_neighbours)
-    found["range_of_all"] = (splines.range_of_all, twin, (a, 7))
+    found["range_of_all"] = (block_sums.range_of_all, twin, (a, 7))
     return found
 
 
 def _range_of_neighbours(places: Any, at: int) -> Any:
-    return splines.range_reference(places, at, splines.NEIGHBOURS)
+    return block_sums.range_reference(places, at, block_sums.NEIGHBOURS)
 
 
 def _with_shape(shape: tuple[int, int]) -> Any:

@@ -9,11 +9,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 from benchmarks.timing import interleaved_medians_s
-from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.curved_space import CurvedSpace, Face
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.optics.microlenses import Lattice
-from lfpiv_cli.optics.ray_bundles import aim_all, trace_all_in, trace_all_out
+from lfpiv_cli.optics.ray_bundles import aim_all
 from lfpiv_cli.optics.surfaces import Cylinder
 from lfpiv_cli.optics.tracing import disc_points, exact_slope
 
@@ -38,13 +37,9 @@ def rates(rays: int, repeats: int) -> dict[str, float]:
     """Return the rays a second of each way, from points all over a tube through all of the main lens."""
     rng = np.random.default_rng(0)
     points = np.concatenate([rng.uniform(-6, 6, (rays, 1)), disc_points(rays, INSIDE_MM, rng)], axis=1)
-    crossing, depths = disc_points(rays, CAMERA.aperture_radius_mm, rng), points[:, 2].copy()
+    crossing = disc_points(rays, CAMERA.aperture_radius_mm, rng)
     faces = TUBE.for_kernels(CAMERA)
-    slopes, _ = aim_all(faces, points, crossing)
-    towards = np.tile([0.01, 0.02, -1.0], (rays, 1))
     ways: dict[str, Callable[[], object]] = {
-        "from the lens into the tube": lambda: trace_all_in(faces, crossing, slopes, depths),
-        "from the tube to the lens": lambda: trace_all_out(faces, points, towards),
         "from points in the tube, aimed at places of the lens": lambda: aim_all(faces, points, crossing),
         "the same through plane layers": lambda: _aimed_through_layers(points, crossing),
     }

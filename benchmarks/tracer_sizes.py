@@ -17,7 +17,7 @@ import yaml
 
 import lfpiv_cli as lf
 from benchmarks.rigs import run_command
-from lfpiv_cli.validation.particles import particle_figures
+from lfpiv_cli.validation.volume import particle_figures
 
 Tree = dict[str, Any]
 CROWDS, SIZES_MM = (0.1, 0.3, 0.65, 1.2, 2.0, 4.0), (0.03, 0.05, 0.1)

@@ -10,9 +10,8 @@ from scipy import sparse
 
 from benchmarks.timing import interleaved_medians_s
 from lfpiv_cli.grid import Grid
-from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.weights.build import factorise
 from lfpiv_cli.weights.operators import FactorisedOperator
 

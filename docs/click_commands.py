@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from lfpiv_cli.cli import cli
+from lfpiv_cli.cli.main import cli
 
 
 def names() -> list[str]:

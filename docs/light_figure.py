@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.files.config import load_config
-from lfpiv_cli.optics.object_space import ObjectSpace
+from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.optics.waves import Waves
 from lfpiv_cli.pictures.style import new_figure, styled
 from lfpiv_cli.synthetic.render import Balls, render_points

@@ -26,11 +26,11 @@ into the functions above. Volumes and fields are indexed [z, y, x]; points and v
 
 Each command is a function as well, files in and files out, with its options as a dataclass::
 
-    from lfpiv_cli.stages.reconstruct import ReconstructOptions, reconstruct
+    from lfpiv_cli.verbs.reconstruct import ReconstructOptions, reconstruct_files
 
-    reconstruct(Path("weights.h5"), images, Path("volumes"), ReconstructOptions(dark=Path("dark.tif")))
+    reconstruct_files(Path("weights.h5"), images, Path("volumes"), ReconstructOptions(dark=Path("dark.tif")))
 
-likewise `lfpiv_cli.stages.calibrate`, `.build_weights`, `.correlate`, `.track`, `.follow` and so on. All that can go
+likewise `lfpiv_cli.verbs.calibrate`, `.build_weights`, `.correlate`, `.track`, `.follow` and so on. All that can go
 wrong is an `LfpivError` of `lfpiv_cli.errors`, whose message names the place, what was found and what was expected;
 what speaks against a result is an `LfpivWarning`.
 """
@@ -47,16 +47,16 @@ if TYPE_CHECKING:
     from lfpiv_cli.files.vtkhdf import open_vectors, open_volume
     from lfpiv_cli.files.weights_file import open_weights
     from lfpiv_cli.flow.combining import combine
-    from lfpiv_cli.interface.calibration import calibrate
-    from lfpiv_cli.interface.fields import fit_field
-    from lfpiv_cli.interface.following import follow
-    from lfpiv_cli.interface.notices import LfpivWarning
-    from lfpiv_cli.interface.particles import find_particles
-    from lfpiv_cli.interface.readers import load_rig, open_calibration, open_particles, open_tracks, read_image
-    from lfpiv_cli.interface.reconstruction import reconstruct
-    from lfpiv_cli.interface.tracks import track
-    from lfpiv_cli.interface.vectors import correlate
-    from lfpiv_cli.interface.weights import build_weights
+    from lfpiv_cli.notice import LfpivWarning
+    from lfpiv_cli.verbs import load_rig, open_calibration, open_particles, open_tracks, read_image
+    from lfpiv_cli.verbs.build_weights import build_weights
+    from lfpiv_cli.verbs.calibrate import calibrate
+    from lfpiv_cli.verbs.correlate import correlate
+    from lfpiv_cli.verbs.fields import fit_field
+    from lfpiv_cli.verbs.following import follow
+    from lfpiv_cli.verbs.particles import find_particles
+    from lfpiv_cli.verbs.reconstruct import reconstruct
+    from lfpiv_cli.verbs.tracks import track
 
 __version__ = "0.1.0"
 __all__ = [
@@ -85,24 +85,24 @@ __all__ = [
 # Where each name is from: they are imported when they are asked for, so that `lfpiv --help` need not wait for them.
 MODULES = {
     "LfpivError": "errors",
-    "LfpivWarning": "interface.notices",
-    "build_weights": "interface.weights",
-    "calibrate": "interface.calibration",
+    "LfpivWarning": "notice",
+    "build_weights": "verbs.build_weights",
+    "calibrate": "verbs.calibrate",
     "combine": "flow.combining",
-    "correlate": "interface.vectors",
-    "find_particles": "interface.particles",
-    "fit_field": "interface.fields",
-    "follow": "interface.following",
-    "load_rig": "interface.readers",
-    "open_calibration": "interface.readers",
-    "open_particles": "interface.readers",
-    "open_tracks": "interface.readers",
+    "correlate": "verbs.correlate",
+    "find_particles": "verbs.particles",
+    "fit_field": "verbs.fields",
+    "follow": "verbs.following",
+    "load_rig": "verbs",
+    "open_calibration": "verbs",
+    "open_particles": "verbs",
+    "open_tracks": "verbs",
     "open_vectors": "files.vtkhdf",
     "open_volume": "files.vtkhdf",
     "open_weights": "files.weights_file",
-    "read_image": "interface.readers",
-    "reconstruct": "interface.reconstruction",
-    "track": "interface.tracks",
+    "read_image": "verbs",
+    "reconstruct": "verbs.reconstruct",
+    "track": "verbs.tracks",
 }
 
 # Before any kernel is imported.

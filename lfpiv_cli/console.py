@@ -17,7 +17,7 @@ from typing import Any
 
 import click
 
-from lfpiv_cli.files.log import EventLog, largest_memory_mb
+from lfpiv_cli.files.atomic import EventLog, largest_memory_mb
 from lfpiv_cli.notice import Notice, written
 
 # Without a terminal, lines of work that is one piece are this far apart, and those within a frame that takes long.

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import math
+import warnings
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from typing import Any
 
 # Numbers from the first on are so many of a word; beyond the second, and below the third, they are powers of ten.
 WORDS = ((1e12, "trillion"), (1e9, "billion"), (1e6, "million"))
 LARGEST_WRITTEN, SMALLEST_WRITTEN = 1e15, 1e-6
+# From `warn_of` through the function of the interface to who called that.
+CALLER = 3
 
 
 @dataclass(frozen=True)
@@ -55,3 +59,17 @@ def written(value: float, digits: int = 3) -> str:
             return f"{written(rounded / unit, digits)} {word}"
     text = f"{rounded:.{max(digits - 1 - math.floor(math.log10(size)), 0)}f}"
     return text.rstrip("0").rstrip(".") if "." in text else text
+
+
+class LfpivWarning(UserWarning):
+    """What speaks against a result; `notice` has its code, what it is about, figure, expectation and remedy."""
+
+    def __init__(self, notice: Notice) -> None:
+        super().__init__(str(notice))
+        self.notice = notice
+
+
+def warn_of(notices: Iterable[Notice]) -> None:
+    """Give each notice as a Python warning; to be called by a function of the interface itself."""
+    for notice in notices:
+        warnings.warn(LfpivWarning(notice), stacklevel=CALLER)

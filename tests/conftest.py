@@ -12,9 +12,8 @@ import numba
 import numpy as np
 import pytest
 
-from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media, Window
-from lfpiv_cli.optics.microlenses import Lattice
 
 TABLE2 = Camera(
     magnification=-1.0,

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import h5py
 
-from lfpiv_cli.cli import cli
-from lfpiv_cli.cli.outcome import outcome_of
+from lfpiv_cli.cli.main import cli
+from lfpiv_cli.cli.options import outcome_of
 from lfpiv_cli.files.hdf5_checks import DIGEST, write_digest
 
 

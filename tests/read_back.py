@@ -12,8 +12,8 @@ import pytest
 from scipy.io import loadmat, netcdf_file
 
 from lfpiv_cli.files.exports.content import Content, columns_of
+from lfpiv_cli.files.exports.vtk import SHOWN
 from lfpiv_cli.files.particle_file import POSITION
-from lfpiv_cli.files.playback import SHOWN
 from lfpiv_cli.files.vtkhdf import VECTORS_FORMAT
 from lfpiv_cli.flow.field import REJECTED
 
@@ -100,7 +100,7 @@ def _without_comments(path: Path, content: Content) -> tuple[list[str], dict[str
 def _ensure_columns(
     head: list[str], rows: list[list[str]], units: dict[str, str], content: Content, order: np.ndarray | None = None
 ) -> None:
-    expected = columns_of(content)
+    expected, _ = columns_of(content)
     assert head == list(expected) == list(units)
     assert (units["x"], units.get("u", "m/s")) == ("mm", "m/s")
     found = dict(zip(head, np.array(rows).reshape(-1, len(head)).T, strict=True))

@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.particles import search
-from lfpiv_cli.particles.active_set import disturbance, overlaps_of
 from lfpiv_cli.particles.fitting import add_all, refine
 from lfpiv_cli.particles.least_squares import SMALLEST_GAIN, Observation
-from lfpiv_cli.particles.search import Task, blank, noise_with, observed, rebuilt, sweep
+from lfpiv_cli.particles.search import Task, blank, disturbance, noise_with, observed, overlaps_of, rebuilt, sweep
 from tests.particle_images import task_with
 
 SWEEPS = 6

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import tifffile
 
-from lfpiv_cli.cli import cli
+from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import InputError, PartialError, StoppedEarlyError, UsageError
-from lfpiv_cli.files import watching
+from lfpiv_cli.files import listing
 from lfpiv_cli.files.images import read_image
 from lfpiv_cli.files.shares import Deadline
 from tests.test_particle_stage import write_frame
@@ -208,7 +208,7 @@ def test_frames_of_a_folder_that_is_being_filled(
     weights: Path, frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
 ) -> None:
     camera = Filling(tmp_path / "run", {1.0: frames[0], 2.0: frames[1], 14.0: frames[2]})
-    monkeypatch.setattr(watching, "time", camera)
+    monkeypatch.setattr(listing, "time", camera)
     alone(weights, [camera.folder], tmp_path / "v", "--watch", "--idle-s", 20, "--json")
     told = json.loads(capsys.readouterr().out)
     assert (told["frames"], told["reconstructed"]) == (3, 3)
@@ -233,7 +233,7 @@ def test_pairs_of_a_folder_that_is_being_filled(
         path.write_bytes(volume.read_bytes())
     common = ("--pairing", pairing, "--windows", "4", "--quiet")
     folder = Filling(tmp_path / "volumes", dict(zip((1.0, 5.9, 6.0, 14.0), named, strict=True)))
-    monkeypatch.setattr(watching, "time", folder)
+    monkeypatch.setattr(listing, "time", folder)
     run("correlate", folder.folder, *common, "--watch", "--idle-s", 20, "-o", tmp_path / "v")
     run("correlate", *named, *common, "-o", tmp_path / "one")
     assert len(bytes_of(tmp_path / "one")) == (2 if pairing == "ab" else 3)
@@ -248,7 +248,7 @@ def test_a_lost_frame_of_a_folder_that_is_being_filled_is_told_at_once(
     for path, volume in zip(named, volumes, strict=True):
         path.write_bytes(volume.read_bytes())
     folder = Filling(tmp_path / "volumes", dict(zip((1.0, 1.5, 2.0, 9.0, 10.0), named, strict=True)))
-    monkeypatch.setattr(watching, "time", folder)
+    monkeypatch.setattr(listing, "time", folder)
     with pytest.raises(PartialError, match="1 of 3 pairs failed, the first because the second frame of its pair"):
         run("correlate", folder.folder, "--pair-by", "{pair}{frame}", "--windows", 4, "--watch", "-o", tmp_path / "v")
     assert sorted(bytes_of(tmp_path / "v")) == ["1a.vtkhdf", "3a.vtkhdf"]
@@ -259,7 +259,7 @@ def test_a_frame_that_stays_alone_in_a_folder_is_told(
     volumes: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = Filling(tmp_path / "volumes", {1.0: volumes[0]})
-    monkeypatch.setattr(watching, "time", folder)
+    monkeypatch.setattr(listing, "time", folder)
     with pytest.raises(InputError, match="no other frame has come"):
         run("correlate", folder.folder, "--pairing", "ab", "--watch", "--idle-s", 5, "-o", tmp_path / "v")
 
@@ -291,7 +291,7 @@ def test_a_mean_needs_all_pairs_and_a_folder_is_needed(weights: Path, volumes: l
 
 def test_nothing_comes(weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     camera = Filling(tmp_path / "run", {})
-    monkeypatch.setattr(watching, "time", camera)
+    monkeypatch.setattr(listing, "time", camera)
     with pytest.raises(InputError, match="no images have come in 5 s"):
         alone(weights, [camera.folder], tmp_path / "v", "--watch", "--idle-s", 5)
 

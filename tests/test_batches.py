@@ -18,23 +18,22 @@ import numpy as np
 import pytest
 import tifffile
 
-from lfpiv_cli import open_volume
-from lfpiv_cli.cli import cli
-from lfpiv_cli.cli.outcome import Terminated
+from lfpiv_cli.cli.main import cli
+from lfpiv_cli.cli.options import Terminated
 from lfpiv_cli.errors import InputError, OutputError, OutputExistsError, PartialError, UsageError
-from lfpiv_cli.files import claims, places
-from lfpiv_cli.files.claims import DEAD_AFTER_S, claim_path, claimed
+from lfpiv_cli.files import atomic, shares
+from lfpiv_cli.files.atomic import ignores_case
 from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.images import read_image
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, read_points
-from lfpiv_cli.files.places import ignores_case
 from lfpiv_cli.files.provenance import record
-from lfpiv_cli.files.vtkhdf import write_volume
+from lfpiv_cli.files.shares import DEAD_AFTER_S, claim_path, claimed
+from lfpiv_cli.files.vtkhdf import open_volume, write_volume
 from lfpiv_cli.grid import Grid
-from lfpiv_cli.interface.particles import TracerSize
 from lfpiv_cli.reference import Reference
-from lfpiv_cli.stages import reconstruct as stage
-from lfpiv_cli.stages.batches import Worked
+from lfpiv_cli.verbs import reconstruct as stage
+from lfpiv_cli.verbs.batches import Worked
+from lfpiv_cli.verbs.tracers import TracerSize
 
 ROOT = Path(__file__).parent.parent
 SAMPLE, CONFIG = ROOT / "sample_data", ROOT / "configs" / "sample.yaml"
@@ -322,7 +321,7 @@ def test_no_claim_stays(weights, images, tmp_path, monkeypatch, end) -> None:
 
 
 def test_a_worker_shows_that_it_is_alive(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(claims, "TOUCHED_EVERY_S", 0.01)
+    monkeypatch.setattr(shares, "TOUCHED_EVERY_S", 0.01)
     with claimed(tmp_path / "x.vtkhdf") as granted:
         assert granted
         claim = claim_path(tmp_path / "x.vtkhdf")
@@ -352,7 +351,7 @@ def test_outputs_of_one_name_are_refused_before_any_work(weights, images, raw, t
     elif case in ("failures", "log"):
         options = [f"--{case}", out / "f0.vtkhdf"]
     elif case == "case":
-        monkeypatch.setattr(places, "ignores_case", lambda folder: True)
+        monkeypatch.setattr(atomic, "ignores_case", lambda folder: True)
     with pytest.raises(UsageError, match="would give the same output|two outputs of this command|is also an input"):
         run("reconstruct", weights, first, second, *QUICK, *options, "-o", target, "--overwrite")
     assert list(out.glob("*.vtkhdf")) in ([], [out / "f0.vtkhdf"])
@@ -399,10 +398,10 @@ def test_a_folder_tells_whether_it_minds_case(tmp_path, monkeypatch) -> None:
     ignores_case.cache_clear()
     (tmp_path / "Folder").mkdir()
     minds = not (tmp_path / "fOLDER").exists()
-    assert (places.folded("A", tmp_path / "Folder") == "A") == minds
+    assert (atomic.folded("A", tmp_path / "Folder") == "A") == minds
     assert ignores_case(tmp_path / "Folder") == ignores_case(tmp_path / "Folder" / "not yet") == (not minds)
-    monkeypatch.setattr(places, "ignores_case", lambda folder: True)
-    assert places.folded("Ü.tif", tmp_path) == places.folded("u\u0308.TIF", tmp_path)
+    monkeypatch.setattr(atomic, "ignores_case", lambda folder: True)
+    assert atomic.folded("Ü.tif", tmp_path) == atomic.folded("u\u0308.TIF", tmp_path)
 
 
 @pytest.mark.slow

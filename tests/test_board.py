@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from lfpiv_cli.calibration.board import locate_board
 from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose, pose_of_dots
-from lfpiv_cli.calibration.dot_model import (
+from lfpiv_cli.calibration.shape_fit import (
     disc_polygon_area,
     disc_shares,
     lens_cell,
@@ -18,12 +18,12 @@ from lfpiv_cli.calibration.dot_model import (
     pixel_rays,
     undistorted,
 )
-from lfpiv_cli.calibration.refocusing import Refocusing
+from lfpiv_cli.calibration.views import Refocusing
 from lfpiv_cli.errors import InputError
-from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.optics.microlenses import Lattice
-from lfpiv_cli.optics.tracing import disc_points, slopes_equivalent, trace
+from lfpiv_cli.optics.tracing import disc_points, trace
+from tests.known_rays import slopes_equivalent
 
 BOARD = BoardGeometry((3, 3), 0.6, 0.2)
 # Twenty rays per lit pixel: a dot's depth is then known to some 0.03 mm, a board's to 0.01 mm.

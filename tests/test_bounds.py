@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.particles.view import Light, View, raw_view
 from lfpiv_cli.synthetic.sensor import Readout
-from lfpiv_cli.validation.bounds import (
+from lfpiv_cli.validation.planning import (
     ROUNDING_VARIANCE,
     UNKNOWNS,
     cramer_rao_bound,

@@ -11,18 +11,18 @@ import pytest
 import tifffile
 import yaml
 
-from lfpiv_cli import open_volume
-from lfpiv_cli.cli import cli
+from lfpiv_cli.cli.main import cli
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.files.images import read_image
+from lfpiv_cli.files.vtkhdf import open_volume
 from lfpiv_cli.optics.media import Media
+from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.paper.bubbles import _rows, bubbles
-from lfpiv_cli.paper.channel import TINY, channel_sections
 from lfpiv_cli.paper.parts import Work, read_json
+from lfpiv_cli.paper.table4 import TINY, channel_sections
 from lfpiv_cli.reconstruction.images import LARGEST_STILL, still_light
 from lfpiv_cli.synthetic.bubbles import Bubbles, bubbles_at_wall, render_bubbles
-from lfpiv_cli.synthetic.render import ObjectSpace
 from lfpiv_cli.synthetic.scenes import Box, channel_walls
 
 AIR = ObjectSpace(Media())

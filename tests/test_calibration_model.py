@@ -25,9 +25,8 @@ from lfpiv_cli.calibration.model import (
     with_mid_plane,
 )
 from lfpiv_cli.errors import InputError
-from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.optics.microlenses import Lattice
 
 BOARD = BoardGeometry((7, 7), 1.0, 0.2)
 CHANNEL = Channel(width_mm=10.0, wall_mm=5.0)
@@ -206,7 +205,7 @@ def test_the_summary_shows_residuals_and_dots_without_the_pictures(plain: Calibr
 
 def test_each_view_is_named_by_its_point_and_none_is_black(plain: Calibration, rig: Rig) -> None:
     pytest.importorskip("matplotlib")
-    from lfpiv_cli.pictures.views import views_figure
+    from lfpiv_cli.pictures.calibration import views_figure
 
     panels = views_figure(plain, rig.camera, rig.media, white_image()).axes
     views = [axes for axes in panels if axes.get_title().startswith("X = ")]

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lfpiv_cli.optics.microlenses import Lattice
+from lfpiv_cli.optics.camera import Lattice
 
 
 def test_table2_lengths(table2):

@@ -15,8 +15,8 @@ import tifffile
 import yaml
 from click.testing import CliRunner
 
-from lfpiv_cli.cli import cli
-from lfpiv_cli.cli.outcome import outcome_of
+from lfpiv_cli.cli.main import cli
+from lfpiv_cli.cli.options import outcome_of
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.files.batch import frames_of, step_between
 from lfpiv_cli.files.provenance import carried_record, even_step_s, seconds_between, sha256

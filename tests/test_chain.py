@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lfpiv_cli import open_vectors, open_volume, open_weights
-from lfpiv_cli.cli import cli
+from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import InputError, LimitMissedError, OutputExistsError, PartialError, UsageError
 from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.hdf5 import read_tree
 from lfpiv_cli.files.particles import read_particles
+from lfpiv_cli.files.vtkhdf import open_vectors, open_volume
+from lfpiv_cli.files.weights_file import open_weights
 
 ROOT = Path(__file__).parent.parent
 SAMPLE = ROOT / "sample_data"

@@ -15,14 +15,14 @@ import pytest
 import tifffile
 
 from lfpiv_cli.calibration.board_pose import BoardGeometry
-from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media, Window, channel_window, fluid_path_to_focus
-from lfpiv_cli.optics.microlenses import Lattice
-from lfpiv_cli.optics.tracing import slopes_equivalent, trace
+from lfpiv_cli.optics.tracing import ObjectSpace, trace
 from lfpiv_cli.synthetic import board as board_module
 from lfpiv_cli.synthetic.board import BoardPlacement, render_board
 from lfpiv_cli.synthetic.flows import advect, square_duct
-from lfpiv_cli.synthetic.render import Balls, ObjectSpace, render_points, render_white
+from lfpiv_cli.synthetic.render import Balls, render_points, render_white
+from tests.known_rays import slopes_equivalent
 
 WATER = Media(1.0, 1.49, 1.33)
 AIR = ObjectSpace(Media())

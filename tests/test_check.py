@@ -17,40 +17,30 @@ from numpy.typing import NDArray
 
 from lfpiv_cli import correlate
 from lfpiv_cli.calibration.model import Calibration, Channel
-from lfpiv_cli.cli import cli
+from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files.config import Config
 from lfpiv_cli.files.images import write_tiff
-from lfpiv_cli.files.rig_numbers import RigNumbers, tree_of
-from lfpiv_cli.files.rig_text import rig_text
-from lfpiv_cli.interface.image_planning import Pictures, image_lines, lattice_of
-from lfpiv_cli.interface.particles import light_of
-from lfpiv_cli.interface.planning import (
-    Line,
-    bench_of,
-    diffraction_line,
-    rig_figures,
-    rig_lines,
-    windows_line,
-    worst,
-)
-from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.files.rig_numbers import RigNumbers, rig_text, tree_of
+from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.optics.microlenses import Lattice
+from lfpiv_cli.optics.tracing import ObjectSpace
+from lfpiv_cli.paper.small_rig import Rig, Search, pairs_of
 from lfpiv_cli.particles.view import raw_view
-from lfpiv_cli.synthetic.render import Balls, ObjectSpace, render_points, render_white
+from lfpiv_cli.synthetic.render import Balls, render_points, render_white
 from lfpiv_cli.synthetic.sensor import Readout
-from lfpiv_cli.validation.bounds import errors_alone_mm
-from lfpiv_cli.validation.place_errors import pairs_of
 from lfpiv_cli.validation.planning import (
     Tracer,
+    errors_alone_mm,
     errors_by_depth_mm,
     half_view_mm,
     in_miniature,
     part_in_front,
     share_in_view,
 )
-from lfpiv_cli.validation.tracer_bench import Rig, Search
+from lfpiv_cli.verbs.check import Pictures, image_lines, lattice_of
+from lfpiv_cli.verbs.particles import light_of
+from lfpiv_cli.verbs.planning import Line, bench_of, diffraction_line, rig_figures, rig_lines, windows_line, worst
 
 WATER = Media(1.0, 1.49, 1.33)
 Tree = dict[str, Any]

@@ -96,7 +96,7 @@ def hear_interrupts():
 
 IGNORED_FIRST = """
 import ctypes, signal, sys, time
-from lfpiv_cli.cli.interrupts import end_by_signals
+from lfpiv_cli.cli.main import end_by_signals
 
 def called_back():
     signal.raise_signal(getattr(signal, sys.argv[1]))
@@ -136,7 +136,7 @@ def test_a_signal_during_a_call_back_is_not_lost(sent, name, said):
 
 IN_A_LONG_CALL = """
 import hashlib
-from lfpiv_cli.cli.interrupts import end_by_signals
+from lfpiv_cli.cli.main import end_by_signals
 
 end_by_signals()
 print("begun", flush=True)
@@ -159,7 +159,7 @@ def test_a_signal_is_answered_while_a_compiled_call_goes_on():
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGHUP")
 def test_what_nohup_has_ignored_stays_so():
-    script = "import signal; from lfpiv_cli.cli.interrupts import end_by_signals; end_by_signals(); "
+    script = "import signal; from lfpiv_cli.cli.main import end_by_signals; end_by_signals(); "
     script += "signal.raise_signal(signal.SIGHUP); print('here')"
     done = subprocess.run(
         [sys.executable, "-c", script],
@@ -206,7 +206,7 @@ def test_signals_end_the_work_and_leave_nothing(tmp_path, sent, code, said):
 A_BROKEN_LIBRARY = """
 import signal, sys
 from lfpiv_cli.cli import main
-from lfpiv_cli.stages import warm_up
+from lfpiv_cli.verbs import chain
 
 def broken(*_, **__):
     try:
@@ -214,7 +214,7 @@ def broken(*_, **__):
     except BaseException:
         raise RuntimeError("no compiled object yet")
 
-warm_up.warm_up = broken
+chain.warm_up = broken
 sys.argv = ["lfpiv", "warm-up"]
 main()
 """

@@ -10,21 +10,27 @@ import tifffile
 import yaml
 from click.testing import CliRunner
 
-from lfpiv_cli import open_volume, open_weights
-from lfpiv_cli.cli import cli
+from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import ConfigError, InputError
+from lfpiv_cli.files.vtkhdf import open_volume
+from lfpiv_cli.files.weights_file import open_weights
 from lfpiv_cli.grid import Grid
-from lfpiv_cli.optics.microlenses import Lattice
-from lfpiv_cli.optics.object_space import ObjectSpace
-from lfpiv_cli.optics.polynomial_rays import PolynomialRays, complete_exponents, polynomial_terms
-from lfpiv_cli.optics.tracing import disc_points, slopes_equivalent, trace
+from lfpiv_cli.optics.camera import Lattice
+from lfpiv_cli.optics.tracing import (
+    ObjectSpace,
+    PolynomialRays,
+    complete_exponents,
+    disc_points,
+    polynomial_terms,
+    trace,
+)
 from lfpiv_cli.weights import columns as columns_module
 from lfpiv_cli.weights.build import factorise, factorise_bricks
 from lfpiv_cli.weights.columns import ColumnOperator, OnDemandOperator, operator_of
 from lfpiv_cli.weights.model import Weights
 from lfpiv_cli.weights.operators import FactorisedOperator
-from lfpiv_cli.weights.quadrature import integrate_columns
-from lfpiv_cli.weights.rays import RayCount, count_columns
+from lfpiv_cli.weights.quadrature import RayCount, count_columns, integrate_columns
+from tests.known_rays import slopes_equivalent
 
 GRID = Grid.centred((4, 3, 5), (0.1, 0.12, 0.8), (0.1, -0.1, 0.5))
 # As far across, with voxels enough to tell the axes apart.

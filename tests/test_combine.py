@@ -11,6 +11,7 @@ from benchmarks.weights import against_sparse_matrix, share_of_matrix_product_ra
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.simd.combine import (
+    COEFFICIENTS,
     GROUP,
     TILE,
     combine_line,
@@ -18,16 +19,13 @@ from lfpiv_cli.simd.combine import (
     combine_reference,
     combine_turned,
     combine_turned_reference,
-    combine_vector,
-    turn,
-    turn_reference,
-)
-from lfpiv_cli.simd.combine_varying import (
-    COEFFICIENTS,
     combine_turned_varying,
     combine_turned_varying_reference,
     combine_varying,
     combine_varying_reference,
+    combine_vector,
+    turn,
+    turn_reference,
 )
 from lfpiv_cli.simd.vectors import LANES, lanes_of
 from lfpiv_cli.weights.build import factorise

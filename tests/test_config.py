@@ -12,12 +12,12 @@ import pytest
 
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.files.config import Config, load_config
-from lfpiv_cli.files.sections import Section, Sections
-from lfpiv_cli.flow.masks import ParallelWalls, RoundWall
-from lfpiv_cli.flow.windows import layout_windows
+from lfpiv_cli.files.sections import Section
+from lfpiv_cli.files.sections_simulated import Sections
+from lfpiv_cli.flow.windows import ParallelWalls, RoundWall, layout_windows
 from lfpiv_cli.optics.media import fluid_path_to_focus
 from lfpiv_cli.reference import Reference
-from lfpiv_cli.stages.reconstruct import ReconstructOptions
+from lfpiv_cli.verbs.reconstruct import ReconstructOptions
 
 CONFIGS = sorted((Path(__file__).parents[1] / "configs").glob("*.yaml"))
 

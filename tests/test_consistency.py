@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lfpiv_cli.flow.consistency import difference_over_stated, divergence_over_stated
-from lfpiv_cli.flow.field import MASKED
+from lfpiv_cli.flow.field import MASKED, difference_over_stated, divergence_over_stated
 from lfpiv_cli.grid import Grid
 from tests.vector_fields import SHAPE, SIGMA_VOXEL, SPACING_MM, VOXEL_MM, field_of, noise_mm, places_mm, rotation_mm
 

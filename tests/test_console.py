@@ -16,11 +16,11 @@ import pytest
 from click.testing import CliRunner
 
 from lfpiv_cli import console as module
-from lfpiv_cli.cli import cli
+from lfpiv_cli.cli.main import cli
 from lfpiv_cli.cli.options import common_options
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import InputError, LimitMissedError, OutputError, UsageError
-from lfpiv_cli.files.log import EventLog
+from lfpiv_cli.files.atomic import EventLog
 from lfpiv_cli.notice import Notice
 
 # The package names the function `main` as its module is named.

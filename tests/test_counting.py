@@ -9,21 +9,14 @@ import numpy as np
 import pytest
 
 import lfpiv_cli as lf
-from lfpiv_cli.calibration.transmission import vignetting_surface
+from lfpiv_cli.calibration.white import vignetting_surface
 from lfpiv_cli.files.config import carried_config
 from lfpiv_cli.files.weights_file import WeightsFile
-from lfpiv_cli.interface.particles import (
-    TracerSize,
-    find,
-    frame_of,
-    light_notices,
-    points_of,
-    task_for,
-    tracers_per_lens,
-)
-from lfpiv_cli.interface.reconstruction import Bench, bench_of
 from lfpiv_cli.particles.fitting import add_all
 from lfpiv_cli.particles.view import raw_view
+from lfpiv_cli.verbs.frames import Bench, bench_of
+from lfpiv_cli.verbs.particles import find, frame_of, points_of, task_for, tracers_per_lens
+from lfpiv_cli.verbs.tracers import TracerSize, light_notices
 
 SAMPLE = Path(__file__).parent.parent / "configs" / "sample.yaml"
 CHANGES = (

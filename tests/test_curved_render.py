@@ -8,13 +8,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.curved_space import CurvedSpace, Face
 from lfpiv_cli.optics.media import Media, Window, fluid_path_to_focus
-from lfpiv_cli.optics.microlenses import Lattice
-from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.optics.surfaces import Cylinder, Plane
-from lfpiv_cli.optics.tracing import disc_points, trace
+from lfpiv_cli.optics.tracing import ObjectSpace, disc_points, trace
 from lfpiv_cli.synthetic.curved_rays import (
     FITTED,
     TERMS,

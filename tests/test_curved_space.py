@@ -12,12 +12,12 @@ from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.names import ColumnAxis
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace, Face
-from lfpiv_cli.optics.face_tracing import aim, trace_in
 from lfpiv_cli.optics.media import Media, Window, fluid_path_to_focus
-from lfpiv_cli.optics.object_space import ObjectSpace
+from lfpiv_cli.optics.ray_bundles import aim, trace_in
 from lfpiv_cli.optics.shapes import Vector
 from lfpiv_cli.optics.surfaces import Cylinder, Plane, Sphere, Surface, TiltedPlane
-from lfpiv_cli.optics.tracing import disc_points, slopes_exact
+from lfpiv_cli.optics.tracing import ObjectSpace, disc_points
+from tests.known_rays import rays_from_air, rays_to_air, slopes_exact
 
 WATER = Media(1.0, 1.49, 1.33)
 # An acrylic tube: inner diameter 10 mm, wall 2 mm.
@@ -46,7 +46,7 @@ def aimed(space: CurvedSpace, camera: Camera, points: NDArray[np.float64], cross
 def ray_at_point(space, camera, point, crossing):
     """Return the direction towards the camera at a point of its ray through a crossing, by two places on the ray."""
     slope = aimed(space, camera, point[np.newaxis], crossing[np.newaxis])
-    (before,), valid = space.rays_from_air(camera, crossing, slope, point[2] - 0.01)
+    (before,), valid = rays_from_air(space, camera, crossing, slope, point[2] - 0.01)
     assert valid.all()
     direction = np.array([*before, point[2] - 0.01]) - point
     return slope[0], direction / np.linalg.norm(direction)
@@ -84,18 +84,18 @@ def test_rays_go_back_the_way_they_came(table2, rng, column_axis: ColumnAxis, ti
     space = tube(axis, (0.2, 0.1, 0.5))
     points, crossing = points_in_tube(rng, 200, 3.0), disc_points(200, 12.5, rng)
     slopes = aimed(space, camera, points, crossing)
-    places, valid = space.rays_from_air(camera, crossing, slopes, points[:, 2])
+    places, valid = rays_from_air(space, camera, crossing, slopes, points[:, 2])
     # a step of Newton's from 1e-6 mm
     assert valid.all()
     np.testing.assert_allclose(places, points[:, :2], atol=1e-12)
-    short, _ = space.rays_from_air(camera, crossing, slopes, points[:, 2] - 1e-3)
+    short, _ = rays_from_air(space, camera, crossing, slopes, points[:, 2] - 1e-3)
     towards = np.concatenate([short - places, np.full((200, 1), -1e-3)], axis=1)
-    back, slopes_back, valid = space.rays_to_air(camera, points, towards)
+    back, slopes_back, valid = rays_to_air(space, camera, points, towards)
     # the direction by a difference of 1e-3 mm, of which 1e-15 are lost: 1e-12, over 200 mm
     assert valid.all()
     np.testing.assert_allclose(back, crossing, atol=1e-9)
     np.testing.assert_allclose(slopes_back, slopes, atol=1e-11)
-    again, valid = space.rays_from_air(camera, back, slopes_back, points[:, 2])
+    again, valid = rays_from_air(space, camera, back, slopes_back, points[:, 2])
     # there and back in the same directions: roundings of 200 mm, of the slopes over as much, and of the rim's bending
     assert valid.all()
     np.testing.assert_allclose(again, points[:, :2], atol=1e-12)
@@ -113,7 +113,7 @@ def test_the_camera_turns_with_the_tube(table2, rng, column_axis: ColumnAxis):
 def test_all_of_a_tube_is_seen(table2, rng):
     """n_w R_i < R_o: to its wall, through all of the lens."""
     points, crossing = points_in_tube(rng, 2000, INNER_MM), disc_points(2000, 12.5, rng)
-    places, valid = tube().rays_from_air(table2, crossing, aimed(tube(), table2, points, crossing), points[:, 2])
+    places, valid = rays_from_air(tube(), table2, crossing, aimed(tube(), table2, points, crossing), points[:, 2])
     assert valid.all()
     # where light grazes a micron is a hundred at the lens: Newton's last step is larger, but no more than this
     np.testing.assert_allclose(places, points[:, :2], atol=1e-9)
@@ -159,11 +159,11 @@ def test_a_thick_lens_has_the_lens_makers_focal_length(table2):
     focal_length = 1.0 / (bent * (1 / first + 1 / second - bent * thickness / (index * first * second)))
     focus = near + thickness + focal_length * (1.0 - bent * thickness / (index * first))
     heights = np.array([[0.01, 0.0], [0.0, 0.01], [0.1, 0.0]])
-    places, valid = space.rays_from_air(table2, heights, np.zeros((3, 2)), focus)
+    places, valid = rays_from_air(space, table2, heights, np.zeros((3, 2)), focus)
     assert valid.all()
     # spherical aberration: of third order in the height over some 60 mm
     np.testing.assert_allclose(places / heights.max(axis=1, keepdims=True) ** 3, 0.0, atol=1e-3)
-    (far,), _ = space.rays_from_air(table2, heights[:1], np.zeros((1, 2)), focus + 1.0)
+    (far,), _ = rays_from_air(space, table2, heights[:1], np.zeros((1, 2)), focus + 1.0)
     assert far[0] == pytest.approx(-0.01 / focal_length, rel=1e-4)
 
 
@@ -255,7 +255,7 @@ def test_a_prism_turns_light_by_its_angle(table2):
     """Straight through the first face, out of the second: asin(n sin A) - A, towards the thick end."""
     angle, index = 0.3, 1.5
     space = stack((Plane(-20.0), index), (TiltedPlane((0.0, 0.0, -10.0), (np.sin(angle), 0.0, np.cos(angle))), 1.0))
-    (near, far), valid = space.rays_from_air(table2, np.zeros((2, 2)), np.zeros((2, 2)), [-10.0, 10.0])
+    (near, far), valid = rays_from_air(space, table2, np.zeros((2, 2)), np.zeros((2, 2)), [-10.0, 10.0])
     assert valid.all()
     np.testing.assert_allclose(near, 0.0, atol=1e-13)
     turned = np.arcsin(index * np.sin(angle)) - angle
@@ -267,14 +267,14 @@ def test_total_reflection_is_a_flag(table2):
     critical = np.arcsin(1 / 1.33)
     angles = critical + np.array([-1e-3, 1e-3])
     towards = np.stack([np.sin(angles), np.zeros(2), -np.cos(angles)], axis=1)
-    crossing, slopes, valid = window.rays_to_air(table2, np.zeros((2, 3)), towards)
+    crossing, slopes, valid = rays_to_air(window, table2, np.zeros((2, 3)), towards)
     assert valid.tolist() == [True, False]
     assert np.isfinite(slopes[0]).all()
     assert np.isnan(slopes[1]).all()
     assert np.isnan(crossing[1]).all()
     # from glass into air, behind a face that light meets at 45 degrees
     prism = stack((Plane(-20.0), 1.5), (TiltedPlane((0.0, 0.0, -10.0), (0.0, 1.0, 1.0)), 1.0))
-    places, valid = prism.rays_from_air(table2, [[0.0, 0.0]], [[0.0, 0.0]], 0.0)
+    places, valid = rays_from_air(prism, table2, [[0.0, 0.0]], [[0.0, 0.0]], 0.0)
     assert not valid.any()
     assert np.isnan(places).all()
 
@@ -291,12 +291,12 @@ def test_rays_and_points_outside_the_fluid_are_flags(table2):
     assert found.valid.tolist() == [False, False, False, False, True]
     assert np.isnan(found.distance_mm[:4]).all()
     for place, towards in ([[0, 0, 0], [0, 0, 1]], [[0, 0, -6], [0, 0, -1]]):
-        assert not space.rays_to_air(table2, [place], [towards])[2].any()
-    places, valid = space.rays_from_air(table2, middle, [[0.0, 0.1]], 0.0)
+        assert not rays_to_air(space, table2, [place], [towards])[2].any()
+    places, valid = rays_from_air(space, table2, middle, [[0.0, 0.1]], 0.0)
     assert not valid.any()
     assert np.isnan(places).all()
     # through the tube and out of the fluid on the far side, which is no face: a place, but not a valid one
-    places, valid = space.rays_from_air(table2, middle, [[0.0, 0.0]], 5.5)
+    places, valid = rays_from_air(space, table2, middle, [[0.0, 0.0]], 5.5)
     assert not valid.any()
     np.testing.assert_allclose(places, 0.0, atol=1e-15)
 

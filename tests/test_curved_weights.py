@@ -10,36 +10,33 @@ import pytest
 import tifffile
 import yaml
 from numba import get_num_threads, set_num_threads
+from numpy.typing import NDArray
 
-from lfpiv_cli import open_volume
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.files.config import Config
 from lfpiv_cli.files.hdf5 import read_tree, write_tree
+from lfpiv_cli.files.vtkhdf import open_volume
 from lfpiv_cli.files.weights_file import FORMAT, UNITS, VERSION, WeightsFile, open_weights, write_weights
 from lfpiv_cli.grid import Grid
-from lfpiv_cli.interface.weights import misfit_notices
+from lfpiv_cli.optics.camera import Lattice
 from lfpiv_cli.optics.curved_space import CurvedSpace, Face
-from lfpiv_cli.optics.height_map import HeightMap
 from lfpiv_cli.optics.media import Window, fluid_path_to_focus
-from lfpiv_cli.optics.microlenses import Lattice
-from lfpiv_cli.optics.object_space import ObjectSpace
+from lfpiv_cli.optics.shapes import HeightMap
 from lfpiv_cli.optics.surfaces import Cylinder, Plane, Sphere, TiltedPlane
+from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.reconstruction.solvers import SolverSettings, reconstruct
 from lfpiv_cli.reference import Reference
-from lfpiv_cli.stages.build_weights import BuildWeightsOptions, build_weights
-from lfpiv_cli.stages.reconstruct import reconstruct as reconstruct_images
+from lfpiv_cli.verbs.build_weights import BuildWeightsOptions, build_weights_file, misfit_notices
+from lfpiv_cli.verbs.reconstruct import reconstruct_files as reconstruct_images
 from lfpiv_cli.weights import strip_blocks
 from lfpiv_cli.weights.build import blur_radius_mm, factorise_through
 from lfpiv_cli.weights.columns import OnDemandOperator, operator_of, seen_share
-from lfpiv_cli.weights.curved import lit_voxels, places_on_array
-from lfpiv_cli.weights.curved_reach import aimed_misfit_mm, curved_padding
 from lfpiv_cli.weights.model import Weights, behind_transmission
-from lfpiv_cli.weights.quadrature import integrate_columns
-from lfpiv_cli.weights.rays import RayCount, count_rays, sampling_error
-from lfpiv_cli.weights.strip_factors import mixed_shares
-from lfpiv_cli.weights.strip_fits import DEGREE_ALONG, evenly_spread, fit_axis, fit_part, strip_rays
+from lfpiv_cli.weights.quadrature import RayCount, count_rays, integrate_columns, sampling_error
+from lfpiv_cli.weights.scene import aimed_misfit_mm, curved_padding, lit_voxels, places_on_array
+from lfpiv_cli.weights.strip_fits import DEGREE_ALONG, evenly_spread, fit_axis, fit_part, mixed_shares, strip_rays
 from lfpiv_cli.weights.strip_kernels import STRIP
-from lfpiv_cli.weights.strips import StripOperator, adjoint_reference, forward_reference
+from lfpiv_cli.weights.strips import StripOperator
 
 VOXEL = (0.1, 0.1, 0.1)
 # Tiles across the aperture: with as many a column's own error is far below what chance makes of a count.
@@ -59,6 +56,24 @@ PLACES = [
 ]
 # Beside the axis of a tube along x, up to the wall and beyond it.
 BESIDE = Grid.centred((4, 20, 7), (0.1, 0.1, 0.4), (0.6, 2.6, 2.6))
+
+
+def forward_reference(operator: StripOperator, volume: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return the image of a volume voxel by voxel: the readable twin of `StripOperator.forward`."""
+    image = np.zeros(operator.image_shape)
+    for index in np.ndindex(*operator.shape):
+        rows, columns, weights = operator.column(*index)
+        image[rows, columns] += weights * np.float64(volume[index])
+    return image
+
+
+def adjoint_reference(operator: StripOperator, image: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return the adjoint voxel by voxel: the readable twin of `StripOperator.adjoint`."""
+    volume = np.zeros(operator.shape)
+    for index in np.ndindex(*operator.shape):
+        rows, columns, weights = operator.column(*index)
+        volume[index] = np.sum(weights * image[rows, columns].astype(np.float64))
+    return volume
 
 
 @pytest.fixture
@@ -429,7 +444,7 @@ def test_a_volume_behind_a_tube_is_reconstructed(tube, tmp_path, monkeypatch, la
     monkeypatch.setattr(Config, "object_space", lambda *_: tube)
     rig, output = tmp_path / "rig.yaml", tmp_path / "weights.h5"
     rig.write_text(yaml.safe_dump(RIG).replace("square", layout))
-    told = build_weights(rig, output)
+    told = build_weights_file(rig, output)
     weights = open_weights(output)
     assert told["voxels_outside_fluid"] == weights.weights.voxels_outside_fluid > 0
     if layout == "square":
@@ -444,5 +459,5 @@ def test_a_volume_behind_a_tube_is_reconstructed(tube, tmp_path, monkeypatch, la
     reconstruct_images(output, [image], found)
     light = open_volume(found).array
     assert np.unravel_index(np.argmax(light), light.shape) == (2, 13, 3)
-    dry = build_weights(rig, tmp_path / "dry.h5", BuildWeightsOptions(dry_run=True))
+    dry = build_weights_file(rig, tmp_path / "dry.h5", BuildWeightsOptions(dry_run=True))
     assert dry["estimated_weights_bytes"] >= 0.0

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lfpiv_cli.flow.derived import derived_fields
-from lfpiv_cli.flow.field import REJECTED, VectorField
+from lfpiv_cli.flow.field import REJECTED, VectorField, derived_fields
 from lfpiv_cli.grid import Grid
 
 SHAPE = (4, 5, 6)

@@ -11,18 +11,17 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.files.config import load_config
 from lfpiv_cli.grid import Grid
-from lfpiv_cli.interface.particles import TracerSize, size_notices
-from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.particles.diameter import NO_SIZES, Diameter, Sizes, diameter_by, diameter_of
 from lfpiv_cli.particles.fitting import add_all
-from lfpiv_cli.particles.response import entries_of
 from lfpiv_cli.particles.search import Task, task_of
 from lfpiv_cli.particles.view import Light, entry_capacity, raw_view, with_radius
 from lfpiv_cli.reconstruction.equations import normalisers
+from lfpiv_cli.verbs.tracers import TracerSize, size_notices
 from lfpiv_cli.weights.build import default_padding, factorise
 from lfpiv_cli.weights.model import Weights
+from tests.particle_twin import entries_of
 
 ROOT = Path(__file__).parent.parent
 LENS_MM = 0.1

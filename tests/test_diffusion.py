@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from lfpiv_cli.files.config import load_config
-from lfpiv_cli.interface.particles import Diffusion, TracerSize, size_notices
-from lfpiv_cli.particles.diffusion import MODEL_SHARE, MODEL_SQUARES, USUAL_DIFFUSION_PX, Forms, forms_of, together_of
+from lfpiv_cli.optics.line_responses import USUAL_DIFFUSION_PX
+from lfpiv_cli.particles.diffusion import MODEL_SHARE, MODEL_SQUARES, Forms, forms_of, together_of
+from lfpiv_cli.verbs.tracers import Diffusion, TracerSize, size_notices
 
 ROOT = Path(__file__).parent.parent
 SIZE, BLUR_PX = 0.5, 0.25

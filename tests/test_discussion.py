@@ -9,19 +9,18 @@ import numpy as np
 import pytest
 
 from lfpiv_cli.console import Console
-from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
-from lfpiv_cli.optics.microlenses import Lattice
-from lfpiv_cli.paper.discussion import discussion
-from lfpiv_cli.paper.parts import Work
-from lfpiv_cli.reconstruction.solvers import SolverSettings
-from lfpiv_cli.synthetic.sensor import Readout
-from lfpiv_cli.validation.depth_resolution import (
+from lfpiv_cli.paper.discussion import (
+    discussion,
     elongations_mm,
     geometric_depth_mm,
     smallest_errors_crowded_mm,
     smallest_errors_mm,
 )
+from lfpiv_cli.paper.parts import Work
+from lfpiv_cli.reconstruction.solvers import SolverSettings
+from lfpiv_cli.synthetic.sensor import Readout
 
 WATER = Media(1.0, 1.49, 1.33)
 

@@ -19,26 +19,23 @@ import pytest
 from lfpiv_cli.console import Console, Frames
 from lfpiv_cli.errors import InputError, OutputError, PartialError, StoppedEarlyError, UsageError
 from lfpiv_cli.files.batch import Target
-from lfpiv_cli.files.claims import claimed
+from lfpiv_cli.files.shares import claimed
 from lfpiv_cli.notice import Notice
-from lfpiv_cli.stages.batches import BatchOptions, ByArguments, Worked, work_through
+from lfpiv_cli.verbs.batches import Batch, BatchOptions, Worked, work_through
 
 distributed = pytest.importorskip("distributed")
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")
 
 
-class Toy(ByArguments):
+class Toy(Batch[int]):
     """Outputs that say in which process they were made; some are faulty, or kill their process."""
 
     label, unit, overwrite = "toy", "frame", True
-    notices, left_out = (), ()
 
     def __init__(self, folder: Path, count: int, faulty: Sequence[int] = (), deadly: Sequence[int] = ()) -> None:
         self.folder, self.faulty, self.deadly = folder, faulty, deadly
         self.targets = [Target(folder / f"{number}.vtkhdf", dict) for number in range(count)]
-        self.names, self.order = [str(number) for number in range(count)], range(count)
         self.inputs: list[Path] = []
-        self.outputs = [target.path for target in self.targets]
 
     def begin(self, numbers: Sequence[int], console: Console) -> float:
         with open(self.folder / "begun", "a") as file:
@@ -131,7 +128,7 @@ def test_no_time_is_told(in_process: str, tmp_path: Path) -> None:
 
 
 def test_an_address_where_nobody_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from lfpiv_cli.stages import distributed as stage
+    from lfpiv_cli.verbs import distributed as stage
 
     monkeypatch.setattr(stage, "CONNECT_S", 0.2)
     for address in ("tcp://127.0.0.1:1", "nonsense"):
@@ -140,7 +137,7 @@ def test_an_address_where_nobody_is(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 def test_without_distributed_the_remedy_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "lfpiv_cli.stages.distributed", None)
+    monkeypatch.setitem(sys.modules, "lfpiv_cli.verbs.distributed", None)
     with pytest.raises(UsageError, match=r'pip install "lfpiv\[cluster\]"'):
         work(Toy(tmp_path, 2), "local")
 

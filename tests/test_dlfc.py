@@ -10,19 +10,17 @@ import tifffile
 import yaml
 from click.testing import CliRunner
 
-from lfpiv_cli import open_weights
 from lfpiv_cli.calibration.board_pose import BoardGeometry
-from lfpiv_cli.calibration.dlfc import SeenBoard, aligned, fit_rays
-from lfpiv_cli.calibration.entrance_pupil import entrance_pupil_mm, shown
+from lfpiv_cli.calibration.dlfc import SeenBoard, aligned, entrance_pupil_mm, fit_rays, shown
 from lfpiv_cli.calibration.sheet import entrance_pupil_notices
-from lfpiv_cli.cli import cli
+from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import InputError, LfpivError
-from lfpiv_cli.optics.microlenses import Lattice
-from lfpiv_cli.optics.object_space import ObjectSpace
-from lfpiv_cli.optics.pupils import thin_lens
-from lfpiv_cli.optics.tracing import disc_points, slopes_equivalent, trace
+from lfpiv_cli.files.weights_file import open_weights
+from lfpiv_cli.optics.camera import Lattice, thin_lens
+from lfpiv_cli.optics.tracing import ObjectSpace, disc_points, trace
 from lfpiv_cli.synthetic import board as synthetic_board
 from lfpiv_cli.synthetic.board import BoardPlacement, render_board
+from tests.known_rays import slopes_equivalent
 
 BOARD = BoardGeometry((5, 4), 0.5, 0.2, medium="fluid")
 DEPTHS = (-4.0, -1.0, 1.5, 5.0)

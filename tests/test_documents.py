@@ -25,10 +25,10 @@ import tifffile
 from click.testing import CliRunner
 
 import lfpiv_cli
-from lfpiv_cli.cli import cli
+from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import LimitMissedError
 from lfpiv_cli.files import calibration_file, particle_file, vtkhdf, weights_file
-from lfpiv_cli.files.exports.series import SERIES_FORMAT, SERIES_VERSION
+from lfpiv_cli.files.exports.vtk import PLAYBACK_FORMAT, PLAYBACK_VERSION, SERIES_FORMAT, SERIES_VERSION
 from lfpiv_cli.files.particle_file import (
     PARTICLES_FORMAT,
     TRACKS_FORMAT,
@@ -36,7 +36,6 @@ from lfpiv_cli.files.particle_file import (
     read_points,
     write_points,
 )
-from lfpiv_cli.files.playback import PLAYBACK_FORMAT, PLAYBACK_VERSION
 from lfpiv_cli.files.vtkhdf import VECTORS_FORMAT, VOLUME_FORMAT
 from tests import camera_files
 
@@ -322,7 +321,7 @@ SPECIFIED = {
 # The formats with the version that is written, and those that are read.
 VERSIONS = {
     calibration_file.FORMAT: (calibration_file.VERSION,),
-    weights_file.FORMAT: (weights_file.VERSION, *weights_file.READABLE_VERSIONS),
+    weights_file.FORMAT: (weights_file.VERSION,),
     **dict.fromkeys((VOLUME_FORMAT, VECTORS_FORMAT), (vtkhdf.FORMAT_VERSION,)),
     **dict.fromkeys((PARTICLES_FORMAT, TRACKS_FORMAT, TRAJECTORIES_FORMAT), (particle_file.FORMAT_VERSION,)),
     PLAYBACK_FORMAT: (PLAYBACK_VERSION,),

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from lfpiv_cli.errors import InputError, OutputExistsError, UsageError
-from lfpiv_cli.files.log import EventLog
+from lfpiv_cli.files.atomic import EventLog
 from tests.test_batches import QUICK, images, pairs, raw, run, spoil, stamps, told, weights
 
 __all__ = ["images", "pairs", "raw", "weights"]

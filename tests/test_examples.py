@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from lfpiv_cli.cli import cli
+from lfpiv_cli.cli.main import cli
 from lfpiv_cli.files.images import read_image
 
 ROOT = Path(__file__).parent.parent

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from scipy.io import loadmat, netcdf_file
 
-from lfpiv_cli.cli import cli
+from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import InputError, OutputError, UsageError
-from lfpiv_cli.files.exports import mat, netcdf
+from lfpiv_cli.files.exports import formats
 from lfpiv_cli.files.exports.content import Content, columns_of, read_content
 from lfpiv_cli.files.exports.formats import FORMATS
 from lfpiv_cli.files.particle_file import (
@@ -100,7 +100,7 @@ def test_tecplot_is_understood_by_the_reader_of_vtk(tmp_path: Path, rng: np.rand
     reader.Update()
     zone = reader.GetOutput().GetBlock(0)
     # It keeps 32 bits.
-    places, columns = vtk_to_numpy(zone.GetPoints().GetData()), columns_of(content)
+    places, columns = vtk_to_numpy(zone.GetPoints().GetData()), columns_of(content)[0]
     np.testing.assert_allclose(places, np.stack([columns[axis] for axis in "xyz"], axis=1), rtol=1e-6)
     np.testing.assert_allclose(vtk_to_numpy(zone.GetPointData().GetArray("u")), columns["u"], rtol=1e-6)
 
@@ -249,10 +249,10 @@ def test_planes_are_counted_from_0_and_points_have_none(tmp_path: Path, rng: np.
         run("export", write_kind("tracks", tmp_path, rng), "--to", "csv", "--plane", 0)
 
 
-@pytest.mark.parametrize(("module", "to"), [(mat, "mat"), (netcdf, "netcdf")])
-def test_arrays_that_are_too_large_are_refused(module, to, tmp_path, rng, monkeypatch) -> None:
+@pytest.mark.parametrize(("limit", "to"), [("LARGEST_BYTES", "mat"), ("LARGEST_VARIABLE", "netcdf")])
+def test_arrays_that_are_too_large_are_refused(limit, to, tmp_path, rng, monkeypatch) -> None:
     source = write_kind("volume", tmp_path, rng)
-    monkeypatch.setattr(module, "LARGEST_BYTES", 40)
+    monkeypatch.setattr(formats, limit, 40)
     with pytest.raises(OutputError, match="intensity has 96 bytes"):
         run("export", source, "--to", to)
     assert sorted(tmp_path.iterdir()) == [source]

@@ -10,21 +10,22 @@ import pytest
 from benchmarks.field_tracks import tracks_of
 from benchmarks.pressure import sequence_of, trial
 from lfpiv_cli.errors import ConfigError, InputError, UsageError
-from lfpiv_cli.fields import gradients, stencils
-from lfpiv_cli.fields.acceleration import Bends, bends_in, bends_of, motion_of, motions_at, six_of, whole
-from lfpiv_cli.fields.lattice import Lattice
+from lfpiv_cli.fields import pressure, stencils
 from lfpiv_cli.fields.pressure import laplacian_at, lattice_over, pressure_field, pressure_gradients
 from lfpiv_cli.fields.samples import Samples
 from lfpiv_cli.fields.spline_field import spline_field
+from lfpiv_cli.fields.stencils import Lattice
 from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.particle_file import Points
-from lfpiv_cli.interface.pressure import link_probability, pressure_of, pressure_of_steady_flow, trajectories_from
 from lfpiv_cli.reference import FOCAL_POINT
 from lfpiv_cli.synthetic.vortices import taylor_green
+from lfpiv_cli.tracks.candidates import Seen
+from lfpiv_cli.tracks.in_time import HighDerivatives, high_derivatives_in, high_derivatives_of, motion_of, motions_at
+from lfpiv_cli.verbs.field import link_probability, pressure_of, pressure_of_steady_flow, trajectories_from
 
 TIME = np.arange(-3.0, 4.0)
-STILL = Bends(np.ones(3), np.zeros((2, 3)))
-ANY = Bends(np.ones(3), np.full((2, 3), 1e6))
+STILL = HighDerivatives(np.ones(3), np.zeros((2, 3)))
+ANY = HighDerivatives(np.ones(3), np.full((2, 3), 1e6))
 BOX = Lattice.over((0.0, 0.0, 0.0), (3.0, 2.0, 2.0), 1.0)
 
 
@@ -46,11 +47,11 @@ def test_a_quartic_is_exact_where_derivatives_may_be_large(rng):
         np.testing.assert_allclose(getattr(found, name), np.tile(derivatives[row], (2, 1)), atol=1e-6)
 
 
-@pytest.mark.parametrize("bends", [STILL, ANY])
-def test_accelerations_err_as_they_state(rng, bends):
+@pytest.mark.parametrize("high", [STILL, ANY])
+def test_accelerations_err_as_they_state(rng, high):
     derivatives = np.vstack([rng.normal(size=(3, 3)), np.zeros((2, 3))])
     position, covariance = places(rng, 4000, derivatives, (1e-3, 2e-3, 1e-2))
-    found = motion_of(position, covariance, TIME, bends)
+    found = motion_of(position, covariance, TIME, high)
     off = (found.acceleration - derivatives[2])[..., np.newaxis]
     white = np.linalg.solve(np.linalg.cholesky(found.covariance), off)[..., 0]
     # of 4000 a variance is known to 0.022 and a correlation to 0.016
@@ -67,17 +68,17 @@ def test_a_parabola_over_seven_places_has_the_textbook_error():
 def test_noise_and_fourth_derivatives_are_told_by_all_tracks(rng):
     position, covariance = places(rng, 3000, np.zeros((5, 3)), (2e-3, 2e-3, 2e-3))
     fourth = rng.normal(0.0, (0.02, 0.0, 0.0), (3000, 1, 3))
-    bends = bends_of(position + fourth * TIME[:, np.newaxis] ** 4 / 24.0, 0.25 * covariance, TIME)
-    np.testing.assert_allclose(bends.noise, 2.0, rtol=0.08)
-    assert np.sqrt(bends.variance[1, 0]) == pytest.approx(0.02, rel=0.1)
-    assert np.all(np.sqrt(bends.variance[1, 1:]) < 0.001)
+    high = high_derivatives_of(position + fourth * TIME[:, np.newaxis] ** 4 / 24.0, 0.25 * covariance, TIME)
+    np.testing.assert_allclose(high.noise, 2.0, rtol=0.08)
+    assert np.sqrt(high.variance[1, 0]) == pytest.approx(0.02, rel=0.1)
+    assert np.all(np.sqrt(high.variance[1, 1:]) < 0.001)
 
 
 def test_too_few_tracks_or_frames_tell_nothing(rng):
     position, covariance = places(rng, 29, np.zeros((5, 3)), (1e-3, 1e-3, 1e-3))
-    assert bends_of(position, covariance, TIME) is None
+    assert high_derivatives_of(position, covariance, TIME) is None
     position, covariance = places(rng, 60, np.zeros((5, 3)), (1e-3, 1e-3, 1e-3))
-    assert bends_of(position[:, :4], covariance[:, :4], TIME[:4]) is None
+    assert high_derivatives_of(position[:, :4], covariance[:, :4], TIME[:4]) is None
 
 
 def test_a_track_with_gaps_is_taken_and_one_of_two_places_is_not(rng):
@@ -89,27 +90,28 @@ def test_a_track_with_gaps_is_taken_and_one_of_two_places_is_not(rng):
     for frame in (0, 1, 2, 4, 5):
         labels[frame][1] = -1
     found = type(sequence.found)(tuple(labels), 40, sequence.found.probability)
-    tracks, motion = motions_at(found, sequence.seen, 3, bends_in(sequence.found, sequence.seen))
+    tracks, motion = motions_at(found, sequence.seen, 3, high_derivatives_in(sequence.found, sequence.seen))
     assert set(range(40)) - set(tracks.tolist()) == {1}
     assert np.isfinite(motion.acceleration).all()
     assert motion.covariance[0, 2, 2] > motion_of_all(sequence).covariance[0, 2, 2]
 
 
 def motion_of_all(sequence):
-    return motions_at(sequence.found, sequence.seen, 3, bends_in(sequence.found, sequence.seen))[1]
+    return motions_at(sequence.found, sequence.seen, 3, high_derivatives_in(sequence.found, sequence.seen))[1]
 
 
 def test_a_place_whose_errors_are_not_known_is_left_out(rng):
     sequence = sequence_of(taylor_green(0.1, 10.0), 40, rng, 0.2)
     sequence.seen[3].covariance_mm2[5] = np.nan
-    _, motion = motions_at(sequence.found, sequence.seen, 3, bends_in(sequence.found, sequence.seen))
+    _, motion = motions_at(sequence.found, sequence.seen, 3, high_derivatives_in(sequence.found, sequence.seen))
     assert np.isfinite(motion.acceleration).all()
 
 
 def test_six_elements_make_a_matrix(rng):
     half = rng.normal(size=(4, 3, 3))
     matrices = half + half.swapaxes(1, 2)
-    np.testing.assert_array_equal(whole(six_of(matrices)), matrices)
+    six = matrices[:, [0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2]]
+    np.testing.assert_array_equal(Seen(np.zeros((4, 3)), six).covariances(), matrices)
 
 
 def gradient_samples(rng, count=60):
@@ -122,11 +124,11 @@ def test_the_matrix_of_gradients_is_that_of_a_small_box(rng):
     samples = gradient_samples(rng)
     weight = np.linalg.inv(samples.covariance_mm2)
     matrix = stencils.empty(BOX, 1)
-    gradients.add_gradients(matrix, BOX, samples.points_mm, weight)
-    whole_matrix, right = gradients.GradientBox.around(BOX, samples).normal(weight)
+    pressure.add_gradients(matrix, BOX, samples.points_mm, weight)
+    whole_matrix, right = pressure.GradientBox.around(BOX, samples).normal(weight)
     np.testing.assert_allclose(stencils.dense(matrix), whole_matrix, atol=1e-10)
     weighted = np.einsum("nij,nj->ni", weight, samples.value_mm)
-    np.testing.assert_allclose(gradients.right_hand_side(BOX, samples.points_mm, weighted), right, atol=1e-10)
+    np.testing.assert_allclose(pressure.right_hand_side(BOX, samples.points_mm, weighted), right, atol=1e-10)
 
 
 def test_gradients_of_splines_are_their_differences(rng):
@@ -139,7 +141,7 @@ def test_gradients_of_splines_are_their_differences(rng):
         columns, values = stencils.rows_of(BOX, at)
         return np.sum(values * coefficients.ravel()[columns], axis=1)
 
-    found = gradients.gradient_at(points, BOX, coefficients)
+    found = pressure.gradient_at(points, BOX, coefficients)
     for axis in range(3):
         shift = step * np.eye(3)[axis]
         np.testing.assert_allclose(

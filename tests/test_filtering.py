@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lfpiv_cli.flow.filtering import INTERPOLATION_VOXEL, mixing, smooth_field, unresolved
+from lfpiv_cli.flow.outliers import INTERPOLATION_VOXEL, mixing, smooth_field, unresolved
 
 SHAPE = (12, 16, 12)
 

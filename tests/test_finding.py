@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ import pytest
 
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.files.batch import Frame
-from lfpiv_cli.stages import finding
+from lfpiv_cli.verbs import particles
 
 BAD = 2
 
@@ -19,19 +18,19 @@ BAD = 2
 @pytest.fixture
 def searched(monkeypatch: pytest.MonkeyPatch) -> None:
     """Searches that return words for how they were made, of frames that are their own numbers."""
-    stub = SimpleNamespace(
-        Frame=int,
-        frame_of=lambda bench, raw, lit: int(raw),
-        find=lambda bench, frame, advance: f"{frame} alone",
-        find_first=lambda bench, frame, advance: f"{frame}",
-        find_second=lambda bench, frame, before, first, advance: f"{frame} after {first}",
-        find_beside=lambda bench, frame, own, others: f"{own} beside {' and '.join(others)}",
-    )
-    monkeypatch.setattr(finding, "particles", stub)
-    monkeypatch.setattr(finding, "check_frame", lambda bench, raw, name: None)
+    stub = {
+        "frame_of": lambda bench, raw, lit: int(raw),
+        "find": lambda bench, frame, advance: f"{frame} alone",
+        "find_first": lambda bench, frame, advance: f"{frame}",
+        "find_second": lambda bench, frame, before, first, advance: f"{frame} after {first}",
+        "find_beside": lambda bench, frame, own, others: f"{own} beside {' and '.join(others)}",
+        "check_frame": lambda bench, raw, name: None,
+    }
+    for name, search in stub.items():
+        monkeypatch.setattr(particles, name, search)
 
 
-def finder(pairing: str, keep_going: bool) -> finding.Finder:
+def finder(pairing: str, keep_going: bool) -> particles.Finder:
     def read(number: int) -> tuple[Any, Any]:
         if number == BAD:
             raise InputError(f"f{number}.tif: is empty")
@@ -41,7 +40,7 @@ def finder(pairing: str, keep_going: bool) -> finding.Finder:
     if pairing == "sequence":
         beside, first_of = [(1,), (0, 2), (1, 3), (2,)], {}
     frames = [Frame(Path(f"f{number}.tif"), 0, 1) for number in range(4)]
-    return finding.Finder(None, read, frames, beside, first_of, keep_going)  # type: ignore[arg-type]
+    return particles.Finder(None, read, frames, beside, first_of, keep_going)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 import lfpiv_cli as lf
-from lfpiv_cli.cli import cli
+from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import InputError, OutputExistsError, PartialError, StoppedEarlyError, UsageError
 from lfpiv_cli.files.batch import Frame
 from lfpiv_cli.files.images import write_tiff
@@ -21,7 +21,7 @@ from lfpiv_cli.files.particle_file import TRAJECTORIES_FORMAT, Points, read_poin
 from lfpiv_cli.files.shares import Deadline
 from lfpiv_cli.particles.fitting import add_all
 from lfpiv_cli.particles.view import raw_view
-from lfpiv_cli.stages import follow as stage
+from lfpiv_cli.verbs import follow as stage
 
 ROOT = Path(__file__).parent.parent
 FRAMES, COUNT = 4, 12

@@ -10,12 +10,10 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from lfpiv_cli.scale import Scale
-from lfpiv_cli.synthetic.flows import Flow, advect, random_modes, rigid_rotation
-from lfpiv_cli.tracks.candidates import Seen
-from lfpiv_cli.tracks.light import Light
-from lfpiv_cli.tracks.sequences import PAST_FRAMES, SoFar, begun, follow, followed_further
-from lfpiv_cli.tracks.smoothing import REACH_FRAMES, expected_in
-from lfpiv_cli.tracks.trajectories import NO_TRACK, long_ones
+from lfpiv_cli.synthetic.flows import advect, random_modes, rigid_rotation
+from lfpiv_cli.synthetic.vortices import Flow
+from lfpiv_cli.tracks.candidates import NO_TRACK, Light, Seen, long_ones
+from lfpiv_cli.tracks.sequences import PAST_FRAMES, REACH_FRAMES, SoFar, begun, expected_in, follow, followed_further
 
 BOX_MM, DT_S = 3.2, 0.002
 SEARCH_MM = 0.4

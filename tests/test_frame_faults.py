@@ -12,10 +12,10 @@ import pytest
 import tifffile
 
 from lfpiv_cli.errors import InputError
-from lfpiv_cli.files.checksums import ensure_verified
 from lfpiv_cli.files.images import count_pages, read_image
-from lfpiv_cli.files.recordings import tiff_chain
-from lfpiv_cli.files.recordings.complaints import taken_complaints
+from lfpiv_cli.files.listing import ensure_verified
+from lfpiv_cli.files.recordings import tiff
+from lfpiv_cli.files.recordings.recording import taken_complaints
 from tests import camera_files
 from tests.hostile_files import ended
 
@@ -44,7 +44,7 @@ def test_directories_without_an_image_are_no_pages(tmp_path: Path) -> None:
 
 
 def test_a_chain_without_an_end_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tiff_chain, "MOST_PAGES", 50)
+    monkeypatch.setattr(tiff, "MOST_PAGES", 50)
     path = tmp_path / "many.tif"
     path.write_bytes(directories(51))
     code, said = ended("check", CONFIG, path)

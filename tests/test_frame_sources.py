@@ -11,7 +11,7 @@ from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files.atomic import write_json
 from lfpiv_cli.files.batch import Frame
 from lfpiv_cli.files.hdf5 import write_header
-from lfpiv_cli.stages.pairs import PairOptions, image_pairs, result_pairs
+from lfpiv_cli.verbs.pairs import PairOptions, image_pairs, result_pairs
 
 AB = PairOptions(pairing="ab")
 

@@ -10,7 +10,7 @@ import pytest
 import tifffile
 import yaml
 
-from lfpiv_cli.cli.outcome import print_json
+from lfpiv_cli.cli.options import print_json
 from tests.hostile_files import ended
 
 ROOT = Path(__file__).parent.parent

@@ -28,7 +28,7 @@ LAYERS = (
     {"validation"},
     {"files"},
     {"console"},
-    {"interface"},
+    {"verbs"},
     {"stages"},
     {"paper"},
     {"cli"},

@@ -9,7 +9,7 @@ import pytest
 import yaml
 from click.testing import CliRunner
 
-from lfpiv_cli.cli import cli
+from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files.hdf5 import write_tree
 from lfpiv_cli.files.particle_file import (

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import lfpiv_cli as lf
-from lfpiv_cli.cli import cli
+from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import ConfigError, InputError, UsageError
 from lfpiv_cli.files.images import write_tiff
 

@@ -19,25 +19,23 @@ from lfpiv_cli.flow.moments import MOMENTS, pair_moments
 from lfpiv_cli.flow.windows import layout_windows
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import Layout
-from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.optics.microlenses import Lattice
-from lfpiv_cli.optics.object_space import ObjectSpace
+from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.particles.fitting import add_all
 from lfpiv_cli.particles.view import raw_view
-from lfpiv_cli.simd import combine, splines
+from lfpiv_cli.simd import block_sums, combine
 from lfpiv_cli.synthetic.render import Balls, render_points
 from lfpiv_cli.weights.build import factorise
 from lfpiv_cli.weights.operators import adjoint_reference, forward_reference
-from lfpiv_cli.weights.quadrature import integrate_columns
-from lfpiv_cli.weights.rays import RayCount, count_rays, sampling_error
+from lfpiv_cli.weights.quadrature import RayCount, count_rays, integrate_columns, sampling_error
 
 # Off the axis and out of focus: a point's light goes through several lenses.
 PLACE_MM, POINT_MM = (0.02, -0.01, 1.8), (1e-3, 1e-3, 1e-3)
 
 
 def test_readable_twins_stand_for_intrinsics_where_nothing_is_compiled() -> None:
-    assert (splines.interpolate is splines.interpolate_reference) == bool(config.DISABLE_JIT)
+    assert (block_sums.interpolate is block_sums.interpolate_reference) == bool(config.DISABLE_JIT)
     assert isfunction(combine.combine_long) == bool(config.DISABLE_JIT)
 
 

@@ -16,9 +16,9 @@ from lfpiv_cli.files.batch import frames_of
 from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, read_points, read_tracks, write_points
 from lfpiv_cli.files.vtkhdf import open_vectors
-from lfpiv_cli.stages import run as run_stage
-from lfpiv_cli.stages.intervals import frames_dt_notices
-from lfpiv_cli.stages.run_options import RunOptions
+from lfpiv_cli.verbs import run as run_stage
+from lfpiv_cli.verbs.frames import frames_dt_notices
+from lfpiv_cli.verbs.run_steps import RunOptions
 from tests.camera_files import STEP_US, write_cine
 from tests.test_particle_stage import run, write_frame
 

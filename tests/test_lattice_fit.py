@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lfpiv_cli.calibration.lattice import fit_lattice, without_strays
-from lfpiv_cli.calibration.spectrum import lattice_vectors
-from lfpiv_cli.calibration.spots import index_spots
+from lfpiv_cli.calibration.lattice import fit_lattice, lattice_vectors, without_strays
+from lfpiv_cli.calibration.white import index_spots
 from lfpiv_cli.errors import InputError
-from lfpiv_cli.optics.microlenses import Lattice
+from lfpiv_cli.optics.camera import Lattice
 
 SHAPE = (220, 260)
 

@@ -15,8 +15,7 @@ from lfpiv_cli.calibration.light_checks import dark_notices, level_notices, posi
 from lfpiv_cli.calibration.rectification import Rectification
 from lfpiv_cli.calibration.sheet import sheet_fit
 from lfpiv_cli.files.provenance import also_used_as
-from lfpiv_cli.optics.camera import Camera
-from lfpiv_cli.optics.microlenses import Lattice
+from lfpiv_cli.optics.camera import Camera, Lattice
 
 SHAPE = (170, 200)
 PITCH_PX, RADIUS_PX = 10.3, 4.9

@@ -9,11 +9,10 @@ import pytest
 from numpy.typing import NDArray
 
 from lfpiv_cli.errors import ConfigError
-from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.line_responses import PHASES, LineResponses
 from lfpiv_cli.optics.media import Media, Window
-from lfpiv_cli.optics.microlenses import Lattice
-from lfpiv_cli.optics.object_space import ObjectSpace
+from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.optics.waves import Waves, WavesInCamera
 from lfpiv_cli.particles.least_squares import respond_all, room_for
 from lfpiv_cli.particles.view import Light, View, entry_capacity, raw_view

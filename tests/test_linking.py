@@ -9,13 +9,20 @@ import pytest
 
 from benchmarks.links import SCALE, Turbulence, shares
 from lfpiv_cli.synthetic.flows import random_modes
-from lfpiv_cli.tracks.association import marginals
-from lfpiv_cli.tracks.candidates import Candidates, Seen
+from lfpiv_cli.tracks.candidates import Candidates, Light, Seen, light_ratio
 from lfpiv_cli.tracks.gridding import on_grid
 from lfpiv_cli.tracks.kriging import Structure, kriged, structure_of
-from lfpiv_cli.tracks.light import Light, light_ratio
-from lfpiv_cli.tracks.tracking import Forecast, track
-from lfpiv_cli.tracks.votes import ALONE, LEAST_LIGHT_RATIO, NEIGHBOURS, REACH, WIDTHS_LENSES, votes
+from lfpiv_cli.tracks.tracking import (
+    ALONE,
+    LEAST_LIGHT_RATIO,
+    NEIGHBOURS,
+    REACH,
+    WIDTHS_LENSES,
+    Forecast,
+    marginals,
+    track,
+    votes,
+)
 
 # The paper's seeding in a corner of its volume: particles half a millimetre apart.
 SMALL = Turbulence(side_mm=5.0)

@@ -9,15 +9,25 @@ from types import SimpleNamespace
 import click
 import pytest
 
-from lfpiv_cli.cli import cli
+from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import InputError
-from lfpiv_cli.files.listing import expanded, in_natural_order, listed
+from lfpiv_cli.files.listing import expanded, files_in, listed
 
 
-def test_numbers_in_names_count_by_their_value() -> None:
+def test_numbers_in_names_count_by_their_value(tmp_path: Path) -> None:
     names = ["b10.tif", "a2.tif", "b9.tif", "B1.tif", "a2_1.tif", "a10.tif", "a02.tif"]
-    ordered = [path.name for path in in_natural_order([Path(name) for name in names])]
-    assert ordered == ["a02.tif", "a2.tif", "a2_1.tif", "a10.tif", "B1.tif", "b9.tif", "b10.tif"]
+    for name in names:
+        (tmp_path / name).touch()
+    found = [path.name for path in files_in(tmp_path, "images")]
+    assert found == [
+        "a02.tif",
+        "a2.tif",
+        "a2_1.tif",
+        "a10.tif",
+        "B1.tif",
+        "b9.tif",
+        "b10.tif",
+    ]
 
 
 def test_a_list_names_a_file_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

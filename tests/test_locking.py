@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from lfpiv_cli.flow.correlation import CorrelationSettings, correlate
-from lfpiv_cli.flow.locking import LOCKING_LENSES, with_locking
+from lfpiv_cli.flow.peaks import LOCKING_LENSES, with_locking
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.reference import Reference
 from lfpiv_cli.scale import Scale

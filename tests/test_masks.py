@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lfpiv_cli.flow.masks import ParallelWalls, RoundWall, inside, rectangle_in_circle
+from lfpiv_cli.flow.windows import ParallelWalls, RoundWall, inside, rectangle_in_circle
 from lfpiv_cli.grid import Grid
 
 

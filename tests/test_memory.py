@@ -9,15 +9,14 @@ import numpy as np
 import pytest
 
 from lfpiv_cli.errors import OutputError
-from lfpiv_cli.files import memory
+from lfpiv_cli.files import inputs
 from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.vtkhdf import write_volume
-from lfpiv_cli.flow.correlation import CorrelationSettings
-from lfpiv_cli.flow.footprint import held_bytes
+from lfpiv_cli.flow.correlation import CorrelationSettings, held_bytes
 from lfpiv_cli.grid import Grid
-from lfpiv_cli.interface import planning
 from lfpiv_cli.reference import FOCAL_POINT
 from lfpiv_cli.validation.planning import depth_of_field_mm
+from lfpiv_cli.verbs import planning
 from tests.hostile_files import ended
 from tests.test_batches import QUICK, images, raw, weights
 
@@ -35,8 +34,8 @@ def system(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (folder / "self" / "status").write_text(STATUS)
     (folder / "meminfo").write_text("MemTotal: 20000000 kB\nMemAvailable: 9000000 kB\nSwapFree: 1000000 kB\n")
     for name, place in (("PROCESS", "self"), ("MACHINE", "meminfo"), ("CONTROL_GROUPS", "groups")):
-        monkeypatch.setattr(memory, name, folder / place)
-    monkeypatch.setattr(memory, "address_space", lambda: None)
+        monkeypatch.setattr(inputs, name, folder / place)
+    monkeypatch.setattr(inputs, "address_space", lambda: None)
     return folder
 
 
@@ -51,13 +50,13 @@ def volume(path: Path, offset: int) -> Path:
 
 
 def test_each_limit_counts(system: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    memory.ensure_room(10e9, "work")
+    inputs.ensure_room(10e9, "work")
     with pytest.raises(OutputError, match=r"work needs 11\.30 GB.* 10\.24 GB are left of this machine"):
-        memory.ensure_room(11e9, "work")
-    monkeypatch.setattr(memory, "address_space", lambda: 3_024_000_000)
-    memory.ensure_room(1.9e9, "work")
+        inputs.ensure_room(11e9, "work")
+    monkeypatch.setattr(inputs, "address_space", lambda: 3_024_000_000)
+    inputs.ensure_room(1.9e9, "work")
     with pytest.raises(OutputError, match=r"2\.00 GB are left of this process's address space"):
-        memory.ensure_room(2.1e9, "work")
+        inputs.ensure_room(2.1e9, "work")
 
 
 @pytest.mark.parametrize(
@@ -70,18 +69,18 @@ def test_a_jobs_limit_holds_for_all_in_it(system: Path, line: str, file: str) ->
     place = system / "groups" / file
     place.parent.mkdir(parents=True)
     place.write_text("max\n")
-    memory.ensure_room(3e9, "work")
+    inputs.ensure_room(3e9, "work")
     place.write_text("2512000000\n")
-    memory.ensure_room(1.9e9, "work")
+    inputs.ensure_room(1.9e9, "work")
     with pytest.raises(OutputError, match=r"2\.00 GB are left of this job's limit"):
-        memory.ensure_room(2.1e9, "work")
+        inputs.ensure_room(2.1e9, "work")
 
 
 def test_other_systems_set_no_limit(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     for name in ("PROCESS", "MACHINE", "CONTROL_GROUPS"):
-        monkeypatch.setattr(memory, name, tmp_path / "none")
-    monkeypatch.setattr(memory, "address_space", lambda: None)
-    memory.ensure_room(1e18, "work")
+        monkeypatch.setattr(inputs, name, tmp_path / "none")
+    monkeypatch.setattr(inputs, "address_space", lambda: None)
+    inputs.ensure_room(1e18, "work")
 
 
 def test_a_correlation_that_does_not_fit_is_not_begun(system: Path, tmp_path: Path) -> None:
@@ -162,7 +161,7 @@ def test_work_that_does_not_fit_is_refused_before_any(
 @pytest.mark.thorough
 def test_weights_that_the_disk_has_no_room_for_are_not_begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     usage = shutil.disk_usage(tmp_path)
-    monkeypatch.setattr(memory.shutil, "disk_usage", lambda _: usage._replace(free=1_000))
+    monkeypatch.setattr(inputs.shutil, "disk_usage", lambda _: usage._replace(free=1_000))
     rig = rig_of(tmp_path, "fluid: 1.33}", "fluid: 1.33}")
     code, said = ended("build-weights", rig, "-o", tmp_path / "w.h5")
     assert (code, "w.h5: needs 0.00 GB, and 0.00 GB are free on the disk" in said) == (7, True), said

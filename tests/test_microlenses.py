@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lfpiv_cli.optics.microlenses import Lattice, nearest_point
+from lfpiv_cli.optics.camera import Lattice, nearest_point
 
 
 def lattice_of(layout, rotation_rad=0.02, origin=(0.013, -0.027)):

@@ -13,10 +13,9 @@ from typing import Any, Literal, get_args, get_origin
 import click
 import pytest
 
-from lfpiv_cli.cli import cli
-from lfpiv_cli.files.section_types import Section
-from lfpiv_cli.files.sections import CorrelationSection, Sections
-from lfpiv_cli.files.sections_simulated import FlowSection
+from lfpiv_cli.cli.main import cli
+from lfpiv_cli.files.sections import CorrelationSection, Section
+from lfpiv_cli.files.sections_simulated import FlowSection, Sections
 from lfpiv_cli.names import (
     BoardMethod,
     Divergence,

@@ -14,6 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 import lfpiv_cli as lf
+from lfpiv_cli.calibration.light_checks import check_residual, residual_share
 from lfpiv_cli.calibration.sheet import (
     board_notices,
     check_f_numbers,
@@ -24,9 +25,8 @@ from lfpiv_cli.calibration.sheet import (
     points_notices,
     sheet_fit,
 )
-from lfpiv_cli.calibration.transmission import lens_image_width
-from lfpiv_cli.calibration.white_checks import check_residual, residual_share
-from lfpiv_cli.cli import cli
+from lfpiv_cli.calibration.white import lens_image_width
+from lfpiv_cli.cli.main import cli
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.files.batch import Target, pending
@@ -37,17 +37,16 @@ from lfpiv_cli.files.images import write_tiff
 from lfpiv_cli.files.particle_file import Points
 from lfpiv_cli.files.provenance import earlier_record, with_warnings
 from lfpiv_cli.files.weights_file import open_weights
-from lfpiv_cli.interface.particles import light_notices
-from lfpiv_cli.interface.tracks import Tracked, doubt_notices, few_notices, still_notices
-from lfpiv_cli.interface.weights import plan_of
-from lfpiv_cli.interface.weights_cost import cost_notices, cost_of
 from lfpiv_cli.notice import Notice
-from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.camera import Camera, Lattice, thin_lens
 from lfpiv_cli.optics.media import Media, Window
-from lfpiv_cli.optics.microlenses import Lattice
-from lfpiv_cli.optics.paraxial import refraction_error_mm, sine_error_mm
-from lfpiv_cli.optics.pupils import thin_lens
+from lfpiv_cli.optics.tracing import refraction_error_mm, sine_error_mm
 from lfpiv_cli.reference import Reference
+from lfpiv_cli.verbs.build_weights import plan_of
+from lfpiv_cli.verbs.checks import doubt_notices, few_notices, still_notices
+from lfpiv_cli.verbs.tracers import light_notices
+from lfpiv_cli.verbs.tracks import Tracked
+from lfpiv_cli.verbs.weights_cost import cost_notices, cost_of
 from lfpiv_cli.weights.operators import FactorisedOperator
 
 ROOT = Path(__file__).parent.parent
@@ -375,7 +374,7 @@ def test_few_links_are_told_where_particles_are_many(counts: tuple[int, int], li
         {"tracks": linked, "expected_wrong_links": 0.0},
         load_config(ROOT / "configs" / "sample.yaml"),
     )
-    assert [notice.code for notice in few_notices(counts, ("a", "b"), found)] == told
+    assert [notice.code for notice in few_notices(counts, ("a", "b"), found.summary, found.points)] == told
 
 
 @pytest.mark.parametrize(

@@ -12,20 +12,18 @@ import pytest
 from lfpiv_cli.calibration.board_pose import BoardGeometry, pose_of_dots
 from lfpiv_cli.calibration.lattice import fit_lattice
 from lfpiv_cli.calibration.lens_light import LensImages
+from lfpiv_cli.calibration.light_checks import field_depth, field_notices, shape_notices, shapes_of
 from lfpiv_cli.calibration.model import Photographs, calibrate
-from lfpiv_cli.calibration.objective_checks import field_depth, field_notices, shape_notices, shapes_of
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files.config import load_config
-from lfpiv_cli.optics.camera import Camera, Objective
+from lfpiv_cli.optics.camera import Camera, Lattice, Objective
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.optics.microlenses import Lattice
-from lfpiv_cli.optics.object_space import ObjectSpace
-from lfpiv_cli.optics.tracing import disc_points
+from lfpiv_cli.optics.tracing import ObjectSpace, disc_points
 from lfpiv_cli.optics.waves import Waves, WavesInCamera
-from lfpiv_cli.stages.simulate import real_camera
 from lfpiv_cli.synthetic.board import BoardPlacement, render_board
 from lfpiv_cli.synthetic.objective import objective_of, passed_light, passes_barrel, trace_real_ray
 from lfpiv_cli.synthetic.render import Balls, render_points, render_white
+from lfpiv_cli.verbs.simulate import real_camera
 
 SAMPLE = Path(__file__).parent.parent / "configs" / "sample.yaml"
 AIR = ObjectSpace(Media(), None, "paraxial")

@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 import yaml
 
-from lfpiv_cli import open_weights
 from lfpiv_cli.errors import InputError, UsageError
-from lfpiv_cli.files.weights_file import WeightsFile
+from lfpiv_cli.files.weights_file import WeightsFile, open_weights
 from tests.hostile_files import ended
 
 SAMPLE = Path(__file__).parent.parent / "configs" / "sample.yaml"

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import pairwise
+from pathlib import PurePath
 
 import pytest
 
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files.frame_names import places_by
-from lfpiv_cli.files.pairing import Pairs, Seen, contradiction, in_order, pair_names
+from lfpiv_cli.files.pairing import Pairs, Seen, contradiction, in_order, pair_frames
+from lfpiv_cli.names import Pairing
 
 # What a camera calls the frames of pair `k`, first and second.
 SEPARATE: dict[str, Callable[[int], tuple[str, str]]] = {
@@ -36,6 +38,11 @@ RUNNING: dict[str, Callable[[int], str]] = {
     "a word behind": lambda n: f"img_{n:04d}_8bit",
     "a camera's serial number": lambda n: f"C001H001S0001_{n:06d}",
 }
+
+
+def pair_names(names: Sequence[str], how: Pairing, by: str | None = None) -> Pairs:
+    """Return which of the frames with these names belong together."""
+    return pair_frames([Seen(name, PurePath(name).name, PurePath(name).as_posix()) for name in names], how, by)
 
 
 def named(names: list[str], found: Pairs) -> set[tuple[str, str]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import sys
-from dataclasses import replace
+from dataclasses import asdict, replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -14,16 +14,14 @@ import pytest
 import yaml
 from click.testing import CliRunner
 
-from lfpiv_cli.cli import cli
+from lfpiv_cli.cli.main import cli
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import InputError, LimitMissedError, OutputExistsError, UsageError
 from lfpiv_cli.files.pages import Table, ensure_pages
 from lfpiv_cli.names import PaperPart, names_in
 from lfpiv_cli.paper import run
-from lfpiv_cli.paper.parts import Drawing, Findings, Row, Work, plain, read_json, rows_of
-from lfpiv_cli.paper.registry import PARTS, Part
-from lfpiv_cli.paper.rig import TABLE_2, sections
-from lfpiv_cli.paper.run import PaperOptions, validate_paper
+from lfpiv_cli.paper.parts import TABLE_2, Drawing, Findings, Row, Work, read_json, rows_of, sections
+from lfpiv_cli.paper.run import PARTS, PaperOptions, Part, validate_paper
 
 ROOT = Path(__file__).parents[1]
 TINY = PaperOptions(size="tiny")
@@ -106,7 +104,7 @@ def test_verdicts(changes: dict[str, Any], verdict: str) -> None:
     row = replace(GOOD, **changes)
     assert row.verdict == verdict
     if changes.get("best") == changes.get("best"):  # nan does not equal itself
-        assert rows_of(plain([row])) == (row,)
+        assert rows_of([asdict(row) | {"verdict": row.verdict}]) == (row,)
 
 
 def test_a_page_holds_its_pictures_and_loads_nothing(parts, tmp_path) -> None:

@@ -9,10 +9,10 @@ from lfpiv_cli.console import Console
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.paper import table3
 from lfpiv_cli.paper.parts import Findings, Work
+from lfpiv_cli.paper.pictures import BoardView, location_figure
 from lfpiv_cli.paper.table3 import table3_experiment
 from lfpiv_cli.synthetic import board as rendering
 from lfpiv_cli.validation.board import MEASURES
-from lfpiv_cli.validation.board_comparison import BoardView, location_figure
 
 QUIET = Console(quiet=True)
 

@@ -13,13 +13,12 @@ from lfpiv_cli.files.config import load_config
 from lfpiv_cli.flow.field import REJECTED, VALID, VectorField
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.paper import table4 as part
-from lfpiv_cli.paper.channel import FULL, QUICK, TINY
+from lfpiv_cli.paper.bubbles import near_wall
 from lfpiv_cli.paper.parts import Work
-from lfpiv_cli.stages.chain import board_depths
-from lfpiv_cli.validation.channel import PAPER_OVERALL, PAPER_SLICES, Duct
-from lfpiv_cli.validation.methods import Measured
-from lfpiv_cli.validation.near_wall import near_wall
-from lfpiv_cli.validation.pictures import profile_at, slice_at
+from lfpiv_cli.paper.table4 import FULL, QUICK, TINY
+from lfpiv_cli.validation.flow import PAPER_OVERALL, PAPER_SLICES, Duct
+from lfpiv_cli.validation.methods import Measured, profile_at, slice_at
+from lfpiv_cli.verbs.chain import board_depths
 
 DUCT = Duct(4.0, (0.0, 0.0, 0.0), "x", 0.1082)
 GRID = Grid.centred((4, 10, 10), (0.4, 0.4, 0.4), (0.0, 0.0, 0.0))
@@ -97,15 +96,15 @@ def test_windows_beside_a_wall_are_judged_alone() -> None:
     velocity[:, beside, :, 0] = 0.5
     velocity[:5, beside, :, 0] = 1.1
     found = near_wall(measured(velocity), DUCT)
-    assert found.windows == 10 * 2 * 4
-    assert found.mean_error == pytest.approx(0.5 * (-0.5 + 0.1))
-    assert found.within_25 == 0.5
-    assert found.within_sigma == pytest.approx(0.5 / np.sqrt(80))
+    assert found["windows"] == 10 * 2 * 4
+    assert found["mean_error"] == pytest.approx(0.5 * (-0.5 + 0.1))
+    assert found["within_25"] == 0.5
+    assert found["within_sigma"] == pytest.approx(0.5 / np.sqrt(80))
     # the errors are 0.3 about their mean
-    assert found.mean_sigma == pytest.approx(0.3 / np.sqrt(80))
+    assert found["mean_sigma"] == pytest.approx(0.3 / np.sqrt(80))
     # a miss is not within anything
     velocity[0, beside, 0] = np.nan
-    assert near_wall(measured(velocity), DUCT).within_25 == pytest.approx(38 / 80)
+    assert near_wall(measured(velocity), DUCT)["within_25"] == pytest.approx(38 / 80)
 
 
 def test_profiles_are_means_of_a_slice_between_planes() -> None:

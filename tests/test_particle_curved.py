@@ -9,19 +9,17 @@ import pytest
 from numpy.typing import NDArray
 
 from lfpiv_cli.errors import ConfigError
-from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.curved_space import CurvedSpace, Face
 from lfpiv_cli.optics.media import Media, Window
-from lfpiv_cli.optics.microlenses import Lattice
-from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.optics.surfaces import Cylinder, Plane
-from lfpiv_cli.optics.tracing import disc_points, trace
+from lfpiv_cli.optics.tracing import ObjectSpace, disc_points, trace
 from lfpiv_cli.particles.fitting import add_all, refine
-from lfpiv_cli.particles.least_squares import lit_by, observation_of, respond_all, respond_once, room_for
+from lfpiv_cli.particles.least_squares import lit_by, observation_of, respond_all, room_for
 from lfpiv_cli.particles.pencil import MEAN_SQUARE, NODES, WEIGHTS, cubic_at, pencil_of
 from lfpiv_cli.particles.refraction import on_line_of_sight, places_by_snell
-from lfpiv_cli.particles.tiles import tile_side_mm
-from lfpiv_cli.particles.view import View, entry_capacity, footprint_radius_mm, on_array_mm, raw_view
+from lfpiv_cli.particles.view import View, entry_capacity, footprint_radius_mm, on_array_mm, raw_view, tile_side_mm
+from tests.particle_twin import respond_once
 
 RADIUS_MM = 0.025
 DEPTHS = (-4.5, 4.5)

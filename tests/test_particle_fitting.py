@@ -10,17 +10,15 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.optics.microlenses import Lattice
-from lfpiv_cli.particles.alternative_depths import try_other_depths
 from lfpiv_cli.particles.covariance import joint_covariance
 from lfpiv_cli.particles.fitting import Least, accept, add_all, claimed_share, judge, refine
-from lfpiv_cli.particles.least_squares import Observation, normal_equations, observation_of, respond_once
+from lfpiv_cli.particles.least_squares import Observation, normal_equations, observation_of
 from lfpiv_cli.particles.noise import WHITE, Correlation, Noise, error_correlation, measured_noise
-from lfpiv_cli.particles.splitting import split
-from lfpiv_cli.particles.tiles import groups_of_tiles
-from lfpiv_cli.particles.view import View, entry_capacity, raw_view, with_radius
+from lfpiv_cli.particles.suspects import split, try_other_depths
+from lfpiv_cli.particles.view import View, entry_capacity, groups_of_tiles, raw_view, with_radius
+from tests.particle_twin import respond_once
 
 # The fits take half a minute to compile.
 pytestmark = pytest.mark.thorough

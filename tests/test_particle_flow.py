@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lfpiv_cli.cli import cli
+from lfpiv_cli.cli.main import cli
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, read_points
 from lfpiv_cli.files.particles import read_particles
-from lfpiv_cli.validation.particles import particle_figures
+from lfpiv_cli.validation.volume import particle_figures
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 

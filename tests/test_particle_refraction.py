@@ -9,7 +9,7 @@ import pytest
 
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media, Window, exact_lateral_mm
-from lfpiv_cli.optics.object_space import ObjectSpace
+from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.particles.fitting import add_all, refine
 from lfpiv_cli.particles.least_squares import observation_of
 from lfpiv_cli.particles.refraction import paraxial_shift, places_by_snell

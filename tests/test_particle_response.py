@@ -9,16 +9,15 @@ import pytest
 from numpy.typing import NDArray
 
 from lfpiv_cli.names import Layout
-from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.optics.microlenses import Lattice
-from lfpiv_cli.particles.cells import cell_shares, level_at, share_at
+from lfpiv_cli.optics.tracing import ObjectSpace
+from lfpiv_cli.particles.cells import cell_shares, covered_share, level_at, rim_table, share_at
 from lfpiv_cli.particles.fitting import add_all, refine
 from lfpiv_cli.particles.least_squares import observation_of
-from lfpiv_cli.particles.response import respond
-from lfpiv_cli.particles.rim import covered_share, rim_table
 from lfpiv_cli.particles.view import View, entry_capacity, raw_view
-from lfpiv_cli.synthetic.render import Balls, ObjectSpace, render_points
+from lfpiv_cli.synthetic.render import Balls, render_points
+from tests.particle_twin import respond
 
 RADIUS_MM = 0.025
 # In, near and out of focus, on both sides, off the axis; light goes through 1 to 50 lenses.

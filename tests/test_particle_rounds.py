@@ -12,12 +12,11 @@ from scipy.spatial import KDTree
 
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import ColumnAxis, Layout
-from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.optics.microlenses import Lattice
-from lfpiv_cli.optics.object_space import ObjectSpace
-from lfpiv_cli.particles.candidates import boxes_of, explain_rest, find_peaks
+from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.particles.fitting import add_all
+from lfpiv_cli.particles.joining import boxes_of, explain_rest, find_peaks
 from lfpiv_cli.particles.rounds import ROUNDS, find_particles, first_pass, first_typical_light
 from lfpiv_cli.particles.search import noise_with, task_of
 from lfpiv_cli.particles.view import raw_view

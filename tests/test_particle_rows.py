@@ -9,16 +9,16 @@ import pytest
 from numba import njit
 from numpy.typing import NDArray
 
-from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media, Window
-from lfpiv_cli.optics.microlenses import Lattice
-from lfpiv_cli.optics.object_space import ObjectSpace
-from lfpiv_cli.particles.least_squares import lit_by, respond_all, respond_once, room_for
+from lfpiv_cli.optics.tracing import ObjectSpace
+from lfpiv_cli.particles.cells import rim_table
+from lfpiv_cli.particles.least_squares import lit_by, respond_all, room_for
 from lfpiv_cli.particles.noise import Noise, pixel_weights
-from lfpiv_cli.particles.rim import rim_table
 from lfpiv_cli.particles.view import View, entry_capacity, raw_view
 from lfpiv_cli.simd import micro_images
 from lfpiv_cli.simd.micro_images import OF_ROW, PROFILE_ROWS, RIM_ROWS, STRIDE, WHOLE, CurvedNumbers, JoinNumbers
+from tests.particle_twin import respond_once
 
 # In, near and out of focus, on both sides, off the axis, and over the sensor's edge; one on the corner of four lenses.
 PLACES = [(0.31, -0.2, 3.0), (0.53, 0.21, 0.02), (-0.063, 0.07, 0.2), (0.2, 0.3, -4.0), (1.08, 0.2, 1.0)]

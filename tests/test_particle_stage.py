@@ -10,7 +10,7 @@ import pytest
 import tifffile
 from scipy.spatial import KDTree
 
-from lfpiv_cli.cli import cli
+from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import InputError, OutputExistsError, UsageError
 from lfpiv_cli.files import vtkhdf
 from lfpiv_cli.files.config import carried_config, load_config

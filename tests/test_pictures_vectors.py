@@ -14,7 +14,7 @@ from lfpiv_cli.flow.field import MASKED, REJECTED, VALID, VectorField
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.pictures import vectors as pictures
 from lfpiv_cli.reference import Reference
-from lfpiv_cli.stages.plot import figures_of
+from lfpiv_cli.verbs.plot import figures_of
 
 pytest.importorskip("matplotlib")
 from matplotlib.quiver import Quiver, QuiverKey  # noqa: E402

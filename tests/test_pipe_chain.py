@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 import tifffile
 
-from lfpiv_cli import open_particles, open_vectors, open_weights
-from lfpiv_cli.cli import cli
+from lfpiv_cli.cli.main import cli
 from lfpiv_cli.files.calibration_file import read_calibration
 from lfpiv_cli.files.config import load_config
+from lfpiv_cli.files.vtkhdf import open_vectors
+from lfpiv_cli.files.weights_file import open_weights
 from lfpiv_cli.flow.field import MASKED
+from lfpiv_cli.verbs import open_particles
 from lfpiv_cli.weights.strips import StripOperator
 
 CONFIGS = Path(__file__).parent.parent / "configs"

@@ -160,7 +160,7 @@ def test_too_little_memory_is_no_bug(monkeypatch: pytest.MonkeyPatch, error: Exc
     def fail(*_: object, **__: object) -> None:
         raise error
 
-    monkeypatch.setattr("lfpiv_cli.stages.check.check", fail)
+    monkeypatch.setattr("lfpiv_cli.verbs.check.check", fail)
     code, said = ended("check", CONFIG)
     assert code == 7
     assert said.startswith("too little memory: ")

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from lfpiv_cli.errors import OutputExistsError
+from lfpiv_cli.files.exports.vtk import write_playback
 from lfpiv_cli.files.particle_file import Points
-from lfpiv_cli.files.playback import write_playback
 from lfpiv_cli.reference import Reference
 
 

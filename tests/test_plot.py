@@ -13,7 +13,7 @@ import yaml
 from click.testing import CliRunner
 from test_info import RIG
 
-from lfpiv_cli.cli import cli
+from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.hdf5 import write_tree
@@ -29,7 +29,7 @@ from lfpiv_cli.files.particle_file import (
 from lfpiv_cli.files.vtkhdf import write_volume
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.reference import Reference
-from lfpiv_cli.stages.plot import figures_of
+from lfpiv_cli.verbs.plot import figures_of
 
 pytest.importorskip("matplotlib")
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.particles.prediction import Predicted, find_predicted
+from lfpiv_cli.particles.neighbour_frames import Predicted, find_predicted
 from lfpiv_cli.particles.search import Task
 from tests.particle_images import found, task_with
 

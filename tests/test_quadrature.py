@@ -8,14 +8,11 @@ import numpy as np
 import pytest
 
 from lfpiv_cli.errors import ConfigError
-from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media, Window
-from lfpiv_cli.optics.microlenses import Lattice
-from lfpiv_cli.optics.object_space import ObjectSpace
-from lfpiv_cli.optics.polynomial_rays import PolynomialRays, complete_exponents
+from lfpiv_cli.optics.tracing import ObjectSpace, PolynomialRays, complete_exponents
 from lfpiv_cli.weights.lens_cells import MOST_CORNERS, neighbours, shared_rectangle
-from lfpiv_cli.weights.quadrature import TILES, integrate_columns
-from lfpiv_cli.weights.rays import RayCount, count_rays, sampling_error
+from lfpiv_cli.weights.quadrature import TILES, RayCount, count_rays, integrate_columns, sampling_error
 from lfpiv_cli.weights.scene import aperture_tiles, kernel_scene, on_array, rays_from
 
 VOXEL = (0.1, 0.1, 0.1)

@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace, Face
-from lfpiv_cli.optics.face_tracing import aim, trace_in
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.optics.ray_bundles import aim_all, trace_all_in
+from lfpiv_cli.optics.ray_bundles import aim, aim_all
 from lfpiv_cli.optics.surfaces import Cylinder, Plane, Sphere, TiltedPlane
 from lfpiv_cli.optics.tracing import disc_points
 from lfpiv_cli.simd.faces import (
@@ -19,13 +18,10 @@ from lfpiv_cli.simd.faces import (
     MISSED,
     SHARE,
     SLOPE_X,
-    TRACE_ROWS,
     aim_lanes,
     aim_lanes_reference,
-    trace_lanes,
-    trace_lanes_reference,
 )
-from lfpiv_cli.simd.formulas import DOUBLES
+from lfpiv_cli.simd.vectors import DOUBLES
 
 WATER = Media(1.0, 1.49, 1.33)
 # A tube that is tilted; a thin-walled one, whose sides light never leaves; and one face of each other kind.
@@ -54,25 +50,6 @@ def everywhere(rng: np.random.Generator, count: int) -> tuple[NDArray[np.float64
 
 
 @SPACES
-def test_rays_traced_together_are_those_traced_one_by_one(
-    table2: Camera, rng: np.random.Generator, space: CurvedSpace
-) -> None:
-    faces, count = space.for_kernels(table2), 501
-    crossing = disc_points(count, 12.5, rng)
-    slopes = crossing / 185.0 + rng.uniform(-0.045, 0.045, (count, 2))
-    slopes[5] = np.nan
-    depths = rng.uniform(-5, 5, count)
-    places, valid = trace_all_in(faces, crossing, slopes, depths)
-    for i in range(count):
-        x, y, seen = trace_in(faces, *crossing[i], *slopes[i], depths[i])
-        assert valid[i] == seen
-        # roundings of 200 mm, which grazing light magnifies
-        np.testing.assert_allclose(places[i], (x, y), atol=1e-10)
-    assert 0.1 < valid.mean() < 0.9
-    assert np.isnan(places).any()
-
-
-@SPACES
 def test_rays_aimed_together_are_those_aimed_one_by_one(
     table2: Camera, rng: np.random.Generator, space: CurvedSpace
 ) -> None:
@@ -96,16 +73,6 @@ def test_a_ray_does_not_depend_on_its_neighbours(table2: Camera, rng: np.random.
     some, also = aim_all(faces, points[-count:] if count else points[:0], crossing[-count:] if count else crossing[:0])
     np.testing.assert_array_equal(some, slopes[60 - count :])
     np.testing.assert_array_equal(also, valid[60 - count :])
-    places, there = trace_all_in(faces, crossing, slopes, points[:, 2].copy())
-    parts = slice(60 - count, 60)
-    some, also = trace_all_in(faces, crossing[parts], slopes[parts], points[parts, 2].copy())
-    np.testing.assert_array_equal(some, places[parts])
-    np.testing.assert_array_equal(also, there[parts])
-
-
-@njit
-def traced(table, lens_z, vertices, normals, axes, curvatures, ratios):
-    trace_lanes(table, lens_z, vertices, normals, axes, curvatures, ratios)
 
 
 @njit
@@ -114,31 +81,20 @@ def aimed(table, lens_z, vertices, normals, axes, curvatures, ratios):
 
 
 @SPACES
-@pytest.mark.parametrize(
-    ("intrinsic", "twin", "rows"),
-    [(traced, trace_lanes_reference, TRACE_ROWS), (aimed, aim_lanes_reference, AIM_ROWS)],
-    ids=["trace", "aim"],
-)
-def test_lanes_do_as_their_readable_twins(
-    table2: Camera, rng: np.random.Generator, space: CurvedSpace, intrinsic, twin, rows: int
-) -> None:
+def test_lanes_do_as_their_readable_twins(table2: Camera, rng: np.random.Generator, space: CurvedSpace) -> None:
     faces = space.for_kernels(table2)
     arrays = faces.vertices_mm, faces.normals, faces.axes, faces.curvatures_per_mm, faces.ratios
     for _ in range(20):
-        table = np.zeros((rows, DOUBLES))
-        if rows == AIM_ROWS:
-            points, crossing = everywhere(rng, DOUBLES)
-            table[:SLOPE_X] = np.concatenate([points, crossing], axis=1).T
-            table[SLOPE_X:MISSED] = rng.uniform(-0.05, 0.05, (2, DOUBLES))
-            table[MISSED], table[SHARE] = np.inf, 1.0
-        else:
-            table[:2], table[2:4] = disc_points(DOUBLES, 12.5, rng).T, rng.uniform(-0.06, 0.06, (2, DOUBLES))
+        table = np.zeros((AIM_ROWS, DOUBLES))
+        points, crossing = everywhere(rng, DOUBLES)
+        table[:SLOPE_X] = np.concatenate([points, crossing], axis=1).T
+        table[SLOPE_X:MISSED] = rng.uniform(-0.05, 0.05, (2, DOUBLES))
+        table[MISSED], table[SHARE] = np.inf, 1.0
         expected = table.copy()
-        twin(expected.ravel(), faces.lens_z_mm, *arrays)
+        aim_lanes_reference(expected.ravel(), faces.lens_z_mm, *arrays)
         found = table.copy()
-        intrinsic(found.ravel(), faces.lens_z_mm, *arrays)
+        aimed(found.ravel(), faces.lens_z_mm, *arrays)
         # products and sums are fused, over 200 mm and where light grazes; what a ray that misses leaves is of no matter
-        through = expected[2] > 0.0 if rows == TRACE_ROWS else np.isfinite(expected[MISSED])
+        through = np.isfinite(expected[MISSED])
         np.testing.assert_allclose(found[:, through], expected[:, through], rtol=1e-9, atol=1e-10)
-        kept = found[2] > 0.0 if rows == TRACE_ROWS else np.isfinite(found[MISSED])
-        np.testing.assert_array_equal(kept, through)
+        np.testing.assert_array_equal(np.isfinite(found[MISSED]), through)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from lfpiv_cli.grid import Grid
-from lfpiv_cli.optics.microlenses import Lattice
-from lfpiv_cli.reconstruction import kernels
-from lfpiv_cli.reconstruction.equations import Problem, normalisers
+from lfpiv_cli.optics.camera import Lattice
+from lfpiv_cli.reconstruction import solvers
+from lfpiv_cli.reconstruction.equations import Problem, line_of_sight_start, lit_support, normalisers
 from lfpiv_cli.reconstruction.registry import SOLVERS
 from lfpiv_cli.reconstruction.solvers import (
     Momentum,
@@ -21,7 +21,6 @@ from lfpiv_cli.reconstruction.solvers import (
     sart_step,
     smart_step,
 )
-from lfpiv_cli.reconstruction.starts import line_of_sight_start, lit_support
 from lfpiv_cli.weights.build import factorise
 
 
@@ -231,9 +230,9 @@ def test_kernels_are_their_array_twins(rng):
     inverse = rng.random((7, 5), dtype=np.float32) * (rng.random((7, 5)) < 0.7).astype(np.float32)
     projection[2, 3] = 0.0
     inverse[2, 3] = 1.0
-    np.testing.assert_array_equal(kernels.correction(image, projection, inverse), (image - projection) * inverse)
+    np.testing.assert_array_equal(solvers.correction(image, projection, inverse), (image - projection) * inverse)
     lit = (projection > 0.0) & (inverse > 0.0)
     expected = np.divide(image, projection, out=np.zeros_like(image), where=lit)
-    np.testing.assert_array_equal(kernels.ratio(image, projection, inverse), expected)
+    np.testing.assert_array_equal(solvers.ratio(image, projection, inverse), expected)
     squares = np.where(inverse > 0.0, (image - projection).astype(np.float64) ** 2, 0.0).sum(axis=1)
-    np.testing.assert_allclose(kernels.square_differences(image, projection, inverse), squares, rtol=1e-14)
+    np.testing.assert_allclose(solvers.square_differences(image, projection, inverse), squares, rtol=1e-14)

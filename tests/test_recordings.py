@@ -24,8 +24,7 @@ from lfpiv_cli.files import images
 from lfpiv_cli.files.inputs import split_part
 from lfpiv_cli.files.provenance import record, sha256
 from lfpiv_cli.files.recordings import tiff
-from lfpiv_cli.files.recordings.bayer import PATTERNS, green_of
-from lfpiv_cli.files.recordings.packing import PACKED_BITS, Packing, Pixels
+from lfpiv_cli.files.recordings.blocks import PACKED_BITS, PATTERNS, Packing, Pixels, green_of
 from tests import camera_files
 
 

@@ -9,7 +9,6 @@ import pytest
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from lfpiv_cli.calibration.dot_model import lens_crossings, pixel_rays
 from lfpiv_cli.calibration.lattice import LatticeFit, fit_lattice
 from lfpiv_cli.calibration.rectification import (
     EXPONENT_ARRAY,
@@ -19,11 +18,11 @@ from lfpiv_cli.calibration.rectification import (
     turn_matrix,
     write_shift,
 )
-from lfpiv_cli.calibration.transmission import relative_transmission
+from lfpiv_cli.calibration.shape_fit import lens_crossings, pixel_rays
 from lfpiv_cli.calibration.views import lens_table, sub_aperture_view
+from lfpiv_cli.calibration.white import relative_transmission
 from lfpiv_cli.errors import InputError
-from lfpiv_cli.optics.camera import Camera
-from lfpiv_cli.optics.microlenses import Lattice
+from lfpiv_cli.optics.camera import Camera, Lattice
 
 SHAPE = (120, 150)
 CENTRE = np.array([(SHAPE[1] - 1) / 2, (SHAPE[0] - 1) / 2])

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lfpiv_cli.cli import cli
+from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files.calibration_file import read_calibration, write_calibration
 from lfpiv_cli.files.hdf5 import open_h5, read_provenance

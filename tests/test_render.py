@@ -9,20 +9,13 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from lfpiv_cli.errors import ConfigError
+from lfpiv_cli.optics.camera import Lattice
 from lfpiv_cli.optics.media import Media, Window, fluid_path_to_focus
-from lfpiv_cli.optics.microlenses import Lattice
-from lfpiv_cli.optics.tracing import disc_points, exact_slope, slopes_equivalent, slopes_exact, trace
+from lfpiv_cli.optics.tracing import ObjectSpace, disc_points, exact_slope, slope_polynomial, slope_ratio, trace
 from lfpiv_cli.synthetic import render
 from lfpiv_cli.synthetic.ray_sequence import in_ball
-from lfpiv_cli.synthetic.render import (
-    Balls,
-    ObjectSpace,
-    pixel_places,
-    render_points,
-    render_white,
-    slope_polynomial,
-    slope_ratio,
-)
+from lfpiv_cli.synthetic.render import Balls, pixel_places, render_points, render_white
+from tests.known_rays import slopes_equivalent, slopes_exact
 
 
 @pytest.fixture

@@ -10,18 +10,18 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from lfpiv_cli.cli import cli
+from lfpiv_cli.cli.main import cli
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import InputError, OutputExistsError, UsageError
 from lfpiv_cli.files.images import write_tiff
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, Points, write_points
 from lfpiv_cli.files.provenance import sha256
 from lfpiv_cli.files.vtkhdf import write_vectors
-from lfpiv_cli.pictures.interactive import MOST_LINES, lines_view
+from lfpiv_cli.pictures.points import MOST_LINES, lines_view
 from lfpiv_cli.reference import Reference
-from lfpiv_cli.stages import report as stage
-from lfpiv_cli.stages.plot import figures_of
-from lfpiv_cli.stages.report import ReportOptions, contents_of, report
+from lfpiv_cli.verbs import report as stage
+from lfpiv_cli.verbs.plot import figures_of
+from lfpiv_cli.verbs.report import ReportOptions, contents_of, report
 from tests.browser import CHROMIUM, opened
 from tests.vector_fields import SHAPE, SIGMA_VOXEL, field_of, noise_mm, rotation_mm
 

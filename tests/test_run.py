@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 import tifffile
 
-from lfpiv_cli.cli import cli
+from lfpiv_cli.cli.main import cli
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import ConfigError, InputError, LfpivError, OutputExistsError, PartialError, UsageError
 from lfpiv_cli.files.provenance import carried_record, differences
-from lfpiv_cli.stages import prepared
-from lfpiv_cli.stages import report as report_stage
-from lfpiv_cli.stages import run as stage
-from lfpiv_cli.stages.report import report
-from lfpiv_cli.stages.run import RunOptions
+from lfpiv_cli.verbs import particles
+from lfpiv_cli.verbs import report as report_stage
+from lfpiv_cli.verbs import run as stage
+from lfpiv_cli.verbs.report import report
+from lfpiv_cli.verbs.run_steps import RunOptions
 
 ROOT = Path(__file__).parent.parent
 SAMPLE = ROOT / "sample_data"
@@ -298,7 +298,7 @@ def test_results_are_kept_without_their_volumes_and_whatever_fails(again: Path, 
     assert sorted(path.name for path in (out / "vectors").iterdir()) == ["next_a.vtkhdf", "pair_a.vtkhdf"]
     assert not (out / "volumes").exists()
     # What stands is known without its volumes, and without the weights.
-    monkeypatch.setattr(prepared, "open_weights", lambda _: pytest.fail("weights were opened"))
+    monkeypatch.setattr(particles, "open_weights", lambda _: pytest.fail("weights were opened"))
     failed()
     assert set(states(again).values()) == {"kept"}
     assert (out / "vectors" / "pair_a.vtkhdf").stat().st_mtime_ns == first

@@ -10,11 +10,11 @@ from typing import Any
 
 import pytest
 
-from lfpiv_cli.cli import cli
+from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import StoppedEarlyError, UsageError
-from lfpiv_cli.files import claims
+from lfpiv_cli.files import shares
 from lfpiv_cli.files.shares import Deadline
-from lfpiv_cli.stages import run_steps
+from lfpiv_cli.verbs import run_steps
 from tests.test_run import PAIR, PHOTOGRAPHS, rig_in
 
 SMALL = (
@@ -96,10 +96,10 @@ def test_weights_that_another_shard_makes_are_waited_for(
 ) -> None:
     weights = with_weights / "weights.h5"
     moved = weights.rename(with_weights.parent / "weights.h5")
-    monkeypatch.setattr(claims, "SECONDS_BETWEEN_LOOKS", 0.05)
+    monkeypatch.setattr(shares, "SECONDS_BETWEEN_LOOKS", 0.05)
     waiting = threading.Event()
     made: list[bool] = []
-    build = run_steps.build_weights
+    build = run_steps.build_weights_file
 
     def built(*arguments: Any, **options: Any) -> dict[str, Any]:
         made.append(not weights.exists())
@@ -110,11 +110,11 @@ def test_weights_that_another_shard_makes_are_waited_for(
         shutil.copy2(moved, weights)
         claim.__exit__(None, None, None)
 
-    monkeypatch.setattr(run_steps, "build_weights", built)
-    claim = claims.claimed(weights)
+    monkeypatch.setattr(run_steps, "build_weights_file", built)
+    claim = shares.claimed(weights)
     assert claim.__enter__()
-    sleep = claims.time.sleep
-    monkeypatch.setattr(claims.time, "sleep", lambda seconds: (waiting.set(), sleep(seconds)))
+    sleep = shares.time.sleep
+    monkeypatch.setattr(shares.time, "sleep", lambda seconds: (waiting.set(), sleep(seconds)))
     other = threading.Thread(target=other_shard)
     other.start()
     run(rig, with_weights, "--shard", "1/3")
@@ -214,11 +214,11 @@ def test_volumes_that_another_worker_needs_stay(rig: Path, with_weights: Path) -
 def test_a_volume_that_another_worker_makes_is_waited_for(
     rig: Path, with_weights: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(claims, "SECONDS_BETWEEN_LOOKS", 0.05)
-    waiting, sleep = threading.Event(), claims.time.sleep
-    monkeypatch.setattr(claims.time, "sleep", lambda seconds: (waiting.set(), sleep(seconds)))
+    monkeypatch.setattr(shares, "SECONDS_BETWEEN_LOOKS", 0.05)
+    waiting, sleep = threading.Event(), shares.time.sleep
+    monkeypatch.setattr(shares.time, "sleep", lambda seconds: (waiting.set(), sleep(seconds)))
     (with_weights / "volumes").mkdir()
-    other = claims.claimed(with_weights / "volumes" / "f0.vtkhdf")
+    other = shares.claimed(with_weights / "volumes" / "f0.vtkhdf")
     assert other.__enter__()
     worker = threading.Thread(
         target=run,
@@ -238,7 +238,7 @@ def test_a_volume_that_another_worker_makes_is_waited_for(
 def test_the_folder_of_volumes_may_go_with_another_workers_last_pair(
     rig: Path, with_weights: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    create, removed = claims.create_alone, []
+    create, removed = shares.create_alone, []
 
     def created(path: Path) -> int:
         if path.parent.name == "volumes" and not removed:
@@ -246,6 +246,6 @@ def test_the_folder_of_volumes_may_go_with_another_workers_last_pair(
             removed.append(True)
         return create(path)
 
-    monkeypatch.setattr(claims, "create_alone", created)
+    monkeypatch.setattr(shares, "create_alone", created)
     run(rig, with_weights, "--shard", "1/2", "--keep", "results", images="in_time")
     assert (with_weights / "vectors" / "f0.vtkhdf").exists()

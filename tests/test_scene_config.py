@@ -13,24 +13,23 @@ import pytest
 import tifffile
 
 from lfpiv_cli.calibration import model
-from lfpiv_cli.calibration.scene_pose import ScenePose
 from lfpiv_cli.console import CONSOLE
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.files.calibration_file import read_calibration, write_calibration
 from lfpiv_cli.files.config import Config, load_config
-from lfpiv_cli.files.heights import read_heights
-from lfpiv_cli.files.sections_scene import FaceSection
-from lfpiv_cli.interface.particles import searchable
-from lfpiv_cli.interface.planning import bench_of
-from lfpiv_cli.interface.weights import plan_of, ray_source, weights_of
+from lfpiv_cli.files.sections import FaceSection
+from lfpiv_cli.files.yaml_nodes import read_heights
 from lfpiv_cli.names import SurfaceKind
+from lfpiv_cli.optics.camera import Lattice
 from lfpiv_cli.optics.curved_space import CurvedSpace, Face
-from lfpiv_cli.optics.height_map import HeightMap
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.optics.microlenses import Lattice
-from lfpiv_cli.optics.object_space import ObjectSpace
+from lfpiv_cli.optics.shapes import HeightMap, ScenePose
 from lfpiv_cli.optics.surfaces import Cylinder, Plane, Sphere, TiltedPlane
-from lfpiv_cli.stages import validate_board, validate_weights
+from lfpiv_cli.optics.tracing import ObjectSpace
+from lfpiv_cli.stages import validate, validate_board
+from lfpiv_cli.verbs.build_weights import plan_of, ray_source, weights_of
+from lfpiv_cli.verbs.particles import searchable
+from lfpiv_cli.verbs.planning import bench_of
 
 RIG = """\
 camera:
@@ -279,7 +278,7 @@ def test_particles_are_fitted_through_a_scene_behind_square_lenses_alone(configu
 def test_weights_are_validated_through_a_scene(configured: Callable[[str], Config], tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     configured(RIG + TUBE + "validation: {weights: {sample: 1}}\n")
-    told = validate_weights.validate_weights(tmp_path / "rig.yaml", tmp_path / "report")
+    told = validate.validate_weights(tmp_path / "rig.yaml", tmp_path / "report")
     assert told["voxels"] == 6
     # Near the tube's axis; 5 million rays alone are off by 0.045.
     assert told["factorised_to_converged.l1_largest"] < 0.03
@@ -288,7 +287,7 @@ def test_weights_are_validated_through_a_scene(configured: Callable[[str], Confi
     assert (tmp_path / "report" / "weights_columns.png").stat().st_size > 10_000
     configured(RIG.replace("voxel_mm: 0.1", "voxel_mm: 0.1, centre_mm: [0, 20, 0]") + TUBE)
     with pytest.raises(ConfigError, match="no voxel of the volume lies wholly in the fluid"):
-        validate_weights.validate_weights(tmp_path / "rig.yaml", tmp_path / "none")
+        validate.validate_weights(tmp_path / "rig.yaml", tmp_path / "none")
 
 
 def test_a_calibration_moves_the_scene_and_the_pipe(configured: Callable[[str], Config], tmp_path: Path) -> None:

@@ -9,12 +9,12 @@ import pytest
 from numpy.typing import NDArray
 
 from lfpiv_cli.grid import Grid
-from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.optics.microlenses import Lattice
-from lfpiv_cli.optics.tracing import disc_points, slopes_equivalent, trace
+from lfpiv_cli.optics.tracing import disc_points, trace
 from lfpiv_cli.weights.build import factorise, scene_distortion
 from lfpiv_cli.weights.model import Weights
+from tests.known_rays import slopes_equivalent
 
 RAYS = 200_000
 # Far more than a real lens has, as the sensor is small: at 2 mm from the axis 1.2 % or 0.03 mm.

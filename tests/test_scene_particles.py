@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from lfpiv_cli import open_particles
-from lfpiv_cli.cli import cli
+from lfpiv_cli.cli.main import cli
 from lfpiv_cli.files.particles import read_particles
+from lfpiv_cli.verbs import open_particles
 
 RIG = """\
 camera:

@@ -12,16 +12,15 @@ from numpy.typing import NDArray
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.optics.curved_space import CurvedSpace, Face
-from lfpiv_cli.optics.rigid_motion import RigidMotion
-from lfpiv_cli.optics.surfaces import Cylinder, HeightMap, Plane, Sphere, Surface, TiltedPlane
+from lfpiv_cli.optics.shapes import HeightMap, RigidMotion
+from lfpiv_cli.optics.surfaces import Cylinder, Plane, Sphere, Surface, TiltedPlane
 from lfpiv_cli.particles.fitting import add_all
 from lfpiv_cli.particles.noise import Noise
 from lfpiv_cli.particles.view import raw_view
-from lfpiv_cli.self_calibration.movable_scene import MovableScene
-from lfpiv_cli.self_calibration.moved_places import moved_places
+from lfpiv_cli.self_calibration.movable_scene import MovableScene, moved_places
 from lfpiv_cli.self_calibration.nuisances import Nuisances, fit_nuisances
-from lfpiv_cli.self_calibration.round_wall import find_round_wall
 from lfpiv_cli.self_calibration.scene_refinement import SceneRefinement, wall_by_places
+from lfpiv_cli.self_calibration.walls import find_round_wall
 
 CONFIG = Path(__file__).parent.parent / "configs" / "pipe.yaml"
 # 0.15 mm across, 0.2 mm towards the camera, a third and a fifth of a degree.
@@ -217,7 +216,7 @@ def test_what_is_told_of_a_scene(scene: MovableScene, rng: np.random.Generator) 
 
 def test_the_picture_shows_the_particles_and_the_wall(scene: MovableScene, rng: np.random.Generator) -> None:
     pytest.importorskip("matplotlib")
-    from lfpiv_cli.pictures.round_wall import round_wall_figure
+    from lfpiv_cli.pictures.walls import round_wall_figure
 
     found = refined(scene, rng, TRUTH)
     section, around, along, counted = round_wall_figure(found).axes

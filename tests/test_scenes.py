@@ -10,12 +10,13 @@ from scipy.spatial.transform import Rotation
 
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.errors import ConfigError
-from lfpiv_cli.flow.masks import RoundWall
+from lfpiv_cli.flow.windows import RoundWall
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.media import Media, channel_window, fluid_path_to_focus
+from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.synthetic.board import BoardPlacement
 from lfpiv_cli.synthetic.flows import Pulsation, advect, random_modes, rigid_rotation, uniform
-from lfpiv_cli.synthetic.render import Balls, ObjectSpace, render_points
+from lfpiv_cli.synthetic.render import Balls, render_points
 from lfpiv_cli.synthetic.scenes import (
     Box,
     Misalignment,

@@ -9,17 +9,15 @@ import pytest
 from numpy.typing import NDArray
 
 from lfpiv_cli.files.batch import Frame
-from lfpiv_cli.interface import particles as particles_interface
-from lfpiv_cli.interface.particles import STEPS
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.particles import second_frames
-from lfpiv_cli.particles.prediction import Predicted
+from lfpiv_cli.particles import neighbour_frames
+from lfpiv_cli.particles.neighbour_frames import Predicted, beyond_doubt, predicted_by, second_frame
 from lfpiv_cli.particles.rounds import first_pass
-from lfpiv_cli.particles.second_frames import beyond_doubt, predicted_by, second_frame
 from lfpiv_cli.scale import Scale
-from lfpiv_cli.stages import finding
-from lfpiv_cli.stages.finding import Finder
+from lfpiv_cli.verbs import particles as particles_interface
+from lfpiv_cli.verbs import reconstruct
+from lfpiv_cli.verbs.particles import STEPS, Finder
 from tests.particle_images import found, task_with
 
 # The fits take half a minute to compile.
@@ -79,14 +77,14 @@ def test_the_second_frame_goes_on_from_the_first(
     )
     first = np.concatenate([true - MOVED, ghosts(rng)])
     told: list[int] = []
-    search = second_frames.find_predicted
+    search = neighbour_frames.find_predicted
     expected: list[Predicted] = []
 
     def watched(*arguments: object) -> object:
         expected.append(arguments[1])
         return search(*arguments)
 
-    monkeypatch.setattr(second_frames, "find_predicted", watched)
+    monkeypatch.setattr(neighbour_frames, "find_predicted", watched)
     particles = second_frame(task, before, first, SEARCH_MM, told.append)
     assert found(particles, np.concatenate([true, new])).all()
     assert len(particles) == 32
@@ -112,7 +110,7 @@ def test_the_order_of_a_pairs_frames_does_not_matter(order: tuple[int, ...], mon
     monkeypatch.setattr(particles_interface, "find_first", first_of)
     monkeypatch.setattr(particles_interface, "find_second", second_of)
     monkeypatch.setattr(particles_interface, "find_beside", lambda bench, frame, own, beside: (own, beside))
-    monkeypatch.setattr(finding, "check_frame", lambda bench, raw, name: None)
+    monkeypatch.setattr(reconstruct, "check_frame", lambda bench, raw, name: None)
     frames = [Frame(Path(f"{number}.tif"), 0, 1) for number in range(4)]
 
     def finder(beside: list[tuple[int, ...]], first_of: dict[int, int]) -> Finder:

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from lfpiv_cli.files.particle_file import POSITION
-from lfpiv_cli.interface.sequence_tracks import SequenceTracks
-from lfpiv_cli.tracks.candidates import Seen
+from lfpiv_cli.tracks.candidates import NO_TRACK, Seen, Trajectories
 from lfpiv_cli.tracks.in_time import scatter_of, scatter_of_pieces
 from lfpiv_cli.tracks.sequences import states_at
-from lfpiv_cli.tracks.trajectories import NO_TRACK, Trajectories
+from lfpiv_cli.verbs.tracks import SequenceTracks
 
 FRAMES, TRACKS, OTHERS = 7, 50, 5
 DT_S = 0.5

@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.scale import Scale
 from lfpiv_cli.synthetic.flows import advect, rigid_rotation
-from lfpiv_cli.tracks.candidates import Seen
+from lfpiv_cli.tracks.candidates import NO_TRACK, Seen, Trajectories
 from lfpiv_cli.tracks.in_time import Scatter, fit_in_time, scatter_of
 from lfpiv_cli.tracks.sequences import follow, scatter_in, states_at
 from lfpiv_cli.tracks.tracking import Forecast, track
-from lfpiv_cli.tracks.trajectories import NO_TRACK, Trajectories
 
 BOX_MM, DT_S = 4.0, 0.002
 NOISE_MM = np.array([0.003, 0.003, 0.02])

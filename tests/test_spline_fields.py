@@ -8,14 +8,20 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
 from lfpiv_cli.fields import spline_field, stencils
-from lfpiv_cli.fields.blocks import factorised
-from lfpiv_cli.fields.errors_of_samples import belonging, without_itself
 from lfpiv_cli.fields.evidence import first_expectation, most_probable
 from lfpiv_cli.fields.fit import FEW_SAMPLES, Field, fit_field
-from lfpiv_cli.fields.lattice import Lattice
-from lfpiv_cli.fields.penalties import DIVERGENCE, SECOND, THIRD, Expectation, bound, expected_inverse
-from lfpiv_cli.fields.samples import Samples, with_places
+from lfpiv_cli.fields.samples import Samples, belonging, with_places, without_itself
 from lfpiv_cli.fields.spline_field import SplineField, lattice_for
+from lfpiv_cli.fields.stencils import (
+    DIVERGENCE,
+    SECOND,
+    THIRD,
+    Expectation,
+    Lattice,
+    bound,
+    expected_inverse,
+    factorised,
+)
 
 LATTICE = Lattice((-1.0, 0.5, 2.0), (0.5, 0.7, 0.6), (4, 2, 1))
 # So many samples are fitted by splines, not kriged.

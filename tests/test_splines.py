@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from numba import njit
 
-from lfpiv_cli.simd import block_sums, splines
-from lfpiv_cli.simd.block_sums import FEW_SHIFTS, MANY_SHIFTS, MOMENTS
-from lfpiv_cli.simd.splines import MOST_TAPS, NEIGHBOURS
+from lfpiv_cli.simd import block_sums
+from lfpiv_cli.simd.block_sums import FEW_SHIFTS, MANY_SHIFTS, MOMENTS, MOST_TAPS, NEIGHBOURS
 from lfpiv_cli.simd.vectors import LANES
 
 # Fused multiply-adds round once where the twins round twice.
@@ -17,12 +16,12 @@ ROUNDING = {"rtol": 1e-5, "atol": 1e-5}
 
 @njit
 def interpolated(out, to, a, b, places, weights, taps):
-    splines.interpolate(out, to, a, b, places, weights, taps)
+    block_sums.interpolate(out, to, a, b, places, weights, taps)
 
 
 @njit
 def weighted(weights, at, places, places_at, low, taps):
-    splines.spline_weights(weights, at, places, places_at, low, taps)
+    block_sums.spline_weights(weights, at, places, places_at, low, taps)
 
 
 @njit
@@ -37,7 +36,7 @@ def gathered(out, to, a, b, valid, places, extent):
 
 @njit
 def extremes(places, at):
-    return splines.range_of_all(places, at)
+    return block_sums.range_of_all(places, at)
 
 
 @pytest.mark.parametrize("taps_x", range(1, MOST_TAPS + 1))
@@ -47,7 +46,7 @@ def test_interpolation_equals_its_reference(taps_x: int, rng: np.random.Generato
     found, expected = np.zeros((2, 5 + 2 * NEIGHBOURS), np.float32)
     places = ((3, NEIGHBOURS + 1), a, b, (1503, 400, 20), weights, (-1, -2, 0, 3, 4, taps_x))
     interpolated(found, *places)
-    splines.interpolate_reference(expected, *places)
+    block_sums.interpolate_reference(expected, *places)
     np.testing.assert_allclose(found, expected, **ROUNDING)
 
 
@@ -58,7 +57,7 @@ def test_spline_weights_equal_their_reference_and_sum_to_one(
     places = rng.uniform(*places, 3 * NEIGHBOURS).astype(np.float32)
     found, expected = np.zeros((2, 7 * NEIGHBOURS), np.float32)
     weighted(found, NEIGHBOURS, places, 5, low, taps)
-    splines.spline_weights_reference(expected, NEIGHBOURS, places, 5, low, taps)
+    block_sums.spline_weights_reference(expected, NEIGHBOURS, places, 5, low, taps)
     np.testing.assert_allclose(found, expected, **ROUNDING)
     np.testing.assert_allclose(found.reshape(7, NEIGHBOURS).sum(axis=0), 1.0, atol=1e-6)
 

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import ConfigError, InputError, UsageError
 from lfpiv_cli.files.calibration_file import read_calibration
-from lfpiv_cli.optics.microlenses import Lattice
-from lfpiv_cli.stages.calibrate import CalibrateOptions, calibrate_snapshot
+from lfpiv_cli.optics.camera import Lattice
+from lfpiv_cli.verbs.calibrate import CalibrateOptions, calibrate_snapshot
 
 SHAPE = (200, 240)
 CONFIG = """

@@ -12,17 +12,17 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from benchmarks.volumes import Seeding, volume_pair
-from lfpiv_cli import open_vectors
-from lfpiv_cli.cli import cli
+from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import InputError, PartialError, UsageError
 from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.provenance import record
-from lfpiv_cli.files.vtkhdf import read_header, write_volume
+from lfpiv_cli.files.vtkhdf import open_vectors, read_header, write_volume
 from lfpiv_cli.flow.correlation import CorrelationSettings, correlate
 from lfpiv_cli.flow.field import MASKED
 from lfpiv_cli.flow.windows import WindowLayout, layout_windows
 from lfpiv_cli.grid import Grid
-from lfpiv_cli.interface.vectors_checks import (
+from lfpiv_cli.reference import Reference
+from lfpiv_cli.verbs.checks import (
     Quality,
     calibration_notices,
     field_notices,
@@ -31,7 +31,6 @@ from lfpiv_cli.interface.vectors_checks import (
     quality_of_all,
     tracers_per_window,
 )
-from lfpiv_cli.reference import Reference
 
 CONFIG = Path(__file__).parent.parent / "configs" / "sample.yaml"
 SHAPE = (30, 22, 40)

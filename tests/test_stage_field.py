@@ -20,12 +20,12 @@ from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, Points, read_tracks, write_points
 from lfpiv_cli.flow.correlation import SMALLEST_VALID_FRACTION
 from lfpiv_cli.flow.field import MASKED
-from lfpiv_cli.flow.masks import RoundWall
-from lfpiv_cli.interface.fields import LARGEST_CHI2, fit_notices, fitted, samples_of_tracks
+from lfpiv_cli.flow.windows import RoundWall
 from lfpiv_cli.names import Divergence
 from lfpiv_cli.reference import Reference
-from lfpiv_cli.stages.field import FieldOptions, fit_flow, read_places
 from lfpiv_cli.synthetic.flows import pipe
+from lfpiv_cli.verbs.field import FieldOptions, fit_flow, read_places
+from lfpiv_cli.verbs.fields import LARGEST_CHI2, fit_notices, fitted, samples_of_tracks
 from tests.test_particle_stage import CONFIG, run
 
 

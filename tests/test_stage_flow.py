@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
-from lfpiv_cli.cli import cli
+from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import LimitMissedError, OutputExistsError, UsageError
 from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.particles import Particles, write_particles
@@ -17,7 +17,7 @@ from lfpiv_cli.files.vtkhdf import write_vectors
 from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.reference import Reference
-from lfpiv_cli.stages.validate_flow import _truth_of_particles, light_notices
+from lfpiv_cli.stages.validate import _truth_of_particles, light_notices
 from lfpiv_cli.synthetic.flows import shear
 
 CONFIGS = Path(__file__).parent.parent / "configs"

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lfpiv_cli.cli import cli
+from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.images import read_image

@@ -8,8 +8,8 @@ import pytest
 
 from lfpiv_cli.console import Console
 from lfpiv_cli.errors import ConfigError, LimitMissedError
-from lfpiv_cli.stages import validate_all
-from lfpiv_cli.stages.validate_flow import validate_flow
+from lfpiv_cli.stages import validate
+from lfpiv_cli.stages.validate import validate_flow
 
 SAMPLE = Path(__file__).parent.parent / "configs" / "sample.yaml"
 
@@ -26,17 +26,17 @@ def test_a_missed_limit_keeps_no_other_report_from_being_made(monkeypatch, tmp_p
 
         return run
 
-    monkeypatch.setattr(validate_all, "ensure_complete", lambda config: None)
+    monkeypatch.setattr(validate, "ensure_complete", lambda config: None)
     for name, fails in (("weights", True), ("board", False), ("flow", True)):
-        monkeypatch.setattr(validate_all, f"validate_{name}", stage(name, fails))
+        monkeypatch.setattr(validate, f"validate_{name}", stage(name, fails))
     with pytest.raises(LimitMissedError, match="weights is bad; flow is bad") as missed:
-        validate_all.validate_all(tmp_path / "c.yaml", tmp_path, console=Console(quiet=True))
+        validate.validate_all(tmp_path / "c.yaml", tmp_path, console=Console(quiet=True))
     assert missed.value.figures == {"weights.error": 0.9, "board.error": 0.1, "flow.error": 0.9}
     assert [name for name, *_ in made] == ["weights", "board", "flow"]
     assert made[2][4] == {}
-    monkeypatch.setattr(validate_all, "validate_weights", stage("weights", False))
-    monkeypatch.setattr(validate_all, "validate_flow", stage("flow", False))
-    summary = validate_all.validate_all(tmp_path / "c.yaml", tmp_path, console=Console(quiet=True))
+    monkeypatch.setattr(validate, "validate_weights", stage("weights", False))
+    monkeypatch.setattr(validate, "validate_flow", stage("flow", False))
+    summary = validate.validate_all(tmp_path / "c.yaml", tmp_path, console=Console(quiet=True))
     assert summary == {"weights.error": 0.1, "board.error": 0.1, "flow.error": 0.1}
 
 
@@ -48,7 +48,7 @@ def test_a_missed_limit_keeps_no_other_report_from_being_made(monkeypatch, tmp_p
         ("board:   {dots: [5, 4]", "board"),
     ],
 )
-@pytest.mark.parametrize("validate", [validate_all.validate_all, validate_flow])
+@pytest.mark.parametrize("validate", [validate.validate_all, validate_flow])
 def test_what_is_missing_is_said_before_anything_is_made(validate, taken_out, said, tmp_path):
     rig = tmp_path / "rig.yaml"
     text = SAMPLE.read_text()

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from lfpiv_cli.errors import InputError
-from lfpiv_cli.flow.field import REJECTED, VectorField
-from lfpiv_cli.flow.statistics import statistics_of
+from lfpiv_cli.flow.field import REJECTED, VectorField, statistics_of
 from lfpiv_cli.grid import Grid
 
 SHAPE = (2, 3, 4)

@@ -11,8 +11,8 @@ from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.names import Facing, SurfaceKind
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace, Face
-from lfpiv_cli.optics.height_map import HeightMap
 from lfpiv_cli.optics.media import Media
+from lfpiv_cli.optics.shapes import HeightMap
 from lfpiv_cli.optics.surfaces import (
     SURFACES,
     Cylinder,

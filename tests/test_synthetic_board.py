@@ -9,8 +9,9 @@ import pytest
 
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.optics.media import Media
+from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.synthetic.board import BoardPlacement, dot_centres, render_board
-from lfpiv_cli.synthetic.render import ObjectSpace, render_white
+from lfpiv_cli.synthetic.render import render_white
 
 BOARD = BoardGeometry(dots=(3, 2), spacing_mm=1.0, dot_diameter_mm=0.2)
 AIR = ObjectSpace(Media())

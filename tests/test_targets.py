@@ -9,21 +9,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from lfpiv_cli.calibration.board import dot_signal, locate_board
+from lfpiv_cli.calibration.board import another_kind, dot_signal, locate_board, sentence
 from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose, pose_of_dots, upright_numbers
-from lfpiv_cli.calibration.corner_model import corner_shares, quadrant_shares
-from lfpiv_cli.calibration.dot_model import lens_cell, pixel_rays
-from lfpiv_cli.calibration.target_kinds import another_kind, sentence
+from lfpiv_cli.calibration.corners import corner_shares, quadrant_shares
+from lfpiv_cli.calibration.shape_fit import lens_cell, pixel_rays
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.names import Polarity
-from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media, Window
-from lfpiv_cli.optics.microlenses import Lattice
-from lfpiv_cli.optics.object_space import ObjectSpace
-from lfpiv_cli.optics.tracing import slopes_exact
-from lfpiv_cli.synthetic.board import BoardPlacement, render_board
-from lfpiv_cli.synthetic.printed import _on_plate, _rays_to, printed_plate
+from lfpiv_cli.optics.tracing import ObjectSpace
+from lfpiv_cli.synthetic.board import BoardPlacement, _on_plate, _rays_to, printed_plate, render_board
 from lfpiv_cli.synthetic.render import Balls, render_points, render_white
+from tests.known_rays import slopes_exact
 
 CHESS = BoardGeometry((4, 3), 0.8, 0.0, pattern="chessboard")
 CHARUCO = BoardGeometry((4, 3), 1.6, 0.0, pattern="charuco", marker_mm=1.2)

@@ -7,17 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lfpiv_cli.optics.camera import Lattice
 from lfpiv_cli.optics.media import Media, Window, equivalent_object_distance
-from lfpiv_cli.optics.microlenses import Lattice
-from lfpiv_cli.optics.tracing import (
-    disc_points,
-    exact_slope,
-    slopes_direct,
-    slopes_equivalent,
-    slopes_exact,
-    trace,
-    trace_ray,
-)
+from lfpiv_cli.optics.tracing import disc_points, exact_slope, trace, trace_ray
+from tests.known_rays import slopes_direct, slopes_equivalent, slopes_exact
 
 
 def scene(rng, camera, n=200):

@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 
 from lfpiv_cli.errors import OutputError
-from lfpiv_cli.files import hdf5, particle_file, track_store
-from lfpiv_cli.files.particle_file import POSITION, TRAJECTORIES_FORMAT, Points, write_points
-from lfpiv_cli.files.playback import write_playback
-from lfpiv_cli.files.track_store import StoredTracks, TrackStore
+from lfpiv_cli.files import hdf5, particle_file
+from lfpiv_cli.files.exports.vtk import write_playback
+from lfpiv_cli.files.particle_file import POSITION, TRAJECTORIES_FORMAT, Points, StoredTracks, TrackStore, write_points
 from lfpiv_cli.reference import Reference
-from lfpiv_cli.stages.stored_tracks import KEPT_FRAMES, SeenFrames
+from lfpiv_cli.verbs.track import KEPT_FRAMES, SeenFrames
 
 FRAMES, TRACKS = 9, 40
 REFERENCE = Reference("mid_plane", 0.5)
@@ -47,7 +46,7 @@ def test_files_are_those_of_tracks_in_memory(
     tracks: Points, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block: int
 ) -> None:
     monkeypatch.setattr(hdf5, "CHUNK_BYTES", 400)
-    monkeypatch.setattr(track_store, "BLOCK_ROWS", block)
+    monkeypatch.setattr(particle_file, "BLOCK_ROWS", block)
     monkeypatch.setattr(particle_file, "CHECKED_ROWS", 30)
     with TrackStore(tmp_path) as store:
         stored = put(store, tracks)
@@ -64,7 +63,7 @@ def test_files_are_those_of_tracks_in_memory(
 
 
 def test_a_block_of_tracks_is_read_at_a_time(tracks: Points, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(track_store, "BLOCK_ROWS", 20)
+    monkeypatch.setattr(particle_file, "BLOCK_ROWS", 20)
     with TrackStore(tmp_path) as store:
         pieces = list(put(store, tracks).rows("track"))
     assert len(pieces) > 5
@@ -94,7 +93,7 @@ def test_a_folder_that_takes_nothing_is_named(tmp_path: Path) -> None:
 
 def test_a_full_disk_is_told(tracks: Points, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     full = open("/dev/full", "r+b", buffering=0)  # noqa: SIM115
-    monkeypatch.setattr(track_store.tempfile, "TemporaryFile", lambda **_: full)
+    monkeypatch.setattr(particle_file.tempfile, "TemporaryFile", lambda **_: full)
     with TrackStore(tmp_path) as store, pytest.raises(OutputError, match="No space left"):
         put(store, tracks)
 

@@ -9,11 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lfpiv_cli.cli import cli
+from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.grid import Grid
-from lfpiv_cli.validation.board import board_figures, elongation_mm, measure_dots
-from lfpiv_cli.validation.board_depths import DEPTH_DEFINITIONS, gaussian_centre_mm
+from lfpiv_cli.validation.board import DEPTH_DEFINITIONS, board_figures, elongation_mm, gaussian_centre_mm, measure_dots
 
 CONFIG = Path(__file__).parent.parent / "configs" / "table2.yaml"
 GRID = Grid.centred((30, 20, 60), (0.1, 0.1, 0.1), (0.0, 0.0, 0.0))

@@ -11,20 +11,20 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.flow.field import REJECTED, VALID, VectorField
-from lfpiv_cli.flow.masks import RoundWall
+from lfpiv_cli.flow.windows import RoundWall
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.synthetic.flows import pipe, shear, square_duct
-from lfpiv_cli.validation.channel import Duct, table_4
 from lfpiv_cli.validation.flow import (
+    Duct,
     compare,
     cumulative_distribution,
     flow_figures,
     relative_errors,
     streamwise_mean_error_at,
+    table_4,
     truth_at_points,
 )
-from lfpiv_cli.validation.methods import Measured, lower_error
-from lfpiv_cli.validation.pipe import pipe_figures
+from lfpiv_cli.validation.methods import Measured, lower_error, pipe_figures
 
 SHAPE = (4, 3, 5)
 VOXEL_MM = (0.1, 0.1, 0.2)
@@ -176,7 +176,7 @@ def test_table_4_takes_the_paper_s_slices_of_a_duct() -> None:
     assert table["x/D 0.24"]["ours_percent"] == pytest.approx(2.6)
     assert table["x/D 0.24"]["paper_ert_percent"] == 10.43
     pytest.importorskip("matplotlib")
-    from lfpiv_cli.validation.pictures import slices_figure
+    from lfpiv_cli.validation.methods import slices_figure
 
     panel = slices_figure({"measured": Measured(field, truth, everywhere)}, duct).axes[0]
     profile = 0.1 * (1.0 + 0.01 * across + 0.02 * -2.0)
@@ -220,7 +220,7 @@ def test_a_pipes_figures_go_by_the_distance_from_its_axis() -> None:
     missing = next(ring for ring in found["rings"] if ring["radius_shares"] == [0.5, 0.7])
     assert missing["within_25_percent_vector"] == pytest.approx(1.0 - 1.0 / missing["vectors"])
     pytest.importorskip("matplotlib")
-    from lfpiv_cli.validation.pipe import radius_figure
+    from lfpiv_cli.validation.methods import radius_figure
 
     panel = radius_figure({"measured": field}, wall, 0.1).axes[0]
     told = {line.get_label(): line for line in panel.lines}
@@ -288,7 +288,7 @@ def test_the_picture_shows_truth_and_methods_in_three_planes_on_one_scale(
     methods: dict[str, Measured], truth: NDArray[np.float64], inside: NDArray[np.bool_]
 ) -> None:
     pytest.importorskip("matplotlib")
-    from lfpiv_cli.validation.pictures import flow_figure
+    from lfpiv_cli.validation.methods import flow_figure
 
     panels = np.array(flow_figure(methods).axes[:9]).reshape(3, 3)
     assert [row[0].get_title().split("\n")[0] for row in panels] == ["true: w", "volumes: w", "particles: w"]
@@ -301,7 +301,7 @@ def test_the_picture_shows_truth_and_methods_in_three_planes_on_one_scale(
 
 def test_errors_of_methods_are_on_one_scale_a_component(methods: dict[str, Measured]) -> None:
     pytest.importorskip("matplotlib")
-    from lfpiv_cli.validation.pictures import errors_figure
+    from lfpiv_cli.validation.methods import errors_figure
 
     figure = errors_figure(methods)
     panels = np.array([axes for axes in figure.axes if axes.images and axes.get_title()]).reshape(3, 2, 3)
@@ -321,7 +321,7 @@ def test_profiles_are_over_the_windows_that_all_have_found(
     methods: dict[str, Measured], truth: NDArray[np.float64]
 ) -> None:
     pytest.importorskip("matplotlib")
-    from lfpiv_cli.validation.pictures import profiles_figure
+    from lfpiv_cli.validation.methods import profiles_figure
 
     panel = np.array(profiles_figure(methods).axes[:9]).reshape(3, 3)[1, 0]
     told = {line.get_label(): line.get_ydata() for line in panel.lines}
@@ -332,7 +332,7 @@ def test_profiles_are_over_the_windows_that_all_have_found(
 
 def test_an_analytic_flow_is_a_line_beyond_the_outer_windows(inside: NDArray[np.bool_]) -> None:
     pytest.importorskip("matplotlib")
-    from lfpiv_cli.validation.pictures import profiles_figure
+    from lfpiv_cli.validation.methods import profiles_figure
 
     flow = shear(100.0, "x", "z")
     field = field_of(np.zeros((*SHAPE, 3)))

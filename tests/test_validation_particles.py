@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lfpiv_cli.validation.particles import match, particle_figures
+from lfpiv_cli.validation.volume import match, particle_figures
 
 LOW, HIGH = np.zeros(3), np.full(3, 5.0)
 

@@ -9,7 +9,7 @@ import click
 import numpy as np
 import pytest
 
-from lfpiv_cli.cli import cli
+from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.files.particles import Particles, write_particles
 from lfpiv_cli.files.vtkhdf import write_volume

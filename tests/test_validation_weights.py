@@ -10,21 +10,22 @@ import pytest
 import yaml
 from click.testing import CliRunner
 
-from lfpiv_cli.cli import cli
+from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import LimitMissedError
-from lfpiv_cli.optics.microlenses import Lattice
-from lfpiv_cli.optics.object_space import ObjectSpace
+from lfpiv_cli.optics.camera import Lattice
+from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.validation.weights import (
     GREY_LEVELS,
     WINDOW_RADIUS_PX,
     Column,
+    columns_figure,
     compare_columns,
-    limits_missed,
     make_columns,
+    similarity_figure,
     ssim,
     weights_figures,
+    weights_limits_missed,
 )
-from lfpiv_cli.validation.weights_pictures import columns_figure, similarity_figure
 
 
 def test_ssim_of_constants_eq_16():
@@ -74,8 +75,10 @@ def test_figures_of_a_column_by_hand():
 
 def test_limits_are_lower_ones_on_ssim_and_upper_ones_elsewhere():
     figures = {"a": {"ssim_smallest": 0.9, "l1_mean": 0.02}, "b": None}
-    assert limits_missed(figures, {"a": {"ssim_smallest": 0.8, "l1_mean": 0.03}, "b": {"l1_mean": None}}) == []
-    assert len(limits_missed(figures, {"a": {"ssim_smallest": 0.95, "l1_mean": 0.01}, "b": {"l1_mean": 0.1}})) == 3
+    assert weights_limits_missed(figures, {"a": {"ssim_smallest": 0.8, "l1_mean": 0.03}, "b": {"l1_mean": None}}) == []
+    assert (
+        len(weights_limits_missed(figures, {"a": {"ssim_smallest": 0.95, "l1_mean": 0.01}, "b": {"l1_mean": 0.1}})) == 3
+    )
 
 
 @pytest.mark.thorough

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lfpiv_cli.calibration.transmission import fit_vignetting, relative_transmission, vignetting_surface
+from lfpiv_cli.calibration.white import fit_vignetting, relative_transmission, vignetting_surface
 from lfpiv_cli.grid import Grid
-from lfpiv_cli.optics.microlenses import Lattice
-from lfpiv_cli.optics.object_space import ObjectSpace
+from lfpiv_cli.optics.camera import Lattice
+from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.synthetic.render import render_white
 from lfpiv_cli.weights.build import factorise
 from lfpiv_cli.weights.columns import OnDemandOperator

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from lfpiv_cli.errors import InputError
-from lfpiv_cli.optics.camera import Camera
-from lfpiv_cli.optics.microlenses import Lattice
+from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.self_calibration.nuisances import Nuisances
 from lfpiv_cli.self_calibration.refinement import Refinement
 from lfpiv_cli.self_calibration.walls import Walls, find_walls

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from lfpiv_cli.errors import InputError
-from lfpiv_cli.files import watching
-from lfpiv_cli.files.watching import LOOK_S, SETTLED_S, as_they_come
+from lfpiv_cli.files import listing
+from lfpiv_cli.files.listing import LOOK_S, SETTLED_S, as_they_come
 
 WHOLE = b"a whole image"
 
@@ -51,7 +51,7 @@ def read(path: Path) -> None:
 @pytest.fixture
 def camera(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Camera:
     camera = Camera(tmp_path)
-    monkeypatch.setattr(watching, "time", camera)
+    monkeypatch.setattr(listing, "time", camera)
     return camera
 
 

@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.calibration.board import fit_one_dot, locate_board
 from lfpiv_cli.calibration.board_pose import BoardGeometry
-from lfpiv_cli.calibration.near_pixels import pixels_near
+from lfpiv_cli.calibration.shape_fit import pixels_near
 from lfpiv_cli.calibration.wave_shapes import Strips, WaveLight, WaveShapes, corner_strips, disc_strips
 from lfpiv_cli.errors import ConfigError
-from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.optics.microlenses import Lattice
-from lfpiv_cli.optics.object_space import ObjectSpace
+from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.optics.waves import Waves
 from lfpiv_cli.synthetic.board import BoardPlacement, render_board
 from lfpiv_cli.synthetic.wave_images import white_by_waves

@@ -10,13 +10,11 @@ from numpy.typing import NDArray
 from scipy.special import j1
 
 from lfpiv_cli.optics import waves
-from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.curved_space import CurvedSpace, Face
 from lfpiv_cli.optics.media import Media, Window, fluid_path_to_focus
-from lfpiv_cli.optics.microlenses import Lattice
-from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.optics.surfaces import Cylinder, Plane
-from lfpiv_cli.optics.tracing import disc_points
+from lfpiv_cli.optics.tracing import ObjectSpace, disc_points
 from lfpiv_cli.optics.waves import DEGREE, Waves, WavesInCamera, pixel_response
 from lfpiv_cli.synthetic.board import sunflower
 from lfpiv_cli.synthetic.render import Balls, render_points, render_white

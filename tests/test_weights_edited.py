@@ -133,10 +133,10 @@ def test_what_is_missing_or_of_another_kind_is_named(tmp_path: Path, weights: by
     assert wrong(weights, tmp_path, lambda file: (file.__delitem__(name), file.create_group(name)))[0] == 4
 
 
-def test_strips_of_an_earlier_version_are_to_be_built_again(tmp_path: Path, weights: bytes) -> None:
-    code, said = wrong(weights, tmp_path, lambda file: file.create_group("strips").attrs.__setitem__("height", 8))
+def test_weights_of_an_earlier_version_are_to_be_built_again(tmp_path: Path, weights: bytes) -> None:
+    code, said = wrong(weights, tmp_path, lambda file: file.attrs.__setitem__("format_version", 3))
     assert code == 4
-    assert "w.h5: weights behind curved faces of an earlier lfpiv; build them again" in said
+    assert "w.h5: has lfpiv-weights version 3, this program reads 4; make it again with this program" in said
 
 
 @pytest.mark.parametrize("media", [(0.5, 1.0, 1.0), (1.0, np.nan, 1.0), (1.0, 1.0, 1e300)])

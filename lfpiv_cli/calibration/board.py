@@ -8,32 +8,121 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose, on_the_grid, pose_of_dots
-from lfpiv_cli.calibration.corners import first_corners
-from lfpiv_cli.calibration.dot_model import (
+from lfpiv_cli.calibration.corners import Fit, Look, enlarged_view, evenly_lit, first_corners
+from lfpiv_cli.calibration.rectification import turned
+from lfpiv_cli.calibration.shape_fit import (
+    MeasuredPoints,
+    ShapeFit,
     checked_disc_radius,
     fit_disc,
+    pixels_near,
 )
-from lfpiv_cli.calibration.measured_points import MeasuredPoints, measured_points
-from lfpiv_cli.calibration.near_pixels import pixels_near
-from lfpiv_cli.calibration.rectification import turned
-from lfpiv_cli.calibration.refocusing import Refocusing
-from lfpiv_cli.calibration.shape_fit import ShapeFit
-from lfpiv_cli.calibration.spots import find_spots
-from lfpiv_cli.calibration.target_kinds import another_kind
-from lfpiv_cli.calibration.wave_shapes import WaveLight, WaveShapes, disc_strips, together
+from lfpiv_cli.calibration.views import Refocusing, alternating, described
+from lfpiv_cli.calibration.wave_shapes import WaveLight, WaveShapes, disc_strips
+from lfpiv_cli.calibration.white import find_spots
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.names import Pattern
 from lfpiv_cli.neighbourhoods import opened
-from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.camera import Camera, refocused
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
-from lfpiv_cli.optics.pupils import refocused
 from lfpiv_cli.robust import BRIGHTEST_PERCENTILE
+
+# What kind of calibration target a picture shows, to name one that the config does not expect.
+
+
+# A chessboard is named by its size where at least this many corners along each side are seen.
+FEWEST_CORNERS = (3, 3)
+# The largest dictionaries of each size hold the smaller ones.
+DICTIONARIES = ("DICT_4X4_1000", "DICT_5X5_1000", "DICT_6X6_1000", "DICT_7X7_1000", "DICT_ARUCO_ORIGINAL")
+# Single markers turn up by chance in pictures of other things.
+FEWEST_MARKERS = 2
+# Round spots make a board of dots when they are as many, and most have a neighbour at the same distance.
+FEWEST_SPOTS = 9
+SAME_DISTANCE = 0.15
+EVEN_SHARE = 0.8
+
+
+def another_kind(
+    image: NDArray[np.float32],
+    camera: Camera,
+    board: BoardGeometry,
+    transmission: NDArray[np.float32] | None = None,
+) -> str | None:
+    """Return a sentence that names the target in a rectified picture where it is not the board's; else None."""
+    passed = np.ones(image.shape, dtype=np.float32) if transmission is None else transmission
+    picture, _ = enlarged_view(evenly_lit(image, passed), camera)
+    for pattern, look in LOOKS_LIKE.items():
+        if (found := look(picture)) is not None:
+            return None if found == described(board) else sentence(found, pattern, board)
+    return None
+
+
+def sentence(found: str, pattern: str, board: BoardGeometry) -> str | None:
+    """Return what to say of a target that was found where the config has another; None where that is not certain."""
+    if pattern == "dots" and board.pattern == "charuco":
+        # its own markers are even and round once they are out of focus
+        return None
+    if pattern != board.pattern:
+        return f"this looks like {found}; board.pattern says {board.pattern}"
+    if pattern == "chessboard":
+        return f"this looks like {found}; the config says {described(board)}"
+    if pattern == "charuco" and not found.endswith(board.dictionary.split("_")[1]):
+        return f"this looks like {found}; board.dictionary says {board.dictionary}"
+    # the same kind; how many dots or markers it has says nothing while some are not seen
+    return None
+
+
+def markers(picture: NDArray[np.uint8]) -> str | None:
+    """Return what a picture with ArUco markers shows."""
+    for name in DICTIONARIES:
+        words = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+        _, identity, _ = cv2.aruco.ArucoDetector(words).detectMarkers(picture)
+        if identity is not None and len(identity) >= FEWEST_MARKERS:
+            return f"a ChArUco board with markers of {name.split('_')[1]}"
+    return None
+
+
+def chessboard(picture: NDArray[np.uint8]) -> str | None:
+    """Return what a picture of a chessboard shows, with the number of its squares."""
+    flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_EXHAUSTIVE
+    there, corners, meta = cv2.findChessboardCornersSBWithMeta(picture, FEWEST_CORNERS, flags)
+    if not there or meta is None:
+        return None
+    shape = (int(meta.shape[0]), int(meta.shape[1]))
+    if not alternating(picture, np.asarray(corners, dtype=np.float64).reshape(*shape, 2)):
+        return None
+    down, across = (n + 1 for n in shape)
+    return f"a chessboard of {max(across, down)} x {min(across, down)} squares"
+
+
+def dots(picture: NDArray[np.uint8]) -> str | None:
+    """Return what a picture of evenly spaced round dots shows, bright or dark."""
+    for polarity, blob in (("bright", 255), ("dark", 0)):
+        settings = cv2.SimpleBlobDetector.Params()
+        settings.blobColor = blob
+        settings.filterByArea, settings.minArea, settings.maxArea = True, 20.0, picture.size / FEWEST_SPOTS
+        settings.minDistBetweenBlobs = 4.0
+        places = np.array([spot.pt for spot in cv2.SimpleBlobDetector.create(settings).detect(picture)]).reshape(-1, 2)
+        if len(places) >= FEWEST_SPOTS and _even(places):
+            return f"a board of {len(places)} {polarity} dots"
+    return None
+
+
+def _even(places: NDArray[np.float64]) -> bool:
+    """Return whether most places have their nearest neighbour at the same distance."""
+    distance = np.hypot(*np.moveaxis(places[:, np.newaxis] - places, -1, 0))
+    nearest = np.min(distance + np.diag(np.full(len(places), np.inf)), axis=1)
+    return bool(np.mean(np.abs(nearest / np.median(nearest) - 1.0) < SAME_DISTANCE) >= EVEN_SHARE)
+
+
+# In this order: a ChArUco board is a chessboard, too, and a chessboard's squares are round once they are out of focus.
+LOOKS_LIKE = {"charuco": markers, "chessboard": chessboard, "dots": dots}
 
 # A pixel shows a dot when it is brighter than this share of the brightest thousandth of the picture.
 BRIGHT_SHARE = 0.2
@@ -59,84 +148,50 @@ LENS_ROUNDS = 2
 SCALE_TOLERANCE = 1e-4
 
 
-class Look(Protocol):
-    """A picture of a target and the points in it, roughly; `medium` is what the target stands in."""
-
-    @property
-    def medium(self) -> Media: ...
-
-    def moved(self, scale: float, depth_mm: float) -> Look:
-        """Return the look with its points nearer the axis by a scale, at another depth."""
-
-    def by_waves(self, light: WaveLight) -> Look:
-        """Return the look with points that are measured by waves."""
-
-    def measured(self, camera: Camera, board: BoardGeometry) -> MeasuredPoints:
-        """Measure the points."""
-
-
 @dataclass(frozen=True, eq=False)
-class FirstLook:
-    """A picture of a board and the dots in it, to within a dot's radius.
+class DotLook(Look):
+    """The dots of a board, to within a dot's radius.
 
     Attributes
     ----------
-    signal : (rows, columns), dots bright
-    passed : (rows, columns) share of light that pixels pass
-    medium : what the board stands in
     radius_mm : of the dots
     start_mm : (n, 2) their lateral places, image axes
     depth_mm : of all of them
-    light : waves that the dots send; None: rays
     """
 
-    signal: NDArray[np.float64]
-    passed: NDArray[np.float32]
-    medium: Media
     radius_mm: float
     start_mm: NDArray[np.float64]
     depth_mm: float
-    light: WaveLight | None = None
 
-    def moved(self, scale: float, depth_mm: float) -> FirstLook:
+    def moved(self, scale: float, depth_mm: float) -> DotLook:
         """Return the look with its dots nearer the axis by a scale, at another depth."""
         return replace(self, start_mm=self.start_mm / scale, depth_mm=depth_mm)
 
-    def by_waves(self, light: WaveLight) -> FirstLook:
-        """Return the look with dots that are fitted by waves, from where rays have them."""
-        return replace(self, light=light)
+    def begun(self, camera: Camera, board: BoardGeometry) -> tuple[NDArray[np.float64], None, Fit]:
+        """Return where the dots were first seen; their grid tells which is which."""
 
-    def measured(self, camera: Camera, board: BoardGeometry) -> MeasuredPoints:
-        """Fit a disc to each dot."""
-        start = np.column_stack([self.start_mm, np.full(len(self.start_mm), self.depth_mm)])
-        found = self._fitted(start, camera, board)
-        if self.light is None or not len(found.places_mm):
-            return found
-        start = found.places_mm[together(found.places_mm[:, 2], camera, self.medium)]
-        return self._fitted(start, camera, board, WaveShapes.of(camera, self.medium, self.light, start[:, 2]))
+        def fit(start_mm: NDArray[np.float64], waves: WaveShapes | None = None) -> ShapeFit | None:
+            x, y, z = start_mm
+            scene = (self.signal, self.passed, camera, board, self.medium)
+            found = fit_one_dot(*scene, (x, y, z), self.radius_mm, waves)
+            return found if found is not None and found.brightness > 0.0 else None
 
-    def _fitted(
-        self, start_mm: NDArray[np.float64], camera: Camera, board: BoardGeometry, waves: WaveShapes | None = None
-    ) -> MeasuredPoints:
-        """Fit discs from first guesses (n, 3), by rays or by waves."""
-        scene = (self.signal, self.passed, camera, board, self.medium)
-        fits = [fit_one_dot(*scene, (x, y, z), self.radius_mm, waves) for x, y, z in start_mm]
-        return measured_points([fit if fit is not None and fit.brightness > 0.0 else None for fit in fits])
+        return np.column_stack([self.start_mm, np.full(len(self.start_mm), self.depth_mm)]), None, fit
 
 
-def first_dots_look(
+def dots_look(
     image: NDArray[np.float32],
     camera: Camera,
     board: BoardGeometry,
     media: Media,
     transmission: NDArray[np.float32] | None = None,
-) -> FirstLook:
+) -> DotLook:
     """Find the dots of a board; parameters and errors are those of `locate_board`."""
     medium = media.in_air() if board.medium == "air" else media
     radius = checked_disc_radius(0.5 * board.dot_diameter_mm, camera)
     passed = np.ones(image.shape, dtype=np.float32) if transmission is None else transmission
     signal = dot_signal(image, passed, board)
-    return FirstLook(
+    return DotLook(
         signal, passed, medium, radius, *first_dots(signal, camera, board, medium, candidate_depths(camera, medium))
     )
 
@@ -198,7 +253,7 @@ def _pose(
         camera = replace(refocused(camera, pose.magnification), distortion_per_mm2=pose.distortion_per_mm2)
         camera = camera.with_micro_images(micro_images)
         look = look.moved(ratio, pose.z0_mm)
-    return pose if light is None else _seen(look.by_waves(light), camera, board, rotation_rad)[0]
+    return pose if light is None else _seen(replace(look, light=light), camera, board, rotation_rad)[0]
 
 
 def _seen(
@@ -218,7 +273,7 @@ def dots_in_world(
 
     Parameters and errors are those of `locate_board`, which believes in the spacing and asks what the camera is.
     """
-    found = first_dots_look(image, camera, board, media).measured(camera, board)
+    found = dots_look(image, camera, board, media).measured(camera, board)
     places, _ = world_places(found, camera, rotation_rad)
     kept, index = on_the_grid(places, board)
     dots = np.full((board.dots[1], board.dots[0], 3), np.nan)
@@ -318,7 +373,7 @@ def fit_one_dot(
 
 # How the points of each pattern are found, by `board.pattern`.
 LOOKS: dict[Pattern, Callable[..., Look]] = {
-    "dots": first_dots_look,
+    "dots": dots_look,
     "chessboard": first_corners,
     "charuco": first_corners,
 }

@@ -8,32 +8,167 @@ Axes: image axes (x along the columns, y along the rows), mm; rectified pictures
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from typing import Protocol
 
 import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.calibration.board_pose import BoardGeometry
-from lfpiv_cli.calibration.corner_model import fit_corner, step_mm
-from lfpiv_cli.calibration.dot_model import undistorted
-from lfpiv_cli.calibration.measured_points import MeasuredPoints, measured_points
-from lfpiv_cli.calibration.near_pixels import pixels_near
-from lfpiv_cli.calibration.shape_fit import ShapeFit
-from lfpiv_cli.calibration.target_detection import (
+from lfpiv_cli.calibration.shape_fit import (
+    BLURRED_SAMPLES,
+    SHARP_SHARE,
+    MeasuredPoints,
+    NearPixels,
+    PixelRays,
+    ShapeFit,
+    SharesAndSlopes,
+    fit_shape,
+    fit_steps,
+    measured_points,
+    pixels_near,
+    scene_points,
+    scene_shares,
+    undistorted,
+)
+from lfpiv_cli.calibration.views import (
     charuco_corners,
     chessboard_corners,
     clear_mm,
     described,
+    lens_table,
     marker_modules,
+    sub_aperture_view,
+    view_crossings,
 )
-from lfpiv_cli.calibration.views import lens_table, sub_aperture_view, view_crossings
 from lfpiv_cli.calibration.wave_shapes import WaveLight, WaveShapes, corner_strips, together
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.robust import MAD_TO_SIGMA
+
+# What a corner of a chessboard looks like on the sensor, and the corner that explains given pixels best.
+#
+# A pixel's light is the share of the polygon that its microlens is, seen in the scene (see `shape_fit`), that lies in
+# two opposite quadrants about the corner, exactly. With sgn u sgn v the quadrants' sign, the integral of it over a
+# polygon is that of |u| sgn v dv along its edges (Green's theorem), which is summed over the parts of an edge in one
+# quadrant.
+#
+# Axes: image axes (x along the columns, y along the rows), mm, z away from the camera from the focal plane; (u, v)
+# along the edges that meet in the corner.
+
+
+# Steps of the fit are measured in this share of a square.
+STEP_SHARE = 0.25
+
+
+def fit_corner(
+    pixels: NearPixels,
+    start_mm: NDArray[np.float64],
+    edges_mm: NDArray[np.float64],
+    camera: Camera,
+    media: Media,
+) -> ShapeFit:
+    """Fit a corner to pixels by least squares: x, y, z, brightness and a sloping background are free.
+
+    Parameters
+    ----------
+    start_mm : (3,) first guess, in image axes, within about half a microlens
+    edges_mm : (2, 2) rows: the squares' sides that meet in the corner, x and y
+    """
+    size = step_mm(edges_mm)
+
+    def shares_at(position: NDArray[np.float64]) -> SharesAndSlopes:
+        return corner_shares(pixels.rays, position, edges_mm, camera, media)
+
+    beside = scene_points(pixels.rays, camera, media, float(start_mm[2])) - start_mm[:2]
+    return fit_shape(pixels.signal, pixels.passed, beside, start_mm, fit_steps(size, camera, media), shares_at)
+
+
+def step_mm(edges_mm: NDArray[np.float64]) -> float:
+    """Return in what steps a fit moves a corner, by the squares' sides (2, 2)."""
+    return STEP_SHARE * float(np.hypot(edges_mm[:, 0], edges_mm[:, 1]).mean())
+
+
+def corner_shares(
+    rays: PixelRays, position_mm: NDArray[np.float64], edges_mm: NDArray[np.float64], camera: Camera, media: Media
+) -> SharesAndSlopes:
+    """Return for each pixel the share (n,) of what it sees at depth z in two opposite quadrants, and its slopes.
+
+    `position_mm` is (x, y, z) in image axes; the slopes (n, 3) are the share's derivatives by it, per mm.
+    """
+    to_edges = np.linalg.inv(edges_mm)
+    sharp = SHARP_SHARE * 0.5 * float(np.hypot(edges_mm[:, 0], edges_mm[:, 1]).min())
+
+    def covered(middle: NDArray[np.float64], cell: NDArray[np.float64], width: float) -> SharesAndSlopes:
+        return quadrant_shares(middle, cell, to_edges, width, 1 if width < sharp else BLURRED_SAMPLES)
+
+    return scene_shares(rays, position_mm, camera, media, covered)
+
+
+@njit(cache=True)
+def quadrant_shares(
+    middle: NDArray[np.float64], cell: NDArray[np.float64], to_edges: NDArray[np.float64], width: float, samples: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the mean share of `cell`, moved to `middle` and over a square of `width` around it, where u v > 0.
+
+    The slopes (n, 4) are its derivatives by the middle's x and y, the logarithm of the cell's size, and the width.
+    """
+    edged = cell @ to_edges
+    shares, slopes = np.zeros(middle.shape[0]), np.zeros((middle.shape[0], 4))
+    sums = np.empty(5)
+    weight = 0.5 / (samples * samples)
+    for n in range(middle.shape[0]):
+        for a in range(samples):
+            for b in range(samples):
+                off_x, off_y = (a + 0.5) / samples - 0.5, (b + 0.5) / samples - 0.5
+                x, y = middle[n, 0] + width * off_x, middle[n, 1] + width * off_y
+                u = x * to_edges[0, 0] + y * to_edges[1, 0]
+                v = x * to_edges[0, 1] + y * to_edges[1, 1]
+                quadrant_sums(u, v, edged, sums)
+                mean, by_u, by_v = sums[0] / sums[4], weight * sums[1] / sums[4], weight * sums[2] / sums[4]
+                by_x = by_u * to_edges[0, 0] + by_v * to_edges[0, 1]
+                by_y = by_u * to_edges[1, 0] + by_v * to_edges[1, 1]
+                shares[n] += weight * (1.0 + mean)
+                slopes[n, 0] += by_x
+                slopes[n, 1] += by_y
+                slopes[n, 2] += weight * (sums[3] / sums[4] - 2.0 * mean)
+                slopes[n, 3] += by_x * off_x + by_y * off_y
+    return shares, slopes
+
+
+@njit(cache=True)
+def quadrant_sums(u: float, v: float, cell: NDArray[np.float64], sums: NDArray[np.float64]) -> None:
+    """Write the integral of sgn u sgn v over a polygon `cell` moved to (u, v), its slopes, and the polygon's area.
+
+    The slopes are by u, by v and by the logarithm of the cell's size: every part of an edge sweeps an area.
+    """
+    sums[:] = 0.0
+    cuts = np.empty(4)
+    for k in range(cell.shape[0]):
+        following = (k + 1) % cell.shape[0]
+        u_0, v_0 = u + cell[k, 0], v + cell[k, 1]
+        du, dv = cell[following, 0] - cell[k, 0], cell[following, 1] - cell[k, 1]
+        cuts[0], cuts[3] = 0.0, 1.0
+        first = min(max(-u_0 / du, 0.0), 1.0) if du != 0.0 else 0.0
+        second = min(max(-v_0 / dv, 0.0), 1.0) if dv != 0.0 else 0.0
+        cuts[1], cuts[2] = min(first, second), max(first, second)
+        sums[4] += 0.5 * (u_0 * dv - v_0 * du)
+        swept = cell[k, 0] * dv - cell[k, 1] * du
+        for part in range(3):
+            length = cuts[part + 1] - cuts[part]
+            half_way = 0.5 * (cuts[part] + cuts[part + 1])
+            at_u, at_v = u_0 + half_way * du, v_0 + half_way * dv
+            sign = length if at_u * at_v > 0.0 else -length
+            sums[0] += sign * at_u * dv
+            sums[1] += sign * dv
+            sums[2] -= sign * du
+            sums[3] += sign * swept
+
 
 # Views are enlarged by this for OpenCV's detectors, which want squares of ten pixels and modules of three.
 ENLARGED = 4
@@ -66,36 +201,64 @@ FEWEST_CORNERS = 4
 MOST_PIXELS = 4_000
 
 
+class Fit(Protocol):
+    """Fits a point's shape from a first guess of its place (3,), by rays or by waves; None where it cannot be."""
+
+    def __call__(self, start_mm: NDArray[np.float64], waves: WaveShapes | None = None) -> ShapeFit | None: ...
+
+
 @dataclass(frozen=True, eq=False)
-class CornerLook:
+class Look(ABC):
+    """A picture of a target and the points in it, roughly.
+
+    Attributes
+    ----------
+    signal, passed : (rows, columns) light, dots bright, and the share of it that pixels pass
+    medium : what the target stands in
+    light : waves that the target sends, whose points are fitted from where rays have them; None: rays
+    """
+
+    signal: NDArray[np.float64]
+    passed: NDArray[np.float32]
+    medium: Media
+    light: WaveLight | None = field(default=None, kw_only=True)
+
+    def moved(self, scale: float, depth_mm: float) -> Look:
+        """Return the look with its points nearer the axis by a scale, at another depth, if it says where they are."""
+        return self
+
+    def measured(self, camera: Camera, board: BoardGeometry) -> MeasuredPoints:
+        """Fit its shape to the pixels that see the surroundings of each point."""
+        start, numbers, fit = self.begun(camera, board)
+        found = measured_points([fit(place) for place in start], numbers)
+        if self.light is None or not len(found.places_mm):
+            return found
+        near = together(found.places_mm[:, 2], camera, self.medium)
+        start = found.places_mm[near]
+        waves = WaveShapes.of(camera, self.medium, self.light, start[:, 2])
+        numbers = None if found.numbers is None else found.numbers[near]
+        return measured_points([fit(place, waves) for place in start], numbers)
+
+    @abstractmethod
+    def begun(self, camera: Camera, board: BoardGeometry) -> tuple[NDArray[np.float64], NDArray[np.int64] | None, Fit]:
+        """Return first guesses (n, 3) of the points, image axes, their numbers (n, 2) if known, and what fits one."""
+
+
+@dataclass(frozen=True, eq=False)
+class CornerLook(Look):
     """The corners of a target in the view from the main lens's middle.
 
     Attributes
     ----------
-    image, passed : (rows, columns) light, and the share of it that pixels pass
-    medium : what the target stands in
     numbers : (n, 2) which corner of the target, along its columns and rows
     sample : (n, 2) where, in samples (column, row) of the upright view
-    light : waves that the target sends; None: rays
     """
 
-    image: NDArray[np.float64]
-    passed: NDArray[np.float32]
-    medium: Media
     numbers: NDArray[np.int64]
     sample: NDArray[np.float64]
-    light: WaveLight | None = None
 
-    def moved(self, scale: float, depth_mm: float) -> CornerLook:
-        """Return what is seen under another magnification: the same."""
-        return self
-
-    def by_waves(self, light: WaveLight) -> CornerLook:
-        """Return the look with corners that are fitted by waves, from where rays have them."""
-        return replace(self, light=light)
-
-    def measured(self, camera: Camera, board: BoardGeometry) -> MeasuredPoints:
-        """Fit a corner to the pixels that see each one's surroundings, from where its line has it."""
+    def begun(self, camera: Camera, board: BoardGeometry) -> tuple[NDArray[np.float64], NDArray[np.int64], Fit]:
+        """Return where the corners' lines have them."""
         start = in_scene(straight_lines(*self.sightings(camera, board), camera), camera, self.medium)
         known = np.isfinite(start).all(axis=1)
         if known.sum() < FEWEST_CORNERS:
@@ -107,29 +270,15 @@ class CornerLook:
         terms = np.column_stack([np.ones(len(numbers)), numbers])
         edges = np.asarray(np.linalg.lstsq(terms, start[:, :2], rcond=None)[0][1:], dtype=np.float64)
         reach = clear_mm(board) - 0.5 * float(camera.lattice.pitch.max()) / abs(camera.magnification)
-        fits = [self._fit(place, edges, reach, camera) for place in start]
-        found = measured_points(fits, numbers)
-        if self.light is None or not len(found.places_mm) or found.numbers is None:
-            return found
-        near = together(found.places_mm[:, 2], camera, self.medium)
-        numbers, start = found.numbers[near], found.places_mm[near]
-        waves = WaveShapes.of(camera, self.medium, self.light, start[:, 2])
-        return measured_points([self._fit(place, edges, reach, camera, waves) for place in start], numbers)
 
-    def _fit(
-        self,
-        start_mm: NDArray[np.float64],
-        edges_mm: NDArray[np.float64],
-        reach_mm: float,
-        camera: Camera,
-        waves: WaveShapes | None = None,
-    ) -> ShapeFit | None:
-        """Fit one corner to the pixels that see its surroundings; None where the sensor ends."""
-        x, y, z = (float(value) for value in start_mm)
-        near = pixels_near((self.image, self.passed), camera, self.medium, (x, y, z), reach_mm, MOST_PIXELS)
-        if near is None or waves is None:
-            return None if near is None else fit_corner(near, start_mm, edges_mm, camera, self.medium)
-        return waves.fit(near, start_mm, step_mm(edges_mm), corner_strips(edges_mm, waves.lens_mm))
+        def fit(start_mm: NDArray[np.float64], waves: WaveShapes | None = None) -> ShapeFit | None:
+            x, y, z = (float(value) for value in start_mm)
+            near = pixels_near((self.signal, self.passed), camera, self.medium, (x, y, z), reach, MOST_PIXELS)
+            if near is None or waves is None:
+                return None if near is None else fit_corner(near, start_mm, edges, camera, self.medium)
+            return waves.fit(near, start_mm, step_mm(edges), corner_strips(edges, waves.lens_mm))
+
+        return start, numbers, fit
 
     def sightings(self, camera: Camera, board: BoardGeometry) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return points of the main lens (views, 2) and where on the array each shows the corners (views, n, 2)."""
@@ -139,7 +288,7 @@ class CornerLook:
         grid = ViewGrid.of(camera)
         clear = clear_mm(board) * abs(camera.magnification) / grid.step_mm
         half = tuple(int(max(2, np.floor(WINDOW_SHARE * n))) for n in clear)
-        even = evenly_lit(self.image, self.passed)
+        even = evenly_lit(self.signal, self.passed)
         pictures = [softened(upright_view(even, camera, grid, crossing)) for crossing in crossings]
         inside = np.isfinite(refined(pictures[0], self.sample, half)).all(axis=1)
         seen = np.full((len(crossings), len(self.sample), 2), np.nan)
@@ -174,10 +323,6 @@ class ViewGrid:
         """Return places on the array (..., 2) of samples (column, row)."""
         return np.asarray(self.origin_mm + sample * self.step_mm, dtype=np.float64)
 
-    def to_sample(self, place_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return samples (column, row) of places on the array (..., 2)."""
-        return np.asarray((place_mm - self.origin_mm) / self.step_mm, dtype=np.float64)
-
 
 def followed(
     pictures: list[NDArray[np.float32]],
@@ -197,7 +342,8 @@ def followed(
     seen = np.full((len(pictures), len(middle), 2), np.nan)
     for round_ in range(VIEW_ROUNDS):
         for k, (crossing, picture) in enumerate(zip(crossings_mm, pictures, strict=True)):
-            seen[k] = grid.to_mm(refined(picture, grid.to_sample(middle + slope * crossing), half))
+            sample = (middle + slope * crossing - grid.origin_mm) / grid.step_mm
+            seen[k] = grid.to_mm(refined(picture, sample, half))
             known = len(pictures) if round_ else k + 1
             if known >= FIRST_VIEWS:
                 slope = common_slope(crossings_mm[:known], seen[:known])

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.calibration.lattice import LatticeFit
 from lfpiv_cli.calibration.rectification import Rectification
-from lfpiv_cli.optics.microlenses import Lattice
+from lfpiv_cli.optics.camera import Lattice
 from lfpiv_cli.threads import share_out
 
 # Parts of a picture along each side.

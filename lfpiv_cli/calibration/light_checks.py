@@ -9,15 +9,295 @@ images is given to other lenses. At 0.8 % of the pitch a displacement is off sid
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
+from scipy.spatial import KDTree
 
+from lfpiv_cli.calibration.board_pose import COMMON_SHARE_OF_LENS_DEPTH, BoardPose, lens_in_scene_mm
 from lfpiv_cli.calibration.lattice import LatticeFit
-from lfpiv_cli.calibration.lens_light import LensImages
-from lfpiv_cli.calibration.white_checks import LARGEST_DIFFERENCE, neighbours_difference
+from lfpiv_cli.calibration.lens_light import LensImages, cell_places, part_middles
+from lfpiv_cli.calibration.white import MIDDLE_PER_PITCH, NARROWEST_LENS_IMAGE
+from lfpiv_cli.errors import InputError
 from lfpiv_cli.notice import Notice, written
+from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.robust import MAD_TO_SIGMA
+
+# What is not a thin lens before a parallel array: an aperture that is cut aslant, a tilted array, a curved field.
+#
+# Lens images show the aperture. A barrel cuts it towards the corners to the shape that two circles have in common
+# (cat's eye), narrower along the image height than across; their second moments tell both, without a threshold of
+# brightness. Where the microlenses are further from the sensor their images are larger. A board's dots tell where the
+# focus is.
+#
+# Axes: (column, row); image heights over that of the sensor's corners.
+
+
+# Lens images of an ideal camera differ by 0.1 to 0.3 %. With a twentieth of the aperture cut off in the corners places
+# erred by four stated errors, with a fifth a sixth of the tracers was found; with microlenses 1.2 % further from the
+# sensor there depths erred by two, with 2.9 % by three. Of photographs one differs by 1.0 % from side to side.
+LARGEST_CUT, LARGEST_GROWTH = 0.02, 0.01
+# Five times what dots have in common anyway, over the depth in which light spreads by one microlens.
+LARGEST_FIELD_DEPTH = 5.0 * COMMON_SHARE_OF_LENS_DEPTH
+
+# What lies above the mean of the brightest tenth of a lens image's cell is its plateau.
+BRIGHTEST_SHARE = 0.1
+# Dots beyond the four numbers that are fitted: fewer know their scatter badly.
+FEWEST_SPARE_DOTS = 5
+
+
+class Fitted(NamedTuple):
+    """A number and its standard error."""
+
+    value: float
+    sigma: float
+
+    def beyond(self, largest: float) -> bool:
+        """Return whether its size is above a limit, and not by chance."""
+        return abs(self.value) > max(largest, CERTAIN_SIGMAS * self.sigma)
+
+
+class Shapes(NamedTuple):
+    """How lens images change from the middle to the corners.
+
+    Attributes
+    ----------
+    cut : share of the light-giving area that is lost
+    oblong : mean square width along the image height over that across, less 1
+    growth : (along the columns, along the rows) of their width
+    """
+
+    cut: Fitted
+    oblong: Fitted
+    growth: tuple[Fitted, Fitted]
+
+
+def shapes_of(images: LensImages, image_shape: tuple[int, int]) -> Shapes:
+    """Return how the lens images of uniform light change over a picture (rows, columns)."""
+    size = np.array(image_shape[::-1], dtype=np.float64)
+    place = part_middles() * size / np.hypot(*size)
+    height2 = np.sum(place**2, axis=1)
+    terms = np.column_stack([np.ones(len(place)), place, height2])
+    along_x, along_y, across = _moments(images)
+    width2 = along_x + along_y
+    middle = float(np.median(width2))
+    area, *_, lost = _fit(terms, _areas(images.pattern))
+    growth = _fit(terms, 0.5 * width2 / middle)
+    (x, y), ones, none = place.T, np.ones(len(place)), np.zeros(len(place))
+    aslant = np.concatenate([np.column_stack([ones, none, x**2 - y**2]), np.column_stack([none, ones, 2.0 * x * y])])
+    oblong = _fit(aslant, np.concatenate([along_x - along_y, 2.0 * across]) / middle)
+    return Shapes(Fitted(-lost.value / area.value, lost.sigma / area.value), oblong[2], (growth[1], growth[2]))
+
+
+def shape_notices(shapes: Shapes) -> Iterator[Notice]:
+    """Say where the aperture is cut towards the corners, or else where the microlenses' distance changes."""
+    if shapes.cut.beyond(LARGEST_CUT) and shapes.oblong.beyond(0.0) and shapes.oblong.value < 0.0 < shapes.cut.value:
+        yield Notice(
+            "aperture-cut",
+            "white image",
+            f"lens images are lens-shaped towards the corners: {shapes.cut.value:.0%} of the aperture is cut off "
+            f"there, at most {LARGEST_CUT:.0%} of a good one; pitch, places and depths are off by it",
+            "stop the main lens down until lens images are alike everywhere",
+            shapes.cut.value,
+            f"at most {LARGEST_CUT:g}",
+        )
+        return
+    most = max(shapes.growth, key=lambda side: abs(side.value))
+    if most.beyond(LARGEST_GROWTH):
+        yield Notice(
+            "array-tilted",
+            "white image",
+            f"lens images are {abs(most.value):.1%} wider half a diagonal from the middle along the "
+            f"{'columns' if most is shapes.growth[0] else 'rows'}, and as much narrower on the other side, at most "
+            f"{LARGEST_GROWTH:.1%} of a good camera: microlenses are not everywhere as far from the sensor",
+            "mount the array parallel to the sensor, or use what is near the middle",
+            most.value,
+            f"within {LARGEST_GROWTH:g}",
+        )
+
+
+def field_depth(pose: BoardPose, camera: Camera) -> Fitted | None:
+    """Return how much further a flat board seems to be in the corners of the sensor than in its middle, mm.
+
+    None where there are too few dots to tell.
+    """
+    if pose.dots_found < 4 + FEWEST_SPARE_DOTS:
+        return None
+    corner = 0.5 * camera.pixel_mm * float(np.hypot(camera.columns, camera.rows))
+    height = camera.px_to_mm(pose.dots_px) / corner
+    terms = np.column_stack([np.ones(len(height)), height, np.sum(height**2, axis=1)])
+    return _fit(terms, pose.residual_mm[:, 2])[3]
+
+
+def field_notices(pose: BoardPose, camera: Camera) -> Iterator[Notice]:
+    """Say where the focus changes with the image height by more than what places in depth may be off."""
+    depth, largest = field_depth(pose, camera), LARGEST_FIELD_DEPTH * lens_in_scene_mm(camera)[1]
+    if depth is None or not depth.beyond(largest):
+        return
+    yield Notice(
+        "field-curved",
+        "board image",
+        f"a flat board seems {written(abs(depth.value))} mm {'further' if depth.value > 0.0 else 'nearer'} in the "
+        f"corners than in the middle (field curvature, or a bent board), at most {written(largest, 2)} mm may be: "
+        "depths are off by it, as the square of the image height",
+        "a flat board, a volume near the axis, another objective; for volumes boards at several --depth-mm and "
+        "method dlfc",
+        depth.value,
+        f"within {written(largest, 2)} mm",
+    )
+
+
+def _areas(pattern: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the areas of lens images (parts,), their light over their plateau, in bins."""
+    light = np.sort(pattern.reshape(len(pattern), -1), axis=1)
+    count = max(1, int(BRIGHTEST_SHARE * light.shape[1]))
+    return np.asarray(light.sum(axis=1) / np.maximum(light[:, -count:].mean(axis=1), np.finfo(np.float64).tiny))
+
+
+def _moments(images: LensImages) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return the second moments (parts,) of lens images along the columns, the rows, and of both, in square pixels."""
+    lattice, pattern = images.lattice_px, images.pattern
+    place = cell_places(pattern.shape[-1]) @ lattice.basis
+    cell = Lattice(np.zeros(2), lattice.basis, lattice.layout)
+    place = place - cell.points(cell.nearest(place))
+    share = pattern / np.maximum(pattern.sum(axis=(1, 2), keepdims=True), np.finfo(np.float64).tiny)
+    mean = np.einsum("pij,ijk->pk", share, place)
+    square = np.einsum("pij,ijk,ijl->pkl", share, place, place) - mean[:, :, np.newaxis] * mean[:, np.newaxis]
+    return square[:, 0, 0], square[:, 1, 1], square[:, 0, 1]
+
+
+def _fit(terms: NDArray[np.float64], values: NDArray[np.float64]) -> list[Fitted]:
+    """Return the coefficients (k,) of terms (n, k) that fit values (n,) best, and standard errors by the scatter."""
+    found = np.linalg.lstsq(terms, values, rcond=None)[0]
+    freedom = max(1, len(values) - terms.shape[1])
+    variance = np.sum((values - terms @ found) ** 2) / freedom * np.diag(np.linalg.pinv(terms.T @ terms))
+    return [Fitted(float(value), float(np.sqrt(square))) for value, square in zip(found, variance, strict=True)]
+
+
+# Whether a white image is one: what its lens images say against it.
+#
+# The limits lie between photographs of uniform light and pictures of scenes taken with the same cameras. Of four
+# white images, two of them through microscopes, the residual of the lattice is 0.05 to 1 % of the pitch, nine in ten
+# lens images differ from their neighbours by less than 0.2 to 4 %, and 91 to 98 % of the lens images are found; of
+# pictures of scenes it is 1 to 13 %, 12 to 17 %, and 3 to 89 %.
+
+
+# Shares of the pitch: twice the worst white image's, and half of what pictures of scenes leave at their worst.
+LARGE_RESIDUAL, LARGEST_RESIDUAL = 0.02, 0.06
+# Where more of the lens images are missing, the lattice is continued far beyond those that were found.
+FEWEST_FOUND = 0.5
+# Nine in ten lens images of a white image differ less from the median of those around.
+LARGEST_DIFFERENCE, DIFFERENCE_PERCENTILE, NEIGHBOURS = 0.08, 90.0, 4
+# Of the brightest lens image: darker ones count as this bright, which is nothing.
+DARKEST = 1e-9
+# What the data sheet says of the lens images' width is believed to this factor.
+WIDTH_TOLERANCE = 1.25
+
+WHITE = "white image"
+IS_IT_WHITE = "photograph uniform light, out of focus, at two thirds of full scale"
+
+
+def check_residual(fit: LatticeFit) -> None:
+    """Refuse lens images that form no lattice.
+
+    Raises
+    ------
+    InputError
+    """
+    share = residual_share(fit)
+    if share > LARGEST_RESIDUAL:
+        raise InputError(
+            f"the lens images of the white image are off a lattice by {100 * share:.1f} % of their pitch, at most "
+            f"{100 * LARGEST_RESIDUAL:.0f} % may be; it is not a white image: {IS_IT_WHITE}"
+        )
+
+
+def residual_share(fit: LatticeFit) -> float:
+    """Return the residual of the lattice's model, along the axis where it is larger, over the pitch."""
+    residual = fit.residual_px if fit.cubic_used else fit.residual_affine_px
+    return float(residual.max() / fit.lattice_px.pitch.mean())
+
+
+def white_notices(
+    white: NDArray[np.float64], fit: LatticeFit, width: float, sheet_width: float | None
+) -> Iterator[Notice]:
+    """Say what speaks against a white image.
+
+    Parameters
+    ----------
+    white : (rows, columns) raw, less the dark image
+    fit : lattice of its lens images
+    width : of the lens images over their pitch, in the image that the transmission is from
+    sheet_width : the same by the data sheet's f-numbers, None where they are not known
+    """
+    share = residual_share(fit)
+    if share > LARGE_RESIDUAL:
+        yield Notice(
+            "lattice-residual",
+            WHITE,
+            f"the lens images are off the lattice by {100 * share:.1f} % of their pitch, at most "
+            f"{100 * LARGE_RESIDUAL:.0f} % of a good one",
+            IS_IT_WHITE,
+            share,
+            f"at most {LARGE_RESIDUAL:g}",
+        )
+    found = fit.lenses * fit.lattice_px.cell_area / white.size
+    if found < FEWEST_FOUND:
+        yield Notice(
+            "lattice-incomplete",
+            WHITE,
+            f"{fit.lenses} lens images were found, {100 * found:.0f} % of those that the sensor has room for; the "
+            "lattice is continued where there are none",
+            f"{IS_IT_WHITE}, and light the whole sensor",
+            found,
+            f"at least {FEWEST_FOUND:g}",
+        )
+    difference = neighbours_difference(white, fit)
+    if difference > LARGEST_DIFFERENCE:
+        yield Notice(
+            "white-not-uniform",
+            WHITE,
+            f"one lens image in ten differs by more than {100 * difference:.0f} % in brightness from those around it, "
+            f"at most {100 * LARGEST_DIFFERENCE:.0f} % under uniform light: it looks like a picture of a scene",
+            IS_IT_WHITE,
+            difference,
+            f"at most {LARGEST_DIFFERENCE:g}",
+        )
+    if width < NARROWEST_LENS_IMAGE:
+        yield Notice(
+            "white-stopped-down",
+            WHITE,
+            f"its lens images are {width:.2f} of the pitch wide, at least {NARROWEST_LENS_IMAGE:g} is needed for the "
+            "transmission, which is left out",
+            "give a second --white, taken with the aperture of the measurements",
+            width,
+            f"at least {NARROWEST_LENS_IMAGE:g}",
+        )
+    elif sheet_width is not None and not 1.0 / WIDTH_TOLERANCE <= width / min(sheet_width, 1.0) <= WIDTH_TOLERANCE:
+        yield Notice(
+            "aperture-not-as-told",
+            "camera.main_lens.aperture_mm",
+            f"the lens images of the white image are {width:.2f} of the pitch wide, {min(sheet_width, 1.0):.2f} by the "
+            "data sheet's apertures",
+            "correct aperture_mm or f_number, or take the white image with the aperture of the measurements",
+            width,
+            f"{written(min(sheet_width, 1.0))} within a factor of {WIDTH_TOLERANCE:g}",
+        )
+
+
+def neighbours_difference(white: NDArray[np.float64], fit: LatticeFit) -> float:
+    """Return how much nine in ten lens images at most differ in brightness from the median of those around."""
+    half = max(1, int(MIDDLE_PER_PITCH * fit.lattice_px.pitch.mean()))
+    level = uniform_filter(np.asarray(white, dtype=np.float64), 2 * half + 1)
+    columns, rows = np.clip(np.round(fit.centres_px).astype(int), 0, np.array(white.shape[::-1]) - 1).T
+    brightness = level[rows, columns]
+    _, nearest = KDTree(fit.centres_px).query(fit.centres_px, NEIGHBOURS + 1)
+    around = np.median(brightness[nearest[:, 1:]], axis=1)
+    relative = np.abs(brightness - around) / np.maximum(around, DARKEST * max(float(np.abs(brightness).max()), DARKEST))
+    return float(np.percentile(relative, DIFFERENCE_PERCENTILE))
+
 
 # Lens images that have moved by less do no harm: a share of the pitch, and what pixels themselves make of small ones.
 LARGEST_SHIFT_SHARE, LARGEST_SHIFT_PX = 0.008, 0.15

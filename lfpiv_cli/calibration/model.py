@@ -17,24 +17,22 @@ from lfpiv_cli.calibration.board import locate_board
 from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose
 from lfpiv_cli.calibration.dlfc import RayFit, fit_rays
 from lfpiv_cli.calibration.lattice import EXPONENTS, LatticeFit, fit_lattice
+from lfpiv_cli.calibration.light_checks import check_residual
 from lfpiv_cli.calibration.rectification import Rectification
-from lfpiv_cli.calibration.scene_pose import ScenePose
 from lfpiv_cli.calibration.sheet import check_pitch, image_distance_mm, sheet_fit
-from lfpiv_cli.calibration.transmission import (
+from lfpiv_cli.calibration.wave_shapes import WaveLight
+from lfpiv_cli.calibration.white import (
     NARROWEST_LENS_IMAGE,
+    by_aperture,
     fit_vignetting,
     lens_image_width,
     relative_transmission,
 )
-from lfpiv_cli.calibration.wave_shapes import WaveLight
-from lfpiv_cli.calibration.white import by_aperture
-from lfpiv_cli.calibration.white_checks import check_residual
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.names import Layout
-from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.camera import Camera, Lattice, refocused
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.optics.microlenses import Lattice
-from lfpiv_cli.optics.pupils import refocused
+from lfpiv_cli.optics.shapes import ScenePose
 
 # A measured magnification replaces the data sheet's when it differs by more standard errors than chance explains.
 MAGNIFICATION_SIGMAS = 3.0

@@ -18,7 +18,7 @@ from scipy import ndimage
 from lfpiv_cli.calibration.lattice import EXPONENTS, LatticeFit
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.names import ColumnAxis
-from lfpiv_cli.optics.microlenses import Lattice, nearest_point
+from lfpiv_cli.optics.camera import Lattice, nearest_point
 from lfpiv_cli.threads import share_out
 
 EXPONENT_ARRAY = np.array(EXPONENTS, dtype=np.int64)

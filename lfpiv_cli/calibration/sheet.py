@@ -11,8 +11,7 @@ import numpy as np
 from lfpiv_cli.calibration.lattice import EXPONENTS, LatticeFit
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.notice import Notice, written
-from lfpiv_cli.optics.camera import Camera
-from lfpiv_cli.optics.pupils import real_lens, with_entrance_pupil
+from lfpiv_cli.optics.camera import Camera, real_lens, with_entrance_pupil
 from lfpiv_cli.scale import Scale
 
 # A lattice further from the data sheet than this is another camera, a binned sensor or a slip in the sheet: the

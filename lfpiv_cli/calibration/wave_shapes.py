@@ -3,7 +3,7 @@
 A shape is a stack of strips. Under a lens the light of a point is a sum of products of line responses (see
 `optics.line_responses`), and so is that of a strip: along either axis the response is a difference of its integral. Of
 light that fills the scene it is the whole integral, which is what a white image shows: a pixel's share is the shape's
-light over that one. By rays (`dot_model`) a disc near the focal plane is taken for one that lies 0.02 mm nearer, as
+light over that one. By rays (`shape_fit`) a disc near the focal plane is taken for one that lies 0.02 mm nearer, as
 lenses beside it are lit on one side.
 
 Axes: image axes (x along the columns, y along the rows), mm, z away from the camera from the focal plane.
@@ -18,13 +18,19 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from lfpiv_cli.calibration.dot_model import PixelRays, fit_steps, scene_points
-from lfpiv_cli.calibration.near_pixels import NearPixels
-from lfpiv_cli.calibration.shape_fit import ShapeFit, SharesAndSlopes, fit_shape
+from lfpiv_cli.calibration.shape_fit import (
+    NearPixels,
+    PixelRays,
+    ShapeFit,
+    SharesAndSlopes,
+    fit_shape,
+    fit_steps,
+    scene_points,
+)
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.line_responses import PHASES, LineResponses, line_responses, on_pixels, spline_weights
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
-from lfpiv_cli.optics.object_space import ObjectSpace
+from lfpiv_cli.optics.tracing import ObjectSpace
 
 # Strips of a shape per lens that it is wide.
 STRIPS_PER_LENS = 24

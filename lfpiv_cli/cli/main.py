@@ -1,55 +1,220 @@
-"""The command `lfpiv`: its subcommands, and how errors become exit codes."""
+"""The command `lfpiv`: its subcommands, and how errors become exit codes.
+
+Signals end the work whenever they arrive. stdout and stderr never stop a command: what cannot be said is lost, what is
+to be written is not.
+"""
 
 from __future__ import annotations
 
+import errno
+import io
+import os
+import signal
 import sys
-from typing import Any, NoReturn
+from contextlib import suppress
+from threading import Lock, Thread, Timer
+from types import FrameType
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
 from lfpiv_cli import __version__
-from lfpiv_cli.cli import (
-    calibration,
-    chain,
-    exports,
-    fields,
-    inspection,
-    planning,
-    reconstruction,
-    report,
-    simulation,
-    tracks,
-    validation,
-    vectors,
-    weights,
-)
-from lfpiv_cli.cli.environment import settle_environment
-from lfpiv_cli.cli.interrupts import end_by_signals, ended_by
-from lfpiv_cli.cli.options import voice_options
-from lfpiv_cli.cli.outcome import outcome_of, print_json_error, printable
-from lfpiv_cli.cli.streams import ensure_said, open_streams
+from lfpiv_cli.cli import measuring, results, rig
+from lfpiv_cli.cli.options import HungUp, Terminated, outcome_of, print_json_error, printable, voice_options
+from lfpiv_cli.errors import OutputError, UsageError
 from lfpiv_cli.files.inputs import ensure_address_space
 
+if TYPE_CHECKING:
+    from sys import UnraisableHookArgs
+
+
+# By then the call that ignored it has returned.
+AGAIN_AFTER_S = 0.1
+# Windows has no SIGHUP.
+RAISED: dict[int, type[BaseException]] = {
+    signal.SIGINT: KeyboardInterrupt,
+    signal.SIGTERM: Terminated,
+    **({signal.SIGHUP: HungUp} if hasattr(signal, "SIGHUP") else {}),
+}
+# The signals that Python has heard of, and whether none has been answered yet.
+_heard: list[int] = []
+_unanswered = Lock()
+
+
+def end_by_signals() -> None:
+    """Have SIGTERM and SIGHUP unwind the program as SIGINT does, have none be lost, and each be answered at once.
+
+    What is ignored from the start stays so: nohup has SIGHUP ignored, shells SIGINT in the background.
+    """
+    for number in RAISED:
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, _unwind)
+    sys.unraisablehook = _send_again
+    if sys.platform != "win32":
+        _answer_at_once()
+
+
+def ended_by(error: BaseException) -> BaseException:
+    """Return what a command ends by: the first signal, whatever a library has made of it, else the error."""
+    if not _heard:
+        return error
+    _answer(_heard[0])
+    return RAISED[_heard[0]]()
+
+
+def _unwind(number: int, _frame: FrameType | None) -> None:
+    _heard.append(number)
+    raise RAISED[number]
+
+
+def _answer_at_once() -> None:
+    """Answer signals from a thread of its own: Python itself hears of them when a compiled call has returned."""
+    heard, told = os.pipe()
+    os.set_blocking(told, False)
+    signal.set_wakeup_fd(told, warn_on_full_buffer=False)
+    # What is sent to a forked process is none of this one's.
+    os.register_at_fork(after_in_child=lambda: signal.set_wakeup_fd(-1))
+    Thread(target=_listen, args=(heard,), daemon=True).start()
+
+
+def _listen(heard: int) -> None:
+    while (number := os.read(heard, 1)[0]) not in RAISED:
+        pass
+    _answer(number)
+
+
+def _answer(number: int) -> None:
+    """Say on stderr by which signal the work ends, once."""
+    if not _unanswered.acquire(blocking=False):
+        return
+    after_bars = "\n" if os.isatty(2) else ""
+    with suppress(OSError):  # a terminal that has closed
+        os.write(2, f"{after_bars}lfpiv: {outcome_of(RAISED[number]())[0]}\n".encode())
+
+
+def _send_again(unraisable: UnraisableHookArgs) -> None:
+    """Send a signal again that arrived where Python ignores exceptions: when a library calls it back.
+
+    LLVM does for each kernel that is compiled or loaded.
+    """
+    for number, raised in RAISED.items():
+        if unraisable.exc_type is raised:
+            again = Timer(AGAIN_AFTER_S, signal.raise_signal, (number,))
+            again.daemon = True
+            again.start()
+            return
+    sys.__unraisablehook__(unraisable)
+
+
+THREADS, SCREEN = "NUMBA_NUM_THREADS", "MPLBACKEND"
+
+
+def settle_environment() -> None:
+    """Refuse a number of threads that is none; forget the screen to draw on, as pictures are drawn into files.
+
+    Raises
+    ------
+    UsageError
+    """
+    os.environ.pop(SCREEN, None)
+    told = os.environ.get(THREADS)
+    if told is not None and not (told.strip().isdecimal() and int(told) > 0):
+        raise UsageError(f"{THREADS} is {told!r}, expected a number of threads from 1 on, or that it is not set")
+
+
+class Stream(io.RawIOBase):
+    """A descriptor to write to, whose first failure is kept and not raised."""
+
+    def __init__(self, descriptor: int) -> None:
+        self._descriptor = descriptor
+        self.failure: OSError | None = None
+
+    def writable(self) -> bool:
+        """Return True."""
+        return True
+
+    def fileno(self) -> int:
+        """Return the descriptor."""
+        return self._descriptor
+
+    def isatty(self) -> bool:
+        """Return whether it is a terminal."""
+        return os.isatty(self._descriptor)
+
+    def write(self, data: bytes | bytearray | memoryview) -> int:  # type: ignore[override]
+        """Write all of the bytes, or none that could be written."""
+        left = memoryview(data).cast("B")
+        try:
+            while left and self.failure is None:
+                left = left[os.write(self._descriptor, left) :]
+        except OSError as error:
+            self.failure = error
+        return len(data)
+
+
+def open_streams() -> Stream:
+    """Put such streams in the place of stdout and stderr, and something in that of descriptors that are closed.
+
+    A file that was opened under the number of a closed stdout would get what is printed.
+
+    Returns
+    -------
+    Stream
+        That of stdout.
+    """
+    descriptor = os.open(os.devnull, os.O_RDWR)
+    while descriptor <= 2:
+        descriptor = os.dup(descriptor)
+    os.close(descriptor)
+    streams = {}
+    for name, number in (("stdout", 1), ("stderr", 2)):
+        before = getattr(sys, name)
+        streams[name] = Stream(number)
+        if before is not getattr(sys, f"__{name}__"):  # whoever has put another one there wants what is said
+            continue
+        encoding, errors = (before.encoding, before.errors) if before else ("utf-8", "backslashreplace")
+        text = io.TextIOWrapper(
+            io.BufferedWriter(streams[name]),  # type: ignore[type-var]
+            encoding=encoding,
+            errors=errors,
+            line_buffering=number == 2,
+        )
+        setattr(sys, name, text)
+    return streams["stdout"]
+
+
+def ensure_said(stdout: Stream) -> None:
+    """Refuse to call a command done whose answer on stdout was lost; a reader that has gone wanted no more of it.
+
+    Raises
+    ------
+    OutputError
+    """
+    sys.stdout.flush()
+    if stdout.failure is not None and stdout.failure.errno != errno.EPIPE:
+        raise OutputError(f"stdout: cannot be written: {os.strerror(stdout.failure.errno or 0)}; all files are written")
+
+
 COMMANDS = (
-    planning.init,
-    planning.check,
-    chain.run,
-    calibration.calibrate_snapshot,
-    calibration.refine_calibration,
-    weights.build_weights,
-    reconstruction.reconstruct,
-    vectors.correlate,
-    vectors.combine,
-    tracks.track,
-    fields.field,
-    tracks.follow,
-    inspection.info,
-    inspection.plot,
-    inspection.warm_up,
-    report.report,
-    exports.export,
-    validation.validate,
-    simulation.simulate,
+    rig.init,
+    rig.check,
+    measuring.run,
+    rig.calibrate_snapshot,
+    rig.refine_calibration,
+    rig.build_weights,
+    measuring.reconstruct,
+    measuring.correlate,
+    measuring.combine,
+    measuring.track,
+    measuring.field,
+    measuring.follow,
+    results.info,
+    results.plot,
+    results.warm_up,
+    results.report,
+    results.export,
+    results.validate,
+    results.simulate,
 )
 
 

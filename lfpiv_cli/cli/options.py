@@ -1,7 +1,8 @@
-"""What commands have in common: options written once, the settings of a run, and how a summary is printed."""
+"""What commands have in common: options written once, the settings of a run, how it is printed, and how it ends."""
 
 from __future__ import annotations
 
+import json
 import os
 import sys
 from collections.abc import Callable, Mapping
@@ -12,14 +13,72 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lfpiv_cli import __version__
-from lfpiv_cli.cli.outcome import error_record, print_json
-from lfpiv_cli.errors import LimitMissedError, PartialError, UsageError
+from lfpiv_cli.errors import LfpivError, LimitMissedError, OutputError, PartialError, UsageError
 from lfpiv_cli.files import kernel_cache
+from lfpiv_cli.files.atomic import shown, without_nan
+from lfpiv_cli.files.inputs import reason
 from lfpiv_cli.files.shares import Shard, parse_time_limit
 from lfpiv_cli.names import InputKind, Pairing, names_in
 
 if TYPE_CHECKING:
-    from lfpiv_cli.files.log import EventLog
+    from lfpiv_cli.files.atomic import EventLog
+
+EXIT_BUG = 1
+EXIT_HUNG_UP = 129
+EXIT_INTERRUPTED = 130
+EXIT_TERMINATED = 143
+
+
+class Terminated(BaseException):
+    """SIGTERM arrived; unwinds like KeyboardInterrupt so that temporary files are removed."""
+
+
+class HungUp(BaseException):
+    """SIGHUP arrived, as the terminal has closed; unwinds like that, too."""
+
+
+def outcome_of(error: BaseException) -> tuple[str, int]:
+    """Return what is said of an error, and the exit code."""
+    if isinstance(error, click.ClickException):
+        return error.format_message(), error.exit_code
+    if isinstance(error, (KeyboardInterrupt, click.Abort)):
+        return "interrupted", EXIT_INTERRUPTED
+    if isinstance(error, Terminated):
+        return "terminated", EXIT_TERMINATED
+    if isinstance(error, HungUp):
+        return "hung up", EXIT_HUNG_UP
+    if isinstance(error, LfpivError):
+        return str(error), error.exit_code
+    if isinstance(error, MemoryError) or "can't start new thread" in str(error):
+        words = reason(error) if str(error) else "the system gave no more"
+        return f"too little memory: {words}; a smaller volume, or fewer --threads, need less", OutputError.exit_code
+    if isinstance(error, OSError) and error.errno and error.filename is not None:
+        # What readers meet they say themselves: this is a place where nothing can be made.
+        return f"{shown(Path(os.fsdecode(error.filename)))}: cannot be used: {reason(error)}", OutputError.exit_code
+    return f"a bug: {type(error).__name__}: {error} (run again with --debug to see where)", EXIT_BUG
+
+
+def print_json(figures: dict[str, Any]) -> None:
+    """Print the one JSON object of a command to stdout; what is no number is null there."""
+    click.echo(json.dumps(without_nan(figures), allow_nan=False, sort_keys=True))
+
+
+def print_json_error(error: BaseException) -> None:
+    """Print an error as the JSON object of a command; one that came with figures stands in theirs already."""
+    if not isinstance(error, (LimitMissedError, PartialError)):
+        print_json(error_record(error))
+
+
+def error_record(error: BaseException) -> dict[str, Any]:
+    """Return an error as plain data."""
+    message, code = outcome_of(error)
+    return {"error": printable(message), "exit_code": code}
+
+
+def printable(message: str) -> str:
+    """Return a message whose names of files may be no UTF-8 as text that is."""
+    return message.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
+
 
 # Whether a file can be read its reader tells: an input's fault, and none of the command line.
 FILE = click.Path(path_type=Path, readable=False)
@@ -132,7 +191,7 @@ def raw_option(command: Callable[..., Any]) -> Callable[..., Any]:
     def run(raw: str | None = None, **arguments: Any) -> Any:
         if raw is None:
             return command(**arguments)
-        from lfpiv_cli.files.recordings.raw import parse_layout, with_layout
+        from lfpiv_cli.files.recordings.blocks import parse_layout, with_layout
 
         parse_layout(raw)
         if arguments.get("watch"):
@@ -249,7 +308,7 @@ def common_options(command: Callable[..., dict[str, Any]]) -> Callable[..., None
         **arguments: Any,
     ) -> None:
         from lfpiv_cli.console import Console
-        from lfpiv_cli.files.recordings.complaints import taken_complaints
+        from lfpiv_cli.files.recordings.recording import taken_complaints
         from lfpiv_cli.notice import Notice
 
         warned: list[Notice] = []
@@ -264,7 +323,7 @@ def common_options(command: Callable[..., dict[str, Any]]) -> Callable[..., None
         try:
             given = {name: value for name, value in arguments.items() if value is not None}
             if verify is not None:
-                from lfpiv_cli.files.checksums import ensure_verified
+                from lfpiv_cli.files.listing import ensure_verified
 
                 ensure_verified(verify, _inputs(given))
             summary = command(console=console, **given)
@@ -296,8 +355,7 @@ def _event_log(path: Path, arguments: Mapping[str, Any]) -> EventLog:
     ------
     UsageError : it would lie in the place of another file of the command
     """
-    from lfpiv_cli.files.log import EventLog
-    from lfpiv_cli.files.places import place_of
+    from lfpiv_cli.files.atomic import EventLog, place_of
 
     values = [each for value in arguments.values() for each in (value if isinstance(value, tuple) else (value,))]
     if place_of(path) in [place_of(other) for other in values if isinstance(other, Path)]:

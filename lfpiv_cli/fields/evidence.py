@@ -16,14 +16,13 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
-from scipy.linalg.lapack import dpotri
 
 from lfpiv_cli.fields import stencils
-from lfpiv_cli.fields.errors_of_samples import belonging, error_covariance, without_itself
-from lfpiv_cli.fields.lattice import Lattice
-from lfpiv_cli.fields.penalties import DIVERGENCE, ORDERS, Expectation, bound, penalty, spread_of
-from lfpiv_cli.fields.samples import Samples
+from lfpiv_cli.fields.samples import Samples, belonging, error_covariance, without_itself
+from lfpiv_cli.fields.stencils import DIVERGENCE, ORDERS, Expectation, Lattice, bound, inverse_of, penalty, spread_of
 from lfpiv_cli.threads import in_threads
+
+Floats = NDArray[np.float64]
 
 # Cells of a box along each axis: some thousand unknowns.
 BOX_CELLS = 4
@@ -59,7 +58,7 @@ class Box:
 
     lattice: Lattice
     samples: Samples
-    splines: NDArray[np.float64]
+    splines: Floats
     components: ClassVar[int] = 3
     integrals: ClassVar[int] = 0
 
@@ -71,7 +70,7 @@ class Box:
         np.put_along_axis(splines, columns, values, axis=1)
         return cls(lattice, samples, splines)
 
-    def normal(self, weight: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def normal(self, weight: Floats) -> tuple[Floats, Floats]:
         """Return the normal equations of samples with weights (n, 3, 3), components one after the other."""
         weighted = np.einsum("nij,nj->ni", weight, self.samples.value_mm)
         parts = [
@@ -80,11 +79,11 @@ class Box:
         ]
         return np.block(parts), (weighted.T @ self.splines).ravel()
 
-    def field(self, coefficients: NDArray[np.float64]) -> NDArray[np.float64]:
+    def field(self, coefficients: Floats) -> Floats:
         """Return the field (n, 3) at the samples."""
         return np.asarray(self.splines @ coefficients.reshape(3, -1).T)
 
-    def covariance(self, inverse: NDArray[np.float64]) -> NDArray[np.float64]:
+    def covariance(self, inverse: Floats) -> Floats:
         """Return the covariances (n, 3, 3) of the field at the samples."""
         count = self.splines.shape[1]
         parts = inverse.reshape(3, count, 3, count)
@@ -95,7 +94,7 @@ class Box:
         return found
 
 
-def by_component(matrix: stencils.Stencil) -> NDArray[np.float64]:
+def by_component(matrix: stencils.Stencil) -> Floats:
     """Return a small matrix whole, components one after the other."""
     nx, count, ny, nz = matrix.shape[:4]
     whole = stencils.dense(matrix).reshape(nx, count, ny * nz, nx, count, ny * nz)
@@ -131,13 +130,14 @@ def first_expectation(samples: Samples, lattice: Lattice, names: Sequence[str], 
     spread = spread_of(samples.value_mm)
     size = BOX_CELLS * float(np.min(lattice.cell_mm))
     reach = spread * size**kind.integrals
-    weights = {name: size ** _power(name) / (reach**2 * size**3) for name in names}
+    powers = {name: 2 if name == DIVERGENCE else 2 * ORDERS[name] for name in names}
+    weights = {name: size**power / (reach**2 * size**3) for name, power in powers.items()}
     return Expectation(weights, spread, 1.0, FIRST_UNRESOLVED * spread)
 
 
 def most_probable(
     samples: Samples, lattice: Lattice, expected: Expectation, rng: np.random.Generator, kind: type[Box] = Box
-) -> tuple[Expectation, NDArray[np.float64]]:
+) -> tuple[Expectation, Floats]:
     """Return the weights and scales that make the samples most probable, from a first guess.
 
     Also the median covariance (3, 3) of the field that a sample's neighbours make without it.
@@ -184,22 +184,18 @@ def held(expected: Expectation, lattice: Lattice) -> Expectation:
     return replace(expected, weights={**expected.weights, DIVERGENCE: weight})
 
 
-def _power(name: str) -> int:
-    return 2 if name == DIVERGENCE else 2 * ORDERS[name]
-
-
 def _updated(
     boxes: Sequence[Box],
     expected: Expectation,
-    beliefs_before: Sequence[NDArray[np.float64]],
-    parts: dict[str, NDArray[np.float64]],
-    bounded: NDArray[np.float64],
+    beliefs_before: Sequence[Floats],
+    parts: dict[str, Floats],
+    bounded: Floats,
 ) -> tuple[Expectation, list[Told]]:
     """Return weights and scales under which the boxes' samples are more probable, and what the boxes tell."""
     before = bounded + sum(weight * parts[name] for name, weight in expected.weights.items())
     before_inverse, _ = _inverse(before)
 
-    def tell(box: Box, belief: NDArray[np.float64]) -> Told:
+    def tell(box: Box, belief: Floats) -> Told:
         return _told(box, belief, expected, parts, before, before_inverse)
 
     told = in_threads(lambda pair: tell(*pair), list(zip(boxes, beliefs_before, strict=True)))
@@ -229,19 +225,14 @@ class Told:
     by_others : (n, 3, 3) covariances of the field that each sample's neighbours make without it
     """
 
-    had: NDArray[np.float64]
-    decided: NDArray[np.float64]
-    belief: NDArray[np.float64]
-    by_others: NDArray[np.float64]
+    had: Floats
+    decided: Floats
+    belief: Floats
+    by_others: Floats
 
 
 def _told(
-    box: Box,
-    belief: NDArray[np.float64],
-    expected: Expectation,
-    parts: dict[str, NDArray[np.float64]],
-    before: NDArray[np.float64],
-    before_inverse: NDArray[np.float64],
+    box: Box, belief: Floats, expected: Expectation, parts: dict[str, Floats], before: Floats, before_inverse: Floats
 ) -> Told:
     """Return what a box tells of the weights and scales."""
     covariance = error_covariance(box.samples, expected.scale, expected.unresolved_mm)
@@ -261,9 +252,7 @@ def _told(
     )
 
 
-def _fit(
-    box: Box, before: NDArray[np.float64], weight: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _fit(box: Box, before: Floats, weight: Floats) -> tuple[Floats, Floats]:
     """Return the coefficients of the field through a box' samples, and their covariance."""
     matrix, right = box.normal(weight)
     inverse, factor = _inverse(matrix + before)
@@ -271,13 +260,8 @@ def _fit(
 
 
 def _error_parts(
-    box: Box,
-    error: NDArray[np.float64],
-    field: NDArray[np.float64],
-    weight: NDArray[np.float64],
-    probability: NDArray[np.float64],
-    expected: Expectation,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    box: Box, error: Floats, field: Floats, weight: Floats, probability: Floats, expected: Expectation
+) -> tuple[Floats, Floats]:
     """Return what the errors have of the stated ones and of the unresolved, and what they would be expected to have."""
     weighted = np.einsum("nij,nj->ni", weight, error)
     shares = np.maximum(probability, np.finfo(np.float64).tiny)
@@ -293,8 +277,7 @@ def _error_parts(
     return had, expects
 
 
-def _inverse(matrix: NDArray[np.float64]) -> tuple[NDArray[np.float64], tuple[NDArray[np.float64], bool]]:
+def _inverse(matrix: Floats) -> tuple[Floats, tuple[Floats, bool]]:
     """Return the inverse of a symmetric positive definite matrix and its factor."""
     factor = cho_factor(matrix, lower=True, check_finite=False)
-    lower = np.tril(dpotri(factor[0], lower=1)[0])
-    return lower + np.tril(lower, -1).T, factor
+    return inverse_of(factor[0]), factor

@@ -2,16 +2,339 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import minimize
+from scipy.spatial import KDTree
+from scipy.special import gammaincinv
 from threadpoolctl import threadpool_limits
 
-from lfpiv_cli.fields.kriging import is_rough, kriged_field, not_outliers
 from lfpiv_cli.fields.samples import Samples
-from lfpiv_cli.fields.spline_field import SplineField, lattice_for, spline_field
+from lfpiv_cli.fields.spline_field import lattice_for, spline_field
+from lfpiv_cli.fields.structure import (
+    INDEPENDENT,
+    Estimates,
+    VectorStructure,
+    between,
+    estimated,
+    estimated_slopes,
+    log_likelihood,
+    unknown_variance,
+)
+from lfpiv_cli.robust import MAD_TO_SIGMA
+from lfpiv_cli.tracks.gridding import FEWEST_OF_STRUCTURE, ROUGH_EXPONENT
+from lfpiv_cli.tracks.kriging import without_own
+
+Floats = NDArray[np.float64]
+
+# A velocity field kriged from samples as vectors: the best linear unbiased estimate where the flow is rough.
+#
+# In turbulence the velocity differs between neighbouring tracks by more than a spline on any affordable lattice
+# follows. How much it differs, and that what differs is free of divergence, the tracks themselves tell: the structure
+# function under which they are likeliest. The estimate at a place is the best combination of the nearest samples, all
+# components of all of them together, by their full covariances: what is known of u and v tells of w.
+#
+# Samples further off what the others let expect than they should be are outliers; wrong links are.
+#
+# Axes: points (m, 3) and displacements in mm.
+
+
+# The structure function under which the samples are likeliest: what a field is kriged with.
+#
+# The likelihood is that of some neighbourhoods spread over the samples, each with all its covariances about an
+# unknown constant: a few hundred samples, which know both what neighbours differ by and how much of it is error.
+# First guesses with wide standard deviations keep what few samples cannot tell where it is likely to be.
+
+
+# So many neighbourhoods of so many samples, more of which change the estimates by less than their errors; and what
+# is enough to tell outliers.
+NEIGHBOURHOODS, FEW_NEIGHBOURHOODS = (20, 40), (12, 25)
+# Shares of potential flow to choose from, and by how much the logarithm of the likelihood must grow for one that is
+# not zero: twice that is exceeded by chi-squared of one degree of freedom once in seventy times.
+POTENTIAL_SHARES = (0.0, 0.03, 0.1, INDEPENDENT, 0.7)
+NEEDED_GROWTH = 3.0
+# First guesses: the power of turbulence, between lengths of so many times the distance of neighbours; the mean square
+# difference of neighbours and the nugget as shares of the variance; and the standard deviations of the logarithms (of
+# the logit of half the power).
+POWER, INNER_SPACINGS, OUTER_SPACINGS, DIFFERENCE_SHARE, NUGGET_SHARE = 2.0 / 3.0, 0.3, 10.0, 0.5, 1e-3
+DEVIATIONS = np.array([3.0, 1.5, 1.0, 1.0, 3.0, 0.5])
+# No parameter is further from its first guess, in these deviations: a search that went on would leave what is a number.
+FARTHEST = 10.0
+STEPS, ENOUGH = 25, 1e-5
+# What stands for a likelihood of none.
+IMPOSSIBLE = 1e12
+
+Cost = Callable[[Floats, float], float]
+
+
+def spacing_of(points: Floats) -> float:
+    """Return the median distance of a point's nearest neighbour, mm."""
+    return float(np.median(KDTree(points).query(points, k=[2])[0]))
+
+
+def likeliest_structure(
+    samples: Samples, shares: Sequence[float], size: tuple[int, int] = NEIGHBOURHOODS
+) -> VectorStructure:
+    """Return the likeliest structure function.
+
+    Parameters
+    ----------
+    samples : without outliers
+    shares : of potential flow, to choose from: the first, unless another is clearly likelier
+    size : number of neighbourhoods and of samples in each
+    """
+    spacing = spacing_of(samples.points_mm)
+    cost, guess = _cost_of(samples, spacing, size), _first_guess(samples, spacing)
+    found = _least(cost, guess, shares[0], guess)
+    # what else is likeliest differs little from share to share
+    other = min(shares, key=lambda share: cost(found, share))
+    if other != shares[0]:
+        better = _least(cost, found, other, guess)
+        if cost(better, other) < cost(found, shares[0]) - NEEDED_GROWTH:
+            return _structure(better, spacing, other)
+    return _structure(found, spacing, shares[0])
+
+
+def _least(cost: Cost, start: Floats, share: float, guess: Floats) -> Floats:
+    """Return the parameters, near some and not too far from the first guess, at which the cost is the smallest."""
+    bounds = list(zip(guess - FARTHEST * DEVIATIONS, guess + FARTHEST * DEVIATIONS, strict=True))
+    options = {"maxiter": STEPS, "ftol": ENOUGH}
+    found = minimize(cost, start, args=(share,), method="L-BFGS-B", bounds=bounds, options=options)
+    return np.asarray(found.x)
+
+
+def _neighbourhoods(points: Floats, number: int, samples_each: int) -> NDArray[np.int64]:
+    """Return the samples (b, k) of neighbourhoods whose middles lie as far from each other as they can."""
+    count = min(samples_each, len(points))
+    middles = [int(np.argmin(np.linalg.norm(points - points.mean(axis=0), axis=1)))]
+    distance = np.linalg.norm(points - points[middles[0]], axis=1)
+    while len(middles) < min(number, max(1, 2 * len(points) // count)):
+        middles.append(int(np.argmax(distance)))
+        distance = np.minimum(distance, np.linalg.norm(points - points[middles[-1]], axis=1))
+    return np.asarray(KDTree(points).query(points[middles], k=np.arange(1, count + 1))[1])
+
+
+def _cost_of(samples: Samples, spacing: float, size: tuple[int, int]) -> Cost:
+    """Return minus the logarithm of the likelihood, of parameters and the share of potential flow."""
+    near = _neighbourhoods(samples.points_mm, *size)
+    points, errors, values = samples.points_mm[near], samples.covariance_mm2[near], samples.value_mm[near]
+    about = (values - values.mean(axis=1, keepdims=True)).swapaxes(1, 2).reshape(len(near), -1)
+    guess, unknown = _first_guess(samples, spacing), unknown_variance(samples)
+
+    def cost(parameters: Floats, share: float) -> float:
+        found = log_likelihood(between(points, errors, _structure(parameters, spacing, share), unknown), about)
+        unlikely = 0.5 * float(np.sum(((parameters - guess) / DEVIATIONS) ** 2))
+        return unlikely - found if np.isfinite(found) else IMPOSSIBLE
+
+    return cost
+
+
+def _first_guess(samples: Samples, spacing: float) -> Floats:
+    variance = max(float(np.var(samples.value_mm, axis=0).mean()), np.finfo(np.float64).tiny)
+    shares = np.log([DIFFERENCE_SHARE * variance, NUGGET_SHARE * variance])
+    lengths = np.log([INNER_SPACINGS * spacing, OUTER_SPACINGS * spacing])
+    return np.array([shares[0], np.log(POWER / (2.0 - POWER)), *lengths, shares[1], 0.0])
+
+
+def _structure(parameters: Floats, spacing: float, share: float) -> VectorStructure:
+    """Return the structure function of: ln D between neighbours, logit p/2, ln l, ln L, ln nugget, ln error factor."""
+    difference, power, inner, outer, nugget, error = parameters.tolist()
+    inner, outer, nugget, error = (math.exp(value) for value in (inner, outer, nugget, error))
+    unit = VectorStructure(1.0, 2.0 / (1.0 + math.exp(-power)), inner, outer, nugget, error, share)
+    return unit.scaled(math.exp(difference) / unit.mean_at(spacing))
+
+
+# Samples that an estimate is made of, and those that show whether one of them is an outlier. With twice as many the
+# errors are 1 to 6 % smaller, and it takes four times as long.
+USED, USED_FOR_OUTLIERS = 60, 12
+# What is worked on at a time bounds the memory to some 100 MB.
+PLACES_AT_ONCE = 100
+# Rounds in which samples that the outliers left alone come back.
+OUTLIER_ROUNDS = 2
+# However certain a link is said to be: one in a hundred is wrong.
+LARGEST_PROBABILITY = 0.99
+# Neighbours in all directions are so many times as far away as the nearest one.
+SPACINGS_APART = 2.0
+# Samples around a place that show how large errors are there.
+AROUND = 40
+# The median of chi-squared of three degrees of freedom.
+CHI_SQUARED_MEDIAN = 2.0 * float(gammaincinv(1.5, 0.5))
+# The shares of potential flow to choose from.
+SHARES = {"free": (0.0,), "penalised": POTENTIAL_SHARES, "off": (INDEPENDENT,)}
+
+
+@dataclass(frozen=True, eq=False)
+class KrigedField:
+    """A velocity field that is kriged from samples.
+
+    Attributes
+    ----------
+    samples : those that are no outliers
+    structure : of the flow
+    off_by : (n, 3) how far each sample is off what the others let expect, in its expected standard deviations
+    kept : (n,) which of all samples these are
+    """
+
+    samples: Samples
+    structure: VectorStructure
+    off_by: Floats
+    kept: NDArray[np.bool_]
+
+    @property
+    def probability(self) -> Floats:
+        """The probability (n,) of each sample to belong to the field: 1, or 0 of outliers."""
+        return self.kept.astype(np.float64)
+
+    def value_at(self, points_mm: Floats) -> Floats:
+        """Return displacements (m, 3) in mm."""
+        return self.estimates_at(points_mm).value_mm
+
+    def variance_at(self, points_mm: Floats) -> Floats:
+        """Return the variances (m, 3) in mm^2 of what the displacements are off by."""
+        return np.asarray(np.einsum("mii->mi", self.estimates_at(points_mm).covariance_mm2))
+
+    def estimates_at(self, points_mm: Floats) -> Estimates:
+        """Return displacements and their covariances at once, in the time that either takes."""
+        unknown = unknown_variance(self.samples)
+        parts = [
+            estimated(points_mm[part], near, self.samples, self.structure, unknown)
+            for part, near in _nearest(self.samples.points_mm, points_mm, USED)
+        ]
+        covariance = np.concatenate([part.covariance_mm2 for part in parts])
+        factor = self._error_factor(points_mm)
+        scaled = covariance * factor[:, :, np.newaxis] * factor[:, np.newaxis]
+        return Estimates(np.concatenate([part.value_mm for part in parts]), scaled)
+
+    def estimate_at(self, points_mm: Floats) -> tuple[Floats, Floats]:
+        """Return displacements and their variances (m, 3)."""
+        found = self.estimates_at(points_mm)
+        return found.value_mm, np.asarray(np.einsum("mii->mi", found.covariance_mm2))
+
+    def gradient_at(self, points_mm: Floats) -> Floats:
+        """Return the gradient (m, 3, 3) per mm [component, direction], each of its nearest samples held fixed."""
+        unknown = unknown_variance(self.samples)
+        parts = [
+            estimated_slopes(points_mm[part], near, self.samples, self.structure, unknown)
+            for part, near in _nearest(self.samples.points_mm, points_mm, USED)
+        ]
+        return np.concatenate(parts)
+
+    def told(self) -> dict[str, Any]:
+        """Return how the field was fitted: figures with their units in their names."""
+        return {
+            "method": "kriging",
+            "belonging": float(np.sum(self.kept)),
+            "reduced_chi2": float(np.mean(self.off_by**2)),
+            "power": self.structure.power,
+            "inner_length_mm": self.structure.inner_mm,
+            "outer_length_mm": self.structure.outer_mm,
+            "nugget_mm": float(np.sqrt(self.structure.nugget_mm2)),
+            "error_over_stated": float(np.sqrt(self.structure.error_factor)),
+            "potential_share": self.structure.potential_share,
+        }
+
+    def _error_factor(self, points_mm: Floats) -> Floats:
+        """Return how large errors (m, 3) are around places over what the equations say."""
+        everywhere = MAD_TO_SIGMA * np.median(self.off_by, axis=0)
+        count = min(AROUND, len(self.samples))
+        near = KDTree(self.samples.points_mm).query(points_mm, k=np.arange(1, count + 1))[1]
+        return np.maximum(everywhere, MAD_TO_SIGMA * np.median(self.off_by[near], axis=1))
+
+
+def is_rough(samples: Samples) -> bool:
+    """Tell whether the flow differs so much between neighbouring samples that kriging is to be used, not splines.
+
+    The mean square difference grows with less than nearly the square of the distance there, and is more than errors.
+    The samples are without outliers.
+    """
+    if len(samples) < FEWEST_OF_STRUCTURE:
+        return False
+    structure = likeliest_structure(samples, SHARES["free"], FEW_NEIGHBOURHOODS)
+    apart = SPACINGS_APART * spacing_of(samples.points_mm)
+    stated = np.median(np.einsum("nii->ni", samples.covariance_mm2), axis=0).min()
+    by_errors = 2.0 * (structure.error_factor * float(stated) + structure.nugget_mm2)
+    return structure.steepness(apart) < ROUGH_EXPONENT and structure.mean_at(apart) > by_errors
+
+
+def kriged_field(samples: Samples, divergence: str) -> KrigedField:
+    """Return the field that samples tell, two at least.
+
+    Parameters
+    ----------
+    samples : with outliers among them
+    divergence : "free": none; "penalised": as much as makes the samples clearly likelier; "off": components apart
+    """
+    structure, kept, off_by = _told(samples, SHARES[divergence], NEIGHBOURHOODS)
+    return KrigedField(samples.subset(kept), structure, off_by, kept)
+
+
+def _told(
+    samples: Samples, shares: Sequence[float], size: tuple[int, int]
+) -> tuple[VectorStructure, NDArray[np.bool_], Floats]:
+    """Return the structure function that samples tell, which (n,) are no outliers, and how far off these are.
+
+    Outliers make a first structure function too rough: by it the far ones go. Shares and size are those of
+    `likeliest_structure`.
+    """
+    rough = likeliest_structure(samples, shares[:1], FEW_NEIGHBOURHOODS)
+    kept, _ = _without_outliers(samples, rough, np.ones(len(samples), dtype=bool), rounds=1)
+    structure = likeliest_structure(samples.subset(kept), shares, size)
+    return structure, *_without_outliers(samples, structure, kept, OUTLIER_ROUNDS)
+
+
+def _without_outliers(
+    samples: Samples, structure: VectorStructure, kept: NDArray[np.bool_], rounds: int
+) -> tuple[NDArray[np.bool_], Floats]:
+    """Return which samples (n,) belong to the flow, and how far off (kept, 3) these are in standard deviations.
+
+    Of each it is the `kept` ones, and in later rounds those of the round before, that let expect something.
+    """
+    for _ in range(rounds):
+        off, covariance = _left_out(samples, kept, structure)
+        kept = _belongs(samples, off, covariance)
+    return kept, np.abs(off[kept]) / np.sqrt(np.einsum("nii->ni", covariance[kept]))
+
+
+def _left_out(samples: Samples, kept: NDArray[np.bool_], structure: VectorStructure) -> tuple[Floats, Floats]:
+    """Return what each sample is off the nearest kept others by (n, 3), and the covariances (n, 3, 3) expected."""
+    others = samples.subset(kept)
+    unknown = unknown_variance(others)
+    number = np.where(kept, np.cumsum(kept) - 1, -1)
+    count = min(USED_FOR_OUTLIERS, len(others) - 1)
+    value, covariance = np.empty((len(samples), 3)), np.empty((len(samples), 3, 3))
+    for part, near in _nearest(others.points_mm, samples.points_mm, count + 1):
+        near = without_own(near, number[part])
+        found = estimated(samples.points_mm[part], near, others, structure, unknown)
+        value[part], covariance[part] = found.value_mm, found.covariance_mm2
+    own = structure.error_factor * samples.covariance_mm2 + structure.nugget_mm2 * np.eye(3)
+    return samples.value_mm - value, covariance + own
+
+
+def _belongs(samples: Samples, off: Floats, covariance: Floats) -> NDArray[np.bool_]:
+    """Return which samples (n,) belong to the flow rather than being off by the order of their neighbours' distance."""
+    spacing = spacing_of(samples.points_mm)
+    of_flow = np.einsum("ni,ni->n", off, np.linalg.solve(covariance, off[..., np.newaxis])[..., 0])
+    times = max(float(np.median(of_flow)) / CHI_SQUARED_MEDIAN, 1.0)
+    wide = covariance * times + spacing**2 * np.eye(3)
+    of_wrong = np.einsum("ni,ni->n", off, np.linalg.solve(wide, off[..., np.newaxis])[..., 0])
+    log_density_ratio = 0.5 * (
+        np.linalg.slogdet(wide)[1] - np.linalg.slogdet(covariance * times)[1] + of_wrong - of_flow / times
+    )
+    probability = np.clip(samples.probability, 1.0 - LARGEST_PROBABILITY, LARGEST_PROBABILITY)
+    return np.asarray(log_density_ratio + np.log(probability / (1.0 - probability)) > 0.0)
+
+
+def _nearest(points: Floats, places: Floats, count: int) -> list[tuple[slice, NDArray[np.int64]]]:
+    """Return slices of the places, and the numbers (b, k) of the points nearest to each of them."""
+    near = KDTree(points).query(places, k=np.arange(1, min(count, len(points)) + 1))[1]
+    parts = [slice(start, start + PLACES_AT_ONCE) for start in range(0, len(places), PLACES_AT_ONCE)]
+    return [(part, near[part]) for part in parts]
+
 
 # The weights are told by boxes that are drawn: always the same ones.
 SEED = 0
@@ -28,23 +351,23 @@ class Field(Protocol):
     """A velocity field that is known everywhere in a box, as displacements from one frame to the next."""
 
     @property
-    def probability(self) -> NDArray[np.float64]:
+    def probability(self) -> Floats:
         """The probability (n,) of each sample to belong to the field."""
         ...
 
-    def value_at(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    def value_at(self, points_mm: Floats) -> Floats:
         """Return displacements (m, 3), mm."""
         ...
 
-    def estimate_at(self, points_mm: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def estimate_at(self, points_mm: Floats) -> tuple[Floats, Floats]:
         """Return displacements and their variances at once."""
         ...
 
-    def variance_at(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    def variance_at(self, points_mm: Floats) -> Floats:
         """Return the variances (m, 3) of the displacements, mm^2."""
         ...
 
-    def gradient_at(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    def gradient_at(self, points_mm: Floats) -> Floats:
         """Return the gradients (m, 3, 3) of the displacements per mm: the component, then the direction."""
         ...
 
@@ -54,11 +377,7 @@ class Field(Protocol):
 
 
 def fit_field(
-    samples: Samples,
-    low_mm: ArrayLike,
-    high_mm: ArrayLike,
-    divergence: str = "penalised",
-    still_mm: NDArray[np.float64] = NO_POINTS,
+    samples: Samples, low_mm: ArrayLike, high_mm: ArrayLike, divergence: str = "penalised", still_mm: Floats = NO_POINTS
 ) -> Field:
     """Fit a field: splines, or kriging where samples are few, or the flow is rough or too fine for splines.
 
@@ -73,23 +392,17 @@ def fit_field(
     """
     # The same bits on every machine, and boxes that are worked on at once do not take more threads than there are.
     with threadpool_limits(limits=1, user_api="blas"):
-        kept = not_outliers(samples)
+        # What is told of each by a dozen others can be bent by one or two of them, not by what is wrong elsewhere.
+        _, kept, _ = _told(samples, SHARES["free"], FEW_NEIGHBOURHOODS)
         inside = samples.subset(kept)
         splines_alone = divergence == "free" or len(still_mm) > 0
         if not splines_alone and (len(inside) < FEW_SAMPLES or is_rough(inside)):
             return kriged_field(samples, divergence)
-        splines = _splined(inside, low_mm, high_mm, divergence, still_mm)
+        places = np.concatenate([inside.points_mm, still_mm, np.atleast_2d(low_mm), np.atleast_2d(high_mm)])
+        lattice = lattice_for(len(inside), places.min(axis=0), places.max(axis=0))
+        splines = spline_field(inside, lattice, divergence, np.random.default_rng(SEED), still_mm)
         if not splines_alone and splines.reduced_chi2 >= UNRESOLVED_CHI2:
             return kriged_field(samples, divergence)
         probability = np.zeros(len(samples))
         probability[kept] = splines.probability
         return replace(splines, probability=probability)
-
-
-def _splined(
-    samples: Samples, low_mm: ArrayLike, high_mm: ArrayLike, divergence: str, still_mm: NDArray[np.float64]
-) -> SplineField:
-    """Return a field of splines."""
-    places = np.concatenate([samples.points_mm, still_mm, np.atleast_2d(low_mm), np.atleast_2d(high_mm)])
-    lattice = lattice_for(len(samples), places.min(axis=0), places.max(axis=0))
-    return spline_field(samples, lattice, divergence, np.random.default_rng(SEED), still_mm)

@@ -13,13 +13,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.fields import stencils
-from lfpiv_cli.fields.blocks import Block, Factor, factorised
-from lfpiv_cli.fields.errors_of_samples import belonging, error_covariance, squares
 from lfpiv_cli.fields.evidence import FREE_DIVERGENCE, divergence_weight, first_expectation, most_probable
-from lfpiv_cli.fields.lattice import Lattice
-from lfpiv_cli.fields.penalties import DIVERGENCE, SECOND, THIRD, Expectation, expected_inverse
-from lfpiv_cli.fields.samples import Samples, with_places
-from lfpiv_cli.fields.stencils import Stencil, rows_of
+from lfpiv_cli.fields.samples import Samples, belonging, error_covariance, squares, with_places
+from lfpiv_cli.fields.stencils import (
+    DIVERGENCE,
+    SECOND,
+    SUPPORT,
+    THIRD,
+    Block,
+    Expectation,
+    Factor,
+    Lattice,
+    Stencil,
+    expected_inverse,
+    factorised,
+    gradient_rows,
+    rows_of,
+)
+
+Floats = NDArray[np.float64]
 
 # Knots are so many times the samples' mean distance apart: a third as many knots as samples. Among factors of 1.2 to
 # 1.8, less adds noise where samples are few, and more holds divergence and values of small vortices further off.
@@ -55,23 +67,23 @@ class SplineField:
     """
 
     lattice: Lattice
-    coefficients: NDArray[np.float64]
+    coefficients: Floats
     covariance: tuple[list[Block], list[Block]]
-    mean_mm: NDArray[np.float64]
+    mean_mm: Floats
     expected: Expectation
-    probability: NDArray[np.float64]
+    probability: Floats
     reduced_chi2: float
 
-    def value_at(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    def value_at(self, points_mm: Floats) -> Floats:
         """Return displacements (m, 3) at points."""
         return self.mean_mm + _field_at(points_mm, self.lattice, self.coefficients)
 
-    def gradient_at(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    def gradient_at(self, points_mm: Floats) -> Floats:
         """Return the gradients (m, 3, 3) per mm: the component, then the direction."""
         parts = [_field_at(points_mm, self.lattice, self.coefficients, axis) for axis in range(3)]
         return np.stack(parts, axis=2)
 
-    def estimate_at(self, points_mm: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def estimate_at(self, points_mm: Floats) -> tuple[Floats, Floats]:
         """Return displacements and their variances (m, 3)."""
         return self.value_at(points_mm), self.variance_at(points_mm)
 
@@ -88,7 +100,7 @@ class SplineField:
             "belonging": float(np.sum(self.probability)),
         }
 
-    def variance_at(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    def variance_at(self, points_mm: Floats) -> Floats:
         """Return the variances (m, 3), with that of what the splines leave unresolved."""
         found = np.empty(points_mm.shape)
         for start in range(0, len(points_mm), POINTS_AT_ONCE):
@@ -96,7 +108,7 @@ class SplineField:
             found[part] = self._variance(points_mm[part])
         return found + self.expected.unresolved_mm**2
 
-    def _variance(self, points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _variance(self, points_mm: Floats) -> Floats:
         columns, values = rows_of(self.lattice, points_mm)
         plane = int(np.prod(self.lattice.shape[1:]))
         planes, within = columns // plane, columns % plane
@@ -113,10 +125,10 @@ class SplineField:
         first: int,
         length: int,
         within: NDArray[np.int64],
-        values: NDArray[np.float64],
+        values: Floats,
         diagonal: list[Block],
         below: list[Block],
-    ) -> NDArray[np.float64]:
+    ) -> Floats:
         """Return variances at points whose splines begin in one plane of x."""
         plane = int(np.prod(self.lattice.shape[1:]))
         each = within.shape[1] // 4
@@ -135,12 +147,7 @@ class SplineField:
         return found
 
 
-def penalties_of(divergence: str) -> tuple[str, ...]:
-    """Return the penalties' names."""
-    return (SECOND, THIRD) if divergence == "off" else (SECOND, THIRD, DIVERGENCE)
-
-
-def lattice_for(samples: int, low_mm: NDArray[np.float64], high_mm: NDArray[np.float64]) -> Lattice:
+def lattice_for(samples: int, low_mm: Floats, high_mm: Floats) -> Lattice:
     """Return the knots for so many samples in a box."""
     distance = float(np.prod(np.subtract(high_mm, low_mm)) / max(samples, 1)) ** (1.0 / 3.0)
     knot = KNOTS_OF_DISTANCE * distance
@@ -150,7 +157,7 @@ def lattice_for(samples: int, low_mm: NDArray[np.float64], high_mm: NDArray[np.f
 
 
 def spline_field(
-    samples: Samples, lattice: Lattice, divergence: str, rng: np.random.Generator, still_mm: NDArray[np.float64]
+    samples: Samples, lattice: Lattice, divergence: str, rng: np.random.Generator, still_mm: Floats
 ) -> SplineField:
     """Fit a field.
 
@@ -164,7 +171,8 @@ def spline_field(
     """
     mean = np.median(samples.value_mm, axis=0) if not len(still_mm) else np.zeros(3)
     about = replace(samples, value_mm=samples.value_mm - mean)
-    expected = first_expectation(about, lattice, penalties_of(divergence))
+    penalties = (SECOND, THIRD) if divergence == "off" else (SECOND, THIRD, DIVERGENCE)
+    expected = first_expectation(about, lattice, penalties)
     about = with_places(about, _first_gradients(about, lattice, still_mm, expected, rng))
     expected, by_others = most_probable(about, lattice, expected, rng)
     if divergence == "free":
@@ -183,12 +191,8 @@ def spline_field(
 
 
 def _first_gradients(
-    samples: Samples,
-    lattice: Lattice,
-    still_mm: NDArray[np.float64],
-    expected: Expectation,
-    rng: np.random.Generator,
-) -> NDArray[np.float64]:
+    samples: Samples, lattice: Lattice, still_mm: Floats, expected: Expectation, rng: np.random.Generator
+) -> Floats:
     """Return the gradients (n, 3, 3) of a field of wide knots at the samples."""
     wide = Lattice.over(lattice.low_mm, lattice.high_mm, WIDE * max(lattice.cell_mm))
     few = np.sort(rng.choice(len(samples), min(len(samples), ENOUGH_OF_UNKNOWNS * wide.unknowns), replace=False))
@@ -199,12 +203,8 @@ def _first_gradients(
 
 
 def _weighed(
-    samples: Samples,
-    lattice: Lattice,
-    still_mm: NDArray[np.float64],
-    expected: Expectation,
-    by_others: NDArray[np.float64],
-) -> tuple[Factor, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    samples: Samples, lattice: Lattice, still_mm: Floats, expected: Expectation, by_others: Floats
+) -> tuple[Factor, Floats, Floats, Floats]:
     """Fit, and weigh samples anew; return factor, coefficients, probabilities and errors (n, 3).
 
     `by_others` (3, 3) is the covariance of the field at a sample that takes no part, so that one left out may return.
@@ -221,12 +221,8 @@ def _weighed(
 
 
 def _solved(
-    samples: Samples,
-    lattice: Lattice,
-    before: Stencil,
-    covariance: NDArray[np.float64],
-    probability: NDArray[np.float64],
-) -> tuple[Factor, NDArray[np.float64]]:
+    samples: Samples, lattice: Lattice, before: Stencil, covariance: Floats, probability: Floats
+) -> tuple[Factor, Floats]:
     """Return the factor of the normal equations and the coefficients (nx, 3, ny, nz)."""
     weight = probability[:, np.newaxis, np.newaxis] * np.linalg.inv(covariance)
     matrix = before.copy()
@@ -237,16 +233,14 @@ def _solved(
     return factor, factor.solve(right.ravel()).reshape(right.shape)
 
 
-def _field_at(
-    points_mm: NDArray[np.float64], lattice: Lattice, coefficients: NDArray[np.float64], along: int | None = None
-) -> NDArray[np.float64]:
+def _field_at(points_mm: Floats, lattice: Lattice, coefficients: Floats, along: int | None = None) -> Floats:
     """Return the sum of splines (n, 3) at points, or its derivative along an axis."""
     columns, values = rows_of(lattice, points_mm, along)
     by_component = coefficients.transpose(1, 0, 2, 3).reshape(3, -1)
     return np.stack([np.sum(values * part[columns], axis=1) for part in by_component], axis=1)
 
 
-def _before(lattice: Lattice, expected: Expectation, still_mm: NDArray[np.float64]) -> Stencil:
+def _before(lattice: Lattice, expected: Expectation, still_mm: Floats) -> Stencil:
     """Return the inverse covariance of the field before any sample, 0 at points that are still."""
     before = expected_inverse(lattice, expected)
     if len(still_mm):
@@ -259,3 +253,43 @@ def _without_divergence(expected: Expectation, lattice: Lattice) -> Expectation:
     """Return the expectation of a field that has next to none."""
     weights = {**expected.weights, DIVERGENCE: divergence_weight(expected, lattice, FREE_DIVERGENCE)}
     return replace(expected, weights=weights)
+
+
+# The covariances of a spline field's gradients, from the blocks of its coefficients' covariance.
+#
+# Axes: a gradient's elements (component, direction) in C order.
+
+COMPONENTS = 3
+
+
+def gradient_covariance_at(field: SplineField, points_mm: Floats) -> Floats:
+    """Return the covariances (m, 9, 9) of a field's gradients at points, per mm^2 of squared displacements."""
+    columns, slopes = gradient_rows(field.lattice, points_mm)
+    plane = int(np.prod(field.lattice.shape[1:]))
+    found = np.empty((len(points_mm), COMPONENTS, 3, COMPONENTS, 3))
+    firsts = columns[:, 0] // plane
+    for first in np.unique(firsts):
+        whole = _of_planes(field, int(first), plane)
+        here = np.flatnonzero(firsts == first)
+        cells, which = np.unique(columns[here], axis=0, return_inverse=True)
+        for number, cell in enumerate(cells):
+            at = here[which.ravel() == number]
+            within = cell - first * plane
+            rows = (within // plane * COMPONENTS + np.arange(COMPONENTS)[:, np.newaxis]) * plane + within % plane
+            of_cell = whole[rows[:, :, np.newaxis, np.newaxis], rows]
+            found[at] = np.einsum("mdk,ckbl,mel->mcdbe", slopes[at], of_cell, slopes[at], optimize=True)
+    return found.reshape(len(points_mm), COMPONENTS * 3, COMPONENTS * 3)
+
+
+def _of_planes(field: SplineField, first: int, plane: int) -> Floats:
+    """Return the covariance of the coefficients of four planes of x, which lie in one block or in two."""
+    diagonal, below = field.covariance
+    length = len(diagonal[0])
+    start, size = first * COMPONENTS * plane, SUPPORT * COMPONENTS * plane
+    block = start // length
+    if start + size <= block * length + len(diagonal[block]):
+        whole = diagonal[block]
+    else:
+        whole = np.block([[diagonal[block], below[block].T], [below[block], diagonal[block + 1]]])
+    inside = slice(start - block * length, start - block * length + size)
+    return whole[inside, inside]

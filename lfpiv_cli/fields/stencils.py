@@ -7,17 +7,139 @@ c is 3 for velocities and 1 for a scalar. Planes of x come first, so that the ro
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from math import factorial
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import BSpline
+from scipy.linalg import cholesky, solve_triangular
+from scipy.linalg.lapack import dpotri
 
-from lfpiv_cli.fields.lattice import DEGREE, NEIGHBOURS, SUPPORT, Lattice
 from lfpiv_cli.threads import share_out
 
-Stencil = NDArray[np.float64]
+Floats = NDArray[np.float64]
+
+# Cubic B-splines on a box: a lattice of knots, the four splines along each axis that reach a point, their integrals.
+#
+# Axes: points (n, 3) in mm; knots are numbered along x, y, z.
+
+
+DEGREE = 3
+# Splines that are not zero within one cell, along one axis.
+SUPPORT = DEGREE + 1
+# Splines that overlap with one spline, along one axis.
+NEIGHBOURS = 2 * DEGREE + 1
+# Gauss points in a cell: exact for products of two cubic pieces.
+GAUSS_POINTS = 4
+# A box that is a whole number of cells long but for rounding has this number.
+ROUNDING = 1e-9
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """A box in equal cells, with cubic B-splines whose knots are the cells' corners.
+
+    Attributes
+    ----------
+    low_mm : the box' corner with the smallest x, y, z
+    cell_mm : size of a cell along x, y, z
+    cells : number of cells along x, y, z
+    """
+
+    low_mm: tuple[float, float, float]
+    cell_mm: tuple[float, float, float]
+    cells: tuple[int, int, int]
+
+    @classmethod
+    def over(cls, low_mm: ArrayLike, high_mm: ArrayLike, knot_mm: float) -> Lattice:
+        """Return the lattice over a box whose knots are at most so far apart."""
+        low = np.asarray(low_mm, dtype=np.float64)
+        size = np.asarray(high_mm, dtype=np.float64) - low
+        cells = np.maximum(np.ceil(size / knot_mm - ROUNDING).astype(np.int64), 1)
+        x, y, z = low.tolist()
+        dx, dy, dz = (size / cells).tolist()
+        nx, ny, nz = cells.tolist()
+        return cls((x, y, z), (dx, dy, dz), (nx, ny, nz))
+
+    @property
+    def high_mm(self) -> Floats:
+        """The box' corner with the largest x, y, z."""
+        return np.asarray(np.add(self.low_mm, np.multiply(self.cells, self.cell_mm)))
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Number of splines along x, y, z."""
+        nx, ny, nz = self.cells
+        return nx + DEGREE, ny + DEGREE, nz + DEGREE
+
+    @property
+    def unknowns(self) -> int:
+        """Number of coefficients of a field of three components."""
+        return 3 * int(np.prod(self.shape))
+
+    @property
+    def volume_mm3(self) -> float:
+        """The box' volume."""
+        return float(np.prod(np.multiply(self.cells, self.cell_mm)))
+
+    @property
+    def smallest_mm(self) -> float:
+        """The box' smallest length."""
+        return float(np.min(np.multiply(self.cells, self.cell_mm)))
+
+    def splines_at(self, points_mm: Floats, along: int | None = None) -> tuple[NDArray[np.int64], list[Floats]]:
+        """Return the first spline (n, 3) that reaches each point, and the values (n, 4) of the four, axis by axis.
+
+        A point outside of the box is taken by its nearest cell's polynomials. `along` an axis: the derivative, per mm.
+        """
+        place = (points_mm - np.asarray(self.low_mm)) / np.asarray(self.cell_mm)
+        first = np.clip(np.floor(place).astype(np.int64), 0, np.asarray(self.cells) - 1)
+        inside = place - first
+        values = [
+            _slopes(inside[:, axis]) / self.cell_mm[axis] if axis == along else _values(inside[:, axis])
+            for axis in range(3)
+        ]
+        return first, values
+
+    def integrals(self, axis: int, first: int, second: int) -> Floats:
+        """Return the integrals (n, 7) of derivatives of splines i and i + k - 3 along an axis over the box, 0 beyond.
+
+        `first`, `second` : order of the derivative of the one and of the other
+        """
+        cells, cell = self.cells[axis], self.cell_mm[axis]
+        count = cells + DEGREE
+        splines = BSpline(np.arange(-DEGREE, count + 1) * cell, np.eye(count), DEGREE)
+        nodes, weights = np.polynomial.legendre.leggauss(GAUSS_POINTS)
+        at = ((np.arange(cells)[:, np.newaxis] + 0.5 + 0.5 * nodes) * cell).ravel()
+        left, right = (splines.derivative(order)(at) if order else splines(at) for order in (first, second))
+        product = left.T @ (np.tile(0.5 * cell * weights, cells)[:, np.newaxis] * right)
+        banded = np.zeros((count, NEIGHBOURS))
+        for k in range(NEIGHBOURS):
+            shift = k - DEGREE
+            rows = np.arange(max(0, -shift), min(count, count - shift))
+            banded[rows, k] = product[rows, rows + shift]
+        return banded
+
+
+def _values(u: Floats) -> Floats:
+    """Return the four splines (n, 4) at places u of a unit cell."""
+    rest = 1.0 - u
+    terms = [rest**3, 3.0 * u**3 - 6.0 * u**2 + 4.0, 3.0 * rest**3 - 6.0 * rest**2 + 4.0, u**3]
+    return np.stack(terms, axis=1) / 6.0
+
+
+def _slopes(u: Floats) -> Floats:
+    """Return the derivatives of the four splines (n, 4) at places u of a unit cell."""
+    rest = 1.0 - u
+    terms = [-(rest**2), 3.0 * u**2 - 4.0 * u, -3.0 * rest**2 + 4.0 * rest, u**2]
+    return 0.5 * np.stack(terms, axis=1)
+
+
+Stencil = Floats
 
 
 def empty(lattice: Lattice, components: int = 3) -> Stencil:
@@ -26,13 +148,13 @@ def empty(lattice: Lattice, components: int = 3) -> Stencil:
     return np.zeros((nx, components, ny, nz, NEIGHBOURS, components, NEIGHBOURS, NEIGHBOURS))
 
 
-def add_scalar(matrix: Stencil, factor: float, integrals: NDArray[np.float64]) -> None:
+def add_scalar(matrix: Stencil, factor: float, integrals: Floats) -> None:
     """Add `factor` times what is alike for all components: (nx, ny, nz, 7, 7, 7) of one of them."""
     for component in range(matrix.shape[1]):
         matrix[:, component, :, :, :, component] += factor * integrals
 
 
-def smoothness(lattice: Lattice, order: int) -> NDArray[np.float64]:
+def smoothness(lattice: Lattice, order: int) -> Floats:
     """Return the integral of the square of all derivatives of one order, of one component: (nx, ny, nz, 7, 7, 7)."""
     total = np.zeros((*lattice.shape, NEIGHBOURS, NEIGHBOURS, NEIGHBOURS))
     along = [[lattice.integrals(axis, each, each) for each in range(order + 1)] for axis in range(3)]
@@ -55,14 +177,14 @@ def divergence(lattice: Lattice) -> Stencil:
     return matrix
 
 
-def _product(x: NDArray[np.float64], y: NDArray[np.float64], z: NDArray[np.float64]) -> NDArray[np.float64]:
+def _product(x: Floats, y: Floats, z: Floats) -> Floats:
     """Return the products (nx, ny, nz, 7, 7, 7) of integrals (n, 7) along three axes."""
     return np.asarray(
         x[:, None, None, :, None, None] * y[None, :, None, None, :, None] * z[None, None, :, None, None, :]
     )
 
 
-def add_samples(matrix: Stencil, lattice: Lattice, points_mm: NDArray[np.float64], weight: NDArray[np.float64]) -> None:
+def add_samples(matrix: Stencil, lattice: Lattice, points_mm: Floats, weight: Floats) -> None:
     """Add the normal equations' matrix of samples at points (n, 3) with weights (n, 3, 3), inverse covariances."""
     first, (x, y, z) = lattice.splines_at(points_mm)
     share_out(_add_samples, len(matrix), matrix, first, x, y, z, np.ascontiguousarray(weight))
@@ -94,9 +216,7 @@ def _add_samples(part, matrix, first, x, y, z, weight):  # type: ignore[no-untyp
                                         )
 
 
-def right_hand_side(
-    lattice: Lattice, points_mm: NDArray[np.float64], weighted: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def right_hand_side(lattice: Lattice, points_mm: Floats, weighted: Floats) -> Floats:
     """Return the normal equations' right-hand side (nx, 3, ny, nz) of weighted values (n, 3)."""
     columns, values = rows_of(lattice, points_mm)
     size = int(np.prod(lattice.shape))
@@ -107,9 +227,7 @@ def right_hand_side(
     return np.ascontiguousarray(found.transpose(1, 0, 2, 3))
 
 
-def rows_of(
-    lattice: Lattice, points_mm: NDArray[np.float64], along: int | None = None
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def rows_of(lattice: Lattice, points_mm: Floats, along: int | None = None) -> tuple[NDArray[np.int64], Floats]:
     """Return numbers and values (n, 64) of the splines that reach each point, in C order of (nx, ny, nz)."""
     first, (x, y, z) = lattice.splines_at(points_mm, along)
     _, ny, nz = lattice.shape
@@ -122,6 +240,12 @@ def rows_of(
     return columns.reshape(len(first), -1), values.reshape(len(first), -1)
 
 
+def gradient_rows(lattice: Lattice, points_mm: Floats) -> tuple[NDArray[np.int64], Floats]:
+    """Return numbers (n, 64) and gradients (n, 3, 64) of the splines that reach each point."""
+    parts = [rows_of(lattice, points_mm, axis) for axis in range(3)]
+    return parts[0][0], np.stack([values for _, values in parts], axis=1)
+
+
 @lru_cache(maxsize=4)
 def _pattern(components: int, ny: int, nz: int) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
     """Return the rows and columns of a plane's block that have entries, and which of the stencil's these are."""
@@ -132,7 +256,7 @@ def _pattern(components: int, ny: int, nz: int) -> tuple[NDArray[np.int64], NDAr
     return rows[inside], columns[inside], inside
 
 
-def plane_block(matrix: Stencil, row: int, column: int) -> NDArray[np.float64]:
+def plane_block(matrix: Stencil, row: int, column: int) -> Floats:
     """Return the dense block of the rows of one plane of x and the columns of another, at most three planes off."""
     _, components, ny, nz, *_ = matrix.shape
     rows, columns, inside = _pattern(components, ny, nz)
@@ -142,7 +266,7 @@ def plane_block(matrix: Stencil, row: int, column: int) -> NDArray[np.float64]:
     return block
 
 
-def dense(matrix: Stencil) -> NDArray[np.float64]:
+def dense(matrix: Stencil) -> Floats:
     """Return the whole matrix; for small ones."""
     planes = matrix.shape[0]
     size = matrix.shape[1] * matrix.shape[2] * matrix.shape[3]
@@ -151,3 +275,154 @@ def dense(matrix: Stencil) -> NDArray[np.float64]:
         for column in range(max(0, row - DEGREE), min(planes, row + DEGREE + 1)):
             whole[row, :, column] = plane_block(matrix, row, column)
     return whole.reshape(planes * size, planes * size)
+
+
+# What a spline field is expected to be before any sample is seen: smooth, and of little divergence.
+#
+# The field is thought of as Gaussian, with the inverse covariance: weight times integral of squared second
+# derivatives, plus the same of third ones, plus the same of the divergence. Second derivatives alone make the
+# spectrum k^-2 of turbulence nearly (k^-5/3), third ones that of smooth flows, k^-4; the weights say how much of each
+# there is.
+
+
+SECOND, THIRD, DIVERGENCE = "second", "third", "divergence"
+ORDERS = {SECOND: 2, THIRD: 3}
+# Constants and linear fields are not penalised by derivatives; they are expected up to ten times the samples' spread.
+SPREADS = 10.0
+
+
+@dataclass(frozen=True)
+class Expectation:
+    """The weights of the penalties, and what is known of the samples' errors.
+
+    Attributes
+    ----------
+    weights : of the integrals, by the penalty's name: mm^(2 order - 3) mm^-2 of squared displacements
+    spread_mm : of the samples' values
+    scale : by which stated standard errors are multiplied
+    unresolved_mm : standard deviation, along each axis, of what the field does within less than a cell
+    """
+
+    weights: Mapping[str, float]
+    spread_mm: float
+    scale: float
+    unresolved_mm: float
+
+
+def penalty(lattice: Lattice, name: str, components: int = 3) -> Stencil:
+    """Return the integral of the squares that a penalty is made of, over the box."""
+    if name == DIVERGENCE:
+        return divergence(lattice)
+    matrix = empty(lattice, components)
+    add_scalar(matrix, 1.0, smoothness(lattice, ORDERS[name]))
+    return matrix
+
+
+def bound(lattice: Lattice, spread_mm: float, components: int = 3) -> Stencil:
+    """Return what keeps fields bounded that no other penalty sees."""
+    matrix = empty(lattice, components)
+    factor = 1.0 / ((SPREADS * spread_mm) ** 2 * lattice.volume_mm3)
+    add_scalar(matrix, factor, smoothness(lattice, 0))
+    return matrix
+
+
+def expected_inverse(lattice: Lattice, expected: Expectation, components: int = 3) -> Stencil:
+    """Return the inverse covariance of a field before any sample."""
+    matrix = bound(lattice, expected.spread_mm, components)
+    for name, weight in expected.weights.items():
+        if name == DIVERGENCE:
+            matrix += weight * divergence(lattice)
+        else:
+            add_scalar(matrix, weight, smoothness(lattice, ORDERS[name]))
+    return matrix
+
+
+def spread_of(values: np.ndarray) -> float:
+    """Return by how much values (n, c) differ, 1.48 times the median distance from their median."""
+    off = np.abs(values - np.median(values, axis=0))
+    return max(float(1.4826 * np.median(off.max(axis=1))), np.finfo(np.float64).tiny)
+
+
+# Cholesky's factorisation of block tridiagonal matrices, and those blocks of the inverse that variances need.
+
+
+Block = Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Factor:
+    """A symmetric positive definite matrix A = F F^T.
+
+    Attributes
+    ----------
+    diagonal : lower triangular blocks of F
+    below : blocks of F below each diagonal one but the last
+    """
+
+    diagonal: Sequence[Block]
+    below: Sequence[Block]
+
+    def solve(self, right: Floats) -> Floats:
+        """Return x of A x = right, (n,)."""
+        edges = np.cumsum([len(block) for block in self.diagonal])[:-1]
+        parts = np.split(right, edges)
+        for i, block in enumerate(self.diagonal):
+            if i:
+                parts[i] = parts[i] - self.below[i - 1] @ parts[i - 1]
+            parts[i] = solve_triangular(block, parts[i], lower=True)
+        for i in reversed(range(len(parts))):
+            if i + 1 < len(parts):
+                parts[i] = parts[i] - self.below[i].T @ parts[i + 1]
+            parts[i] = solve_triangular(self.diagonal[i], parts[i], lower=True, trans="T")
+        return np.concatenate(parts)
+
+    def inverse(self) -> tuple[list[Block], list[Block]]:
+        """Return the diagonal blocks of the inverse of A and those below them (Takahashi's recursion by blocks)."""
+        diagonal, below = [inverse_of(self.diagonal[-1])], []
+        for factor, under in zip(reversed(self.diagonal[:-1]), reversed(self.below), strict=True):
+            across = solve_triangular(factor, under.T, lower=True, trans="T").T
+            minus = -diagonal[-1] @ across
+            below.append(minus)
+            diagonal.append(inverse_of(factor) - across.T @ minus)
+        return diagonal[::-1], below[::-1]
+
+
+def inverse_of(factor: Block) -> Block:
+    """Return the inverse of the matrix whose lower triangular factor is given."""
+    lower = np.tril(dpotri(factor, lower=1)[0])
+    return lower + np.tril(lower, -1).T
+
+
+def factorised(matrix: Stencil) -> Factor:
+    """Factorise the matrix of a spline field.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        It is not positive definite.
+    """
+    planes = matrix.shape[0]
+    starts = list(range(0, planes, DEGREE))
+    parts = [range(start, min(start + DEGREE, planes)) for start in starts]
+    diagonal: list[Block] = []
+    below: list[Block] = []
+    for number, rows in enumerate(parts):
+        block = _block(matrix, rows, rows)
+        if number:
+            under = _block(matrix, rows, parts[number - 1])
+            under = solve_triangular(diagonal[-1], under.T, lower=True, overwrite_b=True).T
+            block -= under @ under.T
+            below.append(under)
+        diagonal.append(cholesky(block, lower=True, overwrite_a=True, check_finite=False))
+    return Factor(diagonal, below)
+
+
+def _block(matrix: Stencil, rows: range, columns: range) -> Block:
+    """Return the dense block of some planes' rows and others' columns."""
+    size = matrix.shape[1] * matrix.shape[2] * matrix.shape[3]
+    block = np.zeros((len(rows), size, len(columns), size))
+    for i, row in enumerate(rows):
+        for j, column in enumerate(columns):
+            if abs(row - column) <= DEGREE:
+                block[i, :, j] = plane_block(matrix, row, column)
+    return block.reshape(len(rows) * size, len(columns) * size)

@@ -1,9 +1,8 @@
-"""Figures of turbulence: fluctuations, dissipation, structure functions and the spectrum of the kinetic energy.
+"""Figures of turbulence: fluctuations, dissipation and the spectrum of the kinetic energy.
 
-Squares of measured velocities are those of the flow plus the variance of the noise: their errors are independent of the
-flow, and the variance is taken off. A fitted field has little noise, and lacks what the fit has smoothed away: the flow
-lies about it with errors that are independent of the fit, whose variance is put on. `errors_of` says which. What a
-field does not resolve at all, as the scales below its knots, neither tells.
+A fitted field has little noise, and lacks what the fit has smoothed away: the flow lies about it with errors that are
+independent of the fit, whose variance is put on. What a field does not resolve at all, as the scales below its knots,
+it does not tell.
 
 Axes: arrays `[z, y, x]` or (n,), vectors (u, v, w) along (x, y, z) last, gradients (component, direction) last.
 Units: m/s and 1/s.
@@ -13,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,13 +19,11 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 MM_PER_M = 1000.0
-ErrorsOf = Literal["fit", "measurement"]
-SIGNS: dict[ErrorsOf, float] = {"fit": 1.0, "measurement": -1.0}
 # A window has a shape from so many on.
 FEWEST_PLANES = 4
 
 
-def fluctuations(velocity: Floats, over: int | Sequence[int]) -> Floats:
+def fluctuations(velocity: Floats, over: tuple[int, ...]) -> Floats:
     """Return velocities less their mean over some axes, those of a homogeneous direction or of time; NaN is left out.
 
     Parameters
@@ -35,27 +31,21 @@ def fluctuations(velocity: Floats, over: int | Sequence[int]) -> Floats:
     velocity : (..., 3), as (nz, ny, nx, 3) or (frames, nz, ny, nx, 3)
     over : the axes
     """
-    return velocity - np.nanmean(velocity, axis=_axes(over), keepdims=True)
+    return velocity - np.nanmean(velocity, axis=over, keepdims=True)
 
 
-def _axes(over: int | Sequence[int]) -> tuple[int, ...]:
-    return (over,) if isinstance(over, int) else tuple(over)
-
-
-def reynolds_stresses(fluctuation: Floats, variance: Floats | None = None, errors_of: ErrorsOf = "fit") -> Floats:
+def reynolds_stresses(fluctuation: Floats, variance: Floats) -> Floats:
     """Return <u_i' u_j'>, (3, 3) in m^2/s^2.
 
     Parameters
     ----------
     fluctuation : (..., 3) m/s
-    variance : (..., 3) of its errors, m^2/s^2; None: not put right
+    variance : (..., 3) of its errors, m^2/s^2
     """
     flat = fluctuation.reshape(-1, 3)
     known = np.isfinite(flat).all(axis=1)
     stresses = flat[known].T @ flat[known] / max(int(np.count_nonzero(known)), 1)
-    if variance is None:
-        return np.asarray(stresses)
-    return np.asarray(stresses + SIGNS[errors_of] * np.diag(np.nanmean(variance.reshape(-1, 3)[known], axis=0)))
+    return np.asarray(stresses + np.diag(np.nanmean(variance.reshape(-1, 3)[known], axis=0)))
 
 
 def kinetic_energy(stresses: Floats) -> float:
@@ -70,22 +60,14 @@ class Dissipation:
     Attributes
     ----------
     rate : of the flow, errors put right
-    of_field : of the field as it is
     sigma : standard error of the mean over the volume
     """
 
     rate: float
-    of_field: float
     sigma: float
 
 
-def dissipation(
-    gradient: Floats,
-    covariance: Floats,
-    viscosity_m2_s: float,
-    independent: float,
-    errors_of: ErrorsOf = "fit",
-) -> Dissipation:
+def dissipation(gradient: Floats, covariance: Floats, viscosity_m2_s: float, independent: float) -> Dissipation:
     """Return 2 nu <s_ij s_ij> of the rate of strain s.
 
     Parameters
@@ -95,37 +77,18 @@ def dissipation(
     independent : number of points that err independently of each other, as that of the fit's knots
     """
     strain = 0.5 * (gradient + gradient.swapaxes(-1, -2))
-    flat, through = strain.reshape(-1, 9), _symmetric()
+    flat = strain.reshape(-1, 9)
+    # What makes the symmetric part of a gradient.
+    through = 0.5 * (np.eye(9) + np.eye(9).reshape(9, 3, 3).swapaxes(1, 2).reshape(9, 9))
     of_errors = through @ covariance @ through
     noise = np.trace(of_errors, axis1=-2, axis2=-1)
     each = np.sum(flat**2, axis=1)
     # Of a Gaussian vector's square: 4 m' C m + 2 tr C^2.
     variance = 4.0 * np.einsum("ni,nij,nj->n", flat, of_errors, flat) + 2.0 * np.sum(of_errors**2, axis=(1, 2))
     sigma = float(np.sqrt(np.mean(variance) / max(independent, 1.0)))
-    put_right = float(np.mean(each) + SIGNS[errors_of] * np.mean(noise))
+    put_right = float(np.mean(each) + np.mean(noise))
     double = 2.0 * viscosity_m2_s
-    return Dissipation(double * max(put_right, 0.0), double * float(np.mean(each)), double * sigma)
-
-
-def _symmetric() -> Floats:
-    """Return the matrix (9, 9) that makes the symmetric part of a gradient."""
-    turned = np.eye(9).reshape(9, 3, 3).swapaxes(1, 2).reshape(9, 9)
-    return 0.5 * (np.eye(9) + turned)
-
-
-def structure_function(velocity: Floats, axis: Literal[0, 1, 2]) -> Floats:
-    """Return the longitudinal structure function <(u(x + r) - u(x))^2> of the component along x, y or z.
-
-    Parameters
-    ----------
-    velocity : (nz, ny, nx, 3)
-
-    Returns
-    -------
-    (k,) m^2/s^2 at separations of 1, 2, ... k nodes, up to half of the box
-    """
-    along = np.moveaxis(velocity[..., axis], 2 - axis, 0)
-    return np.array([float(np.nanmean((along[r:] - along[:-r]) ** 2)) for r in range(1, len(along) // 2 + 1)])
+    return Dissipation(double * put_right, double * sigma)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""The one way in which files are written: beside the target, checked, flushed, then renamed onto it.
+"""How files are written: beside the target, checked, flushed, then renamed onto it; logs alone grow line by line.
 
 A file under its final name is therefore always complete: a fault leaves the old one, or none. Folders of outputs that
 are missing are made, all of them, when the first file in them begins, and gone again where none came to stand in them.
@@ -7,20 +7,110 @@ are missing are made, all of them, when the first file in them begins, and gone 
 from __future__ import annotations
 
 import contextlib
+import errno
+import hashlib
 import json
 import math
 import os
 import re
 import secrets
+import socket
+import sys
+import unicodedata
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from datetime import UTC, datetime
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from lfpiv_cli.errors import InputError, LfpivError, OutputError, OutputExistsError, UsageError
 from lfpiv_cli.files.inputs import reason, split_part
-from lfpiv_cli.files.processes import host_digest, is_running
+
+# Where the files of a command lie: no two outputs in one place, and none in that of an input.
+
+
+# The folder as the system knows it, and the name in it; what an existing file is, whatever leads to it.
+Place = tuple[str, str]
+Identity = tuple[int, int]
+
+
+def ensure_apart(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
+    """Refuse outputs of which one would replace another, or an input, before anything is computed.
+
+    Raises
+    ------
+    UsageError
+    """
+    inputs = [split_part(path)[0] for path in inputs]
+    read = {place_of(path) for path in inputs}
+    files = {identity for identity in map(_identity, inputs) if identity is not None}
+    written: set[Place] = set()
+    for path in outputs:
+        place = place_of(path)
+        if place in read or _identity(path) in files:
+            raise UsageError(f"{path}: the output is also an input")
+        if place in written:
+            raise UsageError(f"{path}: two outputs of this command would have this name")
+        written.add(place)
+
+
+def place_of(path: Path) -> Place:
+    """Return the place of a file, the same for all names that lead there, whether it exists or not."""
+    folder = _real(path.parent)
+    return folder, folded(path.name, Path(folder))
+
+
+def folded(name: str, folder: Path) -> str:
+    """Return a name as a folder's file system compares it: where A is a there, in small letters."""
+    return unicodedata.normalize("NFC", name).casefold() if ignores_case(folder) else name
+
+
+@lru_cache(maxsize=16)
+def ignores_case(folder: Path) -> bool:
+    """Return whether a folder's file system takes A and a for one, asked by the name of a folder that is there."""
+    for place in (folder.resolve(), *folder.resolve().parents):
+        other = place.name.swapcase()
+        if other != place.name and place.exists():
+            return _identity(place.with_name(other)) == _identity(place)
+    return False
+
+
+@lru_cache(maxsize=16)
+def _real(folder: Path) -> str:
+    return os.path.realpath(folder)
+
+
+def _identity(path: Path) -> Identity | None:
+    """Return what tells an existing file from all others; None where there is none."""
+    try:
+        status = os.stat(path)
+    except (OSError, ValueError):
+        return None
+    return status.st_dev, status.st_ino
+
+
+# Which process a file belongs to that some process left: of this host or another one, running or dead.
+
+
+@lru_cache(maxsize=1)
+def host_digest() -> str:
+    """Return what stands for this host in the names of files."""
+    return hashlib.sha256(socket.gethostname().encode()).hexdigest()[:8]
+
+
+def is_running(process: int) -> bool:
+    """Return whether a process of this host runs."""
+    if os.name != "posix":  # where asking with a signal would send it
+        return True
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        return True
+    return True
+
 
 # How much of the target's name the temporary file keeps: 40 characters of 4 bytes and the rest stay below the 255 bytes
 # that common file systems allow.
@@ -45,10 +135,8 @@ def ensure_writable(target: Path, overwrite: bool, inputs: Iterable[Path] = ()) 
     OutputError
         If it is not a regular file, or its folder is read-only or cannot be made.
     """
-    for path in inputs:
-        if _same_file(target, split_part(path)[0]):
-            raise UsageError(f"{target}: the output is also an input")
     _ensure_possible(target)
+    ensure_apart([target], inputs)
     if target.is_dir():
         raise OutputError(f"{target}: cannot be written: it is a folder")
     if os.path.lexists(target):
@@ -140,7 +228,7 @@ def write_atomically(
     write: Callable[[Path], None],
     *,
     overwrite: bool,
-    check: Callable[[Path], None] | None = None,
+    check: Callable[[Path], object] | None = None,
 ) -> None:
     """Write a file so that it appears under its name only when it is complete.
 
@@ -159,7 +247,9 @@ def write_atomically(
         _write(target, write, overwrite, check)
 
 
-def _write(target: Path, write: Callable[[Path], None], overwrite: bool, check: Callable[[Path], None] | None) -> None:
+def _write(
+    target: Path, write: Callable[[Path], None], overwrite: bool, check: Callable[[Path], object] | None
+) -> None:
     """Do the work of `write_atomically` in a folder that is there."""
     temporary: Path | None = None
     try:
@@ -181,7 +271,7 @@ def _write(target: Path, write: Callable[[Path], None], overwrite: bool, check: 
             temporary.unlink(missing_ok=True)
 
 
-def _read_back(target: Path, temporary: Path, check: Callable[[Path], None]) -> None:
+def _read_back(target: Path, temporary: Path, check: Callable[[Path], object]) -> None:
     """Raise where a finished file is not what was meant."""
     try:
         check(temporary)
@@ -255,9 +345,85 @@ def _flush_folder(folder: Path) -> None:
             os.close(descriptor)
 
 
-def _same_file(first: Path, second: Path) -> bool:
-    """Return whether two names lead to one file; a name that leads nowhere yet is compared by its resolved path."""
+# A log for programs that watch batches: a line of JSON for each event, added to what the file holds.
+
+# Opens a pipe that nobody reads with an error, where it would wait for a reader; of Unix alone.
+AT_ONCE = getattr(os, "O_NONBLOCK", 0)
+# How each line begins.
+BEGINS = b'{"time": '
+
+
+class EventLog:
+    """The log of one command.
+
+    Each line has `time` (UTC), `process`, `command` and `event`. Lines are written whole, one at a time, so that
+    several commands can share a file.
+    """
+
+    def __init__(self, path: Path, command: str, read_only: bool = False) -> None:
+        """Take the file, which need not exist; with `read_only` nothing is added to it.
+
+        Raises
+        ------
+        UsageError : it exists and holds something else
+        """
+        self.path, self._command, self._read_only = path, command, read_only
+        if not path.is_file():
+            return
+        with open(path, "rb") as file:
+            begin = file.read(len(BEGINS))
+        if begin and begin != BEGINS:
+            raise UsageError(f"{path}: is no log: its first line is no event with its time; --log would add to it")
+
+    def write(self, event: str, fields: Mapping[str, Any]) -> None:
+        """Add an event.
+
+        Raises
+        ------
+        OutputError
+        """
+        if self._read_only:
+            return
+        head = {
+            "time": datetime.now(UTC).isoformat(timespec="milliseconds"),
+            "process": os.getpid(),
+            "command": self._command,
+            "event": event,
+        }
+        line = json.dumps(head | without_nan(fields), allow_nan=False) + "\n"
+        try:
+            if not self.path.parent.exists():
+                self.path.parent.mkdir(parents=True, exist_ok=True)
+            descriptor = os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | AT_ONCE, 0o666)
+            try:
+                if AT_ONCE:
+                    os.set_blocking(descriptor, True)
+                os.write(descriptor, line.encode())
+            finally:
+                os.close(descriptor)
+        except OSError as error:
+            words = "is a pipe that nobody reads" if error.errno == errno.ENXIO else reason(error)
+            raise OutputError(f"{self.path}: cannot be written: {words}") from error
+
+    def last(self, event: str, **fields: Any) -> dict[str, Any] | None:
+        """Return the last event of this command with this name and these fields; None where there is none."""
+        wanted = {"command": self._command, "event": event} | fields
+        found = None
+        for line in self.path.read_bytes().splitlines() if self.path.is_file() else ():
+            try:
+                read = json.loads(line)
+            except ValueError:
+                continue  # a line that was cut with its process
+            if isinstance(read, dict) and wanted.items() <= read.items():
+                found = read
+        return found
+
+
+def largest_memory_mb() -> float | None:
+    """Return the most memory that this process has had so far; None where the system does not tell (Windows)."""
     try:
-        return os.path.samefile(first, second)
-    except (OSError, ValueError):
-        return os.path.realpath(first) == os.path.realpath(second)
+        import resource
+    except ImportError:
+        return None
+    units = 1e6 if sys.platform == "darwin" else 1e3
+    return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / units, 1)

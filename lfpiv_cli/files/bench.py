@@ -5,38 +5,42 @@ What a section leaves out and another of its keys implies (an aperture from an f
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
 
 from lfpiv_cli.calibration.board_pose import BoardGeometry
-from lfpiv_cli.calibration.model import Channel
 from lfpiv_cli.calibration.wave_shapes import WaveLight
+from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files.sections import (
     BoardSection,
     CameraSection,
-    ChannelSection,
     CorrelationSection,
+    FaceSection,
     MainLens,
     MediaSection,
     Microlenses,
     PipeSection,
     ReconstructionSection,
     VolumeSection,
+    parameters_of,
 )
-from lfpiv_cli.files.sections_scene import FaceSection, parameters_of
-from lfpiv_cli.files.sections_simulated import FlowSection, LightSection, PulsationSection
-from lfpiv_cli.flow.masks import RoundWall
+from lfpiv_cli.files.sections_simulated import FlowSection, LightSection
+from lfpiv_cli.flow.windows import RoundWall
 from lfpiv_cli.grid import Grid
-from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.camera import Camera, Lattice, thin_lens
 from lfpiv_cli.optics.curved_space import CurvedSpace, Face
 from lfpiv_cli.optics.line_responses import USUAL_DIFFUSION_PX
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.optics.microlenses import Lattice
-from lfpiv_cli.optics.pupils import thin_lens
+from lfpiv_cli.optics.shapes import RigidMotion
 from lfpiv_cli.optics.surfaces import SURFACES
 from lfpiv_cli.optics.waves import Waves
 from lfpiv_cli.reference import Reference
 from lfpiv_cli.scale import Scale
-from lfpiv_cli.synthetic.flows import FLOWS, STEADY, Flow, Pulsation
+from lfpiv_cli.synthetic.flows import FLOWS
+from lfpiv_cli.synthetic.vortices import Flow
 
 UM_TO_MM, NM_TO_MM = 1e-3, 1e-6
 # Of the paper's final window along the axis with the smallest voxels; the coarse one is twice as large: a displacement
@@ -177,11 +181,6 @@ def board_of(section: BoardSection) -> BoardGeometry:
     )
 
 
-def channel_of(section: ChannelSection) -> Channel:
-    """Return the channel."""
-    return Channel(section.width_mm, section.wall_mm, section.camera_move_mm, section.board_from_mid_plane_mm)
-
-
 def round_wall_of(section: PipeSection) -> RoundWall:
     """Return the inside of the pipe, in the volume's coordinates."""
     return RoundWall(section.radius_mm, section.centre_mm, section.axis)
@@ -253,11 +252,6 @@ def flow_of(section: FlowSection, reference: Reference) -> Flow:
     return FLOWS[section.kind](**parameters)
 
 
-def pulsation_of(section: PulsationSection | None) -> Pulsation:
-    """Return how a flow changes in time."""
-    return STEADY if section is None else Pulsation(section.amplitude, section.frequency_hz)
-
-
 def waves_of(section: LightSection) -> Waves | None:
     """Return the waves that light is made of, None where it is made of rays."""
     return None if section.kind == "rays" else Waves(section.wavelength_nm * NM_TO_MM, section.points)
@@ -269,3 +263,52 @@ def wave_light_of(section: ReconstructionSection) -> WaveLight | None:
         return None
     diffusion_px = USUAL_DIFFUSION_PX if section.diffusion_px is None else section.diffusion_px
     return WaveLight(section.wavelength_nm * NM_TO_MM, diffusion_px)
+
+
+# The config with its scene where a calibration has it: faces, and the pipe's wall with them, moved as one body.
+
+
+def fingerprint(scene: tuple[FaceSection, ...]) -> str:
+    """Return what tells a scene from another: the SHA-256 of its faces."""
+    plain = [face.model_dump(mode="json", exclude={"file"}) for face in scene]
+    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
+
+
+def moved_faces(scene: tuple[FaceSection, ...], media: MediaSection, motion: RigidMotion) -> list[dict[str, Any]]:
+    """Return the sections of a scene that is moved as one body.
+
+    Raises
+    ------
+    ConfigError : a face cannot be turned
+    """
+    kinds = {surface: kind for kind, surface in SURFACES.items()}
+    moved = []
+    for section in scene:
+        surface: Any = face_of(section, media_of(media)).surface.moved(motion)
+        moved.append({"kind": kinds[type(surface)], **asdict(surface), "behind": section.behind})
+    return moved
+
+
+def moved_pipe(pipe: PipeSection, motion: RigidMotion) -> dict[str, Any]:
+    """Return the section of a pipe that is moved with its scene."""
+    resolved = pipe.model_dump(mode="json")
+    return resolved | {
+        "centre_mm": motion.point(pipe.centre_mm),
+        "axis": motion.direction(round_wall_of(pipe).direction.tolist()),
+    }
+
+
+def ensure_same(scene: tuple[FaceSection, ...] | None, faces_sha256: str, source: str) -> None:
+    """Raise where a scene is not the one that a calibration's motion is counted from.
+
+    Raises
+    ------
+    ConfigError
+    """
+    if scene is None:
+        raise ConfigError(f"{source}: scene: is missing, and the calibration tells where it lies")
+    if fingerprint(scene) != faces_sha256:
+        raise ConfigError(
+            f"{source}: scene: is not the one whose place the calibration tells; refine-calibration again, from a "
+            "calibration that knows of no scene"
+        )

@@ -13,14 +13,12 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from lfpiv_cli.calibration.model import Calibration, Rig
+from lfpiv_cli.calibration.model import Calibration, Channel, Rig
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.files import bench
+from lfpiv_cli.files.bench import ensure_same, fingerprint, moved_faces, moved_pipe
 from lfpiv_cli.files.checks import contradictions
-from lfpiv_cli.files.config_problems import place_of, problem_of, report, sentence
-from lfpiv_cli.files.heights import with_heights
 from lfpiv_cli.files.inputs import content_of, ensure_regular_file, opened
-from lfpiv_cli.files.scene_place import ensure_same, fingerprint, moved_faces, moved_pipe
 from lfpiv_cli.files.sections import (
     BoardSection,
     CameraSection,
@@ -29,31 +27,35 @@ from lfpiv_cli.files.sections import (
     MediaSection,
     PipeSection,
     ReconstructionSection,
-    Sections,
     VolumeSection,
     WeightsSection,
 )
-from lfpiv_cli.files.sections_simulated import FlowSection, SimulationSection, ValidationSection
+from lfpiv_cli.files.sections_simulated import FlowSection, Sections, SimulationSection, ValidationSection
 from lfpiv_cli.files.yaml_nodes import (
     LARGEST_BYTES,
     Document,
     Problem,
     YamlError,
     key_name,
+    place_of,
+    problem_of,
     read_document,
+    report,
+    sentence,
+    with_heights,
 )
 from lfpiv_cli.flow.correlation import CorrelationSettings
-from lfpiv_cli.flow.masks import ParallelWalls, Walls
+from lfpiv_cli.flow.windows import ParallelWalls, Walls
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import Refraction
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.media import Media, Window, channel_window
-from lfpiv_cli.optics.object_space import ObjectSpace
+from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.reconstruction.registry import SOLVERS
 from lfpiv_cli.reconstruction.solvers import SolverSettings, Stopping
 from lfpiv_cli.reference import FOCAL_POINT, Reference
-from lfpiv_cli.synthetic.flows import Flow
+from lfpiv_cli.synthetic.vortices import Flow
 
 # Images and HDF5 files have a zero byte among their first ones, and no text has.
 BEGINNING_BYTES = 512
@@ -305,7 +307,7 @@ class Config:
 
     def rig(self) -> Rig:
         """Return what must be known to read the picture of a board."""
-        channel = None if self.channel is None else bench.channel_of(self.channel)
+        channel = None if self.channel is None else Channel(**self.channel.model_dump(exclude={"no_slip"}))
         light = bench.wave_light_of(self.reconstruction)
         return Rig(self.camera_model(), self.media_model(), bench.board_of(self.board), channel, light)
 
@@ -422,7 +424,7 @@ def _ensure_text(path: Path) -> None:
     with opened(path) as file:
         if b"\0" not in file.read(BEGINNING_BYTES):
             return
-    from lfpiv_cli.files.recordings.formats import format_of
+    from lfpiv_cli.files.images import format_of
 
     try:
         kind = format_of(path).name

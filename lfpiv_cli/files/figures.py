@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from lfpiv_cli.files import calibration_file, vtkhdf
+from lfpiv_cli.errors import InputError
+from lfpiv_cli.files import calibration_file, images, vtkhdf
 from lfpiv_cli.files.calibration_file import read_calibration
+from lfpiv_cli.files.hdf5 import RESERVED, format_of, from_attribute, open_h5, read_provenance
+from lfpiv_cli.files.hdf5_checks import member
+from lfpiv_cli.files.images import frames
+from lfpiv_cli.files.inputs import ensure_regular_file, split_page, split_part
 from lfpiv_cli.files.particle_file import (
     PARTICLES_FORMAT,
     TRACKS_FORMAT,
@@ -18,8 +25,120 @@ from lfpiv_cli.files.particle_file import (
     Points,
     read_points,
 )
-from lfpiv_cli.flow.derived import derived_fields
-from lfpiv_cli.flow.field import MM_TO_M, REJECTED, VALID
+from lfpiv_cli.files.provenance import recorded_warnings
+from lfpiv_cli.files.recordings import stack
+from lfpiv_cli.flow.field import MM_TO_M, REJECTED, VALID, derived_fields
+
+# What `info` tells of a file of frames.
+
+
+def recording_figures(path: Path) -> dict[str, Any]:
+    """Return what the header of a file of frames says, and the steps between their times.
+
+    Raises
+    ------
+    InputError, UsageError : see `images.frames`
+    """
+    file, part = split_part(path)
+    recording = frames(path)
+    found: dict[str, Any] = {
+        "file_bytes": file.stat().st_size,
+        "format": images.format_of(file, split_page(part)[0]).name,
+        "pages": recording.pages,
+        "columns": recording.shape[1],
+        "rows": recording.shape[0],
+        "bits": recording.bits,
+    }
+    if recording.time_s is not None and recording.pages > 1:
+        steps_s = np.diff(recording.time_s)
+        found |= {"shortest_step_s": float(steps_s.min()), "longest_step_s": float(steps_s.max())}
+        duration_s = float(recording.time_s[-1] - recording.time_s[0])
+        if duration_s > 0.0:
+            found |= {"duration_s": duration_s, "frame_rate_hz": (recording.pages - 1) / duration_s}
+    return found
+
+
+def is_recording(path: Path) -> bool:
+    """Return whether a file holds frames, by its first bytes or its name; of HDF5, what is not in a format of ours.
+
+    Raises
+    ------
+    InputError : the file is missing, not a regular file, or empty
+    """
+    file, part = split_part(path)
+    ensure_regular_file(file)
+    try:
+        kind = images.format_of(file, split_page(part)[0])
+    except InputError:
+        return False
+    if kind.starts != (stack.START,) or part is not None:
+        return True
+    with open_h5(file) as content:
+        return "format" not in content.attrs
+
+
+# What is in a file of ours, without its numbers.
+
+
+# Arrays that are told whole: places, sizes, a lattice's basis.
+TOLD_SHAPES = ((2,), (3,), (2, 2))
+# Groups that show our data to other programs once more.
+VIEWS = ("VTKHDF",)
+
+
+def describe(path: Path) -> dict[str, Any]:
+    """Return format, version, how the file was made, and the scalars and the shapes of the arrays in it.
+
+    Raises
+    ------
+    InputError : the file is missing, broken or not one of ours
+    """
+    file_format = format_of(path)
+    with open_h5(path) as file:
+        found: dict[str, Any] = {
+            "file_bytes": path.stat().st_size,
+            "format": file_format,
+            "format_version": int(file.attrs["format_version"]),
+        }
+        found |= _made(read_provenance(file))
+        _list_group(file, "", found)
+    return found
+
+
+def _made(record: dict[str, Any]) -> dict[str, Any]:
+    """Return the short form of a provenance record."""
+    inputs = [f"{role} {entry['name']}" for role, entry in record.get("inputs", {}).items()]
+    made: dict[str, Any] = {
+        "command": record.get("command"),
+        "program_version": record.get("version"),
+        "inputs": inputs,
+    }
+    warnings = recorded_warnings(record)
+    if warnings:
+        made["warnings_recorded"] = warnings
+    weights = (record.get("config") or {}).get("weights")
+    if weights:
+        made |= {name: weights.get(name) for name in ("method", "refraction", "sampling")}
+    return made
+
+
+def _list_group(group: h5py.Group, prefix: str, found: dict[str, Any]) -> None:
+    """Add the scalars and arrays of a group and of those in it."""
+    for name, value in group.attrs.items():
+        if (prefix or name not in RESERVED) and getattr(value, "ndim", 0) == 0 and name not in ("CLASS", "NAME"):
+            scalar = from_attribute(name, value)
+            if not isinstance(scalar, float) or math.isfinite(scalar):
+                found[prefix + name] = scalar
+    for name in group:
+        if not prefix and name in VIEWS:
+            continue
+        item = member(group, name)
+        if isinstance(item, h5py.Group):
+            _list_group(item, f"{prefix}{name}/", found)
+        elif item.shape in TOLD_SHAPES and np.isfinite(item[()]).all():
+            found[prefix + name] = item[()].tolist()
+        else:
+            found[prefix + name] = f"{item.dtype} {list(item.shape)}"
 
 
 def file_figures(path: Path, file_format: str) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from lfpiv_cli.errors import InputError, LfpivError, OutputError
 from lfpiv_cli.files.atomic import write_atomically
 from lfpiv_cli.files.hdf5_checks import DEEPEST, DIGEST, ensure_array, ensure_ours, member, write_digest
-from lfpiv_cli.files.inputs import ensure_regular_file, reason
+from lfpiv_cli.files.inputs import ensure_regular_file, physical_memory, reason
 
 Tree = Mapping[str, Any]
 
@@ -103,7 +103,7 @@ def create(
     fill: Callable[[h5py.File], None],
     *,
     overwrite: bool,
-    check: Callable[[Path], None],
+    check: Callable[[Path], object],
 ) -> None:
     """Create an HDF5 file atomically; `fill` writes into it, `check` reads it back."""
 
@@ -168,7 +168,7 @@ def read_array(dataset: h5py.Dataset, file_bytes: int) -> NDArray[Any]:
     ------
     OutputError : an array that the file does hold does not fit into memory
     """
-    ensure_array(dataset, file_bytes)
+    ensure_array(dataset.name, dataset.id, file_bytes, physical_memory())
     try:
         return dataset[()]
     except MemoryError as error:
@@ -185,19 +185,14 @@ def open_h5(path: Path) -> Iterator[h5py.File]:
     try:
         with h5py.File(path, "r", locking="best-effort") as file:
             if "format" in file.attrs:
-                _ensure_ours(path, file)
+                try:
+                    ensure_ours(file, path.stat().st_size)
+                except MemoryError as error:  # something says a size there that it cannot have
+                    raise ValueError(reason(error)) from error
             yield file
     except LfpivError:
         raise
     except BROKEN_FILE_ERRORS as error:
-        raise InputError(f"{path}: not a readable HDF5 file of ours: {reason(error)}") from error
-
-
-def _ensure_ours(path: Path, file: h5py.File) -> None:
-    """Look at a file's objects; what takes more memory than there is says a size there that it cannot have."""
-    try:
-        ensure_ours(file, path.stat().st_size)
-    except MemoryError as error:
         raise InputError(f"{path}: not a readable HDF5 file of ours: {reason(error)}") from error
 
 
@@ -224,7 +219,8 @@ def ensure_format(path: Path, file: h5py.File, format_name: str, format_versions
     version = from_attribute("format_version", file.attrs["format_version"])
     if version not in format_versions:
         known = ", ".join(str(v) for v in sorted(format_versions))
-        raise InputError(f"{path}: has {format_name} version {version}, this program reads {known}")
+        remedy = "; make it again with this program" if version < min(format_versions) else ""
+        raise InputError(f"{path}: has {format_name} version {version}, this program reads {known}{remedy}")
 
 
 def write_header(file: h5py.File, format_name: str, format_version: int, provenance: Mapping[str, Any]) -> None:
@@ -354,3 +350,73 @@ def _chunk_shape(shape: tuple[int, ...], item_bytes: int) -> tuple[int, ...]:
         chunk.append(max(min(n, left), 1))
         left //= chunk[-1]
     return tuple(reversed(chunk))
+
+
+# Whether a file of ours is there, and whether it is whole: all that it holds read back, through its checksums.
+
+
+def read_whole(path: Path) -> dict[str, Any] | None:
+    """Read all that a file of ours holds; return the record that it carries, None for a file that is not ours.
+
+    Raises
+    ------
+    InputError
+        The file is broken, in any of its parts.
+    """
+    with open_h5(path) as file:
+        if "format" not in file.attrs or "provenance" not in file.attrs:
+            return None
+        size = path.stat().st_size
+
+        def read(_name: str, item: h5py.Group | h5py.Dataset) -> None:
+            dict(item.attrs)
+            if isinstance(item, h5py.Dataset):
+                read_array(item, size)
+
+        dict(file.attrs)
+        # Hard links to one array are followed once, and soft or external ones not at all.
+        file.visititems(read)
+        return read_provenance(file)
+
+
+def ensure_opens(path: Path) -> None:
+    """Refuse a file that is missing, cut or no HDF5, in a fraction of the time that it takes to look at what it holds.
+
+    Raises
+    ------
+    InputError
+    """
+    ensure_regular_file(path)
+    try:
+        with h5py.File(path, "r", locking="best-effort"):
+            return
+    except BROKEN_FILE_ERRORS as error:
+        raise InputError(f"{path}: not a readable HDF5 file of ours: {reason(error)}") from error
+
+
+def fault_of(paths: Iterable[Path]) -> str | None:
+    """Return why one of these files cannot be opened, None where all can."""
+    for path in paths:
+        try:
+            ensure_opens(path)
+        except InputError as error:
+            return str(error)
+    return None
+
+
+def unpacked_bytes(path: Path) -> int:
+    """Return what the arrays of a file of ours take without compression.
+
+    Raises
+    ------
+    InputError
+    """
+    sizes: list[int] = []
+
+    def add(_name: str, item: h5py.Group | h5py.Dataset) -> None:
+        if isinstance(item, h5py.Dataset):
+            sizes.append(item.size * item.dtype.itemsize)
+
+    with open_h5(path) as file:
+        file.visititems(add)
+    return sum(sizes)

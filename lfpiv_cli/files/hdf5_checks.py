@@ -57,7 +57,7 @@ def ensure_ours(file: h5py.File, file_bytes: int) -> None:
     objects, memory = list(_objects(file)), physical_memory()
     for path, item in objects:
         if isinstance(item, h5py.h5d.DatasetID):
-            _ensure_array(_text(path), item, file_bytes, memory)
+            ensure_array(_text(path), item, file_bytes, memory)
     found, written = _digest(objects, file_bytes)
     if written not in (None, found):
         raise ValueError("its attributes are not those that were written: it is damaged, or was edited")
@@ -68,21 +68,17 @@ def write_digest(file: h5py.File) -> None:
     file.attrs[DIGEST] = np.bytes_(_digest(list(_objects(file)), None)[0])
 
 
-def ensure_array(dataset: h5py.Dataset, file_bytes: int) -> None:
-    """Refuse an array that is not numbers, or whose bytes do not lie in this very file, all of them.
-
-    Parameters
-    ----------
-    file_bytes : size of the file, the bound on what may be declared
-    """
-    _ensure_array(dataset.name, dataset.id, file_bytes, physical_memory())
-
-
 # Below, h5py's plain handles: its groups and arrays take ten times as long to open. A handle takes some 10 us, one of a
 # type or a shape, too: as few as possible are asked for.
 
 
-def _ensure_array(name: str, array: h5py.h5d.DatasetID, file_bytes: int, memory: int) -> None:
+def ensure_array(name: str, array: h5py.h5d.DatasetID, file_bytes: int, memory: int) -> None:
+    """Refuse an array that is not numbers, or whose bytes do not lie in this very file, all of them.
+
+    Parameters
+    ----------
+    file_bytes, memory : of the file and of the machine, the bounds on what may be declared
+    """
     # Asked of the list of properties alone: the shape of a virtual dataset would open the files that it leads to.
     properties = array.get_create_plist()
     layout = properties.get_layout()

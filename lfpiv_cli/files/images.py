@@ -1,12 +1,12 @@
-"""Raw images in, images out: any format of `recordings`, refused rather than guessed where anything is odd.
+"""Raw images in, images out: any of `FORMATS`, refused rather than guessed where anything is odd.
 
 Images are float32 arrays `[row, column]` in counts. Colour is read where its channels are all the same.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import replace
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -15,13 +15,109 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
-from lfpiv_cli.errors import InputError
+from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files.atomic import write_atomically
-from lfpiv_cli.files.inputs import ensure_regular_file, split_page, split_part
-from lfpiv_cli.files.recordings import tiff
-from lfpiv_cli.files.recordings.formats import files_beside, open_recording
+from lfpiv_cli.files.inputs import ensure_regular_file, opened, split_page, split_part
+from lfpiv_cli.files.recordings import blocks, davis, high_speed, stack, tiff
 from lfpiv_cli.files.recordings.recording import Image, Recording, Shape
 from lfpiv_cli.notice import written
+
+# Which formats of frames there are, how each is recognised, and what reads it.
+
+
+@dataclass(frozen=True)
+class Format:
+    """A format of frames.
+
+    Attributes
+    ----------
+    name : as people say it
+    starts : the first bytes of its files, where they tell
+    suffixes : of its files' names, in small letters, where the first bytes do not tell
+    frames : reads a file's header
+    frames_of : reads what FILE:PART says of a file, where the format has parts
+    beside : finds the other files that one is read with; a folder stands for all files in it
+    in_folders : whether its files are meant where a folder is given for the images in it; an HDF5 file can be anything,
+        and a set's images are there besides
+    """
+
+    name: str
+    frames: Callable[[Path], Recording]
+    starts: tuple[bytes, ...] = ()
+    suffixes: tuple[str, ...] = ()
+    frames_of: Callable[[Path, str], Recording] | None = None
+    beside: Callable[[Path], tuple[Path, ...]] | None = None
+    in_folders: bool = True
+
+
+RAW = Format("raw", blocks.unstated_frames, suffixes=blocks.SUFFIXES, frames_of=blocks.frames_laid_out)
+FORMATS = (
+    Format("TIFF", tiff.frames, starts=tiff.STARTS),
+    Format("PNG", tiff.png_frames, starts=(tiff.PNG_START,)),
+    Format("HDF5", stack.frames, starts=(stack.START,), frames_of=stack.frames_named, in_folders=False),
+    Format("Phantom cine", high_speed.cine_frames, starts=(high_speed.CINE_START,)),
+    Format("Norpix seq", high_speed.seq_frames, starts=(high_speed.SEQ_START,)),
+    Format("Photron mraw", high_speed.mraw_frames, suffixes=(high_speed.MRAW_SUFFIX,), beside=high_speed.beside),
+    Format("LaVision im7", davis.im7_frames, suffixes=(".im7",)),
+    Format("LaVision set", davis.set_frames, suffixes=(davis.SUFFIX,), beside=davis.beside, in_folders=False),
+    RAW,
+)
+LONGEST_START = max(len(start) for each in FORMATS for start in each.starts)
+
+
+def open_recording(path: Path, part: str | None) -> Recording:
+    """Return what a file's header says of its frames.
+
+    Raises
+    ------
+    InputError : the file is broken or of no known format
+    UsageError : the format has no parts and one was named, or needs more to be said
+    """
+    found = format_of(path, part)
+    if part is None:
+        return found.frames(path)
+    if found.frames_of is None:
+        raise UsageError(f"{path}:{part}: {found.name} files have no parts or layouts to name")
+    return found.frames_of(path, part)
+
+
+def files_beside(path: Path) -> tuple[Path, ...]:
+    """Return the files, or the folder of files, that one is read with, whatever it is: none of most."""
+    for each in FORMATS:
+        if each.beside is not None and path.suffix.lower() in each.suffixes:
+            return each.beside(path)
+    return ()
+
+
+def format_of(path: Path, part: str | None = None) -> Format:
+    """Return the format of a file: by its first bytes, and where they tell nothing by its name.
+
+    What is neither is raw where a layout is stated.
+
+    Raises
+    ------
+    InputError : the file is missing, not a regular file, empty, or of no known format
+    """
+    ensure_regular_file(path)
+    with opened(path) as file:
+        start = file.read(LONGEST_START)
+    by_name = [each for each in FORMATS if path.suffix.lower() in each.suffixes]
+    # Frames without a header can begin with any bytes.
+    if not by_name:
+        for each in FORMATS:
+            if each.starts and start.startswith(each.starts):
+                return each
+    if by_name:
+        return by_name[0]
+    if part is not None and blocks.LOOKS_LAID_OUT.match(part):
+        return RAW
+    raise InputError(f"{path}: is neither a TIFF nor a PNG image, nor a recording of {_others()}")
+
+
+def _others() -> str:
+    names = [each.name for each in FORMATS if each.name not in ("TIFF", "PNG")]
+    return ", ".join(names[:-1]) + f" or {names[-1]}"
+
 
 # Files whose headers are kept, so that a recording of thousands of frames is not looked through again for each. A batch
 # reads one recording after the other, beside a white and a dark image; long ones have some megabytes of places.

@@ -1,18 +1,177 @@
-"""Inputs by the thousand: lists of files, and folders, whose files stand in natural order."""
+"""Inputs by the thousand: lists of files, lists of check sums, and folders, also such as are still being filled."""
 
 from __future__ import annotations
 
 import os
 import re
 import sys
-from collections.abc import Iterable, Sequence
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.files.batch import VTKHDF_SUFFIX
-from lfpiv_cli.files.inputs import content_of, reading_from, split_part
-from lfpiv_cli.files.recordings.formats import format_of
+from lfpiv_cli.files.images import files_beside, format_of
+from lfpiv_cli.files.inputs import content_of, ensure_regular_file, reading_from, split_part
+from lfpiv_cli.files.provenance import sha256
 from lfpiv_cli.names import InputKind
+
+# Inputs against a list of their SHA-256, as `sha256sum` writes it: most cameras' formats have no check sum.
+
+
+# `sha256sum` writes a star before the names of files that are read as bytes.
+LINE = re.compile(r"([0-9a-fA-F]{64}) [ *](.+)")
+LARGEST_LIST_BYTES = 2**28
+
+
+def ensure_verified(listed: Path, inputs: Iterable[Path]) -> int:
+    """Refuse inputs that are not as a list says, or not in it; return how many files were read for that.
+
+    Parameters
+    ----------
+    listed : the list; names in it count from its folder
+    inputs : files, and folders of which all that is listed is asked
+
+    Raises
+    ------
+    InputError
+    """
+    expected = _read(listed)
+    given = [split_part(path)[0] for path in inputs]
+    read = [each for path in given for each in (path, *(() if os.path.isdir(path) else files_beside(path)))]
+    asked = dict(pair for path in read for pair in _files(path, listed, expected))
+    for file, name in asked.items():
+        found = sha256(file)
+        if found != expected[file]:
+            raise InputError(
+                f"{name}: has the SHA-256 {found}, {listed} says {expected[file]}: it is damaged, or another"
+            )
+    return len(asked)
+
+
+def _files(path: Path, listed: Path, expected: dict[Path, str]) -> Iterator[tuple[Path, Path]]:
+    """Yield the resolved name of each file that an input is, with the one that it was given under."""
+    resolved = path.resolve()
+    inside = [file for file in expected if resolved in file.parents] if os.path.isdir(resolved) else [resolved]
+    if not inside or (inside == [resolved] and resolved not in expected):
+        raise InputError(f"{path}: is not in {listed}, which lists {len(expected)} files")
+    for file in inside:
+        yield file, path if file == resolved else file
+
+
+def _read(listed: Path) -> dict[Path, str]:
+    """Return the SHA-256 of each file in a list, by its resolved name."""
+    size = ensure_regular_file(listed)
+    if size > LARGEST_LIST_BYTES:
+        raise InputError(f"{listed}: has {size} bytes, expected a list of at most {LARGEST_LIST_BYTES}")
+    lines = content_of(listed).decode("utf-8", errors="surrogateescape").splitlines()
+    found: dict[Path, str] = {}
+    for number, line in enumerate(lines, 1):
+        if not line.strip() or line.startswith("#"):
+            continue
+        match = LINE.fullmatch(line)
+        if match is None:
+            raise InputError(f"{listed}:{number}: is no line of sha256sum: 64 digits, two spaces, a file's name")
+        name = (listed.parent / match[2]).resolve()
+        if found.setdefault(name, match[1].lower()) != match[1].lower():
+            raise InputError(f"{listed}:{number}: {match[2]} has another SHA-256 further above")
+    return found
+
+
+# Folders that a camera, or another command, is still filling: files are taken when they are complete, in order.
+
+
+# A file is complete when it can be read and has not grown for so long: cameras write a frame at once, or page by page.
+SETTLED_S = 2.0
+LOOK_S = 0.5
+
+# Size and time of change of a file.
+State = tuple[int, int]
+
+
+def as_they_come(
+    listed: Callable[[], Sequence[Path]],
+    read: Callable[[Path], object],
+    idle_s: float,
+) -> Iterator[list[Path]]:
+    """Yield the files that are complete, in groups, until nothing has changed for `idle_s` seconds.
+
+    The order is that of the list: a file waits for those before it. One that is there after the idle time and still
+    cannot be read comes in the last group, for whoever takes it to say what it lacks.
+
+    Parameters
+    ----------
+    listed : returns the files that are there now, in order
+    read : raises `InputError` where a file cannot be read yet
+    """
+    folder, idle_s = _Filling(listed, read), max(idle_s, SETTLED_S)
+    while True:
+        folder.look()
+        if ready := folder.complete():
+            folder.take(ready)
+            yield ready
+        elif time.monotonic() - folder.changed_at >= idle_s:
+            break
+        else:
+            time.sleep(LOOK_S)
+    if rest := list(folder.waiting):
+        yield rest
+
+
+class _Filling:
+    """What is known of files that are being written."""
+
+    def __init__(self, listed: Callable[[], Sequence[Path]], read: Callable[[Path], object]) -> None:
+        """Take how the files are listed and read."""
+        self._listed, self._read = listed, read
+        self._taken: set[Path] = set()
+        # Since when each file that was not taken is as it is.
+        self.waiting: dict[Path, tuple[State, float]] = {}
+        self.changed_at = time.monotonic()
+
+    def look(self) -> None:
+        """Note which files are new, or have changed since the last look."""
+        now, before = time.monotonic(), self.waiting
+        self.waiting = {}
+        for path in self._listed():
+            if path in self._taken or (state := _state(path)) is None:
+                continue
+            known = before.get(path)
+            self.waiting[path] = known if known is not None and known[0] == state else (state, now)
+            if self.waiting[path] is not known:
+                self.changed_at = now
+
+    def complete(self) -> list[Path]:
+        """Return the first of the files that wait, up to one that is not complete."""
+        now, complete = time.monotonic(), []
+        for path, (_, since) in self.waiting.items():
+            if now - since < SETTLED_S or not self._is_readable(path):
+                break
+            complete.append(path)
+        return complete
+
+    def take(self, paths: Sequence[Path]) -> None:
+        """Leave these out from here on."""
+        self._taken.update(paths)
+        for path in paths:
+            del self.waiting[path]
+
+    def _is_readable(self, path: Path) -> bool:
+        try:
+            self._read(path)
+        except InputError:
+            return False
+        return True
+
+
+def _state(path: Path) -> State | None:
+    """Return the size of a file and when it was changed; None where it is gone, or no file."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return (status.st_size, status.st_mtime_ns) if path.is_file() else None
+
 
 # In place of a list's name: the list is read from standard input.
 STANDARD_INPUT = "-"
@@ -53,11 +212,6 @@ def expanded(paths: Iterable[Path], kind: InputKind) -> list[Path]:
     return [path for given in paths for path in (_some_in(given, kind) if os.path.isdir(given) else [given])]
 
 
-def in_natural_order(paths: Sequence[Path]) -> list[Path]:
-    """Return files by their names as people count: `b2` before `b10`."""
-    return sorted(paths, key=lambda path: (_natural(path.name), path.name))
-
-
 def _natural(name: str) -> list[str | int]:
     """Return the parts of a name, numbers by their value; texts and numbers take turns."""
     return [int(part) if place % 2 else part for place, part in enumerate(re.split(r"([0-9]+)", name.casefold()))]
@@ -72,7 +226,7 @@ def files_in(folder: Path, kind: InputKind) -> list[Path]:
     """
     with reading_from(folder):
         found = [path for path in folder.iterdir() if not path.name.startswith(".") and _is_of(path, kind)]
-    return in_natural_order(found)
+    return sorted(found, key=lambda path: (_natural(path.name), path.name))
 
 
 def _some_in(folder: Path, kind: InputKind) -> list[Path]:

@@ -6,12 +6,53 @@ The layout is that of the templates beside this module; Jinja2, which fills them
 from __future__ import annotations
 
 import base64
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from lfpiv_cli.errors import UsageError
-from lfpiv_cli.files.atomic import write_text
+from lfpiv_cli.files.atomic import write_atomically, write_text
 from lfpiv_cli.files.inputs import ensure_regular_file
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+# Pictures to look at, written like every other output. Drawing needs the optional package matplotlib.
+
+
+DOTS_PER_INCH = 110
+
+
+def ensure_drawing() -> None:
+    """Refuse pictures, before anything is computed, where matplotlib is not installed."""
+    try:
+        import matplotlib  # noqa: F401
+    except ImportError as error:
+        raise UsageError('pictures need matplotlib: pip install "lfpiv[plot]"') from error
+
+
+def write_picture(path: Path, figure: Figure, overwrite: bool) -> None:
+    """Write a figure as PNG; without time stamps, so that the same figure gives the same bytes."""
+
+    def save(target: Path) -> None:
+        figure.savefig(target, format="png", dpi=DOTS_PER_INCH, metadata={"Software": None})
+
+    write_atomically(path, save, overwrite=overwrite)
+
+
+def write_pdf(path: Path, figures: Iterable[Figure], overwrite: bool) -> None:
+    """Write figures as the pages of a PDF; without time stamps, so that the same figures give the same bytes."""
+    from matplotlib.backends.backend_pdf import PdfPages
+
+    def save(target: Path) -> None:
+        with PdfPages(target, metadata={"CreationDate": None, "Creator": None, "Producer": None}) as pages:
+            for figure in figures:
+                pages.savefig(figure)
+
+    write_atomically(path, save, overwrite=overwrite)
+
 
 TEMPLATES = Path(__file__).with_name("templates")
 
@@ -72,25 +113,15 @@ def ensure_pages() -> None:
         raise UsageError('reports need Jinja2: pip install "lfpiv[report]"') from error
 
 
-def write_pages(page: Page, html: Path, markdown: Path, overwrite: bool) -> None:
-    """Write a page as HTML with its pictures inside, and as Markdown that links to them.
+def write_pages(page: Page, targets: Iterable[Path], overwrite: bool) -> None:
+    """Write a page as HTML with its pictures inside, or as Markdown that links to them, as each target's name ends.
 
     Raises
     ------
     InputError : a picture cannot be read
     """
-    for target in (html, markdown):
+    for target in targets:
         write_text(target, _rendered(page, target), overwrite)
-
-
-def write_page(page: Page, html: Path, overwrite: bool) -> None:
-    """Write a page as HTML with its pictures inside.
-
-    Raises
-    ------
-    InputError : a picture cannot be read
-    """
-    write_text(html, _rendered(page, html), overwrite)
 
 
 def _rendered(page: Page, target: Path) -> str:

@@ -24,8 +24,8 @@ import lfpiv_cli
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.files.atomic import without_nan
 from lfpiv_cli.files.hdf5 import open_h5, read_provenance
+from lfpiv_cli.files.images import files_beside
 from lfpiv_cli.files.inputs import ensure_regular_file, opened, reading_from, split_part
-from lfpiv_cli.files.recordings.formats import files_beside
 from lfpiv_cli.notice import Notice
 
 # What has changed is not written out where it takes more characters.

@@ -6,29 +6,15 @@ keys is checked in `files.checks`.
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, Tag
+from pydantic_core import PydanticCustomError
 
-from lfpiv_cli.files.section_types import (
-    Count,
-    Diffusion,
-    Index,
-    NotNegative,
-    Overlaps,
-    PerAxis,
-    Pixels,
-    Positive,
-    Section,
-    Vector,
-    Voxels,
-    Wavelength,
-    Windows,
-)
-from lfpiv_cli.files.sections_scene import FaceSection, PipeAxis
-from lfpiv_cli.files.sections_simulated import SimulationSection, ValidationSection
+from lfpiv_cli.flow.windows import LARGEST_TILT_DEG, RoundWall
 from lfpiv_cli.names import (
     ColumnAxis,
+    Facing,
     Layout,
     Mask,
     Medium,
@@ -41,6 +27,159 @@ from lfpiv_cli.names import (
     Start,
 )
 from lfpiv_cli.reconstruction.registry import SolverName
+
+# What the keys of the configuration can be: numbers within ranges, one for each axis, and what all sections share.
+
+
+Positive = Annotated[float, Field(gt=0.0)]
+NotNegative = Annotated[float, Field(ge=0.0)]
+Count = Annotated[int, Field(ge=1)]
+Index = Annotated[float, Field(ge=1.0, le=5.0)]
+Angle = Annotated[float, Field(gt=-90.0, lt=90.0)]
+# Of charge in a sensor: beyond this pixels would tell nothing apart.
+Diffusion = Annotated[float, Field(ge=0.0, le=3.0)]
+# Of light in air, nm.
+Wavelength = Annotated[float, Field(ge=200.0, le=20_000.0)]
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+Pair = tuple[float, float]
+Vector = tuple[float, float, float]
+
+# Sizes above these are slips of the keyboard; they would ask for more memory than any machine has.
+MOST_PIXELS_PER_SIDE = 100_000
+MOST_VOXELS_PER_SIDE = 10_000
+MOST_PARTICLES = 10_000_000
+MOST_FRAMES = 10_000
+MOST_BUBBLES = 10_000
+
+
+def _each_axis(value: Any) -> Any:
+    """Let one number stand for the three axes."""
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        return (value, value, value)
+    return value
+
+
+# What the JSON schema says of a key that takes one number for all three axes.
+PerAxis = Annotated[
+    tuple[Positive, Positive, Positive],
+    BeforeValidator(_each_axis, json_schema_input_type=Positive | tuple[Positive, Positive, Positive]),
+]
+Voxels = Annotated[int, Field(ge=1, le=MOST_VOXELS_PER_SIDE)]
+WindowSide = Annotated[int, Field(ge=4, le=MOST_VOXELS_PER_SIDE)]
+Overlap = Annotated[float, Field(ge=0.0, lt=1.0)]
+Window = tuple[WindowSide, WindowSide, WindowSide]
+Windows = Annotated[
+    tuple[Window, ...],
+    BeforeValidator(
+        lambda value: tuple(map(_each_axis, value)) if isinstance(value, tuple) else value,
+        json_schema_input_type=tuple[WindowSide | Window, ...],
+    ),
+]
+Overlaps = Annotated[
+    tuple[Overlap, Overlap, Overlap],
+    BeforeValidator(_each_axis, json_schema_input_type=Overlap | tuple[Overlap, Overlap, Overlap]),
+]
+Pixels = Annotated[int, Field(ge=1, le=MOST_PIXELS_PER_SIDE)]
+
+
+class Section(BaseModel):
+    """What all sections share."""
+
+    model_config = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+# The section `scene`: the faces that refract light between the lens and the fluid, one entry each.
+
+
+# What is behind a face: named as in `media`, or its refractive index.
+Behind = Annotated[
+    Annotated[Literal["window", "fluid"], Tag("name")] | Annotated[Index, Tag("number")],
+    Discriminator(lambda value: "name" if isinstance(value, str) else "number"),
+]
+# A lateral world axis, or any direction.
+Direction = Annotated[
+    Annotated[Literal["x", "y"], Tag("name")] | Annotated[Vector, Tag("direction")],
+    Discriminator(lambda value: "name" if isinstance(value, str) else "direction"),
+]
+
+
+def _nearly_lateral(axis: str | tuple[float, float, float]) -> str | tuple[float, float, float]:
+    """Refuse a pipe's axis that is tilted too far from both lateral ones."""
+    if not isinstance(axis, str) and not (any(axis) and RoundWall(1.0, axis=axis).tilt_deg <= LARGEST_TILT_DEG):
+        raise PydanticCustomError("pipe_axis", f"a direction within {LARGEST_TILT_DEG:g} degrees of x or y")
+    return axis
+
+
+# Of a round pipe: x, y, or a direction that is tilted from one of them by a few degrees.
+PipeAxis = Annotated[Direction, AfterValidator(_nearly_lateral)]
+
+
+class PlaneFace(Section):
+    """A plane square to the optical axis at z_mm. behind: what is behind each face, window, fluid or an index."""
+
+    kind: Literal["plane"]
+    z_mm: float
+    behind: Behind
+
+
+class TiltedPlaneFace(Section):
+    """A plane through point_mm, square to the direction `normal` (x, y, z); behind as of every face."""
+
+    kind: Literal["tilted_plane"]
+    point_mm: Vector
+    normal: Vector
+    behind: Behind
+
+
+class CylinderFace(Section):
+    """A circular cylinder of radius_mm; its axis, x, y or a direction [x, y, z], goes through centre_mm.
+
+    facing: convex, the side nearer to the camera, behind which is the inside; or concave, the farther side, from inside
+    to outside. behind as of every face.
+    """
+
+    kind: Literal["cylinder"]
+    radius_mm: Positive
+    axis: Direction = "x"
+    centre_mm: Vector = (0.0, 0.0, 0.0)
+    facing: Facing = "convex"
+    behind: Behind
+
+
+class SphereFace(Section):
+    """A sphere of radius_mm about centre_mm; facing as of a cylinder, behind as of every face."""
+
+    kind: Literal["sphere"]
+    radius_mm: Positive
+    centre_mm: Vector = (0.0, 0.0, 0.0)
+    facing: Facing = "convex"
+    behind: Behind
+
+
+class HeightMapFace(Section):
+    """A smooth surface through heights on a grid in a file: text, .npy or .tif, rows along y of heights along x, in mm.
+
+    The file's folder is the rig file's; results carry heights_mm in its place. spacing_mm (x, y) lies between heights;
+    centre_mm is the grid's middle, from whose z they count away from the camera. behind as of every face.
+    """
+
+    kind: Literal["height_map"]
+    file: str | None = None
+    heights_mm: tuple[tuple[float, ...], ...] | None = None
+    spacing_mm: tuple[Positive, Positive]
+    centre_mm: Vector = (0.0, 0.0, 0.0)
+    behind: Behind
+
+
+FaceSection = Annotated[
+    PlaneFace | TiltedPlaneFace | CylinderFace | SphereFace | HeightMapFace, Field(discriminator="kind")
+]
+
+
+def parameters_of(face: FaceSection) -> dict[str, Any]:
+    """Return what the surface of a face is made of, by the names that `optics.surfaces` has."""
+    others = ("kind", "behind", "file")
+    return {name: getattr(face, name) for name in type(face).model_fields if name not in others}
 
 
 class MainLens(Section):
@@ -257,21 +396,3 @@ class CorrelationSection(Section):
     dt_s: Positive | None = None
     mask: Mask | None = None
     exponent: Annotated[float, Field(gt=0.0, le=1.0)] | None = None
-
-
-class Sections(Section):
-    """The whole configuration as it stands in the file; `files.config.Config` says what is missing."""
-
-    camera: CameraSection | None = None
-    media: MediaSection | None = None
-    window: WindowSection | None = None
-    scene: Annotated[tuple[FaceSection, ...], Field(min_length=1)] | None = None
-    volume: VolumeSection | None = None
-    board: BoardSection | None = None
-    channel: ChannelSection | None = None
-    pipe: PipeSection | None = None
-    weights: WeightsSection = WeightsSection()
-    reconstruction: ReconstructionSection = ReconstructionSection()
-    correlation: CorrelationSection = CorrelationSection()
-    simulation: SimulationSection = SimulationSection()
-    validation: ValidationSection = ValidationSection()

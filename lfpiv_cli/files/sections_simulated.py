@@ -1,4 +1,4 @@
-"""The sections of what is not the rig: flows, what `simulate` renders, and what `validate` asks for."""
+"""The sections of what is not the rig: flows, what `simulate` and `validate` do; and all sections together."""
 
 from __future__ import annotations
 
@@ -6,20 +6,31 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from lfpiv_cli.files.section_types import (
+from lfpiv_cli.files.sections import (
     MOST_BUBBLES,
     MOST_FRAMES,
     MOST_PARTICLES,
     Angle,
+    BoardSection,
+    CameraSection,
+    ChannelSection,
+    CorrelationSection,
+    FaceSection,
+    MediaSection,
     NotNegative,
     Pair,
+    PipeAxis,
+    PipeSection,
     Positive,
+    ReconstructionSection,
     Section,
     Share,
     Vector,
+    VolumeSection,
     Wavelength,
+    WeightsSection,
+    WindowSection,
 )
-from lfpiv_cli.files.sections_scene import PipeAxis
 from lfpiv_cli.names import BoardImages, BoardMethod, BubbleWall, FlowMethod, Refraction
 
 # Each point is carried by all of them: of more, a frame of many tracers takes gigabytes.
@@ -342,3 +353,21 @@ class ValidationSection(Section):
     limits: Limits = Limits()
     weights: WeightsValidation = WeightsValidation()
     board: BoardValidation = BoardValidation()
+
+
+class Sections(Section):
+    """The whole configuration as it stands in the file; `files.config.Config` says what is missing."""
+
+    camera: CameraSection | None = None
+    media: MediaSection | None = None
+    window: WindowSection | None = None
+    scene: Annotated[tuple[FaceSection, ...], Field(min_length=1)] | None = None
+    volume: VolumeSection | None = None
+    board: BoardSection | None = None
+    channel: ChannelSection | None = None
+    pipe: PipeSection | None = None
+    weights: WeightsSection = WeightsSection()
+    reconstruction: ReconstructionSection = ReconstructionSection()
+    correlation: CorrelationSection = CorrelationSection()
+    simulation: SimulationSection = SimulationSection()
+    validation: ValidationSection = ValidationSection()

@@ -7,10 +7,10 @@ VTK reads the extent of nz = 1 so. `Origin` is the centre of the first cell, mm;
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import h5py
 import numpy as np
@@ -18,17 +18,105 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.files.hdf5 import (
+    RESERVED,
     create,
     ensure_format,
+    from_attribute,
     open_h5,
     read_array,
+    read_provenance,
+    to_attribute,
     write_array,
+    write_header,
 )
 from lfpiv_cli.files.hdf5_checks import array_member, member
-from lfpiv_cli.files.vtk import Header, create_vtk_group, place_image, read_root, write_root
 from lfpiv_cli.flow.field import REJECTED, VectorField
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.reference import Reference
+
+# What all `*.vtkhdf` files have in common: VTK's header, and what a file says about itself at its root.
+
+
+# The version of VTK's layout that ParaView 5.12 reads and later ones still do.
+VTK_VERSION = (2, 0)
+
+
+@dataclass(frozen=True, eq=False)
+class Header:
+    """What a file says about itself besides its arrays: its coordinates' origin, attributes at the root, provenance."""
+
+    reference: Reference
+    attributes: dict[str, Any]
+    provenance: dict[str, Any]
+
+
+def create_vtk_group(file: h5py.File, kind: Literal["ImageData", "PolyData"]) -> h5py.Group:
+    """Return a new group `/VTKHDF` that names its version and kind."""
+    vtk = file.create_group("VTKHDF")
+    vtk.attrs["Version"] = np.array(VTK_VERSION, dtype=np.int64)
+    # A string of fixed length: VTK up to 9.4.2 fails on a variable one.
+    vtk.attrs["Type"] = np.bytes_(kind)
+    return vtk
+
+
+def place_image(vtk: h5py.Group, grid: Grid) -> None:
+    """Say where the points of an ImageData lie."""
+    nx, ny, nz = grid.shape_xyz
+    vtk.attrs["WholeExtent"] = np.array([0, nx - 1, 0, ny - 1, 0, nz - 1], dtype=np.int64)
+    vtk.attrs["Origin"] = np.array(grid.origin_mm, dtype=np.float64)
+    vtk.attrs["Spacing"] = np.array(grid.spacing_mm, dtype=np.float64)
+    vtk.attrs["Direction"] = np.eye(3).ravel()
+
+
+def write_steps(
+    vtk: h5py.Group, times: Sequence[float], unit: str, begins: Mapping[str, NDArray[np.int64]]
+) -> h5py.Group:
+    """Write the steps of what changes in time, and where the rows of each point array begin in each; return them."""
+    steps = vtk.create_group("Steps")
+    steps.attrs["NSteps"] = np.int64(len(times))
+    write_array(steps, "Values", np.asarray(times, dtype=np.float64), unit)
+    offsets = steps.create_group("PointDataOffsets")
+    for name, of_steps in begins.items():
+        write_array(offsets, name, of_steps)
+    return steps
+
+
+def write_root(
+    file: h5py.File,
+    format_name: str,
+    format_version: int,
+    reference: Reference,
+    attributes: Mapping[str, Any],
+    provenance: Mapping[str, Any],
+) -> None:
+    """Write what a file says about itself; its attributes are scalars, strings and short numeric arrays.
+
+    What is None is not said, as netCDF knows no empty attribute.
+    """
+    write_header(file, format_name, format_version, provenance)
+    for name, value in (reference.attributes() | dict(attributes)).items():
+        if name in RESERVED:
+            raise ValueError(f"{name} is a name that every file uses for itself")
+        if isinstance(value, np.ndarray):
+            file.attrs[name] = value
+        elif value is not None:
+            file.attrs[name] = to_attribute(value)
+
+
+def read_root(file: h5py.File) -> Header:
+    """Return what a file says about itself, besides format and version.
+
+    Raises
+    ------
+    KeyError, ValueError : it does not say where its coordinates begin, or how it was made
+    """
+    attributes = {
+        name: value.tolist() if isinstance(value, np.ndarray) else from_attribute(name, value)
+        for name, value in file.attrs.items()
+        if name not in RESERVED
+    }
+    return Header(Reference.from_attributes(attributes), attributes, read_provenance(file))
+
 
 VOLUME_FORMAT = "lfpiv-volume"
 VECTORS_FORMAT = "lfpiv-vectors"
@@ -98,7 +186,7 @@ def write_volume(
         points = _write_frame(file, grid, with_component=False)
         _write_points(file, points, "intensity", array_zyx.astype(np.float32), "1")
 
-    create(path, fill, overwrite=overwrite, check=_reads(open_volume))
+    create(path, fill, overwrite=overwrite, check=open_volume)
 
 
 def open_volume(path: Path | str) -> Volume:
@@ -159,7 +247,7 @@ def write_vectors(
         for name, (array, unit) in (extra or {}).items():
             _write_points(file, points, name, array, unit)
 
-    create(path, fill, overwrite=overwrite, check=_reads(open_vectors))
+    create(path, fill, overwrite=overwrite, check=open_vectors)
 
 
 def open_vectors(path: Path | str) -> VectorField:
@@ -236,20 +324,6 @@ def read_header(path: Path | str) -> Header:
     """
     with open_h5(Path(path)) as file:
         return read_root(file)
-
-
-def read_record(path: Path) -> dict[str, Any]:
-    """Return the record of how a file was made, as `read_header` does."""
-    return read_header(path).provenance
-
-
-def _reads(read: Callable[[Path], object]) -> Callable[[Path], None]:
-    """Return a check that reads the file and drops the result."""
-
-    def check(path: Path) -> None:
-        read(path)
-
-    return check
 
 
 def _write_frame(file: h5py.File, grid: Grid, with_component: bool) -> h5py.Group:

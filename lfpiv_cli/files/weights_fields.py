@@ -17,14 +17,13 @@ from lfpiv_cli.files.checks import (
     lens_image_faults,
 )
 from lfpiv_cli.files.inputs import physical_memory
-from lfpiv_cli.files.section_types import MOST_PIXELS_PER_SIDE, MOST_VOXELS_PER_SIDE
+from lfpiv_cli.files.sections import MOST_PIXELS_PER_SIDE, MOST_VOXELS_PER_SIDE
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import ColumnAxis, Facing, Layout, names_in
 from lfpiv_cli.notice import written
-from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.curved_space import CurvedSpace, Face
-from lfpiv_cli.optics.media import Media, Window
-from lfpiv_cli.optics.microlenses import Lattice
+from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.surfaces import SURFACES
 
 # Of the camera, those above 0; what else there is of numbers may have any sign.
@@ -51,21 +50,20 @@ def read_camera(tree: dict[str, Any]) -> Camera:
     ------
     KeyError, ValueError : something is missing, of another kind, or nothing that a camera could have
     """
-    known = {"entrance_over_exit": 1.0} | tree  # files from before pupils have thin lenses
-    values: dict[str, Any] = {name: _positive(name, known[name]) for name in POSITIVE}
-    values |= {name: _whole(name, known[name], 1, MOST_PIXELS_PER_SIDE) for name in ("columns", "rows")}
+    values: dict[str, Any] = {name: _positive(name, tree[name]) for name in POSITIVE}
+    values |= {name: _whole(name, tree[name], 1, MOST_PIXELS_PER_SIDE) for name in ("columns", "rows")}
     values["magnification"] = -_positive(
-        "the reverse of magnification", -_number("magnification", known["magnification"])
+        "the reverse of magnification", -read_number("magnification", tree["magnification"])
     )
-    values["distortion_per_mm2"] = _number("distortion_per_mm2", known["distortion_per_mm2"])
+    values["distortion_per_mm2"] = read_number("distortion_per_mm2", tree["distortion_per_mm2"])
     for name, allowed in (("column_axis", names_in(ColumnAxis)), ("layout", names_in(Layout))):
-        if known[name] not in allowed:
-            raise ValueError(f"{name} is {known[name]!r}, expected one of {', '.join(allowed)}")
-    values["column_axis"] = known["column_axis"]
+        if tree[name] not in allowed:
+            raise ValueError(f"{name} is {tree[name]!r}, expected one of {', '.join(allowed)}")
+    values["column_axis"] = tree["column_axis"]
     pixels = values["columns"] * values["rows"]
     if BYTES_A_PIXEL * pixels > physical_memory():
         raise ValueError(f"{values['columns']} x {values['rows']} pixels do not fit into memory")
-    camera = Camera(lattice=_lattice(known), **values)
+    camera = Camera(lattice=_lattice(tree), **values)
     pitch_px = camera.lattice.pitch / camera.pixel_mm
     if not (pitch_px.min() >= FEWEST_PIXELS_A_LENS and pitch_px.max() <= MOST_PIXELS_A_LENS):
         raise ValueError(f"its lens images are {pitch_px.tolist()} px apart")
@@ -81,9 +79,12 @@ def read_grid(tree: dict[str, Any]) -> tuple[Grid, tuple[int, int, int]]:
     ------
     KeyError, ValueError
     """
-    shape, padding = (_whole_triple(name, tree[name], least) for name, least in (("shape_xyz", 1), ("padding_xyz", 0)))
+    shape, padding = (
+        _triple(name, tree[name], lambda name, value, least=least: _whole(name, value, least, MOST_VOXELS_PER_SIDE))
+        for name, least in (("shape_xyz", 1), ("padding_xyz", 0))
+    )
     spacing = _triple("spacing_mm", tree["spacing_mm"], _positive)
-    origin = _triple("origin_mm", tree["origin_mm"], _number)
+    origin = _triple("origin_mm", tree["origin_mm"], read_number)
     grid = Grid(shape, spacing, origin)
     voxels = math.prod(grid.padded(padding).shape_xyz)
     if BYTES_A_VOXEL * voxels > physical_memory():
@@ -98,20 +99,10 @@ def read_media(tree: dict[str, Any]) -> Media:
     ------
     KeyError, ValueError
     """
-    indices = [_number(name, tree[name]) for name in ("air", "window", "fluid")]
+    indices = [read_number(name, tree[name]) for name in ("air", "window", "fluid")]
     if not (min(indices) >= 1.0 and max(indices) <= LARGEST_INDEX):
         raise ValueError(f"its refractive indices are {indices}, expected 1 to {LARGEST_INDEX:g}")
     return Media(*indices)
-
-
-def read_window(tree: dict[str, Any]) -> Window:
-    """Return the window that rays cross.
-
-    Raises
-    ------
-    TypeError, ValueError
-    """
-    return Window(**{name: _number(name, value) for name, value in tree.items()})
 
 
 def faces_tree(space: CurvedSpace) -> dict[str, Any]:
@@ -124,22 +115,18 @@ def faces_tree(space: CurvedSpace) -> dict[str, Any]:
     }
 
 
-def read_faces(tree: dict[str, Any]) -> tuple[Face, ...]:
-    """Return the faces that rays cross.
+def read_face(tree: dict[str, Any]) -> Face:
+    """Return a face that rays cross.
 
     Raises
     ------
     KeyError, TypeError, ValueError
     """
-    return tuple(_face(tree[str(k)]) for k in range(len(tree)))
-
-
-def _face(tree: dict[str, Any]) -> Face:
     if tree["kind"] not in SURFACES:
         raise ValueError(f"a face is a {tree['kind']!r}, expected one of {', '.join(SURFACES)}")
     kind = SURFACES[tree["kind"]]
     values = {field.name: _of_surface(field.name, tree[field.name]) for field in fields(kind)}  # type: ignore[arg-type]
-    index = _number("index", tree["index"])
+    index = read_number("index", tree["index"])
     if not 1.0 <= index <= LARGEST_INDEX:
         raise ValueError(f"the index behind a face is {index:g}, expected 1 to {LARGEST_INDEX:g}")
     return Face(kind(**values), index)
@@ -158,8 +145,8 @@ def _of_surface(name: str, value: Any) -> Any:
         x, y = _array(name, {name: value}, (2,)).tolist()
         return _positive(name, x), _positive(name, y)
     if isinstance(value, np.ndarray):
-        return _triple(name, value, _number)
-    return _positive(name, value) if name == "radius_mm" else _number(name, value)
+        return _triple(name, value, read_number)
+    return _positive(name, value) if name == "radius_mm" else read_number(name, value)
 
 
 def _plain(value: Any) -> Any:
@@ -189,18 +176,15 @@ def _triple(name: str, values: Any, kind: Any) -> tuple[Any, Any, Any]:
     return first, second, third
 
 
-def _whole_triple(name: str, values: Any, least: int) -> tuple[int, int, int]:
-    return _triple(name, values, lambda name, value: _whole(name, value, least, MOST_VOXELS_PER_SIDE))
-
-
-def _number(name: str, value: Any) -> float:
+def read_number(name: str, value: Any) -> float:
+    """Return a number of a file; a `ValueError` says which is none."""
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= LARGEST_NUMBER:
         raise ValueError(f"{name} is {value!r}, expected a number")
     return float(value)
 
 
 def _positive(name: str, value: Any) -> float:
-    if not _number(name, value) >= SMALLEST_NUMBER:
+    if not read_number(name, value) >= SMALLEST_NUMBER:
         raise ValueError(f"{name} is {value!r}, expected {written(SMALLEST_NUMBER)} or more")
     return float(value)
 

@@ -9,13 +9,11 @@ aperture's mask follow from the camera and are computed again on reading.
 Where the axes do not separate there is, in place of `columns` and `rows`, `on_demand` (what rays cross: `method`,
 `refraction`, refractive indices, window; or the method dlfc alone, whose rays the calibration has), from which columns
 are integrated when needed; where rays were counted, `counted` (`start`, `pixel`, `share` of each voxel in the order of
-the sensor's axes). `vignetting` (coefficients, see `calibration.transmission`) scales the pixels on reading. Version 1
-had none of these.
+the sensor's axes). `vignetting` (coefficients, see `calibration.transmission`) scales the pixels on reading.
 
 Behind curved faces `columns` and `rows` are those of strips (`strips`: `lit` of the padded grid, `turned`, `misfit_l1`,
 `order`, `block_plane`, `block_planes`, `block_line`, see `weights.strips`), and `on_demand` holds the `faces`; `grid`
-says how many voxels lie outside the fluid. Version 2 had none of these, and the strips of version 3 were others, which
-are not read.
+says how many voxels lie outside the fluid. Weights of earlier versions are refused: they are to be built again.
 """
 
 from __future__ import annotations
@@ -29,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.calibration.model import Calibration
-from lfpiv_cli.calibration.transmission import vignetting_surface
+from lfpiv_cli.calibration.white import vignetting_surface
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.files import calibration_file
 from lfpiv_cli.files.checks import LARGEST_NUMBER, SMALLEST_NUMBER
@@ -38,24 +36,24 @@ from lfpiv_cli.files.weights_fields import (
     CAMERA_SCALARS,
     faces_tree,
     read_camera,
-    read_faces,
+    read_face,
     read_grid,
     read_media,
-    read_window,
+    read_number,
 )
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import Refraction, TracedMethod, names_in
 from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace
-from lfpiv_cli.optics.object_space import ObjectSpace
+from lfpiv_cli.optics.media import Window
+from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.reference import Reference
-from lfpiv_cli.simd.combine_varying import COEFFICIENTS
-from lfpiv_cli.weights.aperture import aperture_mask
+from lfpiv_cli.simd.combine import COEFFICIENTS
 from lfpiv_cli.weights.axis import AxisWeights
-from lfpiv_cli.weights.axis_cells import AxisOptics, micro_image_cells
 from lfpiv_cli.weights.build import axis_optics
 from lfpiv_cli.weights.columns import ColumnOperator, OnDemandOperator
+from lfpiv_cli.weights.lens_cells import AxisOptics, aperture_mask, micro_image_cells
 from lfpiv_cli.weights.model import Weights, WeightsOperator, behind_transmission
 from lfpiv_cli.weights.operators import BrickOperator, Column, FactorisedOperator
 from lfpiv_cli.weights.quadrature import Columns
@@ -65,7 +63,6 @@ from lfpiv_cli.weights.strips import StripOperator
 
 FORMAT = "lfpiv-weights"
 VERSION = 4
-READABLE_VERSIONS = (1, 2, 3, 4)
 # Of the arrays whose names do not say them.
 NUMBERS = ("start", "cell", "share", "pixel", "vignetting", "lit", "order", "misfit_l1", "normal", "axis")
 BLOCKS = [f"block_{name}" for name in Blocks._fields]
@@ -174,8 +171,7 @@ def open_weights(path: Path | str) -> WeightsFile:
     InputError : the file is missing, broken, of another format or version, or contradicts itself.
     """
     path = Path(path)
-    tree, provenance = read_tree(path, FORMAT, READABLE_VERSIONS)
-    _ensure_own_strips(path, tree)
+    tree, provenance = read_tree(path, FORMAT, (VERSION,))
     try:
         camera = read_camera(_group(tree, "camera"))
         grid, padding = read_grid(_group(tree, "grid"))
@@ -200,17 +196,8 @@ def read_weights_record(path: Path) -> dict[str, Any]:
     InputError : as `open_weights`
     """
     with open_h5(path) as file:
-        ensure_format(path, file, FORMAT, READABLE_VERSIONS)
+        ensure_format(path, file, FORMAT, (VERSION,))
         return read_provenance(file)
-
-
-def _ensure_own_strips(path: Path, tree: dict[str, Any]) -> None:
-    """Refuse the strips of version 3, which had `height` where those of today have `order`."""
-    strips = tree.get("strips")
-    if isinstance(strips, dict) and "height" in strips and "order" not in strips:
-        raise InputError(
-            f"{path}: weights behind curved faces of an earlier lfpiv; build them again: lfpiv build-weights"
-        )
 
 
 def _group(tree: dict[str, Any], name: str) -> dict[str, Any]:
@@ -331,23 +318,20 @@ def _source(tree: dict[str, Any], calibration: Calibration | None) -> Source:
         return calibration.ray_fit.rays
     media = read_media(tree)
     if "faces" in tree:
-        return CurvedSpace(media, read_faces(_group(tree, "faces")))
+        faces = _group(tree, "faces")
+        return CurvedSpace(media, tuple(read_face(faces[str(k)]) for k in range(len(faces))))
     face = tree.get("window_face")
     if tree["method"] not in names_in(TracedMethod) or tree["refraction"] not in names_in(Refraction):
         raise ValueError(f"unknown tracing: {tree['method']}, {tree['refraction']}")
-    return ObjectSpace(media, read_window(face) if face else None, tree["refraction"], tree["method"])
+    window = Window(**{name: read_number(name, value) for name, value in face.items()}) if face else None
+    return ObjectSpace(media, window, tree["refraction"], tree["method"])
 
 
 def _counted(tree: dict[str, Any], voxels: int, pixels: int) -> Columns:
     """Return counted columns after checking that no index leads outside its array."""
     start, pixel, share = tree["start"], tree["pixel"], tree["share"]
-    if start.shape != (voxels + 1,) or pixel.shape != share.shape or pixel.ndim != 1:
-        raise ValueError(f"tables of {start.shape} and {pixel.shape} for {voxels} voxels")
-    if start[0] != 0 or start[-1] != pixel.size or np.any(np.diff(start) < 0):
-        raise ValueError("the table's columns do not follow each other")
-    if pixel.size and (pixel.min() < 0 or pixel.max() >= pixels):
-        raise ValueError(f"pixel {pixel.min()} or {pixel.max()} of {pixels}")
-    _ensure_shares(share, signed=False)
+    _ensure_table(start, pixel, voxels, pixels)
+    _ensure_shares(share, pixel.shape, signed=False)
     return Columns(start.astype(np.int64), pixel.astype(np.int32), share.astype(np.float32))
 
 
@@ -361,14 +345,8 @@ def _axis_weights(
     """Return the per-axis weights, or so many coefficients of each, after checking that no index leads outside."""
     cells = micro_image_cells(optics)
     start, cell, share = tree["start"], tree["cell"], tree["share"]
-    shares = (*cell.shape, coefficients) if coefficients else cell.shape
-    if start.shape != (planes * voxels + 1,) or share.shape != shares or cell.ndim != 1:
-        raise ValueError(f"tables of {start.shape} and {cell.shape} for {planes} planes of {voxels} voxels")
-    if start[0] != 0 or start[-1] != cell.size or np.any(np.diff(start) < 0):
-        raise ValueError("the table's rows do not follow each other")
-    if cell.size and (cell.min() < 0 or cell.max() >= cells.pixel.size):
-        raise ValueError(f"cell {cell.min()} or {cell.max()} of {cells.pixel.size}")
-    _ensure_shares(share, signed=coefficients > 0)
+    _ensure_table(start, cell, planes * voxels, cells.pixel.size)
+    _ensure_shares(share, (*cell.shape, coefficients) if coefficients else cell.shape, signed=coefficients > 0)
     return AxisWeights(
         planes,
         voxels,
@@ -380,8 +358,20 @@ def _axis_weights(
     )
 
 
-def _ensure_shares(share: NDArray[Any], signed: bool) -> None:
+def _ensure_table(start: NDArray[Any], place: NDArray[Any], rows: int, places: int) -> None:
+    """Refuse a table whose rows do not follow each other, or that has a cell or pixel outside its array."""
+    if start.shape != (rows + 1,) or place.ndim != 1:
+        raise ValueError(f"tables of {start.shape} and {place.shape} for {rows} voxels")
+    if start[0] != 0 or start[-1] != place.size or np.any(np.diff(start) < 0):
+        raise ValueError("the table's rows do not follow each other")
+    if place.size and (place.min() < 0 or place.max() >= places):
+        raise ValueError(f"cell or pixel {place.min()} or {place.max()} of {places}")
+
+
+def _ensure_shares(share: NDArray[Any], shape: tuple[int, ...], signed: bool) -> None:
     """Refuse weights that are no numbers, negative where they may not be, or whose sums have no inverse in float32."""
+    if share.shape != shape:
+        raise ValueError(f"weights of the shape {share.shape}, expected {shape}")
     if not np.all(np.isfinite(share)) or (not signed and share.min(initial=0.0) < 0.0):
         raise ValueError("a weight that is negative or not a number")
     largest = float(np.abs(share).max(initial=0.0))

@@ -1,4 +1,4 @@
-"""YAML without its traps: one document of mappings, sequences and YAML 1.2 scalars, and where each of them stands.
+"""A rig file as text: YAML without its traps, where each key stands, what is wrong there, and heights beside it.
 
 PyYAML would read `1e-3` as text, `12:30` as a number and `yes` as a truth value, keep the last of repeated keys without
 a word, and run out of stack on deep nesting. So its node tree is read here, by the core schema of YAML 1.2.
@@ -6,12 +6,24 @@ a word, and run out of stack on deep nesting. So its node tree is read here, by 
 
 from __future__ import annotations
 
+import difflib
+import math
 import re
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
+from numpy.typing import NDArray
+from pydantic_core import ErrorDetails
+
+from lfpiv_cli.errors import ConfigError, InputError
+from lfpiv_cli.files.images import read_image
+from lfpiv_cli.files.inputs import content_of, ensure_regular_file, reason
+from lfpiv_cli.files.sections_simulated import Sections
+from lfpiv_cli.notice import written
 
 # Libyaml's loader is the same parser in C, ten times as fast; both are safe, as only their nodes are used.
 LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -202,3 +214,235 @@ def key_name(path: KeyPath) -> str:
         else:
             name += f".{part}" if name else part
     return name
+
+
+# What is wrong with a configuration, as sentences about places: `rig.yaml:5:16: camera.x: is 3, expected ...`.
+
+
+# More than this many errors at once are one mistake repeated.
+MOST_PROBLEMS = 20
+COMPARISONS = {
+    "greater_than": ("gt", "more than"),
+    "greater_than_equal": ("ge", "at least"),
+    "less_than": ("lt", "less than"),
+    "less_than_equal": ("le", "at most"),
+}
+KINDS = {
+    "float_type": "a number",
+    "int_type": "a whole number",
+    "int_from_float": "a whole number",
+    "bool_type": "true or false",
+    "string_type": "a word",
+    "tuple_type": "a list in brackets",
+    "finite_number": "a finite number",
+    "model_type": "a section of keys",
+    "model_attributes_type": "a section of keys",
+    "dict_type": "a section of keys",
+}
+# Keys without which another section may be what was meant.
+MISSING: dict[KeyPath, str] = {
+    ("window", "distance_mm"): "is missing; where only the thickness of a channel's wall is known, leave window out "
+    "and give channel: {width_mm: ..., wall_mm: ...}, whose calibrated mid plane tells the distance",
+}
+
+
+def report(source: str, problems: Iterable[Problem]) -> str:
+    """Return one line for each problem, in the order of the file."""
+    lines = [sentence(source, problem) for problem in sorted(set(problems), key=lambda p: (p.line, p.column, p.key))]
+    if len(lines) > MOST_PROBLEMS:
+        lines[MOST_PROBLEMS:] = [f"{source}: and {len(lines) - MOST_PROBLEMS} more errors"]
+    return "\n".join(lines)
+
+
+def sentence(source: str, problem: Problem) -> str:
+    place = f"{source}:{problem.line}:{problem.column}" if problem.line else source
+    return f"{place}: {problem.key}: {problem.message}" if problem.key else f"{place}: {problem.message}"
+
+
+def problem_of(document: Document, details: ErrorDetails) -> Problem:
+    """Return a validation error as a sentence about a place."""
+    path = _path_in(document.data, details["loc"])
+    kind, value, context = details["type"], details["input"], details.get("ctx", {})
+    place = place_of(document, path)
+    if kind == "extra_forbidden":
+        place = document.keys.get(path, (0, 0))
+        text = _unknown(path)
+    elif kind in ("missing", "union_tag_not_found"):
+        if kind == "union_tag_not_found":
+            path = (*path, "kind")
+        text = MISSING.get(path, "is missing")
+    elif kind == "too_long" or kind == "too_short":
+        text = (
+            f"has {context['actual_length']} entries, expected {context.get('max_length', context.get('min_length'))}"
+        )
+    elif kind == "literal_error":
+        text = f"is {_shown(value)}, expected {context['expected']}"
+    elif kind == "union_tag_invalid":
+        path = (*path, "kind")
+        place = place_of(document, path)
+        text = f"is '{context['tag']}', expected one of {context['expected_tags']}"
+    elif kind in COMPARISONS:
+        limit, words = COMPARISONS[kind]
+        text = f"is {_shown(value)}, expected {words} {written(context[limit], 6)}"
+    else:
+        text = f"is {_shown(value)}, expected {KINDS.get(kind, details['msg'])}"
+    return Problem(*place, key_name(path), text)
+
+
+def _unknown(path: KeyPath) -> str:
+    """Return the sentence about a key that its section does not know."""
+    known = _known_keys(path[:-1])
+    near = difflib.get_close_matches(str(path[-1]), known, n=1)
+    return f"unknown key; did you mean '{near[0]}'?" if near else f"unknown key; known are {', '.join(known)}"
+
+
+def _known_keys(path: KeyPath) -> list[str]:
+    """Return the keys of the section at a place."""
+    models: list[Any] = [Sections]
+    for part in path:
+        if isinstance(part, int):
+            continue
+        fields = [model.model_fields[part] for model in models if part in model.model_fields]
+        models = [inner for field in fields for inner in _models_in(field.annotation)]
+    return list(dict.fromkeys(name for model in models for name in model.model_fields))
+
+
+def _models_in(annotation: Any) -> list[Any]:
+    """Return the section classes inside a type."""
+    if hasattr(annotation, "model_fields"):
+        return [annotation]
+    return [model for inner in getattr(annotation, "__args__", ()) for model in _models_in(inner)]
+
+
+def _path_in(data: Any, location: tuple[int | str, ...]) -> KeyPath:
+    """Return pydantic's place without the names of union members, which are not in the data."""
+    path: list[int | str] = []
+    for number, part in enumerate(location):
+        inside = part in data if isinstance(data, Mapping) else isinstance(data, tuple) and isinstance(part, int)
+        if inside:
+            data = data[part] if isinstance(data, Mapping) or part < len(data) else None  # type: ignore[operator]
+            path.append(part)
+        elif number == len(location) - 1 and isinstance(data, Mapping):
+            path.append(part)
+    return tuple(path)
+
+
+def place_of(document: Document, path: KeyPath) -> tuple[int, int]:
+    """Return line and column of a value, or of the nearest section around it."""
+    while path and path not in document.values:
+        path = path[:-1]
+    return document.values.get(path, (0, 0)) if path else document.values.get((), (0, 0))
+
+
+def _shown(value: Any) -> str:
+    """Return a value as it would stand in the file, cut where it is long."""
+    words: dict[Any, str] = {None: "empty", True: "true", False: "false"}
+    if value is None or isinstance(value, bool):
+        return words[value]
+    if isinstance(value, Mapping):
+        return "a section"
+    text = repr(list(value)) if isinstance(value, tuple) else repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+# Heights on a grid that a face of `scene` names a file of: read with the configuration, and then part of it.
+#
+# So results carry them, and are the same wherever the file has gone.
+
+
+# Every result carries them, in its record and in those of what it was made from. A smooth surface needs few: through
+# heights 1 mm apart of a lens of 40 mm radius a tracer is seen where the lens shows it to 20 nm.
+MOST_HEIGHTS = 2**14
+# A picometre; further digits of a float would only make records longer.
+DIGITS = 9
+SEPARATORS = re.compile(r"[,;\s]+")
+
+Rows = tuple[tuple[float, ...], ...]
+
+
+def with_heights(document: Document, source: Path) -> Document:
+    """Return a configuration with the heights of each file that a face names, beside `source`, in the file's place.
+
+    Raises
+    ------
+    ConfigError : one cannot be read
+    """
+    scene = document.data.get("scene")
+    if not isinstance(scene, tuple):
+        return document
+    faces = tuple(_with_heights(face, ("scene", k, "file"), document, source) for k, face in enumerate(scene))
+    return replace(document, data=document.data | {"scene": faces})
+
+
+def _with_heights(face: Any, path: KeyPath, document: Document, source: Path) -> Any:
+    """Return one face, its file read; any other as it is, to be judged with the rest."""
+    if not isinstance(face, Mapping) or face.get("kind") != "height_map" or "heights_mm" in face:
+        return face
+    file = face.get("file")
+    if not isinstance(file, str):
+        return face
+    try:
+        heights = read_heights(source.parent / file)
+    except InputError as error:
+        problem = Problem(*place_of(document, path), key_name(path), str(error))
+        raise ConfigError(sentence(str(source), problem)) from error
+    return {name: value for name, value in face.items() if name != "file"} | {"heights_mm": heights}
+
+
+def read_heights(path: Path) -> Rows:
+    """Read rows of heights in mm: a table of numbers (text), an array (.npy), or an image (.tif).
+
+    Raises
+    ------
+    InputError
+        If the file is missing, broken, or holds no rows of numbers, gaps, or more than a smooth surface needs.
+    """
+    ensure_regular_file(path)
+    ending = path.suffix.lower()
+    if ending in (".tif", ".tiff"):
+        rows = _rows_of(read_image(path), path)
+    else:
+        rows = _rows_of(_array(path), path) if ending == ".npy" else tuple(_table(path))
+    bad = [(r, c) for r, row in enumerate(rows, start=1) for c, z in enumerate(row, start=1) if not math.isfinite(z)]
+    if bad:
+        row, column = bad[0]
+        raise InputError(f"{path}: {len(bad)} heights are no numbers, the first one in row {row}, column {column}")
+    return tuple(tuple(round(z, DIGITS) for z in row) for row in rows)
+
+
+def _array(path: Path) -> NDArray[Any]:
+    """Return a NumPy array, its size held against the file's."""
+    try:
+        array = np.load(path, mmap_mode="r", allow_pickle=False)
+    except Exception as error:  # a damaged header can raise anything in NumPy
+        raise InputError(f"{path}: is no NumPy array: {reason(error)}") from error
+    return np.asarray(array)
+
+
+def _rows_of(array: NDArray[Any], path: Path) -> Rows:
+    """Return an array (rows, columns) as rows."""
+    if array.ndim != 2 or array.dtype.kind not in "fiu":
+        raise InputError(f"{path}: is {array.dtype} of the shape {array.shape}, expected numbers (rows, columns)")
+    _ensure_few(array.size, path)
+    return tuple(tuple(row) for row in array.astype(np.float64).tolist())
+
+
+def _table(path: Path) -> Iterator[tuple[float, ...]]:
+    """Yield the rows of a table of numbers between commas, semicolons or spaces; lines with # in front say nothing."""
+    text, count = content_of(path).decode("utf-8-sig", errors="replace"), 0
+    for number, line in enumerate(text.splitlines(), start=1):
+        words = [word for word in SEPARATORS.split(line) if word]
+        if not words or words[0].startswith("#"):
+            continue
+        count += len(words)
+        _ensure_few(count, path)
+        try:
+            yield tuple(map(float, words))
+        except ValueError as error:
+            raise InputError(f"{path}: line {number}: {reason(error)}") from error
+
+
+def _ensure_few(count: int, path: Path) -> None:
+    """Refuse more heights than a smooth surface needs."""
+    if count > MOST_HEIGHTS:
+        raise InputError(f"{path}: holds {count} heights or more, expected at most {MOST_HEIGHTS}; leave some rows out")

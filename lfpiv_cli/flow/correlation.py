@@ -9,33 +9,147 @@ Axes: volumes `[z, y, x]`, vectors (u, v, w) along (x, y, z); a particle that mo
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, reduce
 from operator import add
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
 from lfpiv_cli.errors import ConfigError, InputError
-from lfpiv_cli.flow.coarse import coarse_field, coarse_layout, coarse_size, coarse_sums
 from lfpiv_cli.flow.deformation import (
     Spline,
     deform_pair,
     matrices_to_voxels,
-    resample_field,
     spline_coefficients,
     spline_matrix,
 )
 from lfpiv_cli.flow.field import VectorField
-from lfpiv_cli.flow.filtering import mixing, smooth_field, unresolved
-from lfpiv_cli.flow.maps import map_sums, margins, valid_shares
-from lfpiv_cli.flow.moments import gauss_newton, pair_moments
-from lfpiv_cli.flow.outliers import expected_noise, fill_field, validate_vectors
+from lfpiv_cli.flow.maps import MapSums, map_sums, margins, valid_shares
+from lfpiv_cli.flow.moments import cells_of, gauss_newton, pair_moments
+from lfpiv_cli.flow.outliers import expected_noise, fill_field, mixing, smooth_field, unresolved, validate_vectors
 from lfpiv_cli.flow.peaks import ELONGATED_WIDTH, Peaks, absolute, find_peaks, typical_width, undiluted
 from lfpiv_cli.flow.windows import Triple, WindowLayout, layout_windows
 from lfpiv_cli.grid import Grid
+from lfpiv_cli.simd.block_sums import MOMENTS
+from lfpiv_cli.threads import share_out
+
+Floats = NDArray[np.float64]
+
+# The coarse pass: correlation of binned volumes, which finds displacements up to a quarter of its windows.
+#
+# Axes: volumes `[z, y, x]`, triples and vectors (x, y, z) unless a name says otherwise.
+
+
+# The coarse pass: windows twice the final ones at least (and those that come first), binned to about 16 cells, with
+# shifts of up to 4 cells. That is a quarter of the window, beyond which too few particles are in both volumes.
+COARSE_FACTOR = 2
+COARSE_CELLS = 16
+COARSE_RADIUS = 4
+
+
+def coarse_size(windows: Sequence[Triple]) -> Triple:
+    """Return the windows of the coarse pass in voxels."""
+    x, y, z = (max(first, COARSE_FACTOR * last) for first, last in zip(windows[0], windows[-1], strict=True))
+    return x, y, z
+
+
+@dataclass(frozen=True)
+class CoarseLayout:
+    """The windows of the coarse pass, in cells of `bins` voxels along (x, y, z)."""
+
+    binned: WindowLayout
+    bins: Triple
+    cells_zyx: Triple
+
+    @property
+    def in_voxels(self) -> WindowLayout:
+        """The same windows in voxels."""
+
+        def scaled(triple: Triple) -> Triple:
+            return _triple(tuple(n * width for n, width in zip(triple, self.bins, strict=True)))
+
+        layout = self.binned
+        return WindowLayout(scaled(layout.size), scaled(layout.step), layout.count, scaled(layout.first))
+
+
+def coarse_layout(shape_xyz: Triple, windows: Sequence[Triple], overlap: tuple[float, float, float]) -> CoarseLayout:
+    """Return the windows of the coarse pass.
+
+    Raises
+    ------
+    ConfigError
+        Windows cannot be so.
+    """
+    if not windows or min(min(window) for window in windows) < 2:
+        raise ConfigError(f"correlation windows are {list(windows)} voxels; each must be at least 2 along every axis")
+    if not all(0.0 <= share < 1.0 for share in overlap):
+        raise ConfigError(f"the overlap of the correlation windows is {overlap}; it must be at least 0 and below 1")
+    size = coarse_size(windows)
+    bins = tuple(max(1, round(w / COARSE_CELLS)) for w in size)
+    cells = tuple(-(-n // width) for n, width in zip(shape_xyz, bins, strict=True))
+    binned_size = tuple(max(2, round(w / width)) for w, width in zip(size, bins, strict=True))
+    return CoarseLayout(
+        layout_windows(_triple(cells), _triple(binned_size), overlap), _triple(bins), _triple(cells[::-1])
+    )
+
+
+def coarse_sums(a: NDArray[np.float32], b: NDArray[np.float32], coarse: CoarseLayout) -> MapSums:
+    """Return what the correlation of two volumes is made of after binning."""
+    before, after = margins(coarse.binned, coarse.cells_zyx, COARSE_RADIUS)
+    binned_a, binned_b = (bin_volume(volume, coarse, before, after) for volume in (a, b))
+    return map_sums(binned_a, binned_b, coarse.binned, before, COARSE_RADIUS)
+
+
+def coarse_field(sums: MapSums, coarse: CoarseLayout) -> tuple[Floats, bool]:
+    """Return a filled and filtered field of displacements in voxels, and whether particle images are long."""
+    peaks = find_peaks(sums.correlation())
+    raw, second = absolute(peaks, np.zeros(peaks.offset.shape))
+    nowhere = np.zeros(peaks.found.shape, dtype=np.bool_)
+    displacement, _ = validate_vectors(raw, second, peaks.found, nowhere, expected_noise(peaks.width))
+    width = undiluted(typical_width(peaks.width) * np.asarray(coarse.bins))
+    is_elongated = bool(np.any(width >= ELONGATED_WIDTH))
+    return smooth_field(fill_field(displacement), is_elongated) * np.asarray(coarse.bins), is_elongated
+
+
+def bin_volume(volume: NDArray[np.float32], coarse: CoarseLayout, before: Triple, after: Triple) -> NDArray[np.float32]:
+    """Return sums over bins, scaled to a largest magnitude of 1, with margins of zeros; the last bins may be cut."""
+    padded = tuple(m + n + k for m, n, k in zip(before, coarse.cells_zyx, after, strict=True))
+    sums = np.zeros(padded, dtype=np.float32)
+    inside = tuple(slice(m, m + n) for m, n in zip(before, coarse.cells_zyx, strict=True))
+    share_out(sum_bins, coarse.cells_zyx[0], volume, coarse.bins[::-1], sums[inside])
+    largest = float(max(np.max(sums), -np.min(sums)))
+    if largest > 0.0:
+        sums *= np.float32(1.0 / largest)
+    return sums
+
+
+@njit(cache=True, nogil=True)
+def sum_bins(part: tuple[int, int], volume: NDArray[np.float32], bins: Triple, sums: NDArray[np.float32]) -> None:
+    """Write sums over bins of `bins` voxels along (z, y, x), planes `part` of them."""
+    for cell_z in range(part[0], part[1]):
+        line = np.empty(volume.shape[2])
+        for cell_y in range(sums.shape[1]):
+            line[:] = 0.0
+            for z in range(cell_z * bins[0], min((cell_z + 1) * bins[0], volume.shape[0])):
+                for y in range(cell_y * bins[1], min((cell_y + 1) * bins[1], volume.shape[1])):
+                    row = volume[z, y]
+                    for x in range(row.size):
+                        line[x] += row[x]
+            for cell_x in range(sums.shape[2]):
+                total = 0.0
+                for x in range(cell_x * bins[2], min((cell_x + 1) * bins[2], line.size)):
+                    total += line[x]
+                sums[cell_z, cell_y, cell_x] = total
+
+
+def _triple(values: tuple[int, ...]) -> Triple:
+    return values[0], values[1], values[2]
+
 
 # Strong curvature leaves up to two voxels after the coarse pass and after each change of windows; later one is enough.
 FIRST_RADIUS = 2
@@ -100,13 +214,13 @@ class Pair:
 class Measured:
     """What one pass measured, at the centres of its windows, and the typical width of the peaks along x, y, z."""
 
-    raw: NDArray[np.float64]
-    displacement: NDArray[np.float64]
+    raw: Floats
+    displacement: Floats
     flag: NDArray[np.uint8]
     peaks: Peaks
-    valid_fraction: NDArray[np.float64]
-    uncertainty: NDArray[np.float64]
-    width: NDArray[np.float64]
+    valid_fraction: Floats
+    uncertainty: Floats
+    width: Floats
 
     @property
     def is_long(self) -> NDArray[np.bool_]:
@@ -251,15 +365,15 @@ def plan(shape_xyz: Triple, windows: Sequence[Triple], overlap: tuple[float, flo
     return passes
 
 
-def _between_layouts(field: NDArray[np.float64], old: WindowLayout, new: WindowLayout) -> NDArray[np.float64]:
+def _between_layouts(field: Floats, old: WindowLayout, new: WindowLayout) -> Floats:
     """Return a field at the centres of other windows."""
     if old == new:
         return field
-    along_x, along_y, along_z = (spline_matrix(old.centres_voxel(k), new.centres_voxel(k)) for k in range(3))
-    return resample_field(field, (along_x, along_y, along_z))
+    x, y, z = (spline_matrix(old.centres_voxel(k), new.centres_voxel(k)) for k in range(3))
+    return np.einsum("ck,bj,ai,kjid->cbad", z, y, x, field, optimize=True)
 
 
-def _refine(pairs: Sequence[Pair], predictor: NDArray[np.float64], step: Pass, is_elongated: bool) -> Measured:
+def _refine(pairs: Sequence[Pair], predictor: Floats, step: Pass, is_elongated: bool) -> Measured:
     """Return what is measured in volumes deformed by `predictor`, given at the windows of `step`, in voxels."""
     layout, shape = step.layout, pairs[0].shape_xyz
     before, after = margins(layout, (shape[2], shape[1], shape[0]), step.radius)
@@ -285,7 +399,7 @@ def _refine(pairs: Sequence[Pair], predictor: NDArray[np.float64], step: Pass, i
     return Measured(raw, displacement, flag, peaks, valid_fraction, uncertainty, width)
 
 
-def _unmixed(measured: Measured, filled: NDArray[np.float64], layout: WindowLayout) -> NDArray[np.float64]:
+def _unmixed(measured: Measured, filled: Floats, layout: WindowLayout) -> Floats:
     """Return the displacements without what long particles mix into the components that are located well.
 
     Along the particles' length noise is worse than the mixture.
@@ -294,7 +408,7 @@ def _unmixed(measured: Measured, filled: NDArray[np.float64], layout: WindowLayo
     return measured.displacement - np.where(measured.is_long, 0.0, mixing(filled, sigma, layout.step))
 
 
-def _with_steps(peaks: Peaks, rest: NDArray[np.float64], width: NDArray[np.float64]) -> Peaks:
+def _with_steps(peaks: Peaks, rest: Floats, width: Floats) -> Peaks:
     """Return the peaks with Gauss-Newton steps in place of their offsets along elongated axes, and a share elsewhere.
 
     A step longer than the peak is wide lies outside the range in which the volumes change linearly. Where all axes are
@@ -306,3 +420,28 @@ def _with_steps(peaks: Peaks, rest: NDArray[np.float64], width: NDArray[np.float
     elsewhere = 0.0 if elongated.any() else STEP_SHARE * (np.abs(differ) < LARGEST_DIFFERENCE)
     share = np.where(elongated, np.abs(rest) <= width, elsewhere)
     return replace(peaks, offset=np.where(share > 0.0, peaks.offset + share * differ, peaks.offset))
+
+
+# How much memory a correlation takes, from the size of its volumes and its windows.
+#
+# Measured on two threads, with the program's 0.25 GB: 0.30 GB for 80 x 80 x 120 voxels, 0.41 for 128 x 128 x 160 and
+# 0.75 for 240 x 200 x 160 with windows of 24 and 12 voxels; 1.63 for the first with windows of 16 and 8 and an
+# overlap of 0.75, of which 0.8 are the moments of the cells.
+
+
+# Two volumes, their splines, and both of them deformed, with what is made in between.
+VOXEL_BYTES = 34
+# Of each window and shift the products and their sum, the two maps, and twice the energies of two volumes.
+SHIFT_BYTES = 40
+MOMENT_BYTES = 8
+
+
+def held_bytes(shape_xyz: Triple, settings: CorrelationSettings) -> float:
+    """Return what a correlation of two volumes holds in memory at once, in bytes, without the program."""
+    of_passes = []
+    for step in plan(shape_xyz, settings.windows, settings.overlap):
+        # Moments are those of the last pass, and of few others.
+        cells = math.prod(starts.size for starts in cells_of(step.layout).start) if step.is_last else 0
+        shifts = (2 * step.radius + 1) ** 3 * math.prod(step.layout.count)
+        of_passes.append(SHIFT_BYTES * shifts + MOMENT_BYTES * MOMENTS * cells)
+    return float(VOXEL_BYTES * math.prod(shape_xyz) + max(of_passes))

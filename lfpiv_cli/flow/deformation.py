@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from lfpiv_cli.flow.windows import Triple, WindowLayout
-from lfpiv_cli.simd.splines import (
+from lfpiv_cli.simd.block_sums import (
     MOST_TAPS,
     NEIGHBOURS,
     interpolate,
@@ -27,6 +27,8 @@ from lfpiv_cli.simd.splines import (
     spline_weights,
 )
 from lfpiv_cli.threads import share_out
+
+Floats = NDArray[np.float64]
 
 # Sources lie between the first and the last voxel's centre: the four taps of a cubic B-spline reach one coefficient
 # beyond these, and a fifth of weight zero another.
@@ -127,7 +129,7 @@ def filter_depth(part: tuple[int, int], volume: NDArray[np.float32]) -> None:
         filter_lines(volume[:, y], factors)
 
 
-def spline_matrix(nodes: NDArray[np.float64], positions: NDArray[np.float64]) -> NDArray[np.float64]:
+def spline_matrix(nodes: Floats, positions: Floats) -> Floats:
     """Return the matrix (positions, nodes) that evaluates the cubic spline through values at `nodes`.
 
     Between the nodes the spline is exact for cubics (not-a-knot); beyond them it goes on in a straight line, for a
@@ -139,14 +141,6 @@ def spline_matrix(nodes: NDArray[np.float64], positions: NDArray[np.float64]) ->
     inside = np.clip(positions, nodes[0], nodes[-1])
     beyond = (positions - inside)[:, np.newaxis]
     return spline(inside) + beyond * spline(inside, 1)
-
-
-def resample_field(
-    field: NDArray[np.float64], matrices_xyz: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
-) -> NDArray[np.float64]:
-    """Return a field (nz, ny, nx, 3) carried to other positions by one spline matrix for each of x, y, z."""
-    along_x, along_y, along_z = matrices_xyz
-    return np.einsum("ck,bj,ai,kjid->cbad", along_z, along_y, along_x, field, optimize=True)
 
 
 @lru_cache(maxsize=4)
@@ -168,7 +162,7 @@ def deform_pair(
     a: Spline,
     b: Spline,
     mask: NDArray[np.bool_],
-    predictor: NDArray[np.float64],
+    predictor: Floats,
     to_voxels: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]],
     before: Triple,
     after: Triple,
@@ -293,12 +287,7 @@ def taps_of(places: NDArray[np.float32], at: int, width: int) -> tuple[int, int]
 
 @njit(cache=True)
 def bound_row(
-    half: NDArray[np.float32],
-    shape: Triple,
-    z: int,
-    y: int,
-    moved: NDArray[np.float32],
-    valid: NDArray[np.uint8],
+    half: NDArray[np.float32], shape: Triple, z: int, y: int, moved: NDArray[np.float32], valid: NDArray[np.uint8]
 ) -> None:
     """Write the half displacements of a row cut off where a source would leave the volume, and which ones are whole.
 

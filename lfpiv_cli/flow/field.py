@@ -6,12 +6,17 @@ particle that moves towards +x from the first volume to the second has u > 0.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.errors import InputError
 from lfpiv_cli.grid import Grid
+from lfpiv_cli.robust import HALF_NORMAL_MEDIAN
+
+Floats = NDArray[np.float64]
 
 # Flags, in the order of decreasing trust. A velocity is finite up to SECOND_PEAK and NaN from REJECTED on.
 VALID = 0
@@ -45,13 +50,13 @@ class VectorField:
     """
 
     grid: Grid
-    displacement_voxel: NDArray[np.float64]
-    displacement_raw_voxel: NDArray[np.float64]
-    correlation: NDArray[np.float64]
-    peak_ratio: NDArray[np.float64]
-    valid_fraction: NDArray[np.float64]
+    displacement_voxel: Floats
+    displacement_raw_voxel: Floats
+    correlation: Floats
+    peak_ratio: Floats
+    valid_fraction: Floats
     flag: NDArray[np.uint8]
-    uncertainty_voxel: NDArray[np.float64] | None
+    uncertainty_voxel: Floats | None
     voxel_mm: tuple[float, float, float]
     dt_s: float | None
     window_voxel: tuple[int, int, int]
@@ -62,10 +67,206 @@ class VectorField:
         return {name: int(np.count_nonzero(self.flag == flag)) for flag, name in FLAG_NAMES.items()}
 
     @property
-    def velocity(self) -> NDArray[np.float64]:
+    def velocity(self) -> Floats:
         """Velocity in m/s, shape (nz, ny, nx, 3): NaN where the vector is rejected or masked, or the time unknown."""
         if self.dt_s is None:
             return np.full(self.displacement_voxel.shape, np.nan)
         velocity = self.displacement_voxel * (np.asarray(self.voxel_mm) * MM_TO_M / self.dt_s)
         velocity[self.flag >= REJECTED] = np.nan
         return velocity
+
+
+# What follows from the gradients of a velocity field.
+#
+# Axes: arrays `[z, y, x]`, vectors (u, v, w) along (x, y, z) last; rates in 1/s.
+
+
+@dataclass(frozen=True, eq=False)
+class Derived:
+    """Fields derived from gradients; NaN where a vector that one needs is missing or an axis has one plane only.
+
+    Attributes
+    ----------
+    vorticity : (nz, ny, nx, 3) curl of the velocity, 1/s
+    divergence : (nz, ny, nx) 1/s; zero in a liquid, so that its rms tells the noise of the gradients without a truth
+    strain_rate : (nz, ny, nx) sqrt(2 S : S) of the symmetric part S of the gradient, 1/s
+    q_criterion : (nz, ny, nx) (W : W - S : S) / 2 with the antisymmetric part W, 1/s^2; positive in vortices
+    """
+
+    vorticity: Floats
+    divergence: Floats
+    strain_rate: Floats
+    q_criterion: Floats
+
+    @property
+    def divergence_rms(self) -> float | None:
+        """The rms of the divergence in 1/s, None where it is known nowhere."""
+        known = self.divergence[np.isfinite(self.divergence)]
+        return float(np.sqrt(np.mean(known**2))) if known.size else None
+
+
+def derived_fields(field: VectorField) -> Derived:
+    """Return the derived fields by central differences, one-sided at the faces and exact for quadratic flows there."""
+    return derived_from(velocity_gradient(field))
+
+
+def derived_from(gradient: Floats) -> Derived:
+    """Return what follows from gradients (nz, ny, nx, 3, 3) in 1/s: the component, then the direction."""
+    turned = gradient.swapaxes(-1, -2)
+    strain, rotation = 0.5 * (gradient + turned), 0.5 * (gradient - turned)
+    strain_squared = np.sum(strain**2, axis=(-1, -2))
+    vorticity = [gradient[..., k, j] - gradient[..., j, k] for j, k in ((1, 2), (2, 0), (0, 1))]
+    return Derived(
+        vorticity=np.stack(vorticity, axis=-1),
+        divergence=np.trace(gradient, axis1=-2, axis2=-1),
+        strain_rate=np.sqrt(2.0 * strain_squared),
+        q_criterion=0.5 * (np.sum(rotation**2, axis=(-1, -2)) - strain_squared),
+    )
+
+
+def velocity_gradient(field: VectorField) -> Floats:
+    """Return d(u, v, w)/d(x, y, z), (nz, ny, nx, 3, 3) in 1/s: the component, then the direction."""
+    velocity = field.velocity
+    gradient = np.full((*velocity.shape, 3), np.nan)
+    for axis, spacing_mm in enumerate(field.grid.spacing_mm):
+        planes = field.grid.shape_xyz[axis]
+        if planes > 1:
+            step_m = spacing_mm * MM_TO_M
+            gradient[..., axis] = np.gradient(velocity, step_m, axis=2 - axis, edge_order=2 if planes > 2 else 1)
+    return gradient
+
+
+# Mean and fluctuations over the vector fields of a batch.
+
+
+@dataclass(frozen=True, eq=False)
+class Statistics:
+    """What the fields of a batch have in common and how far they stray from it.
+
+    Attributes
+    ----------
+    mean : the mean displacements, over the fields in which a vector is neither rejected nor masked; its uncertainty is
+        the standard error of the mean (NaN with fewer than two), its flag REJECTED where no field has a vector
+    rms_voxel : (nz, ny, nx, 3) root of the mean square fluctuation about the mean, measurement noise included
+    samples : (nz, ny, nx) in how many fields a vector was found
+    """
+
+    mean: VectorField
+    rms_voxel: Floats
+    samples: NDArray[np.int64]
+
+
+def statistics_of(fields: Iterable[VectorField]) -> Statistics:
+    """Return the statistics of fields on one grid, read one by one.
+
+    Raises
+    ------
+    InputError
+        There are no fields, or one differs from the first in its grid, its time or its voxels.
+    """
+    first: VectorField | None = None
+    for field in fields:
+        if first is None:
+            first, number = field, 0
+            samples = np.zeros(field.flag.shape, dtype=np.int64)
+            mean, spread = np.zeros((2, *field.displacement_voxel.shape))
+            quality = np.zeros((3, *field.flag.shape))
+        elif (field.grid, field.dt_s, field.voxel_mm) != (first.grid, first.dt_s, first.voxel_mm):
+            raise InputError("the vector fields of a batch differ in grid, time or voxels, and have no mean")
+        found = field.flag < REJECTED
+        samples += found
+        # Welford's sums: the squares of displacements themselves would drown small fluctuations in rounding.
+        away = np.where(found[..., np.newaxis], field.displacement_voxel - mean, 0.0)
+        mean += away / np.maximum(1, samples)[..., np.newaxis]
+        spread += away * np.where(found[..., np.newaxis], field.displacement_voxel - mean, 0.0)
+        quality += (field.correlation, field.peak_ratio, field.valid_fraction)
+        number += 1
+    if first is None:
+        raise InputError("there are no vector fields to take a mean of")
+    count = samples[..., np.newaxis].astype(np.float64)
+    none = samples == 0
+    mean[none] = np.nan
+    rms = np.sqrt(np.divide(spread, count, out=np.full(mean.shape, np.nan), where=count > 0))
+    error = np.divide(rms, np.sqrt(np.maximum(1.0, count - 1.0)), out=np.full(mean.shape, np.nan), where=count > 1)
+    correlation, peak_ratio, valid_fraction = quality / number
+    whole = replace(
+        first,
+        displacement_voxel=mean,
+        displacement_raw_voxel=mean,
+        correlation=correlation,
+        peak_ratio=peak_ratio,
+        valid_fraction=valid_fraction,
+        flag=np.where(none, REJECTED, VALID).astype(np.uint8),
+        uncertainty_voxel=error,
+    )
+    return Statistics(whole, rms, samples)
+
+
+# What a flow says against its own vectors, no truth known: its divergence, and another measurement of it.
+#
+# A liquid has no divergence, so that what is found comes from errors, and from what windows cannot resolve. Beside
+# the divergence that the stated standard deviations make, a ratio of 1 confirms them; a large one says that they are
+# too small. Two measurements of one flow by different ways differ likewise by what their standard deviations let
+# expect.
+#
+# Axes: arrays `[z, y, x]`, components last.
+
+
+# Fewer places than this tell no ratio.
+FEWEST_PLACES = 20
+
+
+def divergence_over_stated(field: VectorField) -> float | None:
+    """Return how large the divergence is over the one that the stated standard deviations make; None: not known.
+
+    By central differences, where all six vectors around a place are there: these are two apart, and windows that
+    overlap by half share nothing there.
+    """
+    sigma = _sigma_mm(field)
+    if sigma is None or min(field.grid.shape_xyz) < 3:
+        return None
+    moved = np.where((field.flag < REJECTED)[..., np.newaxis], field.displacement_voxel * field.voxel_mm, np.nan)
+    inner = tuple(n - 2 for n in field.flag.shape)
+    divergence, variance = np.zeros(inner), np.zeros(inner)
+    for axis, spacing_mm in enumerate(field.grid.spacing_mm):
+        divergence = divergence + _difference(moved[..., axis], axis, 1.0, -1.0) / (2.0 * spacing_mm)
+        variance = variance + _difference(sigma[..., axis] ** 2, axis, 1.0, 1.0) / (2.0 * spacing_mm) ** 2
+    return _ratio(divergence, np.sqrt(variance))
+
+
+def difference_over_stated(one: VectorField, other: VectorField) -> list[float] | None:
+    """Return how large the differences of two fields on one grid are over those expected, by component.
+
+    None where the grids are not the same, or too few vectors are in both.
+    """
+    sigma_one, sigma_other = _sigma_mm(one), _sigma_mm(other)
+    same = one.grid.shape_xyz == other.grid.shape_xyz and np.allclose(
+        [one.grid.spacing_mm, one.grid.origin_mm], [other.grid.spacing_mm, other.grid.origin_mm]
+    )
+    if not same or sigma_one is None or sigma_other is None:
+        return None
+    both = (one.flag < REJECTED) & (other.flag < REJECTED)
+    off = one.displacement_voxel * one.voxel_mm - other.displacement_voxel * other.voxel_mm
+    ratios = [_ratio(off[both, k], np.hypot(sigma_one, sigma_other)[both, k]) for k in range(3)]
+    known = [ratio for ratio in ratios if ratio is not None]
+    return known if len(known) == len(ratios) else None
+
+
+def _sigma_mm(field: VectorField) -> Floats | None:
+    return None if field.uncertainty_voxel is None else field.uncertainty_voxel * field.voxel_mm
+
+
+def _difference(values: Floats, axis: int, after: float, before: float) -> Floats:
+    """Return after * values one further along x, y or z (0, 1, 2) + before * values one back, of the inner places."""
+    inner = [slice(1, -1)] * 3
+    ahead, back = list(inner), list(inner)
+    ahead[2 - axis], back[2 - axis] = slice(2, None), slice(None, -2)
+    return np.asarray(after * values[tuple(ahead)] + before * values[tuple(back)])
+
+
+def _ratio(errors: Floats, sigma: Floats) -> float | None:
+    """Return the usual size of errors in stated standard deviations."""
+    known = np.isfinite(errors) & np.isfinite(sigma) & (sigma > 0.0)
+    if np.count_nonzero(known) < FEWEST_PLACES:
+        return None
+    return float(np.median(np.abs(errors[known]) / sigma[known]) / HALF_NORMAL_MEDIAN)

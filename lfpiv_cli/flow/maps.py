@@ -27,6 +27,8 @@ from lfpiv_cli.simd.block_sums import FEW_SHIFTS, MANY_SHIFTS, products
 from lfpiv_cli.simd.vectors import LANES
 from lfpiv_cli.threads import share_out
 
+Floats = NDArray[np.float64]
+
 # Blocks narrower than this cost more in sums of sums than the products they save.
 SMALLEST_BLOCK = 4
 # A window whose energy is below this share of the brightest one's is empty: what the splines carry into empty space
@@ -94,11 +96,11 @@ class MapSums:
     ----------
     products : sum A(x) B(x + s) + A(x - s) B(x) over blocks along z and y, (blocks z, blocks y, windows x, 2r + 1,
         2r + 1, 2r + 1)
-    energies_a, energies_b : sums of squares over the shifted windows, of `window_energies`
+    energies_a, energies_b : sums of squares over the shifted windows, of `energies_of`
     blocks : how windows are made of blocks
     """
 
-    products: NDArray[np.float64]
+    products: Floats
     energies_a: NDArray[np.float32]
     energies_b: NDArray[np.float32]
     blocks: Blocks
@@ -112,33 +114,35 @@ class MapSums:
             self.blocks,
         )
 
-    def amplitude(self) -> NDArray[np.float64]:
+    def amplitude(self) -> Floats:
         """Return the root of the sum of squares over each window where it stands, the mean of both volumes' in logs."""
         middle = self.energies_a.shape[1] // 2
         energy_a, energy_b = (e[:, middle, :, middle, :, middle] for e in (self.energies_a, self.energies_b))
         return np.asarray((energy_a.astype(np.float64) * energy_b).transpose(0, 2, 1) ** 0.25)
 
-    def correlation(self) -> NDArray[np.float64]:
+    def correlation(self) -> Floats:
         """Return R, (nz, ny, nx, 2r + 1, 2r + 1, 2r + 1), zero where a window holds no tracers."""
+        energies, per_window, hop = (self.energies_a, self.energies_b), self.blocks.per_window[:2], self.blocks.hop[:2]
         # The brackets of R hold two windows each.
         brightest = 4.0 * float(np.max(self.energies_a)) * float(np.max(self.energies_b))
-        per_window, hop = self.blocks.per_window[:2], self.blocks.hop[:2]
-        maps = normalise(
-            self.products, self.energies_a, self.energies_b, per_window, hop, SMALLEST_ENERGY**2 * brightest
-        )
-        maps[without_tracers(self.amplitude())] = 0.0
+        nz, shifts, nx, _, ny, _ = self.energies_a.shape
+        blocks = self.products.reshape(*self.products.shape[:2], nx, shifts**3)
+        maps = np.empty((nz, ny, nx, shifts**3))
+        share_out(write_maps, nz * ny, blocks, energies, per_window, hop, SMALLEST_ENERGY**2 * brightest, maps)
+        maps = maps.reshape(nz, ny, nx, shifts, shifts, shifts)
+        # The other windows are what most of the light comes from.
+        amplitude = self.amplitude()
+        maps[amplitude < SMALLEST_AMPLITUDE * of_half_the_sum(amplitude)] = 0.0
         return maps
-
-
-def without_tracers(amplitude: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which windows of these amplitudes hold no tracers, the others being what most of the light comes from."""
-    return np.asarray(amplitude < SMALLEST_AMPLITUDE * of_half_the_sum(amplitude))
 
 
 def map_sums(
     a: NDArray[np.float32], b: NDArray[np.float32], layout: WindowLayout, before: Triple, radius: int
 ) -> MapSums:
     """Return the sums that R is made of for all shifts up to `radius`, those along z, y, x last.
+
+    For one row of blocks the products are first summed over its planes and rows, many columns and several shifts at
+    once, and only then over the columns of each window. These sums are float32: the maps are wanted to 1e-5.
 
     Parameters
     ----------
@@ -148,35 +152,23 @@ def map_sums(
     """
     blocks = blocks_of(layout)
     first = (blocks.first[0] + before[0], blocks.first[1] + before[1], blocks.first[2] + before[2])
-    products = block_products(a, b, first, blocks.size, blocks.stride, blocks.count, radius)
+    shifts = 2 * radius + 1
+    found = np.empty((*blocks.count, shifts, shifts, shifts))
+    share_out(sum_products, blocks.count[0] * blocks.count[1], (a, b), first, blocks.size, blocks.stride, found)
     energies_a, energies_b = (energies_of(volume, layout, before, radius) for volume in (a, b))
-    return MapSums(products, energies_a, energies_b, blocks)
+    return MapSums(found, energies_a, energies_b, blocks)
 
 
 def energies_of(
     volume: NDArray[np.float32], layout: WindowLayout, before: Triple, radius: int = 0
-) -> NDArray[np.float32]:
-    """Return the sums of squares over all windows at all shifts along each axis, of `window_energies`."""
-    size, step, count, low = (triple[::-1] for triple in (layout.size, layout.step, layout.count, layout.first))
-    first = (low[0] + before[0], low[1] + before[1], low[2] + before[2])
-    return window_energies(volume, first, size, step, count, radius)
-
-
-def valid_shares(valid: NDArray[np.uint8], layout: WindowLayout, before: Triple) -> NDArray[np.float64]:
-    """Return the share of each window's voxels that are valid, (nz, ny, nx), from their flags 0 or 1."""
-    # The squares of 0 and 1 are themselves; float32, for which the sums are compiled anyway.
-    seen = energies_of(valid.astype(np.float32), layout, before)[:, 0, :, 0, :, 0].transpose(0, 2, 1)
-    return seen / np.prod(layout.size, dtype=np.float64)
-
-
-def window_energies(
-    volume: NDArray[np.float32], first: Triple, size: Triple, step: Triple, count: Triple, radius: int
 ) -> NDArray[np.float32]:
     """Return the sums of squares over shifted windows: (windows z, shifts z, windows x, shifts x, windows y, shifts y).
 
     One axis after the other. Differences of running sums would take less, but an empty window next to bright ones must
     be exactly zero.
     """
+    size, step, count, low = (triple[::-1] for triple in (layout.size, layout.step, layout.count, layout.first))
+    first = (low[0] + before[0], low[1] + before[1], low[2] + before[2])
     shifts = 2 * radius + 1
     nz, ny, nx = count
     planes = (nz - 1) * step[0] + size[0] + 2 * radius
@@ -186,6 +178,13 @@ def window_energies(
     found = np.empty((nz, shifts, rows.shape[1]), dtype=np.float32)
     share_out(sum_planes, nz, rows, size[0], step[0], radius, found)
     return found.reshape(nz, shifts, nx, shifts, ny, shifts)
+
+
+def valid_shares(valid: NDArray[np.uint8], layout: WindowLayout, before: Triple) -> Floats:
+    """Return the share of each window's voxels that are valid, (nz, ny, nx), from their flags 0 or 1."""
+    # The squares of 0 and 1 are themselves; float32, for which the sums are compiled anyway.
+    seen = energies_of(valid.astype(np.float32), layout, before)[:, 0, :, 0, :, 0].transpose(0, 2, 1)
+    return seen / np.prod(layout.size, dtype=np.float64)
 
 
 @njit(cache=True, nogil=True)
@@ -281,31 +280,15 @@ def square_row(row: NDArray[np.float32], squares: NDArray[np.float32]) -> None:
         squares[x] = row[x] * row[x]
 
 
-def normalise(
-    products: NDArray[np.float64],
-    energies_a: NDArray[np.float32],
-    energies_b: NDArray[np.float32],
-    per_window: tuple[int, int],
-    hop: tuple[int, int],
-    least: float,
-) -> NDArray[np.float64]:
-    """Return R from the members of `MapSums`; zero where the product of the energies is `least` or less."""
-    nz, shifts, nx, _, ny, _ = energies_a.shape
-    blocks = products.reshape(products.shape[0], products.shape[1], nx, shifts**3)
-    maps = np.empty((nz, ny, nx, shifts**3))
-    share_out(write_maps, nz * ny, blocks, (energies_a, energies_b), per_window, hop, least, maps)
-    return maps.reshape(nz, ny, nx, shifts, shifts, shifts)
-
-
 @njit(cache=True, nogil=True)
 def write_maps(
     part: tuple[int, int],
-    blocks: NDArray[np.float64],
+    blocks: Floats,
     energies: tuple[NDArray[np.float32], NDArray[np.float32]],
     per_window: tuple[int, int],
     hop: tuple[int, int],
     least: float,
-    maps: NDArray[np.float64],
+    maps: Floats,
 ) -> None:
     """Write R of the rows of windows `part`, each flat: (nz, ny, nx, shifts cubed), as are the blocks."""
     energies_a, energies_b = energies
@@ -343,26 +326,6 @@ def add_row(target: NDArray[np.float32], row: NDArray[np.float32]) -> None:
         target[i] += row[i]
 
 
-def block_products(
-    a: NDArray[np.float32],
-    b: NDArray[np.float32],
-    first: Triple,
-    size: Triple,
-    stride: Triple,
-    count: Triple,
-    radius: int,
-) -> NDArray[np.float64]:
-    """Return sum A(x) B(x + s) + A(x - s) B(x) over blocks along z and y, windows along x: (z, y, x, shifts z, y, x).
-
-    For one row of blocks the products are first summed over its planes and rows, many columns and several shifts at
-    once, and only then over the columns of each window. These sums are float32: the maps are wanted to 1e-5.
-    """
-    shifts = 2 * radius + 1
-    found = np.empty((*count, shifts, shifts, shifts))
-    share_out(sum_products, count[0] * count[1], (a, b), first, size, stride, found)
-    return found
-
-
 @njit(cache=True, nogil=True)
 def sum_products(
     part: tuple[int, int],
@@ -370,9 +333,9 @@ def sum_products(
     first: Triple,
     size: Triple,
     stride: Triple,
-    found: NDArray[np.float64],
+    found: Floats,
 ) -> None:
-    """Write the sums of `block_products` for the rows of blocks `part`."""
+    """Write the products of `MapSums` for the rows of blocks `part`."""
     a, b = pair
     count, shifts = found.shape[:3], found.shape[3]
     radius = shifts // 2

@@ -29,6 +29,8 @@ from lfpiv_cli.simd.block_sums import moments as lane_moments
 from lfpiv_cli.simd.vectors import LANES
 from lfpiv_cli.threads import share_out
 
+Floats = NDArray[np.float64]
+
 # Cells along an axis of a window, at least, where it has as many voxels: groups enough for a variance.
 CELLS_PER_WINDOW = 4
 # Three components and the gain. Moments are those of their derivatives, and those of these with B - A.
@@ -89,7 +91,7 @@ def _cells_along(size: int, step: int, count: int) -> tuple[NDArray[np.int64], N
 
 def pair_moments(
     a: NDArray[np.float32], b: NDArray[np.float32], valid: NDArray[np.uint8], layout: WindowLayout, before: Triple
-) -> NDArray[np.float64]:
+) -> Floats:
     """Return the moments of all cells of two deformed volumes; of several pairs these add up.
 
     Parameters
@@ -106,9 +108,7 @@ def pair_moments(
     return found
 
 
-def gauss_newton(
-    moments: NDArray[np.float64], layout: WindowLayout, particle_sigma: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def gauss_newton(moments: Floats, layout: WindowLayout, particle_sigma: Floats) -> tuple[Floats, Floats, Floats]:
     """Return the rest displacements, their standard deviations and the response to a predictor, (nz, ny, nx, 3) each.
 
     NaN where a window does not determine them, and for the standard deviation where its groups are too few.
@@ -147,7 +147,7 @@ def sum_cells(
     first: Triple,
     start: Starts,
     size: Starts,
-    found: NDArray[np.float64],
+    found: Floats,
 ) -> None:
     """Write the moments of cells, rows `part` of (cells z, y, x, MOMENTS), of windows that begin at the voxel `first`.
 
@@ -180,7 +180,7 @@ def sum_cells(
 
 
 @njit(cache=True)
-def unpack(moments: NDArray[np.float64], matrix: NDArray[np.float64], vector: NDArray[np.float64]) -> None:
+def unpack(moments: Floats, matrix: Floats, vector: Floats) -> None:
     """Write the moments as a symmetric matrix (4, 4) and the vector (4,) of the products with B - A."""
     place = 0
     for i in range(UNKNOWNS):
@@ -192,7 +192,7 @@ def unpack(moments: NDArray[np.float64], matrix: NDArray[np.float64], vector: ND
 
 
 @njit(cache=True)
-def invert(matrix: NDArray[np.float64], inverse: NDArray[np.float64]) -> bool:
+def invert(matrix: Floats, inverse: Floats) -> bool:
     """Write the inverse of a symmetric positive definite matrix (n, n) and tell whether it has one."""
     n = matrix.shape[0]
     rest = matrix.copy()
@@ -218,12 +218,7 @@ def invert(matrix: NDArray[np.float64], inverse: NDArray[np.float64]) -> bool:
 
 @njit(cache=True, nogil=True)
 def solve_windows(
-    part: tuple[int, int],
-    moments: NDArray[np.float64],
-    per_window: Triple,
-    hop: Triple,
-    grouped: Triple,
-    solved: NDArray[np.float64],
+    part: tuple[int, int], moments: Floats, per_window: Triple, hop: Triple, grouped: Triple, solved: Floats
 ) -> None:
     """Write step, deviation and response of windows, rows `part` of (3, nz, ny, nx, 3), from their cells' moments.
 
@@ -267,12 +262,7 @@ def solve_windows(
 
 
 @njit(cache=True)
-def write_deviation(
-    groups: NDArray[np.float64],
-    inverse: NDArray[np.float64],
-    solution: NDArray[np.float64],
-    deviation: NDArray[np.float64],
-) -> None:
+def write_deviation(groups: Floats, inverse: Floats, solution: Floats, deviation: Floats) -> None:
     """Write the standard deviations (3,) of a solution from what each group (z, y, x, MOMENTS) leaves of its equations.
 
     Summed over all blocks of up to two neighbouring groups along each axis before squaring, as particles at the rim of
@@ -318,7 +308,7 @@ def write_deviation(
 
 
 @njit(cache=True)
-def sum_neighbours(values: NDArray[np.float64]) -> None:
+def sum_neighbours(values: Floats) -> None:
     """Replace values (z, y, x, 3) by the sums of those from each place to the next along z, y and x, in place.
 
     The last ones along each axis are left half done.

@@ -11,11 +11,105 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation
+from scipy.ndimage import binary_dilation, correlate1d
 
 from lfpiv_cli.flow.field import MASKED, REJECTED, REPLACED, SECOND_PEAK, VALID
 from lfpiv_cli.flow.peaks import typical_width
+from lfpiv_cli.flow.windows import Triple
 from lfpiv_cli.threads import share_out
+
+Floats = NDArray[np.float64]
+
+# The filter between passes, and what it says of the scales that a field does not resolve.
+#
+# Fields are (nz, ny, nx, 3) without NaN.
+
+
+# The end of a straight line fitted to the outer three values. Linear flows pass unchanged, and noise does not.
+LINE_END = np.array([5.0, 2.0, -1.0]) / 6.0
+# Six tenths of the end of a parabola fitted to the outer four, the rest of that line: it keeps most of the curvature of
+# a flow along a wall. The parabola alone lets more noise through, and where particle images are long even this does.
+CURVED_END = 0.6 * np.array([19.0, 3.0, -3.0, 1.0]) / 20.0 + 0.4 * np.append(LINE_END, 0.0)
+# Standard deviation of what cubic B-splines leave with the true predictor, .001 voxel where nothing moves to .003 where
+# particles of 1 voxel move by 4.
+INTERPOLATION_VOXEL = 0.002
+# Windows nearer than the particles are long would tell the bend of the flow by differences of their noise.
+LARGEST_MIXING = 0.25
+
+
+def smooth_field(displacement: Floats, is_elongated: bool = False) -> Floats:
+    """Return a field d without what differs from one window to the next; F d for long particles.
+
+    F is a (1/4, 1/2, 1/4) filter along x, y and z; for short particles the result is 2 F d - F F d. Noise from one
+    window to the next vanishes, as with F alone, but what F takes from a curved flow is given back to the second order.
+    Measured on known volumes, it leaves half of the error of F at 0.7 of its strength in clean ones, and less noise in
+    noisy ones. Particle images that are elongated are located so much less well that F alone is better.
+    """
+    if is_elongated:
+        return _filter(displacement, LINE_END)
+    once = _filter(displacement, CURVED_END)
+    return 2.0 * once - _filter(once, CURVED_END)
+
+
+def unresolved(displacement: Floats, is_elongated: bool = False) -> Floats:
+    """Return what a window's own equations cannot know of its error: standard deviations (nz, ny, nx, 3) in voxels.
+
+    The curvature within a window that the predictor missed, and the noise of the neighbours that deformed it, are as
+    large as the part of a field that `smooth_field` takes away: its rms over a vector and its neighbours. And whatever
+    the particles, splines err by `INTERPOLATION_VOXEL`.
+    """
+    mean = (displacement - smooth_field(displacement, is_elongated)) ** 2
+    for axis in range(3):
+        mean = correlate1d(mean, np.full(3, 1.0 / 3.0), axis=axis, mode="nearest")
+    return np.sqrt(mean + INTERPOLATION_VOXEL**2)
+
+
+def mixing(displacement: Floats, sigma_voxel: Floats, step: Triple) -> Floats:
+    """Return by how much long particles change the flow that a correlation sees, (nz, ny, nx, 3) in voxels.
+
+    A particle image moves as a whole, by the flow d at its centre; a voxel away from that sees it all the same. In the
+    product of two Gaussian images of standard deviation s the distances have s / sqrt(2), and the mean of d over these
+    is d + s^2 / 4 d'' to the second order, along the image's length. Nothing at the ends, where particles may lie on
+    one side only.
+
+    Parameters
+    ----------
+    displacement : (nz, ny, nx, 3) without NaN
+    sigma_voxel : (3,) standard deviation of a particle image along x, y, z; 0 where it is short
+    step : distance of the windows along x, y, z, voxels
+    """
+    smooth = _filter(displacement, LINE_END)
+    change = np.zeros(displacement.shape)
+    for axis, sigma, distance in zip((2, 1, 0), sigma_voxel, step, strict=True):
+        share = min(0.25 * (sigma / distance) ** 2, LARGEST_MIXING)
+        if share > 0.0 and displacement.shape[axis] > 2:
+            bend = correlate1d(smooth, (1.0, -2.0, 1.0), axis=axis)
+            moved = np.moveaxis(bend, axis, 0)
+            moved[0] = moved[-1] = 0.0
+            change += share * bend
+    return change
+
+
+def _filter(displacement: Floats, end: Floats) -> Floats:
+    """Return a field after a (1/4, 1/2, 1/4) filter along x, y and z.
+
+    The first and the last value of a line become those that `end` makes of the outer ones; of the straight line where
+    there are too few.
+    """
+    filtered = displacement
+    for axis in range(3):
+        if filtered.shape[axis] >= LINE_END.size:
+            moved = np.moveaxis(filtered, axis, 0)
+            weights = end if moved.shape[0] >= end.size else LINE_END
+            line = np.empty_like(moved)
+            line[1:-1] = 0.25 * moved[:-2] + 0.5 * moved[1:-1] + 0.25 * moved[2:]
+            line[0] = sum(weight * value for weight, value in zip(weights, moved[: weights.size], strict=True))
+            line[-1] = sum(
+                weight * value for weight, value in zip(weights, moved[: -weights.size - 1 : -1], strict=True)
+            )
+            filtered = np.moveaxis(line, 0, axis)
+    return filtered
+
 
 # Measurement noise that the test takes for granted, in voxels for particle images of 1 voxel standard deviation; it
 # grows with their width. A smaller one flags clean vectors where the neighbours happen to agree.
@@ -53,7 +147,7 @@ def sorting_network(count: int) -> NDArray[np.int64]:
 NETWORK = sorting_network(NEIGHBOURHOOD)
 
 
-def expected_noise(width: NDArray[np.float64]) -> NDArray[np.float64]:
+def expected_noise(width: Floats) -> Floats:
     """Return the noise that the test takes for granted, (3,) in voxels, from the widths of correlation peaks (..., 3).
 
     The correlation peak of Gaussian particle images is wider than they are by a factor of sqrt(2).
@@ -62,12 +156,8 @@ def expected_noise(width: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def validate_vectors(
-    raw: NDArray[np.float64],
-    second: NDArray[np.float64],
-    measured: NDArray[np.bool_],
-    masked: NDArray[np.bool_],
-    noise: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    raw: Floats, second: Floats, measured: NDArray[np.bool_], masked: NDArray[np.bool_], noise: Floats
+) -> tuple[Floats, NDArray[np.uint8]]:
     """Return the validated displacements and their flags.
 
     An outlier takes its second peak if that one fits; otherwise the value that its neighbours predict if enough of them
@@ -90,8 +180,10 @@ def validate_vectors(
     flat = (predicted.reshape(-1, 3), spread.reshape(-1, 3), share.reshape(-1))
     for round_number in range(ROUNDS):
         before, usable = usable, flag == VALID
-        # In a later round only what has lost or won a neighbour.
-        again = np.flatnonzero(_around(before != usable)) if round_number else np.arange(measured.size)
+        again = np.arange(measured.size)
+        if round_number:
+            # Only what has lost or won a neighbour.
+            again = np.flatnonzero(binary_dilation(before != usable, np.ones((3, 3, 3), dtype=np.bool_)))
         told = predict(displacement, usable, ~masked, again)
         for kept, new in zip(flat, told, strict=True):
             kept[again] = new
@@ -108,7 +200,7 @@ def validate_vectors(
     return displacement, flag
 
 
-def fill_field(displacement: NDArray[np.float64]) -> NDArray[np.float64]:
+def fill_field(displacement: Floats) -> Floats:
     """Return a field without NaN: gaps are closed from their rims inwards by what the neighbours predict.
 
     A field without a single vector becomes zero.
@@ -127,7 +219,7 @@ def fill_field(displacement: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 @njit(cache=True)
-def sort_columns(rows: NDArray[np.float64]) -> None:
+def sort_columns(rows: Floats) -> None:
     """Sort each column of (NEIGHBOURHOOD, LANES) in place: the same comparisons for all, many at once."""
     for pair in range(NETWORK.shape[0]):
         upper, lower = rows[NETWORK[pair, 0]], rows[NETWORK[pair, 1]]
@@ -137,7 +229,7 @@ def sort_columns(rows: NDArray[np.float64]) -> None:
 
 
 @njit(cache=True)
-def medians(rows: NDArray[np.float64], middle: NDArray[np.float64]) -> None:
+def medians(rows: Floats, middle: Floats) -> None:
     """Write the median of the finite values of each column of (NEIGHBOURHOOD, LANES), 0 without any; sorts `rows`.
 
     Infinity stands for what is not known.
@@ -151,9 +243,7 @@ def medians(rows: NDArray[np.float64], middle: NDArray[np.float64]) -> None:
 
 
 @njit(cache=True)
-def robust_slopes(
-    values: NDArray[np.float64], stride: int, slopes: NDArray[np.float64], middle: NDArray[np.float64]
-) -> None:
+def robust_slopes(values: Floats, stride: int, slopes: Floats, middle: Floats) -> None:
     """Write the median slope along an axis over pairs of neighbours that lie on one line along it; 0 without a pair.
 
     Parameters
@@ -181,12 +271,12 @@ def robust_slopes(
 
 @njit(cache=True)
 def gather(
-    field: NDArray[np.float64],
+    field: Floats,
     usable: NDArray[np.bool_],
     counted: NDArray[np.bool_],
     places: NDArray[np.int64],
-    cubes: NDArray[np.float64],
-    share: NDArray[np.float64],
+    cubes: Floats,
+    share: Floats,
 ) -> None:
     """Write the usable neighbours of up to `LANES` vectors, (3, NEIGHBOURHOOD, LANES), infinity for the others.
 
@@ -211,8 +301,8 @@ def gather(
 
 
 def predict(
-    field: NDArray[np.float64], usable: NDArray[np.bool_], counted: NDArray[np.bool_], wanted: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    field: Floats, usable: NDArray[np.bool_], counted: NDArray[np.bool_], wanted: NDArray[np.int64]
+) -> tuple[Floats, Floats, Floats]:
     """Return what the usable neighbours of each wanted vector predict for it.
 
     Parameters
@@ -240,11 +330,11 @@ def predict(
 @njit(cache=True, nogil=True)
 def predict_tiles(
     part: tuple[int, int],
-    field: NDArray[np.float64],
+    field: Floats,
     usable: NDArray[np.bool_],
     counted: NDArray[np.bool_],
     wanted: NDArray[np.int64],
-    out: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
+    out: tuple[Floats, Floats, Floats],
 ) -> None:
     """Write what `predict` returns for tiles `part` of `LANES` wanted vectors each, (tiles, 3, LANES); see there."""
     predicted, spread, share = out
@@ -267,8 +357,3 @@ def predict_tiles(
                 for lane in range(LANES):
                     rows[place, lane] = abs(values[place, lane] - middle[lane])
             medians(rows, spread[tile, component])
-
-
-def _around(chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return which vectors have a chosen one among their 26 neighbours (or are one)."""
-    return np.asarray(binary_dilation(chosen, np.ones((3, 3, 3), dtype=np.bool_)))

@@ -6,13 +6,45 @@ voxels.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from lfpiv_cli.flow.field import VectorField
+from lfpiv_cli.reference import Reference
+from lfpiv_cli.scale import Scale
 from lfpiv_cli.threads import share_out
+
+Floats = NDArray[np.float64]
+
+# Locking: near the focal plane volumes draw lateral displacements towards whole microlenses.
+#
+# A tracer in focus lights one microlens, wherever in it the tracer is; only from about `Scale.depth_mm` on is its
+# light shared by several, whose shares tell where it is. In between, a displacement of a fraction f of a microlens is
+# measured with an error of about -amplitude sin(2 pi f), the same in all windows at that depth, so that no scatter
+# shows it. It is stated as an uncertainty. Particles, which are fitted to the pixels behind each lens, do not lock.
+
+
+# Root mean square of the error in the focal plane over all fractions of a microlens, in microlenses.
+LOCKING_LENSES = 0.1
+
+
+def with_locking(field: VectorField, reference: Reference, scale: Scale) -> VectorField:
+    """Return vectors from volumes with locking in the uncertainty of their lateral components.
+
+    It is the root mean square of the error over all fractions of a microlens, by the depth from the focal plane.
+    """
+    if field.uncertainty_voxel is None:
+        return field
+    z_mm = np.array([reference.depth_to_focal_point(z) for z in field.grid.axis_mm(2)])
+    error_mm = np.zeros((len(z_mm), 1, 1, 3))
+    error_mm[..., :2] = (
+        LOCKING_LENSES * scale.lens_mm * np.exp(-0.5 * (z_mm / scale.depth_mm) ** 2)[:, None, None, None]
+    )
+    return replace(field, uncertainty_voxel=np.hypot(field.uncertainty_voxel, error_mm / field.voxel_mm))
+
 
 # A ratio beyond this says only that there is no second peak; it keeps the stored numbers finite.
 LARGEST_PEAK_RATIO = 100.0
@@ -34,12 +66,12 @@ class Peaks:
     width : standard deviation of the Gaussian through the peak along each axis; NaN where three points do not bend down
     """
 
-    offset: NDArray[np.float64]
-    height: NDArray[np.float64]
-    second_offset: NDArray[np.float64]
-    second_height: NDArray[np.float64]
-    ratio: NDArray[np.float64]
-    width: NDArray[np.float64]
+    offset: Floats
+    height: Floats
+    second_offset: Floats
+    second_height: Floats
+    ratio: Floats
+    width: Floats
 
     @property
     def found(self) -> NDArray[np.bool_]:
@@ -47,7 +79,7 @@ class Peaks:
         return self.height > 0.0
 
 
-def find_peaks(maps: NDArray[np.float64]) -> Peaks:
+def find_peaks(maps: Floats) -> Peaks:
     """Return the peaks of maps of shape (nz, ny, nx, 2r + 1, 2r + 1, 2r + 1)."""
     windows, shifts = maps.shape[:3], maps.shape[3]
     flat = np.ascontiguousarray(maps).reshape(-1, shifts, shifts, shifts)
@@ -71,7 +103,7 @@ def find_peaks(maps: NDArray[np.float64]) -> Peaks:
     )
 
 
-def typical_width(width: NDArray[np.float64]) -> NDArray[np.float64]:
+def typical_width(width: Floats) -> Floats:
     """Return the median of widths (..., 3) along each axis, leaving out NaN; the square root of 2 where all are NaN.
 
     That is the width for Gaussian particle images with a standard deviation of 1 voxel.
@@ -84,7 +116,7 @@ def typical_width(width: NDArray[np.float64]) -> NDArray[np.float64]:
     return typical
 
 
-def undiluted(width: NDArray[np.float64]) -> NDArray[np.float64]:
+def undiluted(width: Floats) -> Floats:
     """Return the widths of peaks without the pedestal of dense seeding, which widens all axes by about one factor.
 
     Taken as undiluted where the narrowest is that of particles of up to 1 voxel, which volumes are made for.
@@ -92,7 +124,7 @@ def undiluted(width: NDArray[np.float64]) -> NDArray[np.float64]:
     return width * min(1.0, float(np.sqrt(2.0) / width.min()))
 
 
-def absolute(peaks: Peaks, predictor: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def absolute(peaks: Peaks, predictor: Floats) -> tuple[Floats, Floats]:
     """Return the displacements of the first and the second peak, NaN where there is none."""
     first = np.where(peaks.found[..., np.newaxis], predictor + peaks.offset, np.nan)
     has_second = (peaks.second_height > 0.0)[..., np.newaxis]
@@ -124,7 +156,7 @@ def vertex(before: float, at: float, after: float) -> tuple[float, float]:
 
 
 @njit(cache=True)
-def fit_peak(shifts: NDArray[np.float64], iz: int, iy: int, ix: int) -> tuple[float, float, float, float, float, float]:
+def fit_peak(shifts: Floats, iz: int, iy: int, ix: int) -> tuple[float, float, float, float, float, float]:
     """Return offset (x, y, z) and width (x, y, z) of the peak at one node, by three points along each axis.
 
     At the map's border the three outermost points are used: the offset then stays within the map.
@@ -139,7 +171,7 @@ def fit_peak(shifts: NDArray[np.float64], iz: int, iy: int, ix: int) -> tuple[fl
 
 
 @njit(cache=True)
-def is_local_maximum(shifts: NDArray[np.float64], iz: int, iy: int, ix: int) -> bool:
+def is_local_maximum(shifts: Floats, iz: int, iy: int, ix: int) -> bool:
     """Tell whether no neighbour of a node is higher (of equals, the first in memory counts)."""
     last = shifts.shape[0] - 1
     value = shifts[iz, iy, ix]
@@ -154,12 +186,7 @@ def is_local_maximum(shifts: NDArray[np.float64], iz: int, iy: int, ix: int) -> 
 
 @njit(cache=True, nogil=True)
 def write_peaks(
-    part: tuple[int, int],
-    maps: NDArray[np.float64],
-    offset: NDArray[np.float64],
-    second_offset: NDArray[np.float64],
-    width: NDArray[np.float64],
-    heights: NDArray[np.float64],
+    part: tuple[int, int], maps: Floats, offset: Floats, second_offset: Floats, width: Floats, heights: Floats
 ) -> None:
     """Write for maps `part` of (n, s, s, s): offset (n, 3), second offset (n, 3), width (n, 3), and heights (n, 3).
 

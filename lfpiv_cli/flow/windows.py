@@ -7,11 +7,175 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.grid import Grid
+
+# Where there is fluid, and vectors can be measured: between the walls of a channel, or in a round pipe.
+#
+# Axes: points and sides (x, y, z) in mm, arrays [z, y, x]. A kind of walls is a class with the methods of `Walls`.
+
+
+Floats = NDArray[np.float64]
+
+# Pipes that are tilted further from x or y are other pipes than `RoundWall` knows.
+LARGEST_TILT_DEG = 5.0
+
+
+class Walls(Protocol):
+    """What bounds the fluid."""
+
+    def contain(self, points_mm: Floats) -> NDArray[np.bool_]:
+        """Return which points (..., 3) lie in the fluid or on its walls."""
+
+    def shares(self, centres_mm: Floats, sides_mm: Floats) -> Floats:
+        """Return the share (...) of boxes with sides (3,) about centres (..., 3) that lies in the fluid."""
+
+    def volumes_mm3(self, low_mm: Floats, high_mm: Floats) -> Floats:
+        """Return the volume (...) in the fluid of boxes from one corner (..., 3) to the other, 0 of empty ones."""
+
+    def points(self, low_mm: Floats, high_mm: Floats, step_mm: Floats) -> Floats:
+        """Return points (k, 3) on the walls that a box holds, at most a step (3,) apart."""
+
+
+@dataclass(frozen=True)
+class ParallelWalls:
+    """Two walls across z, half the width from z = 0, the channel's mid plane."""
+
+    width_mm: float
+
+    def contain(self, points_mm: Floats) -> NDArray[np.bool_]:
+        """Return which points (..., 3) lie between the walls or on them."""
+        return np.asarray(np.abs(points_mm[..., 2]) <= 0.5 * self.width_mm)
+
+    def shares(self, centres_mm: Floats, sides_mm: Floats) -> Floats:
+        """Return the share (...) of the depth of boxes with sides (3,) about centres (..., 3) between the walls."""
+        z, half, wall = centres_mm[..., 2], 0.5 * sides_mm[2], 0.5 * self.width_mm
+        return np.clip(np.minimum(z + half, wall) - np.maximum(z - half, -wall), 0.0, None) / sides_mm[2]
+
+    def volumes_mm3(self, low_mm: Floats, high_mm: Floats) -> Floats:
+        """Return the volume (...) between the walls of boxes from one corner (..., 3) to the other."""
+        wall = np.array([np.inf, np.inf, 0.5 * self.width_mm])
+        return np.asarray(np.prod(np.maximum(np.minimum(high_mm, wall) - np.maximum(low_mm, -wall), 0.0), axis=-1))
+
+    def points(self, low_mm: Floats, high_mm: Floats, step_mm: Floats) -> Floats:
+        """Return points (k, 3) on those walls that a box holds, at most a step (3,) apart."""
+        along = [spaced(low_mm[axis], high_mm[axis], step_mm[axis]) for axis in range(2)]
+        depths = [z for z in (-0.5 * self.width_mm, 0.5 * self.width_mm) if low_mm[2] <= z <= high_mm[2]]
+        return np.stack(np.meshgrid(*along, np.asarray(depths), indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+@dataclass(frozen=True)
+class RoundWall:
+    """The inside of a round pipe along `axis` through its centre (x, y, z).
+
+    The axis is x, y or a direction of any length near one of them: sections across x or y are taken for circles, which
+    at `LARGEST_TILT_DEG` makes boxes 0.4 % too small.
+    """
+
+    radius_mm: float
+    centre_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    axis: Literal["x", "y"] | tuple[float, float, float] = "x"
+
+    @property
+    def direction(self) -> Floats:
+        """Unit vector (3,) along the pipe."""
+        if isinstance(self.axis, str):
+            return np.eye(3)["xy".index(self.axis)]
+        return np.asarray(np.array(self.axis) / np.linalg.norm(self.axis))
+
+    @property
+    def along(self) -> int:
+        """The axis that the pipe follows, or nearly, 0 for x."""
+        return int(np.abs(self.direction[1]) > np.abs(self.direction[0]))
+
+    @property
+    def tilt_deg(self) -> float:
+        """How far the pipe is tilted from the axis that it nearly follows."""
+        return float(np.rad2deg(np.arccos(min(1.0, abs(self.direction[self.along])))))
+
+    def distances_mm(self, points_mm: Floats) -> Floats:
+        """Return the distance (...) of points (..., 3) from the pipe's axis."""
+        relative, direction = points_mm - np.asarray(self.centre_mm), self.direction
+        return np.asarray(np.linalg.norm(relative - (relative @ direction)[..., np.newaxis] * direction, axis=-1))
+
+    def contain(self, points_mm: Floats) -> NDArray[np.bool_]:
+        """Return which points (..., 3) lie in the pipe or on its wall."""
+        return np.asarray(self.distances_mm(points_mm) <= self.radius_mm)
+
+    def shares(self, centres_mm: Floats, sides_mm: Floats) -> Floats:
+        """Return the share (...) of boxes with sides (3,) about centres (..., 3) that lies in the pipe."""
+        half = 0.5 * sides_mm
+        return self.volumes_mm3(centres_mm - half, centres_mm + half) / np.prod(sides_mm)
+
+    def volumes_mm3(self, low_mm: Floats, high_mm: Floats) -> Floats:
+        """Return the volume (...) in the pipe of boxes from one corner (..., 3) to the other, 0 of empty ones."""
+        high = np.maximum(low_mm, high_mm)
+        middle = self._axis_at(0.5 * (low_mm + high)[..., self.along])
+        first, second = (
+            np.moveaxis((corner - middle)[..., self._across] / self.radius_mm, -1, 0) for corner in (low_mm, high)
+        )
+        area = rectangle_in_circle(first[0], second[0], first[1], second[1]) * self.radius_mm**2
+        return np.asarray(area * (high - low_mm)[..., self.along])
+
+    def points(self, low_mm: Floats, high_mm: Floats, step_mm: Floats) -> Floats:
+        """Return points (k, 3) on the wall that a box holds, at most a step (3,) apart."""
+        along, others = self.along, self._across
+        turns = int(np.ceil(2.0 * np.pi * self.radius_mm / step_mm[others].min()))
+        angle = 2.0 * np.pi * np.arange(turns) / turns
+        ring = np.zeros((turns, 3))
+        ring[:, others] = self.radius_mm * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        places = spaced(low_mm[along], high_mm[along], step_mm[along])
+        found = (self._axis_at(places)[:, np.newaxis] + ring).reshape(-1, 3)
+        return found[np.all((found >= low_mm) & (found <= high_mm), axis=1, where=np.arange(3) != along)]
+
+    @property
+    def _across(self) -> list[int]:
+        """The two axes across the pipe."""
+        return [1 - self.along, 2]
+
+    def _axis_at(self, along_mm: Floats) -> Floats:
+        """Return the points (..., 3) of the pipe's axis at places (...) along the axis that it nearly follows."""
+        centre, direction = np.asarray(self.centre_mm, dtype=np.float64), self.direction
+        share = (np.asarray(along_mm, dtype=np.float64) - centre[self.along]) / direction[self.along]
+        points = np.asarray(centre + share[..., np.newaxis] * direction)
+        points[..., self.along] = along_mm
+        return points
+
+
+def inside(grid: Grid, walls: Walls) -> NDArray[np.bool_]:
+    """Return the voxels (nz, ny, nx) whose centres lie in the fluid."""
+    # plane by plane: the places of all voxels together take more memory than the volume
+    plane = Grid((*grid.shape_xyz[:2], 1), grid.spacing_mm, (*grid.origin_mm[:2], 0.0)).centres_mm()[0]
+    return np.stack([walls.contain(plane + np.array([0.0, 0.0, z])) for z in grid.axis_mm(2)])
+
+
+def spaced(low: float, high: float, step: float) -> Floats:
+    """Return evenly spaced numbers from one end to the other, at most a step apart."""
+    return np.linspace(low, high, int(np.ceil((high - low) / step)) + 1)
+
+
+def rectangle_in_circle(x0: Floats, x1: Floats, y0: Floats, y1: Floats) -> Floats:
+    """Return the area (...) of rectangles, x0 <= x1 and y0 <= y1, inside the circle of radius 1 about the origin."""
+    corners = [_from_origin(x1, y1), _from_origin(x0, y0), _from_origin(x1, y0), _from_origin(x0, y1)]
+    return np.maximum(corners[0] + corners[1] - corners[2] - corners[3], 0.0)
+
+
+def _from_origin(x: Floats, y: Floats) -> Floats:
+    """Return the area inside the circle of rectangles from the origin to (x, y), with the sign of x y."""
+    width, height = np.minimum(np.abs(x), 1.0), np.minimum(np.abs(y), 1.0)
+    # up to here the rectangle's upper side lies in the circle, then the circle bounds it
+    bend = np.minimum(np.sqrt(1.0 - height**2), width)
+    return np.asarray(np.sign(x) * np.sign(y) * (height * bend + _under_arc(width) - _under_arc(bend)))
+
+
+def _under_arc(x: Floats) -> Floats:
+    """Return the area under the circle from 0 to x."""
+    return np.asarray(0.5 * (x * np.sqrt(1.0 - x**2) + np.arcsin(x)))
+
 
 Triple = tuple[int, int, int]
 

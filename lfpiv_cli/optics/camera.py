@@ -12,12 +12,115 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from lfpiv_cli.names import ColumnAxis
+from lfpiv_cli.names import ColumnAxis, Layout
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.optics.microlenses import Lattice
 from lfpiv_cli.scale import Scale
+
+# The microlens array as a plane lattice: an origin and two basis vectors.
+#
+# Lattice point (i, j) lies at origin + i * basis[0] + j * basis[1]. The same class describes the array itself (mm
+# about the optical axis) and the centres of its micro-images (pixels, column and row); each holder says which.
+# Components are always (image x, image y), that is along the columns first.
+
+
+@dataclass(frozen=True, eq=False)
+class Lattice:
+    """A plane lattice.
+
+    Attributes
+    ----------
+    origin : (2,) position of point (0, 0)
+    basis : (2, 2) the two basis vectors as rows, the first one nearest to the direction of the columns
+    layout : square (vectors at 90 degrees) or hexagonal (at 60 degrees)
+    """
+
+    origin: NDArray[np.float64]
+    basis: NDArray[np.float64]
+    layout: Layout = "square"
+
+    @classmethod
+    def regular(
+        cls, pitch: float, layout: Layout = "square", rotation_rad: float = 0.0, origin: ArrayLike = (0.0, 0.0)
+    ) -> Lattice:
+        """Return an ideal lattice, rotated from the columns (image x) towards the rows (image y)."""
+        second = (0.0, 1.0) if layout == "square" else (0.5, np.sqrt(0.75))
+        cosine, sine = np.cos(rotation_rad), np.sin(rotation_rad)
+        turn = np.array([[cosine, sine], [-sine, cosine]])
+        return cls(np.asarray(origin, dtype=np.float64), pitch * np.array([(1.0, 0.0), second]) @ turn, layout)
+
+    @property
+    def rotation_rad(self) -> float:
+        """Angle of the lattice, from the columns towards the rows: the mean over the basis vectors."""
+        ideal = Lattice.regular(1.0, self.layout).basis
+        turns = np.arctan2(self.basis[:, 1], self.basis[:, 0]) - np.arctan2(ideal[:, 1], ideal[:, 0])
+        return float(np.mean(np.arctan2(np.sin(turns), np.cos(turns))))
+
+    @property
+    def pitch(self) -> NDArray[np.float64]:
+        """Lengths of the two basis vectors, shape (2,)."""
+        return np.hypot(self.basis[:, 0], self.basis[:, 1])
+
+    @property
+    def cell_area(self) -> float:
+        """Area of the plane for each point."""
+        return abs(float(np.linalg.det(self.basis)))
+
+    def points(self, indices: ArrayLike) -> NDArray[np.float64]:
+        """Return the positions of lattice points, indices of shape (..., 2)."""
+        return self.origin + np.asarray(indices, dtype=np.float64) @ self.basis
+
+    def coordinates(self, points: ArrayLike) -> NDArray[np.float64]:
+        """Return the fractional indices of positions, shape (..., 2)."""
+        return (np.asarray(points, dtype=np.float64) - self.origin) @ np.linalg.inv(self.basis)
+
+    def nearest(self, points: ArrayLike) -> NDArray[np.int64]:
+        """Return the indices of the lattice point nearest to each position, shape (..., 2).
+
+        Rounding the oblique coordinates is right on squares and names the wrong neighbour for one point in six on
+        hexagons, so the neighbours are compared.
+        """
+        points = np.asarray(points, dtype=np.float64)
+        rounded = np.rint(self.coordinates(points)).astype(np.int64)
+        steps = np.array([(i, j) for i in (0, -1, 1) for j in (0, -1, 1)])
+        candidates = rounded[..., np.newaxis, :] + steps
+        distance2 = np.sum((self.points(candidates) - points[..., np.newaxis, :]) ** 2, axis=-1)
+        best = np.argmin(distance2, axis=-1)
+        return np.take_along_axis(candidates, best[..., np.newaxis, np.newaxis], axis=-2)[..., 0, :]
+
+    def scaled(self, factor: float) -> Lattice:
+        """Return the lattice with all lengths multiplied by `factor` about the coordinate origin."""
+        return Lattice(self.origin * factor, self.basis * factor, self.layout)
+
+    def transformed(self, matrix: ArrayLike, shift: ArrayLike = (0.0, 0.0)) -> Lattice:
+        """Return the lattice of the points `matrix @ p + shift`."""
+        matrix = np.asarray(matrix, dtype=np.float64)
+        return Lattice(matrix @ self.origin + np.asarray(shift), self.basis @ matrix.T, self.layout)
+
+
+@njit(cache=True)
+def nearest_point(x: float, y: float, origin: NDArray[np.float64], basis: NDArray[np.float64]) -> tuple[float, float]:
+    """Return the position of the lattice point nearest to (x, y): `Lattice.nearest` for kernels."""
+    dx = x - origin[0]
+    dy = y - origin[1]
+    determinant = basis[0, 0] * basis[1, 1] - basis[0, 1] * basis[1, 0]
+    i0 = np.rint((dx * basis[1, 1] - dy * basis[1, 0]) / determinant)
+    j0 = np.rint((dy * basis[0, 0] - dx * basis[0, 1]) / determinant)
+    best = np.inf
+    best_x = 0.0
+    best_y = 0.0
+    for di in (0.0, -1.0, 1.0):
+        for dj in (0.0, -1.0, 1.0):
+            px = (i0 + di) * basis[0, 0] + (j0 + dj) * basis[1, 0]
+            py = (i0 + di) * basis[0, 1] + (j0 + dj) * basis[1, 1]
+            distance2 = (px - dx) ** 2 + (py - dy) ** 2
+            if distance2 < best:
+                best = distance2
+                best_x = px
+                best_y = py
+    return origin[0] + best_x, origin[1] + best_y
 
 
 class KernelCamera(NamedTuple):
@@ -75,7 +178,7 @@ class Objective(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """Everything between the scene and the pixels, with a thin main lens; see `pupils` for one that is not thin.
+    """Everything between the scene and the pixels, with a thin main lens; see `thin_lens` for one that is not thin.
 
     Attributes
     ----------
@@ -88,7 +191,7 @@ class Camera:
     columns, rows : sensor size in pixels
     column_axis : world axis that the sensor's columns follow
     distortion_per_mm2 : k1 of r' = r (1 + k1 r^2), about the axis, on where rays meet the array
-    entrance_over_exit : 1/P of the lens that the thin one stands for, see `pupils`; nothing here needs it
+    entrance_over_exit : 1/P of the lens that the thin one stands for, see `thin_lens`; nothing here needs it
     diffusion_px : standard deviation of the Gaussian by which charge diffuses; only what `synthetic` renders has it
     objective : how it departs from this; only what `synthetic` renders does
     """
@@ -195,3 +298,72 @@ class Camera:
         if self.column_axis == "y":
             points[..., [0, 1]] = points[..., [1, 0]]
         return points
+
+
+# A main lens whose pupils differ in size, as the thin lens that stands for it.
+#
+# Seen from behind, the aperture of a real lens is P times as wide as seen from the front, and elsewhere: P > 1 of
+# retrofocus lenses, P < 1 of telephoto ones; behind a lens that is telecentric towards the array the exit pupil is
+# infinitely far away. Of a ray from x, at a distance s before the entrance pupil, through X in that pupil, paraxial
+# optics makes
+#
+#     x_m = (M + beta) X - beta x,   beta = L / s,   L = F_m (1 - M/P)       its place on the array
+#     (x_m / P - X) / L                                                      its slope there
+#
+# with the exit pupil F_m (P - M) in front of the array and the focal plane F_m (1/P - 1/M) in front of the entrance
+# pupil. The first line is that of a thin lens in the place of the entrance pupil, of the same M and of the image
+# distance L; its slopes, (x_m - X) / L, differ from those of the second by (1 - 1/P) x_m / L. On a plane behind the
+# array that is a matter of scale: the thin lens throws the same picture on a sensor that is k times as large and k
+# times as far away,
+#
+#     k = 1 / (1 - (1 - 1/P) s_mu / L)
+#
+# pixel by pixel. So a camera with a thin lens stands for the real one exactly, and nothing in the scene changes:
+# depths, refraction, the diameter of the entrance pupil. (What a distortion, which moves rays on the array and leaves
+# their directions alone, does on the sensor is off by k - 1 of itself.) All is written by 1/P, which is 0 for a
+# telecentric lens and 1 for a thin one.
+
+
+def thin_lens(real: Camera, entrance_over_exit: float) -> Camera:
+    """Return the camera whose thin lens stands for a main lens with pupils.
+
+    Parameters
+    ----------
+    real : with the lengths of the real lens, sensor and array
+    entrance_over_exit : 1/P, diameter of the entrance pupil over that of the exit pupil
+    """
+    magnification = real.magnification
+    narrowing = (1.0 - magnification * entrance_over_exit) / (1.0 - magnification)
+    focal_length = real.focal_length_mm * narrowing
+    lever = real.microlens_distance_mm / (focal_length * (1.0 - magnification))
+    larger = 1.0 / (1.0 - (1.0 - entrance_over_exit) * lever)
+    return replace(
+        real,
+        focal_length_mm=focal_length,
+        microlens_distance_mm=real.microlens_distance_mm * larger,
+        pixel_mm=real.pixel_mm * larger,
+        entrance_over_exit=entrance_over_exit,
+    )
+
+
+def real_lens(thin: Camera) -> Camera:
+    """Return the camera with the lengths of the real lens, sensor and array: the way back from `thin_lens`."""
+    narrowing = (1.0 - thin.magnification * thin.entrance_over_exit) / (1.0 - thin.magnification)
+    larger = 1.0 + (1.0 - thin.entrance_over_exit) * thin.microlens_distance_mm / thin.image_distance_mm
+    return replace(
+        thin,
+        focal_length_mm=thin.focal_length_mm / narrowing,
+        microlens_distance_mm=thin.microlens_distance_mm / larger,
+        pixel_mm=thin.pixel_mm / larger,
+    )
+
+
+def with_entrance_pupil(camera: Camera, distance_mm: float) -> Camera:
+    """Return the camera with its entrance pupil so far from the focal plane's equivalent in air: F_m (1/P - 1/M)."""
+    real = real_lens(camera)
+    return thin_lens(real, distance_mm / real.focal_length_mm + 1.0 / real.magnification)
+
+
+def refocused(camera: Camera, magnification: float) -> Camera:
+    """Return the camera with the same lens at another magnification."""
+    return thin_lens(replace(real_lens(camera), magnification=magnification), camera.entrance_over_exit)

@@ -1,6 +1,6 @@
 """What lies between the scene and the main lens where its faces are not plane: round pipes, spheres, tilted windows.
 
-The same questions as `object_space` answers for plane layers, by exact rays. There is no paraxial point in air that all
+The same questions as `ObjectSpace` answers for plane layers, by exact rays. There is no paraxial point in air that all
 rays of a point come from: behind a cylinder a pencil of rays is astigmatic, and its two apparent distances (see
 `equivalent`) differ by far more than the depth over which light spreads.
 
@@ -33,11 +33,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.optics.camera import Camera
-from lfpiv_cli.optics.height_map import Reliefs, reliefs_of, turned
 from lfpiv_cli.optics.media import Media
-from lfpiv_cli.optics.ray_bundles import aim_all, pencils, trace_all_in, trace_all_out
-from lfpiv_cli.optics.rigid_motion import RigidMotion
-from lfpiv_cli.optics.shapes import Shape
+from lfpiv_cli.optics.ray_bundles import aim_all, pencils
+from lfpiv_cli.optics.shapes import Reliefs, RigidMotion, Shape, reliefs_of, turned
 from lfpiv_cli.optics.surfaces import Faces, Surface
 
 
@@ -159,34 +157,6 @@ class CurvedSpace:
         """
         return camera.focus_distance_mm + self.media.depth_ratio * np.asarray(z_mm, dtype=np.float64)
 
-    def rays_from_air(
-        self, camera: Camera, crossing_mm: ArrayLike, slopes: ArrayLike, z_mm: ArrayLike
-    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Follow rays from the lens to a depth in the fluid.
-
-        Parameters
-        ----------
-        crossing_mm, slopes : (n, 2) where they cross the main lens, and their slopes there
-        z_mm : (n,) or one for all
-
-        Returns
-        -------
-        Places (n, 2), and (n,) whether the ray is there and in the fluid; NaN where it misses a face.
-        """
-        crossing, tangents = _rows(crossing_mm, 2), _rows(slopes, 2)
-        return trace_all_in(self.for_kernels(camera), crossing, tangents, _depths(z_mm, len(crossing)))
-
-    def rays_to_air(
-        self, camera: Camera, points_mm: ArrayLike, directions: ArrayLike
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-        """Follow rays from points (n, 3) in directions (n, 3), towards the camera, to the main lens.
-
-        Returns
-        -------
-        Where they cross it (n, 2), their slopes there (n, 2), and (n,) whether they do; NaN where not.
-        """
-        return trace_all_out(self.for_kernels(camera), _rows(points_mm, 3), _rows(directions, 3))
-
     def slopes(
         self, camera: Camera, points_mm: ArrayLike, crossing_mm: ArrayLike
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
@@ -217,8 +187,3 @@ def _reliefs(shapes: tuple[Shape, ...], camera: Camera) -> Reliefs | None:
 def _rows(values: ArrayLike, columns: int) -> NDArray[np.float64]:
     """Return rows of so many coordinates."""
     return np.ascontiguousarray(values, dtype=np.float64).reshape(-1, columns)
-
-
-def _depths(z_mm: ArrayLike, count: int) -> NDArray[np.float64]:
-    """Return a depth for each ray."""
-    return np.ascontiguousarray(np.broadcast_to(np.asarray(z_mm, dtype=np.float64), count))

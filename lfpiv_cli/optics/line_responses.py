@@ -36,7 +36,7 @@ from scipy.ndimage import spline_filter1d
 from scipy.special import j0
 
 from lfpiv_cli.optics.camera import Camera
-from lfpiv_cli.optics.object_space import ObjectSpace
+from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.threads import COUNT_NO_REFERENCES
 
 # Spots' places per pitch at which responses are known, and samples of the array between two of them: lenses' edges lie

@@ -1,9 +1,16 @@
-"""Many rays through refracting faces: as many at once as a register of the vector unit holds.
+"""Rays through refracting faces by Snell's law, compiled: from the lens into the fluid, and from a point aimed.
 
-`face_tracing` follows one ray; what is here does the same for arrays of them. Faces that are given by their heights are
-met by one ray after the other.
+Axes: image axes, z away from the camera from the nominal focal point, mm. Slopes are those of `tracing`: how fast a
+ray moves away from where it is, towards larger |lateral| position, on its way to the lens. Lines are followed with
+directions of length 1 away from the camera, whichever way the light goes. Snell's law in vectors, with r the
+refractive index in front of a face over that behind it, n its unit normal and c, c' the cosines of incidence and
+refraction:
 
-Axes: image axes, z away from the camera from the nominal focal point, mm; slopes as in `face_tracing`.
+    d' = r d + (c' - r c) n,    c'^2 = 1 - r^2 (1 - c^2)
+
+A ray that misses a face, is totally reflected, or ends outside the fluid is told by a flag, never by an exception.
+Arrays of rays are aimed as many at once as a register of the vector unit holds; faces that are given by their heights
+are met by one ray after the other.
 """
 
 from __future__ import annotations
@@ -12,29 +19,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from lfpiv_cli.optics.face_tracing import (
-    CLOSE_MM,
-    MOST_STEPS,
-    aim,
-    in_fluid,
-    slope_turns,
-    start_at_lens,
-    trace_in,
-    trace_out,
-    trace_pencil,
-)
-from lfpiv_cli.optics.height_map import Reliefs
-from lfpiv_cli.optics.shapes import Vector, row
-from lfpiv_cli.optics.surfaces import Faces
+from lfpiv_cli.optics.shapes import Reliefs, Vector, dot, plus, row, scaled
+from lfpiv_cli.optics.surfaces import Faces, height_behind, meet, normal_change
 from lfpiv_cli.simd.faces import (
     AIM_ROWS,
-    BEHIND,
     LENS_X,
     LENS_Y,
-    MARGIN,
     MISSED,
-    PLACE_X,
-    PLACE_Y,
     POINT_X,
     POINT_Y,
     POINT_Z,
@@ -44,75 +35,178 @@ from lfpiv_cli.simd.faces import (
     SLOPE_Y,
     STEP_X,
     STEP_Y,
-    TRACE_ROWS,
     aim_lanes,
-    trace_lanes,
 )
-from lfpiv_cli.simd.formulas import DOUBLES
+from lfpiv_cli.simd.vectors import DOUBLES
 from lfpiv_cli.threads import COUNT_NO_REFERENCES
+
+# Newton's iteration for the ray through a point converges quadratically: from this near a last step reaches 1e-13 mm.
+CLOSE_MM = 1e-6
+# It takes four steps, ten close to where light grazes; the limit guards against points that no ray reaches.
+MOST_STEPS = 40
+
+Place = tuple[float, float, bool]
+NOWHERE: Place = (np.nan, np.nan, False)
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def refracted(direction: Vector, normal: Vector, cosine: float, ratio: float) -> tuple[Vector, float]:
+    """Return the direction behind a face and its cosine of refraction, 0 where light is totally reflected."""
+    squared = 1.0 - ratio * ratio * (1.0 - cosine * cosine)
+    if squared <= 0.0:
+        return direction, 0.0
+    cosine_behind = np.sqrt(squared)
+    return plus(scaled(ratio, direction), cosine_behind - ratio * cosine, normal), cosine_behind
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def start_at_lens(faces: Faces, X: float, Y: float, slope_x: float, slope_y: float) -> tuple[Vector, Vector]:
+    """Return where a ray crosses the main lens and its direction into the scene."""
+    shortening = 1.0 / np.sqrt(1.0 + slope_x * slope_x + slope_y * slope_y)
+    return (X, Y, faces.lens_z_mm), (-slope_x * shortening, -slope_y * shortening, shortening)
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def in_fluid(faces: Faces, point: Vector) -> bool:
+    """Return whether a point lies behind the last face, or no further in front of it than may be."""
+    return height_behind(faces, faces.ratios.size - 1, point) >= -ROUNDING_MM - faces.beyond_mm
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def trace_in(faces: Faces, X: float, Y: float, slope_x: float, slope_y: float, z: float) -> Place:
+    """Return where a ray from the lens meets the plane of depth z in the fluid: x, y and whether it does."""
+    point, direction = start_at_lens(faces, X, Y, slope_x, slope_y)
+    for k in range(faces.ratios.size):
+        path, normal, cosine = meet(faces, k, point, direction)
+        if cosine == 0.0 or path < -ROUNDING_MM:
+            return NOWHERE
+        point = plus(point, path, direction)
+        direction, cosine = refracted(direction, normal, cosine, faces.ratios[k])
+        if cosine == 0.0 or direction[2] <= 0.0:
+            return NOWHERE
+    path = (z - point[2]) / direction[2]
+    if path < -ROUNDING_MM:
+        return NOWHERE
+    point = plus(point, path, direction)
+    return point[0], point[1], in_fluid(faces, point)
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def _neighbour(
+    faces: Faces,
+    k: int,
+    shift: Vector,
+    turn: Vector,
+    path: float,
+    place: Vector,
+    direction: Vector,
+    normal: Vector,
+    cosine: float,
+    cosine_behind: float,
+) -> tuple[Vector, Vector]:
+    """Return the first-order shift and turn of a ray beside the one that `meet` and `refracted` took through face k.
+
+    Parameters
+    ----------
+    shift, turn : how its point and direction differ before the face
+    path, place, direction, normal, cosine, cosine_behind : of the ray itself: how far it went to which place on the
+        face, its direction in front of it, and what it met there
+    """
+    ratio = faces.ratios[k]
+    shift = plus(shift, path, turn)
+    shift = plus(shift, -dot(normal, shift) / cosine, direction)
+    tilt = normal_change(faces, k, place, shift)
+    cosine_change = dot(tilt, direction) + dot(normal, turn)
+    bend_change = ratio * (ratio * cosine / cosine_behind - 1.0) * cosine_change
+    turned = plus(plus(scaled(ratio, turn), bend_change, normal), cosine_behind - ratio * cosine, tilt)
+    return shift, turned
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def trace_pencil(
+    faces: Faces,
+    point: Vector,
+    direction: Vector,
+    shifts: tuple[Vector, Vector],
+    turns: tuple[Vector, Vector],
+    z: float,
+) -> tuple[Vector, Vector, Vector, Vector, bool]:
+    """Return where a ray from the lens meets the plane of depth z, its direction, and how two beside it are shifted.
+
+    The path may go backwards in the fluid, as Newton's iteration needs it.
+
+    Parameters
+    ----------
+    point, direction : of the ray at the lens, from `start_at_lens`
+    shifts, turns : of both rays beside it there, first order
+    """
+    first, second = shifts
+    first_turn, second_turn = turns
+    for k in range(faces.ratios.size):
+        path, normal, cosine = meet(faces, k, point, direction)
+        if cosine == 0.0 or path < -ROUNDING_MM:
+            return point, direction, first, second, False
+        point = plus(point, path, direction)
+        behind, cosine_behind = refracted(direction, normal, cosine, faces.ratios[k])
+        if cosine_behind == 0.0 or behind[2] <= 0.0:
+            return point, direction, first, second, False
+        first, first_turn = _neighbour(
+            faces, k, first, first_turn, path, point, direction, normal, cosine, cosine_behind
+        )
+        second, second_turn = _neighbour(
+            faces, k, second, second_turn, path, point, direction, normal, cosine, cosine_behind
+        )
+        direction = behind
+    path = (z - point[2]) / direction[2]
+    first, second = plus(first, path, first_turn), plus(second, path, second_turn)
+    first = plus(first, -first[2] / direction[2], direction)
+    second = plus(second, -second[2] / direction[2], direction)
+    return plus(point, path, direction), direction, first, second, True
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def slope_turns(direction: Vector) -> tuple[Vector, Vector]:
+    """Return how a direction at the lens turns with each of its slopes."""
+    along_x = plus((-direction[2], 0.0, 0.0), direction[2] * direction[0], direction)
+    along_y = plus((0.0, -direction[2], 0.0), direction[2] * direction[1], direction)
+    return along_x, along_y
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def aim(faces: Faces, x: float, y: float, z: float, X: float, Y: float) -> Place:
+    """Return the slopes at the lens of the ray from a point that crosses it at (X, Y), and whether there is one.
+
+    Newton's iteration on `trace_in` from the ray through planes at the vertices, its steps halved where they miss.
+    """
+    if not in_fluid(faces, (x, y, z)):
+        return NOWHERE
+    distance = faces.focus_distance_mm + faces.depth_ratio * z
+    # A ray towards the optical axis always meets the faces: steps are halved towards it.
+    slope_x, slope_y = X / distance, Y / distance
+    step_x, step_y = -x / distance, -y / distance
+    share, nearest = 1.0, np.inf
+    still = (0.0, 0.0, 0.0)
+    for _ in range(MOST_STEPS):
+        point, direction = start_at_lens(faces, X, Y, slope_x + share * step_x, slope_y + share * step_y)
+        end, _, first, second, met = trace_pencil(faces, point, direction, (still, still), slope_turns(direction), z)
+        left_x, left_y = x - end[0], y - end[1]
+        missed = np.sqrt(left_x * left_x + left_y * left_y)
+        if not met or missed >= nearest:
+            share *= 0.5
+            continue
+        slope_x, slope_y, share, nearest = slope_x + share * step_x, slope_y + share * step_y, 1.0, missed
+        determinant = first[0] * second[1] - second[0] * first[1]
+        if determinant == 0.0:
+            return NOWHERE
+        step_x = (second[1] * left_x - second[0] * left_y) / determinant
+        step_y = (first[0] * left_y - first[1] * left_x) / determinant
+        if missed <= CLOSE_MM:
+            return slope_x + step_x, slope_y + step_y, True
+    return NOWHERE
+
 
 Rays = NDArray[np.float64]
 Flags = NDArray[np.bool_]
-
-
-@njit(cache=True)
-def trace_all_in(faces: Faces, crossing: Rays, slopes: Rays, z: Rays) -> tuple[Rays, Flags]:
-    """Return `trace_in` of each ray: places (n, 2) and whether they are valid (n,)."""
-    return _trace_all_in(faces.reliefs, faces, crossing, slopes, z)
-
-
-# As in `surfaces`: what takes the heights as an argument of its own is compiled without them where there are none.
-@njit(cache=True)
-def _trace_all_in(reliefs: Reliefs | None, faces: Faces, crossing: Rays, slopes: Rays, z: Rays) -> tuple[Rays, Flags]:
-    if reliefs is None:
-        return _trace_lanes_in(faces, crossing, slopes, z)
-    places, valid = np.empty((len(z), 2)), np.empty(len(z), dtype=np.bool_)
-    for i in range(len(z)):
-        places[i, 0], places[i, 1], valid[i] = trace_in(
-            faces, crossing[i, 0], crossing[i, 1], slopes[i, 0], slopes[i, 1], z[i]
-        )
-    return places, valid
-
-
-@njit(cache=True)
-def _trace_lanes_in(faces: Faces, crossing: Rays, slopes: Rays, z: Rays) -> tuple[Rays, Flags]:
-    places, valid = np.empty((len(z), 2)), np.empty(len(z), dtype=np.bool_)
-    table = np.zeros(TRACE_ROWS * DOUBLES)
-    for first in range(0, len(z), DOUBLES):
-        count = min(DOUBLES, len(z) - first)
-        for lane in range(count):
-            i = first + lane
-            table[lane], table[DOUBLES + lane] = crossing[i, 0], crossing[i, 1]
-            table[2 * DOUBLES + lane], table[3 * DOUBLES + lane] = slopes[i, 0], slopes[i, 1]
-            table[4 * DOUBLES + lane] = z[i]
-        trace_lanes(
-            table,
-            faces.lens_z_mm,
-            faces.vertices_mm,
-            faces.normals,
-            faces.axes,
-            faces.curvatures_per_mm,
-            faces.ratios,
-        )
-        for lane in range(count):
-            i, through = first + lane, table[MARGIN * DOUBLES + lane] > 0.0
-            places[i, 0] = table[PLACE_X * DOUBLES + lane] if through else np.nan
-            places[i, 1] = table[PLACE_Y * DOUBLES + lane] if through else np.nan
-            valid[i] = through and table[BEHIND * DOUBLES + lane] >= -ROUNDING_MM
-    return places, valid
-
-
-@njit(cache=True)
-def trace_all_out(
-    faces: Faces, points: NDArray[np.float64], directions: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-    """Return `trace_out` of each ray: crossings (n, 2), slopes (n, 2) and whether they are valid (n,)."""
-    crossing, slopes, valid = np.empty((len(points), 2)), np.empty((len(points), 2)), np.empty(len(points), np.bool_)
-    for i in range(len(points)):
-        crossing[i, 0], crossing[i, 1], slopes[i, 0], slopes[i, 1], valid[i] = trace_out(
-            faces, row(points, i), row(directions, i)
-        )
-    return crossing, slopes, valid
 
 
 @njit(cache=True)
@@ -121,6 +215,7 @@ def aim_all(faces: Faces, points: Rays, crossing: Rays) -> tuple[Rays, Flags]:
     return _aim_all(faces.reliefs, faces, points, crossing)
 
 
+# As in `surfaces`: what takes the heights as an argument of its own is compiled without them where there are none.
 @njit(cache=True)
 def _aim_all(reliefs: Reliefs | None, faces: Faces, points: Rays, crossing: Rays) -> tuple[Rays, Flags]:
     if reliefs is None:

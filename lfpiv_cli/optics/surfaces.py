@@ -12,7 +12,7 @@ with n the unit normal at v away from the camera, k the curvature (0 of a plane,
 towards the camera) and a the unit vector along a cylinder's axis (0 of a sphere). F is negative in front of the surface
 and positive behind it; on the surface its gradient is the unit normal, and along a ray of unit direction its derivative
 there is the cosine of incidence, which the quadratic equation of the crossing gives with the crossing itself.
-Surfaces given by their heights are of another form (`height_map`).
+Surfaces given by their heights are of another form (`shapes.HeightMap`).
 
 A new kind is one dataclass with `shape` and `moved`, and one line of `SURFACES`.
 """
@@ -28,9 +28,22 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.names import Facing, SurfaceKind
-from lfpiv_cli.optics.height_map import HeightMap, Reliefs, height_at, meet_heights, normal_change_of_heights
-from lfpiv_cli.optics.rigid_motion import RigidMotion
-from lfpiv_cli.optics.shapes import NO_AXIS, Shape, Vector, dot, plus, row, scaled, unit
+from lfpiv_cli.optics.shapes import (
+    NO_AXIS,
+    HeightMap,
+    Reliefs,
+    RigidMotion,
+    Shape,
+    Vector,
+    dot,
+    height_at,
+    meet_heights,
+    normal_change_of_heights,
+    plus,
+    row,
+    scaled,
+    unit,
+)
 from lfpiv_cli.threads import COUNT_NO_REFERENCES
 
 

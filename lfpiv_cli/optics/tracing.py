@@ -7,14 +7,20 @@ exception.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from itertools import product
+from typing import Any
 
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from lfpiv_cli.optics.camera import Camera, KernelCamera
+from lfpiv_cli.errors import ConfigError
+from lfpiv_cli.names import Refraction, TracedMethod
+from lfpiv_cli.optics.camera import Camera, KernelCamera, nearest_point
 from lfpiv_cli.optics.media import (
+    Layers,
     Media,
     Window,
     equivalent_object_distance,
@@ -22,7 +28,86 @@ from lfpiv_cli.optics.media import (
     object_space_matrix,
     snell_invariant,
 )
-from lfpiv_cli.optics.microlenses import nearest_point
+from lfpiv_cli.threads import COUNT_NO_REFERENCES
+
+# Rays as a polynomial has them: where they meet the microlens array, fitted instead of traced.
+#
+# Direct light-field calibration (DLFC, Hall et al. 2018) knows no main lens and no window: it has seen dots at known
+# places through known points of the aperture, and a polynomial of both tells where any other ray goes.
+#
+# Axes: image axes (x along the columns), mm, z away from the camera from the nominal focal point.
+
+
+# x, y, z of where a ray starts, X, Y of where it crosses the main lens.
+VARIABLES = 5
+# Of degree 3 a polynomial has 56 terms, and lenses need no more.
+LARGEST_DEGREE = 3
+
+
+@dataclass(frozen=True, eq=False)
+class PolynomialRays:
+    """Where rays meet the array, as polynomials of where they come from and cross the main lens.
+
+    Attributes
+    ----------
+    scale_mm : (5,) what x, y, z, X, Y are divided by
+    exponents : (terms, 5) int64
+    coefficients_mm : (terms, 2) of both coordinates on the array
+    """
+
+    scale_mm: NDArray[np.float64]
+    exponents: NDArray[np.int64]
+    coefficients_mm: NDArray[np.float64]
+
+    @property
+    def degree(self) -> int:
+        """Largest sum of exponents."""
+        return int(self.exponents.sum(axis=1).max(initial=0))
+
+    def to_tree(self) -> dict[str, Any]:
+        """Return the arrays by name."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    @classmethod
+    def from_tree(cls, tree: Mapping[str, Any]) -> PolynomialRays:
+        """Return the rays that `to_tree` took apart.
+
+        Raises
+        ------
+        KeyError, ValueError : something is missing or cannot be
+        """
+        rays = cls(**{field.name: tree[field.name] for field in fields(cls)})
+        terms = len(rays.exponents)
+        shapes = rays.scale_mm.shape, rays.exponents.shape, rays.coefficients_mm.shape
+        if shapes != ((VARIABLES,), (terms, VARIABLES), (terms, 2)) or not terms:
+            raise ValueError(f"polynomials of {shapes}")
+        if not np.isin(rays.exponents, range(LARGEST_DEGREE + 1)).all() or rays.degree > LARGEST_DEGREE:
+            raise ValueError(f"polynomials with exponents up to {rays.exponents.max()}")
+        if not np.isfinite(rays.coefficients_mm).all() or not np.all(rays.scale_mm > 0.0):
+            raise ValueError("polynomials with coefficients that are no numbers")
+        return rays
+
+    def on_array(self, start_mm: ArrayLike, crossing_mm: ArrayLike) -> NDArray[np.float64]:
+        """Return where rays from (n, 3) through (n, 2) meet the array, (n, 2)."""
+        return polynomial_terms(start_mm, crossing_mm, self.scale_mm, self.exponents) @ self.coefficients_mm
+
+
+def polynomial_terms(
+    start_mm: ArrayLike, crossing_mm: ArrayLike, scale_mm: NDArray[np.float64], exponents: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Return each term (n, terms) for rays from (n, 3) through (n, 2)."""
+    rays = np.concatenate([np.atleast_2d(start_mm), np.atleast_2d(crossing_mm)], axis=1) / scale_mm
+    terms = np.ones((len(rays), len(exponents)))
+    for variable in range(VARIABLES):
+        powers = rays[:, variable, np.newaxis] ** np.arange(int(exponents[:, variable].max(initial=0)) + 1)
+        terms *= powers[:, exponents[:, variable]]
+    return terms
+
+
+def complete_exponents(degree: int) -> NDArray[np.int64]:
+    """Return the exponents (terms, 5) of all terms up to a degree: 21 of degree 2, 56 of degree 3."""
+    all_of_them = product(range(degree + 1), repeat=VARIABLES)
+    return np.array([powers for powers in all_of_them if sum(powers) <= degree], dtype=np.int64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,39 +126,6 @@ class Hits:
     array_mm: NDArray[np.float64]
     lens_mm: NDArray[np.float64]
     valid: NDArray[np.bool_]
-
-
-def slopes_equivalent(
-    points: NDArray[np.float64], lens: NDArray[np.float64], camera: Camera, media: Media
-) -> NDArray[np.float64]:
-    """Return the slopes (n, 2) at the main lens of the rays from the points' equivalents in air (Eqs. 6, 9, 10)."""
-    distance = equivalent_object_distance(points[:, 2], camera.focus_distance_mm, media)
-    return (lens - points[:, :2]) / distance[:, np.newaxis]
-
-
-def slopes_direct(
-    points: NDArray[np.float64], lens: NDArray[np.float64], camera: Camera, media: Media, window: Window
-) -> NDArray[np.float64]:
-    """Return the slopes (n, 2) at the main lens of rays traced through window and fluid, paraxially (Eqs. 14, 15)."""
-    slopes = np.empty_like(lens)
-    for i, (point, crossing) in enumerate(zip(points, lens, strict=True)):
-        matrix = object_space_matrix(point[2], window, camera.focus_distance_mm, media)
-        start = (crossing - matrix[0, 0] * point[:2]) / matrix[0, 1]
-        slopes[i] = matrix[1, 0] * point[:2] + matrix[1, 1] * start
-    return slopes
-
-
-def slopes_exact(
-    points: NDArray[np.float64], lens: NDArray[np.float64], camera: Camera, media: Media, window: Window
-) -> NDArray[np.float64]:
-    """Return the slopes (n, 2) at the main lens of rays refracted by Snell's law at the window's two faces (Eq. 4)."""
-    path = fluid_path_to_focus(window, camera.focus_distance_mm, media)
-    indices = np.array([media.air, media.window, media.fluid])
-    slopes = np.empty_like(lens)
-    for i, (point, crossing) in enumerate(zip(points, lens, strict=True)):
-        layers = np.array([window.distance_mm, window.thickness_mm, path + point[2]])
-        slopes[i] = exact_slope(crossing[0] - point[0], crossing[1] - point[1], layers, indices)
-    return slopes
 
 
 @njit(cache=True)
@@ -95,7 +147,7 @@ def trace(camera: Camera, lens: ArrayLike, slopes: ArrayLike) -> Hits:
     Parameters
     ----------
     lens : (n, 2) where the rays cross the main lens, mm
-    slopes : (n, 2) their tangents in air in front of it, from one of the `slopes_...` functions
+    slopes : (n, 2) their tangents in air in front of it
 
     Notes
     -----
@@ -150,3 +202,198 @@ def disc_points(count: int, radius: float, rng: np.random.Generator) -> NDArray[
     r = radius * np.sqrt(rng.random(count))
     angle = 2.0 * np.pi * rng.random(count)
     return np.stack([r * np.cos(angle), r * np.sin(angle)], axis=1)
+
+
+# What lies between the scene and the main lens, and how rays are bent there.
+#
+# A ray is straight within each plane layer; seen from the lens it comes in at a slope that is nearly proportional to
+# how far sideways it has moved. Paraxial rays are straight in one layer of air, from the equivalent point (Eqs. 6,
+# 9).
+#
+# Axes: z away from the camera from the nominal focal point; lateral distances from the point to the crossing of the
+# main lens, mm.
+
+
+# The slope of a refracted ray over its lateral distance is an analytic function of that distance squared, nearly
+# constant: through five points of it, a polynomial is right to 1e-10 for lenses up to f/1.4.
+SLOPE_NODES = 5
+
+
+@dataclass(frozen=True)
+class ObjectSpace:
+    """What lies in front of the lens.
+
+    Attributes
+    ----------
+    media : refractive indices
+    window : the window, needed for exact refraction unless all is air, and for direct ray tracing
+    refraction : paraxial, or Snell's law at each face (Eq. 4)
+    method : equivalent points (ert, Eqs. 6 and 9) or rays traced through the layers (drt, Eqs. 14 and 15)
+    """
+
+    media: Media
+    window: Window | None = None
+    refraction: Refraction = "exact"
+    method: TracedMethod = "ert"
+
+    @property
+    def straight(self) -> bool:
+        """True where rays are straight from the equivalent point: paraxial refraction, or nothing but air."""
+        return self.refraction == "paraxial" or self.media == self.media.in_air()
+
+    def distance(self, camera: Camera, z_mm: ArrayLike) -> NDArray[np.float64]:
+        """Return how far from the lens, in air, points at depth z appear to paraxial rays.
+
+        Raises
+        ------
+        ConfigError : direct ray tracing without a window
+        """
+        if self.method == "ert":
+            return equivalent_object_distance(z_mm, camera.focus_distance_mm, self.media)
+        if self.window is None:
+            raise ConfigError("direct ray tracing needs a window (its distance and thickness), none was given")
+        depths = np.asarray(z_mm, dtype=np.float64)
+        window = self.window
+        matrices = [object_space_matrix(z, window, camera.focus_distance_mm, self.media) for z in depths.ravel()]
+        return np.array([matrix[0, 1] / matrix[1, 1] for matrix in matrices]).reshape(depths.shape)
+
+    def layers(self, camera: Camera) -> Layers:
+        """Return the layers from the lens to the focal point; the last one grows with z.
+
+        Paraxial rays and rays in air are straight in one layer, the equivalent one.
+
+        Raises
+        ------
+        ConfigError : exact refraction in a fluid without a window
+        """
+        media = self.media
+        if self.straight:
+            return Layers(np.array([camera.focus_distance_mm]), np.array([media.air]))
+        if self.window is None:
+            raise ConfigError(f"exact refraction into a fluid of index {media.fluid} needs a window, none was given")
+        path = fluid_path_to_focus(self.window, camera.focus_distance_mm, media)
+        wall = self.window.thickness_mm
+        if self.method == "drt":
+            air = self.window.distance_mm
+        else:  # what window and fluid, the only ones that aberrate, leave of the equivalent distance
+            air = camera.focus_distance_mm - wall * media.air / media.window - path * media.depth_ratio
+        return Layers(np.array([air, wall, path]), np.array([media.air, media.window, media.fluid]))
+
+    def last_layers_mm(self, camera: Camera, z_mm: ArrayLike) -> NDArray[np.float64]:
+        """Return how thick the last of `layers` is in front of points at depth z; not above 0 in front of the fluid.
+
+        Raises
+        ------
+        ConfigError : exact refraction in a fluid without a window
+        """
+        growth = self.media.depth_ratio if self.straight else 1.0
+        return self.layers(camera).thicknesses_mm[-1] + growth * np.asarray(z_mm, dtype=np.float64)
+
+    def slope_polynomials(
+        self, camera: Camera, z_mm: ArrayLike, reach_mm: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return nodes and factors (n, SLOPE_NODES) of `slope_ratio` for points at depths z (n,).
+
+        Parameters
+        ----------
+        reach_mm : largest lateral distance from a point to where its ray crosses the main lens
+
+        Raises
+        ------
+        ConfigError : a depth in front of the fluid, or no window where one is needed
+        """
+        depths = np.asarray(z_mm, dtype=np.float64)
+        if self.straight:
+            nodes, factors = np.zeros((2, depths.size, SLOPE_NODES))
+            factors[:, 0] = 1.0 / self.distance(camera, depths)
+            return nodes, factors
+        last_layers = self.last_layers_mm(camera, depths)
+        if last_layers.min() <= 0.0:
+            raise ConfigError(f"a point at z = {depths.min():g} mm lies in front of the fluid")
+        return _polynomials_at(last_layers, reach_mm, self.layers(camera))
+
+
+@njit(cache=True)
+def _polynomials_at(
+    last_layers_mm: NDArray[np.float64], reach_mm: float, layers: Layers
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return nodes and factors for points behind as much of the last layer as given."""
+    nodes, factors = np.empty((last_layers_mm.size, SLOPE_NODES)), np.empty((last_layers_mm.size, SLOPE_NODES))
+    thicknesses = layers.thicknesses_mm.copy()
+    for k in range(last_layers_mm.size):
+        thicknesses[-1] = last_layers_mm[k]
+        nodes[k], factors[k] = slope_polynomial(reach_mm, thicknesses, layers.indices)
+    return nodes, factors
+
+
+@njit(cache=True)
+def slope_polynomial(
+    reach_mm: float, layers: NDArray[np.float64], indices: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return nodes and divided differences of slope / lateral over lateral^2, up to the lateral distance `reach_mm`."""
+    nodes = np.empty(SLOPE_NODES)
+    factors = np.empty(SLOPE_NODES)
+    for i in range(SLOPE_NODES):
+        nodes[i] = reach_mm**2 * 0.5 * (1.0 - np.cos(np.pi * (i + 0.5) / SLOPE_NODES))
+        lateral = np.sqrt(nodes[i])
+        factors[i] = exact_slope(lateral, 0.0, layers, indices)[0] / lateral
+    for order in range(1, SLOPE_NODES):
+        for i in range(SLOPE_NODES - 1, order - 1, -1):
+            factors[i] = (factors[i] - factors[i - 1]) / (nodes[i] - nodes[i - order])
+    return nodes, factors
+
+
+@njit(cache=True, **COUNT_NO_REFERENCES)
+def slope_ratio(lateral2_mm2: float, nodes: NDArray[np.float64], factors: NDArray[np.float64]) -> float:
+    """Return slope / lateral distance from `slope_polynomial`."""
+    value = factors[-1]
+    for i in range(SLOPE_NODES - 2, -1, -1):
+        value = factors[i] + (lateral2_mm2 - nodes[i]) * value
+    return value
+
+
+# How far paraxial optics is from the truth at the rim of the aperture, in light's place on the array.
+#
+# Two things bend the outer rays more than the equivalent point does: Snell's law at the faces of window and fluid,
+# and the lens itself, which images a volume's points only if it keeps the sines of the angles, not the tangents of a
+# thin lens (Abbe's condition). Both are worst for points off the focal plane, or deep in the fluid; here they lie on
+# the axis.
+
+
+# Light that is further off falls into another pixel. The paper's channel and the sample are off by a tenth of this, its
+# simulation behind 134 mm of water by twice this.
+LARGEST_ERROR_PX = 0.5
+
+
+def refraction_error_mm(camera: Camera, media: Media, window: Window | None, depths_mm: NDArray[np.float64]) -> float:
+    """Return how far from a paraxial ray's the place of a refracted one on the array is at most, at the rim.
+
+    Parameters
+    ----------
+    window : what is before the fluid; None: not known, the fluid begins at the nearest of the depths
+    depths_mm : of points on the axis; those in front of the fluid do not count
+    """
+    if window is None:
+        window = Window(camera.focus_distance_mm + depths_mm.min() * media.depth_ratio, 0.0)
+    exact = ObjectSpace(media, window, "exact")
+    rim, layers = camera.aperture_radius_mm, exact.layers(camera)
+    thicknesses, last = layers.thicknesses_mm.copy(), exact.last_layers_mm(camera, depths_mm)
+    paraxial = rim / equivalent_object_distance(depths_mm, camera.focus_distance_mm, media)
+    error = 0.0
+    for thickness, slope in zip(last, paraxial, strict=True):
+        if thickness > 0.0:
+            thicknesses[-1] = thickness
+            error = max(error, abs(exact_slope(rim, 0.0, thicknesses, layers.indices)[0] - slope))
+    return camera.image_distance_mm * error
+
+
+def rim_tangent(camera: Camera) -> float:
+    """Return the tangent of the angle under which the rim of the lens is seen from the focal point, in air."""
+    return camera.aperture_radius_mm / camera.focus_distance_mm
+
+
+def sine_error_mm(camera: Camera, media: Media, depths_mm: NDArray[np.float64]) -> float:
+    """Return how far a thin lens is at most from one that keeps sines, in the place of a rim ray on the array."""
+    tangent = rim_tangent(camera)
+    defocus = media.depth_ratio * float(np.abs(depths_mm).max())
+    return abs(camera.magnification) * defocus * (tangent - tangent / np.hypot(1.0, tangent))

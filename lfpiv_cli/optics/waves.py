@@ -34,10 +34,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 from scipy.special import ndtr
 
-from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.camera import Camera, nearest_point
 from lfpiv_cli.optics.curved_space import CurvedSpace
-from lfpiv_cli.optics.microlenses import nearest_point
-from lfpiv_cli.optics.object_space import ObjectSpace, slope_ratio
+from lfpiv_cli.optics.tracing import ObjectSpace, slope_ratio
 
 # The pupil's phase is a polynomial of this degree in both coordinates together: what refraction and distortion leave
 # of it is below a thousandth of a wavelength for lenses up to f/2.

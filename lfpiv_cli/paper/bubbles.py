@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,19 +15,53 @@ from lfpiv_cli.console import Console
 from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.images import read_image, write_tiff
 from lfpiv_cli.files.pages import Table
-from lfpiv_cli.paper.channel import SEED, TINY, ChannelSize, as_paper, at_best, channel_sections
 from lfpiv_cli.paper.parts import Drawing, Findings, Row, Work
+from lfpiv_cli.paper.pictures import PAPERS_WALL, plane_figure, raw_figure, wall_profile_figure
+from lfpiv_cli.paper.table4 import SEED, TINY, ChannelSize, as_paper, at_best, channel_sections
 from lfpiv_cli.reconstruction.images import still_light
-from lfpiv_cli.stages.build_weights import BuildWeightsOptions, build_weights
-from lfpiv_cli.stages.calibrate import CalibrateOptions, calibrate_snapshot
-from lfpiv_cli.stages.correlate import correlate
-from lfpiv_cli.stages.reconstruct import ReconstructOptions, reconstruct
-from lfpiv_cli.stages.simulate import frame_names, simulate_board, simulate_particles, simulate_white
-from lfpiv_cli.stages.validate_flow import duct_of, measured_of
-from lfpiv_cli.validation.bubble_pictures import plane_figure, raw_figure, wall_profile_figure
-from lfpiv_cli.validation.channel import Duct
+from lfpiv_cli.stages.validate import duct_of, measured_of
+from lfpiv_cli.validation.flow import TOLERANCE, Duct, compare, relative_errors
 from lfpiv_cli.validation.methods import Measured
-from lfpiv_cli.validation.near_wall import PAPERS_WALL, beside_wall, near_wall
+from lfpiv_cli.verbs.build_weights import BuildWeightsOptions, build_weights_file
+from lfpiv_cli.verbs.calibrate import CalibrateOptions, calibrate_snapshot
+from lfpiv_cli.verbs.correlate import correlate_files
+from lfpiv_cli.verbs.reconstruct import ReconstructOptions, reconstruct_files
+from lfpiv_cli.verbs.simulate import frame_names, simulate_board, simulate_particles, simulate_white
+
+
+def beside_wall(measured: Measured, duct: Duct, beyond: float = PAPERS_WALL) -> NDArray[np.bool_]:
+    """Return which windows (nz, ny, nx) lie beyond a share of the width, of those that are judged."""
+    axis = duct.across["x/D"]
+    places = measured.field.grid.centres_mm()[..., axis]
+    return np.asarray(measured.inside & (places > duct.position_mm(axis, beyond)))
+
+
+def near_wall(measured: Measured, duct: Duct, beyond: float = PAPERS_WALL) -> dict[str, float]:
+    """Return the figures of a duct's windows near the wall at the high end of its lateral axis, along the flow.
+
+    Returns
+    -------
+    dict
+        `windows`, how many; `within_25`, the share of them within a quarter of the true velocity; `mean_error` of the
+        sum of velocities, a share; `within_sigma`, `mean_sigma`: by how much chance moves the two, one standard error
+    """
+    pairs = compare(measured.field, measured.truth, beside_wall(measured, duct, beyond))
+    streamwise, _ = relative_errors(pairs)
+    # a duct's flow has a direction
+    assert streamwise is not None
+    assert pairs.direction is not None
+    within = streamwise < TOLERANCE
+    true, found = pairs.true @ pairs.direction, pairs.measured @ pairs.direction
+    error, total = (found - true)[pairs.found], float(true[pairs.found].sum())
+    count = len(within)
+    return {
+        "windows": count,
+        "within_25": float(within.mean()),
+        "mean_error": float(error.sum() / total),
+        "within_sigma": float(np.sqrt(within.mean() * (1.0 - within.mean()) / count)),
+        "mean_sigma": float(np.sqrt(error.size) * error.std() / total),
+    }
+
 
 FULL = ChannelSize(10.0, 3.2, 640, 1768, 0.1, (32, 16), 200, (3, 7))
 QUICK = ChannelSize(5.0, 2.4, 480, 900, 0.1, (16,), 40, (3, 4))
@@ -109,7 +143,7 @@ def _simulated(clean: Path, with_bubbles: Path, work: Work) -> dict[str, Any]:
     calibration = work.folder / "calibration.h5"
     pictures = CalibrateOptions(white=[still / "white.tif"], dark=still / "dark.tif", board=[still / "board.tif"])
     calibrate_snapshot(clean, calibration, pictures, **common)
-    build_weights(clean, work.folder / "weights.h5", BuildWeightsOptions(calibration=calibration), **common)
+    build_weights_file(clean, work.folder / "weights.h5", BuildWeightsOptions(calibration=calibration), **common)
     pitch_px = float(load_config(clean).camera_model().micro_image_lattice_px().pitch.max())
     left_out = still_light(_pair(work), pitch_px)
     write_tiff(work.folder / MASK, np.where(left_out, 0, 255).astype(np.uint8), overwrite=True)
@@ -127,10 +161,10 @@ def _measured(name: str, case: Case, work: Work) -> dict[str, Any]:
     folder, quiet = work.folder / f"measured_{name}", Console(quiet=True)
     pair = [work.folder / case.images / image for image in frame_names(2)]
     options = ReconstructOptions(dark=work.folder / "still" / "dark.tif", **case.options)
-    told = reconstruct(work.folder / "weights.h5", pair, folder, options, overwrite=True, console=quiet)
+    told = reconstruct_files(work.folder / "weights.h5", pair, folder, options, overwrite=True, console=quiet)
     volumes = [folder / f"{image.stem}.vtkhdf" for image in pair]
-    correlate(volumes, _vectors(work, name), overwrite=True, console=quiet)
-    figures = asdict(near_wall(_read(work, name), _duct(work.folder / "clean.yaml")))
+    correlate_files(volumes, _vectors(work, name), overwrite=True, console=quiet)
+    figures = near_wall(_read(work, name), _duct(work.folder / "clean.yaml"))
     return figures | {"excluded_pixels": told["excluded_pixels"]}
 
 

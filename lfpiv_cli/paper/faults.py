@@ -13,10 +13,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lfpiv_cli.errors import LimitMissedError
 from lfpiv_cli.files.pages import Table
 from lfpiv_cli.notice import written
 from lfpiv_cli.paper.parts import Drawing, Findings, Row, Work
@@ -26,10 +26,15 @@ from lfpiv_cli.paper.small_rig import (
     HALF_WIDTH_MM,
     Case,
     Figures,
+    Image,
     Points,
+    Tracers,
+    fit_errors,
     index_wrong,
     lattice_shifted,
     lattice_turned,
+    pairs_of,
+    photograph,
     rig,
     search_of,
     sheet,
@@ -37,11 +42,46 @@ from lfpiv_cli.paper.small_rig import (
 )
 from lfpiv_cli.paper.small_scenes import displacement, tracks_between
 from lfpiv_cli.particles.rounds import ROUNDS
+from lfpiv_cli.pictures.style import new_figure, styled
 from lfpiv_cli.synthetic.sensor import Readout
-from lfpiv_cli.validation.fault_pictures import faults_figure
-from lfpiv_cli.validation.particles import Matches
-from lfpiv_cli.validation.place_errors import fit_errors, pairs_of
-from lfpiv_cli.validation.tracer_bench import Image, Tracers, photograph
+from lfpiv_cli.validation.volume import Matches
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+# Shown from a tenth of the limit to a thousand times it.
+DECADES = (-1.0, 3.0)
+
+
+@styled
+def faults_figure(over: Mapping[str, Mapping[str, float]], words: Mapping[str, str]) -> Figure:
+    """Return a table in colours of figures over their limits: a row for each measurement, a column for each figure."""
+    names = list(words)
+    table = np.array([[each[name] for name in names] for each in over.values()])
+    shade = np.clip(np.log10(np.maximum(table, 10.0 ** DECADES[0])), *DECADES)
+    figure = new_figure(10.0, 1.9 + 0.38 * len(table))
+    axes = figure.subplots()
+    image = axes.imshow(shade, cmap="cividis", vmin=DECADES[0], vmax=DECADES[1], aspect="auto")
+    for (row, column), value in np.ndenumerate(table):
+        missed = not value <= 1.0
+        colour = "black" if shade[row, column] > 1.0 else "white"
+        weight = "bold" if missed else "normal"
+        axes.text(column, row, number(value), ha="center", va="center", fontsize=8, color=colour, fontweight=weight)
+    axes.set_xticks(range(len(names)), [words[name] for name in names], rotation=40, ha="right", fontsize=8)
+    axes.set_yticks(range(len(table)), list(over), fontsize=8)
+    bar = figure.colorbar(image, ax=axes, ticks=range(int(DECADES[0]), int(DECADES[1]) + 1))
+    bar.ax.set_yticklabels([f"{10.0**k:g}" for k in range(int(DECADES[0]), int(DECADES[1]) + 1)], fontsize=8)
+    bar.set_label("error / limit (bold: missed)", fontsize=8)
+    return figure
+
+
+def number(value: float) -> str:
+    """Return a ratio in few characters."""
+    if value >= 1000.0:
+        return f"{value:.0e}".replace("e+0", "e")
+    return f"{value:.0f}" if value >= 9.95 else f"{value:.1f}"
+
 
 SEED_OF_LIMITS, SEED = 100, 1
 # Of some fifteen figures of a good measurement one is off by five standard errors once in a hundred thousand times.
@@ -131,7 +171,10 @@ def faults(work: Work) -> Findings:
     known = {seed: work.step(f"none_{seed}", partial(measured, NONE, seed)) for seed in (SEED_OF_LIMITS, SEED)}
     limits, good_figures = limits_of(known[SEED_OF_LIMITS]), known[SEED]
     planted = work.by_size(FAULTS[-1:], FAULTS, FAULTS)
-    figures = {each.name: work.step(file_name(each), partial(measured, each, SEED)) for each in planted}
+    figures = {
+        each.name: work.step(each.name.replace(" ", "_").replace(".", ""), partial(measured, each, SEED))
+        for each in planted
+    }
     over = {name: over_limits(each, limits) for name, each in {"no mistake": good_figures, **figures}.items()}
     return Findings(
         rows=fault_rows(figures, good_figures, limits),
@@ -147,11 +190,6 @@ def faults(work: Work) -> Findings:
         text=text_of(len(planted)),
         seeds=(SEED_OF_LIMITS, SEED),
     )
-
-
-def file_name(fault: Fault) -> str:
-    """Return a mistake's name for its step."""
-    return fault.name.replace(" ", "_").replace(".", "")
 
 
 def measured(fault: Fault, seed: int) -> Figures:
@@ -218,18 +256,6 @@ def missed_limits(figures: Figures, limits: Mapping[str, Limit]) -> list[str]:
     """Return the figures that miss their limits, the worst first."""
     over = over_limits(figures, limits)
     return sorted((name for name, value in over.items() if not value <= 1.0), key=lambda name: -over[name])
-
-
-def ensure_within(figures: Figures, limits: Mapping[str, Limit]) -> None:
-    """Refuse a measurement of which a figure misses its limit.
-
-    Raises
-    ------
-    LimitMissedError
-    """
-    said = said_to(figures, limits)
-    if said:
-        raise LimitMissedError(said, figures)
 
 
 def told(name: str, figures: Figures, limits: Mapping[str, Limit]) -> str:

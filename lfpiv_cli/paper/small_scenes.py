@@ -25,7 +25,11 @@ from lfpiv_cli.paper.small_rig import (
     Case,
     Figures,
     Points,
+    Rig,
+    Search,
+    Tracers,
     judged,
+    photograph,
     place_figures,
     rig,
     search_of,
@@ -38,9 +42,8 @@ from lfpiv_cli.robust import MAD_TO_SIGMA
 from lfpiv_cli.synthetic.sensor import Readout
 from lfpiv_cli.tracks.candidates import Seen
 from lfpiv_cli.tracks.tracking import track
-from lfpiv_cli.validation.bounds import cramer_rao_bound, expected_image, pixel_variance, slopes
-from lfpiv_cli.validation.particles import match, particle_figures
-from lfpiv_cli.validation.tracer_bench import Rig, Search, Tracers, photograph
+from lfpiv_cli.validation.planning import cramer_rao_bound, expected_image, pixel_variance, slopes
+from lfpiv_cli.validation.volume import match, particle_figures
 
 # Table 2's tank: the focal plane 134 mm deep in water, behind 2 mm of acrylic 98 mm from the lens.
 TANK = Channel(2.0 * 133.867, 2.0)

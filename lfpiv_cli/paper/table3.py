@@ -19,20 +19,26 @@ from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.pages import Table
 from lfpiv_cli.notice import written
-from lfpiv_cli.paper.parts import Drawing, Findings, Row, Work
-from lfpiv_cli.paper.rig import AS_PAPER, BOARD, merged, sections
-from lfpiv_cli.stages.validate_board import BoardSolver, bench_of, board_solver, placement_of
-from lfpiv_cli.synthetic.board import dot_centres
-from lfpiv_cli.validation.board import DEPTHS_MM, MEASURES, PAPER, DotFigures, board_figures, measure_dots
-from lfpiv_cli.validation.board_bench import BoardBench
-from lfpiv_cli.validation.board_comparison import (
+from lfpiv_cli.paper.parts import AS_PAPER, BOARD, Drawing, Findings, Row, Work, merged, sections
+from lfpiv_cli.paper.pictures import (
     BoardView,
     centres_figure,
     elongation_figure,
     location_figure,
     views_figure,
 )
-from lfpiv_cli.validation.board_depths import DEPTH_DEFINITIONS, THE_PAPERS
+from lfpiv_cli.stages.validate_board import BoardBench, BoardSolver, bench_of, board_solver, placement_of
+from lfpiv_cli.synthetic.board import dot_centres
+from lfpiv_cli.validation.board import (
+    DEPTH_DEFINITIONS,
+    DEPTHS_MM,
+    MEASURES,
+    PAPER,
+    THE_PAPERS,
+    DotFigures,
+    board_figures,
+    measure_dots,
+)
 
 Half = Literal["ideal", "recorded"]
 Figures = dict[str, dict[str, Any]]
@@ -282,7 +288,10 @@ def _drawings(
     half = boards.half
     named = {METHODS[method]: each for method, each in figures.items()}
     lengths, places = FIGURES[half]
-    centres = {METHODS[method]: np.concatenate([_centres_mm(each) for each in dots[method]]) for method in VIEWED}
+    centres = {
+        METHODS[m]: np.concatenate([np.column_stack([d.lateral_mm, d.depth_mm[THE_PAPERS]]) for d in dots[m]])
+        for m in VIEWED
+    }
     steps = PAPERS_STEPS_MM[half]
     return (
         Drawing(
@@ -305,10 +314,6 @@ def _drawings(
             location_figure(named, boards.board.spacing_mm, steps),
         ),
     )
-
-
-def _centres_mm(dots: DotFigures) -> NDArray[np.float64]:
-    return np.column_stack([dots.lateral_mm, dots.depth_mm[THE_PAPERS]])
 
 
 def _depth_table(figures: Figures) -> Table:

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from lfpiv_cli.grid import Grid
-from lfpiv_cli.optics.camera import Camera
-from lfpiv_cli.optics.microlenses import Lattice
+from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.particles.fitting import add_all
 from lfpiv_cli.particles.search import Task
 from lfpiv_cli.particles.view import View

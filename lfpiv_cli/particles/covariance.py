@@ -38,6 +38,8 @@ from lfpiv_cli.particles.noise import Correlation
 from lfpiv_cli.particles.view import View, footprint_radius_mm, on_array_mm
 from lfpiv_cli.threads import COUNT_NO_REFERENCES, blocks, in_threads
 
+Floats = NDArray[np.float64]
+
 # Neighbours that are left free: with twice as many the errors of 8,300 particles change by a thousandth.
 FREE_NEIGHBOURS = 12
 # Particles that one thread takes at a time.
@@ -85,18 +87,14 @@ class Equations(NamedTuple):
 
     slopes: Slopes
     neighbours: Neighbours
-    alone: NDArray[np.float64]
-    block: NDArray[np.float64]
-    inverses: NDArray[np.float64]
+    alone: Floats
+    block: Floats
+    inverses: Floats
 
 
 def joint_covariance(
-    observation: Observation,
-    particles: NDArray[np.float64],
-    correlation: Correlation,
-    chi2: NDArray[np.float64],
-    changes: NDArray[np.float64] | None = None,
-) -> NDArray[np.float64]:
+    observation: Observation, particles: Floats, correlation: Correlation, chi2: Floats, changes: Floats | None = None
+) -> Floats:
     """Return the covariance (n, 4, 4) of each particle with its neighbours free.
 
     Parameters
@@ -118,7 +116,7 @@ def joint_covariance(
     return result
 
 
-def _equations(observation: Observation, particles: NDArray[np.float64]) -> Equations:
+def _equations(observation: Observation, particles: Floats) -> Equations:
     """Return the normal matrix of all particles."""
     slopes = _slopes(observation, particles)
     neighbours = _overlapping(observation.optics, particles)
@@ -131,7 +129,7 @@ def _equations(observation: Observation, particles: NDArray[np.float64]) -> Equa
     return Equations(slopes, neighbours, alone, block, np.asarray(np.linalg.inv(alone), np.float64))
 
 
-def _slopes(observation: Observation, particles: NDArray[np.float64]) -> Slopes:
+def _slopes(observation: Observation, particles: Floats) -> Slopes:
     """Return what each particle's unknowns do to the pixels."""
     parts = in_threads(lambda part: _slopes_of(observation, particles[part]), blocks(len(particles), BLOCK))
     counts, pixel, slope = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
@@ -141,7 +139,7 @@ def _slopes(observation: Observation, particles: NDArray[np.float64]) -> Slopes:
 
 @njit(cache=True, nogil=True)
 def _slopes_of(
-    observation: Observation, particles: NDArray[np.float64]
+    observation: Observation, particles: Floats
 ) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]:
     """Return the number of entries of each particle, and the pixels and slopes of all."""
     count, capacity = particles.shape[0], observation.capacity
@@ -166,7 +164,7 @@ def _slopes_of(
 
 
 @njit(cache=True)
-def _pulls(slopes: Slopes, changes: NDArray[np.float64], columns: int) -> NDArray[np.float64]:
+def _pulls(slopes: Slopes, changes: Floats, columns: int) -> Floats:
     """Return J_n^T W^(1/2) d (n, 4, k) of each particle and each of the changes d (k, pixels), in standard errors."""
     pulls = np.zeros((slopes.start.size - 1, UNKNOWNS, changes.shape[0]))
     for n in range(pulls.shape[0]):
@@ -178,7 +176,7 @@ def _pulls(slopes: Slopes, changes: NDArray[np.float64], columns: int) -> NDArra
     return pulls
 
 
-def _overlapping(view: View, particles: NDArray[np.float64]) -> Neighbours:
+def _overlapping(view: View, particles: Floats) -> Neighbours:
     """Return the particles whose footprints may overlap."""
     on_array = on_array_mm(view, particles)
     # Light that touches a lens's cell spreads over it.
@@ -206,19 +204,13 @@ def _rectangle(slopes: Slopes, n: int) -> tuple[int, int, int, int]:
 
 
 @njit(cache=True)
-def _at_least(room: NDArray[np.float64], size: int) -> NDArray[np.float64]:
+def _at_least(room: Floats, size: int) -> Floats:
     """Return an array of at least this size, the one that is there if it will do: large ones take long to make."""
     return room if room.size >= size else np.empty(size)
 
 
 @njit(cache=True, nogil=True)
-def _fill_blocks(
-    slopes: Slopes,
-    neighbours: Neighbours,
-    first: int,
-    alone: NDArray[np.float64],
-    block: NDArray[np.float64],
-) -> None:
+def _fill_blocks(slopes: Slopes, neighbours: Neighbours, first: int, alone: Floats, block: Floats) -> None:
     """Fill J_n^T W J_n (n, 4, 4) of the particles from `first` on, and J_n^T W J_m of neighbours m > n, either way.
 
     Both from whole pixels: a pixel that two lenses light has one error, and with two it would be less than its
@@ -271,7 +263,7 @@ def _find_common(
 
 
 @njit(cache=True, fastmath=SUMS, **COUNT_NO_REFERENCES)
-def _set_products(slopes: Slopes, n: int, m: int, common: NDArray[np.int64], block: NDArray[np.float64]) -> None:
+def _set_products(slopes: Slopes, n: int, m: int, common: NDArray[np.int64], block: Floats) -> None:
     """Set a block (4, 4) to J_n^T J_m, from the entries (2, k) that share a pixel."""
     # Kept out of arrays, sums stay in registers.
     m00 = m01 = m02 = m03 = m10 = m11 = m12 = m13 = 0.0
@@ -307,12 +299,7 @@ def _set_products(slopes: Slopes, n: int, m: int, common: NDArray[np.int64], blo
 
 @njit(cache=True, nogil=True)
 def _covariances(
-    equations: Equations,
-    correlation: Correlation,
-    chi2: NDArray[np.float64],
-    pulls: NDArray[np.float64],
-    first: int,
-    result: NDArray[np.float64],
+    equations: Equations, correlation: Correlation, chi2: Floats, pulls: Floats, first: int, result: Floats
 ) -> None:
     """Fill in the covariances of the particles from `first` on.
 
@@ -347,9 +334,7 @@ def _covariances(
 
 
 @njit(cache=True)
-def _add_shared(
-    inverse: NDArray[np.float64], members: NDArray[np.int64], pulls: NDArray[np.float64], result: NDArray[np.float64]
-) -> None:
+def _add_shared(inverse: Floats, members: NDArray[np.int64], pulls: Floats, result: Floats) -> None:
     """Add what errors that all particles share move the first of some members by, with the inverse's rows (4, n)."""
     moved = np.empty(UNKNOWNS)
     for k in range(pulls.shape[2]):
@@ -364,7 +349,7 @@ def _add_shared(
 
 
 @njit(cache=True)
-def _first_columns(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+def _first_columns(matrix: Floats) -> Floats:
     """Return the first columns of a matrix's inverse as rows (4, n); not numbers where it is not positive definite."""
     size = matrix.shape[0]
     lower, one, columns = np.empty((size, size)), np.zeros(size), np.full((UNKNOWNS, size), np.nan)
@@ -377,7 +362,7 @@ def _first_columns(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def _rescale(matrix: NDArray[np.float64], scale: NDArray[np.float64]) -> None:
+def _rescale(matrix: Floats, scale: Floats) -> None:
     """Multiply the first rows and all columns of a matrix by the scales of its unknowns."""
     for i in range(matrix.shape[0]):
         for j in range(scale.size):
@@ -406,7 +391,7 @@ def _strongest(equations: Equations, n: int) -> NDArray[np.int64]:
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def _tie(one: NDArray[np.float64], block: NDArray[np.float64], other: NDArray[np.float64]) -> float:
+def _tie(one: Floats, block: Floats, other: Floats) -> float:
     """Return trace(A B C B^T) of matrices (4, 4)."""
     trace = 0.0
     for a in range(UNKNOWNS):
@@ -420,9 +405,7 @@ def _tie(one: NDArray[np.float64], block: NDArray[np.float64], other: NDArray[np
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def _add_moves(
-    slopes: Slopes, m: int, inverse: NDArray[np.float64], top: int, left: int, moved_by: NDArray[np.float64]
-) -> None:
+def _add_moves(slopes: Slopes, m: int, inverse: Floats, top: int, left: int, moved_by: Floats) -> None:
     """Add to K (rows, columns, 4) what one member's slopes do to it, by its part (4, 4) of the inverse."""
     rows, columns = moved_by.shape[0], moved_by.shape[1]
     for k in range(slopes.start[m], slopes.start[m + 1]):
@@ -434,7 +417,7 @@ def _add_moves(
 
 
 @njit(cache=True, fastmath=SUMS)
-def _add_excess(moved_by: NDArray[np.float64], decay: float, factor: float, result: NDArray[np.float64]) -> None:
+def _add_excess(moved_by: Floats, decay: float, factor: float, result: Floats) -> None:
     """Add factor K (R - 1) K^T (4, 4) for errors whose correlation falls by `decay` from pixel to pixel.
 
     Along an axis, sum_jk decay^|j - k| a_j b_k = (1 - decay^2) sum_n A_n B_n with A_n = sum_(k <= n) decay^(n - k) a_k,
@@ -469,7 +452,7 @@ def _add_excess(moved_by: NDArray[np.float64], decay: float, factor: float, resu
 
 
 @njit(cache=True)
-def _normal_matrix(equations: Equations, members: NDArray[np.int64]) -> NDArray[np.float64]:
+def _normal_matrix(equations: Equations, members: NDArray[np.int64]) -> Floats:
     """Return the normal matrix of some particles together."""
     neighbours = equations.neighbours
     size = UNKNOWNS * members.size
@@ -485,7 +468,7 @@ def _normal_matrix(equations: Equations, members: NDArray[np.int64]) -> NDArray[
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def _put(whole: NDArray[np.float64], a: int, b: int, block: NDArray[np.float64]) -> None:
+def _put(whole: Floats, a: int, b: int, block: Floats) -> None:
     """Put the block (4, 4) of two particles into the matrix of some."""
     for i in range(UNKNOWNS):
         for j in range(UNKNOWNS):

@@ -60,8 +60,7 @@ from lfpiv_cli.particles.search import (
     sweep,
     with_typical_light,
 )
-from lfpiv_cli.particles.tiles import over_tiles
-from lfpiv_cli.particles.view import by_waves, footprint_radius_mm, on_array_mm, with_radius
+from lfpiv_cli.particles.view import by_waves, footprint_radius_mm, on_array_mm, over_tiles, with_radius
 from lfpiv_cli.robust import MAD_TO_SIGMA, of_half_the_sum
 
 # Sizes that are tried first, in microlenses: each about twice the one before, from what no camera resolves on.

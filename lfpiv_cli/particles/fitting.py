@@ -32,9 +32,10 @@ from lfpiv_cli.particles.least_squares import (
     surprise,
 )
 from lfpiv_cli.particles.refraction import on_line_of_sight
-from lfpiv_cli.particles.tiles import over_tiles
-from lfpiv_cli.particles.view import View, entry_capacity
+from lfpiv_cli.particles.view import View, entry_capacity, over_tiles
 from lfpiv_cli.threads import COUNT_NO_REFERENCES
+
+Floats = NDArray[np.float64]
 
 # Candidates are brought into the fit from these depths beside their own, in depths over which light spreads by one lens
 # (Table 2: 0.4 mm).
@@ -49,12 +50,7 @@ CLAIM = 0.7
 
 @njit(cache=True, fastmath=SUMS, **COUNT_NO_REFERENCES)
 def claimed_share(
-    pixels: NDArray[np.int32],
-    values: NDArray[np.float64],
-    light: float,
-    residual: NDArray[np.float64],
-    weight: NDArray[np.float64],
-    own: float,
+    pixels: NDArray[np.int32], values: Floats, light: float, residual: Floats, weight: Floats, own: float
 ) -> float:
     """Return the share of the light that a particle would claim which is there: sum min(r+, c I f) / sum c I f.
 
@@ -70,7 +66,7 @@ def claimed_share(
 
 
 @njit(cache=True, fastmath=SUMS, **COUNT_NO_REFERENCES)
-def seen_share(pixels: NDArray[np.int32], values: NDArray[np.float64], weight: NDArray[np.float64]) -> float:
+def seen_share(pixels: NDArray[np.int32], values: Floats, weight: Floats) -> float:
     """Return the share of a particle's light that meets pixels with weight."""
     seen = 0.0
     for k in range(pixels.size):
@@ -81,11 +77,11 @@ def seen_share(pixels: NDArray[np.int32], values: NDArray[np.float64], weight: N
 
 def refine(
     observation: Observation,
-    particles: NDArray[np.float64],
+    particles: Floats,
     enough: float = SMALLEST_GAIN,
     chosen: NDArray[np.bool_] | None = None,
-    prior: NDArray[np.float64] | None = None,
-) -> NDArray[np.float64]:
+    prior: Floats | None = None,
+) -> Floats:
     """Refine all or the chosen ones of particles (n, 4) once, in place, and keep the residual up to date.
 
     `enough` is what ends a fit, see `least_squares.Effort`, `prior` (n, 8) what is expected of particles, see
@@ -105,17 +101,17 @@ class Refitted(NamedTuple):
     """
 
     moved: NDArray[np.bool_]
-    gain: NDArray[np.float64]
+    gain: Floats
 
 
 def fit_again(
     observation: Observation,
-    particles: NDArray[np.float64],
+    particles: Floats,
     chosen: NDArray[np.bool_],
     effort: Effort,
-    depths_mm: NDArray[np.float64] | None = None,
+    depths_mm: Floats | None = None,
     least: tuple[float, float] = (0.0, 0.0),
-    prior: NDArray[np.float64] | None = None,
+    prior: Floats | None = None,
 ) -> Refitted:
     """Fit the chosen ones of particles (n, 4) in place, from where they are and from other depths.
 
@@ -141,11 +137,11 @@ def fit_again(
 @njit(cache=True, nogil=True)
 def _fit_again(
     observation: Observation,
-    particles: NDArray[np.float64],
-    prior: NDArray[np.float64],
+    particles: Floats,
+    prior: Floats,
     numbers: NDArray[np.int64],
     effort: Effort,
-    depths: NDArray[np.float64],
+    depths: Floats,
     least: tuple[float, float],
     refitted: Refitted,
 ) -> None:
@@ -183,10 +179,10 @@ def _fit_again(
 @njit(cache=True, inline="always")
 def fit_from(
     observation: Observation,
-    particle: NDArray[np.float64],
-    prior: NDArray[np.float64],
+    particle: Floats,
+    prior: Floats,
     depth: float,
-    trial: NDArray[np.float64],
+    trial: Floats,
     responses: Responses,
     effort: Effort,
 ) -> float:
@@ -202,7 +198,7 @@ def fit_from(
     return fit(observation, trial, prior, responses, effort)
 
 
-def nothing_expected(count: int) -> NDArray[np.float64]:
+def nothing_expected(count: int) -> Floats:
     """Return the prior (n, 8) of particles of which nothing is known but their image, see `least_squares.fit`."""
     return np.zeros((count, 2 * UNKNOWNS))
 
@@ -223,7 +219,7 @@ class Least(NamedTuple):
     gain: float
 
 
-def accept(observation: Observation, candidates: NDArray[np.float64], least: Least) -> NDArray[np.bool_]:
+def accept(observation: Observation, candidates: Floats, least: Least) -> NDArray[np.bool_]:
     """Fit candidates (n, 4) in place, one after the other; return which ones stay, their light off the residual."""
     accepted = np.zeros(len(candidates), np.bool_)
 
@@ -241,10 +237,10 @@ def accept(observation: Observation, candidates: NDArray[np.float64], least: Lea
 @njit(cache=True, nogil=True)
 def _accept(
     observation: Observation,
-    candidates: NDArray[np.float64],
+    candidates: Floats,
     numbers: NDArray[np.int64],
     efforts: tuple[Effort, Effort],
-    depths: NDArray[np.float64],
+    depths: Floats,
     least: Least,
     accepted: NDArray[np.bool_],
 ) -> None:
@@ -274,9 +270,7 @@ def _accept(
             add_light(pixels, values, -best[0, 3], residual)
 
 
-def add_all(
-    view: View, particles: NDArray[np.float64], sign: float, image: NDArray[np.float64], depths_mm: tuple[float, float]
-) -> None:
+def add_all(view: View, particles: Floats, sign: float, image: Floats, depths_mm: tuple[float, float]) -> None:
     """Add the light of all particles (n, 4) between two depths, times `sign`, to an image."""
     capacity = entry_capacity(view, *depths_mm)
     over_tiles(lambda numbers: _add_all(view, particles, numbers, sign, image, capacity), view, particles, depths_mm)
@@ -284,12 +278,7 @@ def add_all(
 
 @njit(cache=True, nogil=True)
 def _add_all(
-    view: View,
-    particles: NDArray[np.float64],
-    numbers: NDArray[np.int64],
-    sign: float,
-    image: NDArray[np.float64],
-    capacity: int,
+    view: View, particles: Floats, numbers: NDArray[np.int64], sign: float, image: Floats, capacity: int
 ) -> None:
     """Do the work of `add_all` for the particles of a tile."""
     responses = room_for(1, capacity, 0)
@@ -299,9 +288,7 @@ def _add_all(
         add_light(pixels, values, sign * particles[number, 3], image)
 
 
-def judge(
-    observation: Observation, particles: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def judge(observation: Observation, particles: Floats) -> tuple[Floats, Floats, Floats]:
     """Return local chi-squared, claimed share and share of the light that is seen of each particle.
 
     Local chi-squared is the mean of w r^2 over the particle's light; 1 for a perfect model. Pixels without weight see
@@ -320,12 +307,7 @@ def judge(
 
 @njit(cache=True, nogil=True)
 def _judge(
-    observation: Observation,
-    particles: NDArray[np.float64],
-    numbers: NDArray[np.int64],
-    chi2: NDArray[np.float64],
-    share: NDArray[np.float64],
-    seen: NDArray[np.float64],
+    observation: Observation, particles: Floats, numbers: NDArray[np.int64], chi2: Floats, share: Floats, seen: Floats
 ) -> None:
     """Do the work of `judge` for the particles of a tile."""
     residual, weight = observation.residual, observation.weight

@@ -20,13 +20,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from lfpiv_cli.particles.line_light import respond_by_lines
+from lfpiv_cli.particles.line_light import VALUES, respond_by_lines
 from lfpiv_cli.particles.refraction import bend_of
-from lfpiv_cli.particles.response import VALUES, respond
 from lfpiv_cli.particles.rows import SLACK, Scratch, respond_rows, scratch
-from lfpiv_cli.particles.tiles import LARGEST_MOVE_LENSES
-from lfpiv_cli.particles.view import View, entry_capacity
+from lfpiv_cli.particles.view import LARGEST_MOVE_LENSES, View, entry_capacity
 from lfpiv_cli.threads import COUNT_NO_REFERENCES
+
+Floats = NDArray[np.float64]
 
 UNKNOWNS = 4
 # Damping relative to the diagonal: its start, and the factors after a step that failed or helped.
@@ -56,8 +56,8 @@ class Observation(NamedTuple):
     """
 
     optics: View
-    residual: NDArray[np.float64]
-    weight: NDArray[np.float64]
+    residual: Floats
+    weight: Floats
     low_mm: float
     high_mm: float
     capacity: int
@@ -68,9 +68,7 @@ class Observation(NamedTuple):
         return self.low_mm, self.high_mm
 
 
-def observation_of(
-    view: View, residual: NDArray[np.float64], weight: NDArray[np.float64], depths_mm: tuple[float, float]
-) -> Observation:
+def observation_of(view: View, residual: Floats, weight: Floats, depths_mm: tuple[float, float]) -> Observation:
     """Return the observation of particles between two depths."""
     return Observation(view, residual, weight, *depths_mm, entry_capacity(view, *depths_mm))
 
@@ -97,10 +95,10 @@ class Responses(NamedTuple):
 
     counts: NDArray[np.int64]
     pixels: NDArray[np.int32]
-    values: NDArray[np.float64]
+    values: Floats
     place: NDArray[np.int32]
-    common: NDArray[np.float64]
-    picked: NDArray[np.float64]
+    common: Floats
+    picked: Floats
     scratch: Scratch
 
 
@@ -115,7 +113,7 @@ def room_for(members: int, capacity: int, places: int) -> Responses:
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def copy_rows(source: NDArray[np.float64], target: NDArray[np.float64]) -> None:
+def copy_rows(source: Floats, target: Floats) -> None:
     """Copy the rows of an array (n, m) into another; `target[:] = source` takes a second longer to compile."""
     for row in range(source.shape[0]):
         for column in range(source.shape[1]):
@@ -123,53 +121,13 @@ def copy_rows(source: NDArray[np.float64], target: NDArray[np.float64]) -> None:
 
 
 @njit(cache=True)
-def lit_by(responses: Responses, member: int) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+def lit_by(responses: Responses, member: int) -> tuple[NDArray[np.int32], Floats]:
     """Return the pixels (n,) that a particle lights, and values (4, n or more), the first of which are theirs."""
     return responses.pixels[member][: responses.counts[member]], responses.values[member]
 
 
-@njit(cache=True)
-def respond_once(
-    view: View, x: float, y: float, z: float, pixels: NDArray[np.int32], values: NDArray[np.float64]
-) -> int:
-    """Write the response of a particle of unit light with each pixel named once; return the number of pixels.
-
-    The readable twin of `respond_rows`.
-    """
-    entries = respond(view, x, y, z, pixels, values)
-    if entries == 0:
-        return 0
-    top, bottom, left, right = view.camera.rows, 0, view.camera.columns, 0
-    for k in range(entries):
-        row, column = _row_and_column(pixels[k], view.camera.columns)
-        top, bottom, left, right = min(top, row), max(bottom, row), min(left, column), max(right, column)
-    place = np.zeros((bottom - top + 1, right - left + 1), np.int32)
-    count = 0
-    for k in range(entries):
-        row, column = _row_and_column(pixels[k], view.camera.columns)
-        at = place[row - top, column - left]
-        if at > 0:
-            for m in range(VALUES):
-                values[at - 1, m] += values[k, m]
-            continue
-        if count < k:
-            pixels[count] = pixels[k]
-            for m in range(VALUES):
-                values[count, m] = values[k, m]
-        count += 1
-        place[row - top, column - left] = count
-    return count
-
-
-@njit(cache=True)
-def _row_and_column(pixel: int, columns: int) -> tuple[int, int]:
-    """Return where a flat pixel lies, without a division of integers, which is slow."""
-    row = int((pixel + 0.5) / columns)
-    return row, pixel - row * columns
-
-
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def pick(pixels: NDArray[np.int32], image: NDArray[np.float64], picked: NDArray[np.float64]) -> None:
+def pick(pixels: NDArray[np.int32], image: Floats, picked: Floats) -> None:
     """Fill in an image's values in some pixels: side by side, sums over them are taken many at once."""
     for k in range(pixels.size):
         picked[k] = image[pixels[k]]
@@ -178,13 +136,13 @@ def pick(pixels: NDArray[np.int32], image: NDArray[np.float64], picked: NDArray[
 @njit(cache=True, fastmath=SUMS, **COUNT_NO_REFERENCES)
 def normal_equations(
     pixels: NDArray[np.int32],
-    values: NDArray[np.float64],
+    values: Floats,
     light: float,
-    residual: NDArray[np.float64],
-    weight: NDArray[np.float64],
-    picked: NDArray[np.float64],
-    matrix: NDArray[np.float64],
-    right: NDArray[np.float64],
+    residual: Floats,
+    weight: Floats,
+    picked: Floats,
+    matrix: Floats,
+    right: Floats,
 ) -> float:
     """Fill J^T W J (4, 4) and J^T W (r - I f); return what the particle adds to chi-squared.
 
@@ -227,7 +185,7 @@ def normal_equations(
 
 
 @njit(cache=True, fastmath=SUMS, **COUNT_NO_REFERENCES)
-def _product(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
+def _product(one: Floats, other: Floats) -> float:
     """Return the scalar product of two vectors."""
     total = 0.0
     for k in range(one.size):
@@ -237,11 +195,7 @@ def _product(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
 
 @njit(cache=True)
 def _pair_equations(
-    observation: Observation,
-    pair: NDArray[np.float64],
-    responses: Responses,
-    matrix: NDArray[np.float64],
-    right: NDArray[np.float64],
+    observation: Observation, pair: Floats, responses: Responses, matrix: Floats, right: Floats
 ) -> float:
     """Fill the normal equations (8, 8) of two particles (2, 4); return what they add to chi-squared together.
 
@@ -294,7 +248,7 @@ def _pair_equations(
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def factored(matrix: NDArray[np.float64], damping: float, lower: NDArray[np.float64]) -> bool:
+def factored(matrix: Floats, damping: float, lower: Floats) -> bool:
     """Fill L of A + damping diag A = L L^T (Cholesky); return False where that is not positive definite."""
     for i in range(matrix.shape[0]):
         for j in range(i + 1):
@@ -313,7 +267,7 @@ def factored(matrix: NDArray[np.float64], damping: float, lower: NDArray[np.floa
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def substitute(lower: NDArray[np.float64], right: NDArray[np.float64], solution: NDArray[np.float64]) -> None:
+def substitute(lower: Floats, right: Floats, solution: Floats) -> None:
     """Fill the x of L L^T x = b."""
     n = lower.shape[0]
     for i in range(n):
@@ -329,13 +283,7 @@ def substitute(lower: NDArray[np.float64], right: NDArray[np.float64], solution:
 
 
 @njit(cache=True)
-def fit(
-    observation: Observation,
-    members: NDArray[np.float64],
-    prior: NDArray[np.float64],
-    responses: Responses,
-    effort: Effort,
-) -> float:
+def fit(observation: Observation, members: Floats, prior: Floats, responses: Responses, effort: Effort) -> float:
     """Improve one particle or two (k, 4) in place; return what they add to chi-squared (below 0 where they help).
 
     The residual must contain none of them. Particles without pixels (off the sensor) are left as they are.
@@ -381,12 +329,7 @@ def fit(
 # Inlined: one function less to compile all of the response into.
 @njit(cache=True, inline="always")
 def _equations(
-    observation: Observation,
-    members: NDArray[np.float64],
-    prior: NDArray[np.float64],
-    responses: Responses,
-    matrix: NDArray[np.float64],
-    right: NDArray[np.float64],
+    observation: Observation, members: Floats, prior: Floats, responses: Responses, matrix: Floats, right: Floats
 ) -> float:
     """Fill the normal equations of one particle or two; return what they add to chi-squared."""
     if members.shape[0] == 2:
@@ -405,7 +348,7 @@ def _equations(
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def surprise(members: NDArray[np.float64], prior: NDArray[np.float64]) -> float:
+def surprise(members: Floats, prior: Floats) -> float:
     """Return what particles (k, 4) add to chi-squared by being other than expected (k, 8)."""
     total = 0.0
     for m in range(members.shape[0]):
@@ -415,13 +358,7 @@ def surprise(members: NDArray[np.float64], prior: NDArray[np.float64]) -> float:
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def _move(
-    observation: Observation,
-    members: NDArray[np.float64],
-    begin: NDArray[np.float64],
-    step: NDArray[np.float64],
-    trial: NDArray[np.float64],
-) -> None:
+def _move(observation: Observation, members: Floats, begin: Floats, step: Floats, trial: Floats) -> None:
     """Fill `trial` (k, 4) with particles moved by a step, within what a sweep and a linear model allow."""
     scale = observation.optics.scale
     furthest, deepest = LARGEST_MOVE_LENSES * scale.lens_mm, LONGEST_STEP_DEPTHS * scale.depth_mm
@@ -436,7 +373,7 @@ def _move(
 
 
 @njit(cache=True)
-def respond_all(view: View, members: NDArray[np.float64], responses: Responses) -> None:
+def respond_all(view: View, members: Floats, responses: Responses) -> None:
     """Write the responses of one particle or two (k, 4)."""
     for m in range(members.shape[0]):
         x, y, z = members[m, 0], members[m, 1], members[m, 2]
@@ -451,7 +388,7 @@ def respond_all(view: View, members: NDArray[np.float64], responses: Responses) 
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def _pass(passed: NDArray[np.float32], pixels: NDArray[np.int32], values: NDArray[np.float64]) -> None:
+def _pass(passed: NDArray[np.float32], pixels: NDArray[np.int32], values: Floats) -> None:
     """Leave of light and its derivatives what reaches the pixels."""
     for k in range(pixels.size):
         share = passed[pixels[k]]
@@ -460,12 +397,7 @@ def _pass(passed: NDArray[np.float32], pixels: NDArray[np.int32], values: NDArra
 
 
 @njit(cache=True, fastmath=SUMS, **COUNT_NO_REFERENCES)
-def best_light(
-    pixels: NDArray[np.int32],
-    values: NDArray[np.float64],
-    residual: NDArray[np.float64],
-    weight: NDArray[np.float64],
-) -> float:
+def best_light(pixels: NDArray[np.int32], values: Floats, residual: Floats, weight: Floats) -> float:
     """Return the light, at least 0, that a particle at this place gets by weighted least squares."""
     top = bottom = 0.0
     for k in range(pixels.size):
@@ -476,13 +408,7 @@ def best_light(
 
 
 @njit(cache=True, fastmath=SUMS, **COUNT_NO_REFERENCES)
-def change_by(
-    pixels: NDArray[np.int32],
-    values: NDArray[np.float64],
-    light: float,
-    residual: NDArray[np.float64],
-    weight: NDArray[np.float64],
-) -> float:
+def change_by(pixels: NDArray[np.int32], values: Floats, light: float, residual: Floats, weight: Floats) -> float:
     """Return what a particle of this light adds to chi-squared."""
     change = 0.0
     for k in range(pixels.size):
@@ -492,7 +418,7 @@ def change_by(
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def add_light(pixels: NDArray[np.int32], values: NDArray[np.float64], light: float, image: NDArray[np.float64]) -> None:
+def add_light(pixels: NDArray[np.int32], values: Floats, light: float, image: Floats) -> None:
     """Add light times the response to an image."""
     for k in range(pixels.size):
         image[pixels[k]] += light * values[0, k]

@@ -16,7 +16,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.optics.line_responses import spline_slopes, spline_weights
-from lfpiv_cli.optics.object_space import slope_ratio
+from lfpiv_cli.optics.tracing import slope_ratio
 from lfpiv_cli.particles.refraction import Bend, displaced
 from lfpiv_cli.particles.response import Along, Projection, lenses_of, project
 from lfpiv_cli.particles.view import View

@@ -21,6 +21,8 @@ from lfpiv_cli.particles.diameter import Sizes, middle_of
 from lfpiv_cli.particles.least_squares import UNKNOWNS, lit_by, respond_all, room_for
 from lfpiv_cli.particles.view import View, entry_capacity
 
+Floats = NDArray[np.float64]
+
 # So many particles tell it to a thousandth: those nearest to the optical axis, where lenses are at their best.
 MOST_PARTICLES = 100
 # With fewer their scatter is not known.
@@ -36,12 +38,7 @@ class FocalLength(NamedTuple):
     sigma: float
 
 
-def focal_length_of(
-    view: View,
-    particles: NDArray[np.float64],
-    residual: NDArray[np.float64],
-    weight: NDArray[np.float64],
-) -> FocalLength | None:
+def focal_length_of(view: View, particles: Floats, residual: Floats, weight: Floats) -> FocalLength | None:
     """Return what particles (n, 4) tell of the focal length; None where too few do.
 
     Parameters
@@ -71,11 +68,7 @@ def _with_longer(view: View) -> View:
 
 
 def _step(
-    views: tuple[View, View],
-    particle: NDArray[np.float64],
-    residual: NDArray[np.float64],
-    weight: NDArray[np.float64],
-    room: int,
+    views: tuple[View, View], particle: Floats, residual: Floats, weight: Floats, room: int
 ) -> tuple[float, float] | None:
     """Return the step from the first view that a particle (4,) tells, and its standard error.
 
@@ -95,7 +88,7 @@ def _step(
     return float(np.sum(design * rest)) / told, float(np.sqrt(scatter / told))
 
 
-def _light(view: View, particle: NDArray[np.float64], room: int) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+def _light(view: View, particle: Floats, room: int) -> tuple[NDArray[np.int32], Floats]:
     """Return the pixels (n,) that a particle lights, its light of unit and the derivatives by x, y and z (4, n)."""
     responses = room_for(1, room, 0)
     respond_all(view, particle[np.newaxis], responses)
@@ -103,7 +96,7 @@ def _light(view: View, particle: NDArray[np.float64], room: int) -> tuple[NDArra
     return pixels, values[:UNKNOWNS, : pixels.size]
 
 
-def _on(pixels: NDArray[np.int32], lit: NDArray[np.int32], values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _on(pixels: NDArray[np.int32], lit: NDArray[np.int32], values: Floats) -> Floats:
     """Return values (k, n) of lit pixels as of others (m,) that hold them, (k, m), summed where one is named twice."""
     place = np.searchsorted(pixels, lit)
     return np.stack([np.bincount(place, row, pixels.size) for row in values])

@@ -12,34 +12,211 @@ Axes: particles are rows (x, y, z, light) in image axes, mm and counts.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from lfpiv_cli.particles.joining import with_twins_joined
 from lfpiv_cli.particles.least_squares import SEARCH_GAIN
-from lfpiv_cli.particles.rounds import ROUNDS, finished, with_suspects_checked
+from lfpiv_cli.particles.rounds import (
+    ROUNDS,
+    Round,
+    accepted,
+    after_rounds,
+    candidates_of,
+    finished,
+    with_candidates,
+    with_suspects_checked,
+)
 from lfpiv_cli.particles.search import (
     LAST_UNEXPLAINED,
     State,
     Task,
     blank,
     judged,
+    kept,
     merge,
     noise_with,
     prune,
     rebuilt,
     sweep,
+    with_light,
     with_measured_noise,
     with_typical_light,
 )
-from lfpiv_cli.particles.suspects import settled
+from lfpiv_cli.particles.suspects import SUSPECT_CHI2, good_chi2, settled
 from lfpiv_cli.scale import Scale
-from lfpiv_cli.tracks.candidates import Seen
-from lfpiv_cli.tracks.light import Light
+from lfpiv_cli.tracks.candidates import Light, Seen
 from lfpiv_cli.tracks.tracking import expected_of, known_of, track
+
+Floats = NDArray[np.float64]
+
+# Particles of a frame whose places the frames before predict, as in Shake-The-Box, and those that the rest shows.
+#
+# The predicted particles are refined on the image together, each held where it is expected as firmly as that is
+# known: near the focal plane its past says more of its depth than the image. What finds no light is dropped. What
+# they leave of the image is searched for the others: those that have come into the volume, and those that overlap.
+#
+# Axes: particles are rows (x, y, z, light) in image axes, mm and counts.
+
+
+# A particle goes on as predicted where it ends within so many standard errors of its place and of its light.
+PREDICTED_SIGMAS = 4.0
+# Standard errors of what is predicted, at least: laterally in microlenses, in depth in depths over which light spreads
+# by one lens (Table 2: 0.005 and 0.05 mm), and of the logarithm of the light.
+SURE_LENSES, SURE_DEPTHS, SURE_LIGHT = 0.05, 0.05 / 1.064, 0.02
+# How little unexplained light counts in sweeps in which each light is held within these limits, and in the one after.
+HELD, FREE = (0.3, 0.1, 0.1), 0.05
+# The search of what particles leave that go on.
+SEARCHES = (
+    Round(12, 0.85, 0.1, thorough=True),
+    Round(8, 0.75, 0.07, thorough=True),
+    Round(6, 0.6, 0.05, thorough=True),
+)
+SWEEPS = 2
+# Where fewer than this share of them go on, the frame does not go on from the ones before.
+LEAST_FOUND = 0.3
+# Units of progress that `find_predicted` reports.
+STEPS = sum(settings.iterations + 1 for settings in SEARCHES)
+
+
+@dataclass(frozen=True, eq=False)
+class Predicted:
+    """Particles that are expected in an image.
+
+    Attributes
+    ----------
+    particles : (n, 4)
+    sigma_mm : (n, 3) standard errors of their places
+    light_sigma : of the logarithm of their light
+    """
+
+    particles: Floats
+    sigma_mm: Floats
+    light_sigma: float
+
+    def part(self, chosen: NDArray[np.bool_]) -> Predicted:
+        """Return some of them."""
+        return Predicted(self.particles[chosen], self.sigma_mm[chosen], self.light_sigma)
+
+
+def find_predicted(task: Task, predicted: Predicted, progress: Callable[[int], None] | None = None) -> State | None:
+    """Return what is found where particles are predicted, and what the rest shows.
+
+    None where most predicted particles find no light: the image is to be searched from nothing.
+    """
+    low, high = task.depths_mm
+    depth = predicted.particles[:, 2]
+    expected = predicted.part((depth >= low) & (depth <= high))
+    state = gone_on(task, expected)
+    if not len(expected.particles) or len(state.particles) < LEAST_FOUND * len(expected.particles):
+        return None
+    state = settled(task, state, state.particles)
+    for settings in SEARCHES:
+        candidates, light = candidates_of(task, state, settings.iterations, progress)
+        state = accepted(task, *with_candidates(task, state, candidates, light), settings)
+        sweep(task, state, settings.unexplained, SWEEPS, SEARCH_GAIN)
+        state, _ = with_suspects_checked(task, state, judged(task, state, settings.unexplained), settings)
+        if progress:
+            progress(1)
+    return finished(task, state, SEARCHES[-1])
+
+
+def gone_on(task: Task, predicted: Predicted) -> State:
+    """Return the state with those particles that go on as predicted, all refined together."""
+    at, scale = predicted.particles, task.view.scale
+    typical = float(np.median(at[:, 3])) if len(at) else 0.0
+    state = replace(rebuilt(task, blank(task), at.copy()), typical_light=typical, noise=noise_with(task, typical))
+    sigma = np.hypot(predicted.sigma_mm, scale.box_mm(SURE_LENSES, SURE_DEPTHS))
+    # Their light is not held: what has none is to show it.
+    state = replace(state, expected=np.column_stack([at, 1.0 / sigma**2, np.zeros(len(at))]))
+    spread = PREDICTED_SIGMAS * max(predicted.light_sigma, SURE_LIGHT)
+    low, high = at[:, 3] * np.exp(-spread), at[:, 3] * np.exp(spread)
+    for unexplained in HELD:
+        sweep(task, state, unexplained, 1, SEARCH_GAIN)
+        state = with_light(task, state, np.clip(state.particles[:, 3], low, high))
+    sweep(task, state, FREE, 1, SEARCH_GAIN)
+    found = state.particles
+    sure = (np.abs(found[:, :3] - at[:, :3]) <= PREDICTED_SIGMAS * sigma).all(axis=1)
+    sure &= (found[:, 3] > low) & (found[:, 3] < high)
+    state = kept(task, state, sure)
+    return with_twins_joined(task, state, FREE, judged(task, state, FREE).chi2)
+
+
+# The first pass over the second frame of a pair, which begins with what the first frame lets expect.
+#
+# A first round shows where the flow goes. Where the places of most of the first frame's particles can be expected
+# well, those that are beyond doubt there go on as predicted, as in a sequence, and what they leave is searched. The
+# doubtful ones, most ghosts among them, take no part: the second frame finds them by itself, or not. Where the flow
+# changes too much from particle to particle, the other rounds follow, as if there were no first frame.
+#
+# Axes: particles are rows (x, y, z, light) in image axes, mm and counts.
+
+
+# A particle is beyond doubt that is no suspect and finds this share of the light that it claims.
+TRUSTED_SHARE = 0.98
+# A place is expected well enough with a standard error of this: laterally in microlenses, in depths over which light
+# spreads by one lens (Table 2: 0.02 and 0.1 mm). Beyond, a particle may end at a neighbour's place.
+EXPECTED_LENSES, EXPECTED_DEPTHS = 0.2, 0.1 / 1.064
+# Share of the first frame's particles that must be expected so.
+LEAST_EXPECTED = 0.6
+# Standard error of the logarithm of light from frame to frame: fits share out the light of neighbours differently.
+LIGHT_SIGMA = 0.05
+# Units of progress that prediction saves.
+SAVED_STEPS = sum(settings.iterations + 1 for settings in ROUNDS[1:]) - STEPS
+
+
+def second_frame(
+    task: Task, before: Task, particles: Floats, search_mm: float, progress: Callable[[int], None] | None = None
+) -> Floats:
+    """Return the particles (n, 4) of the first pass over the second frame of a pair.
+
+    Parameters
+    ----------
+    task, before : the second and the first image
+    particles : (m, 4) what the first pass found in the first
+    search_mm : largest displacement along each axis
+    """
+    state = after_rounds(task, blank(task), ROUNDS[:1], progress)
+    trusted = particles[beyond_doubt(before, particles)]
+    predicted = predicted_by(trusted, state.particles, search_mm, task.view.scale)
+    if len(predicted.particles) >= LEAST_EXPECTED * len(particles):
+        found = find_predicted(task, predicted, progress)
+        if found is not None:
+            if progress:
+                progress(SAVED_STEPS)
+            return found.particles
+    return finished(task, after_rounds(task, state, ROUNDS[1:], progress), ROUNDS[-1]).particles
+
+
+def beyond_doubt(task: Task, particles: Floats) -> NDArray[np.bool_]:
+    """Return which particles (n, 4) fit well and find nearly all their light."""
+    state = rebuilt(task, blank(task), particles)
+    state = with_measured_noise(task, with_typical_light(task, state, judged(task, state, LAST_UNEXPLAINED)))
+    fits = judged(task, state, LAST_UNEXPLAINED)
+    return np.asarray((fits.chi2 < SUSPECT_CHI2 * good_chi2(fits.chi2)) & (fits.share > TRUSTED_SHARE))
+
+
+def predicted_by(trusted: Floats, seen: Floats, search_mm: float, scale: Scale) -> Predicted:
+    """Return which of the first frame's particles (n, 4) are expected in the second, where that is known well enough.
+
+    One that was seen there (m, 4) is expected where it was seen.
+    """
+    first, second = (Seen(each[:, :3], light=Light(each[:, 3])) for each in (trusted, seen))
+    tracks = track(first, second, search_mm, scale)
+    known = known_of(first, second, tracks.first, tracks.second, scale)
+    expected = expected_of(first.position_mm, known, search_mm, scale)
+    at, sigma = trusted.copy(), np.sqrt(expected.variance_mm2)
+    at[:, :3] += expected.displacement_mm
+    at[tracks.first, :3], sigma[tracks.first] = second.position_mm[tracks.second], 0.0
+    if len(tracks.first):
+        at[:, 3] *= np.median(seen[tracks.second, 3] / trusted[tracks.first, 3])
+    enough = np.all(sigma < scale.box_mm(EXPECTED_LENSES, EXPECTED_DEPTHS), axis=1)
+    return Predicted(at, sigma, LIGHT_SIGMA).part(enough)
+
 
 # A particle without a partner this near to where one is expected is that one, at another depth: near the focal plane
 # depths may be wrong by as much as lets light spread by one lens. In microlenses and in such depths (Table 2: 1.25 mm).
@@ -52,9 +229,7 @@ REFINING = ((3, 0.1), (4, LAST_UNEXPLAINED))
 CLAIMED_SHARE = 0.6
 
 
-def second_pass(
-    task: Task, own: NDArray[np.float64], neighbours: Sequence[NDArray[np.float64]], search_mm: float
-) -> State:
+def second_pass(task: Task, own: Floats, neighbours: Sequence[Floats], search_mm: float) -> State:
     """Return what is found with the help of neighbour frames.
 
     Parameters
@@ -78,8 +253,8 @@ def second_pass(
 
 
 def _missing_particles(
-    task: Task, own: NDArray[np.float64], neighbours: Sequence[NDArray[np.float64]], search_mm: float
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    task: Task, own: Floats, neighbours: Sequence[Floats], search_mm: float
+) -> tuple[Floats, NDArray[np.bool_]]:
     """Return the neighbours' particles (m, 4) that are missing here, where they are expected, and which own ones (n,)
     have partners among them.
     """
@@ -95,7 +270,7 @@ def _missing_particles(
     return missing * (1.0, 1.0, 1.0, FIRST_SHARE), partnered
 
 
-def _same(points: NDArray[np.float64], known: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _same(points: Floats, known: Floats) -> NDArray[np.bool_]:
     """Return which points (n, 3) are known ones (m, 3): within 1 and each other's nearest."""
     if not len(points) or not len(known):
         return np.zeros(len(points), np.bool_)
@@ -104,9 +279,7 @@ def _same(points: NDArray[np.float64], known: NDArray[np.float64]) -> NDArray[np
     return np.asarray((distance <= 1.0) & (back[to] == np.arange(len(points))))
 
 
-def _without_partner(
-    own: NDArray[np.float64], other: NDArray[np.float64], search_mm: float, scale: Scale
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def _without_partner(own: Floats, other: Floats, search_mm: float, scale: Scale) -> tuple[Floats, NDArray[np.bool_]]:
     """Return another frame's particles (m, 4) that were not tracked, where they are expected here, and which own ones
     were not.
     """

@@ -17,6 +17,8 @@ from scipy.optimize import nnls
 from lfpiv_cli.robust import HALF_NORMAL_MEDIAN
 from lfpiv_cli.threads import COUNT_NO_REFERENCES, share_out
 
+Floats = NDArray[np.float64]
+
 # The optics model of a pixel's light is trusted to this share until what it leaves has been seen.
 MODEL_ERROR = 0.03
 # Photons of a typical tracer. Only the ratio of bright to dark pixels' weights depends on it, and positions hardly do:
@@ -47,9 +49,7 @@ class Noise:
     gain_counts: float
     model_error: float = MODEL_ERROR
 
-    def weights(
-        self, model: NDArray[np.float64], residual: NDArray[np.float64], unexplained: float
-    ) -> NDArray[np.float64]:
+    def weights(self, model: Floats, residual: Floats, unexplained: float) -> Floats:
         """Return 1/variance of each pixel; light above the model adds `unexplained` times its square."""
         model = np.maximum(model, 0.0)
         variance = self.read_counts**2 + self.gain_counts * model + (self.model_error * model) ** 2
@@ -57,12 +57,8 @@ class Noise:
 
 
 def pixel_weights(
-    noise: Noise,
-    image: NDArray[np.float64],
-    residual: NDArray[np.float64],
-    usable: NDArray[np.bool_],
-    unexplained: float,
-) -> NDArray[np.float64]:
+    noise: Noise, image: Floats, residual: Floats, usable: NDArray[np.bool_], unexplained: float
+) -> Floats:
     """Return `Noise.weights` (pixels,) of an image and what the model leaves of it; 0 where it is not usable."""
     weight = np.empty_like(image)
     numbers = (noise.read_counts, noise.gain_counts, noise.model_error, unexplained)
@@ -74,10 +70,10 @@ def pixel_weights(
 def _fill_weights(
     part: tuple[int, int],
     numbers: tuple[float, float, float, float],
-    image: NDArray[np.float64],
-    residual: NDArray[np.float64],
+    image: Floats,
+    residual: Floats,
     usable: NDArray[np.bool_],
-    weight: NDArray[np.float64],
+    weight: Floats,
 ) -> None:
     """Do the work of `pixel_weights` for some pixels."""
     read, gain, model_error, unexplained = numbers
@@ -98,9 +94,7 @@ class Correlation(NamedTuple):
 WHITE = Correlation(0.0, 0.0)
 
 
-def error_correlation(
-    model: NDArray[np.float64], residual: NDArray[np.float64], weight: NDArray[np.float64], noise: Noise
-) -> Correlation:
+def error_correlation(model: Floats, residual: Floats, weight: Floats, noise: Noise) -> Correlation:
     """Return the correlation of what is left of an image (rows, columns) where the model lights it.
 
     `weight` (rows, columns) is each pixel's 1/variance, 0 where it is not usable. A geometric series is fitted to the
@@ -121,16 +115,14 @@ def error_correlation(
     return Correlation(float(np.clip(np.sum(series * found) / np.sum(series**2), 0.0, 1.0)), decay)
 
 
-def _at_lag(error: NDArray[np.float64], lit: NDArray[np.bool_], lag: int, axis: int) -> float:
+def _at_lag(error: Floats, lit: NDArray[np.bool_], lag: int, axis: int) -> float:
     """Return the mean product of errors `lag` pixels apart along an axis; `error` is 0 where not `lit`."""
     ahead, behind = (slice(lag, None), slice(-lag)) if axis == 0 else (np.s_[:, lag:], np.s_[:, :-lag])
     pairs = np.count_nonzero(lit[ahead] & lit[behind])
     return float(np.einsum("ij,ij->", error[ahead], error[behind])) / pairs if pairs else 0.0
 
 
-def measured_noise(
-    model: NDArray[np.float64], residual: NDArray[np.float64], usable: NDArray[np.bool_], noise: Noise
-) -> Noise:
+def measured_noise(model: Floats, residual: Floats, usable: NDArray[np.bool_], noise: Noise) -> Noise:
     """Return noise whose gain and model error are those that a fit leaves of an image.
 
     Light that was not found does not count: the median of the squares in each class of brightness is taken.
@@ -158,7 +150,7 @@ def measured_noise(
     return Noise(noise.read_counts, float(gain), float(np.sqrt(error2)))
 
 
-def _classes(light: NDArray[np.float64], number: int) -> list[NDArray[np.int64]]:
+def _classes(light: Floats, number: int) -> list[NDArray[np.int64]]:
     """Return the pixels of each class of brightness, as many in each as may be.
 
     Where light fills a micro-image its pixels are alike but for rounding, which must not tell where they belong.
@@ -185,7 +177,7 @@ def estimate_noise(read_counts: float, typical_light: float, lens_pixels: float)
     return Noise(max(read_counts, least), typical_light / PHOTONS_PER_PARTICLE)
 
 
-def read_noise(image: NDArray[np.float64]) -> float:
+def read_noise(image: Floats) -> float:
     """Return the read noise of a dark-subtracted image: its spread below zero, where no light hides it.
 
     Where pixels below a threshold were set to zero, as by who removes noise, most are zero and the faintest of the

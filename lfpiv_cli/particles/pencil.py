@@ -24,9 +24,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from lfpiv_cli.optics.face_tracing import aim, slope_turns, start_at_lens, trace_pencil
+from lfpiv_cli.optics.ray_bundles import aim, slope_turns, start_at_lens, trace_pencil
 from lfpiv_cli.optics.surfaces import Faces
 from lfpiv_cli.threads import COUNT_NO_REFERENCES
+
+Floats = NDArray[np.float64]
 
 # Twelve nodes on the disc of radius 1 and their weights, exact up to degree 7 (Stroud's S2 7-1).
 _ROOT = np.sqrt(29.0)
@@ -61,9 +63,9 @@ class Pencil(NamedTuple):
     cubic : (2, TERMS) r_k in mm of X and Y, see `POWERS`
     """
 
-    line: NDArray[np.float64]
-    line_moves: NDArray[np.float64]
-    cubic: NDArray[np.float64]
+    line: Floats
+    line_moves: Floats
+    cubic: Floats
 
 
 class Aimed(NamedTuple):
@@ -168,9 +170,7 @@ def _aimed(
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def _set_cubic(
-    slopes: NDArray[np.float64], radius: float, offset: float, growth: float, k: int, cubic: NDArray[np.float64]
-) -> None:
+def _set_cubic(slopes: Floats, radius: float, offset: float, growth: float, k: int, cubic: Floats) -> None:
     """Set the cubic that slopes along axis k at the nodes leave of a straight line."""
     for term in range(TERMS):
         total = 0.0
@@ -180,7 +180,7 @@ def _set_cubic(
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def _set_line(line: NDArray[np.float64], moves: NDArray[np.float64]) -> None:
+def _set_line(line: Floats, moves: Floats) -> None:
     """Turn the offset and the growth of a line of slopes, and their derivatives, into place and distance."""
     distance = 1.0 / line[1]
     place = -line[0] * distance
@@ -192,7 +192,7 @@ def _set_line(line: NDArray[np.float64], moves: NDArray[np.float64]) -> None:
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def in_row(cubic: NDArray[np.float64], Y: float) -> tuple[float, float, float, float]:
+def in_row(cubic: Floats, Y: float) -> tuple[float, float, float, float]:
     """Return the coefficients of a cubic (TERMS,) in X where it crosses the lens at Y."""
     return (
         cubic[0] + Y * (cubic[1] + Y * (cubic[2] + Y * cubic[3])),
@@ -203,14 +203,14 @@ def in_row(cubic: NDArray[np.float64], Y: float) -> tuple[float, float, float, f
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def cubic_at(cubic: NDArray[np.float64], X: float, Y: float) -> float:
+def cubic_at(cubic: Floats, X: float, Y: float) -> float:
     """Return the value of a cubic (TERMS,) where it crosses the lens."""
     a, b, c, d = in_row(cubic, Y)
     return a + X * (b + X * (c + X * d))
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def rises_at(cubic: NDArray[np.float64], X: float, Y: float) -> tuple[float, float]:
+def rises_at(cubic: Floats, X: float, Y: float) -> tuple[float, float]:
     """Return how the cubics along x and y (2, TERMS) rise, each along its own axis."""
     _, b, c, d = in_row(cubic[0], Y)
     e, f, g = cubic[1, 1] + X * (cubic[1, 5] + X * cubic[1, 8]), cubic[1, 2] + X * cubic[1, 6], cubic[1, 3]
@@ -218,7 +218,7 @@ def rises_at(cubic: NDArray[np.float64], X: float, Y: float) -> tuple[float, flo
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def largest_of(cubic: NDArray[np.float64], radius: float) -> float:
+def largest_of(cubic: Floats, radius: float) -> float:
     """Return a bound of a cubic (TERMS,) on a disc."""
     total = 0.0
     for term in range(TERMS):
@@ -227,7 +227,7 @@ def largest_of(cubic: NDArray[np.float64], radius: float) -> float:
 
 
 @njit(cache=True)
-def lines_of(faces: Faces, radius: float, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+def lines_of(faces: Faces, radius: float, points: Floats) -> tuple[Floats, ...]:
     """Return of points (n, 3 or more) `Pencil.line` (n, 2, 2), `line_moves` (n, 2, 2, 3), and a bound of r (n, 2)."""
     lines, moves, largest = np.empty((len(points), 2, 2)), np.empty((len(points), 2, 2, 3)), np.empty((len(points), 2))
     for n in range(len(points)):

@@ -22,11 +22,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from lfpiv_cli.optics.face_tracing import aim, trace_in
-from lfpiv_cli.optics.object_space import slope_polynomial, slope_ratio
+from lfpiv_cli.optics.ray_bundles import aim, trace_in
+from lfpiv_cli.optics.tracing import slope_polynomial, slope_ratio
 from lfpiv_cli.particles.pencil import cubic_at, largest_of, pencil_of
 from lfpiv_cli.particles.view import View
 from lfpiv_cli.threads import COUNT_NO_REFERENCES
+
+Floats = NDArray[np.float64]
 
 # The shift changes by some 1e-3 of what a point moves: twice leaves a millionth of it.
 REPEATS = 2
@@ -49,14 +51,14 @@ class Bend(NamedTuple):
 
     x: float
     y: float
-    nodes: NDArray[np.float64]
-    factors: NDArray[np.float64]
+    nodes: Floats
+    factors: Floats
     seen_x: float
     seen_y: float
     distance_x: float
     distance_y: float
-    line_moves: NDArray[np.float64]
-    cubic: NDArray[np.float64]
+    line_moves: Floats
+    cubic: Floats
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
@@ -139,7 +141,7 @@ def on_line_of_sight(view: View, x: float, y: float, z: float, depth: float) -> 
     return x, y
 
 
-def places_by_snell(points_mm: NDArray[np.float64], view: View) -> NDArray[np.float64]:
+def places_by_snell(points_mm: Floats, view: View) -> Floats:
     """Return the points (n, 3) that paraxial rays see at the given ones, mm.
 
     Behind curved faces volumes come from exact rays: there they are the given ones.
@@ -151,7 +153,7 @@ def places_by_snell(points_mm: NDArray[np.float64], view: View) -> NDArray[np.fl
 
 
 @njit(cache=True)
-def paraxial_shift(points_mm: NDArray[np.float64], view: View) -> NDArray[np.float64]:
+def paraxial_shift(points_mm: Floats, view: View) -> Floats:
     """Return how far (n, 3) from their places points are seen by who takes rays for paraxial, mm."""
     shift = np.zeros_like(points_mm)
     if view.layers.indices.size < 2:

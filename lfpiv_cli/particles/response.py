@@ -8,7 +8,7 @@ array at x_m = alpha X - beta x, beta = s_i/s_o, and the sensor at
 so every pixel sees a patch of X. Seen from there, the share P(X) of the ball whose light falls into the lens's cell
 is, along each axis of a square cell, a difference of two of the ball's marginal distributions (cubics); mean and slope
 of P over the patch come from a three-point Gauss rule, and the two axes are joined by the patch's covered share and its
-first moments (`rim`). In a hexagonal cell P does not separate; it is taken from a table of its means over
+first moments (`covered_share`). In a hexagonal cell P does not separate; it is taken from a table of its means over
 patches (`cells`).
 
 Faces between media bend the rays (`refraction`). What that moves x_m by in the middle of a lens's patches moves the
@@ -27,20 +27,14 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from lfpiv_cli.particles.cells import BALL_VARIANCE, level_at, share_at
+from lfpiv_cli.particles.cells import BALL_VARIANCE, covered_share, level_at, share_at
 from lfpiv_cli.particles.pencil import rises_at
-from lfpiv_cli.particles.refraction import Bend, bend_of, displaced, is_seen, largest_displacement
-from lfpiv_cli.particles.rim import covered_share
+from lfpiv_cli.particles.refraction import Bend, displaced, largest_displacement
 from lfpiv_cli.particles.view import View
-from lfpiv_cli.simd.micro_images import GAUSS_AT, GAUSS_WEIGHT, LONGEST, SMALLEST_SHARE
+from lfpiv_cli.simd.micro_images import LONGEST
 from lfpiv_cli.threads import COUNT_NO_REFERENCES
 
-# Rows of a profile: mean and slope of P, their derivatives by x and by z, the patch's middle, and how far from the
-# ball's middle the part of it is that is seen, times P.
-MEAN, SLOPE, MEAN_X, SLOPE_X, MEAN_Z, SLOPE_Z, PATCH, AWAY = range(8)
-PROFILE_ROWS = 8
-# Columns of the entries' values: light, and its derivatives by x, y and z.
-VALUES = 4
+Floats = NDArray[np.float64]
 
 
 class Along(NamedTuple):
@@ -81,14 +75,6 @@ class Projection(NamedTuple):
     y: Along
 
 
-class Profile(NamedTuple):
-    """What one lens shows along one axis: the first pixel, their number and their values (PROFILE_ROWS, number)."""
-
-    first: int
-    number: int
-    values: NDArray[np.float64]
-
-
 class Bent(NamedTuple):
     """What bent rays through one lens are moved by on the array along both axes, x + gain_x X: the tangent to it."""
 
@@ -96,72 +82,6 @@ class Bent(NamedTuple):
     y: float
     gain_x: float
     gain_y: float
-
-
-class Lens(NamedTuple):
-    """What one lens shows along both axes, and what its profiles were moved by on the array for bent rays."""
-
-    across: Profile
-    down: Profile
-    bent: Bent
-
-
-@njit(cache=True)
-def ball_share(t: float) -> float:
-    """Return the share of a ball of radius 1 that lies below t along one axis."""
-    if t <= -1.0:
-        return 0.0
-    if t >= 1.0:
-        return 1.0
-    return 0.25 * (2.0 + 3.0 * t - t * t * t)
-
-
-@njit(cache=True)
-def ball_density(t: float) -> float:
-    """Return the derivative of `ball_share`."""
-    return 0.75 * (1.0 - t * t) if -1.0 < t < 1.0 else 0.0
-
-
-@njit(cache=True)
-def ball_moment(t: float) -> float:
-    """Return the integral of t `ball_density` up to t, but for a constant."""
-    t2 = min(t * t, 1.0)
-    return 0.1875 * t2 * (2.0 - t2)
-
-
-@njit(cache=True)
-def respond(view: View, x: float, y: float, z: float, pixels: NDArray[np.int32], values: NDArray[np.float64]) -> int:
-    """Write the entries of a particle of unit light; return their number. Fits use `rows.respond_rows`.
-
-    Parameters
-    ----------
-    x, y, z : its centre, image axes, mm
-    pixels : (capacity,) flat pixel numbers, written
-    values : (capacity, 4) light and its derivatives by x, y, z, written
-    """
-    bend = bend_of(view, x, y, z)
-    if not is_seen(bend):
-        return 0
-    projection = project(view, bend)
-    low_i, high_i, low_j, high_j = lenses_of(view, projection, bend)
-    along_x = np.empty((PROFILE_ROWS, LONGEST))
-    along_y = np.empty((PROFILE_ROWS, LONGEST))
-    count = 0
-    for j in range(low_j, high_j + 1):
-        for i in range(low_i, high_i + 1):
-            s_x, s_y = view.centres_mm[j, i]
-            if view.cell_table.shape[0] > 0:
-                count += join_cell(view, projection, bend, (s_x, s_y), pixels[count:], values[count:])
-                continue
-            bent = bent_at(view, projection, bend, s_x, s_y)
-            across = _profile(view, projection.x, (bent.x, bent.gain_x), s_x, along_x)
-            if across.number == 0:
-                continue
-            down = _profile(view, projection.y, (bent.y, bent.gain_y), s_y, along_y)
-            if down.number > 0:
-                lens = Lens(across, down, bent)
-                count += _join(view, projection, bend, lens, pixels[count:], values[count:])
-    return count
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
@@ -183,7 +103,7 @@ def project(view: View, bend: Bend) -> Projection:
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def _length(vector: NDArray[np.float64]) -> float:
+def _length(vector: Floats) -> float:
     """Return the length of a vector (3,)."""
     return float(np.sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2]))
 
@@ -300,117 +220,6 @@ def lit_pixels(
     return first, max(min(last - first + 1, LONGEST), 0)
 
 
-@njit(cache=True)
-def _profile(view: View, along: Along, bent: tuple[float, float], s: float, out: NDArray[np.float64]) -> Profile:
-    """Fill the profile of the lens at s along one axis, and return it; bent rays are moved as in `Bent`."""
-    camera = view.camera
-    x, beta, slope, stretch = along.x, along.beta, along.slope, along.stretch
-    scale, lever = along.scale, along.lever
-    half, radius, growth, pixels = along.half, along.radius, along.growth, along.pixels
-    at, gain = along.at + bent[0], stretch * along.alpha + bent[1]
-    shift = (1.0 - camera.bend) * s - lever * beta * x
-    first, count = lit_pixels(view, gain, at - s, half + radius, scale, shift, pixels)
-    width = camera.pixel_mm / scale
-    for k in range(count):
-        middle = ((first + k + 0.5 - 0.5 * pixels) * camera.pixel_mm - shift) / scale
-        out[:, k] = 0.0
-        out[PATCH, k] = middle
-        for node in range(3):
-            xi = (node - 1) * GAUSS_AT
-            # X of the node, its derivatives, and those of u, the array point relative to the lens.
-            place = middle + 0.5 * abs(width) * xi
-            place_x, place_z = lever * beta / scale, lever * slope * (x - place) / scale
-            u = at + gain * place - s
-            u_x = gain * place_x - beta * stretch
-            u_z = stretch * (slope * place - slope * x) + gain * place_z
-            upper, lower = (u + half) / radius, (u - half) / radius
-            share = ball_share(upper) - ball_share(lower)
-            dense_upper, dense_lower = ball_density(upper), ball_density(lower)
-            by_u = (dense_upper - dense_lower) / radius
-            by_z = by_u * u_z - (dense_upper * upper - dense_lower * lower) * growth
-            weight = GAUSS_WEIGHT[node]
-            out[MEAN, k] += weight * share
-            out[SLOPE, k] += 3.0 * weight * xi * share
-            out[MEAN_X, k] += weight * by_u * u_x
-            out[SLOPE_X, k] += 3.0 * weight * xi * by_u * u_x
-            out[MEAN_Z, k] += weight * by_z
-            out[SLOPE_Z, k] += 3.0 * weight * xi * by_z
-            out[AWAY, k] += weight * (ball_moment(upper) - ball_moment(lower))
-    return Profile(first, count, out)
-
-
-@njit(cache=True)
-def _join(
-    view: View,
-    projection: Projection,
-    bend: Bend,
-    lens: Lens,
-    pixels: NDArray[np.int32],
-    values: NDArray[np.float64],
-) -> int:
-    """Write the entries of one lens; return their number."""
-    camera = view.camera
-    count = 0
-    of_x, of_y = projection
-    column, columns, along_x = lens.across
-    row, rows, along_y = lens.down
-    # Patches are a few per cent wider one way than the other at most.
-    width = mean_width(view, projection)
-    norm = width * width / (np.pi * camera.aperture_radius_mm**2)
-    # The patch moves by these with x, y and by tilt (x - X) with z, and is widened with z.
-    place_x, place_y = of_x.lever * of_x.beta / of_x.scale, of_y.lever * of_y.beta / of_y.scale
-    tilt_x, tilt_y = of_x.lever * of_x.slope / of_x.scale, of_y.lever * of_y.slope / of_y.scale
-    # What a profile changes by with x, over what the array point does.
-    bent = lens.bent
-    per_x = 1.0 / (of_x.stretch * (of_x.alpha * place_x - of_x.beta) + bent.gain_x * place_x)
-    per_y = 1.0 / (of_y.stretch * (of_y.alpha * place_y - of_y.beta) + bent.gain_y * place_y)
-    inside = max(camera.aperture_radius_mm - 0.71 * width, 0.0) ** 2
-    outside = (camera.aperture_radius_mm + 0.71 * width) ** 2
-    for m in range(rows):
-        v0, v1 = along_y[MEAN, m], along_y[SLOPE, m]
-        v0_y, v1_y, v0_z, v1_z = along_y[MEAN_X, m], along_y[SLOPE_X, m], along_y[MEAN_Z, m], along_y[SLOPE_Z, m]
-        patch_y = along_y[PATCH, m]
-        for n in range(columns):
-            patch_x = along_x[PATCH, n]
-            r2 = patch_x * patch_x + patch_y * patch_y
-            if r2 >= outside:
-                continue
-            h0, h0_x, h0_z = along_x[MEAN, n], along_x[MEAN_X, n], along_x[MEAN_Z, n]
-            if r2 <= inside:
-                light, by_x, by_y = h0 * v0, h0_x * v0, h0 * v0_y
-                # Along each axis the depth is another one's change.
-                by_z_x, by_z_y = h0_z * v0, h0 * v0_z
-            else:
-                h1, h1_x, h1_z = along_x[SLOPE, n], along_x[SLOPE_X, n], along_x[SLOPE_Z, n]
-                # Light from one side of the ball crossed the main lens elsewhere than light from its middle.
-                rim_x = patch_x + place_x * of_x.ball * along_x[AWAY, n] / max(h0, SMALLEST_SHARE)
-                rim_y = patch_y + place_y * of_y.ball * along_y[AWAY, m] / max(v0, SMALLEST_SHARE)
-                share, mean_x, mean_y, share_x, share_y = covered_share(
-                    rim_x, rim_y, width, camera.aperture_radius_mm, view.table, view.table_reach
-                )
-                light = share * h0 * v0 + mean_x * h1 * v0 + mean_y * h0 * v1
-                by_x = share * h0_x * v0 + mean_x * h1_x * v0 + mean_y * h0_x * v1 + share_x * place_x * h0 * v0
-                by_y = share * h0 * v0_y + mean_x * h1 * v0_y + mean_y * h0 * v1_y + share_y * place_y * h0 * v0
-                by_z_x = share * h0_z * v0 + mean_x * h1_z * v0 + mean_y * h0_z * v1
-                by_z_x += share_x * (of_x.x - patch_x) * tilt_x * h0 * v0
-                by_z_y = share * h0 * v0_z + mean_x * h1 * v0_z + mean_y * h0 * v1_z
-                by_z_y += share_y * (of_y.x - patch_y) * tilt_y * h0 * v0
-            slope_x, slope_y = displaced(bend, patch_x, patch_y)
-            more_x = of_x.stretch * camera.image_distance_mm * slope_x - bent.x - bent.gain_x * patch_x
-            more_y = of_y.stretch * camera.image_distance_mm * slope_y - bent.y - bent.gain_y * patch_y
-            light += by_x * per_x * more_x + by_y * per_y * more_y
-            if light <= 0.0 or count >= pixels.size:
-                continue
-            by_z_x, by_z_y = by_z_x - tilt_x * light, by_z_y - tilt_y * light
-            pixels[count] = (row + m) * camera.columns + column + n
-            values[count, 0] = norm * light
-            for j in range(3):
-                to_x, to_y, to_z_x, to_z_y = seen_moves(view, bend, j)
-                values[count, 1 + j] = norm * (to_x * by_x + to_y * by_y + to_z_x * by_z_x + to_z_y * by_z_y)
-            count += 1
-    return count
-
-
 @njit(cache=True, **COUNT_NO_REFERENCES)
 def mean_width(view: View, projection: Projection) -> float:
     """Return the side of a square as large as a pixel's patch on the main lens."""
@@ -433,12 +242,7 @@ def seen_moves(view: View, bend: Bend, axis: int) -> tuple[float, float, float, 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
 def join_cell(
-    view: View,
-    projection: Projection,
-    bend: Bend,
-    lens: tuple[float, float],
-    pixels: NDArray[np.int32],
-    values: NDArray[np.float64],
+    view: View, projection: Projection, bend: Bend, lens: tuple[float, float], pixels: NDArray[np.int32], values: Floats
 ) -> int:
     """Write the entries of one lens whose cell is no rectangle; return their number."""
     camera = view.camera
@@ -519,25 +323,3 @@ def join_cell(
             values[count, 3] = norm * (by_z - 2.0 * lever * slope * light)
             count += 1
     return count
-
-
-@njit(cache=True, nogil=True)
-def entries_of(
-    view: View, particles: NDArray[np.float64], capacity: int
-) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float64]]:
-    """Return the entries of particles (n, 3 or more) of unit light, one particle after another.
-
-    Returns
-    -------
-    counts : (n,) entries of each
-    pixels, values : as `respond` writes them
-    """
-    counts = np.zeros(particles.shape[0], np.int64)
-    pixels = np.empty(particles.shape[0] * capacity, np.int32)
-    values = np.empty((particles.shape[0] * capacity, VALUES))
-    end = 0
-    for n in range(particles.shape[0]):
-        x, y, z = particles[n, 0], particles[n, 1], particles[n, 2]
-        counts[n] = respond(view, x, y, z, pixels[end : end + capacity], values[end : end + capacity])
-        end += counts[n]
-    return counts, pixels[:end].copy(), values[:end].copy()

@@ -16,9 +16,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lfpiv_cli.particles.candidates import boxes_of, explain_rest, find_peaks, points_in_raw_frame
 from lfpiv_cli.particles.fitting import Least, accept, judge
-from lfpiv_cli.particles.joining import with_twins_joined
+from lfpiv_cli.particles.joining import boxes_of, explain_rest, find_peaks, points_in_raw_frame, with_twins_joined
 from lfpiv_cli.particles.least_squares import SEARCH_GAIN
 from lfpiv_cli.particles.refraction import places_by_snell
 from lfpiv_cli.particles.search import (
@@ -42,6 +41,8 @@ from lfpiv_cli.particles.search import (
 )
 from lfpiv_cli.particles.suspects import with_depths_corrected, with_overlaps_split
 from lfpiv_cli.particles.view import lens_pixels
+
+Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -105,7 +106,8 @@ def after_rounds(
 ) -> State:
     """Return the state after some more rounds."""
     for settings in rounds:
-        state = _one_round(task, state, settings, progress)
+        candidates, light = candidates_of(task, state, settings.iterations, progress)
+        state = explained(task, *with_candidates(task, state, candidates, light), settings)
         if progress:
             progress(1)
     return state
@@ -124,13 +126,7 @@ def pruned(task: Task, state: State, settings: Round) -> tuple[State, Fits]:
     return prune(task, state, settings.claimed_share - PRUNING_SLACK, settings.unexplained)
 
 
-def _one_round(task: Task, state: State, settings: Round, progress: Callable[[int], None] | None) -> State:
-    """Return the state after one round."""
-    candidates, light = candidates_of(task, state, settings.iterations, progress)
-    return explained(task, *with_candidates(task, state, candidates, light), settings)
-
-
-def explained(task: Task, state: State, candidates: NDArray[np.float64], settings: Round) -> State:
+def explained(task: Task, state: State, candidates: Floats, settings: Round) -> State:
     """Return the state with what of the candidates holds, refined and checked."""
     state = accepted(task, state, candidates, settings)
     sweep(task, state, settings.unexplained, SWEEPS, SEARCH_GAIN)
@@ -139,9 +135,7 @@ def explained(task: Task, state: State, candidates: NDArray[np.float64], setting
     return with_typical_light(task, *with_suspects_checked(task, state, fits, settings))
 
 
-def with_candidates(
-    task: Task, state: State, candidates: NDArray[np.float64], light: NDArray[np.float64]
-) -> tuple[State, NDArray[np.float64]]:
+def with_candidates(task: Task, state: State, candidates: Floats, light: Floats) -> tuple[State, Floats]:
     """Return the state with its typical light, by candidates where no particle is known, and those to be tried."""
     typical = state.typical_light
     if typical == 0.0:
@@ -153,7 +147,7 @@ def with_candidates(
     return replace(state, typical_light=typical, noise=noise_with(task, typical)), candidates
 
 
-def first_typical_light(light: NDArray[np.float64], noise_counts: float) -> float:
+def first_typical_light(light: Floats, noise_counts: float) -> float:
     """Return the light of a typical particle as far as peaks tell; 0 where there are none.
 
     Where none stands out of the noise all may be noise, and the fit will tell.
@@ -185,7 +179,7 @@ def with_suspects_checked(task: Task, state: State, fits: Fits, settings: Round)
 
 def candidates_of(
     task: Task, state: State, iterations: int, progress: Callable[[int], None] | None
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Floats, Floats]:
     """Return candidates (n, 4), brightest first, and their light (n,)."""
     model = (task.image - state.residual).reshape(task.prepared.shape).astype(np.float32)
     background = task.weights.prepare(model)
@@ -196,7 +190,7 @@ def candidates_of(
     return np.column_stack([points, light]), light
 
 
-def accepted(task: Task, state: State, candidates: NDArray[np.float64], settings: Round) -> State:
+def accepted(task: Task, state: State, candidates: Floats, settings: Round) -> State:
     """Return the state with those candidates that hold."""
     observation = observed(task, state, settings.unexplained)
     light = SMALLEST_LIGHT * state.typical_light

@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from lfpiv_cli.particles.cells import DIRECTIONS, DISTANCES
 from lfpiv_cli.particles.pencil import in_row
 from lfpiv_cli.particles.refraction import Bend, is_seen
 from lfpiv_cli.particles.response import (
@@ -28,7 +29,6 @@ from lfpiv_cli.particles.response import (
     project,
     seen_moves,
 )
-from lfpiv_cli.particles.rim import DIRECTIONS, DISTANCES
 from lfpiv_cli.particles.view import View
 from lfpiv_cli.simd.micro_images import (
     CURVED_NUMBERS,
@@ -47,6 +47,8 @@ from lfpiv_cli.simd.micro_images import (
 )
 from lfpiv_cli.threads import COUNT_NO_REFERENCES
 
+Floats = NDArray[np.float64]
+
 # A row of a micro-image is written up to the end of a register: so many entries more than there are.
 SLACK = 8
 
@@ -54,10 +56,10 @@ SLACK = 8
 class Scratch(NamedTuple):
     """Room for what one lens shows, see `simd.micro_images`."""
 
-    across: NDArray[np.float64]
-    down: NDArray[np.float64]
-    rim: NDArray[np.float64]
-    numbers: NDArray[np.float64]
+    across: Floats
+    down: Floats
+    rim: Floats
+    numbers: Floats
     lenses: NDArray[np.int64]
 
 
@@ -73,13 +75,7 @@ def scratch(capacity: int) -> Scratch:
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def respond_rows(
-    view: View,
-    bend: Bend,
-    pixels: NDArray[np.int32],
-    values: NDArray[np.float64],
-    room: Scratch,
-) -> int:
+def respond_rows(view: View, bend: Bend, pixels: NDArray[np.int32], values: Floats, room: Scratch) -> int:
     """Write the entries of a particle of unit light; return their number.
 
     Parameters
@@ -125,7 +121,7 @@ def respond_rows(
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def _set_numbers(view: View, projection: Projection, bend: Bend, numbers: NDArray[np.float64]) -> None:
+def _set_numbers(view: View, projection: Projection, bend: Bend, numbers: Floats) -> None:
     """Set `JoinNumbers` of a particle, but for those that each lens has of its own."""
     camera, x, y = view.camera, projection.x, projection.y
     ratio = x.lever / x.scale
@@ -150,7 +146,7 @@ def _set_numbers(view: View, projection: Projection, bend: Bend, numbers: NDArra
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def _set_curved_numbers(view: View, projection: Projection, bend: Bend, numbers: NDArray[np.float64]) -> None:
+def _set_curved_numbers(view: View, projection: Projection, bend: Bend, numbers: Floats) -> None:
     """Set `CurvedNumbers` of a particle, but for those that each lens and each row has of its own."""
     camera, x, y = view.camera, projection.x, projection.y
     width = mean_width(view, projection)
@@ -176,7 +172,7 @@ def _write_lens(
     lens: tuple[float, float],
     begin: int,
     pixels: NDArray[np.int32],
-    values: NDArray[np.float64],
+    values: Floats,
     room: Scratch,
     rectangle: NDArray[np.int64],
 ) -> int:
@@ -218,7 +214,7 @@ def _write_lens(
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def _set_bent(view: View, along: Along, bent: float, gain: float, numbers: NDArray[np.float64]) -> None:
+def _set_bent(view: View, along: Along, bent: float, gain: float, numbers: Floats) -> None:
     """Set along one axis what profiles change by with rays' slopes, and did already; see `JoinNumbers`."""
     place = along.lever / along.scale * along.beta
     by_x = along.stretch * (along.alpha * place - along.beta) + gain * place
@@ -240,7 +236,7 @@ def _far(view: View, width: float) -> float:
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def _fill(view: View, along: Along, patches: tuple[float, float, float], count: int, out: NDArray[np.float64]) -> None:
+def _fill(view: View, along: Along, patches: tuple[float, float, float], count: int, out: Floats) -> None:
     """Fill the profile of one lens along an axis.
 
     `patches` are the first patch, and what the array is off by and how that grows with X.
@@ -269,12 +265,12 @@ def _fill(view: View, along: Along, patches: tuple[float, float, float], count: 
 @njit(cache=True, **COUNT_NO_REFERENCES)
 def _write_rows(
     view: View,
-    bent: tuple[NDArray[np.float64], tuple[float, float]],
+    bent: tuple[Floats, tuple[float, float]],
     lit: tuple[tuple[int, int], tuple[int, int]],
     patches: tuple[float, float],
     begin: int,
     pixels: NDArray[np.int32],
-    values: NDArray[np.float64],
+    values: Floats,
     room: Scratch,
     rectangle: NDArray[np.int64],
 ) -> int:
@@ -329,7 +325,7 @@ def _write_rows(
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def _set_row(cubic: NDArray[np.float64], tangent: tuple[float, float], y: float, numbers: NDArray[np.float64]) -> None:
+def _set_row(cubic: Floats, tangent: tuple[float, float], y: float, numbers: Floats) -> None:
     """Set what a row has of its own of `CurvedNumbers`: cubics of X without the tangents that profiles follow."""
     for k in range(2):
         at = OF_CUBIC + 4 * k
@@ -362,9 +358,7 @@ def _set_rectangle(pixels: NDArray[np.int32], columns: int, rectangle: NDArray[n
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def _join_twice_lit(
-    one: tuple[int, int], other: tuple[int, int], pixels: NDArray[np.int32], values: NDArray[np.float64]
-) -> None:
+def _join_twice_lit(one: tuple[int, int], other: tuple[int, int], pixels: NDArray[np.int32], values: Floats) -> None:
     """Move what a lens lights of another's pixels to that one's entries; either's (first, end) ascend."""
     a, b = one[0], other[0]
     while a < one[1] and b < other[1]:

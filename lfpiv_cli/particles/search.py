@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from lfpiv_cli.optics.camera import Camera
-from lfpiv_cli.particles.active_set import DISTURBING, disturbance, overlaps_of
 from lfpiv_cli.particles.covariance import joint_covariance
 from lfpiv_cli.particles.fitting import add_all, judge, nothing_expected, refine
 from lfpiv_cli.particles.least_squares import SMALLEST_GAIN, Observation, observation_of
@@ -29,9 +28,55 @@ from lfpiv_cli.particles.noise import (
     pixel_weights,
     read_noise,
 )
-from lfpiv_cli.particles.view import View, lens_pixels
+from lfpiv_cli.particles.view import View, footprint_radius_mm, lens_pixels, on_array_mm
 from lfpiv_cli.reconstruction.equations import Normalisers
 from lfpiv_cli.weights.model import Weights
+
+Floats = NDArray[np.float64]
+
+# Active sets: which particles the next sweep fits again, because their last fit or neighbours' fits changed
+# something.
+#
+# A fit that lowers chi-squared by g changes a particle's light by g, in pixels' variances. Of that a neighbour sees
+# what their light has in common.
+#
+# Axes: image axes, mm; a particle is a row (x, y, z, light).
+
+
+# A particle is fitted again where its neighbours' gains, as far as their light overlaps with its own, exceed by this
+# factor what ends a fit. What is left undone so is less than a thousandth of what sweeps gain.
+DISTURBING = 20.0
+
+
+class Overlaps(NamedTuple):
+    """Pairs of particles whose footprints overlap, and the share of a gain that the other of the two sees."""
+
+    first: NDArray[np.int64]
+    second: NDArray[np.int64]
+    share: Floats
+
+
+def overlaps_of(view: View, particles: Floats) -> Overlaps:
+    """Return which particles (n, 4) disturb each other: the more, the closer their middles and their radii are."""
+    on_array = on_array_mm(view, particles)
+    # Light that touches a lens's cell spreads over it.
+    radius = footprint_radius_mm(view, particles) + 2.0 * max(view.half_x_mm, view.half_y_mm)
+    pairs = KDTree(on_array).query_pairs(2.0 * float(radius.max(initial=0.0)), output_type="ndarray")
+    first, second = pairs[:, 0].astype(np.int64), pairs[:, 1].astype(np.int64)
+    distance = np.hypot(*(on_array[first] - on_array[second]).T)
+    one, other = radius[first], radius[second]
+    near = np.maximum(1.0 - distance / (one + other), 0.0)
+    return Overlaps(first, second, (near * np.minimum(one, other) / np.maximum(one, other)) ** 2)
+
+
+def disturbance(overlaps: Overlaps, gain: Floats) -> Floats:
+    """Return what each particle (n,) sees of its neighbours' gains (n,)."""
+    first, second, share = overlaps
+    seen = np.zeros(gain.size)
+    for one, other in ((first, second), (second, first)):
+        seen += np.bincount(one, share * gain[other], gain.size)
+    return seen
+
 
 # Sweeps at the end, where light that is not explained counts for little more than noise.
 LAST_SWEEPS, LAST_UNEXPLAINED = 4, 0.02
@@ -63,13 +108,13 @@ class Particles:
     noise : of the image
     """
 
-    position_mm: NDArray[np.float64]
-    light_counts: NDArray[np.float64]
-    light_sigma_counts: NDArray[np.float64]
-    covariance_mm2: NDArray[np.float64]
-    chi2: NDArray[np.float64]
-    seen: NDArray[np.float64]
-    residual: NDArray[np.float64]
+    position_mm: Floats
+    light_counts: Floats
+    light_sigma_counts: Floats
+    covariance_mm2: Floats
+    chi2: Floats
+    seen: Floats
+    residual: Floats
     noise: Noise
 
 
@@ -92,12 +137,12 @@ class Task:
     weights: Weights
     camera: Camera
     sums: Normalisers
-    image: NDArray[np.float64]
+    image: Floats
     usable: NDArray[np.bool_]
     prepared: NDArray[np.float32]
     depths_mm: tuple[float, float]
     photons_per_count: float | None = None
-    light_covariance: NDArray[np.float64] | None = None
+    light_covariance: Floats | None = None
 
     @cached_property
     def read_counts(self) -> float:
@@ -113,9 +158,9 @@ class Fits(NamedTuple):
     chi2, share, seen : (n,) local chi-squared, claimed share, share of the light that is seen
     """
 
-    chi2: NDArray[np.float64]
-    share: NDArray[np.float64]
-    seen: NDArray[np.float64]
+    chi2: Floats
+    share: Floats
+    seen: Floats
 
     def of(self, chosen: NDArray[np.bool_]) -> Fits:
         """Return those of some particles."""
@@ -137,17 +182,17 @@ class State:
     expected : (m, 8) what is known beforehand of the first m particles, see `least_squares.fit`
     """
 
-    particles: NDArray[np.float64]
-    residual: NDArray[np.float64]
+    particles: Floats
+    residual: Floats
     typical_light: float
     noise: Noise
-    unsplit: NDArray[np.float64]
-    unmoved: NDArray[np.float64]
-    settled: NDArray[np.float64]
-    expected: NDArray[np.float64]
+    unsplit: Floats
+    unmoved: Floats
+    settled: Floats
+    expected: Floats
 
     @property
-    def prior(self) -> NDArray[np.float64]:
+    def prior(self) -> Floats:
         """What is known beforehand of all particles (n, 8)."""
         return np.concatenate([self.expected, nothing_expected(len(self.particles) - len(self.expected))])
 
@@ -160,7 +205,7 @@ def task_of(
     sums: Normalisers,
     excluded: NDArray[np.bool_] | None = None,
     photons_per_count: float | None = None,
-    light_covariance: NDArray[np.float64] | None = None,
+    light_covariance: Floats | None = None,
 ) -> Task:
     """Return the task that an image sets.
 
@@ -256,7 +301,7 @@ def kept(task: Task, state: State, keep: NDArray[np.bool_]) -> State:
     return replace(state, particles=state.particles[keep], expected=state.prior[keep], residual=residual)
 
 
-def with_light(task: Task, state: State, light: NDArray[np.float64]) -> State:
+def with_light(task: Task, state: State, light: Floats) -> State:
     """Return the state with particles of other light (n,) at the same places, their residual along with them."""
     particles, residual = state.particles.copy(), state.residual.copy()
     particles[:, 3] = light - state.particles[:, 3]
@@ -266,7 +311,7 @@ def with_light(task: Task, state: State, light: NDArray[np.float64]) -> State:
     return replace(state, particles=particles, residual=residual)
 
 
-def rebuilt(task: Task, state: State, particles: NDArray[np.float64]) -> State:
+def rebuilt(task: Task, state: State, particles: Floats) -> State:
     """Return the state with other particles, its residual computed from the image."""
     residual = task.image.copy()
     add_all(task.view, particles, -1.0, residual, task.depths_mm)

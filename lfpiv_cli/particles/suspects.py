@@ -8,14 +8,180 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from lfpiv_cli.particles.alternative_depths import try_other_depths
+from lfpiv_cli.particles.fitting import fit_again
+from lfpiv_cli.particles.least_squares import (
+    CHOICE_GAIN,
+    UNKNOWNS,
+    Effort,
+    Observation,
+    add_light,
+    copy_rows,
+    fit,
+    lit_by,
+    normal_equations,
+    respond_all,
+    room_for,
+)
 from lfpiv_cli.particles.search import SMALLEST_LIGHT, State, Task, observed
-from lfpiv_cli.particles.splitting import split
-from lfpiv_cli.particles.view import footprint_radius_mm
+from lfpiv_cli.particles.view import footprint_px, footprint_radius_mm, over_tiles
 from lfpiv_cli.scale import Scale
+
+Floats = NDArray[np.float64]
+
+# Overlapping particle images: two particles where one was found, if two explain the light much better.
+#
+# Both are fitted together, eight unknowns: block coordinates creep where two responses nearly coincide.
+#
+# Axes: image axes, mm; light in counts; residual and weights as flat images. A particle is a row (x, y, z, light).
+
+
+# Half the distance (x, y, z) of two particles at the start: sideways in microlenses, or along the depth in which a
+# volume shows two as one, in depths over which light spreads by one lens (Table 2: 0.2, 0.5 and 1 mm).
+STARTS = np.array(
+    [
+        (0.3, 0.0, 0.0),
+        (0.0, 0.3, 0.0),
+        (0.2, 0.2, 0.0),
+        (0.2, -0.2, 0.0),
+        (0.0, 0.0, 0.2 / 1.064),
+        (0.0, 0.0, 0.5 / 1.064),
+        (0.0, 0.0, 1.0 / 1.064),
+    ]
+)
+# Steps from every start. The best ones are fitted on, so many steps at most, if they have by then gained this share of
+# what is asked for: which place is right shows long before a fit has ended.
+FIRST_STEPS = 4
+FINALISTS = 2
+PAIR_STEPS = 12
+FIRST_GAIN = 0.25
+
+
+def split(
+    observation: Observation,
+    particles: Floats,
+    suspects: NDArray[np.bool_],
+    smallest_light: float,
+    smallest_gain: float,
+) -> Floats:
+    """Replace suspects by two particles where that lowers chi-squared by `smallest_gain`.
+
+    The first of the two takes the suspect's place in `particles` (n, 4); the second ones are returned in an array of
+    the same shape whose other rows are zero. The residual is kept up to date.
+    """
+    partners = np.zeros_like(particles)
+    places = footprint_px(observation.optics, *observation.depths_mm) * observation.optics.camera.columns
+
+    def work(numbers: NDArray[np.int64]) -> None:
+        least = (smallest_gain, smallest_light)
+        efforts = Effort(FIRST_STEPS, CHOICE_GAIN), Effort(PAIR_STEPS, CHOICE_GAIN)
+        _split(observation, particles, numbers[suspects[numbers]], places, efforts, least, partners)
+
+    over_tiles(work, observation.optics, particles, observation.depths_mm)
+    return partners
+
+
+@njit(cache=True, nogil=True)
+def _split(
+    observation: Observation,
+    particles: Floats,
+    numbers: NDArray[np.int64],
+    places: int,
+    efforts: tuple[Effort, Effort],
+    least: tuple[float, float],
+    partners: Floats,
+) -> None:
+    """Do the work of `split` for suspects of a tile.
+
+    `efforts` are for every start and for the best ones; `least` is what two must gain, and the light of each.
+    """
+    view, residual, scale = observation.optics, observation.residual, observation.optics.scale
+    responses = room_for(2, observation.capacity, places)
+    matrix, right = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
+    pair, best = np.empty((2, UNKNOWNS)), np.empty((2, UNKNOWNS))
+    prior = np.zeros((2, 2 * UNKNOWNS))
+    begun, changes = np.empty((len(STARTS), 2, UNKNOWNS)), np.empty(len(STARTS))
+    for number in numbers:
+        one = particles[number : number + 1]
+        light = one[0, 3]
+        respond_all(view, one, responses)
+        pixels, values = lit_by(responses, 0)
+        add_light(pixels, values, light, residual)
+        single = normal_equations(pixels, values, light, residual, observation.weight, responses.picked, matrix, right)
+        lowest = single - least[0]
+        promising = single - FIRST_GAIN * least[0]
+        for start, offset in enumerate(STARTS):
+            for m in range(2):
+                sign = 1.0 - 2.0 * m
+                pair[m, 0] = one[0, 0] + sign * offset[0] * scale.lens_mm
+                pair[m, 1] = one[0, 1] + sign * offset[1] * scale.lens_mm
+                depth = one[0, 2] + sign * offset[2] * scale.depth_mm
+                pair[m, 2] = min(max(depth, observation.low_mm), observation.high_mm)
+                pair[m, 3] = 0.5 * light
+            respond_all(view, pair, responses)
+            changes[start] = fit(observation, pair, prior, responses, efforts[0])
+            copy_rows(pair, begun[start])
+        found = False
+        for _ in range(FINALISTS):
+            chosen = np.argmin(changes)
+            if changes[chosen] > promising:
+                break
+            changes[chosen] = np.inf
+            copy_rows(begun[chosen], pair)
+            respond_all(view, pair, responses)
+            change = fit(observation, pair, prior, responses, efforts[1])
+            if change < lowest and min(pair[0, 3], pair[1, 3]) >= least[1]:
+                lowest, found = change, True
+                copy_rows(pair, best)
+        if found:
+            copy_rows(best[:1], one)
+            copy_rows(best[1:], partners[number : number + 1])
+            respond_all(view, best, responses)
+            for m in range(2):
+                pixels, values = lit_by(responses, m)
+                add_light(pixels, values, -best[m, 3], residual)
+        else:
+            respond_all(view, one, responses)
+            pixels, values = lit_by(responses, 0)
+            add_light(pixels, values, -light, residual)
+
+
+# Alternative depths for particles that fit badly, and for those near the focal plane, where many depths look alike.
+#
+# A fit finds the nearest minimum of chi-squared. Near the focal plane, where one lens holds most of a particle's
+# light, chi-squared has several minima along the depth, one of them mirrored; elsewhere a neighbour that was not
+# known yet may have led to the wrong one.
+#
+# Axes: image axes, mm; light in counts; residual and weights as flat images. A particle is a row (x, y, z, light).
+
+
+# Starts relative to the particle's depth, in depths over which light spreads by one lens (Table 2: 0.2 to 2 mm); its
+# mirrored depth is another.
+OTHER_DEPTHS = np.array([-2.0, -1.5, -1.0, -0.7, -0.4, -0.2, 0.2, 0.4, 0.7, 1.0, 1.5, 2.0]) / 1.064
+STEPS = 8
+
+
+def try_other_depths(
+    observation: Observation,
+    particles: Floats,
+    suspects: NDArray[np.bool_],
+    smallest_light: float,
+    smallest_gain: float,
+    prior: Floats | None = None,
+) -> NDArray[np.bool_]:
+    """Move suspects to another depth where that lowers chi-squared by `smallest_gain` more than refinement does.
+
+    All suspects among the particles (n, 4) are refined; the residual is kept up to date. Returns which have moved.
+    """
+    depth = particles[:, 2:3]
+    starts = np.concatenate([depth + OTHER_DEPTHS * observation.optics.scale.depth_mm, -depth], axis=1)
+    starts[(starts < observation.low_mm) | (starts > observation.high_mm)] = np.nan
+    effort, least = Effort(STEPS, CHOICE_GAIN), (smallest_gain, smallest_light)
+    return fit_again(observation, particles, suspects, effort, starts, least, prior).moved
+
 
 # A good particle's chi-squared is the one at this percentile; particles that fit worse by this factor are
 # suspects.
@@ -35,7 +201,7 @@ CHANGED_LENSES, CHANGED_DEPTHS, CHANGED_SHARES = 0.05, 0.05 / 1.064, (0.05, 0.2)
 SETTLED = 4.0
 
 
-def with_depths_corrected(task: Task, state: State, chi2: NDArray[np.float64], unexplained: float) -> State:
+def with_depths_corrected(task: Task, state: State, chi2: Floats, unexplained: float) -> State:
     """Return the state with particles moved to depths that explain the light better, the residual in place."""
     observation = observed(task, state, unexplained)
     good = good_chi2(chi2)
@@ -47,14 +213,12 @@ def with_depths_corrected(task: Task, state: State, chi2: NDArray[np.float64], u
     return replace(state, unmoved=np.concatenate([state.unmoved, signature[suspects & ~moved]]))
 
 
-def settled(task: Task, state: State, particles: NDArray[np.float64]) -> State:
+def settled(task: Task, state: State, particles: Floats) -> State:
     """Return the state in which these particles (m, 4) are not suspected while they stay there: other frames tell."""
     return replace(state, settled=_signature(task.view.scale, particles, np.ones(len(particles)))[:, :-1])
 
 
-def with_overlaps_split(
-    task: Task, state: State, chi2: NDArray[np.float64], unexplained: float, thorough: bool
-) -> State:
+def with_overlaps_split(task: Task, state: State, chi2: Floats, unexplained: float, thorough: bool) -> State:
     """Return the state with overlapping particles separated; `thorough`: also those of usual brightness."""
     observation = observed(task, state, unexplained)
     good = good_chi2(chi2)
@@ -71,28 +235,28 @@ def with_overlaps_split(
     )
 
 
-def good_chi2(chi2: NDArray[np.float64]) -> float:
+def good_chi2(chi2: Floats) -> float:
     """Return chi-squared of a particle that fits well."""
     return max(float(np.percentile(chi2, GOOD_PERCENTILE)), 1.0) if chi2.size else 1.0
 
 
-def _signature(scale: Scale, particles: NDArray[np.float64], chi2: NDArray[np.float64]) -> NDArray[np.float64]:
+def _signature(scale: Scale, particles: Floats, chi2: Floats) -> Floats:
     """Return (n, 5) numbers that differ by 1 where a particle has changed enough to be tried again."""
     tiny = np.finfo(np.float64).tiny
     shares = np.log(np.maximum(np.column_stack([particles[:, 3], chi2]), tiny)) / CHANGED_SHARES
     return np.column_stack([particles[:, :3] / scale.box_mm(CHANGED_LENSES, CHANGED_DEPTHS), shares])
 
 
-def _settled(state: State, signature: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _settled(state: State, signature: Floats) -> NDArray[np.bool_]:
     return _among(state.settled / SETTLED, signature[:, :-1] / SETTLED)
 
 
-def _tried(before: NDArray[np.float64], state: State, signature: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _tried(before: Floats, state: State, signature: Floats) -> NDArray[np.bool_]:
     """Return which particles were tried before or are settled, and have hardly changed since."""
     return _among(before, signature) | _settled(state, signature)
 
 
-def _among(tried: NDArray[np.float64], signature: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _among(tried: Floats, signature: Floats) -> NDArray[np.bool_]:
     """Return which signatures are among others, within 1."""
     if not len(tried):
         return np.zeros(len(signature), dtype=bool)

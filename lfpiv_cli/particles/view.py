@@ -9,6 +9,7 @@ focal point; lengths in mm about the optical axis.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
@@ -18,18 +19,19 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.errors import ConfigError
-from lfpiv_cli.optics.camera import Camera, KernelCamera
+from lfpiv_cli.optics.camera import Camera, KernelCamera, Lattice
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.line_responses import NO_LINES, LineResponses, line_responses, of_balls, on_pixels
 from lfpiv_cli.optics.media import Layers, Media
-from lfpiv_cli.optics.microlenses import Lattice
-from lfpiv_cli.optics.object_space import ObjectSpace
 from lfpiv_cli.optics.surfaces import Faces
-from lfpiv_cli.particles.cells import cell_shares, hexagon_radius, no_shares, smallest_ball_mm
+from lfpiv_cli.optics.tracing import ObjectSpace
+from lfpiv_cli.particles.cells import cell_shares, hexagon_radius, no_shares, rim_table, smallest_ball_mm
 from lfpiv_cli.particles.pencil import lines_of
-from lfpiv_cli.particles.rim import rim_table
 from lfpiv_cli.scale import Scale
+from lfpiv_cli.threads import in_threads
 from lfpiv_cli.weights.scene import NO_FACES
+
+Floats = NDArray[np.float64]
 
 # Particles that are smaller are taken as this large, so that profiles have slopes: a thousandth of a lens.
 SMALLEST_RADIUS_LENSES = 1e-3
@@ -69,16 +71,16 @@ class View(NamedTuple):
     half_x_mm: float
     half_y_mm: float
     cell_reach: float
-    cell_table: NDArray[np.float64]
-    cell_side2_mm2: NDArray[np.float64]
+    cell_table: Floats
+    cell_side2_mm2: Floats
     cell_step_mm: float
     cell_ball_mm: float
     particle_radius_mm: float
-    centres_mm: NDArray[np.float64]
+    centres_mm: Floats
     first_i: int
     first_j: int
-    inverse_basis: NDArray[np.float64]
-    table: NDArray[np.float64]
+    inverse_basis: Floats
+    table: Floats
     table_reach: float
     lines: LineResponses
     points: LineResponses
@@ -254,7 +256,7 @@ def by_waves(view: View) -> bool:
     return view.points.table.shape[0] > 0
 
 
-def on_array_mm(view: View, points: NDArray[np.float64]) -> NDArray[np.float64]:
+def on_array_mm(view: View, points: Floats) -> Floats:
     """Return where the main lens's middle shows points (n, 3 or more) on the array (n, 2), without its distortion.
 
     Of points that the lens does not see behind curved faces, where it would through planes.
@@ -268,11 +270,6 @@ def on_array_mm(view: View, points: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(lines[:, :, 1] > 0.0, shown, places)
 
 
-def lens_on_array_mm(view: View) -> float:
-    """Return the mean pitch of the microlenses on the array, for lengths counted in them."""
-    return view.scale.lens_mm * view.camera.image_distance_mm / view.camera.focus_distance_mm
-
-
 def lens_pixels(view: View) -> float:
     """Return the pixels of a lens's cell.
 
@@ -281,26 +278,12 @@ def lens_pixels(view: View) -> float:
     return 4.0 * view.half_x_mm * view.half_y_mm / view.camera.pixel_mm**2
 
 
-def footprint_radius_mm(view: View, points: NDArray[np.float64]) -> NDArray[np.float64]:
+def footprint_radius_mm(view: View, points: Floats) -> Floats:
     """Return how far (n,) on the array the light of particles (n, 3 or more) spreads from their centres."""
     return np.asarray(_spreads_mm(view, points).max(axis=1))
 
 
-def widest_footprint_mm(view: View, z_low_mm: float, z_high_mm: float) -> float:
-    """Return how far on the array the light of particles between two depths spreads at most from their centres."""
-    return float(_spreads_mm(view, _between(view, z_low_mm, z_high_mm)).max())
-
-
-def largest_stretch(view: View, z_low_mm: float, z_high_mm: float) -> float:
-    """Return how far the main lens shows particles between two depths to move, over how far they do sideways."""
-    if view.faces.ratios.size == 0:
-        return 1.0
-    points = _between(view, z_low_mm, z_high_mm)
-    _, moves, _ = lines_of(view.faces, view.camera.aperture_radius_mm, points)
-    return max(float(np.linalg.norm(moves[:, :, 0], axis=-1).max()), 1.0)
-
-
-def _spreads_mm(view: View, points: NDArray[np.float64]) -> NDArray[np.float64]:
+def _spreads_mm(view: View, points: Floats) -> Floats:
     """Return `footprint_radius_mm` along both image axes (n, 2)."""
     camera, radius = view.camera, view.camera.aperture_radius_mm
     beta = np.repeat(_image_scale(view, points[:, 2])[:, np.newaxis], 2, axis=1)
@@ -314,7 +297,7 @@ def _spreads_mm(view: View, points: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(np.abs(alpha) * radius + beta * ball + camera.image_distance_mm * bent + view.lines.margin_mm)
 
 
-def _between(view: View, z_low_mm: float, z_high_mm: float) -> NDArray[np.float64]:
+def _between(view: View, z_low_mm: float, z_high_mm: float) -> Floats:
     """Return points (n, 3) that stand for all between two depths: plane faces show them alike wherever they are."""
     if view.faces.ratios.size == 0:
         depths = np.linspace(z_low_mm, z_high_mm, SAMPLED_DEPTHS)
@@ -326,7 +309,7 @@ def _between(view: View, z_low_mm: float, z_high_mm: float) -> NDArray[np.float6
     return np.stack(np.meshgrid(x, y, depths), axis=-1).reshape(-1, 3)
 
 
-def _image_scale(view: View, z_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+def _image_scale(view: View, z_mm: Floats) -> Floats:
     """Return s_i/s_o at depths z, without the sign of the inversion."""
     return view.camera.image_distance_mm / (view.camera.focus_distance_mm + view.depth_ratio * z_mm)
 
@@ -345,3 +328,60 @@ def entry_capacity(view: View, z_low_mm: float, z_high_mm: float) -> int:
         pixels = 2.0 * half / camera.pixel_mm + 3.0 if whole else lit / patch + 3.0
         per_axis = max(per_axis, float(np.max(lenses * pixels)))
     return int(per_axis**2) + 1
+
+
+# Particles by tiles of the image, so that threads work on them at once and their number does not matter.
+#
+# The image is cut into square tiles at least as wide as two footprints. Tiles whose numbers are even along both axes
+# form one group, and so on: four groups. Particles of different tiles of one group light no common pixel, so a
+# group's tiles can be worked on at once; within a tile particles follow each other.
+
+
+# How far a particle may be moved within one sweep, in microlenses: footprints must not grow into other tiles.
+LARGEST_MOVE_LENSES = 1.5
+
+
+def over_tiles(
+    work: Callable[[NDArray[np.int64]], None], view: View, points: Floats, depths_mm: tuple[float, float]
+) -> None:
+    """Call work(numbers) with the particles of each tile, in their order, on all threads: one group after another.
+
+    Parameters
+    ----------
+    points : (n, 3 or more), image axes
+    depths_mm : between which particles stay
+    """
+    for tiles in groups_of_tiles(view, points, depths_mm):
+        in_threads(work, tiles)
+
+
+def groups_of_tiles(view: View, points: Floats, depths_mm: tuple[float, float]) -> list[list[NDArray[np.int64]]]:
+    """Return the numbers of the particles of each tile, for the four groups of tiles."""
+    tile = np.floor(on_array_mm(view, points) / tile_side_mm(view, *depths_mm)).astype(np.int64)
+    group = tile[:, 0] % 2 + 2 * (tile[:, 1] % 2)
+    groups = []
+    for number in range(4):
+        members = np.flatnonzero(group == number)
+        members = members[np.lexsort((members, tile[members, 0], tile[members, 1]))]
+        ends = np.flatnonzero(np.any(np.diff(tile[members], axis=0) != 0, axis=1)) + 1
+        groups.append([numbers for numbers in np.split(members, ends) if numbers.size])
+    return groups
+
+
+def tile_side_mm(view: View, z_low_mm: float, z_high_mm: float) -> float:
+    """Return the side of a tile, on the array: two footprints of particles that move in one sweep."""
+    points, stretch = _between(view, z_low_mm, z_high_mm), 1.0
+    if view.faces.ratios.size > 0:
+        # How far curved faces show particles to move, over how far they do sideways.
+        _, moves, _ = lines_of(view.faces, view.camera.aperture_radius_mm, points)
+        stretch = max(float(np.linalg.norm(moves[:, :, 0], axis=-1).max()), 1.0)
+    widest = float(_spreads_mm(view, points).max())
+    lens_on_array_mm = view.scale.lens_mm * view.camera.image_distance_mm / view.camera.focus_distance_mm
+    # Light that touches a lens's cell lands within its micro-image: two cells to each side.
+    move = LARGEST_MOVE_LENSES * lens_on_array_mm * stretch
+    return 2.0 * (widest + 4.0 * max(view.half_x_mm, view.half_y_mm) + move)
+
+
+def footprint_px(view: View, z_low_mm: float, z_high_mm: float) -> int:
+    """Return the side of a square of pixels that holds any particle's footprint."""
+    return int(np.ceil(tile_side_mm(view, z_low_mm, z_high_mm) / view.camera.pixel_mm))

@@ -1,7 +1,8 @@
-"""A picture of a calibration to look at: does the lattice sit on the lens images, was the board found?"""
+"""Pictures of a rig: does its lattice sit on the lens images, are its views alike, what will it see?"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,10 +11,104 @@ from numpy.typing import ArrayLike, NDArray
 from lfpiv_cli.calibration.dlfc import RayFit
 from lfpiv_cli.calibration.lattice import LatticeFit
 from lfpiv_cli.calibration.model import Calibration
-from lfpiv_cli.pictures.style import DIVERGING, SEQUENTIAL, SKY_BLUE, VERMILION, new_figure, styled
+from lfpiv_cli.calibration.views import refocused_stack, views_across
+from lfpiv_cli.notice import written
+from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.media import Media
+from lfpiv_cli.pictures.style import (
+    AXIS_NAMES,
+    BLUE,
+    DIVERGING,
+    GREEN,
+    GREY,
+    MARKERS,
+    SEQUENTIAL,
+    SKY_BLUE,
+    VERMILION,
+    new_figure,
+    styled,
+)
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+
+COLOURS = (GREEN, VERMILION, BLUE)
+
+
+@styled
+def planning_figure(told: Mapping[str, NDArray[np.float64]], bounds_mm: NDArray[np.float64]) -> Figure:
+    """Return errors over depth, and the volume within the field of view seen from above and from the side.
+
+    Parameters
+    ----------
+    told : `depth_mm` (n,), `sigma_mm` (n, 3), half the fields of view `full_view_mm` and `any_view_mm` (n, 2)
+    bounds_mm : (3, 2) of the volume, z from the focal point
+    """
+    figure = new_figure(9.5, 3.6)
+    errors, *views = figure.subplots(1, 3)
+    for axis, name in enumerate(AXIS_NAMES):
+        errors.semilogy(
+            told["depth_mm"], 1e3 * told["sigma_mm"][:, axis], color=COLOURS[axis], marker=MARKERS[axis], label=name
+        )
+    errors.set(xlabel="z from the focal plane (mm)", ylabel="smallest error of a tracer alone (µm)")
+    errors.grid(alpha=0.3, which="both")
+    errors.legend()
+    for axis, axes in enumerate(views):
+        _draw_view(axes, told, bounds_mm, axis)
+    views[0].legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3)
+    return figure
+
+
+def _draw_view(axes: Axes, told: Mapping[str, NDArray[np.float64]], bounds_mm: NDArray[np.float64], axis: int) -> None:
+    """Draw what is in view across one axis, and the volume."""
+    depth = told["depth_mm"]
+    for name, label, shade in (("any_view_mm", "seen in part", 0.85), ("full_view_mm", "seen in full", 0.65)):
+        half = told[name][:, axis]
+        axes.fill_between(depth, -half, half, color=str(shade), label=label)
+    (left, right), (low, high) = bounds_mm[2], bounds_mm[axis]
+    axes.plot([left, right, right, left, left], [low, low, high, high, low], color=VERMILION, label="volume")
+    axes.axvline(0.0, color=GREY, linestyle=":")
+    axes.set(xlabel="z from the focal plane (mm)", ylabel=f"{AXIS_NAMES[axis]} (mm)")
+
+
+# Enough views to see vignetting and a wrong lattice at the rim, few enough to see dots in each.
+VIEWS_PER_SIDE = 5
+# Depths of the stack, in units over which the main lens's rim moves a point by a microlens.
+STEPS = (-4.0, -2.0, 0.0, 2.0, 4.0)
+
+
+@styled
+def views_figure(calibration: Calibration, camera: Camera, media: Media, image: ArrayLike) -> Figure:
+    """Return a figure with the views of a raw picture less its dark frame, and the same refocused about the board.
+
+    `camera` is the data sheet's and `media` what the picture was taken in. Needs matplotlib.
+    """
+    measured = calibration.camera(camera)
+    rectified = calibration.rectification.apply(image)
+    unit = float(measured.lattice.pitch.max()) / measured.aperture_radius_mm * measured.focus_distance_mm
+    middle = 0.0 if calibration.pose is None else calibration.pose.z0_mm
+    depths = middle + np.array(STEPS) * unit * abs(1.0 / measured.magnification) / media.depth_ratio
+    stack = refocused_stack(rectified, measured, media, depths, calibration.transmission)
+
+    views = views_across(rectified, measured, VIEWS_PER_SIDE)
+    brightest = max(float(view.max()) for _, view in views.values())
+    figure = new_figure(13.0, 12.5)
+    grid = figure.add_gridspec(VIEWS_PER_SIDE + 1, len(STEPS), height_ratios=(1.0,) * VIEWS_PER_SIDE + (1.3,))
+    for (row, column), (point, view) in views.items():
+        axis = figure.add_subplot(grid[row, column])
+        axis.imshow(view, cmap="gray", vmin=0.0, vmax=brightest, interpolation="nearest")
+        axis.set_title(f"X = {written(point[0], 2)}, Y = {written(point[1], 2)} mm")
+        axis.set_axis_off()
+    for k, (depth, picture) in enumerate(zip(depths, stack, strict=True)):
+        axis = figure.add_subplot(grid[-1, k])
+        axis.imshow(picture, cmap="gray", interpolation="nearest", vmin=0.0, vmax=float(stack.max()))
+        axis.set_title(f"refocused at z = {depth:z.2f} mm")
+        axis.set_axis_off()
+    figure.suptitle("views from points (X, Y) of the main lens, one sample per microlens; below, refocused")
+    return figure
+
 
 # Zooms show six lenses across: enough to see the order, few enough to see a tenth of the pitch.
 LENSES_ACROSS = 6.0

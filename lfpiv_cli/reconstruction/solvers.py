@@ -14,14 +14,84 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.names import Start
-from lfpiv_cli.reconstruction import kernels
-from lfpiv_cli.reconstruction.equations import Image, Normalisers, Operator, Problem, Volume, normalisers
+from lfpiv_cli.reconstruction.equations import (
+    Image,
+    Normalisers,
+    Operator,
+    Problem,
+    Volume,
+    line_of_sight_start,
+    lit_support,
+    normalisers,
+    uniform_start,
+)
 from lfpiv_cli.reconstruction.images import noise_residual
 from lfpiv_cli.reconstruction.registry import SOLVERS
-from lfpiv_cli.reconstruction.starts import line_of_sight_start, lit_support, uniform_start
+from lfpiv_cli.threads import share_out
+
+# What solvers do with whole images, in one pass over the pixels each.
+#
+# An image has more pixels than a small volume has voxels; array by array these passes cost more than its weights.
+#
+# Axes: images [row, column], float32. Pixels whose inverse row sum is 0 take no part.
+
+
+def correction(image: Image, projection: Image, inverse_row_sum: Image) -> Image:
+    """Return (I - W E) / sum_n w_in, the correction of Eq. 12."""
+    result = np.empty(image.shape, np.float32)
+    share_out(_correct, image.shape[0], image, projection, inverse_row_sum, result)
+    return result
+
+
+@njit(cache=True, nogil=True)
+def _correct(part: tuple[int, int], image: Image, projection: Image, inverse_row_sum: Image, result: Image) -> None:
+    """Write rows `part` of `correction`."""
+    for row in range(part[0], part[1]):
+        for column in range(image.shape[1]):
+            difference = image[row, column] - projection[row, column]
+            result[row, column] = difference * inverse_row_sum[row, column]
+
+
+def ratio(image: Image, projection: Image, inverse_row_sum: Image) -> Image:
+    """Return I / W E, 0 where the volume does not light a pixel or it takes no part."""
+    result = np.empty(image.shape, np.float32)
+    share_out(_divide, image.shape[0], image, projection, inverse_row_sum, result)
+    return result
+
+
+@njit(cache=True, nogil=True)
+def _divide(part: tuple[int, int], image: Image, projection: Image, inverse_row_sum: Image, result: Image) -> None:
+    """Write rows `part` of `ratio`."""
+    for row in range(part[0], part[1]):
+        for column in range(image.shape[1]):
+            seen = projection[row, column] > 0.0 and inverse_row_sum[row, column] > 0.0
+            result[row, column] = image[row, column] / projection[row, column] if seen else np.float32(0.0)
+
+
+def square_differences(image: Image, projection: Image, inverse_row_sum: Image) -> NDArray[np.float64]:
+    """Return the sum of (I - W E)^2 of each row (rows,), so that their sum has the same bits for any threads."""
+    result = np.empty(image.shape[0], np.float64)
+    share_out(_sum_squares, image.shape[0], image, projection, inverse_row_sum, result)
+    return result
+
+
+@njit(cache=True, nogil=True)
+def _sum_squares(
+    part: tuple[int, int], image: Image, projection: Image, inverse_row_sum: Image, result: NDArray[np.float64]
+) -> None:
+    """Write rows `part` of `square_differences`."""
+    for row in range(part[0], part[1]):
+        total = 0.0
+        for column in range(image.shape[1]):
+            if inverse_row_sum[row, column] > 0.0:
+                difference = np.float64(image[row, column] - projection[row, column])
+                total += difference * difference
+        result[row] = total
+
 
 # MART takes the pixels in this many by this many interleaved blocks; neighbours, which see the same voxels, apart.
 MART_BLOCKS = 4
@@ -104,8 +174,8 @@ class Reconstruction:
 
 def sart_step(problem: Problem, volume: Volume, projection: Image, relaxation: float) -> Volume:
     """Return the volume after one step of SART, all pixels at once (Eq. 12), kept non-negative."""
-    correction = kernels.correction(problem.image, projection, problem.sums.inverse_row_sum)
-    update = problem.operator.adjoint(correction) * problem.sums.inverse_column_sum
+    change = correction(problem.image, projection, problem.sums.inverse_row_sum)
+    update = problem.operator.adjoint(change) * problem.sums.inverse_column_sum
     return np.maximum(volume + np.float32(relaxation) * update, np.float32(0.0))
 
 
@@ -114,8 +184,8 @@ def em_step(problem: Problem, volume: Volume, projection: Image, relaxation: flo
 
     E <- E (W^T (I / W E) / W^T 1)^relaxation. A pixel that the volume does not light explains nothing and is left out.
     """
-    ratio = kernels.ratio(problem.image, projection, problem.sums.inverse_row_sum)
-    factor = problem.operator.adjoint(ratio) * problem.sums.inverse_column_sum
+    missing = ratio(problem.image, projection, problem.sums.inverse_row_sum)
+    factor = problem.operator.adjoint(missing) * problem.sums.inverse_column_sum
     if relaxation != 1.0:
         factor **= np.float32(relaxation)
     return volume * factor
@@ -221,5 +291,5 @@ class Momentum:
 
 def _relative_residual(problem: Problem, projection: Image, norm: float) -> float:
     """Return ||I - W E|| / ||I|| over the pixels that take part, 0 for a dark image."""
-    sums = kernels.square_differences(problem.image, projection, problem.sums.inverse_row_sum)
+    sums = square_differences(problem.image, projection, problem.sums.inverse_row_sum)
     return float(np.sqrt(sums.sum())) / norm if norm > 0.0 else 0.0

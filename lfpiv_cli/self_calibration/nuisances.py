@@ -21,13 +21,12 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import lsqr
 
+from lfpiv_cli.particles.cells import rim_table
 from lfpiv_cli.particles.fitting import add_all, refine
 from lfpiv_cli.particles.least_squares import UNKNOWNS, lit_by, observation_of, respond_all, room_for
 from lfpiv_cli.particles.noise import Noise
-from lfpiv_cli.particles.rim import rim_table
 from lfpiv_cli.particles.view import View, entry_capacity, with_radius
-from lfpiv_cli.self_calibration.movable_scene import MovableScene
-from lfpiv_cli.self_calibration.moved_places import moved_places
+from lfpiv_cli.self_calibration.movable_scene import MovableScene, moved_places
 from lfpiv_cli.threads import blocks, in_threads
 
 # A round with this many sweeps over the particles leaves a sixth of an error, four leave 1e-3 of it. They end earlier
@@ -204,21 +203,12 @@ def _model_errors(view: View, scene: MovableScene | None) -> NDArray[np.float64]
     """Return what the optics model gets wrong of the unknowns (9,)."""
     return np.array(
         [
-            *_model_errors_of_camera(view),
-            *(np.zeros(len(MODEL_SCENE)) if scene is None else MODEL_SCENE),
-        ]
-    )
-
-
-def _model_errors_of_camera(view: View) -> NDArray[np.float64]:
-    """Return what the optics model gets wrong of the camera's unknowns (5,)."""
-    return np.array(
-        [
             2.0 * MODEL_SHARE_OF_PITCH * view.half_x_mm,
             2.0 * MODEL_SHARE_OF_PITCH * view.half_y_mm,
             MODEL_SHARE_OF_APERTURE * view.camera.aperture_radius_mm,
             MODEL_SHARE_OF_RADIUS * view.particle_radius_mm,
             MODEL_STRETCH / _corner_mm(view) ** 2,
+            *(np.zeros(len(MODEL_SCENE)) if scene is None else MODEL_SCENE),
         ]
     )
 

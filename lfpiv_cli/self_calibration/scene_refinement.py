@@ -21,26 +21,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.calibration.model import Calibration
-from lfpiv_cli.calibration.scene_pose import ScenePose
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace
+from lfpiv_cli.optics.shapes import ScenePose
 from lfpiv_cli.particles.diameter import UNKNOWN_LENSES, diameter_by
 from lfpiv_cli.particles.rounds import find_particles
 from lfpiv_cli.particles.search import Particles, Task, task_of
 from lfpiv_cli.particles.view import View, footprint_radius_mm, on_array_mm, raw_view, with_radius
 from lfpiv_cli.reconstruction.equations import normalisers
-from lfpiv_cli.self_calibration.camera_figures import camera_figures, shift_px
-from lfpiv_cli.self_calibration.movable_scene import ACROSS, AWAY, TILT_ACROSS, TILT_AWAY, MovableScene
-from lfpiv_cli.self_calibration.moved_places import moved_places, place_changes
+from lfpiv_cli.self_calibration.movable_scene import (
+    ACROSS,
+    AWAY,
+    TILT_ACROSS,
+    TILT_AWAY,
+    MovableScene,
+    moved_places,
+    place_changes,
+)
 from lfpiv_cli.self_calibration.nuisances import SCENE_STEPS, NuisanceFit, Nuisances, fit_nuisances
-from lfpiv_cli.self_calibration.refinement import PLANES_APART, REFINING_ROUNDS
-from lfpiv_cli.self_calibration.round_wall import RING_FROM, RoundWallFit, find_round_wall
-from lfpiv_cli.self_calibration.walls import refuse_few
+from lfpiv_cli.self_calibration.refinement import PLANES_APART, REFINING_ROUNDS, camera_figures, shift_px
+from lfpiv_cli.self_calibration.walls import RING_FROM, RoundWallFit, find_round_wall, refuse_few
 from lfpiv_cli.weights.columns import operator_of
-from lfpiv_cli.weights.curved_reach import curved_padding
 from lfpiv_cli.weights.model import Weights
+from lfpiv_cli.weights.scene import curved_padding
 
 # Particles are looked for again where the wall has moved by more than this share of its radius, at most so often.
 SETTLED_SHARE, SEARCHES = 0.01, 3

@@ -9,15 +9,71 @@ Axes: world axes of the raw sensor, z from the nominal focal point; lengths in m
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize
 from scipy.special import expit, ndtr
 
 from lfpiv_cli.errors import InputError
-from lfpiv_cli.self_calibration.likelihood import covariance_of, improved
+
+# Steps of the numerical slopes, in units of the parameters.
+SLOPE_STEP = 1e-4
+# Packed parameters, of which any number is possible, are what says where the walls are, changes of the seeding, the
+# logarithm of the edges' blur per width or radius, and the logit of the strays' share.
+BLUR, STRAY = -2, -1
+
+LogLikelihood = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+"""The logarithm (n,) of each particle's density, from packed parameters."""
+
+
+def most_likely(
+    best: NDArray[np.float64],
+    first: list[int],
+    free: list[int],
+    places: int,
+    blurs: tuple[float, ...],
+    log_likelihood: LogLikelihood,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the packed parameters (n,) that make the particles of a flow most likely, and their covariance (n, n).
+
+    The first ones are sought with edges of each blur, coarse to fine, then all that are free; the others are left as
+    they are, and have no variance. The covariance is from the scatter of the single particles' slopes.
+    """
+    for blur in blurs:
+        best[BLUR] = np.log(blur)
+        best = _improved(best, first, _units(best, places), log_likelihood)
+    best = _improved(best, free, _units(best, places), log_likelihood)
+    step = SLOPE_STEP * np.where(np.isin(np.arange(len(best)), free), _units(best, places), 0.0)
+    slopes = [(log_likelihood(best + change) - log_likelihood(best - change)) / 2.0 for change in np.diag(step)]
+    design = np.stack(slopes, axis=1)
+    return best, np.asarray(np.linalg.pinv(design.T @ design) * np.outer(step, step), dtype=np.float64)
+
+
+def _improved(
+    start: NDArray[np.float64], free: list[int], units: NDArray[np.float64], log_likelihood: LogLikelihood
+) -> NDArray[np.float64]:
+    """Return the parameters with the free ones made most likely."""
+    unit = units[free]
+
+    def cost(change: NDArray[np.float64]) -> float:
+        packed = start.copy()
+        packed[free] += change * unit
+        return -float(np.mean(log_likelihood(packed)))
+
+    found = minimize(cost, np.zeros(len(free)), method="BFGS")
+    best = start.copy()
+    best[free] += found.x * unit
+    return best
+
+
+def _units(packed: NDArray[np.float64], places: int) -> NDArray[np.float64]:
+    """Return by how much each packed parameter may change before the likelihood's slope does; so many are of places."""
+    return np.array([float(np.exp(packed[BLUR]))] * places + [0.1] * (len(packed) - places - 2) + [0.3] * 2)
+
 
 # Fewer particles leave gaps in depth that pass for walls.
 FEWEST_PARTICLES = 100
@@ -35,7 +91,7 @@ LIMIT_BLURS = 5.0
 # scatter as their standard errors say.
 LEAST_BLUR_SPACINGS = 2.0
 
-MIDDLE, HALF, SLOPE_X, SLOPE_Y, LINEAR, QUADRATIC, BLUR, STRAY = range(8)
+MIDDLE, HALF, SLOPE_X, SLOPE_Y, LINEAR, QUADRATIC = range(6)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,9 +153,19 @@ def find_walls(
     """
     refuse_few(len(position_mm))
     searched = depths_mm[1] - depths_mm[0]
-    best = _most_likely(position_mm, depth_sigma_mm, searched, width_mm)
-    sigma = _standard_errors(best, position_mm, depth_sigma_mm, searched, width_mm) * np.sqrt(frames)
+    low, high = np.quantile(position_mm[:, 2], (FIRST_TAIL, 1.0 - FIRST_TAIL))
+    best = np.zeros(8)
+    best[MIDDLE] = 0.5 * (low + high) / width_mm
+    best[HALF] = np.log((high - low) / (1.0 - 2.0 * FIRST_TAIL) / width_mm)
+    best[STRAY] = -4.0
+    likelihood = partial(_log_likelihood, position=position_mm, sigma=depth_sigma_mm, searched=searched, width=width_mm)
+    first = [MIDDLE, HALF, SLOPE_X, SLOPE_Y, STRAY]
+    best, covariance = most_likely(best, first, list(range(8)), 4, BLURS_PER_WIDTH, likelihood)
     parameters, blur, stray = _unpacked(best, width_mm)
+    sigma = np.sqrt(np.diag(covariance))[:6]
+    sigma[MIDDLE] *= width_mm
+    sigma[HALF] *= parameters[HALF]
+    sigma *= np.sqrt(frames)
     blur = float(np.hypot(blur, LEAST_BLUR_SPACINGS * width_mm / len(position_mm)))
     # The last particle before an edge is on average one spacing from it, however sharp the edge is.
     spacing = 2.0 * parameters[HALF] * frames / len(position_mm)
@@ -144,45 +210,6 @@ def _ensure_walls(walls: Walls, depths_mm: tuple[float, float], width_mm: float)
         )
 
 
-def _most_likely(
-    position: NDArray[np.float64], sigma: NDArray[np.float64], searched: float, width: float
-) -> NDArray[np.float64]:
-    """Return the parameters that make the particles most likely, packed as `_unpacked` reads them."""
-    low, high = np.quantile(position[:, 2], (FIRST_TAIL, 1.0 - FIRST_TAIL))
-    best = np.zeros(8)
-    best[MIDDLE] = 0.5 * (low + high) / width
-    best[HALF] = np.log((high - low) / (1.0 - 2.0 * FIRST_TAIL) / width)
-    best[STRAY] = -4.0
-    free = [MIDDLE, HALF, SLOPE_X, SLOPE_Y, STRAY]
-    likelihood = partial(_log_likelihood, position=position, sigma=sigma, searched=searched, width=width)
-    for blur in BLURS_PER_WIDTH:
-        best[BLUR] = np.log(blur)
-        best = improved(best, free, _units(best), likelihood)
-    return improved(best, list(range(8)), _units(best), likelihood)
-
-
-def _units(packed: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return by how much (8,) each packed parameter may change before the likelihood's slope does."""
-    blur = float(np.exp(packed[BLUR]))
-    return np.array([blur, blur, blur, blur, 0.1, 0.1, 0.3, 0.3])
-
-
-def _standard_errors(
-    best: NDArray[np.float64],
-    position: NDArray[np.float64],
-    sigma: NDArray[np.float64],
-    searched: float,
-    width: float,
-) -> NDArray[np.float64]:
-    """Return the standard errors (6,) of the unpacked parameters, from the scatter of the single particles' slopes."""
-    likelihood = partial(_log_likelihood, position=position, sigma=sigma, searched=searched, width=width)
-    covariance = covariance_of(best, _units(best), likelihood)
-    errors = np.sqrt(np.diag(covariance))[:6]
-    errors[MIDDLE] *= width
-    errors[HALF] *= _unpacked(best, width)[0][HALF]
-    return np.asarray(errors, dtype=np.float64)
-
-
 def _unpacked(packed: NDArray[np.float64], width: float) -> tuple[NDArray[np.float64], float, float]:
     """Return middle, half width, slopes and seeding (6,), the blur in mm and the share of strays.
 
@@ -222,3 +249,206 @@ def _density(
     between = ndtr((depth + half) / edge) - ndtr((depth - half) / edge)
     inside = np.maximum(seeding, LEAST_DENSITY) * between / (2.0 * half)
     return np.asarray((1.0 - stray) * inside + stray / searched, dtype=np.float64)
+
+
+# The wall of a round pipe from the particles in it: where they end, seen from near its axis.
+#
+# Along each direction from the axis, at angle a and at s along it, the wall is at
+#
+#     r = R + (d_1 + t_1 s) cos a + (d_2 + t_2 s) sin a
+#
+# with d the shift and t the tilt of the true axis, small against R. Only the outer ring of the pipe's section is
+# looked at, and each particle's distance for its own angle: where the wall cannot be seen, at a sensor's sides,
+# particles are left out, and a seeding that grows across the pipe does no harm.
+#
+# Axes: the pipe's frame (along, across, away), see `movable_scene`; lengths in mm.
+
+
+# The ring begins at this share of the radius: it holds half of the section, in which seeding changes evenly.
+RING_FROM = 0.7
+# Fewer particles in the ring leave gaps that pass for the wall.
+FEWEST_IN_RING = 200
+# The edge is sought blurred by these shares of the radius, coarse to fine.
+BLURS_PER_RADIUS = (0.02, 0.006)
+# Blurs that are so many times as large or small as the last are not expected (as a standard deviation, logarithm).
+BLUR_FACTOR = 0.5
+# Particles whose places along the pipe spread (rms) by less than this share of its radius say nothing of its tilt. It
+# is left as it is then, and known to so many rad, which any mount is better than.
+LEAST_SPAN_SHARE, UNKNOWN_TILT = 0.3, 0.1
+# An axis that is not known better than to this share of the radius is as good as not found.
+LARGEST_SIGMA_SHARE = 0.02
+
+# Packed: shifts over R, tilts times the rms of s over R, the logarithm of R over the nominal one, and the change of the
+# seeding over the ring, alike at all angles and with the cosine and sine.
+RADIUS, EVEN, COSINE, SINE = range(4, 8)
+PARAMETERS, OF_AXIS = 10, 4
+
+
+@dataclass(frozen=True, eq=False)
+class RoundWallFit:
+    """A wall around a pipe's axis.
+
+    Attributes
+    ----------
+    axis, covariance : (4,), (4, 4) shift across and away, mm, and tilt towards both, rad, from the frame's own axis
+    radius_mm, radius_sigma_mm : apparent distance of the wall from the axis
+    blur_mm : of the edge: the common part of the particles' errors
+    stray_share : of particles that are spread over all that was searched
+    particles : in the ring
+    place_mm : (n, 3) of these
+    """
+
+    axis: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    radius_mm: float
+    radius_sigma_mm: float
+    blur_mm: float
+    stray_share: float
+    place_mm: NDArray[np.float64]
+
+    @property
+    def particles(self) -> int:
+        """How many there are in the ring."""
+        return len(self.place_mm)
+
+    def distance_mm(self, place_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how far (n,) behind the wall, from the axis, places (n, 3) lie; negative inside."""
+        angle, radius = _polar(place_mm)
+        return np.asarray(radius - self.wall_mm(angle, place_mm[:, 0]), dtype=np.float64)
+
+    def wall_mm(self, angle: NDArray[np.float64], along_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the wall's distance (n,) from the frame's axis at angles and places along it."""
+        return _wall(self.radius_mm, self.axis, angle, along_mm)
+
+
+def find_round_wall(
+    place_mm: NDArray[np.float64],
+    sigma_mm: NDArray[np.float64],
+    radius_mm: float,
+    searched_mm: float,
+    frames: int = 1,
+) -> RoundWallFit:
+    """Find the wall by maximum likelihood.
+
+    Parameters
+    ----------
+    place_mm, sigma_mm : (n, 3), (n,) particles in directions in which the wall is seen, and the standard errors of
+        their distances from the axis
+    radius_mm, searched_mm : of the wall, and up to where particles were looked for
+    frames : that the particles come from; they may be the same ones again, and say no more than those of one frame
+
+    Raises
+    ------
+    InputError
+        There are too few particles near the wall, or they do not end at one of this radius, or do not tell its place.
+    """
+    inner = RING_FROM * radius_mm
+    _, distance = _polar(place_mm)
+    ring = (distance > inner) & (distance < searched_mm)
+    place, sigma = place_mm[ring], sigma_mm[ring]
+    if len(place) < FEWEST_IN_RING:
+        raise InputError(
+            f"only {len(place)} particles were found in the outer half of the pipe's section, where its wall is in "
+            f"view; at least {FEWEST_IN_RING} are needed to see where they end"
+        )
+    span = float(np.sqrt(np.mean(place[:, 0] ** 2)))
+    least = LEAST_BLUR_SPACINGS * (radius_mm**2 - inner**2) / (2.0 * radius_mm * len(place))
+    likelihood = partial(
+        _log_likelihood_of_round_wall,
+        place=place,
+        sigma=np.hypot(sigma, least),
+        nominal=radius_mm,
+        searched=searched_mm,
+        span=span,
+    )
+    best = np.zeros(PARAMETERS)
+    best[STRAY] = -4.0
+    of_axis = list(range(OF_AXIS)) if span > LEAST_SPAN_SHARE * radius_mm else [0, 1]
+    free = [*of_axis, *range(OF_AXIS, PARAMETERS)]
+    best, covariance = most_likely(best, [*of_axis, RADIUS, STRAY], free, OF_AXIS + 1, BLURS_PER_RADIUS, likelihood)
+    covariance *= frames
+    unit = radius_mm * np.array([1.0, 1.0, 1.0 / span, 1.0 / span])
+    axis, radius, blur, stray = _unpacked_of_round_wall(best, radius_mm, span)
+    of_place = covariance[:OF_AXIS, :OF_AXIS] * np.outer(unit, unit)
+    if len(of_axis) < OF_AXIS:
+        of_place[[2, 3], [2, 3]] = UNKNOWN_TILT**2
+    found = RoundWallFit(
+        axis=axis,
+        covariance=of_place,
+        radius_mm=radius,
+        radius_sigma_mm=radius * float(np.sqrt(covariance[RADIUS, RADIUS])),
+        blur_mm=float(np.hypot(blur, least)),
+        stray_share=stray,
+        place_mm=place,
+    )
+    _ensure_wall(found, radius_mm, searched_mm)
+    return found
+
+
+def _ensure_wall(found: RoundWallFit, radius_mm: float, searched_mm: float) -> None:
+    """Raise where what was found is not the pipe's wall, or hardly found."""
+    seen = f"the particles end {found.radius_mm:.3f} mm from the pipe's axis"
+    if abs(found.radius_mm / radius_mm - 1.0) > WIDTH_TOLERANCE:
+        raise InputError(f"{seen}, and the wall's radius_mm is {radius_mm:g}; is all of the pipe seeded, and lit?")
+    shift, sigma = float(np.hypot(*found.axis[:2])), np.sqrt(np.diag(found.covariance))[:2]
+    if found.radius_mm + shift > searched_mm - LIMIT_BLURS * found.blur_mm:
+        raise InputError(
+            f"{seen}, which lies {shift:.3f} mm beside the scene's: further than this can mend; measure where the pipe "
+            "is, and put it into the scene"
+        )
+    if np.any(sigma > LARGEST_SIGMA_SHARE * radius_mm):
+        raise InputError(
+            f"{len(found.place_mm)} particles near the pipe's wall tell where its axis lies to {sigma[0]:.3f} mm "
+            f"across and {sigma[1]:.3f} mm in depth, not to {LARGEST_SIGMA_SHARE * radius_mm:g} mm: more of the wall "
+            "has to be in view, and seeded"
+        )
+
+
+def _polar(place_mm: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the angles from across towards away (n,) of places (n, 3), and their distances from the axis (n,)."""
+    return np.arctan2(place_mm[:, 2], place_mm[:, 1]), np.hypot(place_mm[:, 1], place_mm[:, 2])
+
+
+def _wall(
+    radius: float, axis: NDArray[np.float64], angle: NDArray[np.float64], along: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the wall's distance (n,) from the frame's axis."""
+    across, away = axis[0] + axis[2] * along, axis[1] + axis[3] * along
+    return np.asarray(radius + across * np.cos(angle) + away * np.sin(angle), dtype=np.float64)
+
+
+def _unpacked_of_round_wall(
+    packed: NDArray[np.float64], nominal: float, span: float
+) -> tuple[NDArray[np.float64], float, float, float]:
+    """Return the axis (4,), the radius and the blur in mm, and the share of strays."""
+    axis = nominal * packed[:OF_AXIS] / np.array([1.0, 1.0, span, span])
+    blur, strays = nominal * float(np.exp(packed[BLUR])), float(expit(packed[STRAY]))
+    return axis, nominal * float(np.exp(packed[RADIUS])), blur, strays
+
+
+def _log_likelihood_of_round_wall(
+    packed: NDArray[np.float64],
+    place: NDArray[np.float64],
+    sigma: NDArray[np.float64],
+    nominal: float,
+    searched: float,
+    span: float,
+) -> NDArray[np.float64]:
+    """Return the logarithm (n,) of each particle's density along its direction from the axis."""
+    axis, radius, blur, stray = _unpacked_of_round_wall(packed, nominal, span)
+    angle, distance = _polar(place)
+    inner = RING_FROM * nominal
+    middle, half = 0.5 * (inner + nominal), 0.5 * (nominal - inner)
+    wall = _wall(radius, axis, angle, place[:, 0])
+    change = packed[EVEN] + packed[COSINE] * np.cos(angle) + packed[SINE] * np.sin(angle)
+    t, end = np.clip((distance - middle) / half, -1.0, 1.0), (wall - middle) / half
+    seeding = np.maximum(1.0 + change * t, LEAST_DENSITY)
+    # The integral of r (1 + change t) over the ring.
+    whole = half * (
+        middle * (end + 1.0) + 0.5 * (half + middle * change) * (end**2 - 1.0) + half * change * (end**3 + 1.0) / 3.0
+    )
+    inside = distance * seeding * ndtr((wall - distance) / np.hypot(sigma, blur)) / np.maximum(whole, LEAST_DENSITY)
+    density = (1.0 - stray) * inside + stray / (searched - inner)
+    # Few particles do not tell how blurred the edge is.
+    unlikely = 0.5 * ((packed[BLUR] - np.log(BLURS_PER_RADIUS[-1])) / BLUR_FACTOR) ** 2 / len(distance)
+    return np.asarray(np.log(density) - unlikely, dtype=np.float64)

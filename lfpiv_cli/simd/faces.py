@@ -1,6 +1,6 @@
 """Rays through planes, cylinders and spheres, written for the vector unit: as many rays at once as a register holds.
 
-`optics.face_tracing` has the same formulas for one ray, and says what they mean: how far a ray goes to a face, Snell's
+`optics.ray_bundles` has the same formulas for one ray, and says what they mean: how far a ray goes to a face, Snell's
 law, and how rays beside it are shifted to first order. Rays that miss do not end the work of the others: of what must
 be positive for a ray to get through, the smallest is kept as its margin.
 
@@ -17,19 +17,22 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numpy.typing import NDArray
 
-from lfpiv_cli.simd.formulas import (
+from lfpiv_cli.simd.vectors import (
+    DOUBLE_VECTOR,
     DOUBLES,
-    VECTOR,
     Lanes,
     at_least,
     at_most,
+    in_place_of,
+    index,
     lanes,
     load_lanes,
+    load_one,
+    pointers,
     root,
     store_lanes,
     where_above,
 )
-from lfpiv_cli.simd.vectors import in_place_of, index, load_one, pointers
 
 Doubles = NDArray[np.float64]
 # Numbers, or `Lanes` of them.
@@ -37,10 +40,6 @@ Three = tuple[Any, Any, Any]
 
 # What a point may lie in front of the face that it touches, and a path go backwards, by rounding.
 ROUNDING_MM = 1e-9
-# Rows of the table of `trace_lanes`: crossing of the lens, slopes there and depth; it leaves in their place where the
-# ray is at that depth, its margin, and how far behind the last face that is.
-TRACE_ROWS = 5
-PLACE_X, PLACE_Y, MARGIN, BEHIND = range(4)
 # Rows of the table of `aim_lanes`: point and crossing; the slopes of the best ray yet, by how much it misses the point
 # (infinite where none has been tried), the step from it to the next, and the share of this that is tried.
 AIM_ROWS = 11
@@ -93,7 +92,7 @@ def _start(slope_x: Any, slope_y: Any) -> Three:
 
 
 def _cross(face: FaceNumbers, point: Three, direction: Three, margin: Any) -> Crossing:
-    """Return what `surfaces.meet` and `face_tracing.refracted` say of a face."""
+    """Return what `surfaces.meet` and `ray_bundles.refracted` say of a face."""
     ahead = (face.vertex[2] - point[2]) / direction[2]
     start = _plus(point, ahead, direction)
     offset = _plus(start, -1.0, face.vertex)
@@ -114,7 +113,7 @@ def _cross(face: FaceNumbers, point: Three, direction: Three, margin: Any) -> Cr
 
 
 def _neighbour(face: FaceNumbers, met: Crossing, direction: Three, shift: Three, turn: Three) -> tuple[Three, Three]:
-    """Return what `face_tracing` says of the shift and the turn, to first order, of a ray beside another."""
+    """Return what `ray_bundles` says of the shift and the turn, to first order, of a ray beside another."""
     shift = _plus(shift, met.path, turn)
     shift = _plus(shift, -1.0 * _dot(met.normal, shift) / met.cosine, direction)
     tilt = _scaled(face.curvature, _across(face, shift))
@@ -140,10 +139,6 @@ class _PlainFaces:
             state = step(face, state)
         return state
 
-    def last(self) -> FaceNumbers:
-        """Return the face in front of the fluid."""
-        return self._all[-1]
-
 
 class _LaneFaces:
     """Faces met by many rays at once: code is generated that does what `_PlainFaces` does."""
@@ -154,7 +149,7 @@ class _LaneFaces:
     def each(self, state: Sequence[Any], step: Callable[[FaceNumbers, Sequence[Any]], Sequence[Any]]) -> Sequence[Any]:
         """Return what a step at each face, one after the other, makes of some numbers."""
         builder = self._builder
-        slots = [cgutils.alloca_once(builder, VECTOR) for _ in state]
+        slots = [cgutils.alloca_once(builder, DOUBLE_VECTOR) for _ in state]
         for slot, number in zip(slots, state, strict=True):
             builder.store(lanes(builder, number).value, slot)
         with cgutils.for_range(builder, self._count) as loop:
@@ -162,10 +157,6 @@ class _LaneFaces:
             for slot, number in zip(slots, here, strict=True):
                 builder.store(lanes(builder, number).value, slot)
         return [Lanes(builder, builder.load(slot)) for slot in slots]
-
-    def last(self) -> FaceNumbers:
-        """Return the face in front of the fluid."""
-        return self._face(self._builder.sub(self._count, index(1)))
 
     def _face(self, k: Any) -> FaceNumbers:
         vertices, normals, axes, curvatures, ratios = self._arrays
@@ -186,24 +177,6 @@ class _LaneFaces:
 
 
 Faces = _PlainFaces | _LaneFaces
-
-
-def _trace(faces: Faces, lens_z: Any, rows: Sequence[Any]) -> Sequence[Any]:
-    """Return the rows that `trace_lanes` leaves."""
-    lens_x, lens_y, slope_x, slope_y, depth = rows
-
-    def step(face: FaceNumbers, state: Sequence[Any]) -> Sequence[Any]:
-        met = _cross(face, _three(state, 0), _three(state, 3), state[6])
-        return *met.place, *met.behind, met.margin
-
-    state = faces.each((lens_x, lens_y, lens_z, *_start(slope_x, slope_y), 1.0), step)
-    path = (depth - state[2]) / state[5]
-    place = _plus(_three(state, 0), path, _three(state, 3))
-    face = faces.last()
-    offset = _plus(place, -1.0, face.vertex)
-    across = _across(face, offset)
-    behind = _dot(face.normal, offset) + 0.5 * face.curvature * _dot(across, across)
-    return place[0], place[1], at_most(state[6], path + ROUNDING_MM), behind
 
 
 def _aim(faces: Faces, lens_z: Any, rows: Sequence[Any]) -> Sequence[Any]:
@@ -244,56 +217,19 @@ def _three(state: Sequence[Any], first: int) -> Three:
     return state[first], state[first + 1], state[first + 2]
 
 
-def trace_lanes_reference(table: Doubles, lens_z: float, *faces: Doubles) -> None:
-    """Follow rays from the lens to a depth in the fluid: readable twin of `trace_lanes`.
-
-    Parameters
-    ----------
-    table : (TRACE_ROWS * DOUBLES,) see above
-    lens_z, faces : depth of the lens; vertices, normals and axes (m, 3), curvatures and ratios (m,)
-    """
-    _write_rows(_trace, TRACE_ROWS, PLACE_X, table, lens_z, faces)
-
-
 def aim_lanes_reference(table: Doubles, lens_z: float, *faces: Doubles) -> None:
     """Try rays from the lens to points in the fluid, and say what to try next: readable twin of `aim_lanes`.
 
     Parameters
     ----------
     table : (AIM_ROWS * DOUBLES,) see above
-    lens_z, faces : see `trace_lanes_reference`
+    lens_z, faces : depth of the lens; vertices, normals and axes (m, 3), curvatures and ratios (m,)
     """
-    _write_rows(_aim, AIM_ROWS, SLOPE_X, table, lens_z, faces)
-
-
-Formula = Callable[[Faces, Any, Sequence[Any]], Sequence[Any]]
-
-
-def _write_rows(
-    formula: Formula, rows: int, first: int, table: Doubles, lens_z: float, faces: Sequence[Doubles]
-) -> None:
-    """Write the rows that a formula gives for each ray, from the row `first` on."""
-    by_row, plain = table.reshape(rows, DOUBLES), _PlainFaces(faces)
-    # Rays that miss divide by 0, and say so by their margin.
+    by_row, plain = table.reshape(AIM_ROWS, DOUBLES), _PlainFaces(faces)
+    # Rays that miss divide by 0, and say so by how far they miss the point.
     with np.errstate(all="ignore"):
         for lane in range(DOUBLES):
-            found = formula(plain, lens_z, list(by_row[:, lane]))
-            by_row[first : first + len(found), lane] = found
-
-
-@in_place_of(trace_lanes_reference)
-def trace_lanes(
-    typing_context: Any,
-    table: Any,
-    lens_z: Any,
-    vertices: Any,
-    normals: Any,
-    axes: Any,
-    curvatures: Any,
-    ratios: Any,
-) -> Any:
-    """Follow rays from the lens to a depth in the fluid; see `trace_lanes_reference`."""
-    return types.void(table, types.float64, vertices, normals, axes, curvatures, ratios), _generate_trace
+            by_row[SLOPE_X:, lane] = _aim(plain, lens_z, list(by_row[:, lane]))
 
 
 @in_place_of(aim_lanes_reference)
@@ -308,25 +244,15 @@ def aim_lanes(
     ratios: Any,
 ) -> Any:
     """Try rays from the lens to points in the fluid, and say what to try next; see `aim_lanes_reference`."""
-    return types.void(table, types.float64, vertices, normals, axes, curvatures, ratios), _generate_aim
+    return types.void(table, types.float64, vertices, normals, axes, curvatures, ratios), _generate
 
 
-def _generate_trace(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Any) -> Any:
-    return _generate(context, builder, signature, arguments, _trace, TRACE_ROWS, PLACE_X)
-
-
-def _generate_aim(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Any) -> Any:
-    return _generate(context, builder, signature, arguments, _aim, AIM_ROWS, SLOPE_X)
-
-
-def _generate(
-    context: Any, builder: ir.IRBuilder, signature: Any, arguments: Any, formula: Formula, rows: int, first: int
-) -> Any:
+def _generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Any) -> Any:
     table, *arrays = pointers(context, builder, signature, arguments, (0, 2, 3, 4, 5, 6))
     ratios = context.make_array(signature.args[6])(context, builder, arguments[6])
     (count,) = cgutils.unpack_tuple(builder, ratios.shape, 1)
-    known = [load_lanes(builder, table, index(row * DOUBLES)) for row in range(rows)]
-    found = formula(_LaneFaces(builder, arrays, count), lanes(builder, arguments[1]), known)
-    for row, numbers in enumerate(found, start=first):
+    known = [load_lanes(builder, table, index(row * DOUBLES)) for row in range(AIM_ROWS)]
+    found = _aim(_LaneFaces(builder, arrays, count), lanes(builder, arguments[1]), known)
+    for row, numbers in enumerate(found, start=SLOPE_X):
         store_lanes(builder, lanes(builder, numbers), table, index(row * DOUBLES))
     return context.get_dummy_value()

@@ -15,7 +15,7 @@ from numba.core import cgutils, types
 from numba.core.types.containers import UniTuple
 from numpy.typing import NDArray
 
-from lfpiv_cli.simd.formulas import (
+from lfpiv_cli.simd.vectors import (
     DOUBLES,
     Lanes,
     any_above,
@@ -24,16 +24,20 @@ from lfpiv_cli.simd.formulas import (
     counted_from,
     gather,
     groups_of_lanes,
+    in_place_of,
+    index,
+    integers,
     integers_in_lanes,
     lanes,
     load_lanes,
+    load_one,
+    pointers,
     root,
     store_count,
     store_lanes,
     where_above,
     whole_part,
 )
-from lfpiv_cli.simd.vectors import in_place_of, index, integers, load_one, pointers
 
 Doubles = NDArray[np.float64]
 

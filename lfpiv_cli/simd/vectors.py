@@ -9,6 +9,7 @@ and beside it how much faster it is than that twin compiled as a plain loop (`py
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -119,3 +120,191 @@ def store(builder: ir.IRBuilder, vector: Any, array: Any, place: Any) -> None:
 def add_product(builder: ir.IRBuilder, slot: Any, a: Any, b: Any) -> None:
     """Add a product to a sum, rounding once."""
     builder.store(call(builder, "fma", a, b, builder.load(slot)), slot)
+
+
+# Formulas for the vector unit, written as for plain numbers; `Lanes` in place of these generate code for many at
+# once.
+#
+# A formula is a function of numbers by Python's operators and the functions below. A readable twin calls it with one
+# number after the other, its intrinsic once with as many float64 numbers as a register holds. Products and sums may
+# be fused.
+
+
+# A register holds half as many float64 numbers as float32.
+DOUBLES = LANES // 2
+DOUBLE_VECTOR = ir.VectorType(ir.DoubleType(), DOUBLES)
+PIXELS = ir.VectorType(ir.IntType(32), DOUBLES)
+INTEGERS = ir.VectorType(ir.IntType(64), DOUBLES)
+FUSED = ("contract",)
+
+
+class Lanes:
+    """As many float64 numbers as a register holds, at work on which code is generated."""
+
+    def __init__(self, builder: ir.IRBuilder, value: Any) -> None:
+        self.builder = builder
+        self.value = value
+
+    def _with(self, operation: str, a: Any, b: Any) -> Lanes:
+        a, b = (lanes(self.builder, number).value for number in (a, b))
+        return Lanes(self.builder, getattr(self.builder, operation)(a, b, flags=FUSED))
+
+    def __add__(self, other: Lanes | float) -> Lanes:
+        return self._with("fadd", self, other)
+
+    def __radd__(self, other: float) -> Lanes:
+        return self._with("fadd", other, self)
+
+    def __sub__(self, other: Lanes | float) -> Lanes:
+        return self._with("fsub", self, other)
+
+    def __rsub__(self, other: float) -> Lanes:
+        return self._with("fsub", other, self)
+
+    def __mul__(self, other: Lanes | float) -> Lanes:
+        return self._with("fmul", self, other)
+
+    def __rmul__(self, other: float) -> Lanes:
+        return self._with("fmul", other, self)
+
+    def __truediv__(self, other: Lanes | float) -> Lanes:
+        return self._with("fdiv", self, other)
+
+    def __rtruediv__(self, other: float) -> Lanes:
+        return self._with("fdiv", other, self)
+
+    def called(self, name: str, *others: Lanes | float) -> Lanes:
+        """Return what one of LLVM's functions of whole vectors gives."""
+        kind = ir.FunctionType(DOUBLE_VECTOR, [DOUBLE_VECTOR] * (1 + len(others)))
+        function = cgutils.get_or_insert_function(self.builder.module, kind, f"llvm.{name}.v{DOUBLES}f64")
+        values = [lanes(self.builder, number).value for number in (self, *others)]
+        return Lanes(self.builder, self.builder.call(function, values))
+
+
+def at_least(number: Any, least: float) -> Any:
+    """Return a number, or `least` where it is smaller or no number."""
+    return number.called("maxnum", least) if isinstance(number, Lanes) else max(least, number)
+
+
+def at_most(number: Any, most: float) -> Any:
+    """Return a number, or `most` where it is larger."""
+    return number.called("minnum", most) if isinstance(number, Lanes) else min(most, number)
+
+
+def root(number: Any) -> Any:
+    """Return a number's square root."""
+    return number.called("sqrt") if isinstance(number, Lanes) else math.sqrt(number)
+
+
+def where_above(number: Any, limit: Any, kept: Any, other: Any) -> Any:
+    """Return one number where another is above a limit, and a third elsewhere."""
+    if not isinstance(number, Lanes):
+        return kept if number > limit else other
+    builder = number.builder
+    limit, kept, other = (lanes(builder, one).value for one in (limit, kept, other))
+    return Lanes(builder, builder.select(builder.fcmp_ordered(">", number.value, limit), kept, other))
+
+
+def lanes(builder: ir.IRBuilder, number: Any) -> Lanes:
+    """Return a number, known when the code is generated or when it runs, in every lane."""
+    if isinstance(number, Lanes):
+        return number
+    if isinstance(number, float | int):
+        return Lanes(builder, ir.Constant(DOUBLE_VECTOR, [float(number)] * DOUBLES))
+    undefined = ir.Constant(DOUBLE_VECTOR, ir.Undefined)
+    one = builder.insert_element(undefined, number, ir.Constant(ir.IntType(32), 0))
+    order = ir.Constant(ir.VectorType(ir.IntType(32), DOUBLES), [0] * DOUBLES)
+    return Lanes(builder, builder.shuffle_vector(one, undefined, order))
+
+
+def counted_from(builder: ir.IRBuilder, first: Any) -> Lanes:
+    """Return first, first + 1 and so on."""
+    return lanes(builder, builder.sitofp(first, ir.DoubleType())) + Lanes(
+        builder, ir.Constant(DOUBLE_VECTOR, [float(lane) for lane in range(DOUBLES)])
+    )
+
+
+def load_lanes(builder: ir.IRBuilder, array: Any, place: Any) -> Lanes:
+    """Return neighbouring elements of an array."""
+    loaded = builder.load(builder.bitcast(builder.gep(array, [place]), DOUBLE_VECTOR.as_pointer()))
+    loaded.align = 8
+    return Lanes(builder, loaded)
+
+
+def store_lanes(builder: ir.IRBuilder, numbers: Lanes, array: Any, place: Any) -> None:
+    """Write neighbouring elements of an array."""
+    pointer = builder.bitcast(builder.gep(array, [place]), DOUBLE_VECTOR.as_pointer())
+    builder.store(numbers.value, pointer).align = 8
+
+
+def store_count(builder: ir.IRBuilder, first: Any, array: Any, place: Any) -> None:
+    """Write first, first + 1 and so on to neighbouring elements of an array of int32."""
+    narrow = ir.IntType(32)
+    undefined = ir.Constant(PIXELS, ir.Undefined)
+    one = builder.insert_element(undefined, builder.trunc(first, narrow), ir.Constant(narrow, 0))
+    order = ir.Constant(ir.VectorType(narrow, DOUBLES), [0] * DOUBLES)
+    numbers = builder.add(builder.shuffle_vector(one, undefined, order), ir.Constant(PIXELS, list(range(DOUBLES))))
+    pointer = builder.bitcast(builder.gep(array, [place]), PIXELS.as_pointer())
+    builder.store(numbers, pointer).align = 4
+
+
+def groups_of_lanes(builder: ir.IRBuilder, count: Any) -> Any:
+    """Return the loop over as many registers as hold `count` numbers."""
+    return cgutils.for_range(builder, builder.sdiv(builder.add(count, index(DOUBLES - 1)), index(DOUBLES)))
+
+
+def whole_part(numbers: Lanes) -> tuple[Lanes, Any]:
+    """Return numbers from 0 on without their fractions, and as integers."""
+    builder = numbers.builder
+    whole = builder.fptosi(numbers.value, INTEGERS)
+    return Lanes(builder, builder.sitofp(whole, DOUBLE_VECTOR)), whole
+
+
+def integers_in_lanes(builder: ir.IRBuilder, number: Any) -> Any:
+    """Return an integer in every lane."""
+    undefined = ir.Constant(INTEGERS, ir.Undefined)
+    one = builder.insert_element(undefined, number, ir.Constant(ir.IntType(32), 0))
+    order = ir.Constant(ir.VectorType(ir.IntType(32), DOUBLES), [0] * DOUBLES)
+    return builder.shuffle_vector(one, undefined, order)
+
+
+def gather(builder: ir.IRBuilder, array: Any, places: Any, count: int) -> list[Lanes]:
+    """Return the first, the second and so on of `count` neighbouring elements of an array from some places on.
+
+    Read are whole registers, beyond the last element too.
+    """
+    found: list[Lanes] = []
+    for begin in range(0, count, DOUBLES):
+        lines = []
+        for lane in range(DOUBLES):
+            place = builder.extract_element(places, ir.Constant(ir.IntType(32), lane))
+            lines.append(load_lanes(builder, array, builder.add(place, index(begin))).value)
+        found += [Lanes(builder, value) for value in _transposed(builder, lines)]
+    return found[:count]
+
+
+def _transposed(builder: ir.IRBuilder, lines: Sequence[Any]) -> Sequence[Any]:
+    """Return the columns of a square of numbers, a register for each of its lines."""
+    step = 1
+    while step < DOUBLES:
+        swapped = list(lines)
+        for one in range(DOUBLES):
+            if one & step:
+                continue
+            # Columns that have the step in their number change places with the lines that have.
+            pair, other = (lines[one], lines[one + step]), one + step
+            kept = [DOUBLES + k - step if k & step else k for k in range(DOUBLES)]
+            rest = [DOUBLES + k if k & step else k + step for k in range(DOUBLES)]
+            for line, order in ((one, kept), (other, rest)):
+                kind = ir.VectorType(ir.IntType(32), DOUBLES)
+                swapped[line] = builder.shuffle_vector(*pair, ir.Constant(kind, order))
+        lines, step = swapped, 2 * step
+    return lines
+
+
+def any_above(numbers: Lanes, limit: Lanes) -> Any:
+    """Return whether a number in any lane is above a limit."""
+    builder = numbers.builder
+    above = builder.fcmp_ordered(">", numbers.value, limit.value)
+    bits = builder.bitcast(above, ir.IntType(DOUBLES))
+    return builder.icmp_unsigned("!=", bits, ir.Constant(ir.IntType(DOUBLES), 0))

@@ -17,8 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from lfpiv_cli.optics.camera import Camera, KernelCamera, Objective
 from lfpiv_cli.optics.curved_space import CurvedSpace
-from lfpiv_cli.optics.face_tracing import aim
-from lfpiv_cli.optics.ray_bundles import aim_all
+from lfpiv_cli.optics.ray_bundles import aim, aim_all
 from lfpiv_cli.optics.surfaces import Faces
 from lfpiv_cli.optics.tracing import struck_pixel
 from lfpiv_cli.synthetic.objective import trace_real_ray

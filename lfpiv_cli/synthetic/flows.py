@@ -14,8 +14,19 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lfpiv_cli.synthetic.known_flow import MM_PER_M, ORIGIN, Axis, Flow, KnownFlow, axis_index, dynamic_pressure
-from lfpiv_cli.synthetic.vortices import abc, source, taylor_green, vortex_ring
+from lfpiv_cli.synthetic.vortices import (
+    MM_PER_M,
+    ORIGIN,
+    Axis,
+    Flow,
+    KnownFlow,
+    abc,
+    axis_index,
+    dynamic_pressure,
+    source,
+    taylor_green,
+    vortex_ring,
+)
 
 # The terms of the duct's series fall as n^-3 exp(-n pi (1/2 - |z|/D)): 40 odd ones leave 1e-6 of the peak at the wall
 # itself and nothing a window's width away from it.

@@ -19,12 +19,10 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtr
 
 from lfpiv_cli.errors import ConfigError
-from lfpiv_cli.optics.camera import Camera, KernelCamera, Objective
+from lfpiv_cli.optics.camera import Camera, KernelCamera, Objective, nearest_point
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.media import Layers
-from lfpiv_cli.optics.microlenses import nearest_point
-from lfpiv_cli.optics.object_space import ObjectSpace, slope_polynomial, slope_ratio
-from lfpiv_cli.optics.tracing import struck_pixel
+from lfpiv_cli.optics.tracing import ObjectSpace, slope_polynomial, slope_ratio, struck_pixel
 from lfpiv_cli.optics.waves import DIFFUSION_REACH
 from lfpiv_cli.synthetic.curved_rays import fit_of_slopes, trace_curved
 from lfpiv_cli.synthetic.objective import passes_barrel, trace_real_ray

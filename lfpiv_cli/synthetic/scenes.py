@@ -11,19 +11,21 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.errors import ConfigError
-from lfpiv_cli.flow.masks import RoundWall, Walls
+from lfpiv_cli.flow.windows import RoundWall, Walls
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.optics.waves import Waves
 from lfpiv_cli.synthetic.board import BoardPlacement, dot_centres, render_board
-from lfpiv_cli.synthetic.flows import STEADY, Flow, Pulsation, advect
+from lfpiv_cli.synthetic.flows import STEADY, Pulsation, advect
 from lfpiv_cli.synthetic.objective import passed_light
-from lfpiv_cli.synthetic.render import RAYS, Balls, ObjectSpace, Space
+from lfpiv_cli.synthetic.render import RAYS, Balls, Space
 from lfpiv_cli.synthetic.sensor import Readout
+from lfpiv_cli.synthetic.vortices import MM_PER_M, Flow
 from lfpiv_cli.synthetic.wave_images import render_balls, white_image
 
 Triple = tuple[float, float, float]
@@ -60,17 +62,20 @@ class Box:
     high_mm: Triple
 
     @classmethod
+    def of(cls, low_mm: ArrayLike, high_mm: ArrayLike) -> Box:
+        """Return the box between two corners (3,)."""
+        (a, b, c), (d, e, f) = np.asarray(low_mm, np.float64).tolist(), np.asarray(high_mm, np.float64).tolist()
+        return cls((a, b, c), (d, e, f))
+
+    @classmethod
     def around(cls, volume: Grid, margin_mm: Triple) -> Box:
         """Return the volume's box with a margin on both sides of each axis: tracers beyond it light its pixels too."""
-        bounds = [volume.bounds_mm(axis) for axis in range(3)]
-        low = [b[0] - m for b, m in zip(bounds, margin_mm, strict=True)]
-        high = [b[1] + m for b, m in zip(bounds, margin_mm, strict=True)]
-        return cls((low[0], low[1], low[2]), (high[0], high[1], high[2]))
+        low, high = np.transpose([volume.bounds_mm(axis) for axis in range(3)])
+        return cls.of(low, high).wider(margin_mm)
 
     def wider(self, margin_mm: Triple) -> Box:
         """Return the box with a margin on both sides of each axis."""
-        low, high = np.subtract(self.low_mm, margin_mm), np.add(self.high_mm, margin_mm)
-        return Box((low[0], low[1], low[2]), (high[0], high[1], high[2]))
+        return Box.of(np.subtract(self.low_mm, margin_mm), np.add(self.high_mm, margin_mm))
 
     @property
     def volume_mm3(self) -> float:
@@ -94,7 +99,7 @@ class Box:
         high = np.minimum(self.high_mm, other.high_mm)
         if np.any(low >= high):
             raise ConfigError(f"the tracers' box {self} and {other}, of the channel or volume, have no part in common")
-        return Box((low[0], low[1], low[2]), (high[0], high[1], high[2]))
+        return Box.of(low, high)
 
 
 @dataclass(frozen=True)
@@ -255,7 +260,7 @@ def channel_walls(width_mm: float, mid_plane_z_mm: float, axis: str = "x") -> Bo
     across = 1 if axis == "x" else 0
     low, high = [-np.inf, -np.inf, mid_plane_z_mm - half], [np.inf, np.inf, mid_plane_z_mm + half]
     low[across], high[across] = -half, half
-    return Box((low[0], low[1], low[2]), (high[0], high[1], high[2]))
+    return Box.of(low, high)
 
 
 def pipe_bounds(pipe: RoundWall) -> Box:
@@ -263,7 +268,7 @@ def pipe_bounds(pipe: RoundWall) -> Box:
     reach = np.full(3, np.inf if pipe.tilt_deg > 0.0 else pipe.radius_mm)
     reach[pipe.along] = np.inf
     low, high = pipe.centre_mm - reach, pipe.centre_mm + reach
-    return Box((low[0], low[1], low[2]), (high[0], high[1], high[2]))
+    return Box.of(low, high)
 
 
 def simulate_white(camera: RecordingCamera, level: float, rng: np.random.Generator) -> SimulatedStill:
@@ -349,3 +354,36 @@ def camera_truth(camera: Camera) -> dict[str, Any]:
         "lattice_basis_mm": camera.lattice.basis.tolist(),
         "layout": camera.lattice.layout,
     }
+
+
+# Where tracers are seeded, so that images of a volume hold all the light that real ones would.
+#
+# Axes: (x, y, z) in mm, z away from the camera from the nominal focal point.
+
+# Points along each side of the volume at which the flow is asked for its speed: smooth flows change less than this
+# resolves, and the faster tracer that it misses is one at the rim of a sequence's first or last frame.
+SPEED_POINTS = 21
+
+
+def seeded_boxes(volume: Grid, reach_mm: float, flow: Flow, carried_s: float, walls: Box | None) -> tuple[Box, Box]:
+    """Return the box to seed, and the part of the measured volume that holds tracers.
+
+    Parameters
+    ----------
+    volume : that is measured
+    reach_mm : how far beside the volume a tracer still lights its pixels
+    flow, carried_s : tracers are carried by it for this long before and after the time of the seeding; those that come
+        into the volume so, or leave it, are seeded too
+    walls : between which there are tracers; None: everywhere
+    """
+    inside = Box.around(volume, (0.0, 0.0, 0.0))
+    carried = carried_s * largest_speed_mm_s(flow, inside)
+    box = inside.wider((reach_mm + carried[0], reach_mm + carried[1], carried[2]))
+    return (box, inside) if walls is None else (box.within(walls), inside.within(walls))
+
+
+def largest_speed_mm_s(flow: Flow, box: Box) -> NDArray[np.float64]:
+    """Return the largest speed along each axis (3,) on a lattice of points of a box."""
+    sides = [np.linspace(low, high, SPEED_POINTS) for low, high in zip(box.low_mm, box.high_mm, strict=True)]
+    points = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, 3)
+    return np.asarray(MM_PER_M * np.abs(flow(points)).max(axis=0))

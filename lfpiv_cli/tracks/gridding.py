@@ -16,6 +16,7 @@ Axes: points (n, 3) and displacements in mm, at the middle of each track.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,119 @@ from scipy.special import chdtr, gammaincinv
 
 from lfpiv_cli.robust import MAD_TO_SIGMA
 from lfpiv_cli.tracks.kriging import kriged, structure_of
-from lfpiv_cli.tracks.local_fits import SMALLEST_SIGMA_SHARE, LocalFits, fit_around
+
+Floats = NDArray[np.float64]
+
+# Robust polynomials through the tracks around many places at once.
+#
+# Each component is fitted for itself. A fit is linear in the displacements once outliers are weighed down, so that
+# its noise, and that of the difference of two fits, follow from the tracks' stated errors.
+#
+# Axes: m places, k tracks around each, nearest first; points and displacements in mm.
+
+
+# The furthest track of a fit still counts for a quarter: a Gaussian whose deviation is this share of the radius.
+KERNEL_WIDTH = 0.6
+# First rounds that no outlier can mislead (Cauchy's weights never vanish), then Tukey's biweight, which drops outliers.
+CAUCHY_ROUNDS, TUKEY_ROUNDS = 3, 5
+TUKEY = 4.685
+# The biweight takes its weighted mean square from the middle of a normal distribution: this share of the variance.
+TUKEY_VARIANCE = 0.827
+# A share of the mean of the diagonal that keeps the equations of tracks in one plane solvable.
+RIDGE = 1e-10
+# No particle is known better than this share of the distance of those around it; guards against a standard error of
+# zero, and a fit that leaves nothing.
+SMALLEST_SIGMA_SHARE = 1e-6
+SMALLEST_SPREAD = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class LocalFits:
+    """Polynomials of one degree through the k nearest tracks of m places.
+
+    Attributes
+    ----------
+    value : (m, 3) at the places, mm
+    weights : (m, 3, k) what a stated standard error of each track adds to the value, mm
+    scatter2 : (m, 3) mean square of the tracks' residuals over that of their stated errors
+    radius_mm : (m,) distance of the furthest track
+    """
+
+    value: Floats
+    weights: Floats
+    scatter2: Floats
+    radius_mm: Floats
+
+
+def fit_around(offset_mm: Floats, values: Floats, sigma: Floats, degree: int) -> LocalFits:
+    """Fit polynomials of degree 1 or 2.
+
+    Parameters
+    ----------
+    offset_mm : (m, k, 3) from a place to its tracks, nearest first
+    values, sigma : (m, k, 3) their displacements and stated standard errors, mm
+    """
+    distance = np.linalg.norm(offset_mm, axis=2)
+    radius = np.where(distance[:, -1:] > 0.0, distance[:, -1:], 1.0)
+    terms = _terms(offset_mm / radius[..., np.newaxis], degree)
+    kernel = np.exp(-0.5 * (distance / (KERNEL_WIDTH * radius)) ** 2)
+    each = [
+        _fit_component(terms, values[..., axis], np.maximum(sigma[..., axis], SMALLEST_SIGMA_SHARE * radius), kernel)
+        for axis in range(3)
+    ]
+    value, weights, scatter2 = (np.stack(parts, axis=1) for parts in zip(*each, strict=True))
+    return LocalFits(value, weights, scatter2, radius[:, 0])
+
+
+def _terms(offset: Floats, degree: int) -> Floats:
+    """Return the monomials up to a degree of one or two, last axis, the constant first."""
+    x, y, z = np.moveaxis(offset, -1, 0)
+    terms = [np.ones_like(x), x, y, z]
+    if degree == 2:
+        terms += [x * x, y * y, z * z, x * y, x * z, y * z]
+    return np.stack(terms, axis=-1)
+
+
+def _fit_component(terms: Floats, values: Floats, sigma: Floats, kernel: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return value (m,), weights (m, k) and scatter2 (m,) of one component, whose arrays are (m, k)."""
+    robust = np.ones_like(values)
+    for number in range(CAUCHY_ROUNDS + TUKEY_ROUNDS):
+        weighted, matrix = _equations(terms, kernel * robust / sigma**2)
+        coefficients = np.linalg.solve(matrix, weighted @ values[..., np.newaxis])
+        off = np.abs(values - (terms @ coefficients)[..., 0]) / sigma
+        spread = np.maximum(MAD_TO_SIGMA * np.median(off, axis=1, keepdims=True), SMALLEST_SPREAD)
+        if number < CAUCHY_ROUNDS:
+            robust = 1.0 / (1.0 + (off / spread) ** 2)
+        else:
+            robust = np.clip(1.0 - (off / (TUKEY * spread)) ** 2, 0.0, None) ** 2
+    weighted, matrix = _equations(terms, kernel * robust / sigma**2)
+    inverse = np.linalg.inv(matrix)
+    left = TUKEY_VARIANCE * _left_by_fit(terms @ inverse, weighted, sigma)
+    expected = np.maximum(np.sum(kernel * robust * left, axis=1), SMALLEST_SPREAD)
+    scatter2 = np.asarray(np.sum(kernel * robust * off**2, axis=1) / expected)
+    weights = np.asarray((inverse[:, :1] @ weighted)[:, 0] * sigma)
+    return np.asarray(coefficients[:, 0, 0]), weights, scatter2
+
+
+def _equations(terms: Floats, weight: Floats) -> tuple[Floats, Floats]:
+    """Return the weighted terms (m, p, k) and the matrix (m, p, p) of the normal equations."""
+    weighted = (terms * weight[..., np.newaxis]).swapaxes(1, 2)
+    matrix = weighted @ terms
+    diagonal = np.arange(matrix.shape[1])
+    matrix[:, diagonal, diagonal] += RIDGE * np.trace(matrix, axis1=1, axis2=2)[:, np.newaxis] / len(diagonal)
+    return weighted, matrix
+
+
+def _left_by_fit(solved: Floats, weighted: Floats, sigma: Floats) -> Floats:
+    """Return the share (m, k) of each track's variance that a fit leaves in its residual, fit = solved @ weighted @ v.
+
+    The kernel lets the tracks next to a place draw the polynomial to them, where their number alone says little.
+    """
+    own = np.einsum("mkp,mpk->mk", solved, weighted)
+    noise = (weighted * sigma[:, np.newaxis] ** 2) @ weighted.swapaxes(1, 2)
+    from_all = np.einsum("mkp,mkp->mk", solved @ noise, solved) / sigma**2
+    return np.asarray(1.0 - 2.0 * own + from_all)
+
 
 # Degrees and numbers of tracks to choose from: three to ten tracks for each of ten unknowns, five to fifteen for each
 # of four. The first one, whose noise and what it misses are both moderate, is what the others are compared with.
@@ -53,8 +166,7 @@ FEWEST_OF_STRUCTURE = 100
 NODES_AT_ONCE = 2000
 
 
-@dataclass(frozen=True, eq=False)
-class Candidates:
+class Choices(NamedTuple):
     """What c fits say at m nodes.
 
     Attributes
@@ -66,20 +178,16 @@ class Candidates:
     scatter2 : (m, 3) how large the tracks' variances are over the stated ones
     """
 
-    value: NDArray[np.float64]
-    variance: NDArray[np.float64]
-    difference_variance: NDArray[np.float64]
-    radius_mm: NDArray[np.float64]
-    scatter2: NDArray[np.float64]
+    value: Floats
+    variance: Floats
+    difference_variance: Floats
+    radius_mm: Floats
+    scatter2: Floats
 
 
 def on_grid(
-    middle_mm: NDArray[np.float64],
-    displacement_mm: NDArray[np.float64],
-    sigma_mm: NDArray[np.float64],
-    nodes_mm: NDArray[np.float64],
-    reach_mm: float,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    middle_mm: Floats, displacement_mm: Floats, sigma_mm: Floats, nodes_mm: Floats, reach_mm: float
+) -> tuple[Floats, Floats]:
     """Return displacements (m, 3) at nodes and their standard errors (m, 3), mm; NaN where too few tracks are near.
 
     Parameters
@@ -109,16 +217,15 @@ def on_grid(
         near = tree.query(nodes, k=np.arange(1, max(count for _, count in choices) + 1))[1]
         offset = middle_mm[near] - nodes[:, np.newaxis]
         parts.append(_candidates(offset, displacement_mm[near], sigma_mm[near], choices))
-    value[reached], error[reached] = _best(_joined(parts), nodes_mm[reached], choices)
+    *arrays, scatter2 = zip(*parts, strict=True)
+    found = Choices(*[*(np.concatenate(each, axis=1) for each in arrays), np.concatenate(scatter2)])
+    value[reached], error[reached] = _best(found, nodes_mm[reached], choices)
     return value, error
 
 
 def _by_kriging(
-    middle_mm: NDArray[np.float64],
-    displacement_mm: NDArray[np.float64],
-    sigma_mm: NDArray[np.float64],
-    nodes_mm: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    middle_mm: Floats, displacement_mm: Floats, sigma_mm: Floats, nodes_mm: Floats
+) -> tuple[Floats, Floats] | None:
     """Return displacements and standard errors (m, 3) at nodes; None in a smooth flow."""
     if len(middle_mm) < FEWEST_OF_STRUCTURE:
         return None
@@ -147,15 +254,10 @@ def _by_kriging(
     return value, np.maximum(factor, here) * np.sqrt(variance)
 
 
-def _candidates(
-    offset_mm: NDArray[np.float64],
-    values: NDArray[np.float64],
-    sigma: NDArray[np.float64],
-    choices: list[tuple[int, int]],
-) -> Candidates:
+def _candidates(offset_mm: Floats, values: Floats, sigma: Floats, choices: list[tuple[int, int]]) -> Choices:
     """Return what the choices say at nodes whose nearest tracks (m, k, 3) are given."""
     fits = [fit_around(offset_mm[:, :k], values[:, :k], sigma[:, :k], degree) for degree, k in choices]
-    return Candidates(
+    return Choices(
         value=np.stack([fit.value for fit in fits]),
         variance=np.stack([np.sum(fit.weights**2, axis=2) for fit in fits]),
         difference_variance=np.stack([_difference_variance(fit, fits[REFERENCE]) for fit in fits]),
@@ -164,7 +266,7 @@ def _candidates(
     )
 
 
-def _difference_variance(fit: LocalFits, reference: LocalFits) -> NDArray[np.float64]:
+def _difference_variance(fit: LocalFits, reference: LocalFits) -> Floats:
     """Return the variance (m, 3) of the difference of two fits, which share their nearest tracks."""
     common = min(fit.weights.shape[2], reference.weights.shape[2])
     difference = fit.weights[..., :common] - reference.weights[..., :common]
@@ -172,18 +274,7 @@ def _difference_variance(fit: LocalFits, reference: LocalFits) -> NDArray[np.flo
     return np.asarray(np.sum(difference**2, axis=2) + rest[0] + rest[1])
 
 
-def _joined(parts: list[Candidates]) -> Candidates:
-    """Return the candidates of all nodes."""
-    value, variance, difference_variance, radius = (
-        np.concatenate([getattr(part, name) for part in parts], axis=1)
-        for name in ("value", "variance", "difference_variance", "radius_mm")
-    )
-    return Candidates(value, variance, difference_variance, radius, np.concatenate([part.scatter2 for part in parts]))
-
-
-def _best(
-    found: Candidates, nodes_mm: NDArray[np.float64], choices: list[tuple[int, int]]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _best(found: Choices, nodes_mm: Floats, choices: list[tuple[int, int]]) -> tuple[Floats, Floats]:
     """Return each node's value with the smallest error, component by component, and that error, (m, 3)."""
     together = KDTree(nodes_mm).query(nodes_mm, k=np.arange(1, min(NODES_TOGETHER, len(nodes_mm)) + 1))[1]
     scatter2 = np.median(found.scatter2[together], axis=1)
@@ -198,9 +289,7 @@ def _best(
     return value, np.sqrt(smallest)
 
 
-def _missed2(
-    found: Candidates, scatter2: NDArray[np.float64], together: NDArray[np.int64], choices: list[tuple[int, int]]
-) -> NDArray[np.float64]:
+def _missed2(found: Choices, scatter2: Floats, together: NDArray[np.int64], choices: list[tuple[int, int]]) -> Floats:
     """Return the mean square (c, m, 3) of what each fit misses of the flow around a node."""
     excess = np.stack(
         [
@@ -215,9 +304,7 @@ def _missed2(
     return np.where(is_parabola, of_parabolas, of_parabolas[REFERENCE] + excess)
 
 
-def _excess(
-    difference: NDArray[np.float64], noise2: NDArray[np.float64], together: NDArray[np.int64]
-) -> NDArray[np.float64]:
+def _excess(difference: Floats, noise2: Floats, together: NDArray[np.int64]) -> Floats:
     """Return by how much the mean square of differences (m, 3), over nodes that go together, exceeds their noise."""
     dropped = int(TRIMMED * together.shape[1])
     kept = np.sort((difference**2)[together], axis=1)[:, : together.shape[1] - dropped].mean(axis=1)

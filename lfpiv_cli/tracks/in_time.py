@@ -10,23 +10,207 @@ Axes: places (n, m, 3) in mm of n tracks in m frames, NaN where a track has none
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from math import factorial
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
 from lfpiv_cli.robust import MAD_TO_SIGMA
+from lfpiv_cli.tracks.candidates import NO_TRACK, Seen, Trajectories
+
+# Material acceleration: the second derivative of trajectories at one time, with its covariance.
+#
+# A parabola through several places is wrong by what the fourth derivative makes of it, a quartic has four times a
+# parabola's noise. How large third and fourth derivatives are is a property of the flow and is taken from all tracks;
+# each track's are drawn to zero as far as derivatives of that size are what noise makes. What is left out is alike
+# among neighbours, noise is not: a fit to many tracks lessens noise alone, so that derivatives are drawn to zero less
+# than would be best for one track.
+#
+# Axes: places (n, m, 3) in mm of n tracks in m frames, NaN where a track has none; times in frames.
+
+
+Floats = NDArray[np.float64]
+
+# 1, t, t^2/2, t^3/6, t^4/24; the first three are whatever the places say.
+QUARTIC, FREE_OF_QUARTIC = 5, 3
+SECOND = 2
+# Frames on either side of a time: over seven places a quartic has a fourth of the noise that it has over five.
+HALF_FRAMES = 3
+# Tracks of which the most are looked at for what all have in common.
+MOST_TRACKS = 10000
+# Tracks of a fit to many whose errors of noise are averaged, while those of neglected derivatives are not.
+AVERAGED_TRACKS = 30.0
+# No derivative is known to be smaller than so many mm per frame^3 or frame^4, squared; it keeps equations finite.
+SMALLEST_OF_QUARTIC = 1e-16
+
+
+@dataclass(frozen=True, eq=False)
+class HighDerivatives:
+    """What all tracks have in common, by component.
+
+    Attributes
+    ----------
+    noise : (3,) how large errors of places are over the stated ones
+    variance : (2, 3) of the third and fourth derivatives, mm^2 per frame^6 and frame^8
+    """
+
+    noise: Floats
+    variance: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Tracks at one time.
+
+    Attributes
+    ----------
+    position_mm, velocity, acceleration : (n, 3), mm, mm per frame and mm per frame^2
+    covariance : (n, 3, 3) of the acceleration
+    neglected : (n, 3) what fourth derivatives of the size that tracks have make of the acceleration; neighbours are
+        wrong alike
+    """
+
+    position_mm: Floats
+    velocity: Floats
+    acceleration: Floats
+    covariance: Floats
+    neglected: Floats
+
+
+def motions_at(
+    found: Trajectories, frames: Sequence[Seen], frame: int, derivatives: HighDerivatives
+) -> tuple[NDArray[np.int64], Motion]:
+    """Return the tracks that have a place in a frame and two more in the window about it, and their motion there."""
+    numbers = found.labels[frame]
+    numbers = np.unique(numbers[numbers != NO_TRACK])
+    window = _window(frame, len(frames))
+    position, covariance = places_with_covariances(found, frames, window, numbers)
+    enough = np.isfinite(position[..., 0]).sum(axis=1) >= FREE_OF_QUARTIC
+    time = np.array(window, dtype=np.float64) - frame
+    return numbers[enough], motion_of(position[enough], covariance[enough], time, derivatives)
+
+
+def _window(frame: int, frames: int) -> list[int]:
+    return [k for k in range(frame - HALF_FRAMES, frame + HALF_FRAMES + 1) if 0 <= k < frames]
+
+
+def high_derivatives_in(found: Trajectories, frames: Sequence[Seen]) -> HighDerivatives | None:
+    """Return what the tracks of a sequence have in common; None where too few are long enough to tell."""
+    width = min(2 * HALF_FRAMES + 1, len(frames))
+    # Their middles, of windows that do not overlap.
+    middles = range(width // 2, len(frames) - (width - 1) // 2, width)
+    windows = [_window(frame, len(frames)) for frame in middles]
+    share = MOST_TRACKS // len(windows)
+    told: list[tuple[Floats, Floats, Floats]] = []
+    for window in windows:
+        numbers = found.labels[window[0]]
+        numbers = np.unique(numbers[numbers != NO_TRACK])
+        for frame in window[1:]:
+            numbers = np.intersect1d(numbers, found.labels[frame])
+        position, covariance = places_with_covariances(
+            found, frames, window, numbers[:: max(1, len(numbers) // max(share, 1))]
+        )
+        told.append((position, covariance, np.array(window, dtype=np.float64) - window[len(window) // 2]))
+    position, covariance = (np.concatenate([each[k] for each in told]) for k in range(2))
+    known = np.isfinite(position).all(axis=(1, 2))
+    return high_derivatives_of(position[known], covariance[known], told[0][2])
+
+
+def places_with_covariances(
+    found: Trajectories, frames: Sequence[Seen], window: Sequence[int], tracks: NDArray[np.int64]
+) -> tuple[Floats, Floats]:
+    """Return places (n, m, 3) of tracks in the frames of a window, and their covariances (n, m, 3, 3).
+
+    They are NaN where a track has none, or none whose errors are known; the covariances are 1 there.
+    """
+    position = np.full((len(tracks), len(window), 3), np.nan)
+    covariance = np.broadcast_to(np.eye(3), (len(tracks), len(window), 3, 3)).copy()
+    for column, frame in enumerate(window):
+        place = found.particles(frame, tracks)
+        stated = frames[frame].covariances()[place]
+        there = (place >= 0) & (np.linalg.eigvalsh(stated)[:, 0] > 0.0)
+        position[there, column] = frames[frame].position_mm[place[there]]
+        covariance[there, column] = stated[there]
+    return position, covariance
+
+
+def motion_of(position_mm: Floats, covariance_mm2: Floats, time: Floats, derivatives: HighDerivatives) -> Motion:
+    """Return place, velocity and acceleration at time 0 of tracks with three places at least.
+
+    Parameters
+    ----------
+    position_mm, covariance_mm2 : (n, m, 3) and (n, m, 3, 3), as stated
+    time : (m,) of the frames
+    """
+    stated = covariance_mm2 * np.outer(derivatives.noise, derivatives.noise)
+    solution, covariance = _quartic(position_mm, stated, time, AVERAGED_TRACKS * derivatives.variance)
+    fourth = np.where(
+        np.isfinite(position_mm), _terms(time, QUARTIC)[:, -1:] * np.sqrt(derivatives.variance[-1]), np.nan
+    )
+    neglected = _quartic(fourth, stated, time, AVERAGED_TRACKS * derivatives.variance)[0][:, SECOND]
+    return Motion(solution[:, 0], solution[:, 1], solution[:, SECOND], covariance[:, SECOND, :, SECOND], neglected)
+
+
+def high_derivatives_of(position_mm: Floats, covariance_mm2: Floats, time: Floats) -> HighDerivatives | None:
+    """Return noise and higher derivatives of tracks that have all places; None where these are too few to tell.
+
+    Scatter beyond the fits' own errors is the derivatives'; that of the residuals shows the noise.
+    """
+    if len(position_mm) < FEWEST_TRACKS or len(time) < QUARTIC:
+        return None
+    solution, covariance = _quartic(position_mm, covariance_mm2, time, np.full((QUARTIC - FREE_OF_QUARTIC, 3), np.inf))
+    noise2, freedom = np.ones(3), len(time) - QUARTIC
+    if freedom:
+        left = position_mm - np.einsum("mi,nia->nma", _terms(time, QUARTIC), solution)
+        stated = np.diagonal(covariance_mm2, axis1=-2, axis2=-1)
+        # The median of chi-squared.
+        noise2 = np.median(np.sum(left**2 / stated, axis=1), axis=0) / (2.0 * gammaincinv(0.5 * freedom, 0.5))
+    variance = np.empty((QUARTIC - FREE_OF_QUARTIC, 3))
+    for row, term in enumerate(range(FREE_OF_QUARTIC, QUARTIC)):
+        of_noise = noise2 * np.diagonal(covariance[:, term, :, term], axis1=-2, axis2=-1)
+        spread = MAD_TO_SIGMA * np.median(np.abs(solution[:, term]) / np.sqrt(of_noise), axis=0)
+        unseen = SPREAD_ERROR / np.sqrt(len(solution)) * spread**2
+        variance[row] = (np.maximum(spread**2 - 1.0, 0.0) + unseen) * np.median(of_noise, axis=0)
+    return HighDerivatives(np.sqrt(noise2), variance)
+
+
+def _quartic(position_mm: Floats, covariance_mm2: Floats, time: Floats, variance: Floats) -> tuple[Floats, Floats]:
+    """Return the derivatives (n, 5, 3) at time 0, and their covariances (n, 5, 3, 5, 3).
+
+    `variance` : (2, 3) that is expected of the third and fourth ones
+    """
+    terms, known = _terms(time, QUARTIC), np.isfinite(position_mm[..., 0])
+    weight = known[..., np.newaxis, np.newaxis] * np.linalg.inv(covariance_mm2)
+    matrix = np.einsum("nmab,mi,mj->niajb", weight, terms, terms, optimize=True)
+    for row, term in enumerate(range(FREE_OF_QUARTIC, QUARTIC)):
+        for axis in range(3):
+            matrix[:, term, axis, term, axis] += 1.0 / max(variance[row, axis], SMALLEST_OF_QUARTIC)
+    size = 3 * QUARTIC
+    covariance = _inverse(matrix.reshape(-1, size, size))
+    weighted = np.einsum("nmab,nmb->nma", weight, np.where(known[..., np.newaxis], position_mm, 0.0))
+    right = np.einsum("mi,nma->nia", terms, weighted).reshape(-1, size)
+    solution = np.einsum("nij,nj->ni", covariance, right)
+    return solution.reshape(-1, QUARTIC, 3), covariance.reshape(-1, QUARTIC, 3, QUARTIC, 3)
+
+
+def _inverse(matrices: Floats) -> Floats:
+    """Return the inverses of positive definite matrices (n, k, k), with ones on the diagonals in between."""
+    scale = 1.0 / np.sqrt(np.diagonal(matrices, axis1=-2, axis2=-1))
+    both = scale[:, :, np.newaxis] * scale[:, np.newaxis]
+    return np.asarray(np.linalg.inv(matrices * both) * both)
+
 
 # 1, t, t^2/2, t^3/6, of which the first two are whatever the places say. A parabola has three unknowns, a cubic four;
 # with one place more its residual shows the noise.
-TERMS, FREE_TERMS, PARABOLA = 4, 2, 3
+CUBIC, FREE_OF_CUBIC, PARABOLA = 4, 2, 3
 # Fewer tracks than this show neither noise nor bending.
 FEWEST_TRACKS = 30
 # No derivative is known to be smaller than this, squared, mm^2 per frame^4 or frame^6: a nanometre; it keeps the
 # equations finite.
-SMALLEST_VARIANCE = 1e-12
+SMALLEST_OF_CUBIC = 1e-12
 # The standard error of the square of a spread by its median, times the root of the number. Third derivatives that do
 # not show by twice as much are none: to allow for them makes velocities three times as uncertain.
 SPREAD_ERROR, SHOWN = 2.33, 2.0
@@ -42,10 +226,10 @@ class State:
     position_sigma, velocity_sigma : (n, 3) standard errors
     """
 
-    position_mm: NDArray[np.float64]
-    velocity: NDArray[np.float64]
-    position_sigma: NDArray[np.float64]
-    velocity_sigma: NDArray[np.float64]
+    position_mm: Floats
+    velocity: Floats
+    position_sigma: Floats
+    velocity_sigma: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,9 +244,9 @@ class Scatter:
     noise_known, bending_known : whether tracks are enough to tell them, or else errors as stated and straight tracks
     """
 
-    noise: NDArray[np.float64]
-    bending: NDArray[np.float64]
-    twisting: NDArray[np.float64]
+    noise: Floats
+    bending: Floats
+    twisting: Floats
     noise_known: bool = False
     bending_known: bool = False
 
@@ -72,9 +256,7 @@ class Scatter:
         return cls(np.ones(3), np.zeros(3), np.zeros(3))
 
 
-def fit_in_time(
-    position_mm: NDArray[np.float64], sigma_mm: NDArray[np.float64], time: NDArray[np.float64], scatter: Scatter
-) -> State:
+def fit_in_time(position_mm: Floats, sigma_mm: Floats, time: Floats, scatter: Scatter) -> State:
     """Return the state at time 0 of tracks with two places at least.
 
     Parameters
@@ -85,25 +267,23 @@ def fit_in_time(
     expected = np.stack([scatter.bending, scatter.twisting])
     # Residuals smaller than stated show that errors of neighbouring frames are alike, not that they are smaller.
     noise = np.maximum(scatter.noise, 1.0)
-    solution, covariance = _polynomial(position_mm, sigma_mm * noise, time, expected)
+    solution, covariance = _cubic(position_mm, sigma_mm * noise, time, expected)
     error = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
     return State(solution[..., 0], solution[..., 1], error[..., 0], error[..., 1])
 
 
-def scatter_of(position_mm: NDArray[np.float64], sigma_mm: NDArray[np.float64], time: NDArray[np.float64]) -> Scatter:
+def scatter_of(position_mm: Floats, sigma_mm: Floats, time: Floats) -> Scatter:
     """Return noise and bending of tracks; the unknown ones where too few tracks are long enough."""
     return scatter_of_pieces([(position_mm, sigma_mm)], time)
 
 
-def scatter_of_pieces(
-    pieces: Iterable[tuple[NDArray[np.float64], NDArray[np.float64]]], time: NDArray[np.float64]
-) -> Scatter:
+def scatter_of_pieces(pieces: Iterable[tuple[Floats, Floats]], time: Floats) -> Scatter:
     """Return noise and bending as `scatter_of` does, of tracks that come in pieces: of each but little is kept.
 
     Third derivatives are told by tracks of five places or more; where these are too few they are taken for those of
     circles with the velocities and the bendings that there are.
     """
-    told = [_bends_of(position, sigma, time - np.mean(time)) for position, sigma in pieces]
+    told = [_derivatives_of(position, sigma, time - np.mean(time)) for position, sigma in pieces]
     misfit = np.concatenate([each.misfit for each in told])
     second, third = (np.concatenate([getattr(each, name) for each in told]) for name in ("second", "third"))
     velocity = np.concatenate([each.velocity for each in told])
@@ -111,7 +291,7 @@ def scatter_of_pieces(
     del told
     if len(second) < FEWEST_TRACKS:
         return Scatter.unknown()
-    noise2: NDArray[np.float64] = np.ones(3)
+    noise2: Floats = np.ones(3)
     noise_known = len(misfit) >= FEWEST_TRACKS
     if noise_known:
         noise2 = np.median(misfit, axis=0)
@@ -126,7 +306,7 @@ def scatter_of_pieces(
 
 
 @dataclass(frozen=True, eq=False)
-class _Bends:
+class _Derivatives:
     """What tracks tell of noise and bending.
 
     Attributes
@@ -137,13 +317,13 @@ class _Bends:
     third : (j, 2, 3) third derivatives of the tracks with five places or more, and their variances
     """
 
-    misfit: NDArray[np.float64]
-    velocity: NDArray[np.float64]
-    second: NDArray[np.float64]
-    third: NDArray[np.float64]
+    misfit: Floats
+    velocity: Floats
+    second: Floats
+    third: Floats
 
 
-def _variance(derivatives: NDArray[np.float64], noise2: NDArray[np.float64], shown: float = 0.0) -> NDArray[np.float64]:
+def _variance(derivatives: Floats, noise2: Floats, shown: float = 0.0) -> Floats:
     """Return the variance (3,) of derivatives (n, 2, 3), given with their errors' variances, beyond these errors.
 
     Where it does not differ from none by so many standard errors as are to be `shown`, it is 0.
@@ -155,16 +335,16 @@ def _variance(derivatives: NDArray[np.float64], noise2: NDArray[np.float64], sho
     return np.asarray(np.maximum(more, 0.0) * np.median(of_noise, axis=0))
 
 
-def _bends_of(position_mm: NDArray[np.float64], sigma_mm: NDArray[np.float64], time: NDArray[np.float64]) -> _Bends:
+def _derivatives_of(position_mm: Floats, sigma_mm: Floats, time: Floats) -> _Derivatives:
     """Return what the tracks tell that are long enough: by cubics where these leave a residual, else by parabolas."""
     count = np.isfinite(position_mm[..., 0]).sum(axis=1)
     misfit, velocity, second, third = [], [], [], []
-    for which, terms in ((count > TERMS, TERMS), ((count >= PARABOLA) & (count <= TERMS), PARABOLA)):
+    for which, terms in ((count > CUBIC, CUBIC), ((count >= PARABOLA) & (count <= CUBIC), PARABOLA)):
         position, sigma, freedom = position_mm[which], sigma_mm[which], count[which] - terms
-        free = np.full((TERMS - FREE_TERMS, 3), np.inf)
-        free[terms - FREE_TERMS :] = 0.0
-        solution, covariance = _polynomial(position, sigma, time, free)
-        left = position - np.einsum("mi,nai->nma", _terms(time), solution)
+        free = np.full((CUBIC - FREE_OF_CUBIC, 3), np.inf)
+        free[terms - FREE_OF_CUBIC :] = 0.0
+        solution, covariance = _cubic(position, sigma, time, free)
+        left = position - np.einsum("mi,nai->nma", _terms(time, CUBIC), solution)
         squares = np.nansum((left / sigma) ** 2, axis=1)[freedom > 0]
         # The median of chi-squared.
         misfit.append(squares / (2.0 * gammaincinv(0.5 * freedom[freedom > 0], 0.5))[:, np.newaxis])
@@ -172,28 +352,29 @@ def _bends_of(position_mm: NDArray[np.float64], sigma_mm: NDArray[np.float64], t
         parts = [np.stack([solution[..., k], covariance[..., k, k]], axis=1) for k in (2, 3)]
         second.append(parts[0])
         third.append(parts[1][:0] if terms == PARABOLA else parts[1])
-    return _Bends(*(np.concatenate(each) for each in (misfit, velocity, second, third)))
+    return _Derivatives(*(np.concatenate(each) for each in (misfit, velocity, second, third)))
 
 
-def _terms(time: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.stack([np.ones_like(time), time, time**2 / 2.0, time**3 / 6.0], axis=1)
+def _terms(time: Floats, count: int) -> Floats:
+    """Return 1, t, t^2/2, t^3/6 ..., (m, count)."""
+    return np.stack([time**power / factorial(power) for power in range(count)], axis=1)
 
 
-def _polynomial(
-    position_mm: NDArray[np.float64],
-    sigma_mm: NDArray[np.float64],
-    time: NDArray[np.float64],
-    expected: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _cubic(
+    position_mm: Floats,
+    sigma_mm: Floats,
+    time: Floats,
+    expected: Floats,
+) -> tuple[Floats, Floats]:
     """Return the derivatives (n, 3, 4) of each component at time 0, and their covariances (n, 3, 4, 4).
 
     `expected` : (2, 3) variances of the second and third derivatives
     """
-    terms, known = _terms(time), np.isfinite(position_mm)
+    terms, known = _terms(time, CUBIC), np.isfinite(position_mm)
     weight = np.where(known, np.where(known, sigma_mm, 1.0) ** -2.0, 0.0)
     matrix = np.einsum("nma,mi,mj->naij", weight, terms, terms)
-    for row, term in enumerate(range(FREE_TERMS, TERMS)):
-        matrix[..., term, term] += 1.0 / np.maximum(expected[row], SMALLEST_VARIANCE)
+    for row, term in enumerate(range(FREE_OF_CUBIC, CUBIC)):
+        matrix[..., term, term] += 1.0 / np.maximum(expected[row], SMALLEST_OF_CUBIC)
     covariance = np.linalg.inv(matrix)
     right = np.einsum("nma,mi,nma->nai", weight, terms, np.where(known, position_mm, 0.0))
     return np.einsum("naij,naj->nai", covariance, right), covariance

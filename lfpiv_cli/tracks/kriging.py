@@ -20,6 +20,8 @@ from scipy.spatial import KDTree
 from lfpiv_cli.robust import MAD_TO_SIGMA
 from lfpiv_cli.threads import blocks, in_threads
 
+Floats = NDArray[np.float64]
+
 # Neighbours whose differences show the structure function, and that let expect a displacement.
 PAIRED, USED = 12, 16
 # Distances are sorted into so many groups at most, of so many pairs at least.
@@ -45,18 +47,16 @@ class Structure(NamedTuple):
     exponent : common to all
     """
 
-    nugget: NDArray[np.float64]
-    factor: NDArray[np.float64]
+    nugget: Floats
+    factor: Floats
     exponent: float
 
-    def at(self, distance_mm: float) -> NDArray[np.float64]:
+    def at(self, distance_mm: float) -> Floats:
         """Return the mean square difference (3,) that the flow makes over a distance, without what is left at none."""
         return np.asarray(self.factor * distance_mm**self.exponent)
 
 
-def structure_of(
-    points: NDArray[np.float64], displacement: NDArray[np.float64], noise2: NDArray[np.float64]
-) -> Structure:
+def structure_of(points: Floats, displacement: Floats, noise2: Floats) -> Structure:
     """Return the structure function of displacements (n, 3), two at least, whose variances are `noise2` (n, 3)."""
     count = min(PAIRED, len(points) - 1)
     distance, near = KDTree(points).query(points, k=np.arange(2, count + 2))
@@ -76,9 +76,7 @@ def structure_of(
     return Structure(nugget, factor, float(exponent))
 
 
-def _fitted(
-    apart: NDArray[np.float64], square: NDArray[np.float64], exponent: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+def _fitted(apart: Floats, square: Floats, exponent: float) -> tuple[Floats, Floats, float]:
     """Return nugget, factor (3,) and misfit of the structure function with an exponent, by relative errors."""
     terms = np.stack([np.ones_like(apart), apart**exponent], axis=1)
     found = [nnls(terms / values[:, np.newaxis], np.ones(len(values))) for values in square.T]
@@ -87,13 +85,8 @@ def _fitted(
 
 
 def kriged(
-    at: NDArray[np.float64],
-    own: NDArray[np.int64],
-    points: NDArray[np.float64],
-    displacement: NDArray[np.float64],
-    noise2: NDArray[np.float64],
-    structure: Structure,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    at: Floats, own: NDArray[np.int64], points: Floats, displacement: Floats, noise2: Floats, structure: Structure
+) -> tuple[Floats, Floats]:
     """Return the displacements (m, 3) that neighbours let expect, and the variance (m, 3) of what they miss.
 
     Parameters
@@ -108,14 +101,14 @@ def kriged(
 
     def work(part: slice) -> None:
         near = tree.query(at[part], k=np.arange(1, count + 2))[1]
-        near = _without(near, own[part])
+        near = without_own(near, own[part])
         value[part], variance[part] = _solved(at[part], near, points, displacement, noise2, structure)
 
     in_threads(work, blocks(len(at), PLACES_AT_ONCE))
     return value, variance
 
 
-def _without(near: NDArray[np.int64], own: NDArray[np.int64]) -> NDArray[np.int64]:
+def without_own(near: NDArray[np.int64], own: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return all but one of the numbers of each row: its own, or else the last."""
     is_own = near == own[:, np.newaxis]
     drop = np.where(is_own.any(axis=1), is_own.argmax(axis=1), near.shape[1] - 1)
@@ -124,13 +117,8 @@ def _without(near: NDArray[np.int64], own: NDArray[np.int64]) -> NDArray[np.int6
 
 
 def _solved(
-    at: NDArray[np.float64],
-    near: NDArray[np.int64],
-    points: NDArray[np.float64],
-    displacement: NDArray[np.float64],
-    noise2: NDArray[np.float64],
-    structure: Structure,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    at: Floats, near: NDArray[np.int64], points: Floats, displacement: Floats, noise2: Floats, structure: Structure
+) -> tuple[Floats, Floats]:
     """Return values and variances by the equations of universal kriging, whose neighbours (m, k) are given."""
     count = near.shape[1]
     offset = points[near] - at[:, np.newaxis]

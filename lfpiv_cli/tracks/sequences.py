@@ -17,19 +17,10 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.robust import MAD_TO_SIGMA
 from lfpiv_cli.scale import Scale
-from lfpiv_cli.tracks.candidates import Seen
+from lfpiv_cli.tracks.candidates import NO_PARTICLE, NO_TRACK, Frames, Seen, Trajectories, long_ones, places, tracks_in
 from lfpiv_cli.tracks.in_time import FEWEST_TRACKS, Scatter, State, fit_in_time, scatter_of, scatter_of_pieces
 from lfpiv_cli.tracks.kriging import kriged, structure_of
 from lfpiv_cli.tracks.tracking import NO_TRACKS, Forecast, Tracks, known_of, link_some, track
-from lfpiv_cli.tracks.trajectories import (
-    NO_PARTICLE,
-    NO_TRACK,
-    Frames,
-    Trajectories,
-    long_ones,
-    places,
-    tracks_in,
-)
 
 # A forecast takes a track's last four places: enough for a parabola and to see its noise.
 PAST_FRAMES = 4
@@ -313,3 +304,39 @@ def _bridges(
     known = known_of(frames[start], frames[end], through, later[through], scale)
     free = found.labels[end] == NO_TRACK
     return link_some((frames[start], lost), (frames[end], free), known, search_mm, scale, forecast)
+
+
+# Where particles should be in a frame by their tracks before and after it.
+#
+# Once a sequence has been followed, a frame is known from both sides: a particle that it has lost lies between two
+# places of its track, and one whose track begins or ends beside it lies on the way on. As a Kalman smoother does
+# after its filter, what comes later now counts as what came before.
+#
+# Axes: places (n, 3) in mm of each frame.
+
+
+# Frames on either side that are looked at: a cubic has a place or more to spare.
+REACH_FRAMES = 3
+
+
+def expected_in(found: Trajectories, frames: Frames, number: int) -> Ahead:
+    """Return where the particles should be whose tracks have a place in a frame or in one beside it.
+
+    A track's own place in the frame counts as its others do. Of `frames` only those within `REACH_FRAMES` are read.
+    """
+    window = [k for k in range(number - REACH_FRAMES, number + REACH_FRAMES + 1) if 0 <= k < len(found.labels)]
+    tracks = tracks_in(found, [k for k in window if abs(k - number) <= 1])
+    position, sigma = places(found, frames, window, tracks)
+    known = np.isfinite(position[..., 0])
+    told = known.sum(axis=1) > 1
+    tracks, position, sigma, known = tracks[told], position[told], sigma[told], known[told]
+    time = np.array(window, dtype=np.float64) - number
+    state = fit_in_time(position, sigma, time, scatter_of(position, sigma, time))
+    light = np.full(known.shape, np.nan)
+    for column, frame in enumerate(window):
+        there = known[:, column]
+        light[there, column] = np.log(frames[frame].light_value()[found.particles(frame, tracks)[there]])
+    usual = np.nanmedian(light, axis=1) if len(tracks) else np.zeros(0)
+    off = np.abs(light - usual[:, np.newaxis])[known]
+    spread = MAD_TO_SIGMA * float(np.median(off)) if off.size else 0.0
+    return Ahead(state.position_mm, state.position_sigma, np.exp(usual), spread)

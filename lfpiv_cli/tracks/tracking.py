@@ -14,14 +14,132 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from lfpiv_cli.robust import MAD_TO_SIGMA
 from lfpiv_cli.scale import Scale
-from lfpiv_cli.tracks.association import marginals
+from lfpiv_cli.threads import share_out
 from lfpiv_cli.tracks.candidates import Candidates, Seen, candidates_of
 from lfpiv_cli.tracks.kriging import kriged, structure_of
-from lfpiv_cli.tracks.votes import votes
+
+Floats = NDArray[np.float64]
+
+# The first guess of links: neighbours vote for displacements that resemble their own.
+#
+# A displacement that takes a particle to one of the next frame takes many of its neighbours to others there, more or
+# less: how far neighbours' displacements differ is not known at first, so likenesses of several widths count
+# together.
+
+
+NEIGHBOURS = 14
+# Standard deviations of the differences between neighbours' displacements, laterally, in microlenses in the scene.
+WIDTHS_LENSES = (0.4, 0.8, 1.6)
+# Differences beyond so many of the widest one are none of a neighbour's.
+REACH = 3.0
+# The share of neighbours without a partner, or that move in ways of their own.
+ALONE = 0.1
+# Pairs whose light speaks against them more than this take no part.
+LEAST_LIGHT_RATIO = 0.02
+
+
+def votes(points: Floats, candidates: Candidates, density_per_mm3: float, scale: Scale, equal: Floats) -> Floats:
+    """Return the logarithm (c,) of how much more likely each pair is than chance; -inf where light excludes it.
+
+    Parameters
+    ----------
+    points : (n, 3) of the first frame
+    candidates : in the order of these
+    density_per_mm3 : of the particles of the second frame
+    equal : (3,) what distances are divided by, so that they are known equally well along all axes
+    """
+    taken = np.flatnonzero(candidates.light_ratio > LEAST_LIGHT_RATIO)
+    ratio = candidates.light_ratio[taken]
+    begin = np.searchsorted(candidates.first[taken], np.arange(len(points) + 1))
+    count = min(NEIGHBOURS + 1, len(points))
+    neighbours = KDTree(points).query(points, k=np.arange(1, count + 1))[1][:, 1:]
+    widths = np.array(WIDTHS_LENSES) * scale.lens_mm
+    heights = 1.0 / ((2.0 * np.pi) ** 1.5 * widths**3 * np.prod(equal) * len(widths) * density_per_mm3)
+    support = np.empty(len(taken))
+    share_out(
+        _support,
+        len(points),
+        begin,
+        candidates.displacement_mm[taken] / equal,
+        ratio,
+        np.ascontiguousarray(neighbours),
+        widths,
+        heights,
+        support,
+    )
+    score = np.full(len(candidates.first), -np.inf)
+    score[taken] = support + np.log(ratio)
+    return score
+
+
+@njit(cache=True, nogil=True)
+def _support(
+    part: tuple[int, int],
+    begin: NDArray[np.int64],
+    displacement: Floats,
+    ratio: Floats,
+    neighbours: NDArray[np.int64],
+    widths: Floats,
+    heights: Floats,
+    support: Floats,
+) -> None:
+    """Write the sum over a particle's neighbours of how well one of their pairs resembles each of its own."""
+    furthest2 = (REACH * widths[-1]) ** 2
+    for n in range(part[0], part[1]):
+        for c in range(begin[n], begin[n + 1]):
+            total = 0.0
+            for k in range(neighbours.shape[1]):
+                beside = neighbours[n, k]
+                alike = 0.0
+                for other in range(begin[beside], begin[beside + 1]):
+                    x = displacement[other, 0] - displacement[c, 0]
+                    y = displacement[other, 1] - displacement[c, 1]
+                    z = displacement[other, 2] - displacement[c, 2]
+                    off2 = x * x + y * y + z * z
+                    if off2 < furthest2:
+                        for w in range(widths.size):
+                            alike += ratio[other] * heights[w] * np.exp(-0.5 * off2 / (widths[w] * widths[w]))
+                total += np.log(ALONE + (1.0 - ALONE) * alike)
+            support[c] = total
+
+
+# The probability of each link where a particle has one partner at most: exclusive choices, by belief propagation.
+#
+# After Williams and Lau, *Approximate evaluation of marginal association probabilities with belief propagation*, IEEE
+# Trans. Aerosp. Electron. Syst. 50 (2014): messages between the particles of two frames along the pairs that are
+# possible, exact where these form no loops and near it where they do.
+
+
+# Messages settle in some ten rounds; a change of this size is none.
+MOST_ROUNDS = 200
+SETTLED = 1e-6
+
+
+def marginals(first: NDArray[np.int64], second: NDArray[np.int64], odds: Floats, sizes: tuple[int, int]) -> Floats:
+    """Return the probability of each pair (c,).
+
+    Parameters
+    ----------
+    first, second : (c,) numbers of the particles in the two frames
+    odds : (c,) of the pair being one against both having no partner
+    sizes : how many particles the frames have
+    """
+    back = np.ones(len(odds))
+    for _ in range(MOST_ROUNDS):
+        offered = odds * back
+        forth = odds / (1.0 + np.bincount(first, offered, sizes[0])[first] - offered)
+        earlier, back = back, 1.0 / (1.0 + np.bincount(second, forth, sizes[1])[second] - forth)
+        if not len(odds) or np.abs(back - earlier).max() < SETTLED:
+            break
+    offered = odds * back
+    return np.asarray(offered / (1.0 + np.bincount(first, offered, sizes[0])[first]))
+
 
 # Lengths are in the camera's own units: L, a microlens in the scene (Table 2: 0.1 mm), and D, the depth over which
 # light spreads by one lens (1.064 mm).
@@ -67,7 +185,7 @@ class Tracks:
 
     first: NDArray[np.int64]
     second: NDArray[np.int64]
-    probability: NDArray[np.float64]
+    probability: Floats
 
 
 NO_TRACKS = Tracks(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))
@@ -84,24 +202,24 @@ class Known:
     """
 
     number: NDArray[np.int64]
-    displacement_mm: NDArray[np.float64]
-    variance_mm2: NDArray[np.float64]
+    displacement_mm: Floats
+    variance_mm2: Floats
 
 
 @dataclass(frozen=True, eq=False)
 class Expected:
     """Displacements (n, 3) that are expected of particles, and the variances (n, 3) of what is missed, mm, mm^2."""
 
-    displacement_mm: NDArray[np.float64]
-    variance_mm2: NDArray[np.float64]
+    displacement_mm: Floats
+    variance_mm2: Floats
 
 
 @dataclass(frozen=True, eq=False)
 class Forecast:
     """Displacements (n, 3) that particles' own pasts let expect and their standard errors, mm; NaN without a past."""
 
-    displacement_mm: NDArray[np.float64]
-    sigma_mm: NDArray[np.float64]
+    displacement_mm: Floats
+    sigma_mm: Floats
 
 
 def track(first: Seen, second: Seen, search_mm: float, scale: Scale, forecast: Forecast | None = None) -> Tracks:
@@ -159,7 +277,7 @@ def known_of(
 
 
 def expected_of(
-    points: NDArray[np.float64], known: Known, search_mm: float, scale: Scale, forecast: Forecast | None = None
+    points: Floats, known: Known, search_mm: float, scale: Scale, forecast: Forecast | None = None
 ) -> Expected:
     """Return what the known displacements of the neighbours, and a particle's own past, let expect at points (n, 3).
 
@@ -191,7 +309,7 @@ def expected_of(
 
 def probability_of(
     candidates: Candidates, expected: Expected, first: Seen, second: Seen, share: float, density: float
-) -> NDArray[np.float64]:
+) -> Floats:
     """Return the probability (c,) that pairs are one particle.
 
     Parameters
@@ -199,8 +317,7 @@ def probability_of(
     share : of the particles that have a partner
     density : of the second frame's particles, per mm^3
     """
-    covariance = first.covariance()[candidates.first] + second.covariance()[candidates.second]
-    matrix = covariance[:, [0, 3, 5, 3, 1, 4, 5, 4, 2]].reshape(-1, 3, 3).copy()
+    matrix = first.covariances()[candidates.first] + second.covariances()[candidates.second]
     matrix[:, [0, 1, 2], [0, 1, 2]] += expected.variance_mm2[candidates.first]
     off = candidates.displacement_mm - expected.displacement_mm[candidates.first]
     near = np.flatnonzero(np.sum(off**2 / np.diagonal(matrix, axis1=1, axis2=2), axis=1) < FURTHEST_SIGMAS**2)
@@ -222,24 +339,24 @@ def density_per_mm3(first: Seen, second: Seen, search_mm: float) -> float:
     return len(second) / float(np.prod(np.maximum(np.ptp(both, axis=0), 2.0 * search_mm)))
 
 
-def wrong_link_variance(probability: NDArray[np.float64], scale: Scale) -> NDArray[np.float64]:
+def wrong_link_variance(probability: Floats, scale: Scale) -> Floats:
     """Return what is added to the variance (n, 3) of displacements, mm^2, for links being wrong by chance."""
     return (1.0 - probability)[:, np.newaxis] * _variance_of(WRONG_LENSES, scale)
 
 
-def of_equal_errors(scale: Scale) -> NDArray[np.float64]:
+def of_equal_errors(scale: Scale) -> Floats:
     """Return what distances (x, y, z) are divided by: as much more in depth as depths are known worse."""
     return np.array([1.0, 1.0, DEPTH_RATIO * scale.depth_ratio])
 
 
-def _variance_of(lenses: float, scale: Scale) -> NDArray[np.float64]:
+def _variance_of(lenses: float, scale: Scale) -> Floats:
     """Return the variances (3,) of errors of so many L laterally, mm^2, and as much more in depth."""
     return np.asarray((lenses * scale.lens_mm * of_equal_errors(scale)) ** 2)
 
 
 def _sought(
     first: Seen, second: Seen, search_mm: float, scale: Scale, forecast: Forecast | None
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Floats, Floats]:
     """Return around which displacement (n, 3) and how far along each axis (n,) partners are sought."""
     middle, reach = np.zeros(first.position_mm.shape), np.full(len(first), search_mm)
     if forecast is None:
@@ -253,7 +370,7 @@ def _sought(
     return middle, reach
 
 
-def _log_near(candidates: Candidates, search_mm: float, forecast: Forecast | None) -> NDArray[np.float64]:
+def _log_near(candidates: Candidates, search_mm: float, forecast: Forecast | None) -> Floats:
     """Return what is added to the votes (c,): short displacements, or those near a forecast, where nobody votes."""
     off = candidates.displacement_mm
     if forecast is not None:
@@ -261,7 +378,7 @@ def _log_near(candidates: Candidates, search_mm: float, forecast: Forecast | Non
     return np.asarray(-0.5 * np.sum((off / search_mm) ** 2, axis=1))
 
 
-def _exclusive(candidates: Candidates, score: NDArray[np.float64]) -> NDArray[np.int64]:
+def _exclusive(candidates: Candidates, score: Floats) -> NDArray[np.int64]:
     """Return each first particle's best pair, and of those that share a second one the best."""
     order = np.lexsort((-score, candidates.first))
     best = order[np.unique(candidates.first[order], return_index=True)[1]]

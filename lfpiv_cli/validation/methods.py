@@ -2,19 +2,110 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from itertools import cycle
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.flow.field import VectorField
-from lfpiv_cli.flow.masks import RoundWall
-from lfpiv_cli.synthetic.flows import Flow
-from lfpiv_cli.validation.channel import Duct, table_4, worst_slice
-from lfpiv_cli.validation.flow import flow_figures
-from lfpiv_cli.validation.pipe import pipe_figures
+from lfpiv_cli.flow.windows import RoundWall
+from lfpiv_cli.pictures.style import (
+    AXIS_NAMES,
+    BLACK,
+    COLOURS,
+    COMPONENT_NAMES,
+    GREY,
+    MARKERS,
+    new_figure,
+    styled,
+    symmetric_limit,
+)
+from lfpiv_cli.pictures.vectors import compared_figure, draw_maps, mean_of_known, plane_panels, signed_scale, speed_unit
+from lfpiv_cli.synthetic.vortices import Flow
+from lfpiv_cli.validation.flow import (
+    PAPER_SLICES,
+    TOLERANCE,
+    Duct,
+    compare,
+    cumulative_distribution,
+    flow_figures,
+    relative_errors,
+    table_4,
+    worst_slice,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+# Rings of nearly as many windows each, the outer ones thinner: beyond the last but one edge windows of a tenth of the
+# diameter reach beyond the wall.
+RING_EDGES = (0.0, 0.3, 0.5, 0.7, 0.8, 0.9, 1.0)
+# Figures of the inner pipe leave out the last ring.
+INNER = RING_EDGES[-2]
+
+
+def pipe_figures(
+    field: VectorField, truth_velocity: NDArray[np.float64], inside: NDArray[np.bool_], pipe: RoundWall
+) -> dict[str, Any]:
+    """Return the figures of windows by their distance from the axis, ready for JSON.
+
+    Returns
+    -------
+    dict
+        `within_25_percent_vector_inner`, the share of the windows up to 0.9 of the radius whose whole vector errs by
+        less than a quarter; `rings`, for each two edges (shares of the radius) their `vectors`, `streamwise_mean_error`
+        (sum v / sum u - 1) and `within_25_percent_vector`. None where there is no window.
+    """
+    pairs = compare(field, truth_velocity, inside)
+    share = (pipe.distances_mm(field.grid.centres_mm()) / pipe.radius_mm)[inside]
+    right = relative_errors(pairs)[1] < TOLERANCE
+    inner = share <= INNER
+    ring, rings = np.searchsorted(RING_EDGES[1:-1], share), []
+    for number, edges in enumerate(zip(RING_EDGES, RING_EDGES[1:], strict=False)):
+        chosen = ring == number
+        found = chosen & pairs.found
+        measured, true = (float(each[found, pipe.along].sum()) for each in (pairs.measured, pairs.true))
+        rings.append(
+            {
+                "radius_shares": list(edges),
+                "vectors": int(chosen.sum()),
+                "streamwise_mean_error": measured / true - 1.0 if true else None,
+                "within_25_percent_vector": _share(right[chosen]),
+            }
+        )
+    return {"within_25_percent_vector_inner": _share(right[inner]), "rings": rings}
+
+
+def _share(right: NDArray[np.bool_]) -> float | None:
+    """Return how many of some are right, None of none."""
+    return float(right.mean()) if right.size else None
+
+
+@styled
+def radius_figure(fields: Mapping[str, VectorField], pipe: RoundWall, mean_velocity_m_s: float) -> Figure:
+    """Return each component of vectors over their distance from the axis, beside Poiseuille's parabola."""
+    figure = new_figure(11.0, 4.0)
+    radius = np.linspace(0.0, pipe.radius_mm, 101)
+    for component, panel in enumerate(figure.subplots(1, 3)):
+        for (name, field), colour, marker in zip(fields.items(), cycle(COLOURS), cycle(MARKERS), strict=False):
+            distance = pipe.distances_mm(field.grid.centres_mm())
+            seen = np.isfinite(field.velocity[..., component]) & (distance < pipe.radius_mm)
+            panel.plot(
+                distance[seen], field.velocity[seen][:, component], marker, color=colour, markersize=2.0, label=name
+            )
+        axial = 2.0 * mean_velocity_m_s * (1.0 - (radius / pipe.radius_mm) ** 2)
+        panel.plot(radius, axial if component == pipe.along else 0.0 * radius, color=BLACK, label="true, analytic")
+        panel.axvline(INNER * pipe.radius_mm, color=GREY, linewidth=0.8)
+        panel.set(xlabel="distance from the axis (mm)", ylabel=f"{COMPONENT_NAMES[component]} (m/s)")
+    figure.axes[0].legend()
+    return figure
+
 
 # Figures that are compared, by how their error follows from them.
 ERROR_OF = {
@@ -89,3 +180,179 @@ def _lowest(errors: Mapping[str, float | None]) -> str | None:
     if len(known) < len(errors) or len(set(known.values())) < 2:
         return None
     return min(known, key=lambda name: known[name])
+
+
+# Pictures of a measured flow beside the true one, all components of it in three planes.
+#
+# What is compared has one scale. The truth is a line where the flow is analytic; of true particles only its values at
+# the windows are known, as fits to the nearest ones, and are drawn as such.
+
+# Profiles show at least this share of the largest true speed to both sides of zero: less is noise of no account.
+LEAST_RANGE = 0.02
+# Letters of a line above a panel.
+TITLE_WIDTH = 60
+# Points of the lines of an analytic flow.
+LINE_POINTS = 101
+
+
+def flow_figure(methods: Mapping[str, Measured]) -> Figure:
+    """Return the true vectors and those of each method, at least one, in three middle planes on one scale.
+
+    The fields have one grid; what is not judged is left out.
+    """
+    first = next(iter(methods.values()))
+    fields = {"true": first.truth} | {name: m.field.velocity for name, m in methods.items()}
+    factor, unit = speed_unit(_judged(first, first.truth))
+    rows = {name: factor * _judged(methods.get(name, first), values) for name, values in fields.items()}
+    return compared_figure(first.field.grid, rows, unit)
+
+
+def _judged(measured: Measured, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return vectors where they are judged, else NaN."""
+    return np.where(measured.inside[..., np.newaxis], values, np.nan)
+
+
+@styled
+def errors_figure(methods: Mapping[str, Measured]) -> Figure:
+    """Return measured less true velocities in three middle planes: rows of methods, on one scale a component."""
+    errors = {name: _judged(m, m.field.velocity - m.truth) for name, m in methods.items()}
+    factor, unit = speed_unit(*errors.values())
+    grid = next(iter(methods.values())).field.grid
+    figure, axes = plane_panels(grid, rows=3 * len(methods))
+    for component, rows in enumerate(axes.reshape(3, len(methods), 3)):
+        maps = {name: [factor * error[..., component]] * 3 for name, error in errors.items()}
+        scale = signed_scale(*maps.values())
+        for row, (name, values) in zip(rows, maps.items(), strict=True):
+            image = draw_maps(row, grid, values, [f"{name}: error of {COMPONENT_NAMES[component]}"] * 3, **scale)
+        label = f"{COMPONENT_NAMES[component]}, measured less true ({unit})"
+        figure.colorbar(image, ax=rows.ravel().tolist(), label=label)
+    return figure
+
+
+@styled
+def profiles_figure(methods: Mapping[str, Measured]) -> Figure:
+    """Return means of each component over the planes across each axis, and how many vectors err by how much.
+
+    Means are over the windows that all methods have found; the true ones over the same.
+    """
+    first = next(iter(methods.values()))
+    factor, unit = speed_unit(_judged(first, first.truth))
+    figure = new_figure(11.0, 11.0)
+    axes = figure.subplots(4, 3, sharey="row")
+    least = LEAST_RANGE * factor * symmetric_limit(_judged(first, first.truth))
+    for component, row in enumerate(axes[:3]):
+        for axis, panel in enumerate(row):
+            _draw_profile(panel, methods, axis, component, factor)
+            panel.set(
+                xlabel=f"{AXIS_NAMES[axis]} (mm)", ylabel=f"{COMPONENT_NAMES[component]} ({unit}), mean over the plane"
+            )
+        low, high = row[0].get_ylim()
+        row[0].set_ylim(min(low, -least), max(high, least))
+    shares = {name: cumulative_distribution(compare(m.field, m.truth, m.inside)) for name, m in methods.items()}
+    for panel, key, what in zip(
+        axes[3], ("streamwise_share", "vector_share"), ("along the mean flow", "of the whole vector"), strict=False
+    ):
+        for (name, found), colour in zip(shares.items(), cycle(COLOURS), strict=False):
+            if found[key] is not None:
+                panel.plot(found["relative_error"], found[key], color=colour, label=name)
+        panel.axvline(TOLERANCE, color=GREY, linewidth=0.8)
+        panel.set(xlabel=f"relative error {what}", ylabel="share of the vectors", xlim=(0.0, 1.0), ylim=(0.0, 1.01))
+    axes[3, 2].set_axis_off()
+    axes[3, 2].legend(*axes[0, 0].get_legend_handles_labels(), loc="center", title="in all pictures")
+    return figure
+
+
+def _draw_profile(axes: Axes, methods: Mapping[str, Measured], axis: int, component: int, factor: float) -> None:
+    """Draw the means over planes across an axis, over the windows that all methods have found."""
+    others = tuple(k for k in range(3) if k != 2 - axis)
+    first = next(iter(methods.values()))
+    grid = first.field.grid
+    judged = np.all([m.inside & np.isfinite(m.field.velocity).all(axis=-1) for m in methods.values()], axis=0)
+    axes.axhline(0.0, color=GREY, linewidth=0.8)
+    if first.flow is not None:
+        places = np.linspace(*grid.bounds_mm(axis), LINE_POINTS)
+        planes = _on_planes(first.flow, grid.centres_mm()[first.inside], places, axis)
+        axes.plot(places, factor * planes[..., component].mean(axis=1), color=BLACK, label="true, analytic")
+    curves = {"true, at the windows": first.truth} | {name: m.field.velocity for name, m in methods.items()}
+    styles = zip((BLACK, *COLOURS), ("+", *MARKERS), strict=True)
+    for (label, values), (colour, marker) in zip(curves.items(), styles, strict=False):
+        mean = mean_of_known(np.where(judged, values[..., component], np.nan), others)
+        axes.plot(grid.axis_mm(axis), factor * mean, marker, color=colour, markerfacecolor="none", label=label)
+
+
+def _on_planes(
+    flow: Flow, points_mm: NDArray[np.float64], places_mm: NDArray[np.float64], axis: int
+) -> NDArray[np.float64]:
+    """Return a flow in m/s, (places, m, 3), on planes across an axis, at the lateral places of points (n, 3)."""
+    lateral = np.unique(np.delete(points_mm, axis, axis=1), axis=0)
+    points = np.insert(np.tile(lateral, (places_mm.size, 1)), axis, np.repeat(places_mm, len(lateral)), axis=1)
+    return flow(points).reshape(places_mm.size, len(lateral), 3)
+
+
+@styled
+def slices_figure(methods: Mapping[str, Measured], duct: Duct) -> Figure:
+    """Return streamwise profiles across six slices of a duct, those of the paper's Fig. 16, and their errors.
+
+    Profiles are means along the flow, over the planes of windows on both sides of a slice. The paper's errors (Table 4)
+    stand beside ours only where the duct is the paper's.
+    """
+    figure = new_figure(12.0, 7.0)
+    axes = figure.subplots(2, 3)
+    tables = {name: table_4(m.field, m.truth, m.inside, duct) for name, m in methods.items()}
+    main = AXIS_NAMES.index(duct.axis)
+    for row, (name, axis) in zip(axes, duct.across.items(), strict=True):
+        for panel, share in zip(row, PAPER_SLICES[name], strict=True):
+            _draw_slice(panel, methods, duct, axis, duct.position_mm(axis, share))
+            rows = {method: table[f"{name} {share}"] for method, table in tables.items()}
+            ours = {method: errors["ours_percent"] for method, errors in rows.items()}
+            errors = [f"{name} unknown" if e is None else f"{name} {e:.2f} %" for name, e in ours.items()]
+            told = textwrap.fill(f"mean error: {', '.join(errors)}", TITLE_WIDTH)
+            paper = next(iter(rows.values()))["paper_ert_percent"]
+            beside = f" (paper {paper:.2f} %)" if duct.is_the_papers else ""
+            other = 3 - axis - main
+            panel.set(
+                title=f"{name} = {share}{beside}\n{told}",
+                xlabel=f"{AXIS_NAMES[other]} (mm)",
+                ylabel=f"{COMPONENT_NAMES[main]} (m/s)",
+            )
+    axes[0, 0].legend()
+    return figure
+
+
+def _draw_slice(axes: Axes, methods: Mapping[str, Measured], duct: Duct, axis: int, position: float) -> None:
+    """Draw profiles along what is left of a slice across an axis: the true one as far as the walls."""
+    main = AXIS_NAMES.index(duct.axis)
+    other = 3 - axis - main
+    first = next(iter(methods.values()))
+    grid = first.field.grid
+    axes.axhline(0.0, color=GREY, linewidth=0.8)
+    if first.flow is not None:
+        places = np.linspace(duct.position_mm(other, 0.0), duct.position_mm(other, 1.0), LINE_POINTS)
+        points = np.tile(duct.centre_mm, (LINE_POINTS, 1))
+        points[:, axis], points[:, other] = position, places
+        axes.plot(places, first.flow(points)[:, main], color=BLACK, label="true, analytic")
+    curves = {"true, at the windows": _judged(first, first.truth)} if first.flow is None else {}
+    curves |= {name: _judged(m, m.field.velocity) for name, m in methods.items()}
+    for (label, values), colour, marker in zip(curves.items(), COLOURS, MARKERS, strict=False):
+        profile = profile_at(values[..., main], grid.axis_mm(axis), position, axis, main)
+        axes.plot(grid.axis_mm(other), profile, marker, color=colour, markerfacecolor="none", label=label)
+
+
+def profile_at(
+    values: NDArray[np.float64], places: NDArray[np.float64], position: float, axis: int, along: int
+) -> NDArray[np.float64]:
+    """Return a slice across one axis (0 for x) of values [z, y, x], interpolated, and its mean along another."""
+    # what is left of [z, y, x] once the first axis is taken
+    left = [k for k in (2, 1, 0) if k != axis].index(along)
+    return mean_of_known(slice_at(values, places, position, axis), (left,))
+
+
+def slice_at(
+    values: NDArray[np.float64], places: NDArray[np.float64], position: float, axis: int
+) -> NDArray[np.float64]:
+    """Return a slice across one axis (0 for x) of values [z, y, x], interpolated between planes at `places`."""
+    at = float(np.clip(np.interp(position, places, np.arange(places.size)), 0, places.size - 1))
+    low = min(int(at), max(0, places.size - 2))
+    high = min(low + 1, places.size - 1)
+    planes = np.moveaxis(values, 2 - axis, 0)
+    return np.asarray((1.0 - (at - low)) * planes[low] + (at - low) * planes[high])

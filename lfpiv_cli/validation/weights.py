@@ -10,7 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,11 +21,28 @@ from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera
-from lfpiv_cli.optics.object_space import ObjectSpace
+from lfpiv_cli.optics.curved_space import CurvedSpace
+from lfpiv_cli.optics.tracing import ObjectSpace
+from lfpiv_cli.pictures.style import COLOURS, MARKERS, new_figure, styled
 from lfpiv_cli.weights.build import factorise_through
-from lfpiv_cli.weights.columns import seen_share
-from lfpiv_cli.weights.quadrature import REFERENCE_DEPTH_NODES, REFERENCE_TILES, integrate_columns
-from lfpiv_cli.weights.rays import PAPERS_COUNT, RayCount, count_rays, sampling_error
+from lfpiv_cli.weights.columns import operator_of, seen_share
+from lfpiv_cli.weights.quadrature import (
+    DEPTH_NODES,
+    PAPERS_COUNT,
+    REFERENCE_DEPTH_NODES,
+    REFERENCE_TILES,
+    TILES,
+    RayCount,
+    count_rays,
+    integrate_columns,
+    sampling_error,
+)
+from lfpiv_cli.weights.scene import lit_voxels
+from lfpiv_cli.weights.strip_blocks import sample_lit, voxel_centres
+from lfpiv_cli.weights.strips import StripOperator
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 # The voxels p1 to p5 of the equivalent-ray-tracing paper (its Table 1), x, y and depth, mm.
 TABLE1_MM = ((1.0, 0.0, 4.0), (1.5, 0.0, 2.0), (2.0, 0.0, 0.0), (2.5, 0.0, -2.0), (3.0, 0.0, -4.0))
@@ -167,7 +185,7 @@ def weights_figures(columns: list[Column], long_count: NDArray[np.int64]) -> dic
     return {name: _summary([v[name] for v in voxels if name in v]) for name in COMPARISONS} | {"voxels": voxels}
 
 
-def limits_missed(figures: dict[str, Any], limits: dict[str, dict[str, float | None]]) -> list[str]:
+def weights_limits_missed(figures: dict[str, Any], limits: dict[str, dict[str, float | None]]) -> list[str]:
     """Return a sentence for each limit that is missed; a limit that cannot be judged is missed too.
 
     Limits are given by comparison and figure; those on SSIM are lower ones.
@@ -235,12 +253,136 @@ def cut_to_lit(images: dict[str, NDArray[np.float64]]) -> dict[str, NDArray[np.f
 def _summary(each: list[dict[str, float]]) -> dict[str, float] | None:
     if not each:
         return None
-    table = {name: np.array([entry[name] for entry in each]) for name in ("ssim", "rmse_grey", "l1")}
-    return {
-        "ssim_mean": float(table["ssim"].mean()),
-        "ssim_smallest": float(table["ssim"].min()),
-        "rmse_grey_mean": float(table["rmse_grey"].mean()),
-        "rmse_grey_largest": float(table["rmse_grey"].max()),
-        "l1_mean": float(table["l1"].mean()),
-        "l1_largest": float(table["l1"].max()),
-    }
+    summary = {}
+    for name in ("ssim", "rmse_grey", "l1"):
+        values = np.array([entry[name] for entry in each])
+        summary[f"{name}_mean"] = float(values.mean())
+        worst, pick = ("smallest", np.min) if name == "ssim" else ("largest", np.max)
+        summary[f"{name}_{worst}"] = float(pick(values))
+    return summary
+
+
+# Columns behind curved faces: in strips, on demand and counted, beside converged integrals over traced rays.
+#
+# Axes: voxels [plane, row voxel, column voxel] of a grid; centres in world axes (x, y, z), z away from the camera
+# from the nominal focal point; images [row, column].
+
+
+def seen_voxels(
+    camera: Camera, space: CurvedSpace, grid: Grid, count: int, rng: np.random.Generator
+) -> NDArray[np.int64]:
+    """Return (n, 3) random voxels of a grid that lie wholly in the fluid, at most so many.
+
+    Raises
+    ------
+    ConfigError : there are none
+    """
+    found = sample_lit(camera, space, grid, lit_voxels(camera, space, grid), count, rng)
+    if not len(found):
+        raise ConfigError("validation: no voxel of the volume lies wholly in the fluid behind the scene")
+    return found
+
+
+def make_curved_columns(
+    camera: Camera,
+    space: CurvedSpace,
+    grid: Grid,
+    voxels: NDArray[np.int64],
+    rng: np.random.Generator,
+    long_count: NDArray[np.int64],
+    progress: Callable[[int], None] | None = None,
+) -> list[Column]:
+    """Return the columns of voxels (n, 3) by every way there is behind curved faces.
+
+    Parameters
+    ----------
+    long_count : (n,) rays of long counts of each voxel; 0: none
+    progress : called with 1 after each voxel
+    """
+    operator, shape = operator_of(camera, space, grid), (camera.rows, camera.columns)
+    sides = camera.to_image_axes(np.asarray(grid.spacing_mm))
+    columns = []
+    for voxel, point, rays in zip(voxels, voxel_centres(camera, grid, voxels), long_count, strict=True):
+        integrated = partial(integrate_columns, camera, space, point, sides)
+        images = {
+            "ert": integrated(REFERENCE_TILES, REFERENCE_DEPTH_NODES).image(0, shape),
+            "coarser": integrated(REFERENCE_TILES // 2, REFERENCE_DEPTH_NODES).image(0, shape),
+            "on_demand": integrated(TILES, DEPTH_NODES).image(0, shape),
+            "ray_count": count_rays(camera, space, point, sides, rng),
+        }
+        if isinstance(operator, StripOperator):
+            images["factorised"] = np.zeros(shape)
+            rows, cells, weights = operator.column(*voxel.tolist())
+            images["factorised"][rows, cells] = weights
+        if rays:
+            per_point = min(RAYS_PER_POINT_LONG, int(rays))
+            number = RayCount(int(rays) // per_point, per_point)
+            images["long_count"] = count_rays(camera, space, point, sides, rng, number)
+        x, y, z = camera.to_image_axes(point)
+        columns.append(Column((float(x), float(y), float(z)), cut_to_lit(images)))
+        if progress:
+            progress(1)
+    return columns
+
+
+SHOWN = {
+    "drt_exact": "DRT, exact",
+    "ert": "ERT, converged",
+    "factorised": "ERT, factorised",
+    "ray_count": "ERT, 500 x 10,000 rays",
+}
+SHOWN_BEHIND_FACES = {
+    "ert": "traced, converged",
+    "on_demand": "traced, on demand",
+    "factorised": "in strips",
+    "ray_count": "500 x 10,000 rays",
+}
+
+
+@styled
+def columns_figure(columns: list[Column], shown: dict[str, str] = SHOWN) -> Figure:
+    """Return the columns of voxels, one row a voxel: direct tracing, equivalent points, factorised, counted.
+
+    Behind curved faces `SHOWN_BEHIND_FACES`. A row has one scale: the brightest pixel by equivalent points, or traced.
+    """
+    names = [name for name in shown if any(name in column.images for column in columns)]
+    figure = new_figure(2.8 * len(names) + 0.6, 2.9 * len(columns))
+    axes = figure.subplots(len(columns), len(names), squeeze=False)
+    for row, column in zip(axes, columns, strict=True):
+        brightest = column.images["ert"].max()
+        for axis, name in zip(row, names, strict=True):
+            if name not in column.images:
+                axis.set_axis_off()
+                continue
+            picture = axis.imshow(column.images[name], cmap="gray", vmin=0.0, vmax=brightest, interpolation="nearest")
+            axis.set_title(f"{shown[name]}\n({', '.join(written(value) for value in column.centre_mm)}) mm", fontsize=7)
+            axis.set(xlabel="column (px)", ylabel="row (px)")
+        figure.colorbar(picture, ax=row.tolist(), label="weight (1)", shrink=0.8)
+    return figure
+
+
+@styled
+def similarity_figure(figures: dict[str, Any], shown: int) -> Figure:
+    """Return SSIM, RMSE and L1 of the first voxels, by comparison; each has its colour and marker."""
+    figure = new_figure(12.0, 4.2)
+    voxels = figures["voxels"][:shown]
+    names = [name for name in figures if name != "voxels" and figures[name] is not None]
+    for axis, (key, label) in zip(
+        figure.subplots(1, 3), {"ssim": "SSIM", "rmse_grey": "RMSE (grey levels)", "l1": "L1"}.items(), strict=True
+    ):
+        for number, name in enumerate(names):
+            again, k = divmod(number, len(COLOURS))
+            values = [voxel.get(name, {}).get(key, np.nan) for voxel in voxels]
+            axis.plot(
+                np.arange(1, len(voxels) + 1),
+                values,
+                MARKERS[k] + ("-", "--")[again],
+                color=COLOURS[k],
+                markerfacecolor="none",
+                label=name.replace("_", " "),
+            )
+        axis.set(xlabel="voxel", ylabel=label, xticks=np.arange(1, len(voxels) + 1))
+        if key != "ssim":
+            axis.set_ylim(bottom=0.0)
+    figure.legend(*axis.get_legend_handles_labels(), loc="outside lower center", ncols=4)
+    return figure

@@ -9,7 +9,7 @@ on the sensor. All are linear in (x, X), so the rays of a voxel that strike one 
 polygon of the rectangle voxel x aperture; its area is the weight (Eq. 13 with the count replaced by its limit). The
 depth of the voxel is integrated by Gauss-Legendre nodes.
 
-The weights are kept by cell (`axis_cells`); pixels add up their cells.
+The weights are kept by cell (`lens_cells`); pixels add up their cells.
 
 Axes: one image axis at a time (columns or rows), in mm about the optical axis; z as everywhere.
 """
@@ -23,10 +23,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from lfpiv_cli.optics.object_space import slope_ratio
+from lfpiv_cli.optics.tracing import slope_ratio
 from lfpiv_cli.threads import share_out
-from lfpiv_cli.weights.axis_cells import AxisOptics, Cells, micro_image_cells
-from lfpiv_cli.weights.polygons import cut, polygon_area, set_rectangle
+from lfpiv_cli.weights.lens_cells import AxisOptics, Cells, cut, micro_image_cells, polygon_area, set_rectangle
 
 # Along z the weights are smooth except where an edge of a lens or pixel passes; three nodes resolve voxels up to the
 # depth in which a ray at the rim moves by a third of a lens.
@@ -43,7 +42,7 @@ class Bending:
 
     Attributes
     ----------
-    nodes, factors : (planes, depth nodes, k) of `object_space.slope_ratio` at the depth nodes of each plane
+    nodes, factors : (planes, depth nodes, k) of `tracing.slope_ratio` at the depth nodes of each plane
     beside_mm2 : mean square of the voxels' distance from the optical axis along the other axis
     strips : straight pieces in which the aperture is worked on; 1 where rays are straight in front of the lens
     """

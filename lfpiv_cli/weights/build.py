@@ -15,19 +15,15 @@ from numpy.typing import NDArray
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.notice import written
-from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
-from lfpiv_cli.optics.microlenses import Lattice
-from lfpiv_cli.optics.object_space import ObjectSpace
-from lfpiv_cli.optics.polynomial_rays import PolynomialRays
-from lfpiv_cli.optics.tracing import disc_points
-from lfpiv_cli.weights.aperture import aperture_mask
+from lfpiv_cli.optics.tracing import ObjectSpace, PolynomialRays, disc_points
 from lfpiv_cli.weights.axis import Bending, FittedBending, axis_weights, depth_nodes
-from lfpiv_cli.weights.axis_cells import AxisOptics
+from lfpiv_cli.weights.lens_cells import AxisOptics, aperture_mask
 from lfpiv_cli.weights.operators import BrickOperator, FactorisedOperator
 from lfpiv_cli.weights.scene import Source
-from lfpiv_cli.weights.strip_making import StripLayout, factorise_strips, strip_layout
+from lfpiv_cli.weights.strip_blocks import StripLayout, factorise_strips, strip_layout
 from lfpiv_cli.weights.strips import StripOperator
 
 # A lattice counts as aligned with the sensor when over its whole width it strays by less than a hundredth of a pixel.

@@ -19,18 +19,15 @@ from numpy.typing import NDArray
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.neighbourhoods import with_neighbours
-from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.camera import Camera, nearest_point
 from lfpiv_cli.optics.curved_space import CurvedSpace
-from lfpiv_cli.optics.microlenses import nearest_point
 from lfpiv_cli.optics.tracing import struck_pixel
 from lfpiv_cli.robust import BRIGHTEST_PERCENTILE, LIT_SHARE
 from lfpiv_cli.threads import share_out
-from lfpiv_cli.weights.arguments import real_array, voxel_index
 from lfpiv_cli.weights.build import weights_in_axes
-from lfpiv_cli.weights.curved import lit_voxels
-from lfpiv_cli.weights.operators import Column, FactorisedOperator
+from lfpiv_cli.weights.operators import Column, FactorisedOperator, real_array, voxel_index
 from lfpiv_cli.weights.quadrature import DEPTH_NODES, TILES, Columns, integrate_columns
-from lfpiv_cli.weights.scene import Scene, Source, kernel_scene, on_array, on_sensor, rays_from
+from lfpiv_cli.weights.scene import Scene, Source, kernel_scene, lit_voxels, on_array, on_sensor, rays_from
 from lfpiv_cli.weights.strips import StripOperator
 
 # Columns may take this much memory: two thirds of a machine with 24 GiB, the rest is for volumes and images.

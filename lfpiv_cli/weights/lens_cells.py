@@ -5,12 +5,162 @@ Axes: image axes on the array, mm.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from lfpiv_cli.optics.microlenses import Lattice
-from lfpiv_cli.weights.polygons import cut, polygon_moments, set_rectangle
+from lfpiv_cli.optics.camera import KernelCamera, Lattice
+from lfpiv_cli.threads import share_out
+
+# The cells of one axis: where its lenses and its pixels meet.
+#
+# A pixel at the border of two micro-images sees the main lens through both, at opposite ends of the aperture. So
+# weights are kept by *cell*, the meeting of one lens and one pixel.
+#
+# Axes: one image axis at a time (columns or rows), in mm about the optical axis.
+
+
+# Width given to a patch that lies outside the aperture, in radii: small beside the patch of a whole pixel (a tenth).
+SMALLEST_PATCH = 1e-3
+
+
+class AxisOptics(NamedTuple):
+    """One axis of the camera; its square aperture is as wide as the round one.
+
+    Attributes
+    ----------
+    camera : what both axes share
+    lens_origin_mm, lens_pitch_mm : a lens centre on the array and the pitch along this axis
+    lens_width_mm : what of the pitch a lens takes in, half of it to either side
+    pixels : of the sensor along this axis
+    """
+
+    camera: KernelCamera
+    lens_origin_mm: float
+    lens_pitch_mm: float
+    lens_width_mm: float
+    pixels: int
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """The cells of one axis, lens by lens and pixel by pixel.
+
+    Attributes
+    ----------
+    first_lens : number n of the first lens, centred at lens_origin + n lens_pitch
+    start : (lenses + 1,) int64, the first cell of each lens
+    pixel : (cells,) int32, the pixel of each cell, ascending within a lens
+    patch_mm : (cells, 2) the interval of the main lens that the cell sees through its lens's centre, inside the
+    aperture
+    """
+
+    first_lens: int
+    start: NDArray[np.int64]
+    pixel: NDArray[np.int32]
+    patch_mm: NDArray[np.float64]
+
+
+def micro_image_cells(optics: AxisOptics) -> Cells:
+    """Return the cells of all lenses whose micro-image meets the sensor."""
+    camera = optics.camera
+    tilt = camera.microlens_distance_mm / camera.image_distance_mm
+    reach = tilt * camera.aperture_radius_mm + (tilt + abs(camera.bend)) * 0.5 * optics.lens_width_mm
+    half = 0.5 * optics.pixels * camera.pixel_mm
+    edge = np.array([-half - reach, half + reach]) / (1.0 + tilt)
+    first, last = np.rint((edge - optics.lens_origin_mm) / optics.lens_pitch_mm).astype(int)
+    number = np.arange(first, last + 1)
+    lens = optics.lens_origin_mm + number * optics.lens_pitch_mm
+    low = np.floor((lens * (1.0 + tilt) - reach + half) / camera.pixel_mm).astype(int).clip(0, optics.pixels)
+    high = np.floor((lens * (1.0 + tilt) + reach + half) / camera.pixel_mm).astype(int).clip(-1, optics.pixels - 1)
+    counts = np.maximum(high - low + 1, 0)
+    start = np.concatenate([[0], np.cumsum(counts)])
+    owner = np.repeat(np.arange(lens.size), counts)
+    pixel = low[owner] + np.arange(start[-1]) - start[owner]
+    return Cells(int(first), start.astype(np.int64), pixel.astype(np.int32), _patches(optics, lens[owner], pixel))
+
+
+def _patches(optics: AxisOptics, lens_mm: NDArray[np.float64], pixel: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the intervals of the main lens that pixels see through lenses' centres, shape (cells, 2)."""
+    camera = optics.camera
+    magnify = camera.image_distance_mm / camera.microlens_distance_mm
+    edges = (pixel[:, np.newaxis] + np.array([1, 0]) - 0.5 * optics.pixels) * camera.pixel_mm
+    patch = lens_mm[:, np.newaxis] - (edges - lens_mm[:, np.newaxis]) * magnify
+    radius = camera.aperture_radius_mm
+    patch = np.clip(patch, -radius, radius)
+    # A cell that only rays away from the lens's centre reach sees the very edge of the aperture.
+    sliver = SMALLEST_PATCH * radius
+    return np.stack([np.minimum(patch[:, 0], radius - sliver), np.maximum(patch[:, 1], sliver - radius)], axis=1)
+
+
+# Convex polygons as corners in order (n, 2), in kernels: cut by half planes, and their areas.
+
+
+@njit(cache=True)
+def cut(polygon: NDArray[np.float64], a: float, b: float, limit: float, out: NDArray[np.float64]) -> int:
+    """Write the part of a polygon where a x + b y <= limit to `out`; return its number of corners."""
+    kept, corners = 0, len(polygon)
+    for k in range(corners):
+        x0, y0 = polygon[k, 0], polygon[k, 1]
+        after = k + 1 if k + 1 < corners else 0
+        x1, y1 = polygon[after, 0], polygon[after, 1]
+        over0 = a * x0 + b * y0 - limit
+        over1 = a * x1 + b * y1 - limit
+        if over0 <= 0.0:
+            out[kept, 0] = x0
+            out[kept, 1] = y0
+            kept += 1
+        if (over0 < 0.0 < over1) or (over1 < 0.0 < over0):
+            t = over0 / (over0 - over1)
+            out[kept, 0] = x0 + t * (x1 - x0)
+            out[kept, 1] = y0 + t * (y1 - y0)
+            kept += 1
+    return kept
+
+
+@njit(cache=True)
+def set_rectangle(out: NDArray[np.float64], left: float, right: float, bottom: float, top: float) -> None:
+    """Write the four corners of a rectangle to `out`."""
+    for k, (x, y) in enumerate(((left, bottom), (right, bottom), (right, top), (left, top))):
+        out[k, 0] = x
+        out[k, 1] = y
+
+
+@njit(cache=True)
+def polygon_area(polygon: NDArray[np.float64]) -> float:
+    """Return the area of a polygon."""
+    twice = 0.0
+    for k in range(1, len(polygon) - 1):
+        ax, ay = polygon[k, 0] - polygon[0, 0], polygon[k, 1] - polygon[0, 1]
+        bx, by = polygon[k + 1, 0] - polygon[0, 0], polygon[k + 1, 1] - polygon[0, 1]
+        twice += ax * by - ay * bx
+    return 0.5 * abs(twice)
+
+
+@njit(cache=True)
+def polygon_moments(
+    polygon: NDArray[np.float64], offset_x: float, offset_y: float
+) -> tuple[float, float, float, float, float]:
+    """Return area, centroid (moved by the offset) and widths of a polygon."""
+    twice, sum_x, sum_y = 0.0, 0.0, 0.0
+    x0, y0 = polygon[0, 0], polygon[0, 1]
+    left, right, bottom, top = x0, x0, y0, y0
+    for k in range(1, len(polygon)):
+        x1, y1 = polygon[k, 0], polygon[k, 1]
+        left, right, bottom, top = min(left, x1), max(right, x1), min(bottom, y1), max(top, y1)
+        if k + 1 < len(polygon):
+            x2, y2 = polygon[k + 1, 0], polygon[k + 1, 1]
+            area = (x1 - x0) * (y2 - y0) - (y1 - y0) * (x2 - x0)
+            twice += area
+            sum_x += area * (x0 + x1 + x2) / 3.0
+            sum_y += area * (y0 + y1 + y2) / 3.0
+    if twice <= 0.0:
+        return 0.0, 0.0, 0.0, 0.0, 0.0
+    return 0.5 * twice, sum_x / twice + offset_x, sum_y / twice + offset_y, right - left, top - bottom
+
 
 # A rectangle cut by eight half planes has at most twelve corners.
 MOST_CORNERS = 16
@@ -63,3 +213,74 @@ def shared_rectangle(
         if corners < 3:
             return 0.0, 0.0, 0.0, 0.0, 0.0
     return polygon_moments(now[:corners], centre_x, centre_y)
+
+
+# The round aperture seen through the pixels.
+#
+# Every cell (a pixel under a microlens) sees its own patch of the main lens, pixel * s_i/s_mu wide. Where a patch
+# straddles the rim of the aperture, the cell gets only the share of it that lies inside; divided by the disc's share
+# of its square (pi/4), these shares turn the weights of the square aperture into those of the disc.
+#
+# Axes: patches are intervals of X (columns) and Y (rows) on the main lens, in mm about the axis.
+
+
+DISC_SHARE_OF_SQUARE = np.pi / 4.0
+
+
+def aperture_mask(columns: Cells, rows: Cells, radius_mm: float) -> NDArray[np.float32]:
+    """Return C (row cells, column cells): the share of each cell's patch inside the disc, over the square's share."""
+    mask = np.empty((len(rows.patch_mm), len(columns.patch_mm)), np.float32)
+    share_out(_write_mask, len(mask), columns.patch_mm, rows.patch_mm, radius_mm, mask)
+    return mask
+
+
+@njit(cache=True)
+def _chord_integral(a: float, b: float, radius: float) -> float:
+    """Return the integral of sqrt(R^2 - x^2) from a to b, both clipped to the disc."""
+    a = min(max(a, -radius), radius)
+    b = min(max(b, -radius), radius)
+    upper = b * np.sqrt(radius * radius - b * b) + radius * radius * np.arcsin(b / radius)
+    lower = a * np.sqrt(radius * radius - a * a) + radius * radius * np.arcsin(a / radius)
+    return 0.5 * (upper - lower)
+
+
+@njit(cache=True)
+def disc_area_below(x: float, y: float, radius: float) -> float:
+    """Return the area of the part of a disc about 0 that lies at X <= x and Y <= y."""
+    if x <= -radius or y <= -radius:
+        return 0.0
+    x = min(x, radius)
+    if y >= radius:
+        return 2.0 * _chord_integral(-radius, x, radius)
+    flat = np.sqrt(radius * radius - y * y)
+    inner = min(x, flat)
+    area = 0.0
+    if inner > -flat:
+        area += _chord_integral(-flat, inner, radius) + y * (inner + flat)
+    if y > 0.0:
+        area += 2.0 * _chord_integral(-radius, min(x, -flat), radius)
+        if x > flat:
+            area += 2.0 * _chord_integral(flat, x, radius)
+    return area
+
+
+@njit(cache=True, nogil=True)
+def _write_mask(
+    part: tuple[int, int],
+    columns: NDArray[np.float64],
+    rows: NDArray[np.float64],
+    radius: float,
+    mask: NDArray[np.float32],
+) -> None:
+    """Write rows `part` of `aperture_mask`, from the patches (n, 2) of columns and rows."""
+    for r in range(part[0], part[1]):
+        y0, y1 = rows[r]
+        for c in range(columns.shape[0]):
+            x0, x1 = columns[c]
+            inside = (
+                disc_area_below(x1, y1, radius)
+                - disc_area_below(x0, y1, radius)
+                - disc_area_below(x1, y0, radius)
+                + disc_area_below(x0, y0, radius)
+            )
+            mask[r, c] = max(inside, 0.0) / ((x1 - x0) * (y1 - y0)) / DISC_SHARE_OF_SQUARE

@@ -16,9 +16,8 @@ from scipy import ndimage
 
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import ColumnAxis
-from lfpiv_cli.weights.arguments import real_array, voxel_index
 from lfpiv_cli.weights.columns import ColumnOperator, OnDemandOperator
-from lfpiv_cli.weights.operators import BrickOperator, Column, FactorisedOperator
+from lfpiv_cli.weights.operators import BrickOperator, Column, FactorisedOperator, real_array, voxel_index
 from lfpiv_cli.weights.strips import StripOperator
 
 if TYPE_CHECKING:

@@ -13,6 +13,7 @@ volume are exchanged on the way in and out.
 
 from __future__ import annotations
 
+import operator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -21,14 +22,46 @@ import numpy as np
 from numba import get_num_threads
 from numpy.typing import NDArray
 
+from lfpiv_cli.errors import InputError
 from lfpiv_cli.simd.combine import GROUP, TILE
 from lfpiv_cli.simd.vectors import LANES
 from lfpiv_cli.threads import ensure_own_threads
 from lfpiv_cli.weights import kernels
-from lfpiv_cli.weights.arguments import real_array, voxel_index
 from lfpiv_cli.weights.axis import AxisWeights
-from lfpiv_cli.weights.axis_cells import Cells
 from lfpiv_cli.weights.kernels import PLANES_BACK, PLANES_FORWARD, CellBlocks, LitRows, Terms, VoxelSums
+from lfpiv_cli.weights.lens_cells import Cells
+
+# What the weights' verbs are given, checked before compiled loops read it: these know no bounds.
+
+
+def real_array(given: object, shape: tuple[int, ...], what: str) -> NDArray[Any]:
+    """Return an array of real numbers of a shape, as it is given.
+
+    Raises
+    ------
+    InputError : it has another shape, to which nothing is stretched or cut, or holds no real numbers
+    """
+    array = np.asarray(given)
+    if array.dtype.kind not in "fiub":
+        raise InputError(f"{what} of {array.dtype}: expected real numbers")
+    if array.shape != shape:
+        raise InputError(f"{what} of the shape {array.shape} does not fit weights made for {shape}")
+    return array
+
+
+def voxel_index(index: tuple[Any, ...], shape: tuple[int, ...]) -> tuple[int, ...]:
+    """Return the indices of a voxel; none is counted from the end.
+
+    Raises
+    ------
+    IndexError : it lies outside the volume
+    TypeError : it is no whole number
+    """
+    whole = tuple(operator.index(number) for number in index)
+    if not all(0 <= number < count for number, count in zip(whole, shape, strict=True)):
+        raise IndexError(f"voxel {whole} lies outside a volume of the shape {shape}")
+    return whole
+
 
 # Pixel rows, pixel columns and weights of one voxel.
 Column = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]

@@ -15,15 +15,68 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera, KernelCamera
 from lfpiv_cli.optics.curved_space import CurvedSpace
-from lfpiv_cli.optics.object_space import SLOPE_NODES, ObjectSpace, slope_ratio
-from lfpiv_cli.optics.polynomial_rays import PolynomialRays
-from lfpiv_cli.optics.ray_bundles import aim_all
+from lfpiv_cli.optics.ray_bundles import aim, aim_all
 from lfpiv_cli.optics.surfaces import Faces
-from lfpiv_cli.optics.tracing import behind_microlens
-from lfpiv_cli.weights.aperture import disc_area_below
-from lfpiv_cli.weights.lens_cells import cell_radius, neighbours
+from lfpiv_cli.optics.tracing import (
+    SLOPE_NODES,
+    ObjectSpace,
+    PolynomialRays,
+    behind_microlens,
+    disc_points,
+    slope_ratio,
+)
+from lfpiv_cli.threads import share_out
+from lfpiv_cli.weights.lens_cells import cell_radius, disc_area_below, neighbours
+
+# Where rays behind curved faces meet the array, and which voxels are seen at all.
+#
+# Axes: image axes (x along the columns), mm, z away from the camera from the nominal focal point.
+
+
+# Rays by which a voxel is judged to lie in the fluid and to be seen through the whole aperture: the middle and the rim.
+RIM = np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+
+
+def places_on_array(
+    camera: Camera, space: CurvedSpace, points_mm: NDArray[np.float64], crossing_mm: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return where rays from (n, 3) through (n, 2) meet the array, without the distortion, and whether they do."""
+    slopes, valid = space.slopes(camera, points_mm, crossing_mm)
+    return crossing_mm + camera.image_distance_mm * (slopes - crossing_mm / camera.focal_length_mm), valid
+
+
+def lit_voxels(camera: Camera, space: CurvedSpace, grid: Grid) -> NDArray[np.bool_]:
+    """Return which voxels (planes, row voxels, column voxels) have their middle in the fluid, wholly in view."""
+    first, second = (0, 1) if camera.column_axis == "x" else (1, 0)
+    axes = (grid.axis_mm(first), grid.axis_mm(second), grid.axis_mm(2))
+    lit = np.empty(tuple(axis.size for axis in axes[::-1]), np.bool_)
+    rim = camera.aperture_radius_mm * RIM
+    share_out(_write_lit, axes[2].size, space.for_kernels(camera), axes, rim, lit)
+    return lit
+
+
+@njit(cache=True, nogil=True)
+def _write_lit(
+    part: tuple[int, int],
+    faces: Faces,
+    axes: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
+    rim: NDArray[np.float64],
+    lit: NDArray[np.bool_],
+) -> None:
+    """Write planes `part` of `lit_voxels`."""
+    for plane in range(part[0], part[1]):
+        for row in range(axes[1].size):
+            for column in range(axes[0].size):
+                seen = True
+                for k in range(rim.shape[0]):
+                    if seen:
+                        crossing = rim[k, 0], rim[k, 1]
+                        seen = aim(faces, axes[0][column], axes[1][row], axes[2][plane], crossing[0], crossing[1])[2]
+                lit[plane, row, column] = seen
+
 
 # Points per side by which the part of a tile inside the rim is averaged to find its middle.
 RIM_SAMPLES = 16
@@ -274,3 +327,103 @@ def on_sensor(camera: KernelCamera, ideal: float, crossing: float, place: float,
     `ideal` is where the ray from `crossing` of the main lens would meet it without the main lens's distortion.
     """
     return behind_microlens(camera, place, centre, (ideal - crossing) / camera.image_distance_mm)
+
+
+# How far light spreads behind curved faces, and how well rays made for single voxels follow the traced ones.
+#
+# Axes: image axes (x along the columns), mm, z away from the camera from the nominal focal point; grids in world
+# axes.
+
+
+# Places along each axis of a volume at which the spread is looked at: it is largest at the volume's faces.
+SAMPLES = 5
+# Rays along the rim of the aperture.
+RIM_RAYS = 16
+# Places along each axis of a layer of voxels at which fluid is looked for.
+LAYER_SAMPLES = 15
+# Points of a volume from which rays are compared.
+MISFIT_POINTS = 200
+
+
+def curved_padding(camera: Camera, space: CurvedSpace, grid: Grid) -> tuple[int, int, int]:
+    """Return how many voxels to solve for beyond each side of a grid: as far as light spreads, up to the fluid's end.
+
+    Laterally, as `build.default_padding`, with rays that are traced from a sample of the grid.
+    """
+    sides = camera.to_image_axes(np.asarray(grid.spacing_mm))
+    x, y = camera.to_image_axes(np.ceil(spread_mm(camera, space, grid) / sides[:2])).astype(int)
+    return _within_fluid(camera, space, grid, 0, int(x)), _within_fluid(camera, space, grid, 1, int(y)), 0
+
+
+def spread_mm(camera: Camera, space: CurvedSpace, grid: Grid) -> NDArray[np.float64]:
+    """Return how far from its own line of sight a point shares pixels with others, along both image axes (2,), in mm.
+
+    Half a lens and the spread on the array, taken back to the flow by how far apart neighbouring voxels are seen.
+    """
+    points = sample(camera, grid)
+    sides = camera.to_image_axes(np.asarray(grid.spacing_mm))
+    angle = 2.0 * np.pi * np.arange(RIM_RAYS) / RIM_RAYS
+    rim = camera.aperture_radius_mm * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    through_middle = np.zeros((len(points), 2))
+    middle, seen = places_on_array(camera, space, points, through_middle)
+    spread = np.zeros(2)
+    for axis in range(2):
+        beside = points.copy()
+        beside[:, axis] -= np.copysign(
+            sides[axis], beside[:, axis]
+        )  # towards the optical axis, so not out of the fluid
+        shown, also = places_on_array(camera, space, beside, through_middle)
+        for crossing in rim:
+            place, passes = places_on_array(camera, space, points, np.broadcast_to(crossing, (len(points), 2)))
+            good = seen & also & passes
+            on_array = np.abs(place - middle)[good, axis] + 0.5 * float(camera.lattice.pitch.max())
+            back = sides[axis] / np.abs(shown - middle)[good, axis]
+            spread[axis] = max(spread[axis], np.max(on_array * back, initial=0.0))
+    return spread
+
+
+def sample(camera: Camera, grid: Grid) -> NDArray[np.float64]:
+    """Return the middles (n, 3) of some voxels of a grid, those of its faces among them, image axes."""
+    axes = [np.linspace(grid.axis_mm(k)[0], grid.axis_mm(k)[-1], SAMPLES) for k in range(3)]
+    return camera.to_image_axes(np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3))
+
+
+def _within_fluid(camera: Camera, space: CurvedSpace, grid: Grid, axis: int, most: int) -> int:
+    """Return how many layers of voxels, at most so many, have fluid in them on either side of a grid along an axis."""
+    low, high = grid.bounds_mm(axis)
+    for layer in range(most):
+        beyond = (layer + 0.5) * grid.spacing_mm[axis]
+        axes = [np.linspace(*grid.bounds_mm(k), LAYER_SAMPLES) for k in range(3)]
+        axes[axis] = np.array([low - beyond, high + beyond])
+        points = camera.to_image_axes(np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3))
+        if not space.slopes(camera, points, np.zeros((len(points), 2)))[1].any():
+            return layer
+    return most
+
+
+def seen_depths_mm(camera: Camera, space: CurvedSpace, grid: Grid) -> NDArray[np.float64]:
+    """Return the depths in the fluid at which plane windows would show a sample of a grid, along both axes; 0 if none.
+
+    Behind a cylinder a point has two, which differ.
+    """
+    seen = space.equivalent(camera, sample(camera, grid))
+    depths = (seen.distance_mm[seen.valid].ravel() - camera.focus_distance_mm) / space.media.depth_ratio
+    return np.append(depths, 0.0)
+
+
+def aimed_misfit_mm(camera: Camera, space: CurvedSpace, grid: Grid) -> float:
+    """Return how far on the array, rms, rays made for single voxels are from traced ones; 0 where none are seen."""
+    rng = np.random.default_rng(0)
+    bounds = np.array([grid.bounds_mm(axis) for axis in range(3)])
+    points = camera.to_image_axes(rng.uniform(bounds[:, 0], bounds[:, 1], (MISFIT_POINTS, 3)))
+    aimed, fit = aimed_rays(camera.aperture_radius_mm)
+    other = disc_points(len(aimed), camera.aperture_radius_mm, rng)
+    powers = (other / camera.aperture_radius_mm)[:, :, np.newaxis] ** np.arange(AIMED_DEGREE + 1)
+    terms = (powers[:, 0, :, np.newaxis] * powers[:, 1, np.newaxis]).reshape(len(other), -1)
+    squares = []
+    for point in points:
+        start = np.broadcast_to(point, (len(aimed), 3))
+        (known, seen), (truth, also) = (places_on_array(camera, space, start, each) for each in (aimed, other))
+        if seen.all() and also.all():
+            squares.append(np.mean((terms @ fit @ known - truth) ** 2))
+    return float(np.sqrt(np.mean(squares))) if squares else 0.0

@@ -15,8 +15,16 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from lfpiv_cli.simd.combine import GROUP, TILE, VECTORS, combine_long, turn
-from lfpiv_cli.simd.combine_varying import COEFFICIENTS, combine_turned_varying, combine_varying
+from lfpiv_cli.simd.combine import (
+    COEFFICIENTS,
+    GROUP,
+    TILE,
+    VECTORS,
+    combine_long,
+    combine_turned_varying,
+    combine_varying,
+    turn,
+)
 from lfpiv_cli.simd.vectors import LANES
 from lfpiv_cli.threads import in_threads, share_out
 from lfpiv_cli.weights.kernels import Floats, Index, LitRows, Terms, room_for

@@ -1,1 +1,1 @@
-"""Volumes, vectors, particles and tracks in the formats of other programs: a module for each, `formats` lists them."""
+"""Volumes, vectors, particles and tracks in the formats of other programs; `formats.FORMATS` lists them."""

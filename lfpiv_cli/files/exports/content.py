@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -64,14 +64,15 @@ class Content:
         known = {name: value for name, value in self.attributes.items() if value is not None}
         return {"format": self.format_name, **known, "provenance": json.dumps(self.provenance)}
 
-    def comments(self) -> Iterator[str]:
-        """Yield the same as lines of comments, the provenance as JSON over as many lines as it needs."""
+    def comments(self, units: Mapping[str, str]) -> Iterator[str]:
+        """Yield the same as lines of comments, the provenance as JSON over as many as it needs; the units last."""
         for name, value in self.told().items():
             if name != "provenance":
                 yield f"# {name}: {json.dumps(value)}"
         yield "# provenance:"
         for line in json.dumps(self.provenance, indent=1).splitlines():
             yield f"# {line}"
+        yield f"# units: {json.dumps(units)}"
 
 
 def read_content(path: Path) -> Content:
@@ -116,34 +117,23 @@ def plane_of(content: Content, number: int) -> Content:
     )
 
 
-def columns_of(content: Content) -> dict[str, NDArray[Any]]:
-    """Return everything as columns of one row for each place: coordinates first, then each component of each array.
+def columns_of(content: Content) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
+    """Return all as columns of one row for each place, coordinates before each component of each array; and the units.
 
     The velocity's are called u, v, w; x varies fastest on a grid, z slowest.
     """
     columns: dict[str, NDArray[Any]] = {}
+    units: dict[str, str] = {}
     if content.grid is not None:
         centres = content.grid.centres_mm().reshape(-1, 3)
         columns = {axis: centres[:, k] for k, axis in enumerate("xyz")}
-    places = 1 if content.grid is None else 3
-    for name, array in content.arrays.items():
-        if array.ndim == places:
-            columns[name] = array.ravel()
-            continue
-        parts = array.reshape(-1, array.shape[-1])
-        for k, column in enumerate(component_names(name, parts.shape[1])):
-            columns[column] = parts[:, k]
-    return columns
-
-
-def column_units(content: Content) -> dict[str, str]:
-    """Return the unit of each of `columns_of`."""
-    units = dict.fromkeys("xyz", "mm") if content.grid is not None else {}
+        units = dict.fromkeys("xyz", "mm")
     places = 1 if content.grid is None else 3
     for name, array in content.arrays.items():
         names = [name] if array.ndim == places else component_names(name, array.shape[-1])
+        columns |= dict(zip(names, array.reshape(-1, len(names)).T, strict=True))
         units |= dict.fromkeys(names, content.units[name])
-    return units
+    return columns, units
 
 
 def component_names(name: str, count: int) -> list[str]:

@@ -2,16 +2,251 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from lfpiv_cli.errors import InputError, UsageError
-from lfpiv_cli.files.exports import mat, text, vtk_xml
-from lfpiv_cli.files.exports.content import KINDS, OF_POINTS, ON_GRIDS, Content
-from lfpiv_cli.files.particle_file import TRAJECTORIES_FORMAT
+import numpy as np
+from numpy.typing import NDArray
+
+from lfpiv_cli.errors import InputError, OutputError, UsageError
+from lfpiv_cli.files.exports import vtk
+from lfpiv_cli.files.exports.content import (
+    COMPONENTS,
+    KINDS,
+    OF_POINTS,
+    ON_GRIDS,
+    Content,
+    columns_of,
+    frames_of,
+)
+from lfpiv_cli.files.particle_file import POSITION, TRAJECTORIES_FORMAT
 from lfpiv_cli.files.vtkhdf import VECTORS_FORMAT
+from lfpiv_cli.flow.field import REJECTED
 from lfpiv_cli.names import ExportFormat
+
+# Tables of text: CSV, and Tecplot's ASCII format. Numbers have as many digits as bring back the same bits.
+
+
+# NetCDF 3 with 64-bit offsets, which needs no library beyond scipy, here or where it is read.
+#
+# Vectors follow pivpy's schema: `u`, `v`, `w` (m/s) and `chc` (1 where the velocity is known) over y, x, t,
+# coordinates in mm; with more than one plane z comes before these dimensions, so that one plane of it is what pivpy
+# takes.
+
+
+# The format counts the bytes of a variable in 32 bits.
+LARGEST_VARIABLE = 2**32 - 4
+SMALLEST_INTEGER, LARGEST_INTEGER = -(2**31), 2**31 - 1
+# Signed, as NetCDF 3 has no others.
+INTEGERS = {1: np.int16, 2: np.int32, 4: np.int32, 8: np.int32}
+PIVPY_SCHEMA = "1"
+
+
+def write_netcdf(path: Path, contents: Sequence[Content], times_s: Sequence[float] | None) -> None:
+    """Write a volume, particles or tracks, or the vectors of one time or of several.
+
+    Parameters
+    ----------
+    times_s : of each of several vectors, None where only their order is known
+
+    Raises
+    ------
+    OutputError : an array is larger than the format allows
+    """
+    from scipy.io import netcdf_file
+
+    with netcdf_file(path, "w", version=2) as file:
+        for name, value in contents[0].told().items():
+            setattr(file, name, _attribute(value))
+        if contents[0].format_name == VECTORS_FORMAT:
+            _write_vectors(file, contents, times_s)
+        elif contents[0].grid is not None:
+            _write_axes(file, contents[0])
+            _write_arrays(file, contents[0], ("z", "y", "x"))
+        else:
+            file.createDimension("point", len(next(iter(contents[0].arrays.values()))))
+            _write_arrays(file, contents[0], ("point",))
+
+
+def _write_vectors(file: Any, contents: Sequence[Content], times_s: Sequence[float] | None) -> None:
+    first = contents[0]
+    _write_axes(file, first)
+    file.delta_t = _attribute(float(first.attributes.get("dt_s", 0.0)))
+    file.pivpy_schema_version = PIVPY_SCHEMA
+    file.createDimension("t", len(contents))
+    _put(file, "t", np.arange(float(len(contents))) if times_s is None else np.asarray(times_s), ("t",))
+    file.variables["t"].units = "frame" if times_s is None else "s"
+    places = ("y", "x", "t") if first.arrays["flag"].shape[0] == 1 else ("z", "y", "x", "t")
+
+    def over_time(name: str) -> NDArray[Any]:
+        stacked = np.stack([content.arrays[name] for content in contents], axis=3)
+        return stacked[0] if "z" not in places else stacked
+
+    for k, name in enumerate("uvw"):
+        _put(file, name, over_time("velocity")[..., k], places, "m/s")
+        file.variables[name].standard_name = f"{name}_velocity"
+    _put(file, "chc", (over_time("flag") < REJECTED).astype(np.uint8), places, "1")
+    file.variables["chc"].standard_name = "validity_flag"
+    for name in first.arrays:
+        if name != "velocity":
+            stacked = over_time(name)
+            of_components = _component_dimension(file, stacked.shape[len(places) :])
+            _put(file, name, stacked, places + of_components, first.units[name])
+
+
+def _write_axes(file: Any, content: Content) -> None:
+    if content.grid is None:
+        raise ValueError("points have no axes")
+    for k, axis in enumerate("xyz"):
+        values = content.grid.axis_mm(k)
+        if axis == "z" and len(values) == 1 and content.format_name == VECTORS_FORMAT:
+            # A plane has its place as a scalar.
+            _put(file, axis, values[0], (), "mm")
+        else:
+            file.createDimension(axis, len(values))
+            _put(file, axis, values, (axis,), "mm")
+
+
+def _write_arrays(file: Any, content: Content, places: tuple[str, ...]) -> None:
+    for name, array in content.arrays.items():
+        dimensions = places + _component_dimension(file, array.shape[len(places) :])
+        _put(file, name, array, dimensions, content.units[name])
+
+
+def _component_dimension(file: Any, shape: tuple[int, ...]) -> tuple[str, ...]:
+    """Return the dimension of an array's components, none where it has none."""
+    if not shape:
+        return ()
+    name = "component" if shape[0] == len(COMPONENTS[3]) else f"component_{shape[0]}"
+    if name not in file.dimensions:
+        file.createDimension(name, shape[0])
+    return (name,)
+
+
+def _put(file: Any, name: str, array: NDArray[Any], dimensions: tuple[str, ...], unit: str | None = None) -> None:
+    if array.nbytes > LARGEST_VARIABLE:
+        raise OutputError(f"{name} has {array.nbytes} bytes, a variable of NetCDF 3 holds {LARGEST_VARIABLE}")
+    stored = _integers(name, array) if array.dtype.kind in "iu" else array
+    variable = file.createVariable(name, stored.dtype, dimensions)
+    variable.data[...] = stored
+    if unit is not None:
+        variable.units = unit
+
+
+def _integers(name: str, array: NDArray[Any]) -> NDArray[Any]:
+    """Return integers in a type that the format has."""
+    if array.size and not SMALLEST_INTEGER <= int(array.min()) <= int(array.max()) <= LARGEST_INTEGER:
+        raise InputError(f"{name} holds {array.max()}, NetCDF 3 knows integers up to {LARGEST_INTEGER}")
+    return array.astype(INTEGERS[array.dtype.itemsize])
+
+
+def _attribute(value: Any) -> Any:
+    """Return an attribute in a type that the format has; scipy would store a plain float in 32 bits."""
+    if isinstance(value, str):
+        return value.encode()
+    array = np.asarray(value)
+    return _integers("an attribute", array.astype(np.int64)).ravel() if array.dtype.kind in "biu" else array.ravel()
+
+
+# Matlab's MAT files, version 5: a variable for each array and for what the file says about itself; the structure
+# `units` has the unit of each array.
+#
+# Tracks of a sequence come a second time as the list `tracks` of records, one for each track, which flowtracks reads:
+# places `xf`, `yf`, `zf` (mm), velocities `uf`, `vf`, `wf` (mm/s), accelerations `axf`, `ayf`, `azf` (NaN, as they
+# are not measured), frames `t` and the track's number `trajid`.
+
+
+# The format counts the bytes of a variable in 32 bits, of which readers take 31.
+LARGEST_BYTES = 2**31 - 1
+# The first bytes of a file are words, in which scipy writes the time: the same work gives the same bytes.
+WORDS = b"MATLAB 5.0 MAT-file, written by lfpiv".ljust(116)
+MM_PER_M = 1000.0
+FIELDS = ("xf", "yf", "zf", "uf", "vf", "wf", "axf", "ayf", "azf", "t", "trajid")
+
+
+def write_mat(path: Path, content: Content) -> None:
+    """Write everything under the names that it has; arrays on a grid are [z, y, x] and the component last.
+
+    Raises
+    ------
+    OutputError : an array is larger than the format allows
+    """
+    from scipy.io import savemat
+
+    for name, array in content.arrays.items():
+        if array.nbytes > LARGEST_BYTES:
+            raise OutputError(f"{name} has {array.nbytes} bytes, MAT files hold {LARGEST_BYTES}; netcdf holds more")
+    variables: dict[str, Any] = {}
+    if content.format_name == TRAJECTORIES_FORMAT:
+        # First: flowtracks takes the first variable of a file.
+        variables["tracks"] = _tracks(content)
+    if content.grid is not None:
+        variables |= {axis: content.grid.axis_mm(k) for k, axis in enumerate("xyz")}
+    variables |= content.arrays | content.told() | {"units": content.units}
+    savemat(path, variables, appendmat=False, format="5", long_field_names=True, oned_as="column")
+    with open(path, "rb+") as file:
+        file.write(WORDS)
+
+
+def _tracks(content: Content) -> NDArray[np.void]:
+    """Return the tracks of a sequence as a column of records."""
+    track, arrays = content.arrays["track"], content.arrays
+    ends = np.flatnonzero(np.diff(track)) + 1
+    rows = np.split(np.arange(len(track)), ends) if len(track) else []
+    records = np.empty((len(rows), 1), dtype=[(name, object) for name in FIELDS])
+    unknown = np.full(len(track), np.nan)
+    columns = [*arrays[POSITION].T, *(MM_PER_M * arrays["velocity"]).T, unknown, unknown, unknown, arrays["frame"]]
+    for number, here in enumerate(rows):
+        parts = [column[here][:, np.newaxis] for column in columns]
+        records[number, 0] = (*parts, np.array([[track[here[0]]]]))
+    return records
+
+
+def write_csv(path: Path, content: Content) -> None:
+    """Write one row for each place below the columns' names; lines of comments before them begin with #."""
+    columns, units = columns_of(content)
+    with open(path, "w", encoding="utf-8", newline="\n") as file:
+        file.writelines(f"{line}\n" for line in content.comments(units))
+        file.write(",".join(columns) + "\n")
+        file.writelines(",".join(row) + "\n" for row in _rows(columns))
+
+
+def write_tecplot(path: Path, content: Content) -> None:
+    """Write an ordered zone on a grid, one of points, or of a sequence's tracks one for each frame with its time.
+
+    Names of variables have no units, by which readers would not know coordinates as such: comments have them.
+    """
+    columns, units = columns_of(content)
+    with open(path, "w", encoding="utf-8", newline="\n") as file:
+        file.writelines(f"{line}\n" for line in content.comments(units))
+        file.write(f'TITLE = "{KINDS[content.format_name]}"\n')
+        file.write("VARIABLES = " + " ".join(f'"{name}"' for name in columns) + "\n")
+        for head, rows in _zones(content):
+            file.write(f"ZONE {head}, DATAPACKING=POINT\nDT=({'DOUBLE ' * len(columns)})\n")
+            here = columns if rows is None else {name: column[rows] for name, column in columns.items()}
+            file.writelines(" ".join(row) + "\n" for row in _rows(here))
+
+
+def _zones(content: Content) -> Iterator[tuple[str, NDArray[np.int64] | None]]:
+    """Yield the head and the rows of each zone, None where it has all."""
+    kind = KINDS[content.format_name]
+    if content.grid is not None:
+        nx, ny, nz = content.grid.shape_xyz
+        yield f'T="{kind}", I={nx}, J={ny}, K={nz}', None
+    elif content.format_name == TRAJECTORIES_FORMAT:
+        dt_s = float(content.attributes["dt_s"])
+        for number, rows in enumerate(frames_of(content)):
+            if rows.size:
+                yield f'T="frame {number}", STRANDID=1, SOLUTIONTIME={number * dt_s!r}, I={rows.size}, J=1, K=1', rows
+    else:
+        yield f'T="{kind}", I={len(content.arrays["position_mm"])}, J=1, K=1', None
+
+
+def _rows(columns: dict[str, NDArray[np.generic]]) -> Iterator[tuple[str, ...]]:
+    """Yield the rows of columns as text."""
+    return zip(*(map(repr, column.tolist()) for column in columns.values()), strict=True)
 
 
 @dataclass(frozen=True)
@@ -35,11 +270,11 @@ class Format:
 # A volume has millions of voxels: as rows of text it serves nobody.
 FORMATS: dict[ExportFormat, Format] = {
     "netcdf": Format(".nc", ON_GRIDS + OF_POINTS, several=(VECTORS_FORMAT,)),
-    "tecplot": Format(".dat", ON_GRIDS + OF_POINTS, write=text.write_tecplot),
-    "csv": Format(".csv", (VECTORS_FORMAT, *OF_POINTS), write=text.write_csv),
-    "mat": Format(".mat", ON_GRIDS + OF_POINTS, write=mat.write_mat),
-    "vti": Format(".vti", ON_GRIDS, write=vtk_xml.write_vti),
-    "vtp": Format(".vtp", OF_POINTS, write=vtk_xml.write_vtp),
+    "tecplot": Format(".dat", ON_GRIDS + OF_POINTS, write=write_tecplot),
+    "csv": Format(".csv", (VECTORS_FORMAT, *OF_POINTS), write=write_csv),
+    "mat": Format(".mat", ON_GRIDS + OF_POINTS, write=write_mat),
+    "vti": Format(".vti", ON_GRIDS, write=vtk.write_vti),
+    "vtp": Format(".vtp", OF_POINTS, write=vtk.write_vtp),
     "vtkhdf-series": Format("_series.vtkhdf", (*ON_GRIDS, TRAJECTORIES_FORMAT), several=ON_GRIDS),
 }
 

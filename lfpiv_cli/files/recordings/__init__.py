@@ -1,1 +1,1 @@
-"""Frames as cameras and programs write them: a module for each format, `formats` lists them."""
+"""Frames as cameras and programs write them; `files.images.FORMATS` lists what reads each."""

@@ -2,20 +2,154 @@
 
 from __future__ import annotations
 
+import math
+import re
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lfpiv_cli.errors import InputError
-from lfpiv_cli.files.inputs import opened
-from lfpiv_cli.files.recordings.packing import Pixels
-from lfpiv_cli.files.recordings.pixels import CUT, ensure_size
-from lfpiv_cli.files.recordings.recording import Image, Recording, Shape
+from lfpiv_cli.errors import InputError, UsageError
+from lfpiv_cli.files.inputs import opened, split_page, split_part
+from lfpiv_cli.files.recordings.recording import CUT, Image, Recording, Shape, ensure_size
+
+# The green of a sensor behind colour filters.
+
+
+# Colours of the filters over the first two pixels of the first row, and of the second.
+PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
+COLOUR_HINT = (
+    "the frames of a colour sensor; save them without a header and state the layout with its pattern, "
+    "as in frames.raw:1280x800x16:bayer=RGGB, to read their green"
+)
+
+
+def green_of(mosaic: Image, pattern: str) -> Image:
+    """Return what a sensor sees in green: half of its pixels as they are, the others by the mean of those beside.
+
+    A pixel behind a red or blue filter has green ones above, below, left and right; at the rim two or three of them.
+    """
+    green = _is_green(mosaic.shape, pattern)
+    seen = np.pad(np.where(green, mosaic, np.float32(0.0)), 1)
+    there = np.pad(green.astype(np.float32), 1)
+    total, count = (a[:-2, 1:-1] + a[2:, 1:-1] + a[1:-1, :-2] + a[1:-1, 2:] for a in (seen, there))
+    return np.where(green, mosaic, total / np.maximum(count, 1.0)).astype(np.float32)
+
+
+def _is_green(shape: tuple[int, ...], pattern: str) -> NDArray[np.bool_]:
+    """Return which pixels (rows, columns) lie behind green filters."""
+    cell = np.array([colour == "G" for colour in pattern]).reshape(2, 2)
+    rows, columns = shape
+    return np.tile(cell, (rows // 2 + 1, columns // 2 + 1))[:rows, :columns]
+
+
+# How pixels lie in the bytes of a frame that is not compressed.
+
+
+# `whole`: a pixel in one byte, or in two where it has more than 8 bits. The others leave no bit between pixels: the
+# first pixel in the highest bits of the first byte (Photron, Phantom), or in the lowest (GenICam's Mono10p, Mono12p);
+# `gige` has the high bits of two pixels in the first and third of three bytes, and the low ones between them (GigE
+# Vision's Mono10Packed and Mono12Packed).
+Packing = Literal["whole", "high-first", "low-first", "gige"]
+# Bits of a pixel that can be packed: with more, a pixel could touch three bytes.
+PACKED_BITS = (10, 12)
+# The largest pixel that is stored.
+MOST_BITS = 16
+
+
+@dataclass(frozen=True, eq=False)
+class Pixels:
+    """Pixels of a frame as they are stored.
+
+    Attributes
+    ----------
+    shape : (rows, columns)
+    bits : of a pixel, 1 to 16
+    big_endian : whether the higher of two bytes is first
+    row_multiple : bytes of which each row takes a multiple, where pixels are `whole`
+    bottom_up : whether the last row comes first
+    table : count of each stored number, where the numbers are no counts
+    bayer : pattern of the colour filters, of which green is taken, see `bayer.green_of`; None without filters
+    """
+
+    shape: Shape
+    bits: int
+    packing: Packing = "whole"
+    big_endian: bool = False
+    row_multiple: int = 1
+    bottom_up: bool = False
+    table: NDArray[np.uint16] | None = None
+    bayer: str | None = None
+
+    @property
+    def frame_bytes(self) -> int:
+        """Bytes that a frame takes."""
+        rows, columns = self.shape
+        if self.packing == "whole":
+            return rows * self._row_bytes
+        if self.packing == "gige":
+            return 3 * math.ceil(rows * columns / 2)
+        return math.ceil(rows * columns * self.bits / 8)
+
+    def decode(self, data: bytes) -> Image:
+        """Return a frame of `frame_bytes` bytes as an image (rows, columns) in counts."""
+        rows, columns = self.shape
+        if self.packing == "whole":
+            kind = np.dtype(np.uint8 if self.bits <= 8 else ">u2" if self.big_endian else "<u2")
+            lines = np.frombuffer(data, np.uint8).reshape(rows, self._row_bytes)[:, : columns * kind.itemsize]
+            image = np.ascontiguousarray(lines).view(kind)
+        elif self.packing == "gige":
+            image = _unpack_gige(np.frombuffer(data, np.uint8), self.bits)[: rows * columns].reshape(self.shape)
+        else:
+            packed = np.frombuffer(data, np.uint8)
+            pixels = unpack(packed, self.bits, high_first=self.packing == "high-first")
+            image = pixels[: rows * columns].reshape(self.shape)
+        if self.table is not None:
+            image = self.table[image]
+        counts = (image[::-1] if self.bottom_up else image).astype(np.float32)
+        return counts if self.bayer is None else green_of(counts, self.bayer)
+
+    @property
+    def _row_bytes(self) -> int:
+        written = self.shape[1] * (1 if self.bits <= 8 else 2)
+        return math.ceil(written / self.row_multiple) * self.row_multiple
+
+
+def unpack(packed: NDArray[np.uint8], bits: int, high_first: bool) -> NDArray[np.uint16]:
+    """Return the pixels of `bits` bits each, one of `PACKED_BITS`, that lie in bytes without a gap, and what is left.
+
+    A group of pixels that ends with a byte is the unit: all first pixels are taken at once, then all second ones.
+
+    Parameters
+    ----------
+    packed : bytes of whole groups, or of a last one that is cut after a pixel
+    high_first : whether the first pixel is in the highest bits of the first byte, or in the lowest
+    """
+    group_bytes = math.lcm(bits, 8) // 8
+    groups = np.zeros((math.ceil(packed.size / group_bytes), group_bytes), np.uint16)
+    groups.reshape(-1)[: packed.size] = packed
+    pixels = np.empty((len(groups), group_bytes * 8 // bits), np.uint16)
+    for number in range(pixels.shape[1]):
+        byte, skipped = divmod(number * bits, 8)
+        first, second = groups[:, byte], groups[:, byte + 1]
+        if high_first:
+            pixels[:, number] = (first << 8 | second) >> (16 - skipped - bits)
+        else:
+            pixels[:, number] = (second << 8 | first) >> skipped
+    pixels &= (1 << bits) - 1
+    return pixels.reshape(-1)
+
+
+def _unpack_gige(packed: NDArray[np.uint8], bits: int) -> NDArray[np.uint16]:
+    """Return the pixels of GigE Vision's Mono10Packed or Mono12Packed: two in three bytes."""
+    first, low, second = packed.reshape(-1, 3).astype(np.uint16).T
+    kept, mask = bits - 8, (1 << (bits - 8)) - 1
+    return np.stack([first << kept | low & mask, second << kept | low >> 4 & mask], axis=1).reshape(-1)
 
 
 def values_at(path: Path, file: BinaryIO, place: int, layout: str) -> tuple[Any, ...]:
@@ -95,3 +229,141 @@ def at_rate(pages: int, rate_hz: float) -> NDArray[np.float64] | None:
     if not 0.0 < rate_hz < float("inf"):
         return None
     return np.arange(pages) / rate_hz
+
+
+# Frames without a header, whose layout is stated: WIDTHxHEIGHTxBITS and what else is to be known.
+
+
+SIZE = re.compile(r"([1-9]\d{0,5})x([1-9]\d{0,5})x([1-9]\d?)")
+# What tells a layout, right or wrong, from the name of a part.
+LOOKS_LAID_OUT = re.compile(r"\d+x\d")
+# How the names of such files end. Others need their layout in the name, as FILE.dat:LAYOUT.
+SUFFIXES = (".raw", ".bin")
+PACKINGS = get_args(Packing)
+HINT = "a layout is WIDTHxHEIGHTxBITS and options, as in 2352x1768x12:packing=low-first:header=512"
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How frames lie in a file.
+
+    Attributes
+    ----------
+    header, gap : bytes before the first frame, and after each
+    rate_hz : frames in a second, 0 where not stated
+    """
+
+    pixels: Pixels
+    header: int
+    gap: int
+    rate_hz: float
+
+
+def unstated_frames(path: Path) -> Recording:
+    """Refuse frames whose layout is not stated."""
+    raise UsageError(f"{path}: has no header: state its layout with --raw, or as {path}:LAYOUT; {HINT}")
+
+
+def frames_laid_out(path: Path, layout: str) -> Recording:
+    """Return the frames of a file, as many as a stated layout finds in it.
+
+    Raises
+    ------
+    UsageError : the layout is not one
+    InputError : the file does not end with a frame
+    """
+    laid = parse_layout(layout)
+    held = path.stat().st_size - laid.header
+    pages, rest = divmod(held, laid.pixels.frame_bytes + laid.gap)
+    # What lies between two frames may be missing after the last one.
+    if laid.gap and rest == laid.pixels.frame_bytes:
+        pages, rest = pages + 1, 0
+    if held <= 0 or rest:
+        raise InputError(
+            f"{path}: its {held} bytes after the header are {held / (laid.pixels.frame_bytes + laid.gap):.2f} frames "
+            f"of {laid.pixels.frame_bytes + laid.gap} bytes by the layout {layout}, expected a whole number: {CUT}, "
+            "or of another layout"
+        )
+    step = laid.pixels.frame_bytes + laid.gap
+    places = range(laid.header, laid.header + pages * step, step)
+    return recording(path, places, laid.pixels, at_rate(pages, laid.rate_hz))
+
+
+def with_layout(path: Path, layout: str) -> Path:
+    """Return the name of a file with a layout, where it is one without a header by its name and has none yet."""
+    file, part = split_part(path)
+    other, page = split_page(part)
+    if file.suffix.lower() not in SUFFIXES or other is not None:
+        return path
+    return file.with_name(f"{file.name}:{layout}" + ("" if page is None else f":page={page}"))
+
+
+def parse_layout(text: str) -> Layout:
+    """Return the layout that a text states.
+
+    Raises
+    ------
+    UsageError : naming what is wrong with it
+    """
+    size, *options = text.split(":")
+    found = SIZE.fullmatch(size)
+    if found is None:
+        raise UsageError(f"{size!r} is no layout of frames; {HINT}")
+    columns, rows, bits = (int(number) for number in found.groups())
+    if bits > MOST_BITS:
+        raise UsageError(f"layout {text}: has {bits} bits a pixel, expected 1 to {MOST_BITS}")
+    chosen = _options(text, options)
+    packing = chosen.get("packing", "whole")
+    if packing != "whole" and bits not in PACKED_BITS:
+        raise UsageError(f"layout {text}: {bits} bits are not packed, expected {' or '.join(map(str, PACKED_BITS))}")
+    pixels = Pixels((rows, columns), bits, packing, big_endian=chosen.get("order") == "big", bayer=chosen.get("bayer"))
+    return Layout(pixels, chosen.get("header", 0), chosen.get("gap", 0), chosen.get("rate", 0.0))
+
+
+def _bytes(text: str) -> int:
+    number = int(text)
+    if number < 0:
+        raise ValueError
+    return number
+
+
+def _rate(text: str) -> float:
+    rate = float(text)
+    if not (math.isfinite(rate) and rate > 0.0):
+        raise ValueError
+    return rate
+
+
+def _one_of(names: tuple[str, ...]) -> Callable[[str], str]:
+    def parse(text: str) -> str:
+        if text not in names:
+            raise ValueError
+        return text
+
+    return parse
+
+
+# Options of a layout: how each is read, and what is expected of it.
+OPTIONS: Mapping[str, tuple[Callable[[str], Any], str]] = {
+    "packing": (_one_of(PACKINGS), ", ".join(PACKINGS)),
+    "order": (_one_of(("little", "big")), "little, big"),
+    "header": (_bytes, "a number of bytes"),
+    "gap": (_bytes, "a number of bytes"),
+    "rate": (_rate, "frames in a second"),
+    "bayer": (_one_of(PATTERNS), ", ".join(PATTERNS)),
+}
+
+
+def _options(text: str, options: list[str]) -> dict[str, Any]:
+    """Return the options of a layout by their names."""
+    chosen: dict[str, Any] = {}
+    for option in options:
+        name, _, value = option.partition("=")
+        if name not in OPTIONS or name in chosen:
+            raise UsageError(f"layout {text}: {name!r} is no option, or there twice; expected {', '.join(OPTIONS)}")
+        parse, expected = OPTIONS[name]
+        try:
+            chosen[name] = parse(value)
+        except ValueError:
+            raise UsageError(f"layout {text}: {name} is {value!r}, expected {expected}") from None
+    return chosen

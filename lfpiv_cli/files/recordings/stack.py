@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.errors import InputError
-from lfpiv_cli.files.hdf5 import DEEPEST, member, open_h5
-from lfpiv_cli.files.recordings.pixels import CUT, as_counts, ensure_size
-from lfpiv_cli.files.recordings.recording import Image, Recording, Shape
+from lfpiv_cli.files.hdf5 import DEEPEST, open_h5
+from lfpiv_cli.files.hdf5_checks import member
+from lfpiv_cli.files.recordings.recording import CUT, Image, Recording, Shape, as_counts, ensure_size
 
 START = b"\x89HDF\r\n\x1a\n"
 TIMES = "time_s"

@@ -1,23 +1,213 @@
-"""Greyscale TIFF, one frame a page: refused rather than guessed where anything is odd."""
+"""Greyscale TIFF, one frame a page, and PNG, one a file: refused rather than guessed where anything is odd."""
 
 from __future__ import annotations
 
 import math
 import re
+import struct
+import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
+from typing import BinaryIO
 
+import imagecodecs
 import numpy as np
 import tifffile
 
 from lfpiv_cli.errors import InputError, LfpivError
 from lfpiv_cli.files.inputs import reason
-from lfpiv_cli.files.recordings.complaints import keep_complaints, reading
-from lfpiv_cli.files.recordings.pixels import CUT, GREY_HINT, HARMLESS_BYTES, as_counts, ensure_size, one_channel
-from lfpiv_cli.files.recordings.recording import Image, Recording, Shape
-from lfpiv_cli.files.recordings.tiff_chain import directories
+from lfpiv_cli.files.recordings.recording import (
+    CUT,
+    GREY_HINT,
+    HARMLESS_BYTES,
+    Image,
+    Recording,
+    Shape,
+    as_counts,
+    ensure_size,
+    keep_complaints,
+    one_channel,
+    reading,
+)
+
+# Greyscale PNG: one frame a file.
+
+
+PNG_START = b"\x89PNG\r\n\x1a\n"
+# Samples of a pixel by a PNG's colour type, once decoded: grey, colour, palette, and with transparency.
+PNG_SAMPLES = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}
+# Where the header's width, height and bit depth stand, in the part that comes first.
+HEADER_AT, HEADER = 16, ">IIB"
+# Four samples of two bytes, and as much again: what a file has beyond that, and what is said besides, is no image.
+MOST_BYTES_A_PIXEL = 16
+
+
+def png_frames(path: Path) -> Recording:
+    """Return what a PNG file's header says; its check sums are left to the reading.
+
+    Raises
+    ------
+    InputError
+    """
+    with open(path, "rb") as file:
+        file.seek(HEADER_AT)
+        header = file.read(struct.calcsize(HEADER))
+    if len(header) < struct.calcsize(HEADER):
+        raise InputError(f"{path}: its header ends after {HEADER_AT + len(header)} bytes: {CUT}")
+    columns, rows, bits = struct.unpack(HEADER, header)
+    return Recording(1, (rows, columns), bits, partial(_read_png, path))
+
+
+def _read_png(path: Path, page: int, shape: Shape | None) -> Image:
+    """Read a PNG file after checking its header and the check sums of all its parts."""
+    try:
+        declared, size = png_frames(path).shape, path.stat().st_size
+        ensure_size("the image", declared, 1, shape, size)
+        if size > HARMLESS_BYTES + MOST_BYTES_A_PIXEL * math.prod(declared):
+            raise InputError(f"has {size} bytes, more than a PNG of {declared[1]} x {declared[0]} pixels takes: {CUT}")
+        content = path.read_bytes()
+        columns, rows, bits, colour = _png_header(content)
+        if colour not in PNG_SAMPLES:
+            raise InputError(f"is a PNG of colour type {colour}: {GREY_HINT}")
+        ensure_size("the image", (rows, columns), PNG_SAMPLES[colour] * (1 if bits <= 8 else 2), shape, len(content))
+        _ensure_pixels(content, rows, columns, bits * PNG_SAMPLES[colour])
+        array = imagecodecs.png_decode(content)
+        if array.shape[:2] != (rows, columns):
+            raise InputError(f"decodes to {array.shape}, it declares {rows, columns}")
+        return as_counts(one_channel(array, "the image"))
+    except LfpivError as error:
+        raise type(error)(f"{path}: {error}") from error
+    except Exception as error:  # a damaged file can raise anything inside the decoder
+        raise InputError(f"{path}: cannot be decoded: {reason(error)}") from error
+
+
+def _ensure_pixels(content: bytes, rows: int, columns: int, bits: int) -> None:
+    """Refuse packed data that are more than the declared pixels, which a decoder may unpack all the same.
+
+    Parameters
+    ----------
+    bits : of a pixel, at most
+    """
+    # A byte for each line; interlaced images have seven passes, the lines of each filled up.
+    largest = rows * (columns * bits // 8 + 2) + 7 * (2 * rows + columns)
+    unpacker, place = zlib.decompressobj(), len(PNG_START)
+    while place < len(content):
+        length = int.from_bytes(content[place : place + 4], "big")
+        if content[place + 4 : place + 8] == b"IDAT":
+            largest -= len(unpacker.decompress(content[place + 8 : place + 8 + length], largest + 1))
+            if largest < 0 or unpacker.unconsumed_tail:
+                raise InputError(f"its data are more than the {columns} x {rows} pixels that it declares")
+        place += 12 + length
+
+
+def _png_header(content: bytes) -> tuple[int, int, int, int]:
+    """Return width, height, bit depth and colour type of a PNG whose parts are all there and undamaged."""
+    place = len(PNG_START)
+    header = b""
+    while True:
+        length = int.from_bytes(content[place : place + 4], "big")
+        kind = content[place + 4 : place + 8]
+        end = place + 12 + length
+        if end > len(content):
+            raise InputError(f"the part at byte {place} ends at byte {end} of {len(content)}: {CUT}")
+        if zlib.crc32(content[place + 4 : end - 4]) != int.from_bytes(content[end - 4 : end], "big"):
+            raise InputError(f"the part at byte {place} has a wrong check sum: {CUT}")
+        if kind == b"IHDR":
+            header = content[place + 8 : end - 4]
+        if kind == b"IEND":
+            break
+        place = end
+    if len(header) != 13:
+        raise InputError(f"its header has {len(header)} bytes, expected 13")
+    return int.from_bytes(header[:4], "big"), int.from_bytes(header[4:8], "big"), header[8], header[9]
+
+
+# A walk over a TIFF file's directories that takes nothing on trust.
+#
+# The decoding library stops at a broken directory and returns the pages before it; a count of pages that an
+# experiment relies on must not shrink in silence. So the chain is followed here first, and every directory and tag
+# value must lie inside the file. Header and entries as in the TIFF 6.0 and BigTIFF specifications.
+
+
+# Bytes of one value of each tag type, TIFF 6.0 and BigTIFF.
+TYPE_BYTES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8, 17: 8, 18: 8}
+CLASSIC, BIG = 42, 43
+# A camera's directory holds some 20 tags; the decoder gives up at 4096.
+MOST_TAGS = 4096
+# Ten hours at 25 frames a second; a chain of more is looked through for minutes.
+MOST_PAGES = 1_000_000
+# Width, height and where the data of strips or tiles lie: without them a directory is of no image.
+SIZE_TAGS, DATA_TAGS = {256, 257}, {273, 324}
+
+
+def directories(file: BinaryIO, size: int) -> list[int]:
+    """Return where the directory of each page of a TIFF file begins, after checking that each lies inside the file.
+
+    Parameters
+    ----------
+    file : open at any position
+    size : its length in bytes
+
+    Raises
+    ------
+    InputError
+        If the chain leads outside the file or into a circle; the caller adds the file's name.
+    """
+    file.seek(0)
+    head = file.read(16)
+    order = "<" if head[:2] == b"II" else ">"
+    try:
+        (magic,) = struct.unpack_from(order + "H", head, 2)
+        big = magic == BIG
+        (offset,) = struct.unpack_from(order + ("Q" if big else "I"), head, 8 if big else 4)
+    except struct.error:
+        raise InputError(f"its header has {len(head)} bytes: {CUT}") from None
+    if magic not in (CLASSIC, BIG):
+        raise InputError(f"its TIFF version is {magic}, expected {CLASSIC} or {BIG}")
+    seen: dict[int, None] = {}
+    while offset:
+        if offset in seen:
+            raise InputError(f"its directories form a circle after page {len(seen) - 1}")
+        seen[offset] = None
+        if len(seen) > MOST_PAGES:
+            raise InputError(f"it holds more than {MOST_PAGES} pages")
+        offset = _next_directory(file, size, offset, len(seen) - 1, order, big)
+    if not seen:
+        raise InputError("it holds no pages")
+    return list(seen)
+
+
+def _next_directory(file: BinaryIO, size: int, offset: int, page: int, order: str, big: bool) -> int:
+    """Return where the directory after the one at `offset` lies, 0 after the last one."""
+    count_format, pointer_format = ("Q", "Q") if big else ("H", "I")
+    entry_bytes, inline_bytes = (20, 8) if big else (12, 4)
+    file.seek(offset)
+    head = file.read(struct.calcsize(count_format))
+    if len(head) < struct.calcsize(count_format):
+        raise InputError(f"the directory of page {page} lies at byte {offset} of {size}: {CUT}")
+    (count,) = struct.unpack(order + count_format, head)
+    if not 0 < count <= MOST_TAGS:
+        raise InputError(f"the directory of page {page} has {count} entries, expected 1 to {MOST_TAGS}")
+    length = count * entry_bytes + inline_bytes
+    body = file.read(length)
+    if len(body) < length:
+        raise InputError(f"the directory of page {page} ends after {size} bytes: {CUT}")
+    tags = set()
+    for k in range(count):
+        tag, kind, values = struct.unpack_from(order + "HH" + pointer_format, body, k * entry_bytes)
+        tags.add(tag)
+        bytes_used = values * TYPE_BYTES.get(kind, 1)
+        if bytes_used > inline_bytes:
+            (place,) = struct.unpack_from(order + pointer_format, body, (k + 1) * entry_bytes - inline_bytes)
+            if place + bytes_used > size:
+                raise InputError(f"tag {tag} of page {page} ends at byte {place + bytes_used} of {size}: {CUT}")
+    if not tags >= SIZE_TAGS or not tags & DATA_TAGS:
+        raise InputError(f"the directory of page {page} is of no image, it has the tags {sorted(tags)[:20]}: {CUT}")
+    (following,) = struct.unpack_from(order + pointer_format, body, count * entry_bytes)
+    return following
+
 
 STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 # Photometric interpretations: of a greyscale TIFF whose zeros are black, and of colours.

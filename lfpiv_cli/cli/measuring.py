@@ -1,0 +1,381 @@
+"""Commands that measure: the whole chain, volumes and particles, vectors, tracks and fields."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import wraps
+from pathlib import Path
+from typing import Any
+
+import click
+
+from lfpiv_cli.cli.options import (
+    FILE,
+    POSITIVE,
+    background_option,
+    batch_options,
+    board_option,
+    common_options,
+    config_argument,
+    dark_option,
+    depth_option,
+    dt_option,
+    inputs_argument,
+    mask_option,
+    output_option,
+    pairing_options,
+    raw_option,
+    watch_options,
+    white_option,
+    work_options,
+)
+from lfpiv_cli.console import Console
+from lfpiv_cli.errors import UsageError
+from lfpiv_cli.names import Divergence, GridMethod, Kept, RunMethod, Start, names_in
+from lfpiv_cli.reconstruction.registry import SOLVER_NAMES
+
+
+@click.command("field")
+@click.argument("samples", type=FILE, nargs=-1, required=True)
+@dt_option
+@click.option(
+    "--divergence",
+    type=click.Choice(names_in(Divergence)),
+    help="Held down as far as the data ask for (penalised, the default), none (free), or not known (off).",
+)
+@click.option("--frame", type=click.IntRange(min=0), help="Frame of a sequence's tracks, from 0; the middle one.")
+@click.option("--derived", is_flag=True, help="Also write vorticity, divergence, strain rate, Q criterion, gradients.")
+@click.option(
+    "--at", type=FILE, help="File of points (x, y, z in mm a line); velocities there go to OUTPUT's name with _at.csv."
+)
+@click.option(
+    "--pressure",
+    type=FILE,
+    help="Folder of the particles of all frames of a sequence: the pressure is found by its tracks' accelerations.",
+)
+@output_option("File of vectors to write (.vtkhdf).")
+@common_options
+def field(
+    samples: tuple[Path, ...],
+    output: Path,
+    overwrite: bool,
+    console: Console,
+    pressure: Path | None = None,
+    **chosen: Any,
+) -> dict[str, Any]:
+    """Fit one velocity field to tracks and vectors of a flow, each weighed by its error.
+
+    The field is smooth and, in a liquid, free of divergence as far as the data ask for; where no track is near, the
+    vector is rejected. It is written on correlate's grid.
+
+    \b
+    Example: lfpiv field tracks.vtkhdf -o field.vtkhdf
+             lfpiv field tracks.vtkhdf vectors.vtkhdf --derived -o field.vtkhdf
+             lfpiv field run/tracks.vtkhdf --pressure run/particles -o field.vtkhdf
+    """
+    from lfpiv_cli.files.listing import expanded
+    from lfpiv_cli.verbs import field as stage
+
+    particles = [] if pressure is None else expanded([pressure], "results")
+    return stage.fit_flow(
+        samples, output, stage.FieldOptions(pressure=particles, **chosen), overwrite=overwrite, console=console
+    )
+
+
+@click.command("track")
+@inputs_argument("particles", "results")
+@dt_option
+@click.option(
+    "--search", "search_voxel", type=POSITIVE, help="Largest displacement, voxels; six microlenses when not given."
+)
+@click.option(
+    "--shortest",
+    type=click.IntRange(min=2),
+    help="Sequence: fewest frames of a track, shorter ones are ghosts; 3 when not given.",
+)
+@click.option("--grid", is_flag=True, help="Also write vectors on correlate's grid, as OUTPUT's name with _grid.")
+@click.option(
+    "--by",
+    type=click.Choice(names_in(GridMethod)),
+    help="With --grid: local polynomials (the default), or one field of splines, as of field.",
+)
+@pairing_options
+@batch_options
+@output_option("File of tracks to write (.vtkhdf), folder for several pairs.")
+@common_options
+def track(
+    particles: tuple[Path, ...], output: Path, overwrite: bool, console: Console, **chosen: Any
+) -> dict[str, Any]:
+    """Follow particles from one frame to the next, or over a sequence: particle tracking velocimetry (PTV).
+
+    Two files give a displacement for each particle that is in both. More than two, in the order of time, give tracks:
+    each place with the number of its track and frame and with a velocity by a local polynomial in time; --grid then
+    writes one file for each interval between frames (OUTPUT's name with _grid_0000, ...). With --pairing ab they are
+    separate pairs by their names, and each gives a file.
+
+    \b
+    Example: lfpiv track particles/a.vtkhdf particles/b.vtkhdf -o tracks.vtkhdf --grid
+             lfpiv track particles/frame_*.vtkhdf -o tracks.vtkhdf --grid
+             lfpiv track particles --pairing ab --grid --resume --keep-going -o tracks
+    with particles from
+             lfpiv reconstruct weights.h5 a.tif b.tif --dark dark.tif --solver particles -o particles
+    """
+    from lfpiv_cli.verbs import track as stage
+
+    return stage.track_particles(particles, output, stage.TrackOptions(**chosen), overwrite=overwrite, console=console)
+
+
+@click.command("follow")
+@click.argument("weights", type=FILE)
+@inputs_argument("frames")
+@dark_option
+@background_option
+@mask_option
+@dt_option
+@click.option(
+    "--search",
+    "search_voxel",
+    type=POSITIVE,
+    help="Largest displacement from the first frame to the second, voxels; six microlenses when not given.",
+)
+@click.option(
+    "--shortest", type=click.IntRange(min=2), default=4, help="Fewest frames of a track, shorter ones are ghosts; 4."
+)
+@click.option(
+    "--both-ways", is_flag=True, help="Go a second time through the frames, each by its tracks before and after it."
+)
+@click.option("--residuals", is_flag=True, help="Also write what the particles leave of each image.")
+@work_options
+@output_option("Folder for the particles of each frame and the tracks.")
+@common_options
+@raw_option
+def follow(
+    weights: Path, frames: tuple[Path, ...], output: Path, overwrite: bool, console: Console, **chosen: Any
+) -> dict[str, Any]:
+    """Find and track the particles of a time-resolved sequence together, as in Shake-The-Box.
+
+    The first two frames are searched as a pair. Then each track predicts where its particle is in the next frame, the
+    predicted particles are refined together on the image, and only what they leave of it is searched for others. Frames
+    are taken in the order of their numbers, or the pages of one file. With --keep-going, tracks end before a frame that
+    cannot be read, and others begin behind it.
+
+    \b
+    Writes OUTPUT/particles/STEM.vtkhdf for each frame, as reconstruct does, OUTPUT/tracks.vtkhdf, as track does,
+    and OUTPUT/playback.vtkhdf, in which ParaView plays the tracks in time.
+
+    \b
+    Example: lfpiv follow weights.h5 run.tif --dark dark.tif -o run
+             lfpiv follow weights.h5 frame_*.tif --dark dark.tif --both-ways -o run
+    before the limit of a job it stops, and the same command goes on:
+             lfpiv follow weights.h5 run.tif --dark dark.tif --time-limit 50m --resume -o run
+    """
+    from lfpiv_cli.verbs import follow as stage
+
+    return stage.follow_particles(
+        weights, frames, output, stage.FollowOptions(**chosen), overwrite=overwrite, console=console
+    )
+
+
+def parse_windows(
+    _context: click.Context, _parameter: click.Parameter, text: str | None
+) -> tuple[int | tuple[int, ...], ...] | None:
+    """Return windows given as 32,16 or 32x32x16,16x16x8."""
+    return None if text is None else tuple(_window(part) for part in text.split(","))
+
+
+def _window(text: str) -> int | tuple[int, ...]:
+    try:
+        sizes = tuple(int(part) for part in text.lower().split("x"))
+    except ValueError as error:
+        raise UsageError(f"--windows: {text!r} is neither a number of voxels nor three of them as 32x32x16") from error
+    return sizes[0] if len(sizes) == 1 else sizes
+
+
+@click.command("correlate")
+@inputs_argument("volumes", "results")
+@click.option("--config", type=FILE, help="In place of the config carried by the volumes.")
+@dt_option
+@click.option("--windows", callback=parse_windows, help="Interrogation windows in voxels, coarse to fine, as 32,16.")
+@click.option("--overlap", type=click.FloatRange(min=0.0, max=1.0, max_open=True), help="Of neighbouring windows.")
+@pairing_options
+@click.option("--mask", "mask_volume", type=FILE, help="Volume on the same grid: voxels of 0 are left out.")
+@click.option("--ensemble", is_flag=True, help="One field of all pairs together, for a flow that does not change.")
+@click.option("--derived", is_flag=True, help="Also write vorticity, divergence, strain rate and Q criterion.")
+@click.option(
+    "--mean",
+    type=FILE,
+    help="File of the pairs' mean and fluctuations to write (.vtkhdf); of vectors or tracks that are there, too.",
+)
+@batch_options
+@watch_options
+@output_option("File for one pair, folder for several.", required=False)
+@common_options
+def correlate(
+    volumes: tuple[Path, ...], overwrite: bool, console: Console, output: Path | None = None, **chosen: Any
+) -> dict[str, Any]:
+    """Measure the displacements between two volumes by multi-pass three-dimensional cross-correlation.
+
+    From pass to pass interrogation windows get finer and the volumes are deformed by what was found; false vectors are
+    detected by a median test and replaced. More than two volumes need --pairing: ab pairs them by their names (img_1_a
+    with img_1_b, or by numbers), sequence takes each with the next, none across a gap. Of vectors or tracks in place of
+    volumes --mean is made, and nothing else.
+
+    \b
+    Example: lfpiv correlate volumes/a.vtkhdf volumes/b.vtkhdf -o vectors.vtkhdf
+             lfpiv correlate volumes --pairing sequence --mean mean.vtkhdf -o vectors
+             lfpiv correlate vectors --mean mean.vtkhdf
+    """
+    from lfpiv_cli.verbs import correlate as stage
+
+    return stage.correlate_files(
+        volumes, output, stage.CorrelateOptions(**chosen), overwrite=overwrite, console=console
+    )
+
+
+@click.command("combine")
+@click.argument("vectors_a", type=FILE)
+@click.argument("vectors_b", type=FILE)
+@output_option("File of combined vectors to write (.vtkhdf).")
+@common_options
+def combine(vectors_a: Path, vectors_b: Path, output: Path, overwrite: bool, console: Console) -> dict[str, Any]:
+    """Weight two vector fields on one grid by their uncertainties, those of correlate and of track --grid.
+
+    A vector that has none, or that disagrees with the other and with those around it, is left out; share_a is the
+    weight of the first file in each component, disagreement how many standard errors lie between the two.
+
+    \b
+    Example: lfpiv combine vectors.vtkhdf tracks_grid.vtkhdf -o combined.vtkhdf
+    """
+    from lfpiv_cli.verbs import combine as stage
+
+    return stage.combine_vectors(vectors_a, vectors_b, output, overwrite=overwrite, console=console)
+
+
+def named_images(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Let a command take its images by the option --images, too."""
+
+    @click.option("--images", "named", type=FILE, multiple=True, help="The same: images of the flow.")
+    @wraps(command)
+    def run(named: tuple[Path, ...], images: tuple[Path, ...], **arguments: Any) -> Any:
+        return command(images=(*named, *images), **arguments)
+
+    return run
+
+
+@click.command("run")
+@config_argument
+@named_images
+@inputs_argument("images")
+@white_option
+@dark_option
+@board_option
+@depth_option
+@background_option
+@mask_option
+@click.option(
+    "--method", type=click.Choice(names_in(RunMethod)), help="By what the flow is measured; auto when not given."
+)
+@pairing_options
+@dt_option
+@click.option("--combine", is_flag=True, help="With both: also one field that weights their vectors.")
+@click.option("--follow", is_flag=True, help="Time-resolved sequence: find and track particles together.")
+@click.option(
+    "--keep",
+    type=click.Choice(names_in(Kept)),
+    help="results: drop volumes, and particles of separate pairs, as soon as their vectors stand; all when not given.",
+)
+@work_options
+@click.option("--report/--no-report", default=True, help="Make OUTPUT/report.html, a page of all of it.")
+@output_option("Folder for all that is made.")
+@common_options
+@raw_option
+def run(
+    config: Path,
+    images: tuple[Path, ...],
+    output: Path,
+    overwrite: bool,
+    console: Console,
+    **chosen: Any,
+) -> dict[str, Any]:
+    """Go from raw images to vectors: calibrate, build weights, measure the flow.
+
+    Every step writes what its own command does, into OUTPUT. By itself it counts the tracers for each microlens, and
+    measures by particles up to about two, where these err less, and by volumes beyond; OUTPUT/run.json says which and
+    why, and OUTPUT/report.html shows all of it. Run it again, and it keeps what is complete and made alike, and goes on
+    from there, with --resume or without; with --overwrite it makes anew what was made from other inputs or settings.
+    More than two images need --pairing or --follow; thousands of pairs take no more disk than their vectors with --keep
+    results. A --shard makes the files of its pairs; the same command without it then makes run.json and the page.
+
+    \b
+    Example: lfpiv run rig.yaml a.tif b.tif --white white.tif --dark dark.tif --board board.tif -o results
+    by both ways, and one field of the two:
+             lfpiv run rig.yaml a.tif b.tif --white white.tif --dark dark.tif --board board.tif \\
+                 --method both --combine -o results
+    a folder of pairs, whatever becomes of single ones:
+             lfpiv run rig.yaml images --pairing ab --white white.tif --dark dark.tif --board board.tif \\
+                 --keep results --keep-going -o results
+    a third of its pairs, as a job of its own, that stops before the limit of the job:
+             lfpiv run rig.yaml images --pairing ab --white white.tif --dark dark.tif --board board.tif \\
+                 --shard 2/3 --time-limit 50m -o results
+    """
+    from lfpiv_cli.verbs import run as stage
+
+    return stage.run(config, output, stage.RunOptions(images=images, **chosen), overwrite=overwrite, console=console)
+
+
+@click.command("reconstruct")
+@click.argument("weights", type=FILE)
+@inputs_argument("images")
+@click.option("--solver", type=click.Choice(SOLVER_NAMES), help="Of volumes, or particles; default from the config.")
+@click.option("--iterations", type=click.IntRange(min=1), help="Steps of the solver; default from the config.")
+@click.option(
+    "--relaxation",
+    type=click.FloatRange(min=0.0, min_open=True, max=2.0),
+    help="mu of Eq. 12; default from the config.",
+)
+@click.option("--accelerate/--no-accelerate", default=None, help="Extrapolate between steps; default from the config.")
+@click.option("--start", type=click.Choice(names_in(Start)), help="First volume; default from the config.")
+@dark_option
+@background_option
+@mask_option
+@pairing_options
+@click.option(
+    "--residual/--no-residual",
+    default=None,
+    help="Of particles, also write what they leave of each image, as OUTPUT's name with _residual.tif; written when "
+    "not given.",
+)
+@batch_options
+@watch_options
+@output_option("File for one image, folder for several.")
+@common_options
+@raw_option
+def reconstruct(
+    weights: Path, images: tuple[Path, ...], output: Path, overwrite: bool, console: Console, **chosen: Any
+) -> dict[str, Any]:
+    """Reconstruct the volume of tracer particles behind each image (tomographic reconstruction).
+
+    With --solver particles it finds the particles themselves by iterative particle reconstruction: each is fitted to
+    the raw image, and ghost particles are removed; with --pairing, neighbouring frames help each other. Hot and dead
+    pixels of the dark image are left out.
+
+    \b
+    Example: lfpiv reconstruct weights.h5 a.tif b.tif --dark dark.tif -o volumes
+    particles of a pair:
+             lfpiv reconstruct weights.h5 a.tif b.tif --dark dark.tif --solver particles --pairing ab -o particles
+    frames without a header:
+             lfpiv reconstruct weights.h5 shot.raw --raw 2352x1768x12:packing=low-first -o volumes
+    over a long sequence, the background of each frame from the fifteen around it:
+             lfpiv reconstruct weights.h5 run.tif --background minimum:15 --mask mask.png -o volumes
+    all images of a folder, in the order of their numbers, and those of a list:
+             lfpiv reconstruct weights.h5 images --files-from more.txt --resume --keep-going -o volumes
+    on a cluster, a third of them; on this machine, by four processes; while the camera still writes them:
+             lfpiv reconstruct weights.h5 images --shard 2/3 --time-limit 50m --resume -o volumes
+             lfpiv reconstruct weights.h5 images --dask local:4 -o volumes
+             lfpiv reconstruct weights.h5 images --watch --idle-s 30 -o volumes
+    """
+    from lfpiv_cli.verbs import reconstruct as stage
+
+    return stage.reconstruct_files(
+        weights, images, output, stage.ReconstructOptions(**chosen), overwrite=overwrite, console=console
+    )

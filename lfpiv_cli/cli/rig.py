@@ -1,0 +1,319 @@
+"""Commands of a rig: a configuration to begin with, what to expect of it, its calibration and its weights."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+from lfpiv_cli.cli.options import FILE, POSITIVE, common_options, config_argument, dark_option, raw_option
+from lfpiv_cli.console import Console
+from lfpiv_cli.names import KnownCamera, names_in
+
+if TYPE_CHECKING:
+    from lfpiv_cli.files.rig_numbers import RigNumbers
+from lfpiv_cli.cli.options import (
+    board_option,
+    depth_option,
+    output_option,
+    white_option,
+)
+from lfpiv_cli.names import Method, Refraction, Sampling
+
+
+@click.command("build-weights")
+@config_argument
+@click.option("--calibration", type=FILE, help="From calibrate-snapshot; without it the data sheet holds.")
+@click.option(
+    "--method", type=click.Choice(names_in(Method)), help="Equivalent, traced or fitted rays; default from the config."
+)
+@click.option("--refraction", type=click.Choice(names_in(Refraction)), help="Snell's law; default from the config.")
+@click.option("--sampling", type=click.Choice(names_in(Sampling)), help="Integrals or rays; default from the config.")
+@click.option("--dry-run", is_flag=True, help="Check everything and estimate time and memory; write nothing.")
+@output_option("Weights file to write (.h5).")
+@common_options
+def build_weights(config: Path, output: Path, overwrite: bool, console: Console, **chosen: Any) -> dict[str, Any]:
+    """Calculate how every voxel lights every pixel: its point-spread function behind main lens and microlenses.
+
+    \b
+    Example: lfpiv build-weights rig.yaml --calibration calibration.h5 -o weights.h5
+             lfpiv build-weights rig.yaml --calibration calibration.h5 -o weights.h5 --dry-run
+    """
+    from lfpiv_cli.verbs import build_weights as stage
+
+    return stage.build_weights_file(
+        config, output, stage.BuildWeightsOptions(**chosen), overwrite=overwrite, console=console
+    )
+
+
+@click.command("calibrate-snapshot")
+@config_argument
+@white_option
+@dark_option
+@board_option
+@depth_option
+@output_option("Calibration file to write (.h5).")
+@click.option("--picture", type=FILE, help="Picture of the fitted lattice and board to write (.png).")
+@click.option("--views", type=FILE, help="Picture of views and refocused depths to write (.png).")
+@common_options
+@raw_option
+def calibrate_snapshot(config: Path, output: Path, overwrite: bool, console: Console, **chosen: Any) -> dict[str, Any]:
+    """Find microlenses and focal plane from a white image and one snapshot of a calibration target.
+
+    \b
+    Example: lfpiv calibrate-snapshot rig.yaml --white white.tif --dark dark.tif --board board.tif \\
+                 -o calibration.h5 --picture calibration.png
+    for `build-weights --method dlfc`, with targets at several depths in the fluid:
+             lfpiv calibrate-snapshot rig.yaml --white white.tif --board b1.tif --depth-mm -8 \\
+                 --board b2.tif --depth-mm 0 --board b3.tif --depth-mm 8 -o calibration.h5
+    without a target, with a camera known to be focused on the channel's mid plane:
+             lfpiv calibrate-snapshot rig.yaml --white white.tif --depth-mm 0 -o calibration.h5
+    """
+    from lfpiv_cli.verbs import calibrate as stage
+
+    return stage.calibrate_snapshot(
+        config, output, stage.CalibrateOptions(**chosen), overwrite=overwrite, console=console
+    )
+
+
+@click.command("refine-calibration")
+@config_argument
+@click.argument("images", type=FILE, nargs=-1, required=True)
+@click.option("--calibration", type=FILE, required=True, help="From calibrate-snapshot.")
+@dark_option
+@click.option("--background", type=FILE, help="Image without tracers to subtract, in place of the dark one.")
+@output_option("Corrected calibration to write (.h5); without it, only report.", required=False)
+@click.option("--picture", type=FILE, help="Picture of the particles and the walls they end at to write (.png).")
+@common_options
+@raw_option
+def refine_calibration(
+    config: Path, images: tuple[Path, ...], calibration: Path, overwrite: bool, console: Console, **chosen: Any
+) -> dict[str, Any]:
+    """Correct a calibration by the tracers of a flow: volume self-calibration.
+
+    The particles end at the channel's walls, which gives the mid plane, and their images say how far the lens images
+    have moved since the white image. Behind the curved faces of a scene they tell where the pipe's axis lies and how it
+    is tilted; build-weights moves the scene so.
+
+    \b
+    Example: lfpiv refine-calibration rig.yaml a.tif b.tif --calibration calibration.h5 --dark dark.tif \\
+                 -o refined.h5 --picture walls.png
+    """
+    from lfpiv_cli.verbs import refine as stage
+
+    return stage.refine_calibration(
+        config, images, calibration, stage.RefineOptions(**chosen), overwrite=overwrite, console=console
+    )
+
+
+RIG = Path("rig.yaml")
+# What a length may be answered in.
+UNITS_MM = {"m": 1e3, "cm": 10.0, "mm": 1.0, "nm": 1e-6, "um": 1e-3, "µm": 1e-3, "μm": 1e-3}
+Answer = TypeVar("Answer")
+
+
+@click.command("init")
+@click.argument("config", type=FILE, required=False)
+@click.option("-o", "--output", type=FILE, help="File to write, in place of CONFIG; default rig.yaml.")
+@click.option("--camera", type=click.Choice(names_in(KnownCamera)), help="A published camera, nothing is asked.")
+@click.option("--from", "calibration", type=FILE, help="A calibration (.h5), whose configuration is written again.")
+@click.option("--schema", is_flag=True, help="Write the JSON schema of rig files instead, for editors.")
+@common_options
+def init(
+    config: Path | None = None,
+    output: Path | None = None,
+    schema: bool = False,
+    *,
+    overwrite: bool,
+    console: Console,
+    **chosen: Any,
+) -> dict[str, Any]:
+    """Write a rig file to begin with, from a few numbers that are asked for.
+
+    An answer of nothing takes the default in brackets; defaults follow from the answers before. Lengths may have a
+    unit, as 10.5 cm or 5.5 um. The file can be simulated and run as it is. It names the schema where rig.schema.json
+    lies beside it.
+
+    \b
+    Example: lfpiv init rig.yaml
+             lfpiv init --camera table2 -o table2.yaml
+             lfpiv init --from calibration.h5 -o again.yaml
+             lfpiv init --schema -o rig.schema.json
+    """
+    from lfpiv_cli.errors import UsageError
+    from lfpiv_cli.files.atomic import ensure_writable
+    from lfpiv_cli.verbs import init as stage
+
+    if config is not None and output is not None:
+        raise UsageError(f"init writes one file, and {config} and -o {output} were given")
+    if schema:
+        return stage.write_schema(output or config or Path(stage.SCHEMA_NAME), overwrite=overwrite)
+    target = output or config or RIG
+    ensure_writable(target, overwrite)
+    if not chosen:
+        chosen["numbers"] = _asked()
+    return stage.init(target, stage.InitOptions(**chosen), overwrite=overwrite, console=console)
+
+
+@click.command("check")
+@config_argument
+@click.argument("images", type=FILE, nargs=-1)
+@click.option("--white", type=FILE, help="White image, which tells where the lens images lie.")
+@dark_option
+@click.option("--calibration", type=FILE, help="From calibrate-snapshot, in place of the data sheet.")
+@click.option("--velocity-m-s", type=POSITIVE, help="Velocity to expect; default that of the configured flow.")
+@click.option("--picture", type=FILE, help="Picture of errors and field of view by depth to write (.png).")
+@common_options
+@raw_option
+def check(config: Path, images: tuple[Path, ...], overwrite: bool, console: Console, **chosen: Any) -> dict[str, Any]:
+    """Tell what a rig and its images are good for, in seconds, before any work.
+
+    Each line has its verdict: good; look, worth a look; no, it cannot work so; or unknown, where nobody can tell. The
+    verdict on the whole is the worst of them. Errors are the smallest that the light allows. The exit code is 0
+    whatever the verdict, which --json has as `verdict`.
+
+    \b
+    Example: lfpiv check rig.yaml --velocity-m-s 0.2 --picture rig.png
+             lfpiv check rig.yaml a.tif b.tif --white white.tif --dark dark.tif
+             lfpiv check rig.yaml a.tif b.tif --calibration calibration.h5 --dark dark.tif
+    """
+    from lfpiv_cli.verbs import check as stage
+
+    return stage.check(config, images, stage.CheckOptions(**chosen), overwrite=overwrite, console=console)
+
+
+def _asked() -> RigNumbers:
+    """Ask for the numbers of a rig; each default follows from the answers before it."""
+    from lfpiv_cli.files.rig_numbers import RigNumbers
+
+    plain = RigNumbers()
+    answers: dict[str, Any] = {
+        "magnification": _magnification(plain.magnification),
+        "focal_length_mm": _length("focal length of the main lens, mm", plain.focal_length_mm),
+        "pitch_mm": (pitch := _length("pitch of the microlenses, mm", plain.pitch_mm)),
+    }
+    guess = RigNumbers(**answers).complete()
+    focal = _length_or_f_number(
+        "focal length of the microlenses, mm, or their f-number as f/8", f"{guess.microlens_focal_length_mm:g}"
+    )
+    answers["microlens_focal_length_mm"] = focal[0] or focal[1] * pitch
+    guess = RigNumbers(**answers).complete()
+    aperture = _length_or_f_number("f-number of the main lens as f/4, or its aperture, mm", f"f/{guess.f_number:g}")
+    answers["f_number"] = aperture[1] or answers["focal_length_mm"] / aperture[0]
+    answers |= {
+        "pixel_um": _length("size of the pixels, um", plain.pixel_um, "um"),
+        "columns": _count("columns of the images", plain.columns),
+        "rows": _count("rows of the images", plain.rows),
+        "fluid": (fluid := _asked_for("refractive index of the fluid", plain.fluid, _above_zero)),
+    }
+    if fluid != 1.0:
+        answers["wall"] = _asked_for("refractive index of the wall or window", plain.wall, _above_zero)
+        answers["wall_mm"] = _length_or_none("its thickness, mm", plain.wall_mm)
+        width = _length_or_none("inner width of the channel along the optical axis, mm, 0 without one", 0.0)
+        answers["channel_mm"] = width or None
+    guess = RigNumbers(**answers).complete()
+    answers["size_mm"] = _sides("size of the volume, mm", guess.size_mm or (1.0, 1.0, 1.0))
+    answers["velocity_m_s"] = _asked_for(
+        "velocity to expect, m/s", plain.velocity_m_s, lambda answer: _in_unit(answer.removesuffix("/s"), "m")
+    )
+    wavelength = _length_or_none(
+        "wavelength of the light, nm, 0 for rays, with which no camera's images agree", 532.0, "nm"
+    )
+    answers["wavelength_nm"] = wavelength or None
+    return RigNumbers(**answers)
+
+
+def _magnification(default: float) -> float:
+    """Ask for the magnification; images are inverted, whether the answer has its minus or not, and that is said."""
+
+    def parsed(answer: str) -> float:
+        value = -_above_zero(answer.removeprefix("-"))
+        if not answer.startswith("-"):
+            click.echo(f"magnification: taken as {value:g}, because the image is inverted", err=True)
+        return value
+
+    return _asked_for("magnification, image over object, negative because the image is inverted", default, parsed)
+
+
+def _asked_for(text: str, default: float | str, parse: Callable[[str], Answer]) -> Answer:
+    """Ask for what a function makes of an answer; where it raises click asks again."""
+    shown = default if isinstance(default, str) else f"{default:g}"
+    return click.prompt(text, shown, value_proc=lambda answer: parse(answer.strip()), err=True)
+
+
+def _length(text: str, default: float, unit: str = "mm") -> float:
+    return _asked_for(text, default, lambda answer: _in_unit(answer, unit))
+
+
+def _length_or_none(text: str, default: float, unit: str = "mm") -> float:
+    """Ask for a length that may be 0."""
+    return _asked_for(text, default, lambda answer: 0.0 if _split_unit(answer)[0] == "0" else _in_unit(answer, unit))
+
+
+def _count(text: str, default: int) -> int:
+    return int(click.prompt(text, default, type=click.IntRange(min=1), err=True))
+
+
+def _length_or_f_number(text: str, default: str) -> tuple[float, float]:
+    """Ask for a length or an f-number; the other one of the two is 0."""
+
+    def parsed(answer: str) -> tuple[float, float]:
+        word = answer.lower()
+        return (0.0, _above_zero(word.removeprefix("f/"))) if word.startswith("f/") else (_in_unit(word, "mm"), 0.0)
+
+    return _asked_for(text, default, parsed)
+
+
+def _sides(text: str, default: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Ask for three lengths; a unit behind the last one alone is that of all."""
+
+    def parsed(answer: str) -> tuple[float, float, float]:
+        apart = re.sub(r"[,x×]", " ", answer)
+        words = re.sub(rf"\s+(?=({'|'.join(UNITS_MM)})\b)", "", apart).split()
+        units = [_split_unit(word)[1] for word in words]
+        if len(words) == 3 and not any(units[:2]):
+            words = [f"{_split_unit(word)[0]}{units[2]}" for word in words]
+        if len(words) != 3:
+            raise click.UsageError(f"{answer}: expected three lengths, x y z")
+        x, y, z = (_in_unit(word, "mm") for word in words)
+        return x, y, z
+
+    return _asked_for(text, " ".join(f"{side:g}" for side in default), parsed)
+
+
+def _split_unit(word: str) -> tuple[str, str]:
+    """Return the number of an answer, and the unit of length behind it, or nothing."""
+    found = re.fullmatch(rf"(.*?)\s*({'|'.join(UNITS_MM)})?", word, re.DOTALL)
+    return (word, "") if found is None else (found[1], found[2] or "")
+
+
+def _in_unit(answer: str, unit: str) -> float:
+    """Return a length in a unit, which the answer is in where it names no other one.
+
+    Raises
+    ------
+    UsageError : it says none above 0
+    """
+    number, named = _split_unit(answer)
+    value = _above_zero(number)
+    # Not 0.0055 mm as 5.499999999999999 um.
+    return value if named in ("", unit) else float(f"{value * UNITS_MM[named] / UNITS_MM[unit]:.12g}")
+
+
+def _above_zero(word: str) -> float:
+    """Return the number that a word says.
+
+    Raises
+    ------
+    UsageError : it says none, or none above 0; click asks again
+    """
+    try:
+        value = float(word)
+    except ValueError as error:
+        raise click.UsageError(f"{word}: is no number") from error
+    if not 0.0 < value < float("inf"):
+        raise click.UsageError(f"{word}: expected a number above 0")
+    return value

@@ -1,0 +1,257 @@
+"""What changes in time in one file, which ParaView plays: VTKHDF with a step for each time.
+
+Volumes or vectors are VTK's temporal ImageData: `/VTKHDF` with the grid's attributes and `Steps`, and in `PointData`
+the arrays [t, z, y, x], components last; of a single plane [t, y, x], and of a single time without t and `Steps`, as
+VTK reads them. What is measured is in the files of the single times; this one is for the eye. Tracks of a sequence are
+what `playback` writes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+from xml.sax.saxutils import quoteattr
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from lfpiv_cli.files.exports.content import Content
+from lfpiv_cli.files.hdf5 import FILTERS, create, ensure_format, open_h5, write_array, write_rows
+from lfpiv_cli.files.particle_file import POSITION, TRAJECTORIES_FORMAT, UNITS, PointRows, Points, lines_of
+from lfpiv_cli.files.vtkhdf import create_vtk_group, place_image, write_root, write_steps
+from lfpiv_cli.reference import Reference
+
+# VTK's XML files: images (`.vti`) and points (`.vtp`), for programs that do not read VTKHDF.
+#
+# The arrays lie behind the XML as raw bytes, each after its length, so that nothing is rounded.
+
+
+LENGTH = np.dtype("<u8")
+
+
+class _Appended:
+    """The arrays that lie behind the XML."""
+
+    def __init__(self) -> None:
+        """Begin with none."""
+        self.arrays: list[NDArray[Any]] = []
+        self._offset = 0
+
+    def element(self, name: str, array: NDArray[Any], unit: str | None = None) -> str:
+        """Add an array, a row for each place; return the element that speaks of it."""
+        kind = {"f": "Float", "i": "Int", "u": "UInt"}[array.dtype.kind]
+        components = array.shape[1] if array.ndim == 2 else 1
+        head = (
+            f'<DataArray type="{kind}{8 * array.itemsize}" Name={quoteattr(name)} NumberOfComponents="{components}" '
+            f'format="appended" offset="{self._offset}"'
+        )
+        self.arrays.append(np.ascontiguousarray(array, array.dtype.newbyteorder("<")))
+        self._offset += LENGTH.itemsize + array.nbytes
+        if unit is None:
+            return f"{head}/>\n"
+        label = f'<InformationKey name="UNITS_LABEL" location="vtkDataArray">{unit}</InformationKey>'
+        return f"{head}>{label}</DataArray>\n"
+
+
+def write_vti(path: Path, content: Content) -> None:
+    """Write a volume or vectors as an image of VTK, a point for each voxel or window."""
+    if content.grid is None:
+        raise ValueError("points are no image")
+    grid, appended = content.grid, _Appended()
+    extent = " ".join(f"0 {count - 1}" for count in grid.shape_xyz)
+    vectors = ' Vectors="velocity"' if "velocity" in content.arrays else ""
+    arrays = "".join(
+        appended.element(name, array.reshape(-1, *array.shape[3:]), content.units[name])
+        for name, array in content.arrays.items()
+    )
+    origin, spacing = (" ".join(map(repr, map(float, each))) for each in (grid.origin_mm, grid.spacing_mm))
+    body = (
+        f'<ImageData WholeExtent="{extent}" Origin="{origin}" Spacing="{spacing}">\n{_field_data(content)}'
+        f'<Piece Extent="{extent}">\n<PointData{vectors}>\n{arrays}</PointData>\n</Piece>\n</ImageData>\n'
+    )
+    _write(path, "ImageData", body, appended)
+
+
+def write_vtp(path: Path, content: Content) -> None:
+    """Write particles or tracks as points of VTK: a vertex for each, and a line for each track of a sequence."""
+    appended, position = _Appended(), content.arrays[POSITION]
+    arrays = {name: array for name, array in content.arrays.items() if name != POSITION}
+    lines = lines_of(arrays["track"]) if "track" in arrays else np.zeros(1, np.int64)
+    data = "".join(appended.element(name, array, content.units[name]) for name, array in arrays.items())
+    points = appended.element("Points", position, content.units[POSITION])
+    vertices = _cells("Verts", np.arange(len(position) + 1), appended)
+    body = (
+        f'<PolyData>\n{_field_data(content)}<Piece NumberOfPoints="{len(position)}" NumberOfVerts="{len(position)}" '
+        f'NumberOfLines="{len(lines) - 1}" NumberOfStrips="0" NumberOfPolys="0">\n'
+        f"<PointData>\n{data}</PointData>\n<Points>\n{points}</Points>\n{vertices}{_cells('Lines', lines, appended)}"
+        "</Piece>\n</PolyData>\n"
+    )
+    _write(path, "PolyData", body, appended)
+
+
+def _cells(name: str, begins: NDArray[np.int64], appended: _Appended) -> str:
+    """Return the element of cells of consecutive points, each of which begins where the one before ends."""
+    connectivity = appended.element("connectivity", np.arange(begins[-1], dtype=np.int64))
+    offsets = appended.element("offsets", begins[1:].astype(np.int64))
+    return f"<{name}>\n{connectivity}{offsets}</{name}>\n"
+
+
+def _field_data(content: Content) -> str:
+    """Return what the file says about itself, as arrays of text and numbers."""
+    return f"<FieldData>\n{''.join(_field(name, value) for name, value in content.told().items())}</FieldData>\n"
+
+
+def _field(name: str, value: Any) -> str:
+    head = f"<DataArray Name={quoteattr(name)}"
+    if isinstance(value, str):
+        # Text is stored as the numbers of its bytes, and ends with a zero.
+        numbers = " ".join(str(byte) for byte in [*value.encode(), 0])
+        return f'{head} type="String" NumberOfTuples="1" format="ascii">{numbers}</DataArray>\n'
+    array = np.atleast_1d(np.asarray(value))
+    kind = "Float64" if array.dtype.kind == "f" else "Int64"
+    numbers = " ".join(repr(each) for each in array.tolist())
+    return f'{head} type="{kind}" NumberOfTuples="{array.size}" format="ascii">{numbers}</DataArray>\n'
+
+
+def _write(path: Path, kind: str, body: str, appended: _Appended) -> None:
+    head = (
+        f'<?xml version="1.0"?>\n<VTKFile type="{kind}" version="1.0" byte_order="LittleEndian" '
+        f'header_type="UInt64">\n{body}<AppendedData encoding="raw">\n_'
+    )
+    with open(path, "wb") as file:
+        file.write(head.encode())
+        for array in appended.arrays:
+            file.write(np.array(array.nbytes, LENGTH).tobytes())
+            file.write(array.tobytes())
+        file.write(b"\n</AppendedData>\n</VTKFile>\n")
+
+
+# Tracks played in time: VTKHDF PolyData with a step for each frame, in which ParaView shows the places of that frame.
+#
+# Layout: VTK's temporal PolyData, one part a step. The arrays lie under `/VTKHDF` in the order of frames, and within
+# a frame in that of tracks: `Points` (mm), and in `PointData` `track`, `velocity` and `velocity_sigma` (m/s). What is
+# measured is in the file of tracks; this one is for the eye.
+
+
+PLAYBACK_FORMAT, PLAYBACK_VERSION = "lfpiv-playback", 1
+# Of `lfpiv-trajectories`: what is shown at each place.
+SHOWN = ("track", "velocity", "velocity_sigma")
+KINDS = ("Vertices", "Lines", "Polygons", "Strips")
+
+
+def write_playback(path: Path, tracks: PointRows, frames: int, dt_s: float, *, overwrite: bool) -> None:
+    """Write the tracks of a sequence of so many frames, `dt_s` apart, for playing them in time.
+
+    Raises
+    ------
+    OutputExistsError, OutputError
+    """
+    counts, rows = tracks.in_frames(frames)
+    before = np.cumsum(counts) - counts
+    count = int(counts.sum())
+    units = UNITS[TRAJECTORIES_FORMAT]
+
+    def fill(file: h5py.File) -> None:
+        write_root(file, PLAYBACK_FORMAT, PLAYBACK_VERSION, tracks.reference, tracks.attributes, tracks.provenance)
+        vtk = create_vtk_group(file, "PolyData")
+        write_rows(vtk, "Points", count, rows(POSITION), "mm")
+        write_array(vtk, "NumberOfPoints", counts)
+        for kind in KINDS:
+            cells = counts if kind == "Vertices" else np.zeros_like(counts)
+            group = vtk.create_group(kind)
+            write_array(group, "NumberOfCells", cells)
+            write_array(group, "NumberOfConnectivityIds", cells)
+            # Each step has offsets of its own, one more than cells.
+            ids = int(cells.sum())
+            write_rows(group, "Offsets", ids + len(cells), (np.arange(each + 1) for each in cells))
+            write_rows(group, "Connectivity", ids, (np.arange(each) for each in cells))
+        data = vtk.create_group("PointData")
+        for name in SHOWN:
+            write_rows(data, name, count, rows(name), units[name])
+        steps = write_steps(vtk, (dt_s * np.arange(frames)).tolist(), "s", dict.fromkeys(SHOWN, before))
+        write_array(steps, "PartOffsets", np.arange(frames, dtype=np.int64))
+        write_array(steps, "NumberOfParts", np.ones(frames, np.int64))
+        write_array(steps, "PointOffsets", before)
+        of_kinds = np.zeros((frames, len(KINDS)), np.int64)
+        of_kinds[:, 0] = before
+        write_array(steps, "CellOffsets", of_kinds)
+        write_array(steps, "ConnectivityIdOffsets", of_kinds)
+
+    def check(temporary: Path) -> None:
+        with open_h5(temporary) as file:
+            ensure_format(temporary, file, PLAYBACK_FORMAT, (PLAYBACK_VERSION,))
+
+    create(path, fill, overwrite=overwrite, check=check)
+
+
+SERIES_FORMAT, SERIES_VERSION = "lfpiv-series", 1
+
+
+def write_series(
+    path: Path,
+    first: Content,
+    read: Callable[[int], Content],
+    count: int,
+    times_s: Sequence[float] | None,
+    provenance: Mapping[str, Any],
+    *,
+    overwrite: bool,
+) -> None:
+    """Write volumes or vectors on one grid.
+
+    Parameters
+    ----------
+    first : the one that the grid, the names of the arrays and the attributes are taken from
+    read : gives that of each number, which has the same; one at a time is held in memory
+    count : how many there are
+    times_s : of each, None where only their order is known
+
+    Raises
+    ------
+    OutputExistsError, OutputError
+    """
+    if first.grid is None:
+        raise ValueError("points are no image")
+    grid = first.grid
+    of_one = count == 1  # VTK takes one step for none, and its axis for one of the place
+    times, unit = (list(map(float, range(count))), "frame") if times_s is None else (times_s, "s")
+
+    def fill(file: h5py.File) -> None:
+        told = {name: np.asarray(value) if isinstance(value, list) else value for name, value in _others(first).items()}
+        write_root(file, SERIES_FORMAT, SERIES_VERSION, Reference.from_attributes(first.attributes), told, provenance)
+        vtk = create_vtk_group(file, "ImageData")
+        place_image(vtk, grid)
+        points = vtk.create_group("PointData")
+        if "velocity" in first.arrays:
+            points.attrs["Vectors"] = np.bytes_("velocity")
+        for name, array in first.arrays.items():
+            shape = array.shape[array.shape[0] == 1 :]
+            options = {"chunks": (1, *shape)[of_one:], "track_times": False, **FILTERS}
+            dataset = points.create_dataset(name, (count, *shape)[of_one:], array.dtype, **options)
+            dataset.attrs["units"] = np.bytes_(first.units[name])
+        if not of_one:
+            write_steps(vtk, times, unit, dict.fromkeys(first.arrays, np.arange(count, dtype=np.int64)))
+        for number in range(count):
+            for name, array in read(number).arrays.items():
+                points[name][... if of_one else number] = array[0] if array.shape[0] == 1 else array
+
+    def check(temporary: Path) -> None:
+        with open_h5(temporary) as file:
+            ensure_format(temporary, file, SERIES_FORMAT, (SERIES_VERSION,))
+
+    create(path, fill, overwrite=overwrite, check=check)
+
+
+def write_tracks_series(path: Path, tracks: Content, provenance: Mapping[str, Any], *, overwrite: bool) -> None:
+    """Write the tracks of a sequence for playing them in time."""
+    reference = Reference.from_attributes(tracks.attributes)
+    points = Points(tracks.arrays[POSITION], tracks.arrays, reference, _others(tracks), dict(provenance))
+    frames = int(tracks.arrays["frame"].max(initial=0)) + 1
+    write_playback(path, points, frames, float(tracks.attributes["dt_s"]), overwrite=overwrite)
+
+
+def _others(content: Content) -> dict[str, Any]:
+    """Return what a file says about itself besides where its coordinates begin, which is written by its own rule."""
+    return {name: value for name, value in content.attributes.items() if not name.startswith("reference")}

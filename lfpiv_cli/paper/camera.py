@@ -1,0 +1,340 @@
+"""The camera: its numbers (Table 2), its weights (Table 1, Figs. 5 and 6) and where it is focused (Eq. 21)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lfpiv_cli.console import Console
+from lfpiv_cli.files.config import load_config
+from lfpiv_cli.files.pages import Table
+from lfpiv_cli.notice import written
+from lfpiv_cli.paper.parts import BOARD, MISALIGNED, Drawing, Findings, Row, Work, sections
+from lfpiv_cli.pictures.style import BLUE, new_figure, styled
+from lfpiv_cli.validation.weights import (
+    TABLE1_MM,
+    Column,
+    columns_figure,
+    make_columns,
+    sample_voxels,
+    similarity_figure,
+    weights_figures,
+)
+from lfpiv_cli.verbs.calibrate import CalibrateOptions, calibrate_snapshot
+from lfpiv_cli.verbs.simulate import simulate_board, simulate_white
+from lfpiv_cli.weights.quadrature import PAPERS_COUNT
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from matplotlib.figure import Figure
+
+
+SEED = 5
+# Fig. 6: similarity is "approximately 1", and the difference smaller than 2.5 grey levels.
+PAPERS_SSIM, PAPERS_RMSE_GREY = 0.99, 2.5
+CHANCE = "the count differs from the integral that it estimates by chance; the integrals are alike to rounding"
+# Rays traced through the layers by Snell's law and from equivalent points by Snell's law are the same integral.
+LIMIT_EXACT = 1e-6
+COMPARED = {
+    "ert_to_drt_paraxial": "equivalent points against direct tracing, paraxial, integrals",
+    "ert_exact_to_drt_exact": "equivalent points against direct tracing, Snell's law, integrals",
+    "ert_to_drt_exact": "paraxial equivalent points against direct tracing by Snell's law",
+    "ray_count_to_converged": "the paper's count of rays against the integral",
+    "factorised_to_converged": "the weights in use (factors by axis) against the integral",
+    "factorised_exact_to_converged": "the same by Snell's law",
+    "factorised_to_long_count": "the weights in use against a count of 1e8 rays",
+}
+
+
+def table1(work: Work) -> Findings:
+    """Compare the columns of the paper's voxels, and of random ones, made in different ways."""
+    config = work.config("table1", sections(validation={"weights": {"seed": SEED, "long_count_rays": 100_000_000}}))
+    settings = load_config(config)
+    camera, grid, rng = settings.camera_model(), settings.grid(), np.random.default_rng(SEED)
+    space = replace(settings.plane_space("comparing ways to make weights"), window=settings.window_model())
+    paper = np.array(TABLE1_MM)[: work.by_size(1, 5, 5)]
+    centres = np.concatenate([paper, sample_voxels(grid, work.by_size(0, 3, 20), rng)])
+    long_count = np.zeros(len(centres), np.int64)
+    long_count[: len(paper)] = work.by_size(0, 0, 100_000_000)
+    with work.console.progress(len(centres), "weights") as advance:
+        columns = make_columns(camera, space, centres, grid.spacing_mm, rng, long_count, advance)
+    figures = weights_figures(columns, long_count)
+    return Findings(
+        rows=_rows(figures, len(paper)),
+        drawings=_drawings(columns[: len(paper)], figures),
+        tables=(_table(figures),),
+        text=(
+            f"{len(paper)} voxels of the paper and {len(centres) - len(paper)} random ones of its volume. As the paper "
+            f"did it: {PAPERS_COUNT.points} random points of a voxel and {PAPERS_COUNT.rays_per_point} rays from each, "
+            "from their equivalent points, against rays traced through water, window and air (Eq. 14), as many as it "
+            "takes. At its best: the integrals that such counts estimate. The weights in use factorise along the two "
+            "axes of the image; how far they are from the integral is compared with how far the paper's own count is "
+            "from it by chance.",
+        ),
+        commands=("lfpiv validate weights work/table1/table1.yaml -o weights-report",),
+        seeds=(SEED,),
+    )
+
+
+def _rows(figures: dict[str, Any], paper: int) -> tuple[Row, ...]:
+    # equivalent points and direct tracing give the same integral, which the count is held against
+    counted = [voxel["ray_count_to_converged"] for voxel in figures["voxels"][:paper]]
+    same, exact = figures["ert_to_drt_paraxial"], figures["ert_exact_to_drt_exact"]
+    chance, used = figures["ray_count_to_converged"]["l1_mean"], figures["factorised_to_converged"]["l1_mean"]
+    return (
+        Row(
+            quantity="similarity (SSIM) of ERT and DRT weights, smallest",
+            source="Fig. 6",
+            limit=PAPERS_SSIM,
+            sense="at least",
+            paper_ert=1.0,
+            ert=min(each["ssim"] for each in counted),
+            best=same["ssim_smallest"],
+            reason=CHANCE,
+        ),
+        Row(
+            quantity="difference of ERT and DRT weights, largest RMSE (grey levels of 255)",
+            source="Fig. 6",
+            limit=PAPERS_RMSE_GREY,
+            paper_ert=PAPERS_RMSE_GREY,
+            ert=max(each["rmse_grey"] for each in counted),
+            best=same["rmse_grey_largest"],
+        ),
+        Row(
+            quantity="ERT against DRT by Snell's law, largest share of a voxel's light",
+            source="Section 3.2",
+            limit=LIMIT_EXACT,
+            ert=figures["ert_to_drt_exact"]["l1_largest"],
+            best=exact["l1_largest"],
+        ),
+        Row(
+            quantity="weights in use against the integral, mean share of light",
+            source="Eq. 13",
+            limit=chance,
+            ert=chance,
+            best=used,
+        ),
+    )
+
+
+def _drawings(columns: list[Column], figures: dict[str, Any]) -> tuple[Drawing, ...]:
+    return (
+        Drawing(
+            "columns",
+            "The weights of the paper's voxels as the sensor would see them (after Fig. 5): traced directly by Snell's "
+            "law, integrated over equivalent points, as they are in use, and counted as the paper did. A row a voxel, "
+            "one grey scale in each.",
+            columns_figure(columns),
+        ),
+        Drawing(
+            "similarity",
+            "SSIM, RMSE and absolute difference by voxel (after Fig. 6).",
+            similarity_figure(figures, len(columns)),
+        ),
+    )
+
+
+def _table(figures: dict[str, Any]) -> Table:
+    rows = [
+        (
+            words,
+            f"{each['ssim_smallest']:.5f}",
+            written(each["rmse_grey_largest"]),
+            written(each["l1_mean"], 2),
+            written(each["l1_largest"], 2),
+        )
+        for name, words in COMPARED.items()
+        if (each := figures[name]) is not None
+    ]
+    return Table(
+        "Columns of the weights, all voxels",
+        ("compared", "SSIM, smallest", "RMSE (grey levels), largest", "share of light, mean", "largest"),
+        tuple(rows),
+    )
+
+
+# Derived quantities as Table 2 and Section 3.1 have them: the paper's value, and what it is called.
+PAPER = {
+    "f-number of the main lens": 4.0,
+    "f-number of the microlenses": 8.0,
+    "main lens to microlenses (mm)": 200.0,
+    "aperture of the main lens (mm)": 25.0,
+    "microlens pitch (mm)": 0.1,
+    "pixel pitch (µm)": 5.5,
+}
+# The numbers are exact; only rounding in doubles is let through.
+LARGEST_DEVIATION = 1e-9
+
+
+def table2(work: Work) -> Findings:
+    """Return the camera's derived quantities beside the paper's."""
+    settings = load_config(work.config("table2", sections()))
+    camera, scale = settings.camera_model(), settings.camera_model().scale(settings.media_model())
+    pitch = float(camera.lattice.pitch.mean())
+    ours = dict(
+        zip(
+            PAPER,
+            (
+                camera.focal_length_mm / camera.aperture_mm,
+                camera.microlens_focal_length_mm / pitch,
+                camera.image_distance_mm,
+                camera.aperture_mm,
+                pitch,
+                1e3 * camera.pixel_mm,
+            ),
+            strict=True,
+        )
+    )
+    deviation = max(abs(ours[name] / value - 1.0) for name, value in PAPER.items())
+    derived = {
+        "width of a lens image (pixels)": f"{pitch * camera.micro_image_scale / camera.pixel_mm:.3f}",
+        "lens images on the sensor": f"{camera.columns * camera.pixel_mm / pitch / camera.micro_image_scale:.0f} x "
+        f"{camera.rows * camera.pixel_mm / pitch / camera.micro_image_scale:.0f} (the array has 252 x 252)",
+        "microlens in the scene (mm)": f"{scale.lens_mm:.3f}",
+        "depth over which a point spreads by one microlens (mm)": f"{scale.depth_mm:.3f}",
+    }
+    rows = [(name, f"{value:g}", f"{ours[name]:g}") for name, value in PAPER.items()]
+    return Findings(
+        rows=(
+            Row(
+                quantity="largest relative deviation from Table 2",
+                source="Table 2",
+                limit=LARGEST_DEVIATION,
+                best=deviation,
+            ),
+        ),
+        tables=(
+            Table(
+                "Optical parameters",
+                ("quantity", "paper", "ours"),
+                (*rows, *((name, "–", value) for name, value in derived.items())),
+            ),
+        ),
+        text=(
+            "All parts work with this camera. At a magnification of -1 the main lens stands twice its focal length "
+            f"from the array and works at f/{camera.image_distance_mm / camera.aperture_mm:g}, as the microlenses do: "
+            f"lens images are {camera.lens_image_width:.2f} pitches wide and just touch.",
+        ),
+        commands=("lfpiv build-weights work/table2/table2.yaml -o weights.h5",),
+    )
+
+
+@styled
+def focal_plane_figure(focal_error_mm: NDArray, off_mm: NDArray, sigma_mm: NDArray) -> Figure:
+    """Return the error of the mid plane's place (n,) with its standard error over how far the focus was off, mm."""
+    figure = new_figure(6.5, 3.6)
+    axes = figure.subplots()
+    axes.errorbar(focal_error_mm, 1e3 * off_mm, 1e3 * sigma_mm, fmt="o", color=BLUE, capsize=3)
+    axes.axhline(0.0, color="0.6", linewidth=0.8)
+    axes.set(xlabel="board behind the focal plane (mm)", ylabel="mid plane, measured - true (µm)")
+    return figure
+
+
+SEED_OF_FOCUS = 21
+# How far the camera may be focused in front of the wall or behind it, mm.
+LARGEST_MM = 2.0
+# Half a voxel of the paper's: a volume that lies further off than that is another volume.
+LIMIT_MM = 0.05
+# Stated errors are those of Gaussian noise; of some ten boards none is expected beyond so many of them.
+LIMIT_SIGMAS = 4.0
+SMALL = {
+    "camera": {"microlenses": {"columns": None, "rows": None}, "sensor": {"columns": 600, "rows": 448}},
+    "board": {"dots": [5, 4], "spacing_mm": 0.5, "dot_diameter_mm": 0.15},
+}
+
+
+def focal_plane(work: Work) -> Findings:
+    """Photograph a board before and behind the focal plane and measure where the channel's mid plane comes to lie."""
+    errors_mm = np.linspace(-LARGEST_MM, LARGEST_MM, work.by_size(2, 5, 9))
+    whites = work.folder / "white"
+    base = _config(work, "white", 0.0)
+    simulate_white(base, whites, overwrite=True, console=work.console)
+    found = [work.step(f"board_{error:+g}mm", partial(_mid_plane, work, whites, float(error))) for error in errors_mm]
+    measured, sigma, true = (np.array([each[name] for each in found]) for name in ("mid_mm", "sigma_mm", "true_mm"))
+    off, corner = measured - true, "A corner of the sensor, 20 dots half a millimetre apart."
+    return Findings(
+        rows=(
+            Row(
+                quantity="place of the mid plane, largest error (mm)",
+                source="Eq. 21",
+                limit=LIMIT_MM,
+                best=float(np.abs(off).max()),
+            ),
+            Row(
+                quantity="the same, in stated standard errors",
+                source="Eq. 21",
+                limit=LIMIT_SIGMAS,
+                best=float(np.abs(off / sigma).max()),
+            ),
+        ),
+        drawings=(
+            Drawing(
+                "mid_plane",
+                "Where one snapshot puts the mid plane of the channel, less where it is, over how far the camera was "
+                "focused away from the board (Eq. 21). Bars: the stated standard error.",
+                focal_plane_figure(errors_mm, off, sigma),
+            ),
+        ),
+        tables=(_depths_table(errors_mm, measured, true, sigma),),
+        text=(
+            "The board lies on the outer wall of the channel and the camera is meant to be focused on it. Here it is "
+            f"focused up to {LARGEST_MM:g} mm before and behind it; the snapshot alone tells by how much, and Eq. 21 "
+            "where the mid plane of the channel comes to lie once the board is taken away and the camera moved. The "
+            "array is turned and shifted, the board tilted, and light and sensor have their noise. The paper gives no "
+            f"figure; the limit is half of its voxels. {work.by_size(corner, corner, 'Full sensor, 49 dots.')}",
+        ),
+        commands=(
+            "lfpiv simulate white work/focal-plane/white.yaml -o work/focal-plane/white --overwrite",
+            "lfpiv simulate board work/focal-plane/board_+2mm.yaml -o work/focal-plane/board_+2mm --overwrite",
+            "lfpiv calibrate-snapshot work/focal-plane/board_+2mm.yaml --white work/focal-plane/white/white.tif "
+            "--dark work/focal-plane/white/dark.tif --board work/focal-plane/board_+2mm/board.tif "
+            "-o work/focal-plane/board_+2mm/calibration.h5 --overwrite",
+        ),
+        seeds=(SEED_OF_FOCUS,),
+    )
+
+
+def _config(work: Work, name: str, error_mm: float) -> Path:
+    small = work.by_size(SMALL, SMALL, {})
+    return work.config(
+        name,
+        sections(
+            camera=small.get("camera", {}),
+            board=BOARD | {"medium": "air"} | small.get("board", {}),
+            channel={"width_mm": 10.0, "wall_mm": 5.0},
+            window=None,
+            simulation=MISALIGNED | {"seed": SEED_OF_FOCUS, "board_z_mm": float(error_mm)},
+        ),
+    )
+
+
+def _mid_plane(work: Work, whites: Path, error_mm: float) -> dict[str, float]:
+    """Return where a snapshot puts the mid plane, and where it is, mm from the focal plane."""
+    name = f"board_{error_mm:+g}mm"
+    config, folder = _config(work, name, error_mm), work.folder / name
+    quiet = Console(only_warnings=True)
+    simulate_board(config, folder, overwrite=True, console=quiet)
+    pictures = CalibrateOptions(white=[whites / "white.tif"], dark=whites / "dark.tif", board=[folder / "board.tif"])
+    told = calibrate_snapshot(config, folder / "calibration.h5", pictures, overwrite=True, console=quiet)
+    # after the move of Eq. 21 the focal plane is as far off the mid plane as it was off the board, times n_w
+    return {
+        "mid_mm": told["mid_plane_z_mm"],
+        "sigma_mm": told["mid_plane_z_mm_sigma"],
+        "true_mm": error_mm * sections()["media"]["fluid"],
+    }
+
+
+def _depths_table(
+    errors_mm: NDArray[np.float64], measured: NDArray[np.float64], true: NDArray[np.float64], sigma: NDArray[np.float64]
+) -> Table:
+    rows = zip(errors_mm, true, measured, sigma, strict=True)
+    return Table(
+        "Mid plane from the focal plane (mm)",
+        ("board behind the focal plane", "true", "measured", "stated standard error"),
+        tuple((f"{a:+z.2f}", f"{b:+z.3f}", f"{c:+z.3f}", f"{d:.4f}") for a, b, c, d in rows),
+    )

@@ -1,0 +1,376 @@
+"""Pictures of the report: boards (Figs. 8 to 13), the channel (Figs. 15, 16 and 18), bubbles (Fig. 17).
+
+Functions take a mapping from the name of a way to measure, as it is to be read, to what was measured by it; all are
+drawn on one scale, in colours that people with any kind of colour vision tell apart; marks and lines differ as well,
+for print in grey. Lengths in the channel are shares of its width from its low wall; the paper's x is our other
+lateral axis.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lfpiv_cli.grid import Grid
+from lfpiv_cli.pictures.style import BLUE, DIVERGING, GREEN, ORANGE, PURPLE, SEQUENTIAL, VERMILION, new_figure, styled
+from lfpiv_cli.pictures.vectors import mean_of_known
+from lfpiv_cli.validation.flow import PAPER_SLICES, TOLERANCE, Duct, compare, cumulative_distribution
+from lfpiv_cli.validation.methods import Measured, slice_at
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+# Colours that people with any kind of colour vision tell apart; marks and lines differ as well, for print in grey.
+BOARD_STYLES: tuple[dict[str, Any], ...] = (
+    {"color": VERMILION, "marker": "s", "linestyle": "--"},
+    {"color": BLUE, "marker": "o", "linestyle": "-"},
+    {"color": GREEN, "marker": "^", "linestyle": "-."},
+)
+BAND = {"color": "#BBBBBB", "alpha": 0.5, "linewidth": 0.0}
+# Of a board in three dimensions voxels are shown that are brighter than this share of the brightest: 1/e, as for e_z.
+SHOWN_SHARE = float(1.0 / np.e)
+# A board is shown in this many times the depth that its dots reach.
+SHOWN_DEPTHS = 2.0
+# Numbers kept of pictures: as many as a printed page shows.
+DECIMALS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class BoardView:
+    """A reconstructed board as seen from the front and from the side, its brightest voxel 1, and its bright voxels.
+
+    Attributes
+    ----------
+    front : (y, x), the maximum along z
+    side : (z, x), the maximum along y
+    bounds_mm : (3, 2), of the volume along x, y and z
+    bright_mm : (n, 3), where voxels are brighter than `SHOWN_SHARE`
+    """
+
+    front: NDArray[np.float64]
+    side: NDArray[np.float64]
+    bounds_mm: NDArray[np.float64]
+    bright_mm: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, volume: NDArray[np.float32], grid: Grid) -> BoardView:
+        """Return the view of a volume [z, y, x]."""
+        shares = volume / volume.max()
+        inside = np.argwhere(shares > SHOWN_SHARE)
+        x, y, z = (grid.axis_mm(axis)[inside[:, 2 - axis]] for axis in range(3))
+        bounds = np.array([grid.bounds_mm(axis) for axis in range(3)])
+        return cls(shares.max(axis=0), shares.max(axis=1), bounds, np.stack([x, y, z], axis=1))
+
+    def to_plain(self) -> dict[str, Any]:
+        """Return the view as lists of numbers."""
+        arrays = {field.name: np.asarray(getattr(self, field.name), np.float64) for field in fields(self)}
+        return {name: np.round(each, DECIMALS).tolist() for name, each in arrays.items()}
+
+    @classmethod
+    def from_plain(cls, values: Mapping[str, Any]) -> BoardView:
+        """Return the view that lists of numbers hold."""
+        return cls(**{name: np.array(each, np.float64) for name, each in values.items()})
+
+
+@styled
+def views_figure(views: Mapping[str, BoardView]) -> Figure:
+    """Return boards in the focal plane, a row for each method: front, side and in three dimensions (Fig. 8)."""
+    figure = new_figure(11.0, 3.7 * len(views))
+    drawn = None
+    # as much of the depth for each as shows the longest dots and their surroundings
+    reach = SHOWN_DEPTHS * max(float(np.abs(view.bright_mm[:, 2]).max()) for view in views.values())
+    for row, (label, view) in enumerate(views.items()):
+        x, y, z = ((low, high) for low, high in view.bounds_mm)
+        front, side = (figure.add_subplot(len(views), 3, 3 * row + column) for column in (1, 2))
+        drawn = front.imshow(view.front, origin="lower", extent=(*x, *y), cmap=SEQUENTIAL, vmin=0.0, vmax=1.0)
+        front.set(title=f"{label}: maximum along z", xlabel="x (mm)", ylabel="y (mm)")
+        side.imshow(view.side, origin="lower", extent=(*x, *z), cmap=SEQUENTIAL, vmin=0.0, vmax=1.0, aspect="auto")
+        side.set(title=f"{label}: maximum along y", xlabel="x (mm)", ylabel="z (mm)", ylim=(-reach, reach))
+        space: Any = figure.add_subplot(len(views), 3, 3 * row + 3, projection="3d")
+        space.scatter(
+            *view.bright_mm.T, c=view.bright_mm[:, 2], cmap=SEQUENTIAL, s=1.5, linewidths=0.0, rasterized=True
+        )
+        space.set(title=f"{label}: brighter than 1/e", xlabel="x (mm)", ylabel="y (mm)", zlabel="z (mm)")
+        space.set(zlim=(-reach, reach))
+        space.set_box_aspect((1.0, 1.0, 1.2), zoom=0.85)
+        _tidy(space)
+    if drawn is not None:
+        figure.colorbar(drawn, ax=figure.axes, shrink=0.5, label="intensity / largest", location="bottom")
+    return figure
+
+
+@styled
+def elongation_figure(
+    methods: Mapping[str, Mapping[str, Any]], paper_mm: tuple[float, float], paper_sigma_mm: float
+) -> Figure:
+    """Return the elongation of dots and its spread by depth (Figs. 9 and 12).
+
+    Parameters
+    ----------
+    methods : what `board_figures` returns
+    paper_mm : lowest and highest elongation that the paper has
+    paper_sigma_mm : what its spread stays below
+    """
+    figure = new_figure(10.0, 3.8)
+    length, spread = figure.subplots(1, 2)
+    length.axhspan(*paper_mm, label=f"paper: {paper_mm[0]:g} to {paper_mm[1]:g} mm", **BAND)
+    spread.axhspan(0.0, paper_sigma_mm, label=f"paper: below {paper_sigma_mm:g} mm", **BAND)
+    for (label, figures), style in zip(methods.items(), BOARD_STYLES, strict=False):
+        table = figures["by_depth"]
+        length.plot(table["depth_mm"], table["elongation_mm"], label=label, **style)
+        spread.plot(table["depth_mm"], table["elongation_sigma_mm"], label=label, **style)
+    length.set(title="mean over the dots", ylabel="elongation $e_z$ (mm)", ylim=(0.0, None))
+    spread.set(title="standard deviation over the dots", ylabel=r"$\sigma$ (mm)", ylim=(0.0, None))
+    _finish(length, spread)
+    for panel in (length, spread):
+        panel.legend(fontsize=8)
+    return figure
+
+
+@styled
+def location_figure(
+    methods: Mapping[str, Mapping[str, Any]], spacing_mm: float, paper_steps_mm: tuple[float, float] | None
+) -> Figure:
+    """Return lateral and depth separations and their errors by depth (Figs. 11 and 13).
+
+    Parameters
+    ----------
+    methods : what `board_figures` returns
+    spacing_mm : x_g of Eq. 19
+    paper_steps_mm : shortest and longest depth separation that the paper has, where it says
+    """
+    figure = new_figure(10.0, 6.6)
+    (lateral, depth), (lateral_error, depth_error) = figure.subplots(2, 2)
+    lateral.axhline(spacing_mm, color="black", linewidth=0.8, label="true")
+    depth.axhline(1.0, color="black", linewidth=0.8, label="true")
+    if paper_steps_mm is not None:
+        depth.axhspan(*paper_steps_mm, label="paper: separations of {:g} to {:g} mm".format(*paper_steps_mm), **BAND)
+    for (label, figures), style in zip(methods.items(), BOARD_STYLES, strict=False):
+        table = figures["by_depth"]
+        at, spacing = np.array(table["depth_mm"]), np.array(table["spacing_mm"])
+        middle, steps = 0.5 * (at[1:] + at[:-1]), np.diff(table["centre_mm"]) / np.diff(at)
+        lateral.plot(at, spacing, label=label, **style)
+        depth.plot(middle, steps, label=label, **style)
+        lateral_error.plot(at, 100.0 * np.abs(spacing - spacing_mm) / spacing_mm, label=label, **style)
+        depth_error.plot(middle, 100.0 * np.abs(steps - 1.0), label=label, **style)
+    # a spacing that is right within a hundredth of a per cent is to look so
+    reach = max(0.01 * spacing_mm, 1.2 * float(np.abs(np.subtract(lateral.get_ylim(), spacing_mm)).max()))
+    lateral.set(title="lateral spacing", ylabel="mm", ylim=(spacing_mm - reach, spacing_mm + reach))
+    depth.set(title="separation of neighbouring boards in depth", ylabel="measured / true")
+    lateral_error.set(title=r"lateral error $\delta_x$", ylabel="%", ylim=(0.0, None))
+    depth_error.set(title=r"depth error $\delta_z$", ylabel="%", ylim=(0.0, None))
+    _finish(lateral, depth, lateral_error, depth_error)
+    # below the panels: in them it would hide the largest errors
+    figure.legend(*depth.get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=8)
+    return figure
+
+
+@styled
+def centres_figure(centres_mm: Mapping[str, NDArray[np.float64]]) -> Figure:
+    """Return the centres of all dots of all boards, (n, 3) for each method, coloured by depth (Fig. 10)."""
+    figure = new_figure(5.2 * len(centres_mm) + 0.8, 4.2)
+    deepest = max(float(np.abs(each[:, 2]).max()) for each in centres_mm.values())
+    drawn = None
+    for number, (label, each) in enumerate(centres_mm.items(), start=1):
+        space: Any = figure.add_subplot(1, len(centres_mm), number, projection="3d")
+        # depth along the page, as the boards were moved
+        drawn = space.scatter(
+            each[:, 2], each[:, 0], each[:, 1], c=each[:, 2], cmap=SEQUENTIAL, vmin=-deepest, vmax=deepest, s=6.0
+        )
+        space.set(title=label, xlabel="z (mm)", ylabel="x (mm)", zlabel="y (mm)")
+        space.set_box_aspect((2.0, 1.0, 1.0), zoom=1.1)
+        _tidy(space)
+    if drawn is not None:
+        figure.colorbar(drawn, ax=figure.axes, shrink=0.6, label="measured depth z (mm)", location="bottom")
+    return figure
+
+
+def _finish(*panels: Axes) -> None:
+    for panel in panels:
+        panel.set_xlabel("z (mm)")
+        panel.grid(alpha=0.3)
+
+
+def _tidy(space: Any) -> None:
+    """Keep the numbers of a three-dimensional drawing readable."""
+    space.tick_params(labelsize=7, pad=0)
+    space.locator_params(nbins=5)
+
+
+# Colours that the colour-blind tell apart; in print markers do.
+WAY_STYLES = ((VERMILION, "s", "--"), (BLUE, "o", "-."), (GREEN, "^", "-"), (PURPLE, "v", ":"))
+
+
+@styled
+def slice_maps_figure(methods: Mapping[str, Measured], duct: Duct) -> Figure:
+    """Return the size of the velocity in the six slices (columns), true and by each way (rows), on one scale."""
+    first = next(iter(methods.values()))
+    rows = {"true": (first, first.truth)} | {name: (m, m.field.velocity) for name, m in methods.items()}
+    highest = max(float(np.linalg.norm(m.truth[m.inside], axis=-1).max()) for m in methods.values())
+    figure = new_figure(13.0, 2.3 * len(rows) + 0.6)
+    axes = figure.subplots(len(rows), 6, squeeze=False, sharey=True)
+    main = "xyz".index(duct.axis)
+    for row, (name, (measured, velocity)) in zip(axes, rows.items(), strict=True):
+        speed = np.where(measured.inside, np.linalg.norm(velocity, axis=-1), np.nan)
+        places = [(k, axis, share) for k, axis in duct.across.items() for share in PAPER_SLICES[k]]
+        for panel, (key, axis, share) in zip(row, places, strict=True):
+            other = 3 - axis - main
+            position = duct.position_mm(axis, share)
+            shown = slice_at(speed, measured.field.grid.axis_mm(axis), position, axis)
+            # of what is left of [z, y, x] the flow's axis goes up, as the paper has it
+            shown = shown if main == (1 if axis == 2 else 2) else shown.T
+            image = panel.imshow(
+                shown,
+                origin="lower",
+                extent=(*_ends(measured, duct, other), *_ends(measured, duct, main)),
+                vmin=0.0,
+                vmax=highest,
+                cmap=SEQUENTIAL,
+                aspect="auto",
+            )
+            panel.set(xlabel=f"{_paper_name(other)}/D", title=f"{key} = {share}")
+        row[0].set_ylabel(f"{name}\ny/D, along the flow")
+    figure.colorbar(image, ax=axes, label="size of the velocity (m/s)", shrink=0.8)
+    return figure
+
+
+@styled
+def cumulative_figure(methods: Mapping[str, Measured]) -> Figure:
+    """Return the share of vectors over their relative error, along the flow and of the whole vector, with the 25 %."""
+    figure = new_figure(10.0, 4.2)
+    panels = figure.subplots(1, 2, sharey=True)
+    for (name, m), (colour, _, line) in zip(methods.items(), WAY_STYLES, strict=False):
+        shares = cumulative_distribution(compare(m.field, m.truth, m.inside))
+        errors = 100.0 * np.array(shares["relative_error"])
+        for axes, key in zip(panels, ("streamwise_share", "vector_share"), strict=True):
+            axes.plot(errors, 100.0 * np.array(shares[key], dtype=np.float64), line, color=colour, label=name)
+    panels[0].plot([100.0 * TOLERANCE], [75.0], "k*", markersize=9, label="paper: more than 75 %")
+    for axes, what in zip(panels, ("the velocity along the flow", "the whole vector"), strict=True):
+        axes.axvline(100.0 * TOLERANCE, color="0.4", linewidth=0.8)
+        axes.set(xlabel=f"relative error of {what} (%)", xlim=(0.0, 100.0), ylim=(0.0, 101.0))
+        axes.grid(alpha=0.3)
+    panels[0].set_ylabel("share of the vectors (%)")
+    panels[0].legend(loc="lower right")
+    return figure
+
+
+def _paper_name(axis: int) -> str:
+    """Return the paper's name of an axis across the flow: its x is our other lateral one."""
+    return "z" if axis == 2 else "x"
+
+
+def _as_shares(places_mm: NDArray[np.float64], duct: Duct, axis: int) -> NDArray[np.float64]:
+    """Return places along an axis as shares of the width from the low wall."""
+    return np.asarray((places_mm - duct.position_mm(axis, 0.0)) / duct.width_mm)
+
+
+def _ends(measured: Measured, duct: Duct, axis: int) -> tuple[float, float]:
+    """Return the bounds of the windows along an axis as shares of the width; along the flow from the first one."""
+    low, high = measured.field.grid.bounds_mm(axis)
+    if "xyz".index(duct.axis) == axis:
+        return 0.0, (high - low) / duct.width_mm
+    ends = _as_shares(np.array([low, high]), duct, axis)
+    return float(ends[0]), float(ends[1])
+
+
+# The paper sees velocities that are too small beyond this share of the channel's width.
+PAPERS_WALL = 0.8
+CASE_STYLES = ((BLUE, "o"), (VERMILION, "s"), (GREEN, "^"), (PURPLE, "v"), (ORANGE, "D"))
+
+
+@styled
+def raw_figure(image: NDArray[np.float32], mask: NDArray[np.bool_]) -> Figure:
+    """Return a part of a raw image with bubbles, alone and with the outline of what a mask leaves out."""
+    figure = new_figure(10.0, 10.0 * 0.5 * image.shape[0] / image.shape[1] + 1.0)
+    highest = float(np.percentile(image[~mask], 99.9)) if not mask.all() else float(image.max())
+    for axes, title in zip(figure.subplots(1, 2), ("raw image", "left out by the mask"), strict=True):
+        shown = axes.imshow(np.sqrt(np.clip(image, 0.0, highest)), cmap="gray", vmin=0.0, interpolation="nearest")
+        axes.set(xlabel="column (px)", ylabel="row (px)", title=title)
+    axes.imshow(np.where(mask, 1.0, np.nan), cmap="autumn", alpha=0.6, interpolation="nearest")
+    bar = figure.colorbar(shown, ax=figure.axes, shrink=0.8, label="counts, root scale")
+    ticks = np.linspace(0.0, np.sqrt(highest), 4)
+    bar.set_ticks(list(ticks), labels=[f"{tick**2:.0f}" for tick in ticks])
+    return figure
+
+
+@styled
+def plane_figure(methods: Mapping[str, Measured], duct: Duct, plane: int) -> Figure:
+    """Return vectors and the error of the velocity along the flow in one x-y plane of windows, by way to measure."""
+    main, axis = "xyz".index(duct.axis), duct.across["x/D"]
+    first = next(iter(methods.values()))
+    highest = float(first.truth[..., main].max())
+    figure = new_figure(3.2 * len(methods) + 1.0, 8.2)
+    axes = figure.subplots(2, len(methods), squeeze=False, sharex=True, sharey=True)
+    for column, (name, m) in zip(axes.T, methods.items(), strict=True):
+        places = [m.field.grid.axis_mm(k) for k in (main, axis)]
+        along, across = np.meshgrid(*places)
+        shares = _as_shares(across, duct, axis)
+        velocity = _oriented(m.field.velocity[plane], main)
+        error = velocity[..., main] - _oriented(m.truth[plane], main)[..., main]
+        arrows = column[0].quiver(
+            along,
+            shares,
+            velocity[..., main],
+            velocity[..., axis],
+            velocity[..., main],
+            cmap=SEQUENTIAL,
+            clim=(0.0, highest),
+            scale=12.0 * highest,
+            width=0.008,
+        )
+        image = column[1].pcolormesh(along, shares, error, cmap=DIVERGING, vmin=-0.5 * highest, vmax=0.5 * highest)
+        column[0].set(title=name)
+        column[1].set(xlabel=f"{'xyz'[main]}, along the flow (mm)")
+        for panel in column:
+            panel.axhline(PAPERS_WALL, color="0.4", linewidth=0.8, linestyle="--")
+    for panel in axes[:, 0]:
+        panel.set_ylabel("x/D")
+    figure.colorbar(arrows, ax=axes[0], label="velocity along the flow (m/s)")
+    figure.colorbar(image, ax=axes[1], label="measured - true (m/s)")
+    return figure
+
+
+@styled
+def wall_profile_figure(methods: Mapping[str, Measured], duct: Duct) -> Figure:
+    """Return the mean over flow and depth of the velocity along the flow, over x/D, and its error beside it."""
+    figure = new_figure(10.0, 4.2)
+    left, right = figure.subplots(1, 2)
+    main, axis = "xyz".index(duct.axis), duct.across["x/D"]
+    first = next(iter(methods.values()))
+    true = _mean_over(first.truth[..., main], first.inside, axis)
+    left.plot(_as_shares(first.field.grid.axis_mm(axis), duct, axis), true, color="black", label="analytic")
+    for (name, m), (colour, marker) in zip(methods.items(), CASE_STYLES, strict=False):
+        found, places = _mean_over(m.field.velocity[..., main], m.inside, axis), m.field.grid.axis_mm(axis)
+        shares = _as_shares(places, duct, axis)
+        left.plot(shares, found, marker, color=colour, markerfacecolor="none", label=name)
+        own = _mean_over(m.truth[..., main], m.inside, axis)
+        right.plot(shares, 100.0 * (found / own - 1.0), marker + "-", color=colour, label=name)
+    left.set(xlabel="x/D", ylabel="velocity along the flow, mean of the plane (m/s)")
+    right.set(xlabel="x/D", ylabel="its error (%)")
+    right.axhline(0.0, color="0.6", linewidth=0.8)
+    for panel in (left, right):
+        _mark_wall(panel)
+    left.legend(fontsize=8)
+    return figure
+
+
+def _mark_wall(axes: Axes) -> None:
+    """Mark where the paper's velocities are too small."""
+    axes.axvspan(PAPERS_WALL, 1.0, color="0.9", zorder=0)
+    axes.grid(alpha=0.3)
+
+
+def _oriented(plane: NDArray[np.float64], main: int) -> NDArray[np.float64]:
+    """Return a plane [y, x] of vectors with the flow's axis last."""
+    return plane if main == 0 else np.swapaxes(plane, 0, 1)
+
+
+def _mean_over(values: NDArray[np.float64], inside: NDArray[np.bool_], axis: int) -> NDArray[np.float64]:
+    """Return the means (n,) over planes across an axis (0 for x) of values [z, y, x], of what is known inside."""
+    return mean_of_known(np.where(inside, values, np.nan), tuple(k for k in range(3) if k != 2 - axis))

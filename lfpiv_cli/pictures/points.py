@@ -1,0 +1,323 @@
+"""Figures of points: particles behind one image, tracks between images, and a view of lines that a reader can turn.
+
+Axes: points (n, 3) in mm; images [row, column]; covariances (n, 6) as xx, yy, zz, xy, yz, xz. plotly is imported
+inside, as it is an optional extra and slow to load; its JavaScript, 4.5 MB, goes into the page.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from importlib.util import find_spec
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lfpiv_cli.notice import written
+from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.media import Media, equivalent_object_distance
+from lfpiv_cli.pictures.style import (
+    AXIS_NAMES,
+    BLUE,
+    COLOURS,
+    COMPONENT_NAMES,
+    DEPTH_LABEL,
+    DIVERGING,
+    SEQUENTIAL,
+    VERMILION,
+    draw_medians,
+    new_figure,
+    percentiles_by_depth,
+    slab_edges,
+    styled,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+# Of an image's values: the scale ends where so many (%) lie within, single hot pixels beyond it.
+IMAGE_PERCENT = 99.5
+# chi2 beyond this is drawn in the last bar.
+LARGEST_CHI2 = 5.0
+CHI2_BARS = 50
+# The area of all dots on an image, and the smallest and largest of one, in square points: many must not hide it.
+DOTS_AREA, DOT_SIZES = 15_000.0, (6.0, 26.0)
+# Width of pictures with an image, in inches.
+IMAGE_WIDTH = 10.0
+
+
+def places_px(focal_point_mm: NDArray[np.float64], camera: Camera, media: Media) -> NDArray[np.float64]:
+    """Return where rays through the middle of the main lens meet the sensor, (n, 2) as (column, row).
+
+    Parameters
+    ----------
+    focal_point_mm : (n, 3) points, z from the nominal focal point; their rays are taken for paraxial
+    """
+    points = camera.to_image_axes(focal_point_mm)
+    distance = equivalent_object_distance(points[:, 2], camera.focus_distance_mm, media)
+    on_array = -camera.image_distance_mm / distance[:, np.newaxis] * points[:, :2]
+    return camera.mm_to_px(on_array * camera.micro_image_scale)
+
+
+@styled
+def places_figure(position_mm: NDArray[np.float64], light_counts: NDArray[np.float64]) -> Figure:
+    """Return the particles from the front and from the side, coloured by their light (logarithmic)."""
+    from matplotlib.colors import LogNorm
+
+    figure = new_figure(IMAGE_WIDTH, 4.6)
+    lit = light_counts > 0.0
+    norm = LogNorm(*np.percentile(light_counts[lit], (2.0, 98.0))) if lit.sum() > 1 else None
+    panels = figure.subplots(1, 2)
+    for axes, up in zip(panels, (1, 2), strict=True):
+        dots = axes.scatter(
+            position_mm[lit, 0],
+            position_mm[lit, up],
+            c=light_counts[lit],
+            s=6,
+            cmap=SEQUENTIAL,
+            norm=norm,
+            linewidths=0,
+        )
+        axes.set(xlabel="x (mm)", ylabel=f"{AXIS_NAMES[up]} (mm)", aspect="equal")
+    figure.colorbar(dots, ax=panels.tolist(), label="light of a particle (counts)")
+    figure.suptitle(f"{len(position_mm)} particles, from the front and from the side")
+    return figure
+
+
+@styled
+def image_figure(image: NDArray[np.float64], places: NDArray[np.float64], z_mm: NDArray[np.float64]) -> Figure:
+    """Return a raw image in grey with the particles' places (n, 2) as (column, row), coloured by their depth."""
+    figure = _image_canvas(image)
+    (axes,) = figure.axes
+    axes.imshow(image, cmap="gray", vmin=0.0, vmax=_bright(image), interpolation="nearest")
+    size = float(np.clip(DOTS_AREA / max(len(z_mm), 1), *DOT_SIZES))
+    dots = axes.scatter(places[:, 0], places[:, 1], c=z_mm, s=size, cmap=SEQUENTIAL, edgecolors="white", linewidths=0.5)
+    rows, columns = image.shape
+    axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5))
+    figure.colorbar(dots, ax=axes, label="depth z (mm)", shrink=0.7)
+    axes.set_title(f"image and the places of {len(z_mm)} particles (rays through the middle of the lens)")
+    return figure
+
+
+@styled
+def residual_figure(residual: NDArray[np.float64]) -> Figure:
+    """Return what the particles leave of an image: light that none explains, red, and too much light, blue."""
+    figure = _image_canvas(residual)
+    (axes,) = figure.axes
+    limit = _bright(residual)
+    shown = axes.imshow(residual, cmap=DIVERGING, vmin=-limit, vmax=limit, interpolation="nearest")
+    figure.colorbar(shown, ax=axes, label="image less particles (counts)", shrink=0.7)
+    axes.set_title(f"residual, rms {written(np.sqrt(np.mean(residual**2)))} counts")
+    return figure
+
+
+def _image_canvas(image: NDArray[np.float64]) -> Figure:
+    """Return a figure of an image's shape, with axes that are its pixels."""
+    rows, columns = image.shape
+    figure = new_figure(IMAGE_WIDTH, min(max(0.8 * IMAGE_WIDTH * rows / columns + 0.8, 3.0), 12.0))
+    figure.subplots().set(xlabel="column (px)", ylabel="row (px)")
+    return figure
+
+
+def _bright(image: NDArray[np.float64]) -> float:
+    """Return where the scale of an image ends."""
+    limit = float(np.percentile(np.abs(image), IMAGE_PERCENT))
+    return limit if limit > 0.0 else 1.0
+
+
+@styled
+def depths_figure(
+    z_mm: NDArray[np.float64], light_counts: NDArray[np.float64], covariance_mm2: NDArray[np.float64]
+) -> Figure:
+    """Return by depth: how many particles, their light (median and quartiles), and their standard deviations."""
+    figure = new_figure(11.0, 3.6)
+    counts, light, sigmas = figure.subplots(1, 3)
+    counts.hist(z_mm, bins=slab_edges(z_mm), color=BLUE)
+    counts.set(xlabel=DEPTH_LABEL, ylabel="particles")
+    draw_medians(light, z_mm, {"light": light_counts}, "light of a particle (counts), median")
+    places, low = percentiles_by_depth(z_mm, light_counts, 25.0)
+    light.fill_between(
+        places, low, percentiles_by_depth(z_mm, light_counts, 75.0)[1], color=BLUE, alpha=0.25, label="quartiles"
+    )
+    light.legend()
+    along = {f"along {name}": np.sqrt(covariance_mm2[:, k]) for k, name in enumerate(AXIS_NAMES)}
+    draw_medians(sigmas, z_mm, along, "standard deviation (mm), median")
+    return figure
+
+
+@styled
+def chi2_figure(chi2: NDArray[np.float64]) -> Figure:
+    """Return chi2, about 1 where particles explain all light; what is beyond the axis is in the last bar."""
+    figure = new_figure(6.0, 3.6)
+    axes = figure.subplots()
+    axes.hist(np.minimum(chi2, LARGEST_CHI2), bins=CHI2_BARS, range=(0.0, LARGEST_CHI2), color=BLUE)
+    axes.axvline(1.0, color=VERMILION, linestyle="--", label="all light explained")
+    beyond = int(np.count_nonzero(chi2 > LARGEST_CHI2))
+    axes.set(xlabel="chi2", ylabel="particles", title=f"median {np.median(chi2):.2f}, {beyond} beyond {LARGEST_CHI2:g}")
+    axes.legend()
+    return figure
+
+
+# More lines than this are a solid block.
+LINES_DRAWN = 1500
+HISTOGRAM_BARS, PROBABILITY_BARS = 40, 25
+# Of displacements: the longest drawn is this share of the whole extent, so that all are seen.
+LONGEST_SHARE = 0.12
+
+
+def displacement_lines(
+    position_mm: NDArray[np.float64], displacement_mm: NDArray[np.float64]
+) -> tuple[list[NDArray[np.float64]], float]:
+    """Return lines (2, 3) of displacements about their middles, and how many times longer than true they are.
+
+    At most LINES_DRAWN, evenly chosen from the list.
+    """
+    extent = float(np.ptp(position_mm, axis=0).max()) if len(position_mm) else 0.0
+    longest = float(np.linalg.norm(displacement_mm, axis=1).max()) if len(position_mm) else 0.0
+    stretch = max(1.0, LONGEST_SHARE * extent / longest) if longest > 0.0 else 1.0
+    half = 0.5 * stretch * displacement_mm
+    return list(np.stack([position_mm - half, position_mm + half], axis=1)), stretch
+
+
+def trajectory_lines(position_mm: NDArray[np.float64], track: NDArray[np.int64]) -> list[NDArray[np.float64]]:
+    """Return the places (m, 3) of each track in time; rows are ordered by track, then by frame."""
+    return np.split(position_mm, np.flatnonzero(np.diff(track)) + 1) if len(track) else []
+
+
+@styled
+def space_figure(lines: list[NDArray[np.float64]], speed_m_s: NDArray[np.float64], what: str) -> Figure:
+    """Return lines in space coloured by their speed, the depth to the right; many are thinned out evenly.
+
+    Parameters
+    ----------
+    lines : (m, 3) each, mm
+    speed_m_s : of each line
+    what : for the title
+    """
+    from mpl_toolkits.mplot3d.art3d import Line3DCollection
+
+    every = max(1, -(-len(lines) // LINES_DRAWN))
+    chosen, speeds = lines[::every], speed_m_s[::every]
+    figure = new_figure(8.5, 6.5)
+    axes = figure.add_subplot(projection="3d")
+    # (z, x, y): the light comes from the right, y points up
+    drawn = Line3DCollection([line[:, [2, 0, 1]] for line in chosen], cmap=SEQUENTIAL, linewidths=1.0)
+    drawn.set_array(speeds)
+    drawn.set_clim(0.0, float(speeds.max()) if len(speeds) else 1.0)
+    axes.add_collection3d(drawn, autolim=False)
+    points = np.concatenate(lines) if lines else np.zeros((1, 3))
+    low, high = points.min(axis=0), points.max(axis=0)
+    high = np.where(high > low, high, low + 1.0)
+    axes.set(
+        xlim=(low[2], high[2]),
+        ylim=(low[0], high[0]),
+        zlim=(low[1], high[1]),
+        xlabel="z (mm)",
+        ylabel="x (mm)",
+        zlabel="y (mm)",
+    )
+    axes.set_box_aspect((high - low)[[2, 0, 1]])
+    figure.colorbar(drawn, ax=axes, label="speed (m/s)", shrink=0.7)
+    axes.set_title(what if every == 1 else f"{what}; one in {every} drawn")
+    return figure
+
+
+@styled
+def velocities_figure(velocity_m_s: NDArray[np.float64]) -> Figure:
+    """Return histograms of the velocity components."""
+    figure = new_figure(10.0, 3.2)
+    for component, axes in enumerate(figure.subplots(1, 3)):
+        axes.hist(velocity_m_s[:, component], bins=HISTOGRAM_BARS, color=COLOURS[component])
+        axes.set(xlabel=f"{COMPONENT_NAMES[component]} (m/s)", ylabel="tracks")
+    return figure
+
+
+@styled
+def links_figure(link_probability: NDArray[np.float64]) -> Figure:
+    """Return how probable the links are, of those whose probability is known."""
+    known = link_probability[np.isfinite(link_probability)]
+    figure = new_figure(6.0, 3.6)
+    axes = figure.subplots()
+    axes.hist(known, bins=PROBABILITY_BARS, range=(0.0, 1.0), color=BLUE)
+    axes.set_yscale("log")
+    wrong = float(np.sum(1.0 - known))
+    axes.set(
+        xlabel="probability that a link is right",
+        ylabel="links",
+        title=f"{known.size} links, {wrong:.1f} wrong ones expected",
+        xlim=(0.0, 1.0),
+    )
+    return figure
+
+
+@styled
+def sigma_figure(z_mm: NDArray[np.float64], sigma_m_s: NDArray[np.float64]) -> Figure:
+    """Return the stated standard deviations of the velocity's components by depth (medians)."""
+    figure = new_figure(6.0, 3.6)
+    along = {f"σ of {name}": sigma_m_s[:, k] for k, name in enumerate(COMPONENT_NAMES)}
+    draw_medians(figure.subplots(), z_mm, along, "standard deviation (m/s), median")
+    return figure
+
+
+@styled
+def lengths_figure(track: NDArray[np.int64]) -> Figure:
+    """Return how many frames the trajectories span."""
+    lengths = np.unique(track, return_counts=True)[1]
+    figure = new_figure(6.0, 3.6)
+    axes = figure.subplots()
+    most = int(lengths.max()) if lengths.size else 1
+    axes.hist(lengths, bins=(np.arange(most + 1) + 0.5).tolist(), color=BLUE, rwidth=0.9)
+    axes.set(xlabel="frames in a trajectory", ylabel="trajectories", title=f"{lengths.size} trajectories")
+    return figure
+
+
+# More lines make a page slow to turn.
+MOST_LINES = 4000
+HEIGHT_PX = 640
+
+
+def has_views() -> bool:
+    """Return whether views can be made: plotly is installed."""
+    return find_spec("plotly") is not None
+
+
+def lines_view(lines: Sequence[NDArray[np.float64]], values: Sequence[NDArray[np.float64]], label: str) -> str:
+    """Return a view of lines, a dot at the end of each.
+
+    Parameters
+    ----------
+    lines : places (k, 3) of each; of more than `MOST_LINES`, some from all over the list are shown
+    values : (k,) what each place is coloured by
+    label : of the colours, with their unit
+    """
+    from plotly.graph_objects import Figure, Scatter3d
+
+    shown = np.linspace(0, len(lines) - 1, min(MOST_LINES, len(lines))).astype(int).tolist()
+    gap, nothing = np.full((1, 3), np.nan), np.full(1, np.nan)
+    path = np.concatenate([np.zeros((0, 3)), *(part for k in shown for part in (lines[k], gap))]).astype(np.float32)
+    value = np.concatenate([np.zeros(0), *(part for k in shown for part in (values[k], nothing))])
+    ends = np.array([lines[k][-1] for k in shown], dtype=np.float32).reshape(-1, 3)
+    last = np.array([values[k][-1] for k in shown])
+    known = value[np.isfinite(value)]
+    low, high = float(known.min(initial=0.0)), float(known.max(initial=np.finfo(np.float32).tiny))
+    colours = {"colorscale": "Viridis", "cmin": low, "cmax": high}
+    # A line has no colour between two places where one is NaN: there the next one's is not seen.
+    along = {**colours, "color": np.nan_to_num(value), "width": 3}
+    dots = {**colours, "color": last, "size": 2, "colorbar": {"title": label}}
+    figure = Figure(
+        [
+            Scatter3d(x=path[:, 0], y=path[:, 1], z=path[:, 2], mode="lines", line=along, hoverinfo="skip"),
+            Scatter3d(x=ends[:, 0], y=ends[:, 1], z=ends[:, 2], mode="markers", marker=dots, customdata=last).update(
+                hovertemplate="x %{x:.2f}, y %{y:.2f}, z %{z:.2f} mm<br>%{customdata:.4g}<extra></extra>"
+            ),
+        ]
+    )
+    axes = {f"{axis}axis": {"title": f"{axis} (mm)"} for axis in "xyz"}
+    figure.update_layout(
+        scene={**axes, "aspectmode": "data"},
+        height=HEIGHT_PX,
+        showlegend=False,
+        margin={"l": 0, "r": 0, "t": 0, "b": 0},
+    )
+    return str(figure.to_html(full_html=False, include_plotlyjs=True, div_id="view", config={"displaylogo": False}))

@@ -1,0 +1,349 @@
+"""The stages of `validate flow`, `weights`, `volume` and `all`: results held against what is known."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lfpiv_cli.console import CONSOLE, Console
+from lfpiv_cli.errors import ConfigError, InputError, LimitMissedError, UsageError
+from lfpiv_cli.files import vtkhdf
+from lfpiv_cli.files.atomic import ensure_writable, write_json
+from lfpiv_cli.files.config import Config, load_config
+from lfpiv_cli.files.inputs import given
+from lfpiv_cli.files.pages import ensure_drawing, write_picture
+from lfpiv_cli.files.particles import MM_PER_M, read_particles
+from lfpiv_cli.files.provenance import record
+from lfpiv_cli.files.provenance import record as provenance_record
+from lfpiv_cli.files.sections_simulated import FlowSection
+from lfpiv_cli.flow.field import VectorField
+from lfpiv_cli.flow.windows import RoundWall
+from lfpiv_cli.names import Moment
+from lfpiv_cli.notice import Notice
+from lfpiv_cli.optics.tracing import ObjectSpace
+from lfpiv_cli.reference import Reference
+from lfpiv_cli.stages.validate_board import depths_in_volume, validate_board
+from lfpiv_cli.synthetic.vortices import Flow
+from lfpiv_cli.validation.flow import Duct, limits_missed, truth_at_points
+from lfpiv_cli.validation.methods import (
+    Measured,
+    errors_figure,
+    flow_figure,
+    lower_error,
+    profiles_figure,
+    radius_figure,
+    slices_figure,
+)
+from lfpiv_cli.validation.volume import volume_figures
+from lfpiv_cli.validation.weights import (
+    SHOWN,
+    SHOWN_BEHIND_FACES,
+    TABLE1_MM,
+    columns_figure,
+    in_view,
+    make_columns,
+    make_curved_columns,
+    sample_voxels,
+    seen_voxels,
+    similarity_figure,
+    weights_figures,
+    weights_limits_missed,
+)
+from lfpiv_cli.verbs.chain import run_chain
+from lfpiv_cli.verbs.simulate import ensure_experiment
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+# The stage of `validate volume`: a reconstructed volume against the particles that were there.
+
+
+# When the frames of a pair are taken, in units of the time between them, counted from the middle of the pair.
+MOMENTS: dict[Moment, float] = {"a": -0.5, "middle": 0.0, "b": 0.5}
+
+
+def validate_volume(
+    config: Path,
+    output: Path,
+    *,
+    volume: Path,
+    particles: Path,
+    frame: Moment,
+    overwrite: bool = False,
+    console: Console = CONSOLE,
+) -> dict[str, Any]:
+    """Judge a volume by the true particles, which are known at the middle of a pair."""
+    inputs = given(config=config, volume=volume, particles=particles)
+    report = output / "volume.json"
+    ensure_writable(report, overwrite, inputs.values())
+    settings = load_config(config)
+    found, true = vtkhdf.open_volume(volume), read_particles(particles)
+    dt_s = settings.correlation.dt_s
+    if MOMENTS[frame] and dt_s is None:
+        raise ConfigError(f"{config}: correlation.dt_s: is missing, and --frame {frame} needs it")
+    moved = MOMENTS[frame] * (dt_s or 0.0) * MM_PER_M * true.velocities_m_s
+    position = found.reference.points_from_focal_point(true.positions_mm + moved)
+    camera = settings.camera_model()
+    microlens_mm = float(camera.lattice.pitch.mean()) / abs(camera.magnification)
+    figures = volume_figures(found.array, found.grid, position, true.brightness, microlens_mm) | {
+        "residual": found.attributes["residual"][-1],
+        "iterations": len(found.attributes["residual"]) - 1,
+    }
+    provenance = record(f"validate volume, frame {frame}", settings.resolved(), inputs)
+    write_json(report, {"figures": figures, "provenance": provenance}, overwrite)
+    return figures
+
+
+def validate_weights(
+    config: Path, output: Path, *, overwrite: bool = False, console: Console = CONSOLE
+) -> dict[str, Any]:
+    """Hold the weights of the paper's voxels and of a random sample against each other and against integrals.
+
+    Through a scene all voxels are random ones of the fluid.
+    """
+    paths = {name: output / f"weights{name}" for name in (".json", "_columns.png", "_similarity.png")}
+    for target in paths.values():
+        ensure_writable(target, overwrite, [config])
+    ensure_drawing()
+    settings = load_config(config)
+    chosen = settings.validation.weights
+    camera, grid = settings.camera_model(), settings.grid()
+    rng = np.random.default_rng(chosen.seed)
+    scene = settings.scene_space()
+    if scene is not None:
+        voxels = seen_voxels(camera, scene, grid, len(TABLE1_MM) + chosen.sample, rng)
+        long_count = np.where(np.arange(len(voxels)) < len(TABLE1_MM), chosen.long_count_rays, 0)
+        with console.progress(len(voxels), "validate weights") as advance:
+            columns = make_curved_columns(camera, scene, grid, voxels, rng, long_count, advance)
+    else:
+        space = _space(settings)
+        known = [centre for centre in TABLE1_MM if in_view(camera, space, centre, grid.spacing_mm)]
+        centres = np.concatenate([np.array(known).reshape(-1, 3), sample_voxels(grid, chosen.sample, rng)])
+        long_count = np.where(np.arange(len(centres)) < len(known), chosen.long_count_rays, 0)
+        with console.progress(len(centres), "validate weights") as advance:
+            columns = make_columns(camera, space, centres, grid.spacing_mm, rng, long_count, advance)
+    figures = weights_figures(columns, long_count)
+    missed = weights_limits_missed(figures, chosen.limits.model_dump())
+    record = provenance_record("validate weights", settings.resolved(), {"config": config})
+    write_json(paths[".json"], {"figures": figures, "limits_missed": missed, "provenance": record}, overwrite)
+    shown = min(len(TABLE1_MM), len(columns))
+    names = SHOWN if scene is None else SHOWN_BEHIND_FACES
+    write_picture(paths["_columns.png"], columns_figure(columns[:shown], names), overwrite)
+    write_picture(paths["_similarity.png"], similarity_figure(figures, shown), overwrite)
+    summary = {
+        f"{name}.{figure}": each[figure]
+        for name, each in figures.items()
+        if isinstance(each, dict)
+        for figure in ("ssim_smallest", "rmse_grey_largest", "l1_mean", "l1_largest")
+    }
+    if missed:
+        raise LimitMissedError(f"{paths['.json']}: {'; '.join(missed)}", summary)
+    return {"voxels": len(columns)} | summary
+
+
+def _space(settings: Config) -> ObjectSpace:
+    """Return media and window; without the section `window` there is nothing to trace directly."""
+    try:
+        window = settings.window_model()
+    except ConfigError:
+        window = None
+    return ObjectSpace(settings.media_model(), window)
+
+
+PICTURES: dict[str, Callable[[Mapping[str, Measured]], Figure]] = {
+    "flow.png": flow_figure,
+    "flow_errors.png": errors_figure,
+    "flow_profiles.png": profiles_figure,
+}
+# Of a square duct, and of a round pipe.
+SLICES, RADII = "flow_slices.png", "flow_radii.png"
+# Particles follow a flow where they differ from it by less (rms over rms): a mid plane that is off by a tenth of a mm
+# makes 2 % in a channel of 10 mm.
+SAME_FLOW = 0.05
+
+
+def validate_flow(
+    config: Path,
+    output: Path,
+    *,
+    vectors: Path | None = None,
+    particles: Path | None = None,
+    overwrite: bool = False,
+    console: Console = CONSOLE,
+) -> dict[str, Any]:
+    """Judge a vector field by an analytic flow, else by true particles; without one, make it from simulated images.
+
+    The analytic flow is exact; between particles the truth is interpolated, and worse than a good measurement.
+    """
+    is_simulated = vectors is None
+    if is_simulated and particles is not None:
+        raise UsageError("--particles needs --vectors: the flow of a simulation is known")
+    paths = {name: output / name for name in ("flow.json", *PICTURES, SLICES, RADII)}
+    settings = load_config(config)
+    if is_simulated:
+        ensure_experiment(settings)
+        console.warn(light_notices(settings))
+    named = settings.simulation.flow if is_simulated else settings.validation.flow or settings.simulation.flow
+    duct, pipe = duct_of(named), named if named is not None and named.kind == "pipe" else None
+    walls = None if pipe is None else RoundWall(pipe.radius_mm, pipe.centre_mm, pipe.axis)
+    if duct is None:
+        del paths[SLICES]
+    if pipe is None:
+        del paths[RADII]
+    for target in paths.values():
+        ensure_writable(target, overwrite, given(config=config, vectors=vectors, particles=particles).values())
+    ensure_drawing()
+    made = {"measured": vectors} if vectors else run_chain(config, output, overwrite=overwrite, console=console)
+    inputs = given(config=config, particles=particles) | (given(vectors=vectors) if vectors else made)
+    methods = {name: measured_of(path, settings, particles, is_simulated) for name, path in made.items()}
+    if particles and named is not None and methods["measured"].flow is None:
+        console.warn([_other_flow(config, particles)])
+    truth = "analytic flow" if all(measured.flow for measured in methods.values()) else "particles"
+    figures = {name: measured.figures(duct, walls) for name, measured in methods.items()}
+    limits = settings.validation.limits.model_dump()
+    missed = [
+        text if vectors else f"{name}: {text}"
+        for name, found in figures.items()
+        for text in limits_missed(found, limits)
+    ]
+    report: dict[str, Any] = {
+        "figures": figures["measured"] if vectors else figures,
+        "limits_missed": missed,
+        "truth": truth,
+    }
+    if len(methods) > 1:
+        report["lower_error"] = lower_error(methods, figures)
+    report["provenance"] = record("validate flow", settings.resolved(), inputs)
+    write_json(paths["flow.json"], report, overwrite)
+    for name, draw in PICTURES.items():
+        write_picture(paths[name], draw(methods), overwrite)
+    if duct is not None:
+        write_picture(paths[SLICES], slices_figure(methods, duct), overwrite)
+    if pipe is not None and walls is not None:
+        fields = {name: measured.field for name, measured in methods.items()}
+        write_picture(paths[RADII], radius_figure(fields, walls, pipe.mean_velocity_m_s), overwrite)
+    summary = _summary(figures) if is_simulated else _scalars(figures["measured"])
+    summary["truth"] = truth
+    if len(methods) > 1:
+        summary["lower_error"] = report["lower_error"]
+    if missed:
+        raise LimitMissedError(f"{paths['flow.json']}: {'; '.join(missed)}", summary)
+    return summary
+
+
+def duct_of(flow: FlowSection | None) -> Duct | None:
+    """Return the duct of a flow, None where it is another one."""
+    if flow is None or flow.kind != "square_duct":
+        return None
+    return Duct(flow.width_mm, flow.centre_mm, flow.axis, flow.mean_velocity_m_s)
+
+
+def measured_of(vectors: Path, settings: Config, particles: Path | None, is_simulated: bool) -> Measured:
+    """Return vectors with the true flow at their places."""
+    field = vtkhdf.open_vectors(vectors)
+    if field.dt_s is None:
+        raise InputError(f"{vectors}: holds displacements without a time; correlate again with --dt-s")
+    if particles:
+        return _beside_particles(field, vtkhdf.read_header(vectors).reference, settings, particles)
+    flow = settings.simulated_flow() if is_simulated else settings.true_flow()
+    truth = _at_windows(flow, field)
+    return Measured(field, truth, np.asarray(truth.any(axis=-1)), flow)
+
+
+def _at_windows(flow: Flow, field: VectorField) -> NDArray[np.float64]:
+    centres = field.grid.centres_mm()
+    return flow(centres.reshape(-1, 3)).reshape(centres.shape)
+
+
+def _beside_particles(field: VectorField, reference: Reference, settings: Config, particles: Path) -> Measured:
+    """Return vectors, judged where there are particles, with the config's flow if these follow it, else with theirs."""
+    centres = reference.points_to_focal_point(field.grid.centres_mm())
+    truth, inside = _truth_of_particles(particles, centres)
+    if settings.validation.flow is None and settings.simulation.flow is None:
+        return Measured(field, truth, inside)
+    flow, true = settings.true_flow(), read_particles(particles)
+    difference = flow(reference.points_from_focal_point(true.positions_mm)) - true.velocities_m_s
+    if np.linalg.norm(difference) > SAME_FLOW * np.linalg.norm(true.velocities_m_s):
+        return Measured(field, truth, inside)
+    analytic = _at_windows(flow, field)
+    return Measured(field, analytic, inside & analytic.any(axis=-1), flow)
+
+
+def _other_flow(config: Path, particles: Path) -> Notice:
+    return Notice(
+        "truth-contradicts",
+        config.name,
+        f"the particles of {particles.name} do not move as the flow that it names, and are taken for the truth",
+        "validation.flow of this experiment, or none",
+    )
+
+
+def light_notices(settings: Config) -> list[Notice]:
+    """Return where tracers are fitted with other light than they are simulated with."""
+    simulated, fitted_nm = settings.simulation.light, settings.reconstruction.wavelength_nm
+    simulated_nm = None if simulated.kind == "rays" else simulated.wavelength_nm
+    if simulated_nm == fitted_nm:
+        return []
+    made, fitted = ("by rays" if each is None else f"by waves of {each:g} nm" for each in (simulated_nm, fitted_nm))
+    text = f"images are simulated {made}, and tracers are fitted {fitted}: particles err more than with the same light"
+    remedy = "reconstruction.wavelength_nm as simulation.light has it, or neither"
+    return [Notice("light-differs", "simulation.light", text, remedy)]
+
+
+def _scalars(figures: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in figures.items() if not isinstance(value, (list, dict))}
+
+
+def _summary(figures: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the figures that are numbers, each with the value of every method."""
+    names = _scalars(next(iter(figures.values())))
+    return {name: {method: found[name] for method, found in figures.items()} for name in names}
+
+
+def _truth_of_particles(path: Path, centres_mm: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return the true velocities at the window centres, z from the focal point, and which lie among the particles."""
+    particles = read_particles(path)
+    lit = particles.brightness[:, np.newaxis] > 0.0
+    low = particles.positions_mm.min(axis=0, where=lit, initial=np.inf)
+    high = particles.positions_mm.max(axis=0, where=lit, initial=-np.inf)
+    inside = np.all((centres_mm >= low) & (centres_mm <= high), axis=-1)
+    return truth_at_points(particles.positions_mm, particles.velocities_m_s, centres_mm), inside
+
+
+def validate_all(config: Path, output: Path, *, overwrite: bool = False, console: Console = CONSOLE) -> dict[str, Any]:
+    """Write every report into one folder; a limit that one of them misses does not keep the others from being made."""
+    ensure_complete(config)
+    stages: dict[str, Callable[..., dict[str, Any]]] = {
+        "weights": validate_weights,
+        "board": validate_board,
+        "flow": validate_flow,
+    }
+    summary: dict[str, Any] = {}
+    missed = []
+    for name, stage in stages.items():
+        try:
+            found = stage(config, output, overwrite=overwrite, console=console)
+        except LimitMissedError as error:
+            missed.append(str(error))
+            found = error.figures
+        summary |= {f"{name}.{figure}": value for figure, value in found.items()}
+    if missed:
+        raise LimitMissedError("; ".join(missed), summary)
+    return summary
+
+
+def ensure_complete(config: Path) -> None:
+    """Refuse a config that lacks what the last of the reports needs before the first is made.
+
+    Raises
+    ------
+    ConfigError
+    """
+    settings = load_config(config)
+    depths_in_volume(settings)
+    ensure_experiment(settings)

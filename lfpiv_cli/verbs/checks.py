@@ -1,0 +1,276 @@
+"""What speaks against vectors and tracks: windows that do not fit the volumes or hold too few tracers, wrong links."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter
+
+from lfpiv_cli.files.particle_file import PointRows
+from lfpiv_cli.files.provenance import calibrated_with
+from lfpiv_cli.files.vtkhdf import Volume
+from lfpiv_cli.flow.correlation import CorrelationSettings
+from lfpiv_cli.flow.field import MASKED, REJECTED, VALID, VectorField
+from lfpiv_cli.flow.maps import margins, valid_shares
+from lfpiv_cli.flow.windows import WindowLayout
+from lfpiv_cli.notice import Notice, written
+from lfpiv_cli.robust import of_half_the_sum
+from lfpiv_cli.tracks.tracking import FEWEST_OF_FIT
+
+# A frame with less than this share of the fullest one's particles leaves most of those without a partner.
+ONE_SIDED = 0.5
+# With fewer particles than this no local linear fit tells which links are wrong.
+FEW = FEWEST_OF_FIT + 2
+# Of good pairs four in five particles or more are linked; of unrelated images chance links three in ten.
+LEAST_LINKED = 0.5
+# The share of probably wrong links above which vectors of single tracks are in doubt.
+MOST_WRONG = 0.05
+# Particles' places scatter by one to two stated errors about smooth paths; what is more is the flow's.
+LARGEST_NOISE = 3.0
+# Displacements of still particles differ from 0 by a standard error along one axis or another, by chance.
+STILL_SIGMAS = 0.05
+
+# Two vectors along an axis show no profile, and each is half about the volume's face.
+FEWEST_ALONG_AXIS = 3
+# Below five tracers a window the share of false vectors rises steeply; peaks of a volume are fewer than tracers where
+# these are dense, and more where ghosts stand between them: a third of those of the sample's windows.
+FEWEST_TRACERS = 3.0
+# A voxel brighter than those around it and than this share of those that most of the light comes from is a tracer.
+TRACER_SHARE = 0.1
+# Of the vectors.
+MOST_WITHOUT, MOST_IN_DOUBT = 0.5, 0.5
+# Voxels: volumes that have no tracers in common leave more than this sideways, poor ones of a pair a quarter of it.
+LARGEST_MEDIAN_SIGMA = 0.5
+# Only a volume and itself correlate so well and lie so still: two images of the same tracers have different noise.
+SAME_CORRELATION, STILL_VOXEL = 0.9999, 1e-3
+WINDOWS = "correlation.windows"
+
+
+@dataclass(frozen=True, eq=False)
+class Quality:
+    """How good the vectors of one or several fields are.
+
+    Attributes
+    ----------
+    vectors, used, in_doubt, without : how many there are in all, inside the mask, of these not as the highest peak gave
+        them, and finite ones without an uncertainty
+    finite : how many have a displacement
+    sigma : (fields, 3) median standard deviations, NaN where none is known
+    """
+
+    vectors: int
+    used: int
+    in_doubt: int
+    finite: int
+    without: int
+    sigma: NDArray[np.float64]
+
+    def summary(self) -> dict[str, Any]:
+        """Return the figures, units in their names; None where there are no vectors, or none with an uncertainty."""
+        known = np.isfinite(self.sigma).all(axis=1)
+        return {
+            "uncertainty_voxel_median": np.median(self.sigma[known], axis=0).tolist() if known.any() else None,
+            "without_uncertainty_share": self.without / self.finite if self.finite else None,
+            "in_doubt_share": self.in_doubt / self.used if self.used else None,
+        }
+
+
+def quality_of(field: VectorField) -> Quality:
+    """Return how good the vectors of a field are."""
+    finite, used = field.flag < REJECTED, field.flag < MASKED
+    sigma = np.full(field.displacement_voxel.shape, np.nan)
+    if field.uncertainty_voxel is not None:
+        sigma = field.uncertainty_voxel
+    known = finite & np.isfinite(sigma).all(axis=-1)
+    median = np.median(sigma[known], axis=0) if known.any() else np.full(3, np.nan)
+    return Quality(
+        field.flag.size,
+        int(used.sum()),
+        int(np.count_nonzero(used & (field.flag != VALID))),
+        int(finite.sum()),
+        int(np.count_nonzero(finite & ~known)),
+        median[np.newaxis],
+    )
+
+
+def quality_of_all(parts: Sequence[Quality]) -> Quality:
+    """Return how good the vectors of several fields are."""
+    names = ("vectors", "used", "in_doubt", "finite", "without")
+    sums = {name: sum(getattr(part, name) for part in parts) for name in names}
+    return Quality(**sums, sigma=np.concatenate([np.zeros((0, 3)), *(part.sigma for part in parts)]))
+
+
+def field_notices(quality: Quality, name: str) -> Iterator[Notice]:
+    """Yield what speaks against the vectors of a field."""
+    if quality.finite and quality.without > MOST_WITHOUT * quality.finite:
+        share = quality.without / quality.finite
+        text = f"{share:.0%} of the vectors have no uncertainty: their windows hold too little to tell one"
+        yield Notice("no-uncertainty", name, text, "larger correlation.windows", share, f"at most {MOST_WITHOUT:g}")
+    if quality.used and quality.in_doubt > MOST_IN_DOUBT * quality.used:
+        share = quality.in_doubt / quality.used
+        text = f"{share:.0%} of the vectors are rejected, replaced or of a second peak"
+        remedy = (
+            "larger correlation.windows, a shorter time between the images, more tracers; or leave out where there are "
+            "none (--mask)"
+        )
+        yield Notice("vectors-in-doubt", name, text, remedy, share, f"at most {MOST_IN_DOUBT:g}")
+
+
+def pair_notices(field: VectorField, quality: Quality, name: str) -> Iterator[Notice]:
+    """Yield what speaks against the two images that one field of vectors is of."""
+    finite = field.flag < REJECTED
+    correlation = float(np.median(field.correlation[finite])) if finite.any() else 0.0
+    if correlation > SAME_CORRELATION and np.abs(field.displacement_voxel[finite]).max() < STILL_VOXEL:
+        text = "both volumes are one and the same: nothing has moved, and no noise differs"
+        remedy = "check that the two images of the pair are two"
+        yield Notice("volumes-alike", name, text, remedy, correlation, f"at most {SAME_CORRELATION:g}")
+    largest = float(quality.sigma[0, :2].max())
+    if largest > LARGEST_MEDIAN_SIGMA:
+        text = (
+            f"half of the vectors have an uncertainty above {written(largest, 2)} voxels sideways: the volumes have "
+            "few tracers in common"
+        )
+        remedy = "check that both images are of one pair, and the time between them; larger windows, more tracers"
+        yield Notice("volumes-unlike", name, text, remedy, largest, f"at most {LARGEST_MEDIAN_SIGMA:g}")
+
+
+def window_notices(volume: Volume, settings: CorrelationSettings, name: str) -> Iterator[Notice]:
+    """Yield what speaks against correlating a volume in such windows."""
+    size, shape = settings.windows[-1], volume.grid.shape_xyz
+    layout = settings.layout(shape)
+    few = [axis for axis in range(3) if layout.count[axis] < FEWEST_ALONG_AXIS and shape[axis] > 1]
+    if few:
+        fewest = min(few, key=lambda axis: layout.count[axis])
+        axis, length = "xyz"[fewest], size[fewest] * volume.grid.spacing_mm[fewest]
+        text = (
+            f"the final windows are {size[fewest]} voxels ({written(length)} mm) along {axis}, where the volume has "
+            f"{shape[fewest]}: vectors along that axis: {layout.count[fewest]}"
+        )
+        remedy = f"windows as [x, y, z] with fewer voxels along {axis}, or window_mm"
+        yield Notice(
+            "windows-too-large",
+            WINDOWS,
+            text,
+            remedy,
+            float(layout.count[fewest]),
+            f"at least {FEWEST_ALONG_AXIS} vectors",
+        )
+    tracers = tracers_per_window(volume.array, layout)
+    if tracers < FEWEST_TRACERS:
+        text = (
+            f"half of the final windows hold {written(tracers, 2)} bright spots or fewer: below {FEWEST_TRACERS:g} "
+            "vectors are often false"
+        )
+        remedy = (
+            "larger correlation.windows, more tracers, or particle tracking (reconstruct --solver particles, track)"
+        )
+        yield Notice("few-tracers", name, text, remedy, tracers, f"at least {FEWEST_TRACERS:g}")
+
+
+def tracers_per_window(volume: NDArray[np.float32], layout: WindowLayout) -> float:
+    """Return the median number of bright spots of a volume (z, y, x) in windows."""
+    peaks = (volume == maximum_filter(volume, 3)) & (volume > 0.0)
+    if not peaks.any():
+        return 0.0
+    peaks &= volume > TRACER_SHARE * of_half_the_sum(volume[peaks])
+    before, after = margins(layout, (volume.shape[0], volume.shape[1], volume.shape[2]), 0)
+    padded = np.pad(peaks.astype(np.uint8), list(zip(before, after, strict=True)))
+    return float(np.median(valid_shares(padded, layout, before)) * np.prod(layout.size))
+
+
+def calibration_notices(records: Mapping[str, Mapping[str, Any]]) -> list[Notice]:
+    """Return whether results, given as their records by name, were made with different calibrations."""
+    known = [(name, calibrated_with(made)) for name, made in records.items()]
+    known = [(name, calibration) for name, calibration in known if calibration is not None]
+    return [
+        Notice(
+            "other-calibration",
+            name,
+            f"was made with another calibration than {known[0][0]}: what moved between the two counts as motion",
+            "reconstruct all with one calibration",
+        )
+        for name, calibration in known
+        if calibration != known[0][1]
+    ]
+
+
+def few_notices(
+    counts: Sequence[int], names: Sequence[str], summary: Mapping[str, Any], tracks: PointRows
+) -> list[Notice]:
+    """Return which frames hold few particles or none, and whether any could be followed."""
+    fullest, named = max(counts), list(zip(names, counts, strict=True))
+    notices = [
+        Notice(
+            "frame-without-particles",
+            name,
+            "there are no particles in it: no track passes there",
+            "compare exposure, mask and background of the images, or leave the frame out",
+            0.0,
+            "some",
+        )
+        for name, count in named
+        if not count
+    ]
+    notices += [
+        Notice(
+            "frame-with-few-particles",
+            name,
+            f"holds {count} particles, another frame {fullest}, most of which have no partner",
+            "compare exposure, mask and background of the images",
+            float(count),
+            f"at least {ONE_SIDED * fullest:g}",
+        )
+        for name, count in named
+        if 0 < count < ONE_SIDED * fullest
+    ]
+    if fullest < FEW:
+        text = f"{fullest} particles at most in a frame: below {FEW} neighbours do not tell wrong links"
+        remedy = "judge the links by themselves, or find more particles"
+        notices.append(Notice("few-particles", names[0], text, remedy, float(fullest), f"at least {FEW}"))
+    linked, fewest = summary["tracks"], min(counts)
+    if len(counts) == 2 and fewest >= FEW and 0 < linked < LEAST_LINKED * fewest:
+        text = f"{linked} of {fewest} particles have a partner in the other frame, as many as in unrelated images"
+        remedy = "check that both images are of one pair, the time between them, and how far is sought (--search)"
+        notices.append(Notice("few-links", names[0], text, remedy, linked / fewest, f"at least {LEAST_LINKED:g}"))
+    if not linked:
+        text = "no tracks were found from it to the next frame"
+        remedy = "check the order of the frames and how far particles are sought (--search)"
+        notices.append(Notice("no-tracks", names[0], text, remedy, 0.0, "some"))
+    return notices + doubt_notices(summary, names[0]) + still_notices(tracks, names[0])
+
+
+def doubt_notices(summary: Mapping[str, Any], name: str) -> list[Notice]:
+    """Return what is said where many links are probably wrong, and where tracks bend more than fits in time follow."""
+    notices, links = [], summary["tracks"]
+    if "tracked" in summary:
+        links = summary["tracked"] - summary["tracks"]
+    wrong = summary["expected_wrong_links"] / links if links else 0.0
+    if wrong > MOST_WRONG:
+        text = f"{wrong:.0%} of the links are probably wrong, by their alternatives"
+        remedy = "a shorter time between the images, fewer tracers, or larger windows and correlate"
+        notices.append(Notice("wrong-links", name, text, remedy, wrong, f"at most {MOST_WRONG:g}"))
+    noise = summary.get("noise_over_stated")
+    if noise is not None and max(noise) > LARGEST_NOISE:
+        text = f"places lie {max(noise):.1f} times their stated errors off cubics in time, which velocities are of"
+        remedy = "a shorter time between the frames; or believe stated errors of velocities only where tracks are long"
+        notices.append(Notice("tracks-bend", name, text, remedy, max(noise), f"at most {LARGEST_NOISE:g}"))
+    return notices
+
+
+def still_notices(tracks: PointRows, name: str) -> list[Notice]:
+    """Return what is said where nothing moves, not even by the errors of the particles' places: of one image twice."""
+    ratio, count = np.empty(tracks.count), 0
+    for velocity, sigma in zip(tracks.rows("velocity"), tracks.rows("velocity_sigma"), strict=True):
+        known = (sigma > 0.0).all(axis=1)
+        begin, count = count, count + int(np.count_nonzero(known))
+        ratio[begin:count] = (np.abs(velocity[known]) / sigma[known]).max(axis=1)
+    moved = float(np.median(ratio[:count], overwrite_input=True)) if count else STILL_SIGMAS
+    if moved >= STILL_SIGMAS:
+        return []
+    text = "nothing moves from it to the next frame, not even by chance: both are one and the same image"
+    remedy = "check that the images are two"
+    return [Notice("frames-alike", name, text, remedy, moved, f"above {STILL_SIGMAS:g} standard errors")]

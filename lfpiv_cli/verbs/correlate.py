@@ -1,0 +1,473 @@
+"""`correlate`: displacements between pairs of volumes, of each or of all together."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lfpiv_cli.console import CONSOLE, Console, Frames
+from lfpiv_cli.errors import InputError, LfpivError, UsageError
+from lfpiv_cli.files import vtkhdf
+from lfpiv_cli.files.atomic import ensure_writable, folder_of
+from lfpiv_cli.files.batch import Target, output_paths
+from lfpiv_cli.files.config import Config, carried_config, load_config
+from lfpiv_cli.files.hdf5 import ensure_opens, fault_of
+from lfpiv_cli.files.inputs import ensure_room, given
+from lfpiv_cli.files.pairing import Pairs
+from lfpiv_cli.files.provenance import (
+    OF_FRAMES,
+    earlier_record,
+    ensure_agreement,
+    ensure_even,
+    record,
+    seconds_between,
+    with_warnings,
+)
+from lfpiv_cli.files.vtkhdf import Volume
+from lfpiv_cli.flow import correlation
+from lfpiv_cli.flow.correlation import correlate as measure
+from lfpiv_cli.flow.correlation import count_passes, held_bytes
+from lfpiv_cli.flow.field import REJECTED, VectorField, derived_fields
+from lfpiv_cli.flow.peaks import with_locking
+from lfpiv_cli.flow.windows import inside
+from lfpiv_cli.grid import Grid
+from lfpiv_cli.notice import Notice, warn_of
+from lfpiv_cli.reference import FOCAL_POINT, Reference
+from lfpiv_cli.scale import Scale
+from lfpiv_cli.verbs.batches import ALL, BatchOptions, Expected, Worked, dry_run, work_through
+from lfpiv_cli.verbs.checks import (
+    Quality,
+    calibration_notices,
+    field_notices,
+    pair_notices,
+    quality_of,
+    quality_of_all,
+    window_notices,
+)
+from lfpiv_cli.verbs.combine import Mean, are_measured, arrays_of, mean_of_measured
+from lfpiv_cli.verbs.frames import dt_notices
+from lfpiv_cli.verbs.pairs import ComingPairs, PairBatch, PairBatchOptions, result_pairs, watched, work_as_they_come
+
+
+def correlate(
+    a: Volume | NDArray[Any],
+    b: Volume | NDArray[Any],
+    *,
+    mask: NDArray[Any] | None = None,
+    voxel_mm: tuple[float, float, float] | None = None,
+    **settings: Any,
+) -> VectorField:
+    """Measure the displacements between two volumes by three-dimensional cross-correlation.
+
+    Parameters
+    ----------
+    a, b : Volume or (nz, ny, nx) array
+        First and second volume, from `reconstruct` or `open_volume`; or light on a regular grid of your own.
+    mask : (nz, ny, nx), optional
+        0 where the volumes are left out.
+    voxel_mm : (x, y, z) mm, optional
+        Size of a voxel where `a` and `b` are plain arrays; their middle is then the origin.
+    **settings
+        Keys of the rig's section `correlation`, in their place: windows=((32, 32, 32), (16, 16, 16)),
+        overlap=(0.5, 0.5, 0.5), dt_s=0.001, exponent and so on.
+
+    Returns
+    -------
+    VectorField
+        `velocity` (nz, ny, nx, 3) m/s as (u, v, w), NaN where there is no vector or no `dt_s`; `displacement_voxel`,
+        `uncertainty_voxel` and `flag` likewise; `grid` has the centres of the interrogation windows, mm.
+
+    Raises
+    ------
+    InputError
+        The volumes or the mask do not belong together.
+    ConfigError
+        The settings are not possible.
+    UsageError
+        Plain arrays are given without `voxel_mm`.
+    """
+    first, second = (_as_volume(each, voxel_mm) for each in (a, b))
+    ensure_alike(first, second, ("the first volume", "the second volume"))
+    config = first.provenance.get("config")
+    carried = carried_config(first.provenance, "the volume") if config else Config.from_resolved({})
+    chosen = carried.overridden("correlation", **settings)
+    windows = chosen.correlation_settings(first.grid.spacing_mm)
+    usable = usable_voxels(chosen, first.grid, mask)
+    field = correlation.correlate([(first.array, second.array)], first.grid, windows, mask=usable)
+    if config:
+        # Of light that no camera recorded nothing is known.
+        field = with_locking(field, first.reference, scale_of(chosen))
+    quality, name = quality_of(field), "the field"
+    against_field = [*field_notices(quality, name), *pair_notices(field, quality, name)]
+    warn_of([*window_notices(first, windows, "the first volume"), *against_field])
+    return field
+
+
+def scale_of(settings: Config) -> Scale:
+    """Return the lengths in the scene of the camera that volumes were made of."""
+    return settings.camera_model().scale(settings.media_model())
+
+
+def usable_voxels(settings: Config, grid: Grid, mask: NDArray[Any] | None) -> NDArray[np.bool_] | None:
+    """Return where volumes may be used (nz, ny, nx): between walls and where a mask is above 0; None: everywhere."""
+    walls = settings.masking_walls()
+    usable = None if walls is None else inside(grid, walls)
+    if mask is not None:
+        drawn = np.asarray(mask) > 0.0
+        usable = drawn if usable is None else usable & drawn
+    return usable
+
+
+def ensure_alike(first: Volume, second: Volume, names: tuple[str, str]) -> None:
+    """Refuse two volumes that were not made alike.
+
+    Raises
+    ------
+    InputError
+    """
+    if first.grid != second.grid:
+        raise InputError(f"{names[1]}: its grid {second.grid} differs from that of {names[0]}, {first.grid}")
+    if first.reference.name != second.reference.name:
+        raise InputError(f"{names[1]}: its coordinates have another origin than those of {names[0]}")
+    ensure_agreement([first.provenance, second.provenance], names, OF_FRAMES)
+
+
+def _as_volume(volume: Volume | NDArray[Any], voxel_mm: tuple[float, float, float] | None) -> Volume:
+    """Return a volume as such, a plain array about the origin."""
+    if isinstance(volume, Volume):
+        return volume
+    if voxel_mm is None:
+        raise UsageError("correlate: plain arrays need voxel_mm, the size of a voxel along x, y, z")
+    array = np.asarray(volume, dtype=np.float32)
+    if array.ndim != 3:
+        raise InputError(f"a volume of shape {array.shape}, expected (nz, ny, nx)")
+    nz, ny, nx = array.shape
+    return Volume(array, Grid.centred((nx, ny, nz), voxel_mm, (0.0, 0.0, 0.0)), FOCAL_POINT, {}, {})
+
+
+# Numbers of eight bytes that a file has of each vector at most, and derived ones besides.
+NUMBERS_A_VECTOR, NUMBERS_DERIVED, NUMBER_BYTES = 16, 6, 8
+
+
+@dataclass(frozen=True)
+class Job:
+    """One result: the pairs of volumes that it is made of, and the settings."""
+
+    pairs: Sequence[tuple[Path, Path]]
+    settings: Config
+
+    def inputs(self) -> dict[str, Path]:
+        """Return the volumes by their role."""
+        if len(self.pairs) == 1:
+            return given(volume_a=self.pairs[0][0], volume_b=self.pairs[0][1])
+        return {
+            f"volume_{name}_{number:04d}": path
+            for number, pair in enumerate(self.pairs)
+            for name, path in zip("ab", pair, strict=True)
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class CorrelateOptions(PairBatchOptions):
+    """What `correlate` is given besides the volumes.
+
+    Attributes
+    ----------
+    config : in place of the one that the volumes carry
+    dt_s, windows, overlap : in place of the config's, see its section `correlation`
+    mask_volume : volume on the same grid, 0 where the volumes are left out
+    ensemble : one field of all pairs together
+    derived : vorticity, divergence, strain rate and Q criterion, too
+    mean : file of the pairs' mean and fluctuations, to write; of vectors or tracks, in place of volumes, it is all
+    """
+
+    config: Path | None = None
+    dt_s: float | None = None
+    windows: Sequence[int | Sequence[int]] | None = None
+    overlap: float | Sequence[float] | None = None
+    mask_volume: Path | None = None
+    ensemble: bool = False
+    derived: bool = False
+    mean: Path | None = None
+
+
+NO_OPTIONS = CorrelateOptions()
+# What the mean of vectors that are there may be asked with; which belong together is then known.
+FOR_MEANS = {"mean", "derived", "resume", "pairing", "pair_by", "pairs"}
+
+
+def correlate_files(
+    volumes: Sequence[Path],
+    output: Path | None,
+    options: CorrelateOptions = NO_OPTIONS,
+    *,
+    overwrite: bool = False,
+    console: Console = CONSOLE,
+    pairs: Pairs | None = None,
+) -> dict[str, Any]:
+    """Measure the displacements between pairs of volumes; `pairs`, where they are known already.
+
+    Of vectors and tracks that are there, in place of volumes, only the `mean` is made.
+    """
+    if options.mean is not None and not options.watch and are_measured(volumes):
+        _ensure_for_mean(options, volumes[0])
+        if output is not None:
+            console.say(f"{output}: is not written: the vectors are there, and --mean alone is made of them")
+        return mean_of_measured(volumes, options.mean, options, options.derived, overwrite, console)
+    if output is None:
+        raise UsageError("-o: is missing, the file or folder of the vectors; only the --mean of vectors needs none")
+    if options.watch:
+        batch, worked = _as_they_come(volumes, output, options, overwrite, console)
+        return worked.ensure_whole(batch.summary(worked), batch.unit)
+    batch = Correlation(volumes, output, options, overwrite, pairs)
+    if options.dry_run:
+        return dry_run(batch, options, console)
+    worked = work_through(batch, options, console)
+    fields = batch.fields(worked)
+    if options.mean is not None and fields:
+        mean = Mean(options.mean, fields, batch.settings.resolved(), options.derived, overwrite)
+        # What another worker made of the same fields in the meantime is as good.
+        work_through(mean, BatchOptions(resume=True), console)
+    return worked.ensure_whole(batch.summary(worked), batch.unit)
+
+
+def _ensure_for_mean(options: CorrelateOptions, first: Path) -> None:
+    """Refuse options that the mean of vectors that are there has no use for.
+
+    Raises
+    ------
+    UsageError
+    """
+    for each in fields(options):
+        if each.compare and each.name not in FOR_MEANS and getattr(options, each.name) != each.default:
+            name = each.name.removesuffix("_volume").replace("_", "-")
+            raise UsageError(f"--{name}: is for volumes; the mean of {first} and those beside it has no use for it")
+
+
+def _as_they_come(
+    folders: Sequence[Path], output: Path, options: CorrelateOptions, overwrite: bool, console: Console
+) -> tuple[Correlation, Worked[Outcome]]:
+    """Correlate the volumes of folders that are still being filled, each pair when both are there.
+
+    Raises
+    ------
+    UsageError : something is made from all pairs
+    """
+    if options.ensemble or options.mean is not None:
+        refused = "--ensemble" if options.ensemble else "--mean"
+        raise UsageError(f"--watch: {refused} is made from all pairs, some of which have not come yet; wait for them")
+    if not options.are_told:
+        raise UsageError("--watch needs --pairing: ab or sequence")
+    coming = ComingPairs(lambda files: result_pairs(files, options), console)
+
+    def of_pairs(files: Sequence[Path]) -> Correlation:
+        two_by_two = tuple((number, number + 1) for number in range(0, len(files), 2))
+        return Correlation(files, output, options, overwrite, Pairs(two_by_two))
+
+    groups = coming.groups(watched(folders, "results", options, console))
+    with folder_of(output / folders[0].name):
+        return work_as_they_come(of_pairs, groups, options, console, lambda: coming.left_out)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What is told of a field: how good it is, how many vectors are rejected, and the divergence where it is asked."""
+
+    quality: Quality
+    rejected: int
+    divergence_rms: float | None = None
+
+
+class Correlation(PairBatch[Outcome, CorrelateOptions]):
+    """The batch of `correlate`: a field of vectors for each pair of volumes, or one of all pairs together."""
+
+    label = "correlate"
+
+    def _arrange(self, files: Sequence[Path], output: Path, pairs: Pairs | None) -> None:
+        options = self._options
+        self.unit = "field" if options.ensemble else "pair"
+        self._pairs = self._paired(files, pairs)
+        if options.mean is not None and (options.ensemble or len(self._pairs) < 2):
+            raise UsageError("--mean needs several pairs, each correlated by itself")
+        if options.mean is not None and options.shard != ALL:
+            raise UsageError(
+                "--mean needs the fields of all shards: once they are there, the same command without --shard and with "
+                "--resume makes it"
+            )
+        self._groups = [self._pairs] if options.ensemble else [[pair] for pair in self._pairs]
+        self._common = given(config=options.config, mask=options.mask_volume)
+        self._config = load_config(options.config) if options.config else None
+        self.inputs = [*files, *self._common.values()]
+        paths = output_paths(output, [group[0][0].stem for group in self._groups])
+        self.targets = [Target(path, partial(self._record, number)) for number, path in enumerate(paths)]
+        self.beside = [options.mean] if options.mean else []
+        self._first = files[0] if self._gone else _ensure_readable(files, options.keep_going)
+
+    def fault(self, number: int) -> str | None:
+        """Return why a volume of a field cannot be opened."""
+        return fault_of(path for pair in self._groups[number] for path in pair)
+
+    def expected(self) -> Expected:
+        """Return the bytes of a field's arrays, and what a correlation holds."""
+        grid, settings = vtkhdf.read_grid(self._first), self.settings
+        held = held_bytes(grid.shape_xyz, settings.correlation_settings(grid.spacing_mm))
+        return Expected(field_bytes(settings, grid, self._options.derived), len(self._groups[0]) * held)
+
+    def begin(self, numbers: Sequence[int], _console: Console) -> float:
+        """Refuse a mean that could not be written, and fields too large for the memory."""
+        if self._options.mean is not None:
+            ensure_writable(self._options.mean, self.overwrite or self._options.resume)
+        if numbers and not self._gone:
+            ensure_room(self._held(), self.label)
+        return 1.0
+
+    def _held(self) -> float:
+        """Return what a field takes in memory; 0 where its volume cannot be read, which is told in its turn."""
+        try:
+            return self.expected().memory_bytes or 0.0
+        except LfpivError:
+            return 0.0
+
+    def make(self, number: int, work: Frames) -> Outcome:
+        """Correlate a pair, or all of them, and write the vectors."""
+        target = self.targets[number]
+        job = self._job(number)
+        field, reference, notices = _measure(job, self._options.mask_volume, work)
+        quality, name = quality_of(field), target.path.name
+        records = ([self._record_of(path) for path in pair] for pair in job.pairs)
+        notices += dt_notices(job.settings.correlation.dt_s, records, name)
+        notices += [*field_notices(quality, name), *pair_notices(field, quality, name)]
+        work.console.warn(notices)
+        derived = derived_fields(field) if self._options.derived else None
+        vtkhdf.write_vectors(
+            target.path,
+            field,
+            reference,
+            provenance=with_warnings(target.record, notices),
+            # What is complete is skipped: in the place of what is made there is nothing, or something broken.
+            overwrite=self.overwrite or self._options.resume,
+            extra=arrays_of(derived) if derived else None,
+        )
+        rejected = int(np.count_nonzero(field.flag >= REJECTED))
+        return Outcome(quality, rejected, derived.divergence_rms if derived else None)
+
+    def summary(self, worked: Worked[Outcome]) -> dict[str, Any]:
+        """Return what is told of the batch."""
+        return summary_of(worked, len(self._pairs) if self._options.ensemble else worked.total())
+
+    def fields(self, worked: Worked[Outcome]) -> list[Path]:
+        """Return the files of the fields that are there."""
+        failed = {failure.name for failure in worked.failures}
+        return [target.path for target, name in zip(self.targets, self.names, strict=True) if name not in failed]
+
+    @property
+    def settings(self) -> Config:
+        """Those of the first volume that can be opened."""
+        return self._settings_of(self._first)
+
+    def _job(self, number: int) -> Job:
+        """Return the pairs that a field is made of, and the settings."""
+        group = self._groups[number]
+        settings = self._settings_of(group[0][0])
+        if settings.correlation.dt_s is None:
+            settings = settings.overridden("correlation", dt_s=self._step_s(group))
+        return Job(group, settings)
+
+    def _step_s(self, group: Sequence[tuple[Path, Path]]) -> float | None:
+        """Return the time within the pairs of a field, where the recordings of their frames tell it.
+
+        Raises
+        ------
+        InputError : it is not the same in all of them
+        """
+        steps = [seconds_between(self._record_of(first), self._record_of(second)) for first, second in group]
+        told = [step for step in steps if step is not None]
+        return ensure_even(told, [str(group[0][0]), str(group[-1][1])]) if told and len(told) == len(steps) else None
+
+    def _record_of(self, volume: Path) -> Mapping[str, Any]:
+        """Return the record of a volume, which may be gone."""
+        return self._gone[volume].record if volume in self._gone else earlier_record(volume) or {}
+
+    def _settings_of(self, volume: Path) -> Config:
+        """Return the settings for a volume: its own, or those of a config in their place."""
+        settings = self._config or carried_config(self._record_of(volume), volume)
+        return settings.overridden_by("correlation", self._options)
+
+    def _record(self, number: int) -> dict[str, Any]:
+        """Return the record that a field will carry."""
+        options, job = self._options, self._job(number)
+        command = " ".join(["correlate", *["ensemble"] * options.ensemble, *["derived"] * options.derived])
+        return record(command, job.settings.resolved(), self._common | job.inputs(), gone=self._gone)
+
+
+def field_bytes(settings: Config, grid: Grid, derived: bool = False) -> float:
+    """Return the bytes of the arrays of a field of vectors, between volumes on a grid."""
+    windows = math.prod(settings.correlation_settings(grid.spacing_mm).layout(grid.shape_xyz).count)
+    return NUMBER_BYTES * (NUMBERS_A_VECTOR + derived * NUMBERS_DERIVED) * windows
+
+
+def summary_of(worked: Worked[Outcome], pairs: int) -> dict[str, Any]:
+    """Return what is told of the fields of so many pairs."""
+    outcomes = list(worked.outcomes.values())
+    found = quality_of_all([outcome.quality for outcome in outcomes])
+    told: dict[str, Any] = {
+        "pairs": pairs,
+        "skipped": worked.skipped,
+        "vectors": found.vectors,
+        "rejected": sum(outcome.rejected for outcome in outcomes),
+    }
+    divergence = [outcome.divergence_rms for outcome in outcomes if outcome.divergence_rms is not None]
+    return told | found.summary() | ({"divergence_rms_per_s": float(np.mean(divergence))} if divergence else {})
+
+
+def _measure(job: Job, mask: Path | None, work: Frames) -> tuple[VectorField, Reference, list[Notice]]:
+    """Return the vectors of a job, the origin of its volumes' coordinates, and what speaks against its windows."""
+    first = vtkhdf.open_volume(job.pairs[0][0])
+    drawn = None if mask is None else vtkhdf.open_volume(mask)
+    if drawn is not None and drawn.grid != first.grid:
+        raise InputError(f"{mask}: its grid {drawn.grid} differs from that of {job.pairs[0][0]}, {first.grid}")
+
+    def volumes() -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
+        for pair in job.pairs:
+            a, b = (first if path == job.pairs[0][0] else vtkhdf.open_volume(path) for path in pair)
+            for path, volume in zip(pair, (a, b), strict=True):
+                ensure_alike(first, volume, (str(job.pairs[0][0]), str(path)))
+            yield a.array, b.array
+
+    usable = usable_voxels(job.settings, first.grid, None if drawn is None else drawn.array)
+    settings = job.settings.correlation_settings(first.grid.spacing_mm)
+    records = {f"{role} {path.name}": earlier_record(path) or {} for role, path in job.inputs().items()}
+    notices = [*calibration_notices(records), *window_notices(first, settings, job.pairs[0][0].name)]
+    share = 1.0 / count_passes(settings.windows)
+    field = measure(volumes(), first.grid, settings, mask=usable, progress=lambda passes: work.advance(share * passes))
+    field = with_locking(field, first.reference, scale_of(job.settings))
+    return field, first.reference, notices
+
+
+def _ensure_readable(volumes: Sequence[Path], keep_going: bool) -> Path:
+    """Return the first volume that can be opened, after it is known whether the others can, where one is to stop.
+
+    Raises
+    ------
+    InputError : one cannot, or with `keep_going` none
+    """
+    readable, first_fault = [], None
+    for path in volumes:
+        try:
+            ensure_opens(path)
+        except InputError as error:
+            if not keep_going:
+                raise
+            first_fault = first_fault or error
+        else:
+            readable.append(path)
+    if not readable and first_fault is not None:
+        raise first_fault
+    return readable[0]

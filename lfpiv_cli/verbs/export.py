@@ -1,0 +1,120 @@
+"""`export`: results in the formats of other programs, nothing rounded."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from lfpiv_cli.console import CONSOLE, Console
+from lfpiv_cli.errors import InputError, UsageError
+from lfpiv_cli.files.atomic import ensure_writable, write_atomically
+from lfpiv_cli.files.exports.content import Content, plane_of, read_content
+from lfpiv_cli.files.exports.formats import FORMATS, ensure_fits, write_netcdf
+from lfpiv_cli.files.exports.vtk import write_series, write_tracks_series
+from lfpiv_cli.files.provenance import record
+from lfpiv_cli.names import ExportFormat
+
+# What the files of several times have to agree in, besides grid and arrays.
+SHARED = ("reference", "reference_z_mm", "dt_s", "voxel_mm", "window_voxel")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportOptions:
+    """What `export` is given besides the files.
+
+    Attributes
+    ----------
+    to : the format
+    plane : of vectors or a volume only this plane across z, counted from 0
+    step_s : time from one file to the next; where None they are numbered
+    """
+
+    to: ExportFormat
+    plane: int | None = None
+    step_s: float | None = None
+
+
+def export(
+    files: Sequence[Path],
+    output: Path | None,
+    options: ExportOptions,
+    *,
+    overwrite: bool = False,
+    console: Console = CONSOLE,
+) -> dict[str, Any]:
+    """Write what is in a file, or in the files of several times, in the format of another program.
+
+    Parameters
+    ----------
+    output : the file to write; where None, beside the file and named like it
+    """
+    to, target = options.to, output or _beside(files, options.to)
+    ensure_writable(target, overwrite, files)
+    first = _read(files[0], options.plane)
+    ensure_fits(files[0], first.format_name, to, len(files))
+    inputs = {"file": files[0]} if len(files) == 1 else {f"file_{k:04d}": path for k, path in enumerate(files)}
+    words = f"export {to}" if options.plane is None else f"export {to} plane {options.plane}"
+    made = record(words, None, inputs)
+    first = replace(first, provenance=made)
+
+    def read(number: int) -> Content:
+        return first if number == 0 else _alike(first, files[0], _read(files[number], options.plane), files[number])
+
+    times = None if options.step_s is None else [options.step_s * number for number in range(len(files))]
+    write = FORMATS[to].write
+    if to == "vtkhdf-series" and first.grid is None:
+        write_tracks_series(target, first, made, overwrite=overwrite)
+    elif to == "vtkhdf-series":
+        write_series(target, first, read, len(files), times, made, overwrite=overwrite)
+    elif write is None:
+        contents = [read(number) for number in range(len(files))]
+        write_atomically(target, lambda path: write_netcdf(path, contents, times), overwrite=overwrite)
+    else:
+        write_atomically(target, lambda path: write(path, first), overwrite=overwrite)
+    return {
+        "output": target.name,
+        "format": first.format_name,
+        "files": len(files),
+        "arrays": list(first.arrays),
+        "file_bytes": target.stat().st_size,
+    }
+
+
+def _beside(files: Sequence[Path], to: ExportFormat) -> Path:
+    """Return where the result goes that was given no name."""
+    if len(files) > 1:
+        raise UsageError(f"{len(files)} files go into one, whose name -o has to say")
+    return files[0].with_name(files[0].stem + FORMATS[to].ending)
+
+
+def _read(path: Path, plane: int | None) -> Content:
+    """Return a file's content, or one plane of it."""
+    content = read_content(path)
+    if plane is None:
+        return content
+    if content.grid is None:
+        raise UsageError(f"{path}: holds points, which have no planes for --plane")
+    count = content.grid.shape_xyz[2]
+    if plane >= count:
+        raise UsageError(f"--plane {plane}: {path} has {count} planes across z, counted from 0")
+    return plane_of(content, plane)
+
+
+def _alike(first: Content, first_path: Path, other: Content, path: Path) -> Content:
+    """Return the content of another time where it has the same arrays on the same grid.
+
+    Raises
+    ------
+    InputError
+    """
+    if (other.format_name, other.grid) != (first.format_name, first.grid):
+        raise InputError(f"{path}: holds {other.format_name} on {other.grid}, and {first_path} does not")
+    if set(other.arrays) != set(first.arrays):
+        differing = ", ".join(sorted(set(other.arrays) ^ set(first.arrays)))
+        raise InputError(f"{path}: has other arrays than {first_path}: {differing}")
+    ours, theirs = ({k: v for k, v in each.attributes.items() if k in SHARED} for each in (first, other))
+    if ours != theirs:
+        raise InputError(f"{path}: says {theirs}, and {first_path} {ours}")
+    return other

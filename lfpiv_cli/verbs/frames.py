@@ -1,0 +1,404 @@
+"""Frames: read ahead, dark and background taken off; what of them takes part, and what speaks against them.
+
+Their records say of which other frames background and mask are made.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lfpiv_cli.calibration.lens_light import LensImages
+from lfpiv_cli.calibration.light_checks import (
+    exposure_notices,
+    level_notices,
+    position_notices,
+    saturated_share,
+    uniform_notices,
+)
+from lfpiv_cli.calibration.rectification import Rectification
+from lfpiv_cli.calibration.sheet import sheet_fit
+from lfpiv_cli.errors import InputError
+from lfpiv_cli.files import images as image_files
+from lfpiv_cli.files.batch import Frame
+from lfpiv_cli.files.config import Config
+from lfpiv_cli.files.provenance import seconds_between, sha256
+from lfpiv_cli.files.weights_file import WeightsFile
+from lfpiv_cli.notice import Notice, written
+from lfpiv_cli.reconstruction.equations import Normalisers, Operator, normalisers
+from lfpiv_cli.reconstruction.images import (
+    Image,
+    Mask,
+    defects,
+    light,
+    mean_background,
+    minimum_background,
+    saturated,
+    still_light,
+    touched,
+)
+from lfpiv_cli.robust import HALF_NORMAL_MEDIAN, MAD_TO_SIGMA
+
+# Beyond so much the two are not the same.
+CONTRADICTING_SHARE = 0.01
+
+# Reads frame `number`: raw, and with dark or background taken off.
+Read = Callable[[int], tuple[Image, Image]]
+
+# In place of a mask's file: what does not move in the frames is left out.
+STILL = "still"
+BACKGROUNDS = {"minimum": minimum_background, "mean": mean_background}
+
+
+@dataclass(frozen=True)
+class Background:
+    """What is subtracted as background: an image, or the minimum or mean over the frames, or over some around each.
+
+    Attributes
+    ----------
+    path : of the image, None where it is made from the frames
+    kind : name in `BACKGROUNDS`
+    frames : how many around each frame; None: all of them
+    """
+
+    path: Path | None = None
+    kind: str | None = None
+    frames: int | None = None
+
+    @classmethod
+    def parse(cls, text: str | None) -> Background:
+        """Return the background given as a file's name, `minimum`, `mean`, or `minimum:15` for fifteen frames."""
+        if text is None:
+            return cls()
+        over_frames = re.fullmatch(rf"({'|'.join(BACKGROUNDS)})(?::(\d+))?", text)
+        if over_frames is None:
+            return cls(path=Path(text))
+        kind, count = over_frames.groups()
+        return cls(kind=kind, frames=None if count is None else int(count))
+
+    def around(self, number: int, total: int) -> range:
+        """Return the numbers of the frames, of `total`, that the background of one is made from."""
+        if self.kind is None:
+            return range(0)
+        count = total if self.frames is None else min(self.frames, total)
+        first = min(max(number - count // 2, 0), total - count)
+        return range(first, first + count)
+
+
+def reader(
+    level: Background, frames: Sequence[Frame], shape: tuple[int, int], dark: Image | None, keep_going: bool = False
+) -> Read:
+    """Return the function that reads frame `number`: raw, and with dark or background taken off.
+
+    With `keep_going` frames that cannot be read are left out of the backgrounds of others.
+    """
+    fixed = image_files.read_reference(level.path, shape) if level.path else None
+    window = len(level.around(0, len(frames)))
+
+    @lru_cache(maxsize=window if level.frames else 1)
+    def page(number: int) -> Image:
+        return read_frame(frames[number], shape)
+
+    @lru_cache(maxsize=1)
+    def over(numbers: range) -> NDArray[np.float32]:
+        return BACKGROUNDS[level.kind or ""](_readable(page, numbers, keep_going))
+
+    def read(number: int) -> tuple[Image, Image]:
+        numbers = level.around(number, len(frames))
+        raw = page(number)
+        return raw, light(raw, dark, over(numbers) if level.kind else fixed)
+
+    return read
+
+
+def read_frame(frame: Frame, shape: tuple[int, int]) -> Image:
+    """Read a frame.
+
+    Raises
+    ------
+    InputError : it cannot be read, or has another shape
+    """
+    if frame.fault is not None:
+        raise InputError(frame.fault)
+    return image_files.read_page(frame.path, frame.page, shape)
+
+
+def _readable(read: Callable[[int], Image], numbers: Iterable[int], keep_going: bool) -> Iterator[Image]:
+    """Yield images, those that cannot be read left out where the others are to go on."""
+    for number in numbers:
+        try:
+            image = read(number)
+        except InputError:
+            if not keep_going:
+                raise
+            continue
+        yield image
+
+
+def mask_of(
+    given: str | Path | None,
+    frames: Sequence[Frame],
+    shape: tuple[int, int],
+    pitch_px: float,
+    keep_going: bool = False,
+) -> Image | None:
+    """Return the mask, 0 where pixels are left out: of a file, or of what does not move in the frames (`still`)."""
+    if given is None:
+        return None
+    if given != STILL:
+        return image_files.read_reference(Path(given), shape)
+    images = _readable(lambda number: read_frame(frames[number], shape), range(len(frames)), keep_going)
+    still = still_light(images, pitch_px)
+    return np.where(still, np.float32(0.0), np.float32(1.0))
+
+
+class Ahead:
+    """Frames, each read while the one before is worked on."""
+
+    def __init__(self, read: Read, numbers: Sequence[int]) -> None:
+        """Take the function that reads a frame, and the numbers of those that are coming in their order."""
+        self._read, self._pool = read, ThreadPoolExecutor(max_workers=1)
+        self._following = dict(pairwise(numbers))
+        self._coming: tuple[int, Future[tuple[Image, Image]]] | None = None
+
+    def __call__(self, number: int) -> tuple[Image, Image]:
+        """Return a frame, and begin to read the one that follows."""
+        coming, self._coming = self._coming, None
+        current = coming[1] if coming and coming[0] == number else self._pool.submit(self._read, number)
+        following = self._following.get(number)
+        if following is not None:
+            self._coming = following, self._pool.submit(self._read, following)
+        return current.result()
+
+
+def other_frames(level: Background, frames: Sequence[Frame], mask: str | Path | None = None) -> Callable[[int], str]:
+    """Return the function that says which other frames the background and mask of one are made from.
+
+    Frames whose files cannot be read at all are not among them.
+    """
+
+    # The frames around one are nearly those around the next.
+    @lru_cache(maxsize=max(2 * (level.frames or 0), 1))
+    def page(number: int) -> str:
+        return f"{sha256(frames[number].path)} {frames[number].page}\n"
+
+    # Where the background is made from all frames, it is the same for all, as the mask is.
+    @lru_cache(maxsize=2)
+    def over(numbers: range) -> str:
+        pages = [page(k) for k in numbers if frames[k].fault is None]
+        digest = hashlib.sha256("".join(pages).encode()).hexdigest()
+        return f"over {len(pages)} frames, SHA-256 {digest}"
+
+    def words(number: int) -> str:
+        around = level.around(number, len(frames))
+        background = "" if level.kind is None else f", background: {level.kind} {over(around)}"
+        return background + (f", mask: {STILL} {over(range(len(frames)))}" if mask == STILL else "")
+
+    return words
+
+
+def sequence_digests(level: Background, frames: Sequence[Frame], mask: str | Path | None = None) -> list[str]:
+    """Return for each frame which other frames its background and mask are made from, as words for its record."""
+    words = other_frames(level, frames, mask)
+    return [words(number) for number in range(len(frames))]
+
+
+def beside_frames(
+    words: Callable[[int], str], frames: Sequence[Frame], beside: Sequence[tuple[int, ...]]
+) -> Callable[[int], str]:
+    """Return the function that says which frames help one, besides those of its own background and mask (`words`)."""
+
+    def alone(number: int) -> str:
+        frame = frames[number]
+        return f", beside page {frame.page}{words(number)} of SHA-256 {sha256(frame.path)}"
+
+    return lambda number: "".join([words(number), *(alone(k) for k in beside[number] if frames[k].fault is None)])
+
+
+Progress = Callable[[int], None]
+
+# The brightest of some millions of pixels stands 5.2 standard deviations out of normal noise.
+NOISE_SIGMAS = 6.0
+# The name of one in memory.
+IMAGE = "the image"
+MOVED_SINCE_CALIBRATION = (
+    "calibrate with a white image of the camera as it is, or refine-calibration, which finds the shift"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Bench:
+    """What all frames of a recording share.
+
+    Attributes
+    ----------
+    dark : dark image (rows, columns) or None
+    lasting : raw pixels that are never usable: defects of the dark image, and where the mask is black
+    excluded : pixels in the weights' frame that never take part: off the sensor, or touched by `lasting`
+    sums : of the weights without `excluded`; None where weights are made for each image
+    lens_images : what the light of frames is held against
+    light_covariance : of the tracers' size and of diffusion, see `particles.diffusion`; None: not measured
+    """
+
+    content: WeightsFile
+    settings: Config
+    dark: Image | None
+    lasting: Mask
+    excluded: Mask
+    sums: Normalisers | None
+    lens_images: LensImages
+    light_covariance: NDArray[np.float64] | None = None
+
+    def unusable(self, raw: Image) -> Mask:
+        """Return which pixels of a raw frame take no part."""
+        return np.asarray(self.lasting | saturated(raw, self.settings.reconstruction.saturation_counts))
+
+    def excluded_with(self, unusable: Mask) -> Mask:
+        """Return which pixels in the weights' frame take no part in a frame with unusable raw pixels."""
+        too_bright = unusable & ~self.lasting
+        if not too_bright.any():
+            return self.excluded
+        return self.excluded | touched(too_bright, self.content.weights.prepare)
+
+    def sums_without(self, operator: Operator, excluded: Mask) -> Normalisers:
+        """Return an operator's sums without what a frame excludes: from those that all frames share, if they do."""
+        if self.sums is None:
+            return normalisers(operator, excluded)
+        return self.sums if excluded is self.excluded else self.sums.without(operator, excluded)
+
+
+def bench_of(
+    content: WeightsFile, settings: Config, dark: Image | None, mask: Image | None, earlier: Bench | None = None
+) -> Bench:
+    """Return what all frames share, given a dark image and a mask (rows, columns) that is 0 where nothing is believed.
+
+    The sums are those of an `earlier` one with the same weights and pixels.
+
+    Raises
+    ------
+    InputError
+        No pixel is left.
+    """
+    weights = content.weights
+    lasting = np.zeros(weights.image_shape, np.bool_) if dark is None else defects(dark)
+    if mask is not None:
+        lasting |= mask == 0.0
+    if lasting.all():
+        raise InputError("mask and dark image leave out all pixels; a mask is black only where nothing is believed")
+    excluded = touched(lasting, weights.prepare) if lasting.any() else np.zeros(weights.image_shape, np.bool_)
+    if weights.calibration is not None:
+        excluded |= ~weights.calibration.rectification.inside
+    if earlier is not None and earlier.content is content and np.array_equal(earlier.excluded, excluded):
+        sums = earlier.sums
+    else:
+        sums = None if weights.on_demand else normalisers(weights.padded, excluded)
+    return Bench(content, settings, dark, lasting, excluded, sums, _lens_images(content))
+
+
+def _lens_images(content: WeightsFile) -> LensImages:
+    """Return the lens images that weights were made for: calibrated, or the data sheet's."""
+    found, camera = content.weights.calibration, content.camera
+    if found is None:
+        return LensImages.of(Rectification(sheet_fit(camera), content.image_shape), None, camera.lens_image_width)
+    return LensImages.of(found.rectification, found.transmission, camera.lens_image_width)
+
+
+def check_frame(bench: Bench, raw: Image, place: str) -> None:
+    """Refuse a raw frame that shows nothing at all: no pixel is usable, or it has one value everywhere.
+
+    Raises
+    ------
+    InputError
+    """
+    if raw.min() == raw.max():
+        raise InputError(f"{place}: has one value everywhere ({raw.flat[0]:g}); it shows no particles")
+    if bench.unusable(raw).all():
+        raise InputError(f"{place}: all pixels are saturated or left out; there is nothing to reconstruct from")
+
+
+def frame_notices(bench: Bench, raw: Image, lit: Image, name: str) -> list[Notice]:
+    """Return what speaks against a raw frame, given also with dark or background taken off (`lit`)."""
+    unusable = bench.unusable(raw)
+    seen, used = np.where(unusable, np.float32(np.nan), lit), lit[~unusable]
+    share = saturated_share(seen, unusable & ~bench.lasting, bench.lens_images.background(seen))
+    notices = exposure_notices(share, name)
+    brightest, noise = float(used.max() - np.median(used)), _noise(used)
+    if brightest <= NOISE_SIGMAS * noise:
+        text = (
+            f"its brightest pixel is {written(brightest)} counts above the others, with a noise of "
+            f"{written(noise)}: no more than noise makes"
+        )
+        remedy = "check light, exposure and the order of the frames"
+        notices.append(Notice("frame-dark", name, text, remedy, brightest, f"above {written(NOISE_SIGMAS * noise)}"))
+    return [*notices, *_light_notices(bench, seen, name)]
+
+
+def _light_notices(bench: Bench, lit: Image, name: str) -> list[Notice]:
+    """Return what the light of a frame, its unusable pixels NaN, says against it and the calibration."""
+    images, calibration = bench.lens_images, bench.content.weights.calibration
+    notices = [] if calibration is None else list(uniform_notices(images, calibration.fit, lit, name))
+    return [*notices, *level_notices(images, lit, name), *position_notices(images, lit, name, MOVED_SINCE_CALIBRATION)]
+
+
+def _noise(counts: NDArray[np.float32]) -> float:
+    """Return at most the standard deviation of an image's noise: by what lies below 0, or around the median."""
+    noise = MAD_TO_SIGMA * float(np.median(np.abs(counts - np.median(counts))))
+    below = counts[counts < 0.0]
+    return min(noise, float(np.median(-below)) / HALF_NORMAL_MEDIAN) if below.size else noise
+
+
+def picture_for(weights: WeightsFile, picture: NDArray[Any]) -> Image:
+    """Return a picture as the reader of files has it, float32.
+
+    Raises
+    ------
+    InputError
+        Its shape is not that of the images that the weights were made for.
+    """
+    if np.shape(picture) != weights.image_shape:
+        raise InputError(f"a picture of {np.shape(picture)} pixels does not fit weights made for {weights.image_shape}")
+    return np.asarray(picture, dtype=np.float32)
+
+
+def given_picture(weights: WeightsFile, picture: NDArray[Any] | None) -> Image | None:
+    """Return a picture as `picture_for` does, None where there is none."""
+    return None if picture is None else picture_for(weights, picture)
+
+
+def residual_path(particles: Path) -> Path:
+    """Return where the residual image of a file of particles goes."""
+    return particles.with_name(f"{particles.stem}_residual.tif")
+
+
+def dt_notices(stated_s: float | None, pairs: Iterable[Sequence[Mapping[str, Any]]], name: str) -> list[Notice]:
+    """Return where a stated time between frames contradicts the recorded one, by the records of pairs of results."""
+    return _interval_notices(stated_s, [seconds_between(first, second) for first, second in pairs], name)
+
+
+def frames_dt_notices(stated_s: float | None, frames: Sequence[Frame]) -> list[Notice]:
+    """Return where a stated time between frames contradicts the recorded one of frames in a row."""
+    times = [frame.time_s if frame.path == frames[0].path else None for frame in frames]
+    steps = [None if a is None or b is None else b - a for a, b in pairwise(times)]
+    return _interval_notices(stated_s, steps, str(frames[0].path))
+
+
+def _interval_notices(stated_s: float | None, recorded_s: Sequence[float | None], name: str) -> list[Notice]:
+    known = [step for step in recorded_s if step is not None]
+    if stated_s is None or not known:
+        return []
+    worst = max(known, key=lambda step: abs(step - stated_s))
+    if abs(worst - stated_s) <= CONTRADICTING_SHARE * stated_s:
+        return []
+    text = f"its frames were recorded {written(worst, 6)} s apart, and {written(stated_s, 6)} s are stated"
+    remedy = "correct correlation.dt_s, or leave it out: then the recorded time is taken"
+    return [Notice("time-between-frames", name, text, remedy, worst, f"{stated_s:g}")]

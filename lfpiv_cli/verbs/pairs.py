@@ -1,0 +1,459 @@
+"""Which frames of a command belong together, as its options have it, and the batches of what is made of them."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Generic, Protocol, TypeVar
+
+from lfpiv_cli.console import Console, Frames
+from lfpiv_cli.errors import InputError, UsageError
+from lfpiv_cli.files import images as image_files
+from lfpiv_cli.files import vtkhdf
+from lfpiv_cli.files.batch import Frame, State, Target, images_seen, pending, results_seen, state_or_none
+from lfpiv_cli.files.config import Config
+from lfpiv_cli.files.listing import as_they_come, files_in
+from lfpiv_cli.files.pairing import Pairs, Seen, contradiction, in_order, pair_frames, pairs_listed
+from lfpiv_cli.files.provenance import Gone, carried_record, sha256, without_warnings
+from lfpiv_cli.files.shares import awaited
+from lfpiv_cli.names import InputKind, Pairing
+from lfpiv_cli.notice import Notice
+from lfpiv_cli.verbs.batches import (
+    ALL,
+    Batch,
+    BatchOptions,
+    Expected,
+    Failure,
+    Made,
+    Stamp,
+    Worked,
+    stamp_of,
+    work_through,
+)
+from lfpiv_cli.verbs.frames import STILL, Background, residual_path
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairOptions:
+    """How a command is told which frames belong together.
+
+    Attributes
+    ----------
+    pairing : `ab` for separate pairs, `sequence` for each frame with the next; needed for more than two
+    pair_by : how names tell it, as `img_{pair}_{frame}`; the usual ways are known
+    pairs : file that lists pairs
+    """
+
+    pairing: Pairing | None = None
+    pair_by: str | None = None
+    pairs: Path | None = None
+
+    @property
+    def are_told(self) -> bool:
+        """True where any of them is given."""
+        return any(each is not None for each in (self.pairing, self.pair_by, self.pairs))
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairBatchOptions(PairOptions, BatchOptions):
+    """What a batch of pairs is given."""
+
+
+Chosen = TypeVar("Chosen", bound=PairBatchOptions)
+
+
+class PairBatch(Batch[Made], ABC, Generic[Made, Chosen]):
+    """Results of volumes or files of particles that belong together: of two each, or of all."""
+
+    def __init__(
+        self,
+        files: Sequence[Path],
+        output: Path,
+        options: Chosen,
+        overwrite: bool,
+        pairs: Pairs | None = None,
+        gone: Mapping[Path, Gone] | None = None,
+    ) -> None:
+        """Take the arguments of a command; see which files belong together, and read no content.
+
+        Parameters
+        ----------
+        pairs : where they are known already
+        gone : of the files, those that are no longer there
+
+        Raises
+        ------
+        LfpivError : files or outputs do not go together, or a config is wrong
+        """
+        self._options, self.overwrite, self._gone = options, overwrite, gone or {}
+        self.inputs = files
+        self._arrange(files, output, pairs)
+
+    @abstractmethod
+    def _arrange(self, files: Sequence[Path], output: Path, pairs: Pairs | None) -> None:
+        """Say which files each result is made of, and where it goes."""
+
+    def _paired(self, files: Sequence[Path], pairs: Pairs | None) -> list[tuple[Path, Path]]:
+        """Return the files of each pair; note what is to be said of them, and those without a partner."""
+        found = result_pairs(files, self._options) if pairs is None else pairs
+        self.notices, self.left_out = found.settled(self._options.keep_going), failures_of(found)
+        return [(files[first], files[second]) for first, second in found.pairs]
+
+
+def failures_of(pairs: Pairs) -> list[Failure]:
+    """Return the frames that have no partner, as what has failed."""
+    return [Failure(each.name, each.why) for each in pairs.left_out]
+
+
+def image_pairs(frames: Sequence[Frame], options: PairOptions) -> Pairs:
+    """Return which frames of images belong together, see `_found`."""
+    return _found(images_seen(frames), options)
+
+
+def result_pairs(paths: Sequence[Path], options: PairOptions) -> Pairs:
+    """Return which volumes or files of particles belong together, see `_found`."""
+    return _found(results_seen(paths), options)
+
+
+def sequence_of(paths: Sequence[Path]) -> tuple[list[int], list[Notice]]:
+    """Return files of particles in the order of time, by their names, and what is to be said of it.
+
+    Two are taken as they are given.
+    """
+    frames = results_seen(paths)
+    return ([0, 1], _doubts(frames)) if len(frames) == 2 else in_order(frames)
+
+
+def _found(frames: Sequence[Seen], options: PairOptions) -> Pairs:
+    """Return which frames belong together: by a list, by names; without options two as they are given.
+
+    Raises
+    ------
+    UsageError : no option says it and there are not two frames, or options contradict each other
+    """
+    if options.pairs is not None:
+        if options.pairing == "sequence" or options.pair_by is not None:
+            raise UsageError("--pairs lists separate pairs: give it without --pairing sequence and --pair-by")
+        return pairs_listed(options.pairs, frames)
+    if options.are_told:
+        return pair_frames(frames, options.pairing or "ab", options.pair_by)
+    if len(frames) < 2:
+        raise UsageError(f"pairs need two or more frames, got {len(frames)} frames")
+    if len(frames) > 2:
+        raise UsageError(
+            f"{len(frames)} frames need --pairing: ab for separate pairs or sequence for each with the next"
+        )
+    return Pairs(((0, 1),), notices=tuple(_doubts(frames)))
+
+
+def _doubts(frames: Sequence[Seen]) -> list[Notice]:
+    """Say of two frames that are taken as they are given where their names contradict it."""
+    first, second = frames
+    if (why := contradiction(first, second)) is not None:
+        text = f"is taken as the second frame of {first.name}'s pair, but {why}"
+        return [
+            Notice("pair-contradicted", second.name, text, "give frames that belong together, or list them in --pairs")
+        ]
+    if in_order(frames)[0] == [0, 1]:
+        return []
+    text = f"is the second of the pair, and {first.name} the first; by their names they are the other way round"
+    return [Notice("pair-backwards", second.name, text, "give the earlier frame first")]
+
+
+# Batches of folders that are still being filled: what is complete is worked through, then what has come since.
+
+
+OfBatch = TypeVar("OfBatch", bound=Batch)
+
+
+def watched(
+    folders: Sequence[Path],
+    kind: InputKind,
+    options: BatchOptions,
+    console: Console,
+) -> Iterator[list[Path]]:
+    """Yield the files of folders in groups, as they become complete: see `as_they_come`.
+
+    Raises
+    ------
+    UsageError : one is no folder, or a share is asked for
+    InputError : none has come
+    StoppedEarlyError : the time is over
+    """
+    if options.shard != ALL:
+        raise UsageError("--watch: which frames make a share is known when the last one is there; leave out --shard")
+    if options.dry_run:
+        raise UsageError("--watch waits for what is not there, and --dry-run tells what is: leave out one of them")
+    for folder in folders:
+        if not os.path.isdir(folder):
+            raise UsageError(f"{folder}: --watch takes folders")
+    read = _read_image if kind == "images" else vtkhdf.read_header
+    deadline, count = options.deadline(), 0
+    console.say(f"watches {', '.join(map(str, folders))}; ends {options.idle_s:g} s after the last change")
+
+    def listed() -> list[Path]:
+        if not deadline.leaves_time():
+            raise deadline.error(count, count, "frame")
+        return [path for folder in folders for path in files_in(folder, kind)]
+
+    for group in as_they_come(listed, read, options.idle_s):
+        count += len(group)
+        yield group
+    if count == 0:
+        raise InputError(f"{folders[0]}: no {kind} have come in {options.idle_s:g} s")
+
+
+def ensure_frames_alone(settings: Config, background: str | None, mask: str | Path | None) -> None:
+    """Refuse what is made from other frames than a frame's own, where these are still coming.
+
+    Raises
+    ------
+    UsageError
+    """
+    if Background.parse(background).kind is not None:
+        refused = f"--background {background} is"
+    elif mask == STILL:
+        refused = f"--mask {STILL} is"
+    elif settings.reconstruction.solver == "particles":
+        refused = "the tracers' size, which --solver particles needs, is"
+    else:
+        return
+    raise UsageError(f"--watch: {refused} made from all frames, some of which have not come yet; wait for them")
+
+
+def work_as_they_come(
+    make: Callable[[Sequence[Path]], OfBatch],
+    groups: Iterable[Sequence[Path]],
+    options: BatchOptions,
+    console: Console,
+    left_out: Callable[[], Sequence[Failure]] = tuple,
+) -> tuple[OfBatch, Worked]:
+    """Work through a batch for each group of files; return the last one, and what became of all.
+
+    Parameters
+    ----------
+    left_out : returns, at the end, the files that were in no group
+
+    Raises
+    ------
+    LfpivError : as `work_through`
+    InputError : there was no group
+    """
+    alone = replace(options, failures=None)
+    together: Worked = Worked()
+    batch: OfBatch | None = None
+    for group in groups:
+        try:
+            batch = make(group)
+        except InputError as error:
+            if not options.keep_going or batch is None:
+                raise
+            together.failures.append(Failure(group[0].stem, str(error)))
+        else:
+            together.add(work_through(batch, alone, console))
+    together.failures[:0] = left_out()
+    if batch is None:
+        raise InputError(f"{together.failures[0].name}: {together.failures[0].error}")
+    together.list_failures(options.failures)
+    return batch, together
+
+
+class ComingPairs:
+    """The pairs of files that come one after the other.
+
+    Attributes
+    ----------
+    left_out : the files of which no partner has come so far
+    """
+
+    def __init__(self, pair: Callable[[Sequence[Path]], Pairs], console: Console) -> None:
+        """Take which of some files are pairs, and where it is told of those that are passed over."""
+        self._pair, self._console = pair, console
+        self._seen: list[Path] = []
+        self._made: set[tuple[int, int]] = set()
+        self._told: set[Notice] = set()
+        self.left_out: Sequence[Failure] = ()
+
+    def groups(self, coming: Iterable[Sequence[Path]]) -> Iterator[list[Path]]:
+        """Yield the files of pairs that are complete, two by two, as they come."""
+        for files in coming:
+            self._seen += files
+            if len(self._seen) < 2:
+                self.left_out = [Failure(str(self._seen[0]), "no other frame has come")]
+                continue
+            found = self._pair(self._seen)
+            fresh = [pair for pair in found.pairs if pair not in self._made]
+            self._made.update(fresh)
+            self.left_out = failures_of(found)
+            self._tell(found)
+            if fresh:
+                yield [self._seen[number] for pair in fresh for number in pair]
+
+    def _tell(self, found: Pairs) -> None:
+        """Say once what is taken for granted, and which files have no partner though later pairs are complete."""
+        last = max((second for _, second in self._made), default=0)
+        before = {str(path) for path in self._seen[:last]}
+        passed = Pairs((), tuple(each for each in found.left_out if each.name in before), found.notices)
+        fresh = [notice for notice in passed.said() if notice not in self._told]
+        self._told.update(fresh)
+        self._console.warn(fresh)
+
+
+def _read_image(path: Path) -> None:
+    """Read the last frame of an image file: the others are there when it is.
+
+    Raises
+    ------
+    InputError : it cannot be read yet
+    """
+    image_files.read_page(path, image_files.count_pages(path) - 1)
+
+
+# Pairs whose volumes or particles are dropped as soon as their vectors stand.
+#
+# A disk holds the files of two frames at a time, however many pairs there are. What is complete is known without
+# them: a result's record tells of which it was made, with what, and these are asked for what they would be today.
+# Several workers share the files of a frame: each is claimed while it is made, and dropped by whoever completes the
+# last of its pairs.
+
+
+class Join(Protocol[Made]):
+    """Makes the batch of one pair: of the files of its frames, of which some may be gone, into one file."""
+
+    def __call__(self, pair: Sequence[Path], output: Path, gone: Mapping[Path, Gone]) -> Batch[Made]:
+        """Return it."""
+
+
+class PairByPair(Batch[Made]):
+    """The batch of pairs, each from its two images to its vectors."""
+
+    unit = "pair"
+
+    def __init__(
+        self,
+        found: Batch[Any],
+        join: Join[Made],
+        pairs: Pairs,
+        targets: Sequence[Target],
+        file_bytes: float | None = None,
+    ) -> None:
+        """Take the batch of the frames, what joins two of them, where its results go, and how large one is if known."""
+        self._found, self._join, self._pairs = found, join, pairs.pairs
+        self._file_bytes = file_bytes
+        self.label, self.overwrite = found.label, found.overwrite
+        self.targets = [replace(each, make_record=partial(self._record, k)) for k, each in enumerate(targets)]
+        self.inputs = found.inputs
+        self.beside = found.outputs
+        self.notices, self.left_out = found.notices, failures_of(pairs)
+        self._pairs_of: list[list[int]] = [[] for _ in found.targets]
+        for number, pair in enumerate(self._pairs):
+            for k in pair:
+                self._pairs_of[k].append(number)
+        # Pairs that are known to be complete, and frames whose files are, as these were when they were read.
+        self._complete: set[int] = set()
+        self._whole: dict[int, Stamp] = {}
+
+    def begin(self, numbers: Sequence[int], console: Console) -> float:
+        """Prepare the frames of the pairs that are to be made; drop those that no pair needs."""
+        every = list(dict.fromkeys(k for number in numbers for k in self._pairs[number]))
+        left = self._left_of(every) if every else []
+        self._whole = {k: stamp_of(self._found.targets[k].path) for k in set(every) - set(left)}
+        steps = self._found.begin(left, console)
+        self._drop(range(len(self._found.targets)))
+        # Where all frames are there, what joins them is a step.
+        return max(steps * len(left) / max(len(numbers), 1), 1.0)
+
+    def _left_of(self, every: Sequence[int]) -> list[int]:
+        """Return the frames that have to be made."""
+        frames = [self._found.targets[k] for k in every]
+        return [every[k] for k in pending(frames, self.inputs, self.overwrite, resume=True)]
+
+    def make(self, number: int, work: Frames) -> Made:
+        """Make the files of two frames, where they are not there, and of these the result."""
+        for k in self._pairs[number]:
+            self._ensure_made(k, work)
+        joined = self._joined(number, {})
+        joined.begin([0], work.console)
+        made = joined.make(0, work)
+        self._complete.add(number)
+        self._drop(self._pairs[number])
+        return made
+
+    def _ensure_made(self, k: int, work: Frames) -> None:
+        """Make the file of a frame, unless it is there and complete, or another worker makes it."""
+        target = self._found.targets[k]
+        stamp = stamp_of(target.path)
+        if stamp is not None and self._whole.get(k) == stamp:
+            return
+        with awaited(target.path):
+            if state_or_none(target) is not State.COMPLETE:
+                self._found.make(k, work)
+        self._whole[k] = stamp_of(target.path)
+
+    def _is_complete(self, number: int) -> bool:
+        """Return whether the result of a pair is there, by whichever worker."""
+        if number not in self._complete and state_or_none(self.targets[number]) is State.COMPLETE:
+            self._complete.add(number)
+        return number in self._complete
+
+    def _drop(self, frames: Iterable[int]) -> None:
+        """Remove the files of those of some frames whose pairs are all complete, and their folder after the last."""
+        for k in frames:
+            path = self._found.targets[k].path
+            if path.exists() and self._pairs_of[k] and all(map(self._is_complete, self._pairs_of[k])):
+                for each in (path, residual_path(path)):
+                    each.unlink(missing_ok=True)
+        folder = self._found.targets[0].path.parent
+        if folder.is_dir() and not any(folder.iterdir()) and all(map(self._is_complete, range(len(self._pairs)))):
+            with contextlib.suppress(OSError):  # another worker was quicker
+                folder.rmdir()
+
+    def fault(self, number: int) -> str | None:
+        """Return why a frame of a pair cannot be read."""
+        return next(filter(None, map(self._found.fault, self._pairs[number])), None)
+
+    def expected(self) -> Expected:
+        """Return how large a result is, and what is held while the files of a frame are made."""
+        return Expected(self._file_bytes, self._found.expected().memory_bytes)
+
+    def _joined(self, number: int, gone: Mapping[Path, Gone]) -> Batch[Made]:
+        paths = [self._found.targets[k].path for k in self._pairs[number]]
+        return self._join(paths, self.targets[number].path, gone)
+
+    def _record(self, number: int) -> Mapping[str, Any]:
+        """Return the record of a result, of its frames' files as they will be."""
+        targets = [self._found.targets[k] for k in self._pairs[number]]
+        to_come = {target.path: self._to_come(target, self.targets[number].path) for target in targets}
+        gone = {path: file for path, file in to_come.items() if file is not None}
+        return self._joined(number, gone).targets[0].record
+
+    def _to_come(self, frame: Target, result: Path) -> Gone | None:
+        """Return a frame's file where it is gone, with the hash that the result carries, or is to carry another record.
+
+        None where it is there and stays as it is.
+        """
+        carried: Mapping[str, Any]
+        if frame.path.exists():
+            carried, digest = carried_record(frame.path), sha256(frame.path)
+            if without_warnings(carried) == frame.record:
+                return None
+        else:
+            made = carried_record(result)
+            digest = {each["name"]: each["sha256"] for each in made["inputs"].values()}.get(frame.path.name, "")
+            carried = made["made_from"].get(digest, {})
+        return Gone(digest, {**frame.record, **{name: carried[name] for name in ("warnings",) if name in carried}})
+
+
+def joined_by(make: Callable[..., Batch[Made]], *options: Any) -> Join[Made]:
+    """Return what makes the batch of one pair, by the class of the batch and what it takes besides."""
+    one = Pairs(((0, 1),))
+
+    def join(pair: Sequence[Path], output: Path, gone: Mapping[Path, Gone]) -> Batch[Made]:
+        return make(pair, output, *options, one, gone)
+
+    return join

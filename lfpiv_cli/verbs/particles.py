@@ -1,0 +1,490 @@
+"""Finding the particles behind an image in memory (iterative particle reconstruction)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lfpiv_cli.errors import ConfigError, InputError
+from lfpiv_cli.files.batch import Frame as ImageFrame
+from lfpiv_cli.files.bench import NM_TO_MM
+from lfpiv_cli.files.config import Config, carried_config
+from lfpiv_cli.files.hdf5 import unpacked_bytes
+from lfpiv_cli.files.inputs import ensure_room
+from lfpiv_cli.files.particle_file import Points, symmetric
+from lfpiv_cli.files.provenance import record
+from lfpiv_cli.files.weights_file import WeightsFile, open_weights
+from lfpiv_cli.grid import Grid
+from lfpiv_cli.notice import Notice, warn_of
+from lfpiv_cli.optics.curved_space import CurvedSpace
+from lfpiv_cli.optics.line_responses import USUAL_DIFFUSION_PX
+from lfpiv_cli.optics.tracing import ObjectSpace
+from lfpiv_cli.particles.counting import tracers_per_lens as counted
+from lfpiv_cli.particles.diameter import UNKNOWN_LENSES, Diameter, diameter_by
+from lfpiv_cli.particles.light_errors import MUCH_LEFT
+from lfpiv_cli.particles.microlens_focus import FocalLength, focal_length_of
+from lfpiv_cli.particles.neighbour_frames import second_frame, second_pass
+from lfpiv_cli.particles.rounds import ROUNDS, first_pass
+from lfpiv_cli.particles.search import LAST_UNEXPLAINED, Particles, Task, result, task_of
+from lfpiv_cli.particles.view import Light, View, ensure_square_cells, raw_view
+from lfpiv_cli.reconstruction.equations import Normalisers
+from lfpiv_cli.reconstruction.images import Image, Mask, filled, light
+from lfpiv_cli.tracks.tracking import SEARCH_LENSES
+from lfpiv_cli.verbs.frames import (
+    IMAGE,
+    Bench,
+    Progress,
+    Read,
+    bench_of,
+    check_frame,
+    frame_notices,
+    given_picture,
+    picture_for,
+)
+from lfpiv_cli.verbs.tracers import Diffusion, TracerSize, light_notices, size_notices
+from lfpiv_cli.weights.build import factorise_bricks
+from lfpiv_cli.weights.columns import OnDemandOperator
+from lfpiv_cli.weights.model import behind_transmission
+
+# Frames that are looked at for the tracers' diameter, if the first do not hold enough.
+LOOKED_AT = 5
+# Depths beyond the volume in which particles are fitted, too, in depths over which light spreads by one lens.
+BEYOND_DEPTHS = 0.5
+# Units of progress that `find`, `find_first` and `find_second` report.
+STEPS = sum(settings.iterations + 1 for settings in ROUNDS)
+
+
+def find_particles(
+    weights: WeightsFile,
+    image: NDArray[Any],
+    *,
+    neighbours: Sequence[NDArray[Any]] = (),
+    dark: NDArray[Any] | None = None,
+    background: NDArray[Any] | None = None,
+    mask: NDArray[Any] | None = None,
+    **settings: Any,
+) -> Points:
+    """Find the tracer particles behind an image: where they are, how bright, and how well that is known.
+
+    Parameters
+    ----------
+    weights : WeightsFile
+        From `build_weights` or `open_weights`.
+    image : (rows, columns) counts
+        Raw image.
+    neighbours : sequence of (rows, columns) counts, optional
+        Raw images of the frames before and after, or of the other one of a pair, which help to find what overlaps.
+    dark, background, mask
+        As of `reconstruct`.
+    **settings
+        Keys of the rig's section `reconstruction`, in their place: particle_diameter_mm, saturation_counts,
+        photons_per_count.
+
+    Returns
+    -------
+    Points
+        `position_mm` (n, 3), z from the volume's reference, and in `arrays`: `intensity` (n,) counts and its standard
+        error `intensity_sigma`, `covariance_mm2` (n, 6) as xx, yy, zz, xy, yz, xz, `chi2` (n,) about 1 where all light
+        is explained, `seen` (n,) share of the light that meets the sensor, `flag` (n,) 1 outside the volume.
+
+    Raises
+    ------
+    ConfigError
+        The settings are not possible, rays are fitted (dlfc), or the microlenses do not stand upright.
+    InputError
+        An image has another shape than what the weights were made for.
+    """
+    carried = carried_config(weights.provenance, "the weights")
+    chosen = carried.overridden("reconstruction", **(settings | {"solver": "particles"}))
+    bench = bench_of(searchable(weights, chosen), chosen, given_picture(weights, dark), given_picture(weights, mask))
+    level = given_picture(weights, background)
+    raws = [picture_for(weights, each) for each in (image, *neighbours)]
+    check_frame(bench, raws[0], IMAGE)
+    notices = frame_notices(bench, raws[0], light(raws[0], bench.dark, level), IMAGE)
+    frame, *others = (frame_of(bench, raw, light(raw, bench.dark, level)) for raw in raws)
+    bench, size = sized(bench, (frame, *others))
+    if others:
+        own, *beside = (find_first(bench, each) for each in (frame, *others))
+        found = find_beside(bench, frame, own, beside)
+    else:
+        found = find(bench, frame)
+    points = points_of(bench, frame, found, size, record("find_particles", chosen.resolved(), {}))
+    warn_of([*notices, *size_notices(chosen, size), *light_notices(points, IMAGE)])
+    return points
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """An image and what of it takes part.
+
+    Attributes
+    ----------
+    image : (rows, columns) raw but for dark and background
+    unusable : (rows, columns) pixels that take no part
+    sums : of the padded weights without what these touch
+    """
+
+    image: Image
+    unusable: Mask
+    sums: Normalisers
+
+
+def searchable(content: WeightsFile, settings: Config) -> WeightsFile:
+    """Return weights to look for particles with: where an array is hexagonal, those of bricks for its cells.
+
+    Columns on demand behind curved faces are made once and kept, where they fit into memory.
+
+    Raises
+    ------
+    ConfigError
+        Rays are fitted, the array does not stand upright, or it is hexagonal and seen through a scene.
+    """
+    if settings.weights.method == "dlfc":
+        raise ConfigError("weights.method: particles are fitted with traced rays; build weights by ert for them")
+    weights, operator = content.weights, content.weights.solver_operator
+    space = _space(content, settings)
+    ensure_square_cells(content.camera, space)
+    if not isinstance(operator, OnDemandOperator):
+        return content
+    if isinstance(space, CurvedSpace):
+        return replace(content, weights=replace(weights, solver_operator=operator.kept()))
+    bricks = factorise_bricks(content.camera, settings.media_model(), weights.padded.grid)
+    passing = bricks if operator.transmission is None else behind_transmission(bricks, operator.transmission)
+    return replace(content, weights=replace(weights, solver_operator=passing))
+
+
+def frame_of(bench: Bench, raw: Image, lit: Image) -> Frame:
+    """Return a frame as particles are sought in it."""
+    unusable = bench.unusable(raw)
+    excluded = bench.excluded_with(unusable)
+    return Frame(filled(lit, unusable), unusable, bench.sums_without(bench.content.weights.padded, excluded))
+
+
+def sized(bench: Bench, frames: Iterable[Frame]) -> tuple[Bench, TracerSize]:
+    """Return the bench with the tracers' diameter, from the first of its frames where it is not given.
+
+    By waves with the sensor's charge diffusion.
+    """
+    chosen, lens_mm = bench.settings.reconstruction, _lens_mm(bench)
+    given, given_px = chosen.particle_diameter_mm, chosen.diffusion_px
+    found = diameter_by(
+        (task_for(bench, frame) for frame in islice(frames, LOOKED_AT)), given and given / lens_mm, given_px
+    )
+    if found is None:
+        size = TracerSize(given or UNKNOWN_LENSES * lens_mm)
+    else:
+        measured = lens_mm * found.lenses
+        size = TracerSize(given or measured, measured, lens_mm * found.sigma_lenses, found.resolved)
+    if chosen.wavelength_nm is None:
+        settings, covariance = bench.settings.overridden("reconstruction", particle_diameter_mm=size.diameter_mm), None
+    else:
+        diffusion = _diffusion(found, given_px)
+        size = replace(size, diffusion=diffusion)
+        settings = bench.settings.overridden(
+            "reconstruction", particle_diameter_mm=size.diameter_mm, diffusion_px=diffusion.px
+        )
+        covariance = None if found is None or found.held is None else found.held.covariance
+    return replace(bench, settings=settings, light_covariance=covariance), size
+
+
+def _diffusion(found: Diameter | None, given_px: float | None) -> Diffusion:
+    """Return the sensor's charge diffusion: as given, by the images, or as is usual."""
+    given = given_px is not None
+    shown = None if found is None else found.shown if given else found.held
+    px = given_px if given_px is not None else USUAL_DIFFUSION_PX if shown is None else shown.diffusion_px
+    if shown is None:
+        return Diffusion(px, given=given)
+    return Diffusion(px, shown.diffusion_px, shown.sigma_px, given, shown.told)
+
+
+def find(bench: Bench, frame: Frame, progress: Callable[[int], None] | None = None) -> Particles:
+    """Return the particles behind an image."""
+    task = task_for(bench, frame)
+    return result(task, first_pass(task, progress=progress))
+
+
+def find_first(bench: Bench, frame: Frame, progress: Callable[[int], None] | None = None) -> NDArray[np.float64]:
+    """Return the particles (n, 4) of a frame's first pass, for its own second pass and those of its neighbours."""
+    return first_pass(task_for(bench, frame), progress=progress).particles
+
+
+def find_second(
+    bench: Bench,
+    frame: Frame,
+    before: Frame,
+    particles: NDArray[np.float64],
+    progress: Callable[[int], None] | None = None,
+) -> NDArray[np.float64]:
+    """Return what `find_first` returns, for the second frame of a pair: with those (n, 4) of the first, `before`."""
+    task = task_for(bench, frame)
+    return second_frame(task, task_for(bench, before), particles, SEARCH_LENSES * task.view.scale.lens_mm, progress)
+
+
+def find_beside(
+    bench: Bench, frame: Frame, own: NDArray[np.float64], neighbours: Sequence[NDArray[np.float64]]
+) -> Particles:
+    """Return the particles behind an image with the help of the first passes of it and of the frames beside it."""
+    task = task_for(bench, frame)
+    return result(task, second_pass(task, own, neighbours, SEARCH_LENSES * task.view.scale.lens_mm))
+
+
+def _lens_mm(bench: Bench) -> float:
+    return bench.content.camera.scale(bench.settings.media_model()).lens_mm
+
+
+def task_for(bench: Bench, frame: Frame) -> Task:
+    """Return the task that a frame sets."""
+    content, photons = bench.content, bench.settings.reconstruction.photons_per_count
+    view = _view(bench, _light(content, bench.settings))
+    return task_of(
+        frame.image, view, content.weights, content.camera, frame.sums, frame.unusable, photons, bench.light_covariance
+    )
+
+
+def _view(bench: Bench, waves: Light | None) -> View:
+    """Return how particles are seen, by waves or by rays."""
+    content, settings = bench.content, bench.settings
+    radius = 0.5 * (settings.reconstruction.particle_diameter_mm or UNKNOWN_LENSES * _lens_mm(bench))
+    calibration, space = content.weights.calibration, _space(content, settings)
+    # Particles are fitted behind arrays that stand upright, as in the weights' frame.
+    return raw_view(content.camera, settings.media_model(), radius, calibration, space, waves, content.passed)
+
+
+def _light(content: WeightsFile, settings: Config) -> Light | None:
+    """Return the light as waves where its wavelength is given, for all depths of the weights; None: by rays."""
+    margin = BEYOND_DEPTHS * content.camera.scale(settings.media_model()).depth_mm
+    low, high = content.weights.padded.grid.bounds_mm(2)
+    return light_of(settings, (low - margin, high + margin))
+
+
+def light_of(settings: Config, depths_mm: tuple[float, float]) -> Light | None:
+    """Return the light as waves, as it is fitted between two depths; None: by rays."""
+    chosen = settings.reconstruction
+    if chosen.wavelength_nm is None:
+        return None
+    diffusion_px = USUAL_DIFFUSION_PX if chosen.diffusion_px is None else chosen.diffusion_px
+    return Light(chosen.wavelength_nm * NM_TO_MM, diffusion_px, depths_mm)
+
+
+def points_of(bench: Bench, frame: Frame, found: Particles, size: TracerSize, provenance: Mapping[str, Any]) -> Points:
+    """Return the particles found behind an image in the coordinates of files, by Snell's law where it is known."""
+    content = bench.content
+    space = _space(content, bench.settings)
+    outside = _outside(found.position_mm, content.weights.grid)
+    left = what_is_left(frame, found)
+    norm = float(np.linalg.norm(np.where(frame.unusable, 0.0, frame.image)))
+    share_left = float(np.linalg.norm(left)) / norm if norm > 0.0 else 0.0
+    # Of four tracers for each microlens only 1.3 are found, and few of them are right.
+    number = tracers_per_lens(bench, frame) if share_left > MUCH_LEFT else None
+    focus = _focal_length(bench, frame, found)
+    return Points(
+        content.reference.points_from_focal_point(found.position_mm),
+        {
+            "intensity": found.light_counts,
+            "intensity_sigma": found.light_sigma_counts,
+            "covariance_mm2": symmetric(found.covariance_mm2),
+            "chi2": found.chi2,
+            "seen": found.seen,
+            "flag": outside,
+        },
+        content.reference,
+        attributes=content.reference.attributes()
+        | {
+            "refraction": "paraxial" if isinstance(space, ObjectSpace) and space.straight else "exact",
+            "light": "rays" if bench.settings.reconstruction.wavelength_nm is None else "waves",
+            "residual": share_left,
+            "residual_rms_counts": float(np.sqrt(np.mean(left[~frame.unusable] ** 2))),
+            "excluded_pixels": int(np.count_nonzero(frame.unusable)),
+            "read_noise_counts": found.noise.read_counts,
+            "particles_per_lens": float(np.count_nonzero(outside == 0)) / _lenses_before(bench),
+        }
+        | ({} if number is None else {"tracers_per_lens": number})
+        | ({} if focus is None else {"microlens_focus": focus.off, "microlens_focus_sigma": focus.sigma})
+        | size.attributes(),
+        provenance=dict(provenance),
+    )
+
+
+def _focal_length(bench: Bench, frame: Frame, found: Particles) -> FocalLength | None:
+    """Return the microlenses' focal length by the particles of an image; None where too few tell it."""
+    # By rays also where particles are fitted by waves, of which no second table is made: rays tell half of it.
+    view = _view(bench, None)
+    particles = np.column_stack([bench.content.camera.to_image_axes(found.position_mm), found.light_counts])
+    residual = found.residual.ravel()
+    weight = found.noise.weights(frame.image.ravel() - residual, residual, LAST_UNEXPLAINED)
+    weight[frame.unusable.ravel()] = 0.0
+    return focal_length_of(view, particles, residual, weight)
+
+
+def what_is_left(frame: Frame, found: Particles) -> NDArray[np.float64]:
+    """Return what particles leave of an image (rows, columns), counts, 0 where it takes no part."""
+    return np.where(frame.unusable, 0.0, found.residual)
+
+
+def _space(content: WeightsFile, settings: Config) -> ObjectSpace | CurvedSpace:
+    """Return what lies before the particles: by Snell's law where the window's thickness and place are known."""
+    if settings.sections.scene is not None:
+        return settings.object_space()
+    calibration = content.weights.calibration
+    mid_plane = calibration.mid_plane_z_mm if calibration else None
+    if (settings.channel is None or mid_plane is None) and settings.sections.window is None:
+        return ObjectSpace(settings.media_model(), None, "paraxial")
+    return ObjectSpace(settings.media_model(), settings.window_model(mid_plane), "exact")
+
+
+def tracers_per_lens(bench: Bench, frame: Frame) -> float | None:
+    """Return the tracers for each microlens, counted by how uneven their light is.
+
+    None where too little of the volume is seen. Their size hardly matters to it, and what crowded tracers seem to have
+    would: it is taken as half a microlens.
+    """
+    settings = bench.settings.overridden("reconstruction", particle_diameter_mm=UNKNOWN_LENSES * _lens_mm(bench))
+    return counted(task_for(replace(bench, settings=settings), frame), bench.lens_images.lattice_px)
+
+
+def _lenses_before(bench: Bench) -> float:
+    """Return how many microlenses the volume fills as the scene shows them."""
+    camera, grid = bench.content.camera, bench.content.weights.grid
+    (low_x, high_x), (low_y, high_y) = (grid.bounds_mm(axis) for axis in (0, 1))
+    return (high_x - low_x) * (high_y - low_y) * camera.magnification**2 / camera.lattice.cell_area
+
+
+def _outside(position_mm: NDArray[np.float64], grid: Grid) -> NDArray[np.uint8]:
+    """Return 1 for particles outside the volume, kept because they light it, 0 for those inside."""
+    bounds = np.array([grid.bounds_mm(axis) for axis in range(3)])
+    inside = np.all((position_mm >= bounds[:, 0]) & (position_mm <= bounds[:, 1]), axis=1)
+    return (~inside).astype(np.uint8)
+
+
+class Finder:
+    """Finds the particles of frames, alone or with the first passes of those beside them.
+
+    That of the second frame of a pair begins with what the first frame's found, never the other way round: so it does
+    not matter which frames are there already.
+    """
+
+    def __init__(
+        self,
+        bench: Bench,
+        read: Read,
+        frames: Sequence[ImageFrame],
+        beside: Sequence[tuple[int, ...]] | None,
+        first_of: Mapping[int, int],
+        keep_going: bool,
+    ) -> None:
+        """Take how frames are read, which are beside each, and of each second of a pair the first.
+
+        With `keep_going`, one of those beside may be unreadable.
+        """
+        self._bench, self._read, self._frames = bench, read, frames
+        self._beside, self._first_of, self._keep_going = beside, first_of, keep_going
+        # A frame needs itself and one at either side, the next one two of these again.
+        self._first_pass_of: Callable[[int], NDArray[np.float64]] = lru_cache(maxsize=3)(self._first_pass)
+        self._advance: Progress | None = None
+
+    def find(self, number: int, frame: Frame, advance: Progress) -> tuple[Particles, list[Notice]]:
+        """Return the particles of a frame, and which of those beside it did not help.
+
+        Raises
+        ------
+        InputError : one beside it cannot be read, and that is to stop the batch
+        """
+        self._advance = advance
+        if self._beside is None:
+            return find(self._bench, frame, advance), []
+        notices, helping = [], []
+        for k in self._beside[number]:
+            fault = self._fault(k) if self._keep_going else None
+            if fault is None:
+                helping.append(k)
+            else:
+                text = f"is found without the help of {self._frames[k].stem}: {fault}"
+                notices.append(Notice("frame-alone", self._frames[number].stem, text, "mend that one"))
+        if not helping:
+            return find(self._bench, frame, advance), notices
+        seen = {k: self._first_pass_of(k) for k in sorted((number, *helping))}
+        return find_beside(self._bench, frame, seen[number], [seen[k] for k in helping]), notices
+
+    def _first_pass(self, number: int) -> NDArray[np.float64]:
+        frame, first = self._frame(number), self._first_of.get(number)
+        if first is None:
+            return find_first(self._bench, frame, self._advance)
+        before = self._frame(first)
+        return find_second(self._bench, frame, before, self._first_pass_of(first), self._advance)
+
+    def _frame(self, number: int) -> Frame:
+        raw, lit = self._read(number)
+        check_frame(self._bench, raw, str(self._frames[number].path))
+        return frame_of(self._bench, raw, lit)
+
+    def _fault(self, number: int) -> str | None:
+        """Return why a frame cannot help another one, None where it can."""
+        try:
+            self._frame(number)
+        except InputError as error:
+            return str(error)
+        return None
+
+
+class Prepared:
+    """Opens weights once, as long as their file stays as it is: of full size that takes as long as some frames."""
+
+    def __init__(self) -> None:
+        """Begin with nothing."""
+        self._opened = lru_cache(maxsize=1)(lambda path, _size, _modified_ns: open_weights_that_fit(path))
+        self._searchable: tuple[WeightsFile, WeightsFile] | None = None
+        self._bench: Bench | None = None
+
+    def weights(self, path: Path) -> WeightsFile:
+        """Return the weights of a file.
+
+        Raises
+        ------
+        InputError : as `open_weights`
+        """
+        status = path.stat() if path.exists() else None
+        return self._opened(path, status and status.st_size, status and status.st_mtime_ns)
+
+    def searchable(self, path: Path, settings: Config) -> WeightsFile:
+        """Return the weights of a file to look for particles with, see `interface.particles.searchable`."""
+        content = self.weights(path)
+        if self._searchable is None or self._searchable[0] is not content:
+            self._searchable = content, searchable_weights(path, content, settings)
+        return self._searchable[1]
+
+    def bench(self, content: WeightsFile, settings: Config, dark: Image | None, mask: Image | None) -> Bench:
+        """Return what all frames share, with the sums of the last one where these are the same."""
+        self._bench = bench_of(content, settings, dark, mask, earlier=self._bench)
+        return self._bench
+
+
+def searchable_weights(path: Path, content: WeightsFile, settings: Config) -> WeightsFile:
+    """Return the weights of a file to look for particles with.
+
+    Raises
+    ------
+    InputError : they are none for that, see `interface.particles.searchable`
+    """
+    try:
+        return searchable(content, settings)
+    except ConfigError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def open_weights_that_fit(path: Path) -> WeightsFile:
+    """Open weights, where there is memory for them.
+
+    Raises
+    ------
+    InputError : as `open_weights`
+    OutputError : there is too little
+    """
+    ensure_room(unpacked_bytes(path), f"reading {path}")
+    return open_weights(path)

@@ -1,0 +1,440 @@
+"""`plot`: the figures of any file of ours, as PDF or PNG."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lfpiv_cli.console import CONSOLE, Console
+from lfpiv_cli.errors import InputError, UsageError
+from lfpiv_cli.files.atomic import ensure_writable
+from lfpiv_cli.files.hdf5 import format_of
+from lfpiv_cli.files.inputs import given
+from lfpiv_cli.files.pages import ensure_drawing, write_pdf, write_picture
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lfpiv_cli.errors import ConfigError
+from lfpiv_cli.files import calibration_file, vtkhdf, weights_file
+from lfpiv_cli.files.calibration_file import read_calibration
+from lfpiv_cli.files.config import carried_config
+from lfpiv_cli.files.figures import describe, file_figures, is_recording, recording_figures
+from lfpiv_cli.files.hdf5 import open_h5
+from lfpiv_cli.files.hdf5_checks import member
+from lfpiv_cli.files.images import read_image
+from lfpiv_cli.files.particle_file import (
+    PARTICLES_FORMAT,
+    TRACKS_FORMAT,
+    TRAJECTORIES_FORMAT,
+    Points,
+    read_points,
+)
+from lfpiv_cli.files.weights_file import FORMAT, WeightsFile, open_weights
+from lfpiv_cli.flow.field import VectorField
+from lfpiv_cli.notice import written
+from lfpiv_cli.pictures import calibration as of_calibration
+from lfpiv_cli.pictures import points as of_particles
+from lfpiv_cli.pictures import points as of_tracks
+from lfpiv_cli.pictures import vectors as of_vectors
+from lfpiv_cli.pictures import volume as of_volume
+from lfpiv_cli.pictures import volume as of_weights
+from lfpiv_cli.verbs.frames import residual_path
+
+# The figures that each kind of file has, by its format.
+
+
+# Of the light by depth: so many depths show its course, each costs three columns.
+DEPTHS = 41
+# What tells how good vectors are: arrays of the file that are drawn where they are known, by the figure's words.
+QUALITIES = {
+    "correlation": "correlation at the peak",
+    "peak_ratio": "highest over second peak",
+    "disagreement": "disagreement of the two fields (σ)",
+    "valid_fraction": "share of the window in view",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """A figure that can be drawn: what it shows, in a sentence or two, and the function that draws it."""
+
+    caption: str
+    draw: Callable[[], Figure]
+
+
+def _of_vectors(path: Path) -> dict[str, Drawn]:
+    field = vtkhdf.open_vectors(path)
+    figures = {
+        "planes": Drawn(
+            "Vectors in the three middle planes. Arrows show the components in the plane, colour the one across it; "
+            "both have one scale in all three. Crosses are vectors that are missing.",
+            partial(of_vectors.planes_figure, field),
+        ),
+        "components": Drawn(
+            "Each velocity component in the three middle planes, a row and a scale for each.",
+            partial(of_vectors.components_figure, field),
+        ),
+        "profiles": Drawn(
+            "Means of each component over the planes across each axis. The band is the stated standard deviation of "
+            "one vector to both sides.",
+            partial(of_vectors.profiles_figure, field),
+        ),
+    }
+    if field.uncertainty_voxel is not None and np.isfinite(field.uncertainty_voxel).any():
+        figures["sigma"] = Drawn(
+            "Stated standard deviation of each component in the three middle planes, all on one logarithmic scale.",
+            partial(of_vectors.sigma_figure, field),
+        )
+    figures["flags"] = Drawn(
+        "Where vectors are valid, taken from a second peak, replaced by their neighbours, rejected or masked.",
+        partial(of_vectors.flags_figure, field),
+    )
+    qualities = _qualities(path, field)
+    if qualities:
+        figures["quality"] = Drawn(
+            f"What else tells how good vectors are: {', '.join(qualities)}.",
+            partial(of_vectors.quality_figure, field, qualities),
+        )
+    figures["displacements"] = Drawn(
+        "Displacements of the valid vectors, and what they are beyond whole voxels and, where the camera is known, "
+        "whole microlenses: crowded about zero where they lock.",
+        partial(of_vectors.displacements_figure, field, _lens_mm(path)),
+    )
+    if field.dt_s is not None:
+        figures["gradients"] = Drawn(
+            "Vorticity across the three middle planes, and the divergence, which is zero in a liquid: what it shows "
+            "is the noise of gradients. One scale for both.",
+            partial(of_vectors.gradients_figure, field),
+        )
+    return figures
+
+
+def _lens_mm(path: Path) -> float | None:
+    """Return the width of a microlens in the scene; None where the file does not say with what camera it was taken.
+
+    Nor does one whose config is that of another version, which must not keep its figures from being drawn.
+    """
+    try:
+        config = carried_config(vtkhdf.read_header(path).provenance, path)
+        return config.camera_model().scale(config.media_model()).lens_mm
+    except (InputError, ConfigError):
+        return None
+
+
+def _qualities(path: Path, field: VectorField) -> dict[str, NDArray[np.float64]]:
+    """Return what the file knows of the vectors' quality, by the words for it; not what is alike everywhere."""
+    with open_h5(path) as file:
+        found: dict[str, NDArray[Any]] = {
+            words: np.asarray(member(file, name)).reshape(field.flag.shape)
+            for name, words in QUALITIES.items()
+            if name in file
+        }
+    return {words: values for words, values in found.items() if np.unique(values[np.isfinite(values)]).size > 1}
+
+
+def _of_particles(path: Path, raw: Path | None) -> dict[str, Drawn]:
+    points = read_points(path, PARTICLES_FORMAT)
+    arrays, z_mm = points.arrays, points.position_mm[:, 2]
+    figures = {
+        "places": Drawn(
+            "The particles from the front and from the side, coloured by their light.",
+            partial(of_particles.places_figure, points.position_mm, arrays["intensity"]),
+        )
+    }
+    if raw is not None:
+        config = carried_config(points.provenance, path)
+        config.ensure_plane_layers("showing particles on a raw image")
+        focal_point = points.reference.points_to_focal_point(points.position_mm)
+        places = of_particles.places_px(focal_point, config.camera_model(), config.media_model())
+        image = read_image(raw, config.image_shape()).astype(np.float64)
+        figures["image"] = Drawn(
+            "The raw image, and where rays through the middle of the main lens (as the config has it) meet the sensor.",
+            partial(of_particles.image_figure, image, places, z_mm),
+        )
+    left = residual_path(path)
+    if left.is_file():
+        figures["residual"] = Drawn(
+            "What the particles leave of the image: red is light that none explains, blue is too much light.",
+            partial(of_particles.residual_figure, read_image(left).astype(np.float64)),
+        )
+    if len(z_mm):
+        figures["depths"] = Drawn(
+            "By depth: how many particles, their light, and the standard deviations of their places.",
+            partial(of_particles.depths_figure, z_mm, arrays["intensity"], arrays["covariance_mm2"]),
+        )
+        figures["chi2"] = Drawn(
+            "How well the particles explain the light about them: chi2 is about 1 where they explain all of it.",
+            partial(of_particles.chi2_figure, arrays["chi2"]),
+        )
+    return figures
+
+
+def _of_tracks(path: Path) -> dict[str, Drawn]:
+    tracks = read_points(path, TRACKS_FORMAT)
+    arrays = tracks.arrays
+    lines, stretch = of_tracks.displacement_lines(tracks.position_mm, arrays["displacement_mm"])
+    words = f"{len(lines)} displacements, drawn {written(stretch)} times as long"
+    speeds = np.linalg.norm(arrays["velocity"], axis=1)
+    figures = {
+        "space": Drawn(
+            f"The displacements in space, coloured by speed; they are drawn {written(stretch)} times as long as they "
+            "are.",
+            partial(of_tracks.space_figure, lines, speeds, words),
+        )
+    }
+    return figures | _of_all_tracks(tracks)
+
+
+def _of_trajectories(path: Path) -> dict[str, Drawn]:
+    tracks = read_points(path, TRAJECTORIES_FORMAT)
+    track = tracks.arrays["track"]
+    lines = of_tracks.trajectory_lines(tracks.position_mm, track)
+    speeds = of_tracks.trajectory_lines(np.linalg.norm(tracks.arrays["velocity"], axis=1), track)
+    means = np.array([float(each.mean()) for each in speeds])
+    figures = {
+        "space": Drawn(
+            "The trajectories in space, coloured by mean speed.",
+            partial(of_tracks.space_figure, lines, means, f"{len(lines)} trajectories"),
+        ),
+        "lengths": Drawn("How many frames the trajectories span.", partial(of_tracks.lengths_figure, track)),
+    }
+    return figures | _of_all_tracks(tracks)
+
+
+def _of_all_tracks(tracks: Points) -> dict[str, Drawn]:
+    """Return the figures that tracks of two frames and of a sequence have in common."""
+    arrays = tracks.arrays
+    figures = {
+        "velocities": Drawn("The velocity components.", partial(of_tracks.velocities_figure, arrays["velocity"])),
+    }
+    if np.isfinite(arrays["link_probability"]).any():
+        figures["links"] = Drawn(
+            "How probable the links are, and how many wrong ones to expect.",
+            partial(of_tracks.links_figure, arrays["link_probability"]),
+        )
+    if len(tracks.position_mm):
+        figures["sigma"] = Drawn(
+            "Stated standard deviations of the velocity components by depth, medians.",
+            partial(of_tracks.sigma_figure, tracks.position_mm[:, 2], arrays["velocity_sigma"]),
+        )
+    return figures
+
+
+def _of_volume(path: Path) -> dict[str, Drawn]:
+    volume = vtkhdf.open_volume(path)
+    return {
+        "projections": Drawn(
+            "The brightest voxel along each line of sight, in the three directions, on one scale.",
+            partial(of_volume.projections_figure, volume.array, volume.grid),
+        ),
+        "depths": Drawn(
+            "The mean intensity of each plane by depth.", partial(of_volume.depths_figure, volume.array, volume.grid)
+        ),
+    }
+
+
+def _of_calibration(path: Path, white: Path | None) -> dict[str, Drawn]:
+    calibration = read_calibration(path)
+    figures = {
+        "summary": Drawn(
+            "How far the lens images lie off the lattice, what pixels pass, and where the board was found.",
+            partial(of_calibration.summary_figure, calibration),
+        )
+    }
+    if white is not None:
+        image = read_image(white, calibration.image_shape)
+        figures["lattice"] = Drawn(
+            "The lattice on the white image, in the middle and in two corners.",
+            partial(of_calibration.calibration_figure, calibration, image),
+        )
+    return figures
+
+
+def _of_weights(path: Path) -> dict[str, Drawn]:
+    content = open_weights(path)
+    nx, ny, nz = content.weights.grid.shape_xyz
+    return {
+        "column": Drawn(
+            "The pixels that the middle voxel lights: its point-spread function.",
+            partial(column_of, content, (nx // 2, ny // 2, nz // 2)),
+        ),
+        "light": Drawn(
+            "How much of a voxel's light meets the sensor, by depth: on the axis, half-way out, and in a corner.",
+            partial(_light_of, content),
+        ),
+    }
+
+
+def column_of(content: WeightsFile, voxel: tuple[int, int, int]) -> Figure:
+    """Return the figure of the pixels that a voxel (ix, iy, iz) lights.
+
+    Raises
+    ------
+    InputError : it lights none
+    """
+    ix, iy, iz = voxel
+    rows, columns, shares = content.weights.column(iz, iy, ix)
+    if not shares.size:
+        raise InputError(f"voxel {ix} {iy} {iz} lights no pixel")
+    grid = content.reference.grid_from_focal_point(content.weights.grid)
+    place = ", ".join(written(axis, 4) for axis in grid.voxel_to_mm(np.array(voxel, dtype=np.float64)))
+    title = f"voxel {ix}, {iy}, {iz} at ({place}) mm: {shares.size} pixels, sum {shares.sum():.4f}"
+    return of_weights.column_figure((rows, columns), shares, content.camera.pixel_mm, title)
+
+
+def _light_of(content: WeightsFile) -> Figure:
+    grid = content.reference.grid_from_focal_point(content.weights.grid)
+    nx, ny, nz = grid.shape_xyz
+    planes = np.unique(np.linspace(0, nz - 1, min(nz, DEPTHS)).astype(int))
+    places = {"middle": (nx // 2, ny // 2), "half-way out": (nx // 4, ny // 4), "corner": (0, 0)}
+    sums = {
+        name: np.array([float(content.weights.column(int(iz), iy, ix)[2].sum()) for iz in planes])
+        for name, (ix, iy) in places.items()
+    }
+    return of_weights.light_figure(grid.axis_mm(2)[planes], sums)
+
+
+READERS: dict[str, Callable[[Path], dict[str, Drawn]]] = {
+    vtkhdf.VECTORS_FORMAT: _of_vectors,
+    vtkhdf.VOLUME_FORMAT: _of_volume,
+    TRACKS_FORMAT: _of_tracks,
+    TRAJECTORIES_FORMAT: _of_trajectories,
+    weights_file.FORMAT: _of_weights,
+}
+ON_IMAGES: dict[str, Callable[[Path, Path | None], dict[str, Drawn]]] = {
+    PARTICLES_FORMAT: _of_particles,
+    calibration_file.FORMAT: _of_calibration,
+}
+
+__all__ = ["Drawn", "PlotOptions", "figures_of", "plot"]
+
+SUFFIXES = (".png", ".pdf")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlotOptions:
+    """What `plot` draws: names of figures, none for all; and the raw image that the file was made from, to draw on."""
+
+    only: tuple[str, ...] = ()
+    raw: Path | None = None
+
+
+NO_OPTIONS = PlotOptions()
+
+
+def figures_of(path: Path, raw: Path | None = None) -> dict[str, Drawn]:
+    """Return the figures of a file of ours, by name in the order of display; nothing is drawn yet.
+
+    Parameters
+    ----------
+    raw : image to draw on: for particles the one they were found in, for a calibration its white image
+
+    Raises
+    ------
+    InputError : the file is missing, broken or of no format that has figures, or the image does not fit it
+    UsageError : there is no figure on an image in it
+    """
+    of_format = format_of(path)
+    if of_format in ON_IMAGES:
+        return ON_IMAGES[of_format](path, raw)
+    if of_format not in READERS:
+        raise InputError(f"{path}: {of_format} has no figures, only {', '.join(sorted({*READERS, *ON_IMAGES}))}")
+    if raw is not None:
+        raise UsageError(f"--raw: figures of {of_format} show no image, only {' and '.join(ON_IMAGES)} do")
+    return READERS[of_format](path)
+
+
+def plot(
+    file: Path, output: Path, options: PlotOptions = NO_OPTIONS, *, overwrite: bool = False, console: Console = CONSOLE
+) -> dict[str, Any]:
+    """Draw the figures of a file: as pages of one PDF, or as PNG, one for each.
+
+    Raises
+    ------
+    UsageError : the output is neither, or a name is not one of the file's figures
+    """
+    if output.suffix not in SUFFIXES:
+        raise UsageError(f"{output}: pictures are written as {' or '.join(SUFFIXES)}")
+    ensure_drawing()
+    figures = figures_of(file, options.raw)
+    unknown = [name for name in options.only if name not in figures]
+    if unknown:
+        raise UsageError(f"--only {unknown[0]}: {file} has the figures {', '.join(figures)}")
+    chosen = {name: drawn for name, drawn in figures.items() if not options.only or name in options.only}
+    targets = _targets(output, list(chosen))
+    for target in targets.values():
+        ensure_writable(target, overwrite, given(file=file, raw=options.raw).values())
+    with console.progress(len(chosen), "figures") as advance:
+        drawn = _drawn(chosen, advance)
+        if output.suffix == ".pdf":
+            write_pdf(output, drawn, overwrite)
+        else:
+            for target, figure in zip(targets.values(), drawn, strict=True):
+                write_picture(target, figure, overwrite)
+    return {"figures": list(chosen), "files": [str(target) for target in dict.fromkeys(targets.values())]}
+
+
+def _targets(output: Path, names: list[str]) -> dict[str, Path]:
+    """Return where each figure goes: a PDF holds all, a PNG one; of several each has its name at the end."""
+    if output.suffix == ".pdf" or len(names) == 1:
+        return dict.fromkeys(names, output)
+    return {name: output.with_name(f"{output.stem}_{name}{output.suffix}") for name in names}
+
+
+def _drawn(figures: Mapping[str, Drawn], advance: Callable[[int], None]) -> Iterator[Figure]:
+    """Draw one figure after the other, so that few are in memory."""
+    for each in figures.values():
+        yield each.draw()
+        advance(1)
+
+
+# `info`: what is in a file, and the pixels that one voxel of the weights lights.
+
+
+@dataclass(frozen=True, kw_only=True)
+class InfoOptions:
+    """What `info` draws of weights: a picture to write, and which voxel (ix, iy, iz), by default the middle one."""
+
+    picture: Path | None = None
+    voxel: tuple[int, int, int] | None = None
+
+
+NO_INFO_OPTIONS = InfoOptions()
+
+
+def info(
+    file: Path, options: InfoOptions = NO_INFO_OPTIONS, *, overwrite: bool = False, console: Console = CONSOLE
+) -> dict[str, Any]:
+    """Tell what is in a file of ours or of frames, its figures last; of weights, draw the column of one voxel."""
+    picture, voxel = options.picture, options.voxel
+    if picture is None:
+        if voxel is not None:
+            raise UsageError("--voxel needs --picture")
+        return _told(file)
+    ensure_writable(picture, overwrite, [file])
+    ensure_drawing()
+    found = _told(file)
+    if found["format"] != FORMAT:
+        others = "" if is_recording(file) else f"; for the figures of {found['format']}: lfpiv plot {file}"
+        raise UsageError(f"--picture draws a voxel of weights{others}")
+    content = open_weights(file)
+    nx, ny, nz = content.weights.grid.shape_xyz
+    ix, iy, iz = voxel or (nx // 2, ny // 2, nz // 2)
+    if not (0 <= ix < nx and 0 <= iy < ny and 0 <= iz < nz):
+        raise UsageError(f"--voxel {ix} {iy} {iz}: there are {nx} x {ny} x {nz} voxels, counted from 0")
+    write_picture(picture, column_of(content, (ix, iy, iz)), overwrite)
+    return found
+
+
+def _told(file: Path) -> dict[str, Any]:
+    if is_recording(file):
+        return recording_figures(file)
+    found = describe(file)
+    return found | file_figures(file, found["format"])

@@ -1,0 +1,451 @@
+"""`reconstruct`: each image prepared, solved, and its volume or particles kept."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lfpiv_cli.console import CONSOLE, Console, Frames
+from lfpiv_cli.errors import InputError, UsageError
+from lfpiv_cli.files import images as image_files
+from lfpiv_cli.files import vtkhdf
+from lfpiv_cli.files.atomic import ensure_writable, folder_of
+from lfpiv_cli.files.batch import Target, frames_of, output_paths
+from lfpiv_cli.files.config import carried_config
+from lfpiv_cli.files.hdf5 import unpacked_bytes
+from lfpiv_cli.files.inputs import ensure_room, given
+from lfpiv_cli.files.pairing import Pairs
+from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, write_points
+from lfpiv_cli.files.provenance import Gone, also_used_as, record, with_warnings
+from lfpiv_cli.files.vtkhdf import Volume
+from lfpiv_cli.files.weights_file import WeightsFile, read_weights_record
+from lfpiv_cli.names import Start
+from lfpiv_cli.notice import Notice, warn_of
+from lfpiv_cli.particles.search import Particles
+from lfpiv_cli.reconstruction.images import Image, as_if_lit, filled, light
+from lfpiv_cli.reconstruction.registry import SolverName
+from lfpiv_cli.reconstruction.solvers import reconstruct as solve
+from lfpiv_cli.verbs import particles
+from lfpiv_cli.verbs.batches import Batch, BatchOptions, Expected, Worked, dry_run, work_through
+from lfpiv_cli.verbs.frames import (
+    IMAGE,
+    STILL,
+    Ahead,
+    Background,
+    Bench,
+    Progress,
+    Read,
+    bench_of,
+    beside_frames,
+    check_frame,
+    frame_notices,
+    given_picture,
+    mask_of,
+    other_frames,
+    picture_for,
+    reader,
+    residual_path,
+)
+from lfpiv_cli.verbs.pairs import PairOptions, ensure_frames_alone, image_pairs, watched, work_as_they_come
+from lfpiv_cli.verbs.particles import Finder, Prepared
+from lfpiv_cli.verbs.tracers import TracerSize, light_notices, size_notices
+from lfpiv_cli.verbs.weights_cost import FLOAT_BYTES, columns_bytes, held_bytes, on_demand_told
+
+
+def reconstruct(
+    weights: WeightsFile,
+    image: NDArray[Any],
+    *,
+    dark: NDArray[Any] | None = None,
+    background: NDArray[Any] | None = None,
+    mask: NDArray[Any] | None = None,
+    **settings: Any,
+) -> Volume:
+    """Reconstruct the volume of tracer particles behind an image.
+
+    Parameters
+    ----------
+    weights : WeightsFile
+        From `build_weights` or `open_weights`.
+    image : (rows, columns) counts
+        Raw image.
+    dark : (rows, columns) counts, optional
+        Raw image taken with the cap on: is subtracted, and its hot and dead pixels are left out.
+    background : (rows, columns) counts, optional
+        Raw image without tracers, subtracted in place of the dark one.
+    mask : (rows, columns), optional
+        0 where pixels are left out (reflections, bubbles).
+    **settings
+        Keys of the rig's section `reconstruction`, in their place: solver, iterations, relaxation and so on.
+
+    Returns
+    -------
+    Volume
+        `array` (nz, ny, nx) float32, light in counts; `grid`, spacing and origin in mm, z from the volume's reference;
+        `attributes` with the relative `residual` after each iteration.
+
+    Raises
+    ------
+    ConfigError
+        The settings are not possible.
+    UsageError
+        The solver is `particles`, which makes no volume: see `find_particles`.
+    InputError
+        An image has another shape than what the weights were made for, or does not fit into memory.
+    """
+    chosen = carried_config(weights.provenance, "the weights").overridden("reconstruction", **settings)
+    if chosen.reconstruction.solver == "particles":
+        raise UsageError("reconstruct: the solver particles makes no volume; find_particles finds them")
+    bench = bench_of(weights, chosen, given_picture(weights, dark), given_picture(weights, mask))
+    raw = picture_for(weights, image)
+    lit = light(raw, bench.dark, given_picture(weights, background))
+    check_frame(bench, raw, IMAGE)
+    warn_of(frame_notices(bench, raw, lit, IMAGE))
+    return volume_of(bench, raw, lit, record("reconstruct", chosen.resolved(), {}))
+
+
+def volume_of(
+    bench: Bench, raw: Image, lit: Image, provenance: Mapping[str, Any], progress: Progress | None = None
+) -> Volume:
+    """Return the volume behind a raw frame, given also with dark or background taken off (`lit`)."""
+    unusable = bench.unusable(raw)
+    excluded = bench.excluded_with(unusable)
+    content = bench.content
+    image, operator = content.weights.prepare(filled(lit, unusable)), content.weights.padded
+    if bench.sums is None:
+        operator = operator.for_image(as_if_lit(image, excluded))
+    sums = bench.sums_without(operator, excluded)
+    result = solve(operator, image, bench.settings.solver_settings(), sums=sums, progress=progress)
+    return Volume(
+        content.weights.to_world(result.volume),
+        content.reference.grid_from_focal_point(content.weights.grid),
+        content.reference,
+        attributes=content.reference.attributes()
+        | {
+            "residual": result.residual,
+            "excluded_pixels": int(np.count_nonzero(excluded)),
+            "support_voxels": result.support_voxels,
+        },
+        provenance=dict(provenance),
+    )
+
+
+# The particles of the frames of a batch: each frame by itself, or with the help of those beside it.
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What is told of a frame: its relative residual, the number of pixels that took no part, and of particles.
+
+    Of these also the size of the tracers, which all frames share: whoever makes a frame knows it.
+    """
+
+    residual: float
+    excluded_pixels: int
+    particles: int | None = None
+    tracers: TracerSize | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReconstructOptions(PairOptions, BatchOptions):
+    """What `reconstruct` is given besides weights and images.
+
+    Attributes
+    ----------
+    solver, iterations, relaxation, accelerate, start : in place of the config's, see its section `reconstruction`
+    dark : image taken with the cap on; its hot and dead pixels are left out
+    background : image to subtract, or `minimum` or `mean` over the images, or as `minimum:15`
+    mask : image that is black where pixels are left out, or `still`: where bright light does not move in the images
+    residual : of particles, also write what they leave of each image
+    """
+
+    solver: SolverName | None = None
+    iterations: int | None = None
+    relaxation: float | None = None
+    accelerate: bool | None = None
+    start: Start | None = None
+    dark: Path | None = None
+    background: str | None = None
+    mask: str | Path | None = None
+    residual: bool = True
+
+
+NO_OPTIONS = ReconstructOptions()
+
+
+def reconstruct_files(
+    weights: Path,
+    images: Sequence[Path],
+    output: Path,
+    options: ReconstructOptions = NO_OPTIONS,
+    *,
+    overwrite: bool = False,
+    console: Console = CONSOLE,
+    pairs: Pairs | None = None,
+    prepared: Prepared | None = None,
+    order: Sequence[int] | None = None,
+) -> dict[str, Any]:
+    """Reconstruct the volume behind each image, or find its particles.
+
+    `pairs` and `prepared`, where these are known already; `order`, where only some frames are to be made.
+    """
+    if options.watch:
+        settings = carried_config(read_weights_record(weights), weights).overridden_by("reconstruction", options)
+        ensure_frames_alone(settings, options.background, options.mask)
+        groups = watched(images, "images", options, console)
+        with folder_of(output / weights.name):
+            batch, worked = work_as_they_come(
+                lambda group: Reconstruction(weights, group, output, options, overwrite), groups, options, console
+            )
+    else:
+        batch = Reconstruction(weights, images, output, options, overwrite, pairs, prepared, order)
+        if options.dry_run:
+            return dry_run(batch, options, console)
+        worked = work_through(batch, options, console)
+    return worked.ensure_whole(batch.summary(worked), batch.unit)
+
+
+@dataclass(frozen=True, eq=False)
+class _Ready:
+    """What all frames share: with particles their size, and what is said of it."""
+
+    bench: Bench
+    ahead: Ahead
+    finder: Finder
+    size: TracerSize | None
+    said: Sequence[Notice]
+
+
+class Reconstruction(Batch[Outcome]):
+    """The batch of `reconstruct`: a volume, or particles, for each frame."""
+
+    label, unit = "reconstruct", "frame"
+    names: Sequence[str] = ()
+    order: Sequence[int] = ()
+
+    def __init__(
+        self,
+        weights: Path,
+        images: Sequence[Path],
+        output: Path,
+        options: ReconstructOptions,
+        overwrite: bool,
+        pairs: Pairs | None = None,
+        prepared: Prepared | None = None,
+        order: Sequence[int] | None = None,
+        weights_to_come: Gone | None = None,
+    ) -> None:
+        """Take the arguments of `reconstruct`; see which frames there are, and read no image.
+
+        `weights_to_come`, where the weights are to carry another record before anything is made.
+
+        Raises
+        ------
+        LfpivError : frames or outputs do not go together, or a file cannot be opened
+        """
+        self._options, self.overwrite, self._prepared = options, overwrite, prepared or Prepared()
+        # What is complete is skipped: in the place of what is made there is nothing, or something broken.
+        self._replace = overwrite or options.resume
+        self._level = level = Background.parse(options.background)
+        mask_file = None if options.mask is None or options.mask == STILL else Path(options.mask)
+        self._common = given(weights=weights, dark=options.dark, background=level.path, mask=mask_file)
+        self.inputs = [*self._common.values(), *images]
+        self._frames = frames = frames_of(images, options.keep_going)
+        if pairs is None and options.are_told:
+            pairs = image_pairs(frames, options)
+        self.notices = [] if pairs is None else pairs.settled(options.keep_going)
+        self._beside = None if pairs is None else pairs.beside(len(frames))
+        self._first_of = {} if pairs is None else pairs.first_of()
+        every = list(range(len(frames))) if pairs is None else pairs.order(len(frames))
+        self.order = every if order is None else order
+        self.names = [frame.stem for frame in frames]
+        self._paths = output_paths(output, self.names)
+        self._gone = {} if weights_to_come is None else {weights: weights_to_come}
+        carried = read_weights_record(weights) if weights_to_come is None else weights_to_come.record
+        self._settings = carried_config(carried, weights).overridden_by("reconstruction", options)
+        solver = self._settings.reconstruction.solver
+        self._as_particles = solver == "particles"
+        if self._beside is not None and not self._as_particles:
+            raise UsageError(f"--pairing: {solver} takes each frame alone; --solver particles does not")
+        words = other_frames(level, frames, options.mask)
+        self._words = words if self._beside is None else beside_frames(words, frames, self._beside)
+        self._resolved = self._settings.resolved()
+        self.targets = [Target(path, partial(self._record, number)) for number, path in enumerate(self._paths)]
+        with_residuals = self._as_particles and options.residual
+        self.beside = [residual_path(path) for path in self._paths] if with_residuals else []
+        self._ready: _Ready | None = None
+
+    def fault(self, number: int) -> str | None:
+        """Return why a frame's file cannot be read."""
+        return self._frames[number].fault
+
+    def expected(self) -> Expected:
+        """Return the bytes of a volume's voxels and what the solver holds; of particles neither is known."""
+        if self._as_particles:
+            return Expected()
+        path = self._common["weights"]
+        weights = self._prepared.weights(path).weights
+        voxels, pixels = math.prod(weights.padded.shape), math.prod(weights.image_shape)
+        rows = columns_bytes(voxels) if weights.on_demand else unpacked_bytes(path)
+        return Expected(FLOAT_BYTES * math.prod(weights.shape), held_bytes(voxels, pixels) + rows)
+
+    def begin(self, numbers: Sequence[int], console: Console) -> float:
+        """Open the weights, and prepare what all frames share."""
+        options, settings, frames = self._options, self._settings, self._frames
+        if self._as_particles and options.residual:
+            self._ensure_residuals(numbers, console)
+        if not numbers:
+            return 0.0
+        prepared, weights = self._prepared, self._common["weights"]
+        content = prepared.searchable(weights, settings) if self._as_particles else prepared.weights(weights)
+        if not self._as_particles and content.weights.on_demand:
+            console.say(on_demand_told(math.prod(content.weights.padded.shape)))
+        shape = content.image_shape
+        if not self._as_particles:
+            # The weights are in memory by now.
+            ensure_room(held_bytes(math.prod(content.weights.padded.shape), math.prod(shape)), self.label)
+        dark = image_files.read_reference(options.dark, shape) if options.dark else None
+        pitch_px = float(content.camera.micro_image_lattice_px().pitch.max())
+        mask = mask_of(options.mask, frames, shape, pitch_px, options.keep_going)
+        bench = prepared.bench(content, settings, dark, mask)
+        read = reader(self._level, frames, shape, dark, options.keep_going)
+        size, said = None, []
+        if self._as_particles:
+            bench, size = particles.sized(bench, self._looked_at(bench, read))
+            said = size_notices(settings, size)
+            console.warn(said)
+        finder = Finder(bench, read, frames, self._beside, self._first_of, options.keep_going)
+        self._ready = _Ready(bench, Ahead(read, numbers), finder, size, said)
+        if not self._as_particles:
+            return settings.reconstruction.iterations
+        looks = numbers if self._beside is None else {k for number in numbers for k in (number, *self._beside[number])}
+        return particles.STEPS * len(looks) / len(numbers)
+
+    def make(self, number: int, work: Frames) -> Outcome:
+        """Reconstruct a frame, or find its particles, and write them."""
+        ready, name, target = self._begun(), self.names[number], self.targets[number]
+        pictures = ready.ahead(number)
+        check_frame(ready.bench, pictures[0], str(self._frames[number].path))
+        made = target.record
+        notices = file_notices(made, name) + frame_notices(ready.bench, *pictures, name)
+        work.console.warn(notices)
+        if ready.size is None:
+            made = with_warnings(made, notices)
+            return _make_volume(ready.bench, target.path, made, pictures, self._replace, work.advance)
+        frame = particles.frame_of(ready.bench, *pictures)
+        found, alone = ready.finder.find(number, frame, work.advance)
+        work.console.warn(alone)
+        made = with_warnings(made, [*ready.said, *notices, *alone])
+        return self._write_particles(target.path, made, (frame, found, ready.size), work.console)
+
+    def summary(self, worked: Worked[Outcome]) -> dict[str, Any]:
+        """Return what is told of the batch."""
+        outcomes = list(worked.outcomes.values())
+        found = [outcome.particles for outcome in outcomes if outcome.particles is not None]
+        told = {
+            "frames": worked.total(),
+            "reconstructed": len(outcomes),
+            "skipped": worked.skipped,
+            "solver": self._settings.reconstruction.solver,
+            "iterations": None if self._as_particles else self._settings.reconstruction.iterations,
+            "residual": max((outcome.residual for outcome in outcomes), default=None),
+            "excluded_pixels": max((outcome.excluded_pixels for outcome in outcomes), default=None),
+        }
+        counts = {"particles": sum(found), "particles_fewest": min(found)} if found else {}
+        size = next((outcome.tracers for outcome in outcomes), None)
+        return told | counts | (size.summary() if size else {})
+
+    def _record(self, number: int) -> dict[str, Any]:
+        """Return the record that a frame's result will carry."""
+        frame = self._frames[number]
+        if frame.fault is not None:
+            raise InputError(frame.fault)
+        command = f"reconstruct page {frame.page}{self._words(number)}"
+        inputs = {**self._common, "image": frame.path}
+        return record(command, self._resolved, inputs, {"image": frame.time_s}, self._gone)
+
+    def _begun(self) -> _Ready:
+        if self._ready is None:
+            raise RuntimeError("a batch begins before anything of it is made")
+        return self._ready
+
+    def _looked_at(self, bench: Bench, read: Read) -> Iterator[particles.Frame]:
+        """Yield the frames that can be read."""
+        for number in range(len(self._frames)):
+            try:
+                pictures = read(number)
+            except InputError:
+                continue  # it is told where its turn comes
+            yield particles.frame_of(bench, *pictures)
+
+    def _write_particles(
+        self,
+        path: Path,
+        made: Mapping[str, Any],
+        result: tuple[particles.Frame, Particles, TracerSize],
+        console: Console,
+    ) -> Outcome:
+        """Write the particles found behind a frame and, where it is asked for, what they leave of it."""
+        frame, found, size = result
+        points = particles.points_of(self._begun().bench, frame, found, size, made)
+        notices = light_notices(points, path.name)
+        console.warn(notices)
+        if self._options.residual:
+            left = particles.what_is_left(frame, found)
+            # Made again whenever the particles are: an interrupted batch may have left one without them.
+            image_files.write_tiff(residual_path(path), left.astype(np.float32), overwrite=True)
+        told = replace(points, provenance=with_warnings(made, notices))
+        write_points(path, PARTICLES_FORMAT, told, overwrite=self._replace)
+        residual, excluded = points.attributes["residual"], points.attributes["excluded_pixels"]
+        return Outcome(residual, excluded, len(points.position_mm), size)
+
+    def _ensure_residuals(self, numbers: Sequence[int], console: Console) -> None:
+        """Refuse residual images that could not be written; say of how many frames that are complete there is none."""
+        for number in numbers:
+            ensure_writable(residual_path(self._paths[number]), self._replace)
+        coming = set(numbers)
+        without = sum(
+            number not in coming and path.exists() and not residual_path(path).exists()
+            for number, path in enumerate(self._paths)
+        )
+        if without:
+            console.say(f"{without} frames that are complete have no residual image; --overwrite makes both anew")
+
+
+def file_notices(made: Mapping[str, Any], name: str) -> list[Notice]:
+    """Return what is said of a frame whose file was given as something else, too."""
+    other = also_used_as(made, "image")
+    if other is None:
+        return []
+    text = f"the file is also the {other}: it shows no tracers"
+    return [Notice("frame-given-before", name, text, "leave it out of the images, or correct the other")]
+
+
+def _make_volume(
+    bench: Bench,
+    path: Path,
+    made: Mapping[str, Any],
+    pictures: tuple[Image, Image],
+    overwrite: bool,
+    advance: Progress,
+) -> Outcome:
+    """Reconstruct and write the volume of a frame."""
+    volume = volume_of(bench, *pictures, made, advance)
+    told = volume.attributes
+    vtkhdf.write_volume(
+        path,
+        volume.array,
+        volume.grid,
+        volume.reference,
+        provenance=made,
+        attributes=told,
+        overwrite=overwrite,
+    )
+    return Outcome(float(told["residual"][-1]), told["excluded_pixels"])

@@ -1,0 +1,169 @@
+"""`refine-calibration`: images of particles in, the calibration's remaining error and a mended one out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from lfpiv_cli.calibration.model import Calibration
+from lfpiv_cli.console import CONSOLE, Console
+from lfpiv_cli.errors import ConfigError
+from lfpiv_cli.files import images as image_files
+from lfpiv_cli.files.atomic import ensure_apart, ensure_writable
+from lfpiv_cli.files.batch import frames_of
+from lfpiv_cli.files.bench import wave_light_of
+from lfpiv_cli.files.calibration_file import read_calibration, write_calibration
+from lfpiv_cli.files.config import Config, load_config
+from lfpiv_cli.files.inputs import given
+from lfpiv_cli.files.pages import ensure_drawing, write_picture
+from lfpiv_cli.files.provenance import record
+from lfpiv_cli.notice import Notice
+from lfpiv_cli.optics.curved_space import CurvedSpace
+from lfpiv_cli.optics.tracing import ObjectSpace
+from lfpiv_cli.reconstruction.images import Image, light
+from lfpiv_cli.self_calibration.refinement import STEPS, ChannelFlow, Refinement
+from lfpiv_cli.self_calibration.refinement import refine_calibration as refine
+from lfpiv_cli.self_calibration.scene_refinement import (
+    AGREEING_CHI2,
+    STEPS_OF_FIRST,
+    STEPS_OF_OTHER,
+    PipeFlow,
+    SceneRefinement,
+    refine_scene,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+class Refined(NamedTuple):
+    """What was found, the calibration with it, and what draws it."""
+
+    found: Refinement | SceneRefinement
+    calibration: Calibration
+    draw: Callable[[], Figure]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RefineOptions:
+    """What `refine_calibration` takes off the images and what it writes; without `output` it only reports.
+
+    Attributes
+    ----------
+    dark : image taken with the cap on
+    background : image without tracers, in place of the dark one
+    output : mended calibration to write
+    picture : of the particles and the walls that they end at, to write
+    """
+
+    dark: Path | None = None
+    background: Path | None = None
+    output: Path | None = None
+    picture: Path | None = None
+
+
+NO_OPTIONS = RefineOptions()
+
+
+def refine_calibration(
+    config: Path,
+    images: Sequence[Path],
+    calibration: Path,
+    options: RefineOptions = NO_OPTIONS,
+    *,
+    overwrite: bool = False,
+    console: Console = CONSOLE,
+) -> dict[str, Any]:
+    """Find a channel's walls, or a pipe's axis, by the particles, report it, and write the calibration with it."""
+    dark, background, output, picture = options.dark, options.background, options.output, options.picture
+    named = {"image" if k == 0 else f"image_{k + 1}": path for k, path in enumerate(images)}
+    inputs = given(config=config, calibration=calibration, dark=dark, background=background) | named
+    outputs = [path for path in (output, picture) if path is not None]
+    ensure_apart(outputs, inputs.values())
+    for target in outputs:
+        ensure_writable(target, overwrite)
+    if picture:
+        ensure_drawing()
+    before = read_calibration(calibration)
+    told = load_config(config)
+    settings = told.with_scene_of(before)
+    scene = settings.scene_space()
+    if settings.channel is None and scene is None:
+        raise ConfigError(f"{config}: channel: is missing; the walls are known by the channel's width, or by a scene")
+    frames, shape = frames_of(images), settings.image_shape()
+    dark_image, empty = (image_files.read_reference(path, shape) if path else None for path in (dark, background))
+    lit = [light(image_files.read_page(frame.path, frame.page, shape), dark_image, empty) for frame in frames]
+    if scene is None:
+        found, mended, draw = _walls(settings, lit, before, console)
+    else:
+        found, mended, draw = _scene(told, settings, scene, lit, before, console)
+    if output:
+        made_by = record("refine-calibration", told.resolved(), inputs)
+        write_calibration(output, mended, made_by, overwrite)
+    if picture:
+        write_picture(picture, draw(), overwrite)
+    return found.summary()
+
+
+def _walls(settings: Config, lit: Sequence[Image], before: Calibration, console: Console) -> Refined:
+    """Return what tracers tell of a channel."""
+    if settings.channel is None:
+        raise ConfigError(f"{settings.source}: channel: is missing")
+    window = settings.window_model(before.mid_plane_z_mm or 0.0)
+    chosen = settings.reconstruction
+    flow = ChannelFlow(settings.grid(), settings.channel.width_mm, chosen.particle_diameter_mm, wave_light_of(chosen))
+    with console.progress(len(lit) * STEPS + 1, "refine") as advance:
+        found = refine(
+            lit,
+            before,
+            settings.camera_model(),
+            ObjectSpace(settings.media_model(), window, "exact"),
+            flow,
+            advance,
+        )
+
+    def draw() -> Figure:
+        from lfpiv_cli.pictures.walls import walls_figure
+
+        return walls_figure(found)
+
+    return Refined(found, found.applied(before), draw)
+
+
+def _scene(
+    told: Config, settings: Config, scene: CurvedSpace, lit: Sequence[Image], before: Calibration, console: Console
+) -> Refined:
+    """Return what tracers tell of the place of a scene, from where config and calibration have it."""
+    with console.progress(STEPS_OF_FIRST + (len(lit) - 1) * STEPS_OF_OTHER, "refine") as advance:
+        found = refine_scene(
+            lit,
+            before,
+            settings.camera_model(),
+            scene,
+            PipeFlow(settings.grid(), settings.reconstruction.particle_diameter_mm),
+            advance,
+        )
+    if not found.agree:
+        console.warn([disagreement_notice(found)])
+
+    def draw() -> Figure:
+        from lfpiv_cli.pictures.walls import round_wall_figure
+
+        return round_wall_figure(found)
+
+    return Refined(found, found.applied(before, told.scene_fingerprint()), draw)
+
+
+def disagreement_notice(found: SceneRefinement) -> Notice:
+    """Return that the images of the tracers tell of another scene than the wall that they end at."""
+    apart = np.abs(found.by_wall - found.nuisances.scene)[:2].max()
+    text = (
+        f"the tracers' images tell of a pipe whose axis lies {apart:.3f} mm beside that of the wall they end at, more "
+        "than chance explains; the wall is believed"
+    )
+    remedy = "check radii and refractive indices of the scene"
+    return Notice("scene-contradicts", "scene", text, remedy, found.disagreement, f"at most {AGREEING_CHI2:g}")

@@ -1,0 +1,349 @@
+"""`run`: from raw images to vectors, by the stages of the single commands.
+
+In the output folder: `calibration.h5`, `calibration.png`, `weights.h5`; by volumes `volumes/STEM.vtkhdf` and
+`vectors.vtkhdf`; by particles `particles/STEM.vtkhdf`, `tracks.vtkhdf` and `tracks_grid.vtkhdf`; of both together
+`combined.vtkhdf`; of several pairs the folders `vectors`, `tracks` and `combined`. `run.json` says what was chosen,
+why, and what each step told; `report.html` shows all of it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from lfpiv_cli.console import CONSOLE, Console
+from lfpiv_cli.errors import ConfigError, InputError, OutputExistsError, PartialError, UsageError
+from lfpiv_cli.files import images as image_files
+from lfpiv_cli.files.atomic import ensure_writable, without_nan, write_text
+from lfpiv_cli.files.batch import Frame, frames_of, output_paths
+from lfpiv_cli.files.config import Config, load_config
+from lfpiv_cli.files.images import times_of
+from lfpiv_cli.files.inputs import ensure_regular_file, split_part
+from lfpiv_cli.files.pages import ensure_drawing, ensure_pages
+from lfpiv_cli.files.pairing import Pairs
+from lfpiv_cli.files.provenance import sha256
+from lfpiv_cli.files.vtkhdf import open_vectors
+from lfpiv_cli.flow.field import REJECTED, VALID
+from lfpiv_cli.names import FlowMethod
+from lfpiv_cli.notice import written
+from lfpiv_cli.verbs import particles
+from lfpiv_cli.verbs.batches import ALL, Failure
+from lfpiv_cli.verbs.calibrate import ensure_pictures
+from lfpiv_cli.verbs.checks import quality_of, quality_of_all
+from lfpiv_cli.verbs.follow import SEQUENCE_IS_WHOLE
+from lfpiv_cli.verbs.following import SHORTEST, ensure_sequence
+from lfpiv_cli.verbs.frames import STILL, Background, mask_of, other_frames, read_frame, reader
+from lfpiv_cli.verbs.pairs import image_pairs
+from lfpiv_cli.verbs.particles import Prepared
+from lfpiv_cli.verbs.report import ReportOptions, report
+from lfpiv_cli.verbs.run_plan import planned, with_overwrite
+from lfpiv_cli.verbs.run_steps import Chain, RunOptions, Vectors
+from lfpiv_cli.verbs.steps import KEPT, MADE, RECORD, Steps, earlier_run
+from lfpiv_cli.verbs.weights_cost import ensure_volume_fits
+
+# What `run` tells of the vectors of each method, side by side.
+
+
+# A range of displacements leaves out so many percent at either end, where a few are false.
+LEFT_OUT_PERCENT = 5.0
+
+
+def figures_of(fields: Mapping[str, Sequence[Path]]) -> dict[str, dict[str, float | int | None]]:
+    """Return how many vectors each method gives, how good they are and what they range over: figures by method."""
+    by_method = {method: _figures_of(paths) for method, paths in fields.items() if paths}
+    names = next(iter(by_method.values()), {})
+    return {name: {method: figures[name] for method, figures in by_method.items()} for name in names}
+
+
+def _figures_of(paths: Sequence[Path]) -> dict[str, float | int | None]:
+    """Return the figures of a method's fields, which are read one after the other."""
+    qualities, displacements, valid = [], [], 0
+    for path in paths:
+        field = open_vectors(path)
+        qualities.append(quality_of(field))
+        displacements.append(field.displacement_voxel[field.flag < REJECTED])
+        valid += int(np.count_nonzero(field.flag == VALID))
+    quality, moved = quality_of_all(qualities), np.concatenate(displacements)
+    ends = LEFT_OUT_PERCENT, 100.0 - LEFT_OUT_PERCENT
+    low, high = np.percentile(moved, ends, axis=0) if len(moved) else np.full((2, 3), np.nan)
+    sigma = np.median(quality.sigma, axis=0) if len(quality.sigma) else np.full(3, np.nan)
+    told: dict[str, float | int | None] = {"vectors": quality.vectors, "valid": valid}
+    for k, name in enumerate("uvw"):
+        told |= {
+            f"{name}_from_voxel": without_nan(low[k]),
+            f"{name}_to_voxel": without_nan(high[k]),
+            f"{name}_sigma_voxel": without_nan(sigma[k]),
+        }
+    return told
+
+
+REPORT = "report.html"
+
+# Vectors by particles err less than those by volumes up to 1.9 tracers for each microlens, and more from 2.4 on, in the
+# laminar channel of the paper.
+MOST_FOR_PARTICLES = 2.0
+
+
+@dataclass(frozen=True)
+class Choice:
+    """By which methods a flow is measured, and why; the tracers for each microlens where they were counted."""
+
+    methods: tuple[FlowMethod, ...]
+    reason: str
+    tracers_per_lens: float | None = None
+
+    def told(self) -> dict[str, Any]:
+        """Return what is told of it."""
+        method = self.methods[0] if len(self.methods) == 1 else "both"
+        return {"method": method, "reason": self.reason, "tracers_per_lens": self.tracers_per_lens}
+
+
+def run(
+    config: Path, output: Path, options: RunOptions, *, overwrite: bool = False, console: Console = CONSOLE
+) -> dict[str, Any]:
+    """Calibrate, build the weights, and measure the flow in images; what is complete and made alike is kept.
+
+    Raises
+    ------
+    PartialError : frames or pairs failed, and the others were worked on
+    """
+    settings = load_config(config)
+    frames, pairs = _ensure_possible(settings, options)
+    console.warn(pairs.settled(options.keep_going))
+    prepared = Prepared()
+    steps = Steps(output, console, earlier_run(output, overwrite), options.deadline(), options.shard == ALL)
+    chain = Chain(config, options, frames, pairs, steps, prepared, overwrite)
+
+    def choose(weights: Path) -> Choice:
+        return _chosen(settings, options, lambda: _counted(settings, options, weights, frames, prepared, steps))
+
+    def methods(weights: Path) -> tuple[FlowMethod, ...]:
+        return choose(weights).methods
+
+    if not options.dry_run:
+        ensure_volume_fits(settings, options.method in ("volumes", "both"))
+    try:
+        return planned(settings, chain, methods) if options.dry_run else _made(chain, choose, overwrite)
+    except OutputExistsError as error:
+        replacing = Chain(config, options, frames, pairs, steps, prepared, overwrite=True)
+        raise OutputExistsError(f"{error}{with_overwrite(settings, replacing, methods)}") from error
+
+
+def _made(chain: Chain, choose: Callable[[Path], Choice], overwrite: bool) -> dict[str, Any]:
+    """Take all steps; return what is told of them."""
+    steps, options, output = chain.steps, chain.options, chain.steps.output
+    ensure_writable(output / RECORD, overwrite=True)
+    weights = chain.weights()
+    if not chain.share:
+        return _told_of_steps(steps)
+    choice = choose(weights)
+    steps.console.say(f"by {' and '.join(choice.methods)}: {choice.reason}")
+    steps.told.update(choice.told())
+    fields: dict[str, Vectors] = {method: chain.vectors_by(method, weights) for method in choice.methods}
+    if options.combine:
+        fields["combined"] = chain.combined(fields["volumes"], fields["particles"])
+    figures = figures_of({method: list(paths.values()) for method, paths in fields.items()})
+    steps.told["figures"] = figures
+    told = choice.told() | figures
+    if options.report and options.shard == ALL:
+        raw = (
+            *dict.fromkeys(frame.path for frame in chain.frames if frame.fault is None),
+            *options.white,
+            *options.board,
+        )
+        told |= {"verdict": _reported(raw, steps, overwrite).get("verdict"), "report": str(output / REPORT)}
+    steps.write(whole=True)
+    return _ensure_whole(told | _told_of_steps(steps), chain.failures, options.failures)
+
+
+def _told_of_steps(steps: Steps) -> dict[str, Any]:
+    """Return what is told of a run's steps."""
+    return {"steps_made": steps.count(MADE), "steps_kept": steps.count(KEPT), "folder": str(steps.output)}
+
+
+def _ensure_whole(told: dict[str, Any], failures: Sequence[Failure], listed: Path | None) -> dict[str, Any]:
+    """Return what is told of a run in which nothing failed; list what did, where it is asked for.
+
+    Raises
+    ------
+    PartialError : something did
+    """
+    # By both methods a frame fails twice.
+    records = [asdict(failure) for failure in dict.fromkeys(failures)]
+    if listed is not None:
+        write_text(listed, json.dumps(records, indent=2, ensure_ascii=False) + "\n", overwrite=True)
+    if failures:
+        first = f"{failures[0].name}: {failures[0].error}"
+        raise PartialError(f"{len(records)} frames or pairs failed, the first {first}", told | {"failures": records})
+    return told
+
+
+def _reported(raw: Sequence[Path], steps: Steps, overwrite: bool) -> dict[str, Any]:
+    """Make the page of all that the folder holds, where a step has made anything; return what it tells."""
+    page = steps.output / REPORT
+    is_kept = page.exists() and not steps.count(MADE)
+
+    def make() -> dict[str, Any]:
+        if is_kept:
+            return {}
+        replacing = overwrite or bool(steps.earlier)
+        return report(steps.output, page, ReportOptions(raw=raw), overwrite=replacing, console=steps.console)
+
+    return steps.take("report", [page], make)
+
+
+def _ensure_possible(settings: Config, options: RunOptions) -> tuple[list[Frame], Pairs]:
+    """Return the frames of the flow and their pairs, after all that can be known to be wrong has been asked for."""
+    _ensure_settings(settings, options)
+    _ensure_methods(settings, options)
+    ensure_drawing()
+    if options.report:
+        ensure_pages()
+    ensure_pictures(len(options.white), len(options.board), len(options.depth_mm))
+    for path in (*options.white, *options.board):
+        ensure_regular_file(split_part(path)[0])
+    mask = None if options.mask in (None, STILL) else Path(options.mask)
+    for path in filter(None, (options.dark, Background.parse(options.background).path, mask)):
+        image_files.read_reference(path, settings.image_shape())
+    frames = frames_of(options.images, options.keep_going)
+    if options.follow:
+        ensure_sequence(len(frames), SHORTEST)
+        pairs = Pairs(tuple(pairwise(range(len(frames)))), separate=False)
+    else:
+        pairs = image_pairs(frames, options)
+        pairs.settled(options.keep_going)
+    output_paths(Path(), [frame.stem for frame in frames])
+    if options.failures is not None:
+        ensure_writable(options.failures, overwrite=True)
+    _first_readable(frames, settings.image_shape(), options.keep_going)
+    if not options.keep_going:
+        image_files.ensure_shape(dict.fromkeys(frame.path for frame in frames), settings.image_shape())
+    return frames, pairs
+
+
+def _first_readable(frames: Sequence[Frame], shape: tuple[int, int], keep_going: bool) -> int:
+    """Return the number of the first frame; of those that can be read, where the others are to go on.
+
+    Raises
+    ------
+    InputError : it cannot be read, or none can
+    """
+    for number, frame in enumerate(frames):
+        try:
+            read_frame(frame, shape)
+        except InputError:
+            if not keep_going or number == len(frames) - 1:
+                raise
+        else:
+            return number
+    raise InputError("no images were given")
+
+
+def _tell_times(images: Sequence[Path], keep_going: bool) -> bool:
+    """Return whether the recordings of the frames say when each was taken, of those that can be read.
+
+    Raises
+    ------
+    InputError : one cannot be read, and the others are not to go on
+    """
+    told = []
+    for path in images:
+        try:
+            told.append(times_of(path) is not None)
+        except InputError:
+            if not keep_going:
+                raise
+    return bool(told) and all(told)
+
+
+def _ensure_settings(settings: Config, options: RunOptions) -> None:
+    """Raise where the config lacks what a later step needs."""
+    is_stated = options.dt_s is not None or settings.correlation.dt_s is not None
+    if not is_stated and not _tell_times(options.images, options.keep_going):
+        raise ConfigError(
+            f"{settings.source}: correlation.dt_s: is missing, and velocities need it; give it there, or --dt-s"
+        )
+    settings.camera_model()
+    settings.grid()
+    if options.board:
+        settings.rig()
+    if settings.weights.method != "dlfc" and settings.channel is None:
+        settings.object_space()
+
+
+def _ensure_methods(settings: Config, options: RunOptions) -> None:
+    """Raise where the methods that are asked for contradict the config or other options."""
+    by_volumes, by_particles = (options.method in (method, "both") for method in ("volumes", "particles"))
+    if options.combine and options.method != "both":
+        raise UsageError("--combine needs --method both")
+    if options.follow and options.method == "volumes":
+        raise UsageError("--follow finds particles, but --method is volumes")
+    if options.follow and options.shard != ALL:
+        raise UsageError(SEQUENCE_IS_WHOLE)
+    if options.follow and options.combine:
+        raise UsageError("--follow gives tracks, and --combine needs vectors")
+    if by_volumes and settings.reconstruction.solver == "particles":
+        raise ConfigError(f"{settings.source}: reconstruction.solver: is particles; volumes need another one")
+    if settings.weights.method == "dlfc" and (options.follow or by_particles):
+        raise ConfigError(f"{settings.source}: weights.method: is dlfc, but particles are fitted with traced rays")
+
+
+def _chosen(settings: Config, options: RunOptions, count_tracers: Callable[[], float | None]) -> Choice:
+    """Return by which methods the flow is measured: those asked for, or what errs less with so many tracers."""
+    if settings.weights.method == "dlfc":
+        return Choice(("volumes",), "weights.method is dlfc, whose fitted rays particles cannot be fitted with")
+    count = count_tracers()
+    asked: FlowMethod | None = "particles" if options.follow else None
+    if options.method == "both":
+        return Choice(("volumes", "particles"), "as --method asks for", count)
+    if options.method != "auto":
+        asked = options.method
+    elif settings.reconstruction.solver == "particles":
+        return Choice(("particles",), "reconstruction.solver is particles", count)
+    if count is None:
+        return Choice((asked or "particles",), "too little is seen of the volume to count tracers by their light")
+    better: FlowMethod = "particles" if count <= MOST_FOR_PARTICLES else "volumes"
+    side = "up to" if better == "particles" else "beyond"
+    reason = (
+        f"{written(count, 2)} tracers for each microlens, and {better} err less {side} about {MOST_FOR_PARTICLES:g}"
+    )
+    if asked is None or asked == better:
+        return Choice((better,), reason, count)
+    return Choice((asked,), f"as asked for; but there are {reason}", count)
+
+
+def _counted(
+    settings: Config, options: RunOptions, weights: Path, frames: Sequence[Frame], prepared: Prepared, steps: Steps
+) -> float | None:
+    """Return how many tracers for each microlens the first image holds, as the run before has counted if it could."""
+    shape, level = settings.image_shape(), Background.parse(options.background)
+    first = _first_readable(frames, shape, options.keep_going)
+    files = (weights, frames[first].path, *filter(None, (options.dark, level.path)))
+    mask = "" if options.mask in (None, STILL) else sha256(Path(str(options.mask)))
+    words = other_frames(level, frames)(first)
+    counted_from = " ".join([*map(sha256, files), str(frames[first].page), mask, words])
+    steps.told["counted_from"] = hashlib.sha256(counted_from.encode()).hexdigest()
+    if steps.earlier.get("counted_from") == steps.told["counted_from"] and "tracers_per_lens" in steps.earlier:
+        return cast("float | None", steps.earlier["tracers_per_lens"])
+    return _tracers_per_lens(settings, options, weights, frames, first, prepared)
+
+
+def _tracers_per_lens(
+    settings: Config, options: RunOptions, weights: Path, frames: Sequence[Frame], first: int, prepared: Prepared
+) -> float | None:
+    """Return how many tracers for each microlens an image holds."""
+    content = prepared.searchable(weights, settings)
+    shape, level = content.image_shape, Background.parse(options.background)
+    dark = image_files.read_reference(options.dark, shape) if options.dark else None
+    # What stands still would take a look at every image, and a pair hardly shows it better than one counts without.
+    mask = None if options.mask == STILL else mask_of(options.mask, frames, shape, 0.0)
+    bench = prepared.bench(content, settings, dark, mask)
+    read = reader(level, frames, shape, dark, options.keep_going)
+    return particles.tracers_per_lens(bench, particles.frame_of(bench, *read(first)))

@@ -1,0 +1,211 @@
+"""The tracers' size as it is given or seen, and what speaks against it and against the particles found."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lfpiv_cli.files.config import Config
+from lfpiv_cli.files.particle_file import Points
+from lfpiv_cli.notice import Notice, written
+from lfpiv_cli.particles.diameter import LIMIT_SIGMAS
+from lfpiv_cli.particles.diffusion import USUAL_SIGMA_PX
+from lfpiv_cli.particles.light_errors import MUCH_LEFT
+
+# More than this share of an image's light, its noise taken off, is too much to leave unexplained.
+LARGEST_UNEXPLAINED = 0.2
+# At so many found for each microlens, fewer than there are, stated errors begin to cover less than four fifths.
+LARGEST_CROWD = 1.3
+# Microlenses whose focal length is off by a larger share are told: depths are off by some three stated errors for each
+# per cent. Good ones seem up to 0.002 off, and more the more light is left.
+LARGEST_FOCUS_ERROR = 0.005
+# Beyond so many standard errors what is seen is not by chance.
+CERTAIN_SIGMAS = 5.0
+# Beyond so many standard errors a given diameter contradicts the images.
+CONTRADICTING_SIGMAS = 4.0
+
+
+@dataclass(frozen=True)
+class Diffusion:
+    """The sensor's charge diffusion.
+
+    Attributes
+    ----------
+    px : that particles are fitted with by waves
+    measured_px, sigma_px : by the tracers' images, and its standard error; None where no image shows it
+    given : whether it is given
+    told : whether the images tell it, not what is usual
+    """
+
+    px: float
+    measured_px: float | None = None
+    sigma_px: float | None = None
+    given: bool = False
+    told: bool = False
+
+    def attributes(self) -> dict[str, float]:
+        """Return what files say of it: its standard error where it is not given."""
+        usual = USUAL_SIGMA_PX if self.sigma_px is None else self.sigma_px
+        return {"diffusion_px": self.px} | ({} if self.given else {"diffusion_sigma_px": usual})
+
+    def summary(self) -> dict[str, float | None]:
+        """Return what is told of it; None where it is not known."""
+        return {
+            "diffusion_px": self.px,
+            "diffusion_measured_px": self.measured_px,
+            "diffusion_sigma_px": self.sigma_px,
+        }
+
+
+@dataclass(frozen=True)
+class TracerSize:
+    """The tracers' diameter.
+
+    Attributes
+    ----------
+    diameter_mm : that they are fitted with
+    measured_mm, sigma_mm : by their images, and its standard error; None where no image shows it
+    resolved : whether more than an upper limit is known by the images
+    diffusion : by waves, how far charge diffuses in the sensor
+    """
+
+    diameter_mm: float
+    measured_mm: float | None = None
+    sigma_mm: float | None = None
+    resolved: bool = False
+    diffusion: Diffusion | None = None
+
+    @property
+    def at_most_mm(self) -> float | None:
+        """What it is not above, by the images."""
+        if self.measured_mm is None or self.sigma_mm is None:
+            return None
+        return self.measured_mm + LIMIT_SIGMAS * self.sigma_mm
+
+    def attributes(self) -> dict[str, float]:
+        """Return what files say of it: its standard error where it is by the images."""
+        told = {"particle_diameter_mm": self.diameter_mm}
+        if self.sigma_mm is not None and self.diameter_mm == self.measured_mm:
+            told["particle_diameter_sigma_mm"] = self.sigma_mm
+        return told | (self.diffusion.attributes() if self.diffusion else {})
+
+    def summary(self) -> dict[str, float | None]:
+        """Return what is told of it; None where it is not known."""
+        return {
+            "particle_diameter_mm": self.diameter_mm,
+            "particle_diameter_measured_mm": self.measured_mm,
+            "particle_diameter_sigma_mm": self.sigma_mm,
+        } | (self.diffusion.summary() if self.diffusion else {})
+
+
+def size_notices(settings: Config, size: TracerSize) -> list[Notice]:
+    """Return where what is given of diameter and diffusion contradicts the images, or where they do not tell it."""
+    return _diameter_notices(settings, size) + ([] if size.diffusion is None else _diffusion_notices(size.diffusion))
+
+
+def _diffusion_notices(found: Diffusion) -> list[Notice]:
+    """Return where a given diffusion contradicts the images, or where they do not tell it."""
+    key = "reconstruction.diffusion_px"
+    if found.measured_px is None or found.sigma_px is None or not found.told:
+        text = f"the images do not tell how far charge diffuses: {written(found.px)} px is taken"
+        remedy = "give it, or tracers that stand alone at several depths"
+        return [] if found.given else [Notice("diffusion-unknown", key, text, remedy, found.sigma_px, None)]
+    if found.given and abs(found.px - found.measured_px) > CONTRADICTING_SIGMAS * found.sigma_px:
+        text = (
+            f"{found.px:g} px, but by the images it is {written(found.measured_px)} ± {written(found.sigma_px, 2)} px"
+        )
+        remedy = "leave it out, and it is taken from the images; or check wavelength_nm and calibration"
+        return [Notice("diffusion", key, text, remedy, found.px, f"{written(found.measured_px)} px")]
+    return []
+
+
+def _diameter_notices(settings: Config, size: TracerSize) -> list[Notice]:
+    given, key = settings.reconstruction.particle_diameter_mm, "reconstruction.particle_diameter_mm"
+    if size.measured_mm is None or size.sigma_mm is None:
+        if given is not None:
+            return []
+        text = (
+            "too few tracers stand alone for the images to show their size; "
+            f"{written(size.diameter_mm)} mm is taken, half a microlens in the scene"
+        )
+        return [Notice("particle-diameter-unknown", key, text, "give it", None, "tracers that stand alone")]
+    if given is not None and abs(given - size.measured_mm) > CONTRADICTING_SIGMAS * size.sigma_mm:
+        text = f"{given:g} mm, but by the images it is {written(size.measured_mm)} ± {written(size.sigma_mm, 2)} mm"
+        remedy = "leave it out, and it is taken from the images; or check calibration and focus"
+        return [Notice("particle-diameter", key, text, remedy, given, f"{written(size.measured_mm)} mm")]
+    if given is None and not size.resolved and (at_most_mm := size.at_most_mm) is not None:
+        text = f"tracers are smaller than the images show: at most {written(at_most_mm, 2)} mm"
+        return [Notice("particle-diameter-limit", key, text, "give it, if it is known", at_most_mm, None)]
+    return []
+
+
+def light_notices(points: Points, name: str) -> list[Notice]:
+    """Return where none were found, where they crowd, or leave more of the image's light than noise makes."""
+    measured = points.attributes
+    noise_share = measured["read_noise_counts"] / max(measured["residual_rms_counts"], measured["read_noise_counts"])
+    unexplained = measured["residual"] * float(np.sqrt(1.0 - min(noise_share, 1.0) ** 2))
+    count, notices = len(points.position_mm), []
+    if unexplained > LARGEST_UNEXPLAINED:
+        notices.append(
+            Notice(
+                "light-unexplained",
+                name,
+                f"{count or 'no'} particles found, and {unexplained:.0%} of the light is not explained by them, at "
+                f"most {LARGEST_UNEXPLAINED:.0%} of a good image's",
+                "check the calibration (refine-calibration), particle_diameter_mm, --dark, --background and the volume",
+                unexplained,
+                f"at most {LARGEST_UNEXPLAINED:g}",
+            )
+        )
+    elif unexplained > MUCH_LEFT:
+        notices.append(
+            Notice(
+                "light-model",
+                name,
+                f"{unexplained:.0%} of the light is not that of the particles found by {measured['light']}, at most "
+                f"{MUCH_LEFT:.0%} where the model is right and few are missing: stated errors may be too small",
+                "give reconstruction.wavelength_nm, as lenses diffract"
+                if measured["light"] == "rays"
+                else "check the calibration, wavelength_nm and diffusion_px",
+                unexplained,
+                f"at most {MUCH_LEFT:g}",
+            )
+        )
+    found = measured["particles_per_lens"]
+    crowd = max(found, measured.get("tracers_per_lens", 0.0))
+    if crowd > LARGEST_CROWD:
+        counted = (
+            f", {written(found)} found of {written(crowd)} by how unevenly they light them" if crowd > found else ""
+        )
+        notices.append(
+            Notice(
+                "particles-crowded",
+                name,
+                f"{written(crowd)} particles for each microlens{counted}, at most {LARGEST_CROWD:g}: beyond, "
+                "neighbours are taken for one another, and standard errors do not know of it",
+                "fewer tracers, or volumes and their correlation; --background, where other light is in the image",
+                crowd,
+                f"at most {LARGEST_CROWD:g}",
+            )
+        )
+    off, largest = measured.get("microlens_focus", 0.0), LARGEST_FOCUS_ERROR * max(unexplained / MUCH_LEFT, 1.0)
+    if abs(off) > max(largest, CERTAIN_SIGMAS * measured.get("microlens_focus_sigma", 0.0)):
+        least = "at least " if measured.get("light") == "waves" else ""
+        notices.append(
+            Notice(
+                "microlens-focus",
+                name,
+                f"by the tracers' light under single microlenses their focal length is {least}{abs(off):.1%} "
+                f"{'longer' if off > 0.0 else 'shorter'} than the rig says, at most {largest:.1%} of a good one, or "
+                "microlens_distance_mm is as much off the other way: depths are off, and stated errors too small",
+                f"microlenses.focal_length_mm {written(1.0 + off, 4)} times as large, and build the weights again "
+                "until it stays",
+                off,
+                f"within {largest:g}",
+            )
+        )
+    if not count and not notices:
+        text = "no particles found: nothing stands out of the noise"
+        notices.append(Notice("no-particles", name, text, "check exposure, --dark and --mask", 0.0, "some"))
+    return notices

@@ -1,0 +1,331 @@
+"""`track`: particles followed from frame to frame, and their vectors on a grid."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, overload
+
+import numpy as np
+
+from lfpiv_cli.console import CONSOLE, Console, Frames
+from lfpiv_cli.files import vtkhdf
+from lfpiv_cli.files.batch import Target, output_paths
+from lfpiv_cli.files.config import Config
+from lfpiv_cli.files.hdf5 import fault_of
+from lfpiv_cli.files.inputs import given
+from lfpiv_cli.files.pairing import Pairs
+from lfpiv_cli.files.particle_file import (
+    PARTICLES_FORMAT,
+    TRAJECTORIES_FORMAT,
+    PointRows,
+    Points,
+    StoredTracks,
+    TrackStore,
+    read_points,
+    read_tracks,
+    write_points,
+)
+from lfpiv_cli.files.provenance import carried_record, record, with_warnings
+from lfpiv_cli.flow.field import REJECTED, VectorField
+from lfpiv_cli.names import GridMethod
+from lfpiv_cli.reference import Reference
+from lfpiv_cli.tracks.candidates import Seen, Trajectories
+from lfpiv_cli.tracks.sequences import HALVES_FRAMES
+from lfpiv_cli.verbs.batches import Worked, dry_run, work_through
+from lfpiv_cli.verbs.checks import (
+    Quality,
+    calibration_notices,
+    few_notices,
+    field_notices,
+    quality_of,
+    quality_of_all,
+)
+from lfpiv_cli.verbs.fields import fields_of
+from lfpiv_cli.verbs.frames import dt_notices
+from lfpiv_cli.verbs.pairs import PairBatch, PairBatchOptions, sequence_of
+from lfpiv_cli.verbs.tracks import (
+    Tracking,
+    TracksOf,
+    ensure_frames,
+    ensure_particles,
+    seen_in,
+    settings_of,
+    tracked,
+    tracking_of,
+    tracks_through,
+)
+
+# The tracks of a sequence as they are put together: on a disk, with the last few frames in memory.
+
+
+# States look at so many frames, one after the other; forecasts at fewer.
+KEPT_FRAMES = 2 * max(HALVES_FRAMES) + 1
+
+
+class SeenFrames(Sequence[Seen]):
+    """The particles of a sequence's frames, read when they are asked for; the last few stay in memory."""
+
+    def __init__(self, count: int, read: Callable[[int], Points]) -> None:
+        """Take how many frames there are, and what reads one."""
+        self._count, self._read = count, read
+        self._kept: OrderedDict[int, Seen] = OrderedDict()
+        self._counts: dict[int, int] = {}
+
+    def __len__(self) -> int:
+        """Return how many frames there are."""
+        return self._count
+
+    @overload
+    def __getitem__(self, number: int) -> Seen: ...
+
+    @overload
+    def __getitem__(self, number: slice) -> list[Seen]: ...
+
+    def __getitem__(self, number: int | slice) -> Seen | list[Seen]:
+        """Return the particles of a frame."""
+        if isinstance(number, slice):
+            return [self[each] for each in range(self._count)[number]]
+        if number not in self._kept:
+            self._kept[number] = seen_in(self._read(range(self._count)[number]))
+            self._counts[number] = len(self._kept[number])
+            if len(self._kept) > KEPT_FRAMES:
+                self._kept.popitem(last=False)
+        return self._kept[number]
+
+    def particles(self, number: int) -> int:
+        """Return how many particles a frame has."""
+        return self._counts[number] if number in self._counts else len(self[number])
+
+
+@contextmanager
+def stored_tracks(
+    frames: SeenFrames,
+    reference: Reference,
+    settings: Config,
+    chosen: Tracking,
+    provenance: Mapping[str, Any],
+    folder: Path,
+    found: Trajectories | None = None,
+) -> Iterator[TracksOf[StoredTracks]]:
+    """Yield the tracks of a sequence, whose places lie in a folder for as long; as `tracked` in memory.
+
+    Raises
+    ------
+    OutputError : there is no room in the folder
+    """
+    sequence = tracks_through(frames, chosen, found)
+    with TrackStore(folder) as store:
+        for number in range(len(frames)):
+            store.put(sequence.at(number))
+        points = StoredTracks(store, reference, chosen.attributes(reference), dict(provenance))
+        yield TracksOf(points, TRAJECTORIES_FORMAT, sequence.paths, sequence.summary(), settings)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackOptions(PairBatchOptions):
+    """What `track_particles` is given besides the particles; where nothing says pairs, they are one sequence.
+
+    Attributes
+    ----------
+    dt_s : time from one frame to the next, in place of the config's
+    search_voxel : displacements are sought up to this along each axis, six microlenses in the scene where None
+    shortest : fewest frames of a track in a sequence, three where None
+    grid : vectors on the grid of the correlation windows, too
+    by : local polynomials (kriging in rough flows), or one spline field as of `field`, for the grid
+    """
+
+    dt_s: float | None = None
+    search_voxel: float | None = None
+    shortest: int | None = None
+    grid: bool = False
+    by: GridMethod = "polynomials"
+
+
+NO_OPTIONS = TrackOptions()
+
+
+def track_particles(
+    particles: Sequence[Path],
+    output: Path,
+    options: TrackOptions = NO_OPTIONS,
+    *,
+    overwrite: bool = False,
+    console: Console = CONSOLE,
+    pairs: Pairs | None = None,
+) -> dict[str, Any]:
+    """Follow particles from frame to frame, in pairs or over a sequence; `pairs`, where they are known already."""
+    batch = Tracks(particles, output, options, overwrite, pairs)
+    if options.dry_run:
+        return dry_run(batch, options, console)
+    worked = work_through(batch, options, console)
+    return worked.ensure_whole(batch.summary(worked), batch.unit)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What is told of tracks: their figures, and how good the vectors of each interval are."""
+
+    figures: dict[str, Any]
+    qualities: Sequence[Quality]
+    rejected: int
+
+
+class Tracks(PairBatch[Outcome, TrackOptions]):
+    """The batch of `track`: the tracks of each pair of files of particles, or those through all of them."""
+
+    label = "track"
+
+    def _arrange(self, files: Sequence[Path], output: Path, pairs: Pairs | None) -> None:
+        options = self._options
+        in_pairs = pairs is not None or (options.are_told and options.pairing != "sequence")
+        self.unit = "pair" if in_pairs else "sequence"
+        groups: Sequence[tuple[Path, ...]]
+        if in_pairs:
+            groups = self._paired(files, pairs)
+            paths = output_paths(output, [group[0].stem for group in groups])
+        else:
+            order, self.notices = sequence_of(files)
+            groups, paths = [tuple(files[number] for number in order)], [output]
+        ensure_frames(len(groups[0]), options.shortest)
+        self._groups = groups
+        grids = [grid_paths(path, len(groups[0]) - 1) if options.grid else [] for path in paths]
+        self.targets = [
+            Target(path, partial(self._record, number), beside)
+            for number, (path, beside) in enumerate(zip(paths, grids, strict=True))
+        ]
+
+    def fault(self, number: int) -> str | None:
+        """Return why particles of a result cannot be opened."""
+        return fault_of(self._groups[number])
+
+    def make(self, number: int, work: Frames) -> Outcome:
+        """Follow the particles of a pair, or of all frames; write tracks, and vectors where they are asked for."""
+        target, paths = self.targets[number], self._groups[number]
+        names = [str(path) for path in paths]
+        # A pair is read once; of a sequence all that is kept of a frame is its record.
+        read = lru_cache(maxsize=2)(partial(read_points, format_name=PARTICLES_FORMAT))
+        counts, records = zip(*((frame.count, frame.provenance) for frame in map(read, paths)), strict=True)
+        ensure_particles(counts, names)
+        settings = settings_of(records, names, self._options.dt_s)
+        chosen = tracking_of(settings, self._options.search_voxel, self._options.shortest, len(paths), names[0])
+        with _tracks(paths, read, settings, chosen, dict(target.record), target.path.parent) as found:
+            told = {
+                f"{role} {path.name}": made for (role, path), made in zip(_roles(paths).items(), records, strict=True)
+            }
+            doubts = dt_notices(chosen.dt_s, pairwise(records), paths[0].name)
+            few = few_notices(counts, [path.name for path in paths], found.summary, found.points)
+            notices = [*doubts, *calibration_notices(told), *few]
+            work.console.warn(notices)
+            provenance = with_warnings(found.points.provenance, notices)
+            # What is complete is skipped: in the place of what is made there is nothing, or something broken.
+            replacing = self.overwrite or self._options.resume
+            points = replace(found.points, provenance=provenance)
+            write_points(target.path, found.format_name, points, overwrite=replacing)
+            fields = found.fields() if self._options.by == "polynomials" else _fitted(found, names[0])
+            qualities, rejected = _write_grids(target.beside, fields, points, replacing, work.console)
+            return Outcome(found.summary | _sigmas(found.points), qualities, rejected)
+
+    def summary(self, worked: Worked[Outcome]) -> dict[str, Any]:
+        """Return what is told of the batch: all figures of a single result, the sums of several."""
+        return summary_of(worked, [target.path for target in self.targets])
+
+    def _record(self, number: int) -> dict[str, Any]:
+        """Return the record that tracks will carry."""
+        options, paths = self._options, self._groups[number]
+        names = [str(path) for path in paths]
+        records = [self._gone[path].record if path in self._gone else carried_record(path) for path in paths]
+        settings = settings_of(records, names, options.dt_s)
+        chosen = tracking_of(settings, options.search_voxel, options.shortest, len(paths), names[0])
+        told = chosen.told() | ({"grid_by": options.by} if options.grid and options.by != "polynomials" else {})
+        return record("track", settings.resolved() | told, _roles(paths), gone=self._gone)
+
+
+def summary_of(worked: Worked[Outcome], paths: Sequence[Path]) -> dict[str, Any]:
+    """Return what is told of so many files of tracks."""
+    outcomes = list(worked.outcomes.values())
+    if len(paths) == 1:
+        told = outcomes[0].figures if outcomes else {"tracks": count_tracks(paths[0]) if paths[0].exists() else 0}
+    else:
+        tracks = sum(outcome.figures["tracks"] for outcome in outcomes)
+        told = {"pairs": len(paths), "skipped": worked.skipped, "tracks": tracks}
+    qualities = [quality for outcome in outcomes for quality in outcome.qualities]
+    if not qualities:
+        return told
+    every = quality_of_all(qualities)
+    rejected = sum(outcome.rejected for outcome in outcomes)
+    return told | {"vectors": every.vectors, "rejected": rejected} | every.summary()
+
+
+def count_tracks(path: Path) -> int:
+    """Return how many tracks a file holds, of two frames or of a sequence."""
+    points = read_tracks(path)
+    number = points.arrays.get("track")
+    return len(points.position_mm) if number is None else len(np.unique(number))
+
+
+def grid_paths(output: Path, intervals: int) -> list[Path]:
+    """Return where the vectors of each interval between frames go, beside the tracks."""
+    names = ["_grid"] if intervals == 1 else [f"_grid_{number:04d}" for number in range(intervals)]
+    return [output.with_name(f"{output.stem}{name}{output.suffix}") for name in names]
+
+
+def _roles(particles: Sequence[Path]) -> dict[str, Path]:
+    """Return files of particles by their role."""
+    if len(particles) == 2:
+        return given(particles_a=particles[0], particles_b=particles[1])
+    return {f"particles_{number:04d}": path for number, path in enumerate(particles)}
+
+
+@contextmanager
+def _tracks(
+    paths: Sequence[Path],
+    read: Callable[[Path], Points],
+    settings: Config,
+    chosen: Tracking,
+    made: dict[str, Any],
+    folder: Path,
+) -> Iterator[TracksOf[Any]]:
+    """Yield the tracks of a pair of files in memory, those of a sequence on a disk; `made` is their provenance."""
+    if chosen.shortest is None:
+        yield tracked([read(path) for path in paths], settings, chosen, made)
+        return
+    frames, reference = SeenFrames(len(paths), lambda number: read(paths[number])), read(paths[0]).reference
+    with stored_tracks(frames, reference, settings, chosen, made, folder) as found:
+        yield found
+
+
+def _sigmas(tracks: PointRows) -> dict[str, Any]:
+    """Return the median of the tracks' standard deviations, and the share of those without one."""
+    known = [sigma[np.isfinite(sigma).all(axis=1)] for sigma in tracks.rows("velocity_sigma")]
+    sigma = np.concatenate(known)
+    return {
+        "velocity_sigma_m_s_median": np.median(sigma, axis=0).tolist() if len(sigma) else None,
+        "tracks_without_uncertainty_share": (tracks.count - len(sigma)) / tracks.count if tracks.count else None,
+    }
+
+
+def _fitted(found: TracksOf[Any], name: str) -> Iterator[VectorField]:
+    """Yield the vectors of a field fitted to the tracks of each interval."""
+    return (each.vectors() for each in fields_of(found, name))
+
+
+def _write_grids(
+    grids: Sequence[Path], fields: Iterable[VectorField], tracks: PointRows, overwrite: bool, console: Console
+) -> tuple[list[Quality], int]:
+    """Write the vectors of each interval; return how good they are, and how many are rejected."""
+    qualities, rejected = [], 0
+    for target, field in zip(grids, fields if grids else (), strict=True):
+        quality = quality_of(field)
+        notices = list(field_notices(quality, target.name))
+        console.warn(notices)
+        made = with_warnings(tracks.provenance, notices)
+        vtkhdf.write_vectors(target, field, tracks.reference, provenance=made, overwrite=overwrite)
+        qualities.append(quality)
+        rejected += int(np.count_nonzero(field.flag >= REJECTED))
+    return qualities, rejected

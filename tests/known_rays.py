@@ -1,0 +1,107 @@
+"""Rays followed in other ways than the package does, to compare with."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.curved_space import CurvedSpace
+from lfpiv_cli.optics.media import (
+    Media,
+    Window,
+    equivalent_object_distance,
+    fluid_path_to_focus,
+    object_space_matrix,
+)
+from lfpiv_cli.optics.ray_bundles import in_fluid, refracted, trace_in
+from lfpiv_cli.optics.shapes import Vector, dot, plus, scaled
+from lfpiv_cli.optics.surfaces import Faces, meet
+from lfpiv_cli.optics.tracing import exact_slope
+from lfpiv_cli.simd.faces import ROUNDING_MM
+
+
+def slopes_equivalent(
+    points: NDArray[np.float64], lens: NDArray[np.float64], camera: Camera, media: Media
+) -> NDArray[np.float64]:
+    """Return the slopes (n, 2) at the main lens of the rays from the points' equivalents in air (Eqs. 6, 9, 10)."""
+    distance = equivalent_object_distance(points[:, 2], camera.focus_distance_mm, media)
+    return (lens - points[:, :2]) / distance[:, np.newaxis]
+
+
+def slopes_direct(
+    points: NDArray[np.float64], lens: NDArray[np.float64], camera: Camera, media: Media, window: Window
+) -> NDArray[np.float64]:
+    """Return the slopes (n, 2) at the main lens of rays traced through window and fluid, paraxially (Eqs. 14, 15)."""
+    slopes = np.empty_like(lens)
+    for i, (point, crossing) in enumerate(zip(points, lens, strict=True)):
+        matrix = object_space_matrix(point[2], window, camera.focus_distance_mm, media)
+        start = (crossing - matrix[0, 0] * point[:2]) / matrix[0, 1]
+        slopes[i] = matrix[1, 0] * point[:2] + matrix[1, 1] * start
+    return slopes
+
+
+def slopes_exact(
+    points: NDArray[np.float64], lens: NDArray[np.float64], camera: Camera, media: Media, window: Window
+) -> NDArray[np.float64]:
+    """Return the slopes (n, 2) at the main lens of rays refracted by Snell's law at the window's two faces (Eq. 4)."""
+    path = fluid_path_to_focus(window, camera.focus_distance_mm, media)
+    indices = np.array([media.air, media.window, media.fluid])
+    slopes = np.empty_like(lens)
+    for i, (point, crossing) in enumerate(zip(points, lens, strict=True)):
+        layers = np.array([window.distance_mm, window.thickness_mm, path + point[2]])
+        slopes[i] = exact_slope(crossing[0] - point[0], crossing[1] - point[1], layers, indices)
+    return slopes
+
+
+def rays_from_air(
+    space: CurvedSpace, camera: Camera, crossing_mm: ArrayLike, slopes: ArrayLike, z_mm: ArrayLike
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Follow rays from the lens (n, 2) with slopes (n, 2) there to a depth in the fluid.
+
+    Returns places (n, 2), and (n,) whether the ray is there and in the fluid; NaN where it misses a face.
+    """
+    faces, crossing = space.for_kernels(camera), np.asarray(crossing_mm, dtype=np.float64).reshape(-1, 2)
+    slopes, depth = np.asarray(slopes, dtype=np.float64).reshape(-1, 2), np.broadcast_to(z_mm, len(crossing))
+    found = [trace_in(faces, *crossing[i], *slopes[i], float(depth[i])) for i in range(len(crossing))]
+    return np.array([each[:2] for each in found]).reshape(-1, 2), np.array([each[2] for each in found], np.bool_)
+
+
+def rays_to_air(
+    space: CurvedSpace, camera: Camera, points_mm: ArrayLike, directions: ArrayLike
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+    """Follow rays from points (n, 3) in directions (n, 3), towards the camera, to the main lens.
+
+    Returns where they cross it (n, 2), their slopes there (n, 2), and (n,) whether they do; NaN where not.
+    """
+    faces, points = space.for_kernels(camera), np.asarray(points_mm, dtype=np.float64).reshape(-1, 3)
+    towards = np.asarray(directions, dtype=np.float64).reshape(-1, 3)
+    found = [trace_out(faces, tuple(p), tuple(d)) for p, d in zip(points, towards, strict=True)]
+    numbers = np.array([each[:4] for each in found]).reshape(-1, 4)
+    return numbers[:, :2], numbers[:, 2:], np.array([each[4] for each in found], np.bool_)
+
+
+@njit
+def trace_out(faces: Faces, point: Vector, direction: Vector) -> tuple[float, float, float, float, bool]:
+    """Return where a ray from the fluid crosses the main lens: X, Y, its slopes there, and whether it does.
+
+    Parameters
+    ----------
+    point : where it starts
+    direction : towards the camera, of any length
+    """
+    if not (direction[2] < 0.0 and in_fluid(faces, point)):
+        return np.nan, np.nan, np.nan, np.nan, False
+    direction = scaled(-1.0 / np.sqrt(dot(direction, direction)), direction)
+    for k in range(faces.ratios.size - 1, -1, -1):
+        path, normal, cosine = meet(faces, k, point, direction)
+        if cosine == 0.0 or path > ROUNDING_MM:
+            return np.nan, np.nan, np.nan, np.nan, False
+        point = plus(point, path, direction)
+        direction, cosine = refracted(direction, normal, cosine, 1.0 / faces.ratios[k])
+        if cosine == 0.0 or direction[2] <= 0.0:
+            return np.nan, np.nan, np.nan, np.nan, False
+    path = (faces.lens_z_mm - point[2]) / direction[2]
+    point = plus(point, path, direction)
+    return point[0], point[1], -direction[0] / direction[2], -direction[1] / direction[2], path < 0.0
