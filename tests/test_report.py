@@ -164,7 +164,7 @@ def test_of_all_but_the_best_vectors_a_few_figures_are_drawn(
     monkeypatch.setattr(stage, "figures_of", figures_of)
     drawn: list[str] = []
     monkeypatch.setattr(stage.Drawer, "_drawn", lambda _self, caption, _figure: drawn.append(caption.split(":")[0]))
-    monkeypatch.setattr(stage, "write_page", lambda *_given: None)
+    monkeypatch.setattr(stage, "write_pages", lambda *_given: None)
     report(results, tmp_path / "page.html", console=QUIET)
     assert drawn.count("grid.vtkhdf") > 5
     assert drawn.count("vectors.vtkhdf") == 3

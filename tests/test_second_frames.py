@@ -16,7 +16,6 @@ from lfpiv_cli.particles.neighbour_frames import Predicted, beyond_doubt, predic
 from lfpiv_cli.particles.rounds import first_pass
 from lfpiv_cli.scale import Scale
 from lfpiv_cli.verbs import particles as particles_interface
-from lfpiv_cli.verbs import reconstruct
 from lfpiv_cli.verbs.particles import STEPS, Finder
 from tests.particle_images import found, task_with
 
@@ -110,7 +109,7 @@ def test_the_order_of_a_pairs_frames_does_not_matter(order: tuple[int, ...], mon
     monkeypatch.setattr(particles_interface, "find_first", first_of)
     monkeypatch.setattr(particles_interface, "find_second", second_of)
     monkeypatch.setattr(particles_interface, "find_beside", lambda bench, frame, own, beside: (own, beside))
-    monkeypatch.setattr(reconstruct, "check_frame", lambda bench, raw, name: None)
+    monkeypatch.setattr(particles_interface, "check_frame", lambda bench, raw, name: None)
     frames = [Frame(Path(f"{number}.tif"), 0, 1) for number in range(4)]
 
     def finder(beside: list[tuple[int, ...]], first_of: dict[int, int]) -> Finder:
