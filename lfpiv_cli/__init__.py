@@ -48,13 +48,13 @@ if TYPE_CHECKING:
     from lfpiv_cli.files.weights_file import open_weights
     from lfpiv_cli.flow.combining import combine
     from lfpiv_cli.notice import LfpivWarning
-    from lfpiv_cli.verbs import load_rig, open_calibration, open_particles, open_tracks, read_image
     from lfpiv_cli.verbs.build_weights import build_weights
     from lfpiv_cli.verbs.calibrate import calibrate
     from lfpiv_cli.verbs.correlate import correlate
     from lfpiv_cli.verbs.fields import fit_field
     from lfpiv_cli.verbs.following import follow
     from lfpiv_cli.verbs.particles import find_particles
+    from lfpiv_cli.verbs.readers import load_rig, open_calibration, open_particles, open_tracks, read_image
     from lfpiv_cli.verbs.reconstruct import reconstruct
     from lfpiv_cli.verbs.tracks import track
 
@@ -93,14 +93,14 @@ MODULES = {
     "find_particles": "verbs.particles",
     "fit_field": "verbs.fields",
     "follow": "verbs.following",
-    "load_rig": "verbs",
-    "open_calibration": "verbs",
-    "open_particles": "verbs",
-    "open_tracks": "verbs",
+    "load_rig": "verbs.readers",
+    "open_calibration": "verbs.readers",
+    "open_particles": "verbs.readers",
+    "open_tracks": "verbs.readers",
     "open_vectors": "files.vtkhdf",
     "open_volume": "files.vtkhdf",
     "open_weights": "files.weights_file",
-    "read_image": "verbs",
+    "read_image": "verbs.readers",
     "reconstruct": "verbs.reconstruct",
     "track": "verbs.tracks",
 }

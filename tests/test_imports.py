@@ -65,6 +65,12 @@ def test_every_module_has_its_layer(module: Path) -> None:
     assert any(place_of(module) in names for names in LAYERS)
 
 
+def test_a_package_loads_none_of_its_modules() -> None:
+    """Who needs one of them would wait for all: `export` a second and a half. `cli` is loaded as a whole anyway."""
+    loading = {m.parent.name for m in MODULES if m.name == "__init__.py" and any("lfpiv_cli" in n for n in imported(m))}
+    assert loading == {"lfpiv_cli", "cli"}
+
+
 @pytest.mark.thorough
 @pytest.mark.parametrize("module", MODULES, ids=lambda m: str(m.relative_to(PACKAGE)))
 def test_imports_point_back(module: Path) -> None:

@@ -16,7 +16,7 @@ from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.vtkhdf import open_vectors
 from lfpiv_cli.files.weights_file import open_weights
 from lfpiv_cli.flow.field import MASKED
-from lfpiv_cli.verbs import open_particles
+from lfpiv_cli.verbs.readers import open_particles
 from lfpiv_cli.weights.strips import StripOperator
 
 CONFIGS = Path(__file__).parent.parent / "configs"

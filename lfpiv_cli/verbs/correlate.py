@@ -51,8 +51,8 @@ from lfpiv_cli.verbs.checks import (
     quality_of_all,
     window_notices,
 )
-from lfpiv_cli.verbs.combine import Mean, are_measured, arrays_of, mean_of_measured
 from lfpiv_cli.verbs.frames import dt_notices
+from lfpiv_cli.verbs.means import Mean, are_measured, arrays_of, mean_of_measured
 from lfpiv_cli.verbs.pairs import ComingPairs, PairBatch, PairBatchOptions, result_pairs, watched, work_as_they_come
 
 

@@ -23,13 +23,12 @@ from lfpiv_cli.files.hdf5 import format_of
 from lfpiv_cli.files.inputs import content_of
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRAJECTORIES_FORMAT, Points, read_points, read_tracks
 from lfpiv_cli.files.provenance import OF_COORDINATES, record, with_warnings
-from lfpiv_cli.flow.combining import WindowGrid
 from lfpiv_cli.flow.field import MASKED, MM_TO_M, REJECTED, VectorField
+from lfpiv_cli.flow.from_tracks import WindowGrid
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import Divergence
 from lfpiv_cli.tracks.candidates import NO_TRACK, Trajectories
 from lfpiv_cli.tracks.in_time import Motion, high_derivatives_in, motions_at
-from lfpiv_cli.verbs.combine import Extra, arrays_of
 from lfpiv_cli.verbs.fields import (
     FittedField,
     ensure_one_time,
@@ -38,6 +37,7 @@ from lfpiv_cli.verbs.fields import (
     samples_of_tracks,
     samples_of_vectors,
 )
+from lfpiv_cli.verbs.means import Extra, arrays_of
 from lfpiv_cli.verbs.tracks import seen_in, settings_of
 
 # Pressure from a sequence's trajectories, in memory.

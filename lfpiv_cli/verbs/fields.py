@@ -15,9 +15,9 @@ from lfpiv_cli.fields.samples import Samples, joined
 from lfpiv_cli.fields.spline_field import SplineField, gradient_covariance_at
 from lfpiv_cli.files.config import Config
 from lfpiv_cli.files.particle_file import Points, matrices
-from lfpiv_cli.flow.combining import Paths, WindowGrid, without_tracks
 from lfpiv_cli.flow.correlation import SMALLEST_VALID_FRACTION
 from lfpiv_cli.flow.field import MASKED, MM_TO_M, REJECTED, VALID, Derived, VectorField, derived_from
+from lfpiv_cli.flow.from_tracks import Paths, WindowGrid, without_tracks
 from lfpiv_cli.flow.windows import ParallelWalls
 from lfpiv_cli.names import Divergence
 from lfpiv_cli.notice import Notice
