@@ -33,7 +33,7 @@ from lfpiv_cli.robust import MAD_TO_SIGMA
 
 # Where the entrance pupil lies, by how a board shrinks on the array as it moves away.
 #
-# A board at a distance s before the entrance pupil is shown beta = L / s times as large (see `optics.pupils`): 1/beta
+# A board at a distance s before the entrance pupil is shown beta = L / s times as large (see `thin_lens`): 1/beta
 # grows by 1/L for each millimetre in air. At the focal plane, where its pictures through all points of the pupil
 # coincide, beta is -M, and the distance of that plane is L / |M| = F_m (1/P - 1/M). One board alone cannot tell it;
 # of several, the scale of the crossings does not matter.

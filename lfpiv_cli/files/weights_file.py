@@ -9,7 +9,7 @@ aperture's mask follow from the camera and are computed again on reading.
 Where the axes do not separate there is, in place of `columns` and `rows`, `on_demand` (what rays cross: `method`,
 `refraction`, refractive indices, window; or the method dlfc alone, whose rays the calibration has), from which columns
 are integrated when needed; where rays were counted, `counted` (`start`, `pixel`, `share` of each voxel in the order of
-the sensor's axes). `vignetting` (coefficients, see `calibration.transmission`) scales the pixels on reading.
+the sensor's axes). `vignetting` (coefficients, see `calibration.white`) scales the pixels on reading.
 
 Behind curved faces `columns` and `rows` are those of strips (`strips`: `lit` of the padded grid, `turned`, `misfit_l1`,
 `order`, `block_plane`, `block_planes`, `block_line`, see `weights.strips`), and `on_demand` holds the `faces`; `grid`
@@ -68,7 +68,7 @@ NUMBERS = ("start", "cell", "share", "pixel", "vignetting", "lit", "order", "mis
 BLOCKS = [f"block_{name}" for name in Blocks._fields]
 UNITS = calibration_file.UNITS | dict.fromkeys((*NUMBERS, *BLOCKS), "1")
 UNITS |= dict.fromkeys(("shape_xyz", "padding_xyz"), "voxel")
-# Coefficients of `transmission.vignetting_surface`.
+# Coefficients of `white.vignetting_surface`.
 VIGNETTING_SHAPE = (5, 5)
 
 

@@ -1,6 +1,6 @@
 """Fitting single particles to what the others leave of the image.
 
-Particles are refined one after the other (block coordinates), those of different tiles at once (`tiles`).
+Particles are refined one after the other (block coordinates), those of different tiles at once (`view`).
 
 Axes: image axes, mm; light in counts; residual and weights as flat images. A particle is a row (x, y, z, light).
 """

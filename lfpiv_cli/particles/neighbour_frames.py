@@ -4,7 +4,7 @@ A particle that was found in a neighbour frame and has no partner here is put wh
 whether its light seems free or not; then all particles are refined, and those that do not find their light are
 dropped. So overlapping particles that splitting did not find are separated; only those without a partner are suspected
 of being two, or elsewhere. Only first passes serve as neighbours, and of a pair the second frame's first pass begins
-with the first frame's, never the other way round (`second_frames`): each frame's result depends on the images alone,
+with the first frame's, never the other way round (`second_frame`): each frame's result depends on the images alone,
 not on the order in which frames are done.
 
 Axes: particles are rows (x, y, z, light) in image axes, mm and counts.

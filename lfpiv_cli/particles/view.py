@@ -57,7 +57,7 @@ class View(NamedTuple):
     particle_radius_mm : of the balls
     centres_mm : (nj, ni, 2) lens centres on the array; entry [j, i] is lens (first_i + i, first_j + j)
     inverse_basis : (2, 2) of the plain lattice, to find lenses
-    table, table_reach : see `rim`
+    table, table_reach : see `cells.rim_table`
     lines : of light as waves, by which all light goes then; empty: light goes by rays
     points, diffusion_px : the same of points of light before charge diffuses, and how far it does
     passed : (pixels,) share of the middle's light that reaches each pixel; empty: all of it

@@ -237,7 +237,7 @@ def _clipped(t: Any) -> Any:
 
 
 def _covered(x: Any, y: Any, c: RimNumbers, corners: Sequence[Any], place: RimPlace) -> tuple[Any, ...]:
-    """Return what the rim leaves of a patch between four entries of the table; see `rim.covered_share`."""
+    """Return what the rim leaves of a patch between four entries of the table; see `cells.covered_share`."""
     p, q = place.p, place.q
     ka, kb, kc, kd = (1.0 - p) * (1.0 - q), p * (1.0 - q), (1.0 - p) * q, p * q
     share, mean_x, mean_y = (
@@ -373,7 +373,7 @@ def cover_row_reference(
     rim : two tables (RIM_ROWS, STRIDE), flat, by columns of `across`
     across, columns : profile along x; first column and their number
     down, row : profile along y, its column
-    table : see `particles.rim`
+    table : see `particles.cells.rim_table`
     numbers : `RimNumbers`
     """
     known = RimNumbers(*numbers)

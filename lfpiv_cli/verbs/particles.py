@@ -453,7 +453,7 @@ class Prepared:
         return self._opened(path, status and status.st_size, status and status.st_mtime_ns)
 
     def searchable(self, path: Path, settings: Config) -> WeightsFile:
-        """Return the weights of a file to look for particles with, see `interface.particles.searchable`."""
+        """Return the weights of a file to look for particles with, see `searchable`."""
         content = self.weights(path)
         if self._searchable is None or self._searchable[0] is not content:
             self._searchable = content, searchable_weights(path, content, settings)
@@ -470,7 +470,7 @@ def searchable_weights(path: Path, content: WeightsFile, settings: Config) -> We
 
     Raises
     ------
-    InputError : they are none for that, see `interface.particles.searchable`
+    InputError : they are none for that, see `searchable`
     """
     try:
         return searchable(content, settings)

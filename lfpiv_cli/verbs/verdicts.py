@@ -1,7 +1,7 @@
 """Whether a result can be relied on, as far as it tells itself: good, look, or no, with reasons.
 
 Three parts of the chain are judged: the calibration, the images and what was found in them, and the vectors. What was
-warned of when files were made counts, and for vectors what the flow says against them (`flow.consistency`).
+warned of when files were made counts, and for vectors what the flow says against them (`flow.field`).
 """
 
 from __future__ import annotations

@@ -258,7 +258,7 @@ class Format:
     ending : of the file's name
     takes : names of our formats
     several : of these, those of which several times go into one file
-    write : writes one file; None where `stages.export` says how, as times or records come into it
+    write : writes one file; None where `verbs.export` says how, as times or records come into it
     """
 
     ending: str

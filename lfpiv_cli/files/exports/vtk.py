@@ -1,9 +1,9 @@
-"""What changes in time in one file, which ParaView plays: VTKHDF with a step for each time.
+"""Files for ParaView and VTK: what changes in time, tracks played, and VTK's XML.
 
-Volumes or vectors are VTK's temporal ImageData: `/VTKHDF` with the grid's attributes and `Steps`, and in `PointData`
-the arrays [t, z, y, x], components last; of a single plane [t, y, x], and of a single time without t and `Steps`, as
-VTK reads them. What is measured is in the files of the single times; this one is for the eye. Tracks of a sequence are
-what `playback` writes.
+What changes in time is VTKHDF with a step for each time. Volumes or vectors are VTK's temporal ImageData: `/VTKHDF`
+with the grid's attributes and `Steps`, and in `PointData` the arrays [t, z, y, x], components last; of a single plane
+[t, y, x], and of a single time without t and `Steps`, as VTK reads them. What is measured is in the files of the single
+times; this one is for the eye.
 """
 
 from __future__ import annotations

@@ -74,7 +74,7 @@ class Pixels:
     row_multiple : bytes of which each row takes a multiple, where pixels are `whole`
     bottom_up : whether the last row comes first
     table : count of each stored number, where the numbers are no counts
-    bayer : pattern of the colour filters, of which green is taken, see `bayer.green_of`; None without filters
+    bayer : pattern of the colour filters, of which green is taken, see `green_of`; None without filters
     """
 
     shape: Shape
