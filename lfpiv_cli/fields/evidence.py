@@ -14,15 +14,13 @@ from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.fields import stencils
 from lfpiv_cli.fields.samples import Samples, belonging, error_covariance, without_itself
 from lfpiv_cli.fields.stencils import DIVERGENCE, ORDERS, Expectation, Lattice, bound, inverse_of, penalty, spread_of
 from lfpiv_cli.threads import in_threads
-
-Floats = NDArray[np.float64]
 
 # Cells of a box along each axis: some thousand unknowns.
 BOX_CELLS = 4

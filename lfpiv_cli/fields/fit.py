@@ -14,6 +14,7 @@ from scipy.spatial import KDTree
 from scipy.special import gammaincinv
 from threadpoolctl import threadpool_limits
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.fields.samples import Samples
 from lfpiv_cli.fields.spline_field import lattice_for, spline_field
 from lfpiv_cli.fields.structure import (
@@ -29,8 +30,6 @@ from lfpiv_cli.fields.structure import (
 from lfpiv_cli.robust import MAD_TO_SIGMA
 from lfpiv_cli.tracks.gridding import FEWEST_OF_STRUCTURE, ROUGH_EXPONENT
 from lfpiv_cli.tracks.kriging import without_own
-
-Floats = NDArray[np.float64]
 
 # A velocity field kriged from samples as vectors: the best linear unbiased estimate where the flow is rough.
 #

@@ -21,6 +21,7 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.fields.evidence import Box, first_expectation, most_probable
 from lfpiv_cli.fields.fit import Field
 from lfpiv_cli.fields.samples import Samples, belonging, error_covariance, squares
@@ -40,8 +41,6 @@ from lfpiv_cli.fields.stencils import (
     rows_of,
 )
 from lfpiv_cli.robust import MAD_TO_SIGMA
-
-Floats = NDArray[np.float64]
 
 # Gradients of a scalar as samples: what each spline has of them, and their part of the normal equations.
 #

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from lfpiv_cli.arrays import Floats
 
 # Of the middle of two places with independent errors, whose difference is the displacement.
 OF_MIDDLES = 0.25

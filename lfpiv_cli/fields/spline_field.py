@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.fields import stencils
 from lfpiv_cli.fields.evidence import FREE_DIVERGENCE, divergence_weight, first_expectation, most_probable
 from lfpiv_cli.fields.samples import Samples, belonging, error_covariance, squares, with_places
@@ -30,8 +31,6 @@ from lfpiv_cli.fields.stencils import (
     gradient_rows,
     rows_of,
 )
-
-Floats = NDArray[np.float64]
 
 # Knots are so many times the samples' mean distance apart: a third as many knots as samples. Among factors of 1.2 to
 # 1.8, less adds noise where samples are few, and more holds divergence and values of small vortices further off.

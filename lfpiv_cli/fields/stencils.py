@@ -19,9 +19,8 @@ from scipy.interpolate import BSpline
 from scipy.linalg import cholesky, solve_triangular
 from scipy.linalg.lapack import dpotri
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.threads import share_out
-
-Floats = NDArray[np.float64]
 
 # Cubic B-splines on a box: a lattice of knots, the four splines along each axis that reach a point, their integrals.
 #

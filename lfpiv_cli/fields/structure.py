@@ -21,9 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dposv
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.fields.samples import Samples
-
-Floats = NDArray[np.float64]
 
 # The share of potential flow with which components are independent.
 INDEPENDENT = 1.0 / 3.0

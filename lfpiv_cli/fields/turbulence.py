@@ -14,9 +14,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from lfpiv_cli.arrays import Floats
 
 MM_PER_M = 1000.0
 # A window has a shape from so many on.

@@ -20,11 +20,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.flow.field import MASKED, REJECTED, REPLACED, SECOND_PEAK, VALID, VectorField
 from lfpiv_cli.flow.outliers import NEEDED_SHARE, predict
-
-Floats = NDArray[np.float64]
 
 # Vectors further apart than this, in units of the uncertainty of their difference, are not of one flow: by chance one
 # of a hundred has a component that far out.

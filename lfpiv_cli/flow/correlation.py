@@ -20,6 +20,7 @@ from numba import njit
 from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.flow.deformation import (
     Spline,
@@ -37,8 +38,6 @@ from lfpiv_cli.flow.windows import Triple, WindowLayout, layout_windows
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.simd.block_sums import MOMENTS
 from lfpiv_cli.threads import share_out
-
-Floats = NDArray[np.float64]
 
 # The coarse pass: correlation of binned volumes, which finds displacements up to a quarter of its windows.
 #

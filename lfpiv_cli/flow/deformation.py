@@ -17,6 +17,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.flow.windows import Triple, WindowLayout
 from lfpiv_cli.simd.block_sums import (
     MOST_TAPS,
@@ -27,8 +28,6 @@ from lfpiv_cli.simd.block_sums import (
     spline_weights,
 )
 from lfpiv_cli.threads import share_out
-
-Floats = NDArray[np.float64]
 
 # Sources lie between the first and the last voxel's centre: the four taps of a cubic B-spline reach one coefficient
 # beyond these, and a fifth of weight zero another.

@@ -12,11 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.robust import HALF_NORMAL_MEDIAN
-
-Floats = NDArray[np.float64]
 
 # Flags, in the order of decreasing trust. A velocity is finite up to SECOND_PEAK and NaN from REJECTED on.
 VALID = 0

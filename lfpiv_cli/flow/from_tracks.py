@@ -11,14 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.flow.correlation import SMALLEST_VALID_FRACTION
 from lfpiv_cli.flow.field import MASKED, REJECTED, VALID, VectorField
 from lfpiv_cli.flow.windows import Triple, Walls, layout_windows
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.tracks.gridding import on_grid
-
-Floats = NDArray[np.float64]
-
 
 # A vector needs its twelve nearest tracks within this many windows of its centre: in sparse images tracks are further
 # apart than windows, and what a wide fit misses of the flow is in the stated error.

@@ -21,13 +21,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.flow.windows import Triple, WindowLayout
 from lfpiv_cli.robust import of_half_the_sum
 from lfpiv_cli.simd.block_sums import FEW_SHIFTS, MANY_SHIFTS, products
 from lfpiv_cli.simd.vectors import LANES
 from lfpiv_cli.threads import share_out
-
-Floats = NDArray[np.float64]
 
 # Blocks narrower than this cost more in sums of sums than the products they save.
 SMALLEST_BLOCK = 4

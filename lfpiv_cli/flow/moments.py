@@ -22,14 +22,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.flow.maps import SMALLEST_BLOCK
 from lfpiv_cli.flow.windows import Triple, WindowLayout
 from lfpiv_cli.simd.block_sums import MOMENTS
 from lfpiv_cli.simd.block_sums import moments as lane_moments
 from lfpiv_cli.simd.vectors import LANES
 from lfpiv_cli.threads import share_out
-
-Floats = NDArray[np.float64]
 
 # Cells along an axis of a window, at least, where it has as many voxels: groups enough for a variance.
 CELLS_PER_WINDOW = 4

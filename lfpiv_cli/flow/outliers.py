@@ -13,12 +13,11 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, correlate1d
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.flow.field import MASKED, REJECTED, REPLACED, SECOND_PEAK, VALID
 from lfpiv_cli.flow.peaks import typical_width
 from lfpiv_cli.flow.windows import Triple
 from lfpiv_cli.threads import share_out
-
-Floats = NDArray[np.float64]
 
 # The filter between passes, and what it says of the scales that a field does not resolve.
 #

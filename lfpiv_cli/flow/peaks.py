@@ -12,12 +12,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.reference import Reference
 from lfpiv_cli.scale import Scale
 from lfpiv_cli.threads import share_out
-
-Floats = NDArray[np.float64]
 
 # Locking: near the focal plane volumes draw lateral displacements towards whole microlenses.
 #

@@ -12,14 +12,13 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.grid import Grid
 
 # Where there is fluid, and vectors can be measured: between the walls of a channel, or in a round pipe.
 #
 # Axes: points and sides (x, y, z) in mm, arrays [z, y, x]. A kind of walls is a class with the methods of `Walls`.
 
-
-Floats = NDArray[np.float64]
 
 # Pipes that are tilted further from x or y are other pipes than `RoundWall` knows.
 LARGEST_TILT_DEG = 5.0

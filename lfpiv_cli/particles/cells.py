@@ -12,13 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.optics.camera import Lattice
 from lfpiv_cli.threads import COUNT_NO_REFERENCES
 from lfpiv_cli.weights.lens_cells import disc_area_below, neighbours
-
-Floats = NDArray[np.float64]
 
 # How a pixel's patch of the main lens meets the round aperture: its covered share and where that share lies.
 #

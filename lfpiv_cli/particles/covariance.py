@@ -24,6 +24,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.particles.least_squares import (
     SUMS,
     UNKNOWNS,
@@ -37,8 +38,6 @@ from lfpiv_cli.particles.least_squares import (
 from lfpiv_cli.particles.noise import Correlation
 from lfpiv_cli.particles.view import View, footprint_radius_mm, on_array_mm
 from lfpiv_cli.threads import COUNT_NO_REFERENCES, blocks, in_threads
-
-Floats = NDArray[np.float64]
 
 # Neighbours that are left free: with twice as many the errors of 8,300 particles change by a thousandth.
 FREE_NEIGHBOURS = 12

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import KDTree
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.particles.fitting import fit_from, nothing_expected
 from lfpiv_cli.particles.least_squares import (
     CHOICE_GAIN,
@@ -45,8 +46,6 @@ from lfpiv_cli.reconstruction.equations import Normalisers, Problem, uniform_sta
 from lfpiv_cli.reconstruction.solvers import em_step
 from lfpiv_cli.scale import Scale
 from lfpiv_cli.weights.model import Weights
-
-Floats = NDArray[np.float64]
 
 # Where particles may be: peaks of a volume that explains what the particles found so far do not.
 #

@@ -20,13 +20,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.particles.line_light import VALUES, respond_by_lines
 from lfpiv_cli.particles.refraction import bend_of
 from lfpiv_cli.particles.rows import SLACK, Scratch, respond_rows, scratch
 from lfpiv_cli.particles.view import LARGEST_MOVE_LENSES, View, entry_capacity
 from lfpiv_cli.threads import COUNT_NO_REFERENCES
-
-Floats = NDArray[np.float64]
 
 UNKNOWNS = 4
 # Damping relative to the diagonal: its start, and the factors after a step that failed or helped.

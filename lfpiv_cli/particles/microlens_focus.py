@@ -17,11 +17,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.particles.diameter import Sizes, middle_of
 from lfpiv_cli.particles.least_squares import UNKNOWNS, lit_by, respond_all, room_for
 from lfpiv_cli.particles.view import View, entry_capacity
-
-Floats = NDArray[np.float64]
 
 # So many particles tell it to a thousandth: those nearest to the optical axis, where lenses are at their best.
 MOST_PARTICLES = 100

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.particles.joining import with_twins_joined
 from lfpiv_cli.particles.least_squares import SEARCH_GAIN
 from lfpiv_cli.particles.rounds import (
@@ -51,8 +52,6 @@ from lfpiv_cli.particles.suspects import SUSPECT_CHI2, good_chi2, settled
 from lfpiv_cli.scale import Scale
 from lfpiv_cli.tracks.candidates import Light, Seen
 from lfpiv_cli.tracks.tracking import expected_of, known_of, track
-
-Floats = NDArray[np.float64]
 
 # Particles of a frame whose places the frames before predict, as in Shake-The-Box, and those that the rest shows.
 #

@@ -14,10 +14,9 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.robust import HALF_NORMAL_MEDIAN
 from lfpiv_cli.threads import COUNT_NO_REFERENCES, share_out
-
-Floats = NDArray[np.float64]
 
 # The optics model of a pixel's light is trusted to this share until what it leaves has been seen.
 MODEL_ERROR = 0.03

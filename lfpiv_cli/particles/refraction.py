@@ -20,15 +20,13 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.optics.ray_bundles import aim, trace_in
 from lfpiv_cli.optics.tracing import slope_polynomial, slope_ratio
 from lfpiv_cli.particles.pencil import cubic_at, largest_of, pencil_of
 from lfpiv_cli.particles.view import View
 from lfpiv_cli.threads import COUNT_NO_REFERENCES
-
-Floats = NDArray[np.float64]
 
 # The shift changes by some 1e-3 of what a point moves: twice leaves a millionth of it.
 REPEATS = 2

@@ -14,8 +14,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.particles.fitting import Least, accept, judge
 from lfpiv_cli.particles.joining import boxes_of, explain_rest, find_peaks, points_in_raw_frame, with_twins_joined
 from lfpiv_cli.particles.least_squares import SEARCH_GAIN
@@ -41,8 +41,6 @@ from lfpiv_cli.particles.search import (
 )
 from lfpiv_cli.particles.suspects import with_depths_corrected, with_overlaps_split
 from lfpiv_cli.particles.view import lens_pixels
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.particles.cells import DIRECTIONS, DISTANCES
 from lfpiv_cli.particles.pencil import in_row
 from lfpiv_cli.particles.refraction import Bend, is_seen
@@ -46,8 +47,6 @@ from lfpiv_cli.simd.micro_images import (
     join_row,
 )
 from lfpiv_cli.threads import COUNT_NO_REFERENCES
-
-Floats = NDArray[np.float64]
 
 # A row of a micro-image is written up to the end of a register: so many entries more than there are.
 SLACK = 8

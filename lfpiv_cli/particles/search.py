@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.particles.covariance import joint_covariance
 from lfpiv_cli.particles.fitting import add_all, judge, nothing_expected, refine
@@ -31,8 +32,6 @@ from lfpiv_cli.particles.noise import (
 from lfpiv_cli.particles.view import View, footprint_radius_mm, lens_pixels, on_array_mm
 from lfpiv_cli.reconstruction.equations import Normalisers
 from lfpiv_cli.weights.model import Weights
-
-Floats = NDArray[np.float64]
 
 # Active sets: which particles the next sweep fits again, because their last fit or neighbours' fits changed
 # something.

@@ -12,6 +12,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.particles.fitting import fit_again
 from lfpiv_cli.particles.least_squares import (
     CHOICE_GAIN,
@@ -29,8 +30,6 @@ from lfpiv_cli.particles.least_squares import (
 from lfpiv_cli.particles.search import SMALLEST_LIGHT, State, Task, observed
 from lfpiv_cli.particles.view import footprint_px, footprint_radius_mm, over_tiles
 from lfpiv_cli.scale import Scale
-
-Floats = NDArray[np.float64]
 
 # Overlapping particle images: two particles where one was found, if two explain the light much better.
 #

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.optics.camera import Camera, KernelCamera, Lattice
@@ -30,8 +31,6 @@ from lfpiv_cli.particles.pencil import lines_of
 from lfpiv_cli.scale import Scale
 from lfpiv_cli.threads import in_threads
 from lfpiv_cli.weights.scene import NO_FACES
-
-Floats = NDArray[np.float64]
 
 # Particles that are smaller are taken as this large, so that profiles have slopes: a thousandth of a lens.
 SMALLEST_RADIUS_LENSES = 1e-3

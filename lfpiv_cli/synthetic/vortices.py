@@ -10,14 +10,14 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
+
+from lfpiv_cli.arrays import Floats
 
 # What is known of a flow: its velocities, their gradients and, where it has a closed form, its pressure.
 #
 # Axes: world (x, y, z), z away from the camera. Points in mm, velocities in m/s, gradients per second, pressures in
 # Pa.
 
-Floats = NDArray[np.float64]
 
 Flow = Callable[[Floats], Floats]
 """Velocities in m/s, (n, 3), at points in mm, (n, 3)."""

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import KDTree
 
-Floats = NDArray[np.float64]
+from lfpiv_cli.arrays import Floats
 
 # What the light of two particles says of their being one.
 #

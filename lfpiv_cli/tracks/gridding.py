@@ -23,10 +23,9 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from scipy.special import chdtr, gammaincinv
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.robust import MAD_TO_SIGMA
 from lfpiv_cli.tracks.kriging import kriged, structure_of
-
-Floats = NDArray[np.float64]
 
 # Robust polynomials through the tracks around many places at once.
 #

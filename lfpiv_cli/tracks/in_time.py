@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.robust import MAD_TO_SIGMA
 from lfpiv_cli.tracks.candidates import NO_TRACK, Seen, Trajectories
 
@@ -31,8 +32,6 @@ from lfpiv_cli.tracks.candidates import NO_TRACK, Seen, Trajectories
 #
 # Axes: places (n, m, 3) in mm of n tracks in m frames, NaN where a track has none; times in frames.
 
-
-Floats = NDArray[np.float64]
 
 # 1, t, t^2/2, t^3/6, t^4/24; the first three are whatever the places say.
 QUARTIC, FREE_OF_QUARTIC = 5, 3

@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 from scipy.spatial import KDTree
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.robust import MAD_TO_SIGMA
 from lfpiv_cli.threads import blocks, in_threads
-
-Floats = NDArray[np.float64]
 
 # Neighbours whose differences show the structure function, and that let expect a displacement.
 PAIRED, USED = 12, 16

@@ -18,13 +18,12 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.robust import MAD_TO_SIGMA
 from lfpiv_cli.scale import Scale
 from lfpiv_cli.threads import share_out
 from lfpiv_cli.tracks.candidates import Candidates, Seen, candidates_of
 from lfpiv_cli.tracks.kriging import kriged, structure_of
-
-Floats = NDArray[np.float64]
 
 # The first guess of links: neighbours vote for displacements that resemble their own.
 #

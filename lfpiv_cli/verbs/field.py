@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.fields import pressure
@@ -43,7 +44,6 @@ from lfpiv_cli.verbs.tracks import seen_in, settings_of
 # Pressure from a sequence's trajectories, in memory.
 
 
-Floats = NDArray[np.float64]
 MM2_PER_M2 = 1e6
 
 
