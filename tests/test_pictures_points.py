@@ -9,7 +9,9 @@ import pytest
 
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.curved_space import CurvedSpace, Face
 from lfpiv_cli.optics.media import Media
+from lfpiv_cli.optics.surfaces import Cylinder
 from lfpiv_cli.pictures import points as of_points
 from lfpiv_cli.pictures import volume as of_volume
 from lfpiv_cli.pictures.style import SLABS, percentiles_by_depth
@@ -20,16 +22,32 @@ pytest.importorskip("matplotlib")
 @pytest.mark.parametrize("column_axis", ["x", "y"])
 def test_particles_are_seen_where_the_camera_sees_them(table2: Camera, water: Media, column_axis: str) -> None:
     camera = replace(table2, column_axis=column_axis)
-    focal, lateral = of_points.places_px(np.array([[0.0, 0.0, 1.0], [0.3, -0.2, 0.0]]), camera, water)
+    focal, lateral = of_points.places_px(np.array([[0.0, 0.0, 1.0], [0.3, -0.2, 0.0]]), camera, water, None)
     np.testing.assert_allclose(focal, camera.sensor_centre_px)
     # in focus the array has M times the place, the sensor a little more of it behind each lens's centre
     seen = np.array([0.3, -0.2] if column_axis == "x" else [-0.2, 0.3]) * camera.magnification
     expected = camera.sensor_centre_px + seen * camera.micro_image_scale / camera.pixel_mm
     np.testing.assert_allclose(lateral, expected)
     # further away, smaller: by the apparent depth
-    (far,) = of_points.places_px(np.array([[0.3, -0.2, 13.3]]), camera, water)
+    (far,) = of_points.places_px(np.array([[0.3, -0.2, 13.3]]), camera, water, None)
     ratio = camera.focus_distance_mm / (camera.focus_distance_mm + 13.3 * water.depth_ratio)
     np.testing.assert_allclose(far - camera.sensor_centre_px, ratio * (expected - camera.sensor_centre_px))
+
+
+def test_particles_in_a_tube_are_seen_through_its_walls(table2: Camera, water: Media) -> None:
+    tube = CurvedSpace(
+        water,
+        (
+            Face(Cylinder((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 7.0), 1.49),
+            Face(Cylinder((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 5.0), 1.33),
+        ),
+    )
+    (seen, hidden) = of_points.places_px(np.array([[0.3, 0.5, 0.0], [0.0, 5.5, 0.0]]), table2, water, tube)
+    along, across = (seen - table2.sensor_centre_px) * table2.pixel_mm / table2.micro_image_scale / table2.magnification
+    # about its axis a tube is a lens: what is near it seems wider by the fluid's index, 1.33, and along it as it is
+    assert along == pytest.approx(0.3, rel=0.03)
+    assert across == pytest.approx(1.33 * 0.5, rel=0.02)
+    assert np.isnan(hidden).all()
 
 
 def test_the_image_shows_places_coloured_by_depth() -> None:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
 from lfpiv_cli.pictures.style import (
     AXIS_NAMES,
@@ -47,17 +48,23 @@ DOTS_AREA, DOT_SIZES = 15_000.0, (6.0, 26.0)
 IMAGE_WIDTH = 10.0
 
 
-def places_px(focal_point_mm: NDArray[np.float64], camera: Camera, media: Media) -> NDArray[np.float64]:
+def places_px(
+    focal_point_mm: NDArray[np.float64], camera: Camera, media: Media, scene: CurvedSpace | None
+) -> NDArray[np.float64]:
     """Return where rays through the middle of the main lens meet the sensor, (n, 2) as (column, row).
 
     Parameters
     ----------
-    focal_point_mm : (n, 3) points, z from the nominal focal point; their rays are taken for paraxial
+    focal_point_mm : (n, 3) points, z from the nominal focal point
+    scene : faces that their rays cross, NaN where one is not seen; None for plane windows, where they are paraxial
     """
     points = camera.to_image_axes(focal_point_mm)
-    distance = equivalent_object_distance(points[:, 2], camera.focus_distance_mm, media)
-    on_array = -camera.image_distance_mm / distance[:, np.newaxis] * points[:, :2]
-    return camera.mm_to_px(on_array * camera.micro_image_scale)
+    if scene is None:
+        slopes = -points[:, :2] / equivalent_object_distance(points[:, 2:], camera.focus_distance_mm, media)
+    else:
+        slopes, seen = scene.slopes(camera, points, np.zeros((len(points), 2)))
+        slopes[~seen] = np.nan
+    return camera.mm_to_px(camera.image_distance_mm * slopes * camera.micro_image_scale)
 
 
 @styled

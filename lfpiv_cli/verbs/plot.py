@@ -150,9 +150,8 @@ def _of_particles(path: Path, raw: Path | None) -> dict[str, Drawn]:
     }
     if raw is not None:
         config = carried_config(points.provenance, path)
-        config.ensure_plane_layers("showing particles on a raw image")
         focal_point = points.reference.points_to_focal_point(points.position_mm)
-        places = of_particles.places_px(focal_point, config.camera_model(), config.media_model())
+        places = of_particles.places_px(focal_point, config.camera_model(), config.media_model(), config.scene_space())
         image = read_image(raw, config.image_shape()).astype(np.float64)
         figures["image"] = Drawn(
             "The raw image, and where rays through the middle of the main lens (as the config has it) meet the sensor.",
