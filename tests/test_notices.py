@@ -417,9 +417,12 @@ def test_dots_within_single_lenses_are_told(table2: Camera, water: Media) -> Non
 def test_a_board_in_part_or_of_another_size_is_told(table2: Camera) -> None:
     assert board_notices(19, (5, 4)) == []
     assert [each.code for each in board_notices(20, (7, 5))] == ["board-incomplete"]
-    assert magnification_notices(-1.04, table2) == []
+    assert magnification_notices(-1.009, table2) == []
     # Dots 0.5 mm apart that are said to be 0.6.
-    assert [each.code for each in magnification_notices(-0.836, table2)] == ["magnification"]
+    for measured in (-0.836, -1.0112):
+        (notice,) = magnification_notices(measured, table2)
+        assert notice.code == "magnification"
+        assert f"{measured:.4g}, which is used; the rig file says -1" in notice.text
 
 
 @pytest.mark.parametrize(

@@ -23,8 +23,9 @@ IMAGE_DISTANCE_TOLERANCE = 0.1
 IMAGE_DISTANCE_SIGMAS = 3.0
 # Focal lengths are named to a few per cent.
 ENTRANCE_PUPIL_TOLERANCE = 0.03
-# A lens is focused by hand; a board of another spacing, or in another medium, is off by a tenth or more.
-MAGNIFICATION_TOLERANCE = 0.05
+# A board of another spacing, or in another medium, is off by a tenth or more; a lens that was focused by hand by a few
+# per cent, and then all that was planned by the rig file is as far off. Boards tell magnifications to some 0.1 %.
+MAGNIFICATION_TOLERANCE = 0.01
 # Share of a board's points that are found without a word: an origin may be left out, some may lie in dirt.
 FEWEST_POINTS = 0.8
 # The standard errors of a board's place are from how its points scatter about it; of six, a third of the true error was
@@ -126,7 +127,8 @@ def magnification_notices(measured: float, camera: Camera) -> list[Notice]:
         Notice(
             "magnification",
             "board.spacing_mm",
-            f"the board shows a magnification of {written(measured, 4)}, the data sheet {written(sheet, 4)}",
+            f"the board shows a magnification of {written(measured, 4)}, which is used; the rig file says "
+            f"{written(sheet, 4)}",
             "correct what is off of board.spacing_mm, board.medium and main_lens.magnification",
             measured,
             f"{written(sheet, 4)} within {MAGNIFICATION_TOLERANCE:.0%}",
