@@ -169,6 +169,19 @@ def test_particles_are_no_board(table2: Camera, rng: np.random.Generator) -> Non
         pose_of_dots(tracers, np.full(tracers.shape, 1e-3), -tracers[:, :2], table2, board)
 
 
+def test_dots_narrower_than_a_lens_are_refused_for_their_focus(table2: Camera, rng: np.random.Generator) -> None:
+    """Near the focal plane they seem to lie in the middle of their lenses, a grid of 0.1 mm, and not on their own."""
+    i, j = np.divmod(np.arange(81), 9)
+    lateral = 0.24 * np.column_stack([i - 4.0, j - 4.0])
+    dots = np.column_stack([0.1 * np.rint(lateral / 0.1), rng.normal(0.0, 0.01, 81)])
+    for wide, words in (
+        (0.08, r"dots 0\.8 microlenses wide .* by 1\.\d mm off it, .* 0\.2 mm; then board"),
+        (0.2, "check board"),
+    ):
+        with pytest.raises(InputError, match=f"mm rms off a grid of 0.24 mm, .* {words}"):
+            pose_of_dots(dots, np.full(dots.shape, 1e-3), -dots[:, :2], table2, BoardGeometry((9, 9), 0.24, wide))
+
+
 @pytest.mark.thorough
 def test_few_tracers_are_no_small_board(table2: Camera, rng: np.random.Generator) -> None:
     """Half of a board of 4 x 3 is soon found among tracers, near enough to a grid of which six numbers are free."""

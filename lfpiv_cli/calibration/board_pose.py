@@ -382,14 +382,22 @@ def refuse_scattered(fit: FlatFit, board: BoardGeometry, camera: Camera) -> None
     """
     freedom = 2 * len(fit.residual_mm) - (6 if fit.k1_per_mm2 is None else 7)
     sideways = float(np.sqrt(2.0 * np.sum(fit.residual_mm[:, :2] ** 2) / max(1, freedom)))
+    lens, lens_depth = lens_in_scene_mm(camera)
     if sideways > LARGEST_SCATTER * board.spacing_mm:
+        dot = board.dot_diameter_mm / lens
+        check = "board.spacing_mm and that the picture shows the board"
+        if board.pattern == "dots" and dot < 1.0 and sideways < lens:
+            check = (
+                f"the focus first: dots {written(dot, 2)} microlenses wide may lie anywhere in their lenses near the "
+                f"focal plane; move the board by {written((2.0 - dot) * lens_depth, 2)} mm off it, or take dots of two "
+                f"microlenses, {written(2.0 * lens, 2)} mm; then {check}"
+            )
         raise InputError(
             f"what was found lies {written(sideways)} mm rms off a grid of {board.spacing_mm:g} mm, at most "
-            f"{written(LARGEST_SCATTER * board.spacing_mm)} mm is a board's; check board.spacing_mm and that the "
-            "picture shows the board"
+            f"{written(LARGEST_SCATTER * board.spacing_mm)} mm is a board's; check {check}"
         )
     deep = float(np.sqrt(np.sum(fit.residual_mm[:, 2] ** 2) / max(1, len(fit.residual_mm) - 3)))
-    flat = LARGEST_SCATTER_OF_LENS_DEPTH * lens_in_scene_mm(camera)[1]
+    flat = LARGEST_SCATTER_OF_LENS_DEPTH * lens_depth
     if deep > flat:
         raise InputError(
             f"what was found lies {written(deep)} mm rms in front of and behind one plane, at most {written(flat)} mm "
