@@ -130,6 +130,15 @@ def test_architecture_names_every_part_of_the_package():
     assert {part for part in parts if f"`{part}`" not in page} == {"__init__", "__main__"}
 
 
+def test_the_glossary_names_parts_of_the_package():
+    rows = [
+        line.split(" | ") for line in (ROOT / "docs" / "glossary.md").read_text().splitlines() if line.startswith("| ")
+    ]
+    named = {name for row in rows for name in re.findall(r"`(\w+)`", row[-1])}
+    assert len(named) > 10
+    assert {name for name in named if not list((ROOT / "lfpiv_cli").glob(f"{name}*"))} == set()
+
+
 def test_readme_is_short():
     assert len((ROOT / "README.md").read_text().splitlines()) <= 80
 
