@@ -14,7 +14,7 @@ from typing import Any
 from lfpiv_cli.errors import InputError, OutputExistsError, UsageError
 from lfpiv_cli.files.atomic import ensure_apart, ensure_writable, folded
 from lfpiv_cli.files.hdf5 import read_whole, replace_provenance
-from lfpiv_cli.files.images import count_pages, times_of
+from lfpiv_cli.files.images import count_pages, frames
 from lfpiv_cli.files.inputs import split_part
 from lfpiv_cli.files.pairing import Seen
 from lfpiv_cli.files.provenance import bear_alike, differences, earlier_record, ensure_even, without_warnings
@@ -42,7 +42,7 @@ class Frame:
     @property
     def time_s(self) -> float | None:
         """When it was taken, in s from a moment of its file's own; None where the file does not tell."""
-        times = None if self.fault is not None else times_of(self.path)
+        times = None if self.fault is not None else frames(self.path).time_s
         return None if times is None else float(times[self.page])
 
 

@@ -38,15 +38,7 @@ CHUNK_BYTES = 2**20
 # The units of arrays whose names end so; longer ends come before those that end them.
 UNITS_IN_NAMES = {"_per_mm2": "1/mm^2", "_mm2": "mm^2", "_mm": "mm", "_px": "pixel", "_deg": "degree"}
 # What h5py raises on a broken file, depending on where it breaks.
-BROKEN_FILE_ERRORS = (
-    OSError,
-    KeyError,
-    ValueError,
-    TypeError,
-    RuntimeError,
-    OverflowError,
-    AttributeError,
-)
+BROKEN_FILE_ERRORS = (OSError, KeyError, ValueError, TypeError, RuntimeError, OverflowError, AttributeError)
 
 
 def write_tree(
@@ -98,13 +90,7 @@ def read_tree(path: Path, format_name: str, format_versions: Collection[int]) ->
     return tree, provenance
 
 
-def create(
-    path: Path,
-    fill: Callable[[h5py.File], None],
-    *,
-    overwrite: bool,
-    check: Callable[[Path], object],
-) -> None:
+def create(path: Path, fill: Callable[[h5py.File], None], *, overwrite: bool, check: Callable[[Path], object]) -> None:
     """Create an HDF5 file atomically; `fill` writes into it, `check` reads it back."""
 
     def write(temporary: Path) -> None:
@@ -145,10 +131,16 @@ def write_rows(
 
 
 def _storage(name: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> dict[str, Any]:
-    """Return how an array is stored; one without elements has no chunks."""
+    """Return how an array is stored: in chunks of whole rows and planes below `CHUNK_BYTES`, where it has elements."""
     if dtype.kind not in "fiu":
         raise TypeError(f"{name}: arrays are floating point or integer, not {dtype}")
-    return {"chunks": _chunk_shape(shape, dtype.itemsize), **FILTERS} if shape and 0 not in shape else {}
+    if not shape or 0 in shape:
+        return {}
+    left, chunk = max(CHUNK_BYTES // dtype.itemsize, 1), []
+    for n in reversed(shape):
+        chunk.append(max(min(n, left), 1))
+        left //= chunk[-1]
+    return {"chunks": tuple(reversed(chunk)), **FILTERS}
 
 
 def _with_units(dataset: h5py.Dataset, units: str | None) -> h5py.Dataset:
@@ -289,22 +281,12 @@ def _write_group(group: h5py.Group, tree: Tree, units: Mapping[str, str]) -> Non
         if isinstance(value, Mapping):
             _write_group(group.create_group(name), value, units)
         elif isinstance(value, np.ndarray):
-            write_array(group, name, value, _unit_of(name, units))
+            said = [unit for end, unit in UNITS_IN_NAMES.items() if name.endswith(end)]
+            if not said and name not in units:
+                raise ValueError(f"{name} has no unit: its name ends in none, and none is given")
+            write_array(group, name, value, said[0] if said else units[name])
         else:
             group.attrs[name] = to_attribute(value)
-
-
-def _unit_of(name: str, units: Mapping[str, str]) -> str:
-    """Return the unit of a tree's array.
-
-    Raises
-    ------
-    ValueError : nothing says it
-    """
-    said = [unit for end, unit in UNITS_IN_NAMES.items() if name.endswith(end)]
-    if not said and name not in units:
-        raise ValueError(f"{name} has no unit: its name ends in none, and none is given")
-    return said[0] if said else units[name]
 
 
 def _read_group(group: h5py.Group, file_bytes: int, levels: int) -> dict[str, Any]:
@@ -340,16 +322,6 @@ def from_attribute(name: str, value: Any) -> Any:
     if isinstance(value, np.generic):
         return value.item()
     raise ValueError(f"the attribute {name} is a {type(value).__name__}, expected a scalar or a string")
-
-
-def _chunk_shape(shape: tuple[int, ...], item_bytes: int) -> tuple[int, ...]:
-    """Return a chunk of whole rows and planes that stays below `CHUNK_BYTES`."""
-    left = max(CHUNK_BYTES // item_bytes, 1)
-    chunk = []
-    for n in reversed(shape):
-        chunk.append(max(min(n, left), 1))
-        left //= chunk[-1]
-    return tuple(reversed(chunk))
 
 
 # Whether a file of ours is there, and whether it is whole: all that it holds read back, through its checksums.

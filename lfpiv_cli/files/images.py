@@ -5,7 +5,7 @@ Images are float32 arrays `[row, column]` in counts. Colour is read where its ch
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -65,22 +65,6 @@ FORMATS = (
 LONGEST_START = max(len(start) for each in FORMATS for start in each.starts)
 
 
-def open_recording(path: Path, part: str | None) -> Recording:
-    """Return what a file's header says of its frames.
-
-    Raises
-    ------
-    InputError : the file is broken or of no known format
-    UsageError : the format has no parts and one was named, or needs more to be said
-    """
-    found = format_of(path, part)
-    if part is None:
-        return found.frames(path)
-    if found.frames_of is None:
-        raise UsageError(f"{path}:{part}: {found.name} files have no parts or layouts to name")
-    return found.frames_of(path, part)
-
-
 def files_beside(path: Path) -> tuple[Path, ...]:
     """Return the files, or the folder of files, that one is read with, whatever it is: none of most."""
     for each in FORMATS:
@@ -101,22 +85,15 @@ def format_of(path: Path, part: str | None = None) -> Format:
     ensure_regular_file(path)
     with opened(path) as file:
         start = file.read(LONGEST_START)
-    by_name = [each for each in FORMATS if path.suffix.lower() in each.suffixes]
     # Frames without a header can begin with any bytes.
-    if not by_name:
-        for each in FORMATS:
-            if each.starts and start.startswith(each.starts):
-                return each
-    if by_name:
-        return by_name[0]
+    found = [each for each in FORMATS if path.suffix.lower() in each.suffixes]
+    found = found or [each for each in FORMATS if each.starts and start.startswith(each.starts)]
+    if found:
+        return found[0]
     if part is not None and blocks.LOOKS_LAID_OUT.match(part):
         return RAW
-    raise InputError(f"{path}: is neither a TIFF nor a PNG image, nor a recording of {_others()}")
-
-
-def _others() -> str:
-    names = [each.name for each in FORMATS if each.name not in ("TIFF", "PNG")]
-    return ", ".join(names[:-1]) + f" or {names[-1]}"
+    *others, last = (each.name for each in FORMATS if each.name not in ("TIFF", "PNG"))
+    raise InputError(f"{path}: is neither a TIFF nor a PNG image, nor a recording of {', '.join(others)} or {last}")
 
 
 # Files whose headers are kept, so that a recording of thousands of frames is not looked through again for each. A batch
@@ -156,12 +133,15 @@ def _state_of(file: Path) -> tuple[int, int, int]:
 def _frames(file: Path, part: str | None, states: tuple[tuple[int, int, int], ...]) -> Recording:
     """Read a header once; a file that has another size, time or place on the disk is looked at anew."""
     part, page = split_page(part)
-    recording = open_recording(file, part)
-    return recording if page is None else _only(file, recording, page)
-
-
-def _only(file: Path, recording: Recording, page: int) -> Recording:
-    """Return one page of a recording as a recording."""
+    found = format_of(file, part)
+    if part is None:
+        recording = found.frames(file)
+    elif found.frames_of is None:
+        raise UsageError(f"{file}:{part}: {found.name} files have no parts or layouts to name")
+    else:
+        recording = found.frames_of(file, part)
+    if page is None:
+        return recording
     if page >= recording.pages:
         raise InputError(f"{file}: has no page {page}, it holds {recording.pages}")
     time_s = None if recording.time_s is None else recording.time_s[page : page + 1]
@@ -171,16 +151,6 @@ def _only(file: Path, recording: Recording, page: int) -> Recording:
 def count_pages(path: Path) -> int:
     """Return how many frames an image file holds: see `frames`."""
     return frames(path).pages
-
-
-def times_of(path: Path) -> NDArray[np.float64] | None:
-    """Return when each frame of a file was taken, in s, shape (pages,); None where the file does not tell.
-
-    Raises
-    ------
-    InputError : as `frames`
-    """
-    return frames(path).time_s
 
 
 def read_image(path: Path, shape: Shape | None = None) -> Image:
@@ -223,18 +193,6 @@ def read_page(path: Path, page: int, shape: Shape | None = None) -> Image:
     if not 0 <= page < recording.pages:
         raise InputError(f"{path}: has no page {page}, it holds {recording.pages}")
     return recording.read_page(page, shape)
-
-
-def ensure_shape(paths: Iterable[Path], shape: Shape) -> None:
-    """Refuse files whose headers say frames of another shape, before any of them is read.
-
-    Raises
-    ------
-    InputError : as `read_page`
-    """
-    for path in paths:
-        if frames(path).shape != shape:
-            read_page(path, 0, shape)  # says what is wrong
 
 
 def write_tiff(path: Path, array: NDArray[Any], overwrite: bool) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, fields
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -22,18 +22,13 @@ from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import ColumnAxis, Facing, Layout, names_in
 from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera, Lattice
-from lfpiv_cli.optics.curved_space import CurvedSpace, Face
-from lfpiv_cli.optics.media import Media
+from lfpiv_cli.optics.curved_space import Face
 from lfpiv_cli.optics.surfaces import SURFACES
 
 # Of the camera, those above 0; what else there is of numbers may have any sign.
 POSITIVE = (
-    "focal_length_mm",
-    "aperture_mm",
-    "microlens_focal_length_mm",
-    "microlens_distance_mm",
-    "pixel_mm",
-    "entrance_over_exit",
+    *("focal_length_mm", "aperture_mm", "microlens_focal_length_mm", "microlens_distance_mm"),
+    *("pixel_mm", "entrance_over_exit"),
 )
 CAMERA_SCALARS = ("magnification", *POSITIVE, "columns", "rows", "column_axis", "distortion_per_mm2")
 # A kernel holds a volume, its padding, what it is made from, and as many numbers of each pixel.
@@ -63,7 +58,11 @@ def read_camera(tree: dict[str, Any]) -> Camera:
     pixels = values["columns"] * values["rows"]
     if BYTES_A_PIXEL * pixels > physical_memory():
         raise ValueError(f"{values['columns']} x {values['rows']} pixels do not fit into memory")
-    camera = Camera(lattice=_lattice(tree), **values)
+    basis = _array("lattice_basis_mm", tree, (2, 2))
+    lattice = Lattice(_array("lattice_origin_mm", tree, (2,)), basis, tree["layout"])
+    if not lattice.cell_area >= LEAST_SINE * math.prod(lattice.pitch):
+        raise ValueError(f"the lattice's basis {basis.tolist()} is of no array of lenses")
+    camera = Camera(lattice=lattice, **values)
     pitch_px = camera.lattice.pitch / camera.pixel_mm
     if not (pitch_px.min() >= FEWEST_PIXELS_A_LENS and pitch_px.max() <= MOST_PIXELS_A_LENS):
         raise ValueError(f"its lens images are {pitch_px.tolist()} px apart")
@@ -92,29 +91,6 @@ def read_grid(tree: dict[str, Any]) -> tuple[Grid, tuple[int, int, int]]:
     return grid, padding
 
 
-def read_media(tree: dict[str, Any]) -> Media:
-    """Return the media that rays cross.
-
-    Raises
-    ------
-    KeyError, ValueError
-    """
-    indices = [read_number(name, tree[name]) for name in ("air", "window", "fluid")]
-    if not (min(indices) >= 1.0 and max(indices) <= LARGEST_INDEX):
-        raise ValueError(f"its refractive indices are {indices}, expected 1 to {LARGEST_INDEX:g}")
-    return Media(*indices)
-
-
-def faces_tree(space: CurvedSpace) -> dict[str, Any]:
-    """Return faces as a weights file has them: a group each, numbered from the camera on."""
-    kinds = {surface: kind for kind, surface in SURFACES.items()}
-    return {
-        str(k): {"kind": kinds[type(face.surface)], "index": face.index}
-        | {name: _plain(value) for name, value in asdict(face.surface).items()}  # type: ignore[call-overload]
-        for k, face in enumerate(space.faces)
-    }
-
-
 def read_face(tree: dict[str, Any]) -> Face:
     """Return a face that rays cross.
 
@@ -125,41 +101,25 @@ def read_face(tree: dict[str, Any]) -> Face:
     if tree["kind"] not in SURFACES:
         raise ValueError(f"a face is a {tree['kind']!r}, expected one of {', '.join(SURFACES)}")
     kind = SURFACES[tree["kind"]]
-    values = {field.name: _of_surface(field.name, tree[field.name]) for field in fields(kind)}  # type: ignore[arg-type]
+    values: dict[str, Any] = {}
+    for name in (field.name for field in fields(kind)):  # type: ignore[arg-type]
+        value = values[name] = tree[name]
+        if name == "facing":
+            if value not in names_in(Facing):
+                raise ValueError(f"facing is {value!r}, expected one of {', '.join(names_in(Facing))}")
+        elif name == "heights_mm":
+            heights = _array(name, tree, np.shape(value) if np.ndim(value) == 2 else (0, 0))
+            values[name] = tuple(tuple(row) for row in heights.tolist())
+        elif name == "spacing_mm":
+            values[name] = tuple(_positive(name, each) for each in _array(name, tree, (2,)).tolist())
+        elif isinstance(value, np.ndarray):
+            values[name] = _triple(name, value, read_number)
+        else:
+            values[name] = (_positive if name == "radius_mm" else read_number)(name, value)
     index = read_number("index", tree["index"])
     if not 1.0 <= index <= LARGEST_INDEX:
         raise ValueError(f"the index behind a face is {index:g}, expected 1 to {LARGEST_INDEX:g}")
     return Face(kind(**values), index)
-
-
-def _of_surface(name: str, value: Any) -> Any:
-    """Return a number, a point, heights or a word that a surface has."""
-    if name == "facing":
-        if value not in names_in(Facing):
-            raise ValueError(f"facing is {value!r}, expected one of {', '.join(names_in(Facing))}")
-        return value
-    if name == "heights_mm":
-        heights = _array(name, {name: value}, np.shape(value) if np.ndim(value) == 2 else (0, 0))
-        return tuple(tuple(row) for row in heights.tolist())
-    if name == "spacing_mm":
-        x, y = _array(name, {name: value}, (2,)).tolist()
-        return _positive(name, x), _positive(name, y)
-    if isinstance(value, np.ndarray):
-        return _triple(name, value, read_number)
-    return _positive(name, value) if name == "radius_mm" else read_number(name, value)
-
-
-def _plain(value: Any) -> Any:
-    """Return a point as an array, anything else as it is."""
-    return np.asarray(value, dtype=np.float64) if isinstance(value, tuple) else value
-
-
-def _lattice(tree: dict[str, Any]) -> Lattice:
-    origin, basis = _array("lattice_origin_mm", tree, (2,)), _array("lattice_basis_mm", tree, (2, 2))
-    lattice = Lattice(origin, basis, tree["layout"])
-    if not lattice.cell_area >= LEAST_SINE * math.prod(lattice.pitch):
-        raise ValueError(f"the lattice's basis {basis.tolist()} is of no array of lenses")
-    return lattice
 
 
 def _array(name: str, tree: dict[str, Any], shape: tuple[int, ...]) -> NDArray[np.float64]:

@@ -26,7 +26,6 @@ from lfpiv_cli.files.particle_file import (
     PointRows,
     Points,
     StoredTracks,
-    TrackStore,
     read_points,
     read_tracks,
     write_points,
@@ -120,10 +119,9 @@ def stored_tracks(
     OutputError : there is no room in the folder
     """
     sequence = tracks_through(frames, chosen, found)
-    with TrackStore(folder) as store:
+    with StoredTracks(folder, reference, chosen.attributes(reference), dict(provenance)) as points:
         for number in range(len(frames)):
-            store.put(sequence.at(number))
-        points = StoredTracks(store, reference, chosen.attributes(reference), dict(provenance))
+            points.put(sequence.at(number))
         yield TracksOf(points, TRAJECTORIES_FORMAT, sequence.paths, sequence.summary(), settings)
 
 

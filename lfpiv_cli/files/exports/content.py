@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +36,8 @@ ON_GRIDS = (VOLUME_FORMAT, VECTORS_FORMAT)
 OF_POINTS = (PARTICLES_FORMAT, TRACKS_FORMAT, TRAJECTORIES_FORMAT)
 # The last axis of an array, by its length: vectors, and symmetric tensors in VTK's order.
 COMPONENTS = {3: ("x", "y", "z"), 6: ("xx", "yy", "zz", "xy", "yz", "xz")}
+# What the components of these arrays are called; those of others have their name before them.
+NAMES = {POSITION: ["x", "y", "z"], "velocity": ["u", "v", "w"]}
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,19 +106,6 @@ def read_content(path: Path) -> Content:
     return Content(name, None, arrays, units, points.attributes, points.provenance)
 
 
-def plane_of(content: Content, number: int) -> Content:
-    """Return one plane across z of what lies on a grid, counted from 0."""
-    if content.grid is None:
-        raise ValueError("points have no planes")
-    grid = content.grid
-    nx, ny, _ = grid.shape_xyz
-    x, y, _ = grid.origin_mm
-    plane = Grid((nx, ny, 1), grid.spacing_mm, (x, y, float(grid.axis_mm(2)[number])))
-    return replace(
-        content, grid=plane, arrays={name: array[number : number + 1] for name, array in content.arrays.items()}
-    )
-
-
 def columns_of(content: Content) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
     """Return all as columns of one row for each place, coordinates before each component of each array; and the units.
 
@@ -130,19 +119,13 @@ def columns_of(content: Content) -> tuple[dict[str, NDArray[Any]], dict[str, str
         units = dict.fromkeys("xyz", "mm")
     places = 1 if content.grid is None else 3
     for name, array in content.arrays.items():
-        names = [name] if array.ndim == places else component_names(name, array.shape[-1])
+        names = [name]
+        if array.ndim > places:
+            count = array.shape[-1]
+            names = NAMES.get(name, [f"{name}_{suffix}" for suffix in COMPONENTS.get(count, range(count))])
         columns |= dict(zip(names, array.reshape(-1, len(names)).T, strict=True))
         units |= dict.fromkeys(names, content.units[name])
     return columns, units
-
-
-def component_names(name: str, count: int) -> list[str]:
-    """Return what the components of an array are called."""
-    if name == POSITION:
-        return ["x", "y", "z"]
-    if name == "velocity":
-        return ["u", "v", "w"]
-    return [f"{name}_{suffix}" for suffix in COMPONENTS.get(count, range(count))]
 
 
 def frames_of(content: Content) -> list[NDArray[np.int64]]:

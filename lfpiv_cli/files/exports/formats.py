@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -57,72 +57,58 @@ def write_netcdf(path: Path, contents: Sequence[Content], times_s: Sequence[floa
     """
     from scipy.io import netcdf_file
 
-    with netcdf_file(path, "w", version=2) as file:
-        for name, value in contents[0].told().items():
-            setattr(file, name, _attribute(value))
-        if contents[0].format_name == VECTORS_FORMAT:
-            _write_vectors(file, contents, times_s)
-        elif contents[0].grid is not None:
-            _write_axes(file, contents[0])
-            _write_arrays(file, contents[0], ("z", "y", "x"))
-        else:
-            file.createDimension("point", len(next(iter(contents[0].arrays.values()))))
-            _write_arrays(file, contents[0], ("point",))
-
-
-def _write_vectors(file: Any, contents: Sequence[Content], times_s: Sequence[float] | None) -> None:
     first = contents[0]
-    _write_axes(file, first)
-    file.delta_t = _attribute(float(first.attributes.get("dt_s", 0.0)))
-    file.pivpy_schema_version = PIVPY_SCHEMA
-    file.createDimension("t", len(contents))
-    _put(file, "t", np.arange(float(len(contents))) if times_s is None else np.asarray(times_s), ("t",))
-    file.variables["t"].units = "frame" if times_s is None else "s"
-    places = ("y", "x", "t") if first.arrays["flag"].shape[0] == 1 else ("z", "y", "x", "t")
+    with netcdf_file(path, "w", version=2) as file:
+        for name, value in first.told().items():
+            setattr(file, name, _attribute(value))
+        if first.grid is None:
+            file.createDimension("point", len(next(iter(first.arrays.values()))))
+            _write_arrays(file, first.arrays.items(), first.units, ("point",))
+            return
+        of_vectors = first.format_name == VECTORS_FORMAT
+        for k, axis in enumerate("xyz"):
+            values = first.grid.axis_mm(k)
+            if axis == "z" and len(values) == 1 and of_vectors:
+                # A plane has its place as a scalar.
+                _put(file, axis, values[0], (), "mm")
+            else:
+                file.createDimension(axis, len(values))
+                _put(file, axis, values, (axis,), "mm")
+        if not of_vectors:
+            _write_arrays(file, first.arrays.items(), first.units, ("z", "y", "x"))
+            return
 
-    def over_time(name: str) -> NDArray[Any]:
-        stacked = np.stack([content.arrays[name] for content in contents], axis=3)
-        return stacked[0] if "z" not in places else stacked
+        file.delta_t = _attribute(float(first.attributes.get("dt_s", 0.0)))
+        file.pivpy_schema_version = PIVPY_SCHEMA
+        file.createDimension("t", len(contents))
+        _put(file, "t", np.arange(float(len(contents))) if times_s is None else np.asarray(times_s), ("t",))
+        file.variables["t"].units = "frame" if times_s is None else "s"
+        places = ("y", "x", "t") if first.grid.shape_xyz[2] == 1 else ("z", "y", "x", "t")
 
-    for k, name in enumerate("uvw"):
-        _put(file, name, over_time("velocity")[..., k], places, "m/s")
-        file.variables[name].standard_name = f"{name}_velocity"
-    _put(file, "chc", (over_time("flag") < REJECTED).astype(np.uint8), places, "1")
-    file.variables["chc"].standard_name = "validity_flag"
-    for name in first.arrays:
-        if name != "velocity":
-            stacked = over_time(name)
-            of_components = _component_dimension(file, stacked.shape[len(places) :])
-            _put(file, name, stacked, places + of_components, first.units[name])
+        def over_time(name: str) -> NDArray[Any]:
+            stacked = np.stack([content.arrays[name] for content in contents], axis=3)
+            return stacked if "z" in places else stacked[0]
 
-
-def _write_axes(file: Any, content: Content) -> None:
-    if content.grid is None:
-        raise ValueError("points have no axes")
-    for k, axis in enumerate("xyz"):
-        values = content.grid.axis_mm(k)
-        if axis == "z" and len(values) == 1 and content.format_name == VECTORS_FORMAT:
-            # A plane has its place as a scalar.
-            _put(file, axis, values[0], (), "mm")
-        else:
-            file.createDimension(axis, len(values))
-            _put(file, axis, values, (axis,), "mm")
-
-
-def _write_arrays(file: Any, content: Content, places: tuple[str, ...]) -> None:
-    for name, array in content.arrays.items():
-        dimensions = places + _component_dimension(file, array.shape[len(places) :])
-        _put(file, name, array, dimensions, content.units[name])
+        for k, name in enumerate("uvw"):
+            _put(file, name, over_time("velocity")[..., k], places, "m/s")
+            file.variables[name].standard_name = f"{name}_velocity"
+        _put(file, "chc", (over_time("flag") < REJECTED).astype(np.uint8), places, "1")
+        file.variables["chc"].standard_name = "validity_flag"
+        others = ((name, over_time(name)) for name in first.arrays if name != "velocity")
+        _write_arrays(file, others, first.units, places)
 
 
-def _component_dimension(file: Any, shape: tuple[int, ...]) -> tuple[str, ...]:
-    """Return the dimension of an array's components, none where it has none."""
-    if not shape:
-        return ()
-    name = "component" if shape[0] == len(COMPONENTS[3]) else f"component_{shape[0]}"
-    if name not in file.dimensions:
-        file.createDimension(name, shape[0])
-    return (name,)
+def _write_arrays(
+    file: Any, arrays: Iterable[tuple[str, NDArray[Any]]], units: Mapping[str, str], places: tuple[str, ...]
+) -> None:
+    """Write arrays over dimensions that there are, and where they have components over a dimension of these."""
+    for name, array in arrays:
+        of_components: tuple[str, ...] = ()
+        for count in array.shape[len(places) :]:
+            of_components = ("component" if count == len(COMPONENTS[3]) else f"component_{count}",)
+            if of_components[0] not in file.dimensions:
+                file.createDimension(of_components[0], count)
+        _put(file, name, array, places + of_components, units[name])
 
 
 def _put(file: Any, name: str, array: NDArray[Any], dimensions: tuple[str, ...], unit: str | None = None) -> None:
@@ -223,25 +209,23 @@ def write_tecplot(path: Path, content: Content) -> None:
         file.writelines(f"{line}\n" for line in content.comments(units))
         file.write(f'TITLE = "{KINDS[content.format_name]}"\n')
         file.write("VARIABLES = " + " ".join(f'"{name}"' for name in columns) + "\n")
-        for head, rows in _zones(content):
+        kind = KINDS[content.format_name]
+        if content.grid is not None:
+            nx, ny, nz = content.grid.shape_xyz
+            zones: list[tuple[str, Any]] = [(f'T="{kind}", I={nx}, J={ny}, K={nz}', slice(None))]
+        elif content.format_name == TRAJECTORIES_FORMAT:
+            dt_s = float(content.attributes["dt_s"])
+            zones = [
+                (f'T="frame {k}", STRANDID=1, SOLUTIONTIME={k * dt_s!r}, I={rows.size}, J=1, K=1', rows)
+                for k, rows in enumerate(frames_of(content))
+                if rows.size
+            ]
+        else:
+            zones = [(f'T="{kind}", I={len(content.arrays[POSITION])}, J=1, K=1', slice(None))]
+        for head, rows in zones:
             file.write(f"ZONE {head}, DATAPACKING=POINT\nDT=({'DOUBLE ' * len(columns)})\n")
-            here = columns if rows is None else {name: column[rows] for name, column in columns.items()}
+            here = {name: column[rows] for name, column in columns.items()}
             file.writelines(" ".join(row) + "\n" for row in _rows(here))
-
-
-def _zones(content: Content) -> Iterator[tuple[str, NDArray[np.int64] | None]]:
-    """Yield the head and the rows of each zone, None where it has all."""
-    kind = KINDS[content.format_name]
-    if content.grid is not None:
-        nx, ny, nz = content.grid.shape_xyz
-        yield f'T="{kind}", I={nx}, J={ny}, K={nz}', None
-    elif content.format_name == TRAJECTORIES_FORMAT:
-        dt_s = float(content.attributes["dt_s"])
-        for number, rows in enumerate(frames_of(content)):
-            if rows.size:
-                yield f'T="frame {number}", STRANDID=1, SOLUTIONTIME={number * dt_s!r}, I={rows.size}, J=1, K=1', rows
-    else:
-        yield f'T="{kind}", I={len(content.arrays["position_mm"])}, J=1, K=1', None
 
 
 def _rows(columns: dict[str, NDArray[np.generic]]) -> Iterator[tuple[str, ...]]:

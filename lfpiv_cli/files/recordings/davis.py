@@ -6,16 +6,14 @@ after those of the one before.
 
 from __future__ import annotations
 
-import math
 import re
 import zlib
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Iterator
 from itertools import accumulate, pairwise
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
@@ -40,20 +38,6 @@ LENGTH, LENGTH_BYTES = "<I", 4
 PACKED_HINT = "save it from DaVis without compression, or as TIFF"
 
 
-@dataclass(frozen=True)
-class _Content:
-    """What a header declares."""
-
-    pages: int
-    shape: Shape
-    kind: str
-    packed: bool
-
-    @property
-    def frame_bytes(self) -> int:
-        return math.prod(self.shape) * np.dtype(self.kind).itemsize
-
-
 def im7_frames(path: Path) -> Recording:
     """Return the frames that a header declares, after checking that their bytes are there.
 
@@ -70,43 +54,41 @@ def im7_frames(path: Path) -> Recording:
             raise InputError(f"{path}: is packed in a way of its own ({packing}): {PACKED_HINT}")
         if min(columns, rows, pages) < 1:
             raise InputError(f"{path}: declares {pages} frames of {columns} x {rows} pixels (columns x rows)")
-        found = _Content(pages, (rows, columns), KINDS[kind], packing == ZLIB)
-        item_bytes = np.dtype(found.kind).itemsize
-        ensure_size(f"{path}: all frames together", (rows * pages, columns), item_bytes, None, size)
-        stored = found.frame_bytes * pages
-        if found.packed:
+        counts, declared = np.dtype(KINDS[kind]), (rows, columns)
+        ensure_size(f"{path}: all frames together", (rows * pages, columns), counts.itemsize, None, size)
+        frame_bytes = rows * columns * counts.itemsize
+        stored = frame_bytes * pages
+        if packing == ZLIB:
             stored = LENGTH_BYTES + values_at(path, file, HEADER_BYTES, LENGTH)[0]
         if HEADER_BYTES + stored > size:
             raise InputError(
                 f"{path}: declares {pages} frames that end at byte {HEADER_BYTES + stored} of {size}: {CUT}"
             )
-    return Recording(pages, found.shape, 8 * item_bytes, partial(_read_frame, path, found))
+
+    def read_page(page: int, shape: Shape | None) -> Image:
+        with opened(path) as file:
+            ensure_size(f"{path}: frame {page}", declared, 1, shape, file.seek(0, 2))
+            if packing == ZLIB:
+                data = _unpacked(path, file, pages, frame_bytes)[page * frame_bytes : (page + 1) * frame_bytes]
+            else:
+                data = bytes_at(path, file, HEADER_BYTES + page * frame_bytes, frame_bytes)
+        return as_counts(np.frombuffer(data, counts).reshape(declared))
+
+    return Recording(pages, declared, 8 * counts.itemsize, read_page)
 
 
-def _read_frame(path: Path, found: _Content, page: int, shape: Shape | None) -> Image:
-    data = _bytes_of(path, found, page, shape)
-    return as_counts(np.frombuffer(data, found.kind).reshape(found.shape))
-
-
-def _bytes_of(path: Path, found: _Content, page: int, shape: Shape | None) -> bytes:
-    """Return the bytes of a frame; of packed ones all are unpacked, whose check sum tells damage."""
-    begin, end = page * found.frame_bytes, (page + 1) * found.frame_bytes
-    with opened(path) as file:
-        ensure_size(f"{path}: frame {page}", found.shape, 1, shape, file.seek(0, 2))
-        if not found.packed:
-            return bytes_at(path, file, HEADER_BYTES + begin, found.frame_bytes)
-        (length,) = values_at(path, file, HEADER_BYTES, LENGTH)
-        packed = bytes_at(path, file, HEADER_BYTES + LENGTH_BYTES, length)
-    expected = found.pages * found.frame_bytes
+def _unpacked(path: Path, file: BinaryIO, pages: int, frame_bytes: int) -> bytes:
+    """Return the bytes of all frames, whose check sum tells damage."""
+    (length,) = values_at(path, file, HEADER_BYTES, LENGTH)
     unpacking = zlib.decompressobj()
     try:
         # One byte more than there should be, and the check sum after it is looked at.
-        data = unpacking.decompress(packed, expected + 1)
+        data = unpacking.decompress(bytes_at(path, file, HEADER_BYTES + LENGTH_BYTES, length), pages * frame_bytes + 1)
     except zlib.error as error:
         raise InputError(f"{path}: cannot be unpacked: {reason(error)}: {CUT}") from error
-    if len(data) != expected or not unpacking.eof:
-        raise InputError(f"{path}: does not unpack to {found.pages} frames of {found.frame_bytes} bytes: {CUT}")
-    return data[begin:end]
+    if len(data) != pages * frame_bytes or not unpacking.eof:
+        raise InputError(f"{path}: does not unpack to {pages} frames of {frame_bytes} bytes: {CUT}")
+    return data
 
 
 SUFFIX = ".set"
@@ -134,8 +116,17 @@ def set_frames(path: Path) -> Recording:
         if each.shape != found[0].shape:
             raise InputError(f"{file}: has (rows, columns) {each.shape}, the first image of its set {found[0].shape}")
     ends = list(accumulate(each.pages for each in found))
-    bits = max(each.bits for each in found)
-    return Recording(ends[-1], found[0].shape, bits, partial(_read_page, files, ends))
+
+    def read_page(page: int, shape: Shape | None) -> Image:
+        number = bisect_right(ends, page)
+        within = page - (ends[number - 1] if number else 0)
+        # The header is read, too, so that an image that was written anew is not read by its old one.
+        image = im7_frames(files[number])
+        if within >= image.pages:
+            raise InputError(f"{files[number]}: holds {image.pages} frames, fewer than when its set was looked through")
+        return image.read_page(within, shape)
+
+    return Recording(ends[-1], found[0].shape, max(each.bits for each in found), read_page)
 
 
 def beside(path: Path) -> tuple[Path, ...]:
@@ -161,9 +152,14 @@ def _images(path: Path) -> list[Path]:
     (folder,) = beside(path)
     numbered = sorted(_numbered(folder))
     if not numbered:
-        raise InputError(f"{path}: its folder {folder} {_instead(folder)}")
-    numbers = [number for number, _ in numbered]
-    if numbers[0] not in FIRST:
+        within = sorted(each for each in folder.iterdir() if each.is_dir() and any(_numbered(each)))
+        kinds = Counter(each.suffix.lower() for each in folder.iterdir() if each.suffix)
+        others = f", but {kinds.most_common(1)[0][0]} files" if kinds else ""
+        instead = f"holds no images B00001.im7, B00002.im7, ...{others}: {EXPORT_HINT}"
+        if within:
+            instead = f"holds several sets: give one of these folders, as {within[0]}"
+        raise InputError(f"{path}: its folder {folder} {instead}")
+    if numbered[0][0] not in FIRST:
         raise InputError(f"{path}: its first image is {numbered[0][1].name}, and those before it are missing")
     for (before, one), (after, other) in pairwise(numbered):
         if after != before + 1:
@@ -178,23 +174,3 @@ def _numbered(folder: Path) -> Iterator[tuple[int, Path]]:
         for file in folder.iterdir():
             if found := IMAGE.fullmatch(file.name):
                 yield int(found[1]), file
-
-
-def _instead(folder: Path) -> str:
-    """Return what a folder without images holds, and what to do."""
-    within = sorted(each for each in folder.iterdir() if each.is_dir() and any(_numbered(each)))
-    if within:
-        return f"holds several sets: give one of these folders, as {within[0]}"
-    kinds = Counter(each.suffix.lower() for each in folder.iterdir() if each.suffix)
-    others = f", but {kinds.most_common(1)[0][0]} files" if kinds else ""
-    return f"holds no images B00001.im7, B00002.im7, ...{others}: {EXPORT_HINT}"
-
-
-def _read_page(files: Sequence[Path], ends: Sequence[int], page: int, shape: Shape | None) -> Image:
-    """Read a frame; the image's header, too, so that one that was written anew is not read by its old one."""
-    number = bisect_right(ends, page)
-    within = page - (ends[number - 1] if number else 0)
-    found = im7_frames(files[number])
-    if within >= found.pages:
-        raise InputError(f"{files[number]}: holds {found.pages} frames, fewer than when its set was looked through")
-    return found.read_page(within, shape)

@@ -9,7 +9,7 @@ for display nor stretched between black and white levels.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
 from xml.etree import ElementTree
@@ -49,30 +49,33 @@ def mraw_frames(path: Path) -> Recording:
     ------
     InputError
     """
-    header = _header_beside(path)
+    (header,) = beside(path)
     found = _read_header(header)
     colour = found.get("colour", MONO).lower()
     if colour != MONO:
         raise InputError(f"{header}: describes {colour} images: {COLOUR_HINT}")
-    pages, columns, rows, bits = (_number(header, found, name) for name in ("pages", "columns", "rows", "bits"))
+    for name in ("pages", "columns", "rows", "bits"):
+        text = found.get(name)
+        if text is None or re.fullmatch(r"[1-9]\d{0,8}", text) is None:
+            raise InputError(f"{header}: {NAMES[name][0]} is {text}, expected a positive number")
+    pages, columns, rows, bits = (int(found[name]) for name in ("pages", "columns", "rows", "bits"))
     if bits not in STORED_BITS:
         raise InputError(f"{header}: {NAMES['bits'][0]} is {bits}, expected one of {sorted(STORED_BITS)}")
     pixels = Pixels((rows, columns), bits, "high-first" if bits in PACKED_BITS else "whole")
+    rate_hz = 0.0
+    with suppress(ValueError, ZeroDivisionError):
+        # The camera's, or one in so many where it left some out.
+        rate_hz = float(found.get("rate", "0")) / float(found.get("step", "1"))
     places = range(0, pages * pixels.frame_bytes, pixels.frame_bytes)
-    return recording(path, places, pixels, at_rate(pages, _rate_hz(found)))
+    return recording(path, places, pixels, at_rate(pages, rate_hz))
 
 
 def beside(path: Path) -> tuple[Path, ...]:
-    """Return the header of a file, which the counts depend on as on the file itself."""
-    return (_header_beside(path),)
-
-
-def _header_beside(path: Path) -> Path:
-    """Return the header of a file: its name with another ending, in small or large letters."""
+    """Return the header of a file, which the counts depend on as on the file itself: its name with another ending."""
     for suffix in (".cihx", ".cih", ".CIHX", ".CIH"):
         header = path.with_suffix(suffix)
         if header.exists():
-            return header
+            return (header,)
     raise InputError(f"{path}: its header {path.with_suffix('.cihx').name} or .cih is not beside it")
 
 
@@ -95,21 +98,6 @@ def _read_header(header: Path) -> dict[str, str]:
         raise InputError(f"{header}: is not XML: {reason(error)}") from error
     told = {name: tree.findtext(place) for name, (_, place) in NAMES.items()}
     return {name: text.strip() for name, text in told.items() if text is not None}
-
-
-def _number(header: Path, found: Mapping[str, str], name: str) -> int:
-    text = found.get(name)
-    if text is None or re.fullmatch(r"[1-9]\d{0,8}", text) is None:
-        raise InputError(f"{header}: {NAMES[name][0]} is {text}, expected a positive number")
-    return int(text)
-
-
-def _rate_hz(found: Mapping[str, str]) -> float:
-    """Return how many frames a second are in the file: the camera's, or one in so many where it left some out."""
-    try:
-        return float(found.get("rate", "0")) / float(found.get("step", "1"))
-    except (ValueError, ZeroDivisionError):
-        return 0.0
 
 
 # Norpix' .seq: a header of 1024 or 8192 bytes, then frames, each followed by its time.
@@ -157,25 +145,17 @@ def seq_frames(path: Path) -> Recording:
             )
         first = LONG_HEADER if version >= LONG_HEADER_VERSION else SHORT_HEADER
         places = range(first, first + pages * step, step)
-        found = recording(path, places, pixels)
-        return Recording(
-            pages, found.shape, used, found.read_page, _times_of_seq(path, file, places, frame_bytes, version)
-        )
-
-
-def _times_of_seq(path: Path, file: BinaryIO, places: range, frame_bytes: int, version: int) -> NDArray[np.float64]:
-    """Return the times of the frames, in s from the first one's."""
-    size = file.seek(0, 2)
-    stamps = np.empty(len(places), TIME)
-    for page, place in enumerate(places):
-        if place + frame_bytes + TIME.itemsize > size:
-            raise InputError(f"{path}: ends before the time of frame {page}: {CUT}")
-        file.seek(place + frame_bytes)
-        stamps[page] = np.frombuffer(file.read(TIME.itemsize), TIME)[0]
+        found, size = recording(path, places, pixels), file.seek(0, 2)
+        stamps = np.empty(len(places), TIME)
+        for page, place in enumerate(places):
+            if place + frame_bytes + TIME.itemsize > size:
+                raise InputError(f"{path}: ends before the time of frame {page}: {CUT}")
+            file.seek(place + frame_bytes)
+            stamps[page] = np.frombuffer(file.read(TIME.itemsize), TIME)[0]
     if version < LONG_HEADER_VERSION:
         stamps["us"] = 0
     ticks = stamps["s"].astype(np.int64) * 1_000_000 + stamps["ms"].astype(np.int64) * 1000 + stamps["us"]
-    return (ticks - ticks[0]) / 1e6
+    return Recording(pages, found.shape, used, found.read_page, (ticks - ticks[0]) / 1e6)
 
 
 CINE_START = b"CI"
@@ -228,15 +208,28 @@ def cine_frames(path: Path) -> Recording:
         ensure_size(f"{path}: a frame", pixels.shape, 1, None, path.stat().st_size)
         times = _times(path, file, setup_at, places_at, pages)
 
-        def begin(file: BinaryIO, place: int) -> int:
-            return _after_notes(path, file, place, pixels.frame_bytes)
+    def begin(file: BinaryIO, place: int) -> int:
+        (notes_bytes,) = values_at(path, file, place, "<I")
+        if notes_bytes < SHORTEST_NOTES:
+            raise InputError(f"{path}: the notes of the frame at byte {place} have {notes_bytes} bytes: {CUT}")
+        (declared,) = values_at(path, file, place + notes_bytes - 4, "<I")
+        if declared != pixels.frame_bytes:
+            raise InputError(
+                f"{path}: the frame at byte {place} declares {declared} bytes, expected {pixels.frame_bytes}: {CUT}"
+            )
+        return place + notes_bytes
 
-        found = recording(path, places, pixels, begin=begin)
-        return Recording(pages, found.shape, used, found.read_page, times)
+    found = recording(path, places, pixels, begin=begin)
+    return Recording(pages, found.shape, used, found.read_page, times)
 
 
 def _pixels(path: Path, file: BinaryIO, bitmap_at: int, setup_at: int) -> tuple[Pixels, int]:
-    """Return how pixels are stored, and how many of their bits are used."""
+    """Return how pixels are stored, and how many of their bits are used.
+
+    Raises
+    ------
+    UsageError : they are packed to 10 bits, and the library that has the manufacturer's table is missing
+    """
     _, columns, height, _, stored, packing, frame_bytes = values_at(path, file, bitmap_at, BITMAP)
     (mark,) = values_at(path, file, setup_at + SETUP_MARK_AT, "<2s")
     if mark != SETUP_MARK:
@@ -246,7 +239,14 @@ def _pixels(path: Path, file: BinaryIO, bitmap_at: int, setup_at: int) -> tuple[
     if columns <= 0 or height == 0:
         raise InputError(f"{path}: declares frames of {columns} x {height} pixels (columns x rows)")
     if packing == PACKED_10:
-        pixels, used = Pixels(shape, 10, "high-first", table=linear_counts(path)), LINEAR_BITS
+        try:
+            from cine_reader.unpack import unpack_10bit_numpy
+        except ImportError:
+            raise UsageError(f'{path}: is packed to 10 bits: pip install "lfpiv[cameras]"') from None
+        # The count, linear in the light, of each of 1024 codes, four in five bytes, by the library's unpacking.
+        codes = "".join(f"{code:010b}" for code in range(1024))
+        table = unpack_10bit_numpy(int(codes, 2).to_bytes(len(codes) // 8, "big"))
+        pixels, used = Pixels(shape, 10, "high-first", table=table), LINEAR_BITS
     elif packing == PACKED_12:
         pixels = Pixels(shape, 12, "high-first")
     elif packing == WHOLE and stored in (8, 16):
@@ -258,33 +258,6 @@ def _pixels(path: Path, file: BinaryIO, bitmap_at: int, setup_at: int) -> tuple[
     if frame_bytes != pixels.frame_bytes:
         raise InputError(f"{path}: declares {frame_bytes} bytes a frame, expected {pixels.frame_bytes}")
     return pixels, used if 0 < used <= pixels.bits or packing == PACKED_10 else pixels.bits
-
-
-def linear_counts(path: Path) -> NDArray[np.uint16]:
-    """Return the counts, linear in the light and of 12 bits, of the 1024 codes of a cine packed to 10 bits.
-
-    Raises
-    ------
-    UsageError : the library that has the manufacturer's table is missing
-    """
-    try:
-        from cine_reader.unpack import unpack_10bit_numpy
-    except ImportError:
-        raise UsageError(f'{path}: is packed to 10 bits: pip install "lfpiv[cameras]"') from None
-    # Four codes are five bytes: all 1024 in order, through the library's own unpacking.
-    codes = "".join(f"{code:010b}" for code in range(1024))
-    return unpack_10bit_numpy(int(codes, 2).to_bytes(len(codes) // 8, "big"))
-
-
-def _after_notes(path: Path, file: BinaryIO, place: int, frame_bytes: int) -> int:
-    """Return where the pixels of the frame at `place` begin."""
-    (notes_bytes,) = values_at(path, file, place, "<I")
-    if notes_bytes < SHORTEST_NOTES:
-        raise InputError(f"{path}: the notes of the frame at byte {place} have {notes_bytes} bytes: {CUT}")
-    (declared,) = values_at(path, file, place + notes_bytes - 4, "<I")
-    if declared != frame_bytes:
-        raise InputError(f"{path}: the frame at byte {place} declares {declared} bytes, expected {frame_bytes}: {CUT}")
-    return place + notes_bytes
 
 
 def _times(path: Path, file: BinaryIO, setup_at: int, places_at: int, pages: int) -> NDArray[np.float64] | None:

@@ -41,11 +41,10 @@ class _Keeper(logging.Handler):
             _kept.append(notice)
 
 
-def keep_complaints(logger_name: str) -> None:
-    """Keep what a decoder logs, in place of printing it."""
-    logger = logging.getLogger(logger_name)
-    logger.addHandler(_Keeper(logging.WARNING))
-    logger.propagate = False
+# In place of printing it.
+_logger = logging.getLogger("tifffile")
+_logger.addHandler(_Keeper(logging.WARNING))
+_logger.propagate = False
 
 
 def taken_complaints() -> list[Notice]:
