@@ -76,9 +76,8 @@ def ignores_case(folder: Path) -> bool:
     return False
 
 
-@lru_cache(maxsize=16)
-def _real(folder: Path) -> str:
-    return os.path.realpath(folder)
+# Once a folder: there may be thousands of files.
+_real = lru_cache(maxsize=16)(os.path.realpath)
 
 
 def _identity(path: Path) -> Identity | None:
@@ -244,39 +243,38 @@ def write_atomically(
     """
     ensure_writable(target, overwrite)
     with folder_of(target):
-        _write(target, write, overwrite, check)
+        _clear(target.parent.absolute(), os.getpid())
+        begun_by = f"{host_digest()}-{os.getpid()}-{secrets.token_hex(4)}"
+        temporary = target.with_name(f".{target.stem[:KEPT_CHARACTERS]}.{begun_by}.partial{target.suffix}")
+        try:
+            os.close(create_alone(temporary))
+            write(temporary)
+            if check is not None:
+                try:
+                    check(temporary)
+                except InputError as error:
+                    raise OutputError(f"{target}: what was written does not read back: {error}") from error
+            _flush(temporary, os.O_RDWR)
+            ensure_writable(target, overwrite)
+            os.replace(temporary, target)
+            with contextlib.suppress(OSError):  # Windows cannot open folders
+                _flush(target.parent, os.O_RDONLY)
+        except LfpivError:
+            raise
+        except OSError as error:
+            raise OutputError(f"{target}: cannot be written: {reason(error)}") from error
+        finally:
+            with contextlib.suppress(OSError):
+                temporary.unlink()
 
 
-def _write(
-    target: Path, write: Callable[[Path], None], overwrite: bool, check: Callable[[Path], object] | None
-) -> None:
-    """Do the work of `write_atomically` in a folder that is there."""
-    temporary: Path | None = None
+def _flush(path: Path, flags: int) -> None:
+    """Bring a file's content, or a folder's entries, to the disk."""
+    descriptor = os.open(path, flags)
     try:
-        temporary = _reserve(target)
-        write(temporary)
-        if check is not None:
-            _read_back(target, temporary, check)
-        _flush(temporary)
-        ensure_writable(target, overwrite)
-        os.replace(temporary, target)
-        temporary = None
-        _flush_folder(target.parent)
-    except LfpivError:
-        raise
-    except OSError as error:
-        raise OutputError(f"{target}: cannot be written: {reason(error)}") from error
+        os.fsync(descriptor)
     finally:
-        if temporary is not None:
-            temporary.unlink(missing_ok=True)
-
-
-def _read_back(target: Path, temporary: Path, check: Callable[[Path], object]) -> None:
-    """Raise where a finished file is not what was meant."""
-    try:
-        check(temporary)
-    except InputError as error:
-        raise OutputError(f"{target}: what was written does not read back: {error}") from error
+        os.close(descriptor)
 
 
 def write_json(path: Path, value: Mapping[str, Any], overwrite: bool) -> None:
@@ -306,15 +304,6 @@ def without_nan(value: Any) -> Any:
     return value
 
 
-def _reserve(target: Path) -> Path:
-    """Create an empty file beside the target that nobody else has, with the permissions the umask allows."""
-    _clear(target.parent.absolute(), os.getpid())
-    begun_by = f"{host_digest()}-{os.getpid()}-{secrets.token_hex(4)}"
-    temporary = target.with_name(f".{target.stem[:KEPT_CHARACTERS]}.{begun_by}.partial{target.suffix}")
-    os.close(create_alone(temporary))
-    return temporary
-
-
 @lru_cache(maxsize=64)
 def _clear(folder: Path, _process: int) -> None:
     """Remove from a folder what processes of this host had begun to write when they were killed.
@@ -327,22 +316,6 @@ def _clear(folder: Path, _process: int) -> None:
             if left is not None and left["host"] == host_digest() and not is_running(int(left["process"])):
                 with contextlib.suppress(OSError):
                     os.unlink(entry.path)
-
-
-def _flush(path: Path) -> None:
-    """Bring a file's content to the disk."""
-    with open(path, "rb+") as file:
-        os.fsync(file.fileno())
-
-
-def _flush_folder(folder: Path) -> None:
-    """Bring a folder's entries to the disk where the system can (Windows cannot open folders)."""
-    with contextlib.suppress(OSError):
-        descriptor = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
 
 
 # A log for programs that watch batches: a line of JSON for each event, added to what the file holds.

@@ -168,23 +168,19 @@ def state_of(target: Target) -> State:
     if not paths:
         return State.MISSING
     made = target.record
-    states = [_state_of(path, made) for path in paths]
-    if len(paths) <= len(target.beside):
-        states.append(State.MISSING)
-    return max(states, key=lambda state: WORST_LAST.index(state))
-
-
-def _state_of(path: Path, made: Mapping[str, Any]) -> State:
-    """Return what a file is that is there in the place of one with this record."""
-    try:
-        carried = read_whole(path)
-    except InputError:
-        return State.BROKEN
-    if carried is None:
-        return State.OTHER
-    if without_warnings(carried) == made:
-        return State.COMPLETE
-    return State.BEARS_ALIKE if bear_alike(carried, made) else State.OTHER
+    states = [State.MISSING] if len(paths) <= len(target.beside) else []
+    for path in paths:
+        try:
+            carried = read_whole(path)
+        except InputError:
+            states.append(State.BROKEN)
+            continue
+        if carried is not None and without_warnings(carried) == made:
+            states.append(State.COMPLETE)
+        else:
+            alike = carried is not None and bear_alike(carried, made)
+            states.append(State.BEARS_ALIKE if alike else State.OTHER)
+    return max(states, key=WORST_LAST.index)
 
 
 def pending(
@@ -206,7 +202,22 @@ def pending(
     OutputExistsError : a target is there and neither `overwrite` nor a matching `resume` covers it.
     """
     ensure_apart((path for target in targets for path in target.paths), inputs)
-    return [number for number, target in enumerate(targets) if not _is_kept(target, overwrite, resume, dry)]
+    left = []
+    for number, target in enumerate(targets):
+        found = state_or_none(target) if resume else None
+        if found is State.BEARS_ALIKE and overwrite and not dry:
+            made = dict(target.record)
+            for path in target.paths:
+                old = read_whole(path) or {}
+                replace_provenance(path, made | {name: old[name] for name in ("warnings",) if name in old})
+        if found is State.COMPLETE or (found is State.BEARS_ALIKE and overwrite):
+            continue
+        if found in (State.BEARS_ALIKE, State.OTHER) and not overwrite:
+            raise OutputExistsError(_made_otherwise(target, found))
+        for path in target.paths:
+            ensure_writable(path, overwrite or resume)
+        left.append(number)
+    return left
 
 
 def is_kept(
@@ -219,22 +230,6 @@ def is_kept(
     OutputExistsError : as `pending`
     """
     return not pending([Target(path, lambda: made) for path in paths], inputs, overwrite, resume)
-
-
-def _is_kept(target: Target, overwrite: bool, resume: bool, dry: bool) -> bool:
-    """Return whether a target is left as it is, after it is known that it could be written if not."""
-    found = state_or_none(target) if resume else None
-    if found is State.COMPLETE:
-        return True
-    if found is State.BEARS_ALIKE and overwrite:
-        if not dry:
-            _record_anew(target)
-        return True
-    if found in (State.BEARS_ALIKE, State.OTHER) and not overwrite:
-        raise OutputExistsError(_made_otherwise(target, found))
-    for path in target.paths:
-        ensure_writable(path, overwrite or resume)
-    return False
 
 
 def _made_otherwise(target: Target, found: State) -> str:
@@ -257,14 +252,6 @@ def state_or_none(target: Target) -> State | None:
         return state_of(target)
     except InputError:
         return None
-
-
-def _record_anew(target: Target) -> None:
-    """Give a target its new record, and let it keep its data and what was warned of."""
-    made = dict(target.record)
-    for path in target.paths:
-        old = read_whole(path) or {}
-        replace_provenance(path, made | {name: old[name] for name in ("warnings",) if name in old})
 
 
 # What is known of frames besides their names: the pages of their files, and the images that results are of.
@@ -297,38 +284,28 @@ def results_seen(paths: Sequence[Path]) -> list[Seen]:
     pages: dict[str, set[int]] = defaultdict(set)
     for source in sources:
         if source is not None:
-            pages[source.digest].add(source.page)
-    seen = [
-        each if source is None else _of_source(each, source, len(pages[source.digest]) > 1)
-        for each, source in zip(own, sources, strict=True)
-    ]
+            pages[source[1]].add(source[2])
+    seen = list(own)
+    for k, source in enumerate(sources):
+        if source is not None:
+            stem, digest, page = source
+            # Its page, too, where the image's file holds several.
+            several = len(pages[digest]) > 1 or page > 0 or own[k].stem == f"{stem}_{page:04d}"
+            seen[k] = replace(own[k], stem=stem, page=page if several else None, image=f"{digest} {page}")
     if len({(each.stem, each.page) for each in seen}) == len({each.image or each.path for each in seen}):
         return seen
     return [replace(each, image=other.image) for each, other in zip(own, seen, strict=True)]
 
 
-@dataclass(frozen=True)
-class _Source:
-    """The image of a result: its file's name without suffix and SHA-256, and the page."""
+def _source(path: Path) -> tuple[str, str, int] | None:
+    """Return the image that a result is made from: its file's name without suffix and SHA-256, and the page.
 
-    stem: str
-    digest: str
-    page: int
-
-
-def _source(path: Path) -> _Source | None:
-    """Return the image that a result is made from; None where its record does not say, or the file is broken."""
+    None where its record does not say, or the file is broken.
+    """
     try:
         made = earlier_record(path) or {}
         image, page = made["inputs"]["image"], PAGE.search(made["command"])
         stem = split_part(Path(image["name"]))[0].stem
-        return page and _Source(stem, image["sha256"], int(page[1]))
+        return page and (stem, image["sha256"], int(page[1]))
     except (InputError, KeyError, TypeError):
         return None  # what is broken is told where its turn comes
-
-
-def _of_source(own: Seen, source: _Source, several: bool) -> Seen:
-    """Return what is known of a result by its image: its page, too, where the image's file holds several."""
-    several = several or source.page > 0 or own.stem == f"{source.stem}_{source.page:04d}"
-    page = source.page if several else None
-    return replace(own, stem=source.stem, page=page, image=f"{source.digest} {source.page}")

@@ -20,7 +20,7 @@ from lfpiv_cli.files.bench import (
     round_wall_of,
     scene_of,
 )
-from lfpiv_cli.files.sections import CylinderFace, HeightMapFace, MainLens
+from lfpiv_cli.files.sections import CylinderFace, HeightMapFace
 from lfpiv_cli.files.sections_simulated import Sections, SimulationSection
 from lfpiv_cli.files.yaml_nodes import KeyPath
 from lfpiv_cli.flow.windows import RoundWall
@@ -85,17 +85,14 @@ def _pipe(sections: Sections) -> Found:
     inside = round_wall_of(pipe)
     axis = RoundWall(face.radius_mm, axis=face.axis).direction
     if np.linalg.norm(np.cross(inside.direction, axis)) > AGREEMENT:
-        yield ("pipe", "axis"), f"is {_told(pipe.axis)}, but that of the last face in scene is {_told(face.axis)}"
+        ours, theirs = (each if isinstance(each, str) else list(each) for each in (pipe.axis, face.axis))
+        yield ("pipe", "axis"), f"is {ours}, but that of the last face in scene is {theirs}"
     from_focal_point = sections.volume is not None and sections.volume.reference == "focal_point"
     if from_focal_point and inside.distances_mm(np.array(face.centre_mm)) > AGREEMENT_MM:
         yield (
             ("pipe", "centre_mm"),
             f"is {list(pipe.centre_mm)}, but that of the last face in scene is {list(face.centre_mm)}",
         )
-
-
-def _told(axis: str | tuple[float, ...]) -> str:
-    return axis if isinstance(axis, str) else str(list(axis))
 
 
 Found = Iterator[tuple[KeyPath, str]]
@@ -127,7 +124,7 @@ def contradictions(sections: Sections) -> Found:
     if beyond:
         yield from beyond
         return
-    for faults in (_lens, _sensor, _lens_images, _volume, _board, _walls, _scene, _processing, _rays, _object_space):
+    for faults in (_lens, _lens_images, _volume, _board, _walls, _scene, _processing, _rays, _object_space):
         yield from faults(sections)
 
 
@@ -159,7 +156,13 @@ def _lens(sections: Sections) -> Found:
         place = ("camera", "main_lens")
         focal_length = focal_length_mm(lens)
         if lens.image_distance is not None:
-            yield from _telecentric(lens)
+            if lens.focal_length_mm is None:
+                yield place, "needs focal_length_mm, which an infinite image distance does not tell"
+            if lens.image_distance_mm is not None:
+                yield (*place, "image_distance_mm"), f"is {lens.image_distance_mm:g}, but image_distance is infinite"
+            if lens.pupil_ratio != 1.0:
+                text = f"is {lens.pupil_ratio:g}, but image_distance is infinite and so is the ratio"
+                yield (*place, "pupil_ratio"), text
         elif focal_length is None:
             yield place, "needs focal_length_mm or image_distance_mm"
         elif lens.image_distance_mm is not None:
@@ -185,38 +188,22 @@ def _lens(sections: Sections) -> Found:
             )
 
 
-def _telecentric(lens: MainLens) -> Found:
-    """Yield what a lens whose exit pupil is infinitely far away cannot have, and the focal length where it lacks."""
-    place = ("camera", "main_lens")
-    if lens.focal_length_mm is None:
-        yield place, "needs focal_length_mm, which an infinite image distance does not tell"
-    if lens.image_distance_mm is not None:
-        yield (*place, "image_distance_mm"), f"is {lens.image_distance_mm:g}, but image_distance is infinite"
-    if lens.pupil_ratio != 1.0:
-        yield (*place, "pupil_ratio"), f"is {lens.pupil_ratio:g}, but image_distance is infinite and so is the ratio"
-
-
-def _sensor(sections: Sections) -> Found:
-    """Yield pixels so large or so small that lens images cannot be told: most often a slip in the unit."""
-    if sections.camera is None:
+def _lens_images(sections: Sections) -> Found:
+    """Yield pixels that cannot tell lens images, a sensor far out of their focus, and too wide an aperture."""
+    section = sections.camera
+    if section is None:
         return
-    sensor, pitch_mm = sections.camera.sensor, sections.camera.microlenses.pitch_mm
+    sensor, pitch_mm = section.sensor, section.microlenses.pitch_mm
     pitch_px = pitch_mm * 1e3 / sensor.pixel_um
-    if not FEWEST_PIXELS_A_LENS <= pitch_px <= MOST_PIXELS_A_LENS:
+    if not FEWEST_PIXELS_A_LENS <= pitch_px <= MOST_PIXELS_A_LENS:  # most often a slip in the unit
         yield (
             ("camera", "sensor", "pixel_um"),
             f"is {sensor.pixel_um:g}: lens images would be {written(pitch_px, 4)} px apart (pitch_mm is {pitch_mm:g}), "
             f"expected {FEWEST_PIXELS_A_LENS:g} to {MOST_PIXELS_A_LENS:g}: pixels in um, the pitch in mm",
         )
-
-
-def _lens_images(sections: Sections) -> Found:
-    """Yield a sensor far out of the microlenses' focus, and an aperture whose images cover many lenses."""
-    section = sections.camera
-    if section is None or missing_for_camera(section) is not None:
-        return
-    for place, text in lens_image_faults(camera_of(section)):
-        yield ("camera", *place), text
+    if missing_for_camera(section) is None:
+        for place, text in lens_image_faults(camera_of(section)):
+            yield ("camera", *place), text
 
 
 def lens_image_faults(camera: Camera) -> Found:

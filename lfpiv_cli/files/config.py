@@ -6,17 +6,20 @@ mean 'layout'?`
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
 
+from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.calibration.model import Calibration, Channel, Rig
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.files import bench
-from lfpiv_cli.files.bench import ensure_same, fingerprint, moved_faces, moved_pipe
 from lfpiv_cli.files.checks import contradictions
 from lfpiv_cli.files.inputs import content_of, ensure_regular_file, opened
 from lfpiv_cli.files.sections import (
@@ -51,6 +54,7 @@ from lfpiv_cli.names import Refraction
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.media import Media, Window, channel_window
+from lfpiv_cli.optics.surfaces import SURFACES
 from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.reconstruction.registry import SOLVERS
 from lfpiv_cli.reconstruction.solvers import SolverSettings, Stopping
@@ -59,6 +63,16 @@ from lfpiv_cli.synthetic.vortices import Flow
 
 # Images and HDF5 files have a zero byte among their first ones, and no text has.
 BEGINNING_BYTES = 512
+# Of the paper's final window along the axis with the smallest voxels; the coarse one is twice as large: a displacement
+# of a quarter of its side does not leave it.
+DEFAULT_WINDOW = 16
+# Along an axis with longer voxels, where particle images are long: two of them fit.
+SMALLEST_DEFAULT_WINDOW = 8
+SMALLEST_WINDOW = 4
+
+
+Triple = tuple[int, int, int]
+Lengths = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -71,10 +85,23 @@ class Config:
     ----------
     sections : as they stand in the file, defaults filled in
     source : the file's name, for messages
+    channel, pipe, weights, reconstruction, correlation, simulation, validation : the sections that may be left out
     """
 
     sections: Sections
     source: str
+    channel: ChannelSection | None = field(init=False)
+    pipe: PipeSection | None = field(init=False)
+    weights: WeightsSection = field(init=False)
+    reconstruction: ReconstructionSection = field(init=False)
+    correlation: CorrelationSection = field(init=False)
+    simulation: SimulationSection = field(init=False)
+    validation: ValidationSection = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Take these out of the sections."""
+        for each in fields(self)[2:]:
+            object.__setattr__(self, each.name, getattr(self.sections, each.name))
 
     @classmethod
     def from_resolved(cls, resolved: Mapping[str, Any], source: str = "the stored config") -> Config:
@@ -114,7 +141,7 @@ class Config:
         """
         keys = type(getattr(self.sections, section)).model_fields
         return self.overridden(
-            section, **{field.name: getattr(options, field.name) for field in fields(options) if field.name in keys}
+            section, **{each.name: getattr(options, each.name) for each in fields(options) if each.name in keys}
         )
 
     @property
@@ -137,60 +164,25 @@ class Config:
         """The section `board`."""
         return self._needed("board", self.sections.board)
 
-    @property
-    def channel(self) -> ChannelSection | None:
-        """The section `channel`, None where there is none."""
-        return self.sections.channel
-
-    @property
-    def pipe(self) -> PipeSection | None:
-        """The section `pipe`, None where there is none."""
-        return self.sections.pipe
-
-    @property
-    def weights(self) -> WeightsSection:
-        """The section `weights`."""
-        return self.sections.weights
-
-    @property
-    def reconstruction(self) -> ReconstructionSection:
-        """The section `reconstruction`."""
-        return self.sections.reconstruction
-
-    @property
-    def correlation(self) -> CorrelationSection:
-        """The section `correlation`."""
-        return self.sections.correlation
-
-    @property
-    def simulation(self) -> SimulationSection:
-        """The section `simulation`."""
-        return self.sections.simulation
-
-    @property
-    def validation(self) -> ValidationSection:
-        """The section `validation`."""
-        return self.sections.validation
-
     def image_shape(self) -> tuple[int, int]:
         """Return the sensor's (rows, columns)."""
         return self.camera.sensor.rows, self.camera.sensor.columns
 
     def camera_model(self) -> Camera:
         """Return the camera as the data sheet has it, a lens centre on the axis."""
-        section = self.camera
-        missing = bench.missing_for_camera(section)
-        if missing is not None:
-            raise self._missing(f"camera.{missing}")
-        return bench.camera_of(section)
+        camera: Camera = self._needed(f"camera.{bench.missing_for_camera(self.camera)}", self.complete_camera())
+        return camera
 
     def complete_camera(self) -> Camera | None:
         """Return the camera as the data sheet has it, None where it lacks a length."""
         return None if bench.missing_for_camera(self.camera) is not None else bench.camera_of(self.camera)
 
     def micro_image_pitch_px(self) -> float:
-        """Return the pitch of the lens images by the data sheet."""
-        return bench.micro_image_pitch_px(self.camera)
+        """Return the pitch of the lens images by the data sheet, of parallel light where the lens is not known."""
+        camera, section = self.complete_camera(), self.camera
+        if camera is not None:
+            return float(camera.micro_image_lattice_px().pitch.mean())
+        return section.microlenses.pitch_mm / (section.sensor.pixel_um * bench.UM_TO_MM)
 
     def media_model(self) -> Media:
         """Return the refractive indices."""
@@ -240,30 +232,44 @@ class Config:
         return None if scene is None else bench.scene_of(scene, self.media_model())
 
     def scene_fingerprint(self) -> str:
-        """Return what tells the scene from another one.
+        """Return what tells the scene from another one: the SHA-256 of its faces.
 
         Raises
         ------
         ConfigError : there is none
         """
-        return fingerprint(self._needed("scene", self.sections.scene))
+        faces = self._needed("scene", self.sections.scene)
+        plain = [face.model_dump(mode="json", exclude={"file"}) for face in faces]
+        return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
 
     def with_scene_of(self, found: Calibration | None) -> Config:
-        """Return the config with its scene, and the wall of its pipe, where a calibration has found them to lie.
+        """Return the config with its scene where a calibration has found it to lie: moved as one body.
+
+        The wall of its pipe is moved with the faces.
 
         Raises
         ------
         ConfigError
-            If the calibration's is another scene.
+            If the calibration's is another scene, or a face cannot be turned.
         """
         if found is None or found.scene is None:
             return self
         scene, motion = self.sections.scene, found.scene.motion
-        ensure_same(scene, found.scene.faces_sha256, self.source)
-        resolved = self.resolved()
-        resolved["scene"] = moved_faces(scene or (), self.media, motion)
+        if scene is None:
+            raise ConfigError(f"{self.source}: scene: is missing, and the calibration tells where it lies")
+        if self.scene_fingerprint() != found.scene.faces_sha256:
+            raise ConfigError(
+                f"{self.source}: scene: is not the one whose place the calibration tells; refine-calibration again, "
+                "from a calibration that knows of no scene"
+            )
+        resolved, kinds = self.resolved(), {surface: kind for kind, surface in SURFACES.items()}
+        resolved["scene"] = []
+        for section in scene:
+            surface: Any = bench.face_of(section, self.media_model()).surface.moved(motion)
+            resolved["scene"].append({"kind": kinds[type(surface)], **asdict(surface), "behind": section.behind})
         if self.pipe is not None:
-            resolved["pipe"] = moved_pipe(self.pipe, motion)
+            axis = motion.direction(bench.round_wall_of(self.pipe).direction.tolist())
+            resolved["pipe"] |= {"centre_mm": motion.point(self.pipe.centre_mm), "axis": axis}
         return Config.from_resolved(resolved, f"{self.source} with the calibration's scene")
 
     def plane_space(self, what: str, mid_plane_z_mm: float | None = None) -> ObjectSpace:
@@ -306,18 +312,51 @@ class Config:
         return bench.grid_of(self.volume, scale, reference)
 
     def rig(self) -> Rig:
-        """Return what must be known to read the picture of a board."""
-        channel = None if self.channel is None else Channel(**self.channel.model_dump(exclude={"no_slip"}))
-        light = bench.wave_light_of(self.reconstruction)
-        return Rig(self.camera_model(), self.media_model(), bench.board_of(self.board), channel, light)
+        """Return what must be known to read the picture of a board; a chessboard's points are its inner corners."""
+        board, channel = self.board, self.channel
+        points = board.dots if board.squares is None else (board.squares[0] - 1, board.squares[1] - 1)
+        if points is None:
+            raise ValueError("board.dots or board.squares is missing")
+        told = board.model_dump(exclude={"dots", "squares"})
+        told |= {name: told[name] or 0.0 for name in ("dot_diameter_mm", "marker_mm")}
+        return Rig(
+            self.camera_model(),
+            self.media_model(),
+            BoardGeometry(dots=points, **told),
+            None if channel is None else Channel(**channel.model_dump(exclude={"no_slip"})),
+            bench.wave_light_of(self.reconstruction),
+        )
 
-    def windows_voxel(self, voxel_mm: tuple[float, float, float]) -> tuple[tuple[int, int, int], ...]:
-        """Return the correlation windows (x, y, z) in voxels, coarse to fine."""
-        return bench.windows_of(self.correlation, voxel_mm)
+    def windows_voxel(self, voxel_mm: Lengths) -> tuple[Triple, ...]:
+        """Return the correlation windows (x, y, z) in voxels, coarse to fine; `window_mm` is the final one of two.
 
-    def overlap(self, voxel_mm: tuple[float, float, float]) -> tuple[float, float, float]:
-        """Return the overlap of the correlation windows along x, y, z."""
-        return bench.overlap_of(self.correlation, voxel_mm)
+        By default they are as long along all axes, as far as voxels of different sides allow.
+        """
+        section = self.correlation
+        if section.windows is not None:
+            return section.windows
+        lengths, smallest = section.window_mm, SMALLEST_WINDOW
+        if lengths is None:
+            side = DEFAULT_WINDOW * min(voxel_mm)
+            lengths, smallest = (side, side, side), SMALLEST_DEFAULT_WINDOW
+        final = [max(smallest, round(length / voxel)) for length, voxel in zip(lengths, voxel_mm, strict=True)]
+        return (2 * final[0], 2 * final[1], 2 * final[2]), (final[0], final[1], final[2])
+
+    def overlap(self, voxel_mm: Lengths) -> Lengths:
+        """Return the overlap of the final windows in voxels along x, y, z.
+
+        Windows given as `window_mm` are whole voxels only nearly; their overlap is then what leaves the distance
+        between them, and with it their number, as in mm.
+        """
+        section = self.correlation
+        if section.window_mm is None:
+            return section.overlap
+        *_, final = self.windows_voxel(voxel_mm)
+        x, y, z = (
+            max(0.0, 1.0 - length * (1.0 - overlap) / (voxel * size))
+            for length, overlap, voxel, size in zip(section.window_mm, section.overlap, voxel_mm, final, strict=True)
+        )
+        return x, y, z
 
     def masking_walls(self) -> Walls | None:
         """Return the walls beyond which `correlation.mask` leaves voxels and vectors out, None where it does not."""
@@ -345,16 +384,11 @@ class Config:
             Stopping(chosen.stop_change, None, chosen.stop_noise, chosen.photons_per_count),
         )
 
-    def correlation_exponent(self) -> float:
-        """Return the power of the intensities that is correlated: the configured one, or the solver's default."""
-        solver = SOLVERS.get(self.reconstruction.solver)
-        return self.correlation.exponent or (solver.exponent if solver else 1.0)
-
-    def correlation_settings(self, voxel_mm: tuple[float, float, float]) -> CorrelationSettings:
-        """Return how volumes of such voxels are correlated."""
-        return CorrelationSettings(
-            self.windows_voxel(voxel_mm), self.overlap(voxel_mm), self.correlation.dt_s, self.correlation_exponent()
-        )
+    def correlation_settings(self, voxel_mm: Lengths) -> CorrelationSettings:
+        """Return how volumes of such voxels are correlated: by a configured power, or the solver's default."""
+        chosen, solver = self.correlation, SOLVERS.get(self.reconstruction.solver)
+        exponent = chosen.exponent or (solver.exponent if solver else 1.0)
+        return CorrelationSettings(self.windows_voxel(voxel_mm), self.overlap(voxel_mm), chosen.dt_s, exponent)
 
     def simulated_flow(self, reference: Reference = FOCAL_POINT) -> Flow:
         """Return the flow to render, a function of points: z as in the config, or from the focal point as in `grid`."""
@@ -385,11 +419,8 @@ class Config:
 
     def _needed(self, key: str, section: Any) -> Any:
         if section is None:
-            raise self._missing(key)
+            raise ConfigError(f"{self.source}: {key}: is missing, and this command needs it")
         return section
-
-    def _missing(self, key: str) -> ConfigError:
-        return ConfigError(f"{self.source}: {key}: is missing, and this command needs it")
 
 
 def load_config(path: Path) -> Config:
@@ -403,7 +434,15 @@ def load_config(path: Path) -> Config:
         If the file is missing or not a file.
     """
     size = ensure_regular_file(path)
-    _ensure_text(path)
+    with opened(path) as file:
+        is_text = b"\0" not in file.read(BEGINNING_BYTES)
+    if not is_text:  # an image, or a file that commands take in other places; else it is told where it is read
+        from lfpiv_cli.files.images import format_of
+
+        with suppress(InputError):
+            kind = format_of(path).name
+            what = "an HDF5 file" if kind == "HDF5" else f"an image ({kind})"
+            raise ConfigError(f"{path}: is {what}; expected a rig file")
     if size > LARGEST_BYTES:
         raise ConfigError(f"{path}: has {size} bytes, expected at most {LARGEST_BYTES}")
     content = content_of(path)
@@ -412,25 +451,6 @@ def load_config(path: Path) -> Config:
     except YamlError as error:
         raise ConfigError(sentence(str(path), error.problem)) from error
     return _validated(with_heights(document, path), str(path))
-
-
-def _ensure_text(path: Path) -> None:
-    """Refuse an image, or another binary file of a kind that commands take in other places, by what it is.
-
-    Raises
-    ------
-    ConfigError
-    """
-    with opened(path) as file:
-        if b"\0" not in file.read(BEGINNING_BYTES):
-            return
-    from lfpiv_cli.files.images import format_of
-
-    try:
-        kind = format_of(path).name
-    except InputError:
-        return  # what is no text is told where it is read
-    raise ConfigError(f"{path}: is {'an HDF5 file' if kind == 'HDF5' else f'an image ({kind})'}; expected a rig file")
 
 
 def carried_config(record: Mapping[str, Any], source: Path | str) -> Config:

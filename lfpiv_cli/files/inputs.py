@@ -193,26 +193,21 @@ def _rooms() -> Iterator[tuple[float, str]]:
     limit = address_space()
     if limit is not None:
         yield max(limit - own.get("VmSize", 0), 0), "this process's address space (ulimit -v)"
-    for path in _group_limits():
-        if (text := _text(path).strip()).isdecimal():
-            yield max(int(text) - own.get("VmRSS", 0), 0), "this job's limit (its control group)"
+    for line in _text(PROCESS / "cgroup").splitlines():
+        _, controllers, group = line.split(":", 2)
+        if controllers and "memory" not in controllers.split(","):
+            continue
+        # Both versions of control groups; a limit on a group holds for all groups in it.
+        base, name = CONTROL_GROUPS, "memory.max"
+        if controllers:
+            base, name = CONTROL_GROUPS / "memory", "memory.limit_in_bytes"
+        place = base / group.lstrip("/")
+        for folder in (place, *place.parents):
+            if (folder == base or base in folder.parents) and (text := _text(folder / name).strip()).isdecimal():
+                yield max(int(text) - own.get("VmRSS", 0), 0), "this job's limit (its control group)"
     machine = _told(MACHINE)
     if "MemAvailable" in machine:
         yield machine["MemAvailable"] + machine.get("SwapFree", 0), "this machine"
-
-
-def _group_limits() -> Iterator[Path]:
-    """Yield the files that hold the memory limits of this process's control groups, for both of their versions."""
-    for line in _text(PROCESS / "cgroup").splitlines():
-        _, controllers, group = line.split(":", 2)
-        if controllers == "" or "memory" in controllers.split(","):
-            second = controllers == ""
-            base = CONTROL_GROUPS if second else CONTROL_GROUPS / "memory"
-            place = base / group.lstrip("/")
-            # A limit on a group holds for all groups in it.
-            for folder in (place, *place.parents):
-                if folder == base or base in folder.parents:
-                    yield folder / ("memory.max" if second else "memory.limit_in_bytes")
 
 
 def _told(path: Path) -> dict[str, int]:

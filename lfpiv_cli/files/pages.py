@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from lfpiv_cli.errors import UsageError
 from lfpiv_cli.files.atomic import write_atomically, write_text
-from lfpiv_cli.files.inputs import ensure_regular_file
+from lfpiv_cli.files.inputs import content_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -120,31 +120,21 @@ def write_pages(page: Page, targets: Iterable[Path], overwrite: bool) -> None:
     ------
     InputError : a picture cannot be read
     """
-    for target in targets:
-        write_text(target, _rendered(page, target), overwrite)
-
-
-def _rendered(page: Page, target: Path) -> str:
-    """Return a page in the language that a file's name ends in."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-    places = Environment(
-        loader=FileSystemLoader(TEMPLATES),
-        autoescape=lambda name: name is not None and name.endswith(".html"),
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
-    places.filters |= {
-        "data_uri": _data_uri,
-        "cell": lambda text: text.replace("|", "\\|"),
-        "relative": lambda path: path.relative_to(target.parent).as_posix(),
-    }
-    return places.get_template(f"page{target.suffix}").render(page=page)
-
-
-def _data_uri(path: Path) -> str:
-    """Return a PNG file as an address that holds the picture itself."""
-    ensure_regular_file(path)
-    return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode("ascii")
+    for target in targets:
+        places = Environment(
+            loader=FileSystemLoader(TEMPLATES),
+            autoescape=lambda name: name is not None and name.endswith(".html"),
+            undefined=StrictUndefined,
+            trim_blocks=True,
+            lstrip_blocks=True,
+            keep_trailing_newline=True,
+        )
+        places.filters |= {
+            # A PNG file as an address that holds the picture itself.
+            "data_uri": lambda path: "data:image/png;base64," + base64.b64encode(content_of(path)).decode("ascii"),
+            "cell": lambda text: text.replace("|", "\\|"),
+            "relative": lambda path, folder=target.parent: path.relative_to(folder).as_posix(),
+        }
+        write_text(target, places.get_template(f"page{target.suffix}").render(page=page), overwrite)

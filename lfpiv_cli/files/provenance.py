@@ -9,7 +9,7 @@ import hashlib
 import json
 import os
 import platform
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from importlib.metadata import version
@@ -135,16 +135,6 @@ def without_warnings(made: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in made.items() if name != "warnings"}
 
 
-def recorded_warnings(made: Mapping[str, Any]) -> list[str]:
-    """Return what was warned of when a result was made, and before that when its inputs were, each with the command."""
-    records = [*made.get("made_from", {}).values(), made]
-    return [
-        f"{each['command']}: {warning['about']}: {warning['text']}; {warning['remedy']} [{warning['code']}]"
-        for each in records
-        for warning in each.get("warnings", ())
-    ]
-
-
 def also_used_as(made: Mapping[str, Any], role: str) -> str | None:
     """Return as what else the input of a role was given, to this command or to one before; None if as nothing else.
 
@@ -216,7 +206,10 @@ def sha256(path: Path) -> str:
     """
     file, _ = split_part(path)
     if os.path.isdir(file):
-        return _sha256_of_all(file, tuple(_states_in(file)))
+        with reading_from(file), os.scandir(file) as entries:
+            files = [each for each in entries if each.is_file() and not each.name.startswith(".")]
+            states = sorted((each.name, each.stat().st_size, each.stat().st_mtime_ns) for each in files)
+        return _sha256_of_all(file, tuple(states))
     size = ensure_regular_file(file)
     return _sha256(file, size, file.stat().st_mtime_ns)
 
@@ -226,15 +219,6 @@ def _sha256(path: Path, size: int, modified_ns: int) -> str:
     """Hash a file once as long as it does not change: what all frames of a batch share is an input of each."""
     with opened(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _states_in(folder: Path) -> Iterator[tuple[str, int, int]]:
-    """Yield name, size and time of the files in a folder, by their names; not of hidden ones and of folders."""
-    with reading_from(folder), os.scandir(folder) as entries:
-        for entry in sorted(entries, key=lambda each: each.name):
-            if entry.is_file() and not entry.name.startswith("."):
-                status = entry.stat()
-                yield entry.name, status.st_size, status.st_mtime_ns
 
 
 @lru_cache(maxsize=FILES_REMEMBERED)
@@ -268,8 +252,15 @@ def _bearing(made: Mapping[str, Any], earlier: Mapping[str, Any]) -> dict[str, A
 def differences(carried: Mapping[str, Any], made: Mapping[str, Any]) -> list[str]:
     """Return in words what has changed since a result was made, by the record that it carries and that it would get."""
     before, now = _facts(carried), _facts(made)
-    changed = [name for name in dict.fromkeys([*now, *before]) if before.get(name) != now.get(name)]
-    told = [_change(name, before.get(name), now.get(name)) for name in changed]
+    told = []
+    for name in dict.fromkeys([*now, *before]):
+        was, is_now = before.get(name), now.get(name)
+        if isinstance(was, dict) or isinstance(is_now, dict):  # an input, which is no plain value
+            words = f"{name} is another file"
+        else:
+            words = f"{name} was {was}, is {is_now}".replace("None", "not given")
+        if was != is_now:
+            told.append(words if len(words) <= LONGEST_CHANGE else f"{name} has changed")
     configs = [made.get("inputs", {}).get("config") for made in (carried, made)]
     return told or (["the config is another file, which says the same"] if configs[0] != configs[1] else [])
 
@@ -279,14 +270,6 @@ def _facts(made: Mapping[str, Any]) -> dict[str, Any]:
     inputs = _bearing(made, made["made_from"])["inputs"] if "made_from" in made else {}
     versions = {"lfpiv": made.get("version"), **made.get("libraries", {})}
     return {**_values(made.get("config") or {}), **inputs, "the command": made.get("command"), **versions}
-
-
-def _change(name: str, before: Any, now: Any) -> str:
-    """Return in words that something has changed; of an input, which is no plain value, no more than that."""
-    if isinstance(before, dict) or isinstance(now, dict):
-        return f"{name} is another file"
-    words = f"{name} was {before}, is {now}".replace("None", "not given")
-    return words if len(words) <= LONGEST_CHANGE else f"{name} has changed"
 
 
 def ensure_agreement(records: Sequence[Mapping[str, Any]], names: Sequence[str], keys: Sequence[str]) -> None:

@@ -176,12 +176,6 @@ FaceSection = Annotated[
 ]
 
 
-def parameters_of(face: FaceSection) -> dict[str, Any]:
-    """Return what the surface of a face is made of, by the names that `optics.surfaces` has."""
-    others = ("kind", "behind", "file")
-    return {name: getattr(face, name) for name in type(face).model_fields if name not in others}
-
-
 class MainLens(Section):
     """The main lens: M and two of its lengths; what is given twice must agree.
 

@@ -93,7 +93,15 @@ def read_document(content: bytes) -> Document:
     """
     if len(content) > LARGEST_BYTES:
         raise YamlError(1, 1, f"has {len(content)} bytes, expected at most {LARGEST_BYTES}")
-    text = _decode(content)
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        before = content[: error.start]
+        line = before.count(b"\n") + 1
+        raise YamlError(line, error.start - before.rfind(b"\n"), "is not UTF-8 text") from error
+    if found := re.search(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]", text):  # no editor shows them
+        line, column = text.count("\n", 0, found.start()) + 1, found.start() - text.rfind("\n", 0, found.start())
+        raise YamlError(line, column, f"holds the control character {ord(found.group()):#04x}")
     try:
         _ensure_plain(text)
         root = yaml.compose(text, Loader=LOADER)
@@ -112,21 +120,6 @@ def read_document(content: bytes) -> Document:
         raise YamlError(*_place(root), "is not a mapping of sections")
     document.data = _plain(root, (), document)
     return document
-
-
-def _decode(content: bytes) -> str:
-    """Return the text, refusing what is not UTF-8 and control characters, which no editor shows."""
-    try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        before = content[: error.start]
-        line = before.count(b"\n") + 1
-        raise YamlError(line, error.start - before.rfind(b"\n"), "is not UTF-8 text") from error
-    if found := re.search(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]", text):
-        line = text.count("\n", 0, found.start()) + 1
-        column = found.start() - text.rfind("\n", 0, found.start())
-        raise YamlError(line, column, f"holds the control character {ord(found.group()):#04x}")
-    return text
 
 
 def _ensure_plain(text: str) -> None:
@@ -151,52 +144,35 @@ def _ensure_plain(text: str) -> None:
 
 
 def _plain(node: yaml.Node, path: KeyPath, document: Document) -> Any:
-    """Return a node as plain data, noting where everything stands."""
+    """Return a node as plain data, noting where everything stands; unquoted scalars by the core schema of YAML 1.2."""
     document.values[path] = _place(node)
-    if isinstance(node, yaml.MappingNode):
-        return _plain_mapping(node, path, document)
     if isinstance(node, yaml.SequenceNode):
         return tuple(_plain(item, (*path, k), document) for k, item in enumerate(node.value))
-    plain = isinstance(node, yaml.ScalarNode) and not node.style
+    if isinstance(node, yaml.MappingNode):
+        mapping: dict[str, Any] = {}
+        for key_node, value_node in node.value:
+            place, key = _place(key_node), key_node.value
+            if not isinstance(key_node, yaml.ScalarNode):
+                document.problems.append(Problem(*place, key_name(path), "a key must be a word"))
+            elif key in mapping:
+                text = f"repeated key, first on line {document.keys[*path, key][0]}"
+                document.problems.append(Problem(*place, key_name((*path, key)), text))
+            else:
+                document.keys[*path, key] = place
+                mapping[key] = _plain(value_node, (*path, key), document)
+        return mapping
+    if not isinstance(node, yaml.ScalarNode) or node.style:
+        return node.value
+    convert = next((convert for pattern, convert in SCALARS if pattern.fullmatch(node.value)), str)
     try:
-        return _scalar(node.value) if plain else node.value
+        value = convert(node.value)
+        # Python reads and prints no integer of more than 4300 digits, and none of ours needs more than 64 bits.
+        if isinstance(value, int) and abs(value) > LARGEST_INTEGER:
+            raise ValueError
     except ValueError:
         document.problems.append(Problem(*_place(node), key_name(path), "is too long a number"))
         return 0
-
-
-def _plain_mapping(node: yaml.MappingNode, path: KeyPath, document: Document) -> dict[str, Any]:
-    mapping: dict[str, Any] = {}
-    for key_node, value_node in node.value:
-        place = _place(key_node)
-        if not isinstance(key_node, yaml.ScalarNode):
-            document.problems.append(Problem(*place, key_name(path), "a key must be a word"))
-            continue
-        key = key_node.value
-        if key in mapping:
-            first = document.keys[*path, key][0]
-            document.problems.append(Problem(*place, key_name((*path, key)), f"repeated key, first on line {first}"))
-            continue
-        document.keys[*path, key] = place
-        mapping[key] = _plain(value_node, (*path, key), document)
-    return mapping
-
-
-def _scalar(text: str) -> Any:
-    """Return what an unquoted scalar means by the core schema of YAML 1.2.
-
-    Raises
-    ------
-    ValueError : it is an integer of more digits than any of ours has
-    """
-    for pattern, convert in SCALARS:
-        if pattern.fullmatch(text):
-            value = convert(text)
-            # Python prints no integer of more than 4300 digits, and none of ours needs more than 64 bits.
-            if isinstance(value, int) and abs(value) > LARGEST_INTEGER:
-                raise ValueError
-            return value
-    return text
+    return value
 
 
 def _place(node: yaml.Node | yaml.Event) -> tuple[int, int]:
@@ -266,7 +242,13 @@ def problem_of(document: Document, details: ErrorDetails) -> Problem:
     place = place_of(document, path)
     if kind == "extra_forbidden":
         place = document.keys.get(path, (0, 0))
-        text = _unknown(path)
+        models: list[Any] = [Sections]
+        for part in (part for part in path[:-1] if isinstance(part, str)):
+            inner = [model.model_fields[part] for model in models if part in model.model_fields]
+            models = [model for field in inner for model in _models_in(field.annotation)]
+        known = list(dict.fromkeys(name for model in models for name in model.model_fields))
+        near = difflib.get_close_matches(str(path[-1]), known, n=1)
+        text = f"unknown key; did you mean '{near[0]}'?" if near else f"unknown key; known are {', '.join(known)}"
     elif kind in ("missing", "union_tag_not_found"):
         if kind == "union_tag_not_found":
             path = (*path, "kind")
@@ -287,24 +269,6 @@ def problem_of(document: Document, details: ErrorDetails) -> Problem:
     else:
         text = f"is {_shown(value)}, expected {KINDS.get(kind, details['msg'])}"
     return Problem(*place, key_name(path), text)
-
-
-def _unknown(path: KeyPath) -> str:
-    """Return the sentence about a key that its section does not know."""
-    known = _known_keys(path[:-1])
-    near = difflib.get_close_matches(str(path[-1]), known, n=1)
-    return f"unknown key; did you mean '{near[0]}'?" if near else f"unknown key; known are {', '.join(known)}"
-
-
-def _known_keys(path: KeyPath) -> list[str]:
-    """Return the keys of the section at a place."""
-    models: list[Any] = [Sections]
-    for part in path:
-        if isinstance(part, int):
-            continue
-        fields = [model.model_fields[part] for model in models if part in model.model_fields]
-        models = [inner for field in fields for inner in _models_in(field.annotation)]
-    return list(dict.fromkeys(name for model in models for name in model.model_fields))
 
 
 def _models_in(annotation: Any) -> list[Any]:
@@ -363,6 +327,8 @@ Rows = tuple[tuple[float, ...], ...]
 def with_heights(document: Document, source: Path) -> Document:
     """Return a configuration with the heights of each file that a face names, beside `source`, in the file's place.
 
+    What is no such face stays as it is, to be judged with the rest.
+
     Raises
     ------
     ConfigError : one cannot be read
@@ -370,23 +336,20 @@ def with_heights(document: Document, source: Path) -> Document:
     scene = document.data.get("scene")
     if not isinstance(scene, tuple):
         return document
-    faces = tuple(_with_heights(face, ("scene", k, "file"), document, source) for k, face in enumerate(scene))
-    return replace(document, data=document.data | {"scene": faces})
-
-
-def _with_heights(face: Any, path: KeyPath, document: Document, source: Path) -> Any:
-    """Return one face, its file read; any other as it is, to be judged with the rest."""
-    if not isinstance(face, Mapping) or face.get("kind") != "height_map" or "heights_mm" in face:
-        return face
-    file = face.get("file")
-    if not isinstance(file, str):
-        return face
-    try:
-        heights = read_heights(source.parent / file)
-    except InputError as error:
-        problem = Problem(*place_of(document, path), key_name(path), str(error))
-        raise ConfigError(sentence(str(source), problem)) from error
-    return {name: value for name, value in face.items() if name != "file"} | {"heights_mm": heights}
+    faces = list(scene)
+    for k, face in enumerate(scene):
+        if not isinstance(face, Mapping) or face.get("kind") != "height_map" or "heights_mm" in face:
+            continue
+        if not isinstance(face.get("file"), str):
+            continue
+        try:
+            heights = read_heights(source.parent / face["file"])
+        except InputError as error:
+            path: KeyPath = ("scene", k, "file")
+            problem = Problem(*place_of(document, path), key_name(path), str(error))
+            raise ConfigError(sentence(str(source), problem)) from error
+        faces[k] = {name: value for name, value in face.items() if name != "file"} | {"heights_mm": heights}
+    return replace(document, data=document.data | {"scene": tuple(faces)})
 
 
 def read_heights(path: Path) -> Rows:
@@ -401,22 +364,19 @@ def read_heights(path: Path) -> Rows:
     ending = path.suffix.lower()
     if ending in (".tif", ".tiff"):
         rows = _rows_of(read_image(path), path)
+    elif ending == ".npy":
+        try:
+            array = np.load(path, mmap_mode="r", allow_pickle=False)  # its size is held against the file's
+        except Exception as error:  # a damaged header can raise anything in NumPy
+            raise InputError(f"{path}: is no NumPy array: {reason(error)}") from error
+        rows = _rows_of(np.asarray(array), path)
     else:
-        rows = _rows_of(_array(path), path) if ending == ".npy" else tuple(_table(path))
+        rows = tuple(_table(path))
     bad = [(r, c) for r, row in enumerate(rows, start=1) for c, z in enumerate(row, start=1) if not math.isfinite(z)]
     if bad:
         row, column = bad[0]
         raise InputError(f"{path}: {len(bad)} heights are no numbers, the first one in row {row}, column {column}")
     return tuple(tuple(round(z, DIGITS) for z in row) for row in rows)
-
-
-def _array(path: Path) -> NDArray[Any]:
-    """Return a NumPy array, its size held against the file's."""
-    try:
-        array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except Exception as error:  # a damaged header can raise anything in NumPy
-        raise InputError(f"{path}: is no NumPy array: {reason(error)}") from error
-    return np.asarray(array)
 
 
 def _rows_of(array: NDArray[Any], path: Path) -> Rows:
