@@ -29,19 +29,13 @@ from lfpiv_cli.files.inputs import reason, split_part
 
 # Where the files of a command lie: no two outputs in one place, and none in that of an input.
 
-
 # The folder as the system knows it, and the name in it; what an existing file is, whatever leads to it.
 Place = tuple[str, str]
 Identity = tuple[int, int]
 
 
 def ensure_apart(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
-    """Refuse outputs of which one would replace another, or an input, before anything is computed.
-
-    Raises
-    ------
-    UsageError
-    """
+    """Refuse outputs of which one would replace another, or an input, before anything is computed."""
     inputs = [split_part(path)[0] for path in inputs]
     read = {place_of(path) for path in inputs}
     files = {identity for identity in map(_identity, inputs) if identity is not None}
@@ -127,12 +121,9 @@ def ensure_writable(target: Path, overwrite: bool, inputs: Iterable[Path] = ()) 
 
     Raises
     ------
-    UsageError
-        If the target is one of the inputs.
-    OutputExistsError
-        If it exists and `overwrite` is false.
-    OutputError
-        If it is not a regular file, or its folder is read-only or cannot be made.
+    UsageError : the target is one of the inputs
+    OutputExistsError : it exists and `overwrite` is false
+    OutputError : it is not a regular file, or its folder is read-only or cannot be made
     """
     _ensure_possible(target)
     ensure_apart([target], inputs)
@@ -349,12 +340,7 @@ class EventLog:
             raise UsageError(f"{path}: is no log: its first line is no event with its time; --log would add to it")
 
     def write(self, event: str, fields: Mapping[str, Any]) -> None:
-        """Add an event.
-
-        Raises
-        ------
-        OutputError
-        """
+        """Add an event."""
         if self._read_only:
             return
         head = {

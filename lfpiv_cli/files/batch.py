@@ -223,12 +223,7 @@ def pending(
 def is_kept(
     paths: Sequence[Path], made: Mapping[str, Any], inputs: Iterable[Path], overwrite: bool, resume: bool
 ) -> bool:
-    """Return whether all results of a step, which carry one record, are there already, see `pending`.
-
-    Raises
-    ------
-    OutputExistsError : as `pending`
-    """
+    """Return whether all results of a step, which carry one record, are there already, see `pending`."""
     return not pending([Target(path, lambda: made) for path in paths], inputs, overwrite, resume)
 
 
@@ -255,7 +250,6 @@ def state_or_none(target: Target) -> State | None:
 
 
 # What is known of frames besides their names: the pages of their files, and the images that results are of.
-
 
 PAGE = re.compile(r"\bpage (\d+)\b")
 

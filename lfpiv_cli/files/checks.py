@@ -31,7 +31,6 @@ from lfpiv_cli.reference import FOCAL_POINT
 
 # What the section `scene` cannot be, by itself and beside other sections that tell of walls.
 
-
 # Of lengths that are given twice: a tenth of a micron is nothing.
 AGREEMENT_MM = 1e-4
 

@@ -105,12 +105,7 @@ class Config:
 
     @classmethod
     def from_resolved(cls, resolved: Mapping[str, Any], source: str = "the stored config") -> Config:
-        """Return the configuration that `resolved` described.
-
-        Raises
-        ------
-        ConfigError
-        """
+        """Return the configuration that `resolved` described."""
         return _validated(Document(data=_tuples(resolved)), source)
 
     def resolved(self) -> dict[str, Any]:
@@ -122,8 +117,7 @@ class Config:
 
         Raises
         ------
-        ConfigError
-            If the options contradict the rest.
+        ConfigError : the options contradict the rest
         """
         given = {name: value for name, value in options.items() if value is not None}
         if not given:
@@ -201,8 +195,7 @@ class Config:
 
         Raises
         ------
-        ConfigError
-            If there is none, or a `scene` in its place.
+        ConfigError : there is none, or a `scene` in its place
         """
         self.ensure_plane_layers("this command")
         if self.channel is not None and mid_plane_z_mm is not None:
@@ -218,8 +211,7 @@ class Config:
 
         Raises
         ------
-        ConfigError
-            If rays are fitted (dlfc), not traced.
+        ConfigError : rays are fitted (dlfc), not traced
         """
         scene = self.scene_space()
         if scene is not None and self.weights.method != "dlfc":
@@ -232,12 +224,7 @@ class Config:
         return None if scene is None else bench.scene_of(scene, self.media_model())
 
     def scene_fingerprint(self) -> str:
-        """Return what tells the scene from another one: the SHA-256 of its faces.
-
-        Raises
-        ------
-        ConfigError : there is none
-        """
+        """Return what tells the scene from another one: the SHA-256 of its faces."""
         faces = self._needed("scene", self.sections.scene)
         plain = [face.model_dump(mode="json", exclude={"file"}) for face in faces]
         return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
@@ -249,8 +236,7 @@ class Config:
 
         Raises
         ------
-        ConfigError
-            If the calibration's is another scene, or a face cannot be turned.
+        ConfigError : the calibration's is another scene, or a face cannot be turned
         """
         if found is None or found.scene is None:
             return self
@@ -277,8 +263,7 @@ class Config:
 
         Raises
         ------
-        ConfigError
-            If rays are fitted (dlfc), not traced; or if there is a `scene`, which `what` cannot be done through.
+        ConfigError : rays are fitted (dlfc), not traced; or if there is a `scene`, which `what` cannot be done through
         """
         chosen = self.weights
         if chosen.method == "dlfc":
@@ -293,12 +278,7 @@ class Config:
         return self.weights.refraction if self.sections.scene is None else "exact"
 
     def ensure_plane_layers(self, what: str) -> None:
-        """Refuse what is worked out for plane windows alone where the config has a `scene`.
-
-        Raises
-        ------
-        ConfigError
-        """
+        """Refuse what is worked out for plane windows alone where the config has a `scene`."""
         if self.sections.scene is not None:
             raise ConfigError(
                 f"{self.source}: scene: {what} is possible through plane windows (section window or channel) alone, "
@@ -404,8 +384,7 @@ class Config:
 
         Raises
         ------
-        ConfigError
-            If volumes are asked for and the solver makes none.
+        ConfigError : volumes are asked for and the solver makes none
         """
         asked, makes_volumes = self.validation.flow_methods, self.reconstruction.solver != "particles"
         if asked is None:
@@ -428,10 +407,8 @@ def load_config(path: Path) -> Config:
 
     Raises
     ------
-    ConfigError
-        If anything in it is malformed, unknown, contradictory or impossible; all errors at once.
-    InputError
-        If the file is missing or not a file.
+    ConfigError : anything in it is malformed, unknown, contradictory or impossible; all errors at once
+    InputError : the file is missing or not a file
     """
     size = ensure_regular_file(path)
     with opened(path) as file:
@@ -460,8 +437,7 @@ def carried_config(record: Mapping[str, Any], source: Path | str) -> Config:
 
     Raises
     ------
-    InputError
-        If there is none.
+    InputError : there is none
     """
     config = record.get("config")
     if not config:

@@ -78,7 +78,6 @@ def is_recording(path: Path) -> bool:
 
 # What is in a file of ours, without its numbers.
 
-
 # Arrays that are told whole: places, sizes, a lattice's basis.
 TOLD_SHAPES = ((2,), (3,), (2, 2))
 # Groups that show our data to other programs once more.
@@ -86,12 +85,7 @@ VIEWS = ("VTKHDF",)
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """Return format, version, how the file was made, and the scalars and the shapes of the arrays in it.
-
-    Raises
-    ------
-    InputError : the file is missing, broken or not one of ours
-    """
+    """Return format, version, how the file was made, and the scalars and the shapes of the arrays in it."""
     file_format = format_of(path)
     with open_h5(path) as file:
         record = read_provenance(file)

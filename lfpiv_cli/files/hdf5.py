@@ -2,6 +2,9 @@
 
 A tree is a nested dict of numpy arrays, scalars, strings and None: dicts are groups, arrays datasets (each with
 its unit, the attribute `units`), all else attributes. The root says `format`, `format_version` and `provenance` (JSON).
+
+Here and in the modules of each format what reads a file raises `InputError` where it is missing, broken, of another
+format or version, or leads outside itself; what writes one raises as `atomic.write_atomically` does.
 """
 
 from __future__ import annotations
@@ -57,10 +60,6 @@ def write_tree(
     ----------
     tree : nested dict of arrays (float, int, uint8), scalars, strings and None
     units : of arrays by their names, where these do not say them (`UNITS_IN_NAMES`); 1 of pure numbers
-
-    Raises
-    ------
-    OutputExistsError, OutputError
     """
 
     def fill(file: h5py.File) -> None:
@@ -78,8 +77,7 @@ def read_tree(path: Path, format_name: str, format_versions: Collection[int]) ->
 
     Raises
     ------
-    InputError
-        If the file is missing, broken, of another format or version, or leads outside itself.
+    InputError : the file is missing, broken, of another format or version, or leads outside itself
     """
     with open_h5(path) as file:
         ensure_format(path, file, format_name, format_versions)
@@ -189,12 +187,7 @@ def open_h5(path: Path) -> Iterator[h5py.File]:
 
 
 def format_of(path: Path) -> str:
-    """Return the name of a file's format.
-
-    Raises
-    ------
-    InputError : the file is missing, broken or not one of ours
-    """
+    """Return the name of a file's format."""
     with open_h5(path) as file:
         found = file.attrs.get("format")
         if not isinstance(found, bytes):
@@ -332,8 +325,7 @@ def read_whole(path: Path) -> dict[str, Any] | None:
 
     Raises
     ------
-    InputError
-        The file is broken, in any of its parts.
+    InputError : the file is broken, in any of its parts
     """
     with open_h5(path) as file:
         if "format" not in file.attrs or "provenance" not in file.attrs:
@@ -352,12 +344,7 @@ def read_whole(path: Path) -> dict[str, Any] | None:
 
 
 def ensure_opens(path: Path) -> None:
-    """Refuse a file that is missing, cut or no HDF5, in a fraction of the time that it takes to look at what it holds.
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse a file that is missing, cut or no HDF5, in a fraction of the time that looking at what it holds takes."""
     ensure_regular_file(path)
     try:
         with h5py.File(path, "r", locking="best-effort"):
@@ -377,12 +364,7 @@ def fault_of(paths: Iterable[Path]) -> str | None:
 
 
 def unpacked_bytes(path: Path) -> int:
-    """Return what the arrays of a file of ours take without compression.
-
-    Raises
-    ------
-    InputError
-    """
+    """Return what the arrays of a file of ours take without compression."""
     sizes: list[int] = []
 
     def add(_name: str, item: h5py.Group | h5py.Dataset) -> None:

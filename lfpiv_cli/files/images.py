@@ -1,6 +1,7 @@
 """Raw images in, images out: any of `FORMATS`, refused rather than guessed where anything is odd.
 
-Images are float32 arrays `[row, column]` in counts. Colour is read where its channels are all the same.
+Images are float32 arrays `[row, column]` in counts. Colour is read where its channels are all the same. What is odd is
+an `InputError` that names the file, in all formats.
 """
 
 from __future__ import annotations
@@ -113,10 +114,8 @@ def frames(path: Path) -> Recording:
 
     Raises
     ------
-    InputError
-        If the file is missing, broken, or of no known format.
-    UsageError
-        If more has to be said, or what is said does not fit the format.
+    InputError : the file is missing, broken, or of no known format
+    UsageError : more has to be said, or what is said does not fit the format
     """
     file, part = split_part(path)
     ensure_regular_file(file)
@@ -162,8 +161,7 @@ def read_image(path: Path, shape: Shape | None = None) -> Image:
 
     Raises
     ------
-    InputError
-        If the file is broken, holds several frames, is in colour, or has another size.
+    InputError : the file is broken, holds several frames, is in colour, or has another size
     """
     pages = count_pages(path)
     if pages != 1:
@@ -196,12 +194,7 @@ def read_page(path: Path, page: int, shape: Shape | None = None) -> Image:
 
 
 def write_tiff(path: Path, array: NDArray[Any], overwrite: bool) -> None:
-    """Write an image (rows, columns) of type uint8 or uint16, packed without loss and without time stamps.
-
-    Raises
-    ------
-    OutputExistsError, OutputError
-    """
+    """Write an image (rows, columns) of type uint8 or uint16, packed without loss and without time stamps."""
     if array.dtype not in (np.uint8, np.uint16, np.float32) or array.ndim != 2:
         raise TypeError(f"images are uint8, uint16 or float32 (rows, columns), not {array.dtype} {array.shape}")
 

@@ -18,7 +18,6 @@ from lfpiv_cli.names import InputKind
 
 # Inputs against a list of their SHA-256, as `sha256sum` writes it: most cameras' formats have no check sum.
 
-
 # `sha256sum` writes a star before the names of files that are read as bytes.
 LINE = re.compile(r"([0-9a-fA-F]{64}) [ *](.+)")
 LARGEST_LIST_BYTES = 2**28
@@ -31,10 +30,6 @@ def ensure_verified(listed: Path, inputs: Iterable[Path]) -> int:
     ----------
     listed : the list; names in it count from its folder
     inputs : files, and folders of which all that is listed is asked
-
-    Raises
-    ------
-    InputError
     """
     expected = _read(listed)
     given = [split_part(path)[0] for path in inputs]
@@ -76,7 +71,6 @@ def _read(listed: Path) -> dict[Path, str]:
 
 
 # Folders that a camera, or another command, is still filling: files are taken when they are complete, in order.
-
 
 # A file is complete when it can be read and has not grown for so long: cameras write a frame at once, or page by page.
 SETTLED_S = 2.0

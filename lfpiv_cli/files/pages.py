@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
 # Pictures to look at, written like every other output. Drawing needs the optional package matplotlib.
 
-
 DOTS_PER_INCH = 110
 
 
@@ -114,12 +113,7 @@ def ensure_pages() -> None:
 
 
 def write_pages(page: Page, targets: Iterable[Path], overwrite: bool) -> None:
-    """Write a page as HTML with its pictures inside, or as Markdown that links to them, as each target's name ends.
-
-    Raises
-    ------
-    InputError : a picture cannot be read
-    """
+    """Write a page as HTML with its pictures inside, or as Markdown that links to them, as each target's name ends."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     for target in targets:

@@ -33,7 +33,6 @@ from lfpiv_cli.reference import Reference
 #
 # However long a sequence is, a block of tracks, or a frame, is all of it that is in memory.
 
-
 # Rows of the tracks that are put in order together: a few megabytes.
 BLOCK_ROWS = 2**16
 
@@ -52,12 +51,7 @@ class StoredTracks:
     def __init__(
         self, folder: Path, reference: Reference, attributes: dict[str, Any], provenance: dict[str, Any]
     ) -> None:
-        """Begin a file in a folder, on the disk that the tracks will be written to.
-
-        Raises
-        ------
-        OutputError
-        """
+        """Begin a file in a folder, on the disk that the tracks will be written to."""
         self.reference, self.attributes, self.provenance = reference, attributes, provenance
         self._folder = folder
         # For each frame, where its arrays begin in the file, and its number of rows.
@@ -82,12 +76,7 @@ class StoredTracks:
         self._file.close()
 
     def put(self, rows: Mapping[str, NDArray[Any]]) -> None:
-        """Take the arrays of one more frame, in the order of `track`, in which no number comes twice.
-
-        Raises
-        ------
-        OutputError
-        """
+        """Take the arrays of one more frame, in the order of `track`, in which no number comes twice."""
         track = rows["track"]
         if len(track) and track[-1] >= len(self._lengths):
             self._lengths = np.append(self._lengths, np.zeros(track[-1] + 1 - len(self._lengths), np.int64))
@@ -256,12 +245,7 @@ def no_points(format_name: str, reference: Reference) -> Points:
 
 
 def write_points(path: Path, format_name: str, points: PointRows, *, overwrite: bool) -> None:
-    """Write points; their arrays are all that the format needs or may have, each with a row for each point.
-
-    Raises
-    ------
-    OutputExistsError, OutputError
-    """
+    """Write points; their arrays are all that the format needs or may have, each with a row for each point."""
     units = UNITS[format_name]
     if isinstance(points, Points):
         units = units_of(format_name, points.arrays)
@@ -310,8 +294,7 @@ def read_points(path: Path | str, format_name: str) -> Points:
 
     Raises
     ------
-    InputError
-        If the file is missing, broken, of another format, or holds values that are not finite.
+    InputError : the file is missing, broken, of another format, or holds values that are not finite
     """
     path = Path(path)
     with _opened(path, format_name) as (file, datasets):
@@ -348,13 +331,7 @@ def _ensure_finite(path: Path, name: str, rows: NDArray[Any], count: int) -> Non
 
 
 def read_tracks(path: Path | str) -> Points:
-    """Read tracks, of two frames or of a sequence.
-
-    Raises
-    ------
-    InputError
-        As `read_points`.
-    """
+    """Read tracks, of two frames or of a sequence."""
     is_sequence = format_of(Path(path)) == TRAJECTORIES_FORMAT
     return read_points(path, TRAJECTORIES_FORMAT if is_sequence else TRACKS_FORMAT)
 

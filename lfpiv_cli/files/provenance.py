@@ -88,8 +88,7 @@ def record(
 
     Raises
     ------
-    InputError
-        If an input cannot be read.
+    InputError : an input cannot be read
     """
     named: dict[str, dict[str, Any]] = {}
     made_from: dict[str, Any] = {}
@@ -279,10 +278,6 @@ def ensure_agreement(records: Sequence[Mapping[str, Any]], names: Sequence[str],
     ----------
     names : of the results, for messages
     keys : `OF_COORDINATES` or `OF_FRAMES`
-
-    Raises
-    ------
-    InputError
     """
     known = [(_values(made["config"]), name) for made, name in zip(records, names, strict=True) if made.get("config")]
     for (first, first_name), (config, name) in ((known[0], each) for each in known[1:]):
@@ -308,8 +303,7 @@ def carried_record(path: Path) -> dict[str, Any]:
 
     Raises
     ------
-    InputError
-        If there is none, or the file is broken.
+    InputError : there is none, or the file is broken
     """
     with open_h5(path) as file:
         return read_provenance(file)

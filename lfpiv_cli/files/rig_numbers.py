@@ -35,7 +35,6 @@ from lfpiv_cli.validation.planning import (
 
 # A configuration as text: a short YAML file with a comment on each key that a newcomer meets, and its JSON schema.
 
-
 Tree = Mapping[str, Any]
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"

@@ -30,7 +30,6 @@ from lfpiv_cli.reconstruction.registry import SolverName
 
 # What the keys of the configuration can be: numbers within ranges, one for each axis, and what all sections share.
 
-
 Positive = Annotated[float, Field(gt=0.0)]
 NotNegative = Annotated[float, Field(ge=0.0)]
 Count = Annotated[int, Field(ge=1)]
@@ -89,7 +88,6 @@ class Section(BaseModel):
 
 
 # The section `scene`: the faces that refract light between the lens and the fluid, one entry each.
-
 
 # What is behind a face: named as in `media`, or its refractive index.
 Behind = Annotated[

@@ -29,7 +29,6 @@ from lfpiv_cli.files.inputs import reason
 # A claim is a small hidden file beside the output, which only one worker can create. A claim that a dead worker left
 # is taken over; should two take it over at once, both make the output, which is written whole and the same by either.
 
-
 # A worker touches its claim this often; one that was not touched for so long belongs to a worker that is dead, on
 # whatever host. The clocks of hosts that share a disk differ by less.
 TOUCHED_EVERY_S, DEAD_AFTER_S = 20.0, 300.0
@@ -69,12 +68,7 @@ def claimed(target: Path) -> Iterator[bool]:
 
 @contextmanager
 def awaited(target: Path) -> Iterator[None]:
-    """Claim an output, after another worker that makes it now has ended.
-
-    Raises
-    ------
-    OutputError : as `claimed`
-    """
+    """Claim an output, after another worker that makes it now has ended."""
     while True:
         with claimed(target) as granted:
             if granted:

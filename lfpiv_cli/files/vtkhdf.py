@@ -36,7 +36,6 @@ from lfpiv_cli.reference import Reference
 
 # What all `*.vtkhdf` files have in common: VTK's header, and what a file says about itself at its root.
 
-
 # The version of VTK's layout that ParaView 5.12 reads and later ones still do.
 VTK_VERSION = (2, 0)
 
@@ -173,10 +172,6 @@ def write_volume(
     array_zyx : (nz, ny, nx), stored as float32
     reference : the origin that the grid's z counts from
     attributes : scalars, strings and short arrays for the root
-
-    Raises
-    ------
-    OutputExistsError, OutputError
     """
     if array_zyx.shape != grid.shape_zyx:
         raise ValueError(f"the array's shape is {array_zyx.shape}, the grid's {grid.shape_zyx}")
@@ -194,8 +189,7 @@ def open_volume(path: Path | str) -> Volume:
 
     Raises
     ------
-    InputError
-        If the file is missing, broken, not a volume, or holds values that are not finite.
+    InputError : the file is missing, broken, not a volume, or holds values that are not finite
     """
     path = Path(path)
     with open_h5(path) as file:
@@ -224,10 +218,6 @@ def write_vectors(
     ----------
     reference : the origin that the grid's z counts from
     extra : arrays (nz, ny, nx) or (nz, ny, nx, 3) to store besides, by their name, with their unit
-
-    Raises
-    ------
-    OutputExistsError, OutputError
     """
 
     def fill(file: h5py.File) -> None:
@@ -255,8 +245,7 @@ def open_vectors(path: Path | str) -> VectorField:
 
     Raises
     ------
-    InputError
-        If the file is missing, broken, not a vector field, or a vector counts as valid and is not finite.
+    InputError : the file is missing, broken, not a vector field, or a vector counts as valid and is not finite
     """
     path = Path(path)
     with open_h5(path) as file:
@@ -286,12 +275,7 @@ def open_vectors(path: Path | str) -> VectorField:
 
 
 def read_arrays(path: Path | str) -> tuple[Grid, dict[str, tuple[NDArray[Any], str]]]:
-    """Read the grid of a vector field and every array on it with its unit: those that commands store besides, too.
-
-    Raises
-    ------
-    InputError
-    """
+    """Read the grid of a vector field and every array on it with its unit: those that commands store besides, too."""
     path = Path(path)
     with open_h5(path) as file:
         ensure_format(path, file, VECTORS_FORMAT, (FORMAT_VERSION,))
@@ -305,23 +289,13 @@ def read_arrays(path: Path | str) -> tuple[Grid, dict[str, tuple[NDArray[Any], s
 
 
 def read_grid(path: Path) -> Grid:
-    """Read the grid of a volume or a vector field.
-
-    Raises
-    ------
-    InputError
-    """
+    """Read the grid of a volume or a vector field."""
     with open_h5(path) as file:
         return _read_grid(file)
 
 
 def read_header(path: Path | str) -> Header:
-    """Read what a volume, a vector field or points say about themselves.
-
-    Raises
-    ------
-    InputError
-    """
+    """Read what a volume, a vector field or points say about themselves."""
     with open_h5(Path(path)) as file:
         return read_root(file)
 

@@ -1,4 +1,7 @@
-"""The camera and the grid that a weights file holds, believed only as far as a config would be."""
+"""The camera and the grid that a weights file holds, believed only as far as a config would be.
+
+What is missing, of another kind, or nothing that they could have raises KeyError, TypeError or ValueError.
+"""
 
 from __future__ import annotations
 
@@ -39,12 +42,7 @@ LARGEST_INDEX = 5.0
 
 
 def read_camera(tree: dict[str, Any]) -> Camera:
-    """Return the camera of a weights file.
-
-    Raises
-    ------
-    KeyError, ValueError : something is missing, of another kind, or nothing that a camera could have
-    """
+    """Return the camera of a weights file."""
     values: dict[str, Any] = {name: _positive(name, tree[name]) for name in POSITIVE}
     values |= {name: _whole(name, tree[name], 1, MOST_PIXELS_PER_SIDE) for name in ("columns", "rows")}
     values["magnification"] = -_positive(
@@ -72,12 +70,7 @@ def read_camera(tree: dict[str, Any]) -> Camera:
 
 
 def read_grid(tree: dict[str, Any]) -> tuple[Grid, tuple[int, int, int]]:
-    """Return the grid of a weights file and its padding.
-
-    Raises
-    ------
-    KeyError, ValueError
-    """
+    """Return the grid of a weights file and its padding."""
     shape, padding = (
         _triple(name, tree[name], lambda name, value, least=least: _whole(name, value, least, MOST_VOXELS_PER_SIDE))
         for name, least in (("shape_xyz", 1), ("padding_xyz", 0))
@@ -92,12 +85,7 @@ def read_grid(tree: dict[str, Any]) -> tuple[Grid, tuple[int, int, int]]:
 
 
 def read_face(tree: dict[str, Any]) -> Face:
-    """Return a face that rays cross.
-
-    Raises
-    ------
-    KeyError, TypeError, ValueError
-    """
+    """Return a face that rays cross."""
     if tree["kind"] not in SURFACES:
         raise ValueError(f"a face is a {tree['kind']!r}, expected one of {', '.join(SURFACES)}")
     kind = SURFACES[tree["kind"]]

@@ -189,12 +189,7 @@ def open_weights(path: Path | str) -> WeightsFile:
 
 
 def read_weights_record(path: Path) -> dict[str, Any]:
-    """Return the record that a weights file carries; the weights themselves are not read.
-
-    Raises
-    ------
-    InputError : as `open_weights`
-    """
+    """Return the record that a weights file carries; the weights themselves are not read."""
     with open_h5(path) as file:
         ensure_format(path, file, FORMAT, (VERSION,))
         return read_provenance(file)

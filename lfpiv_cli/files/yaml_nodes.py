@@ -88,8 +88,7 @@ def read_document(content: bytes) -> Document:
 
     Raises
     ------
-    YamlError
-        If it is too large, not UTF-8, not YAML, too deep, or uses aliases, tags or several documents.
+    YamlError : it is too large, not UTF-8, not YAML, too deep, or uses aliases, tags or several documents
     """
     if len(content) > LARGEST_BYTES:
         raise YamlError(1, 1, f"has {len(content)} bytes, expected at most {LARGEST_BYTES}")
@@ -193,7 +192,6 @@ def key_name(path: KeyPath) -> str:
 
 
 # What is wrong with a configuration, as sentences about places: `rig.yaml:5:16: camera.x: is 3, expected ...`.
-
 
 # More than this many errors at once are one mistake repeated.
 MOST_PROBLEMS = 20
@@ -313,7 +311,6 @@ def _shown(value: Any) -> str:
 #
 # So results carry them, and are the same wherever the file has gone.
 
-
 # Every result carries them, in its record and in those of what it was made from. A smooth surface needs few: through
 # heights 1 mm apart of a lens of 40 mm radius a tracer is seen where the lens shows it to 20 nm.
 MOST_HEIGHTS = 2**14
@@ -357,8 +354,7 @@ def read_heights(path: Path) -> Rows:
 
     Raises
     ------
-    InputError
-        If the file is missing, broken, or holds no rows of numbers, gaps, or more than a smooth surface needs.
+    InputError : the file is missing, broken, or holds no rows of numbers, gaps, or more than a smooth surface needs
     """
     ensure_regular_file(path)
     ending = path.suffix.lower()

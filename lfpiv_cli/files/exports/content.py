@@ -78,12 +78,7 @@ class Content:
 
 
 def read_content(path: Path) -> Content:
-    """Read a volume, vectors, particles or tracks.
-
-    Raises
-    ------
-    InputError : it is missing, broken or something else
-    """
+    """Read a volume, vectors, particles or tracks."""
     name = format_of(path)
     if name not in KINDS:
         raise InputError(f"{path}: holds {name}, expected {', '.join(KINDS)}")

@@ -28,13 +28,11 @@ from lfpiv_cli.names import ExportFormat
 
 # Tables of text: CSV, and Tecplot's ASCII format. Numbers have as many digits as bring back the same bits.
 
-
 # NetCDF 3 with 64-bit offsets, which needs no library beyond scipy, here or where it is read.
 #
 # Vectors follow pivpy's schema: `u`, `v`, `w` (m/s) and `chc` (1 where the velocity is known) over y, x, t,
 # coordinates in mm; with more than one plane z comes before these dimensions, so that one plane of it is what pivpy
 # takes.
-
 
 # The format counts the bytes of a variable in 32 bits.
 LARGEST_VARIABLE = 2**32 - 4
@@ -142,7 +140,6 @@ def _attribute(value: Any) -> Any:
 # Tracks of a sequence come a second time as the list `tracks` of records, one for each track, which flowtracks reads:
 # places `xf`, `yf`, `zf` (mm), velocities `uf`, `vf`, `wf` (mm/s), accelerations `axf`, `ayf`, `azf` (NaN, as they
 # are not measured), frames `t` and the track's number `trajid`.
-
 
 # The format counts the bytes of a variable in 32 bits, of which readers take 31.
 LARGEST_BYTES = 2**31 - 1

@@ -27,7 +27,6 @@ from lfpiv_cli.reference import Reference
 #
 # The arrays lie behind the XML as raw bytes, each after its length, so that nothing is rounded.
 
-
 LENGTH = np.dtype("<u8")
 
 
@@ -140,12 +139,7 @@ SHOWN = ("track", "velocity", "velocity_sigma")
 
 
 def write_playback(path: Path, tracks: PointRows, frames: int, dt_s: float, *, overwrite: bool) -> None:
-    """Write the tracks of a sequence of so many frames, `dt_s` apart, for playing them in time.
-
-    Raises
-    ------
-    OutputExistsError, OutputError
-    """
+    """Write the tracks of a sequence of so many frames, `dt_s` apart, for playing them in time."""
     counts, rows = tracks.in_frames(frames)
     before = np.cumsum(counts) - counts
     count = int(counts.sum())
@@ -205,10 +199,6 @@ def write_series(
     read : gives that of each number, which has the same; one at a time is held in memory
     count : how many there are
     times_s : of each, None where only their order is known
-
-    Raises
-    ------
-    OutputExistsError, OutputError
     """
     reference = Reference.from_attributes(first.attributes)
     # Where coordinates begin is written by its own rule.

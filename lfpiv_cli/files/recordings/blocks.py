@@ -20,7 +20,6 @@ from lfpiv_cli.files.recordings.recording import CUT, Image, Recording, Shape, e
 
 # The green of a sensor behind colour filters.
 
-
 # Colours of the filters over the first two pixels of the first row, and of the second.
 PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
 COLOUR_HINT = (
@@ -44,7 +43,6 @@ def green_of(mosaic: Image, pattern: str) -> Image:
 
 
 # How pixels lie in the bytes of a frame that is not compressed.
-
 
 # `whole`: a pixel in one byte, or in two where it has more than 8 bits. The others leave no bit between pixels: the
 # first pixel in the highest bits of the first byte (Photron, Phantom), or in the lowest (GenICam's Mono10p, Mono12p);
@@ -177,10 +175,6 @@ def recording(
     Parameters
     ----------
     begin : tells where the pixels of the frame at a place begin, where that is not the place itself
-
-    Raises
-    ------
-    InputError
     """
     size = path.stat().st_size
     if not len(places):
@@ -222,7 +216,6 @@ def at_rate(pages: int, rate_hz: float) -> NDArray[np.float64] | None:
 
 
 # Frames without a header, whose layout is stated: WIDTHxHEIGHTxBITS and what else is to be known.
-
 
 SIZE = re.compile(r"([1-9]\d{0,5})x([1-9]\d{0,5})x([1-9]\d?)")
 # What tells a layout, right or wrong, from the name of a part.

@@ -27,7 +27,6 @@ from lfpiv_cli.files.recordings.recording import CUT, Image, Recording, Shape, a
 # Header as the manufacturer published it (ReadIM7). Counts are those that are stored, without the scale that DaVis
 # shows.
 
-
 # Version, packing, format, sparse; columns, rows, planes, frames.
 HEADER, HEADER_BYTES = "<4h4i", 256
 # Kinds of counts by the format of images; positive ones are of vectors.
@@ -39,12 +38,7 @@ PACKED_HINT = "save it from DaVis without compression, or as TIFF"
 
 
 def im7_frames(path: Path) -> Recording:
-    """Return the frames that a header declares, after checking that their bytes are there.
-
-    Raises
-    ------
-    InputError
-    """
+    """Return the frames that a header declares, after checking that their bytes are there."""
     with opened(path) as file:
         size = file.seek(0, 2)
         _, packing, kind, _, columns, rows, planes, pages = values_at(path, file, 0, HEADER)
@@ -130,12 +124,7 @@ def set_frames(path: Path) -> Recording:
 
 
 def beside(path: Path) -> tuple[Path, ...]:
-    """Return the folder of a set's images.
-
-    Raises
-    ------
-    InputError : there is none
-    """
+    """Return the folder of a set's images."""
     folder = path.with_suffix("")
     if not folder.is_dir():
         raise InputError(f"{path}: the folder of its images, {folder.name}, is not beside it")
@@ -143,12 +132,7 @@ def beside(path: Path) -> tuple[Path, ...]:
 
 
 def _images(path: Path) -> list[Path]:
-    """Return the images of a set in order, after checking that none is missing.
-
-    Raises
-    ------
-    InputError
-    """
+    """Return the images of a set in order, after checking that none is missing."""
     (folder,) = beside(path)
     numbered = sorted(_numbered(folder))
     if not numbered:

@@ -24,7 +24,6 @@ from lfpiv_cli.files.recordings.recording import CUT, Recording, ensure_size
 
 # Photron's .mraw: frames one after the other, and a header in a file beside it, .cihx (XML) or .cih (text).
 
-
 MRAW_SUFFIX = ".mraw"
 # Where the figures stand: the words of a .cih, and the elements of a .cihx.
 NAMES = {
@@ -43,12 +42,7 @@ MOST_HEADER_BYTES = 2**20
 
 
 def mraw_frames(path: Path) -> Recording:
-    """Return the frames that the header beside a file describes, timed by its rate.
-
-    Raises
-    ------
-    InputError
-    """
+    """Return the frames that the header beside a file describes, timed by its rate."""
     (header,) = beside(path)
     found = _read_header(header)
     colour = found.get("colour", MONO).lower()
@@ -104,7 +98,6 @@ def _read_header(header: Path) -> dict[str, str]:
 #
 # Offsets as in the format's description, which StreamPix' manual has.
 
-
 SEQ_START = b"\xed\xfe\0\0"
 # Version, at byte 28; from 5 on the header has 8192 bytes whatever it says, and times have microseconds.
 VERSION_AT, LONG_HEADER_VERSION = 28, 5
@@ -119,12 +112,7 @@ TIME = np.dtype([("s", "<u4"), ("ms", "<u2"), ("us", "<u2")])
 
 
 def seq_frames(path: Path) -> Recording:
-    """Return the frames of a sequence that is not compressed, and their times.
-
-    Raises
-    ------
-    InputError
-    """
+    """Return the frames of a sequence that is not compressed, and their times."""
     with opened(path) as file:
         (version,) = values_at(path, file, VERSION_AT, "<i")
         columns, rows, stored, used, frame_bytes, kind, pages, _, step = values_at(path, file, FRAME_AT, FRAME)
@@ -184,12 +172,7 @@ LINEAR_BITS = 12
 
 
 def cine_frames(path: Path) -> Recording:
-    """Return the frames of a recording of a monochrome camera, and their times.
-
-    Raises
-    ------
-    InputError
-    """
+    """Return the frames of a recording of a monochrome camera, and their times."""
     with opened(path) as file:
         header = values_at(path, file, 0, FILE_HEADER)
         _, _, compression, version, _, _, _, pages, bitmap_at, setup_at, places_at = header

@@ -47,12 +47,7 @@ def frames(path: Path) -> Recording:
 
 
 def frames_named(path: Path, name: str) -> Recording:
-    """Return the frames of a dataset: of one with two dimensions, the only frame.
-
-    Raises
-    ------
-    InputError
-    """
+    """Return the frames of a dataset: of one with two dimensions, the only frame."""
     with open_h5(path) as file:
         return _frames_in(path, _dataset(path, file, name))
 

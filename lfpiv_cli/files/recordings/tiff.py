@@ -33,7 +33,6 @@ from lfpiv_cli.files.recordings.recording import (
 
 # Greyscale PNG: one frame a file.
 
-
 PNG_START = b"\x89PNG\r\n\x1a\n"
 # Samples of a pixel by a PNG's colour type, once decoded: grey, colour, palette, and with transparency.
 PNG_SAMPLES = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}
@@ -44,12 +43,7 @@ MOST_BYTES_A_PIXEL = 16
 
 
 def png_frames(path: Path) -> Recording:
-    """Return what a PNG file's header says; its check sums are left to the reading.
-
-    Raises
-    ------
-    InputError
-    """
+    """Return what a PNG file's header says; its check sums are left to the reading."""
     with open(path, "rb") as file:
         file.seek(HEADER_AT)
         header = file.read(struct.calcsize(HEADER))
@@ -113,7 +107,6 @@ def _parts(content: bytes) -> Iterator[tuple[bytes, bytes]]:
 # experiment relies on must not shrink in silence. So the chain is followed here first, and every directory and tag
 # value must lie inside the file. Header and entries as in the TIFF 6.0 and BigTIFF specifications.
 
-
 # Bytes of one value of each tag type, TIFF 6.0 and BigTIFF.
 TYPE_BYTES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8, 17: 8, 18: 8}
 CLASSIC, BIG = 42, 43
@@ -135,8 +128,7 @@ def directories(file: BinaryIO, size: int) -> list[int]:
 
     Raises
     ------
-    InputError
-        If the chain leads outside the file or into a circle; the caller adds the file's name.
+    InputError : the chain leads outside the file or into a circle; the caller adds the file's name
     """
     file.seek(0)
     head = file.read(16)
@@ -206,12 +198,7 @@ SEPARATE = 2
 
 
 def frames(path: Path) -> Recording:
-    """Return the pages of a TIFF file whose directories are sound.
-
-    Raises
-    ------
-    InputError
-    """
+    """Return the pages of a TIFF file whose directories are sound."""
     with _naming(path), open(path, "rb") as file:
         places = directories(file, path.stat().st_size)
         file.seek(0)
