@@ -8,16 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from lfpiv_cli.calibration.wave_shapes import WaveLight
-from lfpiv_cli.files.sections import (
-    CameraSection,
-    FaceSection,
-    MainLens,
-    MediaSection,
-    Microlenses,
-    PipeSection,
-    ReconstructionSection,
-    VolumeSection,
-)
+from lfpiv_cli.files import sections
 from lfpiv_cli.files.sections_simulated import FlowSection, LightSection
 from lfpiv_cli.flow.windows import RoundWall
 from lfpiv_cli.grid import Grid
@@ -42,19 +33,19 @@ LATERAL_VOXELS_PER_MICROLENS = 3.0
 VOXELS_PER_DEPTH = 1.064 / 0.2
 
 
-def focal_length_mm(lens: MainLens) -> float | None:
+def focal_length_mm(lens: sections.MainLens) -> float | None:
     """Return F_m, given or from S_i = F_m (P - M)."""
     if lens.focal_length_mm is not None or lens.image_distance_mm is None:
         return lens.focal_length_mm
     return lens.image_distance_mm / (lens.pupil_ratio - lens.magnification)
 
 
-def entrance_over_exit(lens: MainLens) -> float:
+def entrance_over_exit(lens: sections.MainLens) -> float:
     """Return 1/P, 0 of a lens that is telecentric towards the array."""
     return 0.0 if lens.image_distance == "infinite" else 1.0 / lens.pupil_ratio
 
 
-def aperture_mm(lens: MainLens) -> float | None:
+def aperture_mm(lens: sections.MainLens) -> float | None:
     """Return p_m, given or from the f-number F_m / p_m."""
     focal_length = focal_length_mm(lens)
     if lens.aperture_mm is not None or lens.f_number is None or focal_length is None:
@@ -62,14 +53,14 @@ def aperture_mm(lens: MainLens) -> float | None:
     return focal_length / lens.f_number
 
 
-def microlens_focal_length_mm(lens: Microlenses) -> float | None:
+def microlens_focal_length_mm(lens: sections.Microlenses) -> float | None:
     """Return f_m, given or from the f-number f_m / p_l."""
     if lens.focal_length_mm is not None or lens.f_number is None:
         return lens.focal_length_mm
     return lens.f_number * lens.pitch_mm
 
 
-def missing_for_camera(section: CameraSection) -> str | None:
+def missing_for_camera(section: sections.CameraSection) -> str | None:
     """Return the first key that a whole camera lacks, None where nothing is missing."""
     lens = section.main_lens
     if lens is None:
@@ -81,7 +72,7 @@ def missing_for_camera(section: CameraSection) -> str | None:
     return "microlenses.focal_length_mm" if microlens_focal_length_mm(section.microlenses) is None else None
 
 
-def camera_of(section: CameraSection) -> Camera:
+def camera_of(section: sections.CameraSection) -> Camera:
     """Return the camera of a section that lacks nothing, a lens centre on the axis, its thin lens for the real one."""
     lens, microlenses, sensor = section.main_lens, section.microlenses, section.sensor
     missing = missing_for_camera(section)
@@ -104,12 +95,12 @@ def camera_of(section: CameraSection) -> Camera:
     return thin_lens(real, entrance_over_exit(lens))
 
 
-def media_of(section: MediaSection) -> Media:
+def media_of(section: sections.MediaSection) -> Media:
     """Return the refractive indices."""
     return Media(section.air, section.window, section.fluid)
 
 
-def face_of(section: FaceSection, media: Media) -> Face:
+def face_of(section: sections.FaceSection, media: Media) -> Face:
     """Return a face: its surface, and the index behind it.
 
     Raises
@@ -123,27 +114,27 @@ def face_of(section: FaceSection, media: Media) -> Face:
     return Face(SURFACES[section.kind](**parameters), index_behind(section, media))
 
 
-def index_behind(section: FaceSection, media: Media) -> float:
+def index_behind(section: sections.FaceSection, media: Media) -> float:
     """Return the refractive index behind a face."""
     return getattr(media, section.behind) if isinstance(section.behind, str) else section.behind
 
 
-def scene_of(sections: Sequence[FaceSection], media: Media) -> CurvedSpace:
+def scene_of(faces: Sequence[sections.FaceSection], media: Media) -> CurvedSpace:
     """Return what lies in front of the lens, face by face.
 
     Raises
     ------
     ConfigError : light cannot cross the faces in this order
     """
-    return CurvedSpace(media, tuple(face_of(section, media) for section in sections))
+    return CurvedSpace(media, tuple(face_of(section, media) for section in faces))
 
 
-def round_wall_of(section: PipeSection) -> RoundWall:
+def round_wall_of(section: sections.PipeSection) -> RoundWall:
     """Return the inside of the pipe, in the volume's coordinates."""
     return RoundWall(section.radius_mm, section.centre_mm, section.axis)
 
 
-def grid_of(section: VolumeSection, scale: Scale | None, reference: Reference) -> Grid:
+def grid_of(section: sections.VolumeSection, scale: Scale | None, reference: Reference) -> Grid:
     """Return the volume's grid, z from the focal point, where the section counts z from a reference.
 
     The camera's `scale` is needed only where the section leaves the voxels to the program.
@@ -177,7 +168,7 @@ def waves_of(section: LightSection) -> Waves | None:
     return None if section.kind == "rays" else Waves(section.wavelength_nm * NM_TO_MM, section.points)
 
 
-def wave_light_of(section: ReconstructionSection) -> WaveLight | None:
+def wave_light_of(section: sections.ReconstructionSection) -> WaveLight | None:
     """Return the waves that images are read by, None where they are read by rays."""
     if section.wavelength_nm is None:
         return None

@@ -9,44 +9,17 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.calibration.model import Calibration, Channel, Rig
 from lfpiv_cli.errors import ConfigError, InputError
-from lfpiv_cli.files import bench
-from lfpiv_cli.files.checks import contradictions
-from lfpiv_cli.files.inputs import content_of, ensure_regular_file, opened
-from lfpiv_cli.files.sections import (
-    BoardSection,
-    CameraSection,
-    ChannelSection,
-    CorrelationSection,
-    MediaSection,
-    PipeSection,
-    ReconstructionSection,
-    VolumeSection,
-    WeightsSection,
-)
+from lfpiv_cli.files import bench, sections
+from lfpiv_cli.files.checks import validated
 from lfpiv_cli.files.sections_simulated import FlowSection, Sections, SimulationSection, ValidationSection
-from lfpiv_cli.files.yaml_nodes import (
-    LARGEST_BYTES,
-    Document,
-    Problem,
-    YamlError,
-    key_name,
-    place_of,
-    problem_of,
-    read_document,
-    report,
-    sentence,
-    with_heights,
-)
+from lfpiv_cli.files.yaml_nodes import Document, read_rig
 from lfpiv_cli.flow.correlation import CorrelationSettings
 from lfpiv_cli.flow.windows import ParallelWalls, Walls
 from lfpiv_cli.grid import Grid
@@ -61,8 +34,6 @@ from lfpiv_cli.reconstruction.solvers import SolverSettings, Stopping
 from lfpiv_cli.reference import FOCAL_POINT, Reference
 from lfpiv_cli.synthetic.vortices import Flow
 
-# Images and HDF5 files have a zero byte among their first ones, and no text has.
-BEGINNING_BYTES = 512
 # Of the paper's final window along the axis with the smallest voxels; the coarse one is twice as large: a displacement
 # of a quarter of its side does not leave it.
 DEFAULT_WINDOW = 16
@@ -90,11 +61,11 @@ class Config:
 
     sections: Sections
     source: str
-    channel: ChannelSection | None = field(init=False)
-    pipe: PipeSection | None = field(init=False)
-    weights: WeightsSection = field(init=False)
-    reconstruction: ReconstructionSection = field(init=False)
-    correlation: CorrelationSection = field(init=False)
+    channel: sections.ChannelSection | None = field(init=False)
+    pipe: sections.PipeSection | None = field(init=False)
+    weights: sections.WeightsSection = field(init=False)
+    reconstruction: sections.ReconstructionSection = field(init=False)
+    correlation: sections.CorrelationSection = field(init=False)
     simulation: SimulationSection = field(init=False)
     validation: ValidationSection = field(init=False)
 
@@ -106,7 +77,7 @@ class Config:
     @classmethod
     def from_resolved(cls, resolved: Mapping[str, Any], source: str = "the stored config") -> Config:
         """Return the configuration that `resolved` described."""
-        return _validated(Document(data=_tuples(resolved)), source)
+        return Config(validated(Document(data=_tuples(resolved)), source), source)
 
     def resolved(self) -> dict[str, Any]:
         """Return everything, defaults included, as plain data for JSON."""
@@ -139,22 +110,22 @@ class Config:
         )
 
     @property
-    def camera(self) -> CameraSection:
+    def camera(self) -> sections.CameraSection:
         """The section `camera`."""
         return self._needed("camera", self.sections.camera)
 
     @property
-    def media(self) -> MediaSection:
+    def media(self) -> sections.MediaSection:
         """The section `media`."""
         return self._needed("media", self.sections.media)
 
     @property
-    def volume(self) -> VolumeSection:
+    def volume(self) -> sections.VolumeSection:
         """The section `volume`."""
         return self._needed("volume", self.sections.volume)
 
     @property
-    def board(self) -> BoardSection:
+    def board(self) -> sections.BoardSection:
         """The section `board`."""
         return self._needed("board", self.sections.board)
 
@@ -344,7 +315,11 @@ class Config:
         if mask is None:
             return None
         section = self._needed(mask, getattr(self.sections, mask))
-        return bench.round_wall_of(section) if isinstance(section, PipeSection) else ParallelWalls(section.width_mm)
+        return (
+            bench.round_wall_of(section)
+            if isinstance(section, sections.PipeSection)
+            else ParallelWalls(section.width_mm)
+        )
 
     def still_walls(self) -> Walls | None:
         """Return the walls at which the fluid stands still, the pipe's or the channel's, None where neither is said."""
@@ -410,24 +385,7 @@ def load_config(path: Path) -> Config:
     ConfigError : anything in it is malformed, unknown, contradictory or impossible; all errors at once
     InputError : the file is missing or not a file
     """
-    size = ensure_regular_file(path)
-    with opened(path) as file:
-        is_text = b"\0" not in file.read(BEGINNING_BYTES)
-    if not is_text:  # an image, or a file that commands take in other places; else it is told where it is read
-        from lfpiv_cli.files.images import format_of
-
-        with suppress(InputError):
-            kind = format_of(path).name
-            what = "an HDF5 file" if kind == "HDF5" else f"an image ({kind})"
-            raise ConfigError(f"{path}: is {what}; expected a rig file")
-    if size > LARGEST_BYTES:
-        raise ConfigError(f"{path}: has {size} bytes, expected at most {LARGEST_BYTES}")
-    content = content_of(path)
-    try:
-        document = read_document(content)
-    except YamlError as error:
-        raise ConfigError(sentence(str(path), error.problem)) from error
-    return _validated(with_heights(document, path), str(path))
+    return Config(validated(read_rig(path), str(path)), str(path))
 
 
 def carried_config(record: Mapping[str, Any], source: Path | str) -> Config:
@@ -443,26 +401,6 @@ def carried_config(record: Mapping[str, Any], source: Path | str) -> Config:
     if not config:
         raise InputError(f"{source}: carries no config; give one with --config")
     return Config.from_resolved({name: value for name, value in config.items() if name in Sections.model_fields})
-
-
-def _validated(document: Document, source: str) -> Config:
-    """Return the configuration of a document, or raise all that is wrong with it."""
-    if document.data and not document.problems and not document.data.keys() & Sections.model_fields.keys():
-        first = ", ".join(map(str, list(document.data)[:3]))
-        raise ConfigError(f"{source}: is no rig file: it has {first}, expected {', '.join(Sections.model_fields)}")
-    problems = list(document.problems)
-    sections = None
-    try:
-        sections = Sections.model_validate(document.data)
-    except ValidationError as error:
-        problems += [problem_of(document, details) for details in error.errors()]
-    if sections is not None:
-        problems += [
-            Problem(*place_of(document, path), key_name(path), text) for path, text in contradictions(sections)
-        ]
-    if problems or sections is None:
-        raise ConfigError(report(source, problems))
-    return Config(sections, source)
 
 
 def _tuples(value: Any) -> Any:

@@ -88,8 +88,10 @@ def read_tree(path: Path, format_name: str, format_versions: Collection[int]) ->
     return tree, provenance
 
 
-def create(path: Path, fill: Callable[[h5py.File], None], *, overwrite: bool, check: Callable[[Path], object]) -> None:
-    """Create an HDF5 file atomically; `fill` writes into it, `check` reads it back."""
+def create(
+    path: Path, fill: Callable[[h5py.File], None], *, overwrite: bool, check: Callable[[Path], object] | None = None
+) -> None:
+    """Create an HDF5 file atomically; `fill` writes into it, `check` reads it back: by default its format."""
 
     def write(temporary: Path) -> None:
         try:
@@ -99,7 +101,7 @@ def create(path: Path, fill: Callable[[h5py.File], None], *, overwrite: bool, ch
         except RuntimeError as error:  # h5py's word for a write that fails on closing
             raise OutputError(f"{path}: cannot be written: {reason(error)}") from error
 
-    write_atomically(path, write, overwrite=overwrite, check=check)
+    write_atomically(path, write, overwrite=overwrite, check=check or format_of)
 
 
 def write_array(group: h5py.Group, name: str, array: NDArray[Any], units: str | None = None) -> h5py.Dataset:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files.atomic import write_atomically
 from lfpiv_cli.files.inputs import ensure_regular_file, opened, split_page, split_part
-from lfpiv_cli.files.recordings import blocks, davis, high_speed, stack, tiff
+from lfpiv_cli.files.recordings import blocks, cameras, stack, tiff
 from lfpiv_cli.files.recordings.recording import Image, Recording, Shape
 from lfpiv_cli.notice import written
 
@@ -56,11 +56,17 @@ FORMATS = (
     Format("TIFF", tiff.frames, starts=tiff.STARTS),
     Format("PNG", tiff.png_frames, starts=(tiff.PNG_START,)),
     Format("HDF5", stack.frames, starts=(stack.START,), frames_of=stack.frames_named, in_folders=False),
-    Format("Phantom cine", high_speed.cine_frames, starts=(high_speed.CINE_START,)),
-    Format("Norpix seq", high_speed.seq_frames, starts=(high_speed.SEQ_START,)),
-    Format("Photron mraw", high_speed.mraw_frames, suffixes=(high_speed.MRAW_SUFFIX,), beside=high_speed.beside),
-    Format("LaVision im7", davis.im7_frames, suffixes=(".im7",)),
-    Format("LaVision set", davis.set_frames, suffixes=(davis.SUFFIX,), beside=davis.beside, in_folders=False),
+    Format("Phantom cine", cameras.cine_frames, starts=(cameras.CINE_START,)),
+    Format("Norpix seq", cameras.seq_frames, starts=(cameras.SEQ_START,)),
+    Format("Photron mraw", cameras.mraw_frames, suffixes=(cameras.MRAW_SUFFIX,), beside=cameras.header_beside),
+    Format("LaVision im7", cameras.im7_frames, suffixes=(".im7",)),
+    Format(
+        "LaVision set",
+        cameras.set_frames,
+        suffixes=(cameras.SET_SUFFIX,),
+        beside=cameras.folder_beside,
+        in_folders=False,
+    ),
     RAW,
 )
 LONGEST_START = max(len(start) for each in FORMATS for start in each.starts)

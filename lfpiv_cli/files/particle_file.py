@@ -254,7 +254,7 @@ def write_points(path: Path, format_name: str, points: PointRows, *, overwrite: 
 
     def fill(file: h5py.File) -> None:
         write_root(file, format_name, FORMAT_VERSION, points.reference, points.attributes, points.provenance)
-        vtk = create_vtk_group(file, "PolyData")
+        vtk = create_vtk_group(file, None)
         vtk["Points"] = write_rows(file, POSITION, points.count, points.rows(POSITION), "mm")
         write_array(vtk, "NumberOfPoints", np.array([points.count], dtype=np.int64))
         # One vertex for each point, lines of consecutive points, and no other cells.

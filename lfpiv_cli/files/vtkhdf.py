@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import h5py
 import numpy as np
@@ -49,22 +49,19 @@ class Header:
     provenance: dict[str, Any]
 
 
-def create_vtk_group(file: h5py.File, kind: Literal["ImageData", "PolyData"]) -> h5py.Group:
-    """Return a new group `/VTKHDF` that names its version and kind."""
+def create_vtk_group(file: h5py.File, grid: Grid | None) -> h5py.Group:
+    """Return a new group `/VTKHDF` that names its version and kind: an image on a grid, or points."""
     vtk = file.create_group("VTKHDF")
     vtk.attrs["Version"] = np.array(VTK_VERSION, dtype=np.int64)
     # A string of fixed length: VTK up to 9.4.2 fails on a variable one.
-    vtk.attrs["Type"] = np.bytes_(kind)
+    vtk.attrs["Type"] = np.bytes_("PolyData" if grid is None else "ImageData")
+    if grid is not None:
+        nx, ny, nz = grid.shape_xyz
+        vtk.attrs["WholeExtent"] = np.array([0, nx - 1, 0, ny - 1, 0, nz - 1], dtype=np.int64)
+        vtk.attrs["Origin"] = np.array(grid.origin_mm, dtype=np.float64)
+        vtk.attrs["Spacing"] = np.array(grid.spacing_mm, dtype=np.float64)
+        vtk.attrs["Direction"] = np.eye(3).ravel()
     return vtk
-
-
-def place_image(vtk: h5py.Group, grid: Grid) -> None:
-    """Say where the points of an ImageData lie."""
-    nx, ny, nz = grid.shape_xyz
-    vtk.attrs["WholeExtent"] = np.array([0, nx - 1, 0, ny - 1, 0, nz - 1], dtype=np.int64)
-    vtk.attrs["Origin"] = np.array(grid.origin_mm, dtype=np.float64)
-    vtk.attrs["Spacing"] = np.array(grid.spacing_mm, dtype=np.float64)
-    vtk.attrs["Direction"] = np.eye(3).ravel()
 
 
 def write_steps(
@@ -306,9 +303,7 @@ def _write_frame(file: h5py.File, grid: Grid, with_component: bool) -> h5py.Grou
         write_array(file, name, grid.axis_mm(axis), "mm").make_scale(name)
     if with_component:
         write_array(file, "component", np.arange(3), "1").make_scale("component")
-    vtk = create_vtk_group(file, "ImageData")
-    place_image(vtk, grid)
-    return vtk.create_group("PointData")
+    return create_vtk_group(file, grid).create_group("PointData")
 
 
 def _write_points(file: h5py.File, points: h5py.Group, name: str, array: NDArray[Any], unit: str) -> None:

@@ -10,7 +10,8 @@ import difflib
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,8 @@ from numpy.typing import NDArray
 from pydantic_core import ErrorDetails
 
 from lfpiv_cli.errors import ConfigError, InputError
-from lfpiv_cli.files.images import read_image
-from lfpiv_cli.files.inputs import content_of, ensure_regular_file, reason
+from lfpiv_cli.files.images import format_of, read_image
+from lfpiv_cli.files.inputs import content_of, ensure_regular_file, opened, reason
 from lfpiv_cli.files.sections_simulated import Sections
 from lfpiv_cli.notice import written
 
@@ -29,6 +30,8 @@ from lfpiv_cli.notice import written
 LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 LARGEST_BYTES = 2**20
+# Images and HDF5 files have a zero byte among their first ones, and no text has.
+BEGINNING_BYTES = 512
 DEEPEST = 20
 LARGEST_INTEGER = 2**63 - 1
 
@@ -83,15 +86,53 @@ class YamlError(Exception):
         self.problem = Problem(line, column, "", message)
 
 
-def read_document(content: bytes) -> Document:
+def read_rig(path: Path) -> Document:
+    """Read a rig file, and the heights of each file that a face names, beside it, in the file's place.
+
+    Raises
+    ------
+    ConfigError : it is no YAML of the kind that is read here, or heights cannot be read
+    InputError : the file is missing or not a file
+    """
+    size = ensure_regular_file(path)
+    with opened(path) as file:
+        is_text = b"\0" not in file.read(BEGINNING_BYTES)
+    if not is_text:  # an image, or a file that commands take in other places; else it is told where it is read
+        with suppress(InputError):
+            kind = format_of(path).name
+            what = "an HDF5 file" if kind == "HDF5" else f"an image ({kind})"
+            raise ConfigError(f"{path}: is {what}; expected a rig file")
+    if size > LARGEST_BYTES:
+        raise ConfigError(f"{path}: has {size} bytes, expected at most {LARGEST_BYTES}")
+    try:
+        document = _read_document(content_of(path))
+    except YamlError as error:
+        raise ConfigError(sentence(str(path), error.problem)) from error
+    scene = document.data.get("scene")
+    faces = list(scene) if isinstance(scene, tuple) else []
+    for k, face in enumerate(faces):
+        if not isinstance(face, Mapping) or face.get("kind") != "height_map" or "heights_mm" in face:
+            continue
+        if isinstance(face.get("file"), str):  # else it is judged with the rest
+            try:
+                heights = read_heights(path.parent / face["file"])
+            except InputError as error:
+                place: KeyPath = ("scene", k, "file")
+                problem = Problem(*place_of(document, place), key_name(place), str(error))
+                raise ConfigError(sentence(str(path), problem)) from error
+            faces[k] = {name: value for name, value in face.items() if name != "file"} | {"heights_mm": heights}
+    if faces:
+        document.data["scene"] = tuple(faces)
+    return document
+
+
+def _read_document(content: bytes) -> Document:
     """Read a YAML document whose root is a mapping.
 
     Raises
     ------
-    YamlError : it is too large, not UTF-8, not YAML, too deep, or uses aliases, tags or several documents
+    YamlError : it is not UTF-8, not YAML, too deep, or uses aliases, tags or several documents
     """
-    if len(content) > LARGEST_BYTES:
-        raise YamlError(1, 1, f"has {len(content)} bytes, expected at most {LARGEST_BYTES}")
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -113,11 +154,10 @@ def read_document(content: bytes) -> Document:
     except yaml.YAMLError as error:
         raise YamlError(1, 1, f"is not YAML: {str(error).splitlines()[0]}") from error
     document = Document()
-    if root is None:
-        return document
-    if not isinstance(root, yaml.MappingNode):
+    if root is not None and not isinstance(root, yaml.MappingNode):
         raise YamlError(*_place(root), "is not a mapping of sections")
-    document.data = _plain(root, (), document)
+    if root is not None:
+        document.data = _plain(root, (), document)
     return document
 
 
@@ -319,34 +359,6 @@ DIGITS = 9
 SEPARATORS = re.compile(r"[,;\s]+")
 
 Rows = tuple[tuple[float, ...], ...]
-
-
-def with_heights(document: Document, source: Path) -> Document:
-    """Return a configuration with the heights of each file that a face names, beside `source`, in the file's place.
-
-    What is no such face stays as it is, to be judged with the rest.
-
-    Raises
-    ------
-    ConfigError : one cannot be read
-    """
-    scene = document.data.get("scene")
-    if not isinstance(scene, tuple):
-        return document
-    faces = list(scene)
-    for k, face in enumerate(scene):
-        if not isinstance(face, Mapping) or face.get("kind") != "height_map" or "heights_mm" in face:
-            continue
-        if not isinstance(face.get("file"), str):
-            continue
-        try:
-            heights = read_heights(source.parent / face["file"])
-        except InputError as error:
-            path: KeyPath = ("scene", k, "file")
-            problem = Problem(*place_of(document, path), key_name(path), str(error))
-            raise ConfigError(sentence(str(source), problem)) from error
-        faces[k] = {name: value for name, value in face.items() if name != "file"} | {"heights_mm": heights}
-    return replace(document, data=document.data | {"scene": tuple(faces)})
 
 
 def read_heights(path: Path) -> Rows:

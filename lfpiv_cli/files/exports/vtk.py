@@ -10,18 +10,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from xml.sax.saxutils import quoteattr
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from lfpiv_cli.files.exports.content import Content
-from lfpiv_cli.files.hdf5 import FILTERS, create, ensure_format, open_h5, write_array, write_rows
+from lfpiv_cli.files.hdf5 import FILTERS, create, write_array, write_rows
 from lfpiv_cli.files.particle_file import CELLS, POSITION, TRAJECTORIES_FORMAT, UNITS, PointRows, Points, lines_of
-from lfpiv_cli.files.vtkhdf import create_vtk_group, place_image, write_root, write_steps
+from lfpiv_cli.files.vtkhdf import create_vtk_group, write_root, write_steps
 from lfpiv_cli.reference import Reference
+
+if TYPE_CHECKING:
+    from lfpiv_cli.files.exports.formats import Content
 
 # VTK's XML files: images (`.vti`) and points (`.vtp`), for programs that do not read VTKHDF.
 #
@@ -147,7 +149,7 @@ def write_playback(path: Path, tracks: PointRows, frames: int, dt_s: float, *, o
 
     def fill(file: h5py.File) -> None:
         write_root(file, PLAYBACK_FORMAT, PLAYBACK_VERSION, tracks.reference, tracks.attributes, tracks.provenance)
-        vtk = create_vtk_group(file, "PolyData")
+        vtk = create_vtk_group(file, None)
         write_rows(vtk, "Points", count, rows(POSITION), "mm")
         write_array(vtk, "NumberOfPoints", counts)
         for kind in CELLS:
@@ -171,11 +173,7 @@ def write_playback(path: Path, tracks: PointRows, frames: int, dt_s: float, *, o
         write_array(steps, "CellOffsets", of_kinds)
         write_array(steps, "ConnectivityIdOffsets", of_kinds)
 
-    def check(temporary: Path) -> None:
-        with open_h5(temporary) as file:
-            ensure_format(temporary, file, PLAYBACK_FORMAT, (PLAYBACK_VERSION,))
-
-    create(path, fill, overwrite=overwrite, check=check)
+    create(path, fill, overwrite=overwrite)
 
 
 SERIES_FORMAT, SERIES_VERSION = "lfpiv-series", 1
@@ -215,8 +213,7 @@ def write_series(
     def fill(file: h5py.File) -> None:
         told = {name: np.asarray(value) if isinstance(value, list) else value for name, value in others.items()}
         write_root(file, SERIES_FORMAT, SERIES_VERSION, reference, told, provenance)
-        vtk = create_vtk_group(file, "ImageData")
-        place_image(vtk, grid)
+        vtk = create_vtk_group(file, grid)
         points = vtk.create_group("PointData")
         if "velocity" in first.arrays:
             points.attrs["Vectors"] = np.bytes_("velocity")
@@ -231,8 +228,4 @@ def write_series(
             for name, array in read(number).arrays.items():
                 points[name][... if of_one else number] = array[0] if array.shape[0] == 1 else array
 
-    def check(temporary: Path) -> None:
-        with open_h5(temporary) as file:
-            ensure_format(temporary, file, SERIES_FORMAT, (SERIES_VERSION,))
-
-    create(path, fill, overwrite=overwrite, check=check)
+    create(path, fill, overwrite=overwrite)

@@ -7,7 +7,6 @@ import re
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO, Literal, get_args
 
@@ -190,22 +189,15 @@ def recording(
             f"{path}: declares {len(places)} frames of {pixels.frame_bytes} bytes, of which the last ends at byte "
             f"{last + pixels.frame_bytes} of {size}: {CUT}"
         )
-    return Recording(len(places), pixels.shape, pixels.bits, partial(_read_page, path, places, pixels, begin), time_s)
 
+    def read_page(page: int, shape: Shape | None) -> Image:
+        with opened(path) as file:
+            ensure_size(f"{path}: frame {page}", pixels.shape, 1, shape, file.seek(0, 2))
+            place = int(places[page])
+            data = bytes_at(path, file, begin(file, place) if begin else place, pixels.frame_bytes)
+        return pixels.decode(data)
 
-def _read_page(
-    path: Path,
-    places: Sequence[int] | NDArray[np.int64],
-    pixels: Pixels,
-    begin: Callable[[BinaryIO, int], int] | None,
-    page: int,
-    shape: Shape | None,
-) -> Image:
-    with opened(path) as file:
-        ensure_size(f"{path}: frame {page}", pixels.shape, 1, shape, file.seek(0, 2))
-        place = int(places[page])
-        data = bytes_at(path, file, begin(file, place) if begin else place, pixels.frame_bytes)
-    return pixels.decode(data)
+    return Recording(len(places), pixels.shape, pixels.bits, read_page, time_s)
 
 
 def at_rate(pages: int, rate_hz: float) -> NDArray[np.float64] | None:
