@@ -7,7 +7,6 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum, auto
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from lfpiv_cli.files.hdf5 import read_whole, replace_provenance
 from lfpiv_cli.files.images import count_pages, frames
 from lfpiv_cli.files.inputs import split_part
 from lfpiv_cli.files.pairing import Seen
-from lfpiv_cli.files.provenance import bear_alike, differences, earlier_record, ensure_even, without_warnings
+from lfpiv_cli.files.provenance import bear_alike, differences, earlier_record, without_warnings
 
 VTKHDF_SUFFIX = ".vtkhdf"
 # So many things that have changed are named, and all others counted.
@@ -45,20 +44,10 @@ class Frame:
         times = None if self.fault is not None else frames(self.path).time_s
         return None if times is None else float(times[self.page])
 
-
-def step_between(frames: Sequence[Frame]) -> float | None:
-    """Return the time from one frame to the next; None where they are not of one recording, or it does not tell.
-
-    Raises
-    ------
-    InputError : frames were not taken at an even rate, or not in this order
-    """
-    times = [frame.time_s for frame in frames if frame.path == frames[0].path]
-    told = [time for time in times if time is not None]
-    if len(told) < max(len(frames), 2):
-        return None
-    names = [f"{frame.path} page {frame.page}" for frame in frames]
-    return ensure_even([after - before for before, after in pairwise(told)], names)
+    def seconds_to(self, other: Frame) -> float | None:
+        """Return the time to another frame; None where they are not of one recording, or it does not tell."""
+        before, after = self.time_s, other.time_s
+        return None if before is None or after is None or self.path != other.path else after - before
 
 
 @dataclass(frozen=True)
@@ -213,32 +202,28 @@ def pending(
         if found is State.COMPLETE or (found is State.BEARS_ALIKE and overwrite):
             continue
         if found in (State.BEARS_ALIKE, State.OTHER) and not overwrite:
-            raise OutputExistsError(_made_otherwise(target, found))
+            path = next(
+                each
+                for each in target.paths
+                if each.exists() and state_of(replace(target, path=each, beside=())) is found
+            )
+            told = differences(read_whole(path) or {}, target.record)
+            if len(told) > MOST_DIFFERENCES:
+                told[MOST_DIFFERENCES:] = [f"{len(told) - MOST_DIFFERENCES} more"]
+            changed = f" ({'; '.join(told)})" if told else ""
+            what = "keeps it, as it depends on none of that" if found is State.BEARS_ALIKE else "makes it anew"
+            raise OutputExistsError(
+                f"{path}: exists and was made from other inputs or settings{changed}; --overwrite {what}"
+            )
         for path in target.paths:
             ensure_writable(path, overwrite or resume)
         left.append(number)
     return left
 
 
-def is_kept(
-    paths: Sequence[Path], made: Mapping[str, Any], inputs: Iterable[Path], overwrite: bool, resume: bool
-) -> bool:
+def is_kept(paths: Sequence[Path], made: Mapping[str, Any], inputs: Iterable[Path], overwrite: bool) -> bool:
     """Return whether all results of a step, which carry one record, are there already, see `pending`."""
-    return not pending([Target(path, lambda: made) for path in paths], inputs, overwrite, resume)
-
-
-def _made_otherwise(target: Target, found: State) -> str:
-    """Return the sentence on a target that is there, and bears alike or is another: what has changed since then."""
-    made = target.record
-    path = next(
-        path for path in target.paths if path.exists() and state_of(replace(target, path=path, beside=())) is found
-    )
-    told = differences(read_whole(path) or {}, made)
-    if len(told) > MOST_DIFFERENCES:
-        told[MOST_DIFFERENCES:] = [f"{len(told) - MOST_DIFFERENCES} more"]
-    changed = f" ({'; '.join(told)})" if told else ""
-    what = "keeps it, as it depends on none of that" if found is State.BEARS_ALIKE else "makes it anew"
-    return f"{path}: exists and was made from other inputs or settings{changed}; --overwrite {what}"
+    return not pending([Target(path, lambda: made) for path in paths], inputs, overwrite, resume=True)
 
 
 def state_or_none(target: Target) -> State | None:

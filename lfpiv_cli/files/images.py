@@ -125,13 +125,8 @@ def frames(path: Path) -> Recording:
     """
     file, part = split_part(path)
     ensure_regular_file(file)
-    return _frames(file, part, tuple(_state_of(each) for each in (file, *files_beside(file))))
-
-
-def _state_of(file: Path) -> tuple[int, int, int]:
-    """Return what changes when a file does."""
-    status = file.stat()
-    return status.st_size, status.st_mtime_ns, status.st_ino
+    states = (each.stat() for each in (file, *files_beside(file)))
+    return _frames(file, part, tuple((state.st_size, state.st_mtime_ns, state.st_ino) for state in states))
 
 
 @lru_cache(KEPT_HEADERS)

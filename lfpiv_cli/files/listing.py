@@ -7,6 +7,7 @@ import re
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from lfpiv_cli.errors import InputError
@@ -190,25 +191,22 @@ def _natural(name: str) -> list[str | int]:
 def files_in(folder: Path, kind: InputKind) -> list[Path]:
     """Return the files in a folder that are of a kind, in natural order; those whose names begin with a dot are not.
 
+    A kind is told by the name, an image also by its first bytes.
+
     Raises
     ------
     InputError : the folder cannot be read
     """
+    found = []
     with reading_from(folder):
-        found = [path for path in folder.iterdir() if not path.name.startswith(".") and _is_of(path, kind)]
+        for path in folder.iterdir():
+            suffix = path.suffix.lower()
+            if path.name.startswith(".") or path.is_dir():
+                continue
+            is_of_kind = suffix in IMAGE_SUFFIXES if kind == "images" else suffix == VTKHDF_SUFFIX
+            if not is_of_kind and kind == "images":
+                with suppress(InputError):
+                    is_of_kind = format_of(path).in_folders
+            if is_of_kind:
+                found.append(path)
     return sorted(found, key=lambda path: (_natural(path.name), path.name))
-
-
-def _is_of(path: Path, kind: InputKind) -> bool:
-    """Return whether a file in a folder is of a kind: by its name, an image also by its first bytes."""
-    suffix = path.suffix.lower()
-    if path.is_dir():
-        return False
-    if kind == "results":
-        return suffix == VTKHDF_SUFFIX
-    if suffix in IMAGE_SUFFIXES:
-        return True
-    try:
-        return format_of(path).in_folders
-    except InputError:
-        return False

@@ -13,7 +13,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from importlib.metadata import version
-from itertools import pairwise
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -159,27 +158,21 @@ def seconds_between(first: Mapping[str, Any], second: Mapping[str, Any]) -> floa
     return float(after) - float(before)
 
 
-def even_step_s(records: Sequence[Mapping[str, Any]], names: Sequence[str]) -> float | None:
-    """Return the time from one frame to the next by the records of results; None where it is not told.
+def even_step_s(steps_s: Sequence[float | None], names: Sequence[str]) -> float | None:
+    """Return the time from one frame to the next, of several that are to be alike; None where one is not told.
 
     Raises
     ------
     InputError : frames are not in the order in which they were taken, or not evenly spaced in time
     """
-    steps = [seconds_between(*pair) for pair in pairwise(records)]
-    told = [step for step in steps if step is not None]
-    if not told or len(told) < len(steps):
+    told = [step for step in steps_s if step is not None]
+    if not told or len(told) < len(steps_s):
         return None
-    return ensure_even(told, names)
-
-
-def ensure_even(steps_s: Sequence[float], names: Sequence[str]) -> float:
-    """Return the mean of the times between frames, which are to be alike; see `even_step_s`."""
-    mean_s, span = sum(steps_s) / len(steps_s), f"{names[0]} to {names[-1]}: the recording's times"
-    if min(steps_s) <= 0.0:
+    mean_s, span = sum(told) / len(told), f"{names[0]} to {names[-1]}: the recording's times"
+    if min(told) <= 0.0:
         raise InputError(f"{span} do not increase from frame to frame; give them in order, or --dt-s")
-    if max(steps_s) - min(steps_s) > UNEVEN * mean_s:
-        raise InputError(f"{span} are {min(steps_s):g} to {max(steps_s):g} s apart, expected even steps; give --dt-s")
+    if max(told) - min(told) > UNEVEN * mean_s:
+        raise InputError(f"{span} are {min(told):g} to {max(told):g} s apart, expected even steps; give --dt-s")
     return mean_s
 
 

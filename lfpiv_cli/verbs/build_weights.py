@@ -361,7 +361,7 @@ def build_weights_file(
         "refraction": settings.refraction(),
     }
     made = record("build-weights", settings.resolved(), inputs)
-    if options.resume and is_kept([output], made, inputs.values(), overwrite, resume=True):
+    if options.resume and is_kept([output], made, inputs.values(), overwrite):
         return summary | {"frame": open_weights(output).frame, "file_bytes": output.stat().st_size}
     cost = cost_of(settings, plan.camera, plan.source, plan.grid.padded(plan.padding))
     console.warn([*plan.notices, *cost_notices(cost)])

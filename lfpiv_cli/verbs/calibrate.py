@@ -270,7 +270,7 @@ def calibrate_snapshot(
     frames = {name: image_files.read_reference(path, shape) for name, path in inputs.items() if name != "config"}
     record = dict(target_of(config, output, options).record)
     if options.resume:
-        kept = is_kept([output], record, inputs.values(), overwrite, resume=True)
+        kept = is_kept([output], record, inputs.values(), overwrite)
         if kept and all(path.exists() for path in drawings):
             return read_calibration(output).summary()
         overwrite = True
