@@ -29,17 +29,13 @@ from lfpiv_cli.files.inputs import reason, split_part
 
 # Where the files of a command lie: no two outputs in one place, and none in that of an input.
 
-# The folder as the system knows it, and the name in it; what an existing file is, whatever leads to it.
-Place = tuple[str, str]
-Identity = tuple[int, int]
-
 
 def ensure_apart(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
     """Refuse outputs of which one would replace another, or an input, before anything is computed."""
     inputs = [split_part(path)[0] for path in inputs]
     read = {place_of(path) for path in inputs}
     files = {identity for identity in map(_identity, inputs) if identity is not None}
-    written: set[Place] = set()
+    written: set[tuple[str, str]] = set()
     for path in outputs:
         place = place_of(path)
         if place in read or _identity(path) in files:
@@ -49,8 +45,8 @@ def ensure_apart(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
         written.add(place)
 
 
-def place_of(path: Path) -> Place:
-    """Return the place of a file, the same for all names that lead there, whether it exists or not."""
+def place_of(path: Path) -> tuple[str, str]:
+    """Return folder and name of a file, the same for all names that lead there, whether it exists or not."""
     folder = _real(path.parent)
     return folder, folded(path.name, Path(folder))
 
@@ -74,7 +70,7 @@ def ignores_case(folder: Path) -> bool:
 _real = lru_cache(maxsize=16)(os.path.realpath)
 
 
-def _identity(path: Path) -> Identity | None:
+def _identity(path: Path) -> tuple[int, int] | None:
     """Return what tells an existing file from all others; None where there is none."""
     try:
         status = os.stat(path)
@@ -214,11 +210,7 @@ def shown(path: Path) -> str:
 
 
 def write_atomically(
-    target: Path,
-    write: Callable[[Path], None],
-    *,
-    overwrite: bool,
-    check: Callable[[Path], object] | None = None,
+    target: Path, write: Callable[[Path], object], *, overwrite: bool, check: Callable[[Path], object] | None = None
 ) -> None:
     """Write a file so that it appears under its name only when it is complete.
 
@@ -275,11 +267,8 @@ def write_json(path: Path, value: Mapping[str, Any], overwrite: bool) -> None:
 
 def write_text(path: Path, text: str, overwrite: bool) -> None:
     """Write text in UTF-8; names of files that are no UTF-8 keep their bytes."""
-
-    def write(temporary: Path) -> None:
-        temporary.write_bytes(text.encode("utf-8", "surrogateescape"))
-
-    write_atomically(path, write, overwrite=overwrite)
+    content = text.encode("utf-8", "surrogateescape")
+    write_atomically(path, lambda temporary: temporary.write_bytes(content), overwrite=overwrite)
 
 
 def without_nan(value: Any) -> Any:

@@ -173,11 +173,7 @@ def state_of(target: Target) -> State:
 
 
 def pending(
-    targets: Sequence[Target],
-    inputs: Iterable[Path],
-    overwrite: bool,
-    resume: bool,
-    dry: bool = False,
+    targets: Sequence[Target], inputs: Iterable[Path], overwrite: bool, resume: bool, dry: bool = False
 ) -> list[int]:
     """Return the numbers of the targets that have to be made.
 

@@ -18,13 +18,7 @@ from lfpiv_cli.files.hdf5 import RESERVED, format_of, from_attribute, open_h5, r
 from lfpiv_cli.files.hdf5_checks import member
 from lfpiv_cli.files.images import frames
 from lfpiv_cli.files.inputs import ensure_regular_file, split_page, split_part
-from lfpiv_cli.files.particle_file import (
-    PARTICLES_FORMAT,
-    TRACKS_FORMAT,
-    TRAJECTORIES_FORMAT,
-    read_points,
-    read_tracks,
-)
+from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, TRAJECTORIES_FORMAT, read_points, read_tracks
 from lfpiv_cli.files.recordings import stack
 from lfpiv_cli.flow.field import MM_TO_M, REJECTED, VALID, derived_fields
 

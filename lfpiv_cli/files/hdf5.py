@@ -108,7 +108,9 @@ def write_array(group: h5py.Group, name: str, array: NDArray[Any], units: str | 
     """Write a numeric array with checksums; an array without elements has nothing to check."""
     array = np.ascontiguousarray(array)
     dataset = group.create_dataset(name, data=array, track_times=False, **_storage(name, array.shape, array.dtype))
-    return _with_units(dataset, units)
+    if units is not None:
+        dataset.attrs["units"] = np.bytes_(units)
+    return dataset
 
 
 def write_rows(
@@ -127,7 +129,9 @@ def write_rows(
             dataset[done : done + whole] = held[:whole]
         done += whole
         held = np.concatenate([held[whole:], piece]) if whole < len(held) else piece
-    return _with_units(dataset, units)
+    if units is not None:
+        dataset.attrs["units"] = np.bytes_(units)
+    return dataset
 
 
 def _storage(name: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> dict[str, Any]:
@@ -141,12 +145,6 @@ def _storage(name: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> dict[st
         chunk.append(max(min(n, left), 1))
         left //= chunk[-1]
     return {"chunks": tuple(reversed(chunk)), **FILTERS}
-
-
-def _with_units(dataset: h5py.Dataset, units: str | None) -> h5py.Dataset:
-    if units is not None:
-        dataset.attrs["units"] = np.bytes_(units)
-    return dataset
 
 
 def read_array(dataset: h5py.Dataset, file_bytes: int) -> NDArray[Any]:

@@ -199,18 +199,10 @@ def write_tiff(path: Path, array: NDArray[Any], overwrite: bool) -> None:
     if array.dtype not in (np.uint8, np.uint16, np.float32) or array.ndim != 2:
         raise TypeError(f"images are uint8, uint16 or float32 (rows, columns), not {array.dtype} {array.shape}")
 
-    def write(temporary: Path) -> None:
-        tifffile.imwrite(
-            temporary,
-            array,
-            photometric="minisblack",
-            compression="zlib",
-            predictor=array.dtype != np.float32,
-            metadata=None,
-            software=False,
-        )
-
-    def check(temporary: Path) -> None:
-        tiff.frames(temporary).read_page(0, (array.shape[0], array.shape[1]))
-
-    write_atomically(path, write, overwrite=overwrite, check=check)
+    kept = {"compression": "zlib", "predictor": array.dtype != np.float32, "metadata": None, "software": False}
+    write_atomically(
+        path,
+        lambda temporary: tifffile.imwrite(temporary, array, photometric="minisblack", **kept),
+        overwrite=overwrite,
+        check=lambda temporary: tiff.frames(temporary).read_page(0, (array.shape[0], array.shape[1])),
+    )

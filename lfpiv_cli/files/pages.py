@@ -34,11 +34,8 @@ def ensure_drawing() -> None:
 
 def write_picture(path: Path, figure: Figure, overwrite: bool) -> None:
     """Write a figure as PNG; without time stamps, so that the same figure gives the same bytes."""
-
-    def save(target: Path) -> None:
-        figure.savefig(target, format="png", dpi=DOTS_PER_INCH, metadata={"Software": None})
-
-    write_atomically(path, save, overwrite=overwrite)
+    told = {"format": "png", "dpi": DOTS_PER_INCH, "metadata": {"Software": None}}
+    write_atomically(path, lambda target: figure.savefig(target, **told), overwrite=overwrite)
 
 
 def write_pdf(path: Path, figures: Iterable[Figure], overwrite: bool) -> None:

@@ -154,13 +154,7 @@ CHECKED_ROWS = 2**16
 
 # Units of the arrays, by format; tensors are symmetric, as xx, yy, zz, xy, yz, xz (VTK's order).
 UNITS = {
-    PARTICLES_FORMAT: {
-        "intensity": "count",
-        "covariance_mm2": "mm^2",
-        "chi2": "1",
-        "seen": "1",
-        "flag": "1",
-    },
+    PARTICLES_FORMAT: {"intensity": "count", "covariance_mm2": "mm^2", "chi2": "1", "seen": "1", "flag": "1"},
     TRACKS_FORMAT: {
         "velocity": "m/s",
         "velocity_sigma": "m/s",
@@ -180,10 +174,7 @@ UNITS = {
     },
 }
 # Arrays that a file may have besides: those of earlier versions have them not.
-OPTIONAL = {
-    PARTICLES_FORMAT: {"intensity_sigma": "count"},
-    TRACKS_FORMAT: {"displacement_covariance_mm2": "mm^2"},
-}
+OPTIONAL = {PARTICLES_FORMAT: {"intensity_sigma": "count"}, TRACKS_FORMAT: {"displacement_covariance_mm2": "mm^2"}}
 # Arrays in which NaN stands for what is not known.
 MAY_BE_UNKNOWN = {"link_probability"}
 NOT_ONE_VALUE = "{}: {} has not one finite value for each of its {} points"

@@ -248,12 +248,7 @@ def tree_of(numbers: RigNumbers) -> dict[str, Any]:
                 "f_number": known.f_number,
             },
             "microlenses": {"focal_length_mm": known.microlens_focal_length_mm, "pitch_mm": known.pitch_mm},
-            "sensor": {
-                "pixel_um": known.pixel_um,
-                "columns": known.columns,
-                "rows": known.rows,
-                "column_axis": "x",
-            },
+            "sensor": {"pixel_um": known.pixel_um, "columns": known.columns, "rows": known.rows, "column_axis": "x"},
         },
         "media": {"air": 1.0, "window": known.wall, "fluid": known.fluid},
     }

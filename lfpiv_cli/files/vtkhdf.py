@@ -175,8 +175,7 @@ def write_volume(
 
     def fill(file: h5py.File) -> None:
         write_root(file, VOLUME_FORMAT, FORMAT_VERSION, reference, attributes, provenance)
-        points = _write_frame(file, grid, with_component=False)
-        _write_points(file, points, "intensity", array_zyx.astype(np.float32), "1")
+        _write_on_grid(file, grid, {"intensity": (array_zyx.astype(np.float32), "1")})
 
     create(path, fill, overwrite=overwrite, check=open_volume)
 
@@ -192,7 +191,7 @@ def open_volume(path: Path | str) -> Volume:
     with open_h5(path) as file:
         ensure_format(path, file, VOLUME_FORMAT, (FORMAT_VERSION,))
         grid = _read_grid(file)
-        array = _read_points(file, "intensity", grid, path.stat().st_size, components=False)
+        array = _read_on_grid(path, file, grid, {"intensity": False})["intensity"]
         root = read_root(file)
     bad = int(np.count_nonzero(~np.isfinite(array)))
     if bad:
@@ -224,15 +223,11 @@ def write_vectors(
         file.attrs["flag_meanings"] = np.bytes_(FLAG_MEANINGS)
         if field.dt_s is not None:
             file.attrs["dt_s"] = float(field.dt_s)
-        points = _write_frame(file, field.grid, with_component=True)
-        points.attrs["Vectors"] = np.bytes_("velocity")
-        _write_points(file, points, "velocity", field.velocity, "m/s")
-        for name, (unit, _) in VECTOR_ARRAYS.items():
-            _write_points(file, points, name, getattr(field, name), unit)
+        arrays = {"velocity": (field.velocity, "m/s")}
+        arrays |= {name: (getattr(field, name), unit) for name, (unit, _) in VECTOR_ARRAYS.items()}
         if field.uncertainty_voxel is not None:
-            _write_points(file, points, UNCERTAINTY, field.uncertainty_voxel, "voxel")
-        for name, (array, unit) in (extra or {}).items():
-            _write_points(file, points, name, array, unit)
+            arrays[UNCERTAINTY] = (field.uncertainty_voxel, "voxel")
+        _write_on_grid(file, field.grid, arrays | dict(extra or {}))
 
     create(path, fill, overwrite=overwrite, check=open_vectors)
 
@@ -248,11 +243,8 @@ def open_vectors(path: Path | str) -> VectorField:
     with open_h5(path) as file:
         ensure_format(path, file, VECTORS_FORMAT, (FORMAT_VERSION,))
         grid = _read_grid(file)
-        size = path.stat().st_size
-        arrays = {
-            name: _read_points(file, name, grid, size, components=vector) for name, (_, vector) in VECTOR_ARRAYS.items()
-        }
-        uncertainty = _read_points(file, UNCERTAINTY, grid, size, components=True) if UNCERTAINTY in file else None
+        components = {name: vector for name, (_, vector) in VECTOR_ARRAYS.items()}
+        arrays = _read_on_grid(path, file, grid, components | ({UNCERTAINTY: True} if UNCERTAINTY in file else {}))
         voxel = [float(v) for v in file.attrs["voxel_mm"]]
         window = [int(v) for v in file.attrs["window_voxel"]]
         dt_s = float(file.attrs["dt_s"]) if "dt_s" in file.attrs else None
@@ -260,11 +252,10 @@ def open_vectors(path: Path | str) -> VectorField:
         raise InputError(f"{path}: a flag is {arrays['flag'].max()}, allowed are 0 to {LARGEST_FLAG}")
     field = VectorField(
         grid=grid,
-        uncertainty_voxel=uncertainty,
         voxel_mm=(voxel[0], voxel[1], voxel[2]),
         dt_s=dt_s,
         window_voxel=(window[0], window[1], window[2]),
-        **arrays,
+        **{UNCERTAINTY: None, **arrays},
     )
     if not np.isfinite(field.displacement_voxel[field.flag < REJECTED]).all():
         raise InputError(f"{path}: a vector that counts as valid is not a finite number")
@@ -276,13 +267,11 @@ def read_arrays(path: Path | str) -> tuple[Grid, dict[str, tuple[NDArray[Any], s
     path = Path(path)
     with open_h5(path) as file:
         ensure_format(path, file, VECTORS_FORMAT, (FORMAT_VERSION,))
-        grid, size, found = _read_grid(file), path.stat().st_size, {}
+        grid = _read_grid(file)
         places = 2 if grid.shape_zyx[0] == 1 else 3
-        for name in member(member(file, "VTKHDF"), "PointData"):
-            dataset = array_member(file, name)
-            array = _read_points(file, name, grid, size, components=dataset.ndim > places)
-            found[name] = (array, dataset.attrs["units"].decode())
-    return grid, found
+        names = member(member(file, "VTKHDF"), "PointData")
+        arrays = _read_on_grid(path, file, grid, {name: array_member(file, name).ndim > places for name in names})
+        return grid, {name: (array, file[name].attrs["units"].decode()) for name, array in arrays.items()}
 
 
 def read_grid(path: Path) -> Grid:
@@ -297,24 +286,23 @@ def read_header(path: Path | str) -> Header:
         return read_root(file)
 
 
-def _write_frame(file: h5py.File, grid: Grid, with_component: bool) -> h5py.Group:
-    """Write the dimension scales and `/VTKHDF`, return its `PointData`."""
+def _write_on_grid(file: h5py.File, grid: Grid, arrays: Mapping[str, tuple[NDArray[Any], str]]) -> None:
+    """Write arrays with their units and dimension scales at the root, and link them under `/VTKHDF/PointData`."""
     for axis, name in enumerate("xyz"):
         write_array(file, name, grid.axis_mm(axis), "mm").make_scale(name)
-    if with_component:
+    if "velocity" in arrays:
         write_array(file, "component", np.arange(3), "1").make_scale("component")
-    return create_vtk_group(file, grid).create_group("PointData")
-
-
-def _write_points(file: h5py.File, points: h5py.Group, name: str, array: NDArray[Any], unit: str) -> None:
-    """Write an array at the root with its dimension scales and link it under PointData."""
-    axes = ["z", "y", "x"] + ["component"] * (array.ndim - 3)
-    if array.shape[0] == 1:
-        array, axes = array[0], axes[1:]
-    dataset = write_array(file, name, array, unit)
-    for position, axis in enumerate(axes):
-        dataset.dims[position].attach_scale(file[axis])
-    points[name] = dataset
+    points = create_vtk_group(file, grid).create_group("PointData")
+    if "velocity" in arrays:
+        points.attrs["Vectors"] = np.bytes_("velocity")
+    for name, (array, unit) in arrays.items():
+        axes = ["z", "y", "x"] + ["component"] * (array.ndim - 3)
+        if array.shape[0] == 1:
+            array, axes = array[0], axes[1:]
+        dataset = write_array(file, name, array, unit)
+        for position, axis_name in enumerate(axes):
+            dataset.dims[position].attach_scale(file[axis_name])
+        points[name] = dataset
 
 
 def _read_grid(file: h5py.File) -> Grid:
@@ -335,11 +323,14 @@ def _read_grid(file: h5py.File) -> Grid:
     )
 
 
-def _read_points(file: h5py.File, name: str, grid: Grid, file_bytes: int, components: bool) -> NDArray[Any]:
-    """Read an array of the grid's shape, with the third axis put back on a single plane."""
-    shape = grid.shape_zyx + ((3,) if components else ())
-    stored = shape[1:] if shape[0] == 1 else shape
-    dataset = array_member(file, name)
-    if dataset.shape != stored:
-        raise ValueError(f"{name} has the shape {dataset.shape}, its extent says {stored}")
-    return read_array(dataset, file_bytes).reshape(shape)
+def _read_on_grid(path: Path, file: h5py.File, grid: Grid, components: Mapping[str, bool]) -> dict[str, NDArray[Any]]:
+    """Read arrays of the grid's shape, with components or without, the third axis put back on a single plane."""
+    found = {}
+    for name, with_components in components.items():
+        shape = grid.shape_zyx + ((3,) if with_components else ())
+        stored = shape[1:] if shape[0] == 1 else shape
+        dataset = array_member(file, name)
+        if dataset.shape != stored:
+            raise ValueError(f"{name} has the shape {dataset.shape}, its extent says {stored}")
+        found[name] = read_array(dataset, path.stat().st_size).reshape(shape)
+    return found

@@ -256,7 +256,7 @@ KINDS = {
 # Keys without which another section may be what was meant.
 MISSING: dict[KeyPath, str] = {
     ("window", "distance_mm"): "is missing; where only the thickness of a channel's wall is known, leave window out "
-    "and give channel: {width_mm: ..., wall_mm: ...}, whose calibrated mid plane tells the distance",
+    "and give channel: {width_mm: ..., wall_mm: ...}, whose calibrated mid plane tells the distance"
 }
 
 
