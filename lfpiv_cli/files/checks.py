@@ -10,18 +10,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from lfpiv_cli.errors import ConfigError
-from lfpiv_cli.files.bench import (
-    camera_of,
-    face_of,
-    focal_length_mm,
-    grid_of,
-    index_behind,
-    media_of,
-    missing_for_camera,
-    round_wall_of,
-    scene_of,
-)
-from lfpiv_cli.files.sections import CylinderFace, HeightMapFace
+from lfpiv_cli.files.sections import CylinderFace, HeightMapFace, scene_of
 from lfpiv_cli.files.sections_simulated import Sections, SimulationSection
 from lfpiv_cli.files.yaml_nodes import Document, KeyPath, Problem, key_name, place_of, problem_of, report
 from lfpiv_cli.flow.windows import RoundWall
@@ -105,7 +94,7 @@ def _lens(sections: Sections) -> Found:
     lens, microlenses = sections.camera.main_lens, sections.camera.microlenses
     if lens is not None:
         place = ("camera", "main_lens")
-        focal_length = focal_length_mm(lens)
+        focal_length = lens.known_focal_length_mm
         if lens.image_distance is not None:
             if lens.focal_length_mm is None:
                 yield place, "needs focal_length_mm, which an infinite image distance does not tell"
@@ -141,9 +130,9 @@ def _lens_images(sections: Sections) -> Found:
         text = f"lens images would be {written(pitch_px, 4)} px apart (pitch_mm is {pitch_mm:g}), expected "
         text += f"{FEWEST_PIXELS_A_LENS:g} to {MOST_PIXELS_A_LENS:g}: pixels in um, the pitch in mm"
         yield ("camera", "sensor", "pixel_um"), f"is {sensor.pixel_um:g}: {text}"
-    if missing_for_camera(section) is None:
-        for place, text in lens_image_faults(camera_of(section)):
-            yield ("camera", *place), text
+    camera = section.model()
+    for place, text in () if camera is None else lens_image_faults(camera):
+        yield ("camera", *place), text
 
 
 def lens_image_faults(camera: Camera) -> Found:
@@ -173,7 +162,7 @@ def _volume(sections: Sections) -> Found:
         for name in ("shape_xyz", "voxel_mm"):
             if getattr(volume, name) is not None:
                 yield (*place, name), "contradicts size_mm, which leaves the voxels to the program"
-        if sections.camera is None or missing_for_camera(sections.camera) is not None or sections.media is None:
+        if sections.camera is None or sections.camera.missing is not None or sections.media is None:
             yield (*place, "size_mm"), "needs the sections media and camera, with all of its main lens, for the voxels"
     elif volume.shape_xyz is None or volume.voxel_mm is None:
         yield place, "needs shape_xyz and voxel_mm, or size_mm"
@@ -223,9 +212,9 @@ def _scene(sections: Sections) -> Found:
     if sections.media is None:
         yield ("scene",), "needs the section media"
         return
-    media = media_of(sections.media)
+    media = sections.media.model()
     last = len(scene) - 1
-    if index_behind(scene[last], media) != media.fluid:
+    if scene[last].index_behind(media) != media.fluid:
         yield ("scene", last, "behind"), f"is {scene[last].behind}, expected fluid behind the last face"
         return
     missed = False
@@ -235,7 +224,7 @@ def _scene(sections: Sections) -> Found:
             missed = True
             continue
         try:
-            face_of(section, media).surface.shape()
+            section.model(media).surface.shape()
         except ConfigError as error:
             yield ("scene", k), str(error)
             missed = True
@@ -243,8 +232,9 @@ def _scene(sections: Sections) -> Found:
         return
     try:
         space = scene_of(scene, media)
-        if sections.camera is not None and missing_for_camera(sections.camera) is None:
-            space.lens_z_mm(camera_of(sections.camera))
+        camera = None if sections.camera is None else sections.camera.model()
+        if camera is not None:
+            space.lens_z_mm(camera)
     except ConfigError as error:
         yield ("scene",), str(error)
         return
@@ -257,7 +247,7 @@ def _pipe(sections: Sections) -> Found:
     if pipe is None or not isinstance(face, CylinderFace):
         return
     yield from _twice(("pipe", "radius_mm"), pipe.radius_mm, face.radius_mm, "that of the last face in scene")
-    inside = round_wall_of(pipe)
+    inside = pipe.wall()
     axis = RoundWall(face.radius_mm, axis=face.axis).direction
     if np.linalg.norm(np.cross(inside.direction, axis)) > AGREEMENT:
         ours, theirs = (each if isinstance(each, str) else list(each) for each in (pipe.axis, face.axis))
@@ -314,12 +304,13 @@ def _object_space(sections: Sections) -> Found:
     With a mid-plane volume the origin is not known yet; it lies within millimetres of the focal point.
     """
     volume, section = sections.volume, sections.camera
-    if volume is None or section is None or sections.media is None or missing_for_camera(section) is not None:
+    camera = None if section is None else section.model()
+    if volume is None or camera is None or sections.media is None:
         return
     if volume.size_mm is None and (volume.shape_xyz is None or volume.voxel_mm is None):
         return
-    camera, media = camera_of(section), media_of(sections.media)
-    grid = grid_of(volume, camera.scale(media), FOCAL_POINT)
+    media = sections.media.model()
+    grid = volume.grid(camera.scale(media), FOCAL_POINT)
     nearest = grid.bounds_mm(2)[0]
     distance = float(equivalent_object_distance(nearest, camera.focus_distance_mm, media))
     if distance <= 0.0:

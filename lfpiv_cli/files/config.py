@@ -16,9 +16,18 @@ from typing import Any
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.calibration.model import Calibration, Channel, Rig
 from lfpiv_cli.errors import ConfigError, InputError
-from lfpiv_cli.files import bench, sections
+from lfpiv_cli.files import sections
 from lfpiv_cli.files.checks import validated
-from lfpiv_cli.files.sections_simulated import FlowSection, Sections, SimulationSection, ValidationSection
+from lfpiv_cli.files.sections_simulated import (
+    CorrelationSection,
+    FlowSection,
+    ReconstructionSection,
+    Sections,
+    SimulationSection,
+    ValidationSection,
+    WeightsSection,
+    flow_of,
+)
 from lfpiv_cli.files.yaml_nodes import Document, read_rig
 from lfpiv_cli.flow.correlation import CorrelationSettings
 from lfpiv_cli.flow.windows import ParallelWalls, Walls
@@ -63,9 +72,9 @@ class Config:
     source: str
     channel: sections.ChannelSection | None = field(init=False)
     pipe: sections.PipeSection | None = field(init=False)
-    weights: sections.WeightsSection = field(init=False)
-    reconstruction: sections.ReconstructionSection = field(init=False)
-    correlation: sections.CorrelationSection = field(init=False)
+    weights: WeightsSection = field(init=False)
+    reconstruction: ReconstructionSection = field(init=False)
+    correlation: CorrelationSection = field(init=False)
     simulation: SimulationSection = field(init=False)
     validation: ValidationSection = field(init=False)
 
@@ -135,23 +144,19 @@ class Config:
 
     def camera_model(self) -> Camera:
         """Return the camera as the data sheet has it, a lens centre on the axis."""
-        camera: Camera = self._needed(f"camera.{bench.missing_for_camera(self.camera)}", self.complete_camera())
+        camera: Camera = self._needed(f"camera.{self.camera.missing}", self.camera.model())
         return camera
-
-    def complete_camera(self) -> Camera | None:
-        """Return the camera as the data sheet has it, None where it lacks a length."""
-        return None if bench.missing_for_camera(self.camera) is not None else bench.camera_of(self.camera)
 
     def micro_image_pitch_px(self) -> float:
         """Return the pitch of the lens images by the data sheet, of parallel light where the lens is not known."""
-        camera, section = self.complete_camera(), self.camera
+        camera, section = self.camera.model(), self.camera
         if camera is not None:
             return float(camera.micro_image_lattice_px().pitch.mean())
-        return section.microlenses.pitch_mm / (section.sensor.pixel_um * bench.UM_TO_MM)
+        return section.microlenses.pitch_mm / (section.sensor.pixel_um * sections.UM_TO_MM)
 
     def media_model(self) -> Media:
         """Return the refractive indices."""
-        return bench.media_of(self.media)
+        return self.media.model()
 
     def fluid_density_kg_m3(self) -> float:
         """Return the fluid's density."""
@@ -192,7 +197,7 @@ class Config:
     def scene_space(self) -> CurvedSpace | None:
         """Return the faces of `scene`, None where there is none."""
         scene = self.sections.scene
-        return None if scene is None else bench.scene_of(scene, self.media_model())
+        return None if scene is None else sections.scene_of(scene, self.media_model())
 
     def scene_fingerprint(self) -> str:
         """Return what tells the scene from another one: the SHA-256 of its faces."""
@@ -222,10 +227,10 @@ class Config:
         resolved, kinds = self.resolved(), {surface: kind for kind, surface in SURFACES.items()}
         resolved["scene"] = []
         for section in scene:
-            surface: Any = bench.face_of(section, self.media_model()).surface.moved(motion)
+            surface: Any = section.model(self.media_model()).surface.moved(motion)
             resolved["scene"].append({"kind": kinds[type(surface)], **asdict(surface), "behind": section.behind})
         if self.pipe is not None:
-            axis = motion.direction(bench.round_wall_of(self.pipe).direction.tolist())
+            axis = motion.direction(self.pipe.wall().direction.tolist())
             resolved["pipe"] |= {"centre_mm": motion.point(self.pipe.centre_mm), "axis": axis}
         return Config.from_resolved(resolved, f"{self.source} with the calibration's scene")
 
@@ -260,22 +265,22 @@ class Config:
         """Return the volume's grid: z as in the config, or from the focal point where its reference is given."""
         chosen = self.volume.size_mm is not None
         scale = self.camera_model().scale(self.media_model()) if chosen else None
-        return bench.grid_of(self.volume, scale, reference)
+        return self.volume.grid(scale, reference)
 
     def rig(self) -> Rig:
         """Return what must be known to read the picture of a board; a chessboard's points are its inner corners."""
-        board, channel = self.board, self.channel
+        camera, media, board, channel = self.camera_model(), self.media_model(), self.board, self.channel
         points = board.dots if board.squares is None else (board.squares[0] - 1, board.squares[1] - 1)
         if points is None:
             raise ValueError("board.dots or board.squares is missing")
         told = board.model_dump(exclude={"dots", "squares"})
         told |= {name: told[name] or 0.0 for name in ("dot_diameter_mm", "marker_mm")}
         return Rig(
-            self.camera_model(),
-            self.media_model(),
+            camera,
+            media,
             BoardGeometry(dots=points, **told),
             None if channel is None else Channel(**channel.model_dump(exclude={"no_slip"})),
-            bench.wave_light_of(self.reconstruction),
+            self.reconstruction.wave_light(),
         )
 
     def windows_voxel(self, voxel_mm: Lengths) -> tuple[Triple, ...]:
@@ -315,16 +320,12 @@ class Config:
         if mask is None:
             return None
         section = self._needed(mask, getattr(self.sections, mask))
-        return (
-            bench.round_wall_of(section)
-            if isinstance(section, sections.PipeSection)
-            else ParallelWalls(section.width_mm)
-        )
+        return section.wall() if isinstance(section, sections.PipeSection) else ParallelWalls(section.width_mm)
 
     def still_walls(self) -> Walls | None:
         """Return the walls at which the fluid stands still, the pipe's or the channel's, None where neither is said."""
         if self.pipe is not None and self.pipe.no_slip:
-            return bench.round_wall_of(self.pipe)
+            return self.pipe.wall()
         return ParallelWalls(self.channel.width_mm) if self.channel is not None and self.channel.no_slip else None
 
     def solver_settings(self) -> SolverSettings:
@@ -347,12 +348,12 @@ class Config:
 
     def simulated_flow(self, reference: Reference = FOCAL_POINT) -> Flow:
         """Return the flow to render, a function of points: z as in the config, or from the focal point as in `grid`."""
-        return bench.flow_of(self._needed("simulation.flow", self.simulation.flow), reference)
+        return flow_of(self._needed("simulation.flow", self.simulation.flow), reference)
 
     def true_flow(self) -> Flow:
         """Return the flow to compare with, in the volume's coordinates: `validation.flow`, else the simulation's."""
         flow: FlowSection | None = self.validation.flow or self.simulation.flow
-        return bench.flow_of(self._needed("validation.flow", flow), FOCAL_POINT)
+        return flow_of(self._needed("validation.flow", flow), FOCAL_POINT)
 
     def flow_methods(self) -> tuple[str, ...]:
         """Return how a simulated flow is measured: as `validation.flow_methods` has it, else every possible way.

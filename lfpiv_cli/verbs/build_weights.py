@@ -20,7 +20,7 @@ from lfpiv_cli.files.calibration_file import read_calibration
 from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.provenance import record, with_warnings
-from lfpiv_cli.files.sections import WeightsSection
+from lfpiv_cli.files.sections_simulated import WeightsSection
 from lfpiv_cli.files.weights_file import WeightsFile, open_weights, write_weights
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import Method, Refraction, Sampling
