@@ -16,8 +16,17 @@ from typing import Any
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.calibration.model import Calibration, Channel, Rig
 from lfpiv_cli.errors import ConfigError, InputError
-from lfpiv_cli.files import sections
 from lfpiv_cli.files.checks import validated
+from lfpiv_cli.files.sections import (
+    UM_TO_MM,
+    BoardSection,
+    CameraSection,
+    ChannelSection,
+    MediaSection,
+    PipeSection,
+    VolumeSection,
+    scene_of,
+)
 from lfpiv_cli.files.sections_simulated import (
     CorrelationSection,
     FlowSection,
@@ -70,8 +79,8 @@ class Config:
 
     sections: Sections
     source: str
-    channel: sections.ChannelSection | None = field(init=False)
-    pipe: sections.PipeSection | None = field(init=False)
+    channel: ChannelSection | None = field(init=False)
+    pipe: PipeSection | None = field(init=False)
     weights: WeightsSection = field(init=False)
     reconstruction: ReconstructionSection = field(init=False)
     correlation: CorrelationSection = field(init=False)
@@ -119,22 +128,22 @@ class Config:
         )
 
     @property
-    def camera(self) -> sections.CameraSection:
+    def camera(self) -> CameraSection:
         """The section `camera`."""
         return self._needed("camera", self.sections.camera)
 
     @property
-    def media(self) -> sections.MediaSection:
+    def media(self) -> MediaSection:
         """The section `media`."""
         return self._needed("media", self.sections.media)
 
     @property
-    def volume(self) -> sections.VolumeSection:
+    def volume(self) -> VolumeSection:
         """The section `volume`."""
         return self._needed("volume", self.sections.volume)
 
     @property
-    def board(self) -> sections.BoardSection:
+    def board(self) -> BoardSection:
         """The section `board`."""
         return self._needed("board", self.sections.board)
 
@@ -152,7 +161,7 @@ class Config:
         camera, section = self.camera.model(), self.camera
         if camera is not None:
             return float(camera.micro_image_lattice_px().pitch.mean())
-        return section.microlenses.pitch_mm / (section.sensor.pixel_um * sections.UM_TO_MM)
+        return section.microlenses.pitch_mm / (section.sensor.pixel_um * UM_TO_MM)
 
     def media_model(self) -> Media:
         """Return the refractive indices."""
@@ -197,7 +206,7 @@ class Config:
     def scene_space(self) -> CurvedSpace | None:
         """Return the faces of `scene`, None where there is none."""
         scene = self.sections.scene
-        return None if scene is None else sections.scene_of(scene, self.media_model())
+        return None if scene is None else scene_of(scene, self.media_model())
 
     def scene_fingerprint(self) -> str:
         """Return what tells the scene from another one: the SHA-256 of its faces."""
@@ -320,7 +329,7 @@ class Config:
         if mask is None:
             return None
         section = self._needed(mask, getattr(self.sections, mask))
-        return section.wall() if isinstance(section, sections.PipeSection) else ParallelWalls(section.width_mm)
+        return section.wall() if isinstance(section, PipeSection) else ParallelWalls(section.width_mm)
 
     def still_walls(self) -> Walls | None:
         """Return the walls at which the fluid stands still, the pipe's or the channel's, None where neither is said."""

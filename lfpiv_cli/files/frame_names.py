@@ -136,8 +136,8 @@ def _read_together(group: Sequence[list[str]], how: Pairing, stamps: Sequence[in
     seen = [k for k in letters if len({MARKS[tokens[k]] for tokens in group}) == 2]
     if not seen and how != "sequence":
         # Unless it is of the number of a buffer, with which names begin as `B00001` and `B0001_0` do.
-        letter, number, *_ = [*group[0], "", ""]
-        buffers = letter == BUFFER and _is_number(number) and (len(number) == BUFFER_DIGITS or _ends_in_frame(group))
+        first, second, *_ = [*group[0], "", ""]
+        buffers = first == BUFFER and _is_number(second) and (len(second) == BUFFER_DIGITS or _ends_in_frame(group))
         seen = [k for k in letters if k or not buffers]
     mark = seen[-1] if seen else None
     marks = [] if mark is None else [MARKS[tokens[mark]] for tokens in group]

@@ -34,8 +34,11 @@ def ensure_drawing() -> None:
 
 def write_picture(path: Path, figure: Figure, overwrite: bool) -> None:
     """Write a figure as PNG; without time stamps, so that the same figure gives the same bytes."""
-    told = {"format": "png", "dpi": DOTS_PER_INCH, "metadata": {"Software": None}}
-    write_atomically(path, lambda target: figure.savefig(target, **told), overwrite=overwrite)
+    write_atomically(
+        path,
+        lambda target: figure.savefig(target, format="png", dpi=DOTS_PER_INCH, metadata={"Software": None}),
+        overwrite=overwrite,
+    )
 
 
 def write_pdf(path: Path, figures: Iterable[Figure], overwrite: bool) -> None:
@@ -111,21 +114,26 @@ def ensure_pages() -> None:
 
 def write_pages(page: Page, targets: Iterable[Path], overwrite: bool) -> None:
     """Write a page as HTML with its pictures inside, or as Markdown that links to them, as each target's name ends."""
+    for target in targets:
+        write_text(target, _rendered(page, target), overwrite)
+
+
+def _rendered(page: Page, target: Path) -> str:
+    """Return a page in the language that a file's name ends in."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-    for target in targets:
-        places = Environment(
-            loader=FileSystemLoader(TEMPLATES),
-            autoescape=lambda name: name is not None and name.endswith(".html"),
-            undefined=StrictUndefined,
-            trim_blocks=True,
-            lstrip_blocks=True,
-            keep_trailing_newline=True,
-        )
-        places.filters |= {
-            # A PNG file as an address that holds the picture itself.
-            "data_uri": lambda path: "data:image/png;base64," + base64.b64encode(content_of(path)).decode("ascii"),
-            "cell": lambda text: text.replace("|", "\\|"),
-            "relative": lambda path, folder=target.parent: path.relative_to(folder).as_posix(),
-        }
-        write_text(target, places.get_template(f"page{target.suffix}").render(page=page), overwrite)
+    places = Environment(
+        loader=FileSystemLoader(TEMPLATES),
+        autoescape=lambda name: name is not None and name.endswith(".html"),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    places.filters |= {
+        # A PNG file as an address that holds the picture itself.
+        "data_uri": lambda path: "data:image/png;base64," + base64.b64encode(content_of(path)).decode("ascii"),
+        "cell": lambda text: text.replace("|", "\\|"),
+        "relative": lambda path: path.relative_to(target.parent).as_posix(),
+    }
+    return places.get_template(f"page{target.suffix}").render(page=page)

@@ -11,7 +11,8 @@ import math
 import tempfile
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -93,6 +94,12 @@ class StoredTracks:
         except OSError as error:
             raise self._error(error) from error
         self._begins.append(begins)
+
+    def with_record(self, provenance: dict[str, Any]) -> StoredTracks:
+        """Return the same tracks with another record."""
+        other = copy(self)
+        other.provenance = provenance
+        return other
 
     @property
     def count(self) -> int:
@@ -199,6 +206,10 @@ class Points:
     reference: Reference
     attributes: dict[str, Any]
     provenance: dict[str, Any]
+
+    def with_record(self, provenance: dict[str, Any]) -> Points:
+        """Return the same points with another record."""
+        return replace(self, provenance=provenance)
 
     @property
     def count(self) -> int:

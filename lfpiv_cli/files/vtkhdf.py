@@ -248,6 +248,7 @@ def open_vectors(path: Path | str) -> VectorField:
         voxel = [float(v) for v in file.attrs["voxel_mm"]]
         window = [int(v) for v in file.attrs["window_voxel"]]
         dt_s = float(file.attrs["dt_s"]) if "dt_s" in file.attrs else None
+    uncertainty = arrays.pop(UNCERTAINTY, None)
     if arrays["flag"].max() > LARGEST_FLAG:
         raise InputError(f"{path}: a flag is {arrays['flag'].max()}, allowed are 0 to {LARGEST_FLAG}")
     field = VectorField(
@@ -255,7 +256,8 @@ def open_vectors(path: Path | str) -> VectorField:
         voxel_mm=(voxel[0], voxel[1], voxel[2]),
         dt_s=dt_s,
         window_voxel=(window[0], window[1], window[2]),
-        **{UNCERTAINTY: None, **arrays},
+        uncertainty_voxel=uncertainty,
+        **arrays,
     )
     if not np.isfinite(field.displacement_voxel[field.flag < REJECTED]).all():
         raise InputError(f"{path}: a vector that counts as valid is not a finite number")

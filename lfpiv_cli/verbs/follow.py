@@ -328,7 +328,7 @@ def _write_tracks(
         counts = [frames.particles(number) for number in there]
         notices = few_notices(counts, [sequence.names[number] for number in there], result.summary, result.points)
         console.warn(notices)
-        told = replace(result.points, provenance=with_warnings(provenance, notices))
+        told = result.points.with_record(with_warnings(provenance, notices))
         write_points(output / TRACKS, result.format_name, told, overwrite=overwrite)
         write_playback(output / PLAYBACK, told, len(frames), tracking.dt_s, overwrite=overwrite)
     return {"particles_fewest": min(counts)} | {k: v for k, v in result.summary.items() if k != "frames"}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from itertools import pairwise
 from pathlib import Path
@@ -223,7 +223,7 @@ class Tracks(PairBatch[Outcome, TrackOptions]):
             provenance = with_warnings(found.points.provenance, notices)
             # What is complete is skipped: in the place of what is made there is nothing, or something broken.
             replacing = self.overwrite or self._options.resume
-            points = replace(found.points, provenance=provenance)
+            points = found.points.with_record(provenance)
             write_points(target.path, found.format_name, points, overwrite=replacing)
             fields = found.fields() if self._options.by == "polynomials" else _fitted(found, names[0])
             qualities, rejected = _write_grids(target.beside, fields, points, replacing, work.console)
