@@ -190,8 +190,8 @@ def open_volume(path: Path | str) -> Volume:
     path = Path(path)
     with open_h5(path) as file:
         ensure_format(path, file, VOLUME_FORMAT, (FORMAT_VERSION,))
-        grid = _read_grid(file)
-        array = _read_on_grid(path, file, grid, {"intensity": False})["intensity"]
+        grid = grid_in(file)
+        array = read_on_grid(path, file, grid, {"intensity": False})["intensity"]
         root = read_root(file)
     bad = int(np.count_nonzero(~np.isfinite(array)))
     if bad:
@@ -242,9 +242,9 @@ def open_vectors(path: Path | str) -> VectorField:
     path = Path(path)
     with open_h5(path) as file:
         ensure_format(path, file, VECTORS_FORMAT, (FORMAT_VERSION,))
-        grid = _read_grid(file)
+        grid = grid_in(file)
         components = {name: vector for name, (_, vector) in VECTOR_ARRAYS.items()}
-        arrays = _read_on_grid(path, file, grid, components | ({UNCERTAINTY: True} if UNCERTAINTY in file else {}))
+        arrays = read_on_grid(path, file, grid, components | ({UNCERTAINTY: True} if UNCERTAINTY in file else {}))
         voxel = [float(v) for v in file.attrs["voxel_mm"]]
         window = [int(v) for v in file.attrs["window_voxel"]]
         dt_s = float(file.attrs["dt_s"]) if "dt_s" in file.attrs else None
@@ -264,22 +264,10 @@ def open_vectors(path: Path | str) -> VectorField:
     return field
 
 
-def read_arrays(path: Path | str) -> tuple[Grid, dict[str, tuple[NDArray[Any], str]]]:
-    """Read the grid of a vector field and every array on it with its unit: those that commands store besides, too."""
-    path = Path(path)
-    with open_h5(path) as file:
-        ensure_format(path, file, VECTORS_FORMAT, (FORMAT_VERSION,))
-        grid = _read_grid(file)
-        places = 2 if grid.shape_zyx[0] == 1 else 3
-        names = member(member(file, "VTKHDF"), "PointData")
-        arrays = _read_on_grid(path, file, grid, {name: array_member(file, name).ndim > places for name in names})
-        return grid, {name: (array, file[name].attrs["units"].decode()) for name, array in arrays.items()}
-
-
 def read_grid(path: Path) -> Grid:
     """Read the grid of a volume or a vector field."""
     with open_h5(path) as file:
-        return _read_grid(file)
+        return grid_in(file)
 
 
 def read_header(path: Path | str) -> Header:
@@ -307,7 +295,8 @@ def _write_on_grid(file: h5py.File, grid: Grid, arrays: Mapping[str, tuple[NDArr
         points[name] = dataset
 
 
-def _read_grid(file: h5py.File) -> Grid:
+def grid_in(file: h5py.File) -> Grid:
+    """Return the grid of an open file."""
     vtk = member(file, "VTKHDF").attrs
     extent = [int(v) for v in vtk["WholeExtent"]]
     spacing = [float(v) for v in vtk["Spacing"]]
@@ -325,7 +314,7 @@ def _read_grid(file: h5py.File) -> Grid:
     )
 
 
-def _read_on_grid(path: Path, file: h5py.File, grid: Grid, components: Mapping[str, bool]) -> dict[str, NDArray[Any]]:
+def read_on_grid(path: Path, file: h5py.File, grid: Grid, components: Mapping[str, bool]) -> dict[str, NDArray[Any]]:
     """Read arrays of the grid's shape, with components or without, the third axis put back on a single plane."""
     found = {}
     for name, with_components in components.items():

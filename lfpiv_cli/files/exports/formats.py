@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.errors import InputError, OutputError, UsageError
 from lfpiv_cli.files.exports import vtk
-from lfpiv_cli.files.hdf5 import format_of
+from lfpiv_cli.files.hdf5 import format_of, open_h5
+from lfpiv_cli.files.hdf5_checks import array_member, member
 from lfpiv_cli.files.particle_file import (
     PARTICLES_FORMAT,
     POSITION,
@@ -22,7 +23,15 @@ from lfpiv_cli.files.particle_file import (
     read_points,
     units_of,
 )
-from lfpiv_cli.files.vtkhdf import VECTORS_FORMAT, VOLUME_FORMAT, open_vectors, open_volume, read_arrays, read_header
+from lfpiv_cli.files.vtkhdf import (
+    VECTORS_FORMAT,
+    VOLUME_FORMAT,
+    grid_in,
+    open_vectors,
+    open_volume,
+    read_on_grid,
+    read_root,
+)
 from lfpiv_cli.flow.field import REJECTED
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import ExportFormat
@@ -92,12 +101,14 @@ def read_content(path: Path) -> Content:
         )
     if name == VECTORS_FORMAT:
         open_vectors(path)  # for its checks
-        grid, found = read_arrays(path)
-        header = read_header(path)
-        # The velocity comes first, as it is what is asked for.
-        names = sorted(found, key=lambda each: (each != "velocity", each))
-        arrays, units = {each: found[each][0] for each in names}, {each: found[each][1] for each in names}
-        return Content(name, grid, arrays, units, header.attributes, header.provenance)
+        with open_h5(path) as file:
+            grid, root = grid_in(file), read_root(file)
+            # All arrays, those that commands store besides, too; the velocity first, as it is what is asked for.
+            names = sorted(member(member(file, "VTKHDF"), "PointData"), key=lambda each: (each != "velocity", each))
+            places = 2 if grid.shape_zyx[0] == 1 else 3
+            arrays = read_on_grid(path, file, grid, {each: array_member(file, each).ndim > places for each in names})
+            units = {each: file[each].attrs["units"].decode() for each in names}
+        return Content(name, grid, arrays, units, root.attributes, root.provenance)
     points = read_points(path, name)
     arrays = {POSITION: points.position_mm, **points.arrays}
     units = {POSITION: "mm", **units_of(name, arrays)}
