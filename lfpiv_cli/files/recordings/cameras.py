@@ -49,7 +49,25 @@ MOST_HEADER_BYTES = 2**20
 def mraw_frames(path: Path) -> Recording:
     """Return the frames that the header beside a file describes, timed by its rate."""
     (header,) = header_beside(path)
-    found = _read_header(header)
+    if ensure_regular_file(header) > MOST_HEADER_BYTES:
+        raise InputError(f"{header}: has more than {MOST_HEADER_BYTES} bytes, and is no header of frames")
+    content = content_of(header)
+    if header.suffix.lower() == ".cih":
+        lines = (line.split(" : ", 1) for line in content.decode("latin-1").splitlines())
+        words = {line[0].strip(): line[1].strip() for line in lines if len(line) == 2}
+        told = {name: words.get(word) for name, (word, _) in NAMES.items()}
+    else:
+        # The XML lies between bytes of the camera's own, without what could declare entities.
+        inside = re.search(rb"<cih>.*</cih>", content, re.DOTALL)
+        if inside is None:
+            raise InputError(f"{header}: holds no <cih> … </cih>: {CUT}")
+        try:
+            tree = ElementTree.fromstring(inside.group().decode("utf-8", errors="replace"))
+        except (ElementTree.ParseError, ValueError) as error:
+            raise InputError(f"{header}: is not XML: {reason(error)}") from error
+        told = {name: tree.findtext(place) for name, (_, place) in NAMES.items()}
+    found = {name: text.strip() for name, text in told.items() if text is not None}
+
     colour = found.get("colour", MONO).lower()
     if colour != MONO:
         raise InputError(f"{header}: describes {colour} images: {COLOUR_HINT}")
@@ -76,27 +94,6 @@ def header_beside(path: Path) -> tuple[Path, ...]:
         if header.exists():
             return (header,)
     raise InputError(f"{path}: its header {path.with_suffix('.cihx').name} or .cih is not beside it")
-
-
-def _read_header(header: Path) -> dict[str, str]:
-    """Return the words of a header by our names; what it does not say is missing."""
-    if ensure_regular_file(header) > MOST_HEADER_BYTES:
-        raise InputError(f"{header}: has more than {MOST_HEADER_BYTES} bytes, and is no header of frames")
-    content = content_of(header)
-    if header.suffix.lower() == ".cih":
-        lines = (line.split(" : ", 1) for line in content.decode("latin-1").splitlines())
-        words = {line[0].strip(): line[1].strip() for line in lines if len(line) == 2}
-        return {name: words[word] for name, (word, _) in NAMES.items() if word in words}
-    # The XML lies between bytes of the camera's own, without what could declare entities.
-    inside = re.search(rb"<cih>.*</cih>", content, re.DOTALL)
-    if inside is None:
-        raise InputError(f"{header}: holds no <cih> … </cih>: {CUT}")
-    try:
-        tree = ElementTree.fromstring(inside.group().decode("utf-8", errors="replace"))
-    except (ElementTree.ParseError, ValueError) as error:
-        raise InputError(f"{header}: is not XML: {reason(error)}") from error
-    told = {name: tree.findtext(place) for name, (_, place) in NAMES.items()}
-    return {name: text.strip() for name, text in told.items() if text is not None}
 
 
 # Norpix' .seq: a header of 1024 or 8192 bytes, then frames, each followed by its time.
@@ -354,7 +351,24 @@ def set_frames(path: Path) -> Recording:
     with opened(path) as text:
         if b"\0" in text.read(TEXT_BYTES):
             raise InputError(f"{path}: is no text beside a folder of images, as sets are: {EXPORT_HINT}")
-    files = _images(path)
+    (folder,) = folder_beside(path)
+    numbered = sorted(_numbered(folder))
+    if not numbered:
+        within = sorted(each for each in folder.iterdir() if each.is_dir() and any(_numbered(each)))
+        kinds = Counter(each.suffix.lower() for each in folder.iterdir() if each.suffix)
+        others = f", but {kinds.most_common(1)[0][0]} files" if kinds else ""
+        instead = f"holds no images B00001.im7, B00002.im7, ...{others}: {EXPORT_HINT}"
+        if within:
+            instead = f"holds several sets: give one of these folders, as {within[0]}"
+        raise InputError(f"{path}: its folder {folder} {instead}")
+    if numbered[0][0] not in FIRST:
+        raise InputError(f"{path}: its first image is {numbered[0][1].name}, and those before it are missing")
+    for (before, one), (after, other) in pairwise(numbered):
+        if after != before + 1:
+            what = "has the same number as" if after == before else "is not the next image after"
+            raise InputError(f"{path}: {other.name} {what} {one.name}: images of the set are missing or there twice")
+
+    files = [file for _, file in numbered]
     found = [im7_frames(file) for file in files]
     for file, each in zip(files, found, strict=True):
         if each.shape != found[0].shape:
@@ -379,27 +393,6 @@ def folder_beside(path: Path) -> tuple[Path, ...]:
     if not folder.is_dir():
         raise InputError(f"{path}: the folder of its images, {folder.name}, is not beside it")
     return (folder,)
-
-
-def _images(path: Path) -> list[Path]:
-    """Return the images of a set in order, after checking that none is missing."""
-    (folder,) = folder_beside(path)
-    numbered = sorted(_numbered(folder))
-    if not numbered:
-        within = sorted(each for each in folder.iterdir() if each.is_dir() and any(_numbered(each)))
-        kinds = Counter(each.suffix.lower() for each in folder.iterdir() if each.suffix)
-        others = f", but {kinds.most_common(1)[0][0]} files" if kinds else ""
-        instead = f"holds no images B00001.im7, B00002.im7, ...{others}: {EXPORT_HINT}"
-        if within:
-            instead = f"holds several sets: give one of these folders, as {within[0]}"
-        raise InputError(f"{path}: its folder {folder} {instead}")
-    if numbered[0][0] not in FIRST:
-        raise InputError(f"{path}: its first image is {numbered[0][1].name}, and those before it are missing")
-    for (before, one), (after, other) in pairwise(numbered):
-        if after != before + 1:
-            what = "has the same number as" if after == before else "is not the next image after"
-            raise InputError(f"{path}: {other.name} {what} {one.name}: images of the set are missing or there twice")
-    return [file for _, file in numbered]
 
 
 def _numbered(folder: Path) -> Iterator[tuple[int, Path]]:
