@@ -33,12 +33,9 @@ def tracks(rng: np.random.Generator) -> Points:
     return Points(rng.random((n, 3)), arrays, REFERENCE, {"dt_s": 0.1}, {"command": "follow"})
 
 
-def begun(folder: Path, tracks: Points) -> StoredTracks:
-    return StoredTracks(folder, tracks.reference, tracks.attributes, tracks.provenance)
-
-
-def put(store: StoredTracks, tracks: Points) -> StoredTracks:
+def put(folder: Path, tracks: Points) -> StoredTracks:
     """Return tracks after they were put on a disk, frame by frame."""
+    store = StoredTracks(folder, tracks.reference, tracks.attributes, tracks.provenance)
     for number in range(FRAMES):
         here = tracks.arrays["frame"] == number
         store.put({POSITION: tracks.position_mm[here]} | {k: v[here] for k, v in tracks.arrays.items()})
@@ -52,8 +49,7 @@ def test_files_are_those_of_tracks_in_memory(
     monkeypatch.setattr(hdf5, "CHUNK_BYTES", 400)
     monkeypatch.setattr(particle_file, "BLOCK_ROWS", block)
     monkeypatch.setattr(particle_file, "CHECKED_ROWS", 30)
-    with begun(tmp_path, tracks) as store:
-        stored = put(store, tracks)
+    with put(tmp_path, tracks) as stored:
         for name, each in (("memory", tracks), ("disk", stored)):
             write_points(tmp_path / f"{name}.vtkhdf", TRAJECTORIES_FORMAT, each, overwrite=False)
             write_playback(tmp_path / f"{name}_played.vtkhdf", each, FRAMES, 0.1, overwrite=False)
@@ -68,8 +64,8 @@ def test_files_are_those_of_tracks_in_memory(
 
 def test_a_block_of_tracks_is_read_at_a_time(tracks: Points, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(particle_file, "BLOCK_ROWS", 20)
-    with begun(tmp_path, tracks) as store:
-        pieces = list(put(store, tracks).rows("track"))
+    with put(tmp_path, tracks) as stored:
+        pieces = list(stored.rows("track"))
     assert len(pieces) > 5
     # The last track of a block is whole.
     assert max(map(len, pieces)) < 20 + FRAMES
@@ -97,8 +93,8 @@ def test_a_folder_that_takes_nothing_is_named(tmp_path: Path) -> None:
 def test_a_full_disk_is_told(tracks: Points, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     full = open("/dev/full", "r+b", buffering=0)  # noqa: SIM115
     monkeypatch.setattr(particle_file.tempfile, "TemporaryFile", lambda **_: full)
-    with begun(tmp_path, tracks) as store, pytest.raises(OutputError, match="No space left"):
-        put(store, tracks)
+    with pytest.raises(OutputError, match="No space left"):
+        put(tmp_path, tracks)
 
 
 def test_the_last_few_frames_stay_in_memory() -> None:
