@@ -59,7 +59,6 @@ DEFAULT_WINDOW = 16
 SMALLEST_DEFAULT_WINDOW = 8
 SMALLEST_WINDOW = 4
 
-
 Triple = tuple[int, int, int]
 Lengths = tuple[float, float, float]
 

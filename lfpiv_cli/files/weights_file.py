@@ -390,8 +390,8 @@ def _camera(tree: dict[str, Any]) -> Camera:
     pixels = values["columns"] * values["rows"]
     if BYTES_A_PIXEL * pixels > physical_memory():
         raise ValueError(f"{values['columns']} x {values['rows']} pixels do not fit into memory")
-    basis = _array("lattice_basis_mm", tree, (2, 2))
-    lattice = Lattice(_array("lattice_origin_mm", tree, (2,)), basis, tree["layout"])
+    origin, basis = _array("lattice_origin_mm", tree, (2,)), _array("lattice_basis_mm", tree, (2, 2))
+    lattice = Lattice(origin, basis, tree["layout"])
     if not lattice.cell_area >= LEAST_SINE * math.prod(lattice.pitch):
         raise ValueError(f"the lattice's basis {basis.tolist()} is of no array of lenses")
     camera = Camera(lattice=lattice, **values)
