@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from click.testing import CliRunner
 from lfpiv_cli.cli.main import cli
 from lfpiv_cli.cli.options import outcome_of
 from lfpiv_cli.errors import InputError
-from lfpiv_cli.files.batch import frames_of, step_between
+from lfpiv_cli.files.batch import frames_of
 from lfpiv_cli.files.provenance import carried_record, even_step_s, seconds_between, sha256
 from lfpiv_cli.files.vtkhdf import open_vectors, open_volume
 from tests import camera_files
@@ -152,17 +153,19 @@ def test_the_recording_tells_the_time_between_frames(folder: Path, tmp_path: Pat
 
 
 def test_steps_between_frames_are_even_or_refused(tmp_path: Path) -> None:
-    def records(*times: float) -> list[dict[str, Any]]:
-        return [{"inputs": {"image": {"sha256": "0", "time_s": time}}} for time in times]
+    def steps(*times: float | None) -> list[float | None]:
+        records = [{"inputs": {"image": {"sha256": "0", "time_s": time}}} for time in times]
+        return [seconds_between(*pair) for pair in pairwise(records)]
 
     names = ["a", "b", "c"]
-    assert even_step_s(records(0.0, 0.1, 0.201), names) == pytest.approx(0.1005)
-    assert even_step_s([*records(0.0, 0.1), {"inputs": {"image": {"sha256": "0"}}}], names) is None
+    assert even_step_s(steps(0.0, 0.1, 0.201), names) == pytest.approx(0.1005)
+    assert even_step_s(steps(0.0, 0.1, None), names) is None
     with pytest.raises(InputError, match=r"a to c: .* are 0\.1 to 0\.2 s apart.*--dt-s"):
-        even_step_s(records(0.0, 0.1, 0.3), names)
+        even_step_s(steps(0.0, 0.1, 0.3), names)
     camera_files.write_cine(tmp_path / "t.cine", np.zeros((3, 2, 4), np.uint8))
-    assert step_between(frames_of([tmp_path / "t.cine"])) == pytest.approx(0.0005, abs=1e-9)
-    assert step_between(frames_of([tmp_path / "t.cine"])[:1]) is None
+    first, second, third = frames_of([tmp_path / "t.cine"])
+    assert even_step_s([first.seconds_to(second), second.seconds_to(third)], names) == pytest.approx(0.0005, abs=1e-9)
+    assert even_step_s([], names) is None
 
 
 def test_info_still_tells_of_results_and_of_nothing_else(folder: Path) -> None:

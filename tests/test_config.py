@@ -394,7 +394,7 @@ def test_flow_centres_move_with_the_origin(write) -> None:
     ],
 )
 def test_the_exponent_follows_from_the_solver_unless_given(write, sections: str, exponent: float) -> None:
-    assert load_config(write(RIG + sections + "\n")).correlation_exponent() == exponent
+    assert load_config(write(RIG + sections + "\n")).correlation_settings((1.0, 1.0, 1.0)).exponent == exponent
 
 
 @pytest.mark.parametrize(

@@ -14,8 +14,7 @@ from scipy.io import loadmat, netcdf_file
 from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import InputError, OutputError, UsageError
 from lfpiv_cli.files.exports import formats
-from lfpiv_cli.files.exports.content import Content, columns_of, read_content
-from lfpiv_cli.files.exports.formats import FORMATS
+from lfpiv_cli.files.exports.formats import FORMATS, Content, columns_of, read_content
 from lfpiv_cli.files.particle_file import (
     OPTIONAL,
     PARTICLES_FORMAT,

@@ -13,8 +13,8 @@ import pytest
 import yaml
 
 import lfpiv_cli
-from lfpiv_cli.files.bench import flow_of
 from lfpiv_cli.files.sections import Section
+from lfpiv_cli.files.sections_simulated import flow_of
 from lfpiv_cli.reconstruction.registry import SOLVERS, Solver
 from lfpiv_cli.reconstruction.solvers import SolverSettings, reconstruct
 from lfpiv_cli.reference import Reference

@@ -14,8 +14,8 @@ import click
 import pytest
 
 from lfpiv_cli.cli.main import cli
-from lfpiv_cli.files.sections import CorrelationSection, Section
-from lfpiv_cli.files.sections_simulated import FlowSection, Sections
+from lfpiv_cli.files.sections import Section
+from lfpiv_cli.files.sections_simulated import CorrelationSection, FlowSection, Sections
 from lfpiv_cli.names import (
     BoardMethod,
     Divergence,

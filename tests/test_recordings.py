@@ -53,7 +53,7 @@ def test_a_header_tells_shape_and_bits(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "t.tif", np.zeros((2, 3, 4), np.uint16), photometric="minisblack", metadata=None)
     recording = images.frames(tmp_path / "t.tif")
     assert (recording.pages, recording.shape, recording.bits) == (2, (3, 4), 16)
-    assert images.times_of(tmp_path / "t.tif") is None
+    assert images.frames(tmp_path / "t.tif").time_s is None
 
 
 def stack_of(rng: np.random.Generator, bits: int, shape: tuple[int, int, int] = (3, 5, 7)) -> np.ndarray:
@@ -119,7 +119,7 @@ def test_each_format_gives_the_counts_and_times_that_were_written(
         np.testing.assert_array_equal(image, stack[page])
     # Norpix' older versions have milliseconds.
     second = 0.0 if kind == "s8.seq" else 0.0005
-    np.testing.assert_allclose(images.times_of(path), [0.0, second, 0.001], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(images.frames(path).time_s, [0.0, second, 0.001], rtol=0, atol=1e-9)
     with pytest.raises(InputError, match=r"7 x 5 pixels.*, expected the sensor's 8 x 5"):
         images.read_page(path, 0, (5, 8))
 
@@ -400,7 +400,7 @@ def test_other_ways_of_writing_a_cine(tmp_path: Path, rng: np.random.Generator) 
     path, stack = tmp_path / "t.cine", stack_of(rng, 8, (2, 4, 5))
     camera_files.write_cine(path, stack, times=False, tight=True)
     np.testing.assert_array_equal(images.read_page(path, 1), stack[1])
-    np.testing.assert_allclose(images.times_of(path), [0.0, 1 / camera_files.RATE_HZ])
+    np.testing.assert_allclose(images.frames(path).time_s, [0.0, 1 / camera_files.RATE_HZ])
     edited(path, 52, "<i", -4)
     np.testing.assert_array_equal(images.read_page(path, 1), stack[1, ::-1])
     camera_files.write_cine(path, stack, filters=3)
@@ -454,7 +454,7 @@ def test_a_header_that_changes_is_read_anew(tmp_path: Path) -> None:
 def test_a_photron_recording_that_left_frames_out_is_timed_by_what_it_kept(tmp_path: Path) -> None:
     (tmp_path / "t.mraw").write_bytes(bytes(70))
     (tmp_path / "t.cih").write_text(CIH.replace("e : 1", "e : 2") + "Record Rate(fps) : 1000\nSave Step : 5\n")
-    np.testing.assert_allclose(images.times_of(tmp_path / "t.mraw"), [0.0, 0.005])
+    np.testing.assert_allclose(images.frames(tmp_path / "t.mraw").time_s, [0.0, 0.005])
 
 
 @pytest.mark.parametrize(
@@ -567,7 +567,7 @@ def test_one_page_of_any_recording_is_an_image(tmp_path: Path, rng: np.random.Ge
         images.read_image(given)
     one = Path(f"{given}:page=2")
     np.testing.assert_array_equal(images.read_image(one, (5, 7)), stack[2])
-    np.testing.assert_array_equal(images.times_of(one), images.times_of(given)[2:])
+    np.testing.assert_array_equal(images.frames(one).time_s, images.frames(given).time_s[2:])
     with pytest.raises(InputError, match="has no page 3, it holds 3"):
         images.read_image(Path(f"{given}:page=3"))
 

@@ -11,7 +11,7 @@ import pytest
 from lfpiv_cli.errors import OutputError
 from lfpiv_cli.files import hdf5, particle_file
 from lfpiv_cli.files.exports.vtk import write_playback
-from lfpiv_cli.files.particle_file import POSITION, TRAJECTORIES_FORMAT, Points, StoredTracks, TrackStore, write_points
+from lfpiv_cli.files.particle_file import POSITION, TRAJECTORIES_FORMAT, Points, StoredTracks, write_points
 from lfpiv_cli.reference import Reference
 from lfpiv_cli.verbs.track import KEPT_FRAMES, SeenFrames
 
@@ -33,12 +33,13 @@ def tracks(rng: np.random.Generator) -> Points:
     return Points(rng.random((n, 3)), arrays, REFERENCE, {"dt_s": 0.1}, {"command": "follow"})
 
 
-def put(store: TrackStore, tracks: Points) -> StoredTracks:
+def put(folder: Path, tracks: Points) -> StoredTracks:
     """Return tracks after they were put on a disk, frame by frame."""
+    store = StoredTracks(folder, tracks.reference, tracks.attributes, tracks.provenance)
     for number in range(FRAMES):
         here = tracks.arrays["frame"] == number
         store.put({POSITION: tracks.position_mm[here]} | {k: v[here] for k, v in tracks.arrays.items()})
-    return StoredTracks(store, tracks.reference, tracks.attributes, tracks.provenance)
+    return store
 
 
 @pytest.mark.parametrize("block", [1, 20, 10_000])
@@ -48,8 +49,7 @@ def test_files_are_those_of_tracks_in_memory(
     monkeypatch.setattr(hdf5, "CHUNK_BYTES", 400)
     monkeypatch.setattr(particle_file, "BLOCK_ROWS", block)
     monkeypatch.setattr(particle_file, "CHECKED_ROWS", 30)
-    with TrackStore(tmp_path) as store:
-        stored = put(store, tracks)
+    with put(tmp_path, tracks) as stored:
         for name, each in (("memory", tracks), ("disk", stored)):
             write_points(tmp_path / f"{name}.vtkhdf", TRAJECTORIES_FORMAT, each, overwrite=False)
             write_playback(tmp_path / f"{name}_played.vtkhdf", each, FRAMES, 0.1, overwrite=False)
@@ -64,8 +64,8 @@ def test_files_are_those_of_tracks_in_memory(
 
 def test_a_block_of_tracks_is_read_at_a_time(tracks: Points, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(particle_file, "BLOCK_ROWS", 20)
-    with TrackStore(tmp_path) as store:
-        pieces = list(put(store, tracks).rows("track"))
+    with put(tmp_path, tracks) as stored:
+        pieces = list(stored.rows("track"))
     assert len(pieces) > 5
     # The last track of a block is whole.
     assert max(map(len, pieces)) < 20 + FRAMES
@@ -76,26 +76,25 @@ def test_no_tracks_are_written_too(tmp_path: Path) -> None:
     nothing |= {"link_probability": np.zeros(0)} | {
         name: np.zeros((0, 3)) for name in (POSITION, "velocity", "velocity_sigma")
     }
-    with TrackStore(tmp_path) as store:
+    with StoredTracks(tmp_path, REFERENCE, {}, {}) as store:
         store.put(nothing)
         store.put(nothing)
-        stored = StoredTracks(store, REFERENCE, {}, {})
-        write_points(tmp_path / "none.vtkhdf", TRAJECTORIES_FORMAT, stored, overwrite=False)
-        write_playback(tmp_path / "played.vtkhdf", stored, 2, 0.1, overwrite=False)
+        write_points(tmp_path / "none.vtkhdf", TRAJECTORIES_FORMAT, store, overwrite=False)
+        write_playback(tmp_path / "played.vtkhdf", store, 2, 0.1, overwrite=False)
     with h5py.File(tmp_path / "none.vtkhdf") as file:
         assert file[POSITION].shape == (0, 3)
 
 
 def test_a_folder_that_takes_nothing_is_named(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="missing: tracks cannot be put there"):
-        TrackStore(tmp_path / "missing")
+        StoredTracks(tmp_path / "missing", REFERENCE, {}, {})
 
 
 def test_a_full_disk_is_told(tracks: Points, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     full = open("/dev/full", "r+b", buffering=0)  # noqa: SIM115
     monkeypatch.setattr(particle_file.tempfile, "TemporaryFile", lambda **_: full)
-    with TrackStore(tmp_path) as store, pytest.raises(OutputError, match="No space left"):
-        put(store, tracks)
+    with pytest.raises(OutputError, match="No space left"):
+        put(tmp_path, tracks)
 
 
 def test_the_last_few_frames_stay_in_memory() -> None:

@@ -30,22 +30,12 @@ from lfpiv_cli.files.inputs import reason, split_part
 # Where the files of a command lie: no two outputs in one place, and none in that of an input.
 
 
-# The folder as the system knows it, and the name in it; what an existing file is, whatever leads to it.
-Place = tuple[str, str]
-Identity = tuple[int, int]
-
-
 def ensure_apart(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
-    """Refuse outputs of which one would replace another, or an input, before anything is computed.
-
-    Raises
-    ------
-    UsageError
-    """
+    """Refuse outputs of which one would replace another, or an input, before anything is computed."""
     inputs = [split_part(path)[0] for path in inputs]
     read = {place_of(path) for path in inputs}
     files = {identity for identity in map(_identity, inputs) if identity is not None}
-    written: set[Place] = set()
+    written: set[tuple[str, str]] = set()
     for path in outputs:
         place = place_of(path)
         if place in read or _identity(path) in files:
@@ -55,8 +45,8 @@ def ensure_apart(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
         written.add(place)
 
 
-def place_of(path: Path) -> Place:
-    """Return the place of a file, the same for all names that lead there, whether it exists or not."""
+def place_of(path: Path) -> tuple[str, str]:
+    """Return folder and name of a file, the same for all names that lead there, whether it exists or not."""
     folder = _real(path.parent)
     return folder, folded(path.name, Path(folder))
 
@@ -76,12 +66,11 @@ def ignores_case(folder: Path) -> bool:
     return False
 
 
-@lru_cache(maxsize=16)
-def _real(folder: Path) -> str:
-    return os.path.realpath(folder)
+# Once a folder: there may be thousands of files.
+_real = lru_cache(maxsize=16)(os.path.realpath)
 
 
-def _identity(path: Path) -> Identity | None:
+def _identity(path: Path) -> tuple[int, int] | None:
     """Return what tells an existing file from all others; None where there is none."""
     try:
         status = os.stat(path)
@@ -128,12 +117,9 @@ def ensure_writable(target: Path, overwrite: bool, inputs: Iterable[Path] = ()) 
 
     Raises
     ------
-    UsageError
-        If the target is one of the inputs.
-    OutputExistsError
-        If it exists and `overwrite` is false.
-    OutputError
-        If it is not a regular file, or its folder is read-only or cannot be made.
+    UsageError : the target is one of the inputs
+    OutputExistsError : it exists and `overwrite` is false
+    OutputError : it is not a regular file, or its folder is read-only or cannot be made
     """
     _ensure_possible(target)
     ensure_apart([target], inputs)
@@ -224,11 +210,7 @@ def shown(path: Path) -> str:
 
 
 def write_atomically(
-    target: Path,
-    write: Callable[[Path], None],
-    *,
-    overwrite: bool,
-    check: Callable[[Path], object] | None = None,
+    target: Path, write: Callable[[Path], object], *, overwrite: bool, check: Callable[[Path], object] | None = None
 ) -> None:
     """Write a file so that it appears under its name only when it is complete.
 
@@ -244,39 +226,38 @@ def write_atomically(
     """
     ensure_writable(target, overwrite)
     with folder_of(target):
-        _write(target, write, overwrite, check)
+        _clear(target.parent.absolute(), os.getpid())
+        begun_by = f"{host_digest()}-{os.getpid()}-{secrets.token_hex(4)}"
+        temporary = target.with_name(f".{target.stem[:KEPT_CHARACTERS]}.{begun_by}.partial{target.suffix}")
+        try:
+            os.close(create_alone(temporary))
+            write(temporary)
+            if check is not None:
+                try:
+                    check(temporary)
+                except InputError as error:
+                    raise OutputError(f"{target}: what was written does not read back: {error}") from error
+            _flush(temporary, os.O_RDWR)
+            ensure_writable(target, overwrite)
+            os.replace(temporary, target)
+            with contextlib.suppress(OSError):  # Windows cannot open folders
+                _flush(target.parent, os.O_RDONLY)
+        except LfpivError:
+            raise
+        except OSError as error:
+            raise OutputError(f"{target}: cannot be written: {reason(error)}") from error
+        finally:
+            with contextlib.suppress(OSError):
+                temporary.unlink()
 
 
-def _write(
-    target: Path, write: Callable[[Path], None], overwrite: bool, check: Callable[[Path], object] | None
-) -> None:
-    """Do the work of `write_atomically` in a folder that is there."""
-    temporary: Path | None = None
+def _flush(path: Path, flags: int) -> None:
+    """Bring a file's content, or a folder's entries, to the disk."""
+    descriptor = os.open(path, flags)
     try:
-        temporary = _reserve(target)
-        write(temporary)
-        if check is not None:
-            _read_back(target, temporary, check)
-        _flush(temporary)
-        ensure_writable(target, overwrite)
-        os.replace(temporary, target)
-        temporary = None
-        _flush_folder(target.parent)
-    except LfpivError:
-        raise
-    except OSError as error:
-        raise OutputError(f"{target}: cannot be written: {reason(error)}") from error
+        os.fsync(descriptor)
     finally:
-        if temporary is not None:
-            temporary.unlink(missing_ok=True)
-
-
-def _read_back(target: Path, temporary: Path, check: Callable[[Path], object]) -> None:
-    """Raise where a finished file is not what was meant."""
-    try:
-        check(temporary)
-    except InputError as error:
-        raise OutputError(f"{target}: what was written does not read back: {error}") from error
+        os.close(descriptor)
 
 
 def write_json(path: Path, value: Mapping[str, Any], overwrite: bool) -> None:
@@ -286,11 +267,8 @@ def write_json(path: Path, value: Mapping[str, Any], overwrite: bool) -> None:
 
 def write_text(path: Path, text: str, overwrite: bool) -> None:
     """Write text in UTF-8; names of files that are no UTF-8 keep their bytes."""
-
-    def write(temporary: Path) -> None:
-        temporary.write_bytes(text.encode("utf-8", "surrogateescape"))
-
-    write_atomically(path, write, overwrite=overwrite)
+    content = text.encode("utf-8", "surrogateescape")
+    write_atomically(path, lambda temporary: temporary.write_bytes(content), overwrite=overwrite)
 
 
 def without_nan(value: Any) -> Any:
@@ -306,15 +284,6 @@ def without_nan(value: Any) -> Any:
     return value
 
 
-def _reserve(target: Path) -> Path:
-    """Create an empty file beside the target that nobody else has, with the permissions the umask allows."""
-    _clear(target.parent.absolute(), os.getpid())
-    begun_by = f"{host_digest()}-{os.getpid()}-{secrets.token_hex(4)}"
-    temporary = target.with_name(f".{target.stem[:KEPT_CHARACTERS]}.{begun_by}.partial{target.suffix}")
-    os.close(create_alone(temporary))
-    return temporary
-
-
 @lru_cache(maxsize=64)
 def _clear(folder: Path, _process: int) -> None:
     """Remove from a folder what processes of this host had begun to write when they were killed.
@@ -327,22 +296,6 @@ def _clear(folder: Path, _process: int) -> None:
             if left is not None and left["host"] == host_digest() and not is_running(int(left["process"])):
                 with contextlib.suppress(OSError):
                     os.unlink(entry.path)
-
-
-def _flush(path: Path) -> None:
-    """Bring a file's content to the disk."""
-    with open(path, "rb+") as file:
-        os.fsync(file.fileno())
-
-
-def _flush_folder(folder: Path) -> None:
-    """Bring a folder's entries to the disk where the system can (Windows cannot open folders)."""
-    with contextlib.suppress(OSError):
-        descriptor = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
 
 
 # A log for programs that watch batches: a line of JSON for each event, added to what the file holds.
@@ -376,12 +329,7 @@ class EventLog:
             raise UsageError(f"{path}: is no log: its first line is no event with its time; --log would add to it")
 
     def write(self, event: str, fields: Mapping[str, Any]) -> None:
-        """Add an event.
-
-        Raises
-        ------
-        OutputError
-        """
+        """Add an event."""
         if self._read_only:
             return
         head = {

@@ -7,17 +7,16 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum, auto
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from lfpiv_cli.errors import InputError, OutputExistsError, UsageError
 from lfpiv_cli.files.atomic import ensure_apart, ensure_writable, folded
 from lfpiv_cli.files.hdf5 import read_whole, replace_provenance
-from lfpiv_cli.files.images import count_pages, times_of
+from lfpiv_cli.files.images import count_pages, frames
 from lfpiv_cli.files.inputs import split_part
 from lfpiv_cli.files.pairing import Seen
-from lfpiv_cli.files.provenance import bear_alike, differences, earlier_record, ensure_even, without_warnings
+from lfpiv_cli.files.provenance import bear_alike, differences, earlier_record, without_warnings
 
 VTKHDF_SUFFIX = ".vtkhdf"
 # So many things that have changed are named, and all others counted.
@@ -42,23 +41,13 @@ class Frame:
     @property
     def time_s(self) -> float | None:
         """When it was taken, in s from a moment of its file's own; None where the file does not tell."""
-        times = None if self.fault is not None else times_of(self.path)
+        times = None if self.fault is not None else frames(self.path).time_s
         return None if times is None else float(times[self.page])
 
-
-def step_between(frames: Sequence[Frame]) -> float | None:
-    """Return the time from one frame to the next; None where they are not of one recording, or it does not tell.
-
-    Raises
-    ------
-    InputError : frames were not taken at an even rate, or not in this order
-    """
-    times = [frame.time_s for frame in frames if frame.path == frames[0].path]
-    told = [time for time in times if time is not None]
-    if len(told) < max(len(frames), 2):
-        return None
-    names = [f"{frame.path} page {frame.page}" for frame in frames]
-    return ensure_even([after - before for before, after in pairwise(told)], names)
+    def seconds_to(self, other: Frame) -> float | None:
+        """Return the time to another frame; None where they are not of one recording, or it does not tell."""
+        before, after = self.time_s, other.time_s
+        return None if before is None or after is None or self.path != other.path else after - before
 
 
 @dataclass(frozen=True)
@@ -168,31 +157,23 @@ def state_of(target: Target) -> State:
     if not paths:
         return State.MISSING
     made = target.record
-    states = [_state_of(path, made) for path in paths]
-    if len(paths) <= len(target.beside):
-        states.append(State.MISSING)
-    return max(states, key=lambda state: WORST_LAST.index(state))
-
-
-def _state_of(path: Path, made: Mapping[str, Any]) -> State:
-    """Return what a file is that is there in the place of one with this record."""
-    try:
-        carried = read_whole(path)
-    except InputError:
-        return State.BROKEN
-    if carried is None:
-        return State.OTHER
-    if without_warnings(carried) == made:
-        return State.COMPLETE
-    return State.BEARS_ALIKE if bear_alike(carried, made) else State.OTHER
+    states = [State.MISSING] if len(paths) <= len(target.beside) else []
+    for path in paths:
+        try:
+            carried = read_whole(path)
+        except InputError:
+            states.append(State.BROKEN)
+            continue
+        if carried is not None and without_warnings(carried) == made:
+            states.append(State.COMPLETE)
+        else:
+            alike = carried is not None and bear_alike(carried, made)
+            states.append(State.BEARS_ALIKE if alike else State.OTHER)
+    return max(states, key=WORST_LAST.index)
 
 
 def pending(
-    targets: Sequence[Target],
-    inputs: Iterable[Path],
-    overwrite: bool,
-    resume: bool,
-    dry: bool = False,
+    targets: Sequence[Target], inputs: Iterable[Path], overwrite: bool, resume: bool, dry: bool = False
 ) -> list[int]:
     """Return the numbers of the targets that have to be made.
 
@@ -206,49 +187,39 @@ def pending(
     OutputExistsError : a target is there and neither `overwrite` nor a matching `resume` covers it.
     """
     ensure_apart((path for target in targets for path in target.paths), inputs)
-    return [number for number, target in enumerate(targets) if not _is_kept(target, overwrite, resume, dry)]
+    left = []
+    for number, target in enumerate(targets):
+        found = state_or_none(target) if resume else None
+        if found is State.BEARS_ALIKE and overwrite and not dry:
+            made = dict(target.record)
+            for path in target.paths:
+                old = read_whole(path) or {}
+                replace_provenance(path, made | {name: old[name] for name in ("warnings",) if name in old})
+        if found is State.COMPLETE or (found is State.BEARS_ALIKE and overwrite):
+            continue
+        if found in (State.BEARS_ALIKE, State.OTHER) and not overwrite:
+            path = next(
+                each
+                for each in target.paths
+                if each.exists() and state_of(replace(target, path=each, beside=())) is found
+            )
+            told = differences(read_whole(path) or {}, target.record)
+            if len(told) > MOST_DIFFERENCES:
+                told[MOST_DIFFERENCES:] = [f"{len(told) - MOST_DIFFERENCES} more"]
+            changed = f" ({'; '.join(told)})" if told else ""
+            what = "keeps it, as it depends on none of that" if found is State.BEARS_ALIKE else "makes it anew"
+            raise OutputExistsError(
+                f"{path}: exists and was made from other inputs or settings{changed}; --overwrite {what}"
+            )
+        for path in target.paths:
+            ensure_writable(path, overwrite or resume)
+        left.append(number)
+    return left
 
 
-def is_kept(
-    paths: Sequence[Path], made: Mapping[str, Any], inputs: Iterable[Path], overwrite: bool, resume: bool
-) -> bool:
-    """Return whether all results of a step, which carry one record, are there already, see `pending`.
-
-    Raises
-    ------
-    OutputExistsError : as `pending`
-    """
-    return not pending([Target(path, lambda: made) for path in paths], inputs, overwrite, resume)
-
-
-def _is_kept(target: Target, overwrite: bool, resume: bool, dry: bool) -> bool:
-    """Return whether a target is left as it is, after it is known that it could be written if not."""
-    found = state_or_none(target) if resume else None
-    if found is State.COMPLETE:
-        return True
-    if found is State.BEARS_ALIKE and overwrite:
-        if not dry:
-            _record_anew(target)
-        return True
-    if found in (State.BEARS_ALIKE, State.OTHER) and not overwrite:
-        raise OutputExistsError(_made_otherwise(target, found))
-    for path in target.paths:
-        ensure_writable(path, overwrite or resume)
-    return False
-
-
-def _made_otherwise(target: Target, found: State) -> str:
-    """Return the sentence on a target that is there, and bears alike or is another: what has changed since then."""
-    made = target.record
-    path = next(
-        path for path in target.paths if path.exists() and state_of(replace(target, path=path, beside=())) is found
-    )
-    told = differences(read_whole(path) or {}, made)
-    if len(told) > MOST_DIFFERENCES:
-        told[MOST_DIFFERENCES:] = [f"{len(told) - MOST_DIFFERENCES} more"]
-    changed = f" ({'; '.join(told)})" if told else ""
-    what = "keeps it, as it depends on none of that" if found is State.BEARS_ALIKE else "makes it anew"
-    return f"{path}: exists and was made from other inputs or settings{changed}; --overwrite {what}"
+def is_kept(paths: Sequence[Path], made: Mapping[str, Any], inputs: Iterable[Path], overwrite: bool) -> bool:
+    """Return whether all results of a step, which carry one record, are there already, see `pending`."""
+    return not pending([Target(path, lambda: made) for path in paths], inputs, overwrite, resume=True)
 
 
 def state_or_none(target: Target) -> State | None:
@@ -259,16 +230,7 @@ def state_or_none(target: Target) -> State | None:
         return None
 
 
-def _record_anew(target: Target) -> None:
-    """Give a target its new record, and let it keep its data and what was warned of."""
-    made = dict(target.record)
-    for path in target.paths:
-        old = read_whole(path) or {}
-        replace_provenance(path, made | {name: old[name] for name in ("warnings",) if name in old})
-
-
 # What is known of frames besides their names: the pages of their files, and the images that results are of.
-
 
 PAGE = re.compile(r"\bpage (\d+)\b")
 
@@ -297,38 +259,28 @@ def results_seen(paths: Sequence[Path]) -> list[Seen]:
     pages: dict[str, set[int]] = defaultdict(set)
     for source in sources:
         if source is not None:
-            pages[source.digest].add(source.page)
-    seen = [
-        each if source is None else _of_source(each, source, len(pages[source.digest]) > 1)
-        for each, source in zip(own, sources, strict=True)
-    ]
+            pages[source[1]].add(source[2])
+    seen = list(own)
+    for k, source in enumerate(sources):
+        if source is not None:
+            stem, digest, page = source
+            # Its page, too, where the image's file holds several.
+            several = len(pages[digest]) > 1 or page > 0 or own[k].stem == f"{stem}_{page:04d}"
+            seen[k] = replace(own[k], stem=stem, page=page if several else None, image=f"{digest} {page}")
     if len({(each.stem, each.page) for each in seen}) == len({each.image or each.path for each in seen}):
         return seen
     return [replace(each, image=other.image) for each, other in zip(own, seen, strict=True)]
 
 
-@dataclass(frozen=True)
-class _Source:
-    """The image of a result: its file's name without suffix and SHA-256, and the page."""
+def _source(path: Path) -> tuple[str, str, int] | None:
+    """Return the image that a result is made from: its file's name without suffix and SHA-256, and the page.
 
-    stem: str
-    digest: str
-    page: int
-
-
-def _source(path: Path) -> _Source | None:
-    """Return the image that a result is made from; None where its record does not say, or the file is broken."""
+    None where its record does not say, or the file is broken.
+    """
     try:
         made = earlier_record(path) or {}
         image, page = made["inputs"]["image"], PAGE.search(made["command"])
         stem = split_part(Path(image["name"]))[0].stem
-        return page and _Source(stem, image["sha256"], int(page[1]))
+        return page and (stem, image["sha256"], int(page[1]))
     except (InputError, KeyError, TypeError):
         return None  # what is broken is told where its turn comes
-
-
-def _of_source(own: Seen, source: _Source, several: bool) -> Seen:
-    """Return what is known of a result by its image: its page, too, where the image's file holds several."""
-    several = several or source.page > 0 or own.stem == f"{source.stem}_{source.page:04d}"
-    page = source.page if several else None
-    return replace(own, stem=source.stem, page=page, image=f"{source.digest} {source.page}")

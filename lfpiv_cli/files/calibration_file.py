@@ -34,12 +34,7 @@ def write_calibration(path: Path, calibration: Calibration, provenance: Mapping[
 
 
 def read_calibration(path: Path) -> Calibration:
-    """Read a calibration.
-
-    Raises
-    ------
-    InputError : the file is missing, broken, or of another format or version.
-    """
+    """Read a calibration."""
     tree, _ = read_tree(path, FORMAT, (VERSION,))
     try:
         return Calibration.from_tree(tree)

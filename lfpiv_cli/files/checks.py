@@ -1,4 +1,4 @@
-"""What several keys of the configuration say together: contradictions and physics that cannot be."""
+"""What is wrong with a configuration: keys by themselves, and together contradictions and physics that cannot be."""
 
 from __future__ import annotations
 
@@ -7,127 +7,64 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 
 from lfpiv_cli.errors import ConfigError
-from lfpiv_cli.files.bench import (
-    camera_of,
-    face_of,
-    focal_length_mm,
-    grid_of,
-    index_behind,
-    media_of,
-    missing_for_camera,
-    round_wall_of,
-    scene_of,
-)
-from lfpiv_cli.files.sections import CylinderFace, HeightMapFace, MainLens
+from lfpiv_cli.files.sections import CylinderFace, HeightMapFace, scene_of
 from lfpiv_cli.files.sections_simulated import Sections, SimulationSection
-from lfpiv_cli.files.yaml_nodes import KeyPath
+from lfpiv_cli.files.yaml_nodes import Document, KeyPath, Problem, key_name, place_of, problem_of, report
 from lfpiv_cli.flow.windows import RoundWall
 from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Window, equivalent_object_distance, fluid_path_to_focus
 from lfpiv_cli.reference import FOCAL_POINT
 
-# What the section `scene` cannot be, by itself and beside other sections that tell of walls.
-
-
-# Of lengths that are given twice: a tenth of a micron is nothing.
-AGREEMENT_MM = 1e-4
-
-
-def _scene(sections: Sections) -> Found:
-    """Yield the place and the sentence of faces that light cannot cross in order, and of walls that contradict them."""
-    scene = sections.scene
-    if scene is None:
-        return
-    for name, why in (("window", "the faces are the window"), ("channel", "its walls are plane")):
-        if getattr(sections, name) is not None:
-            yield (name,), f"contradicts scene: {why}"
-    if sections.media is None:
-        yield ("scene",), "needs the section media"
-        return
-    media = media_of(sections.media)
-    last = len(scene) - 1
-    if index_behind(scene[last], media) != media.fluid:
-        yield ("scene", last, "behind"), f"is {scene[last].behind}, expected fluid behind the last face"
-        return
-    missed = False
-    for k, section in enumerate(scene):
-        if isinstance(section, HeightMapFace) and (section.file is None) == (section.heights_mm is None):
-            yield ("scene", k), "expected a file of heights, or heights_mm, and not both"
-            missed = True
-            continue
-        try:
-            face_of(section, media).surface.shape()
-        except ConfigError as error:
-            yield ("scene", k), str(error)
-            missed = True
-    if missed:
-        return
-    try:
-        space = scene_of(scene, media)
-        if sections.camera is not None and missing_for_camera(sections.camera) is None:
-            space.lens_z_mm(camera_of(sections.camera))
-    except ConfigError as error:
-        yield ("scene",), str(error)
-        return
-    yield from _pipe(sections)
-
-
-def _pipe(sections: Sections) -> Found:
-    """Yield a pipe's wall that is not the cylinder in front of the fluid; its depth is known from the focal point."""
-    pipe, face = sections.pipe, sections.scene[-1] if sections.scene else None
-    if pipe is None or not isinstance(face, CylinderFace):
-        return
-    if not math.isclose(pipe.radius_mm, face.radius_mm, rel_tol=AGREEMENT):
-        yield ("pipe", "radius_mm"), f"is {pipe.radius_mm:g}, but that of the last face in scene is {face.radius_mm:g}"
-    inside = round_wall_of(pipe)
-    axis = RoundWall(face.radius_mm, axis=face.axis).direction
-    if np.linalg.norm(np.cross(inside.direction, axis)) > AGREEMENT:
-        yield ("pipe", "axis"), f"is {_told(pipe.axis)}, but that of the last face in scene is {_told(face.axis)}"
-    from_focal_point = sections.volume is not None and sections.volume.reference == "focal_point"
-    if from_focal_point and inside.distances_mm(np.array(face.centre_mm)) > AGREEMENT_MM:
-        yield (
-            ("pipe", "centre_mm"),
-            f"is {list(pipe.centre_mm)}, but that of the last face in scene is {list(face.centre_mm)}",
-        )
-
-
-def _told(axis: str | tuple[float, ...]) -> str:
-    return axis if isinstance(axis, str) else str(list(axis))
-
-
 Found = Iterator[tuple[KeyPath, str]]
 
 # What the board of each pattern needs besides its spacing; the other keys here are not for it.
-BOARD_KEYS = {
-    "dots": ("dots", "dot_diameter_mm"),
-    "chessboard": ("squares",),
-    "charuco": ("squares", "marker_mm"),
-}
+BOARD_KEYS = {"dots": ("dots", "dot_diameter_mm"), "chessboard": ("squares",), "charuco": ("squares", "marker_mm")}
 # OpenCV finds three by three inner corners and more.
 FEWEST_SQUARES = 4
-# Data sheets give three or four digits.
-AGREEMENT = 1e-3
+# Data sheets give three or four digits; of lengths in a scene that are given twice a tenth of a micron is nothing.
+AGREEMENT, AGREEMENT_MM = 1e-3, 1e-4
 # Three pixels tell the middle of a lens image from its rims; the widest lens images in use are some 100 px wide.
 FEWEST_PIXELS_A_LENS, MOST_PIXELS_A_LENS = 3.0, 1000.0
 # The sensor stands at the microlenses' focal length or, in focused cameras, not far from it; and lens images that are
 # many pitches wide can be told apart by nothing.
 MOST_FOCAL_LENGTHS, MOST_PITCHES = 20.0, 50.0
-
-
 # No length on a bench, in mm, nor any other number here, is as large or as small; squares of these are still numbers.
 LARGEST_NUMBER, SMALLEST_NUMBER = 1e12, 1e-12
 
 
-def contradictions(sections: Sections) -> Found:
+def validated(document: Document, source: str) -> Sections:
+    """Return the sections of a document.
+
+    Raises
+    ------
+    ConfigError : all that is wrong with it
+    """
+    if document.data and not document.problems and not document.data.keys() & Sections.model_fields.keys():
+        first = ", ".join(map(str, list(document.data)[:3]))
+        raise ConfigError(f"{source}: is no rig file: it has {first}, expected {', '.join(Sections.model_fields)}")
+    problems, sections = list(document.problems), None
+    try:
+        sections = Sections.model_validate(document.data)
+    except ValidationError as error:
+        problems += [problem_of(document, details) for details in error.errors()]
+    for path, text in () if sections is None else _contradictions(sections):
+        problems.append(Problem(*place_of(document, path), key_name(path), text))
+    if problems or sections is None:
+        raise ConfigError(report(source, problems))
+    return sections
+
+
+def _contradictions(sections: Sections) -> Found:
     """Yield the place and the sentence of everything that cannot be."""
     beyond = list(_beyond_numbers(sections.model_dump(), ()))
     if beyond:
         yield from beyond
         return
-    for faults in (_lens, _sensor, _lens_images, _volume, _board, _walls, _scene, _processing, _rays, _object_space):
+    for faults in (_lens, _lens_images, _volume, _board, _walls, _scene, _processing, _rays, _object_space):
         yield from faults(sections)
 
 
@@ -140,14 +77,14 @@ def _beyond_numbers(value: Any, path: KeyPath) -> Found:
         for place, item in enumerate(value):
             yield from _beyond_numbers(item, (*path, place))
     elif isinstance(value, float) and value and not SMALLEST_NUMBER <= abs(value) <= LARGEST_NUMBER:
-        yield (
-            path,
-            f"is {written(value, 6)}, expected a size of {written(SMALLEST_NUMBER)} to {written(LARGEST_NUMBER)}",
-        )
+        sizes = f"{written(SMALLEST_NUMBER)} to {written(LARGEST_NUMBER)}"
+        yield path, f"is {written(value, 6)}, expected a size of {sizes}"
 
 
-def _disagree(first: float, second: float) -> bool:
-    return not math.isclose(first, second, rel_tol=AGREEMENT)
+def _twice(place: KeyPath, given: float, expected: float, what: str) -> Found:
+    """Yield what is given twice and differs."""
+    if not math.isclose(given, expected, rel_tol=AGREEMENT):
+        yield place, f"is {given:g}, but {what} is {expected:g}"
 
 
 def _lens(sections: Sections) -> Found:
@@ -157,65 +94,44 @@ def _lens(sections: Sections) -> Found:
     lens, microlenses = sections.camera.main_lens, sections.camera.microlenses
     if lens is not None:
         place = ("camera", "main_lens")
-        focal_length = focal_length_mm(lens)
+        focal_length = lens.known_focal_length_mm
         if lens.image_distance is not None:
-            yield from _telecentric(lens)
+            if lens.focal_length_mm is None:
+                yield place, "needs focal_length_mm, which an infinite image distance does not tell"
+            if lens.image_distance_mm is not None:
+                yield (*place, "image_distance_mm"), f"is {lens.image_distance_mm:g}, but image_distance is infinite"
+            if lens.pupil_ratio != 1.0:
+                text = f"is {lens.pupil_ratio:g}, but image_distance is infinite and so is the ratio"
+                yield (*place, "pupil_ratio"), text
         elif focal_length is None:
             yield place, "needs focal_length_mm or image_distance_mm"
         elif lens.image_distance_mm is not None:
             expected = focal_length * (lens.pupil_ratio - lens.magnification)
-            if _disagree(lens.image_distance_mm, expected):
-                yield (
-                    (*place, "image_distance_mm"),
-                    f"is {lens.image_distance_mm:g}, but focal_length_mm ({lens.pupil_ratio:g} - magnification) is "
-                    f"{expected:g}",
-                )
+            what = f"focal_length_mm ({lens.pupil_ratio:g} - magnification)"
+            yield from _twice((*place, "image_distance_mm"), lens.image_distance_mm, expected, what)
         if lens.aperture_mm is None and lens.f_number is None:
             yield place, "needs aperture_mm or f_number"
         if lens.aperture_mm and lens.f_number and focal_length:
             expected = focal_length / lens.aperture_mm
-            if _disagree(lens.f_number, expected):
-                yield (*place, "f_number"), f"is {lens.f_number:g}, but focal_length_mm / aperture_mm is {expected:g}"
+            yield from _twice((*place, "f_number"), lens.f_number, expected, "focal_length_mm / aperture_mm")
     if microlenses.f_number and microlenses.focal_length_mm:
-        expected = microlenses.focal_length_mm / microlenses.pitch_mm
-        if _disagree(microlenses.f_number, expected):
-            yield (
-                ("camera", "microlenses", "f_number"),
-                f"is {microlenses.f_number:g}, but focal_length_mm / pitch_mm is {expected:g}",
-            )
-
-
-def _telecentric(lens: MainLens) -> Found:
-    """Yield what a lens whose exit pupil is infinitely far away cannot have, and the focal length where it lacks."""
-    place = ("camera", "main_lens")
-    if lens.focal_length_mm is None:
-        yield place, "needs focal_length_mm, which an infinite image distance does not tell"
-    if lens.image_distance_mm is not None:
-        yield (*place, "image_distance_mm"), f"is {lens.image_distance_mm:g}, but image_distance is infinite"
-    if lens.pupil_ratio != 1.0:
-        yield (*place, "pupil_ratio"), f"is {lens.pupil_ratio:g}, but image_distance is infinite and so is the ratio"
-
-
-def _sensor(sections: Sections) -> Found:
-    """Yield pixels so large or so small that lens images cannot be told: most often a slip in the unit."""
-    if sections.camera is None:
-        return
-    sensor, pitch_mm = sections.camera.sensor, sections.camera.microlenses.pitch_mm
-    pitch_px = pitch_mm * 1e3 / sensor.pixel_um
-    if not FEWEST_PIXELS_A_LENS <= pitch_px <= MOST_PIXELS_A_LENS:
-        yield (
-            ("camera", "sensor", "pixel_um"),
-            f"is {sensor.pixel_um:g}: lens images would be {written(pitch_px, 4)} px apart (pitch_mm is {pitch_mm:g}), "
-            f"expected {FEWEST_PIXELS_A_LENS:g} to {MOST_PIXELS_A_LENS:g}: pixels in um, the pitch in mm",
-        )
+        place, expected = ("camera", "microlenses"), microlenses.focal_length_mm / microlenses.pitch_mm
+        yield from _twice((*place, "f_number"), microlenses.f_number, expected, "focal_length_mm / pitch_mm")
 
 
 def _lens_images(sections: Sections) -> Found:
-    """Yield a sensor far out of the microlenses' focus, and an aperture whose images cover many lenses."""
+    """Yield pixels that cannot tell lens images, a sensor far out of their focus, and too wide an aperture."""
     section = sections.camera
-    if section is None or missing_for_camera(section) is not None:
+    if section is None:
         return
-    for place, text in lens_image_faults(camera_of(section)):
+    sensor, pitch_mm = section.sensor, section.microlenses.pitch_mm
+    pitch_px = pitch_mm * 1e3 / sensor.pixel_um
+    if not FEWEST_PIXELS_A_LENS <= pitch_px <= MOST_PIXELS_A_LENS:  # most often a slip in the unit
+        text = f"lens images would be {written(pitch_px, 4)} px apart (pitch_mm is {pitch_mm:g}), expected "
+        text += f"{FEWEST_PIXELS_A_LENS:g} to {MOST_PIXELS_A_LENS:g}: pixels in um, the pitch in mm"
+        yield ("camera", "sensor", "pixel_um"), f"is {sensor.pixel_um:g}: {text}"
+    camera = section.model()
+    for place, text in () if camera is None else lens_image_faults(camera):
         yield ("camera", *place), text
 
 
@@ -246,7 +162,7 @@ def _volume(sections: Sections) -> Found:
         for name in ("shape_xyz", "voxel_mm"):
             if getattr(volume, name) is not None:
                 yield (*place, name), "contradicts size_mm, which leaves the voxels to the program"
-        if sections.camera is None or missing_for_camera(sections.camera) is not None or sections.media is None:
+        if sections.camera is None or sections.camera.missing is not None or sections.media is None:
             yield (*place, "size_mm"), "needs the sections media and camera, with all of its main lens, for the voxels"
     elif volume.shape_xyz is None or volume.voxel_mm is None:
         yield place, "needs shape_xyz and voxel_mm, or size_mm"
@@ -278,11 +194,68 @@ def _walls(sections: Sections) -> Found:
     in_fluid = board is not None and board.medium == "fluid"
     if channel is not None and channel.board_from_mid_plane_mm is not None and not in_fluid:
         yield ("channel", "board_from_mid_plane_mm"), "is for a board in the fluid; one in air stands on the outer wall"
-    if window is not None and channel is not None and _disagree(window.thickness_mm, channel.wall_mm):
-        yield ("window", "thickness_mm"), f"is {window.thickness_mm:g}, but channel.wall_mm is {channel.wall_mm:g}"
+    if window is not None and channel is not None:
+        yield from _twice(("window", "thickness_mm"), window.thickness_mm, channel.wall_mm, "channel.wall_mm")
     pipe = sections.pipe
-    if pipe is not None and channel is not None and _disagree(2.0 * pipe.radius_mm, channel.width_mm):
+    if pipe and channel and not math.isclose(2.0 * pipe.radius_mm, channel.width_mm, rel_tol=AGREEMENT):
         yield ("pipe", "radius_mm"), f"is {pipe.radius_mm:g}, but channel.width_mm is {channel.width_mm:g}"
+
+
+def _scene(sections: Sections) -> Found:
+    """Yield the place and the sentence of faces that light cannot cross in order, and of walls that contradict them."""
+    scene = sections.scene
+    if scene is None:
+        return
+    for name, why in (("window", "the faces are the window"), ("channel", "its walls are plane")):
+        if getattr(sections, name) is not None:
+            yield (name,), f"contradicts scene: {why}"
+    if sections.media is None:
+        yield ("scene",), "needs the section media"
+        return
+    media = sections.media.model()
+    last = len(scene) - 1
+    if scene[last].index_behind(media) != media.fluid:
+        yield ("scene", last, "behind"), f"is {scene[last].behind}, expected fluid behind the last face"
+        return
+    missed = False
+    for k, section in enumerate(scene):
+        if isinstance(section, HeightMapFace) and (section.file is None) == (section.heights_mm is None):
+            yield ("scene", k), "expected a file of heights, or heights_mm, and not both"
+            missed = True
+            continue
+        try:
+            section.model(media).surface.shape()
+        except ConfigError as error:
+            yield ("scene", k), str(error)
+            missed = True
+    if missed:
+        return
+    try:
+        space = scene_of(scene, media)
+        camera = None if sections.camera is None else sections.camera.model()
+        if camera is not None:
+            space.lens_z_mm(camera)
+    except ConfigError as error:
+        yield ("scene",), str(error)
+        return
+    yield from _pipe(sections)
+
+
+def _pipe(sections: Sections) -> Found:
+    """Yield a pipe's wall that is not the cylinder in front of the fluid; its depth is known from the focal point."""
+    pipe, face = sections.pipe, sections.scene[-1] if sections.scene else None
+    if pipe is None or not isinstance(face, CylinderFace):
+        return
+    yield from _twice(("pipe", "radius_mm"), pipe.radius_mm, face.radius_mm, "that of the last face in scene")
+    inside = pipe.wall()
+    axis = RoundWall(face.radius_mm, axis=face.axis).direction
+    if np.linalg.norm(np.cross(inside.direction, axis)) > AGREEMENT:
+        ours, theirs = (each if isinstance(each, str) else list(each) for each in (pipe.axis, face.axis))
+        yield ("pipe", "axis"), f"is {ours}, but that of the last face in scene is {theirs}"
+    from_focal_point = sections.volume is not None and sections.volume.reference == "focal_point"
+    if from_focal_point and inside.distances_mm(np.array(face.centre_mm)) > AGREEMENT_MM:
+        ours, theirs = list(pipe.centre_mm), list(face.centre_mm)
+        yield ("pipe", "centre_mm"), f"is {ours}, but that of the last face in scene is {theirs}"
 
 
 def _processing(sections: Sections) -> Found:
@@ -331,12 +304,13 @@ def _object_space(sections: Sections) -> Found:
     With a mid-plane volume the origin is not known yet; it lies within millimetres of the focal point.
     """
     volume, section = sections.volume, sections.camera
-    if volume is None or section is None or sections.media is None or missing_for_camera(section) is not None:
+    camera = None if section is None else section.model()
+    if volume is None or camera is None or sections.media is None:
         return
     if volume.size_mm is None and (volume.shape_xyz is None or volume.voxel_mm is None):
         return
-    camera, media = camera_of(section), media_of(sections.media)
-    grid = grid_of(volume, camera.scale(media), FOCAL_POINT)
+    media = sections.media.model()
+    grid = volume.grid(camera.scale(media), FOCAL_POINT)
     nearest = grid.bounds_mm(2)[0]
     distance = float(equivalent_object_distance(nearest, camera.focus_distance_mm, media))
     if distance <= 0.0:

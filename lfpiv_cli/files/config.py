@@ -6,44 +6,38 @@ mean 'layout'?`
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
+from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.calibration.model import Calibration, Channel, Rig
 from lfpiv_cli.errors import ConfigError, InputError
-from lfpiv_cli.files import bench
-from lfpiv_cli.files.bench import ensure_same, fingerprint, moved_faces, moved_pipe
-from lfpiv_cli.files.checks import contradictions
-from lfpiv_cli.files.inputs import content_of, ensure_regular_file, opened
+from lfpiv_cli.files.checks import validated
 from lfpiv_cli.files.sections import (
+    UM_TO_MM,
     BoardSection,
     CameraSection,
     ChannelSection,
-    CorrelationSection,
     MediaSection,
     PipeSection,
-    ReconstructionSection,
     VolumeSection,
+    scene_of,
+)
+from lfpiv_cli.files.sections_simulated import (
+    CorrelationSection,
+    FlowSection,
+    ReconstructionSection,
+    Sections,
+    SimulationSection,
+    ValidationSection,
     WeightsSection,
+    flow_of,
 )
-from lfpiv_cli.files.sections_simulated import FlowSection, Sections, SimulationSection, ValidationSection
-from lfpiv_cli.files.yaml_nodes import (
-    LARGEST_BYTES,
-    Document,
-    Problem,
-    YamlError,
-    key_name,
-    place_of,
-    problem_of,
-    read_document,
-    report,
-    sentence,
-    with_heights,
-)
+from lfpiv_cli.files.yaml_nodes import Document, read_rig
 from lfpiv_cli.flow.correlation import CorrelationSettings
 from lfpiv_cli.flow.windows import ParallelWalls, Walls
 from lfpiv_cli.grid import Grid
@@ -51,14 +45,22 @@ from lfpiv_cli.names import Refraction
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.media import Media, Window, channel_window
+from lfpiv_cli.optics.surfaces import SURFACES
 from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.reconstruction.registry import SOLVERS
 from lfpiv_cli.reconstruction.solvers import SolverSettings, Stopping
 from lfpiv_cli.reference import FOCAL_POINT, Reference
 from lfpiv_cli.synthetic.vortices import Flow
 
-# Images and HDF5 files have a zero byte among their first ones, and no text has.
-BEGINNING_BYTES = 512
+# Of the paper's final window along the axis with the smallest voxels; the coarse one is twice as large: a displacement
+# of a quarter of its side does not leave it.
+DEFAULT_WINDOW = 16
+# Along an axis with longer voxels, where particle images are long: two of them fit.
+SMALLEST_DEFAULT_WINDOW = 8
+SMALLEST_WINDOW = 4
+
+Triple = tuple[int, int, int]
+Lengths = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -71,20 +73,28 @@ class Config:
     ----------
     sections : as they stand in the file, defaults filled in
     source : the file's name, for messages
+    channel, pipe, weights, reconstruction, correlation, simulation, validation : the sections that may be left out
     """
 
     sections: Sections
     source: str
+    channel: ChannelSection | None = field(init=False)
+    pipe: PipeSection | None = field(init=False)
+    weights: WeightsSection = field(init=False)
+    reconstruction: ReconstructionSection = field(init=False)
+    correlation: CorrelationSection = field(init=False)
+    simulation: SimulationSection = field(init=False)
+    validation: ValidationSection = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Take these out of the sections."""
+        for each in fields(self)[2:]:
+            object.__setattr__(self, each.name, getattr(self.sections, each.name))
 
     @classmethod
     def from_resolved(cls, resolved: Mapping[str, Any], source: str = "the stored config") -> Config:
-        """Return the configuration that `resolved` described.
-
-        Raises
-        ------
-        ConfigError
-        """
-        return _validated(Document(data=_tuples(resolved)), source)
+        """Return the configuration that `resolved` described."""
+        return Config(validated(Document(data=_tuples(resolved)), source), source)
 
     def resolved(self) -> dict[str, Any]:
         """Return everything, defaults included, as plain data for JSON."""
@@ -95,8 +105,7 @@ class Config:
 
         Raises
         ------
-        ConfigError
-            If the options contradict the rest.
+        ConfigError : the options contradict the rest
         """
         given = {name: value for name, value in options.items() if value is not None}
         if not given:
@@ -114,7 +123,7 @@ class Config:
         """
         keys = type(getattr(self.sections, section)).model_fields
         return self.overridden(
-            section, **{field.name: getattr(options, field.name) for field in fields(options) if field.name in keys}
+            section, **{each.name: getattr(options, each.name) for each in fields(options) if each.name in keys}
         )
 
     @property
@@ -137,64 +146,25 @@ class Config:
         """The section `board`."""
         return self._needed("board", self.sections.board)
 
-    @property
-    def channel(self) -> ChannelSection | None:
-        """The section `channel`, None where there is none."""
-        return self.sections.channel
-
-    @property
-    def pipe(self) -> PipeSection | None:
-        """The section `pipe`, None where there is none."""
-        return self.sections.pipe
-
-    @property
-    def weights(self) -> WeightsSection:
-        """The section `weights`."""
-        return self.sections.weights
-
-    @property
-    def reconstruction(self) -> ReconstructionSection:
-        """The section `reconstruction`."""
-        return self.sections.reconstruction
-
-    @property
-    def correlation(self) -> CorrelationSection:
-        """The section `correlation`."""
-        return self.sections.correlation
-
-    @property
-    def simulation(self) -> SimulationSection:
-        """The section `simulation`."""
-        return self.sections.simulation
-
-    @property
-    def validation(self) -> ValidationSection:
-        """The section `validation`."""
-        return self.sections.validation
-
     def image_shape(self) -> tuple[int, int]:
         """Return the sensor's (rows, columns)."""
         return self.camera.sensor.rows, self.camera.sensor.columns
 
     def camera_model(self) -> Camera:
         """Return the camera as the data sheet has it, a lens centre on the axis."""
-        section = self.camera
-        missing = bench.missing_for_camera(section)
-        if missing is not None:
-            raise self._missing(f"camera.{missing}")
-        return bench.camera_of(section)
-
-    def complete_camera(self) -> Camera | None:
-        """Return the camera as the data sheet has it, None where it lacks a length."""
-        return None if bench.missing_for_camera(self.camera) is not None else bench.camera_of(self.camera)
+        camera: Camera = self._needed(f"camera.{self.camera.missing}", self.camera.model())
+        return camera
 
     def micro_image_pitch_px(self) -> float:
-        """Return the pitch of the lens images by the data sheet."""
-        return bench.micro_image_pitch_px(self.camera)
+        """Return the pitch of the lens images by the data sheet, of parallel light where the lens is not known."""
+        camera, section = self.camera.model(), self.camera
+        if camera is not None:
+            return float(camera.micro_image_lattice_px().pitch.mean())
+        return section.microlenses.pitch_mm / (section.sensor.pixel_um * UM_TO_MM)
 
     def media_model(self) -> Media:
         """Return the refractive indices."""
-        return bench.media_of(self.media)
+        return self.media.model()
 
     def fluid_density_kg_m3(self) -> float:
         """Return the fluid's density."""
@@ -209,8 +179,7 @@ class Config:
 
         Raises
         ------
-        ConfigError
-            If there is none, or a `scene` in its place.
+        ConfigError : there is none, or a `scene` in its place
         """
         self.ensure_plane_layers("this command")
         if self.channel is not None and mid_plane_z_mm is not None:
@@ -226,8 +195,7 @@ class Config:
 
         Raises
         ------
-        ConfigError
-            If rays are fitted (dlfc), not traced.
+        ConfigError : rays are fitted (dlfc), not traced
         """
         scene = self.scene_space()
         if scene is not None and self.weights.method != "dlfc":
@@ -237,33 +205,41 @@ class Config:
     def scene_space(self) -> CurvedSpace | None:
         """Return the faces of `scene`, None where there is none."""
         scene = self.sections.scene
-        return None if scene is None else bench.scene_of(scene, self.media_model())
+        return None if scene is None else scene_of(scene, self.media_model())
 
     def scene_fingerprint(self) -> str:
-        """Return what tells the scene from another one.
-
-        Raises
-        ------
-        ConfigError : there is none
-        """
-        return fingerprint(self._needed("scene", self.sections.scene))
+        """Return what tells the scene from another one: the SHA-256 of its faces."""
+        faces = self._needed("scene", self.sections.scene)
+        plain = [face.model_dump(mode="json", exclude={"file"}) for face in faces]
+        return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
 
     def with_scene_of(self, found: Calibration | None) -> Config:
-        """Return the config with its scene, and the wall of its pipe, where a calibration has found them to lie.
+        """Return the config with its scene where a calibration has found it to lie: moved as one body.
+
+        The wall of its pipe is moved with the faces.
 
         Raises
         ------
-        ConfigError
-            If the calibration's is another scene.
+        ConfigError : the calibration's is another scene, or a face cannot be turned
         """
         if found is None or found.scene is None:
             return self
         scene, motion = self.sections.scene, found.scene.motion
-        ensure_same(scene, found.scene.faces_sha256, self.source)
-        resolved = self.resolved()
-        resolved["scene"] = moved_faces(scene or (), self.media, motion)
+        if scene is None:
+            raise ConfigError(f"{self.source}: scene: is missing, and the calibration tells where it lies")
+        if self.scene_fingerprint() != found.scene.faces_sha256:
+            raise ConfigError(
+                f"{self.source}: scene: is not the one whose place the calibration tells; refine-calibration again, "
+                "from a calibration that knows of no scene"
+            )
+        resolved, kinds = self.resolved(), {surface: kind for kind, surface in SURFACES.items()}
+        resolved["scene"] = []
+        for section in scene:
+            surface: Any = section.model(self.media_model()).surface.moved(motion)
+            resolved["scene"].append({"kind": kinds[type(surface)], **asdict(surface), "behind": section.behind})
         if self.pipe is not None:
-            resolved["pipe"] = moved_pipe(self.pipe, motion)
+            axis = motion.direction(self.pipe.wall().direction.tolist())
+            resolved["pipe"] |= {"centre_mm": motion.point(self.pipe.centre_mm), "axis": axis}
         return Config.from_resolved(resolved, f"{self.source} with the calibration's scene")
 
     def plane_space(self, what: str, mid_plane_z_mm: float | None = None) -> ObjectSpace:
@@ -271,8 +247,7 @@ class Config:
 
         Raises
         ------
-        ConfigError
-            If rays are fitted (dlfc), not traced; or if there is a `scene`, which `what` cannot be done through.
+        ConfigError : rays are fitted (dlfc), not traced; or if there is a `scene`, which `what` cannot be done through
         """
         chosen = self.weights
         if chosen.method == "dlfc":
@@ -287,12 +262,7 @@ class Config:
         return self.weights.refraction if self.sections.scene is None else "exact"
 
     def ensure_plane_layers(self, what: str) -> None:
-        """Refuse what is worked out for plane windows alone where the config has a `scene`.
-
-        Raises
-        ------
-        ConfigError
-        """
+        """Refuse what is worked out for plane windows alone where the config has a `scene`."""
         if self.sections.scene is not None:
             raise ConfigError(
                 f"{self.source}: scene: {what} is possible through plane windows (section window or channel) alone, "
@@ -303,21 +273,54 @@ class Config:
         """Return the volume's grid: z as in the config, or from the focal point where its reference is given."""
         chosen = self.volume.size_mm is not None
         scale = self.camera_model().scale(self.media_model()) if chosen else None
-        return bench.grid_of(self.volume, scale, reference)
+        return self.volume.grid(scale, reference)
 
     def rig(self) -> Rig:
-        """Return what must be known to read the picture of a board."""
-        channel = None if self.channel is None else Channel(**self.channel.model_dump(exclude={"no_slip"}))
-        light = bench.wave_light_of(self.reconstruction)
-        return Rig(self.camera_model(), self.media_model(), bench.board_of(self.board), channel, light)
+        """Return what must be known to read the picture of a board; a chessboard's points are its inner corners."""
+        camera, media, board, channel = self.camera_model(), self.media_model(), self.board, self.channel
+        points = board.dots if board.squares is None else (board.squares[0] - 1, board.squares[1] - 1)
+        if points is None:
+            raise ValueError("board.dots or board.squares is missing")
+        told = board.model_dump(exclude={"dots", "squares"})
+        told |= {name: told[name] or 0.0 for name in ("dot_diameter_mm", "marker_mm")}
+        return Rig(
+            camera,
+            media,
+            BoardGeometry(dots=points, **told),
+            None if channel is None else Channel(**channel.model_dump(exclude={"no_slip"})),
+            self.reconstruction.wave_light(),
+        )
 
-    def windows_voxel(self, voxel_mm: tuple[float, float, float]) -> tuple[tuple[int, int, int], ...]:
-        """Return the correlation windows (x, y, z) in voxels, coarse to fine."""
-        return bench.windows_of(self.correlation, voxel_mm)
+    def windows_voxel(self, voxel_mm: Lengths) -> tuple[Triple, ...]:
+        """Return the correlation windows (x, y, z) in voxels, coarse to fine; `window_mm` is the final one of two.
 
-    def overlap(self, voxel_mm: tuple[float, float, float]) -> tuple[float, float, float]:
-        """Return the overlap of the correlation windows along x, y, z."""
-        return bench.overlap_of(self.correlation, voxel_mm)
+        By default they are as long along all axes, as far as voxels of different sides allow.
+        """
+        section = self.correlation
+        if section.windows is not None:
+            return section.windows
+        lengths, smallest = section.window_mm, SMALLEST_WINDOW
+        if lengths is None:
+            side = DEFAULT_WINDOW * min(voxel_mm)
+            lengths, smallest = (side, side, side), SMALLEST_DEFAULT_WINDOW
+        final = [max(smallest, round(length / voxel)) for length, voxel in zip(lengths, voxel_mm, strict=True)]
+        return (2 * final[0], 2 * final[1], 2 * final[2]), (final[0], final[1], final[2])
+
+    def overlap(self, voxel_mm: Lengths) -> Lengths:
+        """Return the overlap of the final windows in voxels along x, y, z.
+
+        Windows given as `window_mm` are whole voxels only nearly; their overlap is then what leaves the distance
+        between them, and with it their number, as in mm.
+        """
+        section = self.correlation
+        if section.window_mm is None:
+            return section.overlap
+        *_, final = self.windows_voxel(voxel_mm)
+        x, y, z = (
+            max(0.0, 1.0 - length * (1.0 - overlap) / (voxel * size))
+            for length, overlap, voxel, size in zip(section.window_mm, section.overlap, voxel_mm, final, strict=True)
+        )
+        return x, y, z
 
     def masking_walls(self) -> Walls | None:
         """Return the walls beyond which `correlation.mask` leaves voxels and vectors out, None where it does not."""
@@ -325,12 +328,12 @@ class Config:
         if mask is None:
             return None
         section = self._needed(mask, getattr(self.sections, mask))
-        return bench.round_wall_of(section) if isinstance(section, PipeSection) else ParallelWalls(section.width_mm)
+        return section.wall() if isinstance(section, PipeSection) else ParallelWalls(section.width_mm)
 
     def still_walls(self) -> Walls | None:
         """Return the walls at which the fluid stands still, the pipe's or the channel's, None where neither is said."""
         if self.pipe is not None and self.pipe.no_slip:
-            return bench.round_wall_of(self.pipe)
+            return self.pipe.wall()
         return ParallelWalls(self.channel.width_mm) if self.channel is not None and self.channel.no_slip else None
 
     def solver_settings(self) -> SolverSettings:
@@ -345,33 +348,27 @@ class Config:
             Stopping(chosen.stop_change, None, chosen.stop_noise, chosen.photons_per_count),
         )
 
-    def correlation_exponent(self) -> float:
-        """Return the power of the intensities that is correlated: the configured one, or the solver's default."""
-        solver = SOLVERS.get(self.reconstruction.solver)
-        return self.correlation.exponent or (solver.exponent if solver else 1.0)
-
-    def correlation_settings(self, voxel_mm: tuple[float, float, float]) -> CorrelationSettings:
-        """Return how volumes of such voxels are correlated."""
-        return CorrelationSettings(
-            self.windows_voxel(voxel_mm), self.overlap(voxel_mm), self.correlation.dt_s, self.correlation_exponent()
-        )
+    def correlation_settings(self, voxel_mm: Lengths) -> CorrelationSettings:
+        """Return how volumes of such voxels are correlated: by a configured power, or the solver's default."""
+        chosen, solver = self.correlation, SOLVERS.get(self.reconstruction.solver)
+        exponent = chosen.exponent or (solver.exponent if solver else 1.0)
+        return CorrelationSettings(self.windows_voxel(voxel_mm), self.overlap(voxel_mm), chosen.dt_s, exponent)
 
     def simulated_flow(self, reference: Reference = FOCAL_POINT) -> Flow:
         """Return the flow to render, a function of points: z as in the config, or from the focal point as in `grid`."""
-        return bench.flow_of(self._needed("simulation.flow", self.simulation.flow), reference)
+        return flow_of(self._needed("simulation.flow", self.simulation.flow), reference)
 
     def true_flow(self) -> Flow:
         """Return the flow to compare with, in the volume's coordinates: `validation.flow`, else the simulation's."""
         flow: FlowSection | None = self.validation.flow or self.simulation.flow
-        return bench.flow_of(self._needed("validation.flow", flow), FOCAL_POINT)
+        return flow_of(self._needed("validation.flow", flow), FOCAL_POINT)
 
     def flow_methods(self) -> tuple[str, ...]:
         """Return how a simulated flow is measured: as `validation.flow_methods` has it, else every possible way.
 
         Raises
         ------
-        ConfigError
-            If volumes are asked for and the solver makes none.
+        ConfigError : volumes are asked for and the solver makes none
         """
         asked, makes_volumes = self.validation.flow_methods, self.reconstruction.solver != "particles"
         if asked is None:
@@ -385,11 +382,8 @@ class Config:
 
     def _needed(self, key: str, section: Any) -> Any:
         if section is None:
-            raise self._missing(key)
+            raise ConfigError(f"{self.source}: {key}: is missing, and this command needs it")
         return section
-
-    def _missing(self, key: str) -> ConfigError:
-        return ConfigError(f"{self.source}: {key}: is missing, and this command needs it")
 
 
 def load_config(path: Path) -> Config:
@@ -397,40 +391,10 @@ def load_config(path: Path) -> Config:
 
     Raises
     ------
-    ConfigError
-        If anything in it is malformed, unknown, contradictory or impossible; all errors at once.
-    InputError
-        If the file is missing or not a file.
+    ConfigError : anything in it is malformed, unknown, contradictory or impossible; all errors at once
+    InputError : the file is missing or not a file
     """
-    size = ensure_regular_file(path)
-    _ensure_text(path)
-    if size > LARGEST_BYTES:
-        raise ConfigError(f"{path}: has {size} bytes, expected at most {LARGEST_BYTES}")
-    content = content_of(path)
-    try:
-        document = read_document(content)
-    except YamlError as error:
-        raise ConfigError(sentence(str(path), error.problem)) from error
-    return _validated(with_heights(document, path), str(path))
-
-
-def _ensure_text(path: Path) -> None:
-    """Refuse an image, or another binary file of a kind that commands take in other places, by what it is.
-
-    Raises
-    ------
-    ConfigError
-    """
-    with opened(path) as file:
-        if b"\0" not in file.read(BEGINNING_BYTES):
-            return
-    from lfpiv_cli.files.images import format_of
-
-    try:
-        kind = format_of(path).name
-    except InputError:
-        return  # what is no text is told where it is read
-    raise ConfigError(f"{path}: is {'an HDF5 file' if kind == 'HDF5' else f'an image ({kind})'}; expected a rig file")
+    return Config(validated(read_rig(path), str(path)), str(path))
 
 
 def carried_config(record: Mapping[str, Any], source: Path | str) -> Config:
@@ -440,33 +404,12 @@ def carried_config(record: Mapping[str, Any], source: Path | str) -> Config:
 
     Raises
     ------
-    InputError
-        If there is none.
+    InputError : there is none
     """
     config = record.get("config")
     if not config:
         raise InputError(f"{source}: carries no config; give one with --config")
     return Config.from_resolved({name: value for name, value in config.items() if name in Sections.model_fields})
-
-
-def _validated(document: Document, source: str) -> Config:
-    """Return the configuration of a document, or raise all that is wrong with it."""
-    if document.data and not document.problems and not document.data.keys() & Sections.model_fields.keys():
-        first = ", ".join(map(str, list(document.data)[:3]))
-        raise ConfigError(f"{source}: is no rig file: it has {first}, expected {', '.join(Sections.model_fields)}")
-    problems = list(document.problems)
-    sections = None
-    try:
-        sections = Sections.model_validate(document.data)
-    except ValidationError as error:
-        problems += [problem_of(document, details) for details in error.errors()]
-    if sections is not None:
-        problems += [
-            Problem(*place_of(document, path), key_name(path), text) for path, text in contradictions(sections)
-        ]
-    if problems or sections is None:
-        raise ConfigError(report(source, problems))
-    return Config(sections, source)
 
 
 def _tuples(value: Any) -> Any:

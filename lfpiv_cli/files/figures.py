@@ -18,14 +18,7 @@ from lfpiv_cli.files.hdf5 import RESERVED, format_of, from_attribute, open_h5, r
 from lfpiv_cli.files.hdf5_checks import member
 from lfpiv_cli.files.images import frames
 from lfpiv_cli.files.inputs import ensure_regular_file, split_page, split_part
-from lfpiv_cli.files.particle_file import (
-    PARTICLES_FORMAT,
-    TRACKS_FORMAT,
-    TRAJECTORIES_FORMAT,
-    Points,
-    read_points,
-)
-from lfpiv_cli.files.provenance import recorded_warnings
+from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, TRACKS_FORMAT, TRAJECTORIES_FORMAT, read_points, read_tracks
 from lfpiv_cli.files.recordings import stack
 from lfpiv_cli.flow.field import MM_TO_M, REJECTED, VALID, derived_fields
 
@@ -79,7 +72,6 @@ def is_recording(path: Path) -> bool:
 
 # What is in a file of ours, without its numbers.
 
-
 # Arrays that are told whole: places, sizes, a lattice's basis.
 TOLD_SHAPES = ((2,), (3,), (2, 2))
 # Groups that show our data to other programs once more.
@@ -87,39 +79,31 @@ VIEWS = ("VTKHDF",)
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """Return format, version, how the file was made, and the scalars and the shapes of the arrays in it.
-
-    Raises
-    ------
-    InputError : the file is missing, broken or not one of ours
-    """
+    """Return format, version, how the file was made, and the scalars and the shapes of the arrays in it."""
     file_format = format_of(path)
     with open_h5(path) as file:
+        record = read_provenance(file)
         found: dict[str, Any] = {
             "file_bytes": path.stat().st_size,
             "format": file_format,
             "format_version": int(file.attrs["format_version"]),
+            "command": record.get("command"),
+            "program_version": record.get("version"),
+            "inputs": [f"{role} {entry['name']}" for role, entry in record.get("inputs", {}).items()],
         }
-        found |= _made(read_provenance(file))
+        # What was warned of when the inputs were made, and then the file itself, each with the command.
+        warnings = [
+            f"{each['command']}: {warning['about']}: {warning['text']}; {warning['remedy']} [{warning['code']}]"
+            for each in [*record.get("made_from", {}).values(), record]
+            for warning in each.get("warnings", ())
+        ]
+        if warnings:
+            found["warnings_recorded"] = warnings
+        weights = (record.get("config") or {}).get("weights")
+        if weights:
+            found |= {name: weights.get(name) for name in ("method", "refraction", "sampling")}
         _list_group(file, "", found)
     return found
-
-
-def _made(record: dict[str, Any]) -> dict[str, Any]:
-    """Return the short form of a provenance record."""
-    inputs = [f"{role} {entry['name']}" for role, entry in record.get("inputs", {}).items()]
-    made: dict[str, Any] = {
-        "command": record.get("command"),
-        "program_version": record.get("version"),
-        "inputs": inputs,
-    }
-    warnings = recorded_warnings(record)
-    if warnings:
-        made["warnings_recorded"] = warnings
-    weights = (record.get("config") or {}).get("weights")
-    if weights:
-        made |= {name: weights.get(name) for name in ("method", "refraction", "sampling")}
-    return made
 
 
 def _list_group(group: h5py.Group, prefix: str, found: dict[str, Any]) -> None:
@@ -139,16 +123,6 @@ def _list_group(group: h5py.Group, prefix: str, found: dict[str, Any]) -> None:
             found[prefix + name] = item[()].tolist()
         else:
             found[prefix + name] = f"{item.dtype} {list(item.shape)}"
-
-
-def file_figures(path: Path, file_format: str) -> dict[str, Any]:
-    """Return the figures of a file of a format, units in their names, None where unknown; none of other formats.
-
-    Raises
-    ------
-    InputError : the file is broken
-    """
-    return READERS[file_format](path) if file_format in READERS else {}
 
 
 def _of_vectors(path: Path) -> dict[str, Any]:
@@ -192,30 +166,25 @@ def _range(values: NDArray[np.float64]) -> list[float] | None:
 
 
 def _of_tracks(path: Path) -> dict[str, Any]:
-    tracks = read_points(path, TRACKS_FORMAT)
-    unknown = int(np.count_nonzero(np.isnan(tracks.arrays["link_probability"])))
-    return {"tracks": len(tracks.position_mm)} | _of_all_tracks(tracks) | {"links_of_unknown_probability": unknown}
-
-
-def _of_trajectories(path: Path) -> dict[str, Any]:
-    tracks = read_points(path, TRAJECTORIES_FORMAT)
-    lengths = np.unique(tracks.arrays["track"], return_counts=True)[1]
-    found = {
-        "tracks": len(lengths),
-        "frames": len(np.unique(tracks.arrays["frame"])),
-        "median_frames_of_a_track": medians(lengths[:, np.newaxis].astype(np.float64))[0],
-    }
-    return found | _of_all_tracks(tracks)
-
-
-def _of_all_tracks(tracks: Points) -> dict[str, Any]:
-    arrays = tracks.arrays
-    return {
-        "depths_mm": _range(tracks.position_mm[:, 2]),
+    tracks = read_tracks(path)
+    arrays, places = tracks.arrays, tracks.position_mm
+    found: dict[str, Any] = {"tracks": len(places)}
+    if "track" in arrays:
+        lengths = np.unique(arrays["track"], return_counts=True)[1]
+        found = {
+            "tracks": len(lengths),
+            "frames": len(np.unique(arrays["frame"])),
+            "median_frames_of_a_track": medians(lengths[:, np.newaxis].astype(np.float64))[0],
+        }
+    found |= {
+        "depths_mm": _range(places[:, 2]),
         "median_velocity_m_s": medians(arrays["velocity"]),
         "median_velocity_sigma_m_s": medians(arrays["velocity_sigma"]),
         "expected_wrong_links": float(np.nansum(1.0 - arrays["link_probability"])),
     }
+    if "track" not in arrays:
+        found["links_of_unknown_probability"] = int(np.count_nonzero(np.isnan(arrays["link_probability"])))
+    return found
 
 
 def _of_volume(path: Path) -> dict[str, Any]:
@@ -229,15 +198,14 @@ def _of_volume(path: Path) -> dict[str, Any]:
     }
 
 
-def _of_calibration(path: Path) -> dict[str, Any]:
-    return {name: value for name, value in read_calibration(path).summary().items() if value is not None}
-
-
-READERS: dict[str, Callable[[Path], dict[str, Any]]] = {
+# The figures of a file of a format, units in their names, None where unknown.
+FIGURES: dict[str, Callable[[Path], dict[str, Any]]] = {
     vtkhdf.VECTORS_FORMAT: _of_vectors,
     vtkhdf.VOLUME_FORMAT: _of_volume,
     PARTICLES_FORMAT: _of_particles,
     TRACKS_FORMAT: _of_tracks,
-    TRAJECTORIES_FORMAT: _of_trajectories,
-    calibration_file.FORMAT: _of_calibration,
+    TRAJECTORIES_FORMAT: _of_tracks,
+    calibration_file.FORMAT: lambda path: {
+        name: value for name, value in read_calibration(path).summary().items() if value is not None
+    },
 }

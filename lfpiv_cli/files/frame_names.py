@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 
@@ -60,7 +61,9 @@ def places_of(stems: Sequence[str], how: Pairing) -> list[Place | None]:
     alike: dict[tuple[str, ...], list[int]] = defaultdict(list)
     read = [_tokens(stem) for stem in stems]
     for number, (tokens, _) in enumerate(read):
-        alike[tuple(_kind(token) for token in tokens)].append(number)
+        # What tokens in the same place of names of one form have in common.
+        kinds = (f"{token[:-1]}?" if token in MARKS else "#" if _is_number(token) else token for token in tokens)
+        alike[tuple(kinds)].append(number)
     for members in alike.values():
         group = [read[number][0] for number in members]
         places = _read_together(group, how, [read[number][1] for number in members])
@@ -83,7 +86,21 @@ def places_by(template: str, names: Sequence[str]) -> list[Place | None]:
     ------
     UsageError : the template has other fields, or there are more than two frames to a pair
     """
-    form, begins = _compiled(template)
+    parts = FIELD.split(template.casefold())
+    fields = [part.strip("{}").partition(":") for part in parts[1::2] if part != "*"]
+    named = sorted(name for name, _, _ in fields)
+    if any(set(part) & set("{}") for part in parts[::2]) or named not in (["frame", "pair"], ["number"]):
+        raise UsageError(
+            f"--pair-by {template}: takes {{pair}} and {{frame}}, each once, or {{number}} or {{number:1}}; "
+            f"as img_{{pair}}_{{frame}}"
+        )
+    begins = next((int(start) for name, _, start in fields if name == "number" and start), 0)
+    pattern = ""
+    for part in parts:
+        name = part.strip("{}").partition(":")[0]
+        field = f"(?P<{name}>{FIELDS[name]})" if name != part else re.escape(part)
+        pattern += "[^/]*" if part == "*" else field
+    form = re.compile(rf"(?:^|/){pattern}$")
     matches = [form.search(name.casefold()) for name in names]
     frames = sorted({match["frame"] for match in matches if match and "frame" in form.groupindex}, key=_natural)
     if len(frames) > 2:
@@ -99,52 +116,30 @@ def places_by(template: str, names: Sequence[str]) -> list[Place | None]:
     return [match and place(match) for match in matches]
 
 
-def _compiled(template: str) -> tuple[re.Pattern[str], int | None]:
-    """Return the form of names that a template describes, and where its running numbers begin."""
-    parts = FIELD.split(template.casefold())
-    fields = [part.strip("{}").partition(":") for part in parts[1::2] if part != "*"]
-    named = sorted(name for name, _, _ in fields)
-    if any(set(part) & set("{}") for part in parts[::2]) or named not in (["frame", "pair"], ["number"]):
-        raise UsageError(
-            f"--pair-by {template}: takes {{pair}} and {{frame}}, each once, or {{number}} or {{number:1}}; "
-            f"as img_{{pair}}_{{frame}}"
-        )
-    form = ""
-    for part in parts:
-        name = part.strip("{}").partition(":")[0]
-        if part == "*":
-            form += "[^/]*"
-        else:
-            form += f"(?P<{name}>{FIELDS[name]})" if name != part else re.escape(part)
-    begins = next((int(start) for name, _, start in fields if name == "number" and start), 0)
-    return re.compile(rf"(?:^|/){form}$"), begins
-
-
 def _tokens(stem: str) -> tuple[list[str], int | None]:
     """Return the words, numbers and separators of a name, and its time stamp in microseconds, which is none of them."""
-    stamp = TIME_STAMP.search(stem)
-    if stamp is None:
-        return [token.casefold() for token in TOKEN.findall(stem)], None
-    year, _, month, day, hour, _, minute, second, fraction = stamp.groups("")
-    try:
-        moment = datetime(int(year), int(month), int(day), int(hour), int(minute), int(second))
-    except ValueError:
-        return [token.casefold() for token in TOKEN.findall(stem)], None
-    rest = stem[: stamp.start()] + STAMP + stem[stamp.end() :]
-    seconds = (moment - datetime(1970, 1, 1)).total_seconds()
-    return [token.casefold() for token in TOKEN.findall(rest)], int(seconds) * 1_000_000 + int(fraction.ljust(6, "0"))
-
-
-def _kind(token: str) -> str:
-    """Return what tokens in the same place of names of one form have in common."""
-    if _is_number(token):
-        return "#"
-    return f"{token[:-1]}?" if token in MARKS else token
+    ticks, rest = None, stem
+    if (stamp := TIME_STAMP.search(stem)) is not None:
+        year, _, month, day, hour, _, minute, second, fraction = stamp.groups("")
+        with suppress(ValueError):
+            moment = datetime(int(year), int(month), int(day), int(hour), int(minute), int(second))
+            seconds = int((moment - datetime(1970, 1, 1)).total_seconds())
+            ticks = seconds * 1_000_000 + int(fraction.ljust(6, "0"))
+            rest = stem[: stamp.start()] + STAMP + stem[stamp.end() :]
+    return [token.casefold() for token in TOKEN.findall(rest)], ticks
 
 
 def _read_together(group: Sequence[list[str]], how: Pairing, stamps: Sequence[int | None]) -> list[Place | None]:
     """Return what names of one form say."""
-    mark = _letter(group, how)
+    # Which token is the letter of a frame: where both are seen, the last such.
+    letters = [k for k, token in enumerate(group[0]) if token in MARKS]
+    seen = [k for k in letters if len({MARKS[tokens[k]] for tokens in group}) == 2]
+    if not seen and how != "sequence":
+        # Unless it is of the number of a buffer, with which names begin as `B00001` and `B0001_0` do.
+        first, second, *_ = [*group[0], "", ""]
+        buffers = first == BUFFER and _is_number(second) and (len(second) == BUFFER_DIGITS or _ends_in_frame(group))
+        seen = [k for k in letters if k or not buffers]
+    mark = seen[-1] if seen else None
     marks = [] if mark is None else [MARKS[tokens[mark]] for tokens in group]
     if mark is None and how == "ab" and _ends_in_frame(group):
         mark = len(group[0]) - 1
@@ -162,22 +157,6 @@ def _read_together(group: Sequence[list[str]], how: Pairing, stamps: Sequence[in
     return places
 
 
-def _letter(group: Sequence[list[str]], how: Pairing) -> int | None:
-    """Return which token is the letter of a frame: where both are seen, the last such."""
-    letters = [k for k, token in enumerate(group[0]) if token in MARKS]
-    both = [k for k in letters if len({MARKS[tokens[k]] for tokens in group}) == 2]
-    if both or how == "sequence":
-        return both[-1] if both else None
-    single = [k for k in letters if not (k == 0 and _are_buffers(group))]
-    return single[-1] if single else None
-
-
-def _are_buffers(group: Sequence[list[str]]) -> bool:
-    """Return whether names begin with the number of a buffer, as `B00001` and `B0001_0` do."""
-    letter, number, *_ = [*group[0], "", ""]
-    return letter == BUFFER and _is_number(number) and (len(number) == BUFFER_DIGITS or _ends_in_frame(group))
-
-
 def _ends_in_frame(group: Sequence[list[str]]) -> bool:
     """Return whether names end in a number of their own that is the first's or the second's of a pair."""
     *before, last = group[0]
@@ -192,7 +171,10 @@ def _numbered(tokens: Sequence[str], group: Sequence[Sequence[str]]) -> tuple[st
     One that all have and that belongs to a word, as in `img_0001_8bit`, is no running number.
     """
     numbers = [k for k, token in enumerate(tokens) if _is_number(token)]
-    while len(numbers) > 1 and _is_of_word(numbers[-1], tokens, group):
+    while len(numbers) > 1 and len(group) > 1:
+        place = numbers[-1]
+        if not "".join(tokens[place + 1 : place + 2]).isalpha() or len({names[place] for names in group}) > 1:
+            break
         numbers.pop()
     if not numbers:
         return "".join(tokens), None
@@ -203,11 +185,6 @@ def _numbered(tokens: Sequence[str], group: Sequence[Sequence[str]]) -> tuple[st
 
 def _is_number(token: str) -> bool:
     return token.isascii() and token.isdigit()
-
-
-def _is_of_word(place: int, tokens: Sequence[str], group: Sequence[Sequence[str]]) -> bool:
-    followed = place + 1 < len(tokens) and tokens[place + 1].isalpha()
-    return followed and len(group) > 1 and len({names[place] for names in group}) == 1
 
 
 def _natural(text: str) -> tuple[bool, int, str]:

@@ -2,6 +2,9 @@
 
 A tree is a nested dict of numpy arrays, scalars, strings and None: dicts are groups, arrays datasets (each with
 its unit, the attribute `units`), all else attributes. The root says `format`, `format_version` and `provenance` (JSON).
+
+Here and in the modules of each format what reads a file raises `InputError` where it is missing, broken, of another
+format or version, or leads outside itself; what writes one raises as `atomic.write_atomically` does.
 """
 
 from __future__ import annotations
@@ -38,15 +41,7 @@ CHUNK_BYTES = 2**20
 # The units of arrays whose names end so; longer ends come before those that end them.
 UNITS_IN_NAMES = {"_per_mm2": "1/mm^2", "_mm2": "mm^2", "_mm": "mm", "_px": "pixel", "_deg": "degree"}
 # What h5py raises on a broken file, depending on where it breaks.
-BROKEN_FILE_ERRORS = (
-    OSError,
-    KeyError,
-    ValueError,
-    TypeError,
-    RuntimeError,
-    OverflowError,
-    AttributeError,
-)
+BROKEN_FILE_ERRORS = (OSError, KeyError, ValueError, TypeError, RuntimeError, OverflowError, AttributeError)
 
 
 def write_tree(
@@ -65,10 +60,6 @@ def write_tree(
     ----------
     tree : nested dict of arrays (float, int, uint8), scalars, strings and None
     units : of arrays by their names, where these do not say them (`UNITS_IN_NAMES`); 1 of pure numbers
-
-    Raises
-    ------
-    OutputExistsError, OutputError
     """
 
     def fill(file: h5py.File) -> None:
@@ -86,8 +77,7 @@ def read_tree(path: Path, format_name: str, format_versions: Collection[int]) ->
 
     Raises
     ------
-    InputError
-        If the file is missing, broken, of another format or version, or leads outside itself.
+    InputError : the file is missing, broken, of another format or version, or leads outside itself
     """
     with open_h5(path) as file:
         ensure_format(path, file, format_name, format_versions)
@@ -99,13 +89,9 @@ def read_tree(path: Path, format_name: str, format_versions: Collection[int]) ->
 
 
 def create(
-    path: Path,
-    fill: Callable[[h5py.File], None],
-    *,
-    overwrite: bool,
-    check: Callable[[Path], object],
+    path: Path, fill: Callable[[h5py.File], None], *, overwrite: bool, check: Callable[[Path], object] | None = None
 ) -> None:
-    """Create an HDF5 file atomically; `fill` writes into it, `check` reads it back."""
+    """Create an HDF5 file atomically; `fill` writes into it, `check` reads it back: by default its format."""
 
     def write(temporary: Path) -> None:
         try:
@@ -115,14 +101,16 @@ def create(
         except RuntimeError as error:  # h5py's word for a write that fails on closing
             raise OutputError(f"{path}: cannot be written: {reason(error)}") from error
 
-    write_atomically(path, write, overwrite=overwrite, check=check)
+    write_atomically(path, write, overwrite=overwrite, check=check or format_of)
 
 
 def write_array(group: h5py.Group, name: str, array: NDArray[Any], units: str | None = None) -> h5py.Dataset:
     """Write a numeric array with checksums; an array without elements has nothing to check."""
     array = np.ascontiguousarray(array)
     dataset = group.create_dataset(name, data=array, track_times=False, **_storage(name, array.shape, array.dtype))
-    return _with_units(dataset, units)
+    if units is not None:
+        dataset.attrs["units"] = np.bytes_(units)
+    return dataset
 
 
 def write_rows(
@@ -141,20 +129,22 @@ def write_rows(
             dataset[done : done + whole] = held[:whole]
         done += whole
         held = np.concatenate([held[whole:], piece]) if whole < len(held) else piece
-    return _with_units(dataset, units)
-
-
-def _storage(name: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> dict[str, Any]:
-    """Return how an array is stored; one without elements has no chunks."""
-    if dtype.kind not in "fiu":
-        raise TypeError(f"{name}: arrays are floating point or integer, not {dtype}")
-    return {"chunks": _chunk_shape(shape, dtype.itemsize), **FILTERS} if shape and 0 not in shape else {}
-
-
-def _with_units(dataset: h5py.Dataset, units: str | None) -> h5py.Dataset:
     if units is not None:
         dataset.attrs["units"] = np.bytes_(units)
     return dataset
+
+
+def _storage(name: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> dict[str, Any]:
+    """Return how an array is stored: in chunks of whole rows and planes below `CHUNK_BYTES`, where it has elements."""
+    if dtype.kind not in "fiu":
+        raise TypeError(f"{name}: arrays are floating point or integer, not {dtype}")
+    if not shape or 0 in shape:
+        return {}
+    left, chunk = max(CHUNK_BYTES // dtype.itemsize, 1), []
+    for n in reversed(shape):
+        chunk.append(max(min(n, left), 1))
+        left //= chunk[-1]
+    return {"chunks": tuple(reversed(chunk)), **FILTERS}
 
 
 def read_array(dataset: h5py.Dataset, file_bytes: int) -> NDArray[Any]:
@@ -197,12 +187,7 @@ def open_h5(path: Path) -> Iterator[h5py.File]:
 
 
 def format_of(path: Path) -> str:
-    """Return the name of a file's format.
-
-    Raises
-    ------
-    InputError : the file is missing, broken or not one of ours
-    """
+    """Return the name of a file's format."""
     with open_h5(path) as file:
         found = file.attrs.get("format")
         if not isinstance(found, bytes):
@@ -289,22 +274,12 @@ def _write_group(group: h5py.Group, tree: Tree, units: Mapping[str, str]) -> Non
         if isinstance(value, Mapping):
             _write_group(group.create_group(name), value, units)
         elif isinstance(value, np.ndarray):
-            write_array(group, name, value, _unit_of(name, units))
+            said = [unit for end, unit in UNITS_IN_NAMES.items() if name.endswith(end)]
+            if not said and name not in units:
+                raise ValueError(f"{name} has no unit: its name ends in none, and none is given")
+            write_array(group, name, value, said[0] if said else units[name])
         else:
             group.attrs[name] = to_attribute(value)
-
-
-def _unit_of(name: str, units: Mapping[str, str]) -> str:
-    """Return the unit of a tree's array.
-
-    Raises
-    ------
-    ValueError : nothing says it
-    """
-    said = [unit for end, unit in UNITS_IN_NAMES.items() if name.endswith(end)]
-    if not said and name not in units:
-        raise ValueError(f"{name} has no unit: its name ends in none, and none is given")
-    return said[0] if said else units[name]
 
 
 def _read_group(group: h5py.Group, file_bytes: int, levels: int) -> dict[str, Any]:
@@ -342,16 +317,6 @@ def from_attribute(name: str, value: Any) -> Any:
     raise ValueError(f"the attribute {name} is a {type(value).__name__}, expected a scalar or a string")
 
 
-def _chunk_shape(shape: tuple[int, ...], item_bytes: int) -> tuple[int, ...]:
-    """Return a chunk of whole rows and planes that stays below `CHUNK_BYTES`."""
-    left = max(CHUNK_BYTES // item_bytes, 1)
-    chunk = []
-    for n in reversed(shape):
-        chunk.append(max(min(n, left), 1))
-        left //= chunk[-1]
-    return tuple(reversed(chunk))
-
-
 # Whether a file of ours is there, and whether it is whole: all that it holds read back, through its checksums.
 
 
@@ -360,8 +325,7 @@ def read_whole(path: Path) -> dict[str, Any] | None:
 
     Raises
     ------
-    InputError
-        The file is broken, in any of its parts.
+    InputError : the file is broken, in any of its parts
     """
     with open_h5(path) as file:
         if "format" not in file.attrs or "provenance" not in file.attrs:
@@ -380,12 +344,7 @@ def read_whole(path: Path) -> dict[str, Any] | None:
 
 
 def ensure_opens(path: Path) -> None:
-    """Refuse a file that is missing, cut or no HDF5, in a fraction of the time that it takes to look at what it holds.
-
-    Raises
-    ------
-    InputError
-    """
+    """Refuse a file that is missing, cut or no HDF5, in a fraction of the time that looking at what it holds takes."""
     ensure_regular_file(path)
     try:
         with h5py.File(path, "r", locking="best-effort"):
@@ -405,12 +364,7 @@ def fault_of(paths: Iterable[Path]) -> str | None:
 
 
 def unpacked_bytes(path: Path) -> int:
-    """Return what the arrays of a file of ours take without compression.
-
-    Raises
-    ------
-    InputError
-    """
+    """Return what the arrays of a file of ours take without compression."""
     sizes: list[int] = []
 
     def add(_name: str, item: h5py.Group | h5py.Dataset) -> None:

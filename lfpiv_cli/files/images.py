@@ -1,11 +1,12 @@
 """Raw images in, images out: any of `FORMATS`, refused rather than guessed where anything is odd.
 
-Images are float32 arrays `[row, column]` in counts. Colour is read where its channels are all the same.
+Images are float32 arrays `[row, column]` in counts. Colour is read where its channels are all the same. What is odd is
+an `InputError` that names the file, in all formats.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files.atomic import write_atomically
 from lfpiv_cli.files.inputs import ensure_regular_file, opened, split_page, split_part
-from lfpiv_cli.files.recordings import blocks, davis, high_speed, stack, tiff
+from lfpiv_cli.files.recordings import blocks, cameras, stack, tiff
 from lfpiv_cli.files.recordings.recording import Image, Recording, Shape
 from lfpiv_cli.notice import written
 
@@ -55,30 +56,20 @@ FORMATS = (
     Format("TIFF", tiff.frames, starts=tiff.STARTS),
     Format("PNG", tiff.png_frames, starts=(tiff.PNG_START,)),
     Format("HDF5", stack.frames, starts=(stack.START,), frames_of=stack.frames_named, in_folders=False),
-    Format("Phantom cine", high_speed.cine_frames, starts=(high_speed.CINE_START,)),
-    Format("Norpix seq", high_speed.seq_frames, starts=(high_speed.SEQ_START,)),
-    Format("Photron mraw", high_speed.mraw_frames, suffixes=(high_speed.MRAW_SUFFIX,), beside=high_speed.beside),
-    Format("LaVision im7", davis.im7_frames, suffixes=(".im7",)),
-    Format("LaVision set", davis.set_frames, suffixes=(davis.SUFFIX,), beside=davis.beside, in_folders=False),
+    Format("Phantom cine", cameras.cine_frames, starts=(cameras.CINE_START,)),
+    Format("Norpix seq", cameras.seq_frames, starts=(cameras.SEQ_START,)),
+    Format("Photron mraw", cameras.mraw_frames, suffixes=(cameras.MRAW_SUFFIX,), beside=cameras.header_beside),
+    Format("LaVision im7", cameras.im7_frames, suffixes=(".im7",)),
+    Format(
+        "LaVision set",
+        cameras.set_frames,
+        suffixes=(cameras.SET_SUFFIX,),
+        beside=cameras.folder_beside,
+        in_folders=False,
+    ),
     RAW,
 )
 LONGEST_START = max(len(start) for each in FORMATS for start in each.starts)
-
-
-def open_recording(path: Path, part: str | None) -> Recording:
-    """Return what a file's header says of its frames.
-
-    Raises
-    ------
-    InputError : the file is broken or of no known format
-    UsageError : the format has no parts and one was named, or needs more to be said
-    """
-    found = format_of(path, part)
-    if part is None:
-        return found.frames(path)
-    if found.frames_of is None:
-        raise UsageError(f"{path}:{part}: {found.name} files have no parts or layouts to name")
-    return found.frames_of(path, part)
 
 
 def files_beside(path: Path) -> tuple[Path, ...]:
@@ -101,22 +92,15 @@ def format_of(path: Path, part: str | None = None) -> Format:
     ensure_regular_file(path)
     with opened(path) as file:
         start = file.read(LONGEST_START)
-    by_name = [each for each in FORMATS if path.suffix.lower() in each.suffixes]
     # Frames without a header can begin with any bytes.
-    if not by_name:
-        for each in FORMATS:
-            if each.starts and start.startswith(each.starts):
-                return each
-    if by_name:
-        return by_name[0]
+    found = [each for each in FORMATS if path.suffix.lower() in each.suffixes]
+    found = found or [each for each in FORMATS if each.starts and start.startswith(each.starts)]
+    if found:
+        return found[0]
     if part is not None and blocks.LOOKS_LAID_OUT.match(part):
         return RAW
-    raise InputError(f"{path}: is neither a TIFF nor a PNG image, nor a recording of {_others()}")
-
-
-def _others() -> str:
-    names = [each.name for each in FORMATS if each.name not in ("TIFF", "PNG")]
-    return ", ".join(names[:-1]) + f" or {names[-1]}"
+    *others, last = (each.name for each in FORMATS if each.name not in ("TIFF", "PNG"))
+    raise InputError(f"{path}: is neither a TIFF nor a PNG image, nor a recording of {', '.join(others)} or {last}")
 
 
 # Files whose headers are kept, so that a recording of thousands of frames is not looked through again for each. A batch
@@ -136,32 +120,28 @@ def frames(path: Path) -> Recording:
 
     Raises
     ------
-    InputError
-        If the file is missing, broken, or of no known format.
-    UsageError
-        If more has to be said, or what is said does not fit the format.
+    InputError : the file is missing, broken, or of no known format
+    UsageError : more has to be said, or what is said does not fit the format
     """
     file, part = split_part(path)
     ensure_regular_file(file)
-    return _frames(file, part, tuple(_state_of(each) for each in (file, *files_beside(file))))
-
-
-def _state_of(file: Path) -> tuple[int, int, int]:
-    """Return what changes when a file does."""
-    status = file.stat()
-    return status.st_size, status.st_mtime_ns, status.st_ino
+    states = (each.stat() for each in (file, *files_beside(file)))
+    return _frames(file, part, tuple((state.st_size, state.st_mtime_ns, state.st_ino) for state in states))
 
 
 @lru_cache(KEPT_HEADERS)
 def _frames(file: Path, part: str | None, states: tuple[tuple[int, int, int], ...]) -> Recording:
     """Read a header once; a file that has another size, time or place on the disk is looked at anew."""
     part, page = split_page(part)
-    recording = open_recording(file, part)
-    return recording if page is None else _only(file, recording, page)
-
-
-def _only(file: Path, recording: Recording, page: int) -> Recording:
-    """Return one page of a recording as a recording."""
+    found = format_of(file, part)
+    if part is None:
+        recording = found.frames(file)
+    elif found.frames_of is None:
+        raise UsageError(f"{file}:{part}: {found.name} files have no parts or layouts to name")
+    else:
+        recording = found.frames_of(file, part)
+    if page is None:
+        return recording
     if page >= recording.pages:
         raise InputError(f"{file}: has no page {page}, it holds {recording.pages}")
     time_s = None if recording.time_s is None else recording.time_s[page : page + 1]
@@ -173,16 +153,6 @@ def count_pages(path: Path) -> int:
     return frames(path).pages
 
 
-def times_of(path: Path) -> NDArray[np.float64] | None:
-    """Return when each frame of a file was taken, in s, shape (pages,); None where the file does not tell.
-
-    Raises
-    ------
-    InputError : as `frames`
-    """
-    return frames(path).time_s
-
-
 def read_image(path: Path, shape: Shape | None = None) -> Image:
     """Read the only frame of a file, shape (rows, columns), in counts.
 
@@ -192,8 +162,7 @@ def read_image(path: Path, shape: Shape | None = None) -> Image:
 
     Raises
     ------
-    InputError
-        If the file is broken, holds several frames, is in colour, or has another size.
+    InputError : the file is broken, holds several frames, is in colour, or has another size
     """
     pages = count_pages(path)
     if pages != 1:
@@ -225,40 +194,15 @@ def read_page(path: Path, page: int, shape: Shape | None = None) -> Image:
     return recording.read_page(page, shape)
 
 
-def ensure_shape(paths: Iterable[Path], shape: Shape) -> None:
-    """Refuse files whose headers say frames of another shape, before any of them is read.
-
-    Raises
-    ------
-    InputError : as `read_page`
-    """
-    for path in paths:
-        if frames(path).shape != shape:
-            read_page(path, 0, shape)  # says what is wrong
-
-
 def write_tiff(path: Path, array: NDArray[Any], overwrite: bool) -> None:
-    """Write an image (rows, columns) of type uint8 or uint16, packed without loss and without time stamps.
-
-    Raises
-    ------
-    OutputExistsError, OutputError
-    """
+    """Write an image (rows, columns) of type uint8 or uint16, packed without loss and without time stamps."""
     if array.dtype not in (np.uint8, np.uint16, np.float32) or array.ndim != 2:
         raise TypeError(f"images are uint8, uint16 or float32 (rows, columns), not {array.dtype} {array.shape}")
 
-    def write(temporary: Path) -> None:
-        tifffile.imwrite(
-            temporary,
-            array,
-            photometric="minisblack",
-            compression="zlib",
-            predictor=array.dtype != np.float32,
-            metadata=None,
-            software=False,
-        )
-
-    def check(temporary: Path) -> None:
-        tiff.frames(temporary).read_page(0, (array.shape[0], array.shape[1]))
-
-    write_atomically(path, write, overwrite=overwrite, check=check)
+    kept = {"compression": "zlib", "predictor": array.dtype != np.float32, "metadata": None, "software": False}
+    write_atomically(
+        path,
+        lambda temporary: tifffile.imwrite(temporary, array, photometric="minisblack", **kept),
+        overwrite=overwrite,
+        check=lambda temporary: tiff.frames(temporary).read_page(0, (array.shape[0], array.shape[1])),
+    )

@@ -81,8 +81,7 @@ def ensure_regular_file(path: Path) -> int:
 
     Raises
     ------
-    InputError
-        If the file is missing, not a regular file, empty or not readable.
+    InputError : the file is missing, not a regular file, empty or not readable
     """
     try:
         status = os.stat(path)
@@ -121,12 +120,7 @@ def address_space() -> int | None:
 
 
 def ensure_address_space() -> None:
-    """Refuse to begin where the libraries would end the process, without a word, for want of addresses.
-
-    Raises
-    ------
-    OutputError
-    """
+    """Refuse to begin where the libraries would end the process, without a word, for want of addresses."""
     limit = address_space()
     if limit is not None and limit < LEAST_ADDRESS_SPACE:
         raise OutputError(
@@ -145,8 +139,7 @@ def physical_memory() -> int:
     return memory if limit is None else min(memory, limit)
 
 
-# Whether the memory suffices for what is about to be done, as far as that is known: said before, with the size.
-
+# Whether memory and disk suffice for what is about to be done, as far as that is known: an `OutputError` with the size.
 
 # What the program takes with its libraries and compiled code.
 PROGRAM_BYTES = 300e6
@@ -162,10 +155,6 @@ def ensure_room(held_bytes: float, work: str, remedy: str = "a smaller volume, o
     held_bytes : arrays that are yet to be made
     work : what makes them
     remedy : what needs less
-
-    Raises
-    ------
-    OutputError
     """
     for left, by in _rooms():
         if held_bytes > left:
@@ -176,12 +165,7 @@ def ensure_room(held_bytes: float, work: str, remedy: str = "a smaller volume, o
 
 
 def ensure_disk(file_bytes: float, target: Path) -> None:
-    """Refuse to begin what makes a file that the disk has no room for.
-
-    Raises
-    ------
-    OutputError
-    """
+    """Refuse to begin what makes a file that the disk has no room for."""
     left = shutil.disk_usage(target.parent).free
     if file_bytes > left:
         raise OutputError(f"{target}: needs {_gb(file_bytes)} GB, and {_gb(left)} GB are free on the disk")
@@ -193,26 +177,21 @@ def _rooms() -> Iterator[tuple[float, str]]:
     limit = address_space()
     if limit is not None:
         yield max(limit - own.get("VmSize", 0), 0), "this process's address space (ulimit -v)"
-    for path in _group_limits():
-        if (text := _text(path).strip()).isdecimal():
-            yield max(int(text) - own.get("VmRSS", 0), 0), "this job's limit (its control group)"
+    for line in _text(PROCESS / "cgroup").splitlines():
+        _, controllers, group = line.split(":", 2)
+        if controllers and "memory" not in controllers.split(","):
+            continue
+        # Both versions of control groups; a limit on a group holds for all groups in it.
+        base, name = CONTROL_GROUPS, "memory.max"
+        if controllers:
+            base, name = CONTROL_GROUPS / "memory", "memory.limit_in_bytes"
+        place = base / group.lstrip("/")
+        for folder in (place, *place.parents):
+            if (folder == base or base in folder.parents) and (text := _text(folder / name).strip()).isdecimal():
+                yield max(int(text) - own.get("VmRSS", 0), 0), "this job's limit (its control group)"
     machine = _told(MACHINE)
     if "MemAvailable" in machine:
         yield machine["MemAvailable"] + machine.get("SwapFree", 0), "this machine"
-
-
-def _group_limits() -> Iterator[Path]:
-    """Yield the files that hold the memory limits of this process's control groups, for both of their versions."""
-    for line in _text(PROCESS / "cgroup").splitlines():
-        _, controllers, group = line.split(":", 2)
-        if controllers == "" or "memory" in controllers.split(","):
-            second = controllers == ""
-            base = CONTROL_GROUPS if second else CONTROL_GROUPS / "memory"
-            place = base / group.lstrip("/")
-            # A limit on a group holds for all groups in it.
-            for folder in (place, *place.parents):
-                if folder == base or base in folder.parents:
-                    yield folder / ("memory.max" if second else "memory.limit_in_bytes")
 
 
 def _told(path: Path) -> dict[str, int]:

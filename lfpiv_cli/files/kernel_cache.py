@@ -16,7 +16,6 @@ import os
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -40,7 +39,13 @@ def ensure_place() -> None:
     given = os.environ.get(VARIABLE)
     if not given:
         forget_outdated(PACKAGE)
-    if any(map(_is_writable, [Path(given)] if given else _numbas_places())):
+    # Where numba keeps compiled code of its own accord: beside the source, then with the user.
+    places = [PACKAGE / "__pycache__", Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))]
+    if sys.platform == "win32":
+        places[1] = Path(os.environ.get("LOCALAPPDATA", PACKAGE))
+    elif sys.platform == "darwin":
+        places[1] = Path(os.path.expanduser("~/Library/Caches"))
+    if any(map(_is_writable, [Path(given)] if given else places)):
         return
     place = tempfile.mkdtemp(prefix="lfpiv-kernels-")
     atexit.register(shutil.rmtree, place, ignore_errors=True)
@@ -61,7 +66,17 @@ def forget_outdated(package: Path) -> None:
             return
         lines = set(before.splitlines())
         changed = {path for path, time in times.items() if f"{path.relative_to(package)} {time}" not in lines}
-        outdated = _importing(changed, _imports(package, list(times)))
+        imports: dict[Path, set[Path]] = {}
+        for path in times:
+            nodes = [node for node in ast.walk(ast.parse(path.read_bytes())) if isinstance(node, ast.ImportFrom)]
+            names = [f"{node.module}.{each.name}" for node in nodes for each in node.names]
+            names += [node.module or "" for node in nodes]
+            imports[path] = {package.parent.joinpath(*name.split(".")).with_suffix(".py") for name in names}
+        # What has changed, and what imports such files.
+        outdated: set[Path] = set()
+        while changed:
+            outdated |= changed
+            changed = {path for path, imported in imports.items() if path not in outdated and imported & outdated}
         for kernel in [*package.rglob("*.nbi"), *package.rglob("*.nbc")]:
             source = kernel.parents[1] / f"{kernel.name.split('.')[0]}.py"
             if source in outdated or source not in times:
@@ -70,45 +85,11 @@ def forget_outdated(package: Path) -> None:
         stamp.write_text(current, encoding="utf-8")
 
 
-def _imports(package: Path, files: list[Path]) -> dict[Path, set[Path]]:
-    """Return which of the package's files each one imports by name."""
-    found: dict[Path, set[Path]] = {}
-    for path in files:
-        nodes = list(ast.walk(ast.parse(path.read_bytes())))
-        names = [
-            f"{node.module}.{each.name}" for node in nodes if isinstance(node, ast.ImportFrom) for each in node.names
-        ]
-        names += [node.module or "" for node in nodes if isinstance(node, ast.ImportFrom)]
-        found[path] = {package.parent.joinpath(*name.split(".")).with_suffix(".py") for name in names}
-    return found
-
-
-def _importing(changed: set[Path], imports: dict[Path, set[Path]]) -> set[Path]:
-    """Return files that have changed, and those that import such ones."""
-    reached: set[Path] = set()
-    more = changed
-    while more:
-        reached |= more
-        more = {path for path, imported in imports.items() if path not in reached and imported & reached}
-    return reached
-
-
 def use(place: Path) -> None:
     """Keep compiled kernels in a folder from here on, in processes started from this one, too."""
     os.environ[VARIABLE] = str(place)
     if "numba" in sys.modules:
         sys.modules["numba"].config.CACHE_DIR = str(place)
-
-
-def _numbas_places() -> Iterator[Path]:
-    """Yield where numba keeps compiled code of its own accord: beside the source, then with the user."""
-    yield PACKAGE / "__pycache__"
-    if sys.platform == "win32":
-        yield Path(os.environ.get("LOCALAPPDATA", PACKAGE))
-    elif sys.platform == "darwin":
-        yield Path(os.path.expanduser("~/Library/Caches"))
-    else:
-        yield Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
 
 
 def _is_writable(folder: Path) -> bool:

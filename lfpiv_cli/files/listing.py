@@ -7,6 +7,7 @@ import re
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from lfpiv_cli.errors import InputError
@@ -17,7 +18,6 @@ from lfpiv_cli.files.provenance import sha256
 from lfpiv_cli.names import InputKind
 
 # Inputs against a list of their SHA-256, as `sha256sum` writes it: most cameras' formats have no check sum.
-
 
 # `sha256sum` writes a star before the names of files that are read as bytes.
 LINE = re.compile(r"([0-9a-fA-F]{64}) [ *](.+)")
@@ -31,15 +31,18 @@ def ensure_verified(listed: Path, inputs: Iterable[Path]) -> int:
     ----------
     listed : the list; names in it count from its folder
     inputs : files, and folders of which all that is listed is asked
-
-    Raises
-    ------
-    InputError
     """
     expected = _read(listed)
     given = [split_part(path)[0] for path in inputs]
     read = [each for path in given for each in (path, *(() if os.path.isdir(path) else files_beside(path)))]
-    asked = dict(pair for path in read for pair in _files(path, listed, expected))
+    # The name that each file was given under, by its resolved name.
+    asked: dict[Path, Path] = {}
+    for path in read:
+        resolved = path.resolve()
+        inside = [file for file in expected if resolved in file.parents] if os.path.isdir(resolved) else [resolved]
+        if not inside or (inside == [resolved] and resolved not in expected):
+            raise InputError(f"{path}: is not in {listed}, which lists {len(expected)} files")
+        asked |= {file: path if file == resolved else file for file in inside}
     for file, name in asked.items():
         found = sha256(file)
         if found != expected[file]:
@@ -47,16 +50,6 @@ def ensure_verified(listed: Path, inputs: Iterable[Path]) -> int:
                 f"{name}: has the SHA-256 {found}, {listed} says {expected[file]}: it is damaged, or another"
             )
     return len(asked)
-
-
-def _files(path: Path, listed: Path, expected: dict[Path, str]) -> Iterator[tuple[Path, Path]]:
-    """Yield the resolved name of each file that an input is, with the one that it was given under."""
-    resolved = path.resolve()
-    inside = [file for file in expected if resolved in file.parents] if os.path.isdir(resolved) else [resolved]
-    if not inside or (inside == [resolved] and resolved not in expected):
-        raise InputError(f"{path}: is not in {listed}, which lists {len(expected)} files")
-    for file in inside:
-        yield file, path if file == resolved else file
 
 
 def _read(listed: Path) -> dict[Path, str]:
@@ -80,7 +73,6 @@ def _read(listed: Path) -> dict[Path, str]:
 
 # Folders that a camera, or another command, is still filling: files are taken when they are complete, in order.
 
-
 # A file is complete when it can be read and has not grown for so long: cameras write a frame at once, or page by page.
 SETTLED_S = 2.0
 LOOK_S = 0.5
@@ -90,9 +82,7 @@ State = tuple[int, int]
 
 
 def as_they_come(
-    listed: Callable[[], Sequence[Path]],
-    read: Callable[[Path], object],
-    idle_s: float,
+    listed: Callable[[], Sequence[Path]], read: Callable[[Path], object], idle_s: float
 ) -> Iterator[list[Path]]:
     """Yield the files that are complete, in groups, until nothing has changed for `idle_s` seconds.
 
@@ -104,64 +94,39 @@ def as_they_come(
     listed : returns the files that are there now, in order
     read : raises `InputError` where a file cannot be read yet
     """
-    folder, idle_s = _Filling(listed, read), max(idle_s, SETTLED_S)
+    taken: set[Path] = set()
+    # Since when each file that was not taken is as it is.
+    waiting: dict[Path, tuple[State, float]] = {}
+    changed_at = time.monotonic()
     while True:
-        folder.look()
-        if ready := folder.complete():
-            folder.take(ready)
+        now, before, waiting = time.monotonic(), waiting, {}
+        for path in listed():
+            if path in taken or (state := _state(path)) is None:
+                continue
+            known = before.get(path)
+            waiting[path] = known if known is not None and known[0] == state else (state, now)
+            if waiting[path] is not known:
+                changed_at = now
+
+        # The first of the files that wait, up to one that is not complete.
+        now, ready = time.monotonic(), []
+        for path, (_, since) in waiting.items():
+            if now - since < SETTLED_S:
+                break
+            try:
+                read(path)
+            except InputError:
+                break
+            ready.append(path)
+        if ready:
+            taken.update(ready)
             yield ready
-        elif time.monotonic() - folder.changed_at >= idle_s:
+        elif time.monotonic() - changed_at >= max(idle_s, SETTLED_S):
             break
         else:
             time.sleep(LOOK_S)
-    if rest := list(folder.waiting):
-        yield rest
-
-
-class _Filling:
-    """What is known of files that are being written."""
-
-    def __init__(self, listed: Callable[[], Sequence[Path]], read: Callable[[Path], object]) -> None:
-        """Take how the files are listed and read."""
-        self._listed, self._read = listed, read
-        self._taken: set[Path] = set()
-        # Since when each file that was not taken is as it is.
-        self.waiting: dict[Path, tuple[State, float]] = {}
-        self.changed_at = time.monotonic()
-
-    def look(self) -> None:
-        """Note which files are new, or have changed since the last look."""
-        now, before = time.monotonic(), self.waiting
-        self.waiting = {}
-        for path in self._listed():
-            if path in self._taken or (state := _state(path)) is None:
-                continue
-            known = before.get(path)
-            self.waiting[path] = known if known is not None and known[0] == state else (state, now)
-            if self.waiting[path] is not known:
-                self.changed_at = now
-
-    def complete(self) -> list[Path]:
-        """Return the first of the files that wait, up to one that is not complete."""
-        now, complete = time.monotonic(), []
-        for path, (_, since) in self.waiting.items():
-            if now - since < SETTLED_S or not self._is_readable(path):
-                break
-            complete.append(path)
-        return complete
-
-    def take(self, paths: Sequence[Path]) -> None:
-        """Leave these out from here on."""
-        self._taken.update(paths)
-        for path in paths:
-            del self.waiting[path]
-
-    def _is_readable(self, path: Path) -> bool:
-        try:
-            self._read(path)
-        except InputError:
-            return False
-        return True
+    if waiting:
+        yield list(waiting)
 
 
 def _state(path: Path) -> State | None:
@@ -209,7 +174,13 @@ def expanded(paths: Iterable[Path], kind: InputKind) -> list[Path]:
     ------
     InputError : a folder cannot be read, or holds none
     """
-    return [path for given in paths for path in (_some_in(given, kind) if os.path.isdir(given) else [given])]
+    found: list[Path] = []
+    for given in paths:
+        inside = files_in(given, kind) if os.path.isdir(given) else [given]
+        if not inside:
+            raise InputError(f"{given}: holds {'no images' if kind == 'images' else f'no {VTKHDF_SUFFIX} files'}")
+        found += inside
+    return found
 
 
 def _natural(name: str) -> list[str | int]:
@@ -220,33 +191,22 @@ def _natural(name: str) -> list[str | int]:
 def files_in(folder: Path, kind: InputKind) -> list[Path]:
     """Return the files in a folder that are of a kind, in natural order; those whose names begin with a dot are not.
 
+    A kind is told by the name, an image also by its first bytes.
+
     Raises
     ------
     InputError : the folder cannot be read
     """
+    found = []
     with reading_from(folder):
-        found = [path for path in folder.iterdir() if not path.name.startswith(".") and _is_of(path, kind)]
+        for path in folder.iterdir():
+            suffix = path.suffix.lower()
+            if path.name.startswith(".") or path.is_dir():
+                continue
+            is_of_kind = suffix in IMAGE_SUFFIXES if kind == "images" else suffix == VTKHDF_SUFFIX
+            if not is_of_kind and kind == "images":
+                with suppress(InputError):
+                    is_of_kind = format_of(path).in_folders
+            if is_of_kind:
+                found.append(path)
     return sorted(found, key=lambda path: (_natural(path.name), path.name))
-
-
-def _some_in(folder: Path, kind: InputKind) -> list[Path]:
-    found = files_in(folder, kind)
-    if not found:
-        what = "no images" if kind == "images" else f"no {VTKHDF_SUFFIX} files"
-        raise InputError(f"{folder}: holds {what}")
-    return found
-
-
-def _is_of(path: Path, kind: InputKind) -> bool:
-    """Return whether a file in a folder is of a kind: by its name, an image also by its first bytes."""
-    suffix = path.suffix.lower()
-    if path.is_dir():
-        return False
-    if kind == "results":
-        return suffix == VTKHDF_SUFFIX
-    if suffix in IMAGE_SUFFIXES:
-        return True
-    try:
-        return format_of(path).in_folders
-    except InputError:
-        return False

@@ -13,14 +13,13 @@ from typing import TYPE_CHECKING
 
 from lfpiv_cli.errors import UsageError
 from lfpiv_cli.files.atomic import write_atomically, write_text
-from lfpiv_cli.files.inputs import ensure_regular_file
+from lfpiv_cli.files.inputs import content_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
 # Pictures to look at, written like every other output. Drawing needs the optional package matplotlib.
-
 
 DOTS_PER_INCH = 110
 
@@ -35,11 +34,11 @@ def ensure_drawing() -> None:
 
 def write_picture(path: Path, figure: Figure, overwrite: bool) -> None:
     """Write a figure as PNG; without time stamps, so that the same figure gives the same bytes."""
-
-    def save(target: Path) -> None:
-        figure.savefig(target, format="png", dpi=DOTS_PER_INCH, metadata={"Software": None})
-
-    write_atomically(path, save, overwrite=overwrite)
+    write_atomically(
+        path,
+        lambda target: figure.savefig(target, format="png", dpi=DOTS_PER_INCH, metadata={"Software": None}),
+        overwrite=overwrite,
+    )
 
 
 def write_pdf(path: Path, figures: Iterable[Figure], overwrite: bool) -> None:
@@ -114,12 +113,7 @@ def ensure_pages() -> None:
 
 
 def write_pages(page: Page, targets: Iterable[Path], overwrite: bool) -> None:
-    """Write a page as HTML with its pictures inside, or as Markdown that links to them, as each target's name ends.
-
-    Raises
-    ------
-    InputError : a picture cannot be read
-    """
+    """Write a page as HTML with its pictures inside, or as Markdown that links to them, as each target's name ends."""
     for target in targets:
         write_text(target, _rendered(page, target), overwrite)
 
@@ -137,14 +131,9 @@ def _rendered(page: Page, target: Path) -> str:
         keep_trailing_newline=True,
     )
     places.filters |= {
-        "data_uri": _data_uri,
+        # A PNG file as an address that holds the picture itself.
+        "data_uri": lambda path: "data:image/png;base64," + base64.b64encode(content_of(path)).decode("ascii"),
         "cell": lambda text: text.replace("|", "\\|"),
         "relative": lambda path: path.relative_to(target.parent).as_posix(),
     }
     return places.get_template(f"page{target.suffix}").render(page=page)
-
-
-def _data_uri(path: Path) -> str:
-    """Return a PNG file as an address that holds the picture itself."""
-    ensure_regular_file(path)
-    return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode("ascii")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path, PurePath
@@ -131,20 +131,33 @@ def pair_frames(frames: Sequence[Seen], how: Pairing, by: str | None = None) -> 
     ------
     UsageError : there is only one frame, or `by` is no such template
     """
-    if len(frames) < 2:
-        raise UsageError(f"--pairing {how}: needs two or more frames, got {len(frames)}")
+    count = len(frames)
+    if count < 2:
+        raise UsageError(f"--pairing {how}: needs two or more frames, got {count}")
     found = _Found([frame.name for frame in frames])
-    once = _without_repeated(frames, found)
+    first: dict[str, int] = {}
+    once = []  # of each image the first frame only
+    for number, frame in enumerate(frames):
+        earlier = number if frame.image is None else first.setdefault(frame.image, number)
+        if earlier == number:
+            once.append(number)
+        else:
+            found.leave_out([number], f"shows the same image as {frames[earlier].name}")
     places = _places([frames[number] for number in once], how, by)
-    if all(place is None for place in places) and by is None and len(once) == len(frames):
-        return _by_order(frames, how)
+
+    # Where names tell nothing, frames are paired as they were given.
+    if all(place is None for place in places) and by is None and len(once) == count:
+        found.pairs = [(k, k + 1) for k in range(0, count - 1, 2 if how == "ab" else 1)]
+        if count > 2:
+            text = f"the names of {count} frames have no numbers, and only the order in which they are given pairs them"
+            remedy = "number them, so that a missing one is seen"
+            found.notices.append(Notice("paired-by-order", frames[0].name, text, remedy))
+            found.leave_out([count - 1] if how == "ab" and count % 2 else [], "no frame comes after it")
+        return found.told(how)
     placed = {number: place for number, place in zip(once, places, strict=True) if place is not None}
     missed = NO_PLACE if by is None else f"its name is not of the form {by}"
     found.leave_out((number for number in once if number not in placed), missed)
-    if how == "ab":
-        _pair(placed, found)
-    else:
-        _follow(placed, found)
+    (_pair if how == "ab" else _follow)(placed, found)
     return found.told(how)
 
 
@@ -198,35 +211,6 @@ def _places(frames: Sequence[Seen], how: Pairing, by: str | None) -> list[Place 
     ]
 
 
-def _without_repeated(frames: Sequence[Seen], found: _Found) -> list[int]:
-    """Return the numbers of the frames, of each image the first only."""
-    first: dict[str, int] = {}
-    kept = []
-    for number, frame in enumerate(frames):
-        earlier = number if frame.image is None else first.setdefault(frame.image, number)
-        if earlier == number:
-            kept.append(number)
-        else:
-            found.leave_out([number], f"shows the same image as {frames[earlier].name}")
-    return kept
-
-
-def _by_order(frames: Sequence[Seen], how: Pairing) -> Pairs:
-    """Return the pairs where names tell nothing: as they were given."""
-    count, step = len(frames), 2 if how == "ab" else 1
-    pairs = tuple((k, k + 1) for k in range(0, count - 1, step))
-    if count == 2:
-        return Pairs(pairs, separate=how == "ab")
-    notice = Notice(
-        "paired-by-order",
-        frames[0].name,
-        f"the names of {count} frames have no numbers, and only the order in which they are given pairs them",
-        "number them, so that a missing one is seen",
-    )
-    alone = (LeftOut(frames[-1].name, "no frame comes after it"),) if how == "ab" and count % 2 else ()
-    return Pairs(pairs, alone, (notice,), how == "ab")
-
-
 def _pair(places: Mapping[int, Place], found: _Found) -> None:
     """Find separate pairs."""
     numbered = _by_series({number: place for number, place in places.items() if place.frame is None})
@@ -236,30 +220,30 @@ def _pair(places: Mapping[int, Place], found: _Found) -> None:
             slots[place.series, place.number][place.frame].append(number)
     open_ones = [series for series, members in numbered.items() if places[members[0]].begins is None]
     for series, members in numbered.items():
-        begins = places[members[0]].begins
+        begins: int | str | None = places[members[0]].begins
         if begins is None and len(open_ones) > 1:
-            found.leave_out(members, _several(open_ones))
-            continue
-        begins = _beginning([places[k].number for k in members]) if begins is None else begins
-        if begins is None:
-            found.leave_out(members, _unknown_beginning([places[k].number for k in members]))
+            begins = (
+                f"running numbers are of {len(open_ones)} series ({', '.join(open_ones[:3])}), so it is open what is "
+                "first and second of a pair"
+            )
+        elif begins is None:
+            begins = _beginning([places[k].number for k in members])
+        if isinstance(begins, str):
+            found.leave_out(members, begins)
             continue
         for k in members:
-            pair, frame = divmod(places[k].number - begins, 2)
-            slots[series, pair][frame].append(k)
+            pair, half = divmod(places[k].number - begins, 2)
+            slots[series, pair][half].append(k)
     for _, slot in sorted(slots.items()):
-        _take(slot[0], slot[1], found)
-
-
-def _take(first: Sequence[int], second: Sequence[int], found: _Found) -> None:
-    """Take a pair, or say which frame of it is missing or there twice."""
-    if len(first) == len(second) == 1:
-        found.pairs.append((first[0], second[0]))
-    elif len(first) > 1 or len(second) > 1:
-        names = " and ".join(found.names[k] for k in (first if len(first) > 1 else second))
-        found.leave_out((*first, *second), f"of its pair one frame is there twice: {names}")
-    else:
-        found.leave_out((*first, *second), f"the {'second' if first else 'first'} frame of its pair is missing")
+        if len(slot[0]) == len(slot[1]) == 1:
+            found.pairs.append((slot[0][0], slot[1][0]))
+        elif len(slot[0]) > 1 or len(slot[1]) > 1:
+            names = " and ".join(found.names[k] for k in (slot[0] if len(slot[0]) > 1 else slot[1]))
+            found.leave_out((*slot[0], *slot[1]), f"of its pair one frame is there twice: {names}")
+        else:
+            found.leave_out(
+                (*slot[0], *slot[1]), f"the {'second' if slot[0] else 'first'} frame of its pair is missing"
+            )
 
 
 def _by_series(places: Mapping[int, Place]) -> dict[str, list[int]]:
@@ -275,19 +259,16 @@ def _position(place: Place) -> int:
     return place.number if place.frame is None else 2 * place.number + place.frame
 
 
-def _beginning(numbers: Sequence[int]) -> int | None:
-    """Return where running numbers begin that are those of whole pairs; None where a lost frame leaves it open.
+def _beginning(numbers: Sequence[int]) -> int | str:
+    """Return where running numbers begin that are those of whole pairs, or why a lost frame leaves it open.
 
     Frames count from 0 or from 1. With 0 there, it is known; without it, 0 may be what is missing, and where any number
     is missing all others might stand in the wrong halves of pairs. Where neither is there, the first may be a second.
     """
     if numbers[0] == 0:
         return 0
-    whole = len(numbers) % 2 == 0 and list(numbers) == list(range(1, 1 + len(numbers)))
-    return 1 if whole else None
-
-
-def _unknown_beginning(numbers: Sequence[int]) -> str:
+    if len(numbers) % 2 == 0 and list(numbers) == list(range(1, 1 + len(numbers))):
+        return 1
     missing = next((before + 1 for before, after in pairwise(numbers) if after > before + 1), None)
     lost = "not all make pairs" if missing is None else f"{missing} is missing"
     if missing is None and numbers[0] > 1:
@@ -298,13 +279,8 @@ def _unknown_beginning(numbers: Sequence[int]) -> str:
     )
 
 
-def _several(series: Sequence[str]) -> str:
-    names = ", ".join(series[:3])
-    return f"running numbers are of {len(series)} series ({names}), so it is open what is first and second of a pair"
-
-
 def _follow(places: Mapping[int, Place], found: _Found) -> None:
-    """Find pairs of each frame with the next."""
+    """Find pairs of each frame with the next, none across a gap."""
     for members in _by_series(places).values():
         at: dict[int, list[int]] = defaultdict(list)
         for number in members:
@@ -313,23 +289,18 @@ def _follow(places: Mapping[int, Place], found: _Found) -> None:
             names = " and ".join(found.names[k] for k in twice)
             found.leave_out(twice, f"the same frame is there twice: {names}")
         once = [(position, numbers[0]) for position, numbers in at.items() if len(numbers) == 1]
-        _neighbours(once, found)
-
-
-def _neighbours(frames: Sequence[tuple[int, int]], found: _Found) -> None:
-    """Pair each frame with the next, none across a gap."""
-    if len(frames) == 1:
-        found.leave_out([frames[0][1]], "no frame comes before or after it")
-    step = min((after[0] - before[0] for before, after in pairwise(frames)), default=1)
-    for (position, number), (following, after) in pairwise(frames):
-        if following - position <= MOST_STEPS * step:
-            found.pairs.append((number, after))
-        else:
-            found.leave_out([after], f"frames are missing between {found.names[number]} and it")
-    if step > 1:
-        text = f"numbers go up by {step}; each frame is taken with the next that is there"
-        remedy = "where frames are missing between them, set dt_s to the time between those that are there"
-        found.notices.append(Notice("numbers-apart", found.names[frames[0][1]], text, remedy, float(step), "1"))
+        if len(once) == 1:
+            found.leave_out([once[0][1]], "no frame comes before or after it")
+        step = min((after[0] - before[0] for before, after in pairwise(once)), default=1)
+        for (position, number), (following, after) in pairwise(once):
+            if following - position <= MOST_STEPS * step:
+                found.pairs.append((number, after))
+            else:
+                found.leave_out([after], f"frames are missing between {found.names[number]} and it")
+        if step > 1:
+            text = f"numbers go up by {step}; each frame is taken with the next that is there"
+            remedy = "where frames are missing between them, set dt_s to the time between those that are there"
+            found.notices.append(Notice("numbers-apart", found.names[once[0][1]], text, remedy, float(step), "1"))
 
 
 # Lists of pairs as people write them: a line for each pair, with the names of its two frames.
@@ -345,52 +316,35 @@ def pairs_listed(path: Path, frames: Sequence[Seen]) -> Pairs:
     ------
     InputError : the list cannot be read, a line does not name two frames, or a name is that of several
     """
-    called = _called(frames)
+    called: dict[str, set[int]] = defaultdict(set)
+    for number, frame in enumerate(frames):
+        for name in (frame.name, PurePath(frame.name).name, frame.path, PurePath(frame.path).name):
+            called[name].add(number)
     pairs: list[tuple[int, int]] = []
     left_out: list[LeftOut] = []
-    for line, names in _lines(path):
-        numbers = [_number(f"{path}:{line}", name, called) for name in names]
-        missing = [name for name, number in zip(names, numbers, strict=True) if number is None]
-        left_out += [LeftOut(name, f"is in {path}, line {line}, and not among the frames given") for name in missing]
-        if not missing:
-            first, second = (number for number in numbers if number is not None)
+    text = content_of(path).decode("utf-8", errors="surrogateescape")
+    for place, line in enumerate(text.splitlines(), start=1):
+        words = line.partition("#")[0].strip()
+        names = [name.strip() for name in words.split(next((each for each in ",;\t" if each in words), None))]
+        if not words:
+            continue
+        if len(names) != 2 or not all(names):
+            raise InputError(
+                f"{path}:{place}: {line.strip()!r} is not two names, with a comma, a tab or blanks between"
+            )
+        here = [called.get(name, called.get(PurePath(name).as_posix(), set())) for name in names]
+        for name, numbers in zip(names, here, strict=True):
+            if len(numbers) > 1:
+                several = f"{name!r} is the name of {len(numbers)} frames; give its folder, too"
+                raise InputError(f"{path}:{place}: {several}")
+            if not numbers:
+                left_out.append(LeftOut(name, f"is in {path}, line {place}, and not among the frames given"))
+        if all(here):
+            (first,), (second,) = here
             if first == second:
-                raise InputError(f"{path}:{line}: names {names[0]} twice, where a pair has two frames")
+                raise InputError(f"{path}:{place}: names {names[0]} twice, where a pair has two frames")
             pairs.append((first, second))
     unlisted = len(frames) - len({number for pair in pairs for number in pair})
     text = f"{unlisted} of the frames given are in none of its pairs"
     notices = [Notice("frames-unlisted", str(path), text, "add them, or leave them out", float(unlisted), "0")]
     return Pairs(tuple(pairs), tuple(left_out), tuple(notices if unlisted else ()))
-
-
-def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Yield the number of each line and the two names on it."""
-    text = content_of(path).decode("utf-8", errors="surrogateescape")
-    for number, line in enumerate(text.splitlines(), start=1):
-        words = line.partition("#")[0].strip()
-        separator = next((each for each in ",;\t" if each in words), None)
-        names = [name.strip() for name in words.split(separator)]
-        if not words:
-            continue
-        if len(names) != 2 or not all(names):
-            raise InputError(
-                f"{path}:{number}: {line.strip()!r} is not two names, with a comma, a tab or blanks between"
-            )
-        yield number, names
-
-
-def _called(frames: Sequence[Seen]) -> Mapping[str, set[int]]:
-    """Return the numbers of the frames by all that they may be called."""
-    called: dict[str, set[int]] = defaultdict(set)
-    for number, frame in enumerate(frames):
-        for name in (frame.name, PurePath(frame.name).name, frame.path, PurePath(frame.path).name):
-            called[name].add(number)
-    return called
-
-
-def _number(place: str, name: str, called: Mapping[str, set[int]]) -> int | None:
-    """Return the number of the frame that is called so, None where none is."""
-    numbers = called.get(name, called.get(PurePath(name).as_posix(), set()))
-    if len(numbers) > 1:
-        raise InputError(f"{place}: {name!r} is the name of {len(numbers)} frames; give its folder, too")
-    return next(iter(numbers), None)

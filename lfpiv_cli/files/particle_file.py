@@ -11,7 +11,8 @@ import math
 import tempfile
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -23,15 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.errors import InputError, OutputError
-from lfpiv_cli.files.hdf5 import (
-    create,
-    ensure_format,
-    format_of,
-    open_h5,
-    read_array,
-    write_array,
-    write_rows,
-)
+from lfpiv_cli.files.hdf5 import create, ensure_format, format_of, open_h5, read_array, write_array, write_rows
 from lfpiv_cli.files.hdf5_checks import array_member
 from lfpiv_cli.files.inputs import reason
 from lfpiv_cli.files.vtkhdf import create_vtk_group, read_root, write_root
@@ -41,34 +34,39 @@ from lfpiv_cli.reference import Reference
 #
 # However long a sequence is, a block of tracks, or a frame, is all of it that is in memory.
 
-
 # Rows of the tracks that are put in order together: a few megabytes.
 BLOCK_ROWS = 2**16
 
 
-class TrackStore:
-    """Rows of tracks in a file without a name, which ends with the process; by frame, and by track within one."""
+class StoredTracks:
+    """Tracks of a sequence in a file without a name, which ends with the process, in place of `Points` in memory.
 
-    def __init__(self, folder: Path) -> None:
-        """Begin a file in a folder, on the disk that the tracks will be written to.
+    Rows are put there by frame, and by track within one.
 
-        Raises
-        ------
-        OutputError
-        """
+    Attributes
+    ----------
+    reference : the origin of their coordinates
+    attributes, provenance : what their file says about itself
+    """
+
+    def __init__(
+        self, folder: Path, reference: Reference, attributes: dict[str, Any], provenance: dict[str, Any]
+    ) -> None:
+        """Begin a file in a folder, on the disk that the tracks will be written to."""
+        self.reference, self.attributes, self.provenance = reference, attributes, provenance
         self._folder = folder
         # For each frame, where its arrays begin in the file, and its number of rows.
         self._begins: list[dict[str, int]] = []
         self._counts: list[int] = []
         self._kinds: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {}
         # Of each track, its number of rows.
-        self.lengths: NDArray[np.int64] = np.zeros(0, dtype=np.int64)
+        self._lengths: NDArray[np.int64] = np.zeros(0, dtype=np.int64)
         try:
             self._file = tempfile.TemporaryFile(buffering=0, dir=folder)  # noqa: SIM115
         except OSError as error:
             raise self._error(error) from error
 
-    def __enter__(self) -> TrackStore:
+    def __enter__(self) -> StoredTracks:
         """Return itself."""
         return self
 
@@ -78,22 +76,12 @@ class TrackStore:
         """Remove the file."""
         self._file.close()
 
-    @property
-    def frames(self) -> NDArray[np.int64]:
-        """The number of rows of each frame."""
-        return np.array(self._counts, dtype=np.int64)
-
     def put(self, rows: Mapping[str, NDArray[Any]]) -> None:
-        """Take the arrays of one more frame, in the order of `track`, in which no number comes twice.
-
-        Raises
-        ------
-        OutputError
-        """
+        """Take the arrays of one more frame, in the order of `track`, in which no number comes twice."""
         track = rows["track"]
-        if len(track) and track[-1] >= len(self.lengths):
-            self.lengths = np.append(self.lengths, np.zeros(track[-1] + 1 - len(self.lengths), np.int64))
-        self.lengths[track] += 1
+        if len(track) and track[-1] >= len(self._lengths):
+            self._lengths = np.append(self._lengths, np.zeros(track[-1] + 1 - len(self._lengths), np.int64))
+        self._lengths[track] += 1
         self._counts.append(len(track))
         self._kinds = self._kinds or {name: (array.dtype, array.shape[1:]) for name, array in rows.items()}
         begins = {}
@@ -107,24 +95,42 @@ class TrackStore:
             raise self._error(error) from error
         self._begins.append(begins)
 
-    def by_frame(self, name: str) -> Iterator[NDArray[Any]]:
-        """Yield the rows of an array in each frame."""
-        return (self._read(frame, name, 0, count) for frame, count in enumerate(self._counts))
+    def with_record(self, provenance: dict[str, Any]) -> StoredTracks:
+        """Return the same tracks with another record."""
+        other = copy(self)
+        other.provenance = provenance
+        return other
 
-    def by_track(self, name: str) -> Iterator[NDArray[Any]]:
+    @property
+    def count(self) -> int:
+        """How many places there are."""
+        return sum(self._counts)
+
+    def rows(self, name: str) -> Iterator[NDArray[Any]]:
         """Yield the rows of an array by track, then by frame, in blocks of whole tracks; one at least."""
         for begins, ends in pairwise(self._cuts.T):
             tracks = self._block("track", begins, ends)
             order = np.argsort(tracks, kind="stable")
             yield (tracks if name == "track" else self._block(name, begins, ends))[order]
 
+    def lines(self) -> NDArray[np.int64]:
+        """Return where each track's rows begin, and where the last one's end."""
+        return np.concatenate([[0], np.cumsum(self._lengths[self._lengths > 0])])
+
+    def in_frames(self, _frames: int) -> tuple[NDArray[np.int64], Callable[[str], Iterator[NDArray[Any]]]]:
+        """Return how many places each frame has, and what yields an array's rows in each."""
+        return np.array(self._counts, dtype=np.int64), self._by_frame
+
+    def _by_frame(self, name: str) -> Iterator[NDArray[Any]]:
+        return (self._read(frame, name, 0, count) for frame, count in enumerate(self._counts))
+
     @cached_property
     def _cuts(self) -> NDArray[np.int64]:
         """Where in each frame's rows the blocks of tracks begin, and where the last one ends: (frames, blocks + 1)."""
-        ends = np.cumsum(self.lengths)
+        ends = np.cumsum(self._lengths)
         inner = np.searchsorted(ends, np.arange(BLOCK_ROWS, ends[-1] if len(ends) else 0, BLOCK_ROWS), "right")
         edges = np.array([0, *inner, len(ends)])
-        return np.array([np.searchsorted(track, edges) for track in self.by_frame("track")])
+        return np.array([np.searchsorted(track, edges) for track in self._by_frame("track")])
 
     def _block(self, name: str, begins: NDArray[np.int64], ends: NDArray[np.int64]) -> NDArray[Any]:
         """Return rows of an array from each frame, one frame after the other."""
@@ -144,41 +150,6 @@ class TrackStore:
         return OutputError(f"{self._folder}: tracks cannot be put there for a while: {reason(error)}")
 
 
-@dataclass(frozen=True, eq=False)
-class StoredTracks:
-    """Tracks of a sequence that are on a disk, in place of `Points` in memory.
-
-    Attributes
-    ----------
-    store : with all places
-    reference : the origin of their coordinates
-    attributes, provenance : what their file says about itself
-    """
-
-    store: TrackStore
-    reference: Reference
-    attributes: dict[str, Any]
-    provenance: dict[str, Any]
-
-    @property
-    def count(self) -> int:
-        """How many places there are."""
-        return int(self.store.frames.sum())
-
-    def rows(self, name: str) -> Iterator[NDArray[Any]]:
-        """Yield the rows of an array in the order of a file, in pieces."""
-        return self.store.by_track(name)
-
-    def lines(self) -> NDArray[np.int64]:
-        """Return where each track's rows begin, and where the last one's end."""
-        lengths = self.store.lengths
-        return np.concatenate([[0], np.cumsum(lengths[lengths > 0])])
-
-    def in_frames(self, _frames: int) -> tuple[NDArray[np.int64], Callable[[str], Iterator[NDArray[Any]]]]:
-        """Return how many places each frame has, and what yields an array's rows in each."""
-        return self.store.frames, self.store.by_frame
-
-
 PARTICLES_FORMAT = "lfpiv-particles"
 TRACKS_FORMAT = "lfpiv-tracks"
 TRAJECTORIES_FORMAT = "lfpiv-trajectories"
@@ -190,13 +161,7 @@ CHECKED_ROWS = 2**16
 
 # Units of the arrays, by format; tensors are symmetric, as xx, yy, zz, xy, yz, xz (VTK's order).
 UNITS = {
-    PARTICLES_FORMAT: {
-        "intensity": "count",
-        "covariance_mm2": "mm^2",
-        "chi2": "1",
-        "seen": "1",
-        "flag": "1",
-    },
+    PARTICLES_FORMAT: {"intensity": "count", "covariance_mm2": "mm^2", "chi2": "1", "seen": "1", "flag": "1"},
     TRACKS_FORMAT: {
         "velocity": "m/s",
         "velocity_sigma": "m/s",
@@ -216,12 +181,12 @@ UNITS = {
     },
 }
 # Arrays that a file may have besides: those of earlier versions have them not.
-OPTIONAL = {
-    PARTICLES_FORMAT: {"intensity_sigma": "count"},
-    TRACKS_FORMAT: {"displacement_covariance_mm2": "mm^2"},
-}
+OPTIONAL = {PARTICLES_FORMAT: {"intensity_sigma": "count"}, TRACKS_FORMAT: {"displacement_covariance_mm2": "mm^2"}}
 # Arrays in which NaN stands for what is not known.
 MAY_BE_UNKNOWN = {"link_probability"}
+NOT_ONE_VALUE = "{}: {} has not one finite value for each of its {} points"
+# VTK's kinds of cells, of which these files have the first two.
+CELLS = ("Vertices", "Lines", "Polygons", "Strips")
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,6 +206,10 @@ class Points:
     reference: Reference
     attributes: dict[str, Any]
     provenance: dict[str, Any]
+
+    def with_record(self, provenance: dict[str, Any]) -> Points:
+        """Return the same points with another record."""
+        return replace(self, provenance=provenance)
 
     @property
     def count(self) -> int:
@@ -278,23 +247,31 @@ def no_points(format_name: str, reference: Reference) -> Points:
 
 
 def write_points(path: Path, format_name: str, points: PointRows, *, overwrite: bool) -> None:
-    """Write points; their arrays are all that the format needs or may have, each with a row for each point.
-
-    Raises
-    ------
-    OutputExistsError, OutputError
-    """
+    """Write points; their arrays are all that the format needs or may have, each with a row for each point."""
     units = UNITS[format_name]
     if isinstance(points, Points):
         units = units_of(format_name, points.arrays)
-        _ensure_whole(points, units, format_name)
+        if set(points.arrays) != set(units) or any(len(array) != points.count for array in points.arrays.values()):
+            raise ValueError(f"{format_name} has the arrays {sorted(units)} of {points.count} rows each")
 
     def fill(file: h5py.File) -> None:
         write_root(file, format_name, FORMAT_VERSION, points.reference, points.attributes, points.provenance)
-        vtk = create_vtk_group(file, "PolyData")
+        vtk = create_vtk_group(file, None)
         vtk["Points"] = write_rows(file, POSITION, points.count, points.rows(POSITION), "mm")
         write_array(vtk, "NumberOfPoints", np.array([points.count], dtype=np.int64))
-        _write_cells(vtk, points.count, points.lines())
+        # One vertex for each point, lines of consecutive points, and no other cells.
+        count, lines = points.count, points.lines().astype(np.int64)
+        counts: dict[str, tuple[int, int, Iterable[NDArray[np.int64]]]] = {
+            "Vertices": (count, count, _counted(count + 1)),
+            "Lines": (len(lines) - 1, int(lines[-1]), [lines]),
+        }
+        for name in CELLS:
+            cells, ids, offsets = counts.get(name, (0, 0, [np.zeros(1, dtype=np.int64)]))
+            group = vtk.create_group(name)
+            write_array(group, "NumberOfCells", np.array([cells], dtype=np.int64))
+            write_array(group, "NumberOfConnectivityIds", np.array([ids], dtype=np.int64))
+            write_rows(group, "Offsets", cells + 1, offsets)
+            write_rows(group, "Connectivity", ids, _counted(ids))
         data = vtk.create_group("PointData")
         for name, unit in units.items():
             data[name] = write_rows(file, name, points.count, points.rows(name), unit)
@@ -314,19 +291,12 @@ def units_of(format_name: str, names: Container[str]) -> dict[str, str]:
     return UNITS[format_name] | {name: unit for name, unit in OPTIONAL.get(format_name, {}).items() if name in names}
 
 
-def _ensure_whole(points: Points, units: Mapping[str, str], format_name: str) -> None:
-    """Raise where points have other arrays than these, or arrays not a row for each."""
-    if set(points.arrays) != set(units) or any(len(array) != points.count for array in points.arrays.values()):
-        raise ValueError(f"{format_name} has the arrays {sorted(units)} of {points.count} rows each")
-
-
 def read_points(path: Path | str, format_name: str) -> Points:
     """Read points.
 
     Raises
     ------
-    InputError
-        If the file is missing, broken, of another format, or holds values that are not finite.
+    InputError : the file is missing, broken, of another format, or holds values that are not finite
     """
     path = Path(path)
     with _opened(path, format_name) as (file, datasets):
@@ -351,7 +321,7 @@ def _opened(path: Path, format_name: str) -> Iterator[tuple[h5py.File, dict[str,
             raise InputError(f"{path}: its positions have the shape {shape}, expected (n, 3)")
         for name, dataset in datasets.items():
             if len(dataset) != shape[0]:
-                raise _not_one_value(path, name, shape[0])
+                raise InputError(NOT_ONE_VALUE.format(path, name, shape[0]))
         yield file, datasets
 
 
@@ -359,21 +329,11 @@ def _ensure_finite(path: Path, name: str, rows: NDArray[Any], count: int) -> Non
     """Raise where rows of an array of so many are not numbers, or not known where they must be."""
     known = rows[~np.isnan(rows)] if name in MAY_BE_UNKNOWN else rows
     if not np.isfinite(known).all():
-        raise _not_one_value(path, name, count)
-
-
-def _not_one_value(path: Path, name: str, count: int) -> InputError:
-    return InputError(f"{path}: {name} has not one finite value for each of its {count} points")
+        raise InputError(NOT_ONE_VALUE.format(path, name, count))
 
 
 def read_tracks(path: Path | str) -> Points:
-    """Read tracks, of two frames or of a sequence.
-
-    Raises
-    ------
-    InputError
-        As `read_points`.
-    """
+    """Read tracks, of two frames or of a sequence."""
     is_sequence = format_of(Path(path)) == TRAJECTORIES_FORMAT
     return read_points(path, TRAJECTORIES_FORMAT if is_sequence else TRACKS_FORMAT)
 
@@ -391,21 +351,6 @@ def matrices(symmetric_parts: NDArray[np.float64]) -> NDArray[np.float64]:
 def lines_of(track: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return where each track's rows begin, and where the last one's end."""
     return np.concatenate([[0], np.flatnonzero(np.diff(track)) + 1, [len(track)]]) if len(track) else np.zeros(1, int)
-
-
-def _write_cells(vtk: h5py.Group, count: int, lines: NDArray[np.int64]) -> None:
-    """Write one vertex for each point, lines of consecutive points that begin and end as told, and no other cells."""
-    counts: dict[str, tuple[int, int, Iterable[NDArray[np.int64]]]] = {
-        "Vertices": (count, count, _counted(count + 1)),
-        "Lines": (len(lines) - 1, int(lines[-1]), [lines.astype(np.int64)]),
-    }
-    for name in ("Vertices", "Lines", "Polygons", "Strips"):
-        cells, ids, offsets = counts.get(name, (0, 0, [np.zeros(1, dtype=np.int64)]))
-        group = vtk.create_group(name)
-        write_array(group, "NumberOfCells", np.array([cells], dtype=np.int64))
-        write_array(group, "NumberOfConnectivityIds", np.array([ids], dtype=np.int64))
-        write_rows(group, "Offsets", cells + 1, offsets)
-        write_rows(group, "Connectivity", ids, _counted(ids))
 
 
 def _counted(count: int) -> Iterator[NDArray[np.int64]]:

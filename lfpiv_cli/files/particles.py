@@ -64,7 +64,16 @@ def read_particles(path: Path) -> Particles:
     try:
         with zipfile.ZipFile(path) as stored:
             arrays: dict[str, NDArray[np.float64]] = {}
-            for name in _wanted(stored):
+            # A name in the archive's list must be that before the array itself, of arrays that are not read, too: one
+            # that is damaged would be an array that is not told.
+            for entry in stored.infolist():
+                stored.open(entry).close()
+            there = set(stored.namelist())
+            told_names = [name for name in OPTIONAL if f"{name}.npy" in there]
+            # Places first, by which the size of the others is judged.
+            for name in sorted(
+                ["position_mm", "velocity_mm_s", *told_names], key=lambda name: not name.endswith(PLACES)
+            ):
                 arrays[name] = _read_array(stored, name, max((array.size for array in arrays.values()), default=0))
     except Exception as error:  # a damaged archive can raise anything in zipfile and NumPy
         raise InputError(f"{path}: not a list of particles: {reason(error)}") from error
@@ -85,19 +94,6 @@ def read_particles(path: Path) -> Particles:
             f"{written(LARGEST_VALUE)}"
         )
     return Particles(position, velocity / MM_PER_M, told["brightness"], *(told.get(name) for name in OPTIONAL[1:]))
-
-
-def _wanted(stored: zipfile.ZipFile) -> list[str]:
-    """Return the names of the arrays that are read, places first; those that are not optional must be there.
-
-    A name in the archive's list must be that before the array itself, of arrays that are not read, too: one that is
-    damaged would be an array that is not told.
-    """
-    for entry in stored.infolist():
-        stored.open(entry).close()
-    names = set(stored.namelist())
-    told = [name for name in OPTIONAL if f"{name}.npy" in names]
-    return sorted(["position_mm", "velocity_mm_s", *told], key=lambda name: not name.endswith(PLACES))
 
 
 def _read_array(stored: zipfile.ZipFile, name: str, largest: int) -> NDArray[np.float64]:

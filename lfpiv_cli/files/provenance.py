@@ -9,11 +9,10 @@ import hashlib
 import json
 import os
 import platform
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from importlib.metadata import version
-from itertools import pairwise
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -88,8 +87,7 @@ def record(
 
     Raises
     ------
-    InputError
-        If an input cannot be read.
+    InputError : an input cannot be read
     """
     named: dict[str, dict[str, Any]] = {}
     made_from: dict[str, Any] = {}
@@ -135,16 +133,6 @@ def without_warnings(made: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in made.items() if name != "warnings"}
 
 
-def recorded_warnings(made: Mapping[str, Any]) -> list[str]:
-    """Return what was warned of when a result was made, and before that when its inputs were, each with the command."""
-    records = [*made.get("made_from", {}).values(), made]
-    return [
-        f"{each['command']}: {warning['about']}: {warning['text']}; {warning['remedy']} [{warning['code']}]"
-        for each in records
-        for warning in each.get("warnings", ())
-    ]
-
-
 def also_used_as(made: Mapping[str, Any], role: str) -> str | None:
     """Return as what else the input of a role was given, to this command or to one before; None if as nothing else.
 
@@ -170,27 +158,21 @@ def seconds_between(first: Mapping[str, Any], second: Mapping[str, Any]) -> floa
     return float(after) - float(before)
 
 
-def even_step_s(records: Sequence[Mapping[str, Any]], names: Sequence[str]) -> float | None:
-    """Return the time from one frame to the next by the records of results; None where it is not told.
+def even_step_s(steps_s: Sequence[float | None], names: Sequence[str]) -> float | None:
+    """Return the time from one frame to the next, of several that are to be alike; None where one is not told.
 
     Raises
     ------
     InputError : frames are not in the order in which they were taken, or not evenly spaced in time
     """
-    steps = [seconds_between(*pair) for pair in pairwise(records)]
-    told = [step for step in steps if step is not None]
-    if not told or len(told) < len(steps):
+    told = [step for step in steps_s if step is not None]
+    if not told or len(told) < len(steps_s):
         return None
-    return ensure_even(told, names)
-
-
-def ensure_even(steps_s: Sequence[float], names: Sequence[str]) -> float:
-    """Return the mean of the times between frames, which are to be alike; see `even_step_s`."""
-    mean_s, span = sum(steps_s) / len(steps_s), f"{names[0]} to {names[-1]}: the recording's times"
-    if min(steps_s) <= 0.0:
+    mean_s, span = sum(told) / len(told), f"{names[0]} to {names[-1]}: the recording's times"
+    if min(told) <= 0.0:
         raise InputError(f"{span} do not increase from frame to frame; give them in order, or --dt-s")
-    if max(steps_s) - min(steps_s) > UNEVEN * mean_s:
-        raise InputError(f"{span} are {min(steps_s):g} to {max(steps_s):g} s apart, expected even steps; give --dt-s")
+    if max(told) - min(told) > UNEVEN * mean_s:
+        raise InputError(f"{span} are {min(told):g} to {max(told):g} s apart, expected even steps; give --dt-s")
     return mean_s
 
 
@@ -216,7 +198,10 @@ def sha256(path: Path) -> str:
     """
     file, _ = split_part(path)
     if os.path.isdir(file):
-        return _sha256_of_all(file, tuple(_states_in(file)))
+        with reading_from(file), os.scandir(file) as entries:
+            files = [each for each in entries if each.is_file() and not each.name.startswith(".")]
+            states = sorted((each.name, each.stat().st_size, each.stat().st_mtime_ns) for each in files)
+        return _sha256_of_all(file, tuple(states))
     size = ensure_regular_file(file)
     return _sha256(file, size, file.stat().st_mtime_ns)
 
@@ -226,15 +211,6 @@ def _sha256(path: Path, size: int, modified_ns: int) -> str:
     """Hash a file once as long as it does not change: what all frames of a batch share is an input of each."""
     with opened(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _states_in(folder: Path) -> Iterator[tuple[str, int, int]]:
-    """Yield name, size and time of the files in a folder, by their names; not of hidden ones and of folders."""
-    with reading_from(folder), os.scandir(folder) as entries:
-        for entry in sorted(entries, key=lambda each: each.name):
-            if entry.is_file() and not entry.name.startswith("."):
-                status = entry.stat()
-                yield entry.name, status.st_size, status.st_mtime_ns
 
 
 @lru_cache(maxsize=FILES_REMEMBERED)
@@ -268,8 +244,15 @@ def _bearing(made: Mapping[str, Any], earlier: Mapping[str, Any]) -> dict[str, A
 def differences(carried: Mapping[str, Any], made: Mapping[str, Any]) -> list[str]:
     """Return in words what has changed since a result was made, by the record that it carries and that it would get."""
     before, now = _facts(carried), _facts(made)
-    changed = [name for name in dict.fromkeys([*now, *before]) if before.get(name) != now.get(name)]
-    told = [_change(name, before.get(name), now.get(name)) for name in changed]
+    told = []
+    for name in dict.fromkeys([*now, *before]):
+        was, is_now = before.get(name), now.get(name)
+        if isinstance(was, dict) or isinstance(is_now, dict):  # an input, which is no plain value
+            words = f"{name} is another file"
+        else:
+            words = f"{name} was {was}, is {is_now}".replace("None", "not given")
+        if was != is_now:
+            told.append(words if len(words) <= LONGEST_CHANGE else f"{name} has changed")
     configs = [made.get("inputs", {}).get("config") for made in (carried, made)]
     return told or (["the config is another file, which says the same"] if configs[0] != configs[1] else [])
 
@@ -281,14 +264,6 @@ def _facts(made: Mapping[str, Any]) -> dict[str, Any]:
     return {**_values(made.get("config") or {}), **inputs, "the command": made.get("command"), **versions}
 
 
-def _change(name: str, before: Any, now: Any) -> str:
-    """Return in words that something has changed; of an input, which is no plain value, no more than that."""
-    if isinstance(before, dict) or isinstance(now, dict):
-        return f"{name} is another file"
-    words = f"{name} was {before}, is {now}".replace("None", "not given")
-    return words if len(words) <= LONGEST_CHANGE else f"{name} has changed"
-
-
 def ensure_agreement(records: Sequence[Mapping[str, Any]], names: Sequence[str], keys: Sequence[str]) -> None:
     """Refuse results whose configs differ in sections, or in keys of them, as far as their records have a config.
 
@@ -296,10 +271,6 @@ def ensure_agreement(records: Sequence[Mapping[str, Any]], names: Sequence[str],
     ----------
     names : of the results, for messages
     keys : `OF_COORDINATES` or `OF_FRAMES`
-
-    Raises
-    ------
-    InputError
     """
     known = [(_values(made["config"]), name) for made, name in zip(records, names, strict=True) if made.get("config")]
     for (first, first_name), (config, name) in ((known[0], each) for each in known[1:]):
@@ -325,8 +296,7 @@ def carried_record(path: Path) -> dict[str, Any]:
 
     Raises
     ------
-    InputError
-        If there is none, or the file is broken.
+    InputError : there is none, or the file is broken
     """
     with open_h5(path) as file:
         return read_provenance(file)

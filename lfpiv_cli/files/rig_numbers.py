@@ -15,10 +15,8 @@ from typing import Any
 import numpy as np
 
 from lfpiv_cli.errors import ConfigError
-from lfpiv_cli.files.bench import LATERAL_VOXELS_PER_MICROLENS, UM_TO_MM
-from lfpiv_cli.files.sections import CorrelationSection
-from lfpiv_cli.files.sections_simulated import Sections
-from lfpiv_cli.names import KnownCamera
+from lfpiv_cli.files.sections import LATERAL_VOXELS_PER_MICROLENS, UM_TO_MM
+from lfpiv_cli.files.sections_simulated import CorrelationSection, Sections
 from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.line_responses import USUAL_DIFFUSION_PX
@@ -35,7 +33,6 @@ from lfpiv_cli.validation.planning import (
 )
 
 # A configuration as text: a short YAML file with a comment on each key that a newcomer meets, and its JSON schema.
-
 
 Tree = Mapping[str, Any]
 
@@ -179,11 +176,37 @@ class RigNumbers:
     wavelength_nm: float | None = None
 
     def complete(self) -> RigNumbers:
-        """Return the numbers with what follows from others filled in."""
+        """Return the numbers with what follows from others filled in.
+
+        A volume is in full view: as deep as the channel, else as depths are told best.
+
+        Raises
+        ------
+        ConfigError : the sensor sees no such volume
+        """
         microlens = self.microlens_focal_length_mm or 8.0 * self.pitch_mm
         f_number = self.f_number or _rounded(matched_f_number(self.magnification, microlens / self.pitch_mm))
         filled = replace(self, microlens_focal_length_mm=microlens, f_number=f_number)
-        return replace(filled, size_mm=self.size_mm or proposed_size_mm(filled))
+        if self.size_mm is not None:
+            return filled
+        camera, media = filled.camera(), filled.media()
+        depth = self.channel_mm or min(
+            DEPTHS_IN_VOLUME * camera.scale(media).depth_mm,
+            2.0 * depth_of_field_mm(camera, media),
+            SHARE_OF_DISTANCE * camera.focus_distance_mm * self.fluid,
+        )
+        half = half_view_mm(camera, media, [-0.5 * depth, 0.5 * depth]).min(axis=0)
+        if half.min() <= 0.0:
+            raise ConfigError(
+                f"the sensor ({self.columns} x {self.rows} pixels of {self.pixel_um:g} um) sees no point of a volume "
+                f"{written(depth)} mm deep with all of its light; check pixels, pitch, f-numbers and the channel's "
+                "width"
+            )
+        sides = []
+        for side in (2.0 * SHARE_OF_VIEW * float(each) for each in half):  # rounded down, to stay in view
+            step = 10.0 ** (math.floor(math.log10(side)) - DIGITS + 2)
+            sides.append(float(f"{math.floor(side / step) * step:.{DIGITS}g}"))
+        return replace(filled, size_mm=(sides[0], sides[1], depth if self.channel_mm else _rounded(depth)))
 
     def camera(self) -> Camera:
         """Return the camera of numbers that are complete but for the volume."""
@@ -206,25 +229,6 @@ class RigNumbers:
         return Media(1.0, self.wall, self.fluid)
 
 
-def proposed_size_mm(numbers: RigNumbers) -> Sides:
-    """Return a volume in full view: as deep as the channel, else as depths are told best."""
-    camera, media = numbers.camera(), numbers.media()
-    depth = numbers.channel_mm or min(
-        DEPTHS_IN_VOLUME * camera.scale(media).depth_mm,
-        2.0 * depth_of_field_mm(camera, media),
-        SHARE_OF_DISTANCE * camera.focus_distance_mm * numbers.fluid,
-    )
-    half = half_view_mm(camera, media, [-0.5 * depth, 0.5 * depth]).min(axis=0)
-    if half.min() <= 0.0:
-        raise ConfigError(
-            f"the sensor ({numbers.columns} x {numbers.rows} pixels of {numbers.pixel_um:g} um) sees no point of a "
-            f"volume {written(depth)} mm deep with all of its light; check pixels, pitch, f-numbers and the channel's "
-            "width"
-        )
-    width, height = (_rounded_down(2.0 * SHARE_OF_VIEW * side) for side in half)
-    return width, height, depth if numbers.channel_mm else _rounded(depth)
-
-
 def tree_of(numbers: RigNumbers) -> dict[str, Any]:
     """Return the configuration, as plain data."""
     known = numbers.complete()
@@ -234,7 +238,7 @@ def tree_of(numbers: RigNumbers) -> dict[str, Any]:
     camera, media = known.camera(), known.media()
     scale = camera.scale(media)
     overlap = CorrelationSection().overlap
-    window = [float(side) for side in proposed_window_mm(camera, media, size, overlap)]
+    window_mm = [float(side) for side in proposed_window_mm(camera, media, size, overlap)]
     tree: dict[str, Any] = {
         "camera": {
             "main_lens": {
@@ -243,12 +247,7 @@ def tree_of(numbers: RigNumbers) -> dict[str, Any]:
                 "f_number": known.f_number,
             },
             "microlenses": {"focal_length_mm": known.microlens_focal_length_mm, "pitch_mm": known.pitch_mm},
-            "sensor": {
-                "pixel_um": known.pixel_um,
-                "columns": known.columns,
-                "rows": known.rows,
-                "column_axis": "x",
-            },
+            "sensor": {"pixel_um": known.pixel_um, "columns": known.columns, "rows": known.rows, "column_axis": "x"},
         },
         "media": {"air": 1.0, "window": known.wall, "fluid": known.fluid},
     }
@@ -257,13 +256,20 @@ def tree_of(numbers: RigNumbers) -> dict[str, Any]:
     elif known.fluid != media.air:
         tree["window"] = {"distance_mm": _window_distance_mm(known, size[2]), "thickness_mm": known.wall_mm}
     tree["volume"] = {"size_mm": list(size), "reference": "mid_plane" if has_channel else "focal_point"}
-    if _bends(known, camera, size[2]):
-        tree["weights"] = {"refraction": "exact"}
+    if media != media.in_air():
+        if known.channel_mm is not None:
+            window = channel_window(camera.focus_distance_mm, media, known.channel_mm, known.wall_mm, 0.0)
+        else:
+            window = Window(_window_distance_mm(known, size[2]), known.wall_mm)
+        depths = np.linspace(-0.5 * size[2], 0.5 * size[2], 9)
+        # Where Snell's law moves the light of the volume by more than paraxial refraction may be off.
+        if refraction_error_mm(camera, media, window, depths) > LARGEST_ERROR_PX * camera.pixel_mm:
+            tree["weights"] = {"refraction": "exact"}
     tree["board"] = _board(known, scale.lens_mm)
     if known.wavelength_nm is not None:
         tree["reconstruction"] = {"wavelength_nm": known.wavelength_nm}
     voxel_mm = scale.lens_mm / LATERAL_VOXELS_PER_MICROLENS
-    tree["correlation"] = {"window_mm": window, "dt_s": _rounded(time_step_s(known.velocity_m_s, voxel_mm))}
+    tree["correlation"] = {"window_mm": window_mm, "dt_s": _rounded(time_step_s(known.velocity_m_s, voxel_mm))}
     tree["simulation"] = {
         "flow": {
             "kind": "shear",
@@ -278,19 +284,6 @@ def tree_of(numbers: RigNumbers) -> dict[str, Any]:
         tree["camera"]["sensor"]["diffusion_px"] = USUAL_DIFFUSION_PX
         tree["simulation"]["light"] = {"kind": "waves", "wavelength_nm": known.wavelength_nm}
     return tree
-
-
-def _bends(numbers: RigNumbers, camera: Camera, depth_mm: float) -> bool:
-    """Return whether Snell's law moves the light of the volume by more than paraxial refraction may be off."""
-    media = numbers.media()
-    if media == media.in_air():
-        return False
-    if numbers.channel_mm is not None:
-        window = channel_window(camera.focus_distance_mm, media, numbers.channel_mm, numbers.wall_mm, 0.0)
-    else:
-        window = Window(_window_distance_mm(numbers, depth_mm), numbers.wall_mm)
-    depths = np.linspace(-0.5 * depth_mm, 0.5 * depth_mm, 9)
-    return refraction_error_mm(camera, media, window, depths) > LARGEST_ERROR_PX * camera.pixel_mm
 
 
 def _window_distance_mm(numbers: RigNumbers, depth_mm: float) -> float:
@@ -314,19 +307,6 @@ def _board(numbers: RigNumbers, lens_mm: float) -> dict[str, Any]:
 def _rounded(value: float) -> float:
     """Return a number of a few digits."""
     return float(f"{value:.{DIGITS}g}")
-
-
-def _rounded_down(value: float) -> float:
-    """Return the largest number of a few digits that is not above a value."""
-    step = 10.0 ** (math.floor(math.log10(value)) - DIGITS + 2)
-    return float(f"{math.floor(value / step) * step:.{DIGITS}g}")
-
-
-def known_camera(name: KnownCamera) -> dict[str, Any]:
-    """Return the configuration of a published camera, as plain data; without its main lens where nobody has told it."""
-    if name == "table2":
-        return tree_of(TABLE2)
-    return {"camera": LATTICES[name]}
 
 
 # Table 2 of the paper.

@@ -1,35 +1,29 @@
-"""The sections of the configuration: every key, its unit (in its name), its range and its default.
+"""The sections of the rig: every key, its unit (in its name), its range and its default, and what a section stands for.
 
 A key that a section does not know is an error, and so are NaN and infinity. Sequences are tuples. What involves several
-keys is checked in `files.checks`.
+keys is checked in `files.checks`. What a section leaves out and another of its keys implies (an aperture from an
+f-number) is worked out by the section, once.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, Tag
 from pydantic_core import PydanticCustomError
 
 from lfpiv_cli.flow.windows import LARGEST_TILT_DEG, RoundWall
-from lfpiv_cli.names import (
-    ColumnAxis,
-    Facing,
-    Layout,
-    Mask,
-    Medium,
-    Method,
-    Pattern,
-    Polarity,
-    ReferenceName,
-    Refraction,
-    Sampling,
-    Start,
-)
-from lfpiv_cli.reconstruction.registry import SolverName
+from lfpiv_cli.grid import Grid
+from lfpiv_cli.names import ColumnAxis, Facing, Layout, Medium, Pattern, Polarity, ReferenceName
+from lfpiv_cli.optics.camera import Camera, Lattice, thin_lens
+from lfpiv_cli.optics.curved_space import CurvedSpace, Face
+from lfpiv_cli.optics.media import Media
+from lfpiv_cli.optics.surfaces import SURFACES
+from lfpiv_cli.reference import Reference
+from lfpiv_cli.scale import Scale
 
 # What the keys of the configuration can be: numbers within ranges, one for each axis, and what all sections share.
-
 
 Positive = Annotated[float, Field(gt=0.0)]
 NotNegative = Annotated[float, Field(ge=0.0)]
@@ -43,6 +37,15 @@ Wavelength = Annotated[float, Field(ge=200.0, le=20_000.0)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Pair = tuple[float, float]
 Vector = tuple[float, float, float]
+
+UM_TO_MM, NM_TO_MM = 1e-3, 1e-6
+DIRECTIONS = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0)}
+# Voxels as wide as a microlens lock depth to the array's grid and swallow its velocity: of 0.6 mm EM volumes give 0.22
+# with them. With half of one laterally and two along the axis they give nine tenths, with a third 0.98 to 1.02 and a
+# third less spread; a quarter gains no more. Along the axis the depth over which light spreads by one lens counts: two
+# microlenses of Table 2 are 0.2 mm of 1.064 mm.
+LATERAL_VOXELS_PER_MICROLENS = 3.0
+VOXELS_PER_DEPTH = 1.064 / 0.2
 
 # Sizes above these are slips of the keyboard; they would ask for more memory than any machine has.
 MOST_PIXELS_PER_SIDE = 100_000
@@ -90,7 +93,6 @@ class Section(BaseModel):
 
 # The section `scene`: the faces that refract light between the lens and the fluid, one entry each.
 
-
 # What is behind a face: named as in `media`, or its refractive index.
 Behind = Annotated[
     Annotated[Literal["window", "fluid"], Tag("name")] | Annotated[Index, Tag("number")],
@@ -114,7 +116,26 @@ def _nearly_lateral(axis: str | tuple[float, float, float]) -> str | tuple[float
 PipeAxis = Annotated[Direction, AfterValidator(_nearly_lateral)]
 
 
-class PlaneFace(Section):
+class _Face(Section):
+    def index_behind(self, media: Media) -> float:
+        """Return the refractive index behind the face."""
+        behind: str | float = self.behind  # type: ignore[attr-defined]
+        return getattr(media, behind) if isinstance(behind, str) else behind
+
+    def model(self, media: Media) -> Face:
+        """Return the surface, and the index behind it.
+
+        Raises
+        ------
+        ConfigError : heights that are no grid
+        """
+        told = {name: getattr(self, name) for name in type(self).model_fields if name not in ("behind", "file")}
+        if isinstance(told.get("axis"), str):
+            told["axis"] = DIRECTIONS[told["axis"]]
+        return Face(SURFACES[told.pop("kind")](**told), self.index_behind(media))
+
+
+class PlaneFace(_Face):
     """A plane square to the optical axis at z_mm. behind: what is behind each face, window, fluid or an index."""
 
     kind: Literal["plane"]
@@ -122,7 +143,7 @@ class PlaneFace(Section):
     behind: Behind
 
 
-class TiltedPlaneFace(Section):
+class TiltedPlaneFace(_Face):
     """A plane through point_mm, square to the direction `normal` (x, y, z); behind as of every face."""
 
     kind: Literal["tilted_plane"]
@@ -131,7 +152,7 @@ class TiltedPlaneFace(Section):
     behind: Behind
 
 
-class CylinderFace(Section):
+class CylinderFace(_Face):
     """A circular cylinder of radius_mm; its axis, x, y or a direction [x, y, z], goes through centre_mm.
 
     facing: convex, the side nearer to the camera, behind which is the inside; or concave, the farther side, from inside
@@ -146,7 +167,7 @@ class CylinderFace(Section):
     behind: Behind
 
 
-class SphereFace(Section):
+class SphereFace(_Face):
     """A sphere of radius_mm about centre_mm; facing as of a cylinder, behind as of every face."""
 
     kind: Literal["sphere"]
@@ -156,7 +177,7 @@ class SphereFace(Section):
     behind: Behind
 
 
-class HeightMapFace(Section):
+class HeightMapFace(_Face):
     """A smooth surface through heights on a grid in a file: text, .npy or .tif, rows along y of heights along x, in mm.
 
     The file's folder is the rig file's; results carry heights_mm in its place. spacing_mm (x, y) lies between heights;
@@ -176,10 +197,14 @@ FaceSection = Annotated[
 ]
 
 
-def parameters_of(face: FaceSection) -> dict[str, Any]:
-    """Return what the surface of a face is made of, by the names that `optics.surfaces` has."""
-    others = ("kind", "behind", "file")
-    return {name: getattr(face, name) for name in type(face).model_fields if name not in others}
+def scene_of(faces: Sequence[FaceSection], media: Media) -> CurvedSpace:
+    """Return what lies in front of the lens, face by face.
+
+    Raises
+    ------
+    ConfigError : light cannot cross the faces in this order
+    """
+    return CurvedSpace(media, tuple(face.model(media) for face in faces))
 
 
 class MainLens(Section):
@@ -199,6 +224,21 @@ class MainLens(Section):
     aperture_mm: Positive | None = None
     f_number: Positive | None = None
 
+    @property
+    def known_focal_length_mm(self) -> float | None:
+        """F_m, given or from S_i = F_m (P - M)."""
+        if self.focal_length_mm is not None or self.image_distance_mm is None:
+            return self.focal_length_mm
+        return self.image_distance_mm / (self.pupil_ratio - self.magnification)
+
+    @property
+    def known_aperture_mm(self) -> float | None:
+        """p_m, given or from the f-number F_m / p_m."""
+        focal_length = self.known_focal_length_mm
+        if self.aperture_mm is not None or self.f_number is None or focal_length is None:
+            return self.aperture_mm
+        return focal_length / self.f_number
+
 
 class Microlenses(Section):
     """The microlens array: pitch p_l, focal length f_m or f_number (f_m / p_l), layout.
@@ -213,6 +253,13 @@ class Microlenses(Section):
     columns: Count | None = None
     rows: Count | None = None
     layout: Layout | None = None
+
+    @property
+    def known_focal_length_mm(self) -> float | None:
+        """f_m, given or from the f-number f_m / p_l."""
+        if self.focal_length_mm is not None or self.f_number is None:
+            return self.focal_length_mm
+        return self.f_number * self.pitch_mm
 
 
 class Sensor(Section):
@@ -238,6 +285,39 @@ class CameraSection(Section):
     microlenses: Microlenses
     sensor: Sensor
 
+    @property
+    def missing(self) -> str | None:
+        """The first key that a whole camera lacks, None where nothing is missing."""
+        if self.main_lens is None:
+            return "main_lens"
+        if self.main_lens.known_focal_length_mm is None:
+            return "main_lens.focal_length_mm"
+        if self.main_lens.known_aperture_mm is None:
+            return "main_lens.aperture_mm"
+        return "microlenses.focal_length_mm" if self.microlenses.known_focal_length_mm is None else None
+
+    def model(self) -> Camera | None:
+        """Return the camera, a lens centre on the axis, its thin lens for the real one; None where a key is missing."""
+        lens, microlenses, sensor = self.main_lens, self.microlenses, self.sensor
+        if lens is None or self.missing is not None:
+            return None
+        microlens_focal_length = microlenses.known_focal_length_mm or 0.0
+        real = Camera(
+            magnification=lens.magnification,
+            focal_length_mm=lens.known_focal_length_mm or 0.0,
+            aperture_mm=lens.known_aperture_mm or 0.0,
+            microlens_focal_length_mm=microlens_focal_length,
+            microlens_distance_mm=sensor.microlens_distance_mm or microlens_focal_length,
+            lattice=Lattice.regular(microlenses.pitch_mm, microlenses.layout or "square"),
+            pixel_mm=sensor.pixel_um * UM_TO_MM,
+            columns=sensor.columns,
+            rows=sensor.rows,
+            column_axis=sensor.column_axis,
+            diffusion_px=sensor.diffusion_px,
+        )
+        # 1/P, 0 of a lens that is telecentric towards the array.
+        return thin_lens(real, 0.0 if lens.image_distance == "infinite" else 1.0 / lens.pupil_ratio)
+
 
 class MediaSection(Section):
     """Refractive indices in front of the lens: of the air, the window and the fluid.
@@ -250,6 +330,10 @@ class MediaSection(Section):
     fluid: Index = 1.0
     fluid_density_kg_m3: Positive | None = None
     fluid_viscosity_pa_s: Positive | None = None
+
+    def model(self) -> Media:
+        """Return the refractive indices."""
+        return Media(self.air, self.window, self.fluid)
 
 
 class WindowSection(Section):
@@ -271,6 +355,25 @@ class VolumeSection(Section):
     size_mm: tuple[Positive, Positive, Positive] | None = None
     centre_mm: Vector = (0.0, 0.0, 0.0)
     reference: ReferenceName = "focal_point"
+
+    def grid(self, scale: Scale | None, reference: Reference) -> Grid:
+        """Return the volume's grid, z from the focal point, where the section counts z from a reference.
+
+        The camera's `scale` is needed only where the section leaves the voxels to the program.
+        """
+        shape, voxel = self.shape_xyz, self.voxel_mm
+        if shape is None or voxel is None:
+            if self.size_mm is None or scale is None:
+                raise ValueError("neither shape_xyz and voxel_mm nor size_mm with a camera")
+            # What serves the velocity best: near a third of a microlens laterally, as it appears in the scene, and a
+            # fifth of the depth over which light spreads by one lens; voxels divide the size.
+            lateral, depth = scale.lens_mm / LATERAL_VOXELS_PER_MICROLENS, scale.depth_mm / VOXELS_PER_DEPTH
+            sides = zip(self.size_mm, (lateral, lateral, depth), strict=True)
+            nx, ny, nz = (max(1, round(size / target)) for size, target in sides)
+            x, y, z = self.size_mm
+            shape, voxel = (nx, ny, nz), (x / nx, y / ny, z / nz)
+        x, y, z = self.centre_mm
+        return Grid.centred(shape, voxel, (x, y, reference.depth_to_focal_point(z)))
 
 
 # OpenCV's names of the dictionaries of ArUco markers.
@@ -324,75 +427,6 @@ class PipeSection(Section):
     centre_mm: Vector = (0.0, 0.0, 0.0)
     no_slip: bool = False
 
-
-class WeightsSection(Section):
-    """How weights are made.
-
-    method: equivalent points (ert); rays traced through window and fluid (drt), which reads the window's distance; or
-    polynomials fitted to boards at several depths (dlfc), which the calibration holds.
-    refraction: paraxial, or Snell's law with its aberration (exact), which needs the thickness of what lies before the
-    points: the section window, or channel with a calibrated mid plane. sampling: integrals (exact), or the paper's
-    count of rays_per_point rays from each of `points` random points of a voxel (rays), seeded; for small volumes only.
-    """
-
-    method: Method = "ert"
-    refraction: Refraction = "paraxial"
-    sampling: Sampling = "exact"
-    points: Annotated[int, Field(ge=1, le=10_000_000)] = 500
-    rays_per_point: Annotated[int, Field(ge=1, le=10_000_000)] = 10_000
-    seed: Annotated[int, Field(ge=0)] = 0
-
-
-class ReconstructionSection(Section):
-    """The solver: em (default, better for velocity), sart (Eq. 12), smart, mart or particles; iterations; relaxation.
-
-    start: uniform (as the paper), or line_of_sight, which also leaves out for good what no light can have come from.
-    stop_change: end when an iteration lowers the residual by less than this share of it (default: never).
-    stop_noise: end when the residual is this many times the image's noise (default: never): read noise and, with
-    photons_per_count, light's own; the solver `particles` begins with it.
-    saturation_counts: pixels as bright as this are left out (default: those at the end of 8 to 16 bits).
-    particle_diameter_mm: of the tracers (default: by their images); only the solver `particles` reads it.
-    wavelength_nm: of the light, which lenses diffract: the solver `particles` and the fits of a target take waves
-    (default: rays).
-    diffusion_px: of charge in the sensor, as fits by waves take it (default: by the tracers' images,
-    0.3 for a target's).
-    accelerate: step from points extrapolated by Nesterov's momentum; a quarter of the iterations will do.
-    padding_voxel: voxels [x, y, z] solved for beyond each side of the volume and cropped on writing (default: derived
-    from how far light spreads).
-    """
-
-    solver: SolverName = "em"
-    start: Start = "uniform"
-    stop_change: Annotated[float, Field(gt=0.0, lt=1.0)] | None = None
-    stop_noise: Positive | None = None
-    photons_per_count: Positive | None = None
-    saturation_counts: Positive | None = None
-    particle_diameter_mm: Positive | None = None
-    wavelength_nm: Wavelength | None = None
-    diffusion_px: Diffusion | None = None
-    iterations: Annotated[int, Field(ge=1, le=100_000)] = 24
-    relaxation: Annotated[float, Field(gt=0.0, le=2.0)] = 1.0
-    accelerate: bool = True
-    padding_voxel: (
-        tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]] | None
-    ) = None
-
-
-class CorrelationSection(Section):
-    """The correlation windows, coarse to fine, in voxels (numbers or [x, y, z]), or the final one as window_mm.
-
-    Default: 32 and 16 voxels, fewer where voxels are longer along an axis, but not below 16 and 8.
-
-    overlap: of neighbouring windows, a number or [x, y, z]. dt_s: time between the volumes of a pair.
-    mask: channel leaves out what lies beyond the channel's walls across the depth (needs reference: mid_plane), pipe
-    what lies outside the section pipe.
-    exponent: power of the intensities that is correlated (default: 0.5 for volumes of the solvers em, smart and mart;
-    their brightest particles outweigh all others; and 1 for sart's).
-    """
-
-    windows: Windows | None = None
-    window_mm: PerAxis | None = None
-    overlap: Overlaps = (0.5, 0.5, 0.5)
-    dt_s: Positive | None = None
-    mask: Mask | None = None
-    exponent: Annotated[float, Field(gt=0.0, le=1.0)] | None = None
+    def wall(self) -> RoundWall:
+        """Return the inside of the pipe, in the volume's coordinates."""
+        return RoundWall(self.radius_mm, self.centre_mm, self.axis)

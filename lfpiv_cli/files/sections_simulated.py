@@ -1,4 +1,4 @@
-"""The sections of what is not the rig: flows, what `simulate` and `validate` do; and all sections together."""
+"""The sections of what is done with a rig, flows, what `simulate` and `validate` do; and all sections together."""
 
 from __future__ import annotations
 
@@ -6,37 +6,136 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from lfpiv_cli.calibration.wave_shapes import WaveLight
 from lfpiv_cli.files.sections import (
     MOST_BUBBLES,
     MOST_FRAMES,
     MOST_PARTICLES,
+    NM_TO_MM,
     Angle,
     BoardSection,
     CameraSection,
     ChannelSection,
-    CorrelationSection,
+    Diffusion,
     FaceSection,
     MediaSection,
     NotNegative,
+    Overlaps,
     Pair,
+    PerAxis,
     PipeAxis,
     PipeSection,
     Positive,
-    ReconstructionSection,
     Section,
     Share,
     Vector,
     VolumeSection,
     Wavelength,
-    WeightsSection,
+    Windows,
     WindowSection,
 )
-from lfpiv_cli.names import BoardImages, BoardMethod, BubbleWall, FlowMethod, Refraction
+from lfpiv_cli.names import (
+    BoardImages,
+    BoardMethod,
+    BubbleWall,
+    FlowMethod,
+    Mask,
+    Method,
+    Refraction,
+    Sampling,
+    Start,
+)
+from lfpiv_cli.optics.line_responses import USUAL_DIFFUSION_PX
+from lfpiv_cli.optics.waves import Waves
+from lfpiv_cli.reconstruction.registry import SolverName
+from lfpiv_cli.reference import Reference
+from lfpiv_cli.synthetic.flows import FLOWS
+from lfpiv_cli.synthetic.vortices import Flow
 
 # Each point is carried by all of them: of more, a frame of many tracers takes gigabytes.
 MOST_MODES = 2000
 # Of the aperture: beyond this the corners see next to nothing.
 MOST_VIGNETTING = 0.9
+
+
+class WeightsSection(Section):
+    """How weights are made.
+
+    method: equivalent points (ert); rays traced through window and fluid (drt), which reads the window's distance; or
+    polynomials fitted to boards at several depths (dlfc), which the calibration holds.
+    refraction: paraxial, or Snell's law with its aberration (exact), which needs the thickness of what lies before the
+    points: the section window, or channel with a calibrated mid plane. sampling: integrals (exact), or the paper's
+    count of rays_per_point rays from each of `points` random points of a voxel (rays), seeded; for small volumes only.
+    """
+
+    method: Method = "ert"
+    refraction: Refraction = "paraxial"
+    sampling: Sampling = "exact"
+    points: Annotated[int, Field(ge=1, le=10_000_000)] = 500
+    rays_per_point: Annotated[int, Field(ge=1, le=10_000_000)] = 10_000
+    seed: Annotated[int, Field(ge=0)] = 0
+
+
+class ReconstructionSection(Section):
+    """The solver: em (default, better for velocity), sart (Eq. 12), smart, mart or particles; iterations; relaxation.
+
+    start: uniform (as the paper), or line_of_sight, which also leaves out for good what no light can have come from.
+    stop_change: end when an iteration lowers the residual by less than this share of it (default: never).
+    stop_noise: end when the residual is this many times the image's noise (default: never): read noise and, with
+    photons_per_count, light's own; the solver `particles` begins with it.
+    saturation_counts: pixels as bright as this are left out (default: those at the end of 8 to 16 bits).
+    particle_diameter_mm: of the tracers (default: by their images); only the solver `particles` reads it.
+    wavelength_nm: of the light, which lenses diffract: the solver `particles` and the fits of a target take waves
+    (default: rays).
+    diffusion_px: of charge in the sensor, as fits by waves take it (default: by the tracers' images,
+    0.3 for a target's).
+    accelerate: step from points extrapolated by Nesterov's momentum; a quarter of the iterations will do.
+    padding_voxel: voxels [x, y, z] solved for beyond each side of the volume and cropped on writing (default: derived
+    from how far light spreads).
+    """
+
+    solver: SolverName = "em"
+    start: Start = "uniform"
+    stop_change: Annotated[float, Field(gt=0.0, lt=1.0)] | None = None
+    stop_noise: Positive | None = None
+    photons_per_count: Positive | None = None
+    saturation_counts: Positive | None = None
+    particle_diameter_mm: Positive | None = None
+    wavelength_nm: Wavelength | None = None
+    diffusion_px: Diffusion | None = None
+    iterations: Annotated[int, Field(ge=1, le=100_000)] = 24
+    relaxation: Annotated[float, Field(gt=0.0, le=2.0)] = 1.0
+    accelerate: bool = True
+    padding_voxel: (
+        tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]] | None
+    ) = None
+
+    def wave_light(self) -> WaveLight | None:
+        """Return the waves that images are read by, None where they are read by rays."""
+        if self.wavelength_nm is None:
+            return None
+        diffusion_px = USUAL_DIFFUSION_PX if self.diffusion_px is None else self.diffusion_px
+        return WaveLight(self.wavelength_nm * NM_TO_MM, diffusion_px)
+
+
+class CorrelationSection(Section):
+    """The correlation windows, coarse to fine, in voxels (numbers or [x, y, z]), or the final one as window_mm.
+
+    Default: 32 and 16 voxels, fewer where voxels are longer along an axis, but not below 16 and 8.
+
+    overlap: of neighbouring windows, a number or [x, y, z]. dt_s: time between the volumes of a pair.
+    mask: channel leaves out what lies beyond the channel's walls across the depth (needs reference: mid_plane), pipe
+    what lies outside the section pipe.
+    exponent: power of the intensities that is correlated (default: 0.5 for volumes of the solvers em, smart and mart;
+    their brightest particles outweigh all others; and 1 for sart's).
+    """
+
+    windows: Windows | None = None
+    window_mm: PerAxis | None = None
+    overlap: Overlaps = (0.5, 0.5, 0.5)
+    dt_s: Positive | None = None
+    mask: Mask | None = None
+    exponent: Annotated[float, Field(gt=0.0, le=1.0)] | None = None
 
 
 class SquareDuct(Section):
@@ -171,6 +270,15 @@ FlowSection = Annotated[
 ]
 
 
+def flow_of(section: FlowSection, reference: Reference) -> Flow:
+    """Return a flow as a function of points, z from the focal point, where the section counts z from a reference."""
+    parameters = section.model_dump(exclude={"kind"})
+    if "centre_mm" in parameters:
+        x, y, z = parameters["centre_mm"]
+        parameters["centre_mm"] = (x, y, reference.depth_to_focal_point(z))
+    return FLOWS[section.kind](**parameters)
+
+
 class PulsationSection(Section):
     """A flow that is faster and slower by turns, everywhere alike: times 1 + amplitude sin(2 pi frequency_hz t).
 
@@ -186,6 +294,10 @@ class RaysSection(Section):
 
     kind: Literal["rays"] = "rays"
 
+    def waves(self) -> Waves | None:
+        """Return the waves that light is made of: none."""
+        return None
+
 
 class WavesSection(Section):
     """Light of one wavelength_nm (in air) as scalar waves, which main lens and microlenses diffract.
@@ -196,6 +308,10 @@ class WavesSection(Section):
     kind: Literal["waves"]
     wavelength_nm: Wavelength = 532.0
     points: Annotated[int, Field(ge=3, le=1000)] = 16
+
+    def waves(self) -> Waves | None:
+        """Return the waves that light is made of."""
+        return Waves(self.wavelength_nm * NM_TO_MM, self.points)
 
 
 class ObjectiveSection(Section):

@@ -29,7 +29,6 @@ from lfpiv_cli.files.inputs import reason
 # A claim is a small hidden file beside the output, which only one worker can create. A claim that a dead worker left
 # is taken over; should two take it over at once, both make the output, which is written whole and the same by either.
 
-
 # A worker touches its claim this often; one that was not touched for so long belongs to a worker that is dead, on
 # whatever host. The clocks of hosts that share a disk differ by less.
 TOUCHED_EVERY_S, DEAD_AFTER_S = 20.0, 300.0
@@ -46,11 +45,20 @@ def claimed(target: Path) -> Iterator[bool]:
     OutputError : the folder takes no file, or cannot be made
     """
     claim, granted, ended = claim_path(target), False, threading.Event()
+
+    def keep_touching() -> None:
+        while not ended.wait(TOUCHED_EVERY_S):
+            with contextlib.suppress(OSError):
+                os.utime(claim)
+
     with folder_of(target):
         try:
-            granted = _create(claim) or (_is_dead(claim) and _take_over(claim))
+            granted = _create(claim)
+            if not granted and _is_dead(claim):
+                claim.unlink(missing_ok=True)
+                granted = _create(claim)
             if granted:
-                threading.Thread(target=_keep_touching, args=(claim, ended), daemon=True).start()
+                threading.Thread(target=keep_touching, daemon=True).start()
             yield granted
         finally:
             ended.set()
@@ -60,12 +68,7 @@ def claimed(target: Path) -> Iterator[bool]:
 
 @contextmanager
 def awaited(target: Path) -> Iterator[None]:
-    """Claim an output, after another worker that makes it now has ended.
-
-    Raises
-    ------
-    OutputError : as `claimed`
-    """
+    """Claim an output, after another worker that makes it now has ended."""
     while True:
         with claimed(target) as granted:
             if granted:
@@ -95,12 +98,6 @@ def _create(claim: Path) -> bool:
     return True
 
 
-def _take_over(claim: Path) -> bool:
-    """Put a claim in the place of a dead worker's; return whether nobody else was quicker."""
-    claim.unlink(missing_ok=True)
-    return _create(claim)
-
-
 def _is_dead(claim: Path) -> bool:
     """Return whether a claim's worker is dead: no process of this host, or silent for long."""
     try:
@@ -112,13 +109,6 @@ def _is_dead(claim: Path) -> bool:
     except (OSError, ValueError, KeyError, TypeError):
         return silent_s > DEAD_AFTER_S  # it is being written, or its worker was killed while it was
     return silent_s > DEAD_AFTER_S or (host == socket.gethostname() and not is_running(process))
-
-
-def _keep_touching(claim: Path, ended: threading.Event) -> None:
-    """Show that the claim's worker is alive, until the work has ended."""
-    while not ended.wait(TOUCHED_EVERY_S):
-        with contextlib.suppress(OSError):
-            os.utime(claim)
 
 
 # In place of i/n: what Slurm tells each job of an array.
@@ -144,7 +134,15 @@ class Shard:
         UsageError : it is neither, or Slurm's array is not a run of numbers at equal steps.
         """
         if text == SLURM:
-            return cls._of_slurm(environment)
+            task, first, count = (_slurms(environment, name) for name in ("ID", "MIN", "COUNT"))
+            step = _slurms(environment, "STEP", 1)
+            place, beside = divmod(task - first, max(step, 1))
+            if beside or not 0 <= place < count:
+                raise UsageError(
+                    f"--shard {SLURM}: task {task} is none of {count} that begin at {first} in steps of {step}; give "
+                    "a range, as --array=1-20"
+                )
+            return cls(place + 1, count)
         found = re.fullmatch(r"(\d{1,7})/(\d{1,7})", text, re.ASCII)
         if found is None:
             raise UsageError(f"--shard {text}: is neither i/n, as 2/3, nor {SLURM}")
@@ -152,19 +150,6 @@ class Shard:
         if not 1 <= number <= count <= MOST_SHARES:
             raise UsageError(f"--shard {text}: i goes from 1 to n, and n to {MOST_SHARES}")
         return cls(number, count)
-
-    @classmethod
-    def _of_slurm(cls, environment: Mapping[str, str]) -> Shard:
-        """Return the share of a job by its place in Slurm's array."""
-        task, first, count = (_slurms(environment, name) for name in ("ID", "MIN", "COUNT"))
-        step = _slurms(environment, "STEP", 1)
-        place, beside = divmod(task - first, max(step, 1))
-        if beside or not 0 <= place < count:
-            raise UsageError(
-                f"--shard {SLURM}: task {task} is none of {count} that begin at {first} in steps of {step}; give a "
-                "range, as --array=1-20"
-            )
-        return cls(place + 1, count)
 
     @property
     def is_last(self) -> bool:
@@ -266,7 +251,15 @@ class Runs:
         """Return the next frame for a worker, of which there are some left."""
         place = self._last.get(worker, -1) + 1
         if worker not in self._last or place not in self._left:
-            place = self._new_begin()
+            # Where the longest run that is left begins, or its middle if somebody else comes to its begin.
+            runs: list[list[int]] = []
+            for left in sorted(self._left):
+                if runs and left == runs[-1][-1] + 1:
+                    runs[-1].append(left)
+                else:
+                    runs.append([left])
+            longest = max(runs, key=len)
+            place = longest[len(longest) // 2 if longest[0] - 1 in self._last.values() else 0]
         self._last[worker] = place
         self._left.remove(place)
         return self._numbers[place]
@@ -274,14 +267,3 @@ class Runs:
     def put_back(self, number: int) -> None:
         """Take back a frame that a worker was given."""
         self._left.add(self._numbers.index(number))
-
-    def _new_begin(self) -> int:
-        """Return where the longest run that is left begins, or its middle if somebody else comes to its begin."""
-        runs: list[list[int]] = []
-        for place in sorted(self._left):
-            if runs and place == runs[-1][-1] + 1:
-                runs[-1].append(place)
-            else:
-                runs.append([place])
-        longest = max(runs, key=len)
-        return longest[len(longest) // 2 if longest[0] - 1 in self._last.values() else 0]

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import h5py
 import numpy as np
@@ -36,7 +36,6 @@ from lfpiv_cli.reference import Reference
 
 # What all `*.vtkhdf` files have in common: VTK's header, and what a file says about itself at its root.
 
-
 # The version of VTK's layout that ParaView 5.12 reads and later ones still do.
 VTK_VERSION = (2, 0)
 
@@ -50,22 +49,19 @@ class Header:
     provenance: dict[str, Any]
 
 
-def create_vtk_group(file: h5py.File, kind: Literal["ImageData", "PolyData"]) -> h5py.Group:
-    """Return a new group `/VTKHDF` that names its version and kind."""
+def create_vtk_group(file: h5py.File, grid: Grid | None) -> h5py.Group:
+    """Return a new group `/VTKHDF` that names its version and kind: an image on a grid, or points."""
     vtk = file.create_group("VTKHDF")
     vtk.attrs["Version"] = np.array(VTK_VERSION, dtype=np.int64)
     # A string of fixed length: VTK up to 9.4.2 fails on a variable one.
-    vtk.attrs["Type"] = np.bytes_(kind)
+    vtk.attrs["Type"] = np.bytes_("PolyData" if grid is None else "ImageData")
+    if grid is not None:
+        nx, ny, nz = grid.shape_xyz
+        vtk.attrs["WholeExtent"] = np.array([0, nx - 1, 0, ny - 1, 0, nz - 1], dtype=np.int64)
+        vtk.attrs["Origin"] = np.array(grid.origin_mm, dtype=np.float64)
+        vtk.attrs["Spacing"] = np.array(grid.spacing_mm, dtype=np.float64)
+        vtk.attrs["Direction"] = np.eye(3).ravel()
     return vtk
-
-
-def place_image(vtk: h5py.Group, grid: Grid) -> None:
-    """Say where the points of an ImageData lie."""
-    nx, ny, nz = grid.shape_xyz
-    vtk.attrs["WholeExtent"] = np.array([0, nx - 1, 0, ny - 1, 0, nz - 1], dtype=np.int64)
-    vtk.attrs["Origin"] = np.array(grid.origin_mm, dtype=np.float64)
-    vtk.attrs["Spacing"] = np.array(grid.spacing_mm, dtype=np.float64)
-    vtk.attrs["Direction"] = np.eye(3).ravel()
 
 
 def write_steps(
@@ -173,18 +169,13 @@ def write_volume(
     array_zyx : (nz, ny, nx), stored as float32
     reference : the origin that the grid's z counts from
     attributes : scalars, strings and short arrays for the root
-
-    Raises
-    ------
-    OutputExistsError, OutputError
     """
     if array_zyx.shape != grid.shape_zyx:
         raise ValueError(f"the array's shape is {array_zyx.shape}, the grid's {grid.shape_zyx}")
 
     def fill(file: h5py.File) -> None:
         write_root(file, VOLUME_FORMAT, FORMAT_VERSION, reference, attributes, provenance)
-        points = _write_frame(file, grid, with_component=False)
-        _write_points(file, points, "intensity", array_zyx.astype(np.float32), "1")
+        _write_on_grid(file, grid, {"intensity": (array_zyx.astype(np.float32), "1")})
 
     create(path, fill, overwrite=overwrite, check=open_volume)
 
@@ -194,14 +185,13 @@ def open_volume(path: Path | str) -> Volume:
 
     Raises
     ------
-    InputError
-        If the file is missing, broken, not a volume, or holds values that are not finite.
+    InputError : the file is missing, broken, not a volume, or holds values that are not finite
     """
     path = Path(path)
     with open_h5(path) as file:
         ensure_format(path, file, VOLUME_FORMAT, (FORMAT_VERSION,))
-        grid = _read_grid(file)
-        array = _read_points(file, "intensity", grid, path.stat().st_size, components=False)
+        grid = grid_in(file)
+        array = read_on_grid(path, file, grid, {"intensity": False})["intensity"]
         root = read_root(file)
     bad = int(np.count_nonzero(~np.isfinite(array)))
     if bad:
@@ -224,10 +214,6 @@ def write_vectors(
     ----------
     reference : the origin that the grid's z counts from
     extra : arrays (nz, ny, nx) or (nz, ny, nx, 3) to store besides, by their name, with their unit
-
-    Raises
-    ------
-    OutputExistsError, OutputError
     """
 
     def fill(file: h5py.File) -> None:
@@ -237,15 +223,11 @@ def write_vectors(
         file.attrs["flag_meanings"] = np.bytes_(FLAG_MEANINGS)
         if field.dt_s is not None:
             file.attrs["dt_s"] = float(field.dt_s)
-        points = _write_frame(file, field.grid, with_component=True)
-        points.attrs["Vectors"] = np.bytes_("velocity")
-        _write_points(file, points, "velocity", field.velocity, "m/s")
-        for name, (unit, _) in VECTOR_ARRAYS.items():
-            _write_points(file, points, name, getattr(field, name), unit)
+        arrays = {"velocity": (field.velocity, "m/s")}
+        arrays |= {name: (getattr(field, name), unit) for name, (unit, _) in VECTOR_ARRAYS.items()}
         if field.uncertainty_voxel is not None:
-            _write_points(file, points, UNCERTAINTY, field.uncertainty_voxel, "voxel")
-        for name, (array, unit) in (extra or {}).items():
-            _write_points(file, points, name, array, unit)
+            arrays[UNCERTAINTY] = (field.uncertainty_voxel, "voxel")
+        _write_on_grid(file, field.grid, arrays | dict(extra or {}))
 
     create(path, fill, overwrite=overwrite, check=open_vectors)
 
@@ -255,29 +237,26 @@ def open_vectors(path: Path | str) -> VectorField:
 
     Raises
     ------
-    InputError
-        If the file is missing, broken, not a vector field, or a vector counts as valid and is not finite.
+    InputError : the file is missing, broken, not a vector field, or a vector counts as valid and is not finite
     """
     path = Path(path)
     with open_h5(path) as file:
         ensure_format(path, file, VECTORS_FORMAT, (FORMAT_VERSION,))
-        grid = _read_grid(file)
-        size = path.stat().st_size
-        arrays = {
-            name: _read_points(file, name, grid, size, components=vector) for name, (_, vector) in VECTOR_ARRAYS.items()
-        }
-        uncertainty = _read_points(file, UNCERTAINTY, grid, size, components=True) if UNCERTAINTY in file else None
+        grid = grid_in(file)
+        components = {name: vector for name, (_, vector) in VECTOR_ARRAYS.items()}
+        arrays = read_on_grid(path, file, grid, components | ({UNCERTAINTY: True} if UNCERTAINTY in file else {}))
         voxel = [float(v) for v in file.attrs["voxel_mm"]]
         window = [int(v) for v in file.attrs["window_voxel"]]
         dt_s = float(file.attrs["dt_s"]) if "dt_s" in file.attrs else None
+    uncertainty = arrays.pop(UNCERTAINTY, None)
     if arrays["flag"].max() > LARGEST_FLAG:
         raise InputError(f"{path}: a flag is {arrays['flag'].max()}, allowed are 0 to {LARGEST_FLAG}")
     field = VectorField(
         grid=grid,
-        uncertainty_voxel=uncertainty,
         voxel_mm=(voxel[0], voxel[1], voxel[2]),
         dt_s=dt_s,
         window_voxel=(window[0], window[1], window[2]),
+        uncertainty_voxel=uncertainty,
         **arrays,
     )
     if not np.isfinite(field.displacement_voxel[field.flag < REJECTED]).all():
@@ -285,70 +264,39 @@ def open_vectors(path: Path | str) -> VectorField:
     return field
 
 
-def read_arrays(path: Path | str) -> tuple[Grid, dict[str, tuple[NDArray[Any], str]]]:
-    """Read the grid of a vector field and every array on it with its unit: those that commands store besides, too.
-
-    Raises
-    ------
-    InputError
-    """
-    path = Path(path)
-    with open_h5(path) as file:
-        ensure_format(path, file, VECTORS_FORMAT, (FORMAT_VERSION,))
-        grid, size, found = _read_grid(file), path.stat().st_size, {}
-        places = 2 if grid.shape_zyx[0] == 1 else 3
-        for name in member(member(file, "VTKHDF"), "PointData"):
-            dataset = array_member(file, name)
-            array = _read_points(file, name, grid, size, components=dataset.ndim > places)
-            found[name] = (array, dataset.attrs["units"].decode())
-    return grid, found
-
-
 def read_grid(path: Path) -> Grid:
-    """Read the grid of a volume or a vector field.
-
-    Raises
-    ------
-    InputError
-    """
+    """Read the grid of a volume or a vector field."""
     with open_h5(path) as file:
-        return _read_grid(file)
+        return grid_in(file)
 
 
 def read_header(path: Path | str) -> Header:
-    """Read what a volume, a vector field or points say about themselves.
-
-    Raises
-    ------
-    InputError
-    """
+    """Read what a volume, a vector field or points say about themselves."""
     with open_h5(Path(path)) as file:
         return read_root(file)
 
 
-def _write_frame(file: h5py.File, grid: Grid, with_component: bool) -> h5py.Group:
-    """Write the dimension scales and `/VTKHDF`, return its `PointData`."""
+def _write_on_grid(file: h5py.File, grid: Grid, arrays: Mapping[str, tuple[NDArray[Any], str]]) -> None:
+    """Write arrays with their units and dimension scales at the root, and link them under `/VTKHDF/PointData`."""
     for axis, name in enumerate("xyz"):
         write_array(file, name, grid.axis_mm(axis), "mm").make_scale(name)
-    if with_component:
+    if "velocity" in arrays:
         write_array(file, "component", np.arange(3), "1").make_scale("component")
-    vtk = create_vtk_group(file, "ImageData")
-    place_image(vtk, grid)
-    return vtk.create_group("PointData")
+    points = create_vtk_group(file, grid).create_group("PointData")
+    if "velocity" in arrays:
+        points.attrs["Vectors"] = np.bytes_("velocity")
+    for name, (array, unit) in arrays.items():
+        axes = ["z", "y", "x"] + ["component"] * (array.ndim - 3)
+        if array.shape[0] == 1:
+            array, axes = array[0], axes[1:]
+        dataset = write_array(file, name, array, unit)
+        for position, axis_name in enumerate(axes):
+            dataset.dims[position].attach_scale(file[axis_name])
+        points[name] = dataset
 
 
-def _write_points(file: h5py.File, points: h5py.Group, name: str, array: NDArray[Any], unit: str) -> None:
-    """Write an array at the root with its dimension scales and link it under PointData."""
-    axes = ["z", "y", "x"] + ["component"] * (array.ndim - 3)
-    if array.shape[0] == 1:
-        array, axes = array[0], axes[1:]
-    dataset = write_array(file, name, array, unit)
-    for position, axis in enumerate(axes):
-        dataset.dims[position].attach_scale(file[axis])
-    points[name] = dataset
-
-
-def _read_grid(file: h5py.File) -> Grid:
+def grid_in(file: h5py.File) -> Grid:
+    """Return the grid of an open file."""
     vtk = member(file, "VTKHDF").attrs
     extent = [int(v) for v in vtk["WholeExtent"]]
     spacing = [float(v) for v in vtk["Spacing"]]
@@ -366,11 +314,14 @@ def _read_grid(file: h5py.File) -> Grid:
     )
 
 
-def _read_points(file: h5py.File, name: str, grid: Grid, file_bytes: int, components: bool) -> NDArray[Any]:
-    """Read an array of the grid's shape, with the third axis put back on a single plane."""
-    shape = grid.shape_zyx + ((3,) if components else ())
-    stored = shape[1:] if shape[0] == 1 else shape
-    dataset = array_member(file, name)
-    if dataset.shape != stored:
-        raise ValueError(f"{name} has the shape {dataset.shape}, its extent says {stored}")
-    return read_array(dataset, file_bytes).reshape(shape)
+def read_on_grid(path: Path, file: h5py.File, grid: Grid, components: Mapping[str, bool]) -> dict[str, NDArray[Any]]:
+    """Read arrays of the grid's shape, with components or without, the third axis put back on a single plane."""
+    found = {}
+    for name, with_components in components.items():
+        shape = grid.shape_zyx + ((3,) if with_components else ())
+        stored = shape[1:] if shape[0] == 1 else shape
+        dataset = array_member(file, name)
+        if dataset.shape != stored:
+            raise ValueError(f"{name} has the shape {dataset.shape}, its extent says {stored}")
+        found[name] = read_array(dataset, path.stat().st_size).reshape(shape)
+    return found

@@ -18,7 +18,8 @@ says how many voxels lie outside the fluid. Weights of earlier versions are refu
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+import math
+from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -30,23 +31,23 @@ from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.calibration.white import vignetting_surface
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.files import calibration_file
-from lfpiv_cli.files.checks import LARGEST_NUMBER, SMALLEST_NUMBER
-from lfpiv_cli.files.hdf5 import ensure_format, open_h5, read_provenance, read_tree, write_tree
-from lfpiv_cli.files.weights_fields import (
-    CAMERA_SCALARS,
-    faces_tree,
-    read_camera,
-    read_face,
-    read_grid,
-    read_media,
-    read_number,
+from lfpiv_cli.files.checks import (
+    FEWEST_PIXELS_A_LENS,
+    LARGEST_NUMBER,
+    MOST_PIXELS_A_LENS,
+    SMALLEST_NUMBER,
+    lens_image_faults,
 )
+from lfpiv_cli.files.hdf5 import ensure_format, open_h5, read_provenance, read_tree, write_tree
+from lfpiv_cli.files.inputs import physical_memory
+from lfpiv_cli.files.sections import MOST_PIXELS_PER_SIDE, MOST_VOXELS_PER_SIDE
 from lfpiv_cli.grid import Grid
-from lfpiv_cli.names import Refraction, TracedMethod, names_in
+from lfpiv_cli.names import ColumnAxis, Facing, Layout, Refraction, TracedMethod, names_in
 from lfpiv_cli.notice import written
-from lfpiv_cli.optics.camera import Camera
-from lfpiv_cli.optics.curved_space import CurvedSpace
-from lfpiv_cli.optics.media import Window
+from lfpiv_cli.optics.camera import Camera, Lattice
+from lfpiv_cli.optics.curved_space import CurvedSpace, Face
+from lfpiv_cli.optics.media import Media, Window
+from lfpiv_cli.optics.surfaces import SURFACES
 from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.reference import Reference
 from lfpiv_cli.simd.combine import COEFFICIENTS
@@ -70,6 +71,17 @@ UNITS = calibration_file.UNITS | dict.fromkeys((*NUMBERS, *BLOCKS), "1")
 UNITS |= dict.fromkeys(("shape_xyz", "padding_xyz"), "voxel")
 # Coefficients of `white.vignetting_surface`.
 VIGNETTING_SHAPE = (5, 5)
+# Of the camera, those above 0; what else there is of numbers may have any sign.
+POSITIVE = (
+    *("focal_length_mm", "aperture_mm", "microlens_focal_length_mm", "microlens_distance_mm"),
+    *("pixel_mm", "entrance_over_exit"),
+)
+CAMERA_SCALARS = ("magnification", *POSITIVE, "columns", "rows", "column_axis", "distortion_per_mm2")
+# A kernel holds a volume, its padding, what it is made from, and as many numbers of each pixel.
+BYTES_A_VOXEL, BYTES_A_PIXEL = 8, 8
+# A basis whose vectors are nearly parallel is of no array: hexagons have 0.87.
+LEAST_SINE = 0.5
+LARGEST_INDEX = 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,8 +185,8 @@ def open_weights(path: Path | str) -> WeightsFile:
     path = Path(path)
     tree, provenance = read_tree(path, FORMAT, (VERSION,))
     try:
-        camera = read_camera(_group(tree, "camera"))
-        grid, padding = read_grid(_group(tree, "grid"))
+        camera = _camera(_group(tree, "camera"))
+        grid, padding = _grid(_group(tree, "grid"))
         calibration = Calibration.from_tree(tree["calibration"]) if tree.get("calibration") else None
         if calibration:
             calibration.ensure_images_of(camera)
@@ -189,12 +201,7 @@ def open_weights(path: Path | str) -> WeightsFile:
 
 
 def read_weights_record(path: Path) -> dict[str, Any]:
-    """Return the record that a weights file carries; the weights themselves are not read.
-
-    Raises
-    ------
-    InputError : as `open_weights`
-    """
+    """Return the record that a weights file carries; the weights themselves are not read."""
     with open_h5(path) as file:
         ensure_format(path, file, FORMAT, (VERSION,))
         return read_provenance(file)
@@ -218,11 +225,15 @@ def _numbers(tree: dict[str, Any], name: str, shape: tuple[int, ...]) -> NDArray
 
 def _operator_tree(operator: WeightsOperator) -> dict[str, Any]:
     """Return the groups that hold an operator."""
-    if isinstance(operator, FactorisedOperator):
-        return {"columns": _axis_tree(operator.columns), "rows": _axis_tree(operator.rows)}
     if isinstance(operator, ColumnOperator):
         columns = operator.columns
         return {"counted": {"start": columns.start, "pixel": columns.pixel, "share": columns.share}}
+    axes: dict[str, Any] = {}
+    if isinstance(operator, (FactorisedOperator, StripOperator)):
+        for name, axis in (("columns", operator.columns), ("rows", operator.rows)):
+            axes[name] = {"start": axis.start, "cell": axis.cell, "share": axis.share}
+    if isinstance(operator, FactorisedOperator):
+        return axes
     if isinstance(operator, StripOperator):
         strips = {
             "lit": operator.lit.astype(np.uint8),
@@ -231,17 +242,23 @@ def _operator_tree(operator: WeightsOperator) -> dict[str, Any]:
             "misfit_l1": operator.misfit_l1,
         }
         strips |= {f"block_{name}": table for name, table in operator.blocks._asdict().items()}
-        return {"strips": strips, "columns": _axis_tree(operator.columns), "rows": _axis_tree(operator.rows)}
+        return {"strips": strips} | axes
     if isinstance(operator, BrickOperator):
         raise TypeError("bricks stand for hexagonal cells where particles are looked for, and are not stored")
     space = operator.source
     if isinstance(space, CurvedSpace):
-        return {"on_demand": asdict(space.media) | {"method": "ert", "faces": faces_tree(space)}}
+        kinds = {surface: kind for kind, surface in SURFACES.items()}
+        faces: dict[str, dict[str, Any]] = {}
+        for k, face in enumerate(space.faces):  # numbered from the camera on
+            faces[str(k)] = {"kind": kinds[type(face.surface)], "index": face.index}
+            for name, value in asdict(face.surface).items():  # type: ignore[call-overload]
+                faces[str(k)][name] = np.asarray(value, dtype=np.float64) if isinstance(value, tuple) else value
+        return {"on_demand": asdict(space.media) | {"method": "ert", "faces": faces}}
     if not isinstance(space, ObjectSpace):
         return {"on_demand": {"method": "dlfc"}}
     tracing = {"method": space.method, "refraction": space.refraction}
-    face = None if space.window is None else asdict(space.window)
-    return {"on_demand": asdict(space.media) | tracing | {"window_face": face}}
+    window = None if space.window is None else asdict(space.window)
+    return {"on_demand": asdict(space.media) | tracing | {"window_face": window}}
 
 
 def _operator(tree: dict[str, Any], camera: Camera, grid: Grid, calibration: Calibration | None) -> WeightsOperator:
@@ -251,7 +268,7 @@ def _operator(tree: dict[str, Any], camera: Camera, grid: Grid, calibration: Cal
     if "on_demand" in tree:
         return OnDemandOperator(camera, _source(tree["on_demand"], calibration), grid)
     if "counted" in tree:
-        columns = _counted(tree["counted"], nx * ny * nz, camera.rows * camera.columns)
+        columns = Columns(*_table(tree["counted"], "pixel", nx * ny * nz, camera.rows * camera.columns))
         return ColumnOperator((nz, along, across), (camera.rows, camera.columns), np.arange(nx * ny * nz), columns)
     optics = axis_optics(camera)
     if "strips" in tree:
@@ -273,41 +290,28 @@ def _strips(
     if misfit.ndim != 1 or not np.isfinite(misfit).all():
         raise ValueError("the strips' misfit is not a list of numbers")
     voxels, lines = shape[1:] if turned else shape[:0:-1]
-    blocks = _blocks(strips, shape[0], lines)
+    blocks = Blocks(*(strips[f"block_{name}"] for name in Blocks._fields))
+    if any(each.shape != blocks.plane.shape or each.ndim != 1 or each.dtype != np.int64 for each in blocks):
+        raise ValueError("the blocks' tables differ")
+    last = blocks.plane + blocks.planes - 1
+    if np.any(blocks.plane < 0) or np.any(blocks.planes < 1) or np.any(last >= shape[0]):
+        raise ValueError(f"blocks beyond {shape[0]} planes")
+    if np.any(blocks.plane // SLAB != last // SLAB) or np.any(blocks.line < 0) or np.any(blocks.line >= lines):
+        raise ValueError(f"blocks across slabs, or beyond {lines} lines")
+
     planes = int(blocks.planes.sum())
     across, along = optics if turned else optics[::-1]
     by_row = _axis_weights(tree["rows"], planes, STRIP, across)
     by_column = _axis_weights(tree["columns"], planes, voxels, along, COEFFICIENTS)
     mask = aperture_mask(by_column.cells, by_row.cells, camera.aperture_radius_mm)
-    order = _order_of_cells(strips, by_column)
-    return StripOperator(by_column, by_row, blocks, mask, order, lit.astype(bool), turned, misfit.astype(np.float64))
-
-
-def _order_of_cells(strips: dict[str, Any], columns: AxisWeights) -> NDArray[np.int32]:
-    """Return the order of the column cells, after checking that it has every cell that is lit, and none twice."""
-    order = strips["order"]
+    # The column cells in an order that has every one that is lit, and none twice.
+    order = np.asarray(strips["order"])
     if order.ndim != 1 or order.dtype != np.int32 or np.unique(order).size != order.size:
         raise ValueError("the order of the cells is none")
-    if (
-        not np.isin(columns.cell, order).all()
-        or order.min(initial=0) < 0
-        or order.max(initial=0) >= columns.cells.pixel.size
-    ):
+    is_whole = np.isin(by_column.cell, order).all() and order.min(initial=0) >= 0
+    if not is_whole or order.max(initial=0) >= by_column.cells.pixel.size:
         raise ValueError("the order of the cells misses some")
-    return np.asarray(order)
-
-
-def _blocks(strips: dict[str, Any], planes: int, lines: int) -> Blocks:
-    """Return where the blocks of a volume lie, after checking that none leads outside it."""
-    blocks = Blocks(*(strips[f"block_{name}"] for name in Blocks._fields))
-    if any(each.shape != blocks.plane.shape or each.ndim != 1 or each.dtype != np.int64 for each in blocks):
-        raise ValueError("the blocks' tables differ")
-    last = blocks.plane + blocks.planes - 1
-    if np.any(blocks.plane < 0) or np.any(blocks.planes < 1) or np.any(last >= planes):
-        raise ValueError(f"blocks beyond {planes} planes")
-    if np.any(blocks.plane // SLAB != last // SLAB) or np.any(blocks.line < 0) or np.any(blocks.line >= lines):
-        raise ValueError(f"blocks across slabs, or beyond {lines} lines")
-    return blocks
+    return StripOperator(by_column, by_row, blocks, mask, order, lit.astype(bool), turned, misfit.astype(np.float64))
 
 
 def _source(tree: dict[str, Any], calibration: Calibration | None) -> Source:
@@ -316,66 +320,158 @@ def _source(tree: dict[str, Any], calibration: Calibration | None) -> Source:
         if calibration is None or calibration.ray_fit is None:
             raise ValueError("fitted rays are missing")
         return calibration.ray_fit.rays
-    media = read_media(tree)
+    indices = [_number(name, tree[name]) for name in ("air", "window", "fluid")]
+    if not (min(indices) >= 1.0 and max(indices) <= LARGEST_INDEX):
+        raise ValueError(f"its refractive indices are {indices}, expected 1 to {LARGEST_INDEX:g}")
+    media = Media(*indices)
     if "faces" in tree:
         faces = _group(tree, "faces")
-        return CurvedSpace(media, tuple(read_face(faces[str(k)]) for k in range(len(faces))))
+        return CurvedSpace(media, tuple(_face(faces[str(k)]) for k in range(len(faces))))
     face = tree.get("window_face")
     if tree["method"] not in names_in(TracedMethod) or tree["refraction"] not in names_in(Refraction):
         raise ValueError(f"unknown tracing: {tree['method']}, {tree['refraction']}")
-    window = Window(**{name: read_number(name, value) for name, value in face.items()}) if face else None
+    window = Window(**{name: _number(name, value) for name, value in face.items()}) if face else None
     return ObjectSpace(media, window, tree["refraction"], tree["method"])
-
-
-def _counted(tree: dict[str, Any], voxels: int, pixels: int) -> Columns:
-    """Return counted columns after checking that no index leads outside its array."""
-    start, pixel, share = tree["start"], tree["pixel"], tree["share"]
-    _ensure_table(start, pixel, voxels, pixels)
-    _ensure_shares(share, pixel.shape, signed=False)
-    return Columns(start.astype(np.int64), pixel.astype(np.int32), share.astype(np.float32))
-
-
-def _axis_tree(axis: AxisWeights) -> dict[str, Any]:
-    return {"start": axis.start, "cell": axis.cell, "share": axis.share}
 
 
 def _axis_weights(
     tree: dict[str, Any], planes: int, voxels: int, optics: AxisOptics, coefficients: int = 0
 ) -> AxisWeights:
-    """Return the per-axis weights, or so many coefficients of each, after checking that no index leads outside."""
+    """Return the per-axis weights, or so many coefficients of each."""
     cells = micro_image_cells(optics)
-    start, cell, share = tree["start"], tree["cell"], tree["share"]
-    _ensure_table(start, cell, planes * voxels, cells.pixel.size)
-    _ensure_shares(share, (*cell.shape, coefficients) if coefficients else cell.shape, signed=coefficients > 0)
-    return AxisWeights(
-        planes,
-        voxels,
-        optics.pixels,
-        cells,
-        start.astype(np.int64),
-        cell.astype(np.int32),
-        share.astype(np.float32),
-    )
+    table = _table(tree, "cell", planes * voxels, cells.pixel.size, coefficients)
+    return AxisWeights(planes, voxels, optics.pixels, cells, *table)
 
 
-def _ensure_table(start: NDArray[Any], place: NDArray[Any], rows: int, places: int) -> None:
-    """Refuse a table whose rows do not follow each other, or that has a cell or pixel outside its array."""
+def _table(
+    tree: dict[str, Any], name: str, rows: int, places: int, coefficients: int = 0
+) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]:
+    """Return where the rows of a table of weights begin, the cell or pixel of each weight, and the weights.
+
+    Refused are rows that do not follow each other, places outside their array, and weights that are no numbers,
+    negative where they are no coefficients, or whose sums have no inverse in float32.
+    """
+    start, place, share = tree["start"], tree[name], tree["share"]
     if start.shape != (rows + 1,) or place.ndim != 1:
         raise ValueError(f"tables of {start.shape} and {place.shape} for {rows} voxels")
     if start[0] != 0 or start[-1] != place.size or np.any(np.diff(start) < 0):
         raise ValueError("the table's rows do not follow each other")
     if place.size and (place.min() < 0 or place.max() >= places):
         raise ValueError(f"cell or pixel {place.min()} or {place.max()} of {places}")
-
-
-def _ensure_shares(share: NDArray[Any], shape: tuple[int, ...], signed: bool) -> None:
-    """Refuse weights that are no numbers, negative where they may not be, or whose sums have no inverse in float32."""
+    shape = (*place.shape, coefficients) if coefficients else place.shape
     if share.shape != shape:
         raise ValueError(f"weights of the shape {share.shape}, expected {shape}")
-    if not np.all(np.isfinite(share)) or (not signed and share.min(initial=0.0) < 0.0):
+    if not np.all(np.isfinite(share)) or (not coefficients and share.min(initial=0.0) < 0.0):
         raise ValueError("a weight that is negative or not a number")
     largest = float(np.abs(share).max(initial=0.0))
     if share.size and not SMALLEST_NUMBER <= largest <= LARGEST_NUMBER:
         raise ValueError(
             f"the largest weight is {written(largest)}, expected {SMALLEST_NUMBER:g} to {LARGEST_NUMBER:g}"
         )
+    return start.astype(np.int64), place.astype(np.int32), share.astype(np.float32)
+
+
+# The camera, the grid and the faces, believed only as far as a config would be: what is missing, of another kind, or
+# nothing that they could have raises KeyError, TypeError or ValueError.
+
+
+def _camera(tree: dict[str, Any]) -> Camera:
+    """Return the camera of a weights file."""
+    values: dict[str, Any] = {name: _positive(name, tree[name]) for name in POSITIVE}
+    values |= {name: _whole(name, tree[name], 1, MOST_PIXELS_PER_SIDE) for name in ("columns", "rows")}
+    values["magnification"] = -_positive(
+        "the reverse of magnification", -_number("magnification", tree["magnification"])
+    )
+    values["distortion_per_mm2"] = _number("distortion_per_mm2", tree["distortion_per_mm2"])
+    for name, allowed in (("column_axis", names_in(ColumnAxis)), ("layout", names_in(Layout))):
+        if tree[name] not in allowed:
+            raise ValueError(f"{name} is {tree[name]!r}, expected one of {', '.join(allowed)}")
+    values["column_axis"] = tree["column_axis"]
+    pixels = values["columns"] * values["rows"]
+    if BYTES_A_PIXEL * pixels > physical_memory():
+        raise ValueError(f"{values['columns']} x {values['rows']} pixels do not fit into memory")
+    origin, basis = _array("lattice_origin_mm", tree, (2,)), _array("lattice_basis_mm", tree, (2, 2))
+    lattice = Lattice(origin, basis, tree["layout"])
+    if not lattice.cell_area >= LEAST_SINE * math.prod(lattice.pitch):
+        raise ValueError(f"the lattice's basis {basis.tolist()} is of no array of lenses")
+    camera = Camera(lattice=lattice, **values)
+    pitch_px = camera.lattice.pitch / camera.pixel_mm
+    if not (pitch_px.min() >= FEWEST_PIXELS_A_LENS and pitch_px.max() <= MOST_PIXELS_A_LENS):
+        raise ValueError(f"its lens images are {pitch_px.tolist()} px apart")
+    for fault in lens_image_faults(camera):
+        raise ValueError(fault[1])
+    return camera
+
+
+def _grid(tree: dict[str, Any]) -> tuple[Grid, tuple[int, int, int]]:
+    """Return the grid of a weights file and its padding."""
+    shape, padding = (
+        _triple(name, tree[name], lambda name, value, least=least: _whole(name, value, least, MOST_VOXELS_PER_SIDE))
+        for name, least in (("shape_xyz", 1), ("padding_xyz", 0))
+    )
+    spacing = _triple("spacing_mm", tree["spacing_mm"], _positive)
+    origin = _triple("origin_mm", tree["origin_mm"], _number)
+    grid = Grid(shape, spacing, origin)
+    voxels = math.prod(grid.padded(padding).shape_xyz)
+    if BYTES_A_VOXEL * voxels > physical_memory():
+        raise ValueError(f"{voxels} voxels do not fit into memory")
+    return grid, padding
+
+
+def _face(tree: dict[str, Any]) -> Face:
+    """Return a face that rays cross."""
+    if tree["kind"] not in SURFACES:
+        raise ValueError(f"a face is a {tree['kind']!r}, expected one of {', '.join(SURFACES)}")
+    kind = SURFACES[tree["kind"]]
+    values: dict[str, Any] = {}
+    for name in (field.name for field in fields(kind)):  # type: ignore[arg-type]
+        value = values[name] = tree[name]
+        if name == "facing":
+            if value not in names_in(Facing):
+                raise ValueError(f"facing is {value!r}, expected one of {', '.join(names_in(Facing))}")
+        elif name == "heights_mm":
+            heights = _array(name, tree, np.shape(value) if np.ndim(value) == 2 else (0, 0))
+            values[name] = tuple(tuple(row) for row in heights.tolist())
+        elif name == "spacing_mm":
+            values[name] = tuple(_positive(name, each) for each in _array(name, tree, (2,)).tolist())
+        elif isinstance(value, np.ndarray):
+            values[name] = _triple(name, value, _number)
+        else:
+            values[name] = (_positive if name == "radius_mm" else _number)(name, value)
+    index = _number("index", tree["index"])
+    if not 1.0 <= index <= LARGEST_INDEX:
+        raise ValueError(f"the index behind a face is {index:g}, expected 1 to {LARGEST_INDEX:g}")
+    return Face(kind(**values), index)
+
+
+def _array(name: str, tree: dict[str, Any], shape: tuple[int, ...]) -> NDArray[np.float64]:
+    array = np.asarray(tree[name])
+    if array.shape != shape or array.dtype.kind not in "fiu" or not (np.abs(array) <= LARGEST_NUMBER).all():
+        raise ValueError(f"{name} is {array.tolist()}, expected numbers of the shape {shape}")
+    return array.astype(np.float64)
+
+
+def _triple(name: str, values: Any, kind: Any) -> tuple[Any, Any, Any]:
+    if np.shape(values) != (3,):
+        raise ValueError(f"{name} has the shape {np.shape(values)}, expected (3,)")
+    first, second, third = (kind(name, value.item()) for value in np.asarray(values))
+    return first, second, third
+
+
+def _number(name: str, value: Any) -> float:
+    """Return a number of a file; a `ValueError` says which is none."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= LARGEST_NUMBER:
+        raise ValueError(f"{name} is {value!r}, expected a number")
+    return float(value)
+
+
+def _positive(name: str, value: Any) -> float:
+    if not _number(name, value) >= SMALLEST_NUMBER:
+        raise ValueError(f"{name} is {value!r}, expected {written(SMALLEST_NUMBER)} or more")
+    return float(value)
+
+
+def _whole(name: str, value: Any, least: int, most: int) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
+        raise ValueError(f"{name} is {value!r}, expected a whole number from {least} to {most}")
+    return value

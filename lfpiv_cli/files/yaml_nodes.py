@@ -10,7 +10,8 @@ import difflib
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,8 @@ from numpy.typing import NDArray
 from pydantic_core import ErrorDetails
 
 from lfpiv_cli.errors import ConfigError, InputError
-from lfpiv_cli.files.images import read_image
-from lfpiv_cli.files.inputs import content_of, ensure_regular_file, reason
+from lfpiv_cli.files.images import format_of, read_image
+from lfpiv_cli.files.inputs import content_of, ensure_regular_file, opened, reason
 from lfpiv_cli.files.sections_simulated import Sections
 from lfpiv_cli.notice import written
 
@@ -29,6 +30,8 @@ from lfpiv_cli.notice import written
 LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 LARGEST_BYTES = 2**20
+# Images and HDF5 files have a zero byte among their first ones, and no text has.
+BEGINNING_BYTES = 512
 DEEPEST = 20
 LARGEST_INTEGER = 2**63 - 1
 
@@ -83,17 +86,62 @@ class YamlError(Exception):
         self.problem = Problem(line, column, "", message)
 
 
-def read_document(content: bytes) -> Document:
+def read_rig(path: Path) -> Document:
+    """Read a rig file, and the heights of each file that a face names, beside it, in the file's place.
+
+    Raises
+    ------
+    ConfigError : it is no YAML of the kind that is read here, or heights cannot be read
+    InputError : the file is missing or not a file
+    """
+    size = ensure_regular_file(path)
+    with opened(path) as file:
+        is_text = b"\0" not in file.read(BEGINNING_BYTES)
+    if not is_text:  # an image, or a file that commands take in other places; else it is told where it is read
+        with suppress(InputError):
+            kind = format_of(path).name
+            what = "an HDF5 file" if kind == "HDF5" else f"an image ({kind})"
+            raise ConfigError(f"{path}: is {what}; expected a rig file")
+    if size > LARGEST_BYTES:
+        raise ConfigError(f"{path}: has {size} bytes, expected at most {LARGEST_BYTES}")
+    try:
+        document = _read_document(content_of(path))
+    except YamlError as error:
+        raise ConfigError(sentence(str(path), error.problem)) from error
+    scene = document.data.get("scene")
+    faces = list(scene) if isinstance(scene, tuple) else []
+    for k, face in enumerate(faces):
+        if not isinstance(face, Mapping) or face.get("kind") != "height_map" or "heights_mm" in face:
+            continue
+        if isinstance(face.get("file"), str):  # else it is judged with the rest
+            try:
+                heights = read_heights(path.parent / face["file"])
+            except InputError as error:
+                place: KeyPath = ("scene", k, "file")
+                problem = Problem(*place_of(document, place), key_name(place), str(error))
+                raise ConfigError(sentence(str(path), problem)) from error
+            faces[k] = {name: value for name, value in face.items() if name != "file"} | {"heights_mm": heights}
+    if faces:
+        document.data["scene"] = tuple(faces)
+    return document
+
+
+def _read_document(content: bytes) -> Document:
     """Read a YAML document whose root is a mapping.
 
     Raises
     ------
-    YamlError
-        If it is too large, not UTF-8, not YAML, too deep, or uses aliases, tags or several documents.
+    YamlError : it is not UTF-8, not YAML, too deep, or uses aliases, tags or several documents
     """
-    if len(content) > LARGEST_BYTES:
-        raise YamlError(1, 1, f"has {len(content)} bytes, expected at most {LARGEST_BYTES}")
-    text = _decode(content)
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        before = content[: error.start]
+        line = before.count(b"\n") + 1
+        raise YamlError(line, error.start - before.rfind(b"\n"), "is not UTF-8 text") from error
+    if found := re.search(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]", text):  # no editor shows them
+        line, column = text.count("\n", 0, found.start()) + 1, found.start() - text.rfind("\n", 0, found.start())
+        raise YamlError(line, column, f"holds the control character {ord(found.group()):#04x}")
     try:
         _ensure_plain(text)
         root = yaml.compose(text, Loader=LOADER)
@@ -106,27 +154,11 @@ def read_document(content: bytes) -> Document:
     except yaml.YAMLError as error:
         raise YamlError(1, 1, f"is not YAML: {str(error).splitlines()[0]}") from error
     document = Document()
-    if root is None:
-        return document
-    if not isinstance(root, yaml.MappingNode):
+    if root is not None and not isinstance(root, yaml.MappingNode):
         raise YamlError(*_place(root), "is not a mapping of sections")
-    document.data = _plain(root, (), document)
+    if root is not None:
+        document.data = _plain(root, (), document)
     return document
-
-
-def _decode(content: bytes) -> str:
-    """Return the text, refusing what is not UTF-8 and control characters, which no editor shows."""
-    try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        before = content[: error.start]
-        line = before.count(b"\n") + 1
-        raise YamlError(line, error.start - before.rfind(b"\n"), "is not UTF-8 text") from error
-    if found := re.search(r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]", text):
-        line = text.count("\n", 0, found.start()) + 1
-        column = found.start() - text.rfind("\n", 0, found.start())
-        raise YamlError(line, column, f"holds the control character {ord(found.group()):#04x}")
-    return text
 
 
 def _ensure_plain(text: str) -> None:
@@ -151,52 +183,35 @@ def _ensure_plain(text: str) -> None:
 
 
 def _plain(node: yaml.Node, path: KeyPath, document: Document) -> Any:
-    """Return a node as plain data, noting where everything stands."""
+    """Return a node as plain data, noting where everything stands; unquoted scalars by the core schema of YAML 1.2."""
     document.values[path] = _place(node)
-    if isinstance(node, yaml.MappingNode):
-        return _plain_mapping(node, path, document)
     if isinstance(node, yaml.SequenceNode):
         return tuple(_plain(item, (*path, k), document) for k, item in enumerate(node.value))
-    plain = isinstance(node, yaml.ScalarNode) and not node.style
+    if isinstance(node, yaml.MappingNode):
+        mapping: dict[str, Any] = {}
+        for key_node, value_node in node.value:
+            place, key = _place(key_node), key_node.value
+            if not isinstance(key_node, yaml.ScalarNode):
+                document.problems.append(Problem(*place, key_name(path), "a key must be a word"))
+            elif key in mapping:
+                text = f"repeated key, first on line {document.keys[*path, key][0]}"
+                document.problems.append(Problem(*place, key_name((*path, key)), text))
+            else:
+                document.keys[*path, key] = place
+                mapping[key] = _plain(value_node, (*path, key), document)
+        return mapping
+    if not isinstance(node, yaml.ScalarNode) or node.style:
+        return node.value
+    convert = next((convert for pattern, convert in SCALARS if pattern.fullmatch(node.value)), str)
     try:
-        return _scalar(node.value) if plain else node.value
+        value = convert(node.value)
+        # Python reads and prints no integer of more than 4300 digits, and none of ours needs more than 64 bits.
+        if isinstance(value, int) and abs(value) > LARGEST_INTEGER:
+            raise ValueError
     except ValueError:
         document.problems.append(Problem(*_place(node), key_name(path), "is too long a number"))
         return 0
-
-
-def _plain_mapping(node: yaml.MappingNode, path: KeyPath, document: Document) -> dict[str, Any]:
-    mapping: dict[str, Any] = {}
-    for key_node, value_node in node.value:
-        place = _place(key_node)
-        if not isinstance(key_node, yaml.ScalarNode):
-            document.problems.append(Problem(*place, key_name(path), "a key must be a word"))
-            continue
-        key = key_node.value
-        if key in mapping:
-            first = document.keys[*path, key][0]
-            document.problems.append(Problem(*place, key_name((*path, key)), f"repeated key, first on line {first}"))
-            continue
-        document.keys[*path, key] = place
-        mapping[key] = _plain(value_node, (*path, key), document)
-    return mapping
-
-
-def _scalar(text: str) -> Any:
-    """Return what an unquoted scalar means by the core schema of YAML 1.2.
-
-    Raises
-    ------
-    ValueError : it is an integer of more digits than any of ours has
-    """
-    for pattern, convert in SCALARS:
-        if pattern.fullmatch(text):
-            value = convert(text)
-            # Python prints no integer of more than 4300 digits, and none of ours needs more than 64 bits.
-            if isinstance(value, int) and abs(value) > LARGEST_INTEGER:
-                raise ValueError
-            return value
-    return text
+    return value
 
 
 def _place(node: yaml.Node | yaml.Event) -> tuple[int, int]:
@@ -217,7 +232,6 @@ def key_name(path: KeyPath) -> str:
 
 
 # What is wrong with a configuration, as sentences about places: `rig.yaml:5:16: camera.x: is 3, expected ...`.
-
 
 # More than this many errors at once are one mistake repeated.
 MOST_PROBLEMS = 20
@@ -242,7 +256,7 @@ KINDS = {
 # Keys without which another section may be what was meant.
 MISSING: dict[KeyPath, str] = {
     ("window", "distance_mm"): "is missing; where only the thickness of a channel's wall is known, leave window out "
-    "and give channel: {width_mm: ..., wall_mm: ...}, whose calibrated mid plane tells the distance",
+    "and give channel: {width_mm: ..., wall_mm: ...}, whose calibrated mid plane tells the distance"
 }
 
 
@@ -266,7 +280,13 @@ def problem_of(document: Document, details: ErrorDetails) -> Problem:
     place = place_of(document, path)
     if kind == "extra_forbidden":
         place = document.keys.get(path, (0, 0))
-        text = _unknown(path)
+        models: list[Any] = [Sections]
+        for part in (part for part in path[:-1] if isinstance(part, str)):
+            inner = [model.model_fields[part] for model in models if part in model.model_fields]
+            models = [model for field in inner for model in _models_in(field.annotation)]
+        known = list(dict.fromkeys(name for model in models for name in model.model_fields))
+        near = difflib.get_close_matches(str(path[-1]), known, n=1)
+        text = f"unknown key; did you mean '{near[0]}'?" if near else f"unknown key; known are {', '.join(known)}"
     elif kind in ("missing", "union_tag_not_found"):
         if kind == "union_tag_not_found":
             path = (*path, "kind")
@@ -287,24 +307,6 @@ def problem_of(document: Document, details: ErrorDetails) -> Problem:
     else:
         text = f"is {_shown(value)}, expected {KINDS.get(kind, details['msg'])}"
     return Problem(*place, key_name(path), text)
-
-
-def _unknown(path: KeyPath) -> str:
-    """Return the sentence about a key that its section does not know."""
-    known = _known_keys(path[:-1])
-    near = difflib.get_close_matches(str(path[-1]), known, n=1)
-    return f"unknown key; did you mean '{near[0]}'?" if near else f"unknown key; known are {', '.join(known)}"
-
-
-def _known_keys(path: KeyPath) -> list[str]:
-    """Return the keys of the section at a place."""
-    models: list[Any] = [Sections]
-    for part in path:
-        if isinstance(part, int):
-            continue
-        fields = [model.model_fields[part] for model in models if part in model.model_fields]
-        models = [inner for field in fields for inner in _models_in(field.annotation)]
-    return list(dict.fromkeys(name for model in models for name in model.model_fields))
 
 
 def _models_in(annotation: Any) -> list[Any]:
@@ -349,7 +351,6 @@ def _shown(value: Any) -> str:
 #
 # So results carry them, and are the same wherever the file has gone.
 
-
 # Every result carries them, in its record and in those of what it was made from. A smooth surface needs few: through
 # heights 1 mm apart of a lens of 40 mm radius a tracer is seen where the lens shows it to 20 nm.
 MOST_HEIGHTS = 2**14
@@ -360,63 +361,30 @@ SEPARATORS = re.compile(r"[,;\s]+")
 Rows = tuple[tuple[float, ...], ...]
 
 
-def with_heights(document: Document, source: Path) -> Document:
-    """Return a configuration with the heights of each file that a face names, beside `source`, in the file's place.
-
-    Raises
-    ------
-    ConfigError : one cannot be read
-    """
-    scene = document.data.get("scene")
-    if not isinstance(scene, tuple):
-        return document
-    faces = tuple(_with_heights(face, ("scene", k, "file"), document, source) for k, face in enumerate(scene))
-    return replace(document, data=document.data | {"scene": faces})
-
-
-def _with_heights(face: Any, path: KeyPath, document: Document, source: Path) -> Any:
-    """Return one face, its file read; any other as it is, to be judged with the rest."""
-    if not isinstance(face, Mapping) or face.get("kind") != "height_map" or "heights_mm" in face:
-        return face
-    file = face.get("file")
-    if not isinstance(file, str):
-        return face
-    try:
-        heights = read_heights(source.parent / file)
-    except InputError as error:
-        problem = Problem(*place_of(document, path), key_name(path), str(error))
-        raise ConfigError(sentence(str(source), problem)) from error
-    return {name: value for name, value in face.items() if name != "file"} | {"heights_mm": heights}
-
-
 def read_heights(path: Path) -> Rows:
     """Read rows of heights in mm: a table of numbers (text), an array (.npy), or an image (.tif).
 
     Raises
     ------
-    InputError
-        If the file is missing, broken, or holds no rows of numbers, gaps, or more than a smooth surface needs.
+    InputError : the file is missing, broken, or holds no rows of numbers, gaps, or more than a smooth surface needs
     """
     ensure_regular_file(path)
     ending = path.suffix.lower()
     if ending in (".tif", ".tiff"):
         rows = _rows_of(read_image(path), path)
+    elif ending == ".npy":
+        try:
+            array = np.load(path, mmap_mode="r", allow_pickle=False)  # its size is held against the file's
+        except Exception as error:  # a damaged header can raise anything in NumPy
+            raise InputError(f"{path}: is no NumPy array: {reason(error)}") from error
+        rows = _rows_of(np.asarray(array), path)
     else:
-        rows = _rows_of(_array(path), path) if ending == ".npy" else tuple(_table(path))
+        rows = tuple(_table(path))
     bad = [(r, c) for r, row in enumerate(rows, start=1) for c, z in enumerate(row, start=1) if not math.isfinite(z)]
     if bad:
         row, column = bad[0]
         raise InputError(f"{path}: {len(bad)} heights are no numbers, the first one in row {row}, column {column}")
     return tuple(tuple(round(z, DIGITS) for z in row) for row in rows)
-
-
-def _array(path: Path) -> NDArray[Any]:
-    """Return a NumPy array, its size held against the file's."""
-    try:
-        array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except Exception as error:  # a damaged header can raise anything in NumPy
-        raise InputError(f"{path}: is no NumPy array: {reason(error)}") from error
-    return np.asarray(array)
 
 
 def _rows_of(array: NDArray[Any], path: Path) -> Rows:

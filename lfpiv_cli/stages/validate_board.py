@@ -16,7 +16,6 @@ from lfpiv_cli.calibration.model import Photographs, Rig, calibrate
 from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files.atomic import ensure_writable, write_json
-from lfpiv_cli.files.bench import waves_of
 from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.pages import ensure_drawing, write_picture
 from lfpiv_cli.files.provenance import record
@@ -224,7 +223,7 @@ def bench_of(settings: Config, half: str) -> BoardBench:
     if half == "ideal":
         return ideal_bench(rig, grid, scene.peak_counts, rng)
     true = ObjectSpace(rig.media, settings.window_model(), scene.refraction)
-    reality = Reality(misalignment_of(settings), readout_of(settings), true, waves_of(scene.light))
+    reality = Reality(misalignment_of(settings), readout_of(settings), true, scene.light.waves())
     return recorded_bench(rig, settings.plane_space("validating boards"), reality, grid, scene.peak_counts, rng)
 
 

@@ -20,7 +20,7 @@ from lfpiv_cli.files.calibration_file import read_calibration
 from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.provenance import record, with_warnings
-from lfpiv_cli.files.sections import WeightsSection
+from lfpiv_cli.files.sections_simulated import WeightsSection
 from lfpiv_cli.files.weights_file import WeightsFile, open_weights, write_weights
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import Method, Refraction, Sampling
@@ -361,7 +361,7 @@ def build_weights_file(
         "refraction": settings.refraction(),
     }
     made = record("build-weights", settings.resolved(), inputs)
-    if options.resume and is_kept([output], made, inputs.values(), overwrite, resume=True):
+    if options.resume and is_kept([output], made, inputs.values(), overwrite):
         return summary | {"frame": open_weights(output).frame, "file_bytes": output.stat().st_size}
     cost = cost_of(settings, plan.camera, plan.source, plan.grid.padded(plan.padding))
     console.warn([*plan.notices, *cost_notices(cost)])

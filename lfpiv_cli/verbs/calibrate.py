@@ -130,7 +130,7 @@ def calibration_of(rig: Config, pictures: Photographs) -> Calibration:
     """Return the calibration that pictures of the rig give."""
     if pictures.mid_plane_z_mm is not None:
         _check_mid_plane(pictures.mid_plane_z_mm, rig)
-    camera = rig.complete_camera() if pictures.whites else rig.camera_model()
+    camera = rig.camera.model() if pictures.whites else rig.camera_model()
     if camera is not None:
         check_f_numbers(camera)
     sheet = DataSheet(rig.camera.microlenses.layout, rig.micro_image_pitch_px(), camera)
@@ -142,7 +142,7 @@ def calibration_of(rig: Config, pictures: Photographs) -> Calibration:
 
 def calibration_notices(rig: Config, pictures: Photographs, found: Calibration) -> list[Notice]:
     """Return what speaks against a calibration and the pictures that it is from."""
-    camera = rig.complete_camera()
+    camera = rig.camera.model()
     notices = [] if camera is None else f_number_notices(camera)
     if found.pose is not None and rig.board.dots is not None and rig.board.pattern != "charuco":
         notices += board_notices(found.pose.dots_found, rig.board.dots)
@@ -171,7 +171,7 @@ def calibration_notices(rig: Config, pictures: Photographs, found: Calibration) 
 
 def light_notices(rig: Config, pictures: Photographs, found: Calibration) -> list[Notice]:
     """Return what the light of boards and of the dark image says against the lens images, and what these say."""
-    camera = rig.complete_camera()
+    camera = rig.camera.model()
     boards = [*([] if pictures.board is None else [pictures.board]), *pictures.depth_boards]
     if found.transmission is None and camera is None:
         return []
@@ -270,7 +270,7 @@ def calibrate_snapshot(
     frames = {name: image_files.read_reference(path, shape) for name, path in inputs.items() if name != "config"}
     record = dict(target_of(config, output, options).record)
     if options.resume:
-        kept = is_kept([output], record, inputs.values(), overwrite, resume=True)
+        kept = is_kept([output], record, inputs.values(), overwrite)
         if kept and all(path.exists() for path in drawings):
             return read_calibration(output).summary()
         overwrite = True

@@ -35,7 +35,7 @@ def combine_vectors(
     ensure_agreement([header.provenance for header in headers], [str(path) for path in inputs.values()], OF_COORDINATES)
     made = record("combine", headers[0].provenance.get("config"), inputs)
     if resume:
-        if is_kept([output], made, inputs.values(), overwrite, resume=True):
+        if is_kept([output], made, inputs.values(), overwrite):
             return {"vectors": vtkhdf.open_vectors(output).flag.size}
         overwrite = True
     found = combine(*(vtkhdf.open_vectors(path) for path in inputs.values()))

@@ -25,7 +25,7 @@ from lfpiv_cli.files.provenance import (
     OF_FRAMES,
     earlier_record,
     ensure_agreement,
-    ensure_even,
+    even_step_s,
     record,
     seconds_between,
     with_warnings,
@@ -388,8 +388,7 @@ class Correlation(PairBatch[Outcome, CorrelateOptions]):
         InputError : it is not the same in all of them
         """
         steps = [seconds_between(self._record_of(first), self._record_of(second)) for first, second in group]
-        told = [step for step in steps if step is not None]
-        return ensure_even(told, [str(group[0][0]), str(group[-1][1])]) if told and len(told) == len(steps) else None
+        return even_step_s(steps, [str(group[0][0]), str(group[-1][1])])
 
     def _record_of(self, volume: Path) -> Mapping[str, Any]:
         """Return the record of a volume, which may be gone."""

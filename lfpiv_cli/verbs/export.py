@@ -10,10 +10,10 @@ from typing import Any
 from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files.atomic import ensure_writable, write_atomically
-from lfpiv_cli.files.exports.content import Content, plane_of, read_content
-from lfpiv_cli.files.exports.formats import FORMATS, ensure_fits, write_netcdf
-from lfpiv_cli.files.exports.vtk import write_series, write_tracks_series
+from lfpiv_cli.files.exports.formats import FORMATS, Content, ensure_fits, read_content, write_netcdf
+from lfpiv_cli.files.exports.vtk import write_series
 from lfpiv_cli.files.provenance import record
+from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import ExportFormat
 
 # What the files of several times have to agree in, besides grid and arrays.
@@ -64,9 +64,7 @@ def export(
 
     times = None if options.step_s is None else [options.step_s * number for number in range(len(files))]
     write = FORMATS[to].write
-    if to == "vtkhdf-series" and first.grid is None:
-        write_tracks_series(target, first, made, overwrite=overwrite)
-    elif to == "vtkhdf-series":
+    if to == "vtkhdf-series":
         write_series(target, first, read, len(files), times, made, overwrite=overwrite)
     elif write is None:
         contents = [read(number) for number in range(len(files))]
@@ -99,7 +97,9 @@ def _read(path: Path, plane: int | None) -> Content:
     count = content.grid.shape_xyz[2]
     if plane >= count:
         raise UsageError(f"--plane {plane}: {path} has {count} planes across z, counted from 0")
-    return plane_of(content, plane)
+    (nx, ny, _), (x, y, _) = content.grid.shape_xyz, content.grid.origin_mm
+    grid = Grid((nx, ny, 1), content.grid.spacing_mm, (x, y, float(content.grid.axis_mm(2)[plane])))
+    return replace(content, grid=grid, arrays={name: each[plane : plane + 1] for name, each in content.arrays.items()})
 
 
 def _alike(first: Content, first_path: Path, other: Content, path: Path) -> Content:

@@ -12,6 +12,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -27,14 +28,13 @@ from lfpiv_cli.files.batch import (
     images_seen,
     output_paths,
     pending,
-    step_between,
 )
 from lfpiv_cli.files.config import Config, carried_config
 from lfpiv_cli.files.exports.vtk import write_playback
 from lfpiv_cli.files.inputs import given
 from lfpiv_cli.files.pairing import in_order
 from lfpiv_cli.files.particle_file import PARTICLES_FORMAT, Points, no_points, read_points, write_points
-from lfpiv_cli.files.provenance import record, sha256, with_warnings
+from lfpiv_cli.files.provenance import even_step_s, record, sha256, with_warnings
 from lfpiv_cli.files.shares import Deadline
 from lfpiv_cli.notice import Notice
 from lfpiv_cli.reconstruction.images import Image
@@ -211,7 +211,9 @@ def follow_particles(
     settings = carried_config(content.provenance, weights).overridden("reconstruction", solver="particles")
     settings = settings.overridden("correlation", dt_s=options.dt_s)
     if settings.correlation.dt_s is None:
-        settings = settings.overridden("correlation", dt_s=step_between(frames))
+        steps = [before.seconds_to(after) for before, after in pairwise(frames)]
+        names = [f"{each.path} page {each.page}" for each in frames]
+        settings = settings.overridden("correlation", dt_s=even_step_s(steps, names))
     console.warn(frames_dt_notices(settings.correlation.dt_s, frames))
     tracking = tracking_of(settings, options.search_voxel, options.shortest, len(frames), str(weights))
     shape = content.image_shape
@@ -326,7 +328,7 @@ def _write_tracks(
         counts = [frames.particles(number) for number in there]
         notices = few_notices(counts, [sequence.names[number] for number in there], result.summary, result.points)
         console.warn(notices)
-        told = replace(result.points, provenance=with_warnings(provenance, notices))
+        told = result.points.with_record(with_warnings(provenance, notices))
         write_points(output / TRACKS, result.format_name, told, overwrite=overwrite)
         write_playback(output / PLAYBACK, told, len(frames), tracking.dt_s, overwrite=overwrite)
     return {"particles_fewest": min(counts)} | {k: v for k, v in result.summary.items() if k != "frames"}

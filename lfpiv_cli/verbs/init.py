@@ -14,7 +14,7 @@ from lfpiv_cli.files import calibration_file
 from lfpiv_cli.files.atomic import ensure_writable, write_text
 from lfpiv_cli.files.config import Config, carried_config
 from lfpiv_cli.files.hdf5 import read_tree
-from lfpiv_cli.files.rig_numbers import RigNumbers, known_camera, rig_text, schema, tree_of
+from lfpiv_cli.files.rig_numbers import LATTICES, TABLE2, RigNumbers, rig_text, schema, tree_of
 from lfpiv_cli.names import KnownCamera
 from lfpiv_cli.verbs.planning import bench_of, windows_line
 
@@ -67,7 +67,8 @@ def _described(options: InitOptions) -> tuple[str, Mapping[str, Any]]:
     if options.numbers is not None:
         return "A rig, by `lfpiv init`.", tree_of(options.numbers)
     if options.camera is not None:
-        return f"The camera {options.camera}, by `lfpiv init`.", known_camera(options.camera)
+        tree = tree_of(TABLE2) if options.camera == "table2" else {"camera": LATTICES[options.camera]}
+        return f"The camera {options.camera}, by `lfpiv init`.", tree
     if options.calibration is None:
         raise InputError("no calibration")
     _, made = read_tree(options.calibration, calibration_file.FORMAT, (calibration_file.VERSION,))

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.files.batch import Frame as ImageFrame
-from lfpiv_cli.files.bench import NM_TO_MM
 from lfpiv_cli.files.config import Config, carried_config
 from lfpiv_cli.files.hdf5 import unpacked_bytes
 from lfpiv_cli.files.inputs import ensure_room
 from lfpiv_cli.files.particle_file import Points, symmetric
 from lfpiv_cli.files.provenance import record
+from lfpiv_cli.files.sections import NM_TO_MM
 from lfpiv_cli.files.weights_file import WeightsFile, open_weights
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.notice import Notice, warn_of

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.calibration.sheet import LARGE_F_RATIO, LARGEST_F_RATIO
 from lfpiv_cli.errors import ConfigError, InputError
-from lfpiv_cli.files.bench import NM_TO_MM, UM_TO_MM
 from lfpiv_cli.files.config import Config
+from lfpiv_cli.files.sections import NM_TO_MM, UM_TO_MM
 from lfpiv_cli.flow.windows import WindowLayout
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.notice import written

@@ -25,7 +25,7 @@ from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files import calibration_file, vtkhdf, weights_file
 from lfpiv_cli.files.calibration_file import read_calibration
 from lfpiv_cli.files.config import carried_config
-from lfpiv_cli.files.figures import describe, file_figures, is_recording, recording_figures
+from lfpiv_cli.files.figures import FIGURES, describe, is_recording, recording_figures
 from lfpiv_cli.files.hdf5 import open_h5
 from lfpiv_cli.files.hdf5_checks import member
 from lfpiv_cli.files.images import read_image
@@ -436,4 +436,4 @@ def _told(file: Path) -> dict[str, Any]:
     if is_recording(file):
         return recording_figures(file)
     found = describe(file)
-    return found | file_figures(file, found["format"])
+    return found | FIGURES.get(found["format"], lambda _: {})(file)

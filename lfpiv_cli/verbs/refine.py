@@ -15,7 +15,6 @@ from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files.atomic import ensure_apart, ensure_writable
 from lfpiv_cli.files.batch import frames_of
-from lfpiv_cli.files.bench import wave_light_of
 from lfpiv_cli.files.calibration_file import read_calibration, write_calibration
 from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.inputs import given
@@ -115,7 +114,7 @@ def _walls(settings: Config, lit: Sequence[Image], before: Calibration, console:
         raise ConfigError(f"{settings.source}: channel: is missing")
     window = settings.window_model(before.mid_plane_z_mm or 0.0)
     chosen = settings.reconstruction
-    flow = ChannelFlow(settings.grid(), settings.channel.width_mm, chosen.particle_diameter_mm, wave_light_of(chosen))
+    flow = ChannelFlow(settings.grid(), settings.channel.width_mm, chosen.particle_diameter_mm, chosen.wave_light())
     with console.progress(len(lit) * STEPS + 1, "refine") as advance:
         found = refine(
             lit,

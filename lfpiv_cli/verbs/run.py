@@ -24,7 +24,6 @@ from lfpiv_cli.files import images as image_files
 from lfpiv_cli.files.atomic import ensure_writable, without_nan, write_text
 from lfpiv_cli.files.batch import Frame, frames_of, output_paths
 from lfpiv_cli.files.config import Config, load_config
-from lfpiv_cli.files.images import times_of
 from lfpiv_cli.files.inputs import ensure_regular_file, split_part
 from lfpiv_cli.files.pages import ensure_drawing, ensure_pages
 from lfpiv_cli.files.pairing import Pairs
@@ -224,7 +223,9 @@ def _ensure_possible(settings: Config, options: RunOptions) -> tuple[list[Frame]
         ensure_writable(options.failures, overwrite=True)
     _first_readable(frames, settings.image_shape(), options.keep_going)
     if not options.keep_going:
-        image_files.ensure_shape(dict.fromkeys(frame.path for frame in frames), settings.image_shape())
+        for path in dict.fromkeys(frame.path for frame in frames):
+            if image_files.frames(path).shape != settings.image_shape():
+                image_files.read_page(path, 0, settings.image_shape())  # says what is wrong, before any is read
     return frames, pairs
 
 
@@ -256,7 +257,7 @@ def _tell_times(images: Sequence[Path], keep_going: bool) -> bool:
     told = []
     for path in images:
         try:
-            told.append(times_of(path) is not None)
+            told.append(image_files.frames(path).time_s is not None)
         except InputError:
             if not keep_going:
                 raise

@@ -21,7 +21,6 @@ from lfpiv_cli.calibration.model import mid_plane_z_mm
 from lfpiv_cli.console import CONSOLE, Console
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files.atomic import ensure_writable, write_json
-from lfpiv_cli.files.bench import waves_of
 from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.images import write_tiff
 from lfpiv_cli.files.inputs import ensure_room
@@ -302,7 +301,7 @@ def real_camera(settings: Config) -> Camera:
 
 
 def _recording(settings: Config) -> scenes.RecordingCamera:
-    return scenes.RecordingCamera(real_camera(settings), readout_of(settings), waves_of(settings.simulation.light))
+    return scenes.RecordingCamera(real_camera(settings), readout_of(settings), settings.simulation.light.waves())
 
 
 def misalignment_of(settings: Config) -> scenes.Misalignment:

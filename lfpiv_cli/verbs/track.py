@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from itertools import pairwise
 from pathlib import Path
@@ -26,7 +26,6 @@ from lfpiv_cli.files.particle_file import (
     PointRows,
     Points,
     StoredTracks,
-    TrackStore,
     read_points,
     read_tracks,
     write_points,
@@ -120,10 +119,9 @@ def stored_tracks(
     OutputError : there is no room in the folder
     """
     sequence = tracks_through(frames, chosen, found)
-    with TrackStore(folder) as store:
+    with StoredTracks(folder, reference, chosen.attributes(reference), dict(provenance)) as points:
         for number in range(len(frames)):
-            store.put(sequence.at(number))
-        points = StoredTracks(store, reference, chosen.attributes(reference), dict(provenance))
+            points.put(sequence.at(number))
         yield TracksOf(points, TRAJECTORIES_FORMAT, sequence.paths, sequence.summary(), settings)
 
 
@@ -225,7 +223,7 @@ class Tracks(PairBatch[Outcome, TrackOptions]):
             provenance = with_warnings(found.points.provenance, notices)
             # What is complete is skipped: in the place of what is made there is nothing, or something broken.
             replacing = self.overwrite or self._options.resume
-            points = replace(found.points, provenance=provenance)
+            points = found.points.with_record(provenance)
             write_points(target.path, found.format_name, points, overwrite=replacing)
             fields = found.fields() if self._options.by == "polynomials" else _fitted(found, names[0])
             qualities, rejected = _write_grids(target.beside, fields, points, replacing, work.console)

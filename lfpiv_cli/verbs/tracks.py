@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, Generic, TypeVar, overload
 
 import numpy as np
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from lfpiv_cli.errors import InputError, UsageError
 from lfpiv_cli.files.config import Config, carried_config
 from lfpiv_cli.files.particle_file import POSITION, TRACKS_FORMAT, TRAJECTORIES_FORMAT, PointRows, Points
-from lfpiv_cli.files.provenance import OF_FRAMES, ensure_agreement, even_step_s, record
+from lfpiv_cli.files.provenance import OF_FRAMES, ensure_agreement, even_step_s, record, seconds_between
 from lfpiv_cli.flow.field import MM_TO_M, VectorField
 from lfpiv_cli.flow.from_tracks import Paths, WindowGrid, vectors_from_paths
 from lfpiv_cli.notice import warn_of
@@ -286,7 +287,8 @@ def settings_of(
     ensure_agreement(records, names, agreeing)
     settings = carried_config(records[0], names[0]).overridden("correlation", dt_s=dt_s)
     if settings.correlation.dt_s is None:
-        settings = settings.overridden("correlation", dt_s=even_step_s(records, names))
+        steps = [seconds_between(*pair) for pair in pairwise(records)]
+        settings = settings.overridden("correlation", dt_s=even_step_s(steps, names))
     return settings
 
 

@@ -15,7 +15,7 @@ from lfpiv_cli.calibration.sheet import check_f_numbers, check_pitch, f_number_n
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.files.config import Config
 from lfpiv_cli.files.inputs import ensure_disk, ensure_room
-from lfpiv_cli.files.weights_fields import BYTES_A_VOXEL
+from lfpiv_cli.files.weights_file import BYTES_A_VOXEL
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.notice import Notice, written
 from lfpiv_cli.optics.camera import Camera

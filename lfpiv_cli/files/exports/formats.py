@@ -1,8 +1,9 @@
-"""Which format takes what, the ending of its files, and how one is written."""
+"""Results in the formats of other programs: their content in one form, what each format takes, how it is written."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,21 +13,134 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.errors import InputError, OutputError, UsageError
 from lfpiv_cli.files.exports import vtk
-from lfpiv_cli.files.exports.content import (
-    COMPONENTS,
-    KINDS,
-    OF_POINTS,
-    ON_GRIDS,
-    Content,
-    columns_of,
-    frames_of,
+from lfpiv_cli.files.hdf5 import format_of, open_h5
+from lfpiv_cli.files.hdf5_checks import array_member, member
+from lfpiv_cli.files.particle_file import (
+    PARTICLES_FORMAT,
+    POSITION,
+    TRACKS_FORMAT,
+    TRAJECTORIES_FORMAT,
+    read_points,
+    units_of,
 )
-from lfpiv_cli.files.particle_file import POSITION, TRAJECTORIES_FORMAT
-from lfpiv_cli.files.vtkhdf import VECTORS_FORMAT
+from lfpiv_cli.files.vtkhdf import (
+    VECTORS_FORMAT,
+    VOLUME_FORMAT,
+    grid_in,
+    open_vectors,
+    open_volume,
+    read_on_grid,
+    read_root,
+)
 from lfpiv_cli.flow.field import REJECTED
+from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import ExportFormat
 
-# Tables of text: CSV, and Tecplot's ASCII format. Numbers have as many digits as bring back the same bits.
+# What each format holds, as a person says it.
+KINDS = {
+    VOLUME_FORMAT: "a volume",
+    VECTORS_FORMAT: "vectors",
+    PARTICLES_FORMAT: "particles",
+    TRACKS_FORMAT: "tracks of a pair",
+    TRAJECTORIES_FORMAT: "tracks of a sequence",
+}
+ON_GRIDS = (VOLUME_FORMAT, VECTORS_FORMAT)
+OF_POINTS = (PARTICLES_FORMAT, TRACKS_FORMAT, TRAJECTORIES_FORMAT)
+# The last axis of an array, by its length: vectors, and symmetric tensors in VTK's order.
+COMPONENTS = {3: ("x", "y", "z"), 6: ("xx", "yy", "zz", "xy", "yz", "xz")}
+# What the components of these arrays are called; those of others have their name before them.
+NAMES = {POSITION: ["x", "y", "z"], "velocity": ["u", "v", "w"]}
+
+
+@dataclass(frozen=True, eq=False)
+class Content:
+    """The content of a file.
+
+    Attributes
+    ----------
+    format_name : one of `KINDS`
+    grid : of a volume and of vectors, None of points
+    arrays : by name, (nz, ny, nx) or (n,), and with a last axis of components
+    units : of the arrays
+    attributes : what the file says about itself: scalars, strings and short lists
+    provenance : the record of how it was made
+    """
+
+    format_name: str
+    grid: Grid | None
+    arrays: dict[str, NDArray[Any]]
+    units: dict[str, str]
+    attributes: dict[str, Any]
+    provenance: dict[str, Any]
+
+    def told(self) -> dict[str, Any]:
+        """Return what is told besides the arrays: the format, the attributes, and the provenance as JSON."""
+        known = {name: value for name, value in self.attributes.items() if value is not None}
+        return {"format": self.format_name, **known, "provenance": json.dumps(self.provenance)}
+
+    def comments(self, units: Mapping[str, str]) -> Iterator[str]:
+        """Yield the same as lines of comments, the provenance as JSON over as many as it needs; the units last."""
+        for name, value in self.told().items():
+            if name != "provenance":
+                yield f"# {name}: {json.dumps(value)}"
+        yield "# provenance:"
+        for line in json.dumps(self.provenance, indent=1).splitlines():
+            yield f"# {line}"
+        yield f"# units: {json.dumps(units)}"
+
+
+def read_content(path: Path) -> Content:
+    """Read a volume, vectors, particles or tracks."""
+    name = format_of(path)
+    if name not in KINDS:
+        raise InputError(f"{path}: holds {name}, expected {', '.join(KINDS)}")
+    if name == VOLUME_FORMAT:
+        volume = open_volume(path)
+        return Content(
+            name, volume.grid, {"intensity": volume.array}, {"intensity": "1"}, volume.attributes, volume.provenance
+        )
+    if name == VECTORS_FORMAT:
+        open_vectors(path)  # for its checks
+        with open_h5(path) as file:
+            grid, root = grid_in(file), read_root(file)
+            # All arrays, those that commands store besides, too; the velocity first, as it is what is asked for.
+            names = sorted(member(member(file, "VTKHDF"), "PointData"), key=lambda each: (each != "velocity", each))
+            places = 2 if grid.shape_zyx[0] == 1 else 3
+            arrays = read_on_grid(path, file, grid, {each: array_member(file, each).ndim > places for each in names})
+            units = {each: file[each].attrs["units"].decode() for each in names}
+        return Content(name, grid, arrays, units, root.attributes, root.provenance)
+    points = read_points(path, name)
+    arrays = {POSITION: points.position_mm, **points.arrays}
+    units = {POSITION: "mm", **units_of(name, arrays)}
+    return Content(name, None, arrays, units, points.attributes, points.provenance)
+
+
+def columns_of(content: Content) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
+    """Return all as columns of one row for each place, coordinates before each component of each array; and the units.
+
+    The velocity's are called u, v, w; x varies fastest on a grid, z slowest.
+    """
+    columns: dict[str, NDArray[Any]] = {}
+    units: dict[str, str] = {}
+    if content.grid is not None:
+        centres = content.grid.centres_mm().reshape(-1, 3)
+        columns = {axis: centres[:, k] for k, axis in enumerate("xyz")}
+        units = dict.fromkeys("xyz", "mm")
+    places = 1 if content.grid is None else 3
+    for name, array in content.arrays.items():
+        names = [name]
+        if array.ndim > places:
+            count = array.shape[-1]
+            names = NAMES.get(name, [f"{name}_{suffix}" for suffix in COMPONENTS.get(count, range(count))])
+        columns |= dict(zip(names, array.reshape(-1, len(names)).T, strict=True))
+        units |= dict.fromkeys(names, content.units[name])
+    return columns, units
+
+
+def frames_of(content: Content) -> list[NDArray[np.int64]]:
+    """Return the rows of each frame of a sequence's tracks."""
+    frame = content.arrays["frame"]
+    return [np.flatnonzero(frame == number) for number in range(int(frame.max(initial=-1)) + 1)]
 
 
 # NetCDF 3 with 64-bit offsets, which needs no library beyond scipy, here or where it is read.
@@ -34,7 +148,6 @@ from lfpiv_cli.names import ExportFormat
 # Vectors follow pivpy's schema: `u`, `v`, `w` (m/s) and `chc` (1 where the velocity is known) over y, x, t,
 # coordinates in mm; with more than one plane z comes before these dimensions, so that one plane of it is what pivpy
 # takes.
-
 
 # The format counts the bytes of a variable in 32 bits.
 LARGEST_VARIABLE = 2**32 - 4
@@ -57,72 +170,58 @@ def write_netcdf(path: Path, contents: Sequence[Content], times_s: Sequence[floa
     """
     from scipy.io import netcdf_file
 
-    with netcdf_file(path, "w", version=2) as file:
-        for name, value in contents[0].told().items():
-            setattr(file, name, _attribute(value))
-        if contents[0].format_name == VECTORS_FORMAT:
-            _write_vectors(file, contents, times_s)
-        elif contents[0].grid is not None:
-            _write_axes(file, contents[0])
-            _write_arrays(file, contents[0], ("z", "y", "x"))
-        else:
-            file.createDimension("point", len(next(iter(contents[0].arrays.values()))))
-            _write_arrays(file, contents[0], ("point",))
-
-
-def _write_vectors(file: Any, contents: Sequence[Content], times_s: Sequence[float] | None) -> None:
     first = contents[0]
-    _write_axes(file, first)
-    file.delta_t = _attribute(float(first.attributes.get("dt_s", 0.0)))
-    file.pivpy_schema_version = PIVPY_SCHEMA
-    file.createDimension("t", len(contents))
-    _put(file, "t", np.arange(float(len(contents))) if times_s is None else np.asarray(times_s), ("t",))
-    file.variables["t"].units = "frame" if times_s is None else "s"
-    places = ("y", "x", "t") if first.arrays["flag"].shape[0] == 1 else ("z", "y", "x", "t")
+    with netcdf_file(path, "w", version=2) as file:
+        for name, value in first.told().items():
+            setattr(file, name, _attribute(value))
+        if first.grid is None:
+            file.createDimension("point", len(next(iter(first.arrays.values()))))
+            _write_arrays(file, first.arrays.items(), first.units, ("point",))
+            return
+        of_vectors = first.format_name == VECTORS_FORMAT
+        for k, axis in enumerate("xyz"):
+            values = first.grid.axis_mm(k)
+            if axis == "z" and len(values) == 1 and of_vectors:
+                # A plane has its place as a scalar.
+                _put(file, axis, values[0], (), "mm")
+            else:
+                file.createDimension(axis, len(values))
+                _put(file, axis, values, (axis,), "mm")
+        if not of_vectors:
+            _write_arrays(file, first.arrays.items(), first.units, ("z", "y", "x"))
+            return
 
-    def over_time(name: str) -> NDArray[Any]:
-        stacked = np.stack([content.arrays[name] for content in contents], axis=3)
-        return stacked[0] if "z" not in places else stacked
+        file.delta_t = _attribute(float(first.attributes.get("dt_s", 0.0)))
+        file.pivpy_schema_version = PIVPY_SCHEMA
+        file.createDimension("t", len(contents))
+        _put(file, "t", np.arange(float(len(contents))) if times_s is None else np.asarray(times_s), ("t",))
+        file.variables["t"].units = "frame" if times_s is None else "s"
+        places = ("y", "x", "t") if first.grid.shape_xyz[2] == 1 else ("z", "y", "x", "t")
 
-    for k, name in enumerate("uvw"):
-        _put(file, name, over_time("velocity")[..., k], places, "m/s")
-        file.variables[name].standard_name = f"{name}_velocity"
-    _put(file, "chc", (over_time("flag") < REJECTED).astype(np.uint8), places, "1")
-    file.variables["chc"].standard_name = "validity_flag"
-    for name in first.arrays:
-        if name != "velocity":
-            stacked = over_time(name)
-            of_components = _component_dimension(file, stacked.shape[len(places) :])
-            _put(file, name, stacked, places + of_components, first.units[name])
+        def over_time(name: str) -> NDArray[Any]:
+            stacked = np.stack([content.arrays[name] for content in contents], axis=3)
+            return stacked if "z" in places else stacked[0]
 
-
-def _write_axes(file: Any, content: Content) -> None:
-    if content.grid is None:
-        raise ValueError("points have no axes")
-    for k, axis in enumerate("xyz"):
-        values = content.grid.axis_mm(k)
-        if axis == "z" and len(values) == 1 and content.format_name == VECTORS_FORMAT:
-            # A plane has its place as a scalar.
-            _put(file, axis, values[0], (), "mm")
-        else:
-            file.createDimension(axis, len(values))
-            _put(file, axis, values, (axis,), "mm")
-
-
-def _write_arrays(file: Any, content: Content, places: tuple[str, ...]) -> None:
-    for name, array in content.arrays.items():
-        dimensions = places + _component_dimension(file, array.shape[len(places) :])
-        _put(file, name, array, dimensions, content.units[name])
+        for k, name in enumerate("uvw"):
+            _put(file, name, over_time("velocity")[..., k], places, "m/s")
+            file.variables[name].standard_name = f"{name}_velocity"
+        _put(file, "chc", (over_time("flag") < REJECTED).astype(np.uint8), places, "1")
+        file.variables["chc"].standard_name = "validity_flag"
+        others = ((name, over_time(name)) for name in first.arrays if name != "velocity")
+        _write_arrays(file, others, first.units, places)
 
 
-def _component_dimension(file: Any, shape: tuple[int, ...]) -> tuple[str, ...]:
-    """Return the dimension of an array's components, none where it has none."""
-    if not shape:
-        return ()
-    name = "component" if shape[0] == len(COMPONENTS[3]) else f"component_{shape[0]}"
-    if name not in file.dimensions:
-        file.createDimension(name, shape[0])
-    return (name,)
+def _write_arrays(
+    file: Any, arrays: Iterable[tuple[str, NDArray[Any]]], units: Mapping[str, str], places: tuple[str, ...]
+) -> None:
+    """Write arrays over dimensions that there are, and where they have components over a dimension of these."""
+    for name, array in arrays:
+        of_components: tuple[str, ...] = ()
+        for count in array.shape[len(places) :]:
+            of_components = ("component" if count == len(COMPONENTS[3]) else f"component_{count}",)
+            if of_components[0] not in file.dimensions:
+                file.createDimension(of_components[0], count)
+        _put(file, name, array, places + of_components, units[name])
 
 
 def _put(file: Any, name: str, array: NDArray[Any], dimensions: tuple[str, ...], unit: str | None = None) -> None:
@@ -156,7 +255,6 @@ def _attribute(value: Any) -> Any:
 # Tracks of a sequence come a second time as the list `tracks` of records, one for each track, which flowtracks reads:
 # places `xf`, `yf`, `zf` (mm), velocities `uf`, `vf`, `wf` (mm/s), accelerations `axf`, `ayf`, `azf` (NaN, as they
 # are not measured), frames `t` and the track's number `trajid`.
-
 
 # The format counts the bytes of a variable in 32 bits, of which readers take 31.
 LARGEST_BYTES = 2**31 - 1
@@ -204,6 +302,9 @@ def _tracks(content: Content) -> NDArray[np.void]:
     return records
 
 
+# Tables of text: CSV, and Tecplot's ASCII format. Numbers have as many digits as bring back the same bits.
+
+
 def write_csv(path: Path, content: Content) -> None:
     """Write one row for each place below the columns' names; lines of comments before them begin with #."""
     columns, units = columns_of(content)
@@ -223,25 +324,23 @@ def write_tecplot(path: Path, content: Content) -> None:
         file.writelines(f"{line}\n" for line in content.comments(units))
         file.write(f'TITLE = "{KINDS[content.format_name]}"\n')
         file.write("VARIABLES = " + " ".join(f'"{name}"' for name in columns) + "\n")
-        for head, rows in _zones(content):
+        kind = KINDS[content.format_name]
+        if content.grid is not None:
+            nx, ny, nz = content.grid.shape_xyz
+            zones: list[tuple[str, Any]] = [(f'T="{kind}", I={nx}, J={ny}, K={nz}', slice(None))]
+        elif content.format_name == TRAJECTORIES_FORMAT:
+            dt_s = float(content.attributes["dt_s"])
+            zones = [
+                (f'T="frame {k}", STRANDID=1, SOLUTIONTIME={k * dt_s!r}, I={rows.size}, J=1, K=1', rows)
+                for k, rows in enumerate(frames_of(content))
+                if rows.size
+            ]
+        else:
+            zones = [(f'T="{kind}", I={len(content.arrays[POSITION])}, J=1, K=1', slice(None))]
+        for head, rows in zones:
             file.write(f"ZONE {head}, DATAPACKING=POINT\nDT=({'DOUBLE ' * len(columns)})\n")
-            here = columns if rows is None else {name: column[rows] for name, column in columns.items()}
+            here = {name: column[rows] for name, column in columns.items()}
             file.writelines(" ".join(row) + "\n" for row in _rows(here))
-
-
-def _zones(content: Content) -> Iterator[tuple[str, NDArray[np.int64] | None]]:
-    """Yield the head and the rows of each zone, None where it has all."""
-    kind = KINDS[content.format_name]
-    if content.grid is not None:
-        nx, ny, nz = content.grid.shape_xyz
-        yield f'T="{kind}", I={nx}, J={ny}, K={nz}', None
-    elif content.format_name == TRAJECTORIES_FORMAT:
-        dt_s = float(content.attributes["dt_s"])
-        for number, rows in enumerate(frames_of(content)):
-            if rows.size:
-                yield f'T="frame {number}", STRANDID=1, SOLUTIONTIME={number * dt_s!r}, I={rows.size}, J=1, K=1', rows
-    else:
-        yield f'T="{kind}", I={len(content.arrays["position_mm"])}, J=1, K=1', None
 
 
 def _rows(columns: dict[str, NDArray[np.generic]]) -> Iterator[tuple[str, ...]]:

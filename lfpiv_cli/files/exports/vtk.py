@@ -10,23 +10,24 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from xml.sax.saxutils import quoteattr
 
 import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from lfpiv_cli.files.exports.content import Content
-from lfpiv_cli.files.hdf5 import FILTERS, create, ensure_format, open_h5, write_array, write_rows
-from lfpiv_cli.files.particle_file import POSITION, TRAJECTORIES_FORMAT, UNITS, PointRows, Points, lines_of
-from lfpiv_cli.files.vtkhdf import create_vtk_group, place_image, write_root, write_steps
+from lfpiv_cli.files.hdf5 import FILTERS, create, write_array, write_rows
+from lfpiv_cli.files.particle_file import CELLS, POSITION, TRAJECTORIES_FORMAT, UNITS, PointRows, Points, lines_of
+from lfpiv_cli.files.vtkhdf import create_vtk_group, write_root, write_steps
 from lfpiv_cli.reference import Reference
+
+if TYPE_CHECKING:
+    from lfpiv_cli.files.exports.formats import Content
 
 # VTK's XML files: images (`.vti`) and points (`.vtp`), for programs that do not read VTKHDF.
 #
 # The arrays lie behind the XML as raw bytes, each after its length, so that nothing is rounded.
-
 
 LENGTH = np.dtype("<u8")
 
@@ -100,19 +101,18 @@ def _cells(name: str, begins: NDArray[np.int64], appended: _Appended) -> str:
 
 def _field_data(content: Content) -> str:
     """Return what the file says about itself, as arrays of text and numbers."""
-    return f"<FieldData>\n{''.join(_field(name, value) for name, value in content.told().items())}</FieldData>\n"
-
-
-def _field(name: str, value: Any) -> str:
-    head = f"<DataArray Name={quoteattr(name)}"
-    if isinstance(value, str):
-        # Text is stored as the numbers of its bytes, and ends with a zero.
-        numbers = " ".join(str(byte) for byte in [*value.encode(), 0])
-        return f'{head} type="String" NumberOfTuples="1" format="ascii">{numbers}</DataArray>\n'
-    array = np.atleast_1d(np.asarray(value))
-    kind = "Float64" if array.dtype.kind == "f" else "Int64"
-    numbers = " ".join(repr(each) for each in array.tolist())
-    return f'{head} type="{kind}" NumberOfTuples="{array.size}" format="ascii">{numbers}</DataArray>\n'
+    fields = []
+    for name, value in content.told().items():
+        if isinstance(value, str):
+            # Text is stored as the numbers of its bytes, and ends with a zero.
+            kind, count, numbers = "String", 1, " ".join(map(str, [*value.encode(), 0]))
+        else:
+            array = np.atleast_1d(np.asarray(value))
+            kind, count = "Float64" if array.dtype.kind == "f" else "Int64", array.size
+            numbers = " ".join(map(repr, array.tolist()))
+        head = f'<DataArray Name={quoteattr(name)} type="{kind}" NumberOfTuples="{count}" format="ascii">'
+        fields.append(f"{head}{numbers}</DataArray>\n")
+    return f"<FieldData>\n{''.join(fields)}</FieldData>\n"
 
 
 def _write(path: Path, kind: str, body: str, appended: _Appended) -> None:
@@ -138,16 +138,10 @@ def _write(path: Path, kind: str, body: str, appended: _Appended) -> None:
 PLAYBACK_FORMAT, PLAYBACK_VERSION = "lfpiv-playback", 1
 # Of `lfpiv-trajectories`: what is shown at each place.
 SHOWN = ("track", "velocity", "velocity_sigma")
-KINDS = ("Vertices", "Lines", "Polygons", "Strips")
 
 
 def write_playback(path: Path, tracks: PointRows, frames: int, dt_s: float, *, overwrite: bool) -> None:
-    """Write the tracks of a sequence of so many frames, `dt_s` apart, for playing them in time.
-
-    Raises
-    ------
-    OutputExistsError, OutputError
-    """
+    """Write the tracks of a sequence of so many frames, `dt_s` apart, for playing them in time."""
     counts, rows = tracks.in_frames(frames)
     before = np.cumsum(counts) - counts
     count = int(counts.sum())
@@ -155,10 +149,10 @@ def write_playback(path: Path, tracks: PointRows, frames: int, dt_s: float, *, o
 
     def fill(file: h5py.File) -> None:
         write_root(file, PLAYBACK_FORMAT, PLAYBACK_VERSION, tracks.reference, tracks.attributes, tracks.provenance)
-        vtk = create_vtk_group(file, "PolyData")
+        vtk = create_vtk_group(file, None)
         write_rows(vtk, "Points", count, rows(POSITION), "mm")
         write_array(vtk, "NumberOfPoints", counts)
-        for kind in KINDS:
+        for kind in CELLS:
             cells = counts if kind == "Vertices" else np.zeros_like(counts)
             group = vtk.create_group(kind)
             write_array(group, "NumberOfCells", cells)
@@ -174,16 +168,12 @@ def write_playback(path: Path, tracks: PointRows, frames: int, dt_s: float, *, o
         write_array(steps, "PartOffsets", np.arange(frames, dtype=np.int64))
         write_array(steps, "NumberOfParts", np.ones(frames, np.int64))
         write_array(steps, "PointOffsets", before)
-        of_kinds = np.zeros((frames, len(KINDS)), np.int64)
+        of_kinds = np.zeros((frames, len(CELLS)), np.int64)
         of_kinds[:, 0] = before
         write_array(steps, "CellOffsets", of_kinds)
         write_array(steps, "ConnectivityIdOffsets", of_kinds)
 
-    def check(temporary: Path) -> None:
-        with open_h5(temporary) as file:
-            ensure_format(temporary, file, PLAYBACK_FORMAT, (PLAYBACK_VERSION,))
-
-    create(path, fill, overwrite=overwrite, check=check)
+    create(path, fill, overwrite=overwrite)
 
 
 SERIES_FORMAT, SERIES_VERSION = "lfpiv-series", 1
@@ -199,7 +189,7 @@ def write_series(
     *,
     overwrite: bool,
 ) -> None:
-    """Write volumes or vectors on one grid.
+    """Write volumes or vectors on one grid, or the tracks of a sequence for playing them in time.
 
     Parameters
     ----------
@@ -207,22 +197,23 @@ def write_series(
     read : gives that of each number, which has the same; one at a time is held in memory
     count : how many there are
     times_s : of each, None where only their order is known
-
-    Raises
-    ------
-    OutputExistsError, OutputError
     """
+    reference = Reference.from_attributes(first.attributes)
+    # Where coordinates begin is written by its own rule.
+    others = {name: value for name, value in first.attributes.items() if not name.startswith("reference")}
     if first.grid is None:
-        raise ValueError("points are no image")
+        points = Points(first.arrays[POSITION], first.arrays, reference, others, dict(provenance))
+        frames = int(first.arrays["frame"].max(initial=0)) + 1
+        write_playback(path, points, frames, float(first.attributes["dt_s"]), overwrite=overwrite)
+        return
     grid = first.grid
     of_one = count == 1  # VTK takes one step for none, and its axis for one of the place
     times, unit = (list(map(float, range(count))), "frame") if times_s is None else (times_s, "s")
 
     def fill(file: h5py.File) -> None:
-        told = {name: np.asarray(value) if isinstance(value, list) else value for name, value in _others(first).items()}
-        write_root(file, SERIES_FORMAT, SERIES_VERSION, Reference.from_attributes(first.attributes), told, provenance)
-        vtk = create_vtk_group(file, "ImageData")
-        place_image(vtk, grid)
+        told = {name: np.asarray(value) if isinstance(value, list) else value for name, value in others.items()}
+        write_root(file, SERIES_FORMAT, SERIES_VERSION, reference, told, provenance)
+        vtk = create_vtk_group(file, grid)
         points = vtk.create_group("PointData")
         if "velocity" in first.arrays:
             points.attrs["Vectors"] = np.bytes_("velocity")
@@ -237,21 +228,4 @@ def write_series(
             for name, array in read(number).arrays.items():
                 points[name][... if of_one else number] = array[0] if array.shape[0] == 1 else array
 
-    def check(temporary: Path) -> None:
-        with open_h5(temporary) as file:
-            ensure_format(temporary, file, SERIES_FORMAT, (SERIES_VERSION,))
-
-    create(path, fill, overwrite=overwrite, check=check)
-
-
-def write_tracks_series(path: Path, tracks: Content, provenance: Mapping[str, Any], *, overwrite: bool) -> None:
-    """Write the tracks of a sequence for playing them in time."""
-    reference = Reference.from_attributes(tracks.attributes)
-    points = Points(tracks.arrays[POSITION], tracks.arrays, reference, _others(tracks), dict(provenance))
-    frames = int(tracks.arrays["frame"].max(initial=0)) + 1
-    write_playback(path, points, frames, float(tracks.attributes["dt_s"]), overwrite=overwrite)
-
-
-def _others(content: Content) -> dict[str, Any]:
-    """Return what a file says about itself besides where its coordinates begin, which is written by its own rule."""
-    return {name: value for name, value in content.attributes.items() if not name.startswith("reference")}
+    create(path, fill, overwrite=overwrite)

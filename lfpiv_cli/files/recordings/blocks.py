@@ -7,7 +7,6 @@ import re
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO, Literal, get_args
 
@@ -19,7 +18,6 @@ from lfpiv_cli.files.inputs import opened, split_page, split_part
 from lfpiv_cli.files.recordings.recording import CUT, Image, Recording, Shape, ensure_size
 
 # The green of a sensor behind colour filters.
-
 
 # Colours of the filters over the first two pixels of the first row, and of the second.
 PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
@@ -34,22 +32,16 @@ def green_of(mosaic: Image, pattern: str) -> Image:
 
     A pixel behind a red or blue filter has green ones above, below, left and right; at the rim two or three of them.
     """
-    green = _is_green(mosaic.shape, pattern)
+    rows, columns = mosaic.shape
+    cell = np.array([colour == "G" for colour in pattern]).reshape(2, 2)
+    green = np.tile(cell, (rows // 2 + 1, columns // 2 + 1))[:rows, :columns]
     seen = np.pad(np.where(green, mosaic, np.float32(0.0)), 1)
     there = np.pad(green.astype(np.float32), 1)
     total, count = (a[:-2, 1:-1] + a[2:, 1:-1] + a[1:-1, :-2] + a[1:-1, 2:] for a in (seen, there))
     return np.where(green, mosaic, total / np.maximum(count, 1.0)).astype(np.float32)
 
 
-def _is_green(shape: tuple[int, ...], pattern: str) -> NDArray[np.bool_]:
-    """Return which pixels (rows, columns) lie behind green filters."""
-    cell = np.array([colour == "G" for colour in pattern]).reshape(2, 2)
-    rows, columns = shape
-    return np.tile(cell, (rows // 2 + 1, columns // 2 + 1))[:rows, :columns]
-
-
 # How pixels lie in the bytes of a frame that is not compressed.
-
 
 # `whole`: a pixel in one byte, or in two where it has more than 8 bits. The others leave no bit between pixels: the
 # first pixel in the highest bits of the first byte (Photron, Phantom), or in the lowest (GenICam's Mono10p, Mono12p);
@@ -98,16 +90,18 @@ class Pixels:
 
     def decode(self, data: bytes) -> Image:
         """Return a frame of `frame_bytes` bytes as an image (rows, columns) in counts."""
-        rows, columns = self.shape
+        (rows, columns), stored = self.shape, np.frombuffer(data, np.uint8)
         if self.packing == "whole":
             kind = np.dtype(np.uint8 if self.bits <= 8 else ">u2" if self.big_endian else "<u2")
-            lines = np.frombuffer(data, np.uint8).reshape(rows, self._row_bytes)[:, : columns * kind.itemsize]
+            lines = stored.reshape(rows, self._row_bytes)[:, : columns * kind.itemsize]
             image = np.ascontiguousarray(lines).view(kind)
-        elif self.packing == "gige":
-            image = _unpack_gige(np.frombuffer(data, np.uint8), self.bits)[: rows * columns].reshape(self.shape)
         else:
-            packed = np.frombuffer(data, np.uint8)
-            pixels = unpack(packed, self.bits, high_first=self.packing == "high-first")
+            if self.packing == "gige":
+                first, low, second = stored.reshape(-1, 3).astype(np.uint16).T
+                kept, mask = self.bits - 8, (1 << (self.bits - 8)) - 1
+                pixels = np.stack([first << kept | low & mask, second << kept | low >> 4 & mask], axis=1).reshape(-1)
+            else:
+                pixels = unpack(stored, self.bits, high_first=self.packing == "high-first")
             image = pixels[: rows * columns].reshape(self.shape)
         if self.table is not None:
             image = self.table[image]
@@ -145,13 +139,6 @@ def unpack(packed: NDArray[np.uint8], bits: int, high_first: bool) -> NDArray[np
     return pixels.reshape(-1)
 
 
-def _unpack_gige(packed: NDArray[np.uint8], bits: int) -> NDArray[np.uint16]:
-    """Return the pixels of GigE Vision's Mono10Packed or Mono12Packed: two in three bytes."""
-    first, low, second = packed.reshape(-1, 3).astype(np.uint16).T
-    kept, mask = bits - 8, (1 << (bits - 8)) - 1
-    return np.stack([first << kept | low & mask, second << kept | low >> 4 & mask], axis=1).reshape(-1)
-
-
 def values_at(path: Path, file: BinaryIO, place: int, layout: str) -> tuple[Any, ...]:
     """Return the values at a place of a file, laid out as `struct` says.
 
@@ -187,10 +174,6 @@ def recording(
     Parameters
     ----------
     begin : tells where the pixels of the frame at a place begin, where that is not the place itself
-
-    Raises
-    ------
-    InputError
     """
     size = path.stat().st_size
     if not len(places):
@@ -206,22 +189,15 @@ def recording(
             f"{path}: declares {len(places)} frames of {pixels.frame_bytes} bytes, of which the last ends at byte "
             f"{last + pixels.frame_bytes} of {size}: {CUT}"
         )
-    return Recording(len(places), pixels.shape, pixels.bits, partial(_read_page, path, places, pixels, begin), time_s)
 
+    def read_page(page: int, shape: Shape | None) -> Image:
+        with opened(path) as file:
+            ensure_size(f"{path}: frame {page}", pixels.shape, 1, shape, file.seek(0, 2))
+            place = int(places[page])
+            data = bytes_at(path, file, begin(file, place) if begin else place, pixels.frame_bytes)
+        return pixels.decode(data)
 
-def _read_page(
-    path: Path,
-    places: Sequence[int] | NDArray[np.int64],
-    pixels: Pixels,
-    begin: Callable[[BinaryIO, int], int] | None,
-    page: int,
-    shape: Shape | None,
-) -> Image:
-    with opened(path) as file:
-        ensure_size(f"{path}: frame {page}", pixels.shape, 1, shape, file.seek(0, 2))
-        place = int(places[page])
-        data = bytes_at(path, file, begin(file, place) if begin else place, pixels.frame_bytes)
-    return pixels.decode(data)
+    return Recording(len(places), pixels.shape, pixels.bits, read_page, time_s)
 
 
 def at_rate(pages: int, rate_hz: float) -> NDArray[np.float64] | None:
@@ -233,30 +209,23 @@ def at_rate(pages: int, rate_hz: float) -> NDArray[np.float64] | None:
 
 # Frames without a header, whose layout is stated: WIDTHxHEIGHTxBITS and what else is to be known.
 
-
 SIZE = re.compile(r"([1-9]\d{0,5})x([1-9]\d{0,5})x([1-9]\d?)")
 # What tells a layout, right or wrong, from the name of a part.
 LOOKS_LAID_OUT = re.compile(r"\d+x\d")
 # How the names of such files end. Others need their layout in the name, as FILE.dat:LAYOUT.
 SUFFIXES = (".raw", ".bin")
 PACKINGS = get_args(Packing)
+ORDERS = ("little", "big")
+# Options of a layout: the kind of value, which are allowed, and what is expected.
+OPTIONS: Mapping[str, tuple[Callable[[str], Any], Callable[[Any], bool], str]] = {
+    "packing": (str, PACKINGS.__contains__, ", ".join(PACKINGS)),
+    "order": (str, ORDERS.__contains__, ", ".join(ORDERS)),
+    "header": (int, lambda number: number >= 0, "a number of bytes"),
+    "gap": (int, lambda number: number >= 0, "a number of bytes"),
+    "rate": (float, lambda rate: 0.0 < rate < math.inf, "frames in a second"),
+    "bayer": (str, PATTERNS.__contains__, ", ".join(PATTERNS)),
+}
 HINT = "a layout is WIDTHxHEIGHTxBITS and options, as in 2352x1768x12:packing=low-first:header=512"
-
-
-@dataclass(frozen=True)
-class Layout:
-    """How frames lie in a file.
-
-    Attributes
-    ----------
-    header, gap : bytes before the first frame, and after each
-    rate_hz : frames in a second, 0 where not stated
-    """
-
-    pixels: Pixels
-    header: int
-    gap: int
-    rate_hz: float
 
 
 def unstated_frames(path: Path) -> Recording:
@@ -272,21 +241,19 @@ def frames_laid_out(path: Path, layout: str) -> Recording:
     UsageError : the layout is not one
     InputError : the file does not end with a frame
     """
-    laid = parse_layout(layout)
-    held = path.stat().st_size - laid.header
-    pages, rest = divmod(held, laid.pixels.frame_bytes + laid.gap)
+    pixels, options = parse_layout(layout)
+    header, gap = options.get("header", 0), options.get("gap", 0)
+    held, step = path.stat().st_size - header, pixels.frame_bytes + gap
+    pages, rest = divmod(held, step)
     # What lies between two frames may be missing after the last one.
-    if laid.gap and rest == laid.pixels.frame_bytes:
+    if gap and rest == pixels.frame_bytes:
         pages, rest = pages + 1, 0
     if held <= 0 or rest:
         raise InputError(
-            f"{path}: its {held} bytes after the header are {held / (laid.pixels.frame_bytes + laid.gap):.2f} frames "
-            f"of {laid.pixels.frame_bytes + laid.gap} bytes by the layout {layout}, expected a whole number: {CUT}, "
-            "or of another layout"
+            f"{path}: its {held} bytes after the header are {held / step:.2f} frames of {step} bytes by the layout "
+            f"{layout}, expected a whole number: {CUT}, or of another layout"
         )
-    step = laid.pixels.frame_bytes + laid.gap
-    places = range(laid.header, laid.header + pages * step, step)
-    return recording(path, places, laid.pixels, at_rate(pages, laid.rate_hz))
+    return recording(path, range(header, header + pages * step, step), pixels, at_rate(pages, options.get("rate", 0.0)))
 
 
 def with_layout(path: Path, layout: str) -> Path:
@@ -298,8 +265,10 @@ def with_layout(path: Path, layout: str) -> Path:
     return file.with_name(f"{file.name}:{layout}" + ("" if page is None else f":page={page}"))
 
 
-def parse_layout(text: str) -> Layout:
-    """Return the layout that a text states.
+def parse_layout(text: str) -> tuple[Pixels, dict[str, Any]]:
+    """Return how pixels lie in the frames of a layout, and its other options.
+
+    `header` and `gap`: bytes before the first frame, and after each; `rate`: frames in a second.
 
     Raises
     ------
@@ -312,58 +281,20 @@ def parse_layout(text: str) -> Layout:
     columns, rows, bits = (int(number) for number in found.groups())
     if bits > MOST_BITS:
         raise UsageError(f"layout {text}: has {bits} bits a pixel, expected 1 to {MOST_BITS}")
-    chosen = _options(text, options)
-    packing = chosen.get("packing", "whole")
-    if packing != "whole" and bits not in PACKED_BITS:
-        raise UsageError(f"layout {text}: {bits} bits are not packed, expected {' or '.join(map(str, PACKED_BITS))}")
-    pixels = Pixels((rows, columns), bits, packing, big_endian=chosen.get("order") == "big", bayer=chosen.get("bayer"))
-    return Layout(pixels, chosen.get("header", 0), chosen.get("gap", 0), chosen.get("rate", 0.0))
-
-
-def _bytes(text: str) -> int:
-    number = int(text)
-    if number < 0:
-        raise ValueError
-    return number
-
-
-def _rate(text: str) -> float:
-    rate = float(text)
-    if not (math.isfinite(rate) and rate > 0.0):
-        raise ValueError
-    return rate
-
-
-def _one_of(names: tuple[str, ...]) -> Callable[[str], str]:
-    def parse(text: str) -> str:
-        if text not in names:
-            raise ValueError
-        return text
-
-    return parse
-
-
-# Options of a layout: how each is read, and what is expected of it.
-OPTIONS: Mapping[str, tuple[Callable[[str], Any], str]] = {
-    "packing": (_one_of(PACKINGS), ", ".join(PACKINGS)),
-    "order": (_one_of(("little", "big")), "little, big"),
-    "header": (_bytes, "a number of bytes"),
-    "gap": (_bytes, "a number of bytes"),
-    "rate": (_rate, "frames in a second"),
-    "bayer": (_one_of(PATTERNS), ", ".join(PATTERNS)),
-}
-
-
-def _options(text: str, options: list[str]) -> dict[str, Any]:
-    """Return the options of a layout by their names."""
     chosen: dict[str, Any] = {}
     for option in options:
         name, _, value = option.partition("=")
         if name not in OPTIONS or name in chosen:
             raise UsageError(f"layout {text}: {name!r} is no option, or there twice; expected {', '.join(OPTIONS)}")
-        parse, expected = OPTIONS[name]
+        kind, is_allowed, expected = OPTIONS[name]
         try:
-            chosen[name] = parse(value)
+            chosen[name] = kind(value)
         except ValueError:
-            raise UsageError(f"layout {text}: {name} is {value!r}, expected {expected}") from None
-    return chosen
+            chosen[name] = None
+        if chosen[name] is None or not is_allowed(chosen[name]):
+            raise UsageError(f"layout {text}: {name} is {value!r}, expected {expected}")
+    packing = chosen.get("packing", "whole")
+    if packing != "whole" and bits not in PACKED_BITS:
+        raise UsageError(f"layout {text}: {bits} bits are not packed, expected {' or '.join(map(str, PACKED_BITS))}")
+    big = chosen.get("order") == "big"
+    return Pixels((rows, columns), bits, packing, big_endian=big, bayer=chosen.get("bayer")), chosen

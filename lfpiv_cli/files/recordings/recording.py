@@ -16,7 +16,6 @@ from lfpiv_cli.notice import Notice
 
 # What the decoders of images complain of, kept until the command tells it: formats without check sums have no more.
 
-
 # Of a damaged file there can be one for each page.
 MOST_KEPT = 20
 
@@ -41,11 +40,10 @@ class _Keeper(logging.Handler):
             _kept.append(notice)
 
 
-def keep_complaints(logger_name: str) -> None:
-    """Keep what a decoder logs, in place of printing it."""
-    logger = logging.getLogger(logger_name)
-    logger.addHandler(_Keeper(logging.WARNING))
-    logger.propagate = False
+# In place of printing it.
+_logger = logging.getLogger("tifffile")
+_logger.addHandler(_Keeper(logging.WARNING))
+_logger.propagate = False
 
 
 def taken_complaints() -> list[Notice]:
@@ -92,7 +90,6 @@ class Recording:
 
 # What all formats ask of a frame's declared size, and of channels that should be one.
 
-
 # Numbers of samples of which the last is the transparency.
 TRANSPARENT_SAMPLES = (2, 4)
 # The largest sensor sold has 151 million pixels; a header that declares more is wrong or hostile.
@@ -123,10 +120,6 @@ def one_channel(array: NDArray[Any], what: str) -> NDArray[Any]:
     """Return the channel that all channels of an image (rows, columns[, samples]) are alike.
 
     A last one of two or four is how transparent pixels are; it must be the same everywhere.
-
-    Raises
-    ------
-    InputError
     """
     if array.ndim == 2:
         return array

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-from numpy.typing import NDArray
 
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.files.hdf5 import DEEPEST, open_h5
@@ -48,12 +47,7 @@ def frames(path: Path) -> Recording:
 
 
 def frames_named(path: Path, name: str) -> Recording:
-    """Return the frames of a dataset: of one with two dimensions, the only frame.
-
-    Raises
-    ------
-    InputError
-    """
+    """Return the frames of a dataset: of one with two dimensions, the only frame."""
     with open_h5(path) as file:
         return _frames_in(path, _dataset(path, file, name))
 
@@ -87,7 +81,7 @@ def _dataset(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
 
 
 def _frames_in(path: Path, dataset: h5py.Dataset) -> Recording:
-    """Return the frames of a dataset whose bytes are all in this very file."""
+    """Return the frames of a dataset whose bytes are all in this very file, with the times beside it."""
     name = dataset.name
     if dataset.is_virtual or dataset.external:
         raise InputError(f"{path}: {name} lies in another file")
@@ -95,41 +89,28 @@ def _frames_in(path: Path, dataset: h5py.Dataset) -> Recording:
         raise InputError(
             f"{path}: {name} is {dataset.dtype} {dataset.shape}, expected numbers of (frames, rows, columns)"
         )
-    shape = (int(dataset.shape[-2]), int(dataset.shape[-1]))
-    size = path.stat().st_size
-    ensure_size(f"{path}: a frame of {name}", shape, dataset.dtype.itemsize, None, size)
-    _ensure_whole(path, dataset)
-    pages = int(dataset.shape[0]) if dataset.ndim == 3 else 1
-    bits = 8 * dataset.dtype.itemsize
-    return Recording(pages, shape, bits, partial(_read_page, path, name), _times(dataset, pages))
+    shape, item_bytes = (int(dataset.shape[-2]), int(dataset.shape[-1])), dataset.dtype.itemsize
+    ensure_size(f"{path}: a frame of {name}", shape, item_bytes, None, path.stat().st_size)
 
-
-def _ensure_whole(path: Path, dataset: h5py.Dataset) -> None:
-    """Refuse a dataset of which parts were never written, which would be read as zeros."""
-    name, item_bytes = dataset.name, dataset.dtype.itemsize
+    # Parts that were never written would be read as zeros.
     if dataset.chunks is None:
         stored = dataset.id.get_storage_size()
         if stored < dataset.size * item_bytes:
             raise InputError(f"{path}: {name} has {stored} of its {dataset.size * item_bytes} bytes: {CUT}")
-        return
-    if math.prod(dataset.chunks) * item_bytes > MOST_CHUNK_BYTES:
-        raise InputError(f"{path}: {name} has chunks of {dataset.chunks}, more than {MOST_CHUNK_BYTES} bytes each")
-    expected = math.prod(-(-n // c) for n, c in zip(dataset.shape, dataset.chunks, strict=True))
-    found = dataset.id.get_num_chunks()
-    if found != expected:
-        raise InputError(f"{path}: {name} has {found} of its {expected} chunks: {CUT}")
+    else:
+        if math.prod(dataset.chunks) * item_bytes > MOST_CHUNK_BYTES:
+            raise InputError(f"{path}: {name} has chunks of {dataset.chunks}, more than {MOST_CHUNK_BYTES} bytes each")
+        expected = math.prod(-(-n // c) for n, c in zip(dataset.shape, dataset.chunks, strict=True))
+        found = dataset.id.get_num_chunks()
+        if found != expected:
+            raise InputError(f"{path}: {name} has {found} of its {expected} chunks: {CUT}")
 
-
-def _times(dataset: h5py.Dataset, pages: int) -> NDArray[np.float64] | None:
-    """Return the times beside a dataset of frames, where there are as many as frames."""
-    group = dataset.parent
-    if TIMES not in group:
-        return None
-    times = member(group, TIMES)
-    if not isinstance(times, h5py.Dataset) or times.shape != (pages,) or times.dtype.kind not in "uif":
-        return None
-    found = np.asarray(times[()], np.float64)
-    return found if np.isfinite(found).all() else None
+    pages, time_s = int(dataset.shape[0]) if dataset.ndim == 3 else 1, None
+    times = member(dataset.parent, TIMES) if TIMES in dataset.parent else None
+    if isinstance(times, h5py.Dataset) and times.shape == (pages,) and times.dtype.kind in "uif":
+        told = np.asarray(times[()], np.float64)
+        time_s = told if np.isfinite(told).all() else None
+    return Recording(pages, shape, 8 * item_bytes, partial(_read_page, path, name), time_s)
 
 
 def _read_page(path: Path, name: str, page: int, shape: Shape | None) -> Image:

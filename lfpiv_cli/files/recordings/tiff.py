@@ -27,13 +27,11 @@ from lfpiv_cli.files.recordings.recording import (
     Shape,
     as_counts,
     ensure_size,
-    keep_complaints,
     one_channel,
     reading,
 )
 
 # Greyscale PNG: one frame a file.
-
 
 PNG_START = b"\x89PNG\r\n\x1a\n"
 # Samples of a pixel by a PNG's colour type, once decoded: grey, colour, palette, and with transparency.
@@ -45,12 +43,7 @@ MOST_BYTES_A_PIXEL = 16
 
 
 def png_frames(path: Path) -> Recording:
-    """Return what a PNG file's header says; its check sums are left to the reading.
-
-    Raises
-    ------
-    InputError
-    """
+    """Return what a PNG file's header says; its check sums are left to the reading."""
     with open(path, "rb") as file:
         file.seek(HEADER_AT)
         header = file.read(struct.calcsize(HEADER))
@@ -68,11 +61,23 @@ def _read_png(path: Path, page: int, shape: Shape | None) -> Image:
         if size > HARMLESS_BYTES + MOST_BYTES_A_PIXEL * math.prod(declared):
             raise InputError(f"has {size} bytes, more than a PNG of {declared[1]} x {declared[0]} pixels takes: {CUT}")
         content = path.read_bytes()
-        columns, rows, bits, colour = _png_header(content)
+        parts = list(_parts(content))
+        header = dict(parts).get(b"IHDR", b"")
+        if len(header) != 13:
+            raise InputError(f"its header has {len(header)} bytes, expected 13")
+        columns, rows, bits, colour = struct.unpack_from(">IIBB", header)
         if colour not in PNG_SAMPLES:
             raise InputError(f"is a PNG of colour type {colour}: {GREY_HINT}")
         ensure_size("the image", (rows, columns), PNG_SAMPLES[colour] * (1 if bits <= 8 else 2), shape, len(content))
-        _ensure_pixels(content, rows, columns, bits * PNG_SAMPLES[colour])
+
+        # Packed data that are more than the pixels a decoder may unpack all the same. A byte for each line; interlaced
+        # images have seven passes, the lines of each filled up.
+        largest = rows * (columns * bits * PNG_SAMPLES[colour] // 8 + 2) + 7 * (2 * rows + columns)
+        unpacker = zlib.decompressobj()
+        for packed in (body for kind, body in parts if kind == b"IDAT"):
+            largest -= len(unpacker.decompress(packed, largest + 1))
+            if largest < 0 or unpacker.unconsumed_tail:
+                raise InputError(f"its data are more than the {columns} x {rows} pixels that it declares")
         array = imagecodecs.png_decode(content)
         if array.shape[:2] != (rows, columns):
             raise InputError(f"decodes to {array.shape}, it declares {rows, columns}")
@@ -83,45 +88,17 @@ def _read_png(path: Path, page: int, shape: Shape | None) -> Image:
         raise InputError(f"{path}: cannot be decoded: {reason(error)}") from error
 
 
-def _ensure_pixels(content: bytes, rows: int, columns: int, bits: int) -> None:
-    """Refuse packed data that are more than the declared pixels, which a decoder may unpack all the same.
-
-    Parameters
-    ----------
-    bits : of a pixel, at most
-    """
-    # A byte for each line; interlaced images have seven passes, the lines of each filled up.
-    largest = rows * (columns * bits // 8 + 2) + 7 * (2 * rows + columns)
-    unpacker, place = zlib.decompressobj(), len(PNG_START)
-    while place < len(content):
-        length = int.from_bytes(content[place : place + 4], "big")
-        if content[place + 4 : place + 8] == b"IDAT":
-            largest -= len(unpacker.decompress(content[place + 8 : place + 8 + length], largest + 1))
-            if largest < 0 or unpacker.unconsumed_tail:
-                raise InputError(f"its data are more than the {columns} x {rows} pixels that it declares")
-        place += 12 + length
-
-
-def _png_header(content: bytes) -> tuple[int, int, int, int]:
-    """Return width, height, bit depth and colour type of a PNG whose parts are all there and undamaged."""
-    place = len(PNG_START)
-    header = b""
-    while True:
-        length = int.from_bytes(content[place : place + 4], "big")
-        kind = content[place + 4 : place + 8]
-        end = place + 12 + length
+def _parts(content: bytes) -> Iterator[tuple[bytes, bytes]]:
+    """Yield kind and body of each part of a PNG, after checking that all are there and undamaged."""
+    place, kind = len(PNG_START), b""
+    while kind != b"IEND":
+        kind, end = content[place + 4 : place + 8], place + 12 + int.from_bytes(content[place : place + 4], "big")
         if end > len(content):
             raise InputError(f"the part at byte {place} ends at byte {end} of {len(content)}: {CUT}")
         if zlib.crc32(content[place + 4 : end - 4]) != int.from_bytes(content[end - 4 : end], "big"):
             raise InputError(f"the part at byte {place} has a wrong check sum: {CUT}")
-        if kind == b"IHDR":
-            header = content[place + 8 : end - 4]
-        if kind == b"IEND":
-            break
+        yield kind, content[place + 8 : end - 4]
         place = end
-    if len(header) != 13:
-        raise InputError(f"its header has {len(header)} bytes, expected 13")
-    return int.from_bytes(header[:4], "big"), int.from_bytes(header[4:8], "big"), header[8], header[9]
 
 
 # A walk over a TIFF file's directories that takes nothing on trust.
@@ -129,7 +106,6 @@ def _png_header(content: bytes) -> tuple[int, int, int, int]:
 # The decoding library stops at a broken directory and returns the pages before it; a count of pages that an
 # experiment relies on must not shrink in silence. So the chain is followed here first, and every directory and tag
 # value must lie inside the file. Header and entries as in the TIFF 6.0 and BigTIFF specifications.
-
 
 # Bytes of one value of each tag type, TIFF 6.0 and BigTIFF.
 TYPE_BYTES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8, 17: 8, 18: 8}
@@ -152,8 +128,7 @@ def directories(file: BinaryIO, size: int) -> list[int]:
 
     Raises
     ------
-    InputError
-        If the chain leads outside the file or into a circle; the caller adds the file's name.
+    InputError : the chain leads outside the file or into a circle; the caller adds the file's name
     """
     file.seek(0)
     head = file.read(16)
@@ -221,33 +196,57 @@ BLACK_AND_WHITE = (2, 3, 4, 32771)
 # How a TIFF says that its channels lie apart.
 SEPARATE = 2
 
-keep_complaints("tifffile")
-
 
 def frames(path: Path) -> Recording:
-    """Return the pages of a TIFF file whose directories are sound.
-
-    Raises
-    ------
-    InputError
-    """
+    """Return the pages of a TIFF file whose directories are sound."""
     with _naming(path), open(path, "rb") as file:
         places = directories(file, path.stat().st_size)
         file.seek(0)
         with tifffile.TiffFile(file) as tiff:
-            _ensure_one_frame_a_page(tiff, len(places))
-            first = tiff.pages[0]
+            first, said = tiff.pages[0], 1
+            # The writers' private ways of storing many frames behind one directory.
+            if found := re.search(r"^images=(\d+)", first.description, re.MULTILINE):
+                said = int(found.group(1))
+            elif found := re.match(r'{"shape": \[([\d, ]+)\]', first.description):
+                said = math.prod(int(n) for n in found.group(1).split(",")) // max(math.prod(first.shape), 1)
+            if said > len(places):
+                raise InputError(
+                    f"holds {len(places)} pages and says {said} frames: save it as an ordinary multi-page TIFF"
+                )
             bits = first.bitspersample if isinstance(first.bitspersample, int) else first.bitspersample[0]
             return Recording(
                 len(places), (first.imagelength, first.imagewidth), bits, partial(_read_page, path, places)
             )
 
 
-def _read_page(path: Path, places: Sequence[int], page: int, shape: Shape | None) -> Image:
-    """Read the page whose directory lies at `places[page]`: the chain of directories is not walked again."""
+def _read_page(path: Path, places: Sequence[int], number: int, shape: Shape | None) -> Image:
+    """Read the page whose directory lies at `places[number]`, after checking what it declares.
+
+    The chain of directories is not walked again.
+    """
     with _naming(path), open(path, "rb") as file, tifffile.TiffFile(file) as tiff:
-        tiff.filehandle.seek(places[page])
-        return _decode_page(tifffile.TiffPage(tiff, page), page, shape)
+        tiff.filehandle.seek(places[number])
+        page = tifffile.TiffPage(tiff, number)
+        has_palette = page.colormap is not None and page.samplesperpixel == 1 and page.dtype == np.uint8
+        if page.photometric not in (BLACK_IS_ZERO, RGB, PALETTE) or (page.photometric == PALETTE) != has_palette:
+            kind = getattr(page.photometric, "name", page.photometric)
+            raise InputError(f"page {number} is {kind} with {page.samplesperpixel} samples per pixel: {GREY_HINT}")
+        if page.dtype is None or page.dtype.kind not in "uif":
+            raise InputError(f"page {number} has {page.bitspersample} bits per pixel of an unknown kind")
+        if page.compression in BLACK_AND_WHITE:
+            name = page.compression.name
+            raise InputError(f"page {number} is packed as {name}, for black and white alone: {GREY_HINT}")
+        size, declared = tiff.filehandle.size, (page.imagelength, page.imagewidth)
+        ensure_size(f"page {number}", declared, page.dtype.itemsize * page.samplesperpixel, shape, size)
+        _ensure_segments(page, number, size)
+        array = page.asarray(maxworkers=1)
+        if page.samplesperpixel > 1 and page.planarconfig == SEPARATE:
+            array = np.moveaxis(array, 0, -1)
+        if array.shape[:2] != declared:
+            raise InputError(f"page {number} decodes to {array.shape}, it declares {declared}")
+        if page.colormap is not None:
+            array = np.moveaxis(page.colormap[:, array] >> PALETTE_SHIFT, 0, -1)
+        return as_counts(one_channel(array, f"page {number}"))
 
 
 @contextmanager
@@ -267,42 +266,6 @@ def _naming(path: Path) -> Iterator[None]:
         reading.reset(token)
 
 
-def _ensure_one_frame_a_page(tiff: tifffile.TiffFile, pages: int) -> None:
-    """Refuse the writers' private ways of storing many frames behind one directory."""
-    first = tiff.pages[0]
-    description = first.description
-    frames = 1
-    if found := re.search(r"^images=(\d+)", description, re.MULTILINE):
-        frames = int(found.group(1))
-    elif found := re.match(r'{"shape": \[([\d, ]+)\]', description):
-        frames = math.prod(int(n) for n in found.group(1).split(",")) // max(math.prod(first.shape), 1)
-    if frames > pages:
-        raise InputError(f"holds {pages} pages and says {frames} frames: save it as an ordinary multi-page TIFF")
-
-
-def _decode_page(page: tifffile.TiffPage, number: int, shape: Shape | None) -> Image:
-    """Return one page as float32 after checking what it declares."""
-    if page.photometric not in (BLACK_IS_ZERO, RGB, PALETTE) or (page.photometric == PALETTE) != _has_palette(page):
-        kind = getattr(page.photometric, "name", page.photometric)
-        raise InputError(f"page {number} is {kind} with {page.samplesperpixel} samples per pixel: {GREY_HINT}")
-    if page.dtype is None or page.dtype.kind not in "uif":
-        raise InputError(f"page {number} has {page.bitspersample} bits per pixel of an unknown kind")
-    if page.compression in BLACK_AND_WHITE:
-        raise InputError(f"page {number} is packed as {page.compression.name}, for black and white alone: {GREY_HINT}")
-    size = page.parent.filehandle.size
-    pixel_bytes = page.dtype.itemsize * page.samplesperpixel
-    ensure_size(f"page {number}", (page.imagelength, page.imagewidth), pixel_bytes, shape, size)
-    _ensure_segments(page, number, size)
-    array = page.asarray(maxworkers=1)
-    if page.samplesperpixel > 1 and page.planarconfig == SEPARATE:
-        array = np.moveaxis(array, 0, -1)
-    if array.shape[:2] != (page.imagelength, page.imagewidth):
-        raise InputError(f"page {number} decodes to {array.shape}, it declares {page.imagelength, page.imagewidth}")
-    if page.colormap is not None:
-        array = np.moveaxis(page.colormap[:, array] >> PALETTE_SHIFT, 0, -1)
-    return as_counts(one_channel(array, f"page {number}"))
-
-
 def _ensure_segments(page: tifffile.TiffPage, number: int, file_bytes: int) -> None:
     """Refuse strips or tiles that are missing, lie beyond the file's end, or are shorter than their pixels.
 
@@ -315,22 +278,13 @@ def _ensure_segments(page: tifffile.TiffPage, number: int, file_bytes: int) -> N
     for segment, (place, length) in enumerate(zip(page.dataoffsets, page.databytecounts, strict=True)):
         if length == 0 or place + length > file_bytes:
             raise InputError(f"the data of page {number} ends at byte {place + length} of {file_bytes}: {CUT}")
-        pixels = _bytes_of(page, segment)
+        rows, columns, *samples = page.chunks
+        if not page.is_tiled:  # whose last ones are filled up, where the last strip is shorter
+            rows = min(rows, page.imagelength - segment % -(-page.imagelength // rows) * rows)
+        # Where it is not packed; each of its rows takes whole bytes.
+        pixels = rows * -(-columns * math.prod(samples) * page.bitspersample // 8)
         least, most = pixels if page.compression == NOT_PACKED else 1, HARMLESS_BYTES + 2 * pixels
         if not least <= length <= most:
             raise InputError(
                 f"strip or tile {segment} of page {number} has {length} bytes, its pixels take {pixels}: {CUT}"
             )
-
-
-def _bytes_of(page: tifffile.TiffPage, segment: int) -> int:
-    """Return how many bytes a strip or tile takes that is not packed; each of its rows takes whole bytes."""
-    rows, columns, *samples = page.chunks
-    if not page.is_tiled:  # whose last ones are filled up, where the last strip is shorter
-        rows = min(rows, page.imagelength - segment % -(-page.imagelength // rows) * rows)
-    return rows * -(-columns * math.prod(samples) * page.bitspersample // 8)
-
-
-def _has_palette(page: tifffile.TiffPage) -> bool:
-    """Return whether a page holds indices of 8 bits into colours."""
-    return page.colormap is not None and page.samplesperpixel == 1 and page.dtype == np.uint8
