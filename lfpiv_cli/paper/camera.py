@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.console import Console
 from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.pages import Table
@@ -329,9 +330,7 @@ def _mid_plane(work: Work, whites: Path, error_mm: float) -> dict[str, float]:
     }
 
 
-def _depths_table(
-    errors_mm: NDArray[np.float64], measured: NDArray[np.float64], true: NDArray[np.float64], sigma: NDArray[np.float64]
-) -> Table:
+def _depths_table(errors_mm: Floats, measured: Floats, true: Floats, sigma: Floats) -> Table:
     rows = zip(errors_mm, true, measured, sigma, strict=True)
     return Table(
         "Mid plane from the focal plane (mm)",

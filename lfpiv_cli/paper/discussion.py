@@ -11,8 +11,8 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.pages import Table
 from lfpiv_cli.grid import Grid
@@ -90,9 +90,7 @@ def geometric_depth_mm(camera: Camera, media: Media) -> float:
     return float(scale.lens_mm * camera.focus_distance_mm / (2.0 * camera.aperture_radius_mm) / media.depth_ratio)
 
 
-def smallest_errors_mm(
-    camera: Camera, media: Media, depths_mm: Sequence[float], readout: Readout
-) -> NDArray[np.float64]:
+def smallest_errors_mm(camera: Camera, media: Media, depths_mm: Sequence[float], readout: Readout) -> Floats:
     """Return the Cramer-Rao bound (n, 3) of x, y and z of a tracer alone, by its depth."""
     particles = np.array([[*BESIDE_MM, depth, LIGHT_COUNTS] for depth in depths_mm])
     return errors_alone_mm(raw_view(camera, media, RADIUS_MM), particles, readout)
@@ -100,7 +98,7 @@ def smallest_errors_mm(
 
 def smallest_errors_crowded_mm(
     camera: Camera, media: Media, per_lens: float, deepest_mm: float, readout: Readout, rng: np.random.Generator
-) -> NDArray[np.float64]:
+) -> Floats:
     """Return the median bound (3,) of x, y and z of a tracer among others that are to be found as well.
 
     Parameters
@@ -111,7 +109,7 @@ def smallest_errors_crowded_mm(
     scale = camera.scale(media)
     side = np.array([camera.columns, camera.rows]) * camera.pixel_mm * scale.lens_mm / float(camera.lattice.pitch[0])
     count = max(round(per_lens * float(np.prod(side)) / scale.lens_mm**2), 1)
-    errors: list[NDArray[np.float64]] = []
+    errors: list[Floats] = []
     while len(errors) < FEWEST_TRACERS:
         places = rng.uniform([*(-0.5 * side), -deepest_mm], [*(0.5 * side), deepest_mm], (count, 3))
         particles = np.column_stack([places, np.full(count, LIGHT_COUNTS)])
@@ -123,9 +121,7 @@ def smallest_errors_crowded_mm(
     return np.asarray(np.median(errors, axis=0))
 
 
-def elongations_mm(
-    camera: Camera, media: Media, depths_mm: Sequence[float], settings: SolverSettings
-) -> NDArray[np.float64]:
+def elongations_mm(camera: Camera, media: Media, depths_mm: Sequence[float], settings: SolverSettings) -> Floats:
     """Return how long a reconstructed tracer is in depth (n,), each alone in an image without noise."""
     view = raw_view(camera, media, RADIUS_MM)
     found = []

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.pictures.style import BLUE, DIVERGING, GREEN, ORANGE, PURPLE, SEQUENTIAL, VERMILION, new_figure, styled
 from lfpiv_cli.pictures.vectors import mean_of_known
@@ -53,10 +54,10 @@ class BoardView:
     bright_mm : (n, 3), where voxels are brighter than `SHOWN_SHARE`
     """
 
-    front: NDArray[np.float64]
-    side: NDArray[np.float64]
-    bounds_mm: NDArray[np.float64]
-    bright_mm: NDArray[np.float64]
+    front: Floats
+    side: Floats
+    bounds_mm: Floats
+    bright_mm: Floats
 
     @classmethod
     def of(cls, volume: NDArray[np.float32], grid: Grid) -> BoardView:
@@ -172,7 +173,7 @@ def location_figure(
 
 
 @styled
-def centres_figure(centres_mm: Mapping[str, NDArray[np.float64]]) -> Figure:
+def centres_figure(centres_mm: Mapping[str, Floats]) -> Figure:
     """Return the centres of all dots of all boards, (n, 3) for each method, coloured by depth (Fig. 10)."""
     figure = new_figure(5.2 * len(centres_mm) + 0.8, 4.2)
     deepest = max(float(np.abs(each[:, 2]).max()) for each in centres_mm.values())
@@ -265,7 +266,7 @@ def _paper_name(axis: int) -> str:
     return "z" if axis == 2 else "x"
 
 
-def _as_shares(places_mm: NDArray[np.float64], duct: Duct, axis: int) -> NDArray[np.float64]:
+def _as_shares(places_mm: Floats, duct: Duct, axis: int) -> Floats:
     """Return places along an axis as shares of the width from the low wall."""
     return np.asarray((places_mm - duct.position_mm(axis, 0.0)) / duct.width_mm)
 
@@ -366,11 +367,11 @@ def _mark_wall(axes: Axes) -> None:
     axes.grid(alpha=0.3)
 
 
-def _oriented(plane: NDArray[np.float64], main: int) -> NDArray[np.float64]:
+def _oriented(plane: Floats, main: int) -> Floats:
     """Return a plane [y, x] of vectors with the flow's axis last."""
     return plane if main == 0 else np.swapaxes(plane, 0, 1)
 
 
-def _mean_over(values: NDArray[np.float64], inside: NDArray[np.bool_], axis: int) -> NDArray[np.float64]:
+def _mean_over(values: Floats, inside: NDArray[np.bool_], axis: int) -> Floats:
     """Return the means (n,) over planes across an axis (0 for x) of values [z, y, x], of what is known inside."""
     return mean_of_known(np.where(inside, values, np.nan), tuple(k for k in range(3) if k != 2 - axis))

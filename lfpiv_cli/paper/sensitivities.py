@@ -9,8 +9,8 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.files.pages import Table
 from lfpiv_cli.notice import written
 from lfpiv_cli.paper.influences import (
@@ -53,10 +53,10 @@ ROOM = 3
 class Curves:
     """What was measured: values (n,) of the influence, and figures (n, realisations) by name."""
 
-    values: NDArray[np.float64]
-    figures: Mapping[str, NDArray[np.float64]]
+    values: Floats
+    figures: Mapping[str, Floats]
 
-    def median(self, name: str) -> NDArray[np.float64]:
+    def median(self, name: str) -> Floats:
         """Return the median (n,) over the realisations of a figure; NaN where none has it."""
         table = self.figures[name]
         known = np.isfinite(table).any(axis=1)

@@ -12,6 +12,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.calibration.model import Channel, advised_move_mm, mid_plane_z_mm
 from lfpiv_cli.grid import Grid
@@ -85,7 +86,7 @@ class Tracers:
     """Tracers (n, 3) of a diameter, and the light (n,) of each that passes the main lens, in counts."""
 
     position_mm: Points
-    light_counts: NDArray[np.float64]
+    light_counts: Floats
     diameter_mm: float = 0.05
 
     def moved(self, by_mm: Points) -> Tracers:
@@ -167,9 +168,9 @@ class PlaceErrors:
     count : of the tracers fitted
     """
 
-    coefficients: NDArray[np.float64]
-    sigma: NDArray[np.float64]
-    spread_mm: NDArray[np.float64]
+    coefficients: Floats
+    sigma: Floats
+    spread_mm: Floats
     count: int
 
     def figures(self) -> dict[str, float]:
@@ -186,7 +187,7 @@ class PlaceErrors:
         }
 
     @staticmethod
-    def _named(table: NDArray[np.float64], combine: np.ufunc) -> dict[str, float]:
+    def _named(table: Floats, combine: np.ufunc) -> dict[str, float]:
         """Return a table's entries by name; `combine` takes the two halves of a turn."""
         offset, along, twist = table[0], table[1:4], table[4:]
         named = {f"offset_{name}": offset[axis] for axis, name in enumerate("xyz")}
@@ -234,7 +235,7 @@ class Line:
     offset: float
 
 
-def straight_line(x: NDArray[np.float64], y: NDArray[np.float64]) -> Line:
+def straight_line(x: Floats, y: Floats) -> Line:
     """Fit a straight line to the points that are known; NaN where there are not two."""
     known = np.isfinite(y)
     if np.count_nonzero(known) < 2:
@@ -243,7 +244,7 @@ def straight_line(x: NDArray[np.float64], y: NDArray[np.float64]) -> Line:
     return Line(float(slope), float(offset))
 
 
-Points = NDArray[np.float64]
+Points = Floats
 Figures = dict[str, float]
 
 FOCAL_LENGTH_MM, PITCH_MM, PIXEL_MM = 100.0, 0.1, 0.0055

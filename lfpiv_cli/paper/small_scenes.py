@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.model import Channel
 from lfpiv_cli.flow.correlation import CorrelationSettings, correlate
 from lfpiv_cli.flow.field import REJECTED
@@ -159,13 +160,13 @@ def tracks_between(first: Points, second: Points, known: Rig) -> tuple[Points, P
     return 0.5 * (a + b), b - a
 
 
-def _tracked(first: Points, second: Points, known: Rig, inner: NDArray[np.float64]) -> Figures:
+def _tracked(first: Points, second: Points, known: Rig, inner: Floats) -> Figures:
     middle, moved = tracks_between(first, second, known)
     inside = np.all(np.abs(middle) <= inner, axis=1)
     return _velocity_figures(moved[inside], displacement(middle[inside]))
 
 
-def _correlated(search: Search, images: list[NDArray[np.float32]], inner: NDArray[np.float64]) -> Figures:
+def _correlated(search: Search, images: list[NDArray[np.float32]], inner: Floats) -> Figures:
     (first, grid), (second, _) = (search.volume(image, VOXEL_MM, EM) for image in images)
     settings = CorrelationSettings([WINDOW_VOXELS], (0.5, 0.5, 0.5), None, EXPONENT)
     field = correlate([(first, second)], grid, settings)

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.pages import Table
@@ -336,7 +336,7 @@ def _depth_table(figures: Figures) -> Table:
     )
 
 
-def _where_steps(depth_mm: NDArray[np.float64], errors: NDArray[np.float64]) -> str:
+def _where_steps(depth_mm: Floats, errors: Floats) -> str:
     """Return in words which steps the depth error comes from."""
     near = np.abs(0.5 * (depth_mm[1:] + depth_mm[:-1])) < NEAR_MM
     share = np.abs(errors[near]).sum() / np.abs(errors).sum()

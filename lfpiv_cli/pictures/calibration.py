@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.dlfc import RayFit
 from lfpiv_cli.calibration.lattice import LatticeFit
 from lfpiv_cli.calibration.model import Calibration
@@ -38,7 +39,7 @@ COLOURS = (GREEN, VERMILION, BLUE)
 
 
 @styled
-def planning_figure(told: Mapping[str, NDArray[np.float64]], bounds_mm: NDArray[np.float64]) -> Figure:
+def planning_figure(told: Mapping[str, Floats], bounds_mm: Floats) -> Figure:
     """Return errors over depth, and the volume within the field of view seen from above and from the side.
 
     Parameters
@@ -61,7 +62,7 @@ def planning_figure(told: Mapping[str, NDArray[np.float64]], bounds_mm: NDArray[
     return figure
 
 
-def _draw_view(axes: Axes, told: Mapping[str, NDArray[np.float64]], bounds_mm: NDArray[np.float64], axis: int) -> None:
+def _draw_view(axes: Axes, told: Mapping[str, Floats], bounds_mm: Floats, axis: int) -> None:
     """Draw what is in view across one axis, and the volume."""
     depth = told["depth_mm"]
     for name, label, shade in (("any_view_mm", "seen in part", 0.85), ("full_view_mm", "seen in full", 0.65)):
@@ -167,7 +168,7 @@ def calibration_figure(calibration: Calibration, white: ArrayLike, board: ArrayL
     return figure
 
 
-def draw_zoom(axis: Any, image: NDArray[np.float64], fit: LatticeFit, centre: tuple[float, float], half: float) -> None:
+def draw_zoom(axis: Any, image: Floats, fit: LatticeFit, centre: tuple[float, float], half: float) -> None:
     """Show a part of the white image with the modelled and the measured centres in it."""
     middle = fit.lattice_px.nearest(np.array(centre))
     reach = np.arange(-int(LENSES_ACROSS), int(LENSES_ACROSS) + 1)

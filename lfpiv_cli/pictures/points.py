@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
@@ -47,7 +48,7 @@ DOTS_AREA, DOT_SIZES = 15_000.0, (6.0, 26.0)
 IMAGE_WIDTH = 10.0
 
 
-def places_px(focal_point_mm: NDArray[np.float64], camera: Camera, media: Media) -> NDArray[np.float64]:
+def places_px(focal_point_mm: Floats, camera: Camera, media: Media) -> Floats:
     """Return where rays through the middle of the main lens meet the sensor, (n, 2) as (column, row).
 
     Parameters
@@ -61,7 +62,7 @@ def places_px(focal_point_mm: NDArray[np.float64], camera: Camera, media: Media)
 
 
 @styled
-def places_figure(position_mm: NDArray[np.float64], light_counts: NDArray[np.float64]) -> Figure:
+def places_figure(position_mm: Floats, light_counts: Floats) -> Figure:
     """Return the particles from the front and from the side, coloured by their light (logarithmic)."""
     from matplotlib.colors import LogNorm
 
@@ -86,7 +87,7 @@ def places_figure(position_mm: NDArray[np.float64], light_counts: NDArray[np.flo
 
 
 @styled
-def image_figure(image: NDArray[np.float64], places: NDArray[np.float64], z_mm: NDArray[np.float64]) -> Figure:
+def image_figure(image: Floats, places: Floats, z_mm: Floats) -> Figure:
     """Return a raw image in grey with the particles' places (n, 2) as (column, row), coloured by their depth."""
     figure = _image_canvas(image)
     (axes,) = figure.axes
@@ -101,7 +102,7 @@ def image_figure(image: NDArray[np.float64], places: NDArray[np.float64], z_mm: 
 
 
 @styled
-def residual_figure(residual: NDArray[np.float64]) -> Figure:
+def residual_figure(residual: Floats) -> Figure:
     """Return what the particles leave of an image: light that none explains, red, and too much light, blue."""
     figure = _image_canvas(residual)
     (axes,) = figure.axes
@@ -112,7 +113,7 @@ def residual_figure(residual: NDArray[np.float64]) -> Figure:
     return figure
 
 
-def _image_canvas(image: NDArray[np.float64]) -> Figure:
+def _image_canvas(image: Floats) -> Figure:
     """Return a figure of an image's shape, with axes that are its pixels."""
     rows, columns = image.shape
     figure = new_figure(IMAGE_WIDTH, min(max(0.8 * IMAGE_WIDTH * rows / columns + 0.8, 3.0), 12.0))
@@ -120,16 +121,14 @@ def _image_canvas(image: NDArray[np.float64]) -> Figure:
     return figure
 
 
-def _bright(image: NDArray[np.float64]) -> float:
+def _bright(image: Floats) -> float:
     """Return where the scale of an image ends."""
     limit = float(np.percentile(np.abs(image), IMAGE_PERCENT))
     return limit if limit > 0.0 else 1.0
 
 
 @styled
-def depths_figure(
-    z_mm: NDArray[np.float64], light_counts: NDArray[np.float64], covariance_mm2: NDArray[np.float64]
-) -> Figure:
+def depths_figure(z_mm: Floats, light_counts: Floats, covariance_mm2: Floats) -> Figure:
     """Return by depth: how many particles, their light (median and quartiles), and their standard deviations."""
     figure = new_figure(11.0, 3.6)
     counts, light, sigmas = figure.subplots(1, 3)
@@ -147,7 +146,7 @@ def depths_figure(
 
 
 @styled
-def chi2_figure(chi2: NDArray[np.float64]) -> Figure:
+def chi2_figure(chi2: Floats) -> Figure:
     """Return chi2, about 1 where particles explain all light; what is beyond the axis is in the last bar."""
     figure = new_figure(6.0, 3.6)
     axes = figure.subplots()
@@ -166,9 +165,7 @@ HISTOGRAM_BARS, PROBABILITY_BARS = 40, 25
 LONGEST_SHARE = 0.12
 
 
-def displacement_lines(
-    position_mm: NDArray[np.float64], displacement_mm: NDArray[np.float64]
-) -> tuple[list[NDArray[np.float64]], float]:
+def displacement_lines(position_mm: Floats, displacement_mm: Floats) -> tuple[list[Floats], float]:
     """Return lines (2, 3) of displacements about their middles, and how many times longer than true they are.
 
     At most LINES_DRAWN, evenly chosen from the list.
@@ -180,13 +177,13 @@ def displacement_lines(
     return list(np.stack([position_mm - half, position_mm + half], axis=1)), stretch
 
 
-def trajectory_lines(position_mm: NDArray[np.float64], track: NDArray[np.int64]) -> list[NDArray[np.float64]]:
+def trajectory_lines(position_mm: Floats, track: NDArray[np.int64]) -> list[Floats]:
     """Return the places (m, 3) of each track in time; rows are ordered by track, then by frame."""
     return np.split(position_mm, np.flatnonzero(np.diff(track)) + 1) if len(track) else []
 
 
 @styled
-def space_figure(lines: list[NDArray[np.float64]], speed_m_s: NDArray[np.float64], what: str) -> Figure:
+def space_figure(lines: list[Floats], speed_m_s: Floats, what: str) -> Figure:
     """Return lines in space coloured by their speed, the depth to the right; many are thinned out evenly.
 
     Parameters
@@ -224,7 +221,7 @@ def space_figure(lines: list[NDArray[np.float64]], speed_m_s: NDArray[np.float64
 
 
 @styled
-def velocities_figure(velocity_m_s: NDArray[np.float64]) -> Figure:
+def velocities_figure(velocity_m_s: Floats) -> Figure:
     """Return histograms of the velocity components."""
     figure = new_figure(10.0, 3.2)
     for component, axes in enumerate(figure.subplots(1, 3)):
@@ -234,7 +231,7 @@ def velocities_figure(velocity_m_s: NDArray[np.float64]) -> Figure:
 
 
 @styled
-def links_figure(link_probability: NDArray[np.float64]) -> Figure:
+def links_figure(link_probability: Floats) -> Figure:
     """Return how probable the links are, of those whose probability is known."""
     known = link_probability[np.isfinite(link_probability)]
     figure = new_figure(6.0, 3.6)
@@ -252,7 +249,7 @@ def links_figure(link_probability: NDArray[np.float64]) -> Figure:
 
 
 @styled
-def sigma_figure(z_mm: NDArray[np.float64], sigma_m_s: NDArray[np.float64]) -> Figure:
+def sigma_figure(z_mm: Floats, sigma_m_s: Floats) -> Figure:
     """Return the stated standard deviations of the velocity's components by depth (medians)."""
     figure = new_figure(6.0, 3.6)
     along = {f"σ of {name}": sigma_m_s[:, k] for k, name in enumerate(COMPONENT_NAMES)}
@@ -282,7 +279,7 @@ def has_views() -> bool:
     return find_spec("plotly") is not None
 
 
-def lines_view(lines: Sequence[NDArray[np.float64]], values: Sequence[NDArray[np.float64]], label: str) -> str:
+def lines_view(lines: Sequence[Floats], values: Sequence[Floats], label: str) -> str:
     """Return a view of lines, a dot at the end of each.
 
     Parameters

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.flow.field import (
     FLAG_NAMES,
     MASKED,
@@ -147,8 +148,8 @@ HISTOGRAM_BARS, PART_BARS = 40, 20
 class Shown:
     """What is drawn of a field: `values` and `sigma` (nz, ny, nx, 3) in `unit`; NaN where unknown, sigma or None."""
 
-    values: NDArray[np.float64]
-    sigma: NDArray[np.float64] | None
+    values: Floats
+    sigma: Floats | None
     unit: str
 
 
@@ -172,7 +173,7 @@ def planes_figure(field: VectorField) -> Figure:
 
 
 @styled
-def compared_figure(grid: Grid, fields: Mapping[str, NDArray[np.float64]], unit: str) -> Figure:
+def compared_figure(grid: Grid, fields: Mapping[str, Floats], unit: str) -> Figure:
     """Return vectors (nz, ny, nx, 3) in the three middle planes, a row for each field, by its name.
 
     Arrows show the components in the plane and colour the one across it; both have one scale in all. Crosses are
@@ -199,9 +200,7 @@ def compared_figure(grid: Grid, fields: Mapping[str, NDArray[np.float64]], unit:
     return figure
 
 
-def _draw_arrows(
-    axes: Axes, grid: Grid, plane: Plane, values: NDArray[np.float64], arrows: tuple[Sequence[int], float]
-) -> Any:
+def _draw_arrows(axes: Axes, grid: Grid, plane: Plane, values: Floats, arrows: tuple[Sequence[int], float]) -> Any:
     """Draw a plane's arrows, so many vectors apart along x, y, z, and so long that a mm stands for a speed."""
     step, speed_per_mm = arrows
     chosen = (slice(None, None, step[plane.up]), slice(None, None, step[plane.right]))
@@ -223,7 +222,7 @@ def _draw_arrows(
     )
 
 
-def speed_unit(*velocities_m_s: NDArray[np.float64]) -> tuple[float, str]:
+def speed_unit(*velocities_m_s: Floats) -> tuple[float, str]:
     """Return the unit in which velocities read well: what m/s are multiplied by, and its name."""
     known = any(np.isfinite(each).any() for each in velocities_m_s)
     return (1.0 / MM_TO_M, "mm/s") if known and symmetric_limit(*velocities_m_s) < SLOW_M_S else (1.0, "m/s")
@@ -242,7 +241,7 @@ def components_figure(field: VectorField) -> Figure:
     return figure
 
 
-def signed_scale(*rows: Sequence[NDArray[np.float64]]) -> dict[str, Any]:
+def signed_scale(*rows: Sequence[Floats]) -> dict[str, Any]:
     """Return the colours of rows of three maps with a sign, symmetric about zero: by what the middle planes show."""
     limit = symmetric_limit(*(plane.of(values) for maps in rows for plane, values in zip(PLANES, maps, strict=True)))
     return {"cmap": DIVERGING, "vmin": -limit, "vmax": limit}
@@ -282,7 +281,7 @@ def _draw_profile(axes: Axes, field: VectorField, told: Shown, component: int, a
         )
 
 
-def mean_of_known(values: NDArray[np.float64], axes: tuple[int, ...]) -> NDArray[np.float64]:
+def mean_of_known(values: Floats, axes: tuple[int, ...]) -> Floats:
     """Return means over axes of what is finite, NaN where nothing is."""
     known = np.isfinite(values)
     count = known.sum(axis=axes)
@@ -311,7 +310,7 @@ def sigma_figure(field: VectorField) -> Figure:
     return figure
 
 
-def logarithmic_scale(values: NDArray[np.float64]) -> dict[str, Any]:
+def logarithmic_scale(values: Floats) -> dict[str, Any]:
     """Return the colours of positive values over several orders; outer ones take the colours of the ends."""
     from matplotlib.colors import LogNorm
 
@@ -343,7 +342,7 @@ def flags_figure(field: VectorField) -> Figure:
 
 
 @styled
-def quality_figure(field: VectorField, names: dict[str, NDArray[np.float64]]) -> Figure:
+def quality_figure(field: VectorField, names: dict[str, Floats]) -> Figure:
     """Return maps of quantities [z, y, x] that tell how good vectors are (rows), each on its own scale from zero."""
     figure, axes = plane_panels(field.grid, rows=len(names))
     for row, (name, values) in zip(axes, names.items(), strict=True):
@@ -375,7 +374,7 @@ def displacements_figure(field: VectorField, lens_mm: float | None = None) -> Fi
     return figure
 
 
-def _draw_parts(axes: Axes, displacements: NDArray[np.float64], what: str, colour: str) -> None:
+def _draw_parts(axes: Axes, displacements: Floats, what: str, colour: str) -> None:
     """Draw a histogram of parts from -1/2 to 1/2, and the line that evenly spread ones would follow."""
     axes.hist(displacements - np.round(displacements), bins=PART_BARS, range=(-0.5, 0.5), color=colour)
     axes.axhline(displacements.size / PART_BARS, color="black", linestyle="--", linewidth=0.9, label="evenly spread")

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.pictures.style import AXIS_NAMES, COLOURS, DEPTH_LABEL, MARKERS, new_figure, styled
 from lfpiv_cli.pictures.vectors import PLANES, plane_panels
@@ -48,7 +49,7 @@ def _to_mm(first_px: float, pixel_mm: float) -> tuple[Callable[[Any], Any], Call
 
 
 @styled
-def light_figure(z_mm: NDArray[np.float64], sums: Mapping[str, NDArray[np.float64]]) -> Figure:
+def light_figure(z_mm: Floats, sums: Mapping[str, Floats]) -> Figure:
     """Return by depth how much of a voxel's light meets the sensor, for voxels at some lateral places."""
     figure = new_figure(6.5, 3.8)
     axes = figure.subplots()

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.pictures.style import BLACK, GREY, SKY_BLUE, VERMILION, new_figure, styled
 from lfpiv_cli.self_calibration.refinement import Refinement
 from lfpiv_cli.self_calibration.scene_refinement import SceneRefinement
@@ -58,16 +58,14 @@ def round_wall_figure(refinement: SceneRefinement) -> Figure:
     return figure
 
 
-def _wall(
-    refinement: SceneRefinement, angle: NDArray[np.float64], along_mm: NDArray[np.float64] | float = 0.0
-) -> NDArray[np.float64]:
+def _wall(refinement: SceneRefinement, angle: Floats, along_mm: Floats | float = 0.0) -> Floats:
     """Return the distance (n,) of the wall, by its own place and apparent radius, from the axis before."""
     across, away, tilt_across, tilt_away = refinement.by_wall
     shift = (across + tilt_across * along_mm) * np.cos(angle) + (away + tilt_away * along_mm) * np.sin(angle)
     return np.asarray(refinement.wall.radius_mm + shift, dtype=np.float64)
 
 
-def _draw_section(axes: Any, refinement: SceneRefinement, own: NDArray[np.float64], radius: float) -> None:
+def _draw_section(axes: Any, refinement: SceneRefinement, own: Floats, radius: float) -> None:
     """Draw the particles whose wall is in view in the pipe's section, with the wall before and as it was found."""
     fine = np.linspace(-np.pi, np.pi, 400)
     axes.plot(own[:, 1], own[:, 2], ",", color=SKY_BLUE)
@@ -79,9 +77,7 @@ def _draw_section(axes: Any, refinement: SceneRefinement, own: NDArray[np.float6
     axes.set_title(f"{len(own)} of {refinement.particles} particles, whose wall is in view")
 
 
-def _draw_counted(
-    axes: Any, distance: NDArray[np.float64], refinement: SceneRefinement, limits: tuple[float, float]
-) -> None:
+def _draw_counted(axes: Any, distance: Floats, refinement: SceneRefinement, limits: tuple[float, float]) -> None:
     """Draw how many particles lie at each distance, over the area there, beside the wall."""
     edges = np.linspace(*limits, BARS_AT_ROUND_WALL + 1)
     number, _ = np.histogram(distance, edges)
@@ -129,9 +125,7 @@ def walls_figure(refinement: Refinement) -> Figure:
     return figure
 
 
-def _draw_depths(
-    axes: Any, refinement: Refinement, depth: NDArray[np.float64], limits: tuple[float, float], bars: int
-) -> None:
+def _draw_depths(axes: Any, refinement: Refinement, depth: Floats, limits: tuple[float, float], bars: int) -> None:
     """Draw how many particles lie at each depth behind the mid plane, and the fitted profile."""
     axes.hist(depth, bins=bars, range=limits, color=SKY_BLUE, label="particles")
     fine = np.linspace(*limits, 1000)

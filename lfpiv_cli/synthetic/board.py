@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.calibration.shape_fit import nearest_points, undistorted
 from lfpiv_cli.calibration.views import charuco_board
@@ -55,14 +56,14 @@ ROWS_AT_ONCE = 16
 class Plate:
     """A printed plate: its middle and unit vectors along its x and y (3, each), and what is printed, 0 to 1."""
 
-    middle_mm: NDArray[np.float64]
-    along_x: NDArray[np.float64]
-    along_y: NDArray[np.float64]
+    middle_mm: Floats
+    along_x: Floats
+    along_y: Floats
     picture: NDArray[np.float32]
     samples_per_mm: float
 
 
-def printed_plate(camera: Camera, board: BoardGeometry, plate_mm: NDArray[np.float64]) -> Plate:
+def printed_plate(camera: Camera, board: BoardGeometry, plate_mm: Floats) -> Plate:
     """Return the plate of a target.
 
     Parameters
@@ -89,8 +90,8 @@ def target_picture(board: BoardGeometry) -> NDArray[np.uint8]:
 
 
 def render_plate(
-    camera: Camera, space: ObjectSpace, plate: Plate, level: float, blur_px: NDArray[np.float64] | None = None
-) -> NDArray[np.float64]:
+    camera: Camera, space: ObjectSpace, plate: Plate, level: float, blur_px: Floats | None = None
+) -> Floats:
     """Render a lit plate, (rows, columns) float64 expected counts; light outside a pixel's own micro-image is left out.
 
     Parameters
@@ -115,9 +116,7 @@ def render_plate(
     return image
 
 
-def _bright_share(
-    px: NDArray[np.float64], places: NDArray[np.float64], camera: Camera, space: ObjectSpace, plate: Plate
-) -> NDArray[np.float64]:
+def _bright_share(px: Floats, places: Floats, camera: Camera, space: ObjectSpace, plate: Plate) -> Floats:
     """Return the share (rows, columns) of the rays to pixels, (rows, columns, 2), that start on something bright.
 
     `places` (n, 2) are those about the middle of a pixel where rays would end but for the blur.
@@ -135,7 +134,7 @@ def _bright_share(
     return total / len(places)
 
 
-def _printed_at(on_plate_mm: NDArray[np.float64], plate: Plate) -> NDArray[np.float32]:
+def _printed_at(on_plate_mm: Floats, plate: Plate) -> NDArray[np.float32]:
     """Return what is printed (n,) at places (n, 2) about the plate's middle, 0 beyond the plate."""
     size = np.array(plate.picture.shape[::-1])
     column, row = np.floor(on_plate_mm * plate.samples_per_mm + size / 2.0).astype(np.int64).T
@@ -143,9 +142,7 @@ def _printed_at(on_plate_mm: NDArray[np.float64], plate: Plate) -> NDArray[np.fl
     return np.where(there, plate.picture[np.where(there, row, 0), np.where(there, column, 0)], np.float32(0.0))
 
 
-def _rays_to(
-    px: NDArray[np.float64], offset_mm: NDArray[np.float64], camera: Camera
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _rays_to(px: Floats, offset_mm: Floats, camera: Camera) -> tuple[Floats, Floats]:
     """Return where rays cross the main lens (n, 2) and their slopes in front of it (n, 2).
 
     They end at places on the sensor, under the nearest microlens, beside whose centre they pass by `offset_mm` (n, 2).
@@ -160,9 +157,7 @@ def _rays_to(
     return crossing, behind + crossing / camera.focal_length_mm
 
 
-def _on_plate(
-    crossing_mm: NDArray[np.float64], slope: NDArray[np.float64], camera: Camera, space: ObjectSpace, plate: Plate
-) -> NDArray[np.float64]:
+def _on_plate(crossing_mm: Floats, slope: Floats, camera: Camera, space: ObjectSpace, plate: Plate) -> Floats:
     """Return where on the plate (n, 2), about its middle, rays start that cross the main lens with given slopes."""
     thicknesses, indices = space.layers(camera)
     per_depth = space.media.depth_ratio if len(indices) == 1 else 1.0
@@ -207,14 +202,14 @@ class BoardPlacement:
     tilt_deg: tuple[float, float] = (0.0, 0.0)
     rotation_deg: float = 0.0
 
-    def to_world(self, plate_mm: ArrayLike) -> NDArray[np.float64]:
+    def to_world(self, plate_mm: ArrayLike) -> Floats:
         """Return points of the plate, (..., 2) about its centre, in world axes, (..., 3)."""
         plate = np.asarray(plate_mm, dtype=np.float64)
         turn = np.deg2rad(self.rotation_deg)
         axes = np.array([[np.cos(turn), np.sin(turn), 0.0], [-np.sin(turn), np.cos(turn), 0.0]])
         return plate @ axes @ self._tilt_matrix().T + np.array([*self.offset_mm, self.z_mm])
 
-    def _tilt_matrix(self) -> NDArray[np.float64]:
+    def _tilt_matrix(self) -> Floats:
         """Return the shortest rotation that brings the z axis onto the plate's normal."""
         normal = np.array([*-np.tan(np.deg2rad(self.tilt_deg)), 1.0])
         normal /= np.linalg.norm(normal)
@@ -223,12 +218,12 @@ class BoardPlacement:
         return np.eye(3) + spin + spin @ spin / (1.0 + z)
 
 
-def dot_centres(board: BoardGeometry, placement: BoardPlacement) -> NDArray[np.float64]:
+def dot_centres(board: BoardGeometry, placement: BoardPlacement) -> Floats:
     """Return the dots' centres in world axes, (n, 3) mm, the first index along x running fastest."""
     return placement.to_world(_plate_centres(board))
 
 
-def _plate_centres(board: BoardGeometry) -> NDArray[np.float64]:
+def _plate_centres(board: BoardGeometry) -> Floats:
     x, y = (board.spacing_mm * (np.arange(n) - (n - 1) / 2) for n in board.dots)
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
@@ -249,7 +244,7 @@ def render_board(
     *,
     waves: Waves | None = None,
     progress: Callable[[int], None] | None = None,
-) -> NDArray[np.float64]:
+) -> Floats:
     """Render bright dots on dark ground, dark dots on ground that fills the view, or a lit print.
 
     Parameters
@@ -293,7 +288,7 @@ def render_board(
     return np.maximum(white_image(camera, waves, level) - dots, 0.0)
 
 
-def light_per_area(camera: Camera, media: Media, z_mm: ArrayLike, level: float) -> NDArray[np.float64]:
+def light_per_area(camera: Camera, media: Media, z_mm: ArrayLike, level: float) -> Floats:
     """Return the light of a plane at depth z that gives pixels `level` counts where it fills the aperture, per mm^2.
 
     A micro-image has `level` times its pixels; it comes from one lens's cell of the array, which is that of the plane
@@ -305,7 +300,7 @@ def light_per_area(camera: Camera, media: Media, z_mm: ArrayLike, level: float) 
     return per_lens / camera.lattice.cell_area * (camera.image_distance_mm / distance) ** 2
 
 
-def sunflower(count: int, radius: float) -> NDArray[np.float64]:
+def sunflower(count: int, radius: float) -> Floats:
     """Return points that fill a disc evenly, (count, 2), their mean at its centre: the order alone is off by 0.2 %."""
     k = np.arange(count)
     r = radius * np.sqrt((k + 0.5) / count)

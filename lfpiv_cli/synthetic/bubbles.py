@@ -11,8 +11,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.names import BubbleWall
 from lfpiv_cli.optics.camera import Camera
@@ -32,8 +32,8 @@ RAYS_PER_POINT = 1_000
 class Bubbles:
     """Balls at rest: their centres (n, 3) and diameters (n,) in mm."""
 
-    centres_mm: NDArray[np.float64]
-    diameters_mm: NDArray[np.float64]
+    centres_mm: Floats
+    diameters_mm: Floats
 
     def truth(self) -> list[list[float]]:
         """Return x, y, z and diameter of each, mm, ready for JSON."""
@@ -81,7 +81,7 @@ def render_bubbles(
     level: float,
     rng: np.random.Generator,
     waves: Waves | None = None,
-) -> NDArray[np.float64]:
+) -> Floats:
     """Render bubbles whose middle gives `level` expected counts in a pixel that sees nothing else, fading to the rim.
 
     Returns

@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.optics.camera import Camera, KernelCamera, Objective
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.ray_bundles import aim, aim_all
@@ -41,12 +42,12 @@ LENS_PLACES = 24
 @njit(cache=True, nogil=True)
 def trace_curved(
     part: tuple[int, int],
-    placed: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
+    placed: tuple[Floats, Floats, Floats],
     faces: Faces,
     camera: KernelCamera,
     objective: Objective,
-    fit: tuple[NDArray[np.float64], NDArray[np.float64]],
-    blur_mm: NDArray[np.float64],
+    fit: tuple[Floats, Floats],
+    blur_mm: Floats,
     pixels: NDArray[np.int32],
 ) -> None:
     """Write the flat pixel number that each ray of the balls `part` strikes, (n, rays), -1 off the sensor or lost.
@@ -90,8 +91,8 @@ def fitted_slopes(
     radius: float,
     faces: Faces,
     camera: KernelCamera,
-    fit: tuple[NDArray[np.float64], NDArray[np.float64]],
-) -> tuple[NDArray[np.float64], bool]:
+    fit: tuple[Floats, Floats],
+) -> tuple[Floats, bool]:
     """Return the coefficients (TERMS, 2) of a ball's slopes, and whether they are right within the tolerance."""
     places, inverse = fit
     coefficients = np.zeros((TERMS, 2))
@@ -116,7 +117,7 @@ def fitted_slopes(
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def write_terms(lens_x: float, lens_y: float, ball_x: float, ball_y: float, terms: NDArray[np.float64]) -> None:
+def write_terms(lens_x: float, lens_y: float, ball_x: float, ball_y: float, terms: Floats) -> None:
     """Write the polynomial's terms (TERMS,) at a place on the lens and in the ball, both in units of their radius."""
     # the lens' terms by their degree, each of one degree less times x, and the last one times y
     terms[0] = 1.0
@@ -136,7 +137,7 @@ def write_terms(lens_x: float, lens_y: float, ball_x: float, ball_y: float, term
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def _sum_of_terms(terms: NDArray[np.float64], coefficients: NDArray[np.float64]) -> tuple[float, float]:
+def _sum_of_terms(terms: Floats, coefficients: Floats) -> tuple[float, float]:
     """Return the slopes along both axes."""
     x = y = 0.0
     for k in range(TERMS):
@@ -146,7 +147,7 @@ def _sum_of_terms(terms: NDArray[np.float64], coefficients: NDArray[np.float64])
 
 
 @cache
-def fit_of_slopes() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def fit_of_slopes() -> tuple[Floats, Floats]:
     """Return places on lens and ball (FITTED + TRIED, 4), and what makes coefficients of the slopes at the first ones.
 
     The second array (TERMS, FITTED) is the terms' pseudo-inverse, the same for all balls.

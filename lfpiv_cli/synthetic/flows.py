@@ -14,6 +14,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.synthetic.vortices import (
     MM_PER_M,
     ORIGIN,
@@ -51,13 +52,13 @@ def square_duct(
     across = 1 - along
     scale = mean_velocity_m_s / _duct_section_mean()
 
-    def flow(points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    def flow(points_mm: Floats) -> Floats:
         relative = (points_mm - np.asarray(centre_mm, dtype=np.float64)) / (0.5 * width_mm)
         velocity = np.zeros_like(relative)
         velocity[:, along] = scale * _duct_profile(relative[:, across], relative[:, 2])
         return velocity
 
-    def gradient(points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    def gradient(points_mm: Floats) -> Floats:
         relative = (points_mm - np.asarray(centre_mm, dtype=np.float64)) / (0.5 * width_mm)
         found = np.zeros((len(points_mm), 3, 3))
         slopes = _duct_slopes(relative[:, across], relative[:, 2])
@@ -67,7 +68,7 @@ def square_duct(
     return KnownFlow(flow, gradient)
 
 
-def _duct_profile(across: NDArray[np.float64], depth: NDArray[np.float64]) -> NDArray[np.float64]:
+def _duct_profile(across: Floats, depth: Floats) -> Floats:
     """Return u on the square [-1, 1]^2 for u'' = -2, zero on its edge and outside."""
     profile = 1.0 - across**2
     outside = (np.abs(across) >= 1.0) | (np.abs(depth) >= 1.0)
@@ -81,9 +82,7 @@ def _duct_profile(across: NDArray[np.float64], depth: NDArray[np.float64]) -> ND
     return np.where(outside, 0.0, profile)
 
 
-def _duct_slopes(
-    across: NDArray[np.float64], depth: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _duct_slopes(across: Floats, depth: Floats) -> tuple[Floats, Floats]:
     """Return the derivatives of `_duct_profile` across and along the depth, zero on its edge and outside."""
     by_across, by_depth = -2.0 * across, np.zeros_like(depth)
     inside = (np.abs(across) < 1.0) & (np.abs(depth) < 1.0)
@@ -119,17 +118,17 @@ def pipe(
     """
     along = np.eye(3)[axis_index(axis)] if axis in ("x", "y") else _unit(np.asarray([axis], dtype=np.float64))[0]
 
-    def across(points_mm: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def across(points_mm: Floats) -> tuple[Floats, Floats]:
         """Return places from the axis over the radius, (n, 3), and 1 - r^2/R^2, (n,)."""
         relative = (points_mm - np.asarray(centre_mm, dtype=np.float64)) / radius_mm
         relative -= (relative @ along)[:, np.newaxis] * along
         return relative, 1.0 - np.sum(relative**2, axis=1)
 
-    def flow(points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    def flow(points_mm: Floats) -> Floats:
         speed = 2.0 * mean_velocity_m_s * np.maximum(across(points_mm)[1], 0.0)
         return np.asarray(speed[:, np.newaxis] * along)
 
-    def gradient(points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    def gradient(points_mm: Floats) -> Floats:
         relative, profile = across(points_mm)
         slope = -4.0 * mean_velocity_m_s * MM_PER_M / radius_mm * relative
         slope = np.where(profile[:, np.newaxis] > 0.0, slope, 0.0)
@@ -146,16 +145,16 @@ def rigid_rotation(
     """Return omega x (r - centre) + velocity, omega in rad/s (right-handed about x, y, z), and its pressure."""
     omega = np.asarray(angular_velocity_rad_s, dtype=np.float64)
 
-    def flow(points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    def flow(points_mm: Floats) -> Floats:
         return np.cross(omega, points_mm - np.asarray(centre_mm)) / MM_PER_M + np.asarray(velocity_m_s)
 
-    def pressure(points_mm: NDArray[np.float64], density_kg_m3: float) -> NDArray[np.float64]:
+    def pressure(points_mm: Floats, density_kg_m3: float) -> Floats:
         return dynamic_pressure(flow(points_mm), density_kg_m3)
 
     return KnownFlow(flow, _constant(np.cross(omega, np.eye(3)).T), pressure)
 
 
-def _constant(gradient: NDArray[np.float64]) -> Flow:
+def _constant(gradient: Floats) -> Flow:
     """Return the same gradient (3, 3) everywhere."""
     return lambda points_mm: np.tile(gradient, (len(points_mm), 1, 1))
 
@@ -170,7 +169,7 @@ def shear(
     """Return a velocity along one axis that grows by `rate_per_s` per length across, plus a uniform velocity."""
     component, coordinate = axis_index(along), axis_index(across)
 
-    def flow(points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    def flow(points_mm: Floats) -> Floats:
         velocity = np.tile(np.asarray(velocity_m_s, dtype=np.float64), (len(points_mm), 1))
         velocity[:, component] += rate_per_s * (points_mm[:, coordinate] - centre_mm[coordinate]) / MM_PER_M
         return velocity
@@ -183,7 +182,7 @@ def shear(
 def uniform(velocity_m_s: Sequence[float]) -> KnownFlow:
     """Return the same velocity everywhere."""
 
-    def flow(points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    def flow(points_mm: Floats) -> Floats:
         return np.tile(np.asarray(velocity_m_s, dtype=np.float64), (len(points_mm), 1))
 
     return KnownFlow(flow, _constant(np.zeros((3, 3))))
@@ -212,12 +211,12 @@ def random_modes(
     amplitude = wave ** (-1.0 / 3.0)
     amplitude *= rms_m_s * np.sqrt(6.0 / np.sum(amplitude**2))
 
-    def flow(points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    def flow(points_mm: Floats) -> Floats:
         relative = points_mm - np.asarray(centre_mm, dtype=np.float64)
         waves = np.cos(relative @ (wave[:, np.newaxis] * direction).T + phase)
         return waves @ (amplitude[:, np.newaxis] * polarisation) + np.asarray(velocity_m_s, dtype=np.float64)
 
-    def gradient(points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    def gradient(points_mm: Floats) -> Floats:
         relative = points_mm - np.asarray(centre_mm, dtype=np.float64)
         along = wave[:, np.newaxis] * direction
         slopes = -np.sin(relative @ along.T + phase)
@@ -227,7 +226,7 @@ def random_modes(
     return KnownFlow(flow, gradient)
 
 
-def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+def _unit(vectors: Floats) -> Floats:
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
@@ -267,12 +266,12 @@ class Pulsation:
 STEADY = Pulsation()
 
 
-def advect(flow: Flow, points_mm: ArrayLike, duration_s: float) -> NDArray[np.float64]:
+def advect(flow: Flow, points_mm: ArrayLike, duration_s: float) -> Floats:
     """Return where points, (n, 3) in mm, are carried in `duration_s` (negative: where they came from)."""
     points = np.array(points_mm, dtype=np.float64)
     step_s = duration_s / ADVECTION_STEPS
 
-    def moved(by: NDArray[np.float64], share: float) -> NDArray[np.float64]:
+    def moved(by: Floats, share: float) -> Floats:
         return points + MM_PER_M * share * step_s * by
 
     for _ in range(ADVECTION_STEPS):

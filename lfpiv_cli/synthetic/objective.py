@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 from scipy.optimize import brentq
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.optics.camera import Camera, KernelCamera, Objective
 from lfpiv_cli.optics.tracing import trace_ray
 
@@ -51,7 +51,7 @@ def _apart(share: float) -> float:
     return float(brentq(lambda u: 2.0 / np.pi * (np.arccos(u) - u * np.sqrt(1.0 - u * u)) - share, 0.0, 1.0))
 
 
-def passed_light(camera: Camera) -> NDArray[np.float64]:
+def passed_light(camera: Camera) -> Floats:
     """Return the share (rows, columns) of the light that falloff leaves."""
     x, y = camera.px_to_mm(np.stack(np.meshgrid(np.arange(camera.columns), np.arange(camera.rows)), axis=-1)).T
     return np.asarray(np.maximum(1.0 - camera.objective.falloff_per_mm2 * (x**2 + y**2), 0.0).T)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 from scipy.special import ndtri
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.optics.camera import Camera
 
 # Additive recurrence in four dimensions (aperture and ball): powers of the inverse of the root of x^5 = x + 1, whose
@@ -21,7 +21,7 @@ BLUR_PAIRS = 8_192
 
 
 @njit(cache=True)
-def ray_places(shifts: NDArray[np.float64], i: int, k: int) -> tuple[float, float, float, float]:
+def ray_places(shifts: Floats, i: int, k: int) -> tuple[float, float, float, float]:
     """Return ray k of ball i as `on_disc` and `in_ball` take it, the first two numbers and the last ones."""
     return (
         shifts[i, 0] + k * SEQUENCE[0],
@@ -46,23 +46,23 @@ def in_ball(radius: float, radial: float, turn: float) -> tuple[float, float]:
 
 
 @njit(cache=True)
-def blur_place(shifts: NDArray[np.float64], i: int, k: int, count: int) -> int:
+def blur_place(shifts: Floats, i: int, k: int, count: int) -> int:
     """Return which of `count` places ray k of ball i takes beside where it would end."""
     return (int(shifts[i, 0] * count) + k) % count
 
 
-def diffused_mm(camera: Camera) -> NDArray[np.float64]:
+def diffused_mm(camera: Camera) -> Floats:
     """Return places (n, 2) on the sensor beside a ray's end to which charge diffuses: one, 0, where it does not."""
     if camera.diffusion_px == 0.0:
         return np.zeros((1, 2))
     return in_pairs(camera.diffusion_px * camera.pixel_mm * ndtri(blur_numbers()[:, :2]))
 
 
-def blur_numbers() -> NDArray[np.float64]:
+def blur_numbers() -> Floats:
     """Return numbers (`BLUR_PAIRS`, 6) that fill the open unit cube evenly."""
     return ((np.arange(BLUR_PAIRS) + 0.5)[:, np.newaxis] * BLUR_SEQUENCE) % 1.0
 
 
-def in_pairs(places: NDArray[np.float64]) -> NDArray[np.float64]:
+def in_pairs(places: Floats) -> Floats:
     """Return places (n, 2), each followed by the opposite one."""
     return np.stack([places, -places], axis=1).reshape(-1, 2)

@@ -18,6 +18,7 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtr
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.optics.camera import Camera, KernelCamera, Objective, nearest_point
 from lfpiv_cli.optics.curved_space import CurvedSpace
@@ -69,9 +70,9 @@ def render_points(
     rng: np.random.Generator,
     *,
     rays: int = RAYS,
-    blur_mm: NDArray[np.float64] | None = None,
+    blur_mm: Floats | None = None,
     progress: Callable[[int], None] | None = None,
-) -> NDArray[np.float64]:
+) -> Floats:
     """Render small glowing balls.
 
     Parameters
@@ -111,10 +112,10 @@ def render_points(
 def _tracer_of(
     camera: Camera,
     space: Space,
-    points: NDArray[np.float64],
-    radii: NDArray[np.float64],
-    shifts: NDArray[np.float64],
-    blur_mm: NDArray[np.float64],
+    points: Floats,
+    radii: Floats,
+    shifts: Floats,
+    blur_mm: Floats,
 ) -> Callable[[slice, NDArray[np.int32]], None]:
     """Return what writes the pixels (n, rays) that the rays of a part of the balls strike, image axes."""
     seen = camera.for_kernels()
@@ -136,7 +137,7 @@ def _tracer_of(
     return trace_plane
 
 
-def _check_depths(points: NDArray[np.float64], last_layers_mm: NDArray[np.float64]) -> None:
+def _check_depths(points: Floats, last_layers_mm: Floats) -> None:
     """Raise where a point lies on the camera's side of the layer that it should be in."""
     if np.any(last_layers_mm <= 0.0):
         nearest = points[:, 2].min()
@@ -146,11 +147,11 @@ def _check_depths(points: NDArray[np.float64], last_layers_mm: NDArray[np.float6
 @njit(cache=True, nogil=True)
 def _trace_points(
     part: tuple[int, int],
-    placed: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
+    placed: tuple[Floats, Floats, Floats, Floats],
     layers: Layers,
     camera: KernelCamera,
     objective: Objective,
-    blur_mm: NDArray[np.float64],
+    blur_mm: Floats,
     pixels: NDArray[np.int32],
 ) -> None:
     """Write the flat pixel number that each ray of the points `part` strikes, (n, rays), -1 where it strikes none.
@@ -180,7 +181,7 @@ def _trace_points(
 
 
 @njit(cache=True)
-def _add_light(image: NDArray[np.float64], pixels: NDArray[np.int32], weights: NDArray[np.float64]) -> None:
+def _add_light(image: Floats, pixels: NDArray[np.int32], weights: Floats) -> None:
     """Add each point's weight to the pixels of its rays, in order."""
     for i in range(pixels.shape[0]):
         for k in range(pixels.shape[1]):
@@ -188,7 +189,7 @@ def _add_light(image: NDArray[np.float64], pixels: NDArray[np.int32], weights: N
                 image[pixels[i, k]] += weights[i]
 
 
-def render_white(camera: Camera, level: float, samples_per_side: int = WHITE_SAMPLES_PER_SIDE) -> NDArray[np.float64]:
+def render_white(camera: Camera, level: float, samples_per_side: int = WHITE_SAMPLES_PER_SIDE) -> Floats:
     """Render uniform light: every microlens shows the aperture disc.
 
     Traced backwards from a grid of points of each pixel, through evenly spread points of each near microlens, to the
@@ -230,7 +231,7 @@ def render_white(camera: Camera, level: float, samples_per_side: int = WHITE_SAM
     return lit * np.float64(level / samples)
 
 
-def pixel_places(count: int, diffusion_px: float) -> NDArray[np.float64]:
+def pixel_places(count: int, diffusion_px: float) -> Floats:
     """Return places along an axis about a pixel's middle, in pixels, each of which sends it as much charge."""
     share = (np.arange(count) + 0.5) / count
     if diffusion_px == 0.0:
@@ -245,12 +246,12 @@ def pixel_places(count: int, diffusion_px: float) -> NDArray[np.float64]:
 @njit(cache=True, nogil=True)
 def _backtrack_white(
     part: tuple[int, int],
-    positions_px: NDArray[np.float64],
-    offsets: NDArray[np.float64],
+    positions_px: Floats,
+    offsets: Floats,
     camera: KernelCamera,
     objective: Objective,
-    origin_px: NDArray[np.float64],
-    basis_px: NDArray[np.float64],
+    origin_px: Floats,
+    basis_px: Floats,
     lit: NDArray[np.int64],
 ) -> None:
     """Write how many samples of each pixel, rows `part`, come from the aperture, summed over the lenses."""

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.flow.windows import RoundWall, Walls
@@ -131,7 +132,7 @@ class Tracers:
     light_z_mm: tuple[float, float] | None = None
     walls: Walls | None = None
 
-    def draw_places(self, rng: np.random.Generator) -> NDArray[np.float64]:
+    def draw_places(self, rng: np.random.Generator) -> Floats:
         """Return where the tracers are at the sequence's middle (count, 3)."""
         places = rng.uniform(self.box.low_mm, self.box.high_mm, (self.count, 3))
         beyond = np.zeros(self.count, dtype=np.bool_) if self.walls is None else ~self.walls.contain(places)
@@ -140,26 +141,26 @@ class Tracers:
             beyond = ~self.walls.contain(places)
         return places
 
-    def draw_brightness(self, rng: np.random.Generator) -> NDArray[np.float64]:
+    def draw_brightness(self, rng: np.random.Generator) -> Floats:
         """Return the brightness (count,) of each tracer."""
         if self.brightness_log_sigma is None:
             return rng.uniform(*self.brightness, self.count)
         return rng.lognormal(0.0, self.brightness_log_sigma, self.count)
 
-    def draw_sizes(self, rng: np.random.Generator) -> NDArray[np.float64]:
+    def draw_sizes(self, rng: np.random.Generator) -> Floats:
         """Return the diameter (count,) of each tracer over their median; without a spread no numbers are drawn."""
         if self.diameter_log_sigma == 0.0:
             return np.ones(self.count)
         return rng.lognormal(0.0, self.diameter_log_sigma, self.count)
 
-    def draw_flicker(self, frames: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    def draw_flicker(self, frames: int, rng: np.random.Generator) -> Floats:
         """Return each tracer's light in each frame (frames, count) over its own, of mean 1, as `draw_sizes` does."""
         if self.brightness_flicker == 0.0:
             return np.ones((frames, self.count))
         variance = np.log1p(self.brightness_flicker**2)
         return rng.lognormal(-0.5 * variance, np.sqrt(variance), (frames, self.count))
 
-    def lit(self, points_mm: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def lit(self, points_mm: Floats) -> NDArray[np.bool_]:
         """Return which of the points (..., 3) lie in the light."""
         if self.light_z_mm is None:
             return np.ones(points_mm.shape[:-1], dtype=np.bool_)
@@ -175,7 +176,7 @@ class RecordingCamera:
     readout: Readout
     waves: Waves | None = None
 
-    def record(self, expected: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.uint16]:
+    def record(self, expected: Floats, rng: np.random.Generator) -> NDArray[np.uint16]:
         """Return an image recorded of the counts (rows, columns) that an objective without falloff would make."""
         return self.readout.record(expected * passed_light(self.optics), rng)
 
@@ -204,7 +205,7 @@ class Motion:
         """Return for how long the flow of the middle would carry tracers to where each frame finds them."""
         return [self.pulsation.carried_s(time_s) for time_s in self.times_s()]
 
-    def places_mm(self, middle_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    def places_mm(self, middle_mm: Floats) -> Floats:
         """Return where the frames find tracers (frames, n, 3) that are at these places (n, 3) at the middle.
 
         From the middle on they go from frame to frame: over a whole sequence the steps of `advect` would be too long.
@@ -245,12 +246,12 @@ class SimulatedFrames:
 
     images: tuple[NDArray[np.uint16], ...]
     dark: NDArray[np.uint16]
-    positions_mm: NDArray[np.float64]
-    velocities_m_s: NDArray[np.float64]
-    brightness: NDArray[np.float64]
-    diameters_mm: NDArray[np.float64]
-    frame_positions_mm: NDArray[np.float64]
-    frame_brightness: NDArray[np.float64]
+    positions_mm: Floats
+    velocities_m_s: Floats
+    brightness: Floats
+    diameters_mm: Floats
+    frame_positions_mm: Floats
+    frame_brightness: Floats
     truth: dict[str, Any]
 
 
@@ -307,7 +308,7 @@ def simulate_particles(
     motion: Motion,
     rng: np.random.Generator,
     *,
-    still: NDArray[np.float64] | float = 0.0,
+    still: Floats | float = 0.0,
     progress: Callable[[int], None] | None = None,
 ) -> SimulatedFrames:
     """Simulate images of tracers, half of them before the time of the truth's positions and half after.
@@ -382,7 +383,7 @@ def seeded_boxes(volume: Grid, reach_mm: float, flow: Flow, carried_s: float, wa
     return (box, inside) if walls is None else (box.within(walls), inside.within(walls))
 
 
-def largest_speed_mm_s(flow: Flow, box: Box) -> NDArray[np.float64]:
+def largest_speed_mm_s(flow: Flow, box: Box) -> Floats:
     """Return the largest speed along each axis (3,) on a lattice of points of a box."""
     sides = [np.linspace(low, high, SPEED_POINTS) for low, high in zip(box.low_mm, box.high_mm, strict=True)]
     points = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, 3)

@@ -10,11 +10,11 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft
 from scipy.ndimage import map_coordinates
 from scipy.special import ndtri
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.waves import Waves, WavesInCamera, samples_per_pixel
 from lfpiv_cli.synthetic.ray_sequence import blur_numbers, in_pairs
@@ -43,7 +43,7 @@ def render_balls(
     *,
     rays: int = RAYS,
     progress: Callable[[int], None] | None = None,
-) -> NDArray[np.float64]:
+) -> Floats:
     """Render small glowing balls by waves, or where there are none by `render.render_points`."""
     if waves is None:
         return render_points(camera, space, balls, rng, rays=rays, progress=progress)
@@ -57,7 +57,7 @@ def points_by_waves(
     waves: Waves,
     *,
     progress: Callable[[int], None] | None = None,
-) -> NDArray[np.float64]:
+) -> Floats:
     """Render small glowing balls as points that glow independently of each other.
 
     Parameters
@@ -92,7 +92,7 @@ def points_by_waves(
     return image
 
 
-def points_in_ball(count: int) -> NDArray[np.float64]:
+def points_in_ball(count: int) -> Floats:
     """Return points (count, 3) of a ball of radius 1, seen along the axis, that stand for an even glow.
 
     They have its mean and its mean squares, a fifth of the radius's along each axis; their depth does not count.
@@ -105,12 +105,12 @@ def points_in_ball(count: int) -> NDArray[np.float64]:
     return np.column_stack([places @ spread, np.zeros(count)])
 
 
-def white_image(camera: Camera, waves: Waves | None, level: float) -> NDArray[np.float64]:
+def white_image(camera: Camera, waves: Waves | None, level: float) -> Floats:
     """Render uniform light by waves, or where there are none by `render.render_white`."""
     return render_white(camera, level) if waves is None else white_by_waves(camera, waves, level)
 
 
-def white_by_waves(camera: Camera, waves: Waves, level: float) -> NDArray[np.float64]:
+def white_by_waves(camera: Camera, waves: Waves, level: float) -> Floats:
     """Render uniform light: the disc of the aperture, as each microlens throws it, spread by what a lens diffracts.
 
     The places of the aperture glow independently of each other. What reaches a pixel through two lenses at once
@@ -136,7 +136,7 @@ def white_by_waves(camera: Camera, waves: Waves, level: float) -> NDArray[np.flo
     return level * _sum_of_lens_images(camera, table, step)
 
 
-def lens_spread(camera: Camera, waves: Waves, beside_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+def lens_spread(camera: Camera, waves: Waves, beside_mm: Floats) -> Floats:
     """Return the light of a place on the main lens behind the microlens at 0, its sum 1, on samples (y, x) about it."""
     step = beside_mm[1] - beside_mm[0]
     inside = np.ones((len(beside_mm), len(beside_mm)))
@@ -155,7 +155,7 @@ def lens_spread(camera: Camera, waves: Waves, beside_mm: NDArray[np.float64]) ->
     return np.asarray(light / light.sum(), dtype=np.float64)
 
 
-def lens_blur_mm(camera: Camera, waves: Waves) -> NDArray[np.float64]:
+def lens_blur_mm(camera: Camera, waves: Waves) -> Floats:
     """Return places (n, 2) beside a ray's end on the sensor: what one lens diffracts, in focus, and charge diffuses.
 
     Rays that take them in turn show an extended source nearly as waves do: of a dot two microlenses wide 3, 6 and 8 %
@@ -173,14 +173,14 @@ def lens_blur_mm(camera: Camera, waves: Waves) -> NDArray[np.float64]:
     return in_pairs(places + camera.diffusion_px * camera.pixel_mm * ndtri(numbers[:, :2]))
 
 
-def _beside(camera: Camera, waves: Waves) -> NDArray[np.float64]:
+def _beside(camera: Camera, waves: Waves) -> Floats:
     """Return samples along an axis about the middle of a lens image, mm."""
     step = camera.pixel_mm / (LENS_SAMPLES * samples_per_pixel(camera, waves))
     half = fft.next_fast_len(int(np.ceil(0.5 * TABLE_PITCHES * float(camera.lattice.pitch.max()) / step)))
     return np.asarray(step * np.arange(-half, half), dtype=np.float64)
 
 
-def _sum_of_lens_images(camera: Camera, table: NDArray[np.float64], step_mm: float) -> NDArray[np.float64]:
+def _sum_of_lens_images(camera: Camera, table: Floats, step_mm: float) -> Floats:
     """Return the image (rows, columns) of lens images that a table tells beside their middle, those of nine lenses."""
     lattice, middle, per_px = camera.micro_image_lattice_px(), len(table) // 2, camera.pixel_mm / step_mm
     image = np.zeros((camera.rows, camera.columns))

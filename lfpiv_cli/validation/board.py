@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.notice import written
@@ -57,8 +58,8 @@ def board_figure(figures: dict[str, Any], volume: NDArray[np.float32], grid: Gri
 # Eq. 20 needs a depth and the paper says no more of it than "Gaussian peak fittings". Dots next to the focal plane
 # are not even: there definitions differ by tenths of a millimetre.
 
-Depths = NDArray[np.float64]
-Profile = NDArray[np.float64]
+Depths = Floats
+Profile = Floats
 
 # Below this share of the peak of a depth profile lies what is left of other dots' light.
 SHARE = float(1.0 / np.e)
@@ -116,7 +117,7 @@ def gaussian_centre_mm(z_mm: Depths, profile: Profile) -> float:
     ends = width_ends_mm(z_mm, profile)
     width = max((ends[1] - ends[0]) / (2.0 * np.sqrt(2.0)), float(z_mm[1] - z_mm[0]))
 
-    def misfit(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def misfit(values: Floats) -> Floats:
         height, centre, sigma = values
         return np.asarray(height * np.exp(-0.5 * ((z_mm - centre) / sigma) ** 2) - profile)
 
@@ -194,9 +195,9 @@ class DotFigures:
     lateral_mm : (n, 2) centre of mass in the plane
     """
 
-    elongation_mm: NDArray[np.float64]
-    depth_mm: dict[str, NDArray[np.float64]]
-    lateral_mm: NDArray[np.float64]
+    elongation_mm: Floats
+    depth_mm: dict[str, Floats]
+    lateral_mm: Floats
 
     def to_plain(self) -> dict[str, Any]:
         """Return the figures as lists of numbers."""
@@ -214,9 +215,7 @@ class DotFigures:
         return cls(np.array(values["elongation_mm"]), depths, np.array(values["lateral_mm"]))
 
 
-def measure_dots(
-    volume: NDArray[np.float32], grid: Grid, centres_mm: NDArray[np.float64], reach_mm: float
-) -> DotFigures:
+def measure_dots(volume: NDArray[np.float32], grid: Grid, centres_mm: Floats, reach_mm: float) -> DotFigures:
     """Measure each dot in the column of voxels within `reach_mm` of its centre (n, 2) in x and y.
 
     Raises
@@ -231,7 +230,7 @@ def measure_dots(
 
 
 def _measure_dot(
-    volume: NDArray[np.float32], grid: Grid, centre: NDArray[np.float64], reach_mm: float
+    volume: NDArray[np.float32], grid: Grid, centre: Floats, reach_mm: float
 ) -> tuple[float, dict[str, float], tuple[float, float]]:
     x, y, z = (grid.axis_mm(axis) for axis in range(3))
     column = np.ix_(np.arange(z.size), np.abs(y - centre[1]) < reach_mm, np.abs(x - centre[0]) < reach_mm)
@@ -248,7 +247,7 @@ def _measure_dot(
     return elongation_mm(z, profiles["maximum"]), depths, lateral
 
 
-def elongation_mm(z_mm: NDArray[np.float64], height: NDArray[np.float64], peak: int | None = None) -> float:
+def elongation_mm(z_mm: Floats, height: Floats, peak: int | None = None) -> float:
     """Return the depth over which a profile around a peak, by default its highest, exceeds 1/e of it."""
     near, far = width_ends_mm(z_mm, height, peak)
     return far - near
@@ -293,8 +292,8 @@ def board_figures(
 
 
 def place_figures(
-    x_mm: Sequence[NDArray[np.float64]],
-    depth_mm: Sequence[NDArray[np.float64]],
+    x_mm: Sequence[Floats],
+    depth_mm: Sequence[Floats],
     depths_mm: tuple[float, ...],
     spacing_mm: float,
 ) -> dict[str, Any]:
@@ -314,12 +313,12 @@ def place_figures(
     }
 
 
-def depth_error(centre_mm: Sequence[float] | NDArray[np.float64], depths_mm: Sequence[float]) -> float:
+def depth_error(centre_mm: Sequence[float] | Floats, depths_mm: Sequence[float]) -> float:
     """Return Eq. 20 averaged over the steps between neighbouring depths."""
     return float(np.mean(np.abs(np.diff(centre_mm) / np.diff(depths_mm) - 1.0)))
 
 
-def _steps(centre_mm: NDArray[np.float64], depths_mm: Sequence[float]) -> dict[str, float]:
+def _steps(centre_mm: Floats, depths_mm: Sequence[float]) -> dict[str, float]:
     steps = np.diff(centre_mm) / np.diff(depths_mm)
     return {
         "error": depth_error(centre_mm, depths_mm),

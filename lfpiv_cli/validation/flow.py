@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.flow.field import FLAG_NAMES, MM_TO_M, VectorField
 
@@ -44,10 +45,10 @@ class Comparison:
     direction : (3,) unit vector of the mean true flow, or None where it has no direction
     """
 
-    measured: NDArray[np.float64]
-    true: NDArray[np.float64]
+    measured: Floats
+    true: Floats
     index_zyx: NDArray[np.int64]
-    direction: NDArray[np.float64] | None
+    direction: Floats | None
 
     @property
     def found(self) -> NDArray[np.bool_]:
@@ -55,7 +56,7 @@ class Comparison:
         return np.asarray(np.isfinite(self.measured).all(axis=1))
 
 
-def compare(field: VectorField, truth_velocity: NDArray[np.float64], inside: NDArray[np.bool_]) -> Comparison:
+def compare(field: VectorField, truth_velocity: Floats, inside: NDArray[np.bool_]) -> Comparison:
     """Pair measured with true velocities at the windows `inside`; the truth may be anything elsewhere.
 
     Raises
@@ -77,7 +78,7 @@ def compare(field: VectorField, truth_velocity: NDArray[np.float64], inside: NDA
     return Comparison(field.velocity[inside], true, np.argwhere(inside), mean / speed if has_direction else None)
 
 
-def flow_figures(field: VectorField, truth_velocity: NDArray[np.float64], inside: NDArray[np.bool_]) -> dict[str, Any]:
+def flow_figures(field: VectorField, truth_velocity: Floats, inside: NDArray[np.bool_]) -> dict[str, Any]:
     """Return the figures of a measured flow, ready for JSON.
 
     Parameters
@@ -117,7 +118,7 @@ def _counts(field: VectorField, inside: NDArray[np.bool_]) -> dict[str, int]:
     return counts
 
 
-def relative_errors(pairs: Comparison) -> tuple[NDArray[np.float64] | None, NDArray[np.float64]]:
+def relative_errors(pairs: Comparison) -> tuple[Floats | None, Floats]:
     """Return |v - u|/|u| streamwise (None without a direction) and of the whole vector, (n,); infinite for a miss.
 
     Where the truth is zero, only an exact zero is right, and every error infinite.
@@ -129,7 +130,7 @@ def relative_errors(pairs: Comparison) -> tuple[NDArray[np.float64] | None, NDAr
     return _ratio(np.abs(difference @ pairs.direction), np.abs(pairs.true @ pairs.direction)), vector
 
 
-def _ratio(error: NDArray[np.float64], size: NDArray[np.float64]) -> NDArray[np.float64]:
+def _ratio(error: Floats, size: Floats) -> Floats:
     """Return error / size; 0 for 0/0, infinite for a NaN error or a zero size."""
     ratio = np.where(error == 0.0, 0.0, np.inf)
     np.divide(error, size, out=ratio, where=(size > 0.0) & np.isfinite(error))
@@ -191,7 +192,7 @@ def cumulative_distribution(pairs: Comparison) -> dict[str, Any]:
     limits = np.linspace(0.0, 1.0, CUMULATIVE_STEPS)
     streamwise, vector = relative_errors(pairs)
 
-    def shares(errors: NDArray[np.float64]) -> list[float]:
+    def shares(errors: Floats) -> list[float]:
         return (np.searchsorted(np.sort(errors), limits, side="right") / errors.size).tolist()
 
     return {
@@ -201,9 +202,7 @@ def cumulative_distribution(pairs: Comparison) -> dict[str, Any]:
     }
 
 
-def truth_at_points(
-    positions_mm: NDArray[np.float64], velocities: NDArray[np.float64], centres_mm: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def truth_at_points(positions_mm: Floats, velocities: Floats, centres_mm: Floats) -> Floats:
     """Return the velocity of a list of true particles at given points, by a linear fit to the nearest ones of each.
 
     Parameters
@@ -295,9 +294,7 @@ class Duct:
         return self.centre_mm[axis] + (share - 0.5) * self.width_mm
 
 
-def table_4(
-    field: VectorField, truth_velocity: NDArray[np.float64], inside: NDArray[np.bool_], duct: Duct
-) -> dict[str, Any]:
+def table_4(field: VectorField, truth_velocity: Floats, inside: NDArray[np.bool_], duct: Duct) -> dict[str, Any]:
     """Return the sizes of the mean velocity errors in per cent, of the six slices and of the whole, beside the paper's.
 
     By the slice (`overall`, `z/D 0.3` ...): `ours`, `paper_dlfc` and `paper_ert`. A slice between planes of windows is

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.flow.windows import RoundWall
 from lfpiv_cli.pictures.style import (
@@ -51,7 +52,7 @@ INNER = RING_EDGES[-2]
 
 
 def pipe_figures(
-    field: VectorField, truth_velocity: NDArray[np.float64], inside: NDArray[np.bool_], pipe: RoundWall
+    field: VectorField, truth_velocity: Floats, inside: NDArray[np.bool_], pipe: RoundWall
 ) -> dict[str, Any]:
     """Return the figures of windows by their distance from the axis, ready for JSON.
 
@@ -133,7 +134,7 @@ class Measured:
     """
 
     field: VectorField
-    truth: NDArray[np.float64]
+    truth: Floats
     inside: NDArray[np.bool_]
     flow: Flow | None = None
 
@@ -207,7 +208,7 @@ def flow_figure(methods: Mapping[str, Measured]) -> Figure:
     return compared_figure(first.field.grid, rows, unit)
 
 
-def _judged(measured: Measured, values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _judged(measured: Measured, values: Floats) -> Floats:
     """Return vectors where they are judged, else NaN."""
     return np.where(measured.inside[..., np.newaxis], values, np.nan)
 
@@ -280,9 +281,7 @@ def _draw_profile(axes: Axes, methods: Mapping[str, Measured], axis: int, compon
         axes.plot(grid.axis_mm(axis), factor * mean, marker, color=colour, markerfacecolor="none", label=label)
 
 
-def _on_planes(
-    flow: Flow, points_mm: NDArray[np.float64], places_mm: NDArray[np.float64], axis: int
-) -> NDArray[np.float64]:
+def _on_planes(flow: Flow, points_mm: Floats, places_mm: Floats, axis: int) -> Floats:
     """Return a flow in m/s, (places, m, 3), on planes across an axis, at the lateral places of points (n, 3)."""
     lateral = np.unique(np.delete(points_mm, axis, axis=1), axis=0)
     points = np.insert(np.tile(lateral, (places_mm.size, 1)), axis, np.repeat(places_mm, len(lateral)), axis=1)
@@ -338,18 +337,14 @@ def _draw_slice(axes: Axes, methods: Mapping[str, Measured], duct: Duct, axis: i
         axes.plot(grid.axis_mm(other), profile, marker, color=colour, markerfacecolor="none", label=label)
 
 
-def profile_at(
-    values: NDArray[np.float64], places: NDArray[np.float64], position: float, axis: int, along: int
-) -> NDArray[np.float64]:
+def profile_at(values: Floats, places: Floats, position: float, axis: int, along: int) -> Floats:
     """Return a slice across one axis (0 for x) of values [z, y, x], interpolated, and its mean along another."""
     # what is left of [z, y, x] once the first axis is taken
     left = [k for k in (2, 1, 0) if k != axis].index(along)
     return mean_of_known(slice_at(values, places, position, axis), (left,))
 
 
-def slice_at(
-    values: NDArray[np.float64], places: NDArray[np.float64], position: float, axis: int
-) -> NDArray[np.float64]:
+def slice_at(values: Floats, places: Floats, position: float, axis: int) -> Floats:
     """Return a slice across one axis (0 for x) of values [z, y, x], interpolated between planes at `places`."""
     at = float(np.clip(np.interp(position, places, np.arange(places.size)), 0, places.size - 1))
     low = min(int(at), max(0, places.size - 2))

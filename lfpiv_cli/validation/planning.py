@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.flow.windows import ROUNDING
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
@@ -106,16 +107,16 @@ RIDGE = 1e-10
 class Bound:
     """Smallest covariances (n, 4, 4) of each particle, its neighbours known (`alone`) or to be found (`joint`)."""
 
-    alone: NDArray[np.float64]
-    joint: NDArray[np.float64]
+    alone: Floats
+    joint: Floats
 
-    def sigma_mm(self, joint: bool) -> NDArray[np.float64]:
+    def sigma_mm(self, joint: bool) -> Floats:
         """Return the smallest standard errors (n, 3) of x, y and z."""
         chosen = self.joint if joint else self.alone
         return np.asarray(np.sqrt(np.diagonal(chosen, axis1=1, axis2=2)[:, :3]))
 
 
-def slopes(view: View, particles: NDArray[np.float64]) -> sparse.csc_array:
+def slopes(view: View, particles: Floats) -> sparse.csc_array:
     """Return J (pixels, 4 n): what each particle's x, y, z and light do to the expected image."""
     capacity = entry_capacity(view, *_depths(particles))
     room = room_for(1, capacity, 0)
@@ -135,18 +136,16 @@ def slopes(view: View, particles: NDArray[np.float64]) -> sparse.csc_array:
     return sparse.csc_array(sparse.coo_array((np.concatenate(entries), indices), shape=shape))
 
 
-def _depths(particles: NDArray[np.float64]) -> tuple[float, float]:
+def _depths(particles: Floats) -> tuple[float, float]:
     return (float(particles[:, 2].min()), float(particles[:, 2].max())) if len(particles) else (0.0, 0.0)
 
 
-def expected_image(slope: sparse.csc_array, particles: NDArray[np.float64]) -> NDArray[np.float64]:
+def expected_image(slope: sparse.csc_array, particles: Floats) -> Floats:
     """Return the expected counts (pixels,) of particles from their `slopes`."""
     return np.asarray(slope[:, 3::UNKNOWNS] @ particles[:, 3])
 
 
-def pixel_variance(
-    expected_counts: NDArray[np.float64], readout: Readout, counts_per_ray: float = 0.0
-) -> NDArray[np.float64]:
+def pixel_variance(expected_counts: Floats, readout: Readout, counts_per_ray: float = 0.0) -> Floats:
     """Return the variance (pixels,) of recorded pixels: read noise, rounding, light's own noise, and that of its rays.
 
     Parameters
@@ -158,7 +157,7 @@ def pixel_variance(
     return np.asarray(readout.read_noise_counts**2 + ROUNDING_VARIANCE + gain * np.maximum(expected_counts, 0.0))
 
 
-def cramer_rao_bound(slope: sparse.csc_array, variance: NDArray[np.float64]) -> Bound:
+def cramer_rao_bound(slope: sparse.csc_array, variance: Floats) -> Bound:
     """Return the bound of each particle from the `slopes` of all and the variance (pixels,) of the image.
 
     Jointly, the particles that share pixels with a particle are free and those further away held: what these would add
@@ -179,9 +178,7 @@ def cramer_rao_bound(slope: sparse.csc_array, variance: NDArray[np.float64]) -> 
     return Bound(alone, joint)
 
 
-def errors_alone_mm(
-    view: View, particles: NDArray[np.float64], readout: Readout, counts_per_ray: float = 0.0
-) -> NDArray[np.float64]:
+def errors_alone_mm(view: View, particles: Floats, readout: Readout, counts_per_ray: float = 0.0) -> Floats:
     """Return the bound (n, 3) of x, y and z of particles each of which is alone in an image of its own."""
     errors = np.empty((len(particles), 3))
     for number, particle in enumerate(particles):
@@ -191,7 +188,7 @@ def errors_alone_mm(
     return errors
 
 
-def _first_block_of_inverse(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+def _first_block_of_inverse(matrix: Floats) -> Floats:
     """Return the first (4, 4) of a symmetric matrix's inverse; a diagonal of 0 is of something that cannot be known."""
     diagonal = np.diag(matrix)
     known = diagonal > 0.0
@@ -244,10 +241,10 @@ class Miniature(NamedTuple):
     """The view of a sensor just large enough for the light of tracers in its middle, at depths (n,)."""
 
     view: View
-    depths_mm: NDArray[np.float64]
+    depths_mm: Floats
 
 
-def half_view_mm(camera: Camera, media: Media, z_mm: ArrayLike, rim: float = -1.0) -> NDArray[np.float64]:
+def half_view_mm(camera: Camera, media: Media, z_mm: ArrayLike, rim: float = -1.0) -> Floats:
     """Return half the field of view (n, 2) along x and y at depths (n,), 0 where there is none.
 
     Parameters
@@ -264,9 +261,7 @@ def half_view_mm(camera: Camera, media: Media, z_mm: ArrayLike, rim: float = -1.
     return np.asarray(seen if camera.column_axis == "x" else seen[..., ::-1])
 
 
-def share_in_view(
-    camera: Camera, media: Media, bounds_mm: NDArray[np.float64], rim: float = -1.0, planes: int = 41
-) -> float:
+def share_in_view(camera: Camera, media: Media, bounds_mm: Floats, rim: float = -1.0, planes: int = 41) -> float:
     """Return the share of a box's volume in the field of view, `rim` as in `half_view_mm`.
 
     Parameters
@@ -279,7 +274,7 @@ def share_in_view(
     return float(np.mean(np.prod(sides, axis=1)))
 
 
-def part_in_front(camera: Camera, media: Media, bounds_mm: NDArray[np.float64]) -> tuple[slice, slice]:
+def part_in_front(camera: Camera, media: Media, bounds_mm: Floats) -> tuple[slice, slice]:
     """Return the rows and columns of an image that look at the middle of a box, bounds (3, 2)."""
     middle = float(bounds_mm[2].mean())
     distance = float(equivalent_object_distance(middle, camera.focus_distance_mm, media))
@@ -314,7 +309,7 @@ def tracers_in(camera: Camera, per_lens: float, sides_mm: ArrayLike) -> float:
     return float(per_lens * width * height / camera.lattice.cell_area)
 
 
-def proposed_window_mm(camera: Camera, media: Media, sides_mm: ArrayLike, overlap: ArrayLike) -> NDArray[np.float64]:
+def proposed_window_mm(camera: Camera, media: Media, sides_mm: ArrayLike, overlap: ArrayLike) -> Floats:
     """Return the sides (3,) of the final interrogation windows in a volume of sides (3,), at the best seeding.
 
     They are the paper's, or smaller where these give fewer than ten vectors along an axis, as far as tracers allow it;
@@ -344,7 +339,7 @@ def time_step_s(velocity_m_s: float, voxel_mm: float, voxels: float = BEST_STEP)
     return voxels * voxel_mm / (abs(velocity_m_s) * 1e3)
 
 
-def errors_by_depth_mm(seen: Sequence[Miniature], tracer: Tracer, counts_per_ray: float = 0.0) -> NDArray[np.float64]:
+def errors_by_depth_mm(seen: Sequence[Miniature], tracer: Tracer, counts_per_ray: float = 0.0) -> Floats:
     """Return the smallest errors (n, 3) of x, y and z, rms over places, of a tracer alone at depths (n,).
 
     The Cramer-Rao bound; no image tells more. `counts_per_ray` is of images that are rendered ray by ray.
@@ -415,9 +410,7 @@ def in_miniature(
     ]
 
 
-def _at_depths(
-    camera: Camera, media: Media, depths_mm: NDArray[np.float64], radius_mm: float, light: Light | None
-) -> Miniature:
+def _at_depths(camera: Camera, media: Media, depths_mm: Floats, radius_mm: float, light: Light | None) -> Miniature:
     distance = equivalent_object_distance(depths_mm, camera.focus_distance_mm, media)
     blur = np.abs(camera.defocus(distance)) * camera.aperture_radius_mm
     reach = float(np.max(blur + radius_mm * camera.image_distance_mm / distance))
@@ -428,7 +421,7 @@ def _at_depths(
     return Miniature(view, depths_mm)
 
 
-def _particles(seen: Miniature, light: float) -> NDArray[np.float64]:
+def _particles(seen: Miniature, light: float) -> Floats:
     """Return particles (depths * PLACES, 4) whose light is at places all over a lens."""
     view, depths_mm = seen
     cell = (np.outer(np.arange(PLACES) + 0.5, STEPS) % 1.0 - 0.5) @ np.linalg.inv(view.inverse_basis)

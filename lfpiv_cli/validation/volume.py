@@ -15,6 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.particles.joining import Boxes, find_peaks
@@ -33,10 +34,10 @@ class Matches:
 
     found: NDArray[np.int64]
     true: NDArray[np.int64]
-    error_voxel: NDArray[np.float64]
+    error_voxel: Floats
 
 
-def match(found_mm: NDArray[np.float64], true_mm: NDArray[np.float64], voxel_mm: float) -> Matches:
+def match(found_mm: Floats, true_mm: Floats, voxel_mm: float) -> Matches:
     """Pair found with true particles, nearest first, each at most once."""
     scale = voxel_mm * np.array([LATERAL_VOXEL, LATERAL_VOXEL, DEPTH_VOXEL])
     near = KDTree(true_mm / scale).query_ball_point(found_mm / scale, np.sqrt(2.0), return_sorted=True)
@@ -55,12 +56,12 @@ def match(found_mm: NDArray[np.float64], true_mm: NDArray[np.float64], voxel_mm:
 
 
 def particle_figures(
-    found_mm: NDArray[np.float64],
-    true_mm: NDArray[np.float64],
-    low_mm: NDArray[np.float64],
-    high_mm: NDArray[np.float64],
+    found_mm: Floats,
+    true_mm: Floats,
+    low_mm: Floats,
+    high_mm: Floats,
     voxel_mm: float,
-    sigma_mm: NDArray[np.float64] | None = None,
+    sigma_mm: Floats | None = None,
     distances_mm: tuple[float, float] = (0.0, np.inf),
 ) -> dict[str, float]:
     """Return recall, precision, and per component bias, rms and robust spread (1.48 median deviation) in voxels.
@@ -73,7 +74,7 @@ def particle_figures(
     distances_mm : only what lies this far from z = 0, the focal plane, on either side is judged
     """
 
-    def inside(points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def inside(points: Floats) -> NDArray[np.bool_]:
         distance = np.abs(points[:, 2])
         band = (distance >= distances_mm[0]) & (distance < distances_mm[1])
         return np.asarray(band & np.all((points >= low_mm) & (points <= high_mm), axis=1))
@@ -110,8 +111,8 @@ BOXES = Boxes(sum=(3, 1, 1), peak=(3, 3, 3), light=(5, 3, 3))
 def volume_figures(
     volume: NDArray[np.float32],
     grid: Grid,
-    position_mm: NDArray[np.float64],
-    brightness: NDArray[np.float64],
+    position_mm: Floats,
+    brightness: Floats,
     microlens_mm: float,
 ) -> dict[str, float | int]:
     """Return the figures of a volume whose true particles are known.
@@ -170,18 +171,14 @@ def normalised_correlation(first: NDArray[np.float32], second: NDArray[np.float3
     return float(product / np.sqrt(squares)) if squares > 0.0 else 0.0
 
 
-def known_volume(
-    grid: Grid, position_mm: NDArray[np.float64], brightness: NDArray[np.float64], sigma_mm: NDArray[np.float64]
-) -> NDArray[np.float32]:
+def known_volume(grid: Grid, position_mm: Floats, brightness: Floats, sigma_mm: Floats) -> NDArray[np.float32]:
     """Return particles (n, 3) as Gaussians of standard deviations sigma (3,), each as high as it is bright (n,)."""
     volume = np.zeros(grid.shape_zyx, np.float32)
     add_gaussians(volume, grid.mm_to_voxel(position_mm), brightness, sigma_mm / np.asarray(grid.spacing_mm))
     return volume
 
 
-def shared_among_voxels(
-    grid: Grid, position_mm: NDArray[np.float64], brightness: NDArray[np.float64]
-) -> NDArray[np.float32]:
+def shared_among_voxels(grid: Grid, position_mm: Floats, brightness: Floats) -> NDArray[np.float32]:
     """Return particles (n, 3) with their light (n,) shared out among their eight nearest voxels, by distance."""
     volume = np.zeros(grid.shape_zyx)
     index = grid.mm_to_voxel(position_mm)
@@ -194,7 +191,7 @@ def shared_among_voxels(
     return volume.astype(np.float32)
 
 
-def near_a_particle(grid: Grid, position_mm: NDArray[np.float64], microlens_mm: float) -> NDArray[np.bool_]:
+def near_a_particle(grid: Grid, position_mm: Floats, microlens_mm: float) -> NDArray[np.bool_]:
     """Return which voxels (z, y, x) have their centre in the ellipsoid around a particle."""
     scale = microlens_mm * np.array([1.0, 1.0, DEPTH_TO_LATERAL])
     tree = KDTree(position_mm / scale)
@@ -206,7 +203,7 @@ def near_a_particle(grid: Grid, position_mm: NDArray[np.float64], microlens_mm: 
     return near
 
 
-def _median_elongation(volume: NDArray[np.float32], grid: Grid, index_xyz: NDArray[np.float64]) -> float:
+def _median_elongation(volume: NDArray[np.float32], grid: Grid, index_xyz: Floats) -> float:
     """Return the median length in depth of the volume at peaks given by fractional indices, 0 where there are none."""
     z = grid.axis_mm(2)
     lengths = []
@@ -220,9 +217,9 @@ def _median_elongation(volume: NDArray[np.float32], grid: Grid, index_xyz: NDArr
 @njit(cache=True)
 def add_gaussians(
     volume: NDArray[np.float32],
-    centres: NDArray[np.float64],
-    height: NDArray[np.float64],
-    sigma: NDArray[np.float64],
+    centres: Floats,
+    height: Floats,
+    sigma: Floats,
 ) -> None:
     """Add Gaussians of heights (n,) to a volume [z, y, x]; `centres` (n, 3) and `sigma` (3,) in voxels (x, y, z)."""
     shape = (volume.shape[2], volume.shape[1], volume.shape[0])

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.notice import written
@@ -71,7 +72,7 @@ class Column:
     """
 
     centre_mm: tuple[float, float, float]
-    images: dict[str, NDArray[np.float64]]
+    images: dict[str, Floats]
 
 
 # What is compared: reference and judged image.
@@ -89,10 +90,10 @@ COMPARISONS = {
 }
 
 
-def ssim(reference: NDArray[np.float64], image: NDArray[np.float64]) -> float:
+def ssim(reference: Floats, image: Floats) -> float:
     """Return the structural similarity (Eq. 16) of two images in grey levels, the mean over all local windows."""
 
-    def local_mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def local_mean(values: Floats) -> Floats:
         return ndimage.gaussian_filter(values, WINDOW_SIGMA_PX, mode="constant", radius=WINDOW_RADIUS_PX)
 
     c1, c2 = (K1 * GREY_LEVELS) ** 2, (K2 * GREY_LEVELS) ** 2
@@ -105,7 +106,7 @@ def ssim(reference: NDArray[np.float64], image: NDArray[np.float64]) -> float:
     return float(np.mean(above / below))
 
 
-def compare_columns(reference: NDArray[np.float64], image: NDArray[np.float64]) -> dict[str, float]:
+def compare_columns(reference: Floats, image: Floats) -> dict[str, float]:
     """Return SSIM, RMSE in grey levels and L1 of one column against its reference."""
     grey = GREY_LEVELS / reference.max()
     return {
@@ -115,7 +116,7 @@ def compare_columns(reference: NDArray[np.float64], image: NDArray[np.float64]) 
     }
 
 
-def sample_voxels(grid: Grid, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
+def sample_voxels(grid: Grid, count: int, rng: np.random.Generator) -> Floats:
     """Return the centres (count, 3) of random voxels of a grid, world axes."""
     indices = np.stack([rng.integers(0, n, count) for n in grid.shape_xyz], axis=1)
     return grid.voxel_to_mm(indices.astype(np.float64))
@@ -132,7 +133,7 @@ def in_view(
 def make_columns(
     camera: Camera,
     space: ObjectSpace,
-    centres_mm: NDArray[np.float64],
+    centres_mm: Floats,
     voxel_mm: tuple[float, float, float],
     rng: np.random.Generator,
     long_count: NDArray[np.int64],
@@ -214,16 +215,14 @@ def _quadrature_ways(space: ObjectSpace) -> dict[str, tuple[ObjectSpace, int]]:
     return ways
 
 
-def _integrated(
-    camera: Camera, space: ObjectSpace, point: NDArray[np.float64], sides: NDArray[np.float64], tiles: int
-) -> NDArray[np.float64]:
+def _integrated(camera: Camera, space: ObjectSpace, point: Floats, sides: Floats, tiles: int) -> Floats:
     columns = integrate_columns(camera, space, point, sides, tiles, REFERENCE_DEPTH_NODES)
     return columns.image(0, (camera.rows, camera.columns))
 
 
 def _factorised(
-    camera: Camera, space: ObjectSpace, centre: NDArray[np.float64], voxel_mm: tuple[float, float, float]
-) -> dict[str, NDArray[np.float64]]:
+    camera: Camera, space: ObjectSpace, centre: Floats, voxel_mm: tuple[float, float, float]
+) -> dict[str, Floats]:
     """Return the factorised columns of one voxel; none where the axes do not separate."""
     grid = Grid((1, 1, 1), voxel_mm, (centre[0], centre[1], centre[2]))
     spaces = {"factorised": replace(space, refraction="paraxial", method="ert")}
@@ -240,7 +239,7 @@ def _factorised(
     return images
 
 
-def cut_to_lit(images: dict[str, NDArray[np.float64]]) -> dict[str, NDArray[np.float64]]:
+def cut_to_lit(images: dict[str, Floats]) -> dict[str, Floats]:
     """Return the images cut to the rectangle that any of them lights."""
     lit = np.any([image > 0.0 for image in images.values()], axis=0)
     if not lit.any():
