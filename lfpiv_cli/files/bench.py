@@ -39,8 +39,7 @@ from lfpiv_cli.optics.surfaces import SURFACES
 from lfpiv_cli.optics.waves import Waves
 from lfpiv_cli.reference import Reference
 from lfpiv_cli.scale import Scale
-from lfpiv_cli.synthetic.flows import FLOWS
-from lfpiv_cli.synthetic.vortices import Flow
+from lfpiv_cli.synthetic.flows import FLOWS, Flow
 
 UM_TO_MM, NM_TO_MM = 1e-3, 1e-6
 # Of the paper's final window along the axis with the smallest voxels; the coarse one is twice as large: a displacement

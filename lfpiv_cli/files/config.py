@@ -55,7 +55,7 @@ from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.reconstruction.registry import SOLVERS
 from lfpiv_cli.reconstruction.solvers import SolverSettings, Stopping
 from lfpiv_cli.reference import FOCAL_POINT, Reference
-from lfpiv_cli.synthetic.vortices import Flow
+from lfpiv_cli.synthetic.flows import Flow
 
 # Images and HDF5 files have a zero byte among their first ones, and no text has.
 BEGINNING_BYTES = 512

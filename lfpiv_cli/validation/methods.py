@@ -26,7 +26,7 @@ from lfpiv_cli.pictures.style import (
     symmetric_limit,
 )
 from lfpiv_cli.pictures.vectors import compared_figure, draw_maps, mean_of_known, plane_panels, signed_scale, speed_unit
-from lfpiv_cli.synthetic.vortices import Flow
+from lfpiv_cli.synthetic.flows import Flow
 from lfpiv_cli.validation.flow import (
     PAPER_SLICES,
     TOLERANCE,
