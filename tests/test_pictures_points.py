@@ -11,7 +11,7 @@ from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.pictures import points as of_points
-from lfpiv_cli.pictures import volume as of_volume
+from lfpiv_cli.pictures import vectors as of_volume
 from lfpiv_cli.pictures.style import SLABS, percentiles_by_depth
 
 pytest.importorskip("matplotlib")

@@ -15,9 +15,12 @@ from numpy.typing import ArrayLike
 
 from lfpiv_cli.arrays import Floats
 
+# For signatures: what draws has them from here, and nothing is loaded before something is drawn.
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    from matplotlib.axes import Axes as Axes
+    from matplotlib.figure import Figure as Figure
+else:
+    Axes = Figure = Any
 
 
 P = ParamSpec("P")
@@ -74,6 +77,12 @@ def new_figure(width: float, height: float) -> Figure:
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), layout="constrained")
+
+
+def new_panels(width: float, height: float, rows: int = 1, columns: int = 1, **how: Any) -> tuple[Figure, Any]:
+    """Return an empty figure as `new_figure` does, and its axes, one or an array; `how` as `subplots` has it."""
+    figure = new_figure(width, height)
+    return figure, figure.subplots(rows, columns, **how)
 
 
 def symmetric_limit(*values: ArrayLike) -> float:
