@@ -63,7 +63,7 @@ def table1(work: Work) -> Findings:
     long_count = np.zeros(len(centres), np.int64)
     long_count[: len(paper)] = work.by_size(0, 0, 100_000_000)
     with work.console.progress(len(centres), "weights") as advance:
-        columns = make_columns(camera, space, centres, grid.spacing_mm, rng, long_count, advance)
+        columns = make_columns(camera, space, grid, centres, rng, long_count, advance)
     figures = weights_figures(columns, long_count)
     return Findings(
         rows=_rows(figures, len(paper)),

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,10 +18,7 @@ from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.notice import written
-from lfpiv_cli.pictures.style import new_figure, styled
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from lfpiv_cli.pictures.style import Figure, new_panels, styled
 
 
 @styled
@@ -30,8 +27,8 @@ def board_figure(figures: dict[str, Any], volume: NDArray[np.float32], grid: Gri
 
     `volume` [z, y, x] is the reconstruction of the board nearest the focal plane; `figures` are `board_figures`.
     """
-    figure = new_figure(13.0, 8.0)
-    axes = figure.subplots(2, 3).ravel()
+    figure, panels = new_panels(13.0, 8.0, 2, 3)
+    axes = panels.ravel()
     bounds = [grid.bounds_mm(axis) for axis in range(3)]
     axes[0].imshow(volume.max(axis=0), origin="lower", extent=(*bounds[0], *bounds[1]))
     axes[0].set(title="board nearest the focal plane, maximum along z", xlabel="x (mm)", ylabel="y (mm)")
@@ -222,29 +219,23 @@ def measure_dots(volume: NDArray[np.float32], grid: Grid, centres_mm: Floats, re
     ------
     InputError : a dot's column lies outside the volume or holds no light.
     """
-    elongations, depths, lateral = zip(
-        *(_measure_dot(volume, grid, centre, reach_mm) for centre in centres_mm), strict=True
-    )
-    by_definition = {name: np.array([each[name] for each in depths]) for name in DEPTH_DEFINITIONS}
-    return DotFigures(np.array(elongations), by_definition, np.array(lateral))
-
-
-def _measure_dot(
-    volume: NDArray[np.float32], grid: Grid, centre: Floats, reach_mm: float
-) -> tuple[float, dict[str, float], tuple[float, float]]:
     x, y, z = (grid.axis_mm(axis) for axis in range(3))
-    column = np.ix_(np.arange(z.size), np.abs(y - centre[1]) < reach_mm, np.abs(x - centre[0]) < reach_mm)
-    part = volume[column].astype(np.float64)
-    if not part.size or part.max() <= 0.0:
-        raise InputError(
-            f"no light was reconstructed within {reach_mm} mm of the dot at {written(centre[0])}, {written(centre[1])}"
-        )
-    profiles = {"sum": part.sum(axis=(1, 2)), "maximum": part.max(axis=(1, 2))}
-    plane = part[profiles["sum"] > profiles["sum"].max() / np.e].sum(axis=0)
-    own_x, own_y = x[np.abs(x - centre[0]) < reach_mm], y[np.abs(y - centre[1]) < reach_mm]
-    lateral = float(plane.sum(axis=0) @ own_x / plane.sum()), float(plane.sum(axis=1) @ own_y / plane.sum())
-    depths = {name: each.depth_mm(z, profiles[each.profile]) for name, each in DEPTH_DEFINITIONS.items()}
-    return elongation_mm(z, profiles["maximum"]), depths, lateral
+    elongations, lateral = [], []
+    depths: dict[str, list[float]] = {name: [] for name in DEPTH_DEFINITIONS}
+    for centre in centres_mm:
+        near_x, near_y = np.abs(x - centre[0]) < reach_mm, np.abs(y - centre[1]) < reach_mm
+        part = volume[np.ix_(np.arange(z.size), near_y, near_x)].astype(np.float64)
+        if not part.size or part.max() <= 0.0:
+            place = f"{written(centre[0])}, {written(centre[1])}"
+            raise InputError(f"no light was reconstructed within {reach_mm} mm of the dot at {place}")
+        profiles = {"sum": part.sum(axis=(1, 2)), "maximum": part.max(axis=(1, 2))}
+        plane = part[profiles["sum"] > profiles["sum"].max() / np.e].sum(axis=0)
+        lateral.append((plane.sum(axis=0) @ x[near_x] / plane.sum(), plane.sum(axis=1) @ y[near_y] / plane.sum()))
+        elongations.append(elongation_mm(z, profiles["maximum"]))
+        for name, each in DEPTH_DEFINITIONS.items():
+            depths[name].append(each.depth_mm(z, profiles[each.profile]))
+    by_definition = {name: np.array(each) for name, each in depths.items()}
+    return DotFigures(np.array(elongations), by_definition, np.array(lateral))
 
 
 def elongation_mm(z_mm: Floats, height: Floats, peak: int | None = None) -> float:

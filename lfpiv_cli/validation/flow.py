@@ -32,6 +32,8 @@ SMALLEST_MEAN_FLOW = 0.05
 LARGEST_ALLOWED = ("streamwise_mean_error", "slice_mean_error")
 # Particles that a local linear fit takes: seven times its four unknowns, and close enough to the size of a window.
 FIT_PARTICLES = 28
+# Figures of each component, and their units.
+COMPONENT_FIGURES = {"rms": "_voxel", "bias": "_voxel", "slope": ""}
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,27 +97,37 @@ def flow_figures(field: VectorField, truth_velocity: Floats, inside: NDArray[np.
     """
     pairs = compare(field, truth_velocity, inside)
     streamwise, vector = relative_errors(pairs)
-    figures: dict[str, Any] = _counts(field, inside)
+    flags = field.flag[inside]
+    figures: dict[str, Any] = {"vectors": int(field.flag.size), "vectors_inside": int(flags.size)}
+    figures |= {f"vectors_{name.replace(' ', '_')}": int(np.sum(flags == flag)) for flag, name in FLAG_NAMES.items()}
+    figures["vectors_missing"] = int(np.sum(~np.isfinite(field.velocity[inside]).all(axis=1)))
     figures["streamwise_direction"] = None if pairs.direction is None else pairs.direction.tolist()
     figures["streamwise_mean_error"] = _mean_error(*_streamwise_sums(pairs, pairs.found))
     figures["within_25_percent_streamwise"] = None if streamwise is None else float(np.mean(streamwise < TOLERANCE))
     figures["within_25_percent_vector"] = float(np.mean(vector < TOLERANCE))
-    figures |= _component_figures(field, pairs)
-    figures["smallest_slope"] = min(
-        (figures[f"slope_{c}"] for c in "uvw" if figures[f"slope_{c}"] is not None), default=None
-    )
-    figures["slices"] = {name: _slices(field, pairs, axis) for axis, name in enumerate("xyz")}
+
+    # of each component, over the vectors found; unknown without them or without a time
+    figures |= {f"{name}_{c}{unit}": None for c in "uvw" for name, unit in COMPONENT_FIGURES.items()}
+    if field.dt_s is not None and pairs.found.any():
+        to_voxel = field.dt_s / (np.asarray(field.voxel_mm) * MM_TO_M)
+        measured, true = pairs.measured[pairs.found], pairs.true[pairs.found]
+        error = (measured - true) * to_voxel
+        rms, bias = np.sqrt(np.mean(error**2, axis=0)), np.mean(error, axis=0)
+        power = np.sum(true**2, axis=0)
+        for k, c in enumerate("uvw"):
+            figures[f"rms_{c}_voxel"], figures[f"bias_{c}_voxel"] = float(rms[k]), float(bias[k])
+            if power[k] > 0.0:
+                figures[f"slope_{c}"] = float(measured[:, k] @ true[:, k] / power[k])
+    slopes = [figures[f"slope_{c}"] for c in "uvw" if figures[f"slope_{c}"] is not None]
+    figures["smallest_slope"] = min(slopes, default=None)
+    # the streamwise mean error of every plane of windows across each axis
+    figures["slices"] = {}
+    for axis, name in enumerate("xyz"):
+        plane, positions = pairs.index_zyx[:, 2 - axis], field.grid.axis_mm(axis)
+        errors = [_mean_error(*_streamwise_sums(pairs, plane == k)) for k in range(field.grid.shape_xyz[axis])]
+        figures["slices"][name] = {"position_mm": [float(p) for p in positions], "streamwise_mean_error": errors}
     figures["cumulative"] = cumulative_distribution(pairs)
     return figures
-
-
-def _counts(field: VectorField, inside: NDArray[np.bool_]) -> dict[str, int]:
-    """Return how many windows there are, of each flag, and how many are missing."""
-    flags = field.flag[inside]
-    counts = {"vectors": int(field.flag.size), "vectors_inside": int(flags.size)}
-    counts |= {f"vectors_{name.replace(' ', '_')}": int(np.sum(flags == flag)) for flag, name in FLAG_NAMES.items()}
-    counts["vectors_missing"] = int(np.sum(~np.isfinite(field.velocity[inside]).all(axis=1)))
-    return counts
 
 
 def relative_errors(pairs: Comparison) -> tuple[Floats | None, Floats]:
@@ -150,30 +162,6 @@ def _mean_error(measured_sum: float, true_sum: float) -> float | None:
     return measured_sum / true_sum - 1.0 if true_sum > 0.0 else None
 
 
-def _component_figures(field: VectorField, pairs: Comparison) -> dict[str, float | None]:
-    """Return rms and bias of each component in voxels, and its slope of measured on true, over the vectors found."""
-    names = [f"{figure}_{component}" for component in "uvw" for figure in ("rms", "bias", "slope")]
-    names = [name if name.startswith("slope") else f"{name}_voxel" for name in names]
-    if field.dt_s is None or not pairs.found.any():
-        return dict.fromkeys(names)
-    to_voxel = field.dt_s / (np.asarray(field.voxel_mm) * MM_TO_M)
-    measured, true = pairs.measured[pairs.found], pairs.true[pairs.found]
-    error = (measured - true) * to_voxel
-    rms, bias = np.sqrt(np.mean(error**2, axis=0)), np.mean(error, axis=0)
-    power = np.sum(true**2, axis=0)
-    slope = [float(m @ t / p) if p > 0.0 else None for m, t, p in zip(measured.T, true.T, power, strict=True)]
-    values = [value for k in range(3) for value in (float(rms[k]), float(bias[k]), slope[k])]
-    return dict(zip(names, values, strict=True))
-
-
-def _slices(field: VectorField, pairs: Comparison, axis: int) -> dict[str, list[float | None]]:
-    """Return the streamwise mean error of every plane of windows across an axis (0 for x), with its position."""
-    plane = pairs.index_zyx[:, 2 - axis]
-    count = field.grid.shape_xyz[axis]
-    errors = [_mean_error(*_streamwise_sums(pairs, plane == k)) for k in range(count)]
-    return {"position_mm": [float(p) for p in field.grid.axis_mm(axis)], "streamwise_mean_error": list(errors)}
-
-
 def streamwise_mean_error_at(field: VectorField, pairs: Comparison, axis: int, position_mm: float) -> float | None:
     """Return the streamwise mean error of a slice across an axis (0 for x), between planes of windows if need be.
 
@@ -181,10 +169,8 @@ def streamwise_mean_error_at(field: VectorField, pairs: Comparison, axis: int, p
     """
     plane = pairs.index_zyx[:, 2 - axis]
     sums = np.array([_streamwise_sums(pairs, plane == k) for k in range(field.grid.shape_xyz[axis])])
-    positions = field.grid.axis_mm(axis)
-    return _mean_error(
-        float(np.interp(position_mm, positions, sums[:, 0])), float(np.interp(position_mm, positions, sums[:, 1]))
-    )
+    v, u = (float(np.interp(position_mm, field.grid.axis_mm(axis), each)) for each in sums.T)
+    return _mean_error(v, u)
 
 
 def cumulative_distribution(pairs: Comparison) -> dict[str, Any]:
@@ -311,12 +297,6 @@ def table_4(field: VectorField, truth_velocity: Floats, inside: NDArray[np.bool_
             error = streamwise_mean_error_at(field, pairs, axis, duct.position_mm(axis, share))
             table[f"{name} {share}"] = _row(error, *paper)
     return table
-
-
-def worst_slice(table: Mapping[str, Mapping[str, float | None]]) -> float | None:
-    """Return the largest mean velocity error of the six slices (a share, not per cent); None where one is unknown."""
-    errors = [row["ours_percent"] for name, row in table.items() if name != "overall"]
-    return None if None in errors else 0.01 * max(error for error in errors if error is not None)
 
 
 def _row(error: float | None, paper_dlfc: float, paper_ert: float) -> dict[str, float | None]:

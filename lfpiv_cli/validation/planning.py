@@ -54,29 +54,25 @@ def share_beyond(camera: Camera, media: Media, z_mm: tuple[float, float], light:
     image = np.ascontiguousarray(light[top : top + rows, left : left + columns])
     if not image.any():
         return 0.0
-    grid = _longer(small, media, z_mm)
-    volume = reconstruct(factorise(small, media, grid), image, SOLVER).volume
-    by_depth, depths = volume.sum(axis=(1, 2), dtype=np.float64), grid.axis_mm(2)
-    near = NEAR_DEPTHS * camera.scale(media).depth_mm
-    beyond = (depths < z_mm[0] - near) | (depths > z_mm[1] + near)
-    return float(by_depth[beyond].sum() / max(float(by_depth.sum()), np.finfo(np.float64).tiny))
-
-
-def _longer(camera: Camera, media: Media, z_mm: tuple[float, float]) -> Grid:
-    """Return coarse voxels in all that a camera sees, at the depths of a volume and beyond."""
+    # coarse voxels in all that is seen, at the depths of the volume and beyond
     scale = camera.scale(media)
     length = z_mm[1] - z_mm[0]
     longer = float(np.clip(LONGER * length, LEAST_DEPTHS * scale.depth_mm, MOST_DEPTHS * scale.depth_mm))
     low = max(z_mm[0] - longer, -CLEAR * camera.focus_distance_mm / media.depth_ratio)
     high = z_mm[1] + longer
     lateral, plane = VOXEL_LENSES * scale.lens_mm, PLANE_DEPTHS * scale.depth_mm
-    sides = np.array([camera.columns, camera.rows]) * camera.pixel_mm / abs(camera.magnification)
+    sides = np.array([small.columns, small.rows]) * camera.pixel_mm / abs(camera.magnification)
     if camera.column_axis == "y":
         sides = sides[::-1]
     nx, ny = (max(1, round(side / lateral)) for side in sides)
     nz = max(1, round((high - low) / plane))
     grid = Grid.centred((nx, ny, nz), (lateral, lateral, (high - low) / nz), (0.0, 0.0, 0.5 * (low + high)))
-    return grid.padded(default_padding(camera, media, grid))
+    grid = grid.padded(default_padding(small, media, grid))
+    volume = reconstruct(factorise(small, media, grid), image, SOLVER).volume
+    by_depth, depths = volume.sum(axis=(1, 2), dtype=np.float64), grid.axis_mm(2)
+    near = NEAR_DEPTHS * scale.depth_mm
+    beyond = (depths < z_mm[0] - near) | (depths > z_mm[1] + near)
+    return float(by_depth[beyond].sum() / max(float(by_depth.sum()), np.finfo(np.float64).tiny))
 
 
 # How well the particles of a raw image can be known at best: the Cramer-Rao bound.
@@ -118,7 +114,8 @@ class Bound:
 
 def slopes(view: View, particles: Floats) -> sparse.csc_array:
     """Return J (pixels, 4 n): what each particle's x, y, z and light do to the expected image."""
-    capacity = entry_capacity(view, *_depths(particles))
+    depths = (float(particles[:, 2].min()), float(particles[:, 2].max())) if len(particles) else (0.0, 0.0)
+    capacity = entry_capacity(view, *depths)
     room = room_for(1, capacity, 0)
     rows, columns, entries = [], [], []
     for number, particle in enumerate(particles):
@@ -134,10 +131,6 @@ def slopes(view: View, particles: Floats) -> sparse.csc_array:
     # A pixel that is lit through two lenses may be named twice and is added up here.
     indices = (np.concatenate(rows), np.concatenate(columns))
     return sparse.csc_array(sparse.coo_array((np.concatenate(entries), indices), shape=shape))
-
-
-def _depths(particles: Floats) -> tuple[float, float]:
-    return (float(particles[:, 2].min()), float(particles[:, 2].max())) if len(particles) else (0.0, 0.0)
 
 
 def expected_image(slope: sparse.csc_array, particles: Floats) -> Floats:
@@ -344,23 +337,10 @@ def errors_by_depth_mm(seen: Sequence[Miniature], tracer: Tracer, counts_per_ray
 
     The Cramer-Rao bound; no image tells more. `counts_per_ray` is of images that are rendered ray by ray.
     """
-    errors = [
-        errors_alone_mm(each.view, _particles(each, tracer.light_counts), tracer.readout, counts_per_ray)
-        for each in seen
-    ]
+    particles = [_particles(each, tracer.light_counts) for each in seen]
+    each = zip(seen, particles, strict=True)
+    errors = [errors_alone_mm(one.view, some, tracer.readout, counts_per_ray) for one, some in each]
     return np.asarray(np.sqrt(np.mean(np.concatenate(errors).reshape(-1, PLACES, 3) ** 2, axis=1)))
-
-
-def _lit_pixels(seen: Miniature, light_counts: float, level_counts: float) -> list[int]:
-    """Return how many pixels a tracer of so much light lights above a level, at each of its places and depths."""
-    room = room_for(1, entry_capacity(seen.view, float(seen.depths_mm.min()), float(seen.depths_mm.max())), 0)
-    lit = []
-    for particle in _particles(seen, light_counts):
-        respond_all(seen.view, particle[np.newaxis], room)
-        pixels, values = lit_by(room, 0)
-        image = np.bincount(pixels, light_counts * values[0, : pixels.size])
-        lit.append(int(np.count_nonzero(image > level_counts)))
-    return lit
 
 
 def tracers_per_lens(camera: Camera, seen: Sequence[Miniature], lit: tuple[float, float, float]) -> tuple[float, float]:
@@ -386,7 +366,15 @@ def tracers_per_lens(camera: Camera, seen: Sequence[Miniature], lit: tuple[float
         return 0.0, 0.0
     for _ in range(ROUNDS):
         light = mean * cell / number
-        each = float(np.mean([count for one in seen for count in _lit_pixels(one, light, level)]))
+        counts = []
+        for one in seen:
+            room = room_for(1, entry_capacity(one.view, float(one.depths_mm.min()), float(one.depths_mm.max())), 0)
+            for particle in _particles(one, light):
+                respond_all(one.view, particle[np.newaxis], room)
+                pixels, values = lit_by(room, 0)
+                image = np.bincount(pixels, light * values[0, : pixels.size])
+                counts.append(int(np.count_nonzero(image > level)))
+        each = float(np.mean(counts))
         number = -np.log(1.0 - share / most) * most * cell / max(each, 1.0)
     return float(number), float(light)
 
@@ -405,9 +393,7 @@ def in_miniature(
         return [_at_depths(camera, media, depths, radius_mm, None)]
     about = ABOUT_DEPTH * camera.scale(media).depth_mm
     lights = [replace(light, depths_mm=(float(depth) - about, float(depth) + about)) for depth in depths]
-    return [
-        _at_depths(camera, media, depths[n : n + 1], radius_mm, light_there) for n, light_there in enumerate(lights)
-    ]
+    return [_at_depths(camera, media, depths[n : n + 1], radius_mm, each) for n, each in enumerate(lights)]
 
 
 def _at_depths(camera: Camera, media: Media, depths_mm: Floats, radius_mm: float, light: Light | None) -> Miniature:

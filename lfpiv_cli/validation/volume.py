@@ -109,11 +109,7 @@ BOXES = Boxes(sum=(3, 1, 1), peak=(3, 3, 3), light=(5, 3, 3))
 
 
 def volume_figures(
-    volume: NDArray[np.float32],
-    grid: Grid,
-    position_mm: Floats,
-    brightness: Floats,
-    microlens_mm: float,
+    volume: NDArray[np.float32], grid: Grid, position_mm: Floats, brightness: Floats, microlens_mm: float
 ) -> dict[str, float | int]:
     """Return the figures of a volume whose true particles are known.
 
@@ -148,10 +144,15 @@ def volume_figures(
     typical = np.median(light[: int(inside.sum())]) if light.size else 0.0
     index = index[light > FAINTEST * typical]
     pairs = match(grid.voxel_to_mm(index), position_mm, microlens_mm / LATERAL_VOXEL)
+    lengths = []
+    for ix, iy, iz in np.rint(index[pairs.found]).astype(int):
+        height = volume[:, iy, ix].astype(np.float64)
+        if height[iz] > 0.0:
+            lengths.append(elongation_mm(grid.axis_mm(2), height, iz))
     figures |= {
         "completeness": float(inside[pairs.true].sum() / inside.sum()),
         "precision": float(len(pairs.found) / max(len(index), 1)),
-        "elongation_mm": _median_elongation(volume, grid, index[pairs.found]),
+        "elongation_mm": float(np.median(lengths)) if lengths else 0.0,
         "peaks": len(index),
         "particles": int(inside.sum()),
     }
@@ -164,10 +165,8 @@ def volume_figures(
 
 def normalised_correlation(first: NDArray[np.float32], second: NDArray[np.float32]) -> float:
     """Return Q = sum(E F) / sqrt(sum(E^2) sum(F^2)), 0 where a volume is dark."""
-    product, squares = (
-        np.sum(np.multiply(first, second, dtype=np.float64)),
-        np.sum(np.square(first, dtype=np.float64)) * np.sum(np.square(second, dtype=np.float64)),
-    )
+    product = np.sum(np.multiply(first, second, dtype=np.float64))
+    squares = np.sum(np.square(first, dtype=np.float64)) * np.sum(np.square(second, dtype=np.float64))
     return float(product / np.sqrt(squares)) if squares > 0.0 else 0.0
 
 
@@ -203,24 +202,8 @@ def near_a_particle(grid: Grid, position_mm: Floats, microlens_mm: float) -> NDA
     return near
 
 
-def _median_elongation(volume: NDArray[np.float32], grid: Grid, index_xyz: Floats) -> float:
-    """Return the median length in depth of the volume at peaks given by fractional indices, 0 where there are none."""
-    z = grid.axis_mm(2)
-    lengths = []
-    for ix, iy, iz in np.rint(index_xyz).astype(int):
-        height = volume[:, iy, ix].astype(np.float64)
-        if height[iz] > 0.0:
-            lengths.append(elongation_mm(z, height, iz))
-    return float(np.median(lengths)) if lengths else 0.0
-
-
 @njit(cache=True)
-def add_gaussians(
-    volume: NDArray[np.float32],
-    centres: Floats,
-    height: Floats,
-    sigma: Floats,
-) -> None:
+def add_gaussians(volume: NDArray[np.float32], centres: Floats, height: Floats, sigma: Floats) -> None:
     """Add Gaussians of heights (n,) to a volume [z, y, x]; `centres` (n, 3) and `sigma` (3,) in voxels (x, y, z)."""
     shape = (volume.shape[2], volume.shape[1], volume.shape[0])
     profile = np.empty((3, int(2.0 * REACH * sigma.max()) + 3))
