@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lfpiv_cli.optics.media import equivalent_object_distance
-from lfpiv_cli.paper import small_rig, small_scenes
+from lfpiv_cli.paper import small_rig
 from lfpiv_cli.paper.influences import (
     DISTANCE,
     F_NUMBERS,
@@ -26,16 +26,17 @@ from lfpiv_cli.paper.influences import (
 )
 from lfpiv_cli.paper.sensitivities import (
     INFLUENCES,
-    Curves,
     Measured,
     bound_rows,
     care,
     crowding,
     drawing_of,
     rows_of,
+    straight_line,
     table_of,
 )
-from lfpiv_cli.paper.small_rig import CHANNEL, TERMS, WATER, Case, Rig, fit_errors, pairs_of, straight_line
+from lfpiv_cli.paper.small_rig import CHANNEL, WATER, Case, Rig
+from lfpiv_cli.validation.volume import TERMS, fit_errors, pairs_of
 
 DEPTHS = np.array([-3.0, 0.0, 4.0])
 FAINT = 1e-4
@@ -57,18 +58,18 @@ def believed_depth_mm(case: Case, z_mm: NDArray[np.float64]) -> NDArray[np.float
     return np.asarray(seen / case.believed.media.depth_ratio - case.believed.reference.z_mm)
 
 
-def curves_of(influence: Influence, slopes: dict[str, float]) -> Curves:
-    """Curves whose figures are straight lines of these slopes, faint ones for all others."""
+def lines_of(influence: Influence, slopes: dict[str, float]) -> Measured:
+    """An influence whose figures are straight lines of these slopes, faint ones for all others."""
     values = np.array(influence.values[1])
     names = {series.figure for panel in influence.panels for series in panel.series}
     names |= {each.figure for each in influence.sensitivities}
-    return Curves(values, {name: slopes.get(name, FAINT) * values[:, np.newaxis] for name in names})
+    return Measured(influence, values, {name: slopes.get(name, FAINT) * values[:, np.newaxis] for name in names})
 
 
 def by_theory(influence: Influence, factor: float = 1.0) -> Measured:
     """Return an influence with the slopes of theory, times a factor."""
     expected = {each.figure: factor * (each.expected or FAINT) for each in influence.sensitivities}
-    return Measured(influence, curves_of(influence, expected))
+    return lines_of(influence, expected)
 
 
 @pytest.mark.parametrize(
@@ -109,7 +110,7 @@ def test_a_map_of_too_few_places_is_not_known():
 
 
 def test_tracers_apart_are_paired_whatever_their_depths_are_wrong_by():
-    true = small_rig.strewn_apart(np.random.default_rng(2), (-4.0, 4.0), 0.9).position_mm
+    true = small_rig.strewn_apart(np.random.default_rng(2)).position_mm
     shuffled = np.random.default_rng(3).permutation(len(true))
     pairs = pairs_of(true[shuffled] + [0.02, -0.03, -2.7], true, small_rig.GATE_MM)
     assert len(pairs.true) == len(true)
@@ -161,10 +162,10 @@ def test_theory_of_the_slant_is_a_ray_through_another_place_of_the_lens():
 
 
 def test_spherical_aberration_grows_as_the_square_of_the_aperture():
-    assert small_scenes.spherical_aberration_mm(4.0) == pytest.approx(4.0 * small_scenes.spherical_aberration_mm(8.0))
+    assert small_rig.spherical_aberration_mm(4.0) == pytest.approx(4.0 * small_rig.spherical_aberration_mm(8.0))
     # n (2/3) (u^2/2) (t/n) (1 - 1/n^2) of 133.867 mm of water and of the window's 2 mm, u = 1/16
     layers = 133.867 / 1.33 * (1.0 - 1.33**-2) + 2.0 / 1.49 * (1.0 - 1.49**-2)
-    assert small_scenes.spherical_aberration_mm(4.0) == pytest.approx(1.33 / 3.0 / 256.0 * layers)
+    assert small_rig.spherical_aberration_mm(4.0) == pytest.approx(1.33 / 3.0 / 256.0 * layers)
 
 
 def test_the_papers_seeding_in_microlenses():
@@ -172,7 +173,7 @@ def test_the_papers_seeding_in_microlenses():
 
 
 def test_tracers_that_are_strewn_are_as_many_as_asked_for_a_microlens():
-    tracers = small_scenes.strewn(0.5, np.random.default_rng(4))
+    tracers = small_rig.strewn(0.5, np.random.default_rng(4))
     width = np.ptp(tracers.position_mm[:, 0])
     assert len(tracers.position_mm) / (width / 0.1) ** 2 == pytest.approx(0.5, rel=0.05)
 
@@ -186,9 +187,9 @@ def test_rows_are_met_by_theory_and_missed_beside_it(influence: Influence):
 
 @pytest.mark.parametrize(("spread", "verdict"), [(1.4e-2, "met"), (1.6e-2, "missed"), (np.nan, "unknown")])
 def test_scatter_is_held_against_its_bound(spread: float, verdict: str):
-    curves = curves_of(NOISE, {})
-    curves.figures["bound_z"][:], curves.figures["spread_z"][:] = 1e-2, spread
-    assert [row.verdict for row in bound_rows(Measured(NOISE, curves))] == [verdict]
+    found = lines_of(NOISE, {})
+    found.figures["bound_z"][:], found.figures["spread_z"][:] = 1e-2, spread
+    assert [row.verdict for row in bound_rows(found)] == [verdict]
     assert bound_rows(by_theory(INDEX)) == ()
 
 
@@ -199,27 +200,26 @@ def test_a_sensitivity_that_is_not_known_has_no_verdict():
 
 
 def replace_figures(measured: Measured, value: float) -> Measured:
-    figures = {name: np.full_like(table, value) for name, table in measured.curves.figures.items()}
-    return replace(measured, curves=Curves(measured.curves.values, figures))
+    return replace(measured, figures={name: np.full_like(table, value) for name, table in measured.figures.items()})
 
 
 def test_what_harms_most_comes_first():
     found = [by_theory(INDEX), by_theory(WALL), by_theory(FOCUS), by_theory(SHIFT)]
-    (text,) = care(found)
+    text = care(found)
     # 0.3 mm of wall, 0.1 mm of focus, 0.005 of index: 0.27, 0.13 and 0.019 mm; lens images harm least
     assert text.index("0.27 mm") < text.index("0.13 mm") < text.index("0.019 mm")
     assert "white image" not in text
     assert [row[0] for row in table_of(found).rows][:2] == ["wall", "focus"]
     # a wall that is known to the micrometre: what harms is something else
-    known = replace(WALL, sensitivities=tuple(replace(each, typical=0.001) for each in WALL.sensitivities))
-    assert "calliper" not in care([by_theory(known), *found[:1], *found[2:]])[0]
+    known = replace(WALL, typical=(0.001, ""))
+    assert "calliper" not in care([by_theory(known), *found[:1], *found[2:]])
 
 
 @pytest.mark.parametrize(("recall", "told"), [((0.97, 0.95, 0.6), "from 1.2 on"), ((1.0, 1.0, 1.0), "at none")])
 def test_from_where_tracers_crowd(recall: tuple[float, ...], told: str):
-    curves = curves_of(SEEDING, {})
-    curves.figures["recall"][:] = np.array(recall)[:, np.newaxis]  # type: ignore[index]
-    assert told in crowding(Measured(SEEDING, curves))
+    found = lines_of(SEEDING, {})
+    found.figures["recall"][:] = np.array(recall)[:, np.newaxis]  # type: ignore[index]
+    assert told in crowding(found)
 
 
 @pytest.mark.thorough
