@@ -17,9 +17,9 @@ from lfpiv_cli.files.images import read_image, write_tiff
 from lfpiv_cli.files.pages import Table
 from lfpiv_cli.paper.parts import Drawing, Findings, Row, Work
 from lfpiv_cli.paper.pictures import PAPERS_WALL, plane_figure, raw_figure, wall_profile_figure
-from lfpiv_cli.paper.table4 import SEED, TINY, ChannelSize, as_paper, at_best, channel_sections
+from lfpiv_cli.paper.table4 import SEED, TINY, ChannelSize, as_paper, at_best, channel_sections, simulated_duct
 from lfpiv_cli.reconstruction.images import still_light
-from lfpiv_cli.stages.validate import duct_of, measured_of
+from lfpiv_cli.stages.validate import measured_of
 from lfpiv_cli.validation.flow import TOLERANCE, Duct, compare, relative_errors
 from lfpiv_cli.validation.methods import Measured
 from lfpiv_cli.verbs.build_weights import BuildWeightsOptions, build_weights_file
@@ -81,17 +81,6 @@ class Case:
     options: Mapping[str, Any]
 
 
-def _cases(size: ChannelSize, mask: Path) -> dict[str, Case]:
-    return {
-        "clean": Case("no bubbles", "clean", {}),
-        "hidden": Case("no bubbles, same pixels hidden", "clean", {"mask": mask}),
-        "paper": Case("bubbles, SART", "bubbles", as_paper(size)),
-        "bubbles": Case("bubbles", "bubbles", {}),
-        "background": Case("bubbles, background off", "bubbles", {"background": "minimum"}),
-        "mask": Case("bubbles, mask", "bubbles", {"mask": "still"}),
-    }
-
-
 # What the pictures show.
 SHOWN = ("clean", "paper", "bubbles", "background", "mask")
 MASK = "mask.tif"
@@ -106,9 +95,16 @@ def bubbles(work: Work) -> Findings:
     simulation = {"bubbles": count, "bubble_diameter_mm": diameters}
     with_bubbles = work.config("bubbles", channel_sections(size, reconstruction=at_best(size), simulation=simulation))
     work.step("images", partial(_simulated, config, with_bubbles, work))
-    cases = _cases(size, work.folder / MASK)
+    cases = {
+        "clean": Case("no bubbles", "clean", {}),
+        "hidden": Case("no bubbles, same pixels hidden", "clean", {"mask": work.folder / MASK}),
+        "paper": Case("bubbles, SART", "bubbles", as_paper(size)),
+        "bubbles": Case("bubbles", "bubbles", {}),
+        "background": Case("bubbles, background off", "bubbles", {"background": "minimum"}),
+        "mask": Case("bubbles, mask", "bubbles", {"mask": "still"}),
+    }
     found = {name: work.step(f"{name}_figures", partial(_measured, name, case, work)) for name, case in cases.items()}
-    duct = _duct(config)
+    duct = simulated_duct(config)
     methods = {cases[name].words: _read(work, name) for name in SHOWN}
     return Findings(
         rows=_rows(found),
@@ -124,12 +120,6 @@ def bubbles(work: Work) -> Findings:
         ),
         seeds=(SEED,),
     )
-
-
-def _duct(config: Path) -> Duct:
-    duct = duct_of(load_config(config).simulation.flow)
-    assert duct is not None  # the sections of the channel have one
-    return duct
 
 
 def _simulated(clean: Path, with_bubbles: Path, work: Work) -> dict[str, Any]:
@@ -164,7 +154,7 @@ def _measured(name: str, case: Case, work: Work) -> dict[str, Any]:
     told = reconstruct_files(work.folder / "weights.h5", pair, folder, options, overwrite=True, console=quiet)
     volumes = [folder / f"{image.stem}.vtkhdf" for image in pair]
     correlate_files(volumes, _vectors(work, name), overwrite=True, console=quiet)
-    figures = near_wall(_read(work, name), _duct(work.folder / "clean.yaml"))
+    figures = near_wall(_read(work, name), simulated_duct(work.folder / "clean.yaml"))
     return figures | {"excluded_pixels": told["excluded_pixels"]}
 
 
@@ -219,7 +209,11 @@ def _table(cases: Mapping[str, Case], found: Mapping[str, Mapping[str, Any]]) ->
 
 def _drawings(work: Work, methods: Mapping[str, Measured], duct: Duct) -> tuple[Drawing, ...]:
     mask = read_image(work.folder / MASK) == 0.0
-    shown = _piece(mask)
+    # a piece around the pixels that are left out, or the first corner
+    rows, columns = np.nonzero(mask)
+    middle = (np.median(rows), np.median(columns)) if rows.size else (0.0, 0.0)
+    starts = [int(np.clip(m - SHOWN_PX / 2, 0, max(n - SHOWN_PX, 0))) for m, n in zip(middle, mask.shape, strict=True)]
+    shown = np.s_[starts[0] : starts[0] + SHOWN_PX, starts[1] : starts[1] + SHOWN_PX]
     without = methods["bubbles"]
     error = np.linalg.norm(without.field.velocity - without.truth, axis=-1)
     plane = int(np.argmax(np.where(beside_wall(without, duct), np.nan_to_num(error), 0.0).sum(axis=(1, 2))))
@@ -244,14 +238,6 @@ def _drawings(work: Work, methods: Mapping[str, Measured], duct: Duct) -> tuple[
             wall_profile_figure(methods, duct),
         ),
     )
-
-
-def _piece(mask: NDArray[np.bool_]) -> tuple[slice, slice]:
-    """Return the piece of an image around the pixels that a mask leaves out, or its first corner."""
-    rows, columns = np.nonzero(mask)
-    middle = (np.median(rows), np.median(columns)) if rows.size else (0.0, 0.0)
-    starts = [int(np.clip(m - SHOWN_PX / 2, 0, max(n - SHOWN_PX, 0))) for m, n in zip(middle, mask.shape, strict=True)]
-    return slice(starts[0], starts[0] + SHOWN_PX), slice(starts[1], starts[1] + SHOWN_PX)
 
 
 def _text(size: ChannelSize, diameters: list[float], count: int) -> tuple[str, ...]:

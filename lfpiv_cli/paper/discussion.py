@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -20,15 +20,12 @@ from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.paper.parts import Drawing, Findings, Work, sections
 from lfpiv_cli.particles.view import raw_view
-from lfpiv_cli.pictures.style import BLUE, GREEN, ORANGE, VERMILION, new_figure, styled
+from lfpiv_cli.pictures.style import BLUE, GREEN, ORANGE, VERMILION, Figure, new_panels, styled
 from lfpiv_cli.reconstruction.solvers import SolverSettings, reconstruct
 from lfpiv_cli.synthetic.sensor import Readout
 from lfpiv_cli.validation.board import elongation_mm
 from lfpiv_cli.validation.planning import cramer_rao_bound, errors_alone_mm, expected_image, pixel_variance, slopes
 from lfpiv_cli.weights.build import default_padding, factorise
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 @styled
@@ -40,8 +37,7 @@ def depth_resolution_figure(told: Mapping[str, Any], geometric_mm: float, lens_m
     told : `elongation_mm` (m,) at `elongation_depth_mm`, and the bound `sigma_mm` (n, 3) of x, y, z at `depth_mm`
     geometric_mm, lens_mm : depth in which views move by one microlens, and its width in the scene
     """
-    figure = new_figure(7.5, 4.6)
-    axes = figure.subplots()
+    figure, axes = new_panels(7.5, 4.6)
     sigma = np.array(told["sigma_mm"])
     axes.semilogy(told["elongation_depth_mm"], told["elongation_mm"], "s-", color=VERMILION, label="length by SART")
     axes.axhline(geometric_mm, color=ORANGE, linestyle="--", label="depth that moves views by a microlens")
@@ -57,8 +53,7 @@ def depth_resolution_figure(told: Mapping[str, Any], geometric_mm: float, lens_m
 @styled
 def seeding_bound_figure(told: Mapping[str, Any], papers_per_lens: float) -> Figure:
     """Return the bound of places, `sigma_mm` (n, 3), over the tracers `per_lens` (n,), with the paper's seeding."""
-    figure = new_figure(6.5, 3.8)
-    axes = figure.subplots()
+    figure, axes = new_panels(6.5, 3.8)
     sigma = 1e3 * np.array(told["sigma_mm"])
     axes.loglog(told["per_lens"], sigma[:, 2], "o-", color=BLUE, label="depth")
     axes.loglog(told["per_lens"], sigma[:, 0], "^-.", color=GREEN, label="across")

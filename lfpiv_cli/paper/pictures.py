@@ -9,23 +9,31 @@ lateral axis.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.grid import Grid
-from lfpiv_cli.pictures.style import BLUE, DIVERGING, GREEN, ORANGE, PURPLE, SEQUENTIAL, VERMILION, new_figure, styled
+from lfpiv_cli.pictures.style import (
+    BLUE,
+    DIVERGING,
+    GREEN,
+    ORANGE,
+    PURPLE,
+    SEQUENTIAL,
+    VERMILION,
+    Axes,
+    Figure,
+    new_figure,
+    new_panels,
+    styled,
+)
 from lfpiv_cli.pictures.vectors import mean_of_known
 from lfpiv_cli.validation.flow import PAPER_SLICES, TOLERANCE, Duct, compare, cumulative_distribution
 from lfpiv_cli.validation.methods import Measured, slice_at
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
 
 # Colours that people with any kind of colour vision tell apart; marks and lines differ as well, for print in grey.
 BOARD_STYLES: tuple[dict[str, Any], ...] = (
@@ -65,13 +73,10 @@ class BoardView:
         shares = volume / volume.max()
         inside = np.argwhere(shares > SHOWN_SHARE)
         x, y, z = (grid.axis_mm(axis)[inside[:, 2 - axis]] for axis in range(3))
-        bounds = np.array([grid.bounds_mm(axis) for axis in range(3)])
-        return cls(shares.max(axis=0), shares.max(axis=1), bounds, np.stack([x, y, z], axis=1))
-
-    def to_plain(self) -> dict[str, Any]:
-        """Return the view as lists of numbers."""
-        arrays = {field.name: np.asarray(getattr(self, field.name), np.float64) for field in fields(self)}
-        return {name: np.round(each, DECIMALS).tolist() for name, each in arrays.items()}
+        bounds, bright = np.array([grid.bounds_mm(axis) for axis in range(3)]), np.stack([x, y, z], axis=1)
+        arrays = (shares.max(axis=0), shares.max(axis=1), bounds, bright)
+        front, side, bounds, bright = (np.asarray(each, np.float64).round(DECIMALS) for each in arrays)
+        return cls(front, side, bounds, bright)
 
     @classmethod
     def from_plain(cls, values: Mapping[str, Any]) -> BoardView:
@@ -94,9 +99,8 @@ def views_figure(views: Mapping[str, BoardView]) -> Figure:
         side.imshow(view.side, origin="lower", extent=(*x, *z), cmap=SEQUENTIAL, vmin=0.0, vmax=1.0, aspect="auto")
         side.set(title=f"{label}: maximum along y", xlabel="x (mm)", ylabel="z (mm)", ylim=(-reach, reach))
         space: Any = figure.add_subplot(len(views), 3, 3 * row + 3, projection="3d")
-        space.scatter(
-            *view.bright_mm.T, c=view.bright_mm[:, 2], cmap=SEQUENTIAL, s=1.5, linewidths=0.0, rasterized=True
-        )
+        look: dict[str, Any] = {"cmap": SEQUENTIAL, "s": 1.5, "linewidths": 0.0, "rasterized": True}
+        space.scatter(*view.bright_mm.T, c=view.bright_mm[:, 2], **look)
         space.set(title=f"{label}: brighter than 1/e", xlabel="x (mm)", ylabel="y (mm)", zlabel="z (mm)")
         space.set(zlim=(-reach, reach))
         space.set_box_aspect((1.0, 1.0, 1.2), zoom=0.85)
@@ -118,8 +122,7 @@ def elongation_figure(
     paper_mm : lowest and highest elongation that the paper has
     paper_sigma_mm : what its spread stays below
     """
-    figure = new_figure(10.0, 3.8)
-    length, spread = figure.subplots(1, 2)
+    figure, (length, spread) = new_panels(10.0, 3.8, 1, 2)
     length.axhspan(*paper_mm, label=f"paper: {paper_mm[0]:g} to {paper_mm[1]:g} mm", **BAND)
     spread.axhspan(0.0, paper_sigma_mm, label=f"paper: below {paper_sigma_mm:g} mm", **BAND)
     for (label, figures), style in zip(methods.items(), BOARD_STYLES, strict=False):
@@ -146,8 +149,7 @@ def location_figure(
     spacing_mm : x_g of Eq. 19
     paper_steps_mm : shortest and longest depth separation that the paper has, where it says
     """
-    figure = new_figure(10.0, 6.6)
-    (lateral, depth), (lateral_error, depth_error) = figure.subplots(2, 2)
+    figure, ((lateral, depth), (lateral_error, depth_error)) = new_panels(10.0, 6.6, 2, 2)
     lateral.axhline(spacing_mm, color="black", linewidth=0.8, label="true")
     depth.axhline(1.0, color="black", linewidth=0.8, label="true")
     if paper_steps_mm is not None:
@@ -181,9 +183,8 @@ def centres_figure(centres_mm: Mapping[str, Floats]) -> Figure:
     for number, (label, each) in enumerate(centres_mm.items(), start=1):
         space: Any = figure.add_subplot(1, len(centres_mm), number, projection="3d")
         # depth along the page, as the boards were moved
-        drawn = space.scatter(
-            each[:, 2], each[:, 0], each[:, 1], c=each[:, 2], cmap=SEQUENTIAL, vmin=-deepest, vmax=deepest, s=6.0
-        )
+        look: dict[str, Any] = {"cmap": SEQUENTIAL, "vmin": -deepest, "vmax": deepest, "s": 6.0}
+        drawn = space.scatter(each[:, 2], each[:, 0], each[:, 1], c=each[:, 2], **look)
         space.set(title=label, xlabel="z (mm)", ylabel="x (mm)", zlabel="y (mm)")
         space.set_box_aspect((2.0, 1.0, 1.0), zoom=1.1)
         _tidy(space)
@@ -214,8 +215,7 @@ def slice_maps_figure(methods: Mapping[str, Measured], duct: Duct) -> Figure:
     first = next(iter(methods.values()))
     rows = {"true": (first, first.truth)} | {name: (m, m.field.velocity) for name, m in methods.items()}
     highest = max(float(np.linalg.norm(m.truth[m.inside], axis=-1).max()) for m in methods.values())
-    figure = new_figure(13.0, 2.3 * len(rows) + 0.6)
-    axes = figure.subplots(len(rows), 6, squeeze=False, sharey=True)
+    figure, axes = new_panels(13.0, 2.3 * len(rows) + 0.6, len(rows), 6, squeeze=False, sharey=True)
     main = "xyz".index(duct.axis)
     for row, (name, (measured, velocity)) in zip(axes, rows.items(), strict=True):
         speed = np.where(measured.inside, np.linalg.norm(velocity, axis=-1), np.nan)
@@ -226,16 +226,11 @@ def slice_maps_figure(methods: Mapping[str, Measured], duct: Duct) -> Figure:
             shown = slice_at(speed, measured.field.grid.axis_mm(axis), position, axis)
             # of what is left of [z, y, x] the flow's axis goes up, as the paper has it
             shown = shown if main == (1 if axis == 2 else 2) else shown.T
-            image = panel.imshow(
-                shown,
-                origin="lower",
-                extent=(*_ends(measured, duct, other), *_ends(measured, duct, main)),
-                vmin=0.0,
-                vmax=highest,
-                cmap=SEQUENTIAL,
-                aspect="auto",
-            )
-            panel.set(xlabel=f"{_paper_name(other)}/D", title=f"{key} = {share}")
+            extent = (*_ends(measured, duct, other), *_ends(measured, duct, main))
+            look: dict[str, Any] = {"vmin": 0.0, "vmax": highest, "cmap": SEQUENTIAL, "aspect": "auto"}
+            image = panel.imshow(shown, origin="lower", extent=extent, **look)
+            # the paper's x is our other lateral axis
+            panel.set(xlabel=f"{'z' if other == 2 else 'x'}/D", title=f"{key} = {share}")
         row[0].set_ylabel(f"{name}\ny/D, along the flow")
     figure.colorbar(image, ax=axes, label="size of the velocity (m/s)", shrink=0.8)
     return figure
@@ -244,8 +239,7 @@ def slice_maps_figure(methods: Mapping[str, Measured], duct: Duct) -> Figure:
 @styled
 def cumulative_figure(methods: Mapping[str, Measured]) -> Figure:
     """Return the share of vectors over their relative error, along the flow and of the whole vector, with the 25 %."""
-    figure = new_figure(10.0, 4.2)
-    panels = figure.subplots(1, 2, sharey=True)
+    figure, panels = new_panels(10.0, 4.2, 1, 2, sharey=True)
     for (name, m), (colour, _, line) in zip(methods.items(), WAY_STYLES, strict=False):
         shares = cumulative_distribution(compare(m.field, m.truth, m.inside))
         errors = 100.0 * np.array(shares["relative_error"])
@@ -259,11 +253,6 @@ def cumulative_figure(methods: Mapping[str, Measured]) -> Figure:
     panels[0].set_ylabel("share of the vectors (%)")
     panels[0].legend(loc="lower right")
     return figure
-
-
-def _paper_name(axis: int) -> str:
-    """Return the paper's name of an axis across the flow: its x is our other lateral one."""
-    return "z" if axis == 2 else "x"
 
 
 def _as_shares(places_mm: Floats, duct: Duct, axis: int) -> Floats:
@@ -288,9 +277,9 @@ CASE_STYLES = ((BLUE, "o"), (VERMILION, "s"), (GREEN, "^"), (PURPLE, "v"), (ORAN
 @styled
 def raw_figure(image: NDArray[np.float32], mask: NDArray[np.bool_]) -> Figure:
     """Return a part of a raw image with bubbles, alone and with the outline of what a mask leaves out."""
-    figure = new_figure(10.0, 10.0 * 0.5 * image.shape[0] / image.shape[1] + 1.0)
+    figure, panels = new_panels(10.0, 10.0 * 0.5 * image.shape[0] / image.shape[1] + 1.0, 1, 2)
     highest = float(np.percentile(image[~mask], 99.9)) if not mask.all() else float(image.max())
-    for axes, title in zip(figure.subplots(1, 2), ("raw image", "left out by the mask"), strict=True):
+    for axes, title in zip(panels, ("raw image", "left out by the mask"), strict=True):
         shown = axes.imshow(np.sqrt(np.clip(image, 0.0, highest)), cmap="gray", vmin=0.0, interpolation="nearest")
         axes.set(xlabel="column (px)", ylabel="row (px)", title=title)
     axes.imshow(np.where(mask, 1.0, np.nan), cmap="autumn", alpha=0.6, interpolation="nearest")
@@ -306,25 +295,16 @@ def plane_figure(methods: Mapping[str, Measured], duct: Duct, plane: int) -> Fig
     main, axis = "xyz".index(duct.axis), duct.across["x/D"]
     first = next(iter(methods.values()))
     highest = float(first.truth[..., main].max())
-    figure = new_figure(3.2 * len(methods) + 1.0, 8.2)
-    axes = figure.subplots(2, len(methods), squeeze=False, sharex=True, sharey=True)
+    figure, axes = new_panels(3.2 * len(methods) + 1.0, 8.2, 2, len(methods), squeeze=False, sharex=True, sharey=True)
     for column, (name, m) in zip(axes.T, methods.items(), strict=True):
         places = [m.field.grid.axis_mm(k) for k in (main, axis)]
         along, across = np.meshgrid(*places)
         shares = _as_shares(across, duct, axis)
         velocity = _oriented(m.field.velocity[plane], main)
         error = velocity[..., main] - _oriented(m.truth[plane], main)[..., main]
-        arrows = column[0].quiver(
-            along,
-            shares,
-            velocity[..., main],
-            velocity[..., axis],
-            velocity[..., main],
-            cmap=SEQUENTIAL,
-            clim=(0.0, highest),
-            scale=12.0 * highest,
-            width=0.008,
-        )
+        u, v = velocity[..., main], velocity[..., axis]
+        look: dict[str, Any] = {"cmap": SEQUENTIAL, "clim": (0.0, highest), "scale": 12.0 * highest, "width": 0.008}
+        arrows = column[0].quiver(along, shares, u, v, u, **look)
         image = column[1].pcolormesh(along, shares, error, cmap=DIVERGING, vmin=-0.5 * highest, vmax=0.5 * highest)
         column[0].set(title=name)
         column[1].set(xlabel=f"{'xyz'[main]}, along the flow (mm)")
@@ -340,8 +320,7 @@ def plane_figure(methods: Mapping[str, Measured], duct: Duct, plane: int) -> Fig
 @styled
 def wall_profile_figure(methods: Mapping[str, Measured], duct: Duct) -> Figure:
     """Return the mean over flow and depth of the velocity along the flow, over x/D, and its error beside it."""
-    figure = new_figure(10.0, 4.2)
-    left, right = figure.subplots(1, 2)
+    figure, (left, right) = new_panels(10.0, 4.2, 1, 2)
     main, axis = "xyz".index(duct.axis), duct.across["x/D"]
     first = next(iter(methods.values()))
     true = _mean_over(first.truth[..., main], first.inside, axis)
@@ -356,15 +335,10 @@ def wall_profile_figure(methods: Mapping[str, Measured], duct: Duct) -> Figure:
     right.set(xlabel="x/D", ylabel="its error (%)")
     right.axhline(0.0, color="0.6", linewidth=0.8)
     for panel in (left, right):
-        _mark_wall(panel)
+        panel.axvspan(PAPERS_WALL, 1.0, color="0.9", zorder=0)
+        panel.grid(alpha=0.3)
     left.legend(fontsize=8)
     return figure
-
-
-def _mark_wall(axes: Axes) -> None:
-    """Mark where the paper's velocities are too small."""
-    axes.axvspan(PAPERS_WALL, 1.0, color="0.9", zorder=0)
-    axes.grid(alpha=0.3)
 
 
 def _oriented(plane: Floats, main: int) -> Floats:

@@ -31,7 +31,7 @@ from lfpiv_cli.paper.discussion import discussion
 from lfpiv_cli.paper.faults import faults
 from lfpiv_cli.paper.parts import Findings, Row, Work, kept, read_json, rows_of
 from lfpiv_cli.paper.sensitivities import sensitivities
-from lfpiv_cli.paper.table3 import table3, table3_experiment
+from lfpiv_cli.paper.table3 import table3
 from lfpiv_cli.paper.table4 import table4
 
 # The parts of the report, in the order in which they are made and shown; a new one is a line here and in `names`.
@@ -50,9 +50,11 @@ class Part:
 PARTS: dict[PaperPart, Part] = {
     "table1": Part(table1, "Weights of single voxels (Table 1, Figs. 5 and 6)", 0.5, 4.0),
     "table2": Part(table2, "The camera (Table 2)", 0.01, 0.01),
-    "table3": Part(table3, "Boards, an ideal camera (Table 3, numerical; Figs. 8 to 11)", 0.8, 20.0),
+    "table3": Part(
+        partial(table3, half="ideal"), "Boards, an ideal camera (Table 3, numerical; Figs. 8 to 11)", 0.8, 20.0
+    ),
     "table3-experiment": Part(
-        table3_experiment,
+        partial(table3, half="recorded"),
         "Boards, a camera as real ones are, simulated (Table 3, experiment; Figs. 12 and 13)",
         0.8,
         22.0,

@@ -135,11 +135,6 @@ def channel_sections(size: ChannelSize, **changes: Any) -> dict[str, Any]:
     return merged(base, changes)
 
 
-def dlfc_sections(size: ChannelSize) -> Mapping[str, Any]:
-    """Return the changes for weights that are fitted to boards at several depths in the fluid."""
-    return {"board": {"dots": list(size.dots), "medium": "fluid"}, "weights": {"method": "dlfc"}}
-
-
 # The paper's mean velocities, DLFC's and ERT's, m/s, and the share of vectors within a quarter of the truth, per cent.
 PAPERS_MEAN_M_S = (0.1150, 0.1009)
 PAPERS_WITHIN_25 = 75.0
@@ -178,9 +173,7 @@ def table4(work: Work) -> Findings:
         for name, config in configs.items()
     }
     methods = {told: _read(configs[name], work.folder / name) for name, told in SHOWN.items() if name in configs}
-    settings = load_config(configs["ert"])
-    duct = duct_of(settings.simulation.flow)
-    assert duct is not None  # the sections above have one
+    duct = simulated_duct(configs["ert"])
     return Findings(
         rows=_rows(found),
         drawings=_drawings(methods, duct),
@@ -195,17 +188,26 @@ def _ways(size: ChannelSize) -> dict[str, dict[str, Any]]:
     """Return the sections of the config of each of `WAYS`."""
     sart, best = {"reconstruction": as_paper(size)}, {"reconstruction": at_best(size)}
     volumes: dict[str, Any] = {"validation": {"flow_methods": ["volumes"]}}
+    # weights that are fitted to boards at several depths in the fluid
+    fitted = {"board": {"dots": list(size.dots), "medium": "fluid"}, "weights": {"method": "dlfc"}}
     fine = {
         "volume": {"shape_xyz": None, "voxel_mm": None, "size_mm": size.volume_mm},
         "correlation": {"windows": None, "window_mm": size.window_mm},
     }
     return {
-        "dlfc": channel_sections(size, **sart, **volumes, **dlfc_sections(size)),
+        "dlfc": channel_sections(size, **sart, **volumes, **fitted),
         "ert": channel_sections(size, **sart, **volumes),
         "volumes": channel_sections(size, **best, **volumes),
         "fine": channel_sections(size, **best, **volumes, **fine),
         "particles": channel_sections(size, **best, validation={"flow_methods": ["particles"]}),
     }
+
+
+def simulated_duct(config: Path) -> Duct:
+    """Return the duct of a config that has `channel_sections`."""
+    duct = duct_of(load_config(config).simulation.flow)
+    assert duct is not None
+    return duct
 
 
 def _simulated(configs: Mapping[str, Path], images: Path, console: Console) -> dict[str, Any]:
@@ -221,7 +223,7 @@ def _measured(config: Path, images: Path, folder: Path, console: Console) -> dic
     """Measure the flow and return its figures."""
     measure_images(config, images, folder, overwrite=True, console=console)
     measured = _read(config, folder)
-    figures = measured.figures(duct_of(load_config(config).simulation.flow))
+    figures = measured.figures(simulated_duct(config))
     return figures | {"voxel_mm": list(measured.field.voxel_mm)}
 
 
@@ -272,56 +274,37 @@ def _reason(name: str, found: Mapping[str, Mapping[str, Any]], paper: Mapping[st
     worse = [way for way, error in ours.items() if error is not None and error > paper[f"paper_{way}_percent"]]
     if not worse or name == "overall":
         return ""
-    axis = "z" if name.startswith("z") else "y"
-    told = [f"{way.upper()}'s have an rms of {_planes_rms_percent(found[way], axis):.2f} %" for way in worse]
-    return (
-        f"the mean errors of single planes of windows across {axis} scatter: {', '.join(told)}; a slice of less than "
-        "that is one by chance"
-    )
-
-
-def _planes_rms_percent(figures: Mapping[str, Any], axis: str) -> float:
-    errors = np.array(figures["slices"][axis]["streamwise_mean_error"], dtype=np.float64)
-    return float(100.0 * np.sqrt(np.nanmean(errors**2)))
+    axis, told = "z" if name.startswith("z") else "y", []
+    for way in worse:
+        errors = np.array(found[way]["slices"][axis]["streamwise_mean_error"], dtype=np.float64)
+        told.append(f"{way.upper()}'s have an rms of {float(100.0 * np.sqrt(np.nanmean(errors**2))):.2f} %")
+    scatter = f"the mean errors of single planes of windows across {axis} scatter: {', '.join(told)}"
+    return f"{scatter}; a slice of less than that is one by chance"
 
 
 def _table(found: Mapping[str, Mapping[str, Any]]) -> Table:
     """Return all ways side by side."""
-    rows = [
+    rows: list[tuple[str, ...]] = [
         ("paper, DLFC", f"{PAPERS_MEAN_M_S[0]:.4f}", "6.25", "12.01", "75", "", ""),
         ("paper, ERT", f"{PAPERS_MEAN_M_S[1]:.4f}", "6.77", "12.37", "75", "", ""),
     ]
     for name, figures in found.items():
         error = figures["streamwise_mean_error"]
-        rows.append(
-            (
-                WAYS[name],
-                f"{MEAN_VELOCITY_M_S * (1.0 + error):.4f}",
-                f"{100.0 * abs(error):.3f}",
-                f"{100.0 * figures['slice_mean_error']:.3f}",
-                f"{100.0 * figures['within_25_percent_streamwise']:.1f}",
-                f"{100.0 * figures['within_25_percent_vector']:.1f}",
-                _rms_um(figures),
-            )
-        )
-    return Table(
-        f"The flow by all ways to measure it; its true mean velocity is {MEAN_VELOCITY_M_S} m/s",
-        (
-            "measured by",
-            "mean velocity (m/s)",
-            "error of it (%)",
-            "worst slice (%)",
-            "within 25 %, along the flow (%)",
-            "within 25 %, whole vector (%)",
-            "rms error of the displacement along x, y, z (µm)",
-        ),
-        tuple(rows),
-    )
-
-
-def _rms_um(figures: Mapping[str, Any]) -> str:
-    pairs = zip("uvw", figures["voxel_mm"], strict=True)
-    return ", ".join(f"{1e3 * voxel * figures[f'rms_{component}_voxel']:.1f}" for component, voxel in pairs)
+        pairs = zip("uvw", figures["voxel_mm"], strict=True)
+        row = {
+            "measured by": WAYS[name],
+            "mean velocity (m/s)": f"{MEAN_VELOCITY_M_S * (1.0 + error):.4f}",
+            "error of it (%)": f"{100.0 * abs(error):.3f}",
+            "worst slice (%)": f"{100.0 * figures['slice_mean_error']:.3f}",
+            "within 25 %, along the flow (%)": f"{100.0 * figures['within_25_percent_streamwise']:.1f}",
+            "within 25 %, whole vector (%)": f"{100.0 * figures['within_25_percent_vector']:.1f}",
+            "rms error of the displacement along x, y, z (µm)": ", ".join(
+                f"{1e3 * voxel * figures[f'rms_{component}_voxel']:.1f}" for component, voxel in pairs
+            ),
+        }
+        rows.append(tuple(row.values()))
+    caption = f"The flow by all ways to measure it; its true mean velocity is {MEAN_VELOCITY_M_S} m/s"
+    return Table(caption, tuple(row), tuple(rows))
 
 
 def _setup(size: ChannelSize) -> Table:

@@ -196,15 +196,6 @@ class DotFigures:
     depth_mm: dict[str, Floats]
     lateral_mm: Floats
 
-    def to_plain(self) -> dict[str, Any]:
-        """Return the figures as lists of numbers."""
-        depths = {name: each.tolist() for name, each in self.depth_mm.items()}
-        return {
-            "elongation_mm": self.elongation_mm.tolist(),
-            "depth_mm": depths,
-            "lateral_mm": self.lateral_mm.tolist(),
-        }
-
     @classmethod
     def from_plain(cls, values: Mapping[str, Any]) -> DotFigures:
         """Return the figures that lists of numbers hold."""
