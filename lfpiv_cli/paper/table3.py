@@ -55,11 +55,7 @@ BEST = {
     "reconstruction": {"solver": "em", "iterations": 30, "accelerate": True},
 }
 # From what the paper did: nothing, our best, and dots on the corners of voxels.
-CHANGES: dict[str, dict[str, Any]] = {
-    "paper": {},
-    "best": BEST,
-    "corners": {"volume": {"centre_mm": [0.0, 0.0, 0.0]}},
-}
+CHANGES: dict[str, dict[str, Any]] = {"paper": {}, "best": BEST, "corners": {"volume": {"centre_mm": [0.0, 0.0, 0.0]}}}
 # The assembly's tolerances and the lens of a real camera; noise and Snell's law are the simulation's defaults.
 FAULTS = {"rotation_deg": 0.12, "shift_px": [3.4, -2.1], "distortion_per_mm2": 2.0e-5}
 

@@ -102,12 +102,7 @@ def at_best(size: ChannelSize) -> dict[str, Any]:
 
 def channel_sections(size: ChannelSize, **changes: Any) -> dict[str, Any]:
     """Return the sections of the channel, measured with voxels; with changes, see `rig.sections`."""
-    flow = {
-        "kind": "square_duct",
-        "width_mm": size.width_mm,
-        "mean_velocity_m_s": MEAN_VELOCITY_M_S,
-        "axis": "x",
-    }
+    flow = {"kind": "square_duct", "width_mm": size.width_mm, "mean_velocity_m_s": MEAN_VELOCITY_M_S, "axis": "x"}
     dots = [min(7, count) for count in size.dots]
     base = sections(
         camera={"sensor": {"columns": size.columns, "rows": size.rows}},

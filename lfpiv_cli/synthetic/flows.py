@@ -173,9 +173,7 @@ def pipe(
 
 
 def rigid_rotation(
-    angular_velocity_rad_s: Sequence[float],
-    centre_mm: Sequence[float] = ORIGIN,
-    velocity_m_s: Sequence[float] = ORIGIN,
+    angular_velocity_rad_s: Sequence[float], centre_mm: Sequence[float] = ORIGIN, velocity_m_s: Sequence[float] = ORIGIN
 ) -> KnownFlow:
     """Return omega x (r - centre) + velocity, omega in rad/s (right-handed about x, y, z), and its pressure."""
     omega = np.asarray(angular_velocity_rad_s, dtype=np.float64)

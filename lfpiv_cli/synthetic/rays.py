@@ -223,13 +223,7 @@ def trace_curved(
 
 @njit(cache=True)
 def fitted_slopes(
-    x: float,
-    y: float,
-    z: float,
-    radius: float,
-    faces: Faces,
-    camera: KernelCamera,
-    fit: tuple[Floats, Floats],
+    x: float, y: float, z: float, radius: float, faces: Faces, camera: KernelCamera, fit: tuple[Floats, Floats]
 ) -> tuple[Floats, bool]:
     """Return the coefficients (TERMS, 2) of a ball's slopes, and whether they are right within the tolerance."""
     places, inverse = fit

@@ -274,10 +274,7 @@ def board_figures(
 
 
 def place_figures(
-    x_mm: Sequence[Floats],
-    depth_mm: Sequence[Floats],
-    depths_mm: tuple[float, ...],
-    spacing_mm: float,
+    x_mm: Sequence[Floats], depth_mm: Sequence[Floats], depths_mm: tuple[float, ...], spacing_mm: float
 ) -> dict[str, Any]:
     """Return the errors of place (Eqs. 19, 20) and the table by depth; dots that were not found are NaN.
 
@@ -302,8 +299,4 @@ def depth_error(centre_mm: Sequence[float] | Floats, depths_mm: Sequence[float])
 
 def _steps(centre_mm: Floats, depths_mm: Sequence[float]) -> dict[str, float]:
     steps = np.diff(centre_mm) / np.diff(depths_mm)
-    return {
-        "error": depth_error(centre_mm, depths_mm),
-        "shortest": float(steps.min()),
-        "longest": float(steps.max()),
-    }
+    return {"error": depth_error(centre_mm, depths_mm), "shortest": float(steps.min()), "longest": float(steps.max())}
