@@ -27,12 +27,10 @@ from lfpiv_cli.paper.influences import (
 from lfpiv_cli.paper.sensitivities import (
     INFLUENCES,
     Measured,
-    bound_rows,
     care,
     crowding,
     drawing_of,
     rows_of,
-    straight_line,
     table_of,
 )
 from lfpiv_cli.paper.small_rig import CHANNEL, WATER, Case, Rig
@@ -119,9 +117,9 @@ def test_tracers_apart_are_paired_whatever_their_depths_are_wrong_by():
 
 
 def test_a_straight_line_is_fitted_by_least_squares():
-    line = straight_line(np.array([0.0, 1.0, 2.0]), np.array([1.0, 3.3, 5.0]))
-    assert line.slope == pytest.approx(2.0)
-    assert line.offset == pytest.approx(1.1)
+    figures = {"offset_z": np.array([[1.0], [3.3], [5.0]])}
+    line = Measured(WALL, np.array([0.0, 1.0, 2.0]), figures).line(WALL.sensitivities[0])
+    assert line == pytest.approx((1.1, 2.0))
 
 
 def test_eq_21_a_wrong_index_is_right_at_the_inner_wall():
@@ -189,8 +187,7 @@ def test_rows_are_met_by_theory_and_missed_beside_it(influence: Influence):
 def test_scatter_is_held_against_its_bound(spread: float, verdict: str):
     found = lines_of(NOISE, {})
     found.figures["bound_z"][:], found.figures["spread_z"][:] = 1e-2, spread
-    assert [row.verdict for row in bound_rows(found)] == [verdict]
-    assert bound_rows(by_theory(INDEX)) == ()
+    assert [row.verdict for row in rows_of(found)] == [verdict]
 
 
 def test_a_sensitivity_that_is_not_known_has_no_verdict():

@@ -154,7 +154,20 @@ def validate_paper(
     ensure_drawing()
     ensure_pages()
     made = record(f"validate paper, {options.size}", None, {})
-    _make_parts(output, options, made, console)
+    chosen = [name for name in PARTS if name in options.only or not options.only]
+    minutes = {
+        name: {"tiny": 0.1, "quick": PARTS[name].quick_minutes, "full": PARTS[name].full_minutes}[options.size]
+        for name in chosen
+    }
+    begun, expected = time.monotonic(), 0.0
+    for number, name in enumerate(chosen):
+        left = sum(minutes[later] for later in chosen[number:])
+        # the machine's pace, by the parts that are done
+        pace = (time.monotonic() - begun) / 60.0 / expected if expected > 1.0 else 1.0
+        console.say(f"{name} ({number + 1} of {len(chosen)}): {PARTS[name].title}; about {pace * left:.0f} min left")
+        work = Work(output / "work" / name, options.size, console, made, options.resume)
+        kept(output / "parts" / f"{name}.json", made, options.resume, partial(_made, name, work))
+        expected += minutes[name]
     # in their order, those that were made alike
     parts = {}
     for name in PARTS:
@@ -176,24 +189,6 @@ def validate_paper(
     if short:
         raise LimitMissedError(f"{paths['index.html']}: {'; '.join(short)}", summary)
     return summary
-
-
-def _make_parts(output: Path, options: PaperOptions, made: Mapping[str, Any], console: Console) -> None:
-    """Make the parts that are asked for, and say how far the work is."""
-    chosen = [name for name in PARTS if name in options.only or not options.only]
-    minutes = {
-        name: {"tiny": 0.1, "quick": PARTS[name].quick_minutes, "full": PARTS[name].full_minutes}[options.size]
-        for name in chosen
-    }
-    begun, expected = time.monotonic(), 0.0
-    for number, name in enumerate(chosen):
-        left = sum(minutes[later] for later in chosen[number:])
-        # the machine's pace, by the parts that are done
-        pace = (time.monotonic() - begun) / 60.0 / expected if expected > 1.0 else 1.0
-        console.say(f"{name} ({number + 1} of {len(chosen)}): {PARTS[name].title}; about {pace * left:.0f} min left")
-        work = Work(output / "work" / name, options.size, console, made, options.resume)
-        kept(output / "parts" / f"{name}.json", made, options.resume, partial(_made, name, work))
-        expected += minutes[name]
 
 
 def _made(name: PaperPart, work: Work) -> dict[str, Any]:

@@ -41,23 +41,6 @@ MARKS, DASHES = ("o", "s", "^", "D", "v"), ("-", "--", "-.", ":", (0, (5, 1, 1, 
 ROOM = 3
 
 
-@dataclass(frozen=True)
-class Line:
-    """A straight line through measured points."""
-
-    slope: float
-    offset: float
-
-
-def straight_line(x: Floats, y: Floats) -> Line:
-    """Fit a straight line to the points that are known; NaN where there are not two."""
-    known = np.isfinite(y)
-    if np.count_nonzero(known) < 2:
-        return Line(np.nan, np.nan)
-    offset, slope = np.polynomial.polynomial.polyfit(x[known], y[known], 1)
-    return Line(float(slope), float(offset))
-
-
 INFLUENCES = (SEEDING, F_NUMBERS, FOCUS, WALL, INDEX, SHIFT, TURN, NOISE, DISTANCE)
 # Tracers crowd where fewer than this share is found.
 SEEN_SHARE = 0.9
@@ -85,14 +68,19 @@ class Measured:
         result[known] = np.nanmedian(table[known], axis=1)
         return result
 
-    def line(self, of: Sensitivity) -> Line:
-        """Return the straight line of a sensitivity's figure."""
-        return straight_line(self.values**of.power, self.median(of.figure))
+    def line(self, of: Sensitivity) -> tuple[float, float]:
+        """Return offset and slope of the straight line through a sensitivity's known figures; NaN without two."""
+        x, y = self.values**of.power, self.median(of.figure)
+        known = np.isfinite(y)
+        if np.count_nonzero(known) < 2:
+            return np.nan, np.nan
+        offset, slope = np.polynomial.polynomial.polyfit(x[known], y[known], 1)
+        return float(offset), float(slope)
 
     def value(self, of: Sensitivity) -> float:
         """Return a sensitivity as the slope is, or the value at the stated place."""
         if of.at is None:
-            return self.line(of).slope
+            return self.line(of)[1]
         return self.at(of.figure, of.at)
 
     def at(self, figure: str, value: float) -> float:
@@ -119,7 +107,7 @@ def sensitivities(work: Work) -> Findings:
     chosen = [each for each in INFLUENCES if work.size != "tiny" or each.name in TINY]
     found = [measured(work, each) for each in chosen]
     return Findings(
-        rows=tuple(row for each in found for row in (*rows_of(each), *bound_rows(each))),
+        rows=tuple(row for each in found for row in rows_of(each)),
         drawings=tuple(drawing_of(each) for each in found),
         tables=(table_of(found),),
         text=(
@@ -160,32 +148,21 @@ def measured(work: Work, influence: Influence) -> Measured:
 
 
 def rows_of(found: Measured) -> tuple[Row, ...]:
-    """Return a row for each sensitivity that theory tells: how far the measured one is from it."""
-    return tuple(
-        Row(
-            quantity=f"{found.influence.name}: {each.text}, off theory (%)",
-            source="sensitivity by theory",
-            limit=100.0 * each.tolerance,
-            best=100.0 * abs(found.value(each) / each.expected - 1.0),
-        )
-        for each in found.influence.sensitivities
-        if each.expected is not None
-    )
+    """Return a row for each sensitivity that theory tells: how far the measured one is from it.
 
-
-def bound_rows(found: Measured) -> tuple[Row, ...]:
-    """Return the row of scatter by noise, which no measurement without bias can have below its bound."""
-    if found.influence is not NOISE:
-        return ()
-    spread, bound = (found.at(f"{figure}_z", FAINT) for figure in ("spread", "bound"))
-    return (
-        Row(
-            quantity="noise a tenth of the light: spread of depth over the Cramer-Rao bound",
-            source="bound by theory",
-            limit=LARGEST_OVER_BOUND,
-            best=spread / bound,
-        ),
-    )
+    Of noise there is the scatter, which no measurement without bias can have below its bound.
+    """
+    rows = []
+    if found.influence is NOISE:
+        spread, bound = (found.at(f"{figure}_z", FAINT) for figure in ("spread", "bound"))
+        quantity = "noise a tenth of the light: spread of depth over the Cramer-Rao bound"
+        rows = [Row(quantity=quantity, source="bound by theory", limit=LARGEST_OVER_BOUND, best=spread / bound)]
+    for each in found.influence.sensitivities:
+        if each.expected is not None:
+            quantity = f"{found.influence.name}: {each.text}, off theory (%)"
+            off, limit = 100.0 * abs(found.value(each) / each.expected - 1.0), 100.0 * each.tolerance
+            rows.append(Row(quantity=quantity, source="sensitivity by theory", limit=limit, best=off))
+    return tuple(rows)
 
 
 @styled
@@ -226,18 +203,18 @@ def drawing_of(found: Measured) -> Drawing:
     return Drawing(influence.name, f"Errors over the {influence.label}.{bars}", figure)
 
 
-def _draw(axes: Axes, found: Measured, series: Series, number: int, line: Line | None) -> None:
+def _draw(axes: Axes, found: Measured, series: Series, number: int, line: tuple[float, float] | None) -> None:
     """Draw a series: medians, the range over realisations, and its straight line or the points joined."""
     colour, mark, dash = COLOURS[number], MARKS[number], DASHES[number]
     middle, table = series.factor * found.median(series.figure), series.factor * found.figures[series.figure]
-    is_line = series.fitted and line is not None and np.isfinite(line.slope)
+    is_line = series.fitted and line is not None and np.isfinite(line[1])
     axes.plot(found.values, middle, mark, color=colour, ls="" if is_line else dash, ms=5, label=series.label)
     if table.shape[1] > 1:
         axes.vlines(found.values, table.min(axis=1), table.max(axis=1), color=colour, lw=1.5)
     if is_line and line is not None:
         known = found.values[np.isfinite(middle)]
         x = np.linspace(known.min(), known.max(), 50)
-        axes.plot(x, series.factor * (line.offset + line.slope * x**series.power), ls=dash, color=colour, lw=1.2)
+        axes.plot(x, series.factor * (line[0] + line[1] * x**series.power), ls=dash, color=colour, lw=1.2)
 
 
 def table_of(found: Sequence[Measured]) -> Table:

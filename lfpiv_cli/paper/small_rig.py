@@ -183,22 +183,20 @@ class Case:
         return Search(self.believed, (width, width, self.search_depth_mm))
 
 
-def aimed(true: Rig, believed: Rig) -> Case:
+def aimed(believed: Rig) -> Case:
     """Return the case in which the camera was moved by what Eq. 21 advises from what is believed."""
     move = advised_move_mm(BOARD, believed.channel, believed.media)
-    return Case(replace(true, channel=replace(true.channel, camera_move_mm=move)), believed)
+    return Case(Rig(sheet(), channel=replace(CHANNEL, camera_move_mm=move)), believed)
 
 
 def index_wrong(fluid: float) -> Case:
     """Return water taken for a fluid of another index."""
-    camera = sheet()
-    return aimed(Rig(camera), Rig(camera, Media(WATER.air, WATER.window, fluid)))
+    return aimed(Rig(sheet(), Media(WATER.air, WATER.window, fluid)))
 
 
 def wall_wrong(by_mm: float) -> Case:
     """Return a wall taken to be thicker than it is."""
-    camera = sheet()
-    return aimed(Rig(camera), Rig(camera, channel=replace(CHANNEL, wall_mm=CHANNEL.wall_mm + by_mm)))
+    return aimed(Rig(sheet(), channel=replace(CHANNEL, wall_mm=CHANNEL.wall_mm + by_mm)))
 
 
 def focus_wrong(by_mm: float) -> Case:

@@ -82,11 +82,6 @@ def _placed(
     return KnownFlow(velocity, slopes, None if pressure is None else pressures)
 
 
-def axis_index(axis: Axis) -> int:
-    """Return 0, 1 or 2."""
-    return "xyz".index(axis)
-
-
 def dynamic_pressure(velocity_m_s: Floats, density_kg_m3: float) -> Floats:
     """Return rho |v|^2 / 2, (n,) in Pa, of velocities (n, 3)."""
     return np.asarray(0.5 * density_kg_m3 * np.sum(velocity_m_s**2, axis=1))
@@ -102,7 +97,7 @@ def square_duct(
     Solves u'' = const with u = 0 on the walls: a parabola across y (or x) less a Fourier series of functions that are
     harmonic, so that the equation holds exactly however few terms are kept. The mean over the section scales it.
     """
-    along = axis_index(axis)
+    along = "xyz".index(axis)
     across = 1 - along
     waves = 0.5 * np.pi * DUCT_ORDERS
     # over the mean over the square [-1, 1]^2 of u for u'' = -2
@@ -151,7 +146,7 @@ def pipe(
 
     The axis is x, y or a direction of any length, towards which the fluid flows.
     """
-    along = np.eye(3)[axis_index(axis)] if axis in ("x", "y") else _unit(np.asarray([axis], dtype=np.float64))[0]
+    along = np.eye(3)["xyz".index(axis)] if axis in ("x", "y") else _unit(np.asarray([axis], dtype=np.float64))[0]
 
     def across(relative_mm: Floats) -> tuple[Floats, Floats]:
         """Return places from the axis over the radius, (n, 3), and 1 - r^2/R^2, (n,)."""
@@ -195,7 +190,7 @@ def shear(
     velocity_m_s: Sequence[float] = ORIGIN,
 ) -> KnownFlow:
     """Return a velocity along one axis that grows by `rate_per_s` per length across, plus a uniform velocity."""
-    component, coordinate = axis_index(along), axis_index(across)
+    component, coordinate = "xyz".index(along), "xyz".index(across)
 
     def flow(relative_mm: Floats) -> Floats:
         velocity = np.zeros((len(relative_mm), 3))
@@ -365,7 +360,7 @@ def vortex_ring(
     near the ring its distance: smooth on the axis, and gone a few cores off. At one core's distance from the middle of
     a thin core the fluid turns with `speed_m_s`; where R is two cores, this is the speed in the ring's middle.
     """
-    along = axis_index(axis)
+    along = "xyz".index(axis)
     order = [(along + 1) % 3, (along + 2) % 3, along]
     strength = speed_m_s * np.exp(0.5) * core_mm / radius_mm
 
@@ -424,18 +419,8 @@ def source(
     return _placed(lambda r: spread(r) * r / MM_PER_M, gradient, centre_mm, velocity_m_s)
 
 
-FLOWS: dict[str, Callable[..., KnownFlow]] = {
-    "square_duct": square_duct,
-    "pipe": pipe,
-    "rigid_rotation": rigid_rotation,
-    "taylor_green": taylor_green,
-    "shear": shear,
-    "uniform": uniform,
-    "random_modes": random_modes,
-    "abc": abc,
-    "vortex_ring": vortex_ring,
-    "source": source,
-}
+_FACTORIES = (square_duct, pipe, rigid_rotation, taylor_green, shear, uniform, random_modes, abc, vortex_ring, source)
+FLOWS: dict[str, Callable[..., KnownFlow]] = {factory.__name__: factory for factory in _FACTORIES}
 
 
 @dataclass(frozen=True)

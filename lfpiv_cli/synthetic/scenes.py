@@ -77,15 +77,10 @@ class Box:
         """Return the box with a margin on both sides of each axis."""
         return Box.of(np.subtract(self.low_mm, margin_mm), np.add(self.high_mm, margin_mm))
 
-    @property
-    def volume_mm3(self) -> float:
-        """Volume in cubic millimetres."""
-        return float(np.prod(np.subtract(self.high_mm, self.low_mm)))
-
-    def volume_in_mm3(self, walls: Walls | None) -> float:
+    def volume_mm3(self, walls: Walls | None = None) -> float:
         """Return the volume between walls, all of it where there are none, in cubic millimetres."""
         if walls is None:
-            return self.volume_mm3
+            return float(np.prod(np.subtract(self.high_mm, self.low_mm)))
         return float(walls.volumes_mm3(np.asarray(self.low_mm), np.asarray(self.high_mm)))
 
     def within(self, other: Box) -> Box:

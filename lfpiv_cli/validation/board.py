@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,16 +64,8 @@ SHARE = float(1.0 / np.e)
 GAUSSIAN_PARAMETERS = 3
 
 
-@dataclass(frozen=True)
-class DepthDefinition:
-    """A definition of the depth of a dot.
-
-    Attributes
-    ----------
-    words : for people
-    profile : what it is taken from, the sum or the maximum of each plane of a dot's column
-    depth_mm : from the planes' depths and the profile
-    """
+class DepthDefinition(NamedTuple):
+    """A definition of the depth of a dot: from the planes' depths and what of each, its sum or maximum, in a column."""
 
     words: str
     profile: Literal["sum", "maximum"]

@@ -65,7 +65,7 @@ def tracers_of(settings: Config, camera: Camera, reference: Reference, motion: s
     measured = inside.within(scenes.Box.around(volume, (0.0, 0.0, 0.0)))
     pipe = _pipe(settings, reference)
     return scenes.Tracers(
-        round(scene.particles * box.volume_in_mm3(pipe) / measured.volume_in_mm3(pipe)),
+        round(scene.particles * box.volume_mm3(pipe) / measured.volume_mm3(pipe)),
         box,
         scene.particle_diameter_mm,
         scene.particle_counts,
