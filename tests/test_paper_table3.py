@@ -9,7 +9,7 @@ from lfpiv_cli.console import Console
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.paper import table3
 from lfpiv_cli.paper.parts import Findings, Work
-from lfpiv_cli.paper.pictures import BoardView, location_figure
+from lfpiv_cli.paper.pictures import board_view, location_figure
 from lfpiv_cli.synthetic import board as rendering
 from lfpiv_cli.validation.board import MEASURES
 
@@ -98,15 +98,15 @@ def test_where_the_steps_err():
     assert told.endswith("1.00 %")
 
 
-def test_a_view_and_its_plain_form():
+def test_a_view_shows_what_is_bright():
     grid = Grid.centred((6, 5, 7), (0.1, 0.1, 0.2), (0.0, 0.0, 0.0))
     volume = np.zeros(grid.shape_zyx, np.float32)
     volume[3, 2, 4], volume[5, 1, 0] = 10.0, 2.0
-    view = BoardView.from_plain({name: each.tolist() for name, each in vars(BoardView.of(volume, grid)).items()})
-    assert view.front[2, 4] == view.side[3, 4] == 1.0
-    assert view.side[5, 0] == 0.2
-    np.testing.assert_allclose(view.bright_mm, [[0.15, 0.0, 0.0]])
-    np.testing.assert_allclose(view.bounds_mm[2], [-0.7, 0.7])
+    view = board_view(volume, grid)
+    assert view["front"][2, 4] == view["side"][3, 4] == 1.0
+    assert view["side"][5, 0] == 0.2
+    np.testing.assert_allclose(view["bright_mm"], [[0.15, 0.0, 0.0]])
+    np.testing.assert_allclose(view["bounds_mm"][2], [-0.7, 0.7])
 
 
 @pytest.mark.thorough

@@ -153,18 +153,14 @@ def _measured(name: str, case: Case, work: Work) -> dict[str, Any]:
     options = ReconstructOptions(dark=work.folder / "still" / "dark.tif", **case.options)
     told = reconstruct_files(work.folder / "weights.h5", pair, folder, options, overwrite=True, console=quiet)
     volumes = [folder / f"{image.stem}.vtkhdf" for image in pair]
-    correlate_files(volumes, _vectors(work, name), overwrite=True, console=quiet)
+    correlate_files(volumes, work.folder / f"{name}.vtkhdf", overwrite=True, console=quiet)
     figures = near_wall(_read(work, name), simulated_duct(work.folder / "clean.yaml"))
     return figures | {"excluded_pixels": told["excluded_pixels"]}
 
 
-def _vectors(work: Work, name: str) -> Path:
-    return work.folder / f"{name}.vtkhdf"
-
-
 def _read(work: Work, name: str) -> Measured:
     """Return vectors with the true flow."""
-    return measured_of(_vectors(work, name), load_config(work.folder / "clean.yaml"), None, is_simulated=True)
+    return measured_of(work.folder / f"{name}.vtkhdf", load_config(work.folder / "clean.yaml"), None, is_simulated=True)
 
 
 def _rows(found: Mapping[str, Mapping[str, Any]]) -> tuple[Row, ...]:

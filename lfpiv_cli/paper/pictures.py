@@ -9,7 +9,6 @@ lateral axis.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -50,57 +49,40 @@ SHOWN_DEPTHS = 2.0
 DECIMALS = 3
 
 
-@dataclass(frozen=True, eq=False)
-class BoardView:
-    """A reconstructed board as seen from the front and from the side, its brightest voxel 1, and its bright voxels.
+def board_view(volume: NDArray[np.float32], grid: Grid) -> dict[str, Floats]:
+    """Return a reconstructed board [z, y, x] as it is seen, its brightest voxel 1, rounded as a page shows it.
 
-    Attributes
-    ----------
-    front : (y, x), the maximum along z
-    side : (z, x), the maximum along y
-    bounds_mm : (3, 2), of the volume along x, y and z
-    bright_mm : (n, 3), where voxels are brighter than `SHOWN_SHARE`
+    Returns
+    -------
+    dict
+        `front` (y, x), the maximum along z; `side` (z, x), the maximum along y; `bounds_mm` (3, 2) of the volume along
+        x, y and z; `bright_mm` (n, 3), where voxels are brighter than `SHOWN_SHARE`
     """
-
-    front: Floats
-    side: Floats
-    bounds_mm: Floats
-    bright_mm: Floats
-
-    @classmethod
-    def of(cls, volume: NDArray[np.float32], grid: Grid) -> BoardView:
-        """Return the view of a volume [z, y, x]."""
-        shares = volume / volume.max()
-        inside = np.argwhere(shares > SHOWN_SHARE)
-        x, y, z = (grid.axis_mm(axis)[inside[:, 2 - axis]] for axis in range(3))
-        bounds, bright = np.array([grid.bounds_mm(axis) for axis in range(3)]), np.stack([x, y, z], axis=1)
-        arrays = (shares.max(axis=0), shares.max(axis=1), bounds, bright)
-        front, side, bounds, bright = (np.asarray(each, np.float64).round(DECIMALS) for each in arrays)
-        return cls(front, side, bounds, bright)
-
-    @classmethod
-    def from_plain(cls, values: Mapping[str, Any]) -> BoardView:
-        """Return the view that lists of numbers hold."""
-        return cls(**{name: np.array(each, np.float64) for name, each in values.items()})
+    shares = volume / volume.max()
+    inside = np.argwhere(shares > SHOWN_SHARE)
+    view = {"front": shares.max(axis=0), "side": shares.max(axis=1)}
+    view["bounds_mm"] = np.array([grid.bounds_mm(axis) for axis in range(3)])
+    view["bright_mm"] = np.stack([grid.axis_mm(axis)[inside[:, 2 - axis]] for axis in range(3)], axis=1)
+    return {name: np.asarray(each, np.float64).round(DECIMALS) for name, each in view.items()}
 
 
 @styled
-def views_figure(views: Mapping[str, BoardView]) -> Figure:
+def views_figure(views: Mapping[str, Mapping[str, Floats]]) -> Figure:
     """Return boards in the focal plane, a row for each method: front, side and in three dimensions (Fig. 8)."""
     figure = new_figure(11.0, 3.7 * len(views))
     drawn = None
     # as much of the depth for each as shows the longest dots and their surroundings
-    reach = SHOWN_DEPTHS * max(float(np.abs(view.bright_mm[:, 2]).max()) for view in views.values())
+    reach = SHOWN_DEPTHS * max(float(np.abs(view["bright_mm"][:, 2]).max()) for view in views.values())
     for row, (label, view) in enumerate(views.items()):
-        x, y, z = ((low, high) for low, high in view.bounds_mm)
+        x, y, z = ((low, high) for low, high in view["bounds_mm"])
         front, side = (figure.add_subplot(len(views), 3, 3 * row + column) for column in (1, 2))
-        drawn = front.imshow(view.front, origin="lower", extent=(*x, *y), cmap=SEQUENTIAL, vmin=0.0, vmax=1.0)
+        drawn = front.imshow(view["front"], origin="lower", extent=(*x, *y), cmap=SEQUENTIAL, vmin=0.0, vmax=1.0)
         front.set(title=f"{label}: maximum along z", xlabel="x (mm)", ylabel="y (mm)")
-        side.imshow(view.side, origin="lower", extent=(*x, *z), cmap=SEQUENTIAL, vmin=0.0, vmax=1.0, aspect="auto")
+        side.imshow(view["side"], origin="lower", extent=(*x, *z), cmap=SEQUENTIAL, vmin=0.0, vmax=1.0, aspect="auto")
         side.set(title=f"{label}: maximum along y", xlabel="x (mm)", ylabel="z (mm)", ylim=(-reach, reach))
         space: Any = figure.add_subplot(len(views), 3, 3 * row + 3, projection="3d")
         look: dict[str, Any] = {"cmap": SEQUENTIAL, "s": 1.5, "linewidths": 0.0, "rasterized": True}
-        space.scatter(*view.bright_mm.T, c=view.bright_mm[:, 2], **look)
+        space.scatter(*view["bright_mm"].T, c=view["bright_mm"][:, 2], **look)
         space.set(title=f"{label}: brighter than 1/e", xlabel="x (mm)", ylabel="y (mm)", zlabel="z (mm)")
         space.set(zlim=(-reach, reach))
         space.set_box_aspect((1.0, 1.0, 1.2), zoom=0.85)

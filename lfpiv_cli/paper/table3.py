@@ -20,7 +20,7 @@ from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.pages import Table
 from lfpiv_cli.notice import written
 from lfpiv_cli.paper.parts import AS_PAPER, BOARD, Drawing, Findings, Row, Work, merged, sections
-from lfpiv_cli.paper.pictures import BoardView, centres_figure, elongation_figure, location_figure, views_figure
+from lfpiv_cli.paper.pictures import board_view, centres_figure, elongation_figure, location_figure, views_figure
 from lfpiv_cli.stages.validate_board import BoardBench, BoardSolver, bench_of, board_solver, placement_of
 from lfpiv_cli.synthetic.board import dot_centres
 from lfpiv_cli.validation.board import (
@@ -155,7 +155,7 @@ class _Boards:
         volume = bench.weights.to_world(result.volume)
         centres = dot_centres(self.board, placement_of(self.paper, depth))[:, :2]
         dots = measure_dots(volume, bench.weights.grid, centres, 0.5 * self.board.spacing_mm)
-        view = vars(BoardView.of(volume, bench.weights.grid)) if depth == 0.0 else None
+        view = board_view(volume, bench.weights.grid) if depth == 0.0 else None
         return {"dots": vars(dots), "view": view, "residual": float(result.residual[-1])}
 
 
@@ -198,7 +198,8 @@ def table3(work: Work, half: Half) -> Findings:
         for method, each in dots.items()
     }
     middle = boards.depths_mm.index(0.0)
-    views = {METHODS[method]: BoardView.from_plain(steps[method][middle]["view"]) for method in VIEWED}
+    kept = {METHODS[method]: steps[method][middle]["view"] for method in VIEWED}
+    views = {told: {name: np.array(each, np.float64) for name, each in view.items()} for told, view in kept.items()}
     return Findings(
         rows=tuple(_row(boards, measure, figures) for measure in MEASURES),
         drawings=_drawings(boards, figures, views, dots),
@@ -241,7 +242,7 @@ def _row(boards: _Boards, measure: str, figures: Figures) -> Row:
 
 
 def _drawings(
-    boards: _Boards, figures: Figures, views: dict[str, BoardView], dots: dict[str, list[DotFigures]]
+    boards: _Boards, figures: Figures, views: dict[str, dict[str, Floats]], dots: dict[str, list[DotFigures]]
 ) -> tuple[Drawing, ...]:
     half = boards.half
     named = {METHODS[method]: each for method, each in figures.items()}

@@ -389,22 +389,21 @@ def in_miniature(
     light : as waves, whatever its depths; None: by rays
     """
     depths = np.asarray(depths_mm, dtype=np.float64)
-    if light is None:
-        return [_at_depths(camera, media, depths, radius_mm, None)]
-    about = ABOUT_DEPTH * camera.scale(media).depth_mm
-    lights = [replace(light, depths_mm=(float(depth) - about, float(depth) + about)) for depth in depths]
-    return [_at_depths(camera, media, depths[n : n + 1], radius_mm, each) for n, each in enumerate(lights)]
-
-
-def _at_depths(camera: Camera, media: Media, depths_mm: Floats, radius_mm: float, light: Light | None) -> Miniature:
-    distance = equivalent_object_distance(depths_mm, camera.focus_distance_mm, media)
-    blur = np.abs(camera.defocus(distance)) * camera.aperture_radius_mm
-    reach = float(np.max(blur + radius_mm * camera.image_distance_mm / distance))
-    reach += LENSES_AROUND * float(camera.lattice.pitch.max())
-    # As many more as there are fewer on the other side: lenses stay where they are.
-    columns, rows = (2 * int(np.ceil(reach / camera.pixel_mm)) + side % 2 for side in (camera.columns, camera.rows))
-    view = raw_view(replace(camera, columns=columns, rows=rows), media, radius_mm, light=light)
-    return Miniature(view, depths_mm)
+    seen, about = [(depths, light)], ABOUT_DEPTH * camera.scale(media).depth_mm
+    if light is not None:
+        lights = [replace(light, depths_mm=(float(depth) - about, float(depth) + about)) for depth in depths]
+        seen = [(depths[n : n + 1], each) for n, each in enumerate(lights)]
+    found = []
+    for own, each in seen:
+        distance = equivalent_object_distance(own, camera.focus_distance_mm, media)
+        blur = np.abs(camera.defocus(distance)) * camera.aperture_radius_mm
+        reach = float(np.max(blur + radius_mm * camera.image_distance_mm / distance))
+        reach += LENSES_AROUND * float(camera.lattice.pitch.max())
+        # As many more as there are fewer on the other side: lenses stay where they are.
+        columns, rows = (2 * int(np.ceil(reach / camera.pixel_mm)) + side % 2 for side in (camera.columns, camera.rows))
+        view = raw_view(replace(camera, columns=columns, rows=rows), media, radius_mm, light=each)
+        found.append(Miniature(view, own))
+    return found
 
 
 def _particles(seen: Miniature, light: float) -> Floats:
