@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,8 +20,7 @@ from lfpiv_cli.paper.pictures import PAPERS_WALL, plane_figure, raw_figure, wall
 from lfpiv_cli.paper.table4 import SEED, TINY, ChannelSize, as_paper, at_best, channel_sections, simulated_duct
 from lfpiv_cli.reconstruction.images import still_light
 from lfpiv_cli.stages.validate import measured_of
-from lfpiv_cli.validation.flow import TOLERANCE, Duct, compare, relative_errors
-from lfpiv_cli.validation.methods import Measured
+from lfpiv_cli.validation.flow import TOLERANCE, Duct, Measured, relative_errors
 from lfpiv_cli.verbs.build_weights import BuildWeightsOptions, build_weights_file
 from lfpiv_cli.verbs.calibrate import CalibrateOptions, calibrate_snapshot
 from lfpiv_cli.verbs.correlate import correlate_files
@@ -45,7 +44,7 @@ def near_wall(measured: Measured, duct: Duct, beyond: float = PAPERS_WALL) -> di
         `windows`, how many; `within_25`, the share of them within a quarter of the true velocity; `mean_error` of the
         sum of velocities, a share; `within_sigma`, `mean_sigma`: by how much chance moves the two, one standard error
     """
-    pairs = compare(measured.field, measured.truth, beside_wall(measured, duct, beyond))
+    pairs = replace(measured, inside=beside_wall(measured, duct, beyond)).pairs
     streamwise, _ = relative_errors(pairs)
     # a duct's flow has a direction
     assert streamwise is not None

@@ -84,7 +84,7 @@ class Influence:
     label: str
     values: Values
     measure: Callable[[float, int], Figures]
-    panels: tuple[Panel, Panel]
+    panels: tuple[Panel, ...]
     typical: tuple[float, str]
     sensitivities: tuple[Sensitivity, ...]
     advice: str
@@ -144,25 +144,24 @@ F_NUMBERS = Influence(
 # tracers overlap.
 FAINT, LARGEST_OVER_BOUND = 0.1, 1.5
 
+DEPTH_AND_X = {"z": "depth", "x": "x"}
+
 NOISE = Influence(
     name="noise",
     label="read noise over the light of a lit pixel",
     values=((0.0, 0.1), (0.0, 0.1, 0.2), (0.0, 0.05, 0.1, 0.15, 0.2, 0.3)),
     measure=small_rig.in_noise,
-    panels=(
+    panels=tuple(
         Panel(
-            "spread of depth (um)",
-            (Series("spread_z", "measured", 1e3), Series("bound_z", "Cramer-Rao bound (median)", 1e3)),
-        ),
-        Panel(
-            "spread of x (um)",
-            (Series("spread_x", "measured", 1e3), Series("bound_x", "Cramer-Rao bound (median)", 1e3)),
-        ),
+            f"spread of {what} (um)",
+            (Series(f"spread_{name}", "measured", 1e3), Series(f"bound_{name}", "Cramer-Rao bound (median)", 1e3)),
+        )
+        for name, what in DEPTH_AND_X.items()
     ),
     typical=(1.0, "a tenth: faint tracers"),
-    sensitivities=(
-        Sensitivity("spread_z", "spread of depth where noise is a tenth", "um", 1e3, at=FAINT),
-        Sensitivity("spread_x", "spread of x where noise is a tenth", "um", 1e3, at=FAINT),
+    sensitivities=tuple(
+        Sensitivity(f"spread_{name}", f"spread of {what} where noise is a tenth", "um", 1e3, at=FAINT)
+        for name, what in DEPTH_AND_X.items()
     ),
     advice="Give tracers light: where read noise is a tenth of what a lit pixel holds, depths scatter by "
     "{error}, and a velocity by that, times 1.4, over the time between the images.",
@@ -174,17 +173,13 @@ DISTANCE = Influence(
     label="distance of the tracers from the focal plane (mm)",
     values=((1.0, 5.0), (0.25, 3.0, 10.0), (0.25, 1.0, 2.0, 3.5, 5.0, 7.5, 10.0)),
     measure=small_rig.at_depth,
-    panels=(
+    panels=tuple(
         Panel(
-            "error of depth (um)",
-            (Series("spread_z", "typical (1.48 times the median)", 1e3), Series("rms_z", "rms", 1e3)),
+            f"error of {what} (um)",
+            (Series(f"spread_{name}", "typical (1.48 times the median)", 1e3), Series(f"rms_{name}", "rms", 1e3)),
             logarithmic=True,
-        ),
-        Panel(
-            "error of x (um)",
-            (Series("spread_x", "typical (1.48 times the median)", 1e3), Series("rms_x", "rms", 1e3)),
-            logarithmic=True,
-        ),
+        )
+        for name, what in DEPTH_AND_X.items()
     ),
     typical=(1.0, ""),
     sensitivities=(

@@ -31,8 +31,8 @@ from lfpiv_cli.pictures.style import (
     styled,
 )
 from lfpiv_cli.pictures.vectors import mean_of_known
-from lfpiv_cli.validation.flow import PAPER_SLICES, TOLERANCE, Duct, compare, cumulative_distribution
-from lfpiv_cli.validation.methods import Measured, slice_at
+from lfpiv_cli.validation.flow import PAPER_SLICES, TOLERANCE, Duct, Measured, cumulative_distribution
+from lfpiv_cli.validation.methods import slice_at
 
 # Colours that people with any kind of colour vision tell apart; marks and lines differ as well, for print in grey.
 BOARD_STYLES: tuple[dict[str, Any], ...] = (
@@ -223,7 +223,7 @@ def cumulative_figure(methods: Mapping[str, Measured]) -> Figure:
     """Return the share of vectors over their relative error, along the flow and of the whole vector, with the 25 %."""
     figure, panels = new_panels(10.0, 4.2, 1, 2, sharey=True)
     for (name, m), (colour, _, line) in zip(methods.items(), WAY_STYLES, strict=False):
-        shares = cumulative_distribution(compare(m.field, m.truth, m.inside))
+        shares = cumulative_distribution(m.pairs)
         errors = 100.0 * np.array(shares["relative_error"])
         for axes, key in zip(panels, ("streamwise_share", "vector_share"), strict=True):
             axes.plot(errors, 100.0 * np.array(shares[key], dtype=np.float64), line, color=colour, label=name)

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lfpiv_cli.arrays import Floats
-from lfpiv_cli.calibration.dlfc import RayFit
 from lfpiv_cli.calibration.lattice import LatticeFit
 from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.calibration.views import refocused_stack, views_across
@@ -120,10 +119,7 @@ def summary_figure(calibration: Calibration) -> Figure:
         shown = passed.imshow(calibration.transmission, cmap=SEQUENTIAL, vmin=0.0, interpolation="nearest")
         figure.colorbar(shown, ax=passed, label="share of light passed", shrink=0.8)
         passed.set(title="transmission, upright; 0 where unusable", xlabel="column (px)", ylabel="row (px)")
-    if calibration.ray_fit is None:
-        draw_board(figure, board, calibration, None)
-    else:
-        draw_ray_fit(board, calibration.ray_fit)
+    draw_board_or_rays(figure, board, calibration)
     figure.suptitle(lattice_words(calibration.fit))
     return figure
 
@@ -163,10 +159,7 @@ def calibration_figure(calibration: Calibration, white: ArrayLike, board: ArrayL
     axes[0].legend(loc="upper right", framealpha=0.9)
     for axis, direction in ((axes[3], 0), (axes[4], 1)):
         draw_residual(figure, axis, fit, direction, (rows, columns))
-    if calibration.ray_fit is None:
-        draw_board(figure, axes[5], calibration, board)
-    else:
-        draw_ray_fit(axes[5], calibration.ray_fit)
+    draw_board_or_rays(figure, axes[5], calibration, board)
     figure.suptitle(lattice_words(fit))
     return figure
 
@@ -183,19 +176,20 @@ def draw_residual(figure: Any, axis: Any, fit: LatticeFit, direction: int, shape
     axis.set(xlim=(0, shape[1]), ylim=(shape[0], 0), aspect="equal", xlabel="column (px)", ylabel="row (px)")
 
 
-def draw_ray_fit(axis: Any, fit: RayFit) -> None:
-    """Show how far the polynomials miss the dots of each board."""
-    order = np.argsort(fit.depths_mm)
-    for residual, name in zip(fit.residual_mm.T, ("columns", "rows"), strict=True):
-        axis.plot(fit.depths_mm[order], 1e3 * residual[order], "o-", label=f"along the {name}")
-    axis.legend()
-    axis.set(xlabel="depth of the board (mm)", ylabel="rms misfit on the array (µm)", ylim=(0.0, None))
-    axis.set_title(f"polynomials of degree {fit.rays.degree} through {fit.sightings} sightings of dots")
+def draw_board_or_rays(figure: Any, axis: Any, calibration: Calibration, board: ArrayLike | None = None) -> None:
+    """Show the dots that were found, coloured by depth, over the picture of the board where it is given.
 
-
-def draw_board(figure: Any, axis: Any, calibration: Calibration, board: ArrayLike | None) -> None:
-    """Show the dots that were found, coloured by depth, over the picture of the board where it is given."""
-    pose = calibration.pose
+    Of a calibration by boards at several depths, show how far the polynomials miss the dots of each.
+    """
+    pose, fit = calibration.pose, calibration.ray_fit
+    if fit is not None:
+        order = np.argsort(fit.depths_mm)
+        for residual, name in zip(fit.residual_mm.T, ("columns", "rows"), strict=True):
+            axis.plot(fit.depths_mm[order], 1e3 * residual[order], "o-", label=f"along the {name}")
+        axis.legend()
+        axis.set(xlabel="depth of the board (mm)", ylabel="rms misfit on the array (µm)", ylim=(0.0, None))
+        axis.set_title(f"polynomials of degree {fit.rays.degree} through {fit.sightings} sightings of dots")
+        return
     if pose is None:
         _draw_nothing(axis, "no board")
         return

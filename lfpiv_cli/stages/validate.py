@@ -28,9 +28,8 @@ from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.reference import Reference
 from lfpiv_cli.stages.validate_board import depths_in_volume, validate_board
 from lfpiv_cli.synthetic.flows import Flow
-from lfpiv_cli.validation.flow import Duct, limits_missed, truth_at_points
+from lfpiv_cli.validation.flow import Duct, Measured, limits_missed, truth_at_points
 from lfpiv_cli.validation.methods import (
-    Measured,
     errors_figure,
     flow_figure,
     lower_error,

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -21,6 +22,8 @@ from scipy.spatial import KDTree
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.flow.field import FLAG_NAMES, MM_TO_M, VectorField
+from lfpiv_cli.flow.windows import RoundWall
+from lfpiv_cli.synthetic.flows import Flow
 
 # The paper's Fig. 18: the share of vectors within a quarter of the truth.
 TOLERANCE = 0.25
@@ -58,35 +61,73 @@ class Comparison:
         return np.asarray(np.isfinite(self.measured).all(axis=1))
 
 
-def compare(field: VectorField, truth_velocity: Floats, inside: NDArray[np.bool_]) -> Comparison:
-    """Pair measured with true velocities at the windows `inside`; the truth may be anything elsewhere.
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """A measured flow and what it is held against.
 
-    Raises
-    ------
-    InputError
-        The truth or the mask has another shape than the field, no window is inside, or the truth is not finite there.
-    """
-    shape = field.flag.shape
-    if truth_velocity.shape != (*shape, 3) or inside.shape != shape:
-        raise InputError(f"truth {truth_velocity.shape} and mask {inside.shape} do not fit vectors of shape {shape}")
-    if not inside.any():
-        raise InputError("none of the window centres lies inside the flow")
-    true = truth_velocity[inside]
-    if not np.isfinite(true).all():
-        raise InputError("the true velocity is not finite at some window centres inside the flow")
-    mean = true.mean(axis=0)
-    speed = float(np.linalg.norm(mean))
-    has_direction = speed > SMALLEST_MEAN_FLOW * float(np.linalg.norm(true, axis=1).mean())
-    return Comparison(field.velocity[inside], true, np.argwhere(inside), mean / speed if has_direction else None)
-
-
-def flow_figures(field: VectorField, truth_velocity: Floats, inside: NDArray[np.bool_]) -> dict[str, Any]:
-    """Return the figures of a measured flow, ready for JSON.
-
-    Parameters
+    Attributes
     ----------
-    truth_velocity : (nz, ny, nx, 3) m/s at the window centres
+    truth : (nz, ny, nx, 3) m/s at the window centres
     inside : (nz, ny, nx) True for the windows that are judged
+    flow : the analytic flow that the truth is of, in the field's coordinates; None where it is of particles
+    """
+
+    field: VectorField
+    truth: Floats
+    inside: NDArray[np.bool_]
+    flow: Flow | None = None
+
+    @cached_property
+    def pairs(self) -> Comparison:
+        """Measured and true velocities at the windows that are judged; the truth may be anything elsewhere.
+
+        Raises
+        ------
+        InputError
+            The truth or the mask has another shape than the field, no window is inside, or the truth is not finite
+            there.
+        """
+        shape = self.field.flag.shape
+        if self.truth.shape != (*shape, 3) or self.inside.shape != shape:
+            raise InputError(
+                f"truth {self.truth.shape} and mask {self.inside.shape} do not fit vectors of shape {shape}"
+            )
+        if not self.inside.any():
+            raise InputError("none of the window centres lies inside the flow")
+        true = self.truth[self.inside]
+        if not np.isfinite(true).all():
+            raise InputError("the true velocity is not finite at some window centres inside the flow")
+        mean = true.mean(axis=0)
+        speed = float(np.linalg.norm(mean))
+        has_direction = speed > SMALLEST_MEAN_FLOW * float(np.linalg.norm(true, axis=1).mean())
+        return Comparison(
+            self.field.velocity[self.inside], true, np.argwhere(self.inside), mean / speed if has_direction else None
+        )
+
+    @property
+    def found(self) -> NDArray[np.bool_]:
+        """Which windows (nz, ny, nx) are judged and no miss."""
+        return np.asarray(self.inside & np.isfinite(self.field.velocity).all(axis=-1))
+
+    def judged(self, values: Floats) -> Floats:
+        """Return vectors where they are judged, else NaN."""
+        return np.where(self.inside[..., np.newaxis], values, np.nan)
+
+    def figures(self, duct: Duct | None, pipe: RoundWall | None = None) -> dict[str, Any]:
+        """Return the figures of `flow_figures`, with Table 4's for a duct, or those by radius for a pipe."""
+        figures = flow_figures(self)
+        if duct is not None:
+            figures["table_4"] = table_4(self, duct)
+            # the largest of the six slices, a share and not per cent
+            errors = [row["ours_percent"] for name, row in figures["table_4"].items() if name != "overall"]
+            figures["slice_mean_error"] = None if None in errors else 0.01 * max(errors)
+        if pipe is not None:
+            figures |= pipe_figures(self, pipe)
+        return figures
+
+
+def flow_figures(measured: Measured) -> dict[str, Any]:
+    """Return the figures of a measured flow, ready for JSON.
 
     Returns
     -------
@@ -95,7 +136,7 @@ def flow_figures(field: VectorField, truth_velocity: Floats, inside: NDArray[np.
         all windows inside); `rms_u_voxel`, `bias_u_voxel`, `slope_u` (of measured on true through zero) and so on for
         v, w, and the smallest of these; `slices` along each axis; `cumulative`.
     """
-    pairs = compare(field, truth_velocity, inside)
+    field, inside, pairs = measured.field, measured.inside, measured.pairs
     streamwise, vector = relative_errors(pairs)
     flags = field.flag[inside]
     figures: dict[str, Any] = {"vectors": int(field.flag.size), "vectors_inside": int(flags.size)}
@@ -110,14 +151,14 @@ def flow_figures(field: VectorField, truth_velocity: Floats, inside: NDArray[np.
     figures |= {f"{name}_{c}{unit}": None for c in "uvw" for name, unit in COMPONENT_FIGURES.items()}
     if field.dt_s is not None and pairs.found.any():
         to_voxel = field.dt_s / (np.asarray(field.voxel_mm) * MM_TO_M)
-        measured, true = pairs.measured[pairs.found], pairs.true[pairs.found]
-        error = (measured - true) * to_voxel
+        found, true = pairs.measured[pairs.found], pairs.true[pairs.found]
+        error = (found - true) * to_voxel
         rms, bias = np.sqrt(np.mean(error**2, axis=0)), np.mean(error, axis=0)
         power = np.sum(true**2, axis=0)
         for k, c in enumerate("uvw"):
             figures[f"rms_{c}_voxel"], figures[f"bias_{c}_voxel"] = float(rms[k]), float(bias[k])
             if power[k] > 0.0:
-                figures[f"slope_{c}"] = float(measured[:, k] @ true[:, k] / power[k])
+                figures[f"slope_{c}"] = float(found[:, k] @ true[:, k] / power[k])
     slopes = [figures[f"slope_{c}"] for c in "uvw" if figures[f"slope_{c}"] is not None]
     figures["smallest_slope"] = min(slopes, default=None)
     # the streamwise mean error of every plane of windows across each axis
@@ -162,11 +203,12 @@ def _mean_error(measured_sum: float, true_sum: float) -> float | None:
     return measured_sum / true_sum - 1.0 if true_sum > 0.0 else None
 
 
-def streamwise_mean_error_at(field: VectorField, pairs: Comparison, axis: int, position_mm: float) -> float | None:
+def streamwise_mean_error_at(measured: Measured, axis: int, position_mm: float) -> float | None:
     """Return the streamwise mean error of a slice across an axis (0 for x), between planes of windows if need be.
 
     The sums of v and of u, not their ratio, are interpolated; beyond the outer planes the outer one is taken.
     """
+    field, pairs = measured.field, measured.pairs
     plane = pairs.index_zyx[:, 2 - axis]
     sums = np.array([_streamwise_sums(pairs, plane == k) for k in range(field.grid.shape_xyz[axis])])
     v, u = (float(np.interp(position_mm, field.grid.axis_mm(axis), each)) for each in sums.T)
@@ -280,13 +322,13 @@ class Duct:
         return self.centre_mm[axis] + (share - 0.5) * self.width_mm
 
 
-def table_4(field: VectorField, truth_velocity: Floats, inside: NDArray[np.bool_], duct: Duct) -> dict[str, Any]:
+def table_4(measured: Measured, duct: Duct) -> dict[str, Any]:
     """Return the sizes of the mean velocity errors in per cent, of the six slices and of the whole, beside the paper's.
 
     By the slice (`overall`, `z/D 0.3` ...): `ours`, `paper_dlfc` and `paper_ert`. A slice between planes of windows is
     interpolated; ours is None where it has none.
     """
-    pairs = compare(field, truth_velocity, inside)
+    pairs = measured.pairs
     found = pairs.measured[pairs.found].sum(axis=0), pairs.true[pairs.found].sum(axis=0)
     overall = None
     if pairs.direction is not None and pairs.found.any():
@@ -294,7 +336,7 @@ def table_4(field: VectorField, truth_velocity: Floats, inside: NDArray[np.bool_
     table = {"overall": _row(overall, *PAPER_OVERALL)}
     for name, axis in duct.across.items():
         for share, paper in PAPER_SLICES[name].items():
-            error = streamwise_mean_error_at(field, pairs, axis, duct.position_mm(axis, share))
+            error = streamwise_mean_error_at(measured, axis, duct.position_mm(axis, share))
             table[f"{name} {share}"] = _row(error, *paper)
     return table
 
@@ -302,3 +344,45 @@ def table_4(field: VectorField, truth_velocity: Floats, inside: NDArray[np.bool_
 def _row(error: float | None, paper_dlfc: float, paper_ert: float) -> dict[str, float | None]:
     ours = None if error is None else 100.0 * abs(error)
     return {"ours_percent": ours, "paper_dlfc_percent": paper_dlfc, "paper_ert_percent": paper_ert}
+
+
+# Rings of nearly as many windows each, the outer ones thinner: beyond the last but one edge windows of a tenth of the
+# diameter reach beyond the wall.
+RING_EDGES = (0.0, 0.3, 0.5, 0.7, 0.8, 0.9, 1.0)
+# Figures of the inner pipe leave out the last ring.
+INNER = RING_EDGES[-2]
+
+
+def pipe_figures(measured: Measured, pipe: RoundWall) -> dict[str, Any]:
+    """Return the figures of windows by their distance from the axis, ready for JSON.
+
+    Returns
+    -------
+    dict
+        `within_25_percent_vector_inner`, the share of the windows up to 0.9 of the radius whose whole vector errs by
+        less than a quarter; `rings`, for each two edges (shares of the radius) their `vectors`, `streamwise_mean_error`
+        (sum v / sum u - 1) and `within_25_percent_vector`. None where there is no window.
+    """
+    pairs = measured.pairs
+    share = (pipe.distances_mm(measured.field.grid.centres_mm()) / pipe.radius_mm)[measured.inside]
+    right = relative_errors(pairs)[1] < TOLERANCE
+    inner = share <= INNER
+    ring, rings = np.searchsorted(RING_EDGES[1:-1], share), []
+    for number, edges in enumerate(zip(RING_EDGES, RING_EDGES[1:], strict=False)):
+        chosen = ring == number
+        found = chosen & pairs.found
+        sums = [float(each[found, pipe.along].sum()) for each in (pairs.measured, pairs.true)]
+        rings.append(
+            {
+                "radius_shares": list(edges),
+                "vectors": int(chosen.sum()),
+                "streamwise_mean_error": sums[0] / sums[1] - 1.0 if sums[1] else None,
+                "within_25_percent_vector": _share(right[chosen]),
+            }
+        )
+    return {"within_25_percent_vector_inner": _share(right[inner]), "rings": rings}
+
+
+def _share(right: NDArray[np.bool_]) -> float | None:
+    """Return how many of some are right, None of none."""
+    return float(right.mean()) if right.size else None

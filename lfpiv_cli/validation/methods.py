@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping
-from dataclasses import dataclass
 from itertools import cycle
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.flow.field import VectorField
@@ -27,60 +25,7 @@ from lfpiv_cli.pictures.style import (
     symmetric_limit,
 )
 from lfpiv_cli.pictures.vectors import MapRow, compared_figure, maps_figure, mean_of_known, signed_scale, speed_unit
-from lfpiv_cli.synthetic.flows import Flow
-from lfpiv_cli.validation.flow import (
-    PAPER_SLICES,
-    TOLERANCE,
-    Duct,
-    compare,
-    cumulative_distribution,
-    flow_figures,
-    relative_errors,
-    table_4,
-)
-
-# Rings of nearly as many windows each, the outer ones thinner: beyond the last but one edge windows of a tenth of the
-# diameter reach beyond the wall.
-RING_EDGES = (0.0, 0.3, 0.5, 0.7, 0.8, 0.9, 1.0)
-# Figures of the inner pipe leave out the last ring.
-INNER = RING_EDGES[-2]
-
-
-def pipe_figures(
-    field: VectorField, truth_velocity: Floats, inside: NDArray[np.bool_], pipe: RoundWall
-) -> dict[str, Any]:
-    """Return the figures of windows by their distance from the axis, ready for JSON.
-
-    Returns
-    -------
-    dict
-        `within_25_percent_vector_inner`, the share of the windows up to 0.9 of the radius whose whole vector errs by
-        less than a quarter; `rings`, for each two edges (shares of the radius) their `vectors`, `streamwise_mean_error`
-        (sum v / sum u - 1) and `within_25_percent_vector`. None where there is no window.
-    """
-    pairs = compare(field, truth_velocity, inside)
-    share = (pipe.distances_mm(field.grid.centres_mm()) / pipe.radius_mm)[inside]
-    right = relative_errors(pairs)[1] < TOLERANCE
-    inner = share <= INNER
-    ring, rings = np.searchsorted(RING_EDGES[1:-1], share), []
-    for number, edges in enumerate(zip(RING_EDGES, RING_EDGES[1:], strict=False)):
-        chosen = ring == number
-        found = chosen & pairs.found
-        measured, true = (float(each[found, pipe.along].sum()) for each in (pairs.measured, pairs.true))
-        rings.append(
-            {
-                "radius_shares": list(edges),
-                "vectors": int(chosen.sum()),
-                "streamwise_mean_error": measured / true - 1.0 if true else None,
-                "within_25_percent_vector": _share(right[chosen]),
-            }
-        )
-    return {"within_25_percent_vector_inner": _share(right[inner]), "rings": rings}
-
-
-def _share(right: NDArray[np.bool_]) -> float | None:
-    """Return how many of some are right, None of none."""
-    return float(right.mean()) if right.size else None
+from lfpiv_cli.validation.flow import INNER, PAPER_SLICES, TOLERANCE, Duct, Measured, cumulative_distribution, table_4
 
 
 @styled
@@ -114,44 +59,6 @@ ERROR_OF = {
         "slope_w",
     ),
 }
-
-
-@dataclass(frozen=True, eq=False)
-class Measured:
-    """A measured flow and what it is held against.
-
-    Attributes
-    ----------
-    truth : (nz, ny, nx, 3) m/s at the window centres
-    inside : (nz, ny, nx) True for the windows that are judged
-    flow : the analytic flow that the truth is of, in the field's coordinates; None where it is of particles
-    """
-
-    field: VectorField
-    truth: Floats
-    inside: NDArray[np.bool_]
-    flow: Flow | None = None
-
-    @property
-    def found(self) -> NDArray[np.bool_]:
-        """Which windows (nz, ny, nx) are judged and no miss."""
-        return np.asarray(self.inside & np.isfinite(self.field.velocity).all(axis=-1))
-
-    def judged(self, values: Floats) -> Floats:
-        """Return vectors where they are judged, else NaN."""
-        return np.where(self.inside[..., np.newaxis], values, np.nan)
-
-    def figures(self, duct: Duct | None, pipe: RoundWall | None = None) -> dict[str, Any]:
-        """Return the figures of `flow_figures`, with Table 4's for a duct, or those by radius for a pipe."""
-        figures = flow_figures(self.field, self.truth, self.inside)
-        if duct is not None:
-            figures["table_4"] = table_4(self.field, self.truth, self.inside, duct)
-            # the largest of the six slices, a share and not per cent
-            errors = [row["ours_percent"] for name, row in figures["table_4"].items() if name != "overall"]
-            figures["slice_mean_error"] = None if None in errors else 0.01 * max(errors)
-        if pipe is not None:
-            figures |= pipe_figures(self.field, self.truth, self.inside, pipe)
-        return figures
 
 
 def lower_error(methods: Mapping[str, Measured], figures: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
@@ -252,7 +159,7 @@ def profiles_figure(methods: Mapping[str, Measured]) -> Figure:
             panel.set_ylabel(f"{COMPONENT_NAMES[component]} ({unit}), mean over the plane")
         low, high = row[0].get_ylim()
         row[0].set_ylim(min(low, -least), max(high, least))
-    shares = {name: cumulative_distribution(compare(m.field, m.truth, m.inside)) for name, m in methods.items()}
+    shares = {name: cumulative_distribution(m.pairs) for name, m in methods.items()}
     told = {"streamwise_share": "along the mean flow", "vector_share": "of the whole vector"}
     for panel, (key, what) in zip(axes[3], told.items(), strict=False):
         for (name, found), colour in zip(shares.items(), cycle(COLOURS), strict=False):
@@ -276,7 +183,7 @@ def slices_figure(methods: Mapping[str, Measured], duct: Duct) -> Figure:
     first = next(iter(methods.values()))
     curves = {"true, at the windows": first.judged(first.truth)} if first.flow is None else {}
     curves |= {name: m.judged(m.field.velocity) for name, m in methods.items()}
-    tables = {name: table_4(m.field, m.truth, m.inside, duct) for name, m in methods.items()}
+    tables = {name: table_4(m, duct) for name, m in methods.items()}
     main = AXIS_NAMES.index(duct.axis)
     for row, (name, axis) in zip(axes, duct.across.items(), strict=True):
         for panel, share in zip(row, PAPER_SLICES[name], strict=True):
