@@ -84,7 +84,7 @@ def by_theory(influence: Influence, factor: float = 1.0) -> Measured:
 )
 def test_the_map_names_each_displacement(name: str, error: Callable[[NDArray[np.float64]], NDArray[np.float64]]):
     true = places()
-    figures = fit_errors(true, error(true)).figures()
+    figures = fit_errors(true, error(true)).figures
     assert figures.pop(name) == pytest.approx(0.3, abs=1e-12)
     assert np.allclose(list(figures.values()), 0.0, atol=1e-12)
 
@@ -94,7 +94,7 @@ def test_the_map_tells_its_standard_errors_and_leaves_outliers_out():
     error = rng.normal(0.0, [0.01, 0.01, 0.2], true.shape)
     error[:40, 2] += 50.0
     fitted = fit_errors(true, error)
-    figures, sigma = fitted.figures(), fitted.standard_errors()
+    figures, sigma = fitted.figures, fitted.sigma
     assert fitted.count <= len(true) - 40
     assert all(abs(figures[name]) < 5.0 * sigma[name] for name in figures if not name.startswith("spread"))
     assert figures["spread_z"] == pytest.approx(0.2, abs=5.0 * sigma["spread_z"])
@@ -104,7 +104,7 @@ def test_the_map_tells_its_standard_errors_and_leaves_outliers_out():
 
 def test_a_map_of_too_few_places_is_not_known():
     true = places(TERMS)
-    assert np.isnan(list(fit_errors(true, true).figures().values())).all()
+    assert np.isnan(list(fit_errors(true, true).figures.values())).all()
 
 
 def test_tracers_apart_are_paired_whatever_their_depths_are_wrong_by():

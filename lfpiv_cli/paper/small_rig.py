@@ -149,24 +149,13 @@ class Search:
         found = find_particles(task_of(image, view, weights, rig.camera, normalisers(weights.padded)), self.rounds)
         return rig.reference.points_from_focal_point(found.position_mm)
 
-    def volume(
-        self, image: Image, voxel_mm: tuple[float, float, float], settings: SolverSettings
-    ) -> tuple[NDArray[np.float32], Grid]:
-        """Return the volume (z, y, x) behind an image, and its voxels."""
-        rig, grid = self.rig, self.rig.grid(self.size_mm, voxel_mm)
-        px, py, pz = padding = default_padding(rig.camera, rig.media, grid)
-        solved = reconstruct(factorise_through(rig.camera, rig.space, grid.padded(padding)), image, settings)
-        (nz, ny, nx), reference = grid.shape_zyx, rig.reference
-        inner = solved.volume[pz : pz + nz, py : py + ny, px : px + nx]
-        return np.ascontiguousarray(inner), reference.grid_from_focal_point(grid)
 
-
-def sheet(f_number: float = F_NUMBER, pixels: int = SENSOR_PX) -> Camera:
+def sheet(f_number: float = F_NUMBER) -> Camera:
     """Return the camera of the data sheet; the microlenses follow the f-number, so that lens images touch."""
     aperture = FOCAL_LENGTH_MM / f_number
     distance = PITCH_MM * 2.0 * FOCAL_LENGTH_MM / aperture
     lattice = Lattice.regular(PITCH_MM)
-    return Camera(-1.0, FOCAL_LENGTH_MM, aperture, distance, distance, lattice, PIXEL_MM, pixels, pixels)
+    return Camera(-1.0, FOCAL_LENGTH_MM, aperture, distance, distance, lattice, PIXEL_MM, SENSOR_PX, SENSOR_PX)
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,7 +233,7 @@ def place_figures(case: Case, tracers: Tracers, rng: np.random.Generator, readou
 def judged(found: Points, tracers: Tracers) -> Figures:
     """Return the figures of measured places (n, 3) of tracers that stand apart."""
     pairs = pairs_of(found, tracers.position_mm, GATE_MM)
-    figures = fit_errors(tracers.position_mm[pairs.true], pairs.error_voxel).figures()
+    figures = fit_errors(tracers.position_mm[pairs.true], pairs.error_voxel).figures
     return figures | found_shares(pairs, found, tracers)
 
 
@@ -344,8 +333,14 @@ def crowded(per_lens: float, seed: int) -> Figures:
     middle, moved = tracks_between(found[0], found[1], known)
     inside = np.all(np.abs(middle) <= inner, axis=1)
     by_tracks = _velocity_figures("tracks", moved[inside], displacement(middle[inside]))
-    (first, grid), (second, _) = (search.volume(image, VOXEL_MM, EM) for image in images)
-    field = correlate([(first, second)], grid, CorrelationSettings([WINDOW_VOXELS], (0.5, 0.5, 0.5), None, EXPONENT))
+    grid = known.grid(search.size_mm, VOXEL_MM)
+    (nz, ny, nx), padding = grid.shape_zyx, default_padding(known.camera, known.media, grid)
+    px, py, pz = padding
+    operator = factorise_through(known.camera, known.space, grid.padded(padding))
+    whole = [reconstruct(operator, image, EM).volume for image in images]
+    first, second = (np.ascontiguousarray(v[pz : pz + nz, py : py + ny, px : px + nx]) for v in whole)
+    settings = CorrelationSettings([WINDOW_VOXELS], (0.5, 0.5, 0.5), None, EXPONENT)
+    field = correlate([(first, second)], known.reference.grid_from_focal_point(grid), settings)
     centres = field.grid.centres_mm()
     kept = (field.flag < REJECTED) & np.all(np.abs(centres) <= inner, axis=-1)
     by_volumes = field.displacement_voxel[kept] * VOXEL_MM, displacement(centres[kept])

@@ -103,19 +103,21 @@ def plane_panels(grid: Grid, rows: int = 1) -> tuple[Figure, NDArray[Any]]:
 def draw_maps(
     row: Sequence[Axes], grid: Grid, maps: Sequence[NDArray[Any]], titles: Sequence[str], **scale: Any
 ) -> Any:
-    """Draw the middle planes of three arrays [z, y, x] (of one, given three times) as maps on one scale.
+    """Draw the middle planes of three arrays [z, y, x] (of one, given three times), or planes, as maps on one scale.
 
-    A title tells what is shown and where the plane lies. Returns the last image, for the scale; unknown values stay
+    Titles tell what is shown and where a middle plane lies. Returns the last image, for the scale; unknown values stay
     blank.
     """
     for axes, plane, values, title in zip(row, PLANES, maps, titles, strict=True):
-        extent = plane.extent(grid)
-        image = axes.imshow(plane.of(values), origin="lower", extent=extent, interpolation="nearest", **scale)
-        place = f"{plane.name} at {AXIS_NAMES[plane.normal]} = {plane.place_mm(grid):z.2f} mm"
+        extent, place = plane.extent(grid), ""
+        if values.ndim > 2:
+            values = plane.of(values)
+            place = f"{plane.name} at {AXIS_NAMES[plane.normal]} = {plane.place_mm(grid):z.2f} mm"
+        image = axes.imshow(values, origin="lower", extent=extent, interpolation="nearest", **scale)
         axes.set(
             xlabel=f"{AXIS_NAMES[plane.right]} (mm)",
             ylabel=f"{AXIS_NAMES[plane.up]} (mm)",
-            title=f"{title}\n{place}" if title else place,
+            title="\n".join(each for each in (title, place) if each),
             xlim=extent[:2],
             ylim=extent[2:],
             aspect="equal",
@@ -429,15 +431,8 @@ def projections_figure(volume: NDArray[np.float32], grid: Grid) -> Figure:
     # Along an axis that a plane is across, nothing is left but the plane.
     seen = [volume.max(axis=2 - plane.normal) for plane in PLANES]
     limit = float(np.percentile(np.concatenate([each.ravel() for each in seen]), BRIGHT_PERCENT)) or 1.0
-    for panel, plane, values in zip(axes[0], PLANES, seen, strict=True):
-        how: dict[str, Any] = {"cmap": "inferno", "vmin": 0.0, "vmax": limit, "interpolation": "nearest"}
-        image = panel.imshow(values, origin="lower", extent=plane.extent(grid), **how)
-        panel.set(
-            xlabel=f"{AXIS_NAMES[plane.right]} (mm)",
-            ylabel=f"{AXIS_NAMES[plane.up]} (mm)",
-            title=f"largest along {AXIS_NAMES[plane.normal]}",
-            aspect="equal",
-        )
+    titles = [f"largest along {AXIS_NAMES[plane.normal]}" for plane in PLANES]
+    image = draw_maps(axes[0], grid, seen, titles, cmap="inferno", vmin=0.0, vmax=limit)
     figure.colorbar(image, ax=axes[0].tolist(), label="intensity (1)", shrink=0.75, extend="max")
     return figure
 

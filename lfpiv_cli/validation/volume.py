@@ -117,44 +117,16 @@ OUTLIER_SIGMAS, OUTLIER_ROUNDS = 5.0, 3
 TERMS, FEWEST = 6, 10
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class PlaceErrors:
-    """The fitted map.
+    """The fitted map: its figures by name, their standard errors, and how many tracers were fitted.
 
-    Attributes
-    ----------
-    coefficients, sigma : (6, 3) b, B_x, B_y, B_z, C_x, C_y of each component, and standard errors
-    spread_mm : (3,) standard deviation of what is left
-    count : of the tracers fitted
+    Lengths are in mm, stretches and angles are ratios (twist: per mm of depth).
     """
 
-    coefficients: Floats
-    sigma: Floats
-    spread_mm: Floats
+    figures: dict[str, float]
+    sigma: dict[str, float]
     count: int
-
-    def figures(self) -> dict[str, float]:
-        """Return the figures by name, lengths in mm, stretches and angles as ratios (twist: per mm of depth)."""
-        return self._named(self.coefficients, np.subtract) | {
-            f"spread_{name}": float(value) for name, value in zip("xyz", self.spread_mm, strict=True)
-        }
-
-    def standard_errors(self) -> dict[str, float]:
-        """Return the standard errors of the same figures."""
-        return self._named(self.sigma, np.hypot) | {
-            f"spread_{name}": float(value / np.sqrt(2.0 * max(self.count, 1)))
-            for name, value in zip("xyz", self.spread_mm, strict=True)
-        }
-
-    @staticmethod
-    def _named(table: Floats, combine: np.ufunc) -> dict[str, float]:
-        """Return a table's entries by name; `combine` takes the two halves of a turn."""
-        offset, along, twist = table[0], table[1:4], table[4:]
-        named = {f"offset_{name}": offset[axis] for axis, name in enumerate("xyz")}
-        named |= {f"stretch_{name}": along[axis, axis] for axis, name in enumerate("xyz")}
-        named |= {"slant_x": along[2, 0], "slant_y": along[2, 1]}
-        named |= {"turn": 0.5 * combine(along[0, 1], along[1, 0]), "twist": 0.5 * combine(twist[0, 1], twist[1, 0])}
-        return {name: float(value) for name, value in named.items()}
 
 
 def pairs_of(measured_mm: Floats, true_mm: Floats, gate_mm: float) -> Matches:
@@ -169,22 +141,35 @@ def pairs_of(measured_mm: Floats, true_mm: Floats, gate_mm: float) -> Matches:
 
 def fit_errors(true_mm: Floats, error_mm: Floats) -> PlaceErrors:
     """Fit the map to errors (n, 3) at true places (n, 3); NaN where there are hardly more of them than terms."""
-    if len(true_mm) < FEWEST:
-        unknown = np.full((TERMS, 3), np.nan)
-        return PlaceErrors(unknown, unknown, unknown[0], 0)
-    x, y, z = true_mm.T
-    design = np.stack([np.ones_like(x), x, y, z, x * z, y * z], axis=1)
-    kept = np.ones(len(x), dtype=bool)
-    for _ in range(OUTLIER_ROUNDS):
+    # b, B_x, B_y, B_z, C_x, C_y of each component, their standard errors, and the standard deviation of what is left
+    coefficients = sigma = np.full((TERMS, 3), np.nan)
+    spread, count = sigma[0], 0
+    if len(true_mm) >= FEWEST:
+        x, y, z = true_mm.T
+        design = np.stack([np.ones_like(x), x, y, z, x * z, y * z], axis=1)
+        kept = np.ones(len(x), dtype=bool)
+        for _ in range(OUTLIER_ROUNDS):
+            coefficients = np.linalg.lstsq(design[kept], error_mm[kept], rcond=None)[0]
+            left = np.abs(error_mm - design @ coefficients)
+            width = MAD_TO_SIGMA * np.median(left[kept], axis=0)
+            kept = np.all(left <= OUTLIER_SIGMAS * width, axis=1)
         coefficients = np.linalg.lstsq(design[kept], error_mm[kept], rcond=None)[0]
-        left = np.abs(error_mm - design @ coefficients)
-        width = MAD_TO_SIGMA * np.median(left[kept], axis=0)
-        kept = np.all(left <= OUTLIER_SIGMAS * width, axis=1)
-    coefficients = np.linalg.lstsq(design[kept], error_mm[kept], rcond=None)[0]
-    left, count = (error_mm - design @ coefficients)[kept], int(kept.sum())
-    spread = np.sqrt(np.sum(left**2, axis=0) / max(count - TERMS, 1))
-    scatter = np.sqrt(np.diag(np.linalg.pinv(design[kept].T @ design[kept])))
-    return PlaceErrors(coefficients, scatter[:, np.newaxis] * spread, spread, count)
+        left, count = (error_mm - design @ coefficients)[kept], int(kept.sum())
+        spread = np.sqrt(np.sum(left**2, axis=0) / max(count - TERMS, 1))
+        sigma = np.sqrt(np.diag(np.linalg.pinv(design[kept].T @ design[kept])))[:, np.newaxis] * spread
+
+    def named(table: Floats, combine: np.ufunc, spreads: Floats) -> dict[str, float]:
+        """Return a table's entries by name; `combine` takes the two halves of a turn."""
+        offset, along, twist = table[0], table[1:4], table[4:]
+        found = {f"offset_{name}": offset[axis] for axis, name in enumerate("xyz")}
+        found |= {f"stretch_{name}": along[axis, axis] for axis, name in enumerate("xyz")}
+        found |= {"slant_x": along[2, 0], "slant_y": along[2, 1]}
+        found |= {"turn": 0.5 * combine(along[0, 1], along[1, 0]), "twist": 0.5 * combine(twist[0, 1], twist[1, 0])}
+        found |= {f"spread_{name}": value for name, value in zip("xyz", spreads, strict=True)}
+        return {name: float(value) for name, value in found.items()}
+
+    errors = named(sigma, np.hypot, spread / np.sqrt(2.0 * max(count, 1)))
+    return PlaceErrors(named(coefficients, np.subtract, spread), errors, count)
 
 
 # Depth reaches so many times farther than a microlens.
