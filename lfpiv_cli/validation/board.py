@@ -79,8 +79,14 @@ def width_ends_mm(z_mm: Depths, profile: Profile, peak: int | None = None) -> tu
     """
     peak = int(np.argmax(profile)) if peak is None else peak
     limit = profile[peak] * SHARE
-    first, last = _run_above(profile, peak, limit)
-    return _crossing_mm(z_mm, profile, limit, first, -1), _crossing_mm(z_mm, profile, limit, last, 1)
+    ends = []
+    for at, step in zip(_run_above(profile, peak, limit), (-1, 1), strict=True):
+        if 0 <= at + step < z_mm.size:
+            share = (profile[at] - limit) / (profile[at] - profile[at + step])
+            ends.append(float(z_mm[at] + share * (z_mm[at + step] - z_mm[at])))
+        else:
+            ends.append(float(z_mm[at]))
+    return ends[0], ends[1]
 
 
 def _run_above(profile: Profile, peak: int, limit: float) -> tuple[int, int]:
@@ -88,14 +94,6 @@ def _run_above(profile: Profile, peak: int, limit: float) -> tuple[int, int]:
     low = np.flatnonzero(profile[:peak] <= limit)
     high = np.flatnonzero(profile[peak + 1 :] <= limit)
     return int(low[-1]) + 1 if low.size else 0, peak + int(high[0]) if high.size else profile.size - 1
-
-
-def _crossing_mm(z_mm: Depths, profile: Profile, limit: float, at: int, step: int) -> float:
-    beyond = at + step
-    if not 0 <= beyond < z_mm.size:
-        return float(z_mm[at])
-    share = (profile[at] - limit) / (profile[at] - profile[beyond])
-    return float(z_mm[at] + share * (z_mm[beyond] - z_mm[at]))
 
 
 def gaussian_centre_mm(z_mm: Depths, profile: Profile) -> float:
@@ -247,15 +245,17 @@ def board_figures(
     """
     lateral = [each.lateral_mm[:, 0].reshape(shape[1], shape[0]) for each in dots]
     places = place_figures(lateral, [each.depth_mm[THE_PAPERS] for each in dots], depths_mm, spacing_mm)
-    mass = np.array([each.depth_mm["mass"].mean() for each in dots])
+    mass, definitions = np.array([each.depth_mm["mass"].mean() for each in dots]), {}
+    for name in DEPTH_DEFINITIONS:
+        centres = np.array([each.depth_mm[name].mean() for each in dots])
+        steps = np.diff(centres) / np.diff(depths_mm)
+        ends = {"shortest": float(steps.min()), "longest": float(steps.max())}
+        definitions[name] = {"error": depth_error(centres, depths_mm)} | ends
     return places | {
         "elongation_mm": float(np.mean([each.elongation_mm.mean() for each in dots])),
         "elongation_sigma_mm": float(np.mean([each.elongation_mm.std() for each in dots])),
         "depth_error_mass": depth_error(mass, depths_mm),
-        "depth_definitions": {
-            name: _steps(np.array([each.depth_mm[name].mean() for each in dots]), depths_mm)
-            for name in DEPTH_DEFINITIONS
-        },
+        "depth_definitions": definitions,
         "by_depth": places["by_depth"]
         | {
             "elongation_mm": [float(each.elongation_mm.mean()) for each in dots],
@@ -287,8 +287,3 @@ def place_figures(
 def depth_error(centre_mm: Sequence[float] | Floats, depths_mm: Sequence[float]) -> float:
     """Return Eq. 20 averaged over the steps between neighbouring depths."""
     return float(np.mean(np.abs(np.diff(centre_mm) / np.diff(depths_mm) - 1.0)))
-
-
-def _steps(centre_mm: Floats, depths_mm: Sequence[float]) -> dict[str, float]:
-    steps = np.diff(centre_mm) / np.diff(depths_mm)
-    return {"error": depth_error(centre_mm, depths_mm), "shortest": float(steps.min()), "longest": float(steps.max())}
