@@ -2,8 +2,8 @@
 
 Functions take a mapping from the name of a way to measure, as it is to be read, to what was measured by it; all are
 drawn on one scale, in colours that people with any kind of colour vision tell apart; marks and lines differ as well,
-for print in grey. Lengths in the channel are shares of its width from its low wall; the paper's x is our other
-lateral axis.
+for print in grey. Lengths in the channel are shares of its width from its low wall. The report's flow runs along x; the
+paper's x is our y, the other lateral axis.
 """
 
 from __future__ import annotations
@@ -70,7 +70,6 @@ def board_view(volume: NDArray[np.float32], grid: Grid) -> dict[str, Floats]:
 def views_figure(views: Mapping[str, Mapping[str, Floats]]) -> Figure:
     """Return boards in the focal plane, a row for each method: front, side and in three dimensions (Fig. 8)."""
     figure = new_figure(11.0, 3.7 * len(views))
-    drawn = None
     # as much of the depth for each as shows the longest dots and their surroundings
     reach = SHOWN_DEPTHS * max(float(np.abs(view["bright_mm"][:, 2]).max()) for view in views.values())
     for row, (label, view) in enumerate(views.items()):
@@ -87,8 +86,7 @@ def views_figure(views: Mapping[str, Mapping[str, Floats]]) -> Figure:
         space.set(zlim=(-reach, reach))
         space.set_box_aspect((1.0, 1.0, 1.2), zoom=0.85)
         _tidy(space)
-    if drawn is not None:
-        figure.colorbar(drawn, ax=figure.axes, shrink=0.5, label="intensity / largest", location="bottom")
+    figure.colorbar(drawn, ax=figure.axes, shrink=0.5, label="intensity / largest", location="bottom")
     return figure
 
 
@@ -161,7 +159,6 @@ def centres_figure(centres_mm: Mapping[str, Floats]) -> Figure:
     """Return the centres of all dots of all boards, (n, 3) for each method, coloured by depth (Fig. 10)."""
     figure = new_figure(5.2 * len(centres_mm) + 0.8, 4.2)
     deepest = max(float(np.abs(each[:, 2]).max()) for each in centres_mm.values())
-    drawn = None
     for number, (label, each) in enumerate(centres_mm.items(), start=1):
         space: Any = figure.add_subplot(1, len(centres_mm), number, projection="3d")
         # depth along the page, as the boards were moved
@@ -170,8 +167,7 @@ def centres_figure(centres_mm: Mapping[str, Floats]) -> Figure:
         space.set(title=label, xlabel="z (mm)", ylabel="x (mm)", zlabel="y (mm)")
         space.set_box_aspect((2.0, 1.0, 1.0), zoom=1.1)
         _tidy(space)
-    if drawn is not None:
-        figure.colorbar(drawn, ax=figure.axes, shrink=0.6, label="measured depth z (mm)", location="bottom")
+    figure.colorbar(drawn, ax=figure.axes, shrink=0.6, label="measured depth z (mm)", location="bottom")
     return figure
 
 
@@ -198,21 +194,18 @@ def slice_maps_figure(methods: Mapping[str, Measured], duct: Duct) -> Figure:
     rows = {"true": (first, first.truth)} | {name: (m, m.field.velocity) for name, m in methods.items()}
     highest = max(float(np.linalg.norm(m.truth[m.inside], axis=-1).max()) for m in methods.values())
     figure, axes = new_panels(13.0, 2.3 * len(rows) + 0.6, len(rows), 6, squeeze=False, sharey=True)
-    main = "xyz".index(duct.axis)
+    look: dict[str, Any] = {"vmin": 0.0, "vmax": highest, "cmap": SEQUENTIAL, "aspect": "auto"}
     for row, (name, (measured, velocity)) in zip(axes, rows.items(), strict=True):
+        low, high = measured.field.grid.bounds_mm(0)
         speed = np.where(measured.inside, np.linalg.norm(velocity, axis=-1), np.nan)
         places = [(k, axis, share) for k, axis in duct.across.items() for share in PAPER_SLICES[k]]
         for panel, (key, axis, share) in zip(row, places, strict=True):
-            other = 3 - axis - main
-            position = duct.position_mm(axis, share)
-            shown = slice_at(speed, measured.field.grid.axis_mm(axis), position, axis)
-            # of what is left of [z, y, x] the flow's axis goes up, as the paper has it
-            shown = shown if main == (1 if axis == 2 else 2) else shown.T
-            extent = (*_ends(measured, duct, other), *_ends(measured, duct, main))
-            look: dict[str, Any] = {"vmin": 0.0, "vmax": highest, "cmap": SEQUENTIAL, "aspect": "auto"}
+            # of what is left of [z, y, x] the flow's axis goes up, as the paper has it, counted from the first window
+            shown = slice_at(speed, measured.field.grid.axis_mm(axis), duct.position_mm(axis, share), axis).T
+            ends = _as_shares(np.array(measured.field.grid.bounds_mm(3 - axis)), duct, 3 - axis)
+            extent = (float(ends[0]), float(ends[1]), 0.0, (high - low) / duct.width_mm)
             image = panel.imshow(shown, origin="lower", extent=extent, **look)
-            # the paper's x is our other lateral axis
-            panel.set(xlabel=f"{'z' if other == 2 else 'x'}/D", title=f"{key} = {share}")
+            panel.set(xlabel=f"{'z' if axis == 1 else 'x'}/D", title=f"{key} = {share}")
         row[0].set_ylabel(f"{name}\ny/D, along the flow")
     figure.colorbar(image, ax=axes, label="size of the velocity (m/s)", shrink=0.8)
     return figure
@@ -242,15 +235,6 @@ def _as_shares(places_mm: Floats, duct: Duct, axis: int) -> Floats:
     return np.asarray((places_mm - duct.position_mm(axis, 0.0)) / duct.width_mm)
 
 
-def _ends(measured: Measured, duct: Duct, axis: int) -> tuple[float, float]:
-    """Return the bounds of the windows along an axis as shares of the width; along the flow from the first one."""
-    low, high = measured.field.grid.bounds_mm(axis)
-    if "xyz".index(duct.axis) == axis:
-        return 0.0, (high - low) / duct.width_mm
-    ends = _as_shares(np.array([low, high]), duct, axis)
-    return float(ends[0]), float(ends[1])
-
-
 # The paper sees velocities that are too small beyond this share of the channel's width.
 PAPERS_WALL = 0.8
 CASE_STYLES = ((BLUE, "o"), (VERMILION, "s"), (GREEN, "^"), (PURPLE, "v"), (ORANGE, "D"))
@@ -274,22 +258,19 @@ def raw_figure(image: NDArray[np.float32], mask: NDArray[np.bool_]) -> Figure:
 @styled
 def plane_figure(methods: Mapping[str, Measured], duct: Duct, plane: int) -> Figure:
     """Return vectors and the error of the velocity along the flow in one x-y plane of windows, by way to measure."""
-    main, axis = "xyz".index(duct.axis), duct.across["x/D"]
-    first = next(iter(methods.values()))
-    highest = float(first.truth[..., main].max())
+    axis = duct.across["x/D"]
+    highest = float(next(iter(methods.values())).truth[..., 0].max())
     figure, axes = new_panels(3.2 * len(methods) + 1.0, 8.2, 2, len(methods), squeeze=False, sharex=True, sharey=True)
     for column, (name, m) in zip(axes.T, methods.items(), strict=True):
-        places = [m.field.grid.axis_mm(k) for k in (main, axis)]
-        along, across = np.meshgrid(*places)
+        along, across = np.meshgrid(*(m.field.grid.axis_mm(k) for k in (0, axis)))
         shares = _as_shares(across, duct, axis)
-        velocity = _oriented(m.field.velocity[plane], main)
-        error = velocity[..., main] - _oriented(m.truth[plane], main)[..., main]
-        u, v = velocity[..., main], velocity[..., axis]
+        u, v = m.field.velocity[plane][..., 0], m.field.velocity[plane][..., axis]
         look: dict[str, Any] = {"cmap": SEQUENTIAL, "clim": (0.0, highest), "scale": 12.0 * highest, "width": 0.008}
         arrows = column[0].quiver(along, shares, u, v, u, **look)
-        image = column[1].pcolormesh(along, shares, error, cmap=DIVERGING, vmin=-0.5 * highest, vmax=0.5 * highest)
+        error, reach = u - m.truth[plane][..., 0], 0.5 * highest
+        image = column[1].pcolormesh(along, shares, error, cmap=DIVERGING, vmin=-reach, vmax=reach)
         column[0].set(title=name)
-        column[1].set(xlabel=f"{'xyz'[main]}, along the flow (mm)")
+        column[1].set(xlabel="x, along the flow (mm)")
         for panel in column:
             panel.axhline(PAPERS_WALL, color="0.4", linewidth=0.8, linestyle="--")
     for panel in axes[:, 0]:
@@ -303,15 +284,15 @@ def plane_figure(methods: Mapping[str, Measured], duct: Duct, plane: int) -> Fig
 def wall_profile_figure(methods: Mapping[str, Measured], duct: Duct) -> Figure:
     """Return the mean over flow and depth of the velocity along the flow, over x/D, and its error beside it."""
     figure, (left, right) = new_panels(10.0, 4.2, 1, 2)
-    main, axis = "xyz".index(duct.axis), duct.across["x/D"]
+    axis = duct.across["x/D"]
     first = next(iter(methods.values()))
-    true = _mean_over(first.truth[..., main], first.inside, axis)
+    true = _mean_over(first.truth[..., 0], first.inside, axis)
     left.plot(_as_shares(first.field.grid.axis_mm(axis), duct, axis), true, color="black", label="analytic")
     for (name, m), (colour, marker) in zip(methods.items(), CASE_STYLES, strict=False):
-        found, places = _mean_over(m.field.velocity[..., main], m.inside, axis), m.field.grid.axis_mm(axis)
+        found, places = _mean_over(m.field.velocity[..., 0], m.inside, axis), m.field.grid.axis_mm(axis)
         shares = _as_shares(places, duct, axis)
         left.plot(shares, found, marker, color=colour, markerfacecolor="none", label=name)
-        own = _mean_over(m.truth[..., main], m.inside, axis)
+        own = _mean_over(m.truth[..., 0], m.inside, axis)
         right.plot(shares, 100.0 * (found / own - 1.0), marker + "-", color=colour, label=name)
     left.set(xlabel="x/D", ylabel="velocity along the flow, mean of the plane (m/s)")
     right.set(xlabel="x/D", ylabel="its error (%)")
@@ -321,11 +302,6 @@ def wall_profile_figure(methods: Mapping[str, Measured], duct: Duct) -> Figure:
         panel.grid(alpha=0.3)
     left.legend(fontsize=8)
     return figure
-
-
-def _oriented(plane: Floats, main: int) -> Floats:
-    """Return a plane [y, x] of vectors with the flow's axis last."""
-    return plane if main == 0 else np.swapaxes(plane, 0, 1)
 
 
 def _mean_over(values: Floats, inside: NDArray[np.bool_], axis: int) -> Floats:
