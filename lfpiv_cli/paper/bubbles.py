@@ -28,14 +28,14 @@ from lfpiv_cli.verbs.reconstruct import ReconstructOptions, reconstruct_files
 from lfpiv_cli.verbs.simulate import frame_names, simulate_board, simulate_particles, simulate_white
 
 
-def beside_wall(measured: Measured, duct: Duct, beyond: float = PAPERS_WALL) -> NDArray[np.bool_]:
-    """Return which windows (nz, ny, nx) lie beyond a share of the width, of those that are judged."""
+def beside_wall(measured: Measured, duct: Duct) -> NDArray[np.bool_]:
+    """Return which windows (nz, ny, nx) lie beyond `PAPERS_WALL` of the width, of those that are judged."""
     axis = duct.across["x/D"]
     places = measured.field.grid.centres_mm()[..., axis]
-    return np.asarray(measured.inside & (places > duct.position_mm(axis, beyond)))
+    return np.asarray(measured.inside & (places > duct.position_mm(axis, PAPERS_WALL)))
 
 
-def near_wall(measured: Measured, duct: Duct, beyond: float = PAPERS_WALL) -> dict[str, float]:
+def near_wall(measured: Measured, duct: Duct) -> dict[str, float]:
     """Return the figures of a duct's windows near the wall at the high end of its lateral axis, along the flow.
 
     Returns
@@ -44,7 +44,7 @@ def near_wall(measured: Measured, duct: Duct, beyond: float = PAPERS_WALL) -> di
         `windows`, how many; `within_25`, the share of them within a quarter of the true velocity; `mean_error` of the
         sum of velocities, a share; `within_sigma`, `mean_sigma`: by how much chance moves the two, one standard error
     """
-    pairs = replace(measured, inside=beside_wall(measured, duct, beyond)).pairs
+    pairs = replace(measured, inside=beside_wall(measured, duct)).pairs
     streamwise, _ = relative_errors(pairs)
     # a duct's flow has a direction
     assert streamwise is not None
@@ -62,8 +62,8 @@ def near_wall(measured: Measured, duct: Duct, beyond: float = PAPERS_WALL) -> di
     }
 
 
-FULL = ChannelSize(10.0, 3.2, 640, 1768, 0.1, (32, 16), 200, (3, 7))
-QUICK = ChannelSize(5.0, 2.4, 480, 900, 0.1, (16,), 40, (3, 4))
+FULL = ChannelSize(10.0, 3.2, 640, 1768, (32, 16), 200, (3, 7))
+QUICK = ChannelSize(5.0, 2.4, 480, 900, (16,), 40, (3, 4))
 # What the mask leaves must measure as well as a channel without bubbles in which the same pixels are hidden, but for so
 # many standard errors of chance.
 CHANCE_SIGMAS = 2.0

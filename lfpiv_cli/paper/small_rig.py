@@ -53,7 +53,7 @@ SENSOR_PX = 448
 WATER = Media(1.0, 1.49, 1.33)
 CHANNEL = Channel(10.0, 5.0)
 # Counts of a tracer's light: 2.5e5 photons, some 1,900 counts in a lit pixel.
-LIGHT_COUNTS = 5e5
+LIGHT_COUNTS, DIAMETER_MM = 5e5, 0.05
 BRIGHTNESS = (0.6, 1.4)
 # Tracers stand apart by this much, so that each measured place has one true one whatever is wrong, in this square and
 # between these depths: within the channel, and light stays on the sensor.
@@ -106,21 +106,20 @@ class Rig:
 
 @dataclass(frozen=True, eq=False)
 class Tracers:
-    """Tracers (n, 3) of a diameter, and the light (n,) of each that passes the main lens, in counts."""
+    """Places (n, 3) of tracers, and the light (n,) of each that passes the main lens, in counts."""
 
     position_mm: Points
     light_counts: Floats
-    diameter_mm: float = 0.05
 
     def moved(self, by_mm: Points) -> Tracers:
         """Return the tracers, each (n, 3) moved."""
-        return Tracers(self.position_mm + by_mm, self.light_counts, self.diameter_mm)
+        return Tracers(self.position_mm + by_mm, self.light_counts)
 
 
 def photograph(rig: Rig, tracers: Tracers, readout: Readout, rng: np.random.Generator) -> Image:
     """Return the recorded image (rows, columns) of tracers, the dark level taken off."""
     places = rig.reference.points_to_focal_point(tracers.position_mm)
-    balls = Balls(places, tracers.light_counts, tracers.diameter_mm)
+    balls = Balls(places, tracers.light_counts, DIAMETER_MM)
     recorded = readout.record(render_points(rig.camera, rig.space, balls, rng), rng)
     return recorded.astype(np.float32) - np.float32(readout.dark_level_counts)
 
@@ -131,7 +130,6 @@ class Search:
 
     rig: Rig
     size_mm: tuple[float, float, float]
-    diameter_mm: float = 0.05
     search_voxel_mm: tuple[float, float, float] = SEARCH_VOXEL_MM
     rounds: tuple[Round, ...] = ROUNDS
 
@@ -145,7 +143,7 @@ class Search:
     def particles(self, image: Image) -> Points:
         """Return the places (n, 3) of the particles behind an image, those a little outside the box as well."""
         rig, weights = self.rig, self._weights
-        view = raw_view(rig.camera, rig.media, 0.5 * self.diameter_mm, None, rig.space)
+        view = raw_view(rig.camera, rig.media, 0.5 * DIAMETER_MM, None, rig.space)
         found = find_particles(task_of(image, view, weights, rig.camera, normalisers(weights.padded)), self.rounds)
         return rig.reference.points_from_focal_point(found.position_mm)
 
@@ -291,7 +289,7 @@ def in_noise(read_over_light: float, seed: int) -> Figures:
     """Return the figures with read noise of so many times the light of a lit pixel, and the bound of their scatter."""
     rng = np.random.default_rng([seed, 7])
     known = Rig(sheet())
-    view = raw_view(known.camera, WATER, 0.025, None, known.space)
+    view = raw_view(known.camera, WATER, 0.5 * DIAMETER_MM, None, known.space)
     readout = replace(READOUT, read_noise_counts=read_over_light * LIGHT_COUNTS / lens_pixels(view))
     tracers = strewn_apart(rng)
     places = np.column_stack([known.reference.points_to_focal_point(tracers.position_mm), tracers.light_counts])

@@ -26,6 +26,8 @@ from lfpiv_cli.verbs.simulate import simulate_boards
 SEED = 7
 # The mean over the channel's section, m/s: 40 L/h through 1 cm2, rounded as the paper has it.
 MEAN_VELOCITY_M_S = 0.1082
+# Sides of the paper's voxels.
+VOXEL_MM = 0.1
 # How far the board on the wall is off the focal plane, in air, and by Eq. 21 the middle of the channel, in water.
 BOARD_Z_MM, MID_PLANE_Z_MM = -0.2, -0.266
 
@@ -39,7 +41,7 @@ class ChannelSize:
     width_mm : D, its inner width
     length_mm : of the volume along the flow
     columns, rows : of the sensor
-    voxel_mm, windows : of volumes and their correlation, coarse to fine
+    windows : of the correlation in voxels, coarse to fine
     iterations : of SART
     dots : of the boards in the fluid along x and y; the one on the wall has at most seven
     spacing_mm : of the dots
@@ -50,7 +52,6 @@ class ChannelSize:
     length_mm: float
     columns: int
     rows: int
-    voxel_mm: float
     windows: tuple[int, ...]
     iterations: int
     dots: tuple[int, int]
@@ -70,20 +71,20 @@ class ChannelSize:
     @property
     def window_mm(self) -> float:
         """Side of the final interrogation window."""
-        return self.windows[-1] * self.voxel_mm
+        return self.windows[-1] * VOXEL_MM
 
     def told(self) -> str:
         """Return the size in words."""
-        shape = " x ".join(f"{round(side / self.voxel_mm)}" for side in self.volume_mm)
+        shape = " x ".join(f"{round(side / VOXEL_MM)}" for side in self.volume_mm)
         return (
-            f"a channel of {self.width_mm:g} mm, {shape} voxels of {self.voxel_mm:g} mm, {self.particles} tracers, "
+            f"a channel of {self.width_mm:g} mm, {shape} voxels of {VOXEL_MM:g} mm, {self.particles} tracers, "
             f"{self.columns} x {self.rows} pixels"
         )
 
 
-FULL = ChannelSize(10.0, 13.0, 2352, 1768, 0.1, (32, 16), 200, (13, 9))
-QUICK = ChannelSize(5.0, 4.0, 800, 900, 0.1, (32, 16), 60, (5, 5))
-TINY = ChannelSize(1.6, 1.6, 400, 400, 0.1, (8,), 5, (3, 3), 0.5, 5_000)
+FULL = ChannelSize(10.0, 13.0, 2352, 1768, (32, 16), 200, (13, 9))
+QUICK = ChannelSize(5.0, 4.0, 800, 900, (32, 16), 60, (5, 5))
+TINY = ChannelSize(1.6, 1.6, 400, 400, (8,), 5, (3, 3), 0.5, 5_000)
 
 # Iterations of accelerated EM, which needs no more.
 EM_ITERATIONS = 24
@@ -110,8 +111,8 @@ def channel_sections(size: ChannelSize, **changes: Any) -> dict[str, Any]:
         channel={"width_mm": size.width_mm, "wall_mm": 5.0},
         board=BOARD | {"dots": dots, "spacing_mm": size.spacing_mm, "medium": "air"},
         volume={
-            "shape_xyz": [round(side / size.voxel_mm) for side in size.volume_mm],
-            "voxel_mm": size.voxel_mm,
+            "shape_xyz": [round(side / VOXEL_MM) for side in size.volume_mm],
+            "voxel_mm": VOXEL_MM,
             "reference": "mid_plane",
         },
         correlation={"windows": list(size.windows), "overlap": 0.5, "dt_s": 0.0018},
@@ -315,7 +316,7 @@ def _setup(size: ChannelSize) -> Table:
             ("time between the frames", "1.8 ms", "1.8 ms"),
             ("tracers, diameter", "50 µm", "50 µm"),
             ("tracers", "0.002 per pixel", f"{size.particles / (size.columns * size.rows):.4f} per pixel"),
-            ("voxels", "0.1 mm", f"{size.voxel_mm:g} mm"),
+            ("voxels", "0.1 mm", f"{VOXEL_MM:g} mm"),
             ("interrogation windows", "16 voxels, overlap 50 %", f"{size.windows[-1]} voxels, overlap 50 %"),
             ("SART", "200 iterations, relaxation 1", f"{size.iterations} iterations, relaxation 1"),
             ("camera", "Table 2", f"Table 2, {size.columns} x {size.rows} pixels"),

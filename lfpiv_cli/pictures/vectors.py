@@ -69,19 +69,10 @@ class Plane(NamedTuple):
         """The axis that the plane lies across."""
         return 3 - self.right - self.up
 
-    @property
-    def name(self) -> str:
-        """Its axes' names, for instance x-z."""
-        return f"{AXIS_NAMES[self.right]}-{AXIS_NAMES[self.up]}"
-
     def of(self, values: NDArray[Any]) -> NDArray[Any]:
         """Return the middle plane of an array [z, y, x, ...] as [up, right, ...]."""
         along = 2 - self.normal
         return values.take(values.shape[along] // 2, axis=along)
-
-    def place_mm(self, grid: Grid) -> float:
-        """Return where the middle plane lies on its normal."""
-        return float(grid.axis_mm(self.normal)[grid.shape_xyz[self.normal] // 2])
 
     def extent(self, grid: Grid) -> tuple[float, float, float, float]:
         """Return the outer faces: left, right, bottom, top, mm."""
@@ -109,14 +100,15 @@ def draw_maps(
     blank.
     """
     for axes, plane, values, title in zip(row, PLANES, maps, titles, strict=True):
-        extent, place = plane.extent(grid), ""
+        extent, place, right, up = plane.extent(grid), "", AXIS_NAMES[plane.right], AXIS_NAMES[plane.up]
         if values.ndim > 2:
             values = plane.of(values)
-            place = f"{plane.name} at {AXIS_NAMES[plane.normal]} = {plane.place_mm(grid):z.2f} mm"
+            middle = grid.axis_mm(plane.normal)[grid.shape_xyz[plane.normal] // 2]
+            place = f"{right}-{up} at {AXIS_NAMES[plane.normal]} = {middle:z.2f} mm"
         image = axes.imshow(values, origin="lower", extent=extent, interpolation="nearest", **scale)
         axes.set(
-            xlabel=f"{AXIS_NAMES[plane.right]} (mm)",
-            ylabel=f"{AXIS_NAMES[plane.up]} (mm)",
+            xlabel=f"{right} (mm)",
+            ylabel=f"{up} (mm)",
             title="\n".join(each for each in (title, place) if each),
             xlim=extent[:2],
             ylim=extent[2:],

@@ -213,6 +213,8 @@ PLACES, STEPS = 8, np.array([0.7548776662466927, 0.5698402909980532])
 LENSES_AROUND = 3
 # Before and behind a depth alone, in depths over which light spreads by one lens: waves are computed about it.
 ABOUT_DEPTH = 1e-3
+# Planes of a box in which its share in view is looked at.
+VIEW_PLANES = 41
 # Rounds in which light and number of an image's tracers are told from each other.
 ROUNDS = 4
 # Pixels are lit that a lens image's rim only touches.
@@ -254,14 +256,14 @@ def half_view_mm(camera: Camera, media: Media, z_mm: ArrayLike, rim: float = -1.
     return np.asarray(seen if camera.column_axis == "x" else seen[..., ::-1])
 
 
-def share_in_view(camera: Camera, media: Media, bounds_mm: Floats, rim: float = -1.0, planes: int = 41) -> float:
-    """Return the share of a box's volume in the field of view, `rim` as in `half_view_mm`.
+def share_in_view(camera: Camera, media: Media, bounds_mm: Floats) -> float:
+    """Return the share of a box's volume in which all of a point's light is seen.
 
     Parameters
     ----------
     bounds_mm : (3, 2) lowest and highest x, y, z of the box
     """
-    half = half_view_mm(camera, media, np.linspace(bounds_mm[2, 0], bounds_mm[2, 1], planes), rim)
+    half = half_view_mm(camera, media, np.linspace(bounds_mm[2, 0], bounds_mm[2, 1], VIEW_PLANES))
     low, high = np.maximum(bounds_mm[:2, 0], -half), np.minimum(bounds_mm[:2, 1], half)
     sides = np.maximum(high - low, 0.0) / np.diff(bounds_mm[:2])[:, 0]
     return float(np.mean(np.prod(sides, axis=1)))
@@ -327,9 +329,9 @@ def vectors_along(sides_mm: ArrayLike, window_mm: ArrayLike, overlap: ArrayLike)
     return np.maximum(np.floor(np.asarray(sides_mm) / steps + ROUNDING), 1.0).astype(np.int64)
 
 
-def time_step_s(velocity_m_s: float, voxel_mm: float, voxels: float = BEST_STEP) -> float:
-    """Return the time in which a velocity crosses so many voxels."""
-    return voxels * voxel_mm / (abs(velocity_m_s) * 1e3)
+def time_step_s(velocity_m_s: float, voxel_mm: float) -> float:
+    """Return the time in which a velocity crosses the best number of voxels."""
+    return BEST_STEP * voxel_mm / (abs(velocity_m_s) * 1e3)
 
 
 def errors_by_depth_mm(seen: Sequence[Miniature], tracer: Tracer, counts_per_ray: float = 0.0) -> Floats:
