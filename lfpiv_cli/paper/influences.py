@@ -16,19 +16,14 @@ Values = tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]
 
 @dataclass(frozen=True)
 class Series:
-    """A curve of a panel.
+    """A curve of a panel: the figure that is drawn, and what turns it into the panel's unit.
 
-    Attributes
-    ----------
-    figure : name of what is drawn, `factor` turns it into the panel's unit
-    fitted : its straight line is drawn, in this power of the influence
+    Where a sensitivity is a slope, the straight line of its figure is drawn as well.
     """
 
     figure: str
     label: str
     factor: float = 1.0
-    fitted: bool = False
-    power: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -113,7 +108,7 @@ F_NUMBERS = Influence(
         Panel(
             "error of depth behind 134 mm of water (mm)",
             (
-                Series("paraxial_offset_z", "rays taken as paraxial", 1.0, True, power=-2.0),
+                Series("paraxial_offset_z", "rays taken as paraxial", 1.0),
                 Series("exact_offset_z", "rays by Snell's law"),
             ),
         ),
@@ -241,8 +236,8 @@ LEVER = SHEET.image_distance_mm / SHEET.microlens_distance_mm
 SLANT_PER_MM = LEVER / SHEET.focus_distance_mm * WATER.depth_ratio
 TURN_PER_DEG = float(np.deg2rad(1.0))
 
-DEPTH = Panel("error of depth (mm)", (Series("offset_z", "in the middle of the channel", 1.0, True),))
-SCALES = (Series("stretch_z", "along the depth", 100.0, True), Series("stretch_x", "lateral", 100.0, True))
+DEPTH = Panel("error of depth (mm)", (Series("offset_z", "in the middle of the channel", 1.0),))
+SCALES = (Series("stretch_z", "along the depth", 100.0), Series("stretch_x", "lateral", 100.0))
 FOUND = Panel("found of the tracers", (Series("recall", "found"), Series("precision", "of those found, true")))
 VELOCITY = Panel("error of velocities (%)", SCALES, at_least=1.0)
 # With the focal plane 2 mm off, tracers from deeper than this are believed to be in the wall.
@@ -327,7 +322,7 @@ SHIFT = Influence(
     label="lens images believed to lie farther along x (pixels)",
     values=((-0.3, 0.3), (-0.3, 0.0, 0.3), (-1.0, -0.5, -0.2, 0.0, 0.2, 0.5, 1.0)),
     measure=partial(in_places, small_rig.lattice_shifted),
-    panels=(Panel("slant of x over depth (um/mm)", (Series("slant_x", "x per depth, w into u", 1e3, True),)), FOUND),
+    panels=(Panel("slant of x over depth (um/mm)", (Series("slant_x", "x per depth, w into u", 1e3),)), FOUND),
     typical=(0.05, "0.05 px: an older white image"),
     sensitivities=(
         Sensitivity(
@@ -352,8 +347,8 @@ TURN = Influence(
         Panel(
             "turn of lateral places",
             (
-                Series("turn", "in the focal plane (degrees)", 1.0 / TURN_PER_DEG, True),
-                Series("twist", "more for each mm of depth (degrees/mm)", 1.0 / TURN_PER_DEG, True),
+                Series("turn", "in the focal plane (degrees)", 1.0 / TURN_PER_DEG),
+                Series("twist", "more for each mm of depth (degrees/mm)", 1.0 / TURN_PER_DEG),
             ),
         ),
         FOUND,

@@ -28,10 +28,9 @@ from lfpiv_cli.paper.influences import (
     WALL,
     Influence,
     Sensitivity,
-    Series,
 )
 from lfpiv_cli.paper.parts import Drawing, Findings, Row, Work
-from lfpiv_cli.pictures.style import BLUE, GREEN, ORANGE, PURPLE, VERMILION, Axes, new_panels, styled
+from lfpiv_cli.pictures.style import BLUE, GREEN, ORANGE, PURPLE, VERMILION, new_panels, styled
 
 # Colours that colour-blind people tell apart, and marks that a print in grey keeps apart.
 COLOURS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE)
@@ -171,11 +170,22 @@ def drawing_of(found: Measured) -> Drawing:
     from matplotlib.ticker import LogLocator, NullFormatter
 
     influence = found.influence
-    lines = {each.figure: found.line(each) for each in influence.sensitivities if each.at is None}
+    lines = {each.figure: each for each in influence.sensitivities if each.at is None}
     figure, both = new_panels(9.0, 3.8, 1, 2)
     for axes, panel in zip(both, influence.panels, strict=True):
         for number, series in enumerate(panel.series):
-            _draw(axes, found, series, number, lines.get(series.figure))
+            # medians, the range over realisations, and the straight line or the points joined
+            colour, dash, of = COLOURS[number], DASHES[number], lines.get(series.figure)
+            middle, table = series.factor * found.median(series.figure), series.factor * found.figures[series.figure]
+            offset, slope = (np.nan, np.nan) if of is None else found.line(of)
+            style = dash if of is None or not np.isfinite(slope) else ""
+            axes.plot(found.values, middle, MARKS[number], color=colour, ls=style, ms=5, label=series.label)
+            if table.shape[1] > 1:
+                axes.vlines(found.values, table.min(axis=1), table.max(axis=1), color=colour, lw=1.5)
+            if of is not None and np.isfinite(slope):
+                known = found.values[np.isfinite(middle)]
+                x = np.linspace(known.min(), known.max(), 50)
+                axes.plot(x, series.factor * (offset + slope * x**of.power), ls=dash, color=colour, lw=1.2)
         axes.set_xlabel(influence.label, fontsize=9)
         axes.set_ylabel(panel.label, fontsize=9)
         axes.tick_params(labelsize=8)
@@ -201,20 +211,6 @@ def drawing_of(found: Measured) -> Drawing:
             axes.legend(fontsize=8)
     bars = " Medians; bars: all realisations." if found.values.size and influence.repeats > 1 else ""
     return Drawing(influence.name, f"Errors over the {influence.label}.{bars}", figure)
-
-
-def _draw(axes: Axes, found: Measured, series: Series, number: int, line: tuple[float, float] | None) -> None:
-    """Draw a series: medians, the range over realisations, and its straight line or the points joined."""
-    colour, mark, dash = COLOURS[number], MARKS[number], DASHES[number]
-    middle, table = series.factor * found.median(series.figure), series.factor * found.figures[series.figure]
-    is_line = series.fitted and line is not None and np.isfinite(line[1])
-    axes.plot(found.values, middle, mark, color=colour, ls="" if is_line else dash, ms=5, label=series.label)
-    if table.shape[1] > 1:
-        axes.vlines(found.values, table.min(axis=1), table.max(axis=1), color=colour, lw=1.5)
-    if is_line and line is not None:
-        known = found.values[np.isfinite(middle)]
-        x = np.linspace(known.min(), known.max(), 50)
-        axes.plot(x, series.factor * (line[0] + line[1] * x**series.power), ls=dash, color=colour, lw=1.2)
 
 
 def table_of(found: Sequence[Measured]) -> Table:
