@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from lfpiv_cli.synthetic.flows import advect
-from lfpiv_cli.synthetic.vortices import MM_PER_M, Flow
+from lfpiv_cli.synthetic.flows import MM_PER_M, Flow, advect
 
 Floats = NDArray[np.float64]
 

@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from benchmarks.field_tracks import Tracks, tracks_of, true_displacement_mm
 from lfpiv_cli.fields.fit import fit_field
 from lfpiv_cli.fields.samples import Samples
-from lfpiv_cli.synthetic.flows import random_modes
-from lfpiv_cli.synthetic.vortices import Flow, abc, source, taylor_green, vortex_ring
+from lfpiv_cli.synthetic.flows import Flow, abc, random_modes, source, taylor_green, vortex_ring
 from lfpiv_cli.tracks.gridding import on_grid
 
 SIZE_MM = np.array([13.0, 10.0, 10.0])

@@ -11,8 +11,7 @@ import numpy as np
 
 from benchmarks.field_tracks import Floats, stated_covariance
 from lfpiv_cli.fields.pressure import knots_for, lattice_over, pressure_field, pressure_gradients
-from lfpiv_cli.synthetic.flows import advect
-from lfpiv_cli.synthetic.vortices import MM_PER_M, KnownFlow, abc, taylor_green
+from lfpiv_cli.synthetic.flows import MM_PER_M, KnownFlow, abc, advect, taylor_green
 from lfpiv_cli.tracks.candidates import Seen, Trajectories
 from lfpiv_cli.tracks.in_time import high_derivatives_in, motions_at
 from lfpiv_cli.verbs.field import neglected_share

@@ -19,9 +19,8 @@ from lfpiv_cli.files.particles import read_particles
 from lfpiv_cli.files.vtkhdf import open_vectors
 from lfpiv_cli.flow.field import REJECTED
 from lfpiv_cli.particles.view import raw_view
-from lfpiv_cli.synthetic.flows import advect
+from lfpiv_cli.synthetic.flows import MM_PER_M, Flow, advect
 from lfpiv_cli.synthetic.render import RAYS
-from lfpiv_cli.synthetic.vortices import MM_PER_M, Flow
 from lfpiv_cli.validation.planning import Bound, cramer_rao_bound, expected_image, pixel_variance, slopes
 from lfpiv_cli.validation.volume import COVERED_SIGMAS, match
 from lfpiv_cli.verbs.simulate import readout_of, real_camera, simulated_reference

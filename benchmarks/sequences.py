@@ -19,8 +19,7 @@ from lfpiv_cli.files.particle_file import symmetric
 from lfpiv_cli.particles.neighbour_frames import Predicted, find_predicted, second_pass
 from lfpiv_cli.particles.rounds import first_pass
 from lfpiv_cli.particles.search import Particles, result
-from lfpiv_cli.synthetic.flows import advect, random_modes, square_duct
-from lfpiv_cli.synthetic.vortices import Flow, taylor_green
+from lfpiv_cli.synthetic.flows import Flow, advect, random_modes, square_duct, taylor_green
 from lfpiv_cli.tracks.candidates import Light, Seen, long_ones
 from lfpiv_cli.tracks.sequences import Ahead, SoFar, begun, expected_in, followed_further, scatter_in, states_at
 from lfpiv_cli.validation.volume import match

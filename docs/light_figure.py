@@ -12,8 +12,7 @@ from lfpiv_cli.files.config import load_config
 from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.optics.waves import Waves
 from lfpiv_cli.pictures.style import new_figure, styled
-from lfpiv_cli.synthetic.render import Balls, render_points
-from lfpiv_cli.synthetic.wave_images import lens_blur_mm, points_by_waves
+from lfpiv_cli.synthetic.render import Balls, lens_blur_mm, render_points
 
 # Table 2's camera, a tracer in its fluid; nine lenses are some 55 pixels wide.
 DIAMETERS_MM, DEPTH_MM, PLACE_MM, SIDE_PX = (0.0, 0.05), 3.0, (0.012, 0.021), 56
@@ -33,7 +32,7 @@ def images(config: Path, diameter_mm: float) -> dict[str, NDArray[np.float64]]:
         "rays, blurred as by one lens": render_points(
             camera, space, ball, np.random.default_rng(0), rays=RAYS, blur_mm=blur
         ),
-        "waves": points_by_waves(camera, space, ball, GREEN),
+        "waves": render_points(camera, space, ball, np.random.default_rng(0), waves=GREEN),
     }
 
 

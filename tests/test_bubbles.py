@@ -22,8 +22,7 @@ from lfpiv_cli.paper.bubbles import _rows, bubbles
 from lfpiv_cli.paper.parts import Work, read_json
 from lfpiv_cli.paper.table4 import TINY, channel_sections
 from lfpiv_cli.reconstruction.images import LARGEST_STILL, still_light
-from lfpiv_cli.synthetic.bubbles import Bubbles, bubbles_at_wall, render_bubbles
-from lfpiv_cli.synthetic.scenes import Box, channel_walls
+from lfpiv_cli.synthetic.scenes import Box, Bubbles, bubbles_at_wall, channel_walls, render_bubbles
 
 AIR = ObjectSpace(Media())
 MARGIN_PX = 3

@@ -25,7 +25,7 @@ from lfpiv_cli.files.rig_numbers import RigNumbers, rig_text, tree_of
 from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.tracing import ObjectSpace
-from lfpiv_cli.paper.small_rig import Rig, Search, pairs_of
+from lfpiv_cli.paper.small_rig import Rig, Search
 from lfpiv_cli.particles.view import raw_view
 from lfpiv_cli.synthetic.render import Balls, render_points, render_white
 from lfpiv_cli.synthetic.sensor import Readout
@@ -38,6 +38,7 @@ from lfpiv_cli.validation.planning import (
     part_in_front,
     share_in_view,
 )
+from lfpiv_cli.validation.volume import pairs_of
 from lfpiv_cli.verbs.check import Pictures, image_lines, lattice_of
 from lfpiv_cli.verbs.particles import light_of
 from lfpiv_cli.verbs.planning import Line, bench_of, diffraction_line, rig_figures, rig_lines, windows_line, worst

@@ -13,8 +13,9 @@ from lfpiv_cli.optics.curved_space import CurvedSpace, Face
 from lfpiv_cli.optics.media import Media, Window, fluid_path_to_focus
 from lfpiv_cli.optics.surfaces import Cylinder, Plane
 from lfpiv_cli.optics.tracing import ObjectSpace, disc_points, trace
-from lfpiv_cli.synthetic.curved_rays import (
+from lfpiv_cli.synthetic.rays import (
     FITTED,
+    SEQUENCE,
     TERMS,
     TOLERANCE_MM,
     fit_of_slopes,
@@ -22,7 +23,6 @@ from lfpiv_cli.synthetic.curved_rays import (
     unseen,
     write_terms,
 )
-from lfpiv_cli.synthetic.ray_sequence import SEQUENCE
 from lfpiv_cli.synthetic.render import Balls, render_points
 
 WATER = Media(1.0, 1.49, 1.33)

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.field_tracks import BLIND_MM, LENS_MM, stated_covariance, tracks_of, true_displacement_mm
-from lfpiv_cli.synthetic.flows import rigid_rotation
-from lfpiv_cli.synthetic.vortices import taylor_green
+from lfpiv_cli.synthetic.flows import rigid_rotation, taylor_green
 
 FLOW = taylor_green(0.1, 12.0)
 

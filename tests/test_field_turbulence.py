@@ -16,7 +16,7 @@ from lfpiv_cli.fields.turbulence import (
     reynolds_stresses,
     spectrum,
 )
-from lfpiv_cli.synthetic.vortices import taylor_green
+from lfpiv_cli.synthetic.flows import taylor_green
 
 NONE = np.zeros((1, 9, 9))
 

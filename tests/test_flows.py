@@ -11,15 +11,18 @@ from lfpiv_cli.synthetic.flows import (
     FLOWS,
     STEADY,
     Pulsation,
+    abc,
     advect,
     pipe,
     random_modes,
     rigid_rotation,
     shear,
+    source,
     square_duct,
+    taylor_green,
     uniform,
+    vortex_ring,
 )
-from lfpiv_cli.synthetic.vortices import abc, source, taylor_green, vortex_ring
 
 WIDTH = 10.0
 MEAN = 0.1082

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from lfpiv_cli.scale import Scale
-from lfpiv_cli.synthetic.flows import advect, random_modes, rigid_rotation
-from lfpiv_cli.synthetic.vortices import Flow
+from lfpiv_cli.synthetic.flows import Flow, advect, random_modes, rigid_rotation
 from lfpiv_cli.tracks.candidates import NO_TRACK, Light, Seen, long_ones
 from lfpiv_cli.tracks.sequences import PAST_FRAMES, REACH_FRAMES, SoFar, begun, expected_in, follow, followed_further
 

@@ -21,7 +21,7 @@ from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.tracing import ObjectSpace, disc_points
 from lfpiv_cli.optics.waves import Waves, WavesInCamera
 from lfpiv_cli.synthetic.board import BoardPlacement, render_board
-from lfpiv_cli.synthetic.objective import objective_of, passed_light, passes_barrel, trace_real_ray
+from lfpiv_cli.synthetic.rays import objective_of, passed_light, passes_barrel, trace_real_ray
 from lfpiv_cli.synthetic.render import Balls, render_points, render_white
 from lfpiv_cli.verbs.simulate import real_camera
 

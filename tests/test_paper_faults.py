@@ -32,7 +32,7 @@ from lfpiv_cli.paper.faults import (
     said_to,
 )
 from lfpiv_cli.paper.parts import sections
-from lfpiv_cli.paper.small_scenes import displacement
+from lfpiv_cli.paper.small_rig import displacement
 from lfpiv_cli.reference import FOCAL_POINT
 
 Points = NDArray[np.float64]
@@ -43,7 +43,7 @@ SIGMA_MM = np.array([1e-4, 1e-4, 3e-3])
 def tracks(seed: int, change: Any = lambda middle, moved: (middle, moved)) -> dict[str, float]:
     """Figures of tracks with noise, changed by a mistake."""
     rng = np.random.default_rng(seed)
-    true = small_rig.strewn_apart(rng, (-4.0, 4.0), small_rig.HALF_WIDTH_MM).position_mm
+    true = small_rig.strewn_apart(rng).position_mm
     moves = displacement(true)
     middle, moved = (values + rng.normal(0.0, SIGMA_MM, true.shape) for values in (true, moves))
     return place_and_velocity_figures(*change(middle, moved), true, moves)

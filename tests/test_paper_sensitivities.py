@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lfpiv_cli.optics.media import equivalent_object_distance
-from lfpiv_cli.paper import small_rig, small_scenes
+from lfpiv_cli.paper import small_rig
 from lfpiv_cli.paper.influences import (
     DISTANCE,
     F_NUMBERS,
@@ -26,16 +26,15 @@ from lfpiv_cli.paper.influences import (
 )
 from lfpiv_cli.paper.sensitivities import (
     INFLUENCES,
-    Curves,
     Measured,
-    bound_rows,
     care,
     crowding,
     drawing_of,
     rows_of,
     table_of,
 )
-from lfpiv_cli.paper.small_rig import CHANNEL, TERMS, WATER, Case, Rig, fit_errors, pairs_of, straight_line
+from lfpiv_cli.paper.small_rig import CHANNEL, WATER, Case, Rig
+from lfpiv_cli.validation.volume import TERMS, fit_errors, pairs_of
 
 DEPTHS = np.array([-3.0, 0.0, 4.0])
 FAINT = 1e-4
@@ -57,18 +56,18 @@ def believed_depth_mm(case: Case, z_mm: NDArray[np.float64]) -> NDArray[np.float
     return np.asarray(seen / case.believed.media.depth_ratio - case.believed.reference.z_mm)
 
 
-def curves_of(influence: Influence, slopes: dict[str, float]) -> Curves:
-    """Curves whose figures are straight lines of these slopes, faint ones for all others."""
+def lines_of(influence: Influence, slopes: dict[str, float]) -> Measured:
+    """An influence whose figures are straight lines of these slopes, faint ones for all others."""
     values = np.array(influence.values[1])
     names = {series.figure for panel in influence.panels for series in panel.series}
     names |= {each.figure for each in influence.sensitivities}
-    return Curves(values, {name: slopes.get(name, FAINT) * values[:, np.newaxis] for name in names})
+    return Measured(influence, values, {name: slopes.get(name, FAINT) * values[:, np.newaxis] for name in names})
 
 
 def by_theory(influence: Influence, factor: float = 1.0) -> Measured:
     """Return an influence with the slopes of theory, times a factor."""
     expected = {each.figure: factor * (each.expected or FAINT) for each in influence.sensitivities}
-    return Measured(influence, curves_of(influence, expected))
+    return lines_of(influence, expected)
 
 
 @pytest.mark.parametrize(
@@ -85,7 +84,7 @@ def by_theory(influence: Influence, factor: float = 1.0) -> Measured:
 )
 def test_the_map_names_each_displacement(name: str, error: Callable[[NDArray[np.float64]], NDArray[np.float64]]):
     true = places()
-    figures = fit_errors(true, error(true)).figures()
+    figures = fit_errors(true, error(true)).figures
     assert figures.pop(name) == pytest.approx(0.3, abs=1e-12)
     assert np.allclose(list(figures.values()), 0.0, atol=1e-12)
 
@@ -95,7 +94,7 @@ def test_the_map_tells_its_standard_errors_and_leaves_outliers_out():
     error = rng.normal(0.0, [0.01, 0.01, 0.2], true.shape)
     error[:40, 2] += 50.0
     fitted = fit_errors(true, error)
-    figures, sigma = fitted.figures(), fitted.standard_errors()
+    figures, sigma = fitted.figures, fitted.sigma
     assert fitted.count <= len(true) - 40
     assert all(abs(figures[name]) < 5.0 * sigma[name] for name in figures if not name.startswith("spread"))
     assert figures["spread_z"] == pytest.approx(0.2, abs=5.0 * sigma["spread_z"])
@@ -105,11 +104,11 @@ def test_the_map_tells_its_standard_errors_and_leaves_outliers_out():
 
 def test_a_map_of_too_few_places_is_not_known():
     true = places(TERMS)
-    assert np.isnan(list(fit_errors(true, true).figures().values())).all()
+    assert np.isnan(list(fit_errors(true, true).figures.values())).all()
 
 
 def test_tracers_apart_are_paired_whatever_their_depths_are_wrong_by():
-    true = small_rig.strewn_apart(np.random.default_rng(2), (-4.0, 4.0), 0.9).position_mm
+    true = small_rig.strewn_apart(np.random.default_rng(2)).position_mm
     shuffled = np.random.default_rng(3).permutation(len(true))
     pairs = pairs_of(true[shuffled] + [0.02, -0.03, -2.7], true, small_rig.GATE_MM)
     assert len(pairs.true) == len(true)
@@ -118,9 +117,9 @@ def test_tracers_apart_are_paired_whatever_their_depths_are_wrong_by():
 
 
 def test_a_straight_line_is_fitted_by_least_squares():
-    line = straight_line(np.array([0.0, 1.0, 2.0]), np.array([1.0, 3.3, 5.0]))
-    assert line.slope == pytest.approx(2.0)
-    assert line.offset == pytest.approx(1.1)
+    figures = {"offset_z": np.array([[1.0], [3.3], [5.0]])}
+    line = Measured(WALL, np.array([0.0, 1.0, 2.0]), figures).line(WALL.sensitivities[0])
+    assert line == pytest.approx((1.1, 2.0))
 
 
 def test_eq_21_a_wrong_index_is_right_at_the_inner_wall():
@@ -161,10 +160,10 @@ def test_theory_of_the_slant_is_a_ray_through_another_place_of_the_lens():
 
 
 def test_spherical_aberration_grows_as_the_square_of_the_aperture():
-    assert small_scenes.spherical_aberration_mm(4.0) == pytest.approx(4.0 * small_scenes.spherical_aberration_mm(8.0))
+    assert small_rig.spherical_aberration_mm(4.0) == pytest.approx(4.0 * small_rig.spherical_aberration_mm(8.0))
     # n (2/3) (u^2/2) (t/n) (1 - 1/n^2) of 133.867 mm of water and of the window's 2 mm, u = 1/16
     layers = 133.867 / 1.33 * (1.0 - 1.33**-2) + 2.0 / 1.49 * (1.0 - 1.49**-2)
-    assert small_scenes.spherical_aberration_mm(4.0) == pytest.approx(1.33 / 3.0 / 256.0 * layers)
+    assert small_rig.spherical_aberration_mm(4.0) == pytest.approx(1.33 / 3.0 / 256.0 * layers)
 
 
 def test_the_papers_seeding_in_microlenses():
@@ -172,7 +171,7 @@ def test_the_papers_seeding_in_microlenses():
 
 
 def test_tracers_that_are_strewn_are_as_many_as_asked_for_a_microlens():
-    tracers = small_scenes.strewn(0.5, np.random.default_rng(4))
+    tracers = small_rig.strewn(0.5, np.random.default_rng(4))
     width = np.ptp(tracers.position_mm[:, 0])
     assert len(tracers.position_mm) / (width / 0.1) ** 2 == pytest.approx(0.5, rel=0.05)
 
@@ -186,10 +185,9 @@ def test_rows_are_met_by_theory_and_missed_beside_it(influence: Influence):
 
 @pytest.mark.parametrize(("spread", "verdict"), [(1.4e-2, "met"), (1.6e-2, "missed"), (np.nan, "unknown")])
 def test_scatter_is_held_against_its_bound(spread: float, verdict: str):
-    curves = curves_of(NOISE, {})
-    curves.figures["bound_z"][:], curves.figures["spread_z"][:] = 1e-2, spread
-    assert [row.verdict for row in bound_rows(Measured(NOISE, curves))] == [verdict]
-    assert bound_rows(by_theory(INDEX)) == ()
+    found = lines_of(NOISE, {})
+    found.figures["bound_z"][:], found.figures["spread_z"][:] = 1e-2, spread
+    assert [row.verdict for row in rows_of(found)] == [verdict]
 
 
 def test_a_sensitivity_that_is_not_known_has_no_verdict():
@@ -199,27 +197,26 @@ def test_a_sensitivity_that_is_not_known_has_no_verdict():
 
 
 def replace_figures(measured: Measured, value: float) -> Measured:
-    figures = {name: np.full_like(table, value) for name, table in measured.curves.figures.items()}
-    return replace(measured, curves=Curves(measured.curves.values, figures))
+    return replace(measured, figures={name: np.full_like(table, value) for name, table in measured.figures.items()})
 
 
 def test_what_harms_most_comes_first():
     found = [by_theory(INDEX), by_theory(WALL), by_theory(FOCUS), by_theory(SHIFT)]
-    (text,) = care(found)
+    text = care(found)
     # 0.3 mm of wall, 0.1 mm of focus, 0.005 of index: 0.27, 0.13 and 0.019 mm; lens images harm least
     assert text.index("0.27 mm") < text.index("0.13 mm") < text.index("0.019 mm")
     assert "white image" not in text
     assert [row[0] for row in table_of(found).rows][:2] == ["wall", "focus"]
     # a wall that is known to the micrometre: what harms is something else
-    known = replace(WALL, sensitivities=tuple(replace(each, typical=0.001) for each in WALL.sensitivities))
-    assert "calliper" not in care([by_theory(known), *found[:1], *found[2:]])[0]
+    known = replace(WALL, typical=(0.001, ""))
+    assert "calliper" not in care([by_theory(known), *found[:1], *found[2:]])
 
 
 @pytest.mark.parametrize(("recall", "told"), [((0.97, 0.95, 0.6), "from 1.2 on"), ((1.0, 1.0, 1.0), "at none")])
 def test_from_where_tracers_crowd(recall: tuple[float, ...], told: str):
-    curves = curves_of(SEEDING, {})
-    curves.figures["recall"][:] = np.array(recall)[:, np.newaxis]  # type: ignore[index]
-    assert told in crowding(Measured(SEEDING, curves))
+    found = lines_of(SEEDING, {})
+    found.figures["recall"][:] = np.array(recall)[:, np.newaxis]  # type: ignore[index]
+    assert told in crowding(found)
 
 
 @pytest.mark.thorough

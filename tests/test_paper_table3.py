@@ -9,8 +9,7 @@ from lfpiv_cli.console import Console
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.paper import table3
 from lfpiv_cli.paper.parts import Findings, Work
-from lfpiv_cli.paper.pictures import BoardView, location_figure
-from lfpiv_cli.paper.table3 import table3_experiment
+from lfpiv_cli.paper.pictures import board_view, location_figure
 from lfpiv_cli.synthetic import board as rendering
 from lfpiv_cli.validation.board import MEASURES
 
@@ -25,10 +24,10 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def found(folder) -> dict[str, Findings]:
     """Both parts; a fortieth of the rays, as nothing here rests on smooth pictures."""
-    parts = {"table3": table3.table3, "table3-experiment": table3_experiment}
+    halves: dict[str, table3.Half] = {"table3": "ideal", "table3-experiment": "recorded"}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(rendering, "RAYS_PER_POINT", 100)
-        return {name: part(_work(folder, name)) for name, part in parts.items()}
+        return {name: table3.table3(_work(folder, name), half) for name, half in halves.items()}
 
 
 def _work(folder, name: str, resume: bool = False) -> Work:
@@ -69,7 +68,7 @@ def test_a_part_goes_on_from_the_boards_that_are_kept(found, folder, monkeypatch
 
     monkeypatch.setattr(table3._Boards, "measure", counted)
     monkeypatch.setattr(rendering, "RAYS_PER_POINT", 100)
-    again = table3.table3(_work(folder, "table3", resume=True))
+    again = table3.table3(_work(folder, "table3", resume=True), "ideal")
     assert made == [("best", 2)]
     assert again.rows == found["table3"].rows
 
@@ -99,15 +98,15 @@ def test_where_the_steps_err():
     assert told.endswith("1.00 %")
 
 
-def test_a_view_and_its_plain_form():
+def test_a_view_shows_what_is_bright():
     grid = Grid.centred((6, 5, 7), (0.1, 0.1, 0.2), (0.0, 0.0, 0.0))
     volume = np.zeros(grid.shape_zyx, np.float32)
     volume[3, 2, 4], volume[5, 1, 0] = 10.0, 2.0
-    view = BoardView.from_plain(BoardView.of(volume, grid).to_plain())
-    assert view.front[2, 4] == view.side[3, 4] == 1.0
-    assert view.side[5, 0] == 0.2
-    np.testing.assert_allclose(view.bright_mm, [[0.15, 0.0, 0.0]])
-    np.testing.assert_allclose(view.bounds_mm[2], [-0.7, 0.7])
+    view = board_view(volume, grid)
+    assert view["front"][2, 4] == view["side"][3, 4] == 1.0
+    assert view["side"][5, 0] == 0.2
+    np.testing.assert_allclose(view["bright_mm"], [[0.15, 0.0, 0.0]])
+    np.testing.assert_allclose(view["bounds_mm"][2], [-0.7, 0.7])
 
 
 @pytest.mark.thorough

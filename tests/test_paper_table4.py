@@ -16,8 +16,8 @@ from lfpiv_cli.paper import table4 as part
 from lfpiv_cli.paper.bubbles import near_wall
 from lfpiv_cli.paper.parts import Work
 from lfpiv_cli.paper.table4 import FULL, QUICK, TINY
-from lfpiv_cli.validation.flow import PAPER_OVERALL, PAPER_SLICES, Duct
-from lfpiv_cli.validation.methods import Measured, profile_at, slice_at
+from lfpiv_cli.validation.flow import PAPER_OVERALL, PAPER_SLICES, Duct, Measured
+from lfpiv_cli.validation.methods import profile_at, slice_at
 from lfpiv_cli.verbs.chain import board_depths
 
 DUCT = Duct(4.0, (0.0, 0.0, 0.0), "x", 0.1082)

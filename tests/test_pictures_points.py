@@ -13,7 +13,7 @@ from lfpiv_cli.optics.curved_space import CurvedSpace, Face
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.surfaces import Cylinder
 from lfpiv_cli.pictures import points as of_points
-from lfpiv_cli.pictures import volume as of_volume
+from lfpiv_cli.pictures import vectors as of_volume
 from lfpiv_cli.pictures.style import SLABS, percentiles_by_depth
 
 pytest.importorskip("matplotlib")

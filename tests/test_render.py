@@ -13,7 +13,7 @@ from lfpiv_cli.optics.camera import Lattice
 from lfpiv_cli.optics.media import Media, Window, fluid_path_to_focus
 from lfpiv_cli.optics.tracing import ObjectSpace, disc_points, exact_slope, slope_polynomial, slope_ratio, trace
 from lfpiv_cli.synthetic import render
-from lfpiv_cli.synthetic.ray_sequence import in_ball
+from lfpiv_cli.synthetic.rays import in_ball
 from lfpiv_cli.synthetic.render import Balls, pixel_places, render_points, render_white
 from tests.known_rays import slopes_equivalent, slopes_exact
 

@@ -216,7 +216,7 @@ def test_what_is_told_of_a_scene(scene: MovableScene, rng: np.random.Generator) 
 
 def test_the_picture_shows_the_particles_and_the_wall(scene: MovableScene, rng: np.random.Generator) -> None:
     pytest.importorskip("matplotlib")
-    from lfpiv_cli.pictures.walls import round_wall_figure
+    from lfpiv_cli.pictures.calibration import round_wall_figure
 
     found = refined(scene, rng, TRUTH)
     section, around, along, counted = round_wall_figure(found).axes

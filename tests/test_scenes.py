@@ -212,7 +212,7 @@ def test_tracers_fill_a_pipe_and_nothing_else(rng):
     assert share.max() <= 1.0
     # evenly spread over the section, squares of the distance are evenly spread: 1000 with a spread of 27
     assert np.histogram(share, 4, (0.0, 1.0))[0] == pytest.approx([1000] * 4, abs=120)
-    assert box.volume_in_mm3(pipe) == pytest.approx(box.volume_mm3 * np.pi / 4)
+    assert box.volume_mm3(pipe) == pytest.approx(box.volume_mm3() * np.pi / 4)
 
 
 def test_tracers_fill_a_tilted_pipe(rng):

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lfpiv_cli.scale import Scale
-from lfpiv_cli.synthetic.vortices import taylor_green
+from lfpiv_cli.synthetic.flows import taylor_green
 from lfpiv_cli.tracks.candidates import Seen
 from lfpiv_cli.tracks.gridding import on_grid
 from lfpiv_cli.tracks.tracking import track

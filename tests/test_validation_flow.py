@@ -16,15 +16,16 @@ from lfpiv_cli.grid import Grid
 from lfpiv_cli.synthetic.flows import pipe, shear, square_duct
 from lfpiv_cli.validation.flow import (
     Duct,
-    compare,
+    Measured,
     cumulative_distribution,
     flow_figures,
+    pipe_figures,
     relative_errors,
     streamwise_mean_error_at,
     table_4,
     truth_at_points,
 )
-from lfpiv_cli.validation.methods import Measured, lower_error, pipe_figures
+from lfpiv_cli.validation.methods import lower_error
 
 SHAPE = (4, 3, 5)
 VOXEL_MM = (0.1, 0.1, 0.2)
@@ -55,7 +56,7 @@ def inside() -> NDArray[np.bool_]:
 
 
 def test_the_truth_itself_has_no_error(truth: NDArray[np.float64], inside: NDArray[np.bool_]) -> None:
-    figures = flow_figures(field_of(truth), truth, inside)
+    figures = flow_figures(Measured(field_of(truth), truth, inside))
     assert figures["streamwise_mean_error"] == pytest.approx(0.0, abs=1e-12)
     assert figures["within_25_percent_streamwise"] == figures["within_25_percent_vector"] == 1.0
     assert figures["rms_v_voxel"] == pytest.approx(0.0, abs=1e-12)
@@ -65,7 +66,7 @@ def test_the_truth_itself_has_no_error(truth: NDArray[np.float64], inside: NDArr
 def test_components_are_in_their_own_voxels(truth: NDArray[np.float64], inside: NDArray[np.bool_]) -> None:
     measured = truth + (0.01, -0.02, 0.04)
     measured[::2] += (0.02, 0.0, 0.0)
-    figures = flow_figures(field_of(measured), truth, inside)
+    figures = flow_figures(Measured(field_of(measured), truth, inside))
     # 0.01 m/s in 1 ms is 0.01 mm: 0.1 voxel along x, and 0.05 voxel along z.
     assert figures["bias_u_voxel"] == pytest.approx(0.2)
     assert figures["rms_u_voxel"] == pytest.approx(np.sqrt((0.1**2 + 0.3**2) / 2))
@@ -81,7 +82,7 @@ def test_streamwise_and_full_vector_shares_differ(truth: NDArray[np.float64], in
     measured[0, ..., 1] *= 1.3
     measured[1, ..., 2] += 0.3 * truth[1, ..., 1]
     measured[2, ..., 1] *= 1.2
-    figures = flow_figures(field_of(measured), truth, inside)
+    figures = flow_figures(Measured(field_of(measured), truth, inside))
     assert figures["within_25_percent_streamwise"] == pytest.approx(0.75)
     assert figures["within_25_percent_vector"] == pytest.approx(0.5)
     assert figures["streamwise_mean_error"] == pytest.approx(0.5 / 4)
@@ -91,7 +92,7 @@ def test_a_miss_lowers_the_shares_and_leaves_the_means(truth: NDArray[np.float64
     field = field_of(truth)
     flag = field.flag.copy()
     flag[0] = REJECTED
-    figures = flow_figures(replace(field, flag=flag), truth, inside)
+    figures = flow_figures(Measured(replace(field, flag=flag), truth, inside))
     assert figures["vectors_missing"] == figures["vectors_rejected"] == 15
     assert figures["within_25_percent_streamwise"] == pytest.approx(0.75)
     assert figures["streamwise_mean_error"] == pytest.approx(0.0, abs=1e-12)
@@ -106,7 +107,7 @@ def test_relative_error_of_misses_and_of_fluid_at_rest(inside: NDArray[np.bool_]
     measured = truth.copy()
     measured[0, 0, 1] = 0.125
     measured[0, 0, 2] = np.nan
-    pairs = compare(field_of(truth), truth, inside)
+    pairs = Measured(field_of(truth), truth, inside).pairs
     streamwise, vector = relative_errors(replace(pairs, measured=measured.reshape(-1, 3)))
     for errors in (streamwise, vector):
         assert errors is not None
@@ -120,7 +121,7 @@ def test_windows_outside_count_for_nothing(truth: NDArray[np.float64], inside: N
     inside[:, :, 0] = False
     measured[:, :, 0] = 9.0
     truth[:, :, 0] = np.nan
-    figures = flow_figures(field_of(measured), truth, inside)
+    figures = flow_figures(Measured(field_of(measured), truth, inside))
     assert figures["vectors_inside"] == 48
     assert figures["within_25_percent_vector"] == 1.0
 
@@ -131,7 +132,7 @@ def test_figures_are_valid_json_without_nan(
 ) -> None:
     field = field_of(truth)
     rejected = np.full(SHAPE, REJECTED, dtype=np.uint8)
-    figures = flow_figures(replace(field, flag=rejected, dt_s=dt_s), truth, inside)
+    figures = flow_figures(Measured(replace(field, flag=rejected, dt_s=dt_s), truth, inside))
     json.dumps(figures, allow_nan=False)
     assert figures["within_25_percent_streamwise"] == 0.0
     assert figures["streamwise_mean_error"] is None
@@ -141,7 +142,7 @@ def test_figures_are_valid_json_without_nan(
 def test_a_vortex_has_no_streamwise_figures(inside: NDArray[np.bool_]) -> None:
     x = np.broadcast_to(np.arange(5) - 2.0, SHAPE)
     truth = np.stack([np.zeros(SHAPE), 0.1 * x, np.zeros(SHAPE)], axis=-1)
-    figures = flow_figures(field_of(truth), truth, inside)
+    figures = flow_figures(Measured(field_of(truth), truth, inside))
     assert figures["streamwise_direction"] is None
     assert figures["within_25_percent_streamwise"] is None
     assert figures["within_25_percent_vector"] == 1.0
@@ -151,12 +152,11 @@ def test_slices_are_planes_and_between_them_interpolated(truth: NDArray[np.float
     measured = truth.copy()
     measured[..., 0, 1] *= 1.2
     field = field_of(measured)
-    slices = flow_figures(field, truth, inside)["slices"]
+    slices = flow_figures(Measured(field, truth, inside))["slices"]
     np.testing.assert_allclose(slices["x"]["streamwise_mean_error"], [0.2, 0.0, 0.0, 0.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(slices["x"]["position_mm"], [0.0, 0.8, 1.6, 2.4, 3.2])
-    pairs = compare(field, truth, inside)
     # Half-way between the planes of 0.1 (measured 0.12) and 0.2 m/s.
-    assert streamwise_mean_error_at(field, pairs, 0, 0.4) == pytest.approx(0.32 / 0.3 - 1.0)
+    assert streamwise_mean_error_at(Measured(field, truth, inside), 0, 0.4) == pytest.approx(0.32 / 0.3 - 1.0)
 
 
 def test_table_4_takes_the_paper_s_slices_of_a_duct() -> None:
@@ -169,7 +169,7 @@ def test_table_4_takes_the_paper_s_slices_of_a_duct() -> None:
     everywhere = np.ones(truth.shape[:3], dtype=np.bool_)
     field = replace(field_of(truth), grid=grid, displacement_voxel=measured * DT_S / (np.array(VOXEL_MM) * 1e-3))
     duct = Duct(10.0, (0.0, 0.0, -1.0), "x", 0.1082)
-    table = table_4(field, truth, everywhere, duct)
+    table = table_4(Measured(field, truth, everywhere), duct)
     assert table["overall"]["ours_percent"] == pytest.approx(0.0, abs=1e-9)
     for share in (0.3, 0.54, 0.78):
         assert table[f"z/D {share}"]["ours_percent"] == pytest.approx(20.0 * abs(share - 0.5))
@@ -204,7 +204,7 @@ def test_a_pipes_figures_go_by_the_distance_from_its_axis() -> None:
     measured[10, 16, 1] = np.nan
     field = replace(field_of(truth), grid=grid, displacement_voxel=measured * DT_S / (np.array(VOXEL_MM) * 1e-3))
     inside = truth.any(axis=-1)
-    found = pipe_figures(field, truth, inside, wall)
+    found = pipe_figures(Measured(field, truth, inside), wall)
     rings = {tuple(ring["radius_shares"]): ring for ring in found["rings"]}
     assert rings[0.0, 0.3]["streamwise_mean_error"] == pytest.approx(0.02)
     assert rings[0.3, 0.5]["streamwise_mean_error"] == pytest.approx(0.0)
@@ -231,7 +231,7 @@ def test_a_pipes_figures_go_by_the_distance_from_its_axis() -> None:
 def test_cumulative_distribution_meets_the_share(
     truth: NDArray[np.float64], inside: NDArray[np.bool_], rng: np.random.Generator
 ) -> None:
-    figures = flow_figures(field_of(truth * rng.uniform(0.5, 1.5, SHAPE)[..., np.newaxis]), truth, inside)
+    figures = flow_figures(Measured(field_of(truth * rng.uniform(0.5, 1.5, SHAPE)[..., np.newaxis]), truth, inside))
     shares = figures["cumulative"]["streamwise_share"]
     assert np.all(np.diff(shares) >= 0.0)
     assert shares[25] == pytest.approx(figures["within_25_percent_streamwise"])
@@ -247,7 +247,7 @@ def test_what_cannot_be_compared_is_refused(what: str, truth: NDArray[np.float64
     else:
         inside = ~inside
     with pytest.raises(InputError):
-        flow_figures(field, truth, inside)
+        flow_figures(Measured(field, truth, inside))
 
 
 def test_truth_from_particles_is_exact_for_a_linear_flow(rng: np.random.Generator) -> None:

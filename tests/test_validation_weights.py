@@ -12,6 +12,7 @@ from click.testing import CliRunner
 
 from lfpiv_cli.cli.main import cli
 from lfpiv_cli.errors import LimitMissedError
+from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Lattice
 from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.validation.weights import (
@@ -26,6 +27,8 @@ from lfpiv_cli.validation.weights import (
     weights_figures,
     weights_limits_missed,
 )
+
+VOXEL, CENTRES = Grid((1, 1, 1), (0.1,) * 3, (0.3, -0.2, 3.0)), np.array([(0.3, -0.2, 3.0)])
 
 
 def test_ssim_of_constants_eq_16():
@@ -84,9 +87,7 @@ def test_limits_are_lower_ones_on_ssim_and_upper_ones_elsewhere():
 @pytest.mark.thorough
 def test_every_way_agrees_within_its_error(table2, water, window, rng):
     camera = replace(table2, columns=380, rows=260)
-    columns = make_columns(
-        camera, ObjectSpace(water, window), np.array([(0.3, -0.2, 3.0)]), (0.1, 0.1, 0.1), rng, np.array([200_000])
-    )
+    columns = make_columns(camera, ObjectSpace(water, window), VOXEL, CENTRES, rng, np.array([200_000]))
     figures = weights_figures(columns, np.array([200_000]))
     assert figures["ert_to_drt_paraxial"]["l1_largest"] < 1e-6
     assert figures["ert_exact_to_drt_exact"]["l1_largest"] < 1e-6
@@ -101,9 +102,7 @@ def test_every_way_agrees_within_its_error(table2, water, window, rng):
 @pytest.mark.thorough
 def test_a_hexagonal_array_is_judged_without_the_factorised_form(table2, water, rng):
     camera = replace(table2, columns=380, rows=260, lattice=Lattice.regular(0.1, "hexagonal"))
-    columns = make_columns(
-        camera, ObjectSpace(water), np.array([(0.3, -0.2, 3.0)]), (0.1, 0.1, 0.1), rng, np.array([0])
-    )
+    columns = make_columns(camera, ObjectSpace(water), VOXEL, CENTRES, rng, np.array([0]))
     figures = weights_figures(columns, np.array([0]))
     assert figures["factorised_to_converged"] is None
     assert figures["ert_to_drt_exact"] is None

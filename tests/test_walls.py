@@ -70,7 +70,7 @@ def test_what_is_not_the_channel_is_refused(rng: np.random.Generator) -> None:
 
 def test_the_picture_shows_all_particles_and_both_walls(rng: np.random.Generator) -> None:
     pytest.importorskip("matplotlib")
-    from lfpiv_cli.pictures.walls import walls_figure
+    from lfpiv_cli.pictures.calibration import walls_figure
 
     position = between_walls(300, rng)
     walls = walls_of(position)

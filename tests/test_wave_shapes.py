@@ -18,7 +18,7 @@ from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.optics.waves import Waves
 from lfpiv_cli.synthetic.board import BoardPlacement, render_board
-from lfpiv_cli.synthetic.wave_images import white_by_waves
+from lfpiv_cli.synthetic.render import render_white
 
 GREEN = WaveLight(532e-6, 0.3)
 PLACE = (0.13, 0.07, 0.3)
@@ -44,7 +44,7 @@ def picture(camera: Camera) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
     light = Waves(GREEN.wavelength_mm)
     place = BoardPlacement(PLACE[2], PLACE[:2])
     seen = render_board(camera, ObjectSpace(Media()), BOARD, place, 1.0, np.random.default_rng(1), waves=light)
-    return seen, white_by_waves(camera, light, 1.0).astype(np.float32)
+    return seen, render_white(camera, 1.0, waves=light).astype(np.float32)
 
 
 def test_a_dot_by_waves_lies_where_it_is(

@@ -17,18 +17,19 @@ from lfpiv_cli.optics.surfaces import Cylinder, Plane
 from lfpiv_cli.optics.tracing import ObjectSpace, disc_points
 from lfpiv_cli.optics.waves import DEGREE, Waves, WavesInCamera, pixel_response
 from lfpiv_cli.synthetic.board import sunflower
-from lfpiv_cli.synthetic.render import Balls, render_points, render_white
-from lfpiv_cli.synthetic.wave_images import (
+from lfpiv_cli.synthetic.render import (
+    Balls,
     lens_blur_mm,
     lens_spread,
-    points_by_waves,
     points_in_ball,
-    white_by_waves,
+    render_points,
+    render_white,
 )
 
 GREEN = Waves(532e-6)
 # Four times as long: a hundredth of the work.
 INFRARED = Waves(2128e-6)
+NO_RAYS = np.random.default_rng(0)
 AIR = ObjectSpace(Media(), None, "paraxial")
 WATER = Media(1.0, 1.49, 1.33)
 
@@ -46,7 +47,7 @@ def square(table2: Camera) -> Camera:
 
 
 def by_waves(camera: Camera, point: tuple[float, float, float], light: Waves = GREEN, space=AIR, diameter=0.0):
-    return points_by_waves(camera, space, Balls(np.array([point]), 1.0, diameter), light)
+    return render_points(camera, space, Balls(np.array([point]), 1.0, diameter), NO_RAYS, waves=light)
 
 
 def by_rays(camera: Camera, point: tuple[float, float, float], space=AIR, diameter=0.0, rays=400_000):
@@ -306,10 +307,10 @@ def test_sixteen_points_are_a_ball_of_fifty_micrometres(square: Camera) -> None:
 def test_same_bits_for_any_number_of_threads(small: Camera, rng, one_thread) -> None:
     balls = Balls(rng.uniform(-0.4, 0.4, (7, 3)), rng.uniform(1.0, 2.0, 7), 0.05)
     done: list[int] = []
-    image = points_by_waves(small, AIR, balls, Waves(2e-3, 5), progress=done.append)
+    image = render_points(small, AIR, balls, NO_RAYS, waves=Waves(2e-3, 5), progress=done.append)
     assert sum(done) == 7
     with one_thread():
-        assert np.array_equal(points_by_waves(small, AIR, balls, Waves(2e-3, 5)), image)
+        assert np.array_equal(render_points(small, AIR, balls, NO_RAYS, waves=Waves(2e-3, 5)), image)
 
 
 def test_white_light_is_that_of_each_place_on_the_aperture(square: Camera) -> None:
@@ -327,7 +328,7 @@ def test_white_light_is_that_of_each_place_on_the_aperture(square: Camera) -> No
     along = (np.abs(field) ** 2).reshape(29, 6, -1).sum(axis=1) * (0.0055 / 6) / (wavelength * s_mu)
     disc = np.clip((12.5 - np.hypot(pupil[:, np.newaxis], pupil)) / 0.1 + 0.5, 0.0, 1.0)
     expected = along @ disc @ along.T * (0.1 / (0.0055 * s_i / s_mu * 0.1)) ** 2
-    found = white_by_waves(camera, INFRARED, 1.0)
+    found = render_white(camera, 1.0, waves=INFRARED)
     # of what reaches a pixel through two lenses, some per cent interferes with waves of 2 um (0.3 % with green light)
     assert np.abs(found - expected).mean() < 0.02
     assert np.abs(found - expected).mean() < 0.2 * np.abs(render_white(camera, 1.0) - expected).mean()
@@ -337,14 +338,14 @@ def test_white_light_is_that_of_each_place_on_the_aperture(square: Camera) -> No
 def test_white_light_of_short_waves_is_that_of_rays(small: Camera) -> None:
     camera = replace(small, columns=60, rows=50)
     rays = render_white(camera, 1.0, 16)
-    found = [np.abs(white_by_waves(camera, Waves(532e-6 / part), 1.0) - rays).mean() for part in (1, 3)]
+    found = [np.abs(render_white(camera, 1.0, waves=Waves(532e-6 / part)) - rays).mean() for part in (1, 3)]
     assert found[1] < 0.5 * found[0] < 0.03
 
 
 @pytest.mark.thorough
 def test_white_light_diffuses_alike_by_rays_and_waves(small: Camera) -> None:
     camera = replace(small, columns=60, rows=50, diffusion_px=0.5)
-    rays, found = render_white(camera, 1.0), white_by_waves(camera, Waves(532e-6 / 3), 1.0)
+    rays, found = render_white(camera, 1.0), render_white(camera, 1.0, waves=Waves(532e-6 / 3))
     # sixteen places of a pixel along each axis, and what is left of the waves' own blur
     assert np.abs(found - rays).mean() < 0.01
     assert np.abs(found - render_white(replace(camera, diffusion_px=0.0), 1.0, 16)).mean() > 0.03
@@ -355,7 +356,7 @@ def test_rays_with_a_lens_blur_are_half_of_the_way_to_a_dot_by_waves(square: Cam
     """For prints, which are not made of points: figures of `lens_blur_mm`."""
     for z, plain, blurred in [(0.3, 0.06, 0.034), (2.2, 0.11, 0.057), (4.0, 0.15, 0.077)]:
         points = np.array([0.21, -0.13, z]) + np.column_stack([sunflower(256, 0.1), np.zeros(256)])
-        dot = points_by_waves(square, AIR, Balls(points, 1 / 256, 0.0), GREEN)
+        dot = render_points(square, AIR, Balls(points, 1 / 256, 0.0), NO_RAYS, waves=GREEN)
         balls = Balls(points, 1 / 256, 0.2 / 16)
         rng = np.random.default_rng(0)
         assert apart(render_points(square, AIR, balls, rng, rays=20_000), dot) == pytest.approx(plain, abs=0.015)

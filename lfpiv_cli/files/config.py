@@ -50,7 +50,7 @@ from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.reconstruction.registry import SOLVERS
 from lfpiv_cli.reconstruction.solvers import SolverSettings, Stopping
 from lfpiv_cli.reference import FOCAL_POINT, Reference
-from lfpiv_cli.synthetic.vortices import Flow
+from lfpiv_cli.synthetic.flows import Flow
 
 # Of the paper's final window along the axis with the smallest voxels; the coarse one is twice as large: a displacement
 # of a quarter of its side does not leave it.

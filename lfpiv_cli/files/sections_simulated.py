@@ -49,8 +49,7 @@ from lfpiv_cli.optics.line_responses import USUAL_DIFFUSION_PX
 from lfpiv_cli.optics.waves import Waves
 from lfpiv_cli.reconstruction.registry import SolverName
 from lfpiv_cli.reference import Reference
-from lfpiv_cli.synthetic.flows import FLOWS
-from lfpiv_cli.synthetic.vortices import Flow
+from lfpiv_cli.synthetic.flows import FLOWS, Flow
 
 # Each point is carried by all of them: of more, a frame of many tracers takes gigabytes.
 MOST_MODES = 2000

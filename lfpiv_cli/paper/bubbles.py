@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,11 +17,10 @@ from lfpiv_cli.files.images import read_image, write_tiff
 from lfpiv_cli.files.pages import Table
 from lfpiv_cli.paper.parts import Drawing, Findings, Row, Work
 from lfpiv_cli.paper.pictures import PAPERS_WALL, plane_figure, raw_figure, wall_profile_figure
-from lfpiv_cli.paper.table4 import SEED, TINY, ChannelSize, as_paper, at_best, channel_sections
+from lfpiv_cli.paper.table4 import SEED, TINY, ChannelSize, as_paper, at_best, channel_sections, simulated_duct
 from lfpiv_cli.reconstruction.images import still_light
-from lfpiv_cli.stages.validate import duct_of, measured_of
-from lfpiv_cli.validation.flow import TOLERANCE, Duct, compare, relative_errors
-from lfpiv_cli.validation.methods import Measured
+from lfpiv_cli.stages.validate import measured_of
+from lfpiv_cli.validation.flow import TOLERANCE, Duct, Measured, relative_errors
 from lfpiv_cli.verbs.build_weights import BuildWeightsOptions, build_weights_file
 from lfpiv_cli.verbs.calibrate import CalibrateOptions, calibrate_snapshot
 from lfpiv_cli.verbs.correlate import correlate_files
@@ -29,14 +28,14 @@ from lfpiv_cli.verbs.reconstruct import ReconstructOptions, reconstruct_files
 from lfpiv_cli.verbs.simulate import frame_names, simulate_board, simulate_particles, simulate_white
 
 
-def beside_wall(measured: Measured, duct: Duct, beyond: float = PAPERS_WALL) -> NDArray[np.bool_]:
-    """Return which windows (nz, ny, nx) lie beyond a share of the width, of those that are judged."""
+def beside_wall(measured: Measured, duct: Duct) -> NDArray[np.bool_]:
+    """Return which windows (nz, ny, nx) lie beyond `PAPERS_WALL` of the width, of those that are judged."""
     axis = duct.across["x/D"]
     places = measured.field.grid.centres_mm()[..., axis]
-    return np.asarray(measured.inside & (places > duct.position_mm(axis, beyond)))
+    return np.asarray(measured.inside & (places > duct.position_mm(axis, PAPERS_WALL)))
 
 
-def near_wall(measured: Measured, duct: Duct, beyond: float = PAPERS_WALL) -> dict[str, float]:
+def near_wall(measured: Measured, duct: Duct) -> dict[str, float]:
     """Return the figures of a duct's windows near the wall at the high end of its lateral axis, along the flow.
 
     Returns
@@ -45,7 +44,7 @@ def near_wall(measured: Measured, duct: Duct, beyond: float = PAPERS_WALL) -> di
         `windows`, how many; `within_25`, the share of them within a quarter of the true velocity; `mean_error` of the
         sum of velocities, a share; `within_sigma`, `mean_sigma`: by how much chance moves the two, one standard error
     """
-    pairs = compare(measured.field, measured.truth, beside_wall(measured, duct, beyond))
+    pairs = replace(measured, inside=beside_wall(measured, duct)).pairs
     streamwise, _ = relative_errors(pairs)
     # a duct's flow has a direction
     assert streamwise is not None
@@ -63,8 +62,8 @@ def near_wall(measured: Measured, duct: Duct, beyond: float = PAPERS_WALL) -> di
     }
 
 
-FULL = ChannelSize(10.0, 3.2, 640, 1768, 0.1, (32, 16), 200, (3, 7))
-QUICK = ChannelSize(5.0, 2.4, 480, 900, 0.1, (16,), 40, (3, 4))
+FULL = ChannelSize(10.0, 3.2, 640, 1768, (32, 16), 200, (3, 7))
+QUICK = ChannelSize(5.0, 2.4, 480, 900, (16,), 40, (3, 4))
 # What the mask leaves must measure as well as a channel without bubbles in which the same pixels are hidden, but for so
 # many standard errors of chance.
 CHANCE_SIGMAS = 2.0
@@ -81,17 +80,6 @@ class Case:
     options: Mapping[str, Any]
 
 
-def _cases(size: ChannelSize, mask: Path) -> dict[str, Case]:
-    return {
-        "clean": Case("no bubbles", "clean", {}),
-        "hidden": Case("no bubbles, same pixels hidden", "clean", {"mask": mask}),
-        "paper": Case("bubbles, SART", "bubbles", as_paper(size)),
-        "bubbles": Case("bubbles", "bubbles", {}),
-        "background": Case("bubbles, background off", "bubbles", {"background": "minimum"}),
-        "mask": Case("bubbles, mask", "bubbles", {"mask": "still"}),
-    }
-
-
 # What the pictures show.
 SHOWN = ("clean", "paper", "bubbles", "background", "mask")
 MASK = "mask.tif"
@@ -106,9 +94,16 @@ def bubbles(work: Work) -> Findings:
     simulation = {"bubbles": count, "bubble_diameter_mm": diameters}
     with_bubbles = work.config("bubbles", channel_sections(size, reconstruction=at_best(size), simulation=simulation))
     work.step("images", partial(_simulated, config, with_bubbles, work))
-    cases = _cases(size, work.folder / MASK)
+    cases = {
+        "clean": Case("no bubbles", "clean", {}),
+        "hidden": Case("no bubbles, same pixels hidden", "clean", {"mask": work.folder / MASK}),
+        "paper": Case("bubbles, SART", "bubbles", as_paper(size)),
+        "bubbles": Case("bubbles", "bubbles", {}),
+        "background": Case("bubbles, background off", "bubbles", {"background": "minimum"}),
+        "mask": Case("bubbles, mask", "bubbles", {"mask": "still"}),
+    }
     found = {name: work.step(f"{name}_figures", partial(_measured, name, case, work)) for name, case in cases.items()}
-    duct = _duct(config)
+    duct = simulated_duct(config)
     methods = {cases[name].words: _read(work, name) for name in SHOWN}
     return Findings(
         rows=_rows(found),
@@ -124,12 +119,6 @@ def bubbles(work: Work) -> Findings:
         ),
         seeds=(SEED,),
     )
-
-
-def _duct(config: Path) -> Duct:
-    duct = duct_of(load_config(config).simulation.flow)
-    assert duct is not None  # the sections of the channel have one
-    return duct
 
 
 def _simulated(clean: Path, with_bubbles: Path, work: Work) -> dict[str, Any]:
@@ -163,18 +152,14 @@ def _measured(name: str, case: Case, work: Work) -> dict[str, Any]:
     options = ReconstructOptions(dark=work.folder / "still" / "dark.tif", **case.options)
     told = reconstruct_files(work.folder / "weights.h5", pair, folder, options, overwrite=True, console=quiet)
     volumes = [folder / f"{image.stem}.vtkhdf" for image in pair]
-    correlate_files(volumes, _vectors(work, name), overwrite=True, console=quiet)
-    figures = near_wall(_read(work, name), _duct(work.folder / "clean.yaml"))
+    correlate_files(volumes, work.folder / f"{name}.vtkhdf", overwrite=True, console=quiet)
+    figures = near_wall(_read(work, name), simulated_duct(work.folder / "clean.yaml"))
     return figures | {"excluded_pixels": told["excluded_pixels"]}
-
-
-def _vectors(work: Work, name: str) -> Path:
-    return work.folder / f"{name}.vtkhdf"
 
 
 def _read(work: Work, name: str) -> Measured:
     """Return vectors with the true flow."""
-    return measured_of(_vectors(work, name), load_config(work.folder / "clean.yaml"), None, is_simulated=True)
+    return measured_of(work.folder / f"{name}.vtkhdf", load_config(work.folder / "clean.yaml"), None, is_simulated=True)
 
 
 def _rows(found: Mapping[str, Mapping[str, Any]]) -> tuple[Row, ...]:
@@ -219,7 +204,11 @@ def _table(cases: Mapping[str, Case], found: Mapping[str, Mapping[str, Any]]) ->
 
 def _drawings(work: Work, methods: Mapping[str, Measured], duct: Duct) -> tuple[Drawing, ...]:
     mask = read_image(work.folder / MASK) == 0.0
-    shown = _piece(mask)
+    # a piece around the pixels that are left out, or the first corner
+    rows, columns = np.nonzero(mask)
+    middle = (np.median(rows), np.median(columns)) if rows.size else (0.0, 0.0)
+    starts = [int(np.clip(m - SHOWN_PX / 2, 0, max(n - SHOWN_PX, 0))) for m, n in zip(middle, mask.shape, strict=True)]
+    shown = np.s_[starts[0] : starts[0] + SHOWN_PX, starts[1] : starts[1] + SHOWN_PX]
     without = methods["bubbles"]
     error = np.linalg.norm(without.field.velocity - without.truth, axis=-1)
     plane = int(np.argmax(np.where(beside_wall(without, duct), np.nan_to_num(error), 0.0).sum(axis=(1, 2))))
@@ -244,14 +233,6 @@ def _drawings(work: Work, methods: Mapping[str, Measured], duct: Duct) -> tuple[
             wall_profile_figure(methods, duct),
         ),
     )
-
-
-def _piece(mask: NDArray[np.bool_]) -> tuple[slice, slice]:
-    """Return the piece of an image around the pixels that a mask leaves out, or its first corner."""
-    rows, columns = np.nonzero(mask)
-    middle = (np.median(rows), np.median(columns)) if rows.size else (0.0, 0.0)
-    starts = [int(np.clip(m - SHOWN_PX / 2, 0, max(n - SHOWN_PX, 0))) for m, n in zip(middle, mask.shape, strict=True)]
-    return slice(starts[0], starts[0] + SHOWN_PX), slice(starts[1], starts[1] + SHOWN_PX)
 
 
 def _text(size: ChannelSize, diameters: list[float], count: int) -> tuple[str, ...]:

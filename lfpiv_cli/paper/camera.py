@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,10 +15,9 @@ from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.pages import Table
 from lfpiv_cli.notice import written
 from lfpiv_cli.paper.parts import BOARD, MISALIGNED, Drawing, Findings, Row, Work, sections
-from lfpiv_cli.pictures.style import BLUE, new_figure, styled
+from lfpiv_cli.pictures.style import BLUE, Figure, new_panels, styled
 from lfpiv_cli.validation.weights import (
     TABLE1_MM,
-    Column,
     columns_figure,
     make_columns,
     sample_voxels,
@@ -27,12 +27,6 @@ from lfpiv_cli.validation.weights import (
 from lfpiv_cli.verbs.calibrate import CalibrateOptions, calibrate_snapshot
 from lfpiv_cli.verbs.simulate import simulate_board, simulate_white
 from lfpiv_cli.weights.quadrature import PAPERS_COUNT
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from matplotlib.figure import Figure
-
 
 SEED = 5
 # Fig. 6: similarity is "approximately 1", and the difference smaller than 2.5 grey levels.
@@ -62,11 +56,24 @@ def table1(work: Work) -> Findings:
     long_count = np.zeros(len(centres), np.int64)
     long_count[: len(paper)] = work.by_size(0, 0, 100_000_000)
     with work.console.progress(len(centres), "weights") as advance:
-        columns = make_columns(camera, space, centres, grid.spacing_mm, rng, long_count, advance)
+        columns = make_columns(camera, space, grid, centres, rng, long_count, advance)
     figures = weights_figures(columns, long_count)
     return Findings(
         rows=_rows(figures, len(paper)),
-        drawings=_drawings(columns[: len(paper)], figures),
+        drawings=(
+            Drawing(
+                "columns",
+                "The weights of the paper's voxels as the sensor would see them (after Fig. 5): traced directly by "
+                "Snell's law, integrated over equivalent points, as they are in use, and counted as the paper did. A "
+                "row a voxel, one grey scale in each.",
+                columns_figure(columns[: len(paper)]),
+            ),
+            Drawing(
+                "similarity",
+                "SSIM, RMSE and absolute difference by voxel (after Fig. 6).",
+                similarity_figure(figures, len(paper)),
+            ),
+        ),
         tables=(_table(figures),),
         text=(
             f"{len(paper)} voxels of the paper and {len(centres) - len(paper)} random ones of its volume. As the paper "
@@ -122,23 +129,6 @@ def _rows(figures: dict[str, Any], paper: int) -> tuple[Row, ...]:
     )
 
 
-def _drawings(columns: list[Column], figures: dict[str, Any]) -> tuple[Drawing, ...]:
-    return (
-        Drawing(
-            "columns",
-            "The weights of the paper's voxels as the sensor would see them (after Fig. 5): traced directly by Snell's "
-            "law, integrated over equivalent points, as they are in use, and counted as the paper did. A row a voxel, "
-            "one grey scale in each.",
-            columns_figure(columns),
-        ),
-        Drawing(
-            "similarity",
-            "SSIM, RMSE and absolute difference by voxel (after Fig. 6).",
-            similarity_figure(figures, len(columns)),
-        ),
-    )
-
-
 def _table(figures: dict[str, Any]) -> Table:
     rows = [
         (
@@ -176,25 +166,14 @@ def table2(work: Work) -> Findings:
     settings = load_config(work.config("table2", sections()))
     camera, scale = settings.camera_model(), settings.camera_model().scale(settings.media_model())
     pitch = float(camera.lattice.pitch.mean())
-    ours = dict(
-        zip(
-            PAPER,
-            (
-                camera.focal_length_mm / camera.aperture_mm,
-                camera.microlens_focal_length_mm / pitch,
-                camera.image_distance_mm,
-                camera.aperture_mm,
-                pitch,
-                1e3 * camera.pixel_mm,
-            ),
-            strict=True,
-        )
-    )
+    f_numbers = camera.focal_length_mm / camera.aperture_mm, camera.microlens_focal_length_mm / pitch
+    lengths = camera.image_distance_mm, camera.aperture_mm, pitch, 1e3 * camera.pixel_mm
+    ours = dict(zip(PAPER, (*f_numbers, *lengths), strict=True))
     deviation = max(abs(ours[name] / value - 1.0) for name, value in PAPER.items())
+    lenses = (f"{n * camera.pixel_mm / pitch / camera.micro_image_scale:.0f}" for n in (camera.columns, camera.rows))
     derived = {
         "width of a lens image (pixels)": f"{pitch * camera.micro_image_scale / camera.pixel_mm:.3f}",
-        "lens images on the sensor": f"{camera.columns * camera.pixel_mm / pitch / camera.micro_image_scale:.0f} x "
-        f"{camera.rows * camera.pixel_mm / pitch / camera.micro_image_scale:.0f} (the array has 252 x 252)",
+        "lens images on the sensor": f"{' x '.join(lenses)} (the array has 252 x 252)",
         "microlens in the scene (mm)": f"{scale.lens_mm:.3f}",
         "depth over which a point spreads by one microlens (mm)": f"{scale.depth_mm:.3f}",
     }
@@ -227,8 +206,7 @@ def table2(work: Work) -> Findings:
 @styled
 def focal_plane_figure(focal_error_mm: NDArray, off_mm: NDArray, sigma_mm: NDArray) -> Figure:
     """Return the error of the mid plane's place (n,) with its standard error over how far the focus was off, mm."""
-    figure = new_figure(6.5, 3.6)
-    axes = figure.subplots()
+    figure, axes = new_panels(6.5, 3.6)
     axes.errorbar(focal_error_mm, 1e3 * off_mm, 1e3 * sigma_mm, fmt="o", color=BLUE, capsize=3)
     axes.axhline(0.0, color="0.6", linewidth=0.8)
     axes.set(xlabel="board behind the focal plane (mm)", ylabel="mid plane, measured - true (µm)")
@@ -242,6 +220,7 @@ LARGEST_MM = 2.0
 LIMIT_MM = 0.05
 # Stated errors are those of Gaussian noise; of some ten boards none is expected beyond so many of them.
 LIMIT_SIGMAS = 4.0
+DEPTHS_HEAD = ("board behind the focal plane", "true", "measured", "stated standard error")
 SMALL = {
     "camera": {"microlenses": {"columns": None, "rows": None}, "sensor": {"columns": 600, "rows": 448}},
     "board": {"dots": [5, 4], "spacing_mm": 0.5, "dot_diameter_mm": 0.15},
@@ -256,6 +235,8 @@ def focal_plane(work: Work) -> Findings:
     simulate_white(base, whites, overwrite=True, console=work.console)
     found = [work.step(f"board_{error:+g}mm", partial(_mid_plane, work, whites, float(error))) for error in errors_mm]
     measured, sigma, true = (np.array([each[name] for each in found]) for name in ("mid_mm", "sigma_mm", "true_mm"))
+    each = zip(errors_mm, true, measured, sigma, strict=True)
+    rows = tuple((f"{a:+z.2f}", f"{b:+z.3f}", f"{c:+z.3f}", f"{d:.4f}") for a, b, c, d in each)
     off, corner = measured - true, "A corner of the sensor, 20 dots half a millimetre apart."
     return Findings(
         rows=(
@@ -280,7 +261,7 @@ def focal_plane(work: Work) -> Findings:
                 focal_plane_figure(errors_mm, off, sigma),
             ),
         ),
-        tables=(_depths_table(errors_mm, measured, true, sigma),),
+        tables=(Table("Mid plane from the focal plane (mm)", DEPTHS_HEAD, rows),),
         text=(
             "The board lies on the outer wall of the channel and the camera is meant to be focused on it. Here it is "
             f"focused up to {LARGEST_MM:g} mm before and behind it; the snapshot alone tells by how much, and Eq. 21 "
@@ -327,14 +308,3 @@ def _mid_plane(work: Work, whites: Path, error_mm: float) -> dict[str, float]:
         "sigma_mm": told["mid_plane_z_mm_sigma"],
         "true_mm": error_mm * sections()["media"]["fluid"],
     }
-
-
-def _depths_table(
-    errors_mm: NDArray[np.float64], measured: NDArray[np.float64], true: NDArray[np.float64], sigma: NDArray[np.float64]
-) -> Table:
-    rows = zip(errors_mm, true, measured, sigma, strict=True)
-    return Table(
-        "Mid plane from the focal plane (mm)",
-        ("board behind the focal plane", "true", "measured", "stated standard error"),
-        tuple((f"{a:+z.2f}", f"{b:+z.3f}", f"{c:+z.3f}", f"{d:.4f}") for a, b, c, d in rows),
-    )

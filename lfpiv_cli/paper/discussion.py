@@ -8,11 +8,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.files.config import load_config
 from lfpiv_cli.files.pages import Table
 from lfpiv_cli.grid import Grid
@@ -20,15 +20,12 @@ from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.paper.parts import Drawing, Findings, Work, sections
 from lfpiv_cli.particles.view import raw_view
-from lfpiv_cli.pictures.style import BLUE, GREEN, ORANGE, VERMILION, new_figure, styled
+from lfpiv_cli.pictures.style import BLUE, GREEN, ORANGE, VERMILION, Figure, new_panels, styled
 from lfpiv_cli.reconstruction.solvers import SolverSettings, reconstruct
 from lfpiv_cli.synthetic.sensor import Readout
 from lfpiv_cli.validation.board import elongation_mm
 from lfpiv_cli.validation.planning import cramer_rao_bound, errors_alone_mm, expected_image, pixel_variance, slopes
 from lfpiv_cli.weights.build import default_padding, factorise
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 @styled
@@ -40,8 +37,7 @@ def depth_resolution_figure(told: Mapping[str, Any], geometric_mm: float, lens_m
     told : `elongation_mm` (m,) at `elongation_depth_mm`, and the bound `sigma_mm` (n, 3) of x, y, z at `depth_mm`
     geometric_mm, lens_mm : depth in which views move by one microlens, and its width in the scene
     """
-    figure = new_figure(7.5, 4.6)
-    axes = figure.subplots()
+    figure, axes = new_panels(7.5, 4.6)
     sigma = np.array(told["sigma_mm"])
     axes.semilogy(told["elongation_depth_mm"], told["elongation_mm"], "s-", color=VERMILION, label="length by SART")
     axes.axhline(geometric_mm, color=ORANGE, linestyle="--", label="depth that moves views by a microlens")
@@ -57,8 +53,7 @@ def depth_resolution_figure(told: Mapping[str, Any], geometric_mm: float, lens_m
 @styled
 def seeding_bound_figure(told: Mapping[str, Any], papers_per_lens: float) -> Figure:
     """Return the bound of places, `sigma_mm` (n, 3), over the tracers `per_lens` (n,), with the paper's seeding."""
-    figure = new_figure(6.5, 3.8)
-    axes = figure.subplots()
+    figure, axes = new_panels(6.5, 3.8)
     sigma = 1e3 * np.array(told["sigma_mm"])
     axes.loglog(told["per_lens"], sigma[:, 2], "o-", color=BLUE, label="depth")
     axes.loglog(told["per_lens"], sigma[:, 0], "^-.", color=GREEN, label="across")
@@ -90,9 +85,7 @@ def geometric_depth_mm(camera: Camera, media: Media) -> float:
     return float(scale.lens_mm * camera.focus_distance_mm / (2.0 * camera.aperture_radius_mm) / media.depth_ratio)
 
 
-def smallest_errors_mm(
-    camera: Camera, media: Media, depths_mm: Sequence[float], readout: Readout
-) -> NDArray[np.float64]:
+def smallest_errors_mm(camera: Camera, media: Media, depths_mm: Sequence[float], readout: Readout) -> Floats:
     """Return the Cramer-Rao bound (n, 3) of x, y and z of a tracer alone, by its depth."""
     particles = np.array([[*BESIDE_MM, depth, LIGHT_COUNTS] for depth in depths_mm])
     return errors_alone_mm(raw_view(camera, media, RADIUS_MM), particles, readout)
@@ -100,7 +93,7 @@ def smallest_errors_mm(
 
 def smallest_errors_crowded_mm(
     camera: Camera, media: Media, per_lens: float, deepest_mm: float, readout: Readout, rng: np.random.Generator
-) -> NDArray[np.float64]:
+) -> Floats:
     """Return the median bound (3,) of x, y and z of a tracer among others that are to be found as well.
 
     Parameters
@@ -111,7 +104,7 @@ def smallest_errors_crowded_mm(
     scale = camera.scale(media)
     side = np.array([camera.columns, camera.rows]) * camera.pixel_mm * scale.lens_mm / float(camera.lattice.pitch[0])
     count = max(round(per_lens * float(np.prod(side)) / scale.lens_mm**2), 1)
-    errors: list[NDArray[np.float64]] = []
+    errors: list[Floats] = []
     while len(errors) < FEWEST_TRACERS:
         places = rng.uniform([*(-0.5 * side), -deepest_mm], [*(0.5 * side), deepest_mm], (count, 3))
         particles = np.column_stack([places, np.full(count, LIGHT_COUNTS)])
@@ -123,9 +116,7 @@ def smallest_errors_crowded_mm(
     return np.asarray(np.median(errors, axis=0))
 
 
-def elongations_mm(
-    camera: Camera, media: Media, depths_mm: Sequence[float], settings: SolverSettings
-) -> NDArray[np.float64]:
+def elongations_mm(camera: Camera, media: Media, depths_mm: Sequence[float], settings: SolverSettings) -> Floats:
     """Return how long a reconstructed tracer is in depth (n,), each alone in an image without noise."""
     view = raw_view(camera, media, RADIUS_MM)
     found = []

@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -23,32 +22,24 @@ from lfpiv_cli.paper.parts import Drawing, Findings, Row, Work
 from lfpiv_cli.paper.small_rig import (
     GATE_MM,
     HALF_DEPTH_MM,
-    HALF_WIDTH_MM,
+    READOUT,
     Case,
     Figures,
     Image,
     Points,
-    Tracers,
-    fit_errors,
+    Rig,
+    displacement,
     index_wrong,
     lattice_shifted,
     lattice_turned,
-    pairs_of,
     photograph,
-    rig,
-    search_of,
     sheet,
     strewn_apart,
+    tracks_between,
 )
-from lfpiv_cli.paper.small_scenes import displacement, tracks_between
 from lfpiv_cli.particles.rounds import ROUNDS
-from lfpiv_cli.pictures.style import new_figure, styled
-from lfpiv_cli.synthetic.sensor import Readout
-from lfpiv_cli.validation.volume import Matches
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
+from lfpiv_cli.pictures.style import Figure, new_panels, styled
+from lfpiv_cli.validation.volume import fit_errors, pairs_of
 
 # Shown from a tenth of the limit to a thousand times it.
 DECADES = (-1.0, 3.0)
@@ -60,8 +51,7 @@ def faults_figure(over: Mapping[str, Mapping[str, float]], words: Mapping[str, s
     names = list(words)
     table = np.array([[each[name] for name in names] for each in over.values()])
     shade = np.clip(np.log10(np.maximum(table, 10.0 ** DECADES[0])), *DECADES)
-    figure = new_figure(10.0, 1.9 + 0.38 * len(table))
-    axes = figure.subplots()
+    figure, axes = new_panels(10.0, 1.9 + 0.38 * len(table))
     image = axes.imshow(shade, cmap="cividis", vmin=DECADES[0], vmax=DECADES[1], aspect="auto")
     for (row, column), value in np.ndenumerate(table):
         missed = not value <= 1.0
@@ -151,7 +141,7 @@ class Fault:
 
 def good() -> Case:
     """Return the rig as it is."""
-    known = rig(sheet())
+    known = Rig(sheet())
     return Case(known, known)
 
 
@@ -187,7 +177,18 @@ def faults(work: Work) -> Findings:
             ),
         ),
         tables=(fault_table(figures, good_figures, limits),),
-        text=text_of(len(planted)),
+        text=(
+            f"{len(planted)} mistakes are planted, each in a measurement that is good otherwise: a pair of images of "
+            f"some tens of tracers that stand apart and {OFF_FOCUS_MM:g} mm off the focal plane or more, taken by a "
+            "corner of the paper's camera before its channel, with noise and Snell's law. Particles of both images are "
+            "found and joined to tracks. What the tracks say is held against the truth: a map is fitted from true to "
+            "measured places (offsets, scales, slants of the lateral axes over depth, turn about the axis and its "
+            "growth in depth, and what scatters about it), and a slope for each velocity component.",
+            f"The limits are {LIMIT_SIGMAS:g} standard errors of the same figures in a good measurement of other "
+            "tracers; of spreads, above their value there. A validation fails, as `lfpiv validate` does with exit code "
+            "8, where a figure misses its limit. A swapped pair leaves all places as they are, as they are those of "
+            "the middle of the pair: velocities alone tell.",
+        ),
         seeds=(SEED_OF_LIMITS, SEED),
     )
 
@@ -196,20 +197,17 @@ def measured(fault: Fault, seed: int) -> Figures:
     """Return the figures of a measurement with a mistake, `name` and `name_sigma`."""
     rng = np.random.default_rng([seed, 5])
     case = fault.case()
-    tracers = off_focus(strewn_apart(rng, (-HALF_DEPTH_MM, HALF_DEPTH_MM), HALF_WIDTH_MM))
+    tracers = strewn_apart(rng)
+    # they fill the depths but those near the focal plane
+    x, y, z = tracers.position_mm.T
+    off = np.copysign(OFF_FOCUS_MM + (1.0 - OFF_FOCUS_MM / HALF_DEPTH_MM) * np.abs(z), z)
+    tracers = replace(tracers, position_mm=np.column_stack([x, y, off]))
     moves = displacement(tracers.position_mm)
-    first, second = (photograph(case.true, tracers.moved(sign * moves), Readout(), rng) for sign in (-0.5, 0.5))
-    search, signs = replace(search_of(case), rounds=FEW_ROUNDS), np.array(fault.signs)
+    first, second = (photograph(case.true, tracers.moved(sign * moves), READOUT, rng) for sign in (-0.5, 0.5))
+    search, signs = replace(case.search(), rounds=FEW_ROUNDS), np.array(fault.signs)
     found = [search.particles(image) * signs for image in fault.images((first, second))]
     middle, moved = tracks_between(found[0], found[1], case.believed)
     return place_and_velocity_figures(middle, moved, tracers.position_mm, moves)
-
-
-def off_focus(tracers: Tracers) -> Tracers:
-    """Return tracers that fill the depths but those near the focal plane."""
-    x, y, z = tracers.position_mm.T
-    off = np.copysign(OFF_FOCUS_MM + (1.0 - OFF_FOCUS_MM / HALF_DEPTH_MM) * np.abs(z), z)
-    return replace(tracers, position_mm=np.column_stack([x, y, off]))
 
 
 def place_and_velocity_figures(middle: Points, moved: Points, true_places: Points, true_moves: Points) -> Figures:
@@ -218,11 +216,13 @@ def place_and_velocity_figures(middle: Points, moved: Points, true_places: Point
     Which track is which tracer is told by the signs of the axes that pair most of them.
     """
     mirrorings = (1.0 - 2.0 * np.array(signs) for signs in np.ndindex(2, 2, 2))
-    pairs = max((pairs_of(middle * signs, true_places, GATE_MM) for signs in mirrorings), key=closeness)
+    # many pairs, then near in depth
+    paired = (pairs_of(middle * signs, true_places, GATE_MM) for signs in mirrorings)
+    pairs = max(paired, key=lambda each: (len(each.found), -float(np.sum(np.abs(each.error_voxel)))))
     places, moves = middle[pairs.found], moved[pairs.found]
     true, expected = true_places[pairs.true], true_moves[pairs.true]
     fitted = fit_errors(true, places - true)
-    figures, sigma = fitted.figures(), fitted.standard_errors()
+    figures, sigma = fitted.figures, fitted.sigma
     for axis, name in enumerate(COMPONENTS):
         power = np.sum(expected[:, axis] ** 2)
         slope = np.sum(moves[:, axis] * expected[:, axis]) / power
@@ -230,11 +230,6 @@ def place_and_velocity_figures(middle: Points, moved: Points, true_places: Point
         figures[f"slope_{name}"] = float(slope - 1.0)
         sigma[f"slope_{name}"] = float(np.sqrt(np.mean(left**2) / power))
     return figures | {f"{name}_sigma": value for name, value in sigma.items()}
-
-
-def closeness(pairs: Matches) -> tuple[int, float]:
-    """Return by how much pairs are to be preferred: many, then near in depth."""
-    return len(pairs.found), -float(np.sum(np.abs(pairs.error_voxel)))
 
 
 def limits_of(good_figures: Figures) -> dict[str, Limit]:
@@ -258,11 +253,6 @@ def missed_limits(figures: Figures, limits: Mapping[str, Limit]) -> list[str]:
     return sorted((name for name, value in over.items() if not value <= 1.0), key=lambda name: -over[name])
 
 
-def told(name: str, figures: Figures, limits: Mapping[str, Limit]) -> str:
-    """Return a figure with its value and its limit."""
-    return f"{WORDS[name].text} is {WORDS[name].shown(figures[name])}, allowed {allowed(name, limits)}"
-
-
 def allowed(name: str, limits: Mapping[str, Limit]) -> str:
     """Return the limit of a figure in words."""
     limit, words = limits[name], WORDS[name]
@@ -273,12 +263,26 @@ def allowed(name: str, limits: Mapping[str, Limit]) -> str:
 
 def said_to(figures: Figures, limits: Mapping[str, Limit]) -> str:
     """Return what a validation with these limits says to a measurement; empty where it says nothing."""
-    return "; ".join(told(name, figures, limits) for name in missed_limits(figures, limits))
+    values = {name: (WORDS[name].text, WORDS[name].shown(figures[name])) for name in missed_limits(figures, limits)}
+    return "; ".join(f"{text} is {value}, allowed {allowed(name, limits)}" for name, (text, value) in values.items())
 
 
 def fault_rows(figures: Mapping[str, Figures], good_figures: Figures, limits: Mapping[str, Limit]) -> tuple[Row, ...]:
     """Return a row for each mistake with the figure that gives it away, and one for alarms without a mistake."""
-    rows = [fault_row(fault, each, limits) for fault, each in figures.items()]
+    rows = []
+    for fault, each in figures.items():
+        over, said = over_limits(each, limits), said_to(each, limits)
+        # by how many times its limit the worst figure of a mistake is off: it is to fail
+        worst = max(over, key=over.__getitem__)
+        row = Row(
+            quantity=f"{fault}: {WORDS[worst].text}, over its limit",
+            source="planted mistake",
+            limit=1.0,
+            sense="at least",
+            best=over[worst] if said else 0.0,
+            reason="" if said else "validation does not fail: no figure misses its limit",
+        )
+        rows.append(row)
     none = Row(
         quantity="no mistake: figures that miss their limit",
         source="good measurement",
@@ -287,21 +291,6 @@ def fault_rows(figures: Mapping[str, Figures], good_figures: Figures, limits: Ma
         reason=said_to(good_figures, limits),
     )
     return (*rows, none)
-
-
-def fault_row(fault: str, figures: Figures, limits: Mapping[str, Limit]) -> Row:
-    """Return by how many times its limit the worst figure of a mistake is off: it is to fail."""
-    over = over_limits(figures, limits)
-    worst = max(over, key=lambda name: over[name])
-    said = said_to(figures, limits)
-    return Row(
-        quantity=f"{fault}: {WORDS[worst].text}, over its limit",
-        source="planted mistake",
-        limit=1.0,
-        sense="at least",
-        best=over[worst] if said else 0.0,
-        reason="" if said else "validation does not fail: no figure misses its limit",
-    )
 
 
 def fault_table(figures: Mapping[str, Figures], good_figures: Figures, limits: Mapping[str, Limit]) -> Table:
@@ -317,20 +306,3 @@ def fault_table(figures: Mapping[str, Figures], good_figures: Figures, limits: M
     none = ("no mistake", WORDS[worst].text, WORDS[worst].shown(good_figures[worst]), allowed(worst, limits), verdict)
     head = ("mistake", "figure", "value", "limit", "verdict")
     return Table("What gives planted mistakes away, the worst three figures of each", head, (none, *rows))
-
-
-def text_of(planted: int) -> tuple[str, ...]:
-    """Return what was done."""
-    return (
-        f"{planted} mistakes are planted, each in a measurement that is good otherwise: a pair of images of some tens "
-        f"of tracers that stand apart and {OFF_FOCUS_MM:g} mm off the focal plane or more, taken by a corner of the "
-        "paper's camera before its channel, with noise and Snell's law. Particles of both images are found and joined "
-        "to tracks. What the tracks say is held against the truth: a map is fitted from true to measured places "
-        "(offsets, scales, slants of the lateral axes over "
-        "depth, turn about the axis and its growth in depth, and what scatters about it), and a slope for each "
-        "velocity component.",
-        f"The limits are {LIMIT_SIGMAS:g} standard errors of the same figures in a good measurement of other tracers; "
-        "of spreads, above their value there. A validation fails, as `lfpiv validate` does with exit code 8, where a "
-        "figure misses its limit. A swapped pair leaves all places as they are, as they are those of the middle of the "
-        "pair: velocities alone tell.",
-    )

@@ -8,28 +8,22 @@ from functools import partial
 
 import numpy as np
 
-from lfpiv_cli.paper import small_rig, small_scenes
+from lfpiv_cli.paper import small_rig
 from lfpiv_cli.paper.small_rig import CHANNEL, F_NUMBER, HALF_DEPTH_MM, PIXEL_MM, WATER, Case, Figures, sheet
-from lfpiv_cli.synthetic.sensor import Readout
 
 Values = tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]
 
 
 @dataclass(frozen=True)
 class Series:
-    """A curve of a panel.
+    """A curve of a panel: the figure that is drawn, and what turns it into the panel's unit.
 
-    Attributes
-    ----------
-    figure : name of what is drawn, `factor` turns it into the panel's unit
-    fitted : its straight line is drawn, in this power of the influence
+    Where a sensitivity is a slope, the straight line of its figure is drawn as well.
     """
 
     figure: str
     label: str
     factor: float = 1.0
-    fitted: bool = False
-    power: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -50,8 +44,7 @@ class Sensitivity:
     ----------
     figure : whose straight line over the influence has the sensitivity as its slope, or whose value is taken
     text, unit, factor : of what, in which unit, and what turns the slope or value into that
-    typical, typical_text : how wrong the influence typically is, in its own unit, and in words
-    reach, reach_text : what turns the figure into an error of places, mm, and where that holds
+    reach : what turns the figure into an error of places, mm, and where that holds
     at : take the value there in place of a slope; None: the slope
     expected, tolerance : by theory, as the slope is; and by which share the measured one may differ; None: no theory
     power : of the influence in which the figure is a straight line
@@ -61,10 +54,7 @@ class Sensitivity:
     text: str
     unit: str
     factor: float
-    typical: float
-    typical_text: str
-    reach: float = 1.0
-    reach_text: str = "everywhere"
+    reach: tuple[float, str] = (1.0, "everywhere")
     at: float | None = None
     expected: float | None = None
     tolerance: float = 0.05
@@ -80,6 +70,7 @@ class Influence:
     label : of the horizontal axis
     values : at which it is measured: tiny, quick, full
     measure : figures at a value, by seed
+    typical : how wrong the influence typically is, in its own unit, and in words; "": where a sensitivity holds
     advice : what to take care of; {error} is the error that typically follows
     repeats : realisations in full, where scatter matters
     """
@@ -88,7 +79,8 @@ class Influence:
     label: str
     values: Values
     measure: Callable[[float, int], Figures]
-    panels: tuple[Panel, Panel]
+    panels: tuple[Panel, ...]
+    typical: tuple[float, str]
     sensitivities: tuple[Sensitivity, ...]
     advice: str
     repeats: int = 1
@@ -111,12 +103,12 @@ F_NUMBERS = Influence(
     name="f-number",
     label="f-number of the main lens",
     values=((4.0, 8.0), (2.8, 4.0, 8.0), (2.8, 3.3, 4.0, 4.8, 5.6, 6.7, 8.0)),
-    measure=small_scenes.at_f_number,
+    measure=small_rig.at_f_number,
     panels=(
         Panel(
             "error of depth behind 134 mm of water (mm)",
             (
-                Series("paraxial_offset_z", "rays taken as paraxial", 1.0, True, power=-2.0),
+                Series("paraxial_offset_z", "rays taken as paraxial", 1.0),
                 Series("exact_offset_z", "rays by Snell's law"),
             ),
         ),
@@ -128,15 +120,14 @@ F_NUMBERS = Influence(
             ),
         ),
     ),
+    typical=(F_NUMBER**-2, "f/4, paraxial"),
     sensitivities=(
         Sensitivity(
             "paraxial_offset_z",
             "depth by paraxial rays, behind 134 mm of water",
             "mm over the square of the f-number",
             1.0,
-            F_NUMBER**-2,
-            "f/4, paraxial",
-            expected=-small_scenes.spherical_aberration_mm(1.0),
+            expected=-small_rig.spherical_aberration_mm(1.0),
             power=-2.0,
         ),
     ),
@@ -148,28 +139,24 @@ F_NUMBERS = Influence(
 # tracers overlap.
 FAINT, LARGEST_OVER_BOUND = 0.1, 1.5
 
+DEPTH_AND_X = {"z": "depth", "x": "x"}
+
 NOISE = Influence(
     name="noise",
     label="read noise over the light of a lit pixel",
     values=((0.0, 0.1), (0.0, 0.1, 0.2), (0.0, 0.05, 0.1, 0.15, 0.2, 0.3)),
-    measure=small_scenes.in_noise,
-    panels=(
+    measure=small_rig.in_noise,
+    panels=tuple(
         Panel(
-            "spread of depth (um)",
-            (Series("spread_z", "measured", 1e3), Series("bound_z", "Cramer-Rao bound (median)", 1e3)),
-        ),
-        Panel(
-            "spread of x (um)",
-            (Series("spread_x", "measured", 1e3), Series("bound_x", "Cramer-Rao bound (median)", 1e3)),
-        ),
+            f"spread of {what} (um)",
+            (Series(f"spread_{name}", "measured", 1e3), Series(f"bound_{name}", "Cramer-Rao bound (median)", 1e3)),
+        )
+        for name, what in DEPTH_AND_X.items()
     ),
-    sensitivities=(
-        Sensitivity(
-            "spread_z", "spread of depth where noise is a tenth", "um", 1e3, 1.0, "a tenth: faint tracers", at=FAINT
-        ),
-        Sensitivity(
-            "spread_x", "spread of x where noise is a tenth", "um", 1e3, 1.0, "a tenth: faint tracers", at=FAINT
-        ),
+    typical=(1.0, "a tenth: faint tracers"),
+    sensitivities=tuple(
+        Sensitivity(f"spread_{name}", f"spread of {what} where noise is a tenth", "um", 1e3, at=FAINT)
+        for name, what in DEPTH_AND_X.items()
     ),
     advice="Give tracers light: where read noise is a tenth of what a lit pixel holds, depths scatter by "
     "{error}, and a velocity by that, times 1.4, over the time between the images.",
@@ -180,22 +167,19 @@ DISTANCE = Influence(
     name="depth",
     label="distance of the tracers from the focal plane (mm)",
     values=((1.0, 5.0), (0.25, 3.0, 10.0), (0.25, 1.0, 2.0, 3.5, 5.0, 7.5, 10.0)),
-    measure=small_scenes.at_depth,
-    panels=(
+    measure=small_rig.at_depth,
+    panels=tuple(
         Panel(
-            "error of depth (um)",
-            (Series("spread_z", "typical (1.48 times the median)", 1e3), Series("rms_z", "rms", 1e3)),
+            f"error of {what} (um)",
+            (Series(f"spread_{name}", "typical (1.48 times the median)", 1e3), Series(f"rms_{name}", "rms", 1e3)),
             logarithmic=True,
-        ),
-        Panel(
-            "error of x (um)",
-            (Series("spread_x", "typical (1.48 times the median)", 1e3), Series("rms_x", "rms", 1e3)),
-            logarithmic=True,
-        ),
+        )
+        for name, what in DEPTH_AND_X.items()
     ),
+    typical=(1.0, ""),
     sensitivities=(
-        Sensitivity("rms_z", "rms error of depth", "um", 1e3, 1.0, "at 0.25 mm", reach_text="at 0.25 mm", at=0.25),
-        Sensitivity("spread_z", "typical error of depth", "um", 1e3, 1.0, "at 10 mm", reach_text="at 10 mm", at=10.0),
+        Sensitivity("rms_z", "rms error of depth", "um", 1e3, (1.0, "at 0.25 mm"), at=0.25),
+        Sensitivity("spread_z", "typical error of depth", "um", 1e3, (1.0, "at 10 mm"), at=10.0),
     ),
     advice="Keep the focal plane out of what matters most: within a quarter of a millimetre of it depths are wrong by "
     "{error} rms, as light stays within a lens and the side of the plane is hard to tell.",
@@ -206,7 +190,7 @@ SEEDING = Influence(
     name="seeding",
     label="tracers for each microlens",
     values=((0.1, 0.3), (0.1, 0.67, 1.2), (0.1, 0.25, 0.67, 1.2, 2.0, 4.0)),
-    measure=small_scenes.crowded,
+    measure=small_rig.crowded,
     panels=(
         Panel(
             "share, and slope of w",
@@ -229,27 +213,10 @@ SEEDING = Influence(
             logarithmic=True,
         ),
     ),
-    sensitivities=(
-        Sensitivity(
-            "tracks_rms_w",
-            "displacement in depth by particles",
-            "um",
-            1e3,
-            1.0,
-            "the paper's seeding",
-            reach_text="at 0.67 a microlens",
-            at=0.67,
-        ),
-        Sensitivity(
-            "volumes_rms_w",
-            "displacement in depth by volumes",
-            "um",
-            1e3,
-            1.0,
-            "the paper's seeding",
-            reach_text="at 0.67 a microlens",
-            at=0.67,
-        ),
+    typical=(1.0, "the paper's seeding"),
+    sensitivities=tuple(
+        Sensitivity(figure, f"displacement in depth by {by}", "um", 1e3, (1.0, "at 0.67 a microlens"), at=0.67)
+        for figure, by in (("tracks_rms_w", "particles"), ("volumes_rms_w", "volumes"))
     ),
     advice="Take particles rather than volumes where the depth component matters, and seed no more than they "
     "bear: at the paper's seeding volumes have a displacement in depth wrong by {error} rms.",
@@ -261,8 +228,7 @@ SEEDING = Influence(
 
 # Where errors that grow from the middle are told: so deep from the mid plane, and so far from the axis, the paper's
 # volume.
-DEEP_MM, ASIDE_MM = HALF_DEPTH_MM, 5.0
-DEEP_TEXT, ASIDE_TEXT = "4 mm from the mid plane", "5 mm beside the axis"
+DEEP, ASIDE = (HALF_DEPTH_MM, "4 mm from the mid plane"), (5.0, "5 mm beside the axis")
 SHEET = sheet()
 # A lens image that is misplaced by so much moves the place on the main lens by this many times as much; a ray's place
 # in the fluid moves by that over the lens's distance, for each millimetre from the focal plane.
@@ -270,19 +236,19 @@ LEVER = SHEET.image_distance_mm / SHEET.microlens_distance_mm
 SLANT_PER_MM = LEVER / SHEET.focus_distance_mm * WATER.depth_ratio
 TURN_PER_DEG = float(np.deg2rad(1.0))
 
-DEPTH = Panel("error of depth (mm)", (Series("offset_z", "in the middle of the channel", 1.0, True),))
-SCALES = (Series("stretch_z", "along the depth", 100.0, True), Series("stretch_x", "lateral", 100.0, True))
+DEPTH = Panel("error of depth (mm)", (Series("offset_z", "in the middle of the channel", 1.0),))
+SCALES = (Series("stretch_z", "along the depth", 100.0), Series("stretch_x", "lateral", 100.0))
+FOUND = Panel("found of the tracers", (Series("recall", "found"), Series("precision", "of those found, true")))
 VELOCITY = Panel("error of velocities (%)", SCALES, at_least=1.0)
 # With the focal plane 2 mm off, tracers from deeper than this are believed to be in the wall.
 SHALLOW_MM = 2.0
-INDEX_TEXT = "0.005: temperature or solution not measured"
 
 
 def in_places(case: Callable[[float], Case], value: float, seed: int, half_depth_mm: float = HALF_DEPTH_MM) -> Figures:
     """Return how measured places of a case are displaced."""
     rng = np.random.default_rng([seed, 3])
-    tracers = small_rig.strewn_apart(rng, (-half_depth_mm, half_depth_mm), small_rig.HALF_WIDTH_MM)
-    return small_rig.place_figures(case(value), tracers, Readout(), rng)
+    tracers = small_rig.strewn_apart(rng, (-half_depth_mm, half_depth_mm))
+    return small_rig.place_figures(case(value), tracers, rng)
 
 
 INDEX = Influence(
@@ -291,27 +257,18 @@ INDEX = Influence(
     values=around(0.03, WATER.fluid),
     measure=partial(in_places, small_rig.index_wrong),
     panels=(DEPTH, VELOCITY),
+    typical=(0.005, "0.005: temperature or solution not measured"),
     sensitivities=(
         Sensitivity(
             "offset_z",
             "depth in the middle of a 10 mm channel",
             "mm per 0.01",
             0.01,
-            0.005,
-            INDEX_TEXT,
-            reach_text="in the middle",
+            (1.0, "in the middle"),
             expected=0.5 * CHANNEL.width_mm / WATER.fluid,
         ),
         Sensitivity(
-            "stretch_z",
-            "depths and velocities along the depth",
-            "% per 0.01",
-            1.0,
-            0.005,
-            INDEX_TEXT,
-            DEEP_MM,
-            DEEP_TEXT,
-            expected=1.0 / WATER.fluid,
+            "stretch_z", "depths and velocities along the depth", "% per 0.01", 1.0, DEEP, expected=1.0 / WATER.fluid
         ),
     ),
     advice="Measure the index of the fluid at its temperature: 0.005 puts depths off by {error}, more with the "
@@ -324,39 +281,20 @@ FOCUS = Influence(
     values=around(2.0),
     measure=partial(in_places, small_rig.focus_wrong, half_depth_mm=SHALLOW_MM),
     panels=(DEPTH, VELOCITY),
+    typical=(0.1, "0.1 mm: focused by eye"),
     sensitivities=(
+        Sensitivity("offset_z", "depth", "mm per mm", 1.0, expected=WATER.fluid / WATER.air, tolerance=0.03),
         Sensitivity(
-            "offset_z",
-            "depth",
-            "mm per mm",
-            1.0,
-            0.1,
-            "0.1 mm: focused by eye",
-            expected=WATER.fluid / WATER.air,
-            tolerance=0.03,
+            "stretch_x", "lateral places and velocities", "% per mm", 100.0, ASIDE, expected=1.0 / SHEET.focal_length_mm
         ),
-        Sensitivity(
-            "stretch_x",
-            "lateral places and velocities",
-            "% per mm",
-            100.0,
-            0.1,
-            "0.1 mm: focused by eye",
-            ASIDE_MM,
-            ASIDE_TEXT,
-            expected=1.0 / SHEET.focal_length_mm,
-        ),
+        # so near the focal plane the slope has a standard error of 2 %
         Sensitivity(
             "stretch_z",
             "velocities along the depth",
             "% per mm",
             100.0,
-            0.1,
-            "0.1 mm: focused by eye",
-            DEEP_MM,
-            DEEP_TEXT,
+            DEEP,
             expected=2.0 / SHEET.focal_length_mm,
-            # so near the focal plane the slope has a standard error of 2 %
             tolerance=0.1,
         ),
     ),
@@ -370,17 +308,9 @@ WALL = Influence(
     values=around(1.0),
     measure=partial(in_places, small_rig.wall_wrong),
     panels=(DEPTH, VELOCITY),
+    typical=(0.3, "0.3 mm: the tolerance of a 5 mm sheet of acrylic"),
     sensitivities=(
-        Sensitivity(
-            "offset_z",
-            "depth",
-            "mm per mm",
-            1.0,
-            0.3,
-            "0.3 mm: the tolerance of a 5 mm sheet of acrylic",
-            expected=-WATER.fluid / WATER.window,
-            tolerance=0.03,
-        ),
+        Sensitivity("offset_z", "depth", "mm per mm", 1.0, expected=-WATER.fluid / WATER.window, tolerance=0.03),
     ),
     advice="Measure the wall that the board lies on with a calliper, as sheets are not as thick as they are "
     "sold: 0.3 mm puts all depths off by {error}, and leaves velocities alone but where the wall of the flow "
@@ -392,20 +322,15 @@ SHIFT = Influence(
     label="lens images believed to lie farther along x (pixels)",
     values=((-0.3, 0.3), (-0.3, 0.0, 0.3), (-1.0, -0.5, -0.2, 0.0, 0.2, 0.5, 1.0)),
     measure=partial(in_places, small_rig.lattice_shifted),
-    panels=(
-        Panel("slant of x over depth (um/mm)", (Series("slant_x", "x per depth, w into u", 1e3, True),)),
-        Panel("found of the tracers", (Series("recall", "found"), Series("precision", "of those found, true"))),
-    ),
+    panels=(Panel("slant of x over depth (um/mm)", (Series("slant_x", "x per depth, w into u", 1e3),)), FOUND),
+    typical=(0.05, "0.05 px: an older white image"),
     sensitivities=(
         Sensitivity(
             "slant_x",
             "lateral place for each mm from the focal plane",
             "um/mm per 0.1 px",
             100.0,
-            0.05,
-            "0.05 px: an older white image",
-            DEEP_MM,
-            DEEP_TEXT,
+            DEEP,
             expected=-PIXEL_MM * SLANT_PER_MM,
         ),
     ),
@@ -422,22 +347,20 @@ TURN = Influence(
         Panel(
             "turn of lateral places",
             (
-                Series("turn", "in the focal plane (degrees)", 1.0 / TURN_PER_DEG, True),
-                Series("twist", "more for each mm of depth (degrees/mm)", 1.0 / TURN_PER_DEG, True),
+                Series("turn", "in the focal plane (degrees)", 1.0 / TURN_PER_DEG),
+                Series("twist", "more for each mm of depth (degrees/mm)", 1.0 / TURN_PER_DEG),
             ),
         ),
-        Panel("found of the tracers", (Series("recall", "found"), Series("precision", "of those found, true"))),
+        FOUND,
     ),
+    typical=(0.005, "0.005 degrees: an older white image"),
     sensitivities=(
         Sensitivity(
             "twist",
             "turn about the axis for each mm from the focal plane",
             "deg/mm per deg",
             1.0 / TURN_PER_DEG,
-            0.005,
-            "0.005 degrees: an older white image",
-            DEEP_MM * ASIDE_MM,
-            f"{DEEP_TEXT}, {ASIDE_TEXT}",
+            (DEEP[0] * ASIDE[0], f"{DEEP[1]}, {ASIDE[1]}"),
             expected=TURN_PER_DEG * SLANT_PER_MM,
         ),
     ),

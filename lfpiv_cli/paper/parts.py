@@ -27,13 +27,7 @@ TABLE_2: dict[str, Any] = {
     "camera": {
         "main_lens": {"magnification": -1.0, "focal_length_mm": 100.0, "aperture_mm": 25.0},
         "microlenses": {"focal_length_mm": 0.8, "pitch_mm": 0.1, "columns": 252, "rows": 252, "layout": "square"},
-        "sensor": {
-            "pixel_um": 5.5,
-            "columns": 2352,
-            "rows": 1768,
-            "microlens_distance_mm": 0.8,
-            "column_axis": "x",
-        },
+        "sensor": {"pixel_um": 5.5, "columns": 2352, "rows": 1768, "microlens_distance_mm": 0.8, "column_axis": "x"},
     },
     "media": {"air": 1.0, "window": 1.49, "fluid": 1.33},
     "window": {"distance_mm": 98.0, "thickness_mm": 2.0},

@@ -2,29 +2,37 @@
 
 Functions take a mapping from the name of a way to measure, as it is to be read, to what was measured by it; all are
 drawn on one scale, in colours that people with any kind of colour vision tell apart; marks and lines differ as well,
-for print in grey. Lengths in the channel are shares of its width from its low wall; the paper's x is our other
-lateral axis.
+for print in grey. Lengths in the channel are shares of its width from its low wall. The report's flow runs along x; the
+paper's x is our y, the other lateral axis.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.grid import Grid
-from lfpiv_cli.pictures.style import BLUE, DIVERGING, GREEN, ORANGE, PURPLE, SEQUENTIAL, VERMILION, new_figure, styled
+from lfpiv_cli.pictures.style import (
+    BLUE,
+    DIVERGING,
+    GREEN,
+    ORANGE,
+    PURPLE,
+    SEQUENTIAL,
+    VERMILION,
+    Axes,
+    Figure,
+    new_figure,
+    new_panels,
+    styled,
+)
 from lfpiv_cli.pictures.vectors import mean_of_known
-from lfpiv_cli.validation.flow import PAPER_SLICES, TOLERANCE, Duct, compare, cumulative_distribution
-from lfpiv_cli.validation.methods import Measured, slice_at
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
+from lfpiv_cli.validation.flow import PAPER_SLICES, TOLERANCE, Duct, Measured, cumulative_distribution
+from lfpiv_cli.validation.methods import slice_at
 
 # Colours that people with any kind of colour vision tell apart; marks and lines differ as well, for print in grey.
 BOARD_STYLES: tuple[dict[str, Any], ...] = (
@@ -41,67 +49,44 @@ SHOWN_DEPTHS = 2.0
 DECIMALS = 3
 
 
-@dataclass(frozen=True, eq=False)
-class BoardView:
-    """A reconstructed board as seen from the front and from the side, its brightest voxel 1, and its bright voxels.
+def board_view(volume: NDArray[np.float32], grid: Grid) -> dict[str, Floats]:
+    """Return a reconstructed board [z, y, x] as it is seen, its brightest voxel 1, rounded as a page shows it.
 
-    Attributes
-    ----------
-    front : (y, x), the maximum along z
-    side : (z, x), the maximum along y
-    bounds_mm : (3, 2), of the volume along x, y and z
-    bright_mm : (n, 3), where voxels are brighter than `SHOWN_SHARE`
+    Returns
+    -------
+    dict
+        `front` (y, x), the maximum along z; `side` (z, x), the maximum along y; `bounds_mm` (3, 2) of the volume along
+        x, y and z; `bright_mm` (n, 3), where voxels are brighter than `SHOWN_SHARE`
     """
-
-    front: NDArray[np.float64]
-    side: NDArray[np.float64]
-    bounds_mm: NDArray[np.float64]
-    bright_mm: NDArray[np.float64]
-
-    @classmethod
-    def of(cls, volume: NDArray[np.float32], grid: Grid) -> BoardView:
-        """Return the view of a volume [z, y, x]."""
-        shares = volume / volume.max()
-        inside = np.argwhere(shares > SHOWN_SHARE)
-        x, y, z = (grid.axis_mm(axis)[inside[:, 2 - axis]] for axis in range(3))
-        bounds = np.array([grid.bounds_mm(axis) for axis in range(3)])
-        return cls(shares.max(axis=0), shares.max(axis=1), bounds, np.stack([x, y, z], axis=1))
-
-    def to_plain(self) -> dict[str, Any]:
-        """Return the view as lists of numbers."""
-        arrays = {field.name: np.asarray(getattr(self, field.name), np.float64) for field in fields(self)}
-        return {name: np.round(each, DECIMALS).tolist() for name, each in arrays.items()}
-
-    @classmethod
-    def from_plain(cls, values: Mapping[str, Any]) -> BoardView:
-        """Return the view that lists of numbers hold."""
-        return cls(**{name: np.array(each, np.float64) for name, each in values.items()})
+    shares = volume / volume.max()
+    inside = np.argwhere(shares > SHOWN_SHARE)
+    view = {"front": shares.max(axis=0), "side": shares.max(axis=1)}
+    view["bounds_mm"] = np.array([grid.bounds_mm(axis) for axis in range(3)])
+    view["bright_mm"] = np.stack([grid.axis_mm(axis)[inside[:, 2 - axis]] for axis in range(3)], axis=1)
+    return {name: np.asarray(each, np.float64).round(DECIMALS) for name, each in view.items()}
 
 
 @styled
-def views_figure(views: Mapping[str, BoardView]) -> Figure:
+def views_figure(views: Mapping[str, Mapping[str, Floats]]) -> Figure:
     """Return boards in the focal plane, a row for each method: front, side and in three dimensions (Fig. 8)."""
     figure = new_figure(11.0, 3.7 * len(views))
-    drawn = None
     # as much of the depth for each as shows the longest dots and their surroundings
-    reach = SHOWN_DEPTHS * max(float(np.abs(view.bright_mm[:, 2]).max()) for view in views.values())
+    reach = SHOWN_DEPTHS * max(float(np.abs(view["bright_mm"][:, 2]).max()) for view in views.values())
     for row, (label, view) in enumerate(views.items()):
-        x, y, z = ((low, high) for low, high in view.bounds_mm)
+        x, y, z = ((low, high) for low, high in view["bounds_mm"])
         front, side = (figure.add_subplot(len(views), 3, 3 * row + column) for column in (1, 2))
-        drawn = front.imshow(view.front, origin="lower", extent=(*x, *y), cmap=SEQUENTIAL, vmin=0.0, vmax=1.0)
+        drawn = front.imshow(view["front"], origin="lower", extent=(*x, *y), cmap=SEQUENTIAL, vmin=0.0, vmax=1.0)
         front.set(title=f"{label}: maximum along z", xlabel="x (mm)", ylabel="y (mm)")
-        side.imshow(view.side, origin="lower", extent=(*x, *z), cmap=SEQUENTIAL, vmin=0.0, vmax=1.0, aspect="auto")
+        side.imshow(view["side"], origin="lower", extent=(*x, *z), cmap=SEQUENTIAL, vmin=0.0, vmax=1.0, aspect="auto")
         side.set(title=f"{label}: maximum along y", xlabel="x (mm)", ylabel="z (mm)", ylim=(-reach, reach))
         space: Any = figure.add_subplot(len(views), 3, 3 * row + 3, projection="3d")
-        space.scatter(
-            *view.bright_mm.T, c=view.bright_mm[:, 2], cmap=SEQUENTIAL, s=1.5, linewidths=0.0, rasterized=True
-        )
+        look: dict[str, Any] = {"cmap": SEQUENTIAL, "s": 1.5, "linewidths": 0.0, "rasterized": True}
+        space.scatter(*view["bright_mm"].T, c=view["bright_mm"][:, 2], **look)
         space.set(title=f"{label}: brighter than 1/e", xlabel="x (mm)", ylabel="y (mm)", zlabel="z (mm)")
         space.set(zlim=(-reach, reach))
         space.set_box_aspect((1.0, 1.0, 1.2), zoom=0.85)
         _tidy(space)
-    if drawn is not None:
-        figure.colorbar(drawn, ax=figure.axes, shrink=0.5, label="intensity / largest", location="bottom")
+    figure.colorbar(drawn, ax=figure.axes, shrink=0.5, label="intensity / largest", location="bottom")
     return figure
 
 
@@ -117,8 +102,7 @@ def elongation_figure(
     paper_mm : lowest and highest elongation that the paper has
     paper_sigma_mm : what its spread stays below
     """
-    figure = new_figure(10.0, 3.8)
-    length, spread = figure.subplots(1, 2)
+    figure, (length, spread) = new_panels(10.0, 3.8, 1, 2)
     length.axhspan(*paper_mm, label=f"paper: {paper_mm[0]:g} to {paper_mm[1]:g} mm", **BAND)
     spread.axhspan(0.0, paper_sigma_mm, label=f"paper: below {paper_sigma_mm:g} mm", **BAND)
     for (label, figures), style in zip(methods.items(), BOARD_STYLES, strict=False):
@@ -145,8 +129,7 @@ def location_figure(
     spacing_mm : x_g of Eq. 19
     paper_steps_mm : shortest and longest depth separation that the paper has, where it says
     """
-    figure = new_figure(10.0, 6.6)
-    (lateral, depth), (lateral_error, depth_error) = figure.subplots(2, 2)
+    figure, ((lateral, depth), (lateral_error, depth_error)) = new_panels(10.0, 6.6, 2, 2)
     lateral.axhline(spacing_mm, color="black", linewidth=0.8, label="true")
     depth.axhline(1.0, color="black", linewidth=0.8, label="true")
     if paper_steps_mm is not None:
@@ -172,22 +155,19 @@ def location_figure(
 
 
 @styled
-def centres_figure(centres_mm: Mapping[str, NDArray[np.float64]]) -> Figure:
+def centres_figure(centres_mm: Mapping[str, Floats]) -> Figure:
     """Return the centres of all dots of all boards, (n, 3) for each method, coloured by depth (Fig. 10)."""
     figure = new_figure(5.2 * len(centres_mm) + 0.8, 4.2)
     deepest = max(float(np.abs(each[:, 2]).max()) for each in centres_mm.values())
-    drawn = None
     for number, (label, each) in enumerate(centres_mm.items(), start=1):
         space: Any = figure.add_subplot(1, len(centres_mm), number, projection="3d")
         # depth along the page, as the boards were moved
-        drawn = space.scatter(
-            each[:, 2], each[:, 0], each[:, 1], c=each[:, 2], cmap=SEQUENTIAL, vmin=-deepest, vmax=deepest, s=6.0
-        )
+        look: dict[str, Any] = {"cmap": SEQUENTIAL, "vmin": -deepest, "vmax": deepest, "s": 6.0}
+        drawn = space.scatter(each[:, 2], each[:, 0], each[:, 1], c=each[:, 2], **look)
         space.set(title=label, xlabel="z (mm)", ylabel="x (mm)", zlabel="y (mm)")
         space.set_box_aspect((2.0, 1.0, 1.0), zoom=1.1)
         _tidy(space)
-    if drawn is not None:
-        figure.colorbar(drawn, ax=figure.axes, shrink=0.6, label="measured depth z (mm)", location="bottom")
+    figure.colorbar(drawn, ax=figure.axes, shrink=0.6, label="measured depth z (mm)", location="bottom")
     return figure
 
 
@@ -213,28 +193,19 @@ def slice_maps_figure(methods: Mapping[str, Measured], duct: Duct) -> Figure:
     first = next(iter(methods.values()))
     rows = {"true": (first, first.truth)} | {name: (m, m.field.velocity) for name, m in methods.items()}
     highest = max(float(np.linalg.norm(m.truth[m.inside], axis=-1).max()) for m in methods.values())
-    figure = new_figure(13.0, 2.3 * len(rows) + 0.6)
-    axes = figure.subplots(len(rows), 6, squeeze=False, sharey=True)
-    main = "xyz".index(duct.axis)
+    figure, axes = new_panels(13.0, 2.3 * len(rows) + 0.6, len(rows), 6, squeeze=False, sharey=True)
+    look: dict[str, Any] = {"vmin": 0.0, "vmax": highest, "cmap": SEQUENTIAL, "aspect": "auto"}
     for row, (name, (measured, velocity)) in zip(axes, rows.items(), strict=True):
+        low, high = measured.field.grid.bounds_mm(0)
         speed = np.where(measured.inside, np.linalg.norm(velocity, axis=-1), np.nan)
         places = [(k, axis, share) for k, axis in duct.across.items() for share in PAPER_SLICES[k]]
         for panel, (key, axis, share) in zip(row, places, strict=True):
-            other = 3 - axis - main
-            position = duct.position_mm(axis, share)
-            shown = slice_at(speed, measured.field.grid.axis_mm(axis), position, axis)
-            # of what is left of [z, y, x] the flow's axis goes up, as the paper has it
-            shown = shown if main == (1 if axis == 2 else 2) else shown.T
-            image = panel.imshow(
-                shown,
-                origin="lower",
-                extent=(*_ends(measured, duct, other), *_ends(measured, duct, main)),
-                vmin=0.0,
-                vmax=highest,
-                cmap=SEQUENTIAL,
-                aspect="auto",
-            )
-            panel.set(xlabel=f"{_paper_name(other)}/D", title=f"{key} = {share}")
+            # of what is left of [z, y, x] the flow's axis goes up, as the paper has it, counted from the first window
+            shown = slice_at(speed, measured.field.grid.axis_mm(axis), duct.position_mm(axis, share), axis).T
+            ends = _as_shares(np.array(measured.field.grid.bounds_mm(3 - axis)), duct, 3 - axis)
+            extent = (float(ends[0]), float(ends[1]), 0.0, (high - low) / duct.width_mm)
+            image = panel.imshow(shown, origin="lower", extent=extent, **look)
+            panel.set(xlabel=f"{'z' if axis == 1 else 'x'}/D", title=f"{key} = {share}")
         row[0].set_ylabel(f"{name}\ny/D, along the flow")
     figure.colorbar(image, ax=axes, label="size of the velocity (m/s)", shrink=0.8)
     return figure
@@ -243,10 +214,9 @@ def slice_maps_figure(methods: Mapping[str, Measured], duct: Duct) -> Figure:
 @styled
 def cumulative_figure(methods: Mapping[str, Measured]) -> Figure:
     """Return the share of vectors over their relative error, along the flow and of the whole vector, with the 25 %."""
-    figure = new_figure(10.0, 4.2)
-    panels = figure.subplots(1, 2, sharey=True)
+    figure, panels = new_panels(10.0, 4.2, 1, 2, sharey=True)
     for (name, m), (colour, _, line) in zip(methods.items(), WAY_STYLES, strict=False):
-        shares = cumulative_distribution(compare(m.field, m.truth, m.inside))
+        shares = cumulative_distribution(m.pairs)
         errors = 100.0 * np.array(shares["relative_error"])
         for axes, key in zip(panels, ("streamwise_share", "vector_share"), strict=True):
             axes.plot(errors, 100.0 * np.array(shares[key], dtype=np.float64), line, color=colour, label=name)
@@ -260,23 +230,9 @@ def cumulative_figure(methods: Mapping[str, Measured]) -> Figure:
     return figure
 
 
-def _paper_name(axis: int) -> str:
-    """Return the paper's name of an axis across the flow: its x is our other lateral one."""
-    return "z" if axis == 2 else "x"
-
-
-def _as_shares(places_mm: NDArray[np.float64], duct: Duct, axis: int) -> NDArray[np.float64]:
+def _as_shares(places_mm: Floats, duct: Duct, axis: int) -> Floats:
     """Return places along an axis as shares of the width from the low wall."""
     return np.asarray((places_mm - duct.position_mm(axis, 0.0)) / duct.width_mm)
-
-
-def _ends(measured: Measured, duct: Duct, axis: int) -> tuple[float, float]:
-    """Return the bounds of the windows along an axis as shares of the width; along the flow from the first one."""
-    low, high = measured.field.grid.bounds_mm(axis)
-    if "xyz".index(duct.axis) == axis:
-        return 0.0, (high - low) / duct.width_mm
-    ends = _as_shares(np.array([low, high]), duct, axis)
-    return float(ends[0]), float(ends[1])
 
 
 # The paper sees velocities that are too small beyond this share of the channel's width.
@@ -287,9 +243,9 @@ CASE_STYLES = ((BLUE, "o"), (VERMILION, "s"), (GREEN, "^"), (PURPLE, "v"), (ORAN
 @styled
 def raw_figure(image: NDArray[np.float32], mask: NDArray[np.bool_]) -> Figure:
     """Return a part of a raw image with bubbles, alone and with the outline of what a mask leaves out."""
-    figure = new_figure(10.0, 10.0 * 0.5 * image.shape[0] / image.shape[1] + 1.0)
+    figure, panels = new_panels(10.0, 10.0 * 0.5 * image.shape[0] / image.shape[1] + 1.0, 1, 2)
     highest = float(np.percentile(image[~mask], 99.9)) if not mask.all() else float(image.max())
-    for axes, title in zip(figure.subplots(1, 2), ("raw image", "left out by the mask"), strict=True):
+    for axes, title in zip(panels, ("raw image", "left out by the mask"), strict=True):
         shown = axes.imshow(np.sqrt(np.clip(image, 0.0, highest)), cmap="gray", vmin=0.0, interpolation="nearest")
         axes.set(xlabel="column (px)", ylabel="row (px)", title=title)
     axes.imshow(np.where(mask, 1.0, np.nan), cmap="autumn", alpha=0.6, interpolation="nearest")
@@ -302,31 +258,19 @@ def raw_figure(image: NDArray[np.float32], mask: NDArray[np.bool_]) -> Figure:
 @styled
 def plane_figure(methods: Mapping[str, Measured], duct: Duct, plane: int) -> Figure:
     """Return vectors and the error of the velocity along the flow in one x-y plane of windows, by way to measure."""
-    main, axis = "xyz".index(duct.axis), duct.across["x/D"]
-    first = next(iter(methods.values()))
-    highest = float(first.truth[..., main].max())
-    figure = new_figure(3.2 * len(methods) + 1.0, 8.2)
-    axes = figure.subplots(2, len(methods), squeeze=False, sharex=True, sharey=True)
+    axis = duct.across["x/D"]
+    highest = float(next(iter(methods.values())).truth[..., 0].max())
+    figure, axes = new_panels(3.2 * len(methods) + 1.0, 8.2, 2, len(methods), squeeze=False, sharex=True, sharey=True)
     for column, (name, m) in zip(axes.T, methods.items(), strict=True):
-        places = [m.field.grid.axis_mm(k) for k in (main, axis)]
-        along, across = np.meshgrid(*places)
+        along, across = np.meshgrid(*(m.field.grid.axis_mm(k) for k in (0, axis)))
         shares = _as_shares(across, duct, axis)
-        velocity = _oriented(m.field.velocity[plane], main)
-        error = velocity[..., main] - _oriented(m.truth[plane], main)[..., main]
-        arrows = column[0].quiver(
-            along,
-            shares,
-            velocity[..., main],
-            velocity[..., axis],
-            velocity[..., main],
-            cmap=SEQUENTIAL,
-            clim=(0.0, highest),
-            scale=12.0 * highest,
-            width=0.008,
-        )
-        image = column[1].pcolormesh(along, shares, error, cmap=DIVERGING, vmin=-0.5 * highest, vmax=0.5 * highest)
+        u, v = m.field.velocity[plane][..., 0], m.field.velocity[plane][..., axis]
+        look: dict[str, Any] = {"cmap": SEQUENTIAL, "clim": (0.0, highest), "scale": 12.0 * highest, "width": 0.008}
+        arrows = column[0].quiver(along, shares, u, v, u, **look)
+        error, reach = u - m.truth[plane][..., 0], 0.5 * highest
+        image = column[1].pcolormesh(along, shares, error, cmap=DIVERGING, vmin=-reach, vmax=reach)
         column[0].set(title=name)
-        column[1].set(xlabel=f"{'xyz'[main]}, along the flow (mm)")
+        column[1].set(xlabel="x, along the flow (mm)")
         for panel in column:
             panel.axhline(PAPERS_WALL, color="0.4", linewidth=0.8, linestyle="--")
     for panel in axes[:, 0]:
@@ -339,38 +283,27 @@ def plane_figure(methods: Mapping[str, Measured], duct: Duct, plane: int) -> Fig
 @styled
 def wall_profile_figure(methods: Mapping[str, Measured], duct: Duct) -> Figure:
     """Return the mean over flow and depth of the velocity along the flow, over x/D, and its error beside it."""
-    figure = new_figure(10.0, 4.2)
-    left, right = figure.subplots(1, 2)
-    main, axis = "xyz".index(duct.axis), duct.across["x/D"]
+    figure, (left, right) = new_panels(10.0, 4.2, 1, 2)
+    axis = duct.across["x/D"]
     first = next(iter(methods.values()))
-    true = _mean_over(first.truth[..., main], first.inside, axis)
+    true = _mean_over(first.truth[..., 0], first.inside, axis)
     left.plot(_as_shares(first.field.grid.axis_mm(axis), duct, axis), true, color="black", label="analytic")
     for (name, m), (colour, marker) in zip(methods.items(), CASE_STYLES, strict=False):
-        found, places = _mean_over(m.field.velocity[..., main], m.inside, axis), m.field.grid.axis_mm(axis)
+        found, places = _mean_over(m.field.velocity[..., 0], m.inside, axis), m.field.grid.axis_mm(axis)
         shares = _as_shares(places, duct, axis)
         left.plot(shares, found, marker, color=colour, markerfacecolor="none", label=name)
-        own = _mean_over(m.truth[..., main], m.inside, axis)
+        own = _mean_over(m.truth[..., 0], m.inside, axis)
         right.plot(shares, 100.0 * (found / own - 1.0), marker + "-", color=colour, label=name)
     left.set(xlabel="x/D", ylabel="velocity along the flow, mean of the plane (m/s)")
     right.set(xlabel="x/D", ylabel="its error (%)")
     right.axhline(0.0, color="0.6", linewidth=0.8)
     for panel in (left, right):
-        _mark_wall(panel)
+        panel.axvspan(PAPERS_WALL, 1.0, color="0.9", zorder=0)
+        panel.grid(alpha=0.3)
     left.legend(fontsize=8)
     return figure
 
 
-def _mark_wall(axes: Axes) -> None:
-    """Mark where the paper's velocities are too small."""
-    axes.axvspan(PAPERS_WALL, 1.0, color="0.9", zorder=0)
-    axes.grid(alpha=0.3)
-
-
-def _oriented(plane: NDArray[np.float64], main: int) -> NDArray[np.float64]:
-    """Return a plane [y, x] of vectors with the flow's axis last."""
-    return plane if main == 0 else np.swapaxes(plane, 0, 1)
-
-
-def _mean_over(values: NDArray[np.float64], inside: NDArray[np.bool_], axis: int) -> NDArray[np.float64]:
+def _mean_over(values: Floats, inside: NDArray[np.bool_], axis: int) -> Floats:
     """Return the means (n,) over planes across an axis (0 for x) of values [z, y, x], of what is known inside."""
     return mean_of_known(np.where(inside, values, np.nan), tuple(k for k in range(3) if k != 2 - axis))

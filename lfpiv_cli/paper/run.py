@@ -31,7 +31,7 @@ from lfpiv_cli.paper.discussion import discussion
 from lfpiv_cli.paper.faults import faults
 from lfpiv_cli.paper.parts import Findings, Row, Work, kept, read_json, rows_of
 from lfpiv_cli.paper.sensitivities import sensitivities
-from lfpiv_cli.paper.table3 import table3, table3_experiment
+from lfpiv_cli.paper.table3 import table3
 from lfpiv_cli.paper.table4 import table4
 
 # The parts of the report, in the order in which they are made and shown; a new one is a line here and in `names`.
@@ -50,9 +50,11 @@ class Part:
 PARTS: dict[PaperPart, Part] = {
     "table1": Part(table1, "Weights of single voxels (Table 1, Figs. 5 and 6)", 0.5, 4.0),
     "table2": Part(table2, "The camera (Table 2)", 0.01, 0.01),
-    "table3": Part(table3, "Boards, an ideal camera (Table 3, numerical; Figs. 8 to 11)", 0.8, 20.0),
+    "table3": Part(
+        partial(table3, half="ideal"), "Boards, an ideal camera (Table 3, numerical; Figs. 8 to 11)", 0.8, 20.0
+    ),
     "table3-experiment": Part(
-        table3_experiment,
+        partial(table3, half="recorded"),
         "Boards, a camera as real ones are, simulated (Table 3, experiment; Figs. 12 and 13)",
         0.8,
         22.0,
@@ -68,17 +70,8 @@ PARTS: dict[PaperPart, Part] = {
 # The page about the paper, made of what its parts have found.
 
 TITLE = "Equivalent ray tracing for light-field PIV: the paper's tables and figures, computed"
-HEAD = (
-    "quantity",
-    "paper, DLFC",
-    "paper, ERT",
-    "ours, DLFC as the paper did it",
-    "ours, ERT as the paper did it",
-    "ours at its best",
-    "limit",
-    "verdict",
-    "source",
-)
+OURS = ("ours, DLFC as the paper did it", "ours, ERT as the paper did it", "ours at its best")
+HEAD = ("quantity", "paper, DLFC", "paper, ERT", *OURS, "limit", "verdict", "source")
 SIZES: dict[Size, str] = {
     "full": "Everything was computed at the paper's sizes.",
     "quick": (
@@ -89,13 +82,7 @@ SIZES: dict[Size, str] = {
 }
 
 
-def page_of(
-    parts: Mapping[PaperPart, Mapping[str, Any]],
-    titles: Mapping[PaperPart, str],
-    folder: Path,
-    size: Size,
-    made: Mapping[str, Any],
-) -> Page:
+def page_of(parts: Mapping[PaperPart, Mapping[str, Any]], folder: Path, size: Size, made: Mapping[str, Any]) -> Page:
     """Return the page of parts, whose pictures lie below a folder."""
     rows = [row for part in parts.values() for row in rows_of(part["rows"])]
     met = sum(row.verdict == "met" for row in rows)
@@ -110,25 +97,20 @@ def page_of(
     )
     notes = tuple(f"{row.quantity} ({row.source}): {row.reason}" for row in rows if row.reason)
     table = Table("All quantities", HEAD, tuple(_cells(row) for row in rows))
-    sections = [_section(name, titles[name], part, folder, size) for name, part in parts.items()]
+    sections = []
+    for name, part in parts.items():
+        tables = [Table(t["caption"], tuple(t["head"]), tuple(map(tuple, t["rows"]))) for t in part["tables"]]
+        seeds = f"Seeds {', '.join(map(str, part['seeds']))}. " if part["seeds"] else ""
+        told = (*part["text"], f"{seeds}This part took {_duration(part['seconds'])}.")
+        pictures = [Picture(folder / each["path"], each["caption"]) for each in part["pictures"]]
+        again = f"lfpiv validate paper {'--quick ' if size == 'quick' else ''}-o . --resume --only {name}"
+        commands = (*part["commands"], again)
+        sections.append(Section(PARTS[name].title, name, told, tuple(tables), tuple(pictures), commands))
     libraries = ", ".join(f"{name} {version}" for name, version in made["libraries"].items())
     foot = f"Made by lfpiv {made['version']} ({libraries})."
     if notes:
         sections.append(Section("Where ours as the paper did it differs, and why", "reasons", notes))
     return Page(TITLE, text, (table,), tuple(sections), foot)
-
-
-def _section(name: PaperPart, title: str, part: Mapping[str, Any], folder: Path, size: Size) -> Section:
-    tables = [Table(each["caption"], tuple(each["head"]), tuple(map(tuple, each["rows"]))) for each in part["tables"]]
-    seeds = f"Seeds {', '.join(map(str, part['seeds']))}. " if part["seeds"] else ""
-    return Section(
-        title,
-        name,
-        (*part["text"], f"{seeds}This part took {_duration(part['seconds'])}."),
-        tuple(tables),
-        tuple(Picture(folder / each["path"], each["caption"]) for each in part["pictures"]),
-        (*part["commands"], f"lfpiv validate paper {'--quick ' if size == 'quick' else ''}-o . --resume --only {name}"),
-    )
 
 
 def _cells(row: Row) -> tuple[str, ...]:
@@ -172,16 +154,6 @@ def validate_paper(
     ensure_drawing()
     ensure_pages()
     made = record(f"validate paper, {options.size}", None, {})
-    _make_parts(output, options, made, console)
-    parts = _parts_there(output, made)
-    page = page_of(parts, {name: PARTS[name].title for name in parts}, output, options.size, made)
-    write_pages(page, (paths["index.html"], paths["report.md"]), again)
-    write_json(paths["report.json"], {"parts": parts, "provenance": made}, again)
-    return _judged(paths["index.html"], parts)
-
-
-def _make_parts(output: Path, options: PaperOptions, made: Mapping[str, Any], console: Console) -> None:
-    """Make the parts that are asked for, and say how far the work is."""
     chosen = [name for name in PARTS if name in options.only or not options.only]
     minutes = {
         name: {"tiny": 0.1, "quick": PARTS[name].quick_minutes, "full": PARTS[name].full_minutes}[options.size]
@@ -196,6 +168,27 @@ def _make_parts(output: Path, options: PaperOptions, made: Mapping[str, Any], co
         work = Work(output / "work" / name, options.size, console, made, options.resume)
         kept(output / "parts" / f"{name}.json", made, options.resume, partial(_made, name, work))
         expected += minutes[name]
+    # in their order, those that were made alike
+    parts = {}
+    for name in PARTS:
+        path = output / "parts" / f"{name}.json"
+        if path.exists() and (part := read_json(path)).get("made") == made:
+            parts[name] = part["result"]
+    page = page_of(parts, output, options.size, made)
+    write_pages(page, (paths["index.html"], paths["report.md"]), again)
+    write_json(paths["report.json"], {"parts": parts, "provenance": made}, again)
+    rows = [row for part in parts.values() for row in rows_of(part["rows"])]
+    count = {verdict: sum(row.verdict == verdict for row in rows) for verdict in ("met", "missed", "unknown")}
+    summary: dict[str, Any] = {"parts": len(parts), "rows": len(rows)} | count
+    short = []
+    for row in rows:
+        value = getattr(row, row.judged)
+        told = "unknown" if value is None else written(value)
+        if row.verdict != "met":
+            short.append(f"{row.quantity} ({row.source}) is {told}, expected {row.sense} {row.limit:g}")
+    if short:
+        raise LimitMissedError(f"{paths['index.html']}: {'; '.join(short)}", summary)
+    return summary
 
 
 def _made(name: PaperPart, work: Work) -> dict[str, Any]:
@@ -211,39 +204,7 @@ def _made(name: PaperPart, work: Work) -> dict[str, Any]:
     return {
         "rows": [asdict(row) | {"verdict": row.verdict} for row in found.rows],
         "tables": [asdict(table) for table in found.tables],
-        "text": found.text,
-        "commands": found.commands,
-        "seeds": found.seeds,
+        **{name: getattr(found, name) for name in ("text", "commands", "seeds")},
         "pictures": pictures,
         "seconds": round(seconds, 1),
     }
-
-
-def _parts_there(output: Path, made: Mapping[str, Any]) -> dict[PaperPart, dict[str, Any]]:
-    """Return the parts that were made alike, in their order."""
-    found = {}
-    for name in PARTS:
-        path = output / "parts" / f"{name}.json"
-        if path.exists():
-            part = read_json(path)
-            if part.get("made") == made:
-                found[name] = part["result"]
-    return found
-
-
-def _judged(report: Path, parts: Mapping[PaperPart, Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the count of verdicts; raise where one is not met."""
-    rows: list[Row] = [row for part in parts.values() for row in rows_of(part["rows"])]
-    count = {verdict: sum(row.verdict == verdict for row in rows) for verdict in ("met", "missed", "unknown")}
-    summary: dict[str, Any] = {"parts": len(parts), "rows": len(rows)} | count
-    short = [_short(row) for row in rows if row.verdict != "met"]
-    if short:
-        raise LimitMissedError(f"{report}: {'; '.join(short)}", summary)
-    return summary
-
-
-def _short(row: Row) -> str:
-    """Return in words what a row that is not met has."""
-    value = getattr(row, row.judged)
-    told = "unknown" if value is None else written(value)
-    return f"{row.quantity} ({row.source}) is {told}, expected {row.sense} {row.limit:g}"

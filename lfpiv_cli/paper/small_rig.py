@@ -2,6 +2,8 @@
 
 The lenses, pixels and tracers are the paper's, the sensor sees some 24 by 24 microlenses. Images are made of the rig as
 it is, by Snell's law; places are measured with the rig as somebody believes it to be.
+
+What scatters places and velocities is measured with a camera that is known exactly.
 """
 
 from __future__ import annotations
@@ -12,8 +14,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.calibration.model import Channel, advised_move_mm, mid_plane_z_mm
+from lfpiv_cli.flow.correlation import CorrelationSettings, correlate
+from lfpiv_cli.flow.field import REJECTED
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import Refraction
 from lfpiv_cli.optics.camera import Camera, Lattice, refocused
@@ -21,7 +26,7 @@ from lfpiv_cli.optics.media import Media, channel_window
 from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.particles.rounds import ROUNDS, Round, find_particles
 from lfpiv_cli.particles.search import task_of
-from lfpiv_cli.particles.view import raw_view
+from lfpiv_cli.particles.view import lens_pixels, raw_view
 from lfpiv_cli.reconstruction.equations import normalisers
 from lfpiv_cli.reconstruction.solvers import SolverSettings, reconstruct
 from lfpiv_cli.reference import Reference
@@ -29,16 +34,35 @@ from lfpiv_cli.robust import MAD_TO_SIGMA
 from lfpiv_cli.synthetic.render import Balls, render_points
 from lfpiv_cli.synthetic.scenes import Misalignment
 from lfpiv_cli.synthetic.sensor import Readout
-from lfpiv_cli.validation.volume import DEPTH_VOXEL, LATERAL_VOXEL, Matches, match
+from lfpiv_cli.tracks.candidates import Seen
+from lfpiv_cli.tracks.tracking import track
+from lfpiv_cli.validation.planning import cramer_rao_bound, expected_image, pixel_variance, slopes
+from lfpiv_cli.validation.volume import Matches, fit_errors, match, pairs_of, particle_figures
 from lfpiv_cli.weights.build import default_padding, factorise, factorise_through
 from lfpiv_cli.weights.model import Weights
 
-# Tracers in a channel, photographed by a camera as it is and found with the camera as it is believed to be.
-#
 # Axes: (x, y, z) in mm, z away from the camera from where the channel's mid plane is (or is believed to be).
 
 Image = NDArray[np.float32]
+Points = Floats
+Figures = dict[str, float]
 
+FOCAL_LENGTH_MM, PITCH_MM, PIXEL_MM = 100.0, 0.1, 0.0055
+F_NUMBER = 4.0
+SENSOR_PX = 448
+WATER = Media(1.0, 1.49, 1.33)
+CHANNEL = Channel(10.0, 5.0)
+# Counts of a tracer's light: 2.5e5 photons, some 1,900 counts in a lit pixel.
+LIGHT_COUNTS, DIAMETER_MM = 5e5, 0.05
+BRIGHTNESS = (0.6, 1.4)
+# Tracers stand apart by this much, so that each measured place has one true one whatever is wrong, in this square and
+# between these depths: within the channel, and light stays on the sensor.
+APART_MM, JITTER_MM, HALF_WIDTH_MM, HALF_DEPTH_MM = 0.3, 0.05, 0.9, 4.0
+# Lateral errors up to this leave no doubt about which tracer it is.
+GATE_MM = 0.09
+# Beside the tracers, what is searched is this much wider.
+MARGIN_MM = 0.2
+READOUT = Readout()
 # The snapshot of Eq. 21 is of a board without thickness, on the outer wall.
 BOARD = BoardGeometry((7, 7), 1.0, 0.2)
 # Voxels in which particles are sought before they are fitted: a microlens wide, a quarter of its depth long.
@@ -57,8 +81,8 @@ class Rig:
     """
 
     camera: Camera
-    media: Media
-    channel: Channel
+    media: Media = WATER
+    channel: Channel = CHANNEL
     board_z_mm: float = 0.0
     refraction: Refraction = "exact"
 
@@ -82,21 +106,20 @@ class Rig:
 
 @dataclass(frozen=True, eq=False)
 class Tracers:
-    """Tracers (n, 3) of a diameter, and the light (n,) of each that passes the main lens, in counts."""
+    """Places (n, 3) of tracers, and the light (n,) of each that passes the main lens, in counts."""
 
     position_mm: Points
-    light_counts: NDArray[np.float64]
-    diameter_mm: float = 0.05
+    light_counts: Floats
 
     def moved(self, by_mm: Points) -> Tracers:
         """Return the tracers, each (n, 3) moved."""
-        return Tracers(self.position_mm + by_mm, self.light_counts, self.diameter_mm)
+        return Tracers(self.position_mm + by_mm, self.light_counts)
 
 
 def photograph(rig: Rig, tracers: Tracers, readout: Readout, rng: np.random.Generator) -> Image:
     """Return the recorded image (rows, columns) of tracers, the dark level taken off."""
     places = rig.reference.points_to_focal_point(tracers.position_mm)
-    balls = Balls(places, tracers.light_counts, tracers.diameter_mm)
+    balls = Balls(places, tracers.light_counts, DIAMETER_MM)
     recorded = readout.record(render_points(rig.camera, rig.space, balls, rng), rng)
     return recorded.astype(np.float32) - np.float32(readout.dark_level_counts)
 
@@ -107,7 +130,6 @@ class Search:
 
     rig: Rig
     size_mm: tuple[float, float, float]
-    diameter_mm: float = 0.05
     search_voxel_mm: tuple[float, float, float] = SEARCH_VOXEL_MM
     rounds: tuple[Round, ...] = ROUNDS
 
@@ -121,154 +143,17 @@ class Search:
     def particles(self, image: Image) -> Points:
         """Return the places (n, 3) of the particles behind an image, those a little outside the box as well."""
         rig, weights = self.rig, self._weights
-        view = raw_view(rig.camera, rig.media, 0.5 * self.diameter_mm, None, rig.space)
+        view = raw_view(rig.camera, rig.media, 0.5 * DIAMETER_MM, None, rig.space)
         found = find_particles(task_of(image, view, weights, rig.camera, normalisers(weights.padded)), self.rounds)
         return rig.reference.points_from_focal_point(found.position_mm)
 
-    def volume(
-        self, image: Image, voxel_mm: tuple[float, float, float], settings: SolverSettings
-    ) -> tuple[NDArray[np.float32], Grid]:
-        """Return the volume (z, y, x) behind an image, and its voxels."""
-        rig, grid = self.rig, self.rig.grid(self.size_mm, voxel_mm)
-        px, py, pz = padding = default_padding(rig.camera, rig.media, grid)
-        solved = reconstruct(factorise_through(rig.camera, rig.space, grid.padded(padding)), image, settings)
-        (nz, ny, nx), reference = grid.shape_zyx, rig.reference
-        inner = solved.volume[pz : pz + nz, py : py + ny, px : px + nx]
-        return np.ascontiguousarray(inner), reference.grid_from_focal_point(grid)
 
-
-# Errors of measured places as a map of space: shifted, stretched, turned, slanted, twisted, and what is left.
-#
-# With e = measured - true at the true place (x, y, z), z from where depth is counted,
-#
-#     e_k = b_k + B_kx x + B_ky y + B_kz z + C_kx x z + C_ky y z
-#
-# is fitted for each component k, without outliers. A velocity is a difference of places, so that 1 + B is also what
-# happens to velocities: B_zz is the relative error of w, B_xz the share of w that leaks into u.
-#
-# Axes: points (n, 3), x, y, z in mm.
-
-# Depths may be wrong by so many times what lateral places may: an error of the focal plane is one of depth alone.
-DEPTH_TO_LATERAL_GATE = 40.0
-# Errors so many robust standard deviations from the fit are other tracers, or another depth that explains the light as
-# well; looked for so many times.
-OUTLIER_SIGMAS, OUTLIER_ROUNDS = 5.0, 3
-TERMS, FEWEST = 6, 10
-
-
-@dataclass(frozen=True, eq=False)
-class PlaceErrors:
-    """The fitted map.
-
-    Attributes
-    ----------
-    coefficients, sigma : (6, 3) b, B_x, B_y, B_z, C_x, C_y of each component, and standard errors
-    spread_mm : (3,) standard deviation of what is left
-    count : of the tracers fitted
-    """
-
-    coefficients: NDArray[np.float64]
-    sigma: NDArray[np.float64]
-    spread_mm: NDArray[np.float64]
-    count: int
-
-    def figures(self) -> dict[str, float]:
-        """Return the figures by name, lengths in mm, stretches and angles as ratios (twist: per mm of depth)."""
-        return self._named(self.coefficients, np.subtract) | {
-            f"spread_{name}": float(value) for name, value in zip("xyz", self.spread_mm, strict=True)
-        }
-
-    def standard_errors(self) -> dict[str, float]:
-        """Return the standard errors of the same figures."""
-        return self._named(self.sigma, np.hypot) | {
-            f"spread_{name}": float(value / np.sqrt(2.0 * max(self.count, 1)))
-            for name, value in zip("xyz", self.spread_mm, strict=True)
-        }
-
-    @staticmethod
-    def _named(table: NDArray[np.float64], combine: np.ufunc) -> dict[str, float]:
-        """Return a table's entries by name; `combine` takes the two halves of a turn."""
-        offset, along, twist = table[0], table[1:4], table[4:]
-        named = {f"offset_{name}": offset[axis] for axis, name in enumerate("xyz")}
-        named |= {f"stretch_{name}": along[axis, axis] for axis, name in enumerate("xyz")}
-        named |= {"slant_x": along[2, 0], "slant_y": along[2, 1]}
-        named |= {"turn": 0.5 * combine(along[0, 1], along[1, 0]), "twist": 0.5 * combine(twist[0, 1], twist[1, 0])}
-        return {name: float(value) for name, value in named.items()}
-
-
-def pairs_of(measured_mm: Points, true_mm: Points, gate_mm: float) -> Matches:
-    """Pair measured with true tracers that stand apart: nearest first, laterally within a gate, nearly any depth.
-
-    Errors are returned in mm.
-    """
-    scale = np.array([1.0, 1.0, DEPTH_VOXEL / LATERAL_VOXEL / DEPTH_TO_LATERAL_GATE])
-    found = match(measured_mm * scale, true_mm * scale, gate_mm / LATERAL_VOXEL)
-    return Matches(found.found, found.true, measured_mm[found.found] - true_mm[found.true])
-
-
-def fit_errors(true_mm: Points, error_mm: Points) -> PlaceErrors:
-    """Fit the map to errors (n, 3) at true places (n, 3); NaN where there are hardly more of them than terms."""
-    if len(true_mm) < FEWEST:
-        unknown = np.full((TERMS, 3), np.nan)
-        return PlaceErrors(unknown, unknown, unknown[0], 0)
-    x, y, z = true_mm.T
-    design = np.stack([np.ones_like(x), x, y, z, x * z, y * z], axis=1)
-    kept = np.ones(len(x), dtype=bool)
-    for _ in range(OUTLIER_ROUNDS):
-        coefficients = np.linalg.lstsq(design[kept], error_mm[kept], rcond=None)[0]
-        left = np.abs(error_mm - design @ coefficients)
-        width = MAD_TO_SIGMA * np.median(left[kept], axis=0)
-        kept = np.all(left <= OUTLIER_SIGMAS * width, axis=1)
-    coefficients = np.linalg.lstsq(design[kept], error_mm[kept], rcond=None)[0]
-    left, count = (error_mm - design @ coefficients)[kept], int(kept.sum())
-    spread = np.sqrt(np.sum(left**2, axis=0) / max(count - TERMS, 1))
-    scatter = np.sqrt(np.diag(np.linalg.pinv(design[kept].T @ design[kept])))
-    return PlaceErrors(coefficients, scatter[:, np.newaxis] * spread, spread, count)
-
-
-@dataclass(frozen=True)
-class Line:
-    """A straight line through measured points."""
-
-    slope: float
-    offset: float
-
-
-def straight_line(x: NDArray[np.float64], y: NDArray[np.float64]) -> Line:
-    """Fit a straight line to the points that are known; NaN where there are not two."""
-    known = np.isfinite(y)
-    if np.count_nonzero(known) < 2:
-        return Line(np.nan, np.nan)
-    offset, slope = np.polynomial.polynomial.polyfit(x[known], y[known], 1)
-    return Line(float(slope), float(offset))
-
-
-Points = NDArray[np.float64]
-Figures = dict[str, float]
-
-FOCAL_LENGTH_MM, PITCH_MM, PIXEL_MM = 100.0, 0.1, 0.0055
-F_NUMBER = 4.0
-SENSOR_PX = 448
-WATER = Media(1.0, 1.49, 1.33)
-CHANNEL = Channel(10.0, 5.0)
-# Counts of a tracer's light: 2.5e5 photons, some 1,900 counts in a lit pixel.
-LIGHT_COUNTS = 5e5
-BRIGHTNESS = (0.6, 1.4)
-# Tracers stand apart by this much, so that each measured place has one true one whatever is wrong, in this square and
-# between these depths: within the channel, and light stays on the sensor.
-APART_MM, JITTER_MM, HALF_WIDTH_MM, HALF_DEPTH_MM = 0.3, 0.05, 0.9, 4.0
-# Lateral errors up to this leave no doubt about which tracer it is.
-GATE_MM = 0.09
-# Beside the tracers, what is searched is this much wider.
-MARGIN_MM = 0.2
-
-
-def sheet(f_number: float = F_NUMBER, pixels: int = SENSOR_PX) -> Camera:
+def sheet(f_number: float = F_NUMBER) -> Camera:
     """Return the camera of the data sheet; the microlenses follow the f-number, so that lens images touch."""
     aperture = FOCAL_LENGTH_MM / f_number
     distance = PITCH_MM * 2.0 * FOCAL_LENGTH_MM / aperture
     lattice = Lattice.regular(PITCH_MM)
-    return Camera(-1.0, FOCAL_LENGTH_MM, aperture, distance, distance, lattice, PIXEL_MM, pixels, pixels)
+    return Camera(-1.0, FOCAL_LENGTH_MM, aperture, distance, distance, lattice, PIXEL_MM, SENSOR_PX, SENSOR_PX)
 
 
 @dataclass(frozen=True, eq=False)
@@ -279,28 +164,26 @@ class Case:
     believed: Rig
     search_depth_mm: float = 2.0 * HALF_DEPTH_MM + 1.0
 
+    def search(self) -> Search:
+        """Return the search of what is believed, somewhat wider than tracers stand."""
+        width = 2.0 * (HALF_WIDTH_MM + MARGIN_MM)
+        return Search(self.believed, (width, width, self.search_depth_mm))
 
-def rig(camera: Camera, media: Media = WATER, channel: Channel = CHANNEL, refraction: Refraction = "exact") -> Rig:
-    """Return a rig focused on the middle of its channel."""
-    return Rig(camera, media, channel, 0.0, refraction)
 
-
-def aimed(true: Rig, believed: Rig, search_depth_mm: float = 2.0 * HALF_DEPTH_MM + 1.0) -> Case:
+def aimed(believed: Rig) -> Case:
     """Return the case in which the camera was moved by what Eq. 21 advises from what is believed."""
     move = advised_move_mm(BOARD, believed.channel, believed.media)
-    return Case(replace(true, channel=replace(true.channel, camera_move_mm=move)), believed, search_depth_mm)
+    return Case(Rig(sheet(), channel=replace(CHANNEL, camera_move_mm=move)), believed)
 
 
 def index_wrong(fluid: float) -> Case:
     """Return water taken for a fluid of another index."""
-    camera = sheet()
-    return aimed(rig(camera), rig(camera, Media(WATER.air, WATER.window, fluid)))
+    return aimed(Rig(sheet(), Media(WATER.air, WATER.window, fluid)))
 
 
 def wall_wrong(by_mm: float) -> Case:
     """Return a wall taken to be thicker than it is."""
-    camera = sheet()
-    return aimed(rig(camera), rig(camera, channel=replace(CHANNEL, wall_mm=CHANNEL.wall_mm + by_mm)))
+    return aimed(Rig(sheet(), channel=replace(CHANNEL, wall_mm=CHANNEL.wall_mm + by_mm)))
 
 
 def focus_wrong(by_mm: float) -> Case:
@@ -313,50 +196,182 @@ def focus_wrong(by_mm: float) -> Case:
     real = refocused(camera, -focal / (distance - focal))
     believed = camera.with_micro_images(real.micro_image_lattice_px())
     deeper = abs(by_mm) * WATER.fluid / WATER.air
-    return Case(Rig(real, WATER, CHANNEL, by_mm), rig(believed), 2.0 * (HALF_DEPTH_MM + deeper))
+    return Case(Rig(real, board_z_mm=by_mm), Rig(believed), 2.0 * (HALF_DEPTH_MM + deeper))
 
 
 def lattice_shifted(by_px: float) -> Case:
     """Return lens images taken to lie further along the columns than they do."""
     camera = sheet()
-    return Case(rig(Misalignment(shift_px=(-by_px, 0.0)).apply(camera)), rig(camera))
+    return Case(Rig(Misalignment(shift_px=(-by_px, 0.0)).apply(camera)), Rig(camera))
 
 
 def lattice_turned(by_deg: float) -> Case:
     """Return lens images taken to be turned further than they are, from the columns towards the rows."""
     camera = sheet()
-    return Case(rig(Misalignment(rotation_deg=-by_deg).apply(camera)), rig(camera))
+    return Case(Rig(Misalignment(rotation_deg=-by_deg).apply(camera)), Rig(camera))
 
 
-def strewn_apart(rng: np.random.Generator, depth_mm: tuple[float, float], half_width_mm: float) -> Tracers:
+def strewn_apart(rng: np.random.Generator, depth_mm: tuple[float, float] = (-HALF_DEPTH_MM, HALF_DEPTH_MM)) -> Tracers:
     """Return tracers that stand apart laterally, at any depth between two."""
-    line = np.arange(-half_width_mm + 0.5 * APART_MM, half_width_mm, APART_MM)
+    line = np.arange(-HALF_WIDTH_MM + 0.5 * APART_MM, HALF_WIDTH_MM, APART_MM)
     lateral = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
     lateral += rng.uniform(-JITTER_MM, JITTER_MM, lateral.shape)
     position = np.column_stack([lateral, rng.uniform(*depth_mm, len(lateral))])
     return Tracers(position, LIGHT_COUNTS * rng.uniform(*BRIGHTNESS, len(position)))
 
 
-def place_figures(case: Case, tracers: Tracers, readout: Readout, rng: np.random.Generator) -> Figures:
+def place_figures(case: Case, tracers: Tracers, rng: np.random.Generator, readout: Readout = READOUT) -> Figures:
     """Return the figures of the map from true to measured places, and the shares of tracers found and of those true.
 
-    The map is NaN where too few are found to know it.
+    The map is NaN where too few are found to know it. The search is somewhat wider than tracers stand.
     """
-    image = photograph(case.true, tracers, readout, rng)
-    return judged(search_of(case).particles(image), tracers)
-
-
-def search_of(case: Case) -> Search:
-    """Return the search of a case, somewhat wider than tracers stand."""
-    width = 2.0 * (HALF_WIDTH_MM + MARGIN_MM)
-    return Search(case.believed, (width, width, case.search_depth_mm))
+    return judged(case.search().particles(photograph(case.true, tracers, readout, rng)), tracers)
 
 
 def judged(found: Points, tracers: Tracers) -> Figures:
     """Return the figures of measured places (n, 3) of tracers that stand apart."""
     pairs = pairs_of(found, tracers.position_mm, GATE_MM)
-    shares = {
-        "recall": len(pairs.true) / len(tracers.position_mm),
-        "precision": len(pairs.found) / max(len(found), 1),
-    }
-    return fit_errors(tracers.position_mm[pairs.true], pairs.error_voxel).figures() | shares
+    figures = fit_errors(tracers.position_mm[pairs.true], pairs.error_voxel).figures
+    return figures | found_shares(pairs, found, tracers)
+
+
+def found_shares(pairs: Matches, found: Points, tracers: Tracers) -> Figures:
+    """Return the shares of the tracers that were found, and of what was found that is true."""
+    counts = {"recall": len(tracers.position_mm), "precision": max(len(found), 1)}
+    return {name: len(pairs.found) / count for name, count in counts.items()}
+
+
+# What scatters places and velocities: aperture, noise, depth and the number of tracers, the camera known exactly.
+
+# Table 2's tank: the focal plane 134 mm deep in water, behind 2 mm of acrylic 98 mm from the lens.
+TANK = Channel(2.0 * 133.867, 2.0)
+# Room for tracers up to 10 mm before and behind the focal plane.
+WIDE_CHANNEL = Channel(25.0, 5.0)
+BAND_MM = 0.25
+# A crowded scene fills the paper's channel but for what tracers move, and reaches so far beyond what the sensor sees.
+CROWD_DEPTH_MM, BEYOND_MM = 9.6, 0.15
+# Displacement of a tracer at (x, y, z): (0.13 + 0.01 z, 0.07, 0.2 + 0.1 x), mm.
+UNIFORM_MM, DEPTH_SHEAR, LATERAL_SHEAR = (0.13, 0.07, 0.2), 0.01, 0.1
+SEARCH_MM = 0.6
+# As benchmarks of the correlation have it: voxels of a third of a microlens, accelerated EM.
+VOXEL_MM, WINDOW_VOXELS, EXPONENT = (0.1 / 3.0, 0.1 / 3.0, 0.2), (24, 24, 8), 0.5
+CROWD_VOXEL_MM = (0.1, 0.1, 0.1)
+EM = SolverSettings("em", 24)
+
+
+def at_f_number(f_number: float, seed: int) -> Figures:
+    """Return the figures behind the paper's tank, rays taken as they are (exact) and as paraxial ones."""
+    rng = np.random.default_rng([seed, 2])
+    exact = Rig(sheet(f_number), WATER, TANK)
+    tracers = strewn_apart(rng)
+    image = photograph(exact, tracers, READOUT, rng)
+    figures: Figures = {}
+    for name, seen in (("exact", exact), ("paraxial", replace(exact, refraction="paraxial"))):
+        places = judged(Case(exact, seen).search().particles(image), tracers)
+        figures |= {f"{name}_{figure}": value for figure, value in places.items()}
+    return figures
+
+
+def spherical_aberration_mm(f_number: float) -> float:
+    """Return how much nearer paraxial rays see what lies in the middle of the tank, to third order.
+
+    A layer t of index n moves a ray of slope u sideways by t (u/n) (1 - (1 - 1/n^2) u^2/2); over a disc u^3 has its
+    least-squares line at 2/3 of the rim's u^2.
+    """
+    camera = sheet(f_number)
+    rim2 = (camera.aperture_radius_mm / camera.focus_distance_mm) ** 2
+    layers = ((TANK.wall_mm, WATER.window), (0.5 * TANK.width_mm, WATER.fluid))
+    apparent = sum(t / n * (1.0 - n**-2) for t, n in layers) * 0.5 * (2.0 / 3.0) * rim2
+    return float(apparent / WATER.depth_ratio)
+
+
+def in_noise(read_over_light: float, seed: int) -> Figures:
+    """Return the figures with read noise of so many times the light of a lit pixel, and the bound of their scatter."""
+    rng = np.random.default_rng([seed, 7])
+    known = Rig(sheet())
+    view = raw_view(known.camera, WATER, 0.5 * DIAMETER_MM, None, known.space)
+    readout = replace(READOUT, read_noise_counts=read_over_light * LIGHT_COUNTS / lens_pixels(view))
+    tracers = strewn_apart(rng)
+    places = np.column_stack([known.reference.points_to_focal_point(tracers.position_mm), tracers.light_counts])
+    slope = slopes(view, places)
+    bound = cramer_rao_bound(slope, pixel_variance(expected_image(slope, places), readout)).sigma_mm(joint=True)
+    figures = place_figures(Case(known, known), tracers, rng, readout)
+    return figures | {f"bound_{name}": float(np.median(values)) for name, values in zip("xyz", bound.T, strict=True)}
+
+
+def at_depth(distance_mm: float, seed: int) -> Figures:
+    """Return errors of tracers this far before and behind the focal plane: robust spread and rms along x and z."""
+    rng = np.random.default_rng([seed, 8])
+    known = Rig(sheet(), WATER, WIDE_CHANNEL)
+    tracers = strewn_apart(rng, (max(distance_mm - BAND_MM, 0.0), distance_mm + BAND_MM))
+    tracers.position_mm[:, 2] *= rng.choice([-1.0, 1.0], len(tracers.position_mm))
+    found = Case(known, known, 22.0).search().particles(photograph(known, tracers, READOUT, rng))
+    pairs = match(found, tracers.position_mm, PITCH_MM)
+    error_mm = pairs.error_voxel * PITCH_MM if len(pairs.found) else np.full((1, 3), np.nan)
+    spread, rms = MAD_TO_SIGMA * np.median(np.abs(error_mm), axis=0), np.sqrt(np.mean(error_mm**2, axis=0))
+    figures = {"spread_x": spread[0], "spread_z": spread[2], "rms_x": rms[0], "rms_z": rms[2]}
+    return {name: float(value) for name, value in figures.items()} | found_shares(pairs, found, tracers)
+
+
+def crowded(per_lens: float, seed: int) -> Figures:
+    """Return errors of places, and of displacements by tracks and by volumes, of so many tracers a microlens."""
+    rng = np.random.default_rng([seed, 1])
+    known = Rig(sheet())
+    tracers = strewn(per_lens, rng)
+    pair = [tracers.moved(sign * 0.5 * displacement(tracers.position_mm)) for sign in (-1.0, 1.0)]
+    images = [photograph(known, each, READOUT, rng) for each in pair]
+    seen = SENSOR_PX * PIXEL_MM
+    search = Search(known, (seen, seen, CROWD_DEPTH_MM), search_voxel_mm=CROWD_VOXEL_MM)
+    found = [search.particles(image) for image in images]
+    inner = np.array([HALF_WIDTH_MM, HALF_WIDTH_MM, 0.5 * CROWD_DEPTH_MM])
+    places = particle_figures(found[0], pair[0].position_mm, -inner, inner, PITCH_MM)
+    figures = {name: places[name] for name in ("recall", "precision")}
+    figures |= {f"rms_{name}": places.get(f"rms_{name}_voxel", np.nan) * PITCH_MM for name in "xz"}
+
+    middle, moved = tracks_between(found[0], found[1], known)
+    inside = np.all(np.abs(middle) <= inner, axis=1)
+    by_tracks = _velocity_figures("tracks", moved[inside], displacement(middle[inside]))
+    grid = known.grid(search.size_mm, VOXEL_MM)
+    (nz, ny, nx), padding = grid.shape_zyx, default_padding(known.camera, known.media, grid)
+    px, py, pz = padding
+    operator = factorise_through(known.camera, known.space, grid.padded(padding))
+    whole = [reconstruct(operator, image, EM).volume for image in images]
+    first, second = (np.ascontiguousarray(v[pz : pz + nz, py : py + ny, px : px + nx]) for v in whole)
+    settings = CorrelationSettings([WINDOW_VOXELS], (0.5, 0.5, 0.5), None, EXPONENT)
+    field = correlate([(first, second)], known.reference.grid_from_focal_point(grid), settings)
+    centres = field.grid.centres_mm()
+    kept = (field.flag < REJECTED) & np.all(np.abs(centres) <= inner, axis=-1)
+    by_volumes = field.displacement_voxel[kept] * VOXEL_MM, displacement(centres[kept])
+    return figures | by_tracks | _velocity_figures("volumes", *by_volumes)
+
+
+def strewn(per_lens: float, rng: np.random.Generator) -> Tracers:
+    """Return tracers strewn at random before and beside what the sensor sees."""
+    half = np.array([0.5 * SENSOR_PX * PIXEL_MM + BEYOND_MM] * 2 + [0.5 * CROWD_DEPTH_MM])
+    count = max(1, round(per_lens * (2.0 * half[0] / PITCH_MM) ** 2))
+    return Tracers(rng.uniform(-half, half, (count, 3)), LIGHT_COUNTS * rng.uniform(*BRIGHTNESS, count))
+
+
+def displacement(points_mm: Points) -> Points:
+    """Return by how much tracers at points (n, 3) move in a pair."""
+    moved = np.tile(np.asarray(UNIFORM_MM), (len(points_mm), 1))
+    moved[:, 0] += DEPTH_SHEAR * points_mm[:, 2]
+    moved[:, 2] += LATERAL_SHEAR * points_mm[:, 0]
+    return moved
+
+
+def tracks_between(first: Points, second: Points, known: Rig) -> tuple[Points, Points]:
+    """Return the middles (n, 3) of a pair's tracks and their displacements (n, 3)."""
+    tracks = track(Seen(first), Seen(second), SEARCH_MM, known.camera.scale(known.media))
+    a, b = first[tracks.first], second[tracks.second]
+    return 0.5 * (a + b), b - a
+
+
+def _velocity_figures(by: str, moved: Points, true: Points) -> Figures:
+    """Return the slope through zero and the rms error of displacements (n, 3) along x and z, mm, by the way taken."""
+    slope = rms = np.full(3, np.nan)
+    if len(moved):
+        slope = np.sum(moved * true, axis=0) / np.sum(true**2, axis=0)
+        rms = np.sqrt(np.mean((moved - true) ** 2, axis=0))
+    figures = {"slope_u": slope[0], "slope_w": slope[2], "rms_u": rms[0], "rms_w": rms[2]}
+    return {f"{by}_{name}": float(value) for name, value in figures.items()}

@@ -13,20 +13,14 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.files.config import Config, load_config
 from lfpiv_cli.files.pages import Table
 from lfpiv_cli.notice import written
 from lfpiv_cli.paper.parts import AS_PAPER, BOARD, Drawing, Findings, Row, Work, merged, sections
-from lfpiv_cli.paper.pictures import (
-    BoardView,
-    centres_figure,
-    elongation_figure,
-    location_figure,
-    views_figure,
-)
+from lfpiv_cli.paper.pictures import board_view, centres_figure, elongation_figure, location_figure, views_figure
 from lfpiv_cli.stages.validate_board import BoardBench, BoardSolver, bench_of, board_solver, placement_of
 from lfpiv_cli.synthetic.board import dot_centres
 from lfpiv_cli.validation.board import (
@@ -61,11 +55,7 @@ BEST = {
     "reconstruction": {"solver": "em", "iterations": 30, "accelerate": True},
 }
 # From what the paper did: nothing, our best, and dots on the corners of voxels.
-CHANGES: dict[str, dict[str, Any]] = {
-    "paper": {},
-    "best": BEST,
-    "corners": {"volume": {"centre_mm": [0.0, 0.0, 0.0]}},
-}
+CHANGES: dict[str, dict[str, Any]] = {"paper": {}, "best": BEST, "corners": {"volume": {"centre_mm": [0.0, 0.0, 0.0]}}}
 # The assembly's tolerances and the lens of a real camera; noise and Snell's law are the simulation's defaults.
 FAULTS = {"rotation_deg": 0.12, "shift_px": [3.4, -2.1], "distortion_per_mm2": 2.0e-5}
 
@@ -122,37 +112,9 @@ QUANTITIES = {
 }
 
 
-def table3(work: Work) -> Findings:
-    """Reconstruct and measure the boards of an ideal camera (Section 3.3)."""
-    return _found(work, "ideal")
-
-
-def table3_experiment(work: Work) -> Findings:
-    """Reconstruct and measure the boards of a camera with faults and noise (Section 4.1)."""
-    return _found(work, "recorded")
-
-
-@dataclass(frozen=True, eq=False)
-class _Method:
-    """A way to reconstruct boards; its bench and solver are made when a board first needs them."""
-
-    settings: Config
-    make: Callable[[], BoardBench]
-
-    @cached_property
-    def bench(self) -> BoardBench:
-        """Weights and picture-taking."""
-        return self.make()
-
-    @cached_property
-    def solve(self) -> BoardSolver:
-        """Turns a picture into a volume."""
-        return board_solver(self.bench, self.settings)
-
-
 @dataclass(frozen=True, eq=False)
 class _Boards:
-    """The boards of one half of Table 3, their pictures made when they are first needed."""
+    """The boards of one half of Table 3; pictures, benches and solvers are made when a board first needs them."""
 
     half: Half
     depths_mm: tuple[float, ...]
@@ -165,36 +127,36 @@ class _Boards:
         return self.paper.rig().board
 
     @cached_property
-    def pictures(self) -> list[Any]:
-        """One for each depth, in their order, as random numbers are drawn for one after the other."""
-        return [self.methods["ert"].bench.picture(placement_of(self.paper, depth)) for depth in self.depths_mm]
+    def bench(self) -> BoardBench:
+        """Weights and picture-taking as the paper did it, by equivalent points."""
+        return bench_of(self.paper, self.half)
 
     @cached_property
-    def methods(self) -> dict[str, _Method]:
-        """By name."""
-        return {
-            "ert": _Method(self.paper, lambda: bench_of(self.paper, self.half)),
-            "best": _Method(
-                self.best,
-                lambda: self.methods["ert"].bench.with_voxels(
-                    self.best.grid(), self.best.plane_space("validating boards")
-                ),
-            ),
-            "dlfc": _Method(
-                self.paper, lambda: self.methods["ert"].bench.with_fitted_rays(self.pictures, self.depths_mm)
-            ),
-        }
+    def pictures(self) -> list[Any]:
+        """One for each depth, in their order, as random numbers are drawn for one after the other."""
+        return [self.bench.picture(placement_of(self.paper, depth)) for depth in self.depths_mm]
+
+    @cached_property
+    def ways(self) -> dict[str, tuple[BoardBench, BoardSolver]]:
+        """By the method, those that a board has needed so far."""
+        return {}
 
     def measure(self, method: str, number: int, advance: Callable[[int], None]) -> dict[str, Any]:
         """Reconstruct one board and return what is measured of it, as plain data, and of the middle one a view."""
-        way, depth = self.methods[method], self.depths_mm[number]
-        result = way.solve(self.pictures[number], advance)
-        weights = way.bench.weights
-        volume = weights.to_world(result.volume)
+        if method not in self.ways:
+            bench = self.bench
+            if method == "best":
+                bench = bench.with_voxels(self.best.grid(), self.best.plane_space("validating boards"))
+            elif method == "dlfc":
+                bench = bench.with_fitted_rays(self.pictures, self.depths_mm)
+            self.ways[method] = bench, board_solver(bench, self.best if method == "best" else self.paper)
+        (bench, solve), depth = self.ways[method], self.depths_mm[number]
+        result = solve(self.pictures[number], advance)
+        volume = bench.weights.to_world(result.volume)
         centres = dot_centres(self.board, placement_of(self.paper, depth))[:, :2]
-        dots = measure_dots(volume, weights.grid, centres, 0.5 * self.board.spacing_mm)
-        view = BoardView.of(volume, weights.grid).to_plain() if depth == 0.0 else None
-        return {"dots": dots.to_plain(), "view": view, "residual": float(result.residual[-1])}
+        dots = measure_dots(volume, bench.weights.grid, centres, 0.5 * self.board.spacing_mm)
+        view = board_view(volume, bench.weights.grid) if depth == 0.0 else None
+        return {"dots": vars(dots), "view": view, "residual": float(result.residual[-1])}
 
 
 def _boards(work: Work, half: Half) -> _Boards:
@@ -206,28 +168,38 @@ def _boards(work: Work, half: Half) -> _Boards:
 def _config(work: Work, half: Half, name: str) -> Path:
     """Write a config of `CHANGES` for a half of the table and return its path."""
     small = SMALL[work.size]
-    size = {key: small.get(key, {}) for key in ("camera", "board")} | small.get(
-        "best" if name == "best" else "paper", {}
-    )
+    size = {key: small.get(key, {}) for key in ("camera", "board")}
+    size |= small.get("best" if name == "best" else "paper", {})
     own = merged(merged(PAPERS, CHANGES[name]), size)
     asked = {"images": half, "methods": ["ert", "dlfc"] if name == "paper" else ["ert"]}
     faults = FAULTS if half == "recorded" else {}
     return work.config(name, sections(**merged(own, {"simulation": faults, "validation": {"board": asked}})))
 
 
-def _found(work: Work, half: Half) -> Findings:
+def table3(work: Work, half: Half) -> Findings:
+    """Reconstruct and measure boards: of an ideal camera (Section 3.3), or of one with faults and noise (4.1)."""
     boards = _boards(work, half)
     configs = tuple(CHANGES) if half == "ideal" else ("paper", "best")
     for name in configs:
         _config(work, half, name)
-    steps = {method: _measured(work, boards, method) for method in ("ert", "best", "dlfc")}
+    steps: dict[str, list[dict[str, Any]]] = {}
+    for method in ("ert", "best", "dlfc"):
+        # each board a step of its own
+        settings, steps[method] = boards.best if method == "best" else boards.paper, []
+        rounds = settings.reconstruction.iterations * len(boards.depths_mm)
+        with work.console.progress(rounds, METHODS[method]) as advance:
+            for number, depth in enumerate(boards.depths_mm):
+                measure = partial(boards.measure, method, number, advance)
+                steps[method].append(work.step(f"{method}_{depth:+.0f}mm", measure))
+        work.console.say(f"{work.folder.name}: {METHODS[method]}, {len(steps[method])} boards")
     dots = {method: [DotFigures.from_plain(each["dots"]) for each in steps[method]] for method in METHODS}
     figures = {
         method: board_figures(each, boards.depths_mm, boards.board.dots, boards.board.spacing_mm)
         for method, each in dots.items()
     }
     middle = boards.depths_mm.index(0.0)
-    views = {METHODS[method]: BoardView.from_plain(steps[method][middle]["view"]) for method in VIEWED}
+    kept = {METHODS[method]: steps[method][middle]["view"] for method in VIEWED}
+    views = {told: {name: np.array(each, np.float64) for name, each in view.items()} for told, view in kept.items()}
     return Findings(
         rows=tuple(_row(boards, measure, figures) for measure in MEASURES),
         drawings=_drawings(boards, figures, views, dots),
@@ -240,23 +212,24 @@ def _found(work: Work, half: Half) -> Findings:
     )
 
 
-def _measured(work: Work, boards: _Boards, method: str) -> list[dict[str, Any]]:
-    """Return what is measured of each board by a method, each board a step of its own."""
-    iterations = boards.methods[method].settings.reconstruction.iterations
-    found = []
-    with work.console.progress(iterations * len(boards.depths_mm), METHODS[method]) as advance:
-        for number, depth in enumerate(boards.depths_mm):
-            found.append(work.step(f"{method}_{depth:+.0f}mm", partial(boards.measure, method, number, advance)))
-    work.console.say(f"{work.folder.name}: {METHODS[method]}, {len(found)} boards")
-    return found
-
-
 def _row(boards: _Boards, measure: str, figures: Figures) -> Row:
     half, spacing_mm = boards.half, boards.board.spacing_mm
     quantity, scale = QUANTITIES[measure]
     # rounded: 100 x 0.056 is not 5.6
     paper = {method: round(scale * PAPER[half, method][measure], 9) for method in ("dlfc", "ert")}
     ours = {method: scale * each[measure] for method, each in figures.items()}
+    reason = ""
+    if ours["ert"] > paper["ert"]:
+        # at which depths it is made
+        table = figures["ert"]["by_depth"]
+        depth = np.array(table["depth_mm"])
+        if measure == "depth_error":
+            reason = _where_steps(depth, np.diff(table["centre_mm"]) / np.diff(depth) - 1.0)
+        else:
+            off = 100.0 * np.abs(np.array(table["spacing_mm"]) / spacing_mm - 1.0)
+            values, unit = (off, "%") if measure == "lateral_error" else (np.array(table[measure]), "mm")
+            worst, middle = int(np.argmax(values)), f"median over the depths {written(np.median(values))} {unit}"
+            reason = f"largest at z = {depth[worst]:+.0f} mm, {written(values[worst])} {unit}; {middle}"
     return Row(
         quantity=quantity,
         source=f"Table 3, {SOURCE[half]}",
@@ -264,26 +237,12 @@ def _row(boards: _Boards, measure: str, figures: Figures) -> Row:
         paper_dlfc=paper["dlfc"],
         paper_ert=paper["ert"],
         **ours,
-        reason="" if ours["ert"] <= paper["ert"] else _where(measure, figures["ert"], spacing_mm),
+        reason=reason,
     )
 
 
-def _where(measure: str, figures: dict[str, Any], spacing_mm: float) -> str:
-    """Return in words at which depths a figure is made."""
-    table = figures["by_depth"]
-    depth = np.array(table["depth_mm"])
-    if measure == "depth_error":
-        return _where_steps(depth, np.diff(table["centre_mm"]) / np.diff(depth) - 1.0)
-    off = 100.0 * np.abs(np.array(table["spacing_mm"]) / spacing_mm - 1.0)
-    values, unit = (off, "%") if measure == "lateral_error" else (np.array(table[measure]), "mm")
-    worst = int(np.argmax(values))
-    middle = np.median(values)
-    largest = f"largest at z = {depth[worst]:+.0f} mm, {written(values[worst])} {unit}"
-    return f"{largest}; median over the depths {written(middle)} {unit}"
-
-
 def _drawings(
-    boards: _Boards, figures: Figures, views: dict[str, BoardView], dots: dict[str, list[DotFigures]]
+    boards: _Boards, figures: Figures, views: dict[str, dict[str, Floats]], dots: dict[str, list[DotFigures]]
 ) -> tuple[Drawing, ...]:
     half = boards.half
     named = {METHODS[method]: each for method, each in figures.items()}
@@ -321,22 +280,14 @@ def _depth_table(figures: Figures) -> Table:
     rows = []
     for name, definition in DEPTH_DEFINITIONS.items():
         each = {method: figures[method]["depth_definitions"][name] for method in METHODS}
-        steps = each["ert"]
-        rows.append(
-            (
-                definition.words + (" (used)" if name == THE_PAPERS else ""),
-                *(f"{100.0 * each[method]['error']:.2f}" for method in METHODS),
-                f"{steps['shortest']:.3f} to {steps['longest']:.3f}",
-            )
-        )
-    return Table(
-        "Depth error (%) by what is taken for the depth of a dot",
-        ("depth of a dot", *METHODS.values(), "separations, ERT (mm)"),
-        tuple(rows),
-    )
+        errors = (f"{100.0 * found['error']:.2f}" for found in each.values())
+        words = definition.words + (" (used)" if name == THE_PAPERS else "")
+        rows.append((words, *errors, f"{each['ert']['shortest']:.3f} to {each['ert']['longest']:.3f}"))
+    head = ("depth of a dot", *METHODS.values(), "separations, ERT (mm)")
+    return Table("Depth error (%) by what is taken for the depth of a dot", head, tuple(rows))
 
 
-def _where_steps(depth_mm: NDArray[np.float64], errors: NDArray[np.float64]) -> str:
+def _where_steps(depth_mm: Floats, errors: Floats) -> str:
     """Return in words which steps the depth error comes from."""
     near = np.abs(0.5 * (depth_mm[1:] + depth_mm[:-1])) < NEAR_MM
     share = np.abs(errors[near]).sum() / np.abs(errors).sum()

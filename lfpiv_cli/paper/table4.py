@@ -16,8 +16,8 @@ from lfpiv_cli.files.pages import Table
 from lfpiv_cli.paper.parts import AS_PAPER, BOARD, MISALIGNED, Drawing, Findings, Row, Work, merged, sections
 from lfpiv_cli.paper.pictures import cumulative_figure, slice_maps_figure
 from lfpiv_cli.stages.validate import duct_of, measured_of
-from lfpiv_cli.validation.flow import Duct
-from lfpiv_cli.validation.methods import Measured, slices_figure
+from lfpiv_cli.validation.flow import Duct, Measured
+from lfpiv_cli.validation.methods import slices_figure
 from lfpiv_cli.verbs.chain import board_depths, measure_images, simulate_images
 from lfpiv_cli.verbs.simulate import simulate_boards
 
@@ -26,6 +26,8 @@ from lfpiv_cli.verbs.simulate import simulate_boards
 SEED = 7
 # The mean over the channel's section, m/s: 40 L/h through 1 cm2, rounded as the paper has it.
 MEAN_VELOCITY_M_S = 0.1082
+# Sides of the paper's voxels.
+VOXEL_MM = 0.1
 # How far the board on the wall is off the focal plane, in air, and by Eq. 21 the middle of the channel, in water.
 BOARD_Z_MM, MID_PLANE_Z_MM = -0.2, -0.266
 
@@ -39,7 +41,7 @@ class ChannelSize:
     width_mm : D, its inner width
     length_mm : of the volume along the flow
     columns, rows : of the sensor
-    voxel_mm, windows : of volumes and their correlation, coarse to fine
+    windows : of the correlation in voxels, coarse to fine
     iterations : of SART
     dots : of the boards in the fluid along x and y; the one on the wall has at most seven
     spacing_mm : of the dots
@@ -50,7 +52,6 @@ class ChannelSize:
     length_mm: float
     columns: int
     rows: int
-    voxel_mm: float
     windows: tuple[int, ...]
     iterations: int
     dots: tuple[int, int]
@@ -70,20 +71,20 @@ class ChannelSize:
     @property
     def window_mm(self) -> float:
         """Side of the final interrogation window."""
-        return self.windows[-1] * self.voxel_mm
+        return self.windows[-1] * VOXEL_MM
 
     def told(self) -> str:
         """Return the size in words."""
-        shape = " x ".join(f"{round(side / self.voxel_mm)}" for side in self.volume_mm)
+        shape = " x ".join(f"{round(side / VOXEL_MM)}" for side in self.volume_mm)
         return (
-            f"a channel of {self.width_mm:g} mm, {shape} voxels of {self.voxel_mm:g} mm, {self.particles} tracers, "
+            f"a channel of {self.width_mm:g} mm, {shape} voxels of {VOXEL_MM:g} mm, {self.particles} tracers, "
             f"{self.columns} x {self.rows} pixels"
         )
 
 
-FULL = ChannelSize(10.0, 13.0, 2352, 1768, 0.1, (32, 16), 200, (13, 9))
-QUICK = ChannelSize(5.0, 4.0, 800, 900, 0.1, (32, 16), 60, (5, 5))
-TINY = ChannelSize(1.6, 1.6, 400, 400, 0.1, (8,), 5, (3, 3), 0.5, 5_000)
+FULL = ChannelSize(10.0, 13.0, 2352, 1768, (32, 16), 200, (13, 9))
+QUICK = ChannelSize(5.0, 4.0, 800, 900, (32, 16), 60, (5, 5))
+TINY = ChannelSize(1.6, 1.6, 400, 400, (8,), 5, (3, 3), 0.5, 5_000)
 
 # Iterations of accelerated EM, which needs no more.
 EM_ITERATIONS = 24
@@ -102,12 +103,7 @@ def at_best(size: ChannelSize) -> dict[str, Any]:
 
 def channel_sections(size: ChannelSize, **changes: Any) -> dict[str, Any]:
     """Return the sections of the channel, measured with voxels; with changes, see `rig.sections`."""
-    flow = {
-        "kind": "square_duct",
-        "width_mm": size.width_mm,
-        "mean_velocity_m_s": MEAN_VELOCITY_M_S,
-        "axis": "x",
-    }
+    flow = {"kind": "square_duct", "width_mm": size.width_mm, "mean_velocity_m_s": MEAN_VELOCITY_M_S, "axis": "x"}
     dots = [min(7, count) for count in size.dots]
     base = sections(
         camera={"sensor": {"columns": size.columns, "rows": size.rows}},
@@ -115,8 +111,8 @@ def channel_sections(size: ChannelSize, **changes: Any) -> dict[str, Any]:
         channel={"width_mm": size.width_mm, "wall_mm": 5.0},
         board=BOARD | {"dots": dots, "spacing_mm": size.spacing_mm, "medium": "air"},
         volume={
-            "shape_xyz": [round(side / size.voxel_mm) for side in size.volume_mm],
-            "voxel_mm": size.voxel_mm,
+            "shape_xyz": [round(side / VOXEL_MM) for side in size.volume_mm],
+            "voxel_mm": VOXEL_MM,
             "reference": "mid_plane",
         },
         correlation={"windows": list(size.windows), "overlap": 0.5, "dt_s": 0.0018},
@@ -133,11 +129,6 @@ def channel_sections(size: ChannelSize, **changes: Any) -> dict[str, Any]:
         },
     )
     return merged(base, changes)
-
-
-def dlfc_sections(size: ChannelSize) -> Mapping[str, Any]:
-    """Return the changes for weights that are fitted to boards at several depths in the fluid."""
-    return {"board": {"dots": list(size.dots), "medium": "fluid"}, "weights": {"method": "dlfc"}}
 
 
 # The paper's mean velocities, DLFC's and ERT's, m/s, and the share of vectors within a quarter of the truth, per cent.
@@ -178,9 +169,7 @@ def table4(work: Work) -> Findings:
         for name, config in configs.items()
     }
     methods = {told: _read(configs[name], work.folder / name) for name, told in SHOWN.items() if name in configs}
-    settings = load_config(configs["ert"])
-    duct = duct_of(settings.simulation.flow)
-    assert duct is not None  # the sections above have one
+    duct = simulated_duct(configs["ert"])
     return Findings(
         rows=_rows(found),
         drawings=_drawings(methods, duct),
@@ -195,17 +184,26 @@ def _ways(size: ChannelSize) -> dict[str, dict[str, Any]]:
     """Return the sections of the config of each of `WAYS`."""
     sart, best = {"reconstruction": as_paper(size)}, {"reconstruction": at_best(size)}
     volumes: dict[str, Any] = {"validation": {"flow_methods": ["volumes"]}}
+    # weights that are fitted to boards at several depths in the fluid
+    fitted = {"board": {"dots": list(size.dots), "medium": "fluid"}, "weights": {"method": "dlfc"}}
     fine = {
         "volume": {"shape_xyz": None, "voxel_mm": None, "size_mm": size.volume_mm},
         "correlation": {"windows": None, "window_mm": size.window_mm},
     }
     return {
-        "dlfc": channel_sections(size, **sart, **volumes, **dlfc_sections(size)),
+        "dlfc": channel_sections(size, **sart, **volumes, **fitted),
         "ert": channel_sections(size, **sart, **volumes),
         "volumes": channel_sections(size, **best, **volumes),
         "fine": channel_sections(size, **best, **volumes, **fine),
         "particles": channel_sections(size, **best, validation={"flow_methods": ["particles"]}),
     }
+
+
+def simulated_duct(config: Path) -> Duct:
+    """Return the duct of a config that has `channel_sections`."""
+    duct = duct_of(load_config(config).simulation.flow)
+    assert duct is not None
+    return duct
 
 
 def _simulated(configs: Mapping[str, Path], images: Path, console: Console) -> dict[str, Any]:
@@ -221,7 +219,7 @@ def _measured(config: Path, images: Path, folder: Path, console: Console) -> dic
     """Measure the flow and return its figures."""
     measure_images(config, images, folder, overwrite=True, console=console)
     measured = _read(config, folder)
-    figures = measured.figures(duct_of(load_config(config).simulation.flow))
+    figures = measured.figures(simulated_duct(config))
     return figures | {"voxel_mm": list(measured.field.voxel_mm)}
 
 
@@ -272,56 +270,37 @@ def _reason(name: str, found: Mapping[str, Mapping[str, Any]], paper: Mapping[st
     worse = [way for way, error in ours.items() if error is not None and error > paper[f"paper_{way}_percent"]]
     if not worse or name == "overall":
         return ""
-    axis = "z" if name.startswith("z") else "y"
-    told = [f"{way.upper()}'s have an rms of {_planes_rms_percent(found[way], axis):.2f} %" for way in worse]
-    return (
-        f"the mean errors of single planes of windows across {axis} scatter: {', '.join(told)}; a slice of less than "
-        "that is one by chance"
-    )
-
-
-def _planes_rms_percent(figures: Mapping[str, Any], axis: str) -> float:
-    errors = np.array(figures["slices"][axis]["streamwise_mean_error"], dtype=np.float64)
-    return float(100.0 * np.sqrt(np.nanmean(errors**2)))
+    axis, told = "z" if name.startswith("z") else "y", []
+    for way in worse:
+        errors = np.array(found[way]["slices"][axis]["streamwise_mean_error"], dtype=np.float64)
+        told.append(f"{way.upper()}'s have an rms of {float(100.0 * np.sqrt(np.nanmean(errors**2))):.2f} %")
+    scatter = f"the mean errors of single planes of windows across {axis} scatter: {', '.join(told)}"
+    return f"{scatter}; a slice of less than that is one by chance"
 
 
 def _table(found: Mapping[str, Mapping[str, Any]]) -> Table:
     """Return all ways side by side."""
-    rows = [
+    rows: list[tuple[str, ...]] = [
         ("paper, DLFC", f"{PAPERS_MEAN_M_S[0]:.4f}", "6.25", "12.01", "75", "", ""),
         ("paper, ERT", f"{PAPERS_MEAN_M_S[1]:.4f}", "6.77", "12.37", "75", "", ""),
     ]
     for name, figures in found.items():
         error = figures["streamwise_mean_error"]
-        rows.append(
-            (
-                WAYS[name],
-                f"{MEAN_VELOCITY_M_S * (1.0 + error):.4f}",
-                f"{100.0 * abs(error):.3f}",
-                f"{100.0 * figures['slice_mean_error']:.3f}",
-                f"{100.0 * figures['within_25_percent_streamwise']:.1f}",
-                f"{100.0 * figures['within_25_percent_vector']:.1f}",
-                _rms_um(figures),
-            )
-        )
-    return Table(
-        f"The flow by all ways to measure it; its true mean velocity is {MEAN_VELOCITY_M_S} m/s",
-        (
-            "measured by",
-            "mean velocity (m/s)",
-            "error of it (%)",
-            "worst slice (%)",
-            "within 25 %, along the flow (%)",
-            "within 25 %, whole vector (%)",
-            "rms error of the displacement along x, y, z (µm)",
-        ),
-        tuple(rows),
-    )
-
-
-def _rms_um(figures: Mapping[str, Any]) -> str:
-    pairs = zip("uvw", figures["voxel_mm"], strict=True)
-    return ", ".join(f"{1e3 * voxel * figures[f'rms_{component}_voxel']:.1f}" for component, voxel in pairs)
+        pairs = zip("uvw", figures["voxel_mm"], strict=True)
+        row = {
+            "measured by": WAYS[name],
+            "mean velocity (m/s)": f"{MEAN_VELOCITY_M_S * (1.0 + error):.4f}",
+            "error of it (%)": f"{100.0 * abs(error):.3f}",
+            "worst slice (%)": f"{100.0 * figures['slice_mean_error']:.3f}",
+            "within 25 %, along the flow (%)": f"{100.0 * figures['within_25_percent_streamwise']:.1f}",
+            "within 25 %, whole vector (%)": f"{100.0 * figures['within_25_percent_vector']:.1f}",
+            "rms error of the displacement along x, y, z (µm)": ", ".join(
+                f"{1e3 * voxel * figures[f'rms_{component}_voxel']:.1f}" for component, voxel in pairs
+            ),
+        }
+        rows.append(tuple(row.values()))
+    caption = f"The flow by all ways to measure it; its true mean velocity is {MEAN_VELOCITY_M_S} m/s"
+    return Table(caption, tuple(row), tuple(rows))
 
 
 def _setup(size: ChannelSize) -> Table:
@@ -337,7 +316,7 @@ def _setup(size: ChannelSize) -> Table:
             ("time between the frames", "1.8 ms", "1.8 ms"),
             ("tracers, diameter", "50 µm", "50 µm"),
             ("tracers", "0.002 per pixel", f"{size.particles / (size.columns * size.rows):.4f} per pixel"),
-            ("voxels", "0.1 mm", f"{size.voxel_mm:g} mm"),
+            ("voxels", "0.1 mm", f"{VOXEL_MM:g} mm"),
             ("interrogation windows", "16 voxels, overlap 50 %", f"{size.windows[-1]} voxels, overlap 50 %"),
             ("SART", "200 iterations, relaxation 1", f"{size.iterations} iterations, relaxation 1"),
             ("camera", "Table 2", f"Table 2, {size.columns} x {size.rows} pixels"),

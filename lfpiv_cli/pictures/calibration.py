@@ -1,14 +1,14 @@
-"""Pictures of a rig: does its lattice sit on the lens images, are its views alike, what will it see?"""
+"""Pictures of a rig: does its lattice sit on lens images, are its views alike, what will it see, where are walls?"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from lfpiv_cli.calibration.dlfc import RayFit
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.lattice import LatticeFit
 from lfpiv_cli.calibration.model import Calibration
 from lfpiv_cli.calibration.views import refocused_stack, views_across
@@ -17,6 +17,7 @@ from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.pictures.style import (
     AXIS_NAMES,
+    BLACK,
     BLUE,
     DIVERGING,
     GREEN,
@@ -25,20 +26,19 @@ from lfpiv_cli.pictures.style import (
     SEQUENTIAL,
     SKY_BLUE,
     VERMILION,
+    Figure,
     new_figure,
+    new_panels,
     styled,
 )
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
+from lfpiv_cli.self_calibration.refinement import Refinement
+from lfpiv_cli.self_calibration.scene_refinement import SceneRefinement
 
 COLOURS = (GREEN, VERMILION, BLUE)
 
 
 @styled
-def planning_figure(told: Mapping[str, NDArray[np.float64]], bounds_mm: NDArray[np.float64]) -> Figure:
+def planning_figure(told: Mapping[str, Floats], bounds_mm: Floats) -> Figure:
     """Return errors over depth, and the volume within the field of view seen from above and from the side.
 
     Parameters
@@ -46,31 +46,24 @@ def planning_figure(told: Mapping[str, NDArray[np.float64]], bounds_mm: NDArray[
     told : `depth_mm` (n,), `sigma_mm` (n, 3), half the fields of view `full_view_mm` and `any_view_mm` (n, 2)
     bounds_mm : (3, 2) of the volume, z from the focal point
     """
-    figure = new_figure(9.5, 3.6)
-    errors, *views = figure.subplots(1, 3)
+    figure, (errors, *views) = new_panels(9.5, 3.6, 1, 3)
+    depth = told["depth_mm"]
     for axis, name in enumerate(AXIS_NAMES):
-        errors.semilogy(
-            told["depth_mm"], 1e3 * told["sigma_mm"][:, axis], color=COLOURS[axis], marker=MARKERS[axis], label=name
-        )
+        sigma_um = 1e3 * told["sigma_mm"][:, axis]
+        errors.semilogy(depth, sigma_um, color=COLOURS[axis], marker=MARKERS[axis], label=name)
     errors.set(xlabel="z from the focal plane (mm)", ylabel="smallest error of a tracer alone (µm)")
     errors.grid(alpha=0.3, which="both")
     errors.legend()
     for axis, axes in enumerate(views):
-        _draw_view(axes, told, bounds_mm, axis)
+        for key, label, shade in (("any_view_mm", "seen in part", 0.85), ("full_view_mm", "seen in full", 0.65)):
+            half = told[key][:, axis]
+            axes.fill_between(depth, -half, half, color=str(shade), label=label)
+        (left, right), (low, high) = bounds_mm[2], bounds_mm[axis]
+        axes.plot([left, right, right, left, left], [low, low, high, high, low], color=VERMILION, label="volume")
+        axes.axvline(0.0, color=GREY, linestyle=":")
+        axes.set(xlabel="z from the focal plane (mm)", ylabel=f"{AXIS_NAMES[axis]} (mm)")
     views[0].legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3)
     return figure
-
-
-def _draw_view(axes: Axes, told: Mapping[str, NDArray[np.float64]], bounds_mm: NDArray[np.float64], axis: int) -> None:
-    """Draw what is in view across one axis, and the volume."""
-    depth = told["depth_mm"]
-    for name, label, shade in (("any_view_mm", "seen in part", 0.85), ("full_view_mm", "seen in full", 0.65)):
-        half = told[name][:, axis]
-        axes.fill_between(depth, -half, half, color=str(shade), label=label)
-    (left, right), (low, high) = bounds_mm[2], bounds_mm[axis]
-    axes.plot([left, right, right, left, left], [low, low, high, high, low], color=VERMILION, label="volume")
-    axes.axvline(0.0, color=GREY, linestyle=":")
-    axes.set(xlabel="z from the focal plane (mm)", ylabel=f"{AXIS_NAMES[axis]} (mm)")
 
 
 # Enough views to see vignetting and a wrong lattice at the rim, few enough to see dots in each.
@@ -117,15 +110,16 @@ LENSES_ACROSS = 6.0
 @styled
 def summary_figure(calibration: Calibration) -> Figure:
     """Return what a calibration tells without its pictures: residuals, transmission, and the board or the rays."""
-    figure = new_figure(11.0, 8.0)
-    along_columns, along_rows, passed, board = figure.subplots(2, 2).ravel()
+    figure, ((along_columns, along_rows), (passed, board)) = new_panels(11.0, 8.0, 2, 2)
     for axis, direction in ((along_columns, 0), (along_rows, 1)):
         draw_residual(figure, axis, calibration.fit, direction, calibration.image_shape)
-    draw_transmission(figure, passed, calibration.transmission)
-    if calibration.ray_fit is None:
-        draw_board(figure, board, calibration, None)
+    if calibration.transmission is None:
+        _draw_nothing(passed, "transmission not measured")
     else:
-        draw_ray_fit(board, calibration.ray_fit)
+        shown = passed.imshow(calibration.transmission, cmap=SEQUENTIAL, vmin=0.0, interpolation="nearest")
+        figure.colorbar(shown, ax=passed, label="share of light passed", shrink=0.8)
+        passed.set(title="transmission, upright; 0 where unusable", xlabel="column (px)", ylabel="row (px)")
+    draw_board_or_rays(figure, board, calibration)
     figure.suptitle(lattice_words(calibration.fit))
     return figure
 
@@ -142,8 +136,8 @@ def calibration_figure(calibration: Calibration, white: ArrayLike, board: ArrayL
 
     `white` and `board` are the raw pictures (rows, columns). Needs matplotlib.
     """
-    figure = new_figure(14.0, 8.8)
-    axes = figure.subplots(2, 3).ravel()
+    figure, panels = new_panels(14.0, 8.8, 2, 3)
+    axes = panels.ravel()
     image = np.asarray(white, dtype=np.float64)
     rows, columns = image.shape
     fit = calibration.fit
@@ -153,30 +147,21 @@ def calibration_figure(calibration: Calibration, white: ArrayLike, board: ArrayL
         "first corner": (half, half),
         "last corner": (columns - half, rows - half),
     }
+    line = np.arange(-int(LENSES_ACROSS), int(LENSES_ACROSS) + 1)
+    reach = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
     for axis, (name, centre) in zip(axes, zooms.items(), strict=False):
-        draw_zoom(axis, image, fit, centre, half)
-        axis.set_title(f"white image, {name}")
+        model = fit.centres(fit.lattice_px.nearest(np.array(centre)) + reach)
+        axis.imshow(image, cmap="gray", interpolation="nearest")
+        axis.plot(*model.T, "+", color=VERMILION, markersize=14, zorder=3, label="lattice")
+        axis.plot(*fit.centres_px.T, "o", mfc="none", color=SKY_BLUE, markersize=8, label="measured")
+        axis.set(xlim=(centre[0] - half, centre[0] + half), ylim=(centre[1] + half, centre[1] - half))
+        axis.set(title=f"white image, {name}", xlabel="column (px)", ylabel="row (px)")
     axes[0].legend(loc="upper right", framealpha=0.9)
     for axis, direction in ((axes[3], 0), (axes[4], 1)):
         draw_residual(figure, axis, fit, direction, (rows, columns))
-    if calibration.ray_fit is None:
-        draw_board(figure, axes[5], calibration, board)
-    else:
-        draw_ray_fit(axes[5], calibration.ray_fit)
+    draw_board_or_rays(figure, axes[5], calibration, board)
     figure.suptitle(lattice_words(fit))
     return figure
-
-
-def draw_zoom(axis: Any, image: NDArray[np.float64], fit: LatticeFit, centre: tuple[float, float], half: float) -> None:
-    """Show a part of the white image with the modelled and the measured centres in it."""
-    middle = fit.lattice_px.nearest(np.array(centre))
-    reach = np.arange(-int(LENSES_ACROSS), int(LENSES_ACROSS) + 1)
-    model = fit.centres(middle + np.stack(np.meshgrid(reach, reach), axis=-1).reshape(-1, 2))
-    axis.imshow(image, cmap="gray", interpolation="nearest")
-    axis.plot(*model.T, "+", color=VERMILION, markersize=14, zorder=3, label="lattice")
-    axis.plot(*fit.centres_px.T, "o", mfc="none", color=SKY_BLUE, markersize=8, label="measured")
-    axis.set(xlim=(centre[0] - half, centre[0] + half), ylim=(centre[1] + half, centre[1] - half))
-    axis.set(xlabel="column (px)", ylabel="row (px)")
 
 
 def draw_residual(figure: Any, axis: Any, fit: LatticeFit, direction: int, shape: tuple[int, int]) -> None:
@@ -191,29 +176,20 @@ def draw_residual(figure: Any, axis: Any, fit: LatticeFit, direction: int, shape
     axis.set(xlim=(0, shape[1]), ylim=(shape[0], 0), aspect="equal", xlabel="column (px)", ylabel="row (px)")
 
 
-def draw_ray_fit(axis: Any, fit: RayFit) -> None:
-    """Show how far the polynomials miss the dots of each board."""
-    order = np.argsort(fit.depths_mm)
-    for residual, name in zip(fit.residual_mm.T, ("columns", "rows"), strict=True):
-        axis.plot(fit.depths_mm[order], 1e3 * residual[order], "o-", label=f"along the {name}")
-    axis.legend()
-    axis.set(xlabel="depth of the board (mm)", ylabel="rms misfit on the array (µm)", ylim=(0.0, None))
-    axis.set_title(f"polynomials of degree {fit.rays.degree} through {fit.sightings} sightings of dots")
+def draw_board_or_rays(figure: Any, axis: Any, calibration: Calibration, board: ArrayLike | None = None) -> None:
+    """Show the dots that were found, coloured by depth, over the picture of the board where it is given.
 
-
-def draw_transmission(figure: Any, axis: Any, transmission: NDArray[np.float32] | None) -> None:
-    """Map the share of light that pixels pass; nothing where it was not measured."""
-    if transmission is None:
-        _draw_nothing(axis, "transmission not measured")
+    Of a calibration by boards at several depths, show how far the polynomials miss the dots of each.
+    """
+    pose, fit = calibration.pose, calibration.ray_fit
+    if fit is not None:
+        order = np.argsort(fit.depths_mm)
+        for residual, name in zip(fit.residual_mm.T, ("columns", "rows"), strict=True):
+            axis.plot(fit.depths_mm[order], 1e3 * residual[order], "o-", label=f"along the {name}")
+        axis.legend()
+        axis.set(xlabel="depth of the board (mm)", ylabel="rms misfit on the array (µm)", ylim=(0.0, None))
+        axis.set_title(f"polynomials of degree {fit.rays.degree} through {fit.sightings} sightings of dots")
         return
-    shown = axis.imshow(transmission, cmap=SEQUENTIAL, vmin=0.0, interpolation="nearest")
-    figure.colorbar(shown, ax=axis, label="share of light passed", shrink=0.8)
-    axis.set(title="transmission, upright; 0 where unusable", xlabel="column (px)", ylabel="row (px)")
-
-
-def draw_board(figure: Any, axis: Any, calibration: Calibration, board: ArrayLike | None) -> None:
-    """Show the dots that were found, coloured by depth, over the picture of the board where it is given."""
-    pose = calibration.pose
     if pose is None:
         _draw_nothing(axis, "no board")
         return
@@ -232,3 +208,116 @@ def draw_board(figure: Any, axis: Any, calibration: Calibration, board: ArrayLik
 def _draw_nothing(axis: Any, why: str) -> None:
     axis.set_axis_off()
     axis.text(0.5, 0.5, why, ha="center", va="center", transform=axis.transAxes)
+
+
+# Pictures to believe in walls by: where particles lie, and where they end, in depth or around a pipe's axis.
+
+BARS_AT_ROUND_WALL = 60
+# Shown beside the wall: the ring's outer part and as much beyond the wall as was searched.
+ZOOM_PER_RADIUS = 0.08
+
+
+@styled
+def round_wall_figure(refinement: SceneRefinement) -> Figure:
+    """Return a figure of the particles beside the pipe's wall, in its section, by angle, along the axis, and counted.
+
+    Distances are those from the axis that was told before. Needs matplotlib.
+    """
+    scene, wall = refinement.scene, refinement.wall
+    radius = scene.wall.radius_mm
+    own = scene.about_axis(refinement.position_mm, np.zeros(4))
+    angle, distance = np.arctan2(own[:, 2], own[:, 1]), np.hypot(own[:, 1], own[:, 2])
+    limits = radius * (1.0 - ZOOM_PER_RADIUS), radius * (1.0 + ZOOM_PER_RADIUS)
+    figure, ((section, around), (along, counted)) = new_panels(12.0, 9.0, 2, 2)
+    fine = np.linspace(-np.pi, np.pi, 400)
+    found = _wall(refinement, fine)
+    section.plot(own[:, 1], own[:, 2], ",", color=SKY_BLUE)
+    section.plot(found * np.cos(fine), found * np.sin(fine), color=VERMILION, linewidth=1.0)
+    section.plot(radius * np.cos(fine), radius * np.sin(fine), color=GREY, linestyle=":")
+    section.set(xlabel="across (mm)", ylabel="away from the camera (mm)", aspect="equal")
+    section.invert_yaxis()
+    section.set_title(f"{len(own)} of {refinement.particles} particles, whose wall is in view")
+    around.plot(np.rad2deg(angle), distance, ".", color=SKY_BLUE, markersize=2.0, label="particles")
+    around.plot(np.rad2deg(fine), found, color=VERMILION, label="wall by the particles")
+    around.axhline(radius, color=GREY, linestyle=":", label="wall before")
+    around.set(
+        xlabel="angle about the axis, from across to away from the camera (degrees)",
+        ylabel="distance from the axis before (mm)",
+        xlim=(-180.0, 180.0),
+        ylim=limits,
+    )
+    around.legend(loc="lower right")
+    moved = distance - (_wall(refinement, angle, own[:, 0]) - wall.radius_mm)
+    along.plot(own[:, 0], moved, ".", color=SKY_BLUE, markersize=2.0)
+    along.axhline(wall.radius_mm, color=VERMILION)
+    along.axhline(radius, color=GREY, linestyle=":")
+    along.set(xlabel="place along the axis (mm)", ylabel="distance from the axis found (mm)", ylim=limits)
+    edges = np.linspace(*limits, BARS_AT_ROUND_WALL + 1)
+    counted.stairs(np.histogram(moved, edges)[0], edges, fill=True, color=SKY_BLUE)
+    counted.axvline(wall.radius_mm, color=VERMILION, label=f"{wall.radius_mm:.3f} mm, found")
+    counted.axvline(radius, color=BLACK, linestyle=":", label="of the scene")
+    counted.set(xlabel="distance from the axis found (mm)", ylabel="particles", xlim=limits)
+    counted.legend(loc="upper right")
+    sigma = np.sqrt(np.diag(refinement.covariance))
+    shift = " and ".join(f"{1e3 * refinement.axis[k]:z.1f} +- {1e3 * sigma[k]:.1f}" for k in (0, 1))
+    tilt = " and ".join(f"{np.rad2deg(refinement.axis[k]):z.3f} +- {np.rad2deg(sigma[k]):.3f}" for k in (2, 3))
+    figure.suptitle(f"axis {shift} um across and away from the camera beside the one before, tilted by {tilt} degrees")
+    return figure
+
+
+def _wall(refinement: SceneRefinement, angle: Floats, along_mm: Floats | float = 0.0) -> Floats:
+    """Return the distance (n,) of the wall, by its own place and apparent radius, from the axis before."""
+    across, away, tilt_across, tilt_away = refinement.by_wall
+    shift = (across + tilt_across * along_mm) * np.cos(angle) + (away + tilt_away * along_mm) * np.sin(angle)
+    return np.asarray(refinement.wall.radius_mm + shift, dtype=np.float64)
+
+
+# Bars over the whole depth, and beside a wall.
+BARS, BARS_AT_WALL = 100, 60
+# The zooms show this share of the width to both sides of a wall.
+ZOOM_PER_WIDTH = 0.06
+
+
+@styled
+def walls_figure(refinement: Refinement) -> Figure:
+    """Return a figure with the depths of the particles: all, beside each wall, and across the channel.
+
+    Needs matplotlib.
+    """
+    walls = refinement.walls
+    depth = walls.depth_from_middle(refinement.position_mm)
+    half = 0.5 * walls.width_mm
+    searched = refinement.depths_mm[1] - refinement.depths_mm[0]
+    figure, ((whole, across), (near, far)) = new_panels(12.0, 8.0, 2, 2)
+    limits = (0.5 * searched * np.array([-1.0, 1.0])).tolist()
+    _draw_depths(whole, refinement, depth, (limits[0], limits[1]), BARS)
+    expected = (refinement.expected_z_mm or 0.0) - walls.middle_mm
+    for side in (-1.0, 1.0):
+        before = expected + side * 0.5 * refinement.width_mm
+        whole.axvline(before, color="0.5", linestyle=":", label="walls before" if side < 0.0 else None)
+    whole.set_title(f"{len(depth)} particles in {refinement.frames} images")
+    whole.legend()
+    for axes, side, name in ((near, -1.0, "near"), (far, 1.0, "far")):
+        zoom = ZOOM_PER_WIDTH * refinement.width_mm
+        _draw_depths(axes, refinement, depth, (side * half - zoom, side * half + zoom), BARS_AT_WALL)
+        axes.set_title(f"{name} wall, at z = {walls.middle_mm + side * half:z.3f} mm on the axis")
+    position = refinement.position_mm
+    across.plot(position[:, 0], position[:, 2], ",", color=SKY_BLUE)
+    x = np.array([position[:, 0].min(), position[:, 0].max()])
+    for end in (-0.5, 0.5):
+        across.plot(x, walls.middle_mm + end * walls.width_mm + walls.slope[0] * x, color=VERMILION)
+    across.set(xlabel="x (mm)", ylabel="z (mm)", title="from the side, and the walls at y = 0")
+    middle, sigma = walls.middle_mm, refinement.middle_sigma_mm
+    tilt = " and ".join(f"{angle:z.2f}" for angle in np.rad2deg(np.arctan(walls.slope)))
+    figure.suptitle(f"mid plane at z = {middle:z.3f} +- {sigma:.3f} mm, walls tilted by {tilt} degrees")
+    return figure
+
+
+def _draw_depths(axes: Any, refinement: Refinement, depth: Floats, limits: tuple[float, float], bars: int) -> None:
+    """Draw how many particles lie at each depth behind the mid plane, and the fitted profile."""
+    axes.hist(depth, bins=bars, range=limits, color=SKY_BLUE, label="particles")
+    fine = np.linspace(*limits, 1000)
+    width = (limits[1] - limits[0]) / bars
+    expected = refinement.walls.density(fine, refinement.depths_mm[1] - refinement.depths_mm[0]) * len(depth) * width
+    axes.plot(fine, expected, color=VERMILION, label="fitted")
+    axes.set(xlabel="depth behind the mid plane, tilt taken out (mm)", ylabel="particles", xlim=limits)

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from importlib.util import find_spec
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace
@@ -26,16 +27,14 @@ from lfpiv_cli.pictures.style import (
     DIVERGING,
     SEQUENTIAL,
     VERMILION,
+    Figure,
     draw_medians,
     new_figure,
+    new_panels,
     percentiles_by_depth,
     slab_edges,
     styled,
 )
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 
 # Of an image's values: the scale ends where so many (%) lie within, single hot pixels beyond it.
 IMAGE_PERCENT = 99.5
@@ -48,9 +47,7 @@ DOTS_AREA, DOT_SIZES = 15_000.0, (6.0, 26.0)
 IMAGE_WIDTH = 10.0
 
 
-def places_px(
-    focal_point_mm: NDArray[np.float64], camera: Camera, media: Media, scene: CurvedSpace | None
-) -> NDArray[np.float64]:
+def places_px(focal_point_mm: Floats, camera: Camera, media: Media, scene: CurvedSpace | None) -> Floats:
     """Return where rays through the middle of the main lens meet the sensor, (n, 2) as (column, row).
 
     Parameters
@@ -68,24 +65,16 @@ def places_px(
 
 
 @styled
-def places_figure(position_mm: NDArray[np.float64], light_counts: NDArray[np.float64]) -> Figure:
+def places_figure(position_mm: Floats, light_counts: Floats) -> Figure:
     """Return the particles from the front and from the side, coloured by their light (logarithmic)."""
     from matplotlib.colors import LogNorm
 
-    figure = new_figure(IMAGE_WIDTH, 4.6)
     lit = light_counts > 0.0
     norm = LogNorm(*np.percentile(light_counts[lit], (2.0, 98.0))) if lit.sum() > 1 else None
-    panels = figure.subplots(1, 2)
+    figure, panels = new_panels(IMAGE_WIDTH, 4.6, 1, 2)
+    how: dict[str, Any] = {"s": 6, "cmap": SEQUENTIAL, "norm": norm, "linewidths": 0}
     for axes, up in zip(panels, (1, 2), strict=True):
-        dots = axes.scatter(
-            position_mm[lit, 0],
-            position_mm[lit, up],
-            c=light_counts[lit],
-            s=6,
-            cmap=SEQUENTIAL,
-            norm=norm,
-            linewidths=0,
-        )
+        dots = axes.scatter(position_mm[lit, 0], position_mm[lit, up], c=light_counts[lit], **how)
         axes.set(xlabel="x (mm)", ylabel=f"{AXIS_NAMES[up]} (mm)", aspect="equal")
     figure.colorbar(dots, ax=panels.tolist(), label="light of a particle (counts)")
     figure.suptitle(f"{len(position_mm)} particles, from the front and from the side")
@@ -93,10 +82,9 @@ def places_figure(position_mm: NDArray[np.float64], light_counts: NDArray[np.flo
 
 
 @styled
-def image_figure(image: NDArray[np.float64], places: NDArray[np.float64], z_mm: NDArray[np.float64]) -> Figure:
+def image_figure(image: Floats, places: Floats, z_mm: Floats) -> Figure:
     """Return a raw image in grey with the particles' places (n, 2) as (column, row), coloured by their depth."""
-    figure = _image_canvas(image)
-    (axes,) = figure.axes
+    figure, axes = _image_canvas(image)
     axes.imshow(image, cmap="gray", vmin=0.0, vmax=_bright(image), interpolation="nearest")
     size = float(np.clip(DOTS_AREA / max(len(z_mm), 1), *DOT_SIZES))
     dots = axes.scatter(places[:, 0], places[:, 1], c=z_mm, s=size, cmap=SEQUENTIAL, edgecolors="white", linewidths=0.5)
@@ -108,10 +96,9 @@ def image_figure(image: NDArray[np.float64], places: NDArray[np.float64], z_mm: 
 
 
 @styled
-def residual_figure(residual: NDArray[np.float64]) -> Figure:
+def residual_figure(residual: Floats) -> Figure:
     """Return what the particles leave of an image: light that none explains, red, and too much light, blue."""
-    figure = _image_canvas(residual)
-    (axes,) = figure.axes
+    figure, axes = _image_canvas(residual)
     limit = _bright(residual)
     shown = axes.imshow(residual, cmap=DIVERGING, vmin=-limit, vmax=limit, interpolation="nearest")
     figure.colorbar(shown, ax=axes, label="image less particles (counts)", shrink=0.7)
@@ -119,34 +106,30 @@ def residual_figure(residual: NDArray[np.float64]) -> Figure:
     return figure
 
 
-def _image_canvas(image: NDArray[np.float64]) -> Figure:
-    """Return a figure of an image's shape, with axes that are its pixels."""
+def _image_canvas(image: Floats) -> tuple[Figure, Any]:
+    """Return a figure of an image's shape, and its axes, which are the image's pixels."""
     rows, columns = image.shape
-    figure = new_figure(IMAGE_WIDTH, min(max(0.8 * IMAGE_WIDTH * rows / columns + 0.8, 3.0), 12.0))
-    figure.subplots().set(xlabel="column (px)", ylabel="row (px)")
-    return figure
+    figure, axes = new_panels(IMAGE_WIDTH, min(max(0.8 * IMAGE_WIDTH * rows / columns + 0.8, 3.0), 12.0))
+    axes.set(xlabel="column (px)", ylabel="row (px)")
+    return figure, axes
 
 
-def _bright(image: NDArray[np.float64]) -> float:
+def _bright(image: Floats) -> float:
     """Return where the scale of an image ends."""
     limit = float(np.percentile(np.abs(image), IMAGE_PERCENT))
     return limit if limit > 0.0 else 1.0
 
 
 @styled
-def depths_figure(
-    z_mm: NDArray[np.float64], light_counts: NDArray[np.float64], covariance_mm2: NDArray[np.float64]
-) -> Figure:
+def depths_figure(z_mm: Floats, light_counts: Floats, covariance_mm2: Floats) -> Figure:
     """Return by depth: how many particles, their light (median and quartiles), and their standard deviations."""
     figure = new_figure(11.0, 3.6)
     counts, light, sigmas = figure.subplots(1, 3)
     counts.hist(z_mm, bins=slab_edges(z_mm), color=BLUE)
     counts.set(xlabel=DEPTH_LABEL, ylabel="particles")
     draw_medians(light, z_mm, {"light": light_counts}, "light of a particle (counts), median")
-    places, low = percentiles_by_depth(z_mm, light_counts, 25.0)
-    light.fill_between(
-        places, low, percentiles_by_depth(z_mm, light_counts, 75.0)[1], color=BLUE, alpha=0.25, label="quartiles"
-    )
+    (places, low), (_, high) = (percentiles_by_depth(z_mm, light_counts, percent) for percent in (25.0, 75.0))
+    light.fill_between(places, low, high, color=BLUE, alpha=0.25, label="quartiles")
     light.legend()
     along = {f"along {name}": np.sqrt(covariance_mm2[:, k]) for k, name in enumerate(AXIS_NAMES)}
     draw_medians(sigmas, z_mm, along, "standard deviation (mm), median")
@@ -154,10 +137,9 @@ def depths_figure(
 
 
 @styled
-def chi2_figure(chi2: NDArray[np.float64]) -> Figure:
+def chi2_figure(chi2: Floats) -> Figure:
     """Return chi2, about 1 where particles explain all light; what is beyond the axis is in the last bar."""
-    figure = new_figure(6.0, 3.6)
-    axes = figure.subplots()
+    figure, axes = new_panels(6.0, 3.6)
     axes.hist(np.minimum(chi2, LARGEST_CHI2), bins=CHI2_BARS, range=(0.0, LARGEST_CHI2), color=BLUE)
     axes.axvline(1.0, color=VERMILION, linestyle="--", label="all light explained")
     beyond = int(np.count_nonzero(chi2 > LARGEST_CHI2))
@@ -173,9 +155,7 @@ HISTOGRAM_BARS, PROBABILITY_BARS = 40, 25
 LONGEST_SHARE = 0.12
 
 
-def displacement_lines(
-    position_mm: NDArray[np.float64], displacement_mm: NDArray[np.float64]
-) -> tuple[list[NDArray[np.float64]], float]:
+def displacement_lines(position_mm: Floats, displacement_mm: Floats) -> tuple[list[Floats], float]:
     """Return lines (2, 3) of displacements about their middles, and how many times longer than true they are.
 
     At most LINES_DRAWN, evenly chosen from the list.
@@ -187,13 +167,13 @@ def displacement_lines(
     return list(np.stack([position_mm - half, position_mm + half], axis=1)), stretch
 
 
-def trajectory_lines(position_mm: NDArray[np.float64], track: NDArray[np.int64]) -> list[NDArray[np.float64]]:
+def trajectory_lines(position_mm: Floats, track: NDArray[np.int64]) -> list[Floats]:
     """Return the places (m, 3) of each track in time; rows are ordered by track, then by frame."""
     return np.split(position_mm, np.flatnonzero(np.diff(track)) + 1) if len(track) else []
 
 
 @styled
-def space_figure(lines: list[NDArray[np.float64]], speed_m_s: NDArray[np.float64], what: str) -> Figure:
+def space_figure(lines: list[Floats], speed_m_s: Floats, what: str) -> Figure:
     """Return lines in space coloured by their speed, the depth to the right; many are thinned out evenly.
 
     Parameters
@@ -216,14 +196,8 @@ def space_figure(lines: list[NDArray[np.float64]], speed_m_s: NDArray[np.float64
     points = np.concatenate(lines) if lines else np.zeros((1, 3))
     low, high = points.min(axis=0), points.max(axis=0)
     high = np.where(high > low, high, low + 1.0)
-    axes.set(
-        xlim=(low[2], high[2]),
-        ylim=(low[0], high[0]),
-        zlim=(low[1], high[1]),
-        xlabel="z (mm)",
-        ylabel="x (mm)",
-        zlabel="y (mm)",
-    )
+    axes.set(xlim=(low[2], high[2]), ylim=(low[0], high[0]), zlim=(low[1], high[1]))
+    axes.set(xlabel="z (mm)", ylabel="x (mm)", zlabel="y (mm)")
     axes.set_box_aspect((high - low)[[2, 0, 1]])
     figure.colorbar(drawn, ax=axes, label="speed (m/s)", shrink=0.7)
     axes.set_title(what if every == 1 else f"{what}; one in {every} drawn")
@@ -231,7 +205,7 @@ def space_figure(lines: list[NDArray[np.float64]], speed_m_s: NDArray[np.float64
 
 
 @styled
-def velocities_figure(velocity_m_s: NDArray[np.float64]) -> Figure:
+def velocities_figure(velocity_m_s: Floats) -> Figure:
     """Return histograms of the velocity components."""
     figure = new_figure(10.0, 3.2)
     for component, axes in enumerate(figure.subplots(1, 3)):
@@ -241,29 +215,23 @@ def velocities_figure(velocity_m_s: NDArray[np.float64]) -> Figure:
 
 
 @styled
-def links_figure(link_probability: NDArray[np.float64]) -> Figure:
+def links_figure(link_probability: Floats) -> Figure:
     """Return how probable the links are, of those whose probability is known."""
     known = link_probability[np.isfinite(link_probability)]
-    figure = new_figure(6.0, 3.6)
-    axes = figure.subplots()
+    figure, axes = new_panels(6.0, 3.6)
     axes.hist(known, bins=PROBABILITY_BARS, range=(0.0, 1.0), color=BLUE)
     axes.set_yscale("log")
-    wrong = float(np.sum(1.0 - known))
-    axes.set(
-        xlabel="probability that a link is right",
-        ylabel="links",
-        title=f"{known.size} links, {wrong:.1f} wrong ones expected",
-        xlim=(0.0, 1.0),
-    )
+    axes.set_title(f"{known.size} links, {float(np.sum(1.0 - known)):.1f} wrong ones expected")
+    axes.set(xlabel="probability that a link is right", ylabel="links", xlim=(0.0, 1.0))
     return figure
 
 
 @styled
-def sigma_figure(z_mm: NDArray[np.float64], sigma_m_s: NDArray[np.float64]) -> Figure:
+def sigma_figure(z_mm: Floats, sigma_m_s: Floats) -> Figure:
     """Return the stated standard deviations of the velocity's components by depth (medians)."""
-    figure = new_figure(6.0, 3.6)
+    figure, axes = new_panels(6.0, 3.6)
     along = {f"σ of {name}": sigma_m_s[:, k] for k, name in enumerate(COMPONENT_NAMES)}
-    draw_medians(figure.subplots(), z_mm, along, "standard deviation (m/s), median")
+    draw_medians(axes, z_mm, along, "standard deviation (m/s), median")
     return figure
 
 
@@ -271,8 +239,7 @@ def sigma_figure(z_mm: NDArray[np.float64], sigma_m_s: NDArray[np.float64]) -> F
 def lengths_figure(track: NDArray[np.int64]) -> Figure:
     """Return how many frames the trajectories span."""
     lengths = np.unique(track, return_counts=True)[1]
-    figure = new_figure(6.0, 3.6)
-    axes = figure.subplots()
+    figure, axes = new_panels(6.0, 3.6)
     most = int(lengths.max()) if lengths.size else 1
     axes.hist(lengths, bins=(np.arange(most + 1) + 0.5).tolist(), color=BLUE, rwidth=0.9)
     axes.set(xlabel="frames in a trajectory", ylabel="trajectories", title=f"{lengths.size} trajectories")
@@ -289,7 +256,7 @@ def has_views() -> bool:
     return find_spec("plotly") is not None
 
 
-def lines_view(lines: Sequence[NDArray[np.float64]], values: Sequence[NDArray[np.float64]], label: str) -> str:
+def lines_view(lines: Sequence[Floats], values: Sequence[Floats], label: str) -> str:
     """Return a view of lines, a dot at the end of each.
 
     Parameters
@@ -321,10 +288,6 @@ def lines_view(lines: Sequence[NDArray[np.float64]], values: Sequence[NDArray[np
         ]
     )
     axes = {f"{axis}axis": {"title": f"{axis} (mm)"} for axis in "xyz"}
-    figure.update_layout(
-        scene={**axes, "aspectmode": "data"},
-        height=HEIGHT_PX,
-        showlegend=False,
-        margin={"l": 0, "r": 0, "t": 0, "b": 0},
-    )
+    scene, margin = {**axes, "aspectmode": "data"}, {"l": 0, "r": 0, "t": 0, "b": 0}
+    figure.update_layout(scene=scene, height=HEIGHT_PX, showlegend=False, margin=margin)
     return str(figure.to_html(full_html=False, include_plotlyjs=True, div_id="view", config={"displaylogo": False}))

@@ -11,11 +11,16 @@ from functools import wraps
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from lfpiv_cli.arrays import Floats
+
+# For signatures: what draws has them from here, and nothing is loaded before something is drawn.
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    from matplotlib.axes import Axes as Axes
+    from matplotlib.figure import Figure as Figure
+else:
+    Axes = Figure = Any
 
 
 P = ParamSpec("P")
@@ -74,6 +79,12 @@ def new_figure(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), layout="constrained")
 
 
+def new_panels(width: float, height: float, rows: int = 1, columns: int = 1, **how: Any) -> tuple[Figure, Any]:
+    """Return an empty figure as `new_figure` does, and its axes, one or an array; `how` as `subplots` has it."""
+    figure = new_figure(width, height)
+    return figure, figure.subplots(rows, columns, **how)
+
+
 def symmetric_limit(*values: ArrayLike) -> float:
     """Return the largest finite size among values, at which a scale about zero ends; 1 where there is none."""
     finite = [np.abs(array[np.isfinite(array)]) for array in map(np.asarray, values)]
@@ -87,7 +98,7 @@ FEWEST_POINTS = 3
 DEPTH_LABEL = "z (mm)"
 
 
-def slab_edges(z_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+def slab_edges(z_mm: Floats) -> Floats:
     """Return the faces of slabs (SLABS + 1,) between the first and the last point; of unit thickness without any."""
     if not z_mm.size or np.ptp(z_mm) == 0.0:
         middle = float(z_mm[0]) if z_mm.size else 0.0
@@ -95,9 +106,7 @@ def slab_edges(z_mm: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.linspace(float(z_mm.min()), float(z_mm.max()), SLABS + 1)
 
 
-def percentiles_by_depth(
-    z_mm: NDArray[np.float64], values: NDArray[np.float64], percent: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def percentiles_by_depth(z_mm: Floats, values: Floats, percent: float) -> tuple[Floats, Floats]:
     """Return the middles of slabs, and a percentile (100 for the largest) of the known values in each, else NaN."""
     edges = slab_edges(z_mm)
     slab = np.clip(np.searchsorted(edges, z_mm, side="right") - 1, 0, SLABS - 1)
@@ -109,7 +118,7 @@ def percentiles_by_depth(
     return 0.5 * (edges[:-1] + edges[1:]), found
 
 
-def draw_medians(axes: Axes, z_mm: NDArray[np.float64], quantities: dict[str, NDArray[np.float64]], label: str) -> None:
+def draw_medians(axes: Axes, z_mm: Floats, quantities: dict[str, Floats], label: str) -> None:
     """Draw medians by depth, a curve for each quantity, on a logarithmic scale."""
     for (name, values), colour, marker in zip(quantities.items(), COLOURS, MARKERS, strict=False):
         axes.plot(*percentiles_by_depth(z_mm, values, 50.0), f"{marker}-", color=colour, label=name)

@@ -1,17 +1,19 @@
-"""Figures of a vector field, none of which needs to know the true flow.
+"""Figures of what lives on a grid: a vector field, none of which needs to know the true flow, a volume, and weights.
 
 Velocities are drawn in m/s or mm/s, whichever reads better; fields without a time as displacements in voxels.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from itertools import groupby
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.flow.field import (
     FLAG_NAMES,
     MASKED,
@@ -29,21 +31,20 @@ from lfpiv_cli.pictures.style import (
     BLUE,
     COLOURS,
     COMPONENT_NAMES,
+    DEPTH_LABEL,
     DIVERGING,
     GREY,
+    MARKERS,
     ORANGE,
     SEQUENTIAL,
     SKY_BLUE,
     VERMILION,
-    new_figure,
+    Axes,
+    Figure,
+    new_panels,
     styled,
     symmetric_limit,
 )
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
 
 # The three middle planes of what lives on a grid, side by side at one length per mm.
 #
@@ -68,19 +69,10 @@ class Plane(NamedTuple):
         """The axis that the plane lies across."""
         return 3 - self.right - self.up
 
-    @property
-    def name(self) -> str:
-        """Its axes' names, for instance x-z."""
-        return f"{AXIS_NAMES[self.right]}-{AXIS_NAMES[self.up]}"
-
     def of(self, values: NDArray[Any]) -> NDArray[Any]:
         """Return the middle plane of an array [z, y, x, ...] as [up, right, ...]."""
         along = 2 - self.normal
         return values.take(values.shape[along] // 2, axis=along)
-
-    def place_mm(self, grid: Grid) -> float:
-        """Return where the middle plane lies on its normal."""
-        return float(grid.axis_mm(self.normal)[grid.shape_xyz[self.normal] // 2])
 
     def extent(self, grid: Grid) -> tuple[float, float, float, float]:
         """Return the outer faces: left, right, bottom, top, mm."""
@@ -96,37 +88,57 @@ def plane_panels(grid: Grid, rows: int = 1) -> tuple[Figure, NDArray[Any]]:
     widths = [sizes[plane.right] for plane in PLANES]
     tallest = ROW_WIDTH * max(sizes[plane.up] for plane in PLANES) / sum(widths)
     height = MARGIN_HEIGHT + min(max(tallest, LEAST_HEIGHT), LARGEST_HEIGHT)
-    figure = new_figure(ROW_WIDTH + MARGIN_WIDTH, rows * height)
-    return figure, figure.subplots(rows, 3, squeeze=False, width_ratios=widths)
-
-
-def label_plane(axes: Axes, grid: Grid, plane: Plane, what: str = "") -> None:
-    """Name a panel's axes, and in its title what it shows and where the plane lies."""
-    place = f"{plane.name} at {AXIS_NAMES[plane.normal]} = {plane.place_mm(grid):z.2f} mm"
-    left, right, bottom, top = plane.extent(grid)
-    axes.set(
-        xlabel=f"{AXIS_NAMES[plane.right]} (mm)",
-        ylabel=f"{AXIS_NAMES[plane.up]} (mm)",
-        title=f"{what}\n{place}" if what else place,
-        xlim=(left, right),
-        ylim=(bottom, top),
-        aspect="equal",
-    )
+    return new_panels(ROW_WIDTH + MARGIN_WIDTH, rows * height, rows, 3, squeeze=False, width_ratios=widths)
 
 
 def draw_maps(
     row: Sequence[Axes], grid: Grid, maps: Sequence[NDArray[Any]], titles: Sequence[str], **scale: Any
 ) -> Any:
-    """Draw the middle planes of three arrays [z, y, x] (of one, given three times) as maps on one scale.
+    """Draw the middle planes of three arrays [z, y, x] (of one, given three times), or planes, as maps on one scale.
 
-    Returns the last image, for the scale; unknown values stay blank.
+    Titles tell what is shown and where a middle plane lies. Returns the last image, for the scale; unknown values stay
+    blank.
     """
     for axes, plane, values, title in zip(row, PLANES, maps, titles, strict=True):
-        image = axes.imshow(
-            plane.of(values), origin="lower", extent=plane.extent(grid), interpolation="nearest", **scale
+        extent, place, right, up = plane.extent(grid), "", AXIS_NAMES[plane.right], AXIS_NAMES[plane.up]
+        if values.ndim > 2:
+            values = plane.of(values)
+            middle = grid.axis_mm(plane.normal)[grid.shape_xyz[plane.normal] // 2]
+            place = f"{right}-{up} at {AXIS_NAMES[plane.normal]} = {middle:z.2f} mm"
+        image = axes.imshow(values, origin="lower", extent=extent, interpolation="nearest", **scale)
+        axes.set(
+            xlabel=f"{right} (mm)",
+            ylabel=f"{up} (mm)",
+            title="\n".join(each for each in (title, place) if each),
+            xlim=extent[:2],
+            ylim=extent[2:],
+            aspect="equal",
         )
-        label_plane(axes, grid, plane, title)
     return image
+
+
+@dataclass(frozen=True, eq=False)
+class MapRow:
+    """A row of maps: an array [z, y, x] for each plane, its title, what the colours are called, and their scale."""
+
+    maps: Sequence[NDArray[Any]]
+    titles: Sequence[str]
+    label: str
+    scale: dict[str, Any]
+
+
+@styled
+def maps_figure(grid: Grid, rows: Sequence[MapRow], shrink: float = 1.0) -> Figure:
+    """Return rows of maps in the three middle planes; neighbours whose colours are called alike share their bar."""
+    figure, axes = plane_panels(grid, rows=len(rows))
+    drawn = zip(axes, rows, strict=True)
+    for label, group in groupby(drawn, key=lambda each: each[1].label):
+        of_bar = []
+        for panels, row in group:
+            image = draw_maps(panels, grid, row.maps, row.titles, **row.scale)
+            of_bar += panels.tolist()
+        figure.colorbar(image, ax=of_bar, label=label, shrink=shrink)
+    return figure
 
 
 FLAG_COLOURS = {VALID: BLUE, SECOND_PEAK: SKY_BLUE, REPLACED: ORANGE, REJECTED: VERMILION, MASKED: "0.85"}
@@ -147,8 +159,8 @@ HISTOGRAM_BARS, PART_BARS = 40, 20
 class Shown:
     """What is drawn of a field: `values` and `sigma` (nz, ny, nx, 3) in `unit`; NaN where unknown, sigma or None."""
 
-    values: NDArray[np.float64]
-    sigma: NDArray[np.float64] | None
+    values: Floats
+    sigma: Floats | None
     unit: str
 
 
@@ -172,7 +184,7 @@ def planes_figure(field: VectorField) -> Figure:
 
 
 @styled
-def compared_figure(grid: Grid, fields: Mapping[str, NDArray[np.float64]], unit: str) -> Figure:
+def compared_figure(grid: Grid, fields: Mapping[str, Floats], unit: str) -> Figure:
     """Return vectors (nz, ny, nx, 3) in the three middle planes, a row for each field, by its name.
 
     Arrows show the components in the plane and colour the one across it; both have one scale in all. Crosses are
@@ -186,12 +198,20 @@ def compared_figure(grid: Grid, fields: Mapping[str, NDArray[np.float64]], unit:
     )
     step = [-(-n // MOST_ARROWS) for n in grid.shape_xyz]
     spacing = max(spacing * n for spacing, n in zip(grid.spacing_mm, step, strict=True))
+    how: dict[str, Any] = {"angles": "xy", "scale_units": "xy", "scale": longest / (ARROW_REACH * spacing)}
+    how |= {"units": "inches", "width": ARROW_WIDTH, "pivot": "mid"}
     for row, (name, values) in zip(axes, fields.items(), strict=True):
         components = [COMPONENT_NAMES[plane.normal] for plane in PLANES]
         titles = [f"{name}: {component}" if name else component for component in components]
         image = draw_maps(row, grid, across[name], titles, **scale)
         for panel, plane in zip(row, PLANES, strict=True):
-            arrows = _draw_arrows(panel, grid, plane, values, (step, longest / (ARROW_REACH * spacing)))
+            chosen = (slice(None, None, step[plane.up]), slice(None, None, step[plane.right]))
+            of_plane = plane.of(values)[chosen]
+            right, up = np.meshgrid(grid.axis_mm(plane.right)[chosen[1]], grid.axis_mm(plane.up)[chosen[0]])
+            known = np.isfinite(of_plane).all(axis=-1)
+            panel.plot(right[~known], up[~known], "x", color=GREY, markersize=3)
+            along, across_mm = of_plane[known, plane.right], of_plane[known, plane.up]
+            arrows = panel.quiver(right[known], up[known], along, across_mm, **how)
     length = float(f"{0.7 * longest:.1g}")
     place = 1.0 - 0.25 / figure.get_figheight()
     axes[0, 0].quiverkey(arrows, 0.96, place, length, f"{length:g} {unit}", coordinates="figure", labelpos="W")
@@ -199,50 +219,21 @@ def compared_figure(grid: Grid, fields: Mapping[str, NDArray[np.float64]], unit:
     return figure
 
 
-def _draw_arrows(
-    axes: Axes, grid: Grid, plane: Plane, values: NDArray[np.float64], arrows: tuple[Sequence[int], float]
-) -> Any:
-    """Draw a plane's arrows, so many vectors apart along x, y, z, and so long that a mm stands for a speed."""
-    step, speed_per_mm = arrows
-    chosen = (slice(None, None, step[plane.up]), slice(None, None, step[plane.right]))
-    of_plane = plane.of(values)[chosen]
-    right, up = np.meshgrid(grid.axis_mm(plane.right)[chosen[1]], grid.axis_mm(plane.up)[chosen[0]])
-    known = np.isfinite(of_plane).all(axis=-1)
-    axes.plot(right[~known], up[~known], "x", color=GREY, markersize=3)
-    return axes.quiver(
-        right[known],
-        up[known],
-        of_plane[known, plane.right],
-        of_plane[known, plane.up],
-        angles="xy",
-        scale_units="xy",
-        scale=speed_per_mm,
-        units="inches",
-        width=ARROW_WIDTH,
-        pivot="mid",
-    )
-
-
-def speed_unit(*velocities_m_s: NDArray[np.float64]) -> tuple[float, str]:
+def speed_unit(*velocities_m_s: Floats) -> tuple[float, str]:
     """Return the unit in which velocities read well: what m/s are multiplied by, and its name."""
     known = any(np.isfinite(each).any() for each in velocities_m_s)
     return (1.0 / MM_TO_M, "mm/s") if known and symmetric_limit(*velocities_m_s) < SLOW_M_S else (1.0, "m/s")
 
 
-@styled
 def components_figure(field: VectorField) -> Figure:
     """Return maps of each component (rows) in the three middle planes, on one scale a component."""
     told = shown(field)
-    figure, axes = plane_panels(field.grid, rows=3)
-    for component, row in enumerate(axes):
-        values = told.values[..., component]
-        name = COMPONENT_NAMES[component]
-        image = draw_maps(row, field.grid, [values] * 3, [name] * 3, **signed_scale([values] * 3))
-        figure.colorbar(image, ax=row.tolist(), label=f"{name} ({told.unit})")
-    return figure
+    each = [(name, [told.values[..., component]] * 3) for component, name in enumerate(COMPONENT_NAMES)]
+    rows = [MapRow(maps, [name] * 3, f"{name} ({told.unit})", signed_scale(maps)) for name, maps in each]
+    return maps_figure(field.grid, rows)
 
 
-def signed_scale(*rows: Sequence[NDArray[np.float64]]) -> dict[str, Any]:
+def signed_scale(*rows: Sequence[Floats]) -> dict[str, Any]:
     """Return the colours of rows of three maps with a sign, symmetric about zero: by what the middle planes show."""
     limit = symmetric_limit(*(plane.of(values) for maps in rows for plane, values in zip(PLANES, maps, strict=True)))
     return {"cmap": DIVERGING, "vmin": -limit, "vmax": limit}
@@ -255,34 +246,26 @@ def profiles_figure(field: VectorField) -> Figure:
     The band is the standard deviation of one vector (rms over the plane) to both sides, where it is known.
     """
     told = shown(field)
-    figure = new_figure(10.0, 7.5)
-    axes = figure.subplots(3, 3, sharey="row", sharex="col")
-    for component, row in enumerate(axes):
-        for axis, panel in enumerate(row):
-            _draw_profile(panel, field, told, component, axis)
-        row[0].set_ylabel(f"{COMPONENT_NAMES[component]} ({told.unit}), mean over the plane")
-    for axis, panel in enumerate(axes[-1]):
-        panel.set_xlabel(f"{AXIS_NAMES[axis]} (mm)")
+    figure, axes = new_panels(10.0, 7.5, 3, 3, sharey="row", sharex="col")
+    for (component, axis), panel in np.ndenumerate(axes):
+        others = tuple(k for k in range(3) if k != 2 - axis)
+        places, colour = field.grid.axis_mm(axis), COLOURS[component]
+        mean = mean_of_known(told.values[..., component], others)
+        panel.axhline(0.0, color=GREY, linewidth=0.8)
+        panel.plot(places, mean, "o-", color=colour)
+        if told.sigma is not None:
+            sigma = np.sqrt(mean_of_known(told.sigma[..., component] ** 2, others))
+            band: dict[str, Any] = {"color": colour, "alpha": 0.25, "linewidth": 0.0}
+            panel.fill_between(places, mean - sigma, mean + sigma, label="± σ of one vector", **band)
+    for k in range(3):
+        axes[k, 0].set_ylabel(f"{COMPONENT_NAMES[k]} ({told.unit}), mean over the plane")
+        axes[-1, k].set_xlabel(f"{AXIS_NAMES[k]} (mm)")
     if told.sigma is not None:
         axes[0, 0].legend()
     return figure
 
 
-def _draw_profile(axes: Axes, field: VectorField, told: Shown, component: int, axis: int) -> None:
-    others = tuple(k for k in range(3) if k != 2 - axis)
-    places = field.grid.axis_mm(axis)
-    mean = mean_of_known(told.values[..., component], others)
-    colour = COLOURS[component]
-    axes.axhline(0.0, color=GREY, linewidth=0.8)
-    axes.plot(places, mean, "o-", color=colour)
-    if told.sigma is not None:
-        sigma = np.sqrt(mean_of_known(told.sigma[..., component] ** 2, others))
-        axes.fill_between(
-            places, mean - sigma, mean + sigma, color=colour, alpha=0.25, linewidth=0.0, label="± σ of one vector"
-        )
-
-
-def mean_of_known(values: NDArray[np.float64], axes: tuple[int, ...]) -> NDArray[np.float64]:
+def mean_of_known(values: Floats, axes: tuple[int, ...]) -> Floats:
     """Return means over axes of what is finite, NaN where nothing is."""
     known = np.isfinite(values)
     count = known.sum(axis=axes)
@@ -291,35 +274,27 @@ def mean_of_known(values: NDArray[np.float64], axes: tuple[int, ...]) -> NDArray
     return mean
 
 
-@styled
 def sigma_figure(field: VectorField) -> Figure:
     """Return maps of the stated standard deviation of each component (rows), on one logarithmic scale.
+
+    Outer ones take the colours of the scale's ends.
 
     Raises
     ------
     ValueError : the field does not know it
     """
+    from matplotlib.colors import LogNorm
+
     told = shown(field)
     if told.sigma is None:
         raise ValueError("the field states no uncertainty")
-    figure, axes = plane_panels(field.grid, rows=3)
-    scale = logarithmic_scale(told.sigma)
-    for component, row in enumerate(axes):
-        title = f"σ of {COMPONENT_NAMES[component]}"
-        image = draw_maps(row, field.grid, [told.sigma[..., component]] * 3, [title] * 3, **scale)
-    figure.colorbar(image, ax=axes.ravel().tolist(), label=f"stated standard deviation ({told.unit})", shrink=0.6)
-    return figure
-
-
-def logarithmic_scale(values: NDArray[np.float64]) -> dict[str, Any]:
-    """Return the colours of positive values over several orders; outer ones take the colours of the ends."""
-    from matplotlib.colors import LogNorm
-
-    known = values[np.isfinite(values) & (values > 0.0)]
+    known = told.sigma[np.isfinite(told.sigma) & (told.sigma > 0.0)]
     low, high = np.percentile(known, SCALE_PERCENT) if known.size else (0.1, 1.0)
     if low == high:
         low, high = 0.5 * low, 2.0 * high
-    return {"cmap": SEQUENTIAL, "norm": LogNorm(low, high)}
+    label, scale = f"stated standard deviation ({told.unit})", {"cmap": SEQUENTIAL, "norm": LogNorm(low, high)}
+    each = [([told.sigma[..., component]] * 3, [f"σ of {name}"] * 3) for component, name in enumerate(COMPONENT_NAMES)]
+    return maps_figure(field.grid, [MapRow(maps, titles, label, scale) for maps, titles in each], shrink=0.6)
 
 
 @styled
@@ -342,14 +317,11 @@ def flags_figure(field: VectorField) -> Figure:
     return figure
 
 
-@styled
-def quality_figure(field: VectorField, names: dict[str, NDArray[np.float64]]) -> Figure:
+def quality_figure(field: VectorField, names: dict[str, Floats]) -> Figure:
     """Return maps of quantities [z, y, x] that tell how good vectors are (rows), each on its own scale from zero."""
-    figure, axes = plane_panels(field.grid, rows=len(names))
-    for row, (name, values) in zip(axes, names.items(), strict=True):
-        image = draw_maps(row, field.grid, [values] * 3, [""] * 3, vmin=0.0, vmax=symmetric_limit(values))
-        figure.colorbar(image, ax=row.tolist(), label=name)
-    return figure
+    scales = [{"vmin": 0.0, "vmax": symmetric_limit(values)} for values in names.values()]
+    each = zip(names.items(), scales, strict=True)
+    return maps_figure(field.grid, [MapRow([values] * 3, [""] * 3, name, scale) for (name, values), scale in each])
 
 
 @styled
@@ -362,8 +334,7 @@ def displacements_figure(field: VectorField, lens_mm: float | None = None) -> Fi
     units = {"voxels": np.ones(3)}
     if lens_mm is not None:
         units["microlenses"] = lens_mm / np.asarray(field.voxel_mm)
-    figure = new_figure(10.0, 2.6 * (1 + len(units)))
-    axes = figure.subplots(1 + len(units), 3)
+    figure, axes = new_panels(10.0, 2.6 * (1 + len(units)), 1 + len(units), 3)
     valid = field.displacement_voxel[field.flag == VALID]
     for component, column in enumerate(axes.T):
         values = valid[np.isfinite(valid[:, component]), component]
@@ -371,19 +342,14 @@ def displacements_figure(field: VectorField, lens_mm: float | None = None) -> Fi
         column[0].hist(values, bins=HISTOGRAM_BARS, color=colour)
         column[0].set(xlabel=f"displacement {name} (voxel)", ylabel="valid vectors")
         for panel, (unit, size) in zip(column[1:], units.items(), strict=True):
-            _draw_parts(panel, values / size[component], f"{name} beyond whole {unit} ({unit})", colour)
+            parts = values / size[component]
+            panel.hist(parts - np.round(parts), bins=PART_BARS, range=(-0.5, 0.5), color=colour)
+            panel.axhline(parts.size / PART_BARS, color="black", linestyle="--", linewidth=0.9, label="evenly spread")
+            panel.set(xlabel=f"{name} beyond whole {unit} ({unit})", ylabel="valid vectors", xlim=(-0.5, 0.5))
+            panel.legend()
     return figure
 
 
-def _draw_parts(axes: Axes, displacements: NDArray[np.float64], what: str, colour: str) -> None:
-    """Draw a histogram of parts from -1/2 to 1/2, and the line that evenly spread ones would follow."""
-    axes.hist(displacements - np.round(displacements), bins=PART_BARS, range=(-0.5, 0.5), color=colour)
-    axes.axhline(displacements.size / PART_BARS, color="black", linestyle="--", linewidth=0.9, label="evenly spread")
-    axes.set(xlabel=what, ylabel="valid vectors", xlim=(-0.5, 0.5))
-    axes.legend()
-
-
-@styled
 def gradients_figure(field: VectorField) -> Figure:
     """Return the vorticity across the three middle planes, and below it the divergence, zero in a liquid, in 1/s.
 
@@ -394,12 +360,79 @@ def gradients_figure(field: VectorField) -> Figure:
     if field.dt_s is None:
         raise ValueError("rates need a time between the frames")
     derived = derived_fields(field)
-    figure, axes = plane_panels(field.grid, rows=2)
     across = [derived.vorticity[..., plane.normal] for plane in PLANES]
     names = [f"vorticity along {AXIS_NAMES[plane.normal]}" for plane in PLANES]
     # One scale for both: the divergence, which should be zero, tells how much of the vorticity is noise.
     scale = signed_scale(across, [derived.divergence] * 3)
-    draw_maps(axes[0], field.grid, across, names, **scale)
-    image = draw_maps(axes[1], field.grid, [derived.divergence] * 3, ["divergence"] * 3, **scale)
-    figure.colorbar(image, ax=axes.ravel().tolist(), label="1/s", shrink=0.7)
+    rows = [(across, names), ([derived.divergence] * 3, ["divergence"] * 3)]
+    return maps_figure(field.grid, [MapRow(maps, titles, "1/s", scale) for maps, titles in rows], shrink=0.7)
+
+
+# A reconstructed volume [z, y, x], and weights: where a voxel's light falls, and how much by depth.
+
+# The scale of projections ends where so many (%) of their values lie within.
+BRIGHT_PERCENT = 99.8
+
+
+@styled
+def column_figure(
+    pixels: tuple[NDArray[np.int64], NDArray[np.int64]], weights: NDArray[np.float32], pixel_mm: float, title: str
+) -> Figure:
+    """Return one voxel's column as the sensor would see it, against pixels' numbers and mm on the sensor.
+
+    Parameters
+    ----------
+    pixels : rows and columns of the pixels that the voxel lights, one weight each
+    """
+    rows, columns = pixels
+    picture = np.zeros((int(np.ptp(rows)) + 1, int(np.ptp(columns)) + 1))
+    picture[rows - rows.min(), columns - columns.min()] = weights
+    left, right, top, bottom = columns.min() - 0.5, columns.max() + 0.5, rows.min() - 0.5, rows.max() + 0.5
+    figure, axis = new_panels(6.8, 6.0)
+    image = axis.imshow(picture, cmap="gray", extent=(left, right, bottom, top), interpolation="nearest")
+    figure.colorbar(image, ax=axis, label="weight (share of the voxel's light)", location="bottom", shrink=0.8)
+    axis.set(xlabel="column (px)", ylabel="row (px)")
+    beside = "mm, from the first pixel lit"
+    axis.secondary_xaxis("top", functions=_to_mm(left, pixel_mm)).set_xlabel(beside)
+    axis.secondary_yaxis("right", functions=_to_mm(top, pixel_mm)).set_ylabel(beside)
+    figure.suptitle(title)
+    return figure
+
+
+def _to_mm(first_px: float, pixel_mm: float) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
+    """Return the conversions from pixels to mm from a place, and back."""
+    return lambda px: (px - first_px) * pixel_mm, lambda mm: mm / pixel_mm + first_px
+
+
+@styled
+def light_figure(z_mm: Floats, sums: Mapping[str, Floats]) -> Figure:
+    """Return by depth how much of a voxel's light meets the sensor, for voxels at some lateral places."""
+    figure, axes = new_panels(6.5, 3.8)
+    for (name, values), colour, marker in zip(sums.items(), COLOURS, MARKERS, strict=False):
+        axes.plot(z_mm, values, f"{marker}-", color=colour, markerfacecolor="none", label=name)
+    highest = max((float(values.max()) for values in sums.values()), default=1.0)
+    axes.set(xlabel=DEPTH_LABEL, ylabel="sum of a voxel's weights (1)", ylim=(0.0, 1.05 * highest or 1.0))
+    axes.legend()
+    return figure
+
+
+@styled
+def projections_figure(volume: NDArray[np.float32], grid: Grid) -> Figure:
+    """Return the brightest voxel along each line of sight in the three directions, on one scale."""
+    figure, axes = plane_panels(grid)
+    # Along an axis that a plane is across, nothing is left but the plane.
+    seen = [volume.max(axis=2 - plane.normal) for plane in PLANES]
+    limit = float(np.percentile(np.concatenate([each.ravel() for each in seen]), BRIGHT_PERCENT)) or 1.0
+    titles = [f"largest along {AXIS_NAMES[plane.normal]}" for plane in PLANES]
+    image = draw_maps(axes[0], grid, seen, titles, cmap="inferno", vmin=0.0, vmax=limit)
+    figure.colorbar(image, ax=axes[0].tolist(), label="intensity (1)", shrink=0.75, extend="max")
+    return figure
+
+
+@styled
+def depths_figure(volume: NDArray[np.float32], grid: Grid) -> Figure:
+    """Return the mean intensity of each plane by depth."""
+    figure, axes = new_panels(6.0, 3.6)
+    axes.plot(grid.axis_mm(2), volume.mean(axis=(1, 2), dtype=np.float64))
+    axes.set(xlabel=DEPTH_LABEL, ylabel="mean intensity of the plane (1)", ylim=(0.0, None))
     return figure

@@ -27,10 +27,9 @@ from lfpiv_cli.notice import Notice
 from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.reference import Reference
 from lfpiv_cli.stages.validate_board import depths_in_volume, validate_board
-from lfpiv_cli.synthetic.vortices import Flow
-from lfpiv_cli.validation.flow import Duct, limits_missed, truth_at_points
+from lfpiv_cli.synthetic.flows import Flow
+from lfpiv_cli.validation.flow import Duct, Measured, limits_missed, truth_at_points
 from lfpiv_cli.validation.methods import (
-    Measured,
     errors_figure,
     flow_figure,
     lower_error,
@@ -44,11 +43,8 @@ from lfpiv_cli.validation.weights import (
     SHOWN_BEHIND_FACES,
     TABLE1_MM,
     columns_figure,
-    in_view,
+    judged_voxels,
     make_columns,
-    make_curved_columns,
-    sample_voxels,
-    seen_voxels,
     similarity_figure,
     weights_figures,
     weights_limits_missed,
@@ -115,18 +111,11 @@ def validate_weights(
     camera, grid = settings.camera_model(), settings.grid()
     rng = np.random.default_rng(chosen.seed)
     scene = settings.scene_space()
-    if scene is not None:
-        voxels = seen_voxels(camera, scene, grid, len(TABLE1_MM) + chosen.sample, rng)
-        long_count = np.where(np.arange(len(voxels)) < len(TABLE1_MM), chosen.long_count_rays, 0)
-        with console.progress(len(voxels), "validate weights") as advance:
-            columns = make_curved_columns(camera, scene, grid, voxels, rng, long_count, advance)
-    else:
-        space = _space(settings)
-        known = [centre for centre in TABLE1_MM if in_view(camera, space, centre, grid.spacing_mm)]
-        centres = np.concatenate([np.array(known).reshape(-1, 3), sample_voxels(grid, chosen.sample, rng)])
-        long_count = np.where(np.arange(len(centres)) < len(known), chosen.long_count_rays, 0)
-        with console.progress(len(centres), "validate weights") as advance:
-            columns = make_columns(camera, space, centres, grid.spacing_mm, rng, long_count, advance)
+    space = _space(settings) if scene is None else scene
+    centres, counted = judged_voxels(camera, space, grid, chosen.sample, rng)
+    long_count = np.where(counted, chosen.long_count_rays, 0)
+    with console.progress(len(centres), "validate weights") as advance:
+        columns = make_columns(camera, space, grid, centres, rng, long_count, advance)
     figures = weights_figures(columns, long_count)
     missed = weights_limits_missed(figures, chosen.limits.model_dump())
     record = provenance_record("validate weights", settings.resolved(), {"config": config})

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.calibration.shape_fit import nearest_points, undistorted
 from lfpiv_cli.calibration.views import charuco_board
@@ -22,9 +23,8 @@ from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.media import Media, equivalent_object_distance, exact_lateral_mm
 from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.optics.waves import Waves
-from lfpiv_cli.synthetic.ray_sequence import SEQUENCE, diffused_mm
-from lfpiv_cli.synthetic.render import Balls, Space
-from lfpiv_cli.synthetic.wave_images import lens_blur_mm, render_balls, white_image
+from lfpiv_cli.synthetic.rays import GOLDEN_ANGLE, SEQUENCE, diffused_mm
+from lfpiv_cli.synthetic.render import Balls, Space, lens_blur_mm, render_points, render_white
 
 # Expected images of calibration targets printed on a plate: chessboards and ChArUco boards.
 #
@@ -55,15 +55,15 @@ ROWS_AT_ONCE = 16
 class Plate:
     """A printed plate: its middle and unit vectors along its x and y (3, each), and what is printed, 0 to 1."""
 
-    middle_mm: NDArray[np.float64]
-    along_x: NDArray[np.float64]
-    along_y: NDArray[np.float64]
+    middle_mm: Floats
+    along_x: Floats
+    along_y: Floats
     picture: NDArray[np.float32]
     samples_per_mm: float
 
 
-def printed_plate(camera: Camera, board: BoardGeometry, plate_mm: NDArray[np.float64]) -> Plate:
-    """Return the plate of a target.
+def printed_plate(camera: Camera, board: BoardGeometry, plate_mm: Floats) -> Plate:
+    """Return the plate of a target: what is printed, rows along y and columns along x, `SQUARE_SAMPLES` to a square.
 
     Parameters
     ----------
@@ -72,80 +72,57 @@ def printed_plate(camera: Camera, board: BoardGeometry, plate_mm: NDArray[np.flo
     middle, x, y = camera.to_image_axes(plate_mm)
     # a print is read from the front, whatever the sensor's axes are called
     along_x = x - middle if camera.column_axis == "x" else middle - x
-    samples = SQUARE_SAMPLES / board.spacing_mm
-    return Plate(middle, along_x, y - middle, target_picture(board).astype(np.float32) / 255.0, samples)
-
-
-def target_picture(board: BoardGeometry) -> NDArray[np.uint8]:
-    """Return what is printed, 255 where bright, (rows along y, columns along x), `SQUARE_SAMPLES` to a square."""
     across, down = (n + 1 for n in board.dots)
     margin = round(MARGIN_SQUARES * SQUARE_SAMPLES)
     if board.pattern == "charuco":
         size = (across * SQUARE_SAMPLES + 2 * margin, down * SQUARE_SAMPLES + 2 * margin)
-        return np.asarray(charuco_board(board).generateImage(size, marginSize=margin), dtype=np.uint8)
-    squares = np.indices((down, across)).sum(axis=0) % 2
-    picture = np.kron(255 * squares, np.ones((SQUARE_SAMPLES, SQUARE_SAMPLES))).astype(np.uint8)
-    return np.asarray(cv2.copyMakeBorder(picture, margin, margin, margin, margin, cv2.BORDER_CONSTANT, value=255))
+        picture = np.asarray(charuco_board(board).generateImage(size, marginSize=margin), dtype=np.uint8)
+    else:
+        squares = np.kron(255 * (np.indices((down, across)).sum(axis=0) % 2), np.ones((SQUARE_SAMPLES, SQUARE_SAMPLES)))
+        around = (squares.astype(np.uint8), margin, margin, margin, margin)
+        picture = np.asarray(cv2.copyMakeBorder(*around, cv2.BORDER_CONSTANT, value=255))
+    printed = picture.astype(np.float32) / 255.0
+    return Plate(middle, along_x, y - middle, printed, SQUARE_SAMPLES / board.spacing_mm)
 
 
-def render_plate(
-    camera: Camera, space: ObjectSpace, plate: Plate, level: float, blur_px: NDArray[np.float64] | None = None
-) -> NDArray[np.float64]:
+def render_plate(camera: Camera, space: ObjectSpace, plate: Plate, level: float, blur_px: Floats) -> Floats:
     """Render a lit plate, (rows, columns) float64 expected counts; light outside a pixel's own micro-image is left out.
 
     Parameters
     ----------
     level : expected counts of a pixel that sees only what is bright
-    blur_px : (n, 2) places beside where rays would end on the sensor, which they take in turn; default: as charge
-        diffuses
+    blur_px : (n, 2) places beside where rays would end on the sensor, which they take in turn
 
     Raises
     ------
     ConfigError : no window for exact refraction
     """
-    blur = diffused_mm(camera) / camera.pixel_mm if blur_px is None else blur_px
-    samples = SAMPLES_PER_SIDE if len(blur) == 1 else BLURRED_SAMPLES_PER_SIDE
+    samples = SAMPLES_PER_SIDE if len(blur_px) == 1 else BLURRED_SAMPLES_PER_SIDE
     line = (np.arange(samples) + 0.5) / samples - 0.5
-    places = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2) - blur[np.arange(samples**2) % len(blur)]
+    # about the middle of a pixel, where rays would end but for the blur
+    places = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2) - blur_px[np.arange(samples**2) % len(blur_px)]
+    centred = Lattice(np.zeros(2), camera.lattice.basis, camera.lattice.layout)
+    size = np.array(plate.picture.shape[::-1])
     image = np.empty((camera.rows, camera.columns))
     for top in range(0, camera.rows, ROWS_AT_ONCE):
         row, column = np.mgrid[top : min(top + ROWS_AT_ONCE, camera.rows), : camera.columns]
         px = np.stack([column, row], axis=-1).astype(np.float64)
-        image[top : top + len(px)] = level * _bright_share(px, places, camera, space, plate)
+        first, total = (px @ PIXEL_STEPS).reshape(-1, 2), np.zeros(px.shape[:2])
+        for k, place in enumerate(places):
+            cell = ((first + k * SEQUENCE[:2]) % 1.0) @ centred.basis
+            offset = cell - nearest_points(cell, centred.origin, centred.basis)
+            crossing, slope = _rays_to((px + place).reshape(-1, 2), offset, camera)
+            passes = np.flatnonzero(np.hypot(crossing[:, 0], crossing[:, 1]) <= camera.aperture_radius_mm)
+            on_plate = _on_plate(crossing[passes], slope[passes], camera, space, plate)
+            x, y = np.floor(on_plate * plate.samples_per_mm + size / 2.0).astype(np.int64).T
+            there = (x >= 0) & (x < size[0]) & (y >= 0) & (y < size[1])
+            printed = plate.picture[np.where(there, y, 0), np.where(there, x, 0)]
+            total.ravel()[passes] += np.where(there, printed, np.float32(0.0))
+        image[top : top + len(px)] = level * (total / len(places))
     return image
 
 
-def _bright_share(
-    px: NDArray[np.float64], places: NDArray[np.float64], camera: Camera, space: ObjectSpace, plate: Plate
-) -> NDArray[np.float64]:
-    """Return the share (rows, columns) of the rays to pixels, (rows, columns, 2), that start on something bright.
-
-    `places` (n, 2) are those about the middle of a pixel where rays would end but for the blur.
-    """
-    centred = Lattice(np.zeros(2), camera.lattice.basis, camera.lattice.layout)
-    first = (px @ PIXEL_STEPS).reshape(-1, 2)
-    total = np.zeros(px.shape[:2])
-    for k, place in enumerate(places):
-        cell = ((first + k * SEQUENCE[:2]) % 1.0) @ centred.basis
-        offset = cell - nearest_points(cell, centred.origin, centred.basis)
-        crossing, slope = _rays_to((px + place).reshape(-1, 2), offset, camera)
-        passes = np.flatnonzero(np.hypot(crossing[:, 0], crossing[:, 1]) <= camera.aperture_radius_mm)
-        on_plate = _on_plate(crossing[passes], slope[passes], camera, space, plate)
-        total.ravel()[passes] += _printed_at(on_plate, plate)
-    return total / len(places)
-
-
-def _printed_at(on_plate_mm: NDArray[np.float64], plate: Plate) -> NDArray[np.float32]:
-    """Return what is printed (n,) at places (n, 2) about the plate's middle, 0 beyond the plate."""
-    size = np.array(plate.picture.shape[::-1])
-    column, row = np.floor(on_plate_mm * plate.samples_per_mm + size / 2.0).astype(np.int64).T
-    there = (column >= 0) & (column < size[0]) & (row >= 0) & (row < size[1])
-    return np.where(there, plate.picture[np.where(there, row, 0), np.where(there, column, 0)], np.float32(0.0))
-
-
-def _rays_to(
-    px: NDArray[np.float64], offset_mm: NDArray[np.float64], camera: Camera
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _rays_to(px: Floats, offset_mm: Floats, camera: Camera) -> tuple[Floats, Floats]:
     """Return where rays cross the main lens (n, 2) and their slopes in front of it (n, 2).
 
     They end at places on the sensor, under the nearest microlens, beside whose centre they pass by `offset_mm` (n, 2).
@@ -160,9 +137,7 @@ def _rays_to(
     return crossing, behind + crossing / camera.focal_length_mm
 
 
-def _on_plate(
-    crossing_mm: NDArray[np.float64], slope: NDArray[np.float64], camera: Camera, space: ObjectSpace, plate: Plate
-) -> NDArray[np.float64]:
+def _on_plate(crossing_mm: Floats, slope: Floats, camera: Camera, space: ObjectSpace, plate: Plate) -> Floats:
     """Return where on the plate (n, 2), about its middle, rays start that cross the main lens with given slopes."""
     thicknesses, indices = space.layers(camera)
     per_depth = space.media.depth_ratio if len(indices) == 1 else 1.0
@@ -184,7 +159,6 @@ def _on_plate(
 # A dot is made of this many points in a sunflower's order, small balls that close the gaps between them: 0.2 mm dots of
 # 0.0125 mm points, an eighth of a microlens. By waves they are points: 1 % of their light (L1) is astray.
 POINTS_PER_DOT = 256
-GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 
 # A dot as bright as a white image sends some 5e6 photons: these rays add about half of its shot noise.
 RAYS_PER_POINT = 4_000
@@ -207,28 +181,26 @@ class BoardPlacement:
     tilt_deg: tuple[float, float] = (0.0, 0.0)
     rotation_deg: float = 0.0
 
-    def to_world(self, plate_mm: ArrayLike) -> NDArray[np.float64]:
+    def to_world(self, plate_mm: ArrayLike) -> Floats:
         """Return points of the plate, (..., 2) about its centre, in world axes, (..., 3)."""
         plate = np.asarray(plate_mm, dtype=np.float64)
         turn = np.deg2rad(self.rotation_deg)
         axes = np.array([[np.cos(turn), np.sin(turn), 0.0], [-np.sin(turn), np.cos(turn), 0.0]])
-        return plate @ axes @ self._tilt_matrix().T + np.array([*self.offset_mm, self.z_mm])
-
-    def _tilt_matrix(self) -> NDArray[np.float64]:
-        """Return the shortest rotation that brings the z axis onto the plate's normal."""
+        # the shortest rotation that brings the z axis onto the plate's normal
         normal = np.array([*-np.tan(np.deg2rad(self.tilt_deg)), 1.0])
         normal /= np.linalg.norm(normal)
         x, y, z = normal
         spin = np.array([[0.0, 0.0, x], [0.0, 0.0, y], [-x, -y, 0.0]])
-        return np.eye(3) + spin + spin @ spin / (1.0 + z)
+        tilt = np.eye(3) + spin + spin @ spin / (1.0 + z)
+        return plate @ axes @ tilt.T + np.array([*self.offset_mm, self.z_mm])
 
 
-def dot_centres(board: BoardGeometry, placement: BoardPlacement) -> NDArray[np.float64]:
+def dot_centres(board: BoardGeometry, placement: BoardPlacement) -> Floats:
     """Return the dots' centres in world axes, (n, 3) mm, the first index along x running fastest."""
     return placement.to_world(_plate_centres(board))
 
 
-def _plate_centres(board: BoardGeometry) -> NDArray[np.float64]:
+def _plate_centres(board: BoardGeometry) -> Floats:
     x, y = (board.spacing_mm * (np.arange(n) - (n - 1) / 2) for n in board.dots)
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
@@ -249,7 +221,7 @@ def render_board(
     *,
     waves: Waves | None = None,
     progress: Callable[[int], None] | None = None,
-) -> NDArray[np.float64]:
+) -> Floats:
     """Render bright dots on dark ground, dark dots on ground that fills the view, or a lit print.
 
     Parameters
@@ -276,8 +248,8 @@ def render_board(
         if isinstance(space, CurvedSpace):
             raise ConfigError(f"board.pattern: is {board.pattern}; behind the faces of a scene only dots are simulated")
         steps = placement.to_world([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-        blur = None if waves is None else lens_blur_mm(camera, waves) / camera.pixel_mm
-        return render_plate(camera, space, printed_plate(camera, board, steps), level, blur)
+        blur = diffused_mm(camera) if waves is None else lens_blur_mm(camera, waves)
+        return render_plate(camera, space, printed_plate(camera, board, steps), level, blur / camera.pixel_mm)
     plate = _plate_centres(board)
     if shown is not None:
         plate = plate[np.asarray(shown, dtype=bool)]
@@ -286,14 +258,15 @@ def render_board(
     area = 0.25 * np.pi * board.dot_diameter_mm**2 / POINTS_PER_DOT
     light = area * light_per_area(camera, space.media, points[:, 2], level)
     size = board.dot_diameter_mm / np.sqrt(POINTS_PER_DOT) if waves is None else 0.0
-    dots = render_balls(camera, space, Balls(points, light, size), rng, waves, rays=RAYS_PER_POINT, progress=progress)
+    balls = Balls(points, light, size)
+    dots = render_points(camera, space, balls, rng, waves=waves, rays=RAYS_PER_POINT, progress=progress)
     if board.polarity != "dark":
         return dots
     # the rays' noise may ask for more than there is
-    return np.maximum(white_image(camera, waves, level) - dots, 0.0)
+    return np.maximum(render_white(camera, level, waves=waves) - dots, 0.0)
 
 
-def light_per_area(camera: Camera, media: Media, z_mm: ArrayLike, level: float) -> NDArray[np.float64]:
+def light_per_area(camera: Camera, media: Media, z_mm: ArrayLike, level: float) -> Floats:
     """Return the light of a plane at depth z that gives pixels `level` counts where it fills the aperture, per mm^2.
 
     A micro-image has `level` times its pixels; it comes from one lens's cell of the array, which is that of the plane
@@ -305,7 +278,7 @@ def light_per_area(camera: Camera, media: Media, z_mm: ArrayLike, level: float) 
     return per_lens / camera.lattice.cell_area * (camera.image_distance_mm / distance) ** 2
 
 
-def sunflower(count: int, radius: float) -> NDArray[np.float64]:
+def sunflower(count: int, radius: float) -> Floats:
     """Return points that fill a disc evenly, (count, 2), their mean at its centre: the order alone is off by 0.2 %."""
     k = np.arange(count)
     r = radius * np.sqrt((k + 0.5) / count)

@@ -1,8 +1,8 @@
 """Known flows, made by small factories, and the way of what they carry.
 
 Axes: world (x, y, z), z away from the camera, in the frame of the points that are passed in; each flow is placed by its
-`centre_mm` in that frame. Points in mm, velocities in m/s, rates per second. A new flow is one factory and one line of
-`FLOWS`.
+`centre_mm` in that frame. Points in mm, velocities in m/s, rates and gradients per second, pressures in Pa. A new flow
+is one factory, which tells it about the origin, and one line of `FLOWS`.
 """
 
 from __future__ import annotations
@@ -12,29 +12,79 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from lfpiv_cli.synthetic.vortices import (
-    MM_PER_M,
-    ORIGIN,
-    Axis,
-    Flow,
-    KnownFlow,
-    abc,
-    axis_index,
-    dynamic_pressure,
-    source,
-    taylor_green,
-    vortex_ring,
-)
+from lfpiv_cli.arrays import Floats
+
+Flow = Callable[[Floats], Floats]
+"""Velocities in m/s, (n, 3), at points in mm, (n, 3)."""
+
+Pressure = Callable[[Floats, float], Floats]
+"""Pressures in Pa, (n,), up to a constant, at points in mm, (n, 3), of a fluid of a density in kg/m^3."""
+
+Axis = Literal["x", "y", "z"]
+
+MM_PER_M = 1000.0
+
+ORIGIN = (0.0, 0.0, 0.0)
 
 # The terms of the duct's series fall as n^-3 exp(-n pi (1/2 - |z|/D)): 40 odd ones leave 1e-6 of the peak at the wall
 # itself and nothing a window's width away from it.
-DUCT_TERMS = 40
+DUCT_ORDERS = 2 * np.arange(40) + 1
 
 # A tracer turns by a fraction of a radian in a pair; over a quarter of a radian four Runge-Kutta steps of order 4 leave
 # 5e-8 of its distance from the vortex's centre.
 ADVECTION_STEPS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class KnownFlow:
+    """A steady flow, called like its velocities.
+
+    Attributes
+    ----------
+    velocity : (n, 3) in m/s at points (n, 3) in mm
+    gradient : (n, 3, 3) in 1/s, of component i along axis j
+    pressure : that of an inviscid fluid, whose gradient is what accelerates this one; None where it has no closed form
+    """
+
+    velocity: Flow
+    gradient: Callable[[Floats], Floats]
+    pressure: Pressure | None = None
+
+    def __call__(self, points_mm: Floats) -> Floats:
+        """Return the velocities (n, 3) in m/s at points (n, 3) in mm."""
+        return self.velocity(points_mm)
+
+
+def _placed(
+    flow: Flow,
+    gradient: Callable[[Floats], Floats] | Floats,
+    centre_mm: Sequence[float],
+    velocity_m_s: Sequence[float] | None = None,
+    pressure: Pressure | None = None,
+) -> KnownFlow:
+    """Return a flow about the origin moved to a centre, plus a uniform velocity; one gradient (3, 3) is everywhere."""
+    centre = np.asarray(centre_mm, dtype=np.float64)
+    uniform_m_s = np.zeros(3) if velocity_m_s is None else np.asarray(velocity_m_s, dtype=np.float64)
+
+    def velocity(points_mm: Floats) -> Floats:
+        own = flow(points_mm - centre)
+        return own if velocity_m_s is None else np.asarray(own + uniform_m_s)
+
+    def slopes(points_mm: Floats) -> Floats:
+        return gradient(points_mm - centre) if callable(gradient) else np.tile(gradient, (len(points_mm), 1, 1))
+
+    def pressures(points_mm: Floats, density_kg_m3: float) -> Floats:
+        assert pressure is not None
+        return pressure(points_mm - centre, density_kg_m3)
+
+    return KnownFlow(velocity, slopes, None if pressure is None else pressures)
+
+
+def dynamic_pressure(velocity_m_s: Floats, density_kg_m3: float) -> Floats:
+    """Return rho |v|^2 / 2, (n,) in Pa, of velocities (n, 3)."""
+    return np.asarray(0.5 * density_kg_m3 * np.sum(velocity_m_s**2, axis=1))
 
 
 def square_duct(
@@ -47,64 +97,43 @@ def square_duct(
     Solves u'' = const with u = 0 on the walls: a parabola across y (or x) less a Fourier series of functions that are
     harmonic, so that the equation holds exactly however few terms are kept. The mean over the section scales it.
     """
-    along = axis_index(axis)
+    along = "xyz".index(axis)
     across = 1 - along
-    scale = mean_velocity_m_s / _duct_section_mean()
+    waves = 0.5 * np.pi * DUCT_ORDERS
+    # over the mean over the square [-1, 1]^2 of u for u'' = -2
+    scale = mean_velocity_m_s / float(2.0 / 3.0 - np.sum(4.0 * np.tanh(waves) / waves**5))
 
-    def flow(points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        relative = (points_mm - np.asarray(centre_mm, dtype=np.float64)) / (0.5 * width_mm)
-        velocity = np.zeros_like(relative)
-        velocity[:, along] = scale * _duct_profile(relative[:, across], relative[:, 2])
+    def flow(relative_mm: Floats) -> Floats:
+        places = relative_mm / (0.5 * width_mm)
+        beside, depth = places[:, across], places[:, 2]
+        profile = 1.0 - beside**2
+        inner_depth = np.minimum(np.abs(depth), 1.0)
+        for wave in waves:
+            # cosh(wave z)/cosh(wave) in exponentials that cannot overflow
+            decay = np.exp(wave * (inner_depth - 1.0)) * (1.0 + np.exp(-2.0 * wave * inner_depth))
+            decay /= 1.0 + np.exp(-2.0 * wave)
+            profile -= 4.0 * np.sin(wave) / wave**3 * np.cos(wave * beside) * decay
+        velocity = np.zeros_like(places)
+        velocity[:, along] = scale * np.where((np.abs(beside) >= 1.0) | (np.abs(depth) >= 1.0), 0.0, profile)
         return velocity
 
-    def gradient(points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        relative = (points_mm - np.asarray(centre_mm, dtype=np.float64)) / (0.5 * width_mm)
-        found = np.zeros((len(points_mm), 3, 3))
-        slopes = _duct_slopes(relative[:, across], relative[:, 2])
-        found[:, along, across], found[:, along, 2] = (scale * MM_PER_M / (0.5 * width_mm) * slope for slope in slopes)
+    def gradient(relative_mm: Floats) -> Floats:
+        places = relative_mm / (0.5 * width_mm)
+        beside, depth = places[:, across], places[:, 2]
+        by_across, by_depth = -2.0 * beside, np.zeros_like(depth)
+        inside = (np.abs(beside) < 1.0) & (np.abs(depth) < 1.0)
+        inner_depth = np.minimum(np.abs(depth), 1.0)
+        for wave in waves:
+            grown, shrunk = np.exp(wave * (inner_depth - 1.0)), np.exp(-2.0 * wave * inner_depth)
+            factor = 4.0 * np.sin(wave) / wave**2 * grown / (1.0 + np.exp(-2.0 * wave))
+            by_across += factor * np.sin(wave * beside) * (1.0 + shrunk)
+            by_depth -= factor * np.cos(wave * beside) * (1.0 - shrunk)
+        found, per_width = np.zeros((len(places), 3, 3)), scale * MM_PER_M / (0.5 * width_mm)
+        found[:, along, across] = per_width * np.where(inside, by_across, 0.0)
+        found[:, along, 2] = per_width * np.where(inside, np.sign(depth) * by_depth, 0.0)
         return found
 
-    return KnownFlow(flow, gradient)
-
-
-def _duct_profile(across: NDArray[np.float64], depth: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return u on the square [-1, 1]^2 for u'' = -2, zero on its edge and outside."""
-    profile = 1.0 - across**2
-    outside = (np.abs(across) >= 1.0) | (np.abs(depth) >= 1.0)
-    inner_depth = np.minimum(np.abs(depth), 1.0)
-    for order in _duct_orders():
-        wave = 0.5 * np.pi * order
-        # cosh(wave z)/cosh(wave) in exponentials that cannot overflow
-        decay = np.exp(wave * (inner_depth - 1.0)) * (1.0 + np.exp(-2.0 * wave * inner_depth))
-        decay /= 1.0 + np.exp(-2.0 * wave)
-        profile -= 4.0 * np.sin(wave) / wave**3 * np.cos(wave * across) * decay
-    return np.where(outside, 0.0, profile)
-
-
-def _duct_slopes(
-    across: NDArray[np.float64], depth: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the derivatives of `_duct_profile` across and along the depth, zero on its edge and outside."""
-    by_across, by_depth = -2.0 * across, np.zeros_like(depth)
-    inside = (np.abs(across) < 1.0) & (np.abs(depth) < 1.0)
-    inner_depth = np.minimum(np.abs(depth), 1.0)
-    for order in _duct_orders():
-        wave = 0.5 * np.pi * order
-        grown, shrunk = np.exp(wave * (inner_depth - 1.0)), np.exp(-2.0 * wave * inner_depth)
-        factor = 4.0 * np.sin(wave) / wave**2 * grown / (1.0 + np.exp(-2.0 * wave))
-        by_across += factor * np.sin(wave * across) * (1.0 + shrunk)
-        by_depth -= factor * np.cos(wave * across) * (1.0 - shrunk)
-    return np.where(inside, by_across, 0.0), np.where(inside, np.sign(depth) * by_depth, 0.0)
-
-
-def _duct_section_mean() -> float:
-    """Return the mean of `_duct_profile` over the square."""
-    wave = 0.5 * np.pi * _duct_orders()
-    return float(2.0 / 3.0 - np.sum(4.0 * np.tanh(wave) / wave**5))
-
-
-def _duct_orders() -> NDArray[np.int64]:
-    return 2 * np.arange(DUCT_TERMS) + 1
+    return _placed(flow, gradient, centre_mm)
 
 
 def pipe(
@@ -117,47 +146,40 @@ def pipe(
 
     The axis is x, y or a direction of any length, towards which the fluid flows.
     """
-    along = np.eye(3)[axis_index(axis)] if axis in ("x", "y") else _unit(np.asarray([axis], dtype=np.float64))[0]
+    along = np.eye(3)["xyz".index(axis)] if axis in ("x", "y") else _unit(np.asarray([axis], dtype=np.float64))[0]
 
-    def across(points_mm: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def across(relative_mm: Floats) -> tuple[Floats, Floats]:
         """Return places from the axis over the radius, (n, 3), and 1 - r^2/R^2, (n,)."""
-        relative = (points_mm - np.asarray(centre_mm, dtype=np.float64)) / radius_mm
+        relative = relative_mm / radius_mm
         relative -= (relative @ along)[:, np.newaxis] * along
         return relative, 1.0 - np.sum(relative**2, axis=1)
 
-    def flow(points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        speed = 2.0 * mean_velocity_m_s * np.maximum(across(points_mm)[1], 0.0)
+    def flow(relative_mm: Floats) -> Floats:
+        speed = 2.0 * mean_velocity_m_s * np.maximum(across(relative_mm)[1], 0.0)
         return np.asarray(speed[:, np.newaxis] * along)
 
-    def gradient(points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        relative, profile = across(points_mm)
+    def gradient(relative_mm: Floats) -> Floats:
+        relative, profile = across(relative_mm)
         slope = -4.0 * mean_velocity_m_s * MM_PER_M / radius_mm * relative
         slope = np.where(profile[:, np.newaxis] > 0.0, slope, 0.0)
         return np.asarray(along[:, np.newaxis] * slope[:, np.newaxis, :])
 
-    return KnownFlow(flow, gradient)
+    return _placed(flow, gradient, centre_mm)
 
 
 def rigid_rotation(
-    angular_velocity_rad_s: Sequence[float],
-    centre_mm: Sequence[float] = ORIGIN,
-    velocity_m_s: Sequence[float] = ORIGIN,
+    angular_velocity_rad_s: Sequence[float], centre_mm: Sequence[float] = ORIGIN, velocity_m_s: Sequence[float] = ORIGIN
 ) -> KnownFlow:
     """Return omega x (r - centre) + velocity, omega in rad/s (right-handed about x, y, z), and its pressure."""
     omega = np.asarray(angular_velocity_rad_s, dtype=np.float64)
 
-    def flow(points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.cross(omega, points_mm - np.asarray(centre_mm)) / MM_PER_M + np.asarray(velocity_m_s)
+    def flow(relative_mm: Floats) -> Floats:
+        return np.cross(omega, relative_mm) / MM_PER_M
 
-    def pressure(points_mm: NDArray[np.float64], density_kg_m3: float) -> NDArray[np.float64]:
-        return dynamic_pressure(flow(points_mm), density_kg_m3)
+    def pressure(relative_mm: Floats, density_kg_m3: float) -> Floats:
+        return dynamic_pressure(flow(relative_mm) + np.asarray(velocity_m_s), density_kg_m3)
 
-    return KnownFlow(flow, _constant(np.cross(omega, np.eye(3)).T), pressure)
-
-
-def _constant(gradient: NDArray[np.float64]) -> Flow:
-    """Return the same gradient (3, 3) everywhere."""
-    return lambda points_mm: np.tile(gradient, (len(points_mm), 1, 1))
+    return _placed(flow, np.cross(omega, np.eye(3)).T, centre_mm, velocity_m_s, pressure)
 
 
 def shear(
@@ -168,25 +190,21 @@ def shear(
     velocity_m_s: Sequence[float] = ORIGIN,
 ) -> KnownFlow:
     """Return a velocity along one axis that grows by `rate_per_s` per length across, plus a uniform velocity."""
-    component, coordinate = axis_index(along), axis_index(across)
+    component, coordinate = "xyz".index(along), "xyz".index(across)
 
-    def flow(points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        velocity = np.tile(np.asarray(velocity_m_s, dtype=np.float64), (len(points_mm), 1))
-        velocity[:, component] += rate_per_s * (points_mm[:, coordinate] - centre_mm[coordinate]) / MM_PER_M
+    def flow(relative_mm: Floats) -> Floats:
+        velocity = np.zeros((len(relative_mm), 3))
+        velocity[:, component] = rate_per_s * relative_mm[:, coordinate] / MM_PER_M
         return velocity
 
     gradient = np.zeros((3, 3))
     gradient[component, coordinate] = rate_per_s
-    return KnownFlow(flow, _constant(gradient))
+    return _placed(flow, gradient, centre_mm, velocity_m_s)
 
 
 def uniform(velocity_m_s: Sequence[float]) -> KnownFlow:
     """Return the same velocity everywhere."""
-
-    def flow(points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.tile(np.asarray(velocity_m_s, dtype=np.float64), (len(points_mm), 1))
-
-    return KnownFlow(flow, _constant(np.zeros((3, 3))))
+    return _placed(lambda relative_mm: np.zeros((len(relative_mm), 3)), np.zeros((3, 3)), ORIGIN, velocity_m_s)
 
 
 def random_modes(
@@ -207,42 +225,202 @@ def random_modes(
     wave = 2.0 * np.pi * np.exp(rng.uniform(-np.log(longest_mm), -np.log(shortest_mm), modes))
     direction, other = _unit(rng.normal(size=(modes, 3))), rng.normal(size=(modes, 3))
     polarisation = _unit(np.cross(direction, other))
-    phase = rng.uniform(0.0, 2.0 * np.pi, modes)
+    phase, along = rng.uniform(0.0, 2.0 * np.pi, modes), wave[:, np.newaxis] * direction
     # the energy of an interval of ln k is k E(k); a wave of amplitude a has a^2 / 2, over three components
     amplitude = wave ** (-1.0 / 3.0)
     amplitude *= rms_m_s * np.sqrt(6.0 / np.sum(amplitude**2))
 
-    def flow(points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        relative = points_mm - np.asarray(centre_mm, dtype=np.float64)
-        waves = np.cos(relative @ (wave[:, np.newaxis] * direction).T + phase)
-        return waves @ (amplitude[:, np.newaxis] * polarisation) + np.asarray(velocity_m_s, dtype=np.float64)
+    def flow(relative_mm: Floats) -> Floats:
+        return np.asarray(np.cos(relative_mm @ along.T + phase) @ (amplitude[:, np.newaxis] * polarisation))
 
-    def gradient(points_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-        relative = points_mm - np.asarray(centre_mm, dtype=np.float64)
-        along = wave[:, np.newaxis] * direction
-        slopes = -np.sin(relative @ along.T + phase)
+    def gradient(relative_mm: Floats) -> Floats:
+        slopes = -np.sin(relative_mm @ along.T + phase)
         by_mode = amplitude[:, np.newaxis, np.newaxis] * polarisation[:, :, np.newaxis] * along[:, np.newaxis]
         return np.asarray(MM_PER_M * np.tensordot(slopes, by_mode, axes=1))
 
-    return KnownFlow(flow, gradient)
+    return _placed(flow, gradient, centre_mm, velocity_m_s)
 
 
-def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+def _unit(vectors: Floats) -> Floats:
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
-FLOWS: dict[str, Callable[..., KnownFlow]] = {
-    "square_duct": square_duct,
-    "pipe": pipe,
-    "rigid_rotation": rigid_rotation,
-    "taylor_green": taylor_green,
-    "shear": shear,
-    "uniform": uniform,
-    "random_modes": random_modes,
-    "abc": abc,
-    "vortex_ring": vortex_ring,
-    "source": source,
-}
+def taylor_green(
+    amplitude_m_s: float,
+    wavelength_mm: float,
+    centre_mm: Sequence[float] = ORIGIN,
+    plane: Literal["xy", "xz", "yz"] = "xz",
+    third_amplitude_m_s: float | None = None,
+    velocity_m_s: Sequence[float] = ORIGIN,
+) -> KnownFlow:
+    """Return Taylor-Green vortices plus a uniform velocity; the corner where the vortices meet is the centre.
+
+    Plane ones, in `plane` (a, b): v_a = A sin(k a) cos(k b), v_b = -A cos(k a) sin(k b), k = 2 pi / wavelength. With a
+    third amplitude C they are three-dimensional: v_a = A sin(k a) cos(k b) cos(k c), v_b = -(A + C) cos(k a) sin(k b)
+    cos(k c), v_c = C cos(k a) cos(k b) sin(k c). Plane ones have a closed form of the pressure, if the uniform velocity
+    lies along the third axis.
+    """
+    first, second = ("xyz".index(axis) for axis in plane)
+    wave = 2.0 * np.pi / wavelength_mm
+    if third_amplitude_m_s is not None:
+        amplitudes = np.empty(3)
+        amplitudes[first], amplitudes[second] = amplitude_m_s, -(amplitude_m_s + third_amplitude_m_s)
+        amplitudes[3 - first - second] = third_amplitude_m_s
+        return _placed(*_cellular(amplitudes, wave), centre_mm, velocity_m_s)
+
+    def phases(relative_mm: Floats) -> tuple[Floats, Floats]:
+        return wave * relative_mm[:, first], wave * relative_mm[:, second]
+
+    def flow(relative_mm: Floats) -> Floats:
+        a, b = phases(relative_mm)
+        velocity = np.zeros((len(relative_mm), 3))
+        velocity[:, first] = amplitude_m_s * np.sin(a) * np.cos(b)
+        velocity[:, second] = -amplitude_m_s * np.cos(a) * np.sin(b)
+        return velocity
+
+    def gradient(relative_mm: Floats) -> Floats:
+        a, b = phases(relative_mm)
+        found = np.zeros((len(relative_mm), 3, 3))
+        rate = MM_PER_M * wave * amplitude_m_s
+        found[:, first, first] = rate * np.cos(a) * np.cos(b)
+        found[:, second, second] = -found[:, first, first]
+        found[:, second, first] = rate * np.sin(a) * np.sin(b)
+        found[:, first, second] = -found[:, second, first]
+        return found
+
+    def pressure(relative_mm: Floats, density_kg_m3: float) -> Floats:
+        a, b = phases(relative_mm)
+        return 0.25 * density_kg_m3 * amplitude_m_s**2 * (np.cos(2.0 * a) + np.cos(2.0 * b))
+
+    at_rest = velocity_m_s[first] == 0.0 and velocity_m_s[second] == 0.0
+    return _placed(flow, gradient, centre_mm, velocity_m_s, pressure if at_rest else None)
+
+
+def _cellular(amplitudes_m_s: Floats, wave: float) -> tuple[Flow, Flow]:
+    """Return three-dimensional Taylor-Green vortices, whose three amplitudes add up to nothing, and their gradient."""
+
+    def flow(relative_mm: Floats) -> Floats:
+        sine, cosine = np.sin(wave * relative_mm), np.cos(wave * relative_mm)
+        others = np.stack([np.prod(np.delete(cosine, i, axis=1), axis=1) for i in range(3)], axis=1)
+        return np.asarray(amplitudes_m_s * sine * others)
+
+    def gradient(relative_mm: Floats) -> Floats:
+        sine, cosine = np.sin(wave * relative_mm), np.cos(wave * relative_mm)
+        found = np.empty((len(relative_mm), 3, 3))
+        for i in range(3):
+            for j in range(3):
+                third = cosine[:, 3 - i - j] if i != j else np.prod(cosine, axis=1)
+                found[:, i, j] = third if i == j else -sine[:, i] * sine[:, j] * third
+        return MM_PER_M * wave * amplitudes_m_s[:, np.newaxis] * found
+
+    return flow, gradient
+
+
+def abc(
+    amplitudes_m_s: Sequence[float],
+    wavelength_mm: float,
+    centre_mm: Sequence[float] = ORIGIN,
+    velocity_m_s: Sequence[float] = ORIGIN,
+) -> KnownFlow:
+    """Return the flow of Arnold, Beltrami and Childress plus a uniform velocity.
+
+    For A, B, C: u = A sin(k z) + C cos(k y), v = B sin(k x) + A cos(k z), w = C sin(k y) + B cos(k x). Its vorticity is
+    k times its velocity; without the uniform velocity its pressure is Bernoulli's.
+    """
+    of_x, of_y, of_z = amplitudes_m_s[1], amplitudes_m_s[2], amplitudes_m_s[0]
+    wave = 2.0 * np.pi / wavelength_mm
+    # of component i the amplitude of the cosine or sine of k times coordinate j
+    cosines = np.array([[0.0, of_y, 0.0], [0.0, 0.0, of_z], [of_x, 0.0, 0.0]])
+    sines = np.array([[0.0, 0.0, of_z], [of_x, 0.0, 0.0], [0.0, of_y, 0.0]])
+
+    def flow(relative_mm: Floats) -> Floats:
+        return np.asarray(np.cos(wave * relative_mm) @ cosines.T + np.sin(wave * relative_mm) @ sines.T)
+
+    def gradient(relative_mm: Floats) -> Floats:
+        phase = wave * relative_mm[:, np.newaxis]
+        return np.asarray(MM_PER_M * wave * (sines * np.cos(phase) - cosines * np.sin(phase)))
+
+    def pressure(relative_mm: Floats, density_kg_m3: float) -> Floats:
+        return -dynamic_pressure(flow(relative_mm), density_kg_m3)
+
+    return _placed(flow, gradient, centre_mm, velocity_m_s, None if np.any(velocity_m_s) else pressure)
+
+
+def vortex_ring(
+    speed_m_s: float,
+    radius_mm: float = 3.0,
+    core_mm: float = 1.5,
+    axis: Axis = "z",
+    centre_mm: Sequence[float] = ORIGIN,
+    velocity_m_s: Sequence[float] = ORIGIN,
+) -> KnownFlow:
+    """Return a frozen vortex ring about `axis` plus a uniform velocity; the fluid in its middle moves along the axis.
+
+    It is the curl of the azimuthal vector potential a rho exp(-(p^2 + z^2) / (2 core^2)), p = (rho^2 - R^2) / (2 R),
+    near the ring its distance: smooth on the axis, and gone a few cores off. At one core's distance from the middle of
+    a thin core the fluid turns with `speed_m_s`; where R is two cores, this is the speed in the ring's middle.
+    """
+    along = "xyz".index(axis)
+    order = [(along + 1) % 3, (along + 2) % 3, along]
+    strength = speed_m_s * np.exp(0.5) * core_mm / radius_mm
+
+    def local(relative_mm: Floats) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+        """Return x, y and z about the ring's axis, p and the potential over rho."""
+        x, y, z = relative_mm[:, order].T
+        p = (x**2 + y**2 - radius_mm**2) / (2.0 * radius_mm)
+        return x, y, z, p, np.asarray(strength * np.exp(-(p**2 + z**2) / (2.0 * core_mm**2)))
+
+    def flow(relative_mm: Floats) -> Floats:
+        x, y, z, p, g = local(relative_mm)
+        by_s, by_z = -p / (2.0 * radius_mm * core_mm**2) * g, -z / core_mm**2 * g
+        velocity = np.empty_like(relative_mm, dtype=np.float64)
+        velocity[:, order] = np.stack([-x * by_z, -y * by_z, 2.0 * (g + (x**2 + y**2) * by_s)], axis=1)
+        return velocity
+
+    def gradient(relative_mm: Floats) -> Floats:
+        x, y, z, p, g = local(relative_mm)
+        s, core2 = x**2 + y**2, core_mm**2
+        # s = rho^2: the potential's derivatives along s and z, p rising with s by 1 / (2 R)
+        by_s, by_z = -p / (2.0 * radius_mm * core2) * g, -z / core2 * g
+        by_ss = (p**2 / core2 - 1.0) / (4.0 * radius_mm**2 * core2) * g
+        by_sz, by_zz = p * z / (2.0 * radius_mm * core2**2) * g, (z**2 / core2 - 1.0) / core2 * g
+        twist, lift = -2.0 * x * y * by_sz, 4.0 * (2.0 * by_s + s * by_ss)
+        rows = [
+            [-by_z - 2.0 * x**2 * by_sz, twist, -x * by_zz],
+            [twist, -by_z - 2.0 * y**2 * by_sz, -y * by_zz],
+            [x * lift, y * lift, 2.0 * (by_z + s * by_sz)],
+        ]
+        found = np.empty((len(relative_mm), 3, 3))
+        found[np.ix_(range(len(found)), order, order)] = np.moveaxis(np.array(rows), 2, 0)
+        return MM_PER_M * found
+
+    return _placed(flow, gradient, centre_mm, velocity_m_s)
+
+
+def source(
+    rate_per_s: float,
+    radius_mm: float = 2.0,
+    centre_mm: Sequence[float] = ORIGIN,
+    velocity_m_s: Sequence[float] = ORIGIN,
+) -> KnownFlow:
+    """Return the flow out of a Gaussian cloud, q exp(-r^2 / (2 radius^2)) r, plus a uniform velocity.
+
+    It is not solenoidal, unlike all others: `rate_per_s` is its divergence at the centre, 3 q; beyond 1.7 radii sinks
+    take up the fluid.
+    """
+
+    def spread(r: Floats) -> Floats:
+        return rate_per_s / 3.0 * np.exp(-np.sum(r**2, axis=1, keepdims=True) / (2.0 * radius_mm**2))
+
+    def gradient(r: Floats) -> Floats:
+        outer = r[:, :, np.newaxis] * r[:, np.newaxis]
+        return np.asarray(spread(r)[:, :, np.newaxis] * (np.eye(3) - outer / radius_mm**2))
+
+    return _placed(lambda r: spread(r) * r / MM_PER_M, gradient, centre_mm, velocity_m_s)
+
+
+_FACTORIES = (square_duct, pipe, rigid_rotation, taylor_green, shear, uniform, random_modes, abc, vortex_ring, source)
+FLOWS: dict[str, Callable[..., KnownFlow]] = {factory.__name__: factory for factory in _FACTORIES}
 
 
 @dataclass(frozen=True)
@@ -267,12 +445,12 @@ class Pulsation:
 STEADY = Pulsation()
 
 
-def advect(flow: Flow, points_mm: ArrayLike, duration_s: float) -> NDArray[np.float64]:
+def advect(flow: Flow, points_mm: ArrayLike, duration_s: float) -> Floats:
     """Return where points, (n, 3) in mm, are carried in `duration_s` (negative: where they came from)."""
     points = np.array(points_mm, dtype=np.float64)
     step_s = duration_s / ADVECTION_STEPS
 
-    def moved(by: NDArray[np.float64], share: float) -> NDArray[np.float64]:
+    def moved(by: Floats, share: float) -> Floats:
         return points + MM_PER_M * share * step_s * by
 
     for _ in range(ADVECTION_STEPS):

@@ -1,33 +1,49 @@
-"""Expected images of glowing points and of uniform light, ray by ray through the tracer's own functions.
+"""Expected images of glowing points and of uniform light: ray by ray through the tracer's own functions, or by waves.
 
 Axes: points in world axes (mm, z away from the camera from the nominal focal point); images `[row, column]` of expected
 counts, float64, without noise. The rays are those of `optics.tracing`, so a rotated, shifted or hexagonal array and the
 distortion come from the camera.
 
 Every point has its own shift of one sequence of rays, drawn before any work is shared out, and light is added up in the
-order of the points: the same bits for any number of threads.
+order of the points, by waves too: the same bits for any number of threads.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import ndtr
+from scipy import fft
+from scipy.ndimage import map_coordinates
+from scipy.special import ndtr, ndtri
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.optics.camera import Camera, KernelCamera, Objective, nearest_point
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.media import Layers
 from lfpiv_cli.optics.tracing import ObjectSpace, slope_polynomial, slope_ratio, struck_pixel
-from lfpiv_cli.optics.waves import DIFFUSION_REACH
-from lfpiv_cli.synthetic.curved_rays import fit_of_slopes, trace_curved
-from lfpiv_cli.synthetic.objective import passes_barrel, trace_real_ray
-from lfpiv_cli.synthetic.ray_sequence import SEQUENCE, blur_place, diffused_mm, in_ball, on_disc, ray_places
-from lfpiv_cli.threads import share_out
+from lfpiv_cli.optics.waves import DIFFUSION_REACH, Waves, WavesInCamera, samples_per_pixel
+from lfpiv_cli.synthetic.rays import (
+    GOLDEN_ANGLE,
+    SEQUENCE,
+    blur_numbers,
+    blur_place,
+    diffused_mm,
+    fit_of_slopes,
+    in_ball,
+    in_pairs,
+    on_disc,
+    passes_barrel,
+    ray_places,
+    trace_curved,
+    trace_real_ray,
+)
+from lfpiv_cli.threads import blocks, in_threads, share_out
 
 Space = ObjectSpace | CurvedSpace
 """What lies in front of the lens: plane layers or curved faces."""
@@ -44,6 +60,17 @@ WHITE_SAMPLES_PER_SIDE = 8
 
 # Places along an axis that tell from where a pixel collects charge.
 QUANTILE_PLACES = 2001
+
+# Patches of waves' light that are held before they are added up, each of up to some 0.5 MB.
+PATCHES_AT_ONCE = 64
+# Lenses around one that can bound it.
+NEIGHBOURS = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
+# For uniform light samples are so much finer than for tracers: the table of a lens image is read linearly.
+LENS_SAMPLES = 2
+# Samples of a lens image are this many pitches wide in all.
+TABLE_PITCHES = 4.0
+# Rows of pixels whose lens images are looked up at once.
+ROWS_AT_ONCE = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,14 +95,16 @@ def render_points(
     balls: Balls,
     rng: np.random.Generator,
     *,
+    waves: Waves | None = None,
     rays: int = RAYS,
-    blur_mm: NDArray[np.float64] | None = None,
+    blur_mm: Floats | None = None,
     progress: Callable[[int], None] | None = None,
-) -> NDArray[np.float64]:
-    """Render small glowing balls.
+) -> Floats:
+    """Render small glowing balls, by rays or, as points that glow independently of each other, by waves.
 
     Parameters
     ----------
+    waves : what light is made of; default: rays
     rays : rays per ball
     blur_mm : (n, 2) places beside where rays would end on the sensor, which they take in turn; default: as charge
         diffuses
@@ -91,66 +120,63 @@ def render_points(
         not in the fluid is dark
     """
     points = camera.to_image_axes(balls.points_mm).reshape(-1, 3)
-    weights = np.broadcast_to(np.asarray(balls.light, dtype=np.float64), len(points)) / rays
-    radii = np.broadcast_to(0.5 * np.asarray(balls.diameter_mm, dtype=np.float64), len(points))
-    blur = diffused_mm(camera) if blur_mm is None else blur_mm
-    trace = _tracer_of(camera, space, points, radii.copy(), rng.random((len(points), 4)), blur)
+    light = np.broadcast_to(np.asarray(balls.light, dtype=np.float64), len(points))
+    radii = np.broadcast_to(0.5 * np.asarray(balls.diameter_mm, dtype=np.float64), len(points)).copy()
+    image, told = np.zeros((camera.rows, camera.columns)), progress or (lambda done: None)
+    if waves is not None:
+        inside, seen = points_in_ball(waves.points), WavesInCamera(camera, space, waves)
+        for part in blocks(len(points), PATCHES_AT_ONCE):
+            numbers = range(len(points))[part]
+            patches = in_threads(
+                lambda i: seen.patch(points[i] + radii[i] * inside if radii[i] > 0.0 else points[i]), numbers
+            )
+            for i, patch in zip(numbers, patches, strict=True):
+                if patch is not None:
+                    patch.add_to(image, light[i])
+            told(len(numbers))
+        return image
 
-    image = np.zeros((camera.rows, camera.columns))
-    batch = max(RAYS_AT_ONCE // rays, 1)
-    for start in range(0, len(points), batch):
-        part = slice(start, start + batch)
+    blur, shifts = diffused_mm(camera) if blur_mm is None else blur_mm, rng.random((len(points), 4))
+    kernel: Callable[..., None] = trace_curved
+    placed: tuple[Floats, ...] = (points, radii, shifts)
+    if isinstance(space, CurvedSpace):
+        between: tuple[Any, ...] = (space.for_kernels(camera), fit_of_slopes())
+    else:
+        last_layers = space.last_layers_mm(camera, points[:, 2])
+        if np.any(last_layers <= 0.0):
+            nearest = points[:, 2].min()
+            raise ConfigError(f"a point at z = {nearest:g} mm lies {-last_layers.min():g} mm in front of the fluid")
+        kernel, placed, between = _trace_points, (points, radii, last_layers, shifts), (space.layers(camera),)
+    for part in blocks(len(points), max(RAYS_AT_ONCE // rays, 1)):
         pixels = np.empty((len(points[part]), rays), dtype=np.int32)
-        trace(part, pixels)
-        _add_light(image.ravel(), pixels, weights[part])
-        if progress is not None:
-            progress(len(pixels))
+        of_part = tuple(each[part] for each in placed)
+        share_out(kernel, len(pixels), of_part, *between, camera.for_kernels(), camera.objective, blur, pixels)
+        _add_light(image.ravel(), pixels, light[part] / rays)
+        told(len(pixels))
     return image
 
 
-def _tracer_of(
-    camera: Camera,
-    space: Space,
-    points: NDArray[np.float64],
-    radii: NDArray[np.float64],
-    shifts: NDArray[np.float64],
-    blur_mm: NDArray[np.float64],
-) -> Callable[[slice, NDArray[np.int32]], None]:
-    """Return what writes the pixels (n, rays) that the rays of a part of the balls strike, image axes."""
-    seen = camera.for_kernels()
-    if isinstance(space, CurvedSpace):
-        faces, fit = space.for_kernels(camera), fit_of_slopes()
+def points_in_ball(count: int) -> Floats:
+    """Return points (count, 3) of a ball of radius 1, seen along the axis, that stand for an even glow.
 
-        def trace(part: slice, pixels: NDArray[np.int32]) -> None:
-            placed = (points[part], radii[part], shifts[part])
-            share_out(trace_curved, len(pixels), placed, faces, seen, camera.objective, fit, blur_mm, pixels)
-
-        return trace
-    last_layers, layers = space.last_layers_mm(camera, points[:, 2]), space.layers(camera)
-    _check_depths(points, last_layers)
-
-    def trace_plane(part: slice, pixels: NDArray[np.int32]) -> None:
-        placed = (points[part], radii[part], last_layers[part], shifts[part])
-        share_out(_trace_points, len(pixels), placed, layers, seen, camera.objective, blur_mm, pixels)
-
-    return trace_plane
-
-
-def _check_depths(points: NDArray[np.float64], last_layers_mm: NDArray[np.float64]) -> None:
-    """Raise where a point lies on the camera's side of the layer that it should be in."""
-    if np.any(last_layers_mm <= 0.0):
-        nearest = points[:, 2].min()
-        raise ConfigError(f"a point at z = {nearest:g} mm lies {-last_layers_mm.min():g} mm in front of the fluid")
+    They have its mean and its mean squares, a fifth of the radius's along each axis; their depth does not count.
+    """
+    within = (np.arange(count) + 0.5) / count
+    radius, turn = np.sqrt(1.0 - within ** (2.0 / 3.0)), GOLDEN_ANGLE * np.arange(count)
+    places = radius[:, np.newaxis] * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    places -= places.mean(axis=0)
+    spread = np.linalg.cholesky(np.linalg.inv(5.0 * places.T @ places / count))
+    return np.column_stack([places @ spread, np.zeros(count)])
 
 
 @njit(cache=True, nogil=True)
 def _trace_points(
     part: tuple[int, int],
-    placed: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
+    placed: tuple[Floats, Floats, Floats, Floats],
     layers: Layers,
     camera: KernelCamera,
     objective: Objective,
-    blur_mm: NDArray[np.float64],
+    blur_mm: Floats,
     pixels: NDArray[np.int32],
 ) -> None:
     """Write the flat pixel number that each ray of the points `part` strikes, (n, rays), -1 where it strikes none.
@@ -180,7 +206,7 @@ def _trace_points(
 
 
 @njit(cache=True)
-def _add_light(image: NDArray[np.float64], pixels: NDArray[np.int32], weights: NDArray[np.float64]) -> None:
+def _add_light(image: Floats, pixels: NDArray[np.int32], weights: Floats) -> None:
     """Add each point's weight to the pixels of its rays, in order."""
     for i in range(pixels.shape[0]):
         for k in range(pixels.shape[1]):
@@ -188,8 +214,10 @@ def _add_light(image: NDArray[np.float64], pixels: NDArray[np.int32], weights: N
                 image[pixels[i, k]] += weights[i]
 
 
-def render_white(camera: Camera, level: float, samples_per_side: int = WHITE_SAMPLES_PER_SIDE) -> NDArray[np.float64]:
-    """Render uniform light: every microlens shows the aperture disc.
+def render_white(
+    camera: Camera, level: float, samples_per_side: int = WHITE_SAMPLES_PER_SIDE, waves: Waves | None = None
+) -> Floats:
+    """Render uniform light, by rays or by waves: every microlens shows the aperture disc.
 
     Traced backwards from a grid of points of each pixel, through evenly spread points of each near microlens, to the
     main lens. Only the nearest lens and its eight neighbours are asked, enough while micro-images overlap less than
@@ -198,11 +226,14 @@ def render_white(camera: Camera, level: float, samples_per_side: int = WHITE_SAM
     Parameters
     ----------
     level : expected counts of a pixel whose light is not cut by the aperture
+    waves : what light is made of; default: rays
 
     Returns
     -------
     (rows, columns) float64, expected counts
     """
+    if waves is not None:
+        return level * _white_by_waves(camera, waves)
     # charge comes from further around, and less evenly
     across = samples_per_side if camera.diffusion_px == 0.0 else 2 * samples_per_side
     samples = across**2
@@ -216,21 +247,12 @@ def render_white(camera: Camera, level: float, samples_per_side: int = WHITE_SAM
     offsets = offsets - offsets.mean(axis=0)
     centres = camera.micro_image_lattice_px()
     lit = np.empty((camera.rows, camera.columns), dtype=np.int64)
-    share_out(
-        _backtrack_white,
-        camera.rows,
-        positions,
-        offsets,
-        camera.for_kernels(),
-        camera.objective,
-        centres.origin,
-        centres.basis,
-        lit,
-    )
+    seen = camera.for_kernels(), camera.objective
+    share_out(_backtrack_white, camera.rows, positions, offsets, *seen, centres.origin, centres.basis, lit)
     return lit * np.float64(level / samples)
 
 
-def pixel_places(count: int, diffusion_px: float) -> NDArray[np.float64]:
+def pixel_places(count: int, diffusion_px: float) -> Floats:
     """Return places along an axis about a pixel's middle, in pixels, each of which sends it as much charge."""
     share = (np.arange(count) + 0.5) / count
     if diffusion_px == 0.0:
@@ -245,12 +267,12 @@ def pixel_places(count: int, diffusion_px: float) -> NDArray[np.float64]:
 @njit(cache=True, nogil=True)
 def _backtrack_white(
     part: tuple[int, int],
-    positions_px: NDArray[np.float64],
-    offsets: NDArray[np.float64],
+    positions_px: Floats,
+    offsets: Floats,
     camera: KernelCamera,
     objective: Objective,
-    origin_px: NDArray[np.float64],
-    basis_px: NDArray[np.float64],
+    origin_px: Floats,
+    basis_px: Floats,
     lit: NDArray[np.int64],
 ) -> None:
     """Write how many samples of each pixel, rows `part`, come from the aperture, summed over the lenses."""
@@ -281,3 +303,78 @@ def _backtrack_white(
                         if passes_barrel(camera, objective, x, y, s_x + q_x, s_y + q_y):
                             count += 1
             lit[row, column] = count
+
+
+def _white_by_waves(camera: Camera, waves: Waves) -> Floats:
+    """Return uniform light (rows, columns): the aperture's disc behind each microlens, spread by what it diffracts.
+
+    The places of the aperture glow independently of each other. What reaches a pixel through two lenses at once
+    interferes, but comes from places so far apart on the aperture that nothing of it is seen.
+    """
+    beside = _beside(camera, waves)
+    step = float(beside[1] - beside[0])
+    radius = camera.aperture_radius_mm * camera.microlens_distance_mm / camera.image_distance_mm
+    disc = np.clip((radius - np.hypot(beside[:, np.newaxis], beside)) / step + 0.5, 0.0, 1.0)
+    frequency = fft.fftfreq(len(beside), step)
+    blurred = np.exp(-2.0 * (np.pi * camera.diffusion_px * camera.pixel_mm * frequency) ** 2)
+    pixel = np.sinc(frequency * camera.pixel_mm) * blurred
+    spread = fft.fft2(fft.ifftshift(lens_spread(camera, waves, beside))) * pixel[:, np.newaxis] * pixel
+    table = fft.fftshift(fft.ifft2(fft.fft2(fft.ifftshift(disc)) * spread).real)
+    # a pixel has the lens images of nine lenses, which the table tells beside their middle
+    lattice, middle, per_px = camera.micro_image_lattice_px(), len(table) // 2, camera.pixel_mm / step
+    image = np.zeros((camera.rows, camera.columns))
+
+    def write(rows: slice) -> None:
+        row, column = np.mgrid[rows, : camera.columns]
+        places = np.stack([column, row], axis=-1).astype(np.float64)
+        near = lattice.nearest(places)
+        for neighbour in [(0, 0), *NEIGHBOURS]:
+            beside = (places - lattice.points(near + np.array(neighbour))) * per_px + middle
+            image[rows] += map_coordinates(table, [beside[..., 1], beside[..., 0]], order=1, mode="constant")
+
+    in_threads(write, blocks(camera.rows, ROWS_AT_ONCE))
+    return image
+
+
+def lens_spread(camera: Camera, waves: Waves, beside_mm: Floats) -> Floats:
+    """Return the light of a place on the main lens behind the microlens at 0, its sum 1, on samples (y, x) about it."""
+    step = beside_mm[1] - beside_mm[0]
+    inside = np.ones((len(beside_mm), len(beside_mm)))
+    for neighbour in NEIGHBOURS:
+        x, y = np.array(neighbour) @ camera.lattice.basis
+        apart = np.hypot(x, y)
+        beyond = (x * beside_mm + y * beside_mm[:, np.newaxis]) / apart - 0.5 * apart
+        inside = np.minimum(inside, np.clip(0.5 - beyond / step, 0.0, 1.0))
+    bend = 1.0 / camera.image_distance_mm - 1.0 / camera.microlens_focal_length_mm
+    along = np.exp(1j * np.pi / waves.wavelength_mm * bend * beside_mm**2)
+    way = np.exp(
+        -1j * np.pi * waves.wavelength_mm * camera.microlens_distance_mm * fft.fftfreq(len(beside_mm), step) ** 2
+    )
+    field = fft.ifft2(fft.fft2(inside * along[:, np.newaxis] * along) * way[:, np.newaxis] * way)
+    light = field.real**2 + field.imag**2
+    return np.asarray(light / light.sum(), dtype=np.float64)
+
+
+def lens_blur_mm(camera: Camera, waves: Waves) -> Floats:
+    """Return places (n, 2) beside a ray's end on the sensor: what one lens diffracts, in focus, and charge diffuses.
+
+    Rays that take them in turn show an extended source nearly as waves do: of a dot two microlenses wide 3, 6 and 8 %
+    of the light (L1) is elsewhere at a depth of 0.3, 2.2 and 4 mm with Table 2's camera, where of plain rays 6, 11 and
+    15 % is. What is left comes from lenses that light reaches in part, and from the main lens's rim.
+    """
+    distance = 1.0 / (1.0 / camera.microlens_distance_mm + 1.0 / camera.image_distance_mm)
+    beside = _beside(camera, waves)
+    light = lens_spread(replace(camera, microlens_focal_length_mm=distance), waves, beside)
+    numbers, step = blur_numbers(), beside[1] - beside[0]
+    row = np.searchsorted(np.cumsum(light.sum(axis=1)), numbers[:, 2])
+    of_row = np.cumsum(light, axis=1)
+    column = [np.searchsorted(of_row[i], share * of_row[i, -1]) for i, share in zip(row, numbers[:, 3], strict=True)]
+    places = beside[np.stack([column, row], axis=-1)] + step * (numbers[:, 4:] - 0.5)
+    return in_pairs(places + camera.diffusion_px * camera.pixel_mm * ndtri(numbers[:, :2]))
+
+
+def _beside(camera: Camera, waves: Waves) -> Floats:
+    """Return samples along an axis about the middle of a lens image, mm."""
+    step = camera.pixel_mm / (LENS_SAMPLES * samples_per_pixel(camera, waves))
+    half = fft.next_fast_len(int(np.ceil(0.5 * TABLE_PITCHES * float(camera.lattice.pitch.max()) / step)))
+    return np.asarray(step * np.arange(-half, half), dtype=np.float64)

@@ -1,4 +1,4 @@
-"""Recorded images of known scenes, with their truth: white light, a board, tracers in a flow.
+"""Recorded images of known scenes, with their truth: white light, a board, tracers in a flow, bubbles on its wall.
 
 Axes: world axes, origin at the nominal focal point in the medium that the scene stands in, z away from the camera. The
 truth of tracers is that of the middle of the pair or sequence.
@@ -13,20 +13,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.flow.windows import RoundWall, Walls
 from lfpiv_cli.grid import Grid
+from lfpiv_cli.names import BubbleWall
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.optics.waves import Waves
-from lfpiv_cli.synthetic.board import BoardPlacement, dot_centres, render_board
-from lfpiv_cli.synthetic.flows import STEADY, Pulsation, advect
-from lfpiv_cli.synthetic.objective import passed_light
-from lfpiv_cli.synthetic.render import RAYS, Balls, Space
+from lfpiv_cli.synthetic.board import BoardPlacement, dot_centres, light_per_area, render_board, sunflower
+from lfpiv_cli.synthetic.flows import MM_PER_M, STEADY, Flow, Pulsation, advect
+from lfpiv_cli.synthetic.rays import passed_light
+from lfpiv_cli.synthetic.render import RAYS, Balls, Space, render_points, render_white
 from lfpiv_cli.synthetic.sensor import Readout
-from lfpiv_cli.synthetic.vortices import MM_PER_M, Flow
-from lfpiv_cli.synthetic.wave_images import render_balls, white_image
 
 Triple = tuple[float, float, float]
 
@@ -77,15 +77,10 @@ class Box:
         """Return the box with a margin on both sides of each axis."""
         return Box.of(np.subtract(self.low_mm, margin_mm), np.add(self.high_mm, margin_mm))
 
-    @property
-    def volume_mm3(self) -> float:
-        """Volume in cubic millimetres."""
-        return float(np.prod(np.subtract(self.high_mm, self.low_mm)))
-
-    def volume_in_mm3(self, walls: Walls | None) -> float:
+    def volume_mm3(self, walls: Walls | None = None) -> float:
         """Return the volume between walls, all of it where there are none, in cubic millimetres."""
         if walls is None:
-            return self.volume_mm3
+            return float(np.prod(np.subtract(self.high_mm, self.low_mm)))
         return float(walls.volumes_mm3(np.asarray(self.low_mm), np.asarray(self.high_mm)))
 
     def within(self, other: Box) -> Box:
@@ -131,7 +126,7 @@ class Tracers:
     light_z_mm: tuple[float, float] | None = None
     walls: Walls | None = None
 
-    def draw_places(self, rng: np.random.Generator) -> NDArray[np.float64]:
+    def draw_places(self, rng: np.random.Generator) -> Floats:
         """Return where the tracers are at the sequence's middle (count, 3)."""
         places = rng.uniform(self.box.low_mm, self.box.high_mm, (self.count, 3))
         beyond = np.zeros(self.count, dtype=np.bool_) if self.walls is None else ~self.walls.contain(places)
@@ -140,26 +135,26 @@ class Tracers:
             beyond = ~self.walls.contain(places)
         return places
 
-    def draw_brightness(self, rng: np.random.Generator) -> NDArray[np.float64]:
+    def draw_brightness(self, rng: np.random.Generator) -> Floats:
         """Return the brightness (count,) of each tracer."""
         if self.brightness_log_sigma is None:
             return rng.uniform(*self.brightness, self.count)
         return rng.lognormal(0.0, self.brightness_log_sigma, self.count)
 
-    def draw_sizes(self, rng: np.random.Generator) -> NDArray[np.float64]:
+    def draw_sizes(self, rng: np.random.Generator) -> Floats:
         """Return the diameter (count,) of each tracer over their median; without a spread no numbers are drawn."""
         if self.diameter_log_sigma == 0.0:
             return np.ones(self.count)
         return rng.lognormal(0.0, self.diameter_log_sigma, self.count)
 
-    def draw_flicker(self, frames: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    def draw_flicker(self, frames: int, rng: np.random.Generator) -> Floats:
         """Return each tracer's light in each frame (frames, count) over its own, of mean 1, as `draw_sizes` does."""
         if self.brightness_flicker == 0.0:
             return np.ones((frames, self.count))
         variance = np.log1p(self.brightness_flicker**2)
         return rng.lognormal(-0.5 * variance, np.sqrt(variance), (frames, self.count))
 
-    def lit(self, points_mm: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def lit(self, points_mm: Floats) -> NDArray[np.bool_]:
         """Return which of the points (..., 3) lie in the light."""
         if self.light_z_mm is None:
             return np.ones(points_mm.shape[:-1], dtype=np.bool_)
@@ -175,7 +170,7 @@ class RecordingCamera:
     readout: Readout
     waves: Waves | None = None
 
-    def record(self, expected: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.uint16]:
+    def record(self, expected: Floats, rng: np.random.Generator) -> NDArray[np.uint16]:
         """Return an image recorded of the counts (rows, columns) that an objective without falloff would make."""
         return self.readout.record(expected * passed_light(self.optics), rng)
 
@@ -204,7 +199,7 @@ class Motion:
         """Return for how long the flow of the middle would carry tracers to where each frame finds them."""
         return [self.pulsation.carried_s(time_s) for time_s in self.times_s()]
 
-    def places_mm(self, middle_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    def places_mm(self, middle_mm: Floats) -> Floats:
         """Return where the frames find tracers (frames, n, 3) that are at these places (n, 3) at the middle.
 
         From the middle on they go from frame to frame: over a whole sequence the steps of `advect` would be too long.
@@ -245,12 +240,12 @@ class SimulatedFrames:
 
     images: tuple[NDArray[np.uint16], ...]
     dark: NDArray[np.uint16]
-    positions_mm: NDArray[np.float64]
-    velocities_m_s: NDArray[np.float64]
-    brightness: NDArray[np.float64]
-    diameters_mm: NDArray[np.float64]
-    frame_positions_mm: NDArray[np.float64]
-    frame_brightness: NDArray[np.float64]
+    positions_mm: Floats
+    velocities_m_s: Floats
+    brightness: Floats
+    diameters_mm: Floats
+    frame_positions_mm: Floats
+    frame_brightness: Floats
     truth: dict[str, Any]
 
 
@@ -273,7 +268,7 @@ def pipe_bounds(pipe: RoundWall) -> Box:
 
 def simulate_white(camera: RecordingCamera, level: float, rng: np.random.Generator) -> SimulatedStill:
     """Simulate an image of uniform light, `level` expected counts where a pixel sees nothing but the aperture."""
-    image = camera.record(white_image(camera.optics, camera.waves, level), rng)
+    image = camera.record(render_white(camera.optics, level, waves=camera.waves), rng)
     return SimulatedStill(image, camera.dark_frame(rng), camera_truth(camera.optics))
 
 
@@ -307,7 +302,7 @@ def simulate_particles(
     motion: Motion,
     rng: np.random.Generator,
     *,
-    still: NDArray[np.float64] | float = 0.0,
+    still: Floats | float = 0.0,
     progress: Callable[[int], None] | None = None,
 ) -> SimulatedFrames:
     """Simulate images of tracers, half of them before the time of the truth's positions and half after.
@@ -326,7 +321,8 @@ def simulate_particles(
     images = []
     for place, seen, light in zip(places, lit, tracers.light_counts * shown, strict=True):
         balls = Balls(place[seen], light[seen], diameters[seen])
-        expected = render_balls(camera.optics, space, balls, rng, camera.waves, rays=tracers.rays, progress=progress)
+        how: dict[str, Any] = {"waves": camera.waves, "rays": tracers.rays, "progress": progress}
+        expected = render_points(camera.optics, space, balls, rng, **how)
         images.append(camera.record(expected + still, rng))
     window = space.window if isinstance(space, ObjectSpace) else None
     truth = {
@@ -377,13 +373,82 @@ def seeded_boxes(volume: Grid, reach_mm: float, flow: Flow, carried_s: float, wa
     walls : between which there are tracers; None: everywhere
     """
     inside = Box.around(volume, (0.0, 0.0, 0.0))
-    carried = carried_s * largest_speed_mm_s(flow, inside)
+    sides = [np.linspace(low, high, SPEED_POINTS) for low, high in zip(inside.low_mm, inside.high_mm, strict=True)]
+    points = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, 3)
+    carried = carried_s * (MM_PER_M * np.abs(flow(points)).max(axis=0))
     box = inside.wider((reach_mm + carried[0], reach_mm + carried[1], carried[2]))
     return (box, inside) if walls is None else (box.within(walls), inside.within(walls))
 
 
-def largest_speed_mm_s(flow: Flow, box: Box) -> NDArray[np.float64]:
-    """Return the largest speed along each axis (3,) on a lattice of points of a box."""
-    sides = [np.linspace(low, high, SPEED_POINTS) for low, high in zip(box.low_mm, box.high_mm, strict=True)]
-    points = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, 3)
-    return np.asarray(MM_PER_M * np.abs(flow(points)).max(axis=0))
+# Bubbles that stick to a channel's wall, as in the paper's Fig. 17: balls that shine and do not move.
+#
+# A bubble is lit as brightly as a ball that glows in the middle and fades to its rim. Its depth does not count: it is
+# the disc of its rim, square to the optical axis. The light of tracers goes through it.
+
+# A bubble is made of points this dense, as the dots of boards are; with so many rays each, those add less noise than
+# light does.
+POINTS_PER_MICROLENS = 8
+RAYS_PER_BUBBLE_POINT = 1_000
+
+
+@dataclass(frozen=True, eq=False)
+class Bubbles:
+    """Balls at rest: their centres (n, 3) and diameters (n,) in mm."""
+
+    centres_mm: Floats
+    diameters_mm: Floats
+
+    def truth(self) -> list[list[float]]:
+        """Return x, y, z and diameter of each, mm, ready for JSON."""
+        return np.column_stack([self.centres_mm, self.diameters_mm]).tolist()
+
+
+def bubbles_at_wall(
+    count: int, diameter_mm: tuple[float, float], wall: BubbleWall, seen: Box, walls: Box, rng: np.random.Generator
+) -> Bubbles:
+    """Return balls that touch a wall of a square channel, evenly spread over the part of it that is seen.
+
+    Parameters
+    ----------
+    diameter_mm : smallest and largest, evenly spread between them
+    seen : box with tracers
+    walls : inside of the channel, endless along its flow
+
+    Raises
+    ------
+    ConfigError : a bubble is wider than the channel
+    """
+    diameters = rng.uniform(*diameter_mm, count)
+    radii = 0.5 * diameters[:, np.newaxis]
+    low, high = np.maximum(seen.low_mm, walls.low_mm + radii), np.minimum(seen.high_mm, walls.high_mm - radii)
+    if np.any(low > high):
+        raise ConfigError(f"bubbles of {diameters.max():g} mm do not fit into the channel that is seen, {seen}")
+    centres = rng.uniform(low, high)
+    axis = 2 if wall in ("near", "far") else int(np.flatnonzero(np.isfinite(walls.low_mm))[0])
+    if wall in ("near", "low"):
+        centres[:, axis] = walls.low_mm[axis] + radii[:, 0]
+    else:
+        centres[:, axis] = walls.high_mm[axis] - radii[:, 0]
+    return Bubbles(centres, diameters)
+
+
+def render_bubbles(
+    camera: Camera, space: Space, bubbles: Bubbles, level: float, rng: np.random.Generator, waves: Waves | None = None
+) -> Floats:
+    """Render bubbles whose middle gives `level` expected counts in a pixel that sees nothing else, fading to the rim.
+
+    Returns
+    -------
+    (rows, columns) float64, expected counts
+    """
+    spacing = float(camera.lattice.pitch[0]) / (POINTS_PER_MICROLENS * abs(camera.magnification))
+    points, light = [np.empty((0, 3))], [np.empty(0)]
+    for centre, diameter in zip(bubbles.centres_mm, bubbles.diameters_mm, strict=True):
+        inside = sunflower(max(round((diameter / spacing) ** 2), 1), 0.5 * diameter)
+        share = np.maximum(1.0 - (inside**2).sum(axis=1) / (0.5 * diameter) ** 2, 0.0)
+        placed = centre + np.column_stack([inside, np.zeros(len(inside))])
+        area = 0.25 * np.pi * diameter**2 / len(inside)
+        points.append(placed)
+        light.append(area * share * light_per_area(camera, space.media, placed[:, 2], level))
+    balls = Balls(np.concatenate(points), np.concatenate(light), spacing if waves is None else 0.0)
+    return render_points(camera, space, balls, rng, waves=waves, rays=RAYS_PER_BUBBLE_POINT)

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
+
 
 @dataclass(frozen=True)
 class Readout:
@@ -25,7 +27,7 @@ class Readout:
     dark_level_counts: float = 96.0
     bits: int = 16
 
-    def record(self, expected_counts: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.uint16]:
+    def record(self, expected_counts: Floats, rng: np.random.Generator) -> NDArray[np.uint16]:
         """Return the recorded image of expected counts (without the dark level), rounded and clipped."""
         counts = expected_counts
         if self.photons_per_count is not None:

@@ -8,19 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.notice import written
-from lfpiv_cli.pictures.style import new_figure, styled
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from lfpiv_cli.pictures.style import Figure, new_panels, styled
 
 
 @styled
@@ -29,8 +27,8 @@ def board_figure(figures: dict[str, Any], volume: NDArray[np.float32], grid: Gri
 
     `volume` [z, y, x] is the reconstruction of the board nearest the focal plane; `figures` are `board_figures`.
     """
-    figure = new_figure(13.0, 8.0)
-    axes = figure.subplots(2, 3).ravel()
+    figure, panels = new_panels(13.0, 8.0, 2, 3)
+    axes = panels.ravel()
     bounds = [grid.bounds_mm(axis) for axis in range(3)]
     axes[0].imshow(volume.max(axis=0), origin="lower", extent=(*bounds[0], *bounds[1]))
     axes[0].set(title="board nearest the focal plane, maximum along z", xlabel="x (mm)", ylabel="y (mm)")
@@ -57,8 +55,8 @@ def board_figure(figures: dict[str, Any], volume: NDArray[np.float32], grid: Gri
 # Eq. 20 needs a depth and the paper says no more of it than "Gaussian peak fittings". Dots next to the focal plane
 # are not even: there definitions differ by tenths of a millimetre.
 
-Depths = NDArray[np.float64]
-Profile = NDArray[np.float64]
+Depths = Floats
+Profile = Floats
 
 # Below this share of the peak of a depth profile lies what is left of other dots' light.
 SHARE = float(1.0 / np.e)
@@ -66,16 +64,8 @@ SHARE = float(1.0 / np.e)
 GAUSSIAN_PARAMETERS = 3
 
 
-@dataclass(frozen=True)
-class DepthDefinition:
-    """A definition of the depth of a dot.
-
-    Attributes
-    ----------
-    words : for people
-    profile : what it is taken from, the sum or the maximum of each plane of a dot's column
-    depth_mm : from the planes' depths and the profile
-    """
+class DepthDefinition(NamedTuple):
+    """A definition of the depth of a dot: from the planes' depths and what of each, its sum or maximum, in a column."""
 
     words: str
     profile: Literal["sum", "maximum"]
@@ -89,8 +79,14 @@ def width_ends_mm(z_mm: Depths, profile: Profile, peak: int | None = None) -> tu
     """
     peak = int(np.argmax(profile)) if peak is None else peak
     limit = profile[peak] * SHARE
-    first, last = _run_above(profile, peak, limit)
-    return _crossing_mm(z_mm, profile, limit, first, -1), _crossing_mm(z_mm, profile, limit, last, 1)
+    ends = []
+    for at, step in zip(_run_above(profile, peak, limit), (-1, 1), strict=True):
+        if 0 <= at + step < z_mm.size:
+            share = (profile[at] - limit) / (profile[at] - profile[at + step])
+            ends.append(float(z_mm[at] + share * (z_mm[at + step] - z_mm[at])))
+        else:
+            ends.append(float(z_mm[at]))
+    return ends[0], ends[1]
 
 
 def _run_above(profile: Profile, peak: int, limit: float) -> tuple[int, int]:
@@ -98,14 +94,6 @@ def _run_above(profile: Profile, peak: int, limit: float) -> tuple[int, int]:
     low = np.flatnonzero(profile[:peak] <= limit)
     high = np.flatnonzero(profile[peak + 1 :] <= limit)
     return int(low[-1]) + 1 if low.size else 0, peak + int(high[0]) if high.size else profile.size - 1
-
-
-def _crossing_mm(z_mm: Depths, profile: Profile, limit: float, at: int, step: int) -> float:
-    beyond = at + step
-    if not 0 <= beyond < z_mm.size:
-        return float(z_mm[at])
-    share = (profile[at] - limit) / (profile[at] - profile[beyond])
-    return float(z_mm[at] + share * (z_mm[beyond] - z_mm[at]))
 
 
 def gaussian_centre_mm(z_mm: Depths, profile: Profile) -> float:
@@ -116,7 +104,7 @@ def gaussian_centre_mm(z_mm: Depths, profile: Profile) -> float:
     ends = width_ends_mm(z_mm, profile)
     width = max((ends[1] - ends[0]) / (2.0 * np.sqrt(2.0)), float(z_mm[1] - z_mm[0]))
 
-    def misfit(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def misfit(values: Floats) -> Floats:
         height, centre, sigma = values
         return np.asarray(height * np.exp(-0.5 * ((z_mm - centre) / sigma) ** 2) - profile)
 
@@ -194,18 +182,9 @@ class DotFigures:
     lateral_mm : (n, 2) centre of mass in the plane
     """
 
-    elongation_mm: NDArray[np.float64]
-    depth_mm: dict[str, NDArray[np.float64]]
-    lateral_mm: NDArray[np.float64]
-
-    def to_plain(self) -> dict[str, Any]:
-        """Return the figures as lists of numbers."""
-        depths = {name: each.tolist() for name, each in self.depth_mm.items()}
-        return {
-            "elongation_mm": self.elongation_mm.tolist(),
-            "depth_mm": depths,
-            "lateral_mm": self.lateral_mm.tolist(),
-        }
+    elongation_mm: Floats
+    depth_mm: dict[str, Floats]
+    lateral_mm: Floats
 
     @classmethod
     def from_plain(cls, values: Mapping[str, Any]) -> DotFigures:
@@ -214,41 +193,33 @@ class DotFigures:
         return cls(np.array(values["elongation_mm"]), depths, np.array(values["lateral_mm"]))
 
 
-def measure_dots(
-    volume: NDArray[np.float32], grid: Grid, centres_mm: NDArray[np.float64], reach_mm: float
-) -> DotFigures:
+def measure_dots(volume: NDArray[np.float32], grid: Grid, centres_mm: Floats, reach_mm: float) -> DotFigures:
     """Measure each dot in the column of voxels within `reach_mm` of its centre (n, 2) in x and y.
 
     Raises
     ------
     InputError : a dot's column lies outside the volume or holds no light.
     """
-    elongations, depths, lateral = zip(
-        *(_measure_dot(volume, grid, centre, reach_mm) for centre in centres_mm), strict=True
-    )
-    by_definition = {name: np.array([each[name] for each in depths]) for name in DEPTH_DEFINITIONS}
+    x, y, z = (grid.axis_mm(axis) for axis in range(3))
+    elongations, lateral = [], []
+    depths: dict[str, list[float]] = {name: [] for name in DEPTH_DEFINITIONS}
+    for centre in centres_mm:
+        near_x, near_y = np.abs(x - centre[0]) < reach_mm, np.abs(y - centre[1]) < reach_mm
+        part = volume[np.ix_(np.arange(z.size), near_y, near_x)].astype(np.float64)
+        if not part.size or part.max() <= 0.0:
+            place = f"{written(centre[0])}, {written(centre[1])}"
+            raise InputError(f"no light was reconstructed within {reach_mm} mm of the dot at {place}")
+        profiles = {"sum": part.sum(axis=(1, 2)), "maximum": part.max(axis=(1, 2))}
+        plane = part[profiles["sum"] > profiles["sum"].max() / np.e].sum(axis=0)
+        lateral.append((plane.sum(axis=0) @ x[near_x] / plane.sum(), plane.sum(axis=1) @ y[near_y] / plane.sum()))
+        elongations.append(elongation_mm(z, profiles["maximum"]))
+        for name, each in DEPTH_DEFINITIONS.items():
+            depths[name].append(each.depth_mm(z, profiles[each.profile]))
+    by_definition = {name: np.array(each) for name, each in depths.items()}
     return DotFigures(np.array(elongations), by_definition, np.array(lateral))
 
 
-def _measure_dot(
-    volume: NDArray[np.float32], grid: Grid, centre: NDArray[np.float64], reach_mm: float
-) -> tuple[float, dict[str, float], tuple[float, float]]:
-    x, y, z = (grid.axis_mm(axis) for axis in range(3))
-    column = np.ix_(np.arange(z.size), np.abs(y - centre[1]) < reach_mm, np.abs(x - centre[0]) < reach_mm)
-    part = volume[column].astype(np.float64)
-    if not part.size or part.max() <= 0.0:
-        raise InputError(
-            f"no light was reconstructed within {reach_mm} mm of the dot at {written(centre[0])}, {written(centre[1])}"
-        )
-    profiles = {"sum": part.sum(axis=(1, 2)), "maximum": part.max(axis=(1, 2))}
-    plane = part[profiles["sum"] > profiles["sum"].max() / np.e].sum(axis=0)
-    own_x, own_y = x[np.abs(x - centre[0]) < reach_mm], y[np.abs(y - centre[1]) < reach_mm]
-    lateral = float(plane.sum(axis=0) @ own_x / plane.sum()), float(plane.sum(axis=1) @ own_y / plane.sum())
-    depths = {name: each.depth_mm(z, profiles[each.profile]) for name, each in DEPTH_DEFINITIONS.items()}
-    return elongation_mm(z, profiles["maximum"]), depths, lateral
-
-
-def elongation_mm(z_mm: NDArray[np.float64], height: NDArray[np.float64], peak: int | None = None) -> float:
+def elongation_mm(z_mm: Floats, height: Floats, peak: int | None = None) -> float:
     """Return the depth over which a profile around a peak, by default its highest, exceeds 1/e of it."""
     near, far = width_ends_mm(z_mm, height, peak)
     return far - near
@@ -274,15 +245,17 @@ def board_figures(
     """
     lateral = [each.lateral_mm[:, 0].reshape(shape[1], shape[0]) for each in dots]
     places = place_figures(lateral, [each.depth_mm[THE_PAPERS] for each in dots], depths_mm, spacing_mm)
-    mass = np.array([each.depth_mm["mass"].mean() for each in dots])
+    mass, definitions = np.array([each.depth_mm["mass"].mean() for each in dots]), {}
+    for name in DEPTH_DEFINITIONS:
+        centres = np.array([each.depth_mm[name].mean() for each in dots])
+        steps = np.diff(centres) / np.diff(depths_mm)
+        ends = {"shortest": float(steps.min()), "longest": float(steps.max())}
+        definitions[name] = {"error": depth_error(centres, depths_mm)} | ends
     return places | {
         "elongation_mm": float(np.mean([each.elongation_mm.mean() for each in dots])),
         "elongation_sigma_mm": float(np.mean([each.elongation_mm.std() for each in dots])),
         "depth_error_mass": depth_error(mass, depths_mm),
-        "depth_definitions": {
-            name: _steps(np.array([each.depth_mm[name].mean() for each in dots]), depths_mm)
-            for name in DEPTH_DEFINITIONS
-        },
+        "depth_definitions": definitions,
         "by_depth": places["by_depth"]
         | {
             "elongation_mm": [float(each.elongation_mm.mean()) for each in dots],
@@ -293,10 +266,7 @@ def board_figures(
 
 
 def place_figures(
-    x_mm: Sequence[NDArray[np.float64]],
-    depth_mm: Sequence[NDArray[np.float64]],
-    depths_mm: tuple[float, ...],
-    spacing_mm: float,
+    x_mm: Sequence[Floats], depth_mm: Sequence[Floats], depths_mm: tuple[float, ...], spacing_mm: float
 ) -> dict[str, Any]:
     """Return the errors of place (Eqs. 19, 20) and the table by depth; dots that were not found are NaN.
 
@@ -314,15 +284,6 @@ def place_figures(
     }
 
 
-def depth_error(centre_mm: Sequence[float] | NDArray[np.float64], depths_mm: Sequence[float]) -> float:
+def depth_error(centre_mm: Sequence[float] | Floats, depths_mm: Sequence[float]) -> float:
     """Return Eq. 20 averaged over the steps between neighbouring depths."""
     return float(np.mean(np.abs(np.diff(centre_mm) / np.diff(depths_mm) - 1.0)))
-
-
-def _steps(centre_mm: NDArray[np.float64], depths_mm: Sequence[float]) -> dict[str, float]:
-    steps = np.diff(centre_mm) / np.diff(depths_mm)
-    return {
-        "error": depth_error(centre_mm, depths_mm),
-        "shortest": float(steps.min()),
-        "longest": float(steps.max()),
-    }

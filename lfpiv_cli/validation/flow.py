@@ -12,14 +12,18 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.flow.field import FLAG_NAMES, MM_TO_M, VectorField
+from lfpiv_cli.flow.windows import RoundWall
+from lfpiv_cli.synthetic.flows import Flow
 
 # The paper's Fig. 18: the share of vectors within a quarter of the truth.
 TOLERANCE = 0.25
@@ -31,6 +35,8 @@ SMALLEST_MEAN_FLOW = 0.05
 LARGEST_ALLOWED = ("streamwise_mean_error", "slice_mean_error")
 # Particles that a local linear fit takes: seven times its four unknowns, and close enough to the size of a window.
 FIT_PARTICLES = 28
+# Figures of each component, and their units.
+COMPONENT_FIGURES = {"rms": "_voxel", "bias": "_voxel", "slope": ""}
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,10 +50,10 @@ class Comparison:
     direction : (3,) unit vector of the mean true flow, or None where it has no direction
     """
 
-    measured: NDArray[np.float64]
-    true: NDArray[np.float64]
+    measured: Floats
+    true: Floats
     index_zyx: NDArray[np.int64]
-    direction: NDArray[np.float64] | None
+    direction: Floats | None
 
     @property
     def found(self) -> NDArray[np.bool_]:
@@ -55,35 +61,73 @@ class Comparison:
         return np.asarray(np.isfinite(self.measured).all(axis=1))
 
 
-def compare(field: VectorField, truth_velocity: NDArray[np.float64], inside: NDArray[np.bool_]) -> Comparison:
-    """Pair measured with true velocities at the windows `inside`; the truth may be anything elsewhere.
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """A measured flow and what it is held against.
 
-    Raises
-    ------
-    InputError
-        The truth or the mask has another shape than the field, no window is inside, or the truth is not finite there.
-    """
-    shape = field.flag.shape
-    if truth_velocity.shape != (*shape, 3) or inside.shape != shape:
-        raise InputError(f"truth {truth_velocity.shape} and mask {inside.shape} do not fit vectors of shape {shape}")
-    if not inside.any():
-        raise InputError("none of the window centres lies inside the flow")
-    true = truth_velocity[inside]
-    if not np.isfinite(true).all():
-        raise InputError("the true velocity is not finite at some window centres inside the flow")
-    mean = true.mean(axis=0)
-    speed = float(np.linalg.norm(mean))
-    has_direction = speed > SMALLEST_MEAN_FLOW * float(np.linalg.norm(true, axis=1).mean())
-    return Comparison(field.velocity[inside], true, np.argwhere(inside), mean / speed if has_direction else None)
-
-
-def flow_figures(field: VectorField, truth_velocity: NDArray[np.float64], inside: NDArray[np.bool_]) -> dict[str, Any]:
-    """Return the figures of a measured flow, ready for JSON.
-
-    Parameters
+    Attributes
     ----------
-    truth_velocity : (nz, ny, nx, 3) m/s at the window centres
+    truth : (nz, ny, nx, 3) m/s at the window centres
     inside : (nz, ny, nx) True for the windows that are judged
+    flow : the analytic flow that the truth is of, in the field's coordinates; None where it is of particles
+    """
+
+    field: VectorField
+    truth: Floats
+    inside: NDArray[np.bool_]
+    flow: Flow | None = None
+
+    @cached_property
+    def pairs(self) -> Comparison:
+        """Measured and true velocities at the windows that are judged; the truth may be anything elsewhere.
+
+        Raises
+        ------
+        InputError
+            The truth or the mask has another shape than the field, no window is inside, or the truth is not finite
+            there.
+        """
+        shape = self.field.flag.shape
+        if self.truth.shape != (*shape, 3) or self.inside.shape != shape:
+            raise InputError(
+                f"truth {self.truth.shape} and mask {self.inside.shape} do not fit vectors of shape {shape}"
+            )
+        if not self.inside.any():
+            raise InputError("none of the window centres lies inside the flow")
+        true = self.truth[self.inside]
+        if not np.isfinite(true).all():
+            raise InputError("the true velocity is not finite at some window centres inside the flow")
+        mean = true.mean(axis=0)
+        speed = float(np.linalg.norm(mean))
+        has_direction = speed > SMALLEST_MEAN_FLOW * float(np.linalg.norm(true, axis=1).mean())
+        return Comparison(
+            self.field.velocity[self.inside], true, np.argwhere(self.inside), mean / speed if has_direction else None
+        )
+
+    @property
+    def found(self) -> NDArray[np.bool_]:
+        """Which windows (nz, ny, nx) are judged and no miss."""
+        return np.asarray(self.inside & np.isfinite(self.field.velocity).all(axis=-1))
+
+    def judged(self, values: Floats) -> Floats:
+        """Return vectors where they are judged, else NaN."""
+        return np.where(self.inside[..., np.newaxis], values, np.nan)
+
+    def figures(self, duct: Duct | None, pipe: RoundWall | None = None) -> dict[str, Any]:
+        """Return the figures of `flow_figures`, with Table 4's for a duct, or those by radius for a pipe."""
+        figures = flow_figures(self)
+        if duct is not None:
+            figures["table_4"] = table_4(self, duct)
+            # the largest of the six slices, a share and not per cent
+            errors = [row["ours_percent"] for name, row in figures["table_4"].items() if name != "overall"]
+            figures["slice_mean_error"] = None if None in errors else 0.01 * max(errors)
+        if pipe is not None:
+            figures |= pipe_figures(self, pipe)
+        return figures
+
+
+def flow_figures(measured: Measured) -> dict[str, Any]:
+    """Return the figures of a measured flow, ready for JSON.
 
     Returns
     -------
@@ -92,32 +136,42 @@ def flow_figures(field: VectorField, truth_velocity: NDArray[np.float64], inside
         all windows inside); `rms_u_voxel`, `bias_u_voxel`, `slope_u` (of measured on true through zero) and so on for
         v, w, and the smallest of these; `slices` along each axis; `cumulative`.
     """
-    pairs = compare(field, truth_velocity, inside)
+    field, inside, pairs = measured.field, measured.inside, measured.pairs
     streamwise, vector = relative_errors(pairs)
-    figures: dict[str, Any] = _counts(field, inside)
+    flags = field.flag[inside]
+    figures: dict[str, Any] = {"vectors": int(field.flag.size), "vectors_inside": int(flags.size)}
+    figures |= {f"vectors_{name.replace(' ', '_')}": int(np.sum(flags == flag)) for flag, name in FLAG_NAMES.items()}
+    figures["vectors_missing"] = int(np.sum(~np.isfinite(field.velocity[inside]).all(axis=1)))
     figures["streamwise_direction"] = None if pairs.direction is None else pairs.direction.tolist()
     figures["streamwise_mean_error"] = _mean_error(*_streamwise_sums(pairs, pairs.found))
     figures["within_25_percent_streamwise"] = None if streamwise is None else float(np.mean(streamwise < TOLERANCE))
     figures["within_25_percent_vector"] = float(np.mean(vector < TOLERANCE))
-    figures |= _component_figures(field, pairs)
-    figures["smallest_slope"] = min(
-        (figures[f"slope_{c}"] for c in "uvw" if figures[f"slope_{c}"] is not None), default=None
-    )
-    figures["slices"] = {name: _slices(field, pairs, axis) for axis, name in enumerate("xyz")}
+
+    # of each component, over the vectors found; unknown without them or without a time
+    figures |= {f"{name}_{c}{unit}": None for c in "uvw" for name, unit in COMPONENT_FIGURES.items()}
+    if field.dt_s is not None and pairs.found.any():
+        to_voxel = field.dt_s / (np.asarray(field.voxel_mm) * MM_TO_M)
+        found, true = pairs.measured[pairs.found], pairs.true[pairs.found]
+        error = (found - true) * to_voxel
+        rms, bias = np.sqrt(np.mean(error**2, axis=0)), np.mean(error, axis=0)
+        power = np.sum(true**2, axis=0)
+        for k, c in enumerate("uvw"):
+            figures[f"rms_{c}_voxel"], figures[f"bias_{c}_voxel"] = float(rms[k]), float(bias[k])
+            if power[k] > 0.0:
+                figures[f"slope_{c}"] = float(found[:, k] @ true[:, k] / power[k])
+    slopes = [figures[f"slope_{c}"] for c in "uvw" if figures[f"slope_{c}"] is not None]
+    figures["smallest_slope"] = min(slopes, default=None)
+    # the streamwise mean error of every plane of windows across each axis
+    figures["slices"] = {}
+    for axis, name in enumerate("xyz"):
+        plane, positions = pairs.index_zyx[:, 2 - axis], field.grid.axis_mm(axis)
+        errors = [_mean_error(*_streamwise_sums(pairs, plane == k)) for k in range(field.grid.shape_xyz[axis])]
+        figures["slices"][name] = {"position_mm": [float(p) for p in positions], "streamwise_mean_error": errors}
     figures["cumulative"] = cumulative_distribution(pairs)
     return figures
 
 
-def _counts(field: VectorField, inside: NDArray[np.bool_]) -> dict[str, int]:
-    """Return how many windows there are, of each flag, and how many are missing."""
-    flags = field.flag[inside]
-    counts = {"vectors": int(field.flag.size), "vectors_inside": int(flags.size)}
-    counts |= {f"vectors_{name.replace(' ', '_')}": int(np.sum(flags == flag)) for flag, name in FLAG_NAMES.items()}
-    counts["vectors_missing"] = int(np.sum(~np.isfinite(field.velocity[inside]).all(axis=1)))
-    return counts
-
-
-def relative_errors(pairs: Comparison) -> tuple[NDArray[np.float64] | None, NDArray[np.float64]]:
+def relative_errors(pairs: Comparison) -> tuple[Floats | None, Floats]:
     """Return |v - u|/|u| streamwise (None without a direction) and of the whole vector, (n,); infinite for a miss.
 
     Where the truth is zero, only an exact zero is right, and every error infinite.
@@ -129,7 +183,7 @@ def relative_errors(pairs: Comparison) -> tuple[NDArray[np.float64] | None, NDAr
     return _ratio(np.abs(difference @ pairs.direction), np.abs(pairs.true @ pairs.direction)), vector
 
 
-def _ratio(error: NDArray[np.float64], size: NDArray[np.float64]) -> NDArray[np.float64]:
+def _ratio(error: Floats, size: Floats) -> Floats:
     """Return error / size; 0 for 0/0, infinite for a NaN error or a zero size."""
     ratio = np.where(error == 0.0, 0.0, np.inf)
     np.divide(error, size, out=ratio, where=(size > 0.0) & np.isfinite(error))
@@ -149,41 +203,16 @@ def _mean_error(measured_sum: float, true_sum: float) -> float | None:
     return measured_sum / true_sum - 1.0 if true_sum > 0.0 else None
 
 
-def _component_figures(field: VectorField, pairs: Comparison) -> dict[str, float | None]:
-    """Return rms and bias of each component in voxels, and its slope of measured on true, over the vectors found."""
-    names = [f"{figure}_{component}" for component in "uvw" for figure in ("rms", "bias", "slope")]
-    names = [name if name.startswith("slope") else f"{name}_voxel" for name in names]
-    if field.dt_s is None or not pairs.found.any():
-        return dict.fromkeys(names)
-    to_voxel = field.dt_s / (np.asarray(field.voxel_mm) * MM_TO_M)
-    measured, true = pairs.measured[pairs.found], pairs.true[pairs.found]
-    error = (measured - true) * to_voxel
-    rms, bias = np.sqrt(np.mean(error**2, axis=0)), np.mean(error, axis=0)
-    power = np.sum(true**2, axis=0)
-    slope = [float(m @ t / p) if p > 0.0 else None for m, t, p in zip(measured.T, true.T, power, strict=True)]
-    values = [value for k in range(3) for value in (float(rms[k]), float(bias[k]), slope[k])]
-    return dict(zip(names, values, strict=True))
-
-
-def _slices(field: VectorField, pairs: Comparison, axis: int) -> dict[str, list[float | None]]:
-    """Return the streamwise mean error of every plane of windows across an axis (0 for x), with its position."""
-    plane = pairs.index_zyx[:, 2 - axis]
-    count = field.grid.shape_xyz[axis]
-    errors = [_mean_error(*_streamwise_sums(pairs, plane == k)) for k in range(count)]
-    return {"position_mm": [float(p) for p in field.grid.axis_mm(axis)], "streamwise_mean_error": list(errors)}
-
-
-def streamwise_mean_error_at(field: VectorField, pairs: Comparison, axis: int, position_mm: float) -> float | None:
+def streamwise_mean_error_at(measured: Measured, axis: int, position_mm: float) -> float | None:
     """Return the streamwise mean error of a slice across an axis (0 for x), between planes of windows if need be.
 
     The sums of v and of u, not their ratio, are interpolated; beyond the outer planes the outer one is taken.
     """
+    field, pairs = measured.field, measured.pairs
     plane = pairs.index_zyx[:, 2 - axis]
     sums = np.array([_streamwise_sums(pairs, plane == k) for k in range(field.grid.shape_xyz[axis])])
-    positions = field.grid.axis_mm(axis)
-    return _mean_error(
-        float(np.interp(position_mm, positions, sums[:, 0])), float(np.interp(position_mm, positions, sums[:, 1]))
-    )
+    v, u = (float(np.interp(position_mm, field.grid.axis_mm(axis), each)) for each in sums.T)
+    return _mean_error(v, u)
 
 
 def cumulative_distribution(pairs: Comparison) -> dict[str, Any]:
@@ -191,7 +220,7 @@ def cumulative_distribution(pairs: Comparison) -> dict[str, Any]:
     limits = np.linspace(0.0, 1.0, CUMULATIVE_STEPS)
     streamwise, vector = relative_errors(pairs)
 
-    def shares(errors: NDArray[np.float64]) -> list[float]:
+    def shares(errors: Floats) -> list[float]:
         return (np.searchsorted(np.sort(errors), limits, side="right") / errors.size).tolist()
 
     return {
@@ -201,9 +230,7 @@ def cumulative_distribution(pairs: Comparison) -> dict[str, Any]:
     }
 
 
-def truth_at_points(
-    positions_mm: NDArray[np.float64], velocities: NDArray[np.float64], centres_mm: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def truth_at_points(positions_mm: Floats, velocities: Floats, centres_mm: Floats) -> Floats:
     """Return the velocity of a list of true particles at given points, by a linear fit to the nearest ones of each.
 
     Parameters
@@ -295,15 +322,13 @@ class Duct:
         return self.centre_mm[axis] + (share - 0.5) * self.width_mm
 
 
-def table_4(
-    field: VectorField, truth_velocity: NDArray[np.float64], inside: NDArray[np.bool_], duct: Duct
-) -> dict[str, Any]:
+def table_4(measured: Measured, duct: Duct) -> dict[str, Any]:
     """Return the sizes of the mean velocity errors in per cent, of the six slices and of the whole, beside the paper's.
 
     By the slice (`overall`, `z/D 0.3` ...): `ours`, `paper_dlfc` and `paper_ert`. A slice between planes of windows is
     interpolated; ours is None where it has none.
     """
-    pairs = compare(field, truth_velocity, inside)
+    pairs = measured.pairs
     found = pairs.measured[pairs.found].sum(axis=0), pairs.true[pairs.found].sum(axis=0)
     overall = None
     if pairs.direction is not None and pairs.found.any():
@@ -311,17 +336,53 @@ def table_4(
     table = {"overall": _row(overall, *PAPER_OVERALL)}
     for name, axis in duct.across.items():
         for share, paper in PAPER_SLICES[name].items():
-            error = streamwise_mean_error_at(field, pairs, axis, duct.position_mm(axis, share))
+            error = streamwise_mean_error_at(measured, axis, duct.position_mm(axis, share))
             table[f"{name} {share}"] = _row(error, *paper)
     return table
-
-
-def worst_slice(table: Mapping[str, Mapping[str, float | None]]) -> float | None:
-    """Return the largest mean velocity error of the six slices (a share, not per cent); None where one is unknown."""
-    errors = [row["ours_percent"] for name, row in table.items() if name != "overall"]
-    return None if None in errors else 0.01 * max(error for error in errors if error is not None)
 
 
 def _row(error: float | None, paper_dlfc: float, paper_ert: float) -> dict[str, float | None]:
     ours = None if error is None else 100.0 * abs(error)
     return {"ours_percent": ours, "paper_dlfc_percent": paper_dlfc, "paper_ert_percent": paper_ert}
+
+
+# Rings of nearly as many windows each, the outer ones thinner: beyond the last but one edge windows of a tenth of the
+# diameter reach beyond the wall.
+RING_EDGES = (0.0, 0.3, 0.5, 0.7, 0.8, 0.9, 1.0)
+# Figures of the inner pipe leave out the last ring.
+INNER = RING_EDGES[-2]
+
+
+def pipe_figures(measured: Measured, pipe: RoundWall) -> dict[str, Any]:
+    """Return the figures of windows by their distance from the axis, ready for JSON.
+
+    Returns
+    -------
+    dict
+        `within_25_percent_vector_inner`, the share of the windows up to 0.9 of the radius whose whole vector errs by
+        less than a quarter; `rings`, for each two edges (shares of the radius) their `vectors`, `streamwise_mean_error`
+        (sum v / sum u - 1) and `within_25_percent_vector`. None where there is no window.
+    """
+    pairs = measured.pairs
+    share = (pipe.distances_mm(measured.field.grid.centres_mm()) / pipe.radius_mm)[measured.inside]
+    right = relative_errors(pairs)[1] < TOLERANCE
+    inner = share <= INNER
+    ring, rings = np.searchsorted(RING_EDGES[1:-1], share), []
+    for number, edges in enumerate(zip(RING_EDGES, RING_EDGES[1:], strict=False)):
+        chosen = ring == number
+        found = chosen & pairs.found
+        sums = [float(each[found, pipe.along].sum()) for each in (pairs.measured, pairs.true)]
+        rings.append(
+            {
+                "radius_shares": list(edges),
+                "vectors": int(chosen.sum()),
+                "streamwise_mean_error": sums[0] / sums[1] - 1.0 if sums[1] else None,
+                "within_25_percent_vector": _share(right[chosen]),
+            }
+        )
+    return {"within_25_percent_vector_inner": _share(right[inner]), "rings": rings}
+
+
+def _share(right: NDArray[np.bool_]) -> float | None:
+    """Return how many of some are right, None of none."""
+    return float(right.mean()) if right.size else None

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping
-from dataclasses import dataclass
 from itertools import cycle
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.flow.windows import RoundWall
 from lfpiv_cli.pictures.style import (
@@ -20,85 +19,26 @@ from lfpiv_cli.pictures.style import (
     COMPONENT_NAMES,
     GREY,
     MARKERS,
-    new_figure,
+    Figure,
+    new_panels,
     styled,
     symmetric_limit,
 )
-from lfpiv_cli.pictures.vectors import compared_figure, draw_maps, mean_of_known, plane_panels, signed_scale, speed_unit
-from lfpiv_cli.synthetic.vortices import Flow
-from lfpiv_cli.validation.flow import (
-    PAPER_SLICES,
-    TOLERANCE,
-    Duct,
-    compare,
-    cumulative_distribution,
-    flow_figures,
-    relative_errors,
-    table_4,
-    worst_slice,
-)
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-
-# Rings of nearly as many windows each, the outer ones thinner: beyond the last but one edge windows of a tenth of the
-# diameter reach beyond the wall.
-RING_EDGES = (0.0, 0.3, 0.5, 0.7, 0.8, 0.9, 1.0)
-# Figures of the inner pipe leave out the last ring.
-INNER = RING_EDGES[-2]
-
-
-def pipe_figures(
-    field: VectorField, truth_velocity: NDArray[np.float64], inside: NDArray[np.bool_], pipe: RoundWall
-) -> dict[str, Any]:
-    """Return the figures of windows by their distance from the axis, ready for JSON.
-
-    Returns
-    -------
-    dict
-        `within_25_percent_vector_inner`, the share of the windows up to 0.9 of the radius whose whole vector errs by
-        less than a quarter; `rings`, for each two edges (shares of the radius) their `vectors`, `streamwise_mean_error`
-        (sum v / sum u - 1) and `within_25_percent_vector`. None where there is no window.
-    """
-    pairs = compare(field, truth_velocity, inside)
-    share = (pipe.distances_mm(field.grid.centres_mm()) / pipe.radius_mm)[inside]
-    right = relative_errors(pairs)[1] < TOLERANCE
-    inner = share <= INNER
-    ring, rings = np.searchsorted(RING_EDGES[1:-1], share), []
-    for number, edges in enumerate(zip(RING_EDGES, RING_EDGES[1:], strict=False)):
-        chosen = ring == number
-        found = chosen & pairs.found
-        measured, true = (float(each[found, pipe.along].sum()) for each in (pairs.measured, pairs.true))
-        rings.append(
-            {
-                "radius_shares": list(edges),
-                "vectors": int(chosen.sum()),
-                "streamwise_mean_error": measured / true - 1.0 if true else None,
-                "within_25_percent_vector": _share(right[chosen]),
-            }
-        )
-    return {"within_25_percent_vector_inner": _share(right[inner]), "rings": rings}
-
-
-def _share(right: NDArray[np.bool_]) -> float | None:
-    """Return how many of some are right, None of none."""
-    return float(right.mean()) if right.size else None
+from lfpiv_cli.pictures.vectors import MapRow, compared_figure, maps_figure, mean_of_known, signed_scale, speed_unit
+from lfpiv_cli.validation.flow import INNER, PAPER_SLICES, TOLERANCE, Duct, Measured, cumulative_distribution, table_4
 
 
 @styled
 def radius_figure(fields: Mapping[str, VectorField], pipe: RoundWall, mean_velocity_m_s: float) -> Figure:
     """Return each component of vectors over their distance from the axis, beside Poiseuille's parabola."""
-    figure = new_figure(11.0, 4.0)
+    figure, panels = new_panels(11.0, 4.0, 1, 3)
     radius = np.linspace(0.0, pipe.radius_mm, 101)
-    for component, panel in enumerate(figure.subplots(1, 3)):
+    for component, panel in enumerate(panels):
         for (name, field), colour, marker in zip(fields.items(), cycle(COLOURS), cycle(MARKERS), strict=False):
             distance = pipe.distances_mm(field.grid.centres_mm())
             seen = np.isfinite(field.velocity[..., component]) & (distance < pipe.radius_mm)
-            panel.plot(
-                distance[seen], field.velocity[seen][:, component], marker, color=colour, markersize=2.0, label=name
-            )
+            values = field.velocity[seen][:, component]
+            panel.plot(distance[seen], values, marker, color=colour, markersize=2.0, label=name)
         axial = 2.0 * mean_velocity_m_s * (1.0 - (radius / pipe.radius_mm) ** 2)
         panel.plot(radius, axial if component == pipe.along else 0.0 * radius, color=BLACK, label="true, analytic")
         panel.axvline(INNER * pipe.radius_mm, color=GREY, linewidth=0.8)
@@ -121,39 +61,17 @@ ERROR_OF = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class Measured:
-    """A measured flow and what it is held against.
-
-    Attributes
-    ----------
-    truth : (nz, ny, nx, 3) m/s at the window centres
-    inside : (nz, ny, nx) True for the windows that are judged
-    flow : the analytic flow that the truth is of, in the field's coordinates; None where it is of particles
-    """
-
-    field: VectorField
-    truth: NDArray[np.float64]
-    inside: NDArray[np.bool_]
-    flow: Flow | None = None
-
-    def figures(self, duct: Duct | None, pipe: RoundWall | None = None) -> dict[str, Any]:
-        """Return the figures of `flow_figures`, with Table 4's for a duct, or those by radius for a pipe."""
-        figures = flow_figures(self.field, self.truth, self.inside)
-        if duct is not None:
-            figures["table_4"] = table_4(self.field, self.truth, self.inside, duct)
-            figures["slice_mean_error"] = worst_slice(figures["table_4"])
-        if pipe is not None:
-            figures |= pipe_figures(self.field, self.truth, self.inside, pipe)
-        return figures
-
-
 def lower_error(methods: Mapping[str, Measured], figures: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
     """Return the method with the lower error: by figure, and (`whole_vector`) by the rms over windows all have found.
 
     Left out is a figure that a method does not know, or in which all err alike.
     """
-    better = {"whole_vector": _lowest(_common_rms(methods))}
+    common = np.all([m.found for m in methods.values()], axis=0)
+    rms: dict[str, float | None] = dict.fromkeys(methods)
+    if common.any():
+        for method, m in methods.items():
+            rms[method] = float(np.sqrt(np.mean(np.sum((m.field.velocity - m.truth)[common] ** 2, axis=-1))))
+    better = {"whole_vector": _lowest(rms)}
     for kind, names in ERROR_OF.items():
         for name in names:
             values = {method: found.get(name) for method, found in figures.items()}
@@ -161,17 +79,6 @@ def lower_error(methods: Mapping[str, Measured], figures: Mapping[str, Mapping[s
                 values = {method: None if value is None else 1.0 - value for method, value in values.items()}
             better[name] = _lowest({method: None if value is None else abs(value) for method, value in values.items()})
     return {name: method for name, method in better.items() if method is not None}
-
-
-def _common_rms(methods: Mapping[str, Measured]) -> dict[str, float | None]:
-    """Return the rms of each method's error of the whole vector, m/s, over the windows that no method has missed."""
-    found = np.all([m.inside & np.isfinite(m.field.velocity).all(axis=-1) for m in methods.values()], axis=0)
-    if not found.any():
-        return dict.fromkeys(methods)
-    return {
-        name: float(np.sqrt(np.mean(np.sum((m.field.velocity - m.truth)[found] ** 2, axis=-1))))
-        for name, m in methods.items()
-    }
 
 
 def _lowest(errors: Mapping[str, float | None]) -> str | None:
@@ -202,31 +109,21 @@ def flow_figure(methods: Mapping[str, Measured]) -> Figure:
     """
     first = next(iter(methods.values()))
     fields = {"true": first.truth} | {name: m.field.velocity for name, m in methods.items()}
-    factor, unit = speed_unit(_judged(first, first.truth))
-    rows = {name: factor * _judged(methods.get(name, first), values) for name, values in fields.items()}
+    factor, unit = speed_unit(first.judged(first.truth))
+    rows = {name: factor * methods.get(name, first).judged(values) for name, values in fields.items()}
     return compared_figure(first.field.grid, rows, unit)
 
 
-def _judged(measured: Measured, values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return vectors where they are judged, else NaN."""
-    return np.where(measured.inside[..., np.newaxis], values, np.nan)
-
-
-@styled
 def errors_figure(methods: Mapping[str, Measured]) -> Figure:
     """Return measured less true velocities in three middle planes: rows of methods, on one scale a component."""
-    errors = {name: _judged(m, m.field.velocity - m.truth) for name, m in methods.items()}
+    errors = {name: m.judged(m.field.velocity - m.truth) for name, m in methods.items()}
     factor, unit = speed_unit(*errors.values())
-    grid = next(iter(methods.values())).field.grid
-    figure, axes = plane_panels(grid, rows=3 * len(methods))
-    for component, rows in enumerate(axes.reshape(3, len(methods), 3)):
+    rows = []
+    for component, letter in enumerate(COMPONENT_NAMES):
         maps = {name: [factor * error[..., component]] * 3 for name, error in errors.items()}
-        scale = signed_scale(*maps.values())
-        for row, (name, values) in zip(rows, maps.items(), strict=True):
-            image = draw_maps(row, grid, values, [f"{name}: error of {COMPONENT_NAMES[component]}"] * 3, **scale)
-        label = f"{COMPONENT_NAMES[component]}, measured less true ({unit})"
-        figure.colorbar(image, ax=rows.ravel().tolist(), label=label)
-    return figure
+        label, scale = f"{letter}, measured less true ({unit})", signed_scale(*maps.values())
+        rows += [MapRow(each, [f"{name}: error of {letter}"] * 3, label, scale) for name, each in maps.items()]
+    return maps_figure(next(iter(methods.values())).field.grid, rows)
 
 
 @styled
@@ -236,22 +133,35 @@ def profiles_figure(methods: Mapping[str, Measured]) -> Figure:
     Means are over the windows that all methods have found; the true ones over the same.
     """
     first = next(iter(methods.values()))
-    factor, unit = speed_unit(_judged(first, first.truth))
-    figure = new_figure(11.0, 11.0)
-    axes = figure.subplots(4, 3, sharey="row")
-    least = LEAST_RANGE * factor * symmetric_limit(_judged(first, first.truth))
+    factor, unit = speed_unit(first.judged(first.truth))
+    figure, axes = new_panels(11.0, 11.0, 4, 3, sharey="row")
+    grid, found_by_all = first.field.grid, np.all([m.found for m in methods.values()], axis=0)
+    curves = {"true, at the windows": first.truth} | {name: m.field.velocity for name, m in methods.items()}
+    styles = list(zip((BLACK, *COLOURS), ("+", *MARKERS), strict=True))
+    least = LEAST_RANGE * factor * symmetric_limit(first.judged(first.truth))
     for component, row in enumerate(axes[:3]):
         for axis, panel in enumerate(row):
-            _draw_profile(panel, methods, axis, component, factor)
-            panel.set(
-                xlabel=f"{AXIS_NAMES[axis]} (mm)", ylabel=f"{COMPONENT_NAMES[component]} ({unit}), mean over the plane"
-            )
+            panel.axhline(0.0, color=GREY, linewidth=0.8)
+            if first.flow is not None:
+                # on planes across the axis, at the lateral places of the windows
+                places = np.linspace(*grid.bounds_mm(axis), LINE_POINTS)
+                lateral = np.unique(np.delete(grid.centres_mm()[first.inside], axis, axis=1), axis=0)
+                points = np.tile(lateral, (places.size, 1))
+                on_planes = first.flow(np.insert(points, axis, np.repeat(places, len(lateral)), axis=1))
+                true = on_planes.reshape(places.size, len(lateral), 3)[..., component].mean(axis=1)
+                panel.plot(places, factor * true, color=BLACK, label="true, analytic")
+            for (label, values), (colour, marker) in zip(curves.items(), styles, strict=False):
+                known = np.where(found_by_all, values[..., component], np.nan)
+                mean = mean_of_known(known, tuple(k for k in range(3) if k != 2 - axis))
+                look = {"color": colour, "markerfacecolor": "none", "label": label}
+                panel.plot(grid.axis_mm(axis), factor * mean, marker, **look)
+            panel.set_xlabel(f"{AXIS_NAMES[axis]} (mm)")
+            panel.set_ylabel(f"{COMPONENT_NAMES[component]} ({unit}), mean over the plane")
         low, high = row[0].get_ylim()
         row[0].set_ylim(min(low, -least), max(high, least))
-    shares = {name: cumulative_distribution(compare(m.field, m.truth, m.inside)) for name, m in methods.items()}
-    for panel, key, what in zip(
-        axes[3], ("streamwise_share", "vector_share"), ("along the mean flow", "of the whole vector"), strict=False
-    ):
+    shares = {name: cumulative_distribution(m.pairs) for name, m in methods.items()}
+    told = {"streamwise_share": "along the mean flow", "vector_share": "of the whole vector"}
+    for panel, (key, what) in zip(axes[3], told.items(), strict=False):
         for (name, found), colour in zip(shares.items(), cycle(COLOURS), strict=False):
             if found[key] is not None:
                 panel.plot(found["relative_error"], found[key], color=colour, label=name)
@@ -262,33 +172,6 @@ def profiles_figure(methods: Mapping[str, Measured]) -> Figure:
     return figure
 
 
-def _draw_profile(axes: Axes, methods: Mapping[str, Measured], axis: int, component: int, factor: float) -> None:
-    """Draw the means over planes across an axis, over the windows that all methods have found."""
-    others = tuple(k for k in range(3) if k != 2 - axis)
-    first = next(iter(methods.values()))
-    grid = first.field.grid
-    judged = np.all([m.inside & np.isfinite(m.field.velocity).all(axis=-1) for m in methods.values()], axis=0)
-    axes.axhline(0.0, color=GREY, linewidth=0.8)
-    if first.flow is not None:
-        places = np.linspace(*grid.bounds_mm(axis), LINE_POINTS)
-        planes = _on_planes(first.flow, grid.centres_mm()[first.inside], places, axis)
-        axes.plot(places, factor * planes[..., component].mean(axis=1), color=BLACK, label="true, analytic")
-    curves = {"true, at the windows": first.truth} | {name: m.field.velocity for name, m in methods.items()}
-    styles = zip((BLACK, *COLOURS), ("+", *MARKERS), strict=True)
-    for (label, values), (colour, marker) in zip(curves.items(), styles, strict=False):
-        mean = mean_of_known(np.where(judged, values[..., component], np.nan), others)
-        axes.plot(grid.axis_mm(axis), factor * mean, marker, color=colour, markerfacecolor="none", label=label)
-
-
-def _on_planes(
-    flow: Flow, points_mm: NDArray[np.float64], places_mm: NDArray[np.float64], axis: int
-) -> NDArray[np.float64]:
-    """Return a flow in m/s, (places, m, 3), on planes across an axis, at the lateral places of points (n, 3)."""
-    lateral = np.unique(np.delete(points_mm, axis, axis=1), axis=0)
-    points = np.insert(np.tile(lateral, (places_mm.size, 1)), axis, np.repeat(places_mm, len(lateral)), axis=1)
-    return flow(points).reshape(places_mm.size, len(lateral), 3)
-
-
 @styled
 def slices_figure(methods: Mapping[str, Measured], duct: Duct) -> Figure:
     """Return streamwise profiles across six slices of a duct, those of the paper's Fig. 16, and their errors.
@@ -296,60 +179,46 @@ def slices_figure(methods: Mapping[str, Measured], duct: Duct) -> Figure:
     Profiles are means along the flow, over the planes of windows on both sides of a slice. The paper's errors (Table 4)
     stand beside ours only where the duct is the paper's.
     """
-    figure = new_figure(12.0, 7.0)
-    axes = figure.subplots(2, 3)
-    tables = {name: table_4(m.field, m.truth, m.inside, duct) for name, m in methods.items()}
+    figure, axes = new_panels(12.0, 7.0, 2, 3)
+    first = next(iter(methods.values()))
+    curves = {"true, at the windows": first.judged(first.truth)} if first.flow is None else {}
+    curves |= {name: m.judged(m.field.velocity) for name, m in methods.items()}
+    tables = {name: table_4(m, duct) for name, m in methods.items()}
     main = AXIS_NAMES.index(duct.axis)
     for row, (name, axis) in zip(axes, duct.across.items(), strict=True):
         for panel, share in zip(row, PAPER_SLICES[name], strict=True):
-            _draw_slice(panel, methods, duct, axis, duct.position_mm(axis, share))
+            position, other = duct.position_mm(axis, share), 3 - axis - main
+            panel.axhline(0.0, color=GREY, linewidth=0.8)
+            if first.flow is not None:
+                # as far as the walls
+                places = np.linspace(duct.position_mm(other, 0.0), duct.position_mm(other, 1.0), LINE_POINTS)
+                points = np.tile(duct.centre_mm, (LINE_POINTS, 1))
+                points[:, axis], points[:, other] = position, places
+                panel.plot(places, first.flow(points)[:, main], color=BLACK, label="true, analytic")
+            for (label, values), colour, marker in zip(curves.items(), COLOURS, MARKERS, strict=False):
+                profile = profile_at(values[..., main], first.field.grid.axis_mm(axis), position, axis, main)
+                look = {"color": colour, "markerfacecolor": "none", "label": label}
+                panel.plot(first.field.grid.axis_mm(other), profile, marker, **look)
             rows = {method: table[f"{name} {share}"] for method, table in tables.items()}
             ours = {method: errors["ours_percent"] for method, errors in rows.items()}
             errors = [f"{name} unknown" if e is None else f"{name} {e:.2f} %" for name, e in ours.items()]
             told = textwrap.fill(f"mean error: {', '.join(errors)}", TITLE_WIDTH)
             paper = next(iter(rows.values()))["paper_ert_percent"]
             beside = f" (paper {paper:.2f} %)" if duct.is_the_papers else ""
-            other = 3 - axis - main
-            panel.set(
-                title=f"{name} = {share}{beside}\n{told}",
-                xlabel=f"{AXIS_NAMES[other]} (mm)",
-                ylabel=f"{COMPONENT_NAMES[main]} (m/s)",
-            )
+            panel.set_title(f"{name} = {share}{beside}\n{told}")
+            panel.set(xlabel=f"{AXIS_NAMES[other]} (mm)", ylabel=f"{COMPONENT_NAMES[main]} (m/s)")
     axes[0, 0].legend()
     return figure
 
 
-def _draw_slice(axes: Axes, methods: Mapping[str, Measured], duct: Duct, axis: int, position: float) -> None:
-    """Draw profiles along what is left of a slice across an axis: the true one as far as the walls."""
-    main = AXIS_NAMES.index(duct.axis)
-    other = 3 - axis - main
-    first = next(iter(methods.values()))
-    grid = first.field.grid
-    axes.axhline(0.0, color=GREY, linewidth=0.8)
-    if first.flow is not None:
-        places = np.linspace(duct.position_mm(other, 0.0), duct.position_mm(other, 1.0), LINE_POINTS)
-        points = np.tile(duct.centre_mm, (LINE_POINTS, 1))
-        points[:, axis], points[:, other] = position, places
-        axes.plot(places, first.flow(points)[:, main], color=BLACK, label="true, analytic")
-    curves = {"true, at the windows": _judged(first, first.truth)} if first.flow is None else {}
-    curves |= {name: _judged(m, m.field.velocity) for name, m in methods.items()}
-    for (label, values), colour, marker in zip(curves.items(), COLOURS, MARKERS, strict=False):
-        profile = profile_at(values[..., main], grid.axis_mm(axis), position, axis, main)
-        axes.plot(grid.axis_mm(other), profile, marker, color=colour, markerfacecolor="none", label=label)
-
-
-def profile_at(
-    values: NDArray[np.float64], places: NDArray[np.float64], position: float, axis: int, along: int
-) -> NDArray[np.float64]:
+def profile_at(values: Floats, places: Floats, position: float, axis: int, along: int) -> Floats:
     """Return a slice across one axis (0 for x) of values [z, y, x], interpolated, and its mean along another."""
     # what is left of [z, y, x] once the first axis is taken
     left = [k for k in (2, 1, 0) if k != axis].index(along)
     return mean_of_known(slice_at(values, places, position, axis), (left,))
 
 
-def slice_at(
-    values: NDArray[np.float64], places: NDArray[np.float64], position: float, axis: int
-) -> NDArray[np.float64]:
+def slice_at(values: Floats, places: Floats, position: float, axis: int) -> Floats:
     """Return a slice across one axis (0 for x) of values [z, y, x], interpolated between planes at `places`."""
     at = float(np.clip(np.interp(position, places, np.arange(places.size)), 0, places.size - 1))
     low = min(int(at), max(0, places.size - 2))

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.flow.windows import ROUNDING
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.optics.camera import Camera
@@ -53,29 +54,25 @@ def share_beyond(camera: Camera, media: Media, z_mm: tuple[float, float], light:
     image = np.ascontiguousarray(light[top : top + rows, left : left + columns])
     if not image.any():
         return 0.0
-    grid = _longer(small, media, z_mm)
-    volume = reconstruct(factorise(small, media, grid), image, SOLVER).volume
-    by_depth, depths = volume.sum(axis=(1, 2), dtype=np.float64), grid.axis_mm(2)
-    near = NEAR_DEPTHS * camera.scale(media).depth_mm
-    beyond = (depths < z_mm[0] - near) | (depths > z_mm[1] + near)
-    return float(by_depth[beyond].sum() / max(float(by_depth.sum()), np.finfo(np.float64).tiny))
-
-
-def _longer(camera: Camera, media: Media, z_mm: tuple[float, float]) -> Grid:
-    """Return coarse voxels in all that a camera sees, at the depths of a volume and beyond."""
+    # coarse voxels in all that is seen, at the depths of the volume and beyond
     scale = camera.scale(media)
     length = z_mm[1] - z_mm[0]
     longer = float(np.clip(LONGER * length, LEAST_DEPTHS * scale.depth_mm, MOST_DEPTHS * scale.depth_mm))
     low = max(z_mm[0] - longer, -CLEAR * camera.focus_distance_mm / media.depth_ratio)
     high = z_mm[1] + longer
     lateral, plane = VOXEL_LENSES * scale.lens_mm, PLANE_DEPTHS * scale.depth_mm
-    sides = np.array([camera.columns, camera.rows]) * camera.pixel_mm / abs(camera.magnification)
+    sides = np.array([small.columns, small.rows]) * camera.pixel_mm / abs(camera.magnification)
     if camera.column_axis == "y":
         sides = sides[::-1]
     nx, ny = (max(1, round(side / lateral)) for side in sides)
     nz = max(1, round((high - low) / plane))
     grid = Grid.centred((nx, ny, nz), (lateral, lateral, (high - low) / nz), (0.0, 0.0, 0.5 * (low + high)))
-    return grid.padded(default_padding(camera, media, grid))
+    grid = grid.padded(default_padding(small, media, grid))
+    volume = reconstruct(factorise(small, media, grid), image, SOLVER).volume
+    by_depth, depths = volume.sum(axis=(1, 2), dtype=np.float64), grid.axis_mm(2)
+    near = NEAR_DEPTHS * scale.depth_mm
+    beyond = (depths < z_mm[0] - near) | (depths > z_mm[1] + near)
+    return float(by_depth[beyond].sum() / max(float(by_depth.sum()), np.finfo(np.float64).tiny))
 
 
 # How well the particles of a raw image can be known at best: the Cramer-Rao bound.
@@ -106,18 +103,19 @@ RIDGE = 1e-10
 class Bound:
     """Smallest covariances (n, 4, 4) of each particle, its neighbours known (`alone`) or to be found (`joint`)."""
 
-    alone: NDArray[np.float64]
-    joint: NDArray[np.float64]
+    alone: Floats
+    joint: Floats
 
-    def sigma_mm(self, joint: bool) -> NDArray[np.float64]:
+    def sigma_mm(self, joint: bool) -> Floats:
         """Return the smallest standard errors (n, 3) of x, y and z."""
         chosen = self.joint if joint else self.alone
         return np.asarray(np.sqrt(np.diagonal(chosen, axis1=1, axis2=2)[:, :3]))
 
 
-def slopes(view: View, particles: NDArray[np.float64]) -> sparse.csc_array:
+def slopes(view: View, particles: Floats) -> sparse.csc_array:
     """Return J (pixels, 4 n): what each particle's x, y, z and light do to the expected image."""
-    capacity = entry_capacity(view, *_depths(particles))
+    depths = (float(particles[:, 2].min()), float(particles[:, 2].max())) if len(particles) else (0.0, 0.0)
+    capacity = entry_capacity(view, *depths)
     room = room_for(1, capacity, 0)
     rows, columns, entries = [], [], []
     for number, particle in enumerate(particles):
@@ -135,18 +133,12 @@ def slopes(view: View, particles: NDArray[np.float64]) -> sparse.csc_array:
     return sparse.csc_array(sparse.coo_array((np.concatenate(entries), indices), shape=shape))
 
 
-def _depths(particles: NDArray[np.float64]) -> tuple[float, float]:
-    return (float(particles[:, 2].min()), float(particles[:, 2].max())) if len(particles) else (0.0, 0.0)
-
-
-def expected_image(slope: sparse.csc_array, particles: NDArray[np.float64]) -> NDArray[np.float64]:
+def expected_image(slope: sparse.csc_array, particles: Floats) -> Floats:
     """Return the expected counts (pixels,) of particles from their `slopes`."""
     return np.asarray(slope[:, 3::UNKNOWNS] @ particles[:, 3])
 
 
-def pixel_variance(
-    expected_counts: NDArray[np.float64], readout: Readout, counts_per_ray: float = 0.0
-) -> NDArray[np.float64]:
+def pixel_variance(expected_counts: Floats, readout: Readout, counts_per_ray: float = 0.0) -> Floats:
     """Return the variance (pixels,) of recorded pixels: read noise, rounding, light's own noise, and that of its rays.
 
     Parameters
@@ -158,7 +150,7 @@ def pixel_variance(
     return np.asarray(readout.read_noise_counts**2 + ROUNDING_VARIANCE + gain * np.maximum(expected_counts, 0.0))
 
 
-def cramer_rao_bound(slope: sparse.csc_array, variance: NDArray[np.float64]) -> Bound:
+def cramer_rao_bound(slope: sparse.csc_array, variance: Floats) -> Bound:
     """Return the bound of each particle from the `slopes` of all and the variance (pixels,) of the image.
 
     Jointly, the particles that share pixels with a particle are free and those further away held: what these would add
@@ -179,9 +171,7 @@ def cramer_rao_bound(slope: sparse.csc_array, variance: NDArray[np.float64]) -> 
     return Bound(alone, joint)
 
 
-def errors_alone_mm(
-    view: View, particles: NDArray[np.float64], readout: Readout, counts_per_ray: float = 0.0
-) -> NDArray[np.float64]:
+def errors_alone_mm(view: View, particles: Floats, readout: Readout, counts_per_ray: float = 0.0) -> Floats:
     """Return the bound (n, 3) of x, y and z of particles each of which is alone in an image of its own."""
     errors = np.empty((len(particles), 3))
     for number, particle in enumerate(particles):
@@ -191,7 +181,7 @@ def errors_alone_mm(
     return errors
 
 
-def _first_block_of_inverse(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+def _first_block_of_inverse(matrix: Floats) -> Floats:
     """Return the first (4, 4) of a symmetric matrix's inverse; a diagonal of 0 is of something that cannot be known."""
     diagonal = np.diag(matrix)
     known = diagonal > 0.0
@@ -223,6 +213,8 @@ PLACES, STEPS = 8, np.array([0.7548776662466927, 0.5698402909980532])
 LENSES_AROUND = 3
 # Before and behind a depth alone, in depths over which light spreads by one lens: waves are computed about it.
 ABOUT_DEPTH = 1e-3
+# Planes of a box in which its share in view is looked at.
+VIEW_PLANES = 41
 # Rounds in which light and number of an image's tracers are told from each other.
 ROUNDS = 4
 # Pixels are lit that a lens image's rim only touches.
@@ -244,10 +236,10 @@ class Miniature(NamedTuple):
     """The view of a sensor just large enough for the light of tracers in its middle, at depths (n,)."""
 
     view: View
-    depths_mm: NDArray[np.float64]
+    depths_mm: Floats
 
 
-def half_view_mm(camera: Camera, media: Media, z_mm: ArrayLike, rim: float = -1.0) -> NDArray[np.float64]:
+def half_view_mm(camera: Camera, media: Media, z_mm: ArrayLike, rim: float = -1.0) -> Floats:
     """Return half the field of view (n, 2) along x and y at depths (n,), 0 where there is none.
 
     Parameters
@@ -264,22 +256,20 @@ def half_view_mm(camera: Camera, media: Media, z_mm: ArrayLike, rim: float = -1.
     return np.asarray(seen if camera.column_axis == "x" else seen[..., ::-1])
 
 
-def share_in_view(
-    camera: Camera, media: Media, bounds_mm: NDArray[np.float64], rim: float = -1.0, planes: int = 41
-) -> float:
-    """Return the share of a box's volume in the field of view, `rim` as in `half_view_mm`.
+def share_in_view(camera: Camera, media: Media, bounds_mm: Floats) -> float:
+    """Return the share of a box's volume in which all of a point's light is seen.
 
     Parameters
     ----------
     bounds_mm : (3, 2) lowest and highest x, y, z of the box
     """
-    half = half_view_mm(camera, media, np.linspace(bounds_mm[2, 0], bounds_mm[2, 1], planes), rim)
+    half = half_view_mm(camera, media, np.linspace(bounds_mm[2, 0], bounds_mm[2, 1], VIEW_PLANES))
     low, high = np.maximum(bounds_mm[:2, 0], -half), np.minimum(bounds_mm[:2, 1], half)
     sides = np.maximum(high - low, 0.0) / np.diff(bounds_mm[:2])[:, 0]
     return float(np.mean(np.prod(sides, axis=1)))
 
 
-def part_in_front(camera: Camera, media: Media, bounds_mm: NDArray[np.float64]) -> tuple[slice, slice]:
+def part_in_front(camera: Camera, media: Media, bounds_mm: Floats) -> tuple[slice, slice]:
     """Return the rows and columns of an image that look at the middle of a box, bounds (3, 2)."""
     middle = float(bounds_mm[2].mean())
     distance = float(equivalent_object_distance(middle, camera.focus_distance_mm, media))
@@ -314,7 +304,7 @@ def tracers_in(camera: Camera, per_lens: float, sides_mm: ArrayLike) -> float:
     return float(per_lens * width * height / camera.lattice.cell_area)
 
 
-def proposed_window_mm(camera: Camera, media: Media, sides_mm: ArrayLike, overlap: ArrayLike) -> NDArray[np.float64]:
+def proposed_window_mm(camera: Camera, media: Media, sides_mm: ArrayLike, overlap: ArrayLike) -> Floats:
     """Return the sides (3,) of the final interrogation windows in a volume of sides (3,), at the best seeding.
 
     They are the paper's, or smaller where these give fewer than ten vectors along an axis, as far as tracers allow it;
@@ -339,33 +329,20 @@ def vectors_along(sides_mm: ArrayLike, window_mm: ArrayLike, overlap: ArrayLike)
     return np.maximum(np.floor(np.asarray(sides_mm) / steps + ROUNDING), 1.0).astype(np.int64)
 
 
-def time_step_s(velocity_m_s: float, voxel_mm: float, voxels: float = BEST_STEP) -> float:
-    """Return the time in which a velocity crosses so many voxels."""
-    return voxels * voxel_mm / (abs(velocity_m_s) * 1e3)
+def time_step_s(velocity_m_s: float, voxel_mm: float) -> float:
+    """Return the time in which a velocity crosses the best number of voxels."""
+    return BEST_STEP * voxel_mm / (abs(velocity_m_s) * 1e3)
 
 
-def errors_by_depth_mm(seen: Sequence[Miniature], tracer: Tracer, counts_per_ray: float = 0.0) -> NDArray[np.float64]:
+def errors_by_depth_mm(seen: Sequence[Miniature], tracer: Tracer, counts_per_ray: float = 0.0) -> Floats:
     """Return the smallest errors (n, 3) of x, y and z, rms over places, of a tracer alone at depths (n,).
 
     The Cramer-Rao bound; no image tells more. `counts_per_ray` is of images that are rendered ray by ray.
     """
-    errors = [
-        errors_alone_mm(each.view, _particles(each, tracer.light_counts), tracer.readout, counts_per_ray)
-        for each in seen
-    ]
+    particles = [_particles(each, tracer.light_counts) for each in seen]
+    each = zip(seen, particles, strict=True)
+    errors = [errors_alone_mm(one.view, some, tracer.readout, counts_per_ray) for one, some in each]
     return np.asarray(np.sqrt(np.mean(np.concatenate(errors).reshape(-1, PLACES, 3) ** 2, axis=1)))
-
-
-def _lit_pixels(seen: Miniature, light_counts: float, level_counts: float) -> list[int]:
-    """Return how many pixels a tracer of so much light lights above a level, at each of its places and depths."""
-    room = room_for(1, entry_capacity(seen.view, float(seen.depths_mm.min()), float(seen.depths_mm.max())), 0)
-    lit = []
-    for particle in _particles(seen, light_counts):
-        respond_all(seen.view, particle[np.newaxis], room)
-        pixels, values = lit_by(room, 0)
-        image = np.bincount(pixels, light_counts * values[0, : pixels.size])
-        lit.append(int(np.count_nonzero(image > level_counts)))
-    return lit
 
 
 def tracers_per_lens(camera: Camera, seen: Sequence[Miniature], lit: tuple[float, float, float]) -> tuple[float, float]:
@@ -391,7 +368,15 @@ def tracers_per_lens(camera: Camera, seen: Sequence[Miniature], lit: tuple[float
         return 0.0, 0.0
     for _ in range(ROUNDS):
         light = mean * cell / number
-        each = float(np.mean([count for one in seen for count in _lit_pixels(one, light, level)]))
+        counts = []
+        for one in seen:
+            room = room_for(1, entry_capacity(one.view, float(one.depths_mm.min()), float(one.depths_mm.max())), 0)
+            for particle in _particles(one, light):
+                respond_all(one.view, particle[np.newaxis], room)
+                pixels, values = lit_by(room, 0)
+                image = np.bincount(pixels, light * values[0, : pixels.size])
+                counts.append(int(np.count_nonzero(image > level)))
+        each = float(np.mean(counts))
         number = -np.log(1.0 - share / most) * most * cell / max(each, 1.0)
     return float(number), float(light)
 
@@ -406,29 +391,24 @@ def in_miniature(
     light : as waves, whatever its depths; None: by rays
     """
     depths = np.asarray(depths_mm, dtype=np.float64)
-    if light is None:
-        return [_at_depths(camera, media, depths, radius_mm, None)]
-    about = ABOUT_DEPTH * camera.scale(media).depth_mm
-    lights = [replace(light, depths_mm=(float(depth) - about, float(depth) + about)) for depth in depths]
-    return [
-        _at_depths(camera, media, depths[n : n + 1], radius_mm, light_there) for n, light_there in enumerate(lights)
-    ]
+    seen, about = [(depths, light)], ABOUT_DEPTH * camera.scale(media).depth_mm
+    if light is not None:
+        lights = [replace(light, depths_mm=(float(depth) - about, float(depth) + about)) for depth in depths]
+        seen = [(depths[n : n + 1], each) for n, each in enumerate(lights)]
+    found = []
+    for own, each in seen:
+        distance = equivalent_object_distance(own, camera.focus_distance_mm, media)
+        blur = np.abs(camera.defocus(distance)) * camera.aperture_radius_mm
+        reach = float(np.max(blur + radius_mm * camera.image_distance_mm / distance))
+        reach += LENSES_AROUND * float(camera.lattice.pitch.max())
+        # As many more as there are fewer on the other side: lenses stay where they are.
+        columns, rows = (2 * int(np.ceil(reach / camera.pixel_mm)) + side % 2 for side in (camera.columns, camera.rows))
+        view = raw_view(replace(camera, columns=columns, rows=rows), media, radius_mm, light=each)
+        found.append(Miniature(view, own))
+    return found
 
 
-def _at_depths(
-    camera: Camera, media: Media, depths_mm: NDArray[np.float64], radius_mm: float, light: Light | None
-) -> Miniature:
-    distance = equivalent_object_distance(depths_mm, camera.focus_distance_mm, media)
-    blur = np.abs(camera.defocus(distance)) * camera.aperture_radius_mm
-    reach = float(np.max(blur + radius_mm * camera.image_distance_mm / distance))
-    reach += LENSES_AROUND * float(camera.lattice.pitch.max())
-    # As many more as there are fewer on the other side: lenses stay where they are.
-    columns, rows = (2 * int(np.ceil(reach / camera.pixel_mm)) + side % 2 for side in (camera.columns, camera.rows))
-    view = raw_view(replace(camera, columns=columns, rows=rows), media, radius_mm, light=light)
-    return Miniature(view, depths_mm)
-
-
-def _particles(seen: Miniature, light: float) -> NDArray[np.float64]:
+def _particles(seen: Miniature, light: float) -> Floats:
     """Return particles (depths * PLACES, 4) whose light is at places all over a lens."""
     view, depths_mm = seen
     cell = (np.outer(np.arange(PLACES) + 0.5, STEPS) % 1.0 - 0.5) @ np.linalg.inv(view.inverse_basis)

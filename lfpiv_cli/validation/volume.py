@@ -15,6 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.particles.joining import Boxes, find_peaks
@@ -33,10 +34,10 @@ class Matches:
 
     found: NDArray[np.int64]
     true: NDArray[np.int64]
-    error_voxel: NDArray[np.float64]
+    error_voxel: Floats
 
 
-def match(found_mm: NDArray[np.float64], true_mm: NDArray[np.float64], voxel_mm: float) -> Matches:
+def match(found_mm: Floats, true_mm: Floats, voxel_mm: float) -> Matches:
     """Pair found with true particles, nearest first, each at most once."""
     scale = voxel_mm * np.array([LATERAL_VOXEL, LATERAL_VOXEL, DEPTH_VOXEL])
     near = KDTree(true_mm / scale).query_ball_point(found_mm / scale, np.sqrt(2.0), return_sorted=True)
@@ -55,12 +56,12 @@ def match(found_mm: NDArray[np.float64], true_mm: NDArray[np.float64], voxel_mm:
 
 
 def particle_figures(
-    found_mm: NDArray[np.float64],
-    true_mm: NDArray[np.float64],
-    low_mm: NDArray[np.float64],
-    high_mm: NDArray[np.float64],
+    found_mm: Floats,
+    true_mm: Floats,
+    low_mm: Floats,
+    high_mm: Floats,
     voxel_mm: float,
-    sigma_mm: NDArray[np.float64] | None = None,
+    sigma_mm: Floats | None = None,
     distances_mm: tuple[float, float] = (0.0, np.inf),
 ) -> dict[str, float]:
     """Return recall, precision, and per component bias, rms and robust spread (1.48 median deviation) in voxels.
@@ -73,7 +74,7 @@ def particle_figures(
     distances_mm : only what lies this far from z = 0, the focal plane, on either side is judged
     """
 
-    def inside(points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def inside(points: Floats) -> NDArray[np.bool_]:
         distance = np.abs(points[:, 2])
         band = (distance >= distances_mm[0]) & (distance < distances_mm[1])
         return np.asarray(band & np.all((points >= low_mm) & (points <= high_mm), axis=1))
@@ -97,6 +98,80 @@ def particle_figures(
     return {name: float(value) for name, value in figures.items()}
 
 
+# Errors of measured places as a map of space: shifted, stretched, turned, slanted, twisted, and what is left.
+#
+# With e = measured - true at the true place (x, y, z), z from where depth is counted,
+#
+#     e_k = b_k + B_kx x + B_ky y + B_kz z + C_kx x z + C_ky y z
+#
+# is fitted for each component k, without outliers. A velocity is a difference of places, so that 1 + B is also what
+# happens to velocities: B_zz is the relative error of w, B_xz the share of w that leaks into u.
+#
+# Axes: points (n, 3), x, y, z in mm.
+
+# Depths may be wrong by so many times what lateral places may: an error of the focal plane is one of depth alone.
+DEPTH_TO_LATERAL_GATE = 40.0
+# Errors so many robust standard deviations from the fit are other tracers, or another depth that explains the light as
+# well; looked for so many times.
+OUTLIER_SIGMAS, OUTLIER_ROUNDS = 5.0, 3
+TERMS, FEWEST = 6, 10
+
+
+@dataclass(frozen=True)
+class PlaceErrors:
+    """The fitted map: its figures by name, their standard errors, and how many tracers were fitted.
+
+    Lengths are in mm, stretches and angles are ratios (twist: per mm of depth).
+    """
+
+    figures: dict[str, float]
+    sigma: dict[str, float]
+    count: int
+
+
+def pairs_of(measured_mm: Floats, true_mm: Floats, gate_mm: float) -> Matches:
+    """Pair measured with true tracers that stand apart: nearest first, laterally within a gate, nearly any depth.
+
+    Errors are returned in mm.
+    """
+    scale = np.array([1.0, 1.0, DEPTH_VOXEL / LATERAL_VOXEL / DEPTH_TO_LATERAL_GATE])
+    found = match(measured_mm * scale, true_mm * scale, gate_mm / LATERAL_VOXEL)
+    return Matches(found.found, found.true, measured_mm[found.found] - true_mm[found.true])
+
+
+def fit_errors(true_mm: Floats, error_mm: Floats) -> PlaceErrors:
+    """Fit the map to errors (n, 3) at true places (n, 3); NaN where there are hardly more of them than terms."""
+    # b, B_x, B_y, B_z, C_x, C_y of each component, their standard errors, and the standard deviation of what is left
+    coefficients = sigma = np.full((TERMS, 3), np.nan)
+    spread, count = sigma[0], 0
+    if len(true_mm) >= FEWEST:
+        x, y, z = true_mm.T
+        design = np.stack([np.ones_like(x), x, y, z, x * z, y * z], axis=1)
+        kept = np.ones(len(x), dtype=bool)
+        for _ in range(OUTLIER_ROUNDS):
+            coefficients = np.linalg.lstsq(design[kept], error_mm[kept], rcond=None)[0]
+            left = np.abs(error_mm - design @ coefficients)
+            width = MAD_TO_SIGMA * np.median(left[kept], axis=0)
+            kept = np.all(left <= OUTLIER_SIGMAS * width, axis=1)
+        coefficients = np.linalg.lstsq(design[kept], error_mm[kept], rcond=None)[0]
+        left, count = (error_mm - design @ coefficients)[kept], int(kept.sum())
+        spread = np.sqrt(np.sum(left**2, axis=0) / max(count - TERMS, 1))
+        sigma = np.sqrt(np.diag(np.linalg.pinv(design[kept].T @ design[kept])))[:, np.newaxis] * spread
+
+    def named(table: Floats, combine: np.ufunc, spreads: Floats) -> dict[str, float]:
+        """Return a table's entries by name; `combine` takes the two halves of a turn."""
+        offset, along, twist = table[0], table[1:4], table[4:]
+        found = {f"offset_{name}": offset[axis] for axis, name in enumerate("xyz")}
+        found |= {f"stretch_{name}": along[axis, axis] for axis, name in enumerate("xyz")}
+        found |= {"slant_x": along[2, 0], "slant_y": along[2, 1]}
+        found |= {"turn": 0.5 * combine(along[0, 1], along[1, 0]), "twist": 0.5 * combine(twist[0, 1], twist[1, 0])}
+        found |= {f"spread_{name}": value for name, value in zip("xyz", spreads, strict=True)}
+        return {name: float(value) for name, value in found.items()}
+
+    errors = named(sigma, np.hypot, spread / np.sqrt(2.0 * max(count, 1)))
+    return PlaceErrors(named(coefficients, np.subtract, spread), errors, count)
+
+
 # Depth reaches so many times farther than a microlens.
 DEPTH_TO_LATERAL = DEPTH_VOXEL / LATERAL_VOXEL
 # Beyond this many standard deviations a Gaussian particle is below 1e-4 of its peak.
@@ -108,11 +183,7 @@ BOXES = Boxes(sum=(3, 1, 1), peak=(3, 3, 3), light=(5, 3, 3))
 
 
 def volume_figures(
-    volume: NDArray[np.float32],
-    grid: Grid,
-    position_mm: NDArray[np.float64],
-    brightness: NDArray[np.float64],
-    microlens_mm: float,
+    volume: NDArray[np.float32], grid: Grid, position_mm: Floats, brightness: Floats, microlens_mm: float
 ) -> dict[str, float | int]:
     """Return the figures of a volume whose true particles are known.
 
@@ -147,10 +218,15 @@ def volume_figures(
     typical = np.median(light[: int(inside.sum())]) if light.size else 0.0
     index = index[light > FAINTEST * typical]
     pairs = match(grid.voxel_to_mm(index), position_mm, microlens_mm / LATERAL_VOXEL)
+    lengths = []
+    for ix, iy, iz in np.rint(index[pairs.found]).astype(int):
+        height = volume[:, iy, ix].astype(np.float64)
+        if height[iz] > 0.0:
+            lengths.append(elongation_mm(grid.axis_mm(2), height, iz))
     figures |= {
         "completeness": float(inside[pairs.true].sum() / inside.sum()),
         "precision": float(len(pairs.found) / max(len(index), 1)),
-        "elongation_mm": _median_elongation(volume, grid, index[pairs.found]),
+        "elongation_mm": float(np.median(lengths)) if lengths else 0.0,
         "peaks": len(index),
         "particles": int(inside.sum()),
     }
@@ -163,25 +239,19 @@ def volume_figures(
 
 def normalised_correlation(first: NDArray[np.float32], second: NDArray[np.float32]) -> float:
     """Return Q = sum(E F) / sqrt(sum(E^2) sum(F^2)), 0 where a volume is dark."""
-    product, squares = (
-        np.sum(np.multiply(first, second, dtype=np.float64)),
-        np.sum(np.square(first, dtype=np.float64)) * np.sum(np.square(second, dtype=np.float64)),
-    )
+    product = np.sum(np.multiply(first, second, dtype=np.float64))
+    squares = np.sum(np.square(first, dtype=np.float64)) * np.sum(np.square(second, dtype=np.float64))
     return float(product / np.sqrt(squares)) if squares > 0.0 else 0.0
 
 
-def known_volume(
-    grid: Grid, position_mm: NDArray[np.float64], brightness: NDArray[np.float64], sigma_mm: NDArray[np.float64]
-) -> NDArray[np.float32]:
+def known_volume(grid: Grid, position_mm: Floats, brightness: Floats, sigma_mm: Floats) -> NDArray[np.float32]:
     """Return particles (n, 3) as Gaussians of standard deviations sigma (3,), each as high as it is bright (n,)."""
     volume = np.zeros(grid.shape_zyx, np.float32)
     add_gaussians(volume, grid.mm_to_voxel(position_mm), brightness, sigma_mm / np.asarray(grid.spacing_mm))
     return volume
 
 
-def shared_among_voxels(
-    grid: Grid, position_mm: NDArray[np.float64], brightness: NDArray[np.float64]
-) -> NDArray[np.float32]:
+def shared_among_voxels(grid: Grid, position_mm: Floats, brightness: Floats) -> NDArray[np.float32]:
     """Return particles (n, 3) with their light (n,) shared out among their eight nearest voxels, by distance."""
     volume = np.zeros(grid.shape_zyx)
     index = grid.mm_to_voxel(position_mm)
@@ -194,7 +264,7 @@ def shared_among_voxels(
     return volume.astype(np.float32)
 
 
-def near_a_particle(grid: Grid, position_mm: NDArray[np.float64], microlens_mm: float) -> NDArray[np.bool_]:
+def near_a_particle(grid: Grid, position_mm: Floats, microlens_mm: float) -> NDArray[np.bool_]:
     """Return which voxels (z, y, x) have their centre in the ellipsoid around a particle."""
     scale = microlens_mm * np.array([1.0, 1.0, DEPTH_TO_LATERAL])
     tree = KDTree(position_mm / scale)
@@ -206,24 +276,8 @@ def near_a_particle(grid: Grid, position_mm: NDArray[np.float64], microlens_mm: 
     return near
 
 
-def _median_elongation(volume: NDArray[np.float32], grid: Grid, index_xyz: NDArray[np.float64]) -> float:
-    """Return the median length in depth of the volume at peaks given by fractional indices, 0 where there are none."""
-    z = grid.axis_mm(2)
-    lengths = []
-    for ix, iy, iz in np.rint(index_xyz).astype(int):
-        height = volume[:, iy, ix].astype(np.float64)
-        if height[iz] > 0.0:
-            lengths.append(elongation_mm(z, height, iz))
-    return float(np.median(lengths)) if lengths else 0.0
-
-
 @njit(cache=True)
-def add_gaussians(
-    volume: NDArray[np.float32],
-    centres: NDArray[np.float64],
-    height: NDArray[np.float64],
-    sigma: NDArray[np.float64],
-) -> None:
+def add_gaussians(volume: NDArray[np.float32], centres: Floats, height: Floats, sigma: Floats) -> None:
     """Add Gaussians of heights (n,) to a volume [z, y, x]; `centres` (n, 3) and `sigma` (3,) in voxels (x, y, z)."""
     shape = (volume.shape[2], volume.shape[1], volume.shape[0])
     profile = np.empty((3, int(2.0 * REACH * sigma.max()) + 3))

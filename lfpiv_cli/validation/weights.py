@@ -9,21 +9,22 @@ Axes: voxels in world axes (x, y, z), z away from the camera from the nominal fo
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.tracing import ObjectSpace
-from lfpiv_cli.pictures.style import COLOURS, MARKERS, new_figure, styled
+from lfpiv_cli.pictures.style import COLOURS, MARKERS, Figure, new_panels, styled
 from lfpiv_cli.weights.build import factorise_through
 from lfpiv_cli.weights.columns import operator_of, seen_share
 from lfpiv_cli.weights.quadrature import (
@@ -41,8 +42,7 @@ from lfpiv_cli.weights.scene import lit_voxels
 from lfpiv_cli.weights.strip_blocks import sample_lit, voxel_centres
 from lfpiv_cli.weights.strips import StripOperator
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+Space = ObjectSpace | CurvedSpace
 
 # The voxels p1 to p5 of the equivalent-ray-tracing paper (its Table 1), x, y and depth, mm.
 TABLE1_MM = ((1.0, 0.0, 4.0), (1.5, 0.0, 2.0), (2.0, 0.0, 0.0), (2.5, 0.0, -2.0), (3.0, 0.0, -4.0))
@@ -71,7 +71,7 @@ class Column:
     """
 
     centre_mm: tuple[float, float, float]
-    images: dict[str, NDArray[np.float64]]
+    images: dict[str, Floats]
 
 
 # What is compared: reference and judged image.
@@ -87,12 +87,14 @@ COMPARISONS = {
     "factorised_to_long_count": ("long_count", "factorised"),
     "ert_exact_to_long_count": ("long_count_exact", "ert_exact"),
 }
+# What columns are compared by, and which of their voxels is the worst.
+WORST = (("ssim", "smallest", np.min), ("rmse_grey", "largest", np.max), ("l1", "largest", np.max))
 
 
-def ssim(reference: NDArray[np.float64], image: NDArray[np.float64]) -> float:
+def ssim(reference: Floats, image: Floats) -> float:
     """Return the structural similarity (Eq. 16) of two images in grey levels, the mean over all local windows."""
 
-    def local_mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def local_mean(values: Floats) -> Floats:
         return ndimage.gaussian_filter(values, WINDOW_SIGMA_PX, mode="constant", radius=WINDOW_RADIUS_PX)
 
     c1, c2 = (K1 * GREY_LEVELS) ** 2, (K2 * GREY_LEVELS) ** 2
@@ -105,7 +107,7 @@ def ssim(reference: NDArray[np.float64], image: NDArray[np.float64]) -> float:
     return float(np.mean(above / below))
 
 
-def compare_columns(reference: NDArray[np.float64], image: NDArray[np.float64]) -> dict[str, float]:
+def compare_columns(reference: Floats, image: Floats) -> dict[str, float]:
     """Return SSIM, RMSE in grey levels and L1 of one column against its reference."""
     grey = GREY_LEVELS / reference.max()
     return {
@@ -115,25 +117,44 @@ def compare_columns(reference: NDArray[np.float64], image: NDArray[np.float64]) 
     }
 
 
-def sample_voxels(grid: Grid, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
+def sample_voxels(grid: Grid, count: int, rng: np.random.Generator) -> Floats:
     """Return the centres (count, 3) of random voxels of a grid, world axes."""
     indices = np.stack([rng.integers(0, n, count) for n in grid.shape_xyz], axis=1)
     return grid.voxel_to_mm(indices.astype(np.float64))
 
 
-def in_view(
-    camera: Camera, space: ObjectSpace, centre_mm: tuple[float, float, float], voxel_mm: tuple[float, float, float]
-) -> bool:
-    """Return whether all light of a voxel, world axes, meets the sensor."""
-    paraxial = replace(space, refraction="paraxial", method="ert")
-    return seen_share(camera, paraxial, Grid((1, 1, 1), voxel_mm, centre_mm))[0] > WHOLLY_SEEN
+def judged_voxels(
+    camera: Camera, space: Space, grid: Grid, sample: int, rng: np.random.Generator
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """Return the centres (n, 3), world axes, of voxels that are compared, and of which (n,) rays are counted for long.
+
+    These are the paper's that are in view, with `sample` random ones of the grid. Behind curved faces all are random
+    ones that lie wholly in the fluid, as many.
+
+    Raises
+    ------
+    ConfigError : there are none in the fluid
+    """
+    if isinstance(space, CurvedSpace):
+        lit, count = lit_voxels(camera, space, grid), len(TABLE1_MM) + sample
+        found = sample_lit(camera, space, grid, lit, count, rng)
+        if not len(found):
+            raise ConfigError("validation: no voxel of the volume lies wholly in the fluid behind the scene")
+        centres, known = camera.to_image_axes(voxel_centres(camera, grid, found)), len(TABLE1_MM)
+    else:
+        paraxial = replace(space, refraction="paraxial", method="ert")
+        alone = ((centre, Grid((1, 1, 1), grid.spacing_mm, centre)) for centre in TABLE1_MM)
+        papers = [centre for centre, voxel in alone if seen_share(camera, paraxial, voxel)[0] > WHOLLY_SEEN]
+        centres = np.concatenate([np.array(papers).reshape(-1, 3), sample_voxels(grid, sample, rng)])
+        known = len(papers)
+    return centres, np.arange(len(centres)) < known
 
 
 def make_columns(
     camera: Camera,
-    space: ObjectSpace,
-    centres_mm: NDArray[np.float64],
-    voxel_mm: tuple[float, float, float],
+    space: Space,
+    grid: Grid,
+    centres_mm: Floats,
     rng: np.random.Generator,
     long_count: NDArray[np.int64],
     progress: Callable[[int], None] | None = None,
@@ -142,29 +163,62 @@ def make_columns(
 
     Parameters
     ----------
+    space : media and window, without which there is no direct tracing and no exact refraction; or curved faces, behind
+        which columns are made in strips and on demand
+    grid : whose voxels are compared; behind plane layers only their sides count
     centres_mm : (n, 3), world axes
-    voxel_mm : their sides
-    space : media and window; without a window there is no direct tracing and no exact refraction
-    long_count : (n,) rays of long counts of each voxel, with equivalent points and with exact direct tracing; 0: none
+    long_count : (n,) rays of long counts of each voxel, with equivalent points (or traced through the faces) and with
+        exact direct tracing; 0: none
     progress : called with 1 after each voxel
     """
-    ways = _quadrature_ways(space)
-    points, sides = camera.to_image_axes(centres_mm), camera.to_image_axes(np.asarray(voxel_mm))
+    fine, coarse = (REFERENCE_TILES, REFERENCE_DEPTH_NODES), (REFERENCE_TILES // 2, REFERENCE_DEPTH_NODES)
+    in_use: dict[str, ObjectSpace] = {}
+    if isinstance(space, CurvedSpace):
+        ways: dict[str, tuple[Space, tuple[int, int]]] = {"on_demand": (space, (TILES, DEPTH_NODES))}
+        counted: dict[str, Space] = {"long_count": space}
+        strips = operator_of(camera, space, grid)
+    else:
+        strips = None
+        in_use["factorised"] = paraxial = replace(space, refraction="paraxial", method="ert")
+        ways, counted = {}, {"long_count": paraxial}
+        if space.window is not None:
+            in_use["factorised_exact"] = exact = replace(space, refraction="exact", method="ert")
+            counted["long_count_exact"] = direct = replace(space, refraction="exact", method="drt")
+            ways["drt_paraxial"] = (replace(space, refraction="paraxial", method="drt"), fine)
+            ways |= {"drt_exact": (direct, fine), "ert_exact": (exact, fine)}
+    ways |= {"ert": (counted["long_count"], fine), "coarser": (counted["long_count"], coarse)}
+    shape, sides = (camera.rows, camera.columns), camera.to_image_axes(np.asarray(grid.spacing_mm))
     columns = []
-    for centre, point, rays in zip(centres_mm, points, long_count, strict=True):
+    for centre, rays in zip(centres_mm, long_count, strict=True):
+        point, place = camera.to_image_axes(centre), (float(centre[0]), float(centre[1]), float(centre[2]))
         images = {
-            name: _integrated(camera, way, point, sides, tiles) for name, (way, tiles) in ways.items()
-        } | _factorised(camera, space, centre, voxel_mm)
-        paraxial = replace(space, refraction="paraxial", method="ert")
-        images["ray_count"] = count_rays(camera, paraxial, point, sides, rng)
+            name: integrate_columns(camera, way, point, sides, *nodes).image(0, shape)
+            for name, (way, nodes) in ways.items()
+        }
+        columns_in_use = {}
+        if isinstance(strips, StripOperator):
+            column, row, plane = np.rint(camera.to_image_axes(grid.mm_to_voxel(centre))).astype(int).tolist()
+            columns_in_use["factorised"] = strips.column(plane, row, column)
+        for name, each in in_use.items():
+            # none where the axes do not separate
+            with suppress(ConfigError):
+                voxel = Grid((1, 1, 1), grid.spacing_mm, place)
+                columns_in_use[name] = factorise_through(camera, each, voxel).column(0, 0, 0)
+        for name, (rows, cells, weights) in columns_in_use.items():
+            images[name] = np.zeros(shape)
+            images[name][rows, cells] = weights
+        images["ray_count"] = count_rays(camera, counted["long_count"], point, sides, rng)
         if rays:
             per_point = min(RAYS_PER_POINT_LONG, int(rays))
             number = RayCount(int(rays) // per_point, per_point)
-            images["long_count"] = count_rays(camera, paraxial, point, sides, rng, number)
-            if space.window is not None:
-                direct = replace(space, refraction="exact", method="drt")
-                images["long_count_exact"] = count_rays(camera, direct, point, sides, rng, number)
-        columns.append(Column((centre[0], centre[1], centre[2]), cut_to_lit(images)))
+            images |= {name: count_rays(camera, each, point, sides, rng, number) for name, each in counted.items()}
+        # cut to the rectangle that any of them lights
+        lit = np.any([image > 0.0 for image in images.values()], axis=0)
+        if not lit.any():
+            raise ConfigError("validation: a voxel lies outside the camera's view")
+        lit_rows, lit_columns = np.flatnonzero(lit.any(axis=1)), np.flatnonzero(lit.any(axis=0))
+        part = np.s_[lit_rows[0] : lit_rows[-1] + 1, lit_columns[0] : lit_columns[-1] + 1]
+        columns.append(Column(place, {name: image[part].copy() for name, image in images.items()}))
         if progress:
             progress(1)
     return columns
@@ -182,7 +236,15 @@ def weights_figures(columns: list[Column], long_count: NDArray[np.int64]) -> dic
         entry["pixels"] = int(np.count_nonzero(converged))
         entry["independent_rays_l1"] = sampling_error(converged, int(rays) or PAPERS_COUNT.rays)
         voxels.append(entry)
-    return {name: _summary([v[name] for v in voxels if name in v]) for name in COMPARISONS} | {"voxels": voxels}
+    figures: dict[str, Any] = {}
+    for name in COMPARISONS:
+        known = [voxel[name] for voxel in voxels if name in voxel]
+        summary: dict[str, float] = {}
+        for key, worst, pick in WORST if known else ():
+            values = np.array([each[key] for each in known])
+            summary |= {f"{key}_mean": float(values.mean()), f"{key}_{worst}": float(pick(values))}
+        figures[name] = summary or None
+    return figures | {"voxels": voxels}
 
 
 def weights_limits_missed(figures: dict[str, Any], limits: dict[str, dict[str, float | None]]) -> list[str]:
@@ -201,128 +263,6 @@ def weights_limits_missed(figures: dict[str, Any], limits: dict[str, dict[str, f
             elif (value < limit) if figure.startswith("ssim") else (value > limit):
                 missed.append(f"{comparison}.{figure} is {written(value, 4)}, the limit {limit:g}")
     return missed
-
-
-def _quadrature_ways(space: ObjectSpace) -> dict[str, tuple[ObjectSpace, int]]:
-    """Return the object space and the tiles of each column that is integrated on its own."""
-    paraxial = replace(space, refraction="paraxial", method="ert")
-    ways = {"ert": (paraxial, REFERENCE_TILES), "coarser": (paraxial, REFERENCE_TILES // 2)}
-    if space.window is not None:
-        ways["drt_paraxial"] = (replace(space, refraction="paraxial", method="drt"), REFERENCE_TILES)
-        ways["drt_exact"] = (replace(space, refraction="exact", method="drt"), REFERENCE_TILES)
-        ways["ert_exact"] = (replace(space, refraction="exact", method="ert"), REFERENCE_TILES)
-    return ways
-
-
-def _integrated(
-    camera: Camera, space: ObjectSpace, point: NDArray[np.float64], sides: NDArray[np.float64], tiles: int
-) -> NDArray[np.float64]:
-    columns = integrate_columns(camera, space, point, sides, tiles, REFERENCE_DEPTH_NODES)
-    return columns.image(0, (camera.rows, camera.columns))
-
-
-def _factorised(
-    camera: Camera, space: ObjectSpace, centre: NDArray[np.float64], voxel_mm: tuple[float, float, float]
-) -> dict[str, NDArray[np.float64]]:
-    """Return the factorised columns of one voxel; none where the axes do not separate."""
-    grid = Grid((1, 1, 1), voxel_mm, (centre[0], centre[1], centre[2]))
-    spaces = {"factorised": replace(space, refraction="paraxial", method="ert")}
-    if space.window is not None:
-        spaces["factorised_exact"] = replace(space, refraction="exact", method="ert")
-    images = {}
-    for name, each in spaces.items():
-        try:
-            rows, columns, weight = factorise_through(camera, each, grid).column(0, 0, 0)
-        except ConfigError:
-            continue
-        images[name] = np.zeros((camera.rows, camera.columns))
-        images[name][rows, columns] = weight
-    return images
-
-
-def cut_to_lit(images: dict[str, NDArray[np.float64]]) -> dict[str, NDArray[np.float64]]:
-    """Return the images cut to the rectangle that any of them lights."""
-    lit = np.any([image > 0.0 for image in images.values()], axis=0)
-    if not lit.any():
-        raise ConfigError("validation: a voxel lies outside the camera's view")
-    rows, columns = np.flatnonzero(lit.any(axis=1)), np.flatnonzero(lit.any(axis=0))
-    part = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-    return {name: image[part].copy() for name, image in images.items()}
-
-
-def _summary(each: list[dict[str, float]]) -> dict[str, float] | None:
-    if not each:
-        return None
-    summary = {}
-    for name in ("ssim", "rmse_grey", "l1"):
-        values = np.array([entry[name] for entry in each])
-        summary[f"{name}_mean"] = float(values.mean())
-        worst, pick = ("smallest", np.min) if name == "ssim" else ("largest", np.max)
-        summary[f"{name}_{worst}"] = float(pick(values))
-    return summary
-
-
-# Columns behind curved faces: in strips, on demand and counted, beside converged integrals over traced rays.
-#
-# Axes: voxels [plane, row voxel, column voxel] of a grid; centres in world axes (x, y, z), z away from the camera
-# from the nominal focal point; images [row, column].
-
-
-def seen_voxels(
-    camera: Camera, space: CurvedSpace, grid: Grid, count: int, rng: np.random.Generator
-) -> NDArray[np.int64]:
-    """Return (n, 3) random voxels of a grid that lie wholly in the fluid, at most so many.
-
-    Raises
-    ------
-    ConfigError : there are none
-    """
-    found = sample_lit(camera, space, grid, lit_voxels(camera, space, grid), count, rng)
-    if not len(found):
-        raise ConfigError("validation: no voxel of the volume lies wholly in the fluid behind the scene")
-    return found
-
-
-def make_curved_columns(
-    camera: Camera,
-    space: CurvedSpace,
-    grid: Grid,
-    voxels: NDArray[np.int64],
-    rng: np.random.Generator,
-    long_count: NDArray[np.int64],
-    progress: Callable[[int], None] | None = None,
-) -> list[Column]:
-    """Return the columns of voxels (n, 3) by every way there is behind curved faces.
-
-    Parameters
-    ----------
-    long_count : (n,) rays of long counts of each voxel; 0: none
-    progress : called with 1 after each voxel
-    """
-    operator, shape = operator_of(camera, space, grid), (camera.rows, camera.columns)
-    sides = camera.to_image_axes(np.asarray(grid.spacing_mm))
-    columns = []
-    for voxel, point, rays in zip(voxels, voxel_centres(camera, grid, voxels), long_count, strict=True):
-        integrated = partial(integrate_columns, camera, space, point, sides)
-        images = {
-            "ert": integrated(REFERENCE_TILES, REFERENCE_DEPTH_NODES).image(0, shape),
-            "coarser": integrated(REFERENCE_TILES // 2, REFERENCE_DEPTH_NODES).image(0, shape),
-            "on_demand": integrated(TILES, DEPTH_NODES).image(0, shape),
-            "ray_count": count_rays(camera, space, point, sides, rng),
-        }
-        if isinstance(operator, StripOperator):
-            images["factorised"] = np.zeros(shape)
-            rows, cells, weights = operator.column(*voxel.tolist())
-            images["factorised"][rows, cells] = weights
-        if rays:
-            per_point = min(RAYS_PER_POINT_LONG, int(rays))
-            number = RayCount(int(rays) // per_point, per_point)
-            images["long_count"] = count_rays(camera, space, point, sides, rng, number)
-        x, y, z = camera.to_image_axes(point)
-        columns.append(Column((float(x), float(y), float(z)), cut_to_lit(images)))
-        if progress:
-            progress(1)
-    return columns
 
 
 SHOWN = {
@@ -346,8 +286,8 @@ def columns_figure(columns: list[Column], shown: dict[str, str] = SHOWN) -> Figu
     Behind curved faces `SHOWN_BEHIND_FACES`. A row has one scale: the brightest pixel by equivalent points, or traced.
     """
     names = [name for name in shown if any(name in column.images for column in columns)]
-    figure = new_figure(2.8 * len(names) + 0.6, 2.9 * len(columns))
-    axes = figure.subplots(len(columns), len(names), squeeze=False)
+    size = 2.8 * len(names) + 0.6, 2.9 * len(columns)
+    figure, axes = new_panels(*size, len(columns), len(names), squeeze=False)
     for row, column in zip(axes, columns, strict=True):
         brightest = column.images["ert"].max()
         for axis, name in zip(row, names, strict=True):
@@ -364,23 +304,16 @@ def columns_figure(columns: list[Column], shown: dict[str, str] = SHOWN) -> Figu
 @styled
 def similarity_figure(figures: dict[str, Any], shown: int) -> Figure:
     """Return SSIM, RMSE and L1 of the first voxels, by comparison; each has its colour and marker."""
-    figure = new_figure(12.0, 4.2)
+    figure, axes = new_panels(12.0, 4.2, 1, 3)
     voxels = figures["voxels"][:shown]
     names = [name for name in figures if name != "voxels" and figures[name] is not None]
-    for axis, (key, label) in zip(
-        figure.subplots(1, 3), {"ssim": "SSIM", "rmse_grey": "RMSE (grey levels)", "l1": "L1"}.items(), strict=True
-    ):
+    labels = {"ssim": "SSIM", "rmse_grey": "RMSE (grey levels)", "l1": "L1"}
+    for axis, (key, label) in zip(axes, labels.items(), strict=True):
         for number, name in enumerate(names):
             again, k = divmod(number, len(COLOURS))
             values = [voxel.get(name, {}).get(key, np.nan) for voxel in voxels]
-            axis.plot(
-                np.arange(1, len(voxels) + 1),
-                values,
-                MARKERS[k] + ("-", "--")[again],
-                color=COLOURS[k],
-                markerfacecolor="none",
-                label=name.replace("_", " "),
-            )
+            look = {"color": COLOURS[k], "markerfacecolor": "none", "label": name.replace("_", " ")}
+            axis.plot(np.arange(1, len(voxels) + 1), values, MARKERS[k] + ("-", "--")[again], **look)
         axis.set(xlabel="voxel", ylabel=label, xticks=np.arange(1, len(voxels) + 1))
         if key != "ssim":
             axis.set_ylim(bottom=0.0)

@@ -43,8 +43,8 @@ from lfpiv_cli.pictures import calibration as of_calibration
 from lfpiv_cli.pictures import points as of_particles
 from lfpiv_cli.pictures import points as of_tracks
 from lfpiv_cli.pictures import vectors as of_vectors
-from lfpiv_cli.pictures import volume as of_volume
-from lfpiv_cli.pictures import volume as of_weights
+from lfpiv_cli.pictures import vectors as of_volume
+from lfpiv_cli.pictures import vectors as of_weights
 from lfpiv_cli.verbs.frames import residual_path
 
 # The figures that each kind of file has, by its format.

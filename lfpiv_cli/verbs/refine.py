@@ -126,7 +126,7 @@ def _walls(settings: Config, lit: Sequence[Image], before: Calibration, console:
         )
 
     def draw() -> Figure:
-        from lfpiv_cli.pictures.walls import walls_figure
+        from lfpiv_cli.pictures.calibration import walls_figure
 
         return walls_figure(found)
 
@@ -150,7 +150,7 @@ def _scene(
         console.warn([disagreement_notice(found)])
 
     def draw() -> Figure:
-        from lfpiv_cli.pictures.walls import round_wall_figure
+        from lfpiv_cli.pictures.calibration import round_wall_figure
 
         return round_wall_figure(found)
 

@@ -35,12 +35,10 @@ from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.reference import FOCAL_POINT, Reference
 from lfpiv_cli.synthetic import scenes
 from lfpiv_cli.synthetic.board import BoardPlacement, points_of
-from lfpiv_cli.synthetic.bubbles import Bubbles, bubbles_at_wall, render_bubbles
-from lfpiv_cli.synthetic.curved_rays import unseen
 from lfpiv_cli.synthetic.flows import STEADY, Pulsation
-from lfpiv_cli.synthetic.objective import objective_of
+from lfpiv_cli.synthetic.rays import objective_of, unseen
 from lfpiv_cli.synthetic.render import RAYS, Space
-from lfpiv_cli.synthetic.scenes import seeded_boxes
+from lfpiv_cli.synthetic.scenes import Bubbles, bubbles_at_wall, render_bubbles, seeded_boxes
 from lfpiv_cli.synthetic.sensor import Readout
 from lfpiv_cli.verbs.weights_cost import LONG_S, MUCH_BYTES
 from lfpiv_cli.weights.build import blur_radius_mm
@@ -66,7 +64,7 @@ def tracers_of(settings: Config, camera: Camera, reference: Reference, motion: s
     measured = inside.within(scenes.Box.around(volume, (0.0, 0.0, 0.0)))
     pipe = _pipe(settings, reference)
     return scenes.Tracers(
-        round(scene.particles * box.volume_in_mm3(pipe) / measured.volume_in_mm3(pipe)),
+        round(scene.particles * box.volume_mm3(pipe) / measured.volume_mm3(pipe)),
         box,
         scene.particle_diameter_mm,
         scene.particle_counts,
