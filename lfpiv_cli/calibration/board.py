@@ -13,16 +13,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose, on_the_grid, pose_of_dots
 from lfpiv_cli.calibration.corners import Fit, Look, enlarged_view, evenly_lit, first_corners
 from lfpiv_cli.calibration.rectification import turned
-from lfpiv_cli.calibration.shape_fit import (
-    MeasuredPoints,
-    ShapeFit,
-    checked_disc_radius,
-    fit_disc,
-    pixels_near,
-)
+from lfpiv_cli.calibration.shape_fit import MeasuredPoints, ShapeFit, checked_disc_radius, fit_disc, pixels_near
 from lfpiv_cli.calibration.views import Refocusing, alternating, described
 from lfpiv_cli.calibration.wave_shapes import WaveLight, WaveShapes, disc_strips
 from lfpiv_cli.calibration.white import find_spots
@@ -49,10 +44,7 @@ EVEN_SHARE = 0.8
 
 
 def another_kind(
-    image: NDArray[np.float32],
-    camera: Camera,
-    board: BoardGeometry,
-    transmission: NDArray[np.float32] | None = None,
+    image: NDArray[np.float32], camera: Camera, board: BoardGeometry, transmission: NDArray[np.float32] | None = None
 ) -> str | None:
     """Return a sentence that names the target in a rectified picture where it is not the board's; else None."""
     passed = np.ones(image.shape, dtype=np.float32) if transmission is None else transmission
@@ -114,7 +106,7 @@ def dots(picture: NDArray[np.uint8]) -> str | None:
     return None
 
 
-def _even(places: NDArray[np.float64]) -> bool:
+def _even(places: Floats) -> bool:
     """Return whether most places have their nearest neighbour at the same distance."""
     distance = np.hypot(*np.moveaxis(places[:, np.newaxis] - places, -1, 0))
     nearest = np.min(distance + np.diag(np.full(len(places), np.inf)), axis=1)
@@ -160,17 +152,17 @@ class DotLook(Look):
     """
 
     radius_mm: float
-    start_mm: NDArray[np.float64]
+    start_mm: Floats
     depth_mm: float
 
     def moved(self, scale: float, depth_mm: float) -> DotLook:
         """Return the look with its dots nearer the axis by a scale, at another depth."""
         return replace(self, start_mm=self.start_mm / scale, depth_mm=depth_mm)
 
-    def begun(self, camera: Camera, board: BoardGeometry) -> tuple[NDArray[np.float64], None, Fit]:
+    def begun(self, camera: Camera, board: BoardGeometry) -> tuple[Floats, None, Fit]:
         """Return where the dots were first seen; their grid tells which is which."""
 
-        def fit(start_mm: NDArray[np.float64], waves: WaveShapes | None = None) -> ShapeFit | None:
+        def fit(start_mm: Floats, waves: WaveShapes | None = None) -> ShapeFit | None:
             x, y, z = start_mm
             scene = (self.signal, self.passed, camera, board, self.medium)
             found = fit_one_dot(*scene, (x, y, z), self.radius_mm, waves)
@@ -256,9 +248,7 @@ def _pose(
     return pose if light is None else _seen(replace(look, light=light), camera, board, rotation_rad)[0]
 
 
-def _seen(
-    look: Look, camera: Camera, board: BoardGeometry, rotation_rad: float
-) -> tuple[BoardPose, NDArray[np.float64]]:
+def _seen(look: Look, camera: Camera, board: BoardGeometry, rotation_rad: float) -> tuple[BoardPose, Floats]:
     """Return the pose as a camera sees it, and where an ideal one has the points on the array (n, 2)."""
     found = look.measured(camera, board)
     places, sigmas = world_places(found, camera, rotation_rad)
@@ -268,7 +258,7 @@ def _seen(
 
 def dots_in_world(
     image: NDArray[np.float32], camera: Camera, board: BoardGeometry, media: Media, rotation_rad: float = 0.0
-) -> NDArray[np.float64]:
+) -> Floats:
     """Return where the camera, believed as it is, sees each dot: (dots along y, dots along x, 3); NaN where none is.
 
     Parameters and errors are those of `locate_board`, which believes in the spacing and asks what the camera is.
@@ -281,22 +271,20 @@ def dots_in_world(
     return dots
 
 
-def world_places(
-    found: MeasuredPoints, camera: Camera, rotation_rad: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def world_places(found: MeasuredPoints, camera: Camera, rotation_rad: float) -> tuple[Floats, Floats]:
     """Return places and standard errors (n, 3) of the measured points, turned back to the raw sensor's axes."""
     places, sigmas = found.places_mm, found.sigmas_mm
     return camera.to_image_axes(turned(places, rotation_rad)), camera.to_image_axes(sigmas)
 
 
-def array_places(places_mm: NDArray[np.float64], camera: Camera, media: Media) -> NDArray[np.float64]:
+def array_places(places_mm: Floats, camera: Camera, media: Media) -> Floats:
     """Return where an ideal main lens shows places (n, 3) on the array (n, 2), seen through its middle, image axes."""
     distance = equivalent_object_distance(places_mm[:, 2], camera.focus_distance_mm, media)
     forward = camera.image_distance_mm / distance
     return -forward[:, np.newaxis] * camera.to_image_axes(places_mm)[:, :2]
 
 
-def dot_signal(image: NDArray[np.float32], passed: NDArray[np.float32], board: BoardGeometry) -> NDArray[np.float64]:
+def dot_signal(image: NDArray[np.float32], passed: NDArray[np.float32], board: BoardGeometry) -> Floats:
     """Return the picture with the dots bright on a dim ground; dark dots are what the lit board lacks of full light.
 
     Dots cover the smaller part of a board: where the polarity is not known, most of the picture is the board.
@@ -313,8 +301,8 @@ def dot_signal(image: NDArray[np.float32], passed: NDArray[np.float32], board: B
 
 
 def first_dots(
-    signal: NDArray[np.float64], camera: Camera, board: BoardGeometry, media: Media, depths_mm: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], float]:
+    signal: Floats, camera: Camera, board: BoardGeometry, media: Media, depths_mm: Floats
+) -> tuple[Floats, float]:
     """Return the lateral places (n, 2) of the dots in image axes and their common depth, to within a dot's radius.
 
     The rays of all bright pixels are carried back to planes at `depths_mm`; where the dots are smallest, the sum of
@@ -327,7 +315,7 @@ def first_dots(
     planes = Refocusing.of(camera, media, (row, column), SAMPLES_PER_LENS, HALF_WIDTH)
     widest = max(3, round(DOT_PER_SPACING * board.spacing_mm / planes.sample_mm))
 
-    def refocused(z_mm: float) -> NDArray[np.float64]:
+    def refocused(z_mm: float) -> Floats:
         (smooth,) = planes.pictures(z_mm, (light,), SAMPLES_PER_LENS)
         return smooth - opened(smooth, widest)
 
@@ -336,7 +324,7 @@ def first_dots(
     return (spots - planes.half[::-1]) * planes.sample_mm, depth
 
 
-def candidate_depths(camera: Camera, media: Media) -> NDArray[np.float64]:
+def candidate_depths(camera: Camera, media: Media) -> Floats:
     """Return depths in the medium at equal steps of defocus alpha about the focal plane."""
     step = float(camera.lattice.pitch.min()) / camera.aperture_radius_mm / FOCUS_STEPS_PER_LENS
     count = FOCUS_LENSES * FOCUS_STEPS_PER_LENS
@@ -348,7 +336,7 @@ def candidate_depths(camera: Camera, media: Media) -> NDArray[np.float64]:
 
 
 def fit_one_dot(
-    signal: NDArray[np.float64],
+    signal: Floats,
     passed: NDArray[np.float32],
     camera: Camera,
     board: BoardGeometry,
@@ -372,8 +360,4 @@ def fit_one_dot(
 
 
 # How the points of each pattern are found, by `board.pattern`.
-LOOKS: dict[Pattern, Callable[..., Look]] = {
-    "dots": dots_look,
-    "chessboard": first_corners,
-    "charuco": first_corners,
-}
+LOOKS: dict[Pattern, Callable[..., Look]] = {"dots": dots_look, "chessboard": first_corners, "charuco": first_corners}

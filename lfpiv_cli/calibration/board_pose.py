@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.white import first_of_each
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.names import Medium, Pattern, Polarity
@@ -46,20 +47,15 @@ class FlatFit:
     k1_per_mm2, k1_sigma_per_mm2 : the distortion and its standard error; None where it was left out
     """
 
-    coefficients: NDArray[np.float64]
-    residual_mm: NDArray[np.float64]
-    sigma: NDArray[np.float64]
+    coefficients: Floats
+    residual_mm: Floats
+    sigma: Floats
     half_span_mm: float
     k1_per_mm2: float | None = None
     k1_sigma_per_mm2: float | None = None
 
 
-def bent_fit(
-    dots_mm: NDArray[np.float64],
-    indices: NDArray[np.int64],
-    array_radius_mm: NDArray[np.float64],
-    board: BoardGeometry,
-) -> FlatFit:
+def bent_fit(dots_mm: Floats, indices: NDArray[np.int64], array_radius_mm: Floats, board: BoardGeometry) -> FlatFit:
     """Return the fit with the distortion, or without it where the dots cannot tell it from the magnification."""
     if len(indices) >= FEWEST_DOTS_FOR_DISTORTION:
         bending = dots_mm[:, :2] * array_radius_mm[:, np.newaxis] ** 2
@@ -71,10 +67,7 @@ def bent_fit(
 
 
 def flat_fit(
-    dots_mm: NDArray[np.float64],
-    indices: NDArray[np.int64],
-    board: BoardGeometry,
-    bending: NDArray[np.float64] | None = None,
+    dots_mm: Floats, indices: NDArray[np.int64], board: BoardGeometry, bending: Floats | None = None
 ) -> FlatFit:
     """Fit a flat regular board, and the coefficient of `bending` (n, 2) in the lateral places where it is given.
 
@@ -101,9 +94,7 @@ def flat_fit(
     )
 
 
-def least_squares(
-    terms: NDArray[np.float64], values: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def least_squares(terms: Floats, values: Floats) -> tuple[Floats, Floats, Floats]:
     """Return coefficients, their standard errors by the scatter of the values, and the residuals."""
     scale = np.abs(terms).max(axis=0)
     if np.any(scale == 0.0) or np.linalg.matrix_rank(terms / scale, tol=LEAST_RANK * len(terms)) < terms.shape[1]:
@@ -116,7 +107,7 @@ def least_squares(
     return coefficients, sigma, residual
 
 
-def outliers(residual: NDArray[np.float64]) -> NDArray[np.bool_]:
+def outliers(residual: Floats) -> NDArray[np.bool_]:
     """Return which dots (n,) are off the board sideways or in depth by far more than most."""
     distance = np.stack([np.hypot(residual[:, 0], residual[:, 1]), np.abs(residual[:, 2])], axis=1)
     limit = OUTLIER_SIGMAS * MAD_TO_SIGMA * np.median(distance, axis=0)
@@ -205,18 +196,18 @@ class BoardPose:
     """
 
     indices: NDArray[np.int64]
-    dots_mm: NDArray[np.float64]
-    dots_sigma_mm: NDArray[np.float64]
-    residual_mm: NDArray[np.float64]
-    dots_px: NDArray[np.float64]
+    dots_mm: Floats
+    dots_sigma_mm: Floats
+    residual_mm: Floats
+    dots_px: Floats
     z0_mm: float
     z0_sigma_mm: float
-    tilt_deg: NDArray[np.float64]
-    tilt_sigma_deg: NDArray[np.float64]
+    tilt_deg: Floats
+    tilt_sigma_deg: Floats
     rotation_deg: float
     rotation_sigma_deg: float
-    offset_mm: NDArray[np.float64]
-    offset_sigma_mm: NDArray[np.float64]
+    offset_mm: Floats
+    offset_sigma_mm: Floats
     magnification: float
     magnification_sigma: float
     k1_per_mm2: float | None = None
@@ -236,9 +227,9 @@ class BoardPose:
 
 
 def pose_of_dots(
-    dots_mm: NDArray[np.float64],
-    sigma_mm: NDArray[np.float64],
-    array_mm: NDArray[np.float64],
+    dots_mm: Floats,
+    sigma_mm: Floats,
+    array_mm: Floats,
     camera: Camera,
     board: BoardGeometry,
     numbers: NDArray[np.int64] | None = None,
@@ -309,7 +300,7 @@ def total_distortion(bent: FlatFit, camera: Camera) -> tuple[float | None, float
     return camera.distortion_per_mm2 + bent.k1_per_mm2, bent.k1_sigma_per_mm2
 
 
-def scatter_ratio(residual_mm: NDArray[np.float64], sigma_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+def scatter_ratio(residual_mm: Floats, sigma_mm: Floats) -> Floats:
     """Return by how much (3,) the dots scatter about the board beyond their own standard errors, at least 1.
 
     The errors of single dots come from the scatter of their pixels, which does not know how well a rendering can fit.
@@ -318,7 +309,7 @@ def scatter_ratio(residual_mm: NDArray[np.float64], sigma_mm: NDArray[np.float64
     return np.maximum(1.0, np.sqrt(freedom * np.mean((residual_mm / sigma_mm) ** 2, axis=0)))
 
 
-def on_the_grid(dots_mm: NDArray[np.float64], board: BoardGeometry) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def on_the_grid(dots_mm: Floats, board: BoardGeometry) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return which dots belong to the board (m,) and their indices on it (m, 2); dots may be missing."""
     refuse_few(len(dots_mm), board)
     lateral = dots_mm[:, :2]
@@ -336,9 +327,7 @@ def on_the_grid(dots_mm: NDArray[np.float64], board: BoardGeometry) -> tuple[NDA
     return kept[within], indices[within] - corner
 
 
-def numbered_dots(
-    lateral: NDArray[np.float64], start: int, spacing_mm: float
-) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+def numbered_dots(lateral: Floats, start: int, spacing_mm: float) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Number the dots by a grid through one of them, which grows outward and adapts: (n, 2), and which are on it (n,).
 
     Missing dots leave gaps that a walk from neighbour to neighbour could not cross.
@@ -398,7 +387,7 @@ def refuse_scattered(fit: FlatFit, board: BoardGeometry, camera: Camera) -> None
 
 
 def upright_numbers(
-    numbers: NDArray[np.int64], lateral_mm: NDArray[np.float64], board: BoardGeometry
+    numbers: NDArray[np.int64], lateral_mm: Floats, board: BoardGeometry
 ) -> tuple[NDArray[np.int64], BoardGeometry]:
     """Return numbers (n, 2) of a board's points that grow with x and y, and the board as it is then seen."""
     terms = np.column_stack([np.ones(len(numbers)), numbers])
@@ -410,7 +399,7 @@ def upright_numbers(
     return np.where(np.diag(along) < 0.0, last - numbers, numbers), board
 
 
-def rows_direction(lateral: NDArray[np.float64], start: int, spacing_mm: float) -> NDArray[np.float64]:
+def rows_direction(lateral: Floats, start: int, spacing_mm: float) -> Floats:
     """Return the vectors (2, 2) from a dot to its neighbours, the first one nearest world x.
 
     The nearest dot about one spacing away tells the direction, up to quarter turns.
@@ -424,7 +413,7 @@ def rows_direction(lateral: NDArray[np.float64], start: int, spacing_mm: float) 
 
 
 def best_window(
-    indices: NDArray[np.int64], lateral: NDArray[np.float64], board: BoardGeometry
+    indices: NDArray[np.int64], lateral: Floats, board: BoardGeometry
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Return the first index (2,) of the window of the board's size that holds most dots, and which (n,) these are.
 
@@ -445,7 +434,7 @@ def best_window(
     return best, ((indices >= best) & (indices < best + size)).all(axis=1)
 
 
-def refuse_turned(count: int, indices: NDArray[np.int64], lateral: NDArray[np.float64], board: BoardGeometry) -> None:
+def refuse_turned(count: int, indices: NDArray[np.int64], lateral: Floats, board: BoardGeometry) -> None:
     """Raise where the dots are those of the board turned by 90 degrees, of which it holds `count` as it is told.
 
     Outside of a board that is told as it is lie strays, and not most of a row as long as its shorter side.

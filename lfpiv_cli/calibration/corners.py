@@ -17,6 +17,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.calibration.shape_fit import (
     BLURRED_SAMPLES,
@@ -66,13 +67,7 @@ from lfpiv_cli.robust import MAD_TO_SIGMA
 STEP_SHARE = 0.25
 
 
-def fit_corner(
-    pixels: NearPixels,
-    start_mm: NDArray[np.float64],
-    edges_mm: NDArray[np.float64],
-    camera: Camera,
-    media: Media,
-) -> ShapeFit:
+def fit_corner(pixels: NearPixels, start_mm: Floats, edges_mm: Floats, camera: Camera, media: Media) -> ShapeFit:
     """Fit a corner to pixels by least squares: x, y, z, brightness and a sloping background are free.
 
     Parameters
@@ -82,20 +77,20 @@ def fit_corner(
     """
     size = step_mm(edges_mm)
 
-    def shares_at(position: NDArray[np.float64]) -> SharesAndSlopes:
+    def shares_at(position: Floats) -> SharesAndSlopes:
         return corner_shares(pixels.rays, position, edges_mm, camera, media)
 
     beside = scene_points(pixels.rays, camera, media, float(start_mm[2])) - start_mm[:2]
     return fit_shape(pixels.signal, pixels.passed, beside, start_mm, fit_steps(size, camera, media), shares_at)
 
 
-def step_mm(edges_mm: NDArray[np.float64]) -> float:
+def step_mm(edges_mm: Floats) -> float:
     """Return in what steps a fit moves a corner, by the squares' sides (2, 2)."""
     return STEP_SHARE * float(np.hypot(edges_mm[:, 0], edges_mm[:, 1]).mean())
 
 
 def corner_shares(
-    rays: PixelRays, position_mm: NDArray[np.float64], edges_mm: NDArray[np.float64], camera: Camera, media: Media
+    rays: PixelRays, position_mm: Floats, edges_mm: Floats, camera: Camera, media: Media
 ) -> SharesAndSlopes:
     """Return for each pixel the share (n,) of what it sees at depth z in two opposite quadrants, and its slopes.
 
@@ -104,7 +99,7 @@ def corner_shares(
     to_edges = np.linalg.inv(edges_mm)
     sharp = SHARP_SHARE * 0.5 * float(np.hypot(edges_mm[:, 0], edges_mm[:, 1]).min())
 
-    def covered(middle: NDArray[np.float64], cell: NDArray[np.float64], width: float) -> SharesAndSlopes:
+    def covered(middle: Floats, cell: Floats, width: float) -> SharesAndSlopes:
         return quadrant_shares(middle, cell, to_edges, width, 1 if width < sharp else BLURRED_SAMPLES)
 
     return scene_shares(rays, position_mm, camera, media, covered)
@@ -112,8 +107,8 @@ def corner_shares(
 
 @njit(cache=True)
 def quadrant_shares(
-    middle: NDArray[np.float64], cell: NDArray[np.float64], to_edges: NDArray[np.float64], width: float, samples: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    middle: Floats, cell: Floats, to_edges: Floats, width: float, samples: int
+) -> tuple[Floats, Floats]:
     """Return the mean share of `cell`, moved to `middle` and over a square of `width` around it, where u v > 0.
 
     The slopes (n, 4) are its derivatives by the middle's x and y, the logarithm of the cell's size, and the width.
@@ -142,7 +137,7 @@ def quadrant_shares(
 
 
 @njit(cache=True)
-def quadrant_sums(u: float, v: float, cell: NDArray[np.float64], sums: NDArray[np.float64]) -> None:
+def quadrant_sums(u: float, v: float, cell: Floats, sums: Floats) -> None:
     """Write the integral of sgn u sgn v over a polygon `cell` moved to (u, v), its slopes, and the polygon's area.
 
     The slopes are by u, by v and by the logarithm of the cell's size: every part of an edge sweeps an area.
@@ -204,7 +199,7 @@ MOST_PIXELS = 4_000
 class Fit(Protocol):
     """Fits a point's shape from a first guess of its place (3,), by rays or by waves; None where it cannot be."""
 
-    def __call__(self, start_mm: NDArray[np.float64], waves: WaveShapes | None = None) -> ShapeFit | None: ...
+    def __call__(self, start_mm: Floats, waves: WaveShapes | None = None) -> ShapeFit | None: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,7 +213,7 @@ class Look(ABC):
     light : waves that the target sends, whose points are fitted from where rays have them; None: rays
     """
 
-    signal: NDArray[np.float64]
+    signal: Floats
     passed: NDArray[np.float32]
     medium: Media
     light: WaveLight | None = field(default=None, kw_only=True)
@@ -240,7 +235,7 @@ class Look(ABC):
         return measured_points([fit(place, waves) for place in start], numbers)
 
     @abstractmethod
-    def begun(self, camera: Camera, board: BoardGeometry) -> tuple[NDArray[np.float64], NDArray[np.int64] | None, Fit]:
+    def begun(self, camera: Camera, board: BoardGeometry) -> tuple[Floats, NDArray[np.int64] | None, Fit]:
         """Return first guesses (n, 3) of the points, image axes, their numbers (n, 2) if known, and what fits one."""
 
 
@@ -255,9 +250,9 @@ class CornerLook(Look):
     """
 
     numbers: NDArray[np.int64]
-    sample: NDArray[np.float64]
+    sample: Floats
 
-    def begun(self, camera: Camera, board: BoardGeometry) -> tuple[NDArray[np.float64], NDArray[np.int64], Fit]:
+    def begun(self, camera: Camera, board: BoardGeometry) -> tuple[Floats, NDArray[np.int64], Fit]:
         """Return where the corners' lines have them."""
         start = in_scene(straight_lines(*self.sightings(camera, board), camera), camera, self.medium)
         known = np.isfinite(start).all(axis=1)
@@ -271,7 +266,7 @@ class CornerLook(Look):
         edges = np.asarray(np.linalg.lstsq(terms, start[:, :2], rcond=None)[0][1:], dtype=np.float64)
         reach = clear_mm(board) - 0.5 * float(camera.lattice.pitch.max()) / abs(camera.magnification)
 
-        def fit(start_mm: NDArray[np.float64], waves: WaveShapes | None = None) -> ShapeFit | None:
+        def fit(start_mm: Floats, waves: WaveShapes | None = None) -> ShapeFit | None:
             x, y, z = (float(value) for value in start_mm)
             near = pixels_near((self.signal, self.passed), camera, self.medium, (x, y, z), reach, MOST_PIXELS)
             if near is None or waves is None:
@@ -280,7 +275,7 @@ class CornerLook(Look):
 
         return start, numbers, fit
 
-    def sightings(self, camera: Camera, board: BoardGeometry) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def sightings(self, camera: Camera, board: BoardGeometry) -> tuple[Floats, Floats]:
         """Return points of the main lens (views, 2) and where on the array each shows the corners (views, n, 2)."""
         step = camera.pixel_mm * camera.image_distance_mm / camera.microlens_distance_mm
         crossings = view_crossings(camera.aperture_radius_mm - RIM_PIXELS * step, step)
@@ -307,9 +302,9 @@ class ViewGrid:
     origin_mm, step_mm : (2,) of the samples on the array
     """
 
-    lenses_mm: NDArray[np.float64]
-    origin_mm: NDArray[np.float64]
-    step_mm: NDArray[np.float64]
+    lenses_mm: Floats
+    origin_mm: Floats
+    step_mm: Floats
 
     @classmethod
     def of(cls, camera: Camera) -> ViewGrid:
@@ -319,18 +314,14 @@ class ViewGrid:
         step = np.array([lenses[0, 1, 0] - lenses[0, 0, 0], lenses[1, 0, 1] - lenses[0, 0, 1]])
         return cls(lenses, np.array([left, lenses[0, 0, 1]]), step)
 
-    def to_mm(self, sample: NDArray[np.float64]) -> NDArray[np.float64]:
+    def to_mm(self, sample: Floats) -> Floats:
         """Return places on the array (..., 2) of samples (column, row)."""
         return np.asarray(self.origin_mm + sample * self.step_mm, dtype=np.float64)
 
 
 def followed(
-    pictures: list[NDArray[np.float32]],
-    crossings_mm: NDArray[np.float64],
-    middle_mm: NDArray[np.float64],
-    grid: ViewGrid,
-    half: tuple[int, ...],
-) -> NDArray[np.float64]:
+    pictures: list[NDArray[np.float32]], crossings_mm: Floats, middle_mm: Floats, grid: ViewGrid, half: tuple[int, ...]
+) -> Floats:
     """Return where on the array each view shows corners (views, n, 2), NaN where it does not.
 
     Parameters
@@ -354,21 +345,19 @@ def followed(
     return seen
 
 
-def upright_view(
-    image: NDArray[np.float64], camera: Camera, grid: ViewGrid, crossing_mm: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def upright_view(image: Floats, camera: Camera, grid: ViewGrid, crossing_mm: Floats) -> Floats:
     """Return the view from a point of the main lens on the upright samples of the grid."""
     view = sub_aperture_view(image, camera, crossing_mm)
     at = grid.origin_mm[0] + np.arange(view.shape[1]) * grid.step_mm[0]
     return np.stack([np.interp(at, lenses[:, 0], row) for lenses, row in zip(grid.lenses_mm, view, strict=True)])
 
 
-def softened(picture: NDArray[np.float64]) -> NDArray[np.float32]:
+def softened(picture: Floats) -> NDArray[np.float32]:
     """Return a view as OpenCV refines corners in it."""
     return np.asarray(cv2.GaussianBlur(picture, (0, 0), SOFTENING), dtype=np.float32)
 
 
-def refined(picture: NDArray[np.float32], guess: NDArray[np.float64], half: tuple[int, ...]) -> NDArray[np.float64]:
+def refined(picture: NDArray[np.float32], guess: Floats, half: tuple[int, ...]) -> Floats:
     """Return corners (n, 2) to a fraction of a sample, NaN where the window leaves the picture or the corner it."""
     rows, columns = picture.shape
     margin = np.array(half) + 1.0
@@ -382,7 +371,7 @@ def refined(picture: NDArray[np.float32], guess: NDArray[np.float64], half: tupl
     return found
 
 
-def common_slope(crossing_mm: NDArray[np.float64], seen_mm: NDArray[np.float64]) -> float:
+def common_slope(crossing_mm: Floats, seen_mm: Floats) -> float:
     """Return the slope of the places (views, n, 2) of all corners over the points of the main lens (views, 2)."""
     seen = seen_mm[:, np.isfinite(seen_mm).any(axis=(0, 2))]
     off = seen - np.nanmean(seen, axis=0)
@@ -391,9 +380,7 @@ def common_slope(crossing_mm: NDArray[np.float64], seen_mm: NDArray[np.float64])
     return float(np.sum(np.where(known, off, 0.0) * crossing) / np.sum(crossing**2))
 
 
-def straight_lines(
-    crossing_mm: NDArray[np.float64], seen_mm: NDArray[np.float64], camera: Camera
-) -> NDArray[np.float64]:
+def straight_lines(crossing_mm: Floats, seen_mm: Floats, camera: Camera) -> Floats:
     """Return for each corner the middle (x, y) and the slope alpha of its line (n, 3), NaN where few views show it.
 
     Parameters
@@ -424,7 +411,7 @@ def straight_lines(
     return lines
 
 
-def in_scene(lines: NDArray[np.float64], camera: Camera, media: Media) -> NDArray[np.float64]:
+def in_scene(lines: Floats, camera: Camera, media: Media) -> Floats:
     """Return the places (n, 3) of points whose lines x_m = alpha X - x s_i/s_o are known."""
     s_i = camera.image_distance_mm
     distance = s_i / (lines[:, 2] - 1.0 + s_i / camera.focal_length_mm)
@@ -473,13 +460,13 @@ def refuse_small(board: BoardGeometry, camera: Camera) -> None:
             )
 
 
-def evenly_lit(image: NDArray[np.floating], passed: NDArray[np.float32]) -> NDArray[np.float64]:
+def evenly_lit(image: NDArray[np.floating], passed: NDArray[np.float32]) -> Floats:
     """Return a picture (rows, columns) divided by the share of light that pixels pass, 0 where it is unusable."""
     usable = passed > 0.0
     return np.where(usable, image.astype(np.float64) / np.where(usable, passed, 1.0), 0.0)
 
 
-def enlarged_view(signal: NDArray[np.float64], camera: Camera) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+def enlarged_view(signal: Floats, camera: Camera) -> tuple[NDArray[np.uint8], Floats]:
     """Return the middle's view in grey levels, enlarged, its samples square, and by how much along columns and rows."""
     grid = ViewGrid.of(camera)
     view = upright_view(signal, camera, grid, np.zeros(2))

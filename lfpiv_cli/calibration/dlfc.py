@@ -20,6 +20,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.board import candidate_depths, dot_signal, first_dots
 from lfpiv_cli.calibration.board_pose import BoardGeometry, on_the_grid
 from lfpiv_cli.calibration.rectification import turn_matrix
@@ -63,13 +64,7 @@ class Shown:
     beta_sigma: float
 
 
-def shown(
-    z_mm: float,
-    plate_mm: NDArray[np.float64],
-    dot: NDArray[np.int64],
-    crossing_mm: NDArray[np.float64],
-    array_mm: NDArray[np.float64],
-) -> Shown:
+def shown(z_mm: float, plate_mm: Floats, dot: NDArray[np.int64], crossing_mm: Floats, array_mm: Floats) -> Shown:
     """Fit x_m = alpha X - beta x to what was seen of a board, turned and placed as it is.
 
     Parameters
@@ -155,10 +150,10 @@ class RayFit:
     """
 
     rays: PolynomialRays
-    depths_mm: NDArray[np.float64]
-    reach_mm: NDArray[np.float64]
+    depths_mm: Floats
+    reach_mm: Floats
     sightings: int
-    residual_mm: NDArray[np.float64]
+    residual_mm: Floats
     entrance_pupil_mm: float | None = None
     entrance_pupil_sigma_mm: float | None = None
 
@@ -189,8 +184,8 @@ class Sightings:
     """A board's dots in views: which dot (n,), crossings (n, 2) of the main lens, places (n, 2) on the array."""
 
     dot: NDArray[np.int64]
-    crossing_mm: NDArray[np.float64]
-    array_mm: NDArray[np.float64]
+    crossing_mm: Floats
+    array_mm: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,10 +201,10 @@ class SeenBoard:
     index : (n, 2) which dots they are
     """
 
-    signal: NDArray[np.float64]
+    signal: Floats
     z_mm: float
     seen_z_mm: float
-    place_mm: NDArray[np.float64]
+    place_mm: Floats
     index: NDArray[np.int64]
 
 
@@ -333,7 +328,7 @@ def aligned(boards: list[SeenBoard], board: BoardGeometry) -> list[SeenBoard]:
     return result
 
 
-def common_grid(boards: list[SeenBoard], board: BoardGeometry) -> NDArray[np.float64]:
+def common_grid(boards: list[SeenBoard], board: BoardGeometry) -> Floats:
     """Return where the dots stand, (dots along x, dots along y, 2): turned and placed as the boards are on average.
 
     The scale under which a camera sees a board is that of its magnification; it is taken out about the optical axis.
@@ -344,12 +339,12 @@ def common_grid(boards: list[SeenBoard], board: BoardGeometry) -> NDArray[np.flo
     return np.asarray(_plate(np.moveaxis(np.indices(board.dots), 0, -1), board) @ turn.T + middle, dtype=np.float64)
 
 
-def _plate(index: NDArray[np.int64], board: BoardGeometry) -> NDArray[np.float64]:
+def _plate(index: NDArray[np.int64], board: BoardGeometry) -> Floats:
     """Return places (..., 2) about the board's middle of dots given by their numbers."""
     return board.spacing_mm * (index - (np.array(board.dots) - 1) / 2)
 
 
-def _similarity(seen: SeenBoard, board: BoardGeometry) -> tuple[float, NDArray[np.float64]]:
+def _similarity(seen: SeenBoard, board: BoardGeometry) -> tuple[float, Floats]:
     """Return turn (rad) and middle (2,) of a board, its scale about the axis taken out."""
     plate = _plate(seen.index, board)
     zero, one = np.zeros(len(plate)), np.ones(len(plate))
@@ -396,9 +391,7 @@ def sightings_of(seen: SeenBoard, camera: Camera, board: BoardGeometry, media: M
 
 
 @njit(cache=True)
-def dot_centroids(
-    view: NDArray[np.float64], lenses: NDArray[np.float64], guess: NDArray[np.float64], window: float, reach: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def dot_centroids(view: Floats, lenses: Floats, guess: Floats, window: float, reach: float) -> tuple[Floats, Floats]:
     """Return centroids (n, 2) and heights above the ground (n,) of dots in a view; NaN at its border.
 
     The ground is the median within `reach` of the guess; the light above it is weighed within `window` of the centroid.
@@ -440,12 +433,8 @@ def dot_centroids(
 
 
 def polynomial_fit(
-    start_mm: NDArray[np.float64],
-    crossing_mm: NDArray[np.float64],
-    array_mm: NDArray[np.float64],
-    degree: int,
-    camera: Camera,
-) -> tuple[PolynomialRays, NDArray[np.float64], NDArray[np.bool_]]:
+    start_mm: Floats, crossing_mm: Floats, array_mm: Floats, degree: int, camera: Camera
+) -> tuple[PolynomialRays, Floats, NDArray[np.bool_]]:
     """Return the complete polynomials through rays from (n, 3) through (n, 2) to (n, 2), and how well they fit.
 
     That is the misfit (n, 2) in mm, and which rays were used (n,).

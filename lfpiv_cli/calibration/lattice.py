@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft, ndimage
 from scipy.special import fdtrc
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.white import (
     NARROWEST_LENS_IMAGE,
     checked_white,
@@ -51,7 +52,7 @@ BIN_TOLERANCE = 2
 REFINE_BINS = 2
 
 
-def lattice_vectors(image: NDArray[np.float64]) -> tuple[NDArray[np.float64], Layout]:
+def lattice_vectors(image: Floats) -> tuple[Floats, Layout]:
     """Return two basis vectors (2, 2) of the lattice of bright spots, the first nearest the columns, and its layout.
 
     The slowest line that has a partner tells the layout by where this stands: at 90 degrees on squares, at 60 on
@@ -80,7 +81,7 @@ def lattice_vectors(image: NDArray[np.float64]) -> tuple[NDArray[np.float64], La
     )
 
 
-def centre_spectrum(image: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def centre_spectrum(image: Floats) -> tuple[Floats, Floats]:
     """Return the power spectrum of the image's middle and its frequency step along (columns, rows).
 
     The power is indexed [row frequency, column frequency >= 0]; slow illumination is taken off first.
@@ -95,7 +96,7 @@ def centre_spectrum(image: NDArray[np.float64]) -> tuple[NDArray[np.float64], ND
     return power, np.array([1.0 / size[1], 1.0 / size[0]])
 
 
-def spectral_lines(power: NDArray[np.float64], step: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+def spectral_lines(power: Floats, step: Floats) -> list[Floats]:
     """Return the strong local maxima of the spectrum as frequencies (column, row), the slowest first."""
     frequency = np.hypot(*np.meshgrid(step[0] * np.arange(power.shape[1]), fft.fftfreq(power.shape[0])))
     in_range = (frequency >= 1.0 / LARGEST_PITCH_PX) & (frequency <= 1.0 / (SMALLEST_PITCH_PX * np.sqrt(0.75)))
@@ -108,15 +109,15 @@ def spectral_lines(power: NDArray[np.float64], step: NDArray[np.float64]) -> lis
     return list(lines[np.argsort(np.hypot(lines[:, 0], lines[:, 1]), kind="stable")])
 
 
-def rotated(vector: NDArray[np.float64], angle_rad: float) -> NDArray[np.float64]:
+def rotated(vector: Floats, angle_rad: float) -> Floats:
     """Return the vector turned from the columns towards the rows."""
     cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
     return np.array([cosine * vector[0] - sine * vector[1], sine * vector[0] + cosine * vector[1]])
 
 
 def bins_around(
-    power: NDArray[np.float64], step: NDArray[np.float64], line: NDArray[np.float64], reach: int
-) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
+    power: Floats, step: Floats, line: Floats, reach: int
+) -> tuple[Floats, NDArray[np.int64], NDArray[np.int64]]:
     """Return the power near a frequency and its column and row bin numbers; the half-plane is mirrored where needed."""
     column, row = np.rint(line / step).astype(np.int64)
     columns = np.arange(column - reach, column + reach + 1)[np.newaxis, :]
@@ -125,14 +126,12 @@ def bins_around(
     return power[(rows * mirror) % power.shape[0], np.abs(columns)], columns, rows
 
 
-def line_power(power: NDArray[np.float64], step: NDArray[np.float64], line: NDArray[np.float64]) -> float:
+def line_power(power: Floats, step: Floats, line: Floats) -> float:
     """Return the strongest power within the tolerance around a frequency."""
     return float(bins_around(power, step, line, BIN_TOLERANCE)[0].max())
 
 
-def refined_line(
-    power: NDArray[np.float64], step: NDArray[np.float64], line: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def refined_line(power: Floats, step: Floats, line: Floats) -> Floats:
     """Return the frequency of a line to a fraction of a bin: the centroid of its power about the strongest bin."""
     near, columns, rows = bins_around(power, step, line, BIN_TOLERANCE)
     peak_row, peak_column = np.unravel_index(np.argmax(near), near.shape)
@@ -142,13 +141,7 @@ def refined_line(
     return np.array([(near * columns).sum() / total, (near * rows).sum() / total]) * step
 
 
-def first_basis(
-    power: NDArray[np.float64],
-    step: NDArray[np.float64],
-    first: NDArray[np.float64],
-    second: NDArray[np.float64],
-    layout: Layout,
-) -> NDArray[np.float64]:
+def first_basis(power: Floats, step: Floats, first: Floats, second: Floats, layout: Layout) -> Floats:
     """Return lattice vectors from two neighbouring lines: the rows of the inverse transpose of the frequencies.
 
     On hexagons the frequencies stand at 60 degrees and the vectors at 120; the sum of these stands at 60 to the first.
@@ -160,7 +153,7 @@ def first_basis(
     return basis
 
 
-def column_first(basis: NDArray[np.float64], layout: Layout) -> NDArray[np.float64]:
+def column_first(basis: Floats, layout: Layout) -> Floats:
     """Return the same lattice with the first vector nearest the columns, the second turned from it towards the rows."""
     if layout == "square":
         around = np.array([basis[0], basis[1], -basis[0], -basis[1]])
@@ -214,13 +207,13 @@ class LatticeFit:
 
     lattice_px: Lattice
     indices: NDArray[np.int64]
-    centres_px: NDArray[np.float64]
-    cubic_px: NDArray[np.float64]
+    centres_px: Floats
+    cubic_px: Floats
     cubic_used: bool
-    residual_px: NDArray[np.float64]
-    residual_affine_px: NDArray[np.float64]
-    pitch_sigma_px: NDArray[np.float64]
-    origin_sigma_px: NDArray[np.float64]
+    residual_px: Floats
+    residual_affine_px: Floats
+    pitch_sigma_px: Floats
+    origin_sigma_px: Floats
     rotation_sigma_rad: float
 
     @property
@@ -229,7 +222,7 @@ class LatticeFit:
         return len(self.indices)
 
     @property
-    def coefficients_px(self) -> NDArray[np.float64]:
+    def coefficients_px(self) -> Floats:
         """Coefficients (10, 2) of the chosen model, in the order of `EXPONENTS`."""
         if self.cubic_used:
             return self.cubic_px
@@ -237,11 +230,11 @@ class LatticeFit:
         plain[0], plain[1:3] = self.lattice_px.origin, self.lattice_px.basis
         return plain
 
-    def centres(self, indices: ArrayLike) -> NDArray[np.float64]:
+    def centres(self, indices: ArrayLike) -> Floats:
         """Return the modelled centres of lens images, (column, row), indices of shape (..., 2)."""
         return polynomial_terms(indices) @ self.coefficients_px
 
-    def shifted(self, shift_px: NDArray[np.float64]) -> LatticeFit:
+    def shifted(self, shift_px: Floats) -> LatticeFit:
         """Return the lattice with all lens images moved by a shift (2,), (columns, rows)."""
         cubic = self.cubic_px.copy()
         cubic[0] += shift_px
@@ -275,7 +268,7 @@ def fit_lattice(
     return fit if falloff is None else _lattice_of(image / falloff, layout)
 
 
-def _lattice_of(image: NDArray[np.float64], layout: Layout | None) -> LatticeFit:
+def _lattice_of(image: Floats, layout: Layout | None) -> LatticeFit:
     """Return the lattice through the centroids of the lens images of a white image less the dark one."""
     basis, seen = lattice_vectors(image)
     if layout is not None and seen != layout:
@@ -289,7 +282,7 @@ def _lattice_of(image: NDArray[np.float64], layout: Layout | None) -> LatticeFit
     return lattice_through(indices, points, centre, seen)
 
 
-def _falloff(image: NDArray[np.float64], lattice_px: Lattice) -> NDArray[np.float32] | None:
+def _falloff(image: Floats, lattice_px: Lattice) -> NDArray[np.float32] | None:
     """Return the share (rows, columns) of light that passes, smooth over the lenses; None where that moves no centroid.
 
     Light that falls towards the corners pulls the centroids of lens images to the middle, in proportion to the image
@@ -305,9 +298,7 @@ def _falloff(image: NDArray[np.float64], lattice_px: Lattice) -> NDArray[np.floa
     return passed if np.ptp(passed) > EVEN_LIGHT else None
 
 
-def indexed_from_centre(
-    points: NDArray[np.float64], basis: NDArray[np.float64], centre: NDArray[np.float64]
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def indexed_from_centre(points: Floats, basis: Floats, centre: Floats) -> tuple[NDArray[np.int64], Floats]:
     """Return lattice indices and positions of the spots that a walk from the middle of the image reaches."""
     best = np.zeros(len(points), dtype=bool)
     best_indices = np.zeros((len(points), 2), dtype=np.int64)
@@ -325,15 +316,13 @@ def indexed_from_centre(
     return best_indices[best], points[best]
 
 
-def polynomial_terms(indices: ArrayLike, count: int = len(EXPONENTS)) -> NDArray[np.float64]:
+def polynomial_terms(indices: ArrayLike, count: int = len(EXPONENTS)) -> Floats:
     """Return the first `count` monomials of the indices, shape (..., count)."""
     index = np.asarray(indices, dtype=np.float64)
     return np.stack([index[..., 0] ** a * index[..., 1] ** b for a, b in EXPONENTS[:count]], axis=-1)
 
 
-def robust_fit(
-    terms: NDArray[np.float64], points: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def robust_fit(terms: Floats, points: Floats) -> tuple[Floats, Floats]:
     """Return coefficients (terms, 2) by least squares with Tukey's weights, and these weights (n,)."""
     scale = np.abs(terms).max(axis=0)
     weights = np.ones(len(points))
@@ -348,9 +337,7 @@ def robust_fit(
     return coefficients, weights
 
 
-def without_strays(
-    indices: NDArray[np.int64], points: NDArray[np.float64], pitch_px: float
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def without_strays(indices: NDArray[np.int64], points: Floats, pitch_px: float) -> tuple[NDArray[np.int64], Floats]:
     """Drop the spots that lie more than a quarter of the pitch off the cubic: dirt between the lenses."""
     terms = polynomial_terms(indices)
     coefficients, _ = robust_fit(terms, points)
@@ -358,9 +345,7 @@ def without_strays(
     return indices[kept], points[kept]
 
 
-def lattice_through(
-    indices: NDArray[np.int64], points: NDArray[np.float64], centre: NDArray[np.float64], layout: Layout
-) -> LatticeFit:
+def lattice_through(indices: NDArray[np.int64], points: Floats, centre: Floats, layout: Layout) -> LatticeFit:
     """Fit the plain lattice and the cubic to numbered lens images and judge whether the cubic is worth it."""
     first, _ = robust_fit(polynomial_terms(indices, 3), points)
     indices = indices - Lattice(first[0], first[1:3], layout).nearest(centre)
@@ -388,12 +373,12 @@ def lattice_through(
     )
 
 
-def weighted_rms(residual: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
+def weighted_rms(residual: Floats, weights: Floats) -> Floats:
     """Return the rms (2,) of the residuals whose weight is not zero: dirt on a lens is not the fit's error."""
     return np.sqrt(np.mean(residual[weights > 0.0] ** 2, axis=0))
 
 
-def cubic_is_significant(terms: NDArray[np.float64], points: NDArray[np.float64], weights: NDArray[np.float64]) -> bool:
+def cubic_is_significant(terms: Floats, points: Floats, weights: Floats) -> bool:
     """Tell by an F-test whether the seven further coefficients per axis do enough, and more than chance.
 
     What a centroid's place within its pixel explains is the pixels' own error: behind a telecentric lens, where lens
@@ -420,9 +405,7 @@ def cubic_is_significant(terms: NDArray[np.float64], points: NDArray[np.float64]
     return bool(fdtrc(more, rest, ratio) < CUBIC_CHANCE)
 
 
-def coefficient_sigmas(
-    terms: NDArray[np.float64], residual: NDArray[np.float64], weights: NDArray[np.float64], places: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def coefficient_sigmas(terms: Floats, residual: Floats, weights: Floats, places: Floats) -> Floats:
     """Return standard errors (terms, 2) of coefficients fitted with weights, errors being alike in parts of the image.
 
     The sandwich estimate over parts: what the residuals of each part pull at the coefficients counts as one error.
@@ -445,7 +428,7 @@ def coefficient_sigmas(
     return np.stack(sigmas, axis=1)
 
 
-def affine_errors(basis: NDArray[np.float64], sigma: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+def affine_errors(basis: Floats, sigma: Floats) -> tuple[Floats, float]:
     """Return the standard errors of the pitch (2,) px and the rotation (rad) from those of the basis (2, 2)."""
     length2 = np.sum(basis**2, axis=1)
     along = np.sqrt(np.sum((basis * sigma) ** 2, axis=1) / length2)

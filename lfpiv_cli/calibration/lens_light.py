@@ -20,6 +20,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.lattice import LatticeFit
 from lfpiv_cli.calibration.rectification import Rectification
 from lfpiv_cli.optics.camera import Lattice
@@ -59,11 +60,11 @@ class Cells(NamedTuple):
     origin_px, inverse_basis : (2,), (2, 2) of the plain lattice
     """
 
-    off: NDArray[np.float64]
+    off: Floats
     first_i: int
     first_j: int
-    origin_px: NDArray[np.float64]
-    inverse_basis: NDArray[np.float64]
+    origin_px: Floats
+    inverse_basis: Floats
 
     @classmethod
     def of(cls, lattice_px: Lattice, shape: tuple[int, int], fit: LatticeFit | None = None) -> Cells:
@@ -80,7 +81,7 @@ class Cells(NamedTuple):
 class Place(NamedTuple):
     """How far beside its lens images the light lies somewhere, (2,) pixels, and the standard error along that."""
 
-    shift_px: NDArray[np.float64]
+    shift_px: Floats
     sigma_px: float
 
 
@@ -116,8 +117,8 @@ class LensImages:
 
     lattice_px: Lattice
     cells: Cells
-    area: NDArray[np.float64]
-    pattern: NDArray[np.float64]
+    area: Floats
+    pattern: Floats
     between: NDArray[np.int64]
 
     @classmethod
@@ -153,7 +154,7 @@ class LensImages:
         """Return level and noise of a picture's background: what darker pixels between lens images vary about."""
         return dark_level(picture.ravel()[self.between])
 
-    def _settled(self, light: NDArray[np.float64], unknowns: NDArray[np.float64]) -> tuple[System, NDArray[np.float64]]:
+    def _settled(self, light: Floats, unknowns: Floats) -> tuple[System, Floats]:
         """Return the last normal equations, and the unknowns by Gauss-Newton from first values of them."""
         for _ in range(ROUNDS):
             system = _system(light, self.pattern, self.lattice_px, unknowns)
@@ -174,7 +175,7 @@ def dark_level(pixels: NDArray[np.floating]) -> tuple[float, float]:
     return float(2.0 * one - two), float(one - two)
 
 
-def folded(picture: NDArray[np.floating], level: float, cells: Cells, bins: int) -> NDArray[np.float64]:
+def folded(picture: NDArray[np.floating], level: float, cells: Cells, bins: int) -> Floats:
     """Return the light above a level on one cell (parts, bins, bins), summed over each part of a picture.
 
     Pixels that are not numbers have none.
@@ -189,7 +190,7 @@ def folded(picture: NDArray[np.floating], level: float, cells: Cells, bins: int)
 
 @njit(cache=True, nogil=True)
 def fold_strips(
-    strips: tuple[int, int], picture: NDArray[np.float32], level: float, cells: Cells, total: NDArray[np.float64]
+    strips: tuple[int, int], picture: NDArray[np.float32], level: float, cells: Cells, total: Floats
 ) -> None:
     """Add the light of strips of parts to `total`; a pixel's is shared by the four bins around it."""
     (rows, columns), bins = picture.shape, total.shape[1] - 2
@@ -225,22 +226,22 @@ class System(NamedTuple):
     amount : (parts,) light that follows the lens images
     """
 
-    matrix: NDArray[np.float64]
-    pull: NDArray[np.float64]
-    amount: NDArray[np.float64]
+    matrix: Floats
+    pull: Floats
+    amount: Floats
 
     @property
-    def inverse(self) -> NDArray[np.float64]:
+    def inverse(self) -> Floats:
         """(k, k) of the sum of all parts."""
         return np.asarray(np.linalg.inv(self.matrix.sum(axis=0)))
 
     @property
-    def step(self) -> NDArray[np.float64]:
+    def step(self) -> Floats:
         """(k,) towards the solution."""
         return np.asarray(self.inverse @ self.pull.sum(axis=0))
 
     @property
-    def told(self) -> NDArray[np.float64]:
+    def told(self) -> Floats:
         """(parts,) how much each part tells of the shift."""
         return np.asarray(np.trace(self.matrix[:, :2, :2], axis1=1, axis2=2))
 
@@ -250,14 +251,14 @@ class System(NamedTuple):
         return float(self.told.sum() ** 2 / np.sum(self.told**2))
 
     @property
-    def covariance(self) -> NDArray[np.float64]:
+    def covariance(self) -> Floats:
         """(k, k) by how parts differ (the sandwich estimate), and bins; of no use where too few parts tell."""
         few = 0.5 * self.pull.shape[1] + 1.0
         freedom = self.alike / max(self.alike - few, 1.0)
         apart = self.inverse @ (self.pull.T @ self.pull) @ self.inverse
         return np.asarray(freedom * (apart + self.inverse))
 
-    def following(self, light: NDArray[np.float64]) -> tuple[float, float]:
+    def following(self, light: Floats) -> tuple[float, float]:
         """Return the share of all light that follows the lens images, and its standard error by how parts differ."""
         level = light.mean(axis=(1, 2))
         total = max(float(level.sum()), np.finfo(np.float64).tiny)
@@ -265,9 +266,7 @@ class System(NamedTuple):
         return share, float(np.sqrt(np.sum((self.amount - share * level) ** 2))) / total
 
 
-def _system(
-    light: NDArray[np.float64], pattern: NDArray[np.float64], lattice: Lattice, unknowns: NDArray[np.float64]
-) -> System:
+def _system(light: Floats, pattern: Floats, lattice: Lattice, unknowns: Floats) -> System:
     """Return the normal equations about the shift that `unknowns` (2,) or (6,) tell."""
     parts, bins = len(light), light.shape[-1]
     inverse = np.linalg.inv(lattice.basis)
@@ -293,7 +292,7 @@ def _system(
     return System(matrix, pull, amount)
 
 
-def _moved(pattern: NDArray[np.float64], shift: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _moved(pattern: Floats, shift: Floats) -> tuple[Floats, Floats]:
     """Return the pattern moved by a shift (parts, 2) in cells, and its slopes (parts, bins, bins, 2) with the shift."""
     bins = pattern.shape[-1]
     frequency = np.fft.fftfreq(bins, 1.0 / bins)
@@ -305,7 +304,7 @@ def _moved(pattern: NDArray[np.float64], shift: NDArray[np.float64]) -> tuple[ND
     return np.fft.ifft2(spectrum).real, np.stack(slope, axis=-1)
 
 
-def _nearest_bin(light: NDArray[np.float64], pattern: NDArray[np.float64], lattice: Lattice) -> NDArray[np.float64]:
+def _nearest_bin(light: Floats, pattern: Floats, lattice: Lattice) -> Floats:
     """Return the shift (2,) in pixels, to a bin, by which the pattern correlates best with the light."""
     spectra = (np.fft.fft2(each.sum(axis=0) - each.sum(axis=0).mean()) for each in (light, pattern))
     first, second = spectra
@@ -315,7 +314,7 @@ def _nearest_bin(light: NDArray[np.float64], pattern: NDArray[np.float64], latti
     return np.asarray((share - np.rint(share)) @ lattice.basis)
 
 
-def _places(unknowns: NDArray[np.float64], system: System) -> tuple[Place, ...]:
+def _places(unknowns: Floats, system: System) -> tuple[Place, ...]:
     """Return shifts in the middles of parts that tell of them, with the standard errors along them."""
     places, covariance, known = [], system.covariance, system.alike > FEWEST_PARTS
     for lever in _levers(part_middles()[system.told >= WELL_LIT * system.told.max()])[..., : len(unknowns)]:
@@ -325,25 +324,25 @@ def _places(unknowns: NDArray[np.float64], system: System) -> tuple[Place, ...]:
     return tuple(places)
 
 
-def _levers(places: NDArray[np.float64]) -> NDArray[np.float64]:
+def _levers(places: Floats) -> Floats:
     """Return the matrices (n, 2, 6) from the unknowns to the shift at places (n, 2), from -1 to 1 along each side."""
     terms = np.column_stack([np.ones(len(places)), places])
     return np.asarray(np.einsum("nk,ab->nakb", terms, np.eye(2)).reshape(len(places), 2, 6))
 
 
-def part_middles() -> NDArray[np.float64]:
+def part_middles() -> Floats:
     """Return the middles (parts, 2) of the parts, from -1 to 1 along each side."""
     side = (2.0 * np.arange(PARTS) + 1.0) / PARTS - 1.0
     return np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
 
 
-def cell_places(bins: int) -> NDArray[np.float64]:
+def cell_places(bins: int) -> Floats:
     """Return the places (bins, bins, 2) of the bins in shares of the basis."""
     share = np.arange(bins) / bins
     return np.stack(np.meshgrid(share, share), axis=-1)
 
 
-def _discs(lattice: Lattice, bins: int, width: float) -> NDArray[np.float64]:
+def _discs(lattice: Lattice, bins: int, width: float) -> Floats:
     """Return discs of a width in pitches on the cell (bins, bins), a pixel's rim soft."""
     place, radius = cell_places(bins), 0.5 * width * float(lattice.pitch.mean())
     steps = range(-2, 4)
@@ -351,7 +350,7 @@ def _discs(lattice: Lattice, bins: int, width: float) -> NDArray[np.float64]:
     return np.asarray(sum(np.clip(radius + 0.5 - distance, 0.0, 1.0) for distance in distances))
 
 
-def _between(cells: Cells, shape: tuple[int, int], pattern: NDArray[np.float64]) -> NDArray[np.int64]:
+def _between(cells: Cells, shape: tuple[int, int], pattern: Floats) -> NDArray[np.int64]:
     """Return the numbers of pixels, of enough all over a picture, that uniform light leaves dark; of all if none is."""
     number = np.arange(0, shape[0] * shape[1], shape[0] * shape[1] // ENOUGH + 1)
     place = np.column_stack([number % shape[1], number // shape[1]]) - cells.origin_px
@@ -362,6 +361,6 @@ def _between(cells: Cells, shape: tuple[int, int], pattern: NDArray[np.float64])
     return np.asarray(number[pattern[row, column] <= max(DARK_SHARE * pattern.max(), pattern.min())])
 
 
-def _over(light: NDArray[np.float64], area: NDArray[np.float64]) -> NDArray[np.float64]:
+def _over(light: Floats, area: Floats) -> Floats:
     """Return the mean light (parts, bins, bins) of pixels, 0 in bins without any."""
     return np.asarray(light / np.where(area > 0.0, area, 1.0))

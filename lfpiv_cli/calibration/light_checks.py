@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 from scipy.spatial import KDTree
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.board_pose import COMMON_SHARE_OF_LENS_DEPTH, BoardPose, lens_in_scene_mm
 from lfpiv_cli.calibration.lattice import LatticeFit
 from lfpiv_cli.calibration.lens_light import LensImages, cell_places, part_middles
@@ -149,14 +150,14 @@ def field_notices(pose: BoardPose, camera: Camera) -> Iterator[Notice]:
     )
 
 
-def _areas(pattern: NDArray[np.float64]) -> NDArray[np.float64]:
+def _areas(pattern: Floats) -> Floats:
     """Return the areas of lens images (parts,), their light over their plateau, in bins."""
     light = np.sort(pattern.reshape(len(pattern), -1), axis=1)
     count = max(1, int(BRIGHTEST_SHARE * light.shape[1]))
     return np.asarray(light.sum(axis=1) / np.maximum(light[:, -count:].mean(axis=1), np.finfo(np.float64).tiny))
 
 
-def _moments(images: LensImages) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def _moments(images: LensImages) -> tuple[Floats, Floats, Floats]:
     """Return the second moments (parts,) of lens images along the columns, the rows, and of both, in square pixels."""
     lattice, pattern = images.lattice_px, images.pattern
     place = cell_places(pattern.shape[-1]) @ lattice.basis
@@ -168,7 +169,7 @@ def _moments(images: LensImages) -> tuple[NDArray[np.float64], NDArray[np.float6
     return square[:, 0, 0], square[:, 1, 1], square[:, 0, 1]
 
 
-def _fit(terms: NDArray[np.float64], values: NDArray[np.float64]) -> list[Fitted]:
+def _fit(terms: Floats, values: Floats) -> list[Fitted]:
     """Return the coefficients (k,) of terms (n, k) that fit values (n,) best, and standard errors by the scatter."""
     found = np.linalg.lstsq(terms, values, rcond=None)[0]
     freedom = max(1, len(values) - terms.shape[1])
@@ -220,9 +221,7 @@ def residual_share(fit: LatticeFit) -> float:
     return float(residual.max() / fit.lattice_px.pitch.mean())
 
 
-def white_notices(
-    white: NDArray[np.float64], fit: LatticeFit, width: float, sheet_width: float | None
-) -> Iterator[Notice]:
+def white_notices(white: Floats, fit: LatticeFit, width: float, sheet_width: float | None) -> Iterator[Notice]:
     """Say what speaks against a white image.
 
     Parameters
@@ -287,7 +286,7 @@ def white_notices(
         )
 
 
-def neighbours_difference(white: NDArray[np.float64], fit: LatticeFit) -> float:
+def neighbours_difference(white: Floats, fit: LatticeFit) -> float:
     """Return how much nine in ten lens images at most differ in brightness from the median of those around."""
     half = max(1, int(MIDDLE_PER_PITCH * fit.lattice_px.pitch.mean()))
     level = uniform_filter(np.asarray(white, dtype=np.float64), 2 * half + 1)

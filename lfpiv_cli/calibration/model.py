@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from threadpoolctl import threadpool_limits
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.board import locate_board
 from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose
 from lfpiv_cli.calibration.dlfc import RayFit, fit_rays
@@ -37,13 +38,7 @@ from lfpiv_cli.optics.shapes import ScenePose
 # A measured magnification replaces the data sheet's when it differs by more standard errors than chance explains.
 MAGNIFICATION_SIGMAS = 3.0
 # Numbers that the file keeps as they are.
-CARRIED = (
-    "camera_move_mm",
-    "mid_plane_z_mm",
-    "mid_plane_z_sigma_mm",
-    "image_distance_mm",
-    "image_distance_sigma_mm",
-)
+CARRIED = ("camera_move_mm", "mid_plane_z_mm", "mid_plane_z_sigma_mm", "image_distance_mm", "image_distance_sigma_mm")
 # Shapes of the arrays that the file keeps, None for any length.
 OF_RAYS: Mapping[str, tuple[int | None, ...]] = {"depths_mm": (None,), "reach_mm": (2, 2), "residual_mm": (None, 2)}
 SHAPES: Mapping[str, tuple[int | None, ...]] = {
@@ -162,7 +157,7 @@ class Calibration:
                 f"columns) and the configured sensor has {camera.rows} x {camera.columns}"
             )
 
-    def vignetting(self) -> NDArray[np.float64] | None:
+    def vignetting(self) -> Floats | None:
         """Return the slow part of the transmission as coefficients; None where it was not measured."""
         if self.transmission is None:
             return None
@@ -303,7 +298,7 @@ class Photographs:
         """All but the dark one."""
         return [*self.whites, *([] if self.board is None else [self.board]), *self.depth_boards]
 
-    def less_dark(self, picture: ArrayLike) -> NDArray[np.float64]:
+    def less_dark(self, picture: ArrayLike) -> Floats:
         """Return a picture with the dark one taken off."""
         image = np.asarray(picture, dtype=np.float64)
         return image if self.dark is None else image - np.asarray(self.dark, dtype=np.float64)
@@ -392,7 +387,7 @@ def known(value: ArrayLike) -> Any:
     return array.tolist() if np.isfinite(array).all() else None
 
 
-def board_pose(image: NDArray[np.float64], calibration: Calibration, rig: Rig) -> BoardPose:
+def board_pose(image: Floats, calibration: Calibration, rig: Rig) -> BoardPose:
     """Return the pose of the board in its raw picture less the dark frame."""
     rectification = calibration.rectification
     camera = calibration.camera(rig.camera)
@@ -400,9 +395,7 @@ def board_pose(image: NDArray[np.float64], calibration: Calibration, rig: Rig) -
     return locate_board(picture, camera, rig.board, rig.media, turn, calibration.transmission, rig.light)
 
 
-def ray_fit(
-    images: Sequence[NDArray[np.float64]], depths_mm: Sequence[float], calibration: Calibration, rig: Rig
-) -> RayFit:
+def ray_fit(images: Sequence[Floats], depths_mm: Sequence[float], calibration: Calibration, rig: Rig) -> RayFit:
     """Return the polynomials through boards in the fluid, in raw pictures less the dark frame."""
     rectified = [calibration.rectification.apply(image) for image in images]
     camera = calibration.camera(rig.camera)

@@ -15,6 +15,7 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.lattice import EXPONENTS, LatticeFit
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.names import ColumnAxis
@@ -87,22 +88,22 @@ class Rectification:
         coefficients = ndimage.spline_filter(raw, order=3, mode="mirror")
         return sample_spline(coefficients, self.shift_px, self.inside)
 
-    def to_world(self, points: ArrayLike, column_axis: ColumnAxis = "x") -> NDArray[np.float64]:
+    def to_world(self, points: ArrayLike, column_axis: ColumnAxis = "x") -> Floats:
         """Turn lateral world coordinates (..., 2 or 3) from the rectified frame to the raw sensor's axes."""
         return turned(points, self.rotation_rad if column_axis == "x" else -self.rotation_rad)
 
-    def from_world(self, points: ArrayLike, column_axis: ColumnAxis = "x") -> NDArray[np.float64]:
+    def from_world(self, points: ArrayLike, column_axis: ColumnAxis = "x") -> Floats:
         """Turn lateral world coordinates (..., 2 or 3) from the raw sensor's axes to the rectified frame."""
         return turned(points, -self.rotation_rad if column_axis == "x" else self.rotation_rad)
 
 
-def turn_matrix(angle_rad: float) -> NDArray[np.float64]:
+def turn_matrix(angle_rad: float) -> Floats:
     """Return the matrix that turns columns of (x, y) from x towards y."""
     cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
     return np.array([[cosine, -sine], [sine, cosine]])
 
 
-def turned(points: ArrayLike, angle_rad: float) -> NDArray[np.float64]:
+def turned(points: ArrayLike, angle_rad: float) -> Floats:
     """Return points (..., 2 or more) with their first two components turned from x towards y."""
     result = np.array(points, dtype=np.float64)
     result[..., :2] = result[..., :2] @ turn_matrix(angle_rad).T
@@ -112,10 +113,10 @@ def turned(points: ArrayLike, angle_rad: float) -> NDArray[np.float64]:
 @njit(cache=True, nogil=True)
 def write_shift(
     part: tuple[int, int],
-    origin: NDArray[np.float64],
-    basis: NDArray[np.float64],
-    model: tuple[NDArray[np.float64], NDArray[np.int64]],
-    turn: NDArray[np.float64],
+    origin: Floats,
+    basis: Floats,
+    model: tuple[Floats, NDArray[np.int64]],
+    turn: Floats,
     shift: NDArray[np.float32],
 ) -> None:
     """Write for each rectified pixel of rows `part` its raw place less its own (rows, columns, 2).
@@ -161,9 +162,7 @@ def mirrored(index: int, size: int) -> int:
     return index
 
 
-def sample_spline(
-    coefficients: NDArray[np.float64], shift: NDArray[np.float32], inside: NDArray[np.bool_]
-) -> NDArray[np.float32]:
+def sample_spline(coefficients: Floats, shift: NDArray[np.float32], inside: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Return a cubic spline at each pixel's place plus its shift, 0 where not inside."""
     image = np.zeros(coefficients.shape, dtype=np.float32)
     share_out(sample_rows, coefficients.shape[0], coefficients, shift, inside, image)
@@ -173,7 +172,7 @@ def sample_spline(
 @njit(cache=True, nogil=True)
 def sample_rows(
     part: tuple[int, int],
-    coefficients: NDArray[np.float64],
+    coefficients: Floats,
     shift: NDArray[np.float32],
     inside: NDArray[np.bool_],
     image: NDArray[np.float32],

@@ -12,6 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera, Lattice, nearest_point
@@ -24,7 +25,7 @@ FIT_HALVINGS = 6
 FIT_TOLERANCE = 1e-4
 
 # Shares of what pixels see (n,), and their derivatives (n, k).
-SharesAndSlopes = tuple[NDArray[np.float64], NDArray[np.float64]]
+SharesAndSlopes = tuple[Floats, Floats]
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,8 +41,8 @@ class ShapeFit:
     converged : the steps became small before the rounds were used up
     """
 
-    position_mm: NDArray[np.float64]
-    covariance_mm2: NDArray[np.float64]
+    position_mm: Floats
+    covariance_mm2: Floats
     brightness: float
     background: float
     rms: float
@@ -56,19 +57,19 @@ class LinearFit:
     what is left, `misfit` its square.
     """
 
-    design: NDArray[np.float64]
-    levels: NDArray[np.float64]
-    residual: NDArray[np.float64]
+    design: Floats
+    levels: Floats
+    residual: Floats
     misfit: float
 
 
 def fit_shape(
-    signal: NDArray[np.float64],
-    passed: NDArray[np.float64],
-    beside_mm: NDArray[np.float64],
-    start_mm: NDArray[np.float64],
-    steps_mm: NDArray[np.float64],
-    shares_at: Callable[[NDArray[np.float64]], SharesAndSlopes],
+    signal: Floats,
+    passed: Floats,
+    beside_mm: Floats,
+    start_mm: Floats,
+    steps_mm: Floats,
+    shares_at: Callable[[Floats], SharesAndSlopes],
 ) -> ShapeFit:
     """Fit a shape to pixels by least squares: x, y, z, brightness and a sloping background are free.
 
@@ -82,7 +83,7 @@ def fit_shape(
     """
     ground = passed[:, np.newaxis] * np.column_stack([np.ones(len(passed)), beside_mm / steps_mm[0]])
 
-    def linear_fit(position: NDArray[np.float64]) -> LinearFit:
+    def linear_fit(position: Floats) -> LinearFit:
         shares, moves = shares_at(position)
         design = np.column_stack([passed * shares, ground])
         levels = solved(design, signal)
@@ -112,7 +113,7 @@ def fit_shape(
     return ShapeFit(position, covariance, float(best.levels[0]), float(best.levels[1]), rms, converged)
 
 
-def solved(design: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+def solved(design: Floats, values: Floats) -> Floats:
     """Return the coefficients of the design's columns that explain the values best."""
     return np.asarray(np.linalg.lstsq(design, values, rcond=None)[0], dtype=np.float64)
 
@@ -132,8 +133,8 @@ class MeasuredPoints:
     numbers : (n, 2) which point of the target each is, the target turned in any way; None where the grid tells
     """
 
-    places_mm: NDArray[np.float64]
-    sigmas_mm: NDArray[np.float64]
+    places_mm: Floats
+    sigmas_mm: Floats
     numbers: NDArray[np.int64] | None = None
 
 
@@ -173,9 +174,9 @@ class PixelRays:
     ideal_mm : (n, 2) where the main lens would have sent the rays to these centres without its distortion
     """
 
-    place_mm: NDArray[np.float64]
-    lens_mm: NDArray[np.float64]
-    ideal_mm: NDArray[np.float64]
+    place_mm: Floats
+    lens_mm: Floats
+    ideal_mm: Floats
 
 
 def pixel_rays(camera: Camera, column: NDArray[np.int64], row: NDArray[np.int64]) -> PixelRays:
@@ -187,9 +188,7 @@ def pixel_rays(camera: Camera, column: NDArray[np.int64], row: NDArray[np.int64]
 
 
 @njit(cache=True)
-def nearest_points(
-    points: NDArray[np.float64], origin: NDArray[np.float64], basis: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def nearest_points(points: Floats, origin: Floats, basis: Floats) -> Floats:
     """Return the lattice points nearest to points, both (n, 2)."""
     found = np.empty_like(points)
     for n in range(len(points)):
@@ -197,7 +196,7 @@ def nearest_points(
     return found
 
 
-def undistorted(points_mm: NDArray[np.float64], distortion_per_mm2: float) -> NDArray[np.float64]:
+def undistorted(points_mm: Floats, distortion_per_mm2: float) -> Floats:
     """Return the points (n, 2) that r' = r (1 + k1 r^2) carries to the given ones."""
     ideal = points_mm
     for _ in range(UNDISTORT_ROUNDS if distortion_per_mm2 else 0):
@@ -205,13 +204,13 @@ def undistorted(points_mm: NDArray[np.float64], distortion_per_mm2: float) -> ND
     return ideal
 
 
-def lens_crossings(rays: PixelRays, camera: Camera) -> NDArray[np.float64]:
+def lens_crossings(rays: PixelRays, camera: Camera) -> Floats:
     """Return where on the main lens (n, 2) the light comes from that reaches each pixel through its lens's centre."""
     stretch = camera.image_distance_mm / camera.microlens_distance_mm
     return rays.ideal_mm - (rays.place_mm - rays.lens_mm) * stretch
 
 
-def scene_points(rays: PixelRays, camera: Camera, media: Media, z_mm: float) -> NDArray[np.float64]:
+def scene_points(rays: PixelRays, camera: Camera, media: Media, z_mm: float) -> Floats:
     """Return where in the plane z (n, 2) the light starts that reaches each pixel through its lens's centre.
 
     From x_m = alpha X - x s_i/s_o.
@@ -222,7 +221,7 @@ def scene_points(rays: PixelRays, camera: Camera, media: Media, z_mm: float) -> 
     return (alpha * lens_crossings(rays, camera) - rays.ideal_mm) * back
 
 
-def lens_cell(lattice: Lattice) -> NDArray[np.float64]:
+def lens_cell(lattice: Lattice) -> Floats:
     """Return the corners (4 or 6, 2) of the region nearest to one lattice point, about that point, in order."""
     first, second = lattice.basis
     if lattice.layout == "square":
@@ -232,14 +231,14 @@ def lens_cell(lattice: Lattice) -> NDArray[np.float64]:
 
 
 def disc_shares(
-    rays: PixelRays, position_mm: NDArray[np.float64], radius_mm: float, camera: Camera, media: Media
+    rays: PixelRays, position_mm: Floats, radius_mm: float, camera: Camera, media: Media
 ) -> SharesAndSlopes:
     """Return for each pixel the share (n,) of the scene it sees at depth z that a disc there covers, and its slopes.
 
     `position_mm` is (x, y, z) in image axes; the slopes (n, 3) are the share's derivatives by it, per mm.
     """
 
-    def covered(middle: NDArray[np.float64], cell: NDArray[np.float64], width: float) -> SharesAndSlopes:
+    def covered(middle: Floats, cell: Floats, width: float) -> SharesAndSlopes:
         samples = 1 if width < SHARP_SHARE * radius_mm else BLURRED_SAMPLES
         return covered_shares(middle, cell, radius_mm, width, samples)
 
@@ -248,10 +247,10 @@ def disc_shares(
 
 def scene_shares(
     rays: PixelRays,
-    position_mm: NDArray[np.float64],
+    position_mm: Floats,
     camera: Camera,
     media: Media,
-    covered: Callable[[NDArray[np.float64], NDArray[np.float64], float], SharesAndSlopes],
+    covered: Callable[[Floats, Floats, float], SharesAndSlopes],
 ) -> SharesAndSlopes:
     """Return the shares (n,) of what pixels see in the plane of `position_mm` that a shape there covers, and slopes.
 
@@ -285,9 +284,7 @@ def scene_shares(
 
 
 @njit(cache=True)
-def covered_shares(
-    middle: NDArray[np.float64], cell: NDArray[np.float64], radius: float, width: float, samples: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def covered_shares(middle: Floats, cell: Floats, radius: float, width: float, samples: int) -> tuple[Floats, Floats]:
     """Return the mean share of `cell`, moved to `middle` and over a square of `width` around it, inside the disc.
 
     The slopes (n, 4) are its derivatives by the middle's x and y, the logarithm of the cell's size, and the width.
@@ -324,9 +321,7 @@ def covered_shares(
 
 
 @njit(cache=True)
-def disc_polygon_growth(
-    x: float, y: float, cell: NDArray[np.float64], radius: float, growth: NDArray[np.float64]
-) -> None:
+def disc_polygon_growth(x: float, y: float, cell: Floats, radius: float, growth: Floats) -> None:
     """Write the derivatives of `disc_polygon_area` by x, by y, and by the logarithm of the cell's size.
 
     Every edge sweeps an area as long as its part inside the disc.
@@ -349,7 +344,7 @@ def disc_polygon_growth(
 
 
 @njit(cache=True)
-def disc_polygon_area(x: float, y: float, cell: NDArray[np.float64], radius: float) -> float:
+def disc_polygon_area(x: float, y: float, cell: Floats, radius: float) -> float:
     """Return the area shared by a disc about (0, 0) and the polygon `cell` moved by (x, y), with the polygon's sign."""
     area = 0.0
     for k in range(cell.shape[0]):
@@ -386,13 +381,7 @@ def disc_triangle_area(ax: float, ay: float, bx: float, by: float, radius: float
 
 
 def fit_disc(
-    signal: NDArray[np.float64],
-    passed: NDArray[np.float64],
-    rays: PixelRays,
-    start_mm: NDArray[np.float64],
-    radius_mm: float,
-    camera: Camera,
-    media: Media,
+    signal: Floats, passed: Floats, rays: PixelRays, start_mm: Floats, radius_mm: float, camera: Camera, media: Media
 ) -> ShapeFit:
     """Fit a disc of known radius to pixels by least squares.
 
@@ -402,14 +391,14 @@ def fit_disc(
     start_mm : (3,) first guess, in image axes, within about the radius
     """
 
-    def shares_at(position: NDArray[np.float64]) -> SharesAndSlopes:
+    def shares_at(position: Floats) -> SharesAndSlopes:
         return disc_shares(rays, position, radius_mm, camera, media)
 
     beside = scene_points(rays, camera, media, float(start_mm[2])) - start_mm[:2]
     return fit_shape(signal, passed, beside, start_mm, fit_steps(radius_mm, camera, media), shares_at)
 
 
-def fit_steps(size_mm: float, camera: Camera, media: Media) -> NDArray[np.float64]:
+def fit_steps(size_mm: float, camera: Camera, media: Media) -> Floats:
     """Return moves (3,) that change a shape's light alike: its size sideways, and what moves the rim's rays as far."""
     deep = size_mm * camera.focus_distance_mm / (camera.aperture_radius_mm * media.depth_ratio)
     return np.array([size_mm, size_mm, deep])
@@ -445,13 +434,13 @@ MOST_PIXELS = 10_000
 class NearPixels:
     """Pixels (n,): their light, the share of it that they pass, and their rays."""
 
-    signal: NDArray[np.float64]
-    passed: NDArray[np.float64]
+    signal: Floats
+    passed: Floats
     rays: PixelRays
 
 
 def pixels_near(
-    picture: tuple[NDArray[np.float64], NDArray[np.float32]],
+    picture: tuple[Floats, NDArray[np.float32]],
     camera: Camera,
     media: Media,
     start_mm: tuple[float, float, float],

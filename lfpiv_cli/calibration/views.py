@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.calibration.shape_fit import PixelRays, lens_crossings, pixel_rays, scene_points
 from lfpiv_cli.optics.camera import Camera
@@ -27,9 +28,7 @@ from lfpiv_cli.optics.media import Media
 LEAST_CONTRAST = 60.0
 
 
-def chessboard_corners(
-    picture: NDArray[np.uint8], board: BoardGeometry
-) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
+def chessboard_corners(picture: NDArray[np.uint8], board: BoardGeometry) -> tuple[NDArray[np.int64], Floats] | None:
     """Return numbers and places (n, 2) of all inner corners of a chessboard; None where it is not wholly there."""
     # CALIB_CB_NORMALIZE_IMAGE would equalise the histogram, which draws corners of small boards off by a square
     flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
@@ -40,7 +39,7 @@ def chessboard_corners(
     return board_numbers(board), np.asarray(corners, dtype=np.float64).reshape(-1, 2)
 
 
-def alternating(picture: NDArray[np.uint8], corners: NDArray[np.float64]) -> bool:
+def alternating(picture: NDArray[np.uint8], corners: Floats) -> bool:
     """Return whether the squares about corners (rows, columns, 2) are black and white by turns.
 
     OpenCV finds a grid of three by three corners in many pictures, of particles or of white light.
@@ -64,9 +63,7 @@ def board_numbers(board: BoardGeometry) -> NDArray[np.int64]:
     return np.stack(np.meshgrid(*(np.arange(n) for n in board.dots)), axis=-1).reshape(-1, 2).astype(np.int64)
 
 
-def charuco_corners(
-    picture: NDArray[np.uint8], board: BoardGeometry
-) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
+def charuco_corners(picture: NDArray[np.uint8], board: BoardGeometry) -> tuple[NDArray[np.int64], Floats] | None:
     """Return numbers and places (n, 2) of the inner corners of a ChArUco board that are seen; None where none is."""
     settings = cv2.aruco.CharucoParameters()
     settings.minMarkers = 1  # of the two beside a corner: at the picture's edge one is cut
@@ -168,9 +165,7 @@ class Refocusing:
         """Rows and columns of the pictures; the middle sample lies on the axis."""
         return 2 * self.half[0] + 1, 2 * self.half[1] + 1
 
-    def pictures(
-        self, z_mm: float, light: tuple[NDArray[np.float64], ...], smoothing: float
-    ) -> list[NDArray[np.float64]]:
+    def pictures(self, z_mm: float, light: tuple[Floats, ...], smoothing: float) -> list[Floats]:
         """Return what each kind of the pixels' light (n,) makes on the plane at a depth.
 
         Parameters
@@ -211,7 +206,7 @@ def lens_table(camera: Camera) -> NDArray[np.int64]:
     return table.astype(np.int64)
 
 
-def view_places_px(camera: Camera, crossing_mm: ArrayLike) -> NDArray[np.float64]:
+def view_places_px(camera: Camera, crossing_mm: ArrayLike) -> Floats:
     """Return where on the sensor (column, row) the ray through (X, Y) and each lens's centre ends, (rows, columns, 2).
 
     With x_m = s_ux in Eq. 1 the microlens does not bend the ray: x_s = s_ux + s_mu (s_ux - X)/s_i.
@@ -221,7 +216,7 @@ def view_places_px(camera: Camera, crossing_mm: ArrayLike) -> NDArray[np.float64
     return camera.mm_to_px(lens + camera.microlens_distance_mm * step)
 
 
-def view_crossings(radius_mm: float, step_mm: float) -> NDArray[np.float64]:
+def view_crossings(radius_mm: float, step_mm: float) -> Floats:
     """Return points (n, 2) of the main lens, a square grid about its middle."""
     count = int(radius_mm / step_mm)
     line = step_mm * np.arange(-count, count + 1)
@@ -229,7 +224,7 @@ def view_crossings(radius_mm: float, step_mm: float) -> NDArray[np.float64]:
     return points[np.hypot(points[:, 0], points[:, 1]) <= radius_mm]
 
 
-def sub_aperture_view(image: ArrayLike, camera: Camera, crossing_mm: ArrayLike) -> NDArray[np.float64]:
+def sub_aperture_view(image: ArrayLike, camera: Camera, crossing_mm: ArrayLike) -> Floats:
     """Return the view (lens rows, lens columns) from the point (X, Y) of the main lens, linearly interpolated.
 
     Parameters
@@ -243,9 +238,7 @@ def sub_aperture_view(image: ArrayLike, camera: Camera, crossing_mm: ArrayLike) 
     return ndimage.map_coordinates(pixels, [places[..., 1], places[..., 0]], order=1, mode="nearest")
 
 
-def views_across(
-    image: ArrayLike, camera: Camera, views_per_side: int
-) -> dict[tuple[int, int], tuple[NDArray[np.float64], NDArray[np.float64]]]:
+def views_across(image: ArrayLike, camera: Camera, views_per_side: int) -> dict[tuple[int, int], tuple[Floats, Floats]]:
     """Return the points (X, Y) in mm and the views from a square grid of them, by its row and column.
 
     The grid's cells cover the main lens; a cell whose middle lies beyond the rim has no view. X grows with the columns
@@ -262,7 +255,7 @@ def views_across(
 
 def refocused_stack(
     image: ArrayLike, camera: Camera, media: Media, depths_mm: ArrayLike, passed: ArrayLike | None = None
-) -> NDArray[np.float64]:
+) -> Floats:
     """Return what the scene looks like when focused at depths: (depths, rows, columns), one sample per microlens.
 
     Every pixel's light is carried back along its ray to the plane and averaged there. The pictures are centred on the
@@ -279,7 +272,7 @@ def refocused_stack(
     row, column = np.nonzero(share > 0.0)
     planes = Refocusing.of(camera, media, (row, column), samples_per_lens=1, half_width=0.5)
 
-    def refocused(z_mm: float) -> NDArray[np.float64]:
+    def refocused(z_mm: float) -> Floats:
         light, passing = planes.pictures(z_mm, (pixels[row, column], share[row, column]), REFOCUS_SMOOTHING)
         enough = passing > LEAST_SEEN * np.median(passing)
         return np.where(enough, light / np.where(enough, passing, 1.0), 0.0)

@@ -18,6 +18,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.shape_fit import (
     NearPixels,
     PixelRays,
@@ -42,8 +43,6 @@ BY_RAYS = 0.05
 # Below this slope a strip is parallel to an edge.
 PARALLEL = 1e-9
 
-Values = NDArray[np.float64]
-
 
 @dataclass(frozen=True)
 class WaveLight:
@@ -59,13 +58,13 @@ class Strips(NamedTuple):
     Lengths in the scene, mm, from the shape's place.
     """
 
-    begin_mm: Values
-    end_mm: Values
-    aside_mm: Values
-    width_mm: Values
+    begin_mm: Floats
+    end_mm: Floats
+    aside_mm: Floats
+    width_mm: Floats
 
 
-def together(depths_mm: Values, camera: Camera, medium: Media) -> NDArray[np.bool_]:
+def together(depths_mm: Floats, camera: Camera, medium: Media) -> NDArray[np.bool_]:
     """Return which depths (n,) lie within the one over which light spreads by a lens from the middle one of them.
 
     The others are no points of a board, and line responses over all depths take long to compute.
@@ -83,7 +82,7 @@ def disc_strips(radius_mm: float, lens_mm: float) -> Strips:
     return Strips(-half, half, edges[:-1] + 0.5 * width, width)
 
 
-def corner_strips(edges_mm: Values, lens_mm: float) -> Strips:
+def corner_strips(edges_mm: Floats, lens_mm: float) -> Strips:
     """Return the strips of two squares that meet in a corner, those where both of u and v have one sign.
 
     Parameters
@@ -120,7 +119,7 @@ class WaveShapes:
     lines: LineResponses
 
     @classmethod
-    def of(cls, camera: Camera, medium: Media, light: WaveLight, depths_mm: Values) -> WaveShapes:
+    def of(cls, camera: Camera, medium: Media, light: WaveLight, depths_mm: Floats) -> WaveShapes:
         """Compute the line responses about depths (n,) that rays tell, some seconds' work."""
         space, beyond = ObjectSpace(medium, refraction="paraxial"), BY_RAYS * camera.scale(medium).depth_mm
         ends = float(depths_mm.min()) - beyond, float(depths_mm.max()) + beyond
@@ -133,11 +132,11 @@ class WaveShapes:
         """What a lens sees of the focal plane."""
         return float(self.camera.lattice.pitch.mean()) / abs(self.camera.magnification)
 
-    def fit(self, near: NearPixels, start_mm: Values, size_mm: float, strips: Strips) -> ShapeFit:
+    def fit(self, near: NearPixels, start_mm: Floats, size_mm: float, strips: Strips) -> ShapeFit:
         """Fit a shape of about this size to pixels, from a first guess (3,)."""
         steps = fit_steps(size_mm, self.camera, self.medium)
 
-        def shares_at(position: Values) -> SharesAndSlopes:
+        def shares_at(position: Floats) -> SharesAndSlopes:
             shares = self.shares(near.rays, position, strips)
             moved = [self.shares(near.rays, position + step, strips) for step in DIFFERENCE * np.diag(steps)]
             return shares, (np.stack(moved, axis=1) - shares[:, np.newaxis]) / (DIFFERENCE * steps)
@@ -145,7 +144,7 @@ class WaveShapes:
         beside = scene_points(near.rays, self.camera, self.medium, float(start_mm[2])) - start_mm[:2]
         return fit_shape(near.signal, near.passed, beside, start_mm, steps, shares_at)
 
-    def shares(self, rays: PixelRays, position_mm: Values, strips: Strips) -> Values:
+    def shares(self, rays: PixelRays, position_mm: Floats, strips: Strips) -> Floats:
         """Return for each pixel the light (n,) of a shape over that of light that fills the scene."""
         camera, lines, z = self.camera, self.lines, float(position_mm[2])
         back = camera.image_distance_mm / float(equivalent_object_distance(z, camera.focus_distance_mm, self.medium))
@@ -159,7 +158,7 @@ class WaveShapes:
         filled = (along * lines.signs) @ across.T
         return np.asarray((light / filled)[of_column, of_row])
 
-    def _lines_of(self, rays: PixelRays, spot_mm: Values, axis: int) -> tuple[NDArray[np.int64], Values, Values]:
+    def _lines_of(self, rays: PixelRays, spot_mm: Floats, axis: int) -> tuple[NDArray[np.int64], Floats, Floats]:
         """Return the column or row of each pixel (n,), and of each of these where spot (m, 1) and pixels (m,) lie.
 
         The spot from the lens, mm, and the pixels from the middle of the lens image. Distortion moves the lenses of one
@@ -170,7 +169,7 @@ class WaveShapes:
         under = rays.place_mm[first, axis] - self.camera.micro_image_scale * rays.lens_mm[first, axis]
         return number, beside[:, np.newaxis], under / self.camera.pixel_mm
 
-    def _read(self, sums: Values, beside_mm: Values, under_px: Values) -> Values:
+    def _read(self, sums: Floats, beside_mm: Floats, under_px: Floats) -> Floats:
         """Return sums (offsets, terms, responses) up to where spots (n, m) light pixels (n,): (n, m, terms).
 
         They end halfway between the offsets of the responses.
@@ -181,13 +180,13 @@ class WaveShapes:
         return found
 
 
-def _by_place(plane: NDArray[np.float32] | Values) -> Values:
+def _by_place(plane: NDArray[np.float32] | Floats) -> Floats:
     """Return responses (offsets, terms, responses) of those by phases (offsets, phases, terms, pixels)."""
     offsets, _, terms, _ = plane.shape
     return np.ascontiguousarray(plane.transpose(0, 2, 3, 1).reshape(offsets, terms, -1), dtype=np.float64)
 
 
-def _at_depth(lines: LineResponses, z_mm: float) -> Values:
+def _at_depth(lines: LineResponses, z_mm: float) -> Floats:
     """Return the responses at a depth, by phases."""
     first, weights = _about((z_mm - lines.first_depth_mm) / lines.depth_step_mm, len(lines.table))
     return np.asarray(np.tensordot(np.array(weights), lines.table[first : first + 4], 1))
@@ -201,7 +200,7 @@ def _about(place: float, count: int) -> tuple[int, tuple[float, float, float, fl
 
 
 @njit(cache=True)
-def _interpolate(table: Values, offset: Values, response: Values, found: Values) -> None:
+def _interpolate(table: Floats, offset: Floats, response: Floats, found: Floats) -> None:
     """Write a table (offsets, terms, responses) at places (n, m) and (n,): (n, m, terms).
 
     A table of one offset is that of all.

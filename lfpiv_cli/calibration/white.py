@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.neighbourhoods import largest_around, smallest_around
 from lfpiv_cli.optics.camera import Lattice
@@ -42,7 +43,7 @@ WALK_TOLERANCE = 0.25
 WALK_GAIN = 0.25
 
 
-def find_spots(image: NDArray[np.float64], pitch_px: float) -> NDArray[np.float64]:
+def find_spots(image: Floats, pitch_px: float) -> Floats:
     """Return the centres (n, 2) of the bright spots that lie wholly inside the image, in no particular order."""
     smooth = ndimage.gaussian_filter(image, SMOOTHING_PER_PITCH * pitch_px, mode="nearest")
     size = max(3, int(np.rint(SEPARATION_PER_PITCH * pitch_px)))
@@ -60,12 +61,8 @@ def find_spots(image: NDArray[np.float64], pitch_px: float) -> NDArray[np.float6
 
 @njit(cache=True)
 def spot_centroids(
-    image: NDArray[np.float64],
-    start: NDArray[np.float64],
-    base: NDArray[np.float64],
-    height: NDArray[np.float64],
-    radius_px: float,
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    image: Floats, start: Floats, base: Floats, height: Floats, radius_px: float
+) -> tuple[Floats, NDArray[np.bool_]]:
     """Return clipped centroids (n, 2) in a disc that follows them, and whether each converged inside the image."""
     rows, columns = image.shape
     centres = start.copy()
@@ -101,9 +98,7 @@ def spot_centroids(
     return centres, good
 
 
-def index_spots(
-    points: NDArray[np.float64], start: int, basis: NDArray[np.float64]
-) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+def index_spots(points: Floats, start: int, basis: Floats) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Number the points by walking outward over a lattice whose vectors may change slowly on the way.
 
     Parameters
@@ -209,7 +204,7 @@ def lens_image_width(white: NDArray[np.float32], lattice_px: Lattice) -> float:
     return float(np.sqrt(4.0 / np.pi * area) / lattice_px.pitch.mean())
 
 
-def fit_vignetting(transmission: NDArray[np.float32], lattice_px: Lattice) -> NDArray[np.float64] | None:
+def fit_vignetting(transmission: NDArray[np.float32], lattice_px: Lattice) -> Floats | None:
     """Return what of the transmission varies slowly over the lenses, as coefficients [y power, x power]; see below.
 
     Only the middles of the lens images are used: their rims show the aperture, which the weights hold already. None
@@ -235,7 +230,7 @@ def fit_vignetting(transmission: NDArray[np.float32], lattice_px: Lattice) -> ND
     return coefficients
 
 
-def vignetting_surface(coefficients: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.float32]:
+def vignetting_surface(coefficients: Floats, shape: tuple[int, int]) -> NDArray[np.float32]:
     """Return the share (rows, columns) of the middle's light that passes: a polynomial in the place over the sensor.
 
     x and y run from -1 to 1 over the columns and the rows.
@@ -247,7 +242,7 @@ def vignetting_surface(coefficients: NDArray[np.float64], shape: tuple[int, int]
 
 def _middle_part(
     white: NDArray[np.float32], lattice_px: Lattice
-) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.int64]]:
+) -> tuple[NDArray[np.float32], Floats, NDArray[np.int64]]:
     """Return the square around the sensor's centre, its pixels' places (..., 2) as (column, row), and their lenses."""
     rows, columns = white.shape
     top, left = max(0, (rows - MIDDLE_SIDE_PX) // 2), max(0, (columns - MIDDLE_SIDE_PX) // 2)
@@ -257,9 +252,7 @@ def _middle_part(
     return part, place, lattice_px.nearest(place)
 
 
-def _block_levels(
-    transmission: NDArray[np.float32], lattice_px: Lattice
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _block_levels(transmission: NDArray[np.float32], lattice_px: Lattice) -> tuple[Floats, Floats]:
     """Return places (n, 2) as (column, row) and medians (n,) of the middles of lens images, block by block."""
     rows, columns = transmission.shape
     width = LENSES_PER_BLOCK * float(lattice_px.pitch.max())
@@ -292,7 +285,7 @@ CAMERA_BITS = (8, 10, 12, 14, 16)
 FULL_PERCENTILE = 99.0
 
 
-def checked_white(white: ArrayLike, dark: ArrayLike | None, saturation: float | None) -> NDArray[np.float64]:
+def checked_white(white: ArrayLike, dark: ArrayLike | None, saturation: float | None) -> Floats:
     """Return white minus dark, or say why it cannot be used."""
     raw = np.asarray(white)
     image = raw.astype(np.float64)

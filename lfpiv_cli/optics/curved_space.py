@@ -31,6 +31,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
@@ -59,8 +60,8 @@ class Equivalent:
     valid : (n,) the point is in the fluid and seen from the middle of the lens
     """
 
-    place_mm: NDArray[np.float64]
-    distance_mm: NDArray[np.float64]
+    place_mm: Floats
+    distance_mm: Floats
     valid: NDArray[np.bool_]
 
 
@@ -150,16 +151,14 @@ class CurvedSpace:
             reliefs=_reliefs(shapes, camera),
         )
 
-    def distance(self, camera: Camera, z_mm: ArrayLike) -> NDArray[np.float64]:
+    def distance(self, camera: Camera, z_mm: ArrayLike) -> Floats:
         """Return how far from the lens, in air, points on the optical axis would appear behind planes at the vertices.
 
         What `ObjectSpace.distance` gives for planes; along a cylinder's axis it is the apparent distance.
         """
         return camera.focus_distance_mm + self.media.depth_ratio * np.asarray(z_mm, dtype=np.float64)
 
-    def slopes(
-        self, camera: Camera, points_mm: ArrayLike, crossing_mm: ArrayLike
-    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    def slopes(self, camera: Camera, points_mm: ArrayLike, crossing_mm: ArrayLike) -> tuple[Floats, NDArray[np.bool_]]:
         """Return the slopes (n, 2) at the lens of the rays from points (n, 3) that cross it at (n, 2), if they do."""
         return aim_all(self.for_kernels(camera), _rows(points_mm, 3), _rows(crossing_mm, 2))
 
@@ -184,6 +183,6 @@ def _reliefs(shapes: tuple[Shape, ...], camera: Camera) -> Reliefs | None:
     return reliefs_of(reliefs)
 
 
-def _rows(values: ArrayLike, columns: int) -> NDArray[np.float64]:
+def _rows(values: ArrayLike, columns: int) -> Floats:
     """Return rows of so many coordinates."""
     return np.ascontiguousarray(values, dtype=np.float64).reshape(-1, columns)

@@ -35,6 +35,7 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import spline_filter1d
 from scipy.special import j0
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.tracing import ObjectSpace
 from lfpiv_cli.threads import COUNT_NO_REFERENCES
@@ -164,7 +165,7 @@ def on_pixels(points: LineResponses, diffusion_px: float) -> LineResponses:
     return points._replace(table=_mixed(points.table, np.asarray(np.linalg.solve(spline, blur @ spline))))
 
 
-def _spline_of_places(pixels: int) -> NDArray[np.float64]:
+def _spline_of_places(pixels: int) -> Floats:
     """Return what makes coefficients of a spline of values at places under the lens, (from, to)."""
     return np.asarray(spline_filter1d(np.eye(PHASES * pixels)), dtype=np.float64)
 
@@ -183,7 +184,7 @@ def spline_slopes(t: float) -> tuple[float, float, float, float]:
     return -0.5 * u * u, t * (1.5 * t - 2.0), u * (2.0 - 1.5 * u), 0.5 * t * t
 
 
-def _mixed(table: Lines, shares: NDArray[np.float64]) -> Lines:
+def _mixed(table: Lines, shares: Floats) -> Lines:
     """Return the table with each place under the lens replaced by a sum of all, `shares` (from, to)."""
     found = np.zeros_like(table)
     for before in range(PHASES):
@@ -202,9 +203,7 @@ def _by_phases(lines: Lines) -> Lines:
 class _Pupil:
     """What all depths have in common: the aperture's nodes, samples of array and sensor, and the way between them."""
 
-    def __init__(
-        self, camera: Camera, space: ObjectSpace, wavelength_mm: float, depths_mm: NDArray[np.float64]
-    ) -> None:
+    def __init__(self, camera: Camera, space: ObjectSpace, wavelength_mm: float, depths_mm: Floats) -> None:
         s_i, s_mu, radius = camera.image_distance_mm, camera.microlens_distance_mm, camera.aperture_radius_mm
         pitch, wave_number = float(camera.lattice.pitch.mean()), 2.0 * np.pi / wavelength_mm
         self.camera, self.depths_mm, self.pitch_mm = camera, depths_mm, pitch
@@ -248,9 +247,7 @@ class _Pupil:
         return np.asarray(((basis @ left) * np.sqrt(turn * values))[:, :FIELD_TERMS].T)
 
 
-def _on_array(
-    camera: Camera, space: ObjectSpace, depths_mm: NDArray[np.float64], pupil_mm: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _on_array(camera: Camera, space: ObjectSpace, depths_mm: Floats, pupil_mm: Floats) -> Floats:
     """Return where rays of points on the axis through places of the pupil meet the array (depths, places)."""
     nodes, factors = space.slope_polynomials(camera, depths_mm, camera.aperture_radius_mm)
     ratio = np.zeros((len(depths_mm), len(pupil_mm))) + factors[:, -1:]
@@ -260,13 +257,7 @@ def _on_array(
     return np.asarray(pupil_mm * (1.0 - s_i / camera.focal_length_mm + s_i * ratio))
 
 
-def _phases(
-    camera: Camera,
-    space: ObjectSpace,
-    depths_mm: NDArray[np.float64],
-    pupil_mm: NDArray[np.float64],
-    wave_number: float,
-) -> NDArray[np.float64]:
+def _phases(camera: Camera, space: ObjectSpace, depths_mm: Floats, pupil_mm: Floats, wave_number: float) -> Floats:
     """Return the phase on the pupil (depths, places) whose normals are the rays: its slope is k x_m / s_i."""
     nodes, weights = np.polynomial.legendre.leggauss(6)
     # The integral from the axis on; x_m is an odd polynomial of degree 9.

@@ -19,6 +19,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.optics.shapes import Reliefs, Vector, dot, plus, row, scaled
 from lfpiv_cli.optics.surfaces import Faces, height_behind, meet, normal_change
 from lfpiv_cli.simd.faces import (
@@ -205,19 +206,18 @@ def aim(faces: Faces, x: float, y: float, z: float, X: float, Y: float) -> Place
     return NOWHERE
 
 
-Rays = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 
 @njit(cache=True)
-def aim_all(faces: Faces, points: Rays, crossing: Rays) -> tuple[Rays, Flags]:
+def aim_all(faces: Faces, points: Floats, crossing: Floats) -> tuple[Floats, Flags]:
     """Return `aim` from each point through each crossing: slopes (n, 2) and whether they are valid (n,)."""
     return _aim_all(faces.reliefs, faces, points, crossing)
 
 
 # As in `surfaces`: what takes the heights as an argument of its own is compiled without them where there are none.
 @njit(cache=True)
-def _aim_all(reliefs: Reliefs | None, faces: Faces, points: Rays, crossing: Rays) -> tuple[Rays, Flags]:
+def _aim_all(reliefs: Reliefs | None, faces: Faces, points: Floats, crossing: Floats) -> tuple[Floats, Flags]:
     if reliefs is None:
         return _aim_lanes_all(faces, points, crossing)
     slopes, valid = np.empty((len(points), 2)), np.empty(len(points), dtype=np.bool_)
@@ -229,7 +229,7 @@ def _aim_all(reliefs: Reliefs | None, faces: Faces, points: Rays, crossing: Rays
 
 
 @njit(cache=True)
-def _aim_lanes_all(faces: Faces, points: Rays, crossing: Rays) -> tuple[Rays, Flags]:
+def _aim_lanes_all(faces: Faces, points: Floats, crossing: Floats) -> tuple[Floats, Flags]:
     """Return `aim_all`; a lane whose ray is found takes the next one, so that none waits for the slowest."""
     slopes, valid = np.full((len(points), 2), np.nan), np.zeros(len(points), dtype=np.bool_)
     table = np.zeros(AIM_ROWS * DOUBLES)
@@ -246,13 +246,7 @@ def _aim_lanes_all(faces: Faces, points: Rays, crossing: Rays) -> tuple[Rays, Fl
         if running == 0:
             return slopes, valid
         aim_lanes(
-            table,
-            faces.lens_z_mm,
-            faces.vertices_mm,
-            faces.normals,
-            faces.axes,
-            faces.curvatures_per_mm,
-            faces.ratios,
+            table, faces.lens_z_mm, faces.vertices_mm, faces.normals, faces.axes, faces.curvatures_per_mm, faces.ratios
         )
         for lane in range(DOUBLES):
             i = ray[lane]
@@ -269,7 +263,7 @@ def _aim_lanes_all(faces: Faces, points: Rays, crossing: Rays) -> tuple[Rays, Fl
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def _begin(faces: Faces, point: Vector, X: float, Y: float, table: Rays, lane: int) -> None:
+def _begin(faces: Faces, point: Vector, X: float, Y: float, table: Floats, lane: int) -> None:
     """Put a ray into a lane of the table of `aim_lanes`, from where `aim` begins."""
     distance = faces.focus_distance_mm + faces.depth_ratio * point[2]
     table[POINT_X * DOUBLES + lane], table[POINT_Y * DOUBLES + lane] = point[0], point[1]
@@ -281,9 +275,7 @@ def _begin(faces: Faces, point: Vector, X: float, Y: float, table: Rays, lane: i
 
 
 @njit(cache=True)
-def pencils(
-    faces: Faces, points: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+def pencils(faces: Faces, points: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:
     """Return, for the ray from each point through the lens' middle, its slopes (n, 2) and their growth (n, 2, 2).
 
     The growth [k, l] is how slope k grows with the crossing along axis l.

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.threads import COUNT_NO_REFERENCES
 
@@ -30,9 +31,9 @@ class Relief(NamedTuple):
     coefficients : (ny - 1, nx - 1, 4, 4) of each cell: powers 0 to 3 of y, then of x, from its first node, in steps
     """
 
-    first_mm: NDArray[np.float64]
-    step_mm: NDArray[np.float64]
-    coefficients: NDArray[np.float64]
+    first_mm: Floats
+    step_mm: Floats
+    coefficients: Floats
 
 
 class Shape(NamedTuple):
@@ -86,7 +87,7 @@ def scaled(factor: float, a: Vector) -> Vector:
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def row(rows: NDArray[np.float64], k: int) -> Vector:
+def row(rows: Floats, k: int) -> Vector:
     """Return row k of an array (n, 3)."""
     return rows[k, 0], rows[k, 1], rows[k, 2]
 
@@ -116,12 +117,12 @@ class RigidMotion:
         """Whether it is more than a shift."""
         return any(self.turn_rad)
 
-    def points(self, points_mm: ArrayLike) -> NDArray[np.float64]:
+    def points(self, points_mm: ArrayLike) -> Floats:
         """Return where points (..., 3) are moved to."""
         pivot = np.asarray(self.pivot_mm)
         return self.directions(np.asarray(points_mm, dtype=np.float64) - pivot) + pivot + np.asarray(self.shift_mm)
 
-    def directions(self, directions: ArrayLike) -> NDArray[np.float64]:
+    def directions(self, directions: ArrayLike) -> Floats:
         """Return how directions (..., 3) are turned."""
         return np.asarray(np.asarray(directions, dtype=np.float64) @ self._rotation.as_matrix().T)
 
@@ -242,9 +243,9 @@ class Reliefs(NamedTuple):
 
     starts: NDArray[np.int64]
     cells: NDArray[np.int64]
-    firsts_mm: NDArray[np.float64]
-    steps_mm: NDArray[np.float64]
-    coefficients: NDArray[np.float64]
+    firsts_mm: Floats
+    steps_mm: Floats
+    coefficients: Floats
 
 
 def turned(relief: Relief) -> Relief:
@@ -257,7 +258,7 @@ def reliefs_of(reliefs: Sequence[Relief | None]) -> Reliefs:
     count = len(reliefs)
     starts, cells = np.full(count, -1), np.zeros((count, 2), np.int64)
     firsts, steps = np.zeros((count, 2)), np.ones((count, 2))
-    flat: list[NDArray[np.float64]] = []
+    flat: list[Floats] = []
     for k, relief in enumerate(reliefs):
         if relief is not None:
             starts[k] = sum(part.size for part in flat)
@@ -352,11 +353,11 @@ class ScenePose:
     faces_sha256 : of the config's scene that it is counted from
     """
 
-    shift_mm: NDArray[np.float64]
-    turn_deg: NDArray[np.float64]
-    pivot_mm: NDArray[np.float64]
-    shift_sigma_mm: NDArray[np.float64]
-    turn_sigma_deg: NDArray[np.float64]
+    shift_mm: Floats
+    turn_deg: Floats
+    pivot_mm: Floats
+    shift_sigma_mm: Floats
+    turn_sigma_deg: Floats
     faces_sha256: str
 
     @property

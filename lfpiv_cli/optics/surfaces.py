@@ -24,8 +24,8 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.names import Facing, SurfaceKind
 from lfpiv_cli.optics.shapes import (
@@ -214,11 +214,11 @@ class Faces(NamedTuple):
     lens_z_mm: float
     focus_distance_mm: float
     depth_ratio: float
-    vertices_mm: NDArray[np.float64]
-    normals: NDArray[np.float64]
-    axes: NDArray[np.float64]
-    curvatures_per_mm: NDArray[np.float64]
-    ratios: NDArray[np.float64]
+    vertices_mm: Floats
+    normals: Floats
+    axes: Floats
+    curvatures_per_mm: Floats
+    ratios: Floats
     reliefs: Reliefs | None = None
     beyond_mm: float = 0.0
 

@@ -16,6 +16,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.names import Refraction, TracedMethod
 from lfpiv_cli.optics.camera import Camera, KernelCamera, nearest_point
@@ -55,9 +56,9 @@ class PolynomialRays:
     coefficients_mm : (terms, 2) of both coordinates on the array
     """
 
-    scale_mm: NDArray[np.float64]
+    scale_mm: Floats
     exponents: NDArray[np.int64]
-    coefficients_mm: NDArray[np.float64]
+    coefficients_mm: Floats
 
     @property
     def degree(self) -> int:
@@ -87,14 +88,14 @@ class PolynomialRays:
             raise ValueError("polynomials with coefficients that are no numbers")
         return rays
 
-    def on_array(self, start_mm: ArrayLike, crossing_mm: ArrayLike) -> NDArray[np.float64]:
+    def on_array(self, start_mm: ArrayLike, crossing_mm: ArrayLike) -> Floats:
         """Return where rays from (n, 3) through (n, 2) meet the array, (n, 2)."""
         return polynomial_terms(start_mm, crossing_mm, self.scale_mm, self.exponents) @ self.coefficients_mm
 
 
 def polynomial_terms(
-    start_mm: ArrayLike, crossing_mm: ArrayLike, scale_mm: NDArray[np.float64], exponents: NDArray[np.int64]
-) -> NDArray[np.float64]:
+    start_mm: ArrayLike, crossing_mm: ArrayLike, scale_mm: Floats, exponents: NDArray[np.int64]
+) -> Floats:
     """Return each term (n, terms) for rays from (n, 3) through (n, 2)."""
     rays = np.concatenate([np.atleast_2d(start_mm), np.atleast_2d(crossing_mm)], axis=1) / scale_mm
     terms = np.ones((len(rays), len(exponents)))
@@ -122,16 +123,14 @@ class Hits:
     valid : (n,) the ray passes the aperture
     """
 
-    sensor_mm: NDArray[np.float64]
-    array_mm: NDArray[np.float64]
-    lens_mm: NDArray[np.float64]
+    sensor_mm: Floats
+    array_mm: Floats
+    lens_mm: Floats
     valid: NDArray[np.bool_]
 
 
 @njit(cache=True)
-def exact_slope(
-    dx: float, dy: float, thicknesses_mm: NDArray[np.float64], indices: NDArray[np.float64]
-) -> tuple[float, float]:
+def exact_slope(dx: float, dy: float, thicknesses_mm: Floats, indices: Floats) -> tuple[float, float]:
     """Return the slopes in the first layer of the ray that moves (dx, dy) sideways through the layers."""
     lateral = np.sqrt(dx * dx + dy * dy)
     if lateral == 0.0:
@@ -197,7 +196,7 @@ def struck_pixel(camera: KernelCamera, x: float, y: float) -> int:
     return row * camera.columns + column if 0 <= column < camera.columns and 0 <= row < camera.rows else -1
 
 
-def disc_points(count: int, radius: float, rng: np.random.Generator) -> NDArray[np.float64]:
+def disc_points(count: int, radius: float, rng: np.random.Generator) -> Floats:
     """Return `count` random points (n, 2), uniform over a disc."""
     r = radius * np.sqrt(rng.random(count))
     angle = 2.0 * np.pi * rng.random(count)
@@ -241,7 +240,7 @@ class ObjectSpace:
         """True where rays are straight from the equivalent point: paraxial refraction, or nothing but air."""
         return self.refraction == "paraxial" or self.media == self.media.in_air()
 
-    def distance(self, camera: Camera, z_mm: ArrayLike) -> NDArray[np.float64]:
+    def distance(self, camera: Camera, z_mm: ArrayLike) -> Floats:
         """Return how far from the lens, in air, points at depth z appear to paraxial rays.
 
         Raises
@@ -279,7 +278,7 @@ class ObjectSpace:
             air = camera.focus_distance_mm - wall * media.air / media.window - path * media.depth_ratio
         return Layers(np.array([air, wall, path]), np.array([media.air, media.window, media.fluid]))
 
-    def last_layers_mm(self, camera: Camera, z_mm: ArrayLike) -> NDArray[np.float64]:
+    def last_layers_mm(self, camera: Camera, z_mm: ArrayLike) -> Floats:
         """Return how thick the last of `layers` is in front of points at depth z; not above 0 in front of the fluid.
 
         Raises
@@ -289,9 +288,7 @@ class ObjectSpace:
         growth = self.media.depth_ratio if self.straight else 1.0
         return self.layers(camera).thicknesses_mm[-1] + growth * np.asarray(z_mm, dtype=np.float64)
 
-    def slope_polynomials(
-        self, camera: Camera, z_mm: ArrayLike, reach_mm: float
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def slope_polynomials(self, camera: Camera, z_mm: ArrayLike, reach_mm: float) -> tuple[Floats, Floats]:
         """Return nodes and factors (n, SLOPE_NODES) of `slope_ratio` for points at depths z (n,).
 
         Parameters
@@ -314,9 +311,7 @@ class ObjectSpace:
 
 
 @njit(cache=True)
-def _polynomials_at(
-    last_layers_mm: NDArray[np.float64], reach_mm: float, layers: Layers
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _polynomials_at(last_layers_mm: Floats, reach_mm: float, layers: Layers) -> tuple[Floats, Floats]:
     """Return nodes and factors for points behind as much of the last layer as given."""
     nodes, factors = np.empty((last_layers_mm.size, SLOPE_NODES)), np.empty((last_layers_mm.size, SLOPE_NODES))
     thicknesses = layers.thicknesses_mm.copy()
@@ -327,9 +322,7 @@ def _polynomials_at(
 
 
 @njit(cache=True)
-def slope_polynomial(
-    reach_mm: float, layers: NDArray[np.float64], indices: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def slope_polynomial(reach_mm: float, layers: Floats, indices: Floats) -> tuple[Floats, Floats]:
     """Return nodes and divided differences of slope / lateral over lateral^2, up to the lateral distance `reach_mm`."""
     nodes = np.empty(SLOPE_NODES)
     factors = np.empty(SLOPE_NODES)
@@ -344,7 +337,7 @@ def slope_polynomial(
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def slope_ratio(lateral2_mm2: float, nodes: NDArray[np.float64], factors: NDArray[np.float64]) -> float:
+def slope_ratio(lateral2_mm2: float, nodes: Floats, factors: Floats) -> float:
     """Return slope / lateral distance from `slope_polynomial`."""
     value = factors[-1]
     for i in range(SLOPE_NODES - 2, -1, -1):
@@ -365,7 +358,7 @@ def slope_ratio(lateral2_mm2: float, nodes: NDArray[np.float64], factors: NDArra
 LARGEST_ERROR_PX = 0.5
 
 
-def refraction_error_mm(camera: Camera, media: Media, window: Window | None, depths_mm: NDArray[np.float64]) -> float:
+def refraction_error_mm(camera: Camera, media: Media, window: Window | None, depths_mm: Floats) -> float:
     """Return how far from a paraxial ray's the place of a refracted one on the array is at most, at the rim.
 
     Parameters
@@ -392,7 +385,7 @@ def rim_tangent(camera: Camera) -> float:
     return camera.aperture_radius_mm / camera.focus_distance_mm
 
 
-def sine_error_mm(camera: Camera, media: Media, depths_mm: NDArray[np.float64]) -> float:
+def sine_error_mm(camera: Camera, media: Media, depths_mm: Floats) -> float:
     """Return how far a thin lens is at most from one that keeps sines, in the place of a rim ray on the array."""
     tangent = rim_tangent(camera)
     defocus = media.depth_ratio * float(np.abs(depths_mm).max())

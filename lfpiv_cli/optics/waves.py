@@ -34,6 +34,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 from scipy.special import ndtr
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.optics.camera import Camera, nearest_point
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.tracing import ObjectSpace, slope_ratio
@@ -76,9 +77,9 @@ class Patch:
     """Light on a part of the sensor; `first` is its (row, column) on the sensor, which may lie beyond it."""
 
     first: tuple[int, int]
-    light: NDArray[np.float64]
+    light: Floats
 
-    def add_to(self, image: NDArray[np.float64], counts: float) -> None:
+    def add_to(self, image: Floats, counts: float) -> None:
         """Add `counts` times the light to what lies on the sensor."""
         (row, column), (height, width) = self.first, self.light.shape
         top, bottom = np.clip([row, row + height], 0, image.shape[0])
@@ -137,7 +138,7 @@ class WavesInCamera:
         _write_pixels(light, self.samples, self._to_pixels, pixels)
         return Patch(first, pixels / len(points))
 
-    def _rays(self, point_mm: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    def _rays(self, point_mm: Floats) -> tuple[Floats, NDArray[np.bool_]]:
         """Return where a point's rays through places of the pupil meet the array (places, 2), and which there are."""
         crossing = self._pupil_places
         slopes, seen = _slopes(self.camera, self.space, point_mm, crossing)
@@ -145,13 +146,13 @@ class WavesInCamera:
         array = array + self.camera.objective.aberration(crossing, array)
         return array * (1.0 + self.camera.distortion_per_mm2 * np.sum(array**2, axis=1, keepdims=True)), seen
 
-    def _seen(self, point_mm: NDArray[np.float64], pupil_mm: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def _seen(self, point_mm: Floats, pupil_mm: Floats) -> NDArray[np.bool_]:
         """Return which of the pupil's samples (y, x) a ray of the point reaches."""
         places = np.stack(np.meshgrid(pupil_mm, pupil_mm), axis=-1).reshape(-1, 2)
         return _slopes(self.camera, self.space, point_mm, places)[1].reshape(len(pupil_mm), -1)
 
     @cached_property
-    def _terms(self) -> NDArray[np.float64]:
+    def _terms(self) -> Floats:
         """Slopes (2 places, terms) that each term of the phase has on the pupil of radius 1, along x and then y."""
         x, y = (self._pupil_places / self.camera.aperture_radius_mm).T
         i, j = _TERMS[:, 0], _TERMS[:, 1]
@@ -160,11 +161,11 @@ class WavesInCamera:
         return np.concatenate([along_x, along_y])
 
     @cached_property
-    def _slope_fit(self) -> NDArray[np.float64]:
+    def _slope_fit(self) -> Floats:
         """What makes terms of slopes, where there are all."""
         return np.asarray(np.linalg.pinv(self._terms), dtype=np.float64)
 
-    def _phase(self, array_mm: NDArray[np.float64], seen: NDArray[np.bool_]) -> NDArray[np.float64]:
+    def _phase(self, array_mm: Floats, seen: NDArray[np.bool_]) -> Floats:
         """Return the coefficients (y, x) of the phase, on the pupil of radius 1, whose normals meet the array there."""
         slopes = self._wave_number * self.camera.aperture_radius_mm / self.camera.image_distance_mm * array_mm
         if seen.all():
@@ -186,7 +187,7 @@ class WavesInCamera:
             self._windows[size] = _Window.of(camera, self.waves, size, self.step_mm)
         return self._windows[size]
 
-    def _place(self, spot_mm: NDArray[np.float64], window: _Window) -> tuple[tuple[int, int], NDArray[np.float64]]:
+    def _place(self, spot_mm: Floats, window: _Window) -> tuple[tuple[int, int], Floats]:
         """Return the window's first (row, column) on the sensor, and its middle on the array.
 
         The middle is seen at the corner of pixels that is nearest to the spot, with as many samples on either side.
@@ -218,7 +219,7 @@ def samples_per_pixel(camera: Camera, waves: Waves) -> int:
     return int(np.ceil(2.0 * STEEPNESS * steepest(camera) * camera.pixel_mm / waves.wavelength_mm))
 
 
-def pixel_response(samples: int, diffusion_px: float) -> NDArray[np.float64]:
+def pixel_response(samples: int, diffusion_px: float) -> Floats:
     """Return the share of the charge of samples about a pixel that it collects; `samples` of them lie on the pixel.
 
     Charge diffuses as a Gaussian before the pixel adds it up.
@@ -245,9 +246,9 @@ class _Window:
     """
 
     size: int
-    pupil: NDArray[np.float64]
-    amplitude: NDArray[np.float64]
-    beside: NDArray[np.float64]
+    pupil: Floats
+    amplitude: Floats
+    beside: Floats
     transfer: Complex
 
     @classmethod
@@ -270,7 +271,7 @@ class _Window:
             ).astype(np.complex64),
         )
 
-    def on_array(self, amplitude: NDArray[np.float64], phase: NDArray[np.float64], radius_mm: float) -> Complex:
+    def on_array(self, amplitude: Floats, phase: Floats, radius_mm: float) -> Complex:
         """Return the field on the array (y, x), without the lenses, of this amplitude and phase on the pupil."""
         half = len(self.pupil) // 2
         numbers = np.arange(-half, half + 1) % self.size
@@ -280,7 +281,7 @@ class _Window:
         whole[numbers] = fft.fft(field, axis=1, overwrite_x=True)
         return np.asarray(fft.fft(whole, axis=0, overwrite_x=True), dtype=np.complex64)
 
-    def lenses(self, camera: Camera, middle_mm: NDArray[np.float64], wave_number: float) -> Complex:
+    def lenses(self, camera: Camera, middle_mm: Floats, wave_number: float) -> Complex:
         """Return what the array does to the light (y, x), with the curvature of light from the main lens."""
         found = np.empty((self.size, self.size), dtype=np.complex64)
         curvatures = 0.5 * wave_number / camera.image_distance_mm, 0.5 * wave_number / camera.microlens_focal_length_mm
@@ -296,9 +297,7 @@ class _Window:
 
 
 @njit(cache=True, nogil=True)
-def _write_pupil(
-    amplitude: NDArray[np.float64], phase: NDArray[np.float64], places: NDArray[np.float64], field: Complex
-) -> None:
+def _write_pupil(amplitude: Floats, phase: Floats, places: Floats, field: Complex) -> None:
     """Write the field of each sample of the pupil (n, size), those left of the middle at the end, by frequency."""
     count, degree = places.size, phase.shape[0] - 1
     along_x = np.empty(degree + 1)
@@ -320,12 +319,7 @@ def _write_pupil(
 
 @njit(cache=True, nogil=True)
 def _write_lenses(
-    beside: NDArray[np.float64],
-    middle: NDArray[np.float64],
-    curvatures: tuple[float, float],
-    origin: NDArray[np.float64],
-    basis: NDArray[np.float64],
-    found: Complex,
+    beside: Floats, middle: Floats, curvatures: tuple[float, float], origin: Floats, basis: Floats, found: Complex
 ) -> None:
     """Write the phase factor of each sample on the array: the converging light's, less that of the nearest lens.
 
@@ -365,9 +359,7 @@ def _add_intensity(field: Complex, light: NDArray[np.float32]) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _write_pixels(
-    light: NDArray[np.float32], samples: int, response: NDArray[np.float64], pixels: NDArray[np.float64]
-) -> None:
+def _write_pixels(light: NDArray[np.float32], samples: int, response: Floats, pixels: Floats) -> None:
     """Add up what pixels collect of the light of samples, those of `pixel_response`."""
     size, beside = light.shape[0], (response.size - samples) // 2
     of_rows = np.zeros(size)
@@ -384,8 +376,8 @@ def _write_pixels(
 
 
 def _slopes(
-    camera: Camera, space: ObjectSpace | CurvedSpace, point_mm: NDArray[np.float64], crossing_mm: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    camera: Camera, space: ObjectSpace | CurvedSpace, point_mm: Floats, crossing_mm: Floats
+) -> tuple[Floats, NDArray[np.bool_]]:
     """Return the slopes (n, 2) at the main lens of a point's rays that cross it at (n, 2), and which there are.
 
     Raises
@@ -400,9 +392,7 @@ def _slopes(
 
 
 @njit(cache=True, nogil=True)
-def _plane_slopes(
-    lateral: NDArray[np.float64], nodes: NDArray[np.float64], factors: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _plane_slopes(lateral: Floats, nodes: Floats, factors: Floats) -> Floats:
     """Return the slopes of rays that move sideways by (n, 2) from `slope_polynomial`."""
     slopes = np.empty_like(lateral)
     for k in range(lateral.shape[0]):
@@ -411,7 +401,7 @@ def _plane_slopes(
     return slopes
 
 
-def _undistorted(place_mm: NDArray[np.float64], scale: float, distortion_per_mm2: float) -> NDArray[np.float64]:
+def _undistorted(place_mm: Floats, scale: float, distortion_per_mm2: float) -> Floats:
     """Return the x (2,) for which x (scale + k1 |x|^2) is a place; each round gains three times the distortion."""
     ideal = place_mm / scale
     for _ in range(UNDISTORT_ROUNDS if distortion_per_mm2 else 0):
@@ -419,7 +409,7 @@ def _undistorted(place_mm: NDArray[np.float64], scale: float, distortion_per_mm2
     return ideal
 
 
-def _even_disc(count: int) -> NDArray[np.float64]:
+def _even_disc(count: int) -> Floats:
     """Return points that fill a disc of radius 1 evenly, its rim included, in a sunflower's order."""
     turn = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(count)
     radius = np.sqrt(np.arange(count) / (count - 1.0))
