@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -15,15 +16,15 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose, on_the_grid, pose_of_dots
-from lfpiv_cli.calibration.corners import Fit, Look, enlarged_view, evenly_lit, first_corners
-from lfpiv_cli.calibration.rectification import turned
-from lfpiv_cli.calibration.shape_fit import MeasuredPoints, ShapeFit, checked_disc_radius, fit_disc, pixels_near
+from lfpiv_cli.calibration.corners import Look, enlarged_view, evenly_lit, first_corners
+from lfpiv_cli.calibration.shape_fit import PointShape, covered_shares
 from lfpiv_cli.calibration.views import Refocusing, alternating, described
-from lfpiv_cli.calibration.wave_shapes import WaveLight, WaveShapes, disc_strips
+from lfpiv_cli.calibration.wave_shapes import WaveLight, disc_strips
 from lfpiv_cli.calibration.white import find_spots
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.names import Pattern
 from lfpiv_cli.neighbourhoods import opened
+from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera, refocused
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
 from lfpiv_cli.robust import BRIGHTEST_PERCENTILE
@@ -128,8 +129,7 @@ SAMPLES_PER_LENS = 2
 # The refocused picture reaches this many widths of the sensor to either side: a tenth more than the focal plane has, as
 # what lies behind it is seen wider.
 HALF_WIDTH = 0.6
-# Pixels that see the plane of the dots within this many microlenses of a dot's rim, but not half-way to the next dot,
-# belong to its fit.
+# Pixels that see the plane of the dots within this many microlenses of a dot's rim belong to its fit.
 MARGIN_LENSES = 2.5
 # What is wider than this share of the dots' distance in the refocused picture is light on the board, not a dot.
 DOT_PER_SPACING = 0.5
@@ -155,20 +155,27 @@ class DotLook(Look):
     start_mm: Floats
     depth_mm: float
 
+    most_pixels = 10_000
+
     def moved(self, scale: float, depth_mm: float) -> DotLook:
         """Return the look with its dots nearer the axis by a scale, at another depth."""
         return replace(self, start_mm=self.start_mm / scale, depth_mm=depth_mm)
 
-    def begun(self, camera: Camera, board: BoardGeometry) -> tuple[Floats, None, Fit]:
+    def begun(self, camera: Camera, board: BoardGeometry) -> tuple[Floats, None, PointShape]:
         """Return where the dots were first seen; their grid tells which is which."""
+        start = np.column_stack([self.start_mm, np.full(len(self.start_mm), self.depth_mm)])
+        return start, None, disc_shape(self.radius_mm)
 
-        def fit(start_mm: Floats, waves: WaveShapes | None = None) -> ShapeFit | None:
-            x, y, z = start_mm
-            scene = (self.signal, self.passed, camera, board, self.medium)
-            found = fit_one_dot(*scene, (x, y, z), self.radius_mm, waves)
-            return found if found is not None and found.brightness > 0.0 else None
+    def reach_mm(self, camera: Camera, board: BoardGeometry, z_mm: float) -> float:
+        """Return how far some microlenses beyond the rim are, but not half-way to the next dot."""
+        distance = float(equivalent_object_distance(z_mm, camera.focus_distance_mm, self.medium))
+        forward = camera.image_distance_mm / distance
+        return min(0.5 * board.spacing_mm, self.radius_mm + MARGIN_LENSES * float(camera.lattice.pitch.max()) / forward)
 
-        return np.column_stack([self.start_mm, np.full(len(self.start_mm), self.depth_mm)]), None, fit
+
+def disc_shape(radius_mm: float) -> PointShape:
+    """Return a dot."""
+    return PointShape(radius_mm, radius_mm, covered_shares, radius_mm, partial(disc_strips, radius_mm))
 
 
 def dots_look(
@@ -180,7 +187,13 @@ def dots_look(
 ) -> DotLook:
     """Find the dots of a board; parameters and errors are those of `locate_board`."""
     medium = media.in_air() if board.medium == "air" else media
-    radius = checked_disc_radius(0.5 * board.dot_diameter_mm, camera)
+    radius = 0.5 * board.dot_diameter_mm
+    seen, pitch = abs(camera.magnification) * radius, float(camera.lattice.pitch.min())
+    if seen < 0.25 * pitch:
+        raise InputError(
+            f"the board's dots are {written(2 * seen)} mm wide on the microlens array, less than half a microlens "
+            f"({written(pitch)} mm); use a board with larger dots"
+        )
     passed = np.ones(image.shape, dtype=np.float32) if transmission is None else transmission
     signal = dot_signal(image, passed, board)
     return DotLook(
@@ -236,8 +249,17 @@ def _pose(
     Rays are near enough for these; waves then take one look more.
     """
     micro_images = camera.micro_image_lattice_px()
+
+    def seen(look: Look) -> tuple[BoardPose, Floats]:
+        """Return the pose as the camera sees it, and where an ideal one has the points on the array (n, 2)."""
+        places, sigmas, numbers = look.measured(camera, board, rotation_rad)
+        distance = equivalent_object_distance(places[:, 2], camera.focus_distance_mm, look.medium)
+        forward = camera.image_distance_mm / distance
+        array = -forward[:, np.newaxis] * camera.to_image_axes(places)[:, :2]
+        return pose_of_dots(places, sigmas, array, camera, board, numbers), array
+
     for _ in range(LENS_ROUNDS):
-        pose, array = _seen(look, camera, board, rotation_rad)
+        pose, array = seen(look)
         ratio = pose.magnification / camera.magnification
         bend = pose.distortion_per_mm2 - camera.distortion_per_mm2
         if max(abs(ratio - 1.0), abs(bend) * float(np.sum(array**2, axis=1).max())) < SCALE_TOLERANCE:
@@ -245,15 +267,7 @@ def _pose(
         camera = replace(refocused(camera, pose.magnification), distortion_per_mm2=pose.distortion_per_mm2)
         camera = camera.with_micro_images(micro_images)
         look = look.moved(ratio, pose.z0_mm)
-    return pose if light is None else _seen(replace(look, light=light), camera, board, rotation_rad)[0]
-
-
-def _seen(look: Look, camera: Camera, board: BoardGeometry, rotation_rad: float) -> tuple[BoardPose, Floats]:
-    """Return the pose as a camera sees it, and where an ideal one has the points on the array (n, 2)."""
-    found = look.measured(camera, board)
-    places, sigmas = world_places(found, camera, rotation_rad)
-    array = array_places(places, camera, look.medium)
-    return pose_of_dots(places, sigmas, array, camera, board, found.numbers), array
+    return pose if light is None else seen(replace(look, light=light))[0]
 
 
 def dots_in_world(
@@ -263,25 +277,11 @@ def dots_in_world(
 
     Parameters and errors are those of `locate_board`, which believes in the spacing and asks what the camera is.
     """
-    found = dots_look(image, camera, board, media).measured(camera, board)
-    places, _ = world_places(found, camera, rotation_rad)
+    places, _, _ = dots_look(image, camera, board, media).measured(camera, board, rotation_rad)
     kept, index = on_the_grid(places, board)
     dots = np.full((board.dots[1], board.dots[0], 3), np.nan)
     dots[index[:, 1], index[:, 0]] = places[kept]
     return dots
-
-
-def world_places(found: MeasuredPoints, camera: Camera, rotation_rad: float) -> tuple[Floats, Floats]:
-    """Return places and standard errors (n, 3) of the measured points, turned back to the raw sensor's axes."""
-    places, sigmas = found.places_mm, found.sigmas_mm
-    return camera.to_image_axes(turned(places, rotation_rad)), camera.to_image_axes(sigmas)
-
-
-def array_places(places_mm: Floats, camera: Camera, media: Media) -> Floats:
-    """Return where an ideal main lens shows places (n, 3) on the array (n, 2), seen through its middle, image axes."""
-    distance = equivalent_object_distance(places_mm[:, 2], camera.focus_distance_mm, media)
-    forward = camera.image_distance_mm / distance
-    return -forward[:, np.newaxis] * camera.to_image_axes(places_mm)[:, :2]
 
 
 def dot_signal(image: NDArray[np.float32], passed: NDArray[np.float32], board: BoardGeometry) -> Floats:
@@ -333,30 +333,6 @@ def candidate_depths(camera: Camera, media: Media) -> Floats:
     distance = s_i / (alpha - 1.0 + s_i / camera.focal_length_mm)
     depths = (distance[distance > 0.0] - camera.focus_distance_mm) / media.depth_ratio
     return np.asarray(depths, dtype=np.float64)
-
-
-def fit_one_dot(
-    signal: Floats,
-    passed: NDArray[np.float32],
-    camera: Camera,
-    board: BoardGeometry,
-    media: Media,
-    start_mm: tuple[float, float, float],
-    radius_mm: float,
-    waves: WaveShapes | None = None,
-) -> ShapeFit | None:
-    """Fit a disc to the pixels that see the surroundings of its first guess, in image axes; None off the sensor."""
-    distance = float(equivalent_object_distance(start_mm[2], camera.focus_distance_mm, media))
-    forward = camera.image_distance_mm / distance
-    pitch = float(camera.lattice.pitch.max())
-    reach = min(0.5 * board.spacing_mm, radius_mm + MARGIN_LENSES * pitch / forward)
-    near = pixels_near((signal, passed), camera, media, start_mm, reach)
-    if near is None:
-        return None
-    start = np.array(start_mm, dtype=np.float64)
-    if waves is None:
-        return fit_disc(near.signal, near.passed, near.rays, start, radius_mm, camera, media)
-    return waves.fit(near, start, radius_mm, disc_strips(radius_mm, waves.lens_mm))
 
 
 # How the points of each pattern are found, by `board.pattern`.

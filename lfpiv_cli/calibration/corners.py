@@ -10,7 +10,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from typing import Protocol
+from functools import partial
+from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -19,17 +20,12 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.board_pose import BoardGeometry
+from lfpiv_cli.calibration.rectification import turned
 from lfpiv_cli.calibration.shape_fit import (
-    BLURRED_SAMPLES,
-    SHARP_SHARE,
-    MeasuredPoints,
-    NearPixels,
-    PixelRays,
+    PointShape,
     ShapeFit,
-    SharesAndSlopes,
     fit_shape,
     fit_steps,
-    measured_points,
     pixels_near,
     scene_points,
     scene_shares,
@@ -41,11 +37,10 @@ from lfpiv_cli.calibration.views import (
     clear_mm,
     described,
     lens_table,
-    marker_modules,
     sub_aperture_view,
     view_crossings,
 )
-from lfpiv_cli.calibration.wave_shapes import WaveLight, WaveShapes, corner_strips, together
+from lfpiv_cli.calibration.wave_shapes import WaveLight, WaveShapes, corner_strips
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera
@@ -67,42 +62,11 @@ from lfpiv_cli.robust import MAD_TO_SIGMA
 STEP_SHARE = 0.25
 
 
-def fit_corner(pixels: NearPixels, start_mm: Floats, edges_mm: Floats, camera: Camera, media: Media) -> ShapeFit:
-    """Fit a corner to pixels by least squares: x, y, z, brightness and a sloping background are free.
-
-    Parameters
-    ----------
-    start_mm : (3,) first guess, in image axes, within about half a microlens
-    edges_mm : (2, 2) rows: the squares' sides that meet in the corner, x and y
-    """
-    size = step_mm(edges_mm)
-
-    def shares_at(position: Floats) -> SharesAndSlopes:
-        return corner_shares(pixels.rays, position, edges_mm, camera, media)
-
-    beside = scene_points(pixels.rays, camera, media, float(start_mm[2])) - start_mm[:2]
-    return fit_shape(pixels.signal, pixels.passed, beside, start_mm, fit_steps(size, camera, media), shares_at)
-
-
-def step_mm(edges_mm: Floats) -> float:
-    """Return in what steps a fit moves a corner, by the squares' sides (2, 2)."""
-    return STEP_SHARE * float(np.hypot(edges_mm[:, 0], edges_mm[:, 1]).mean())
-
-
-def corner_shares(
-    rays: PixelRays, position_mm: Floats, edges_mm: Floats, camera: Camera, media: Media
-) -> SharesAndSlopes:
-    """Return for each pixel the share (n,) of what it sees at depth z in two opposite quadrants, and its slopes.
-
-    `position_mm` is (x, y, z) in image axes; the slopes (n, 3) are the share's derivatives by it, per mm.
-    """
-    to_edges = np.linalg.inv(edges_mm)
-    sharp = SHARP_SHARE * 0.5 * float(np.hypot(edges_mm[:, 0], edges_mm[:, 1]).min())
-
-    def covered(middle: Floats, cell: Floats, width: float) -> SharesAndSlopes:
-        return quadrant_shares(middle, cell, to_edges, width, 1 if width < sharp else BLURRED_SAMPLES)
-
-    return scene_shares(rays, position_mm, camera, media, covered)
+def corner_shape(edges_mm: Floats) -> PointShape:
+    """Return the squares that meet in a corner, by their sides x and y (2, 2), those of one colour."""
+    side = np.hypot(edges_mm[:, 0], edges_mm[:, 1])
+    step, to_edges = STEP_SHARE * float(side.mean()), np.asarray(np.linalg.inv(edges_mm), dtype=np.float64)
+    return PointShape(step, 0.5 * float(side.min()), quadrant_shares, to_edges, partial(corner_strips, edges_mm))
 
 
 @njit(cache=True)
@@ -192,14 +156,6 @@ VIEW_ROUNDS = 2
 FEWEST_VIEWS = 8
 # With fewer corners than these there is no grid.
 FEWEST_CORNERS = 4
-# More pixels than these make a corner's fit slower and hardly better.
-MOST_PIXELS = 4_000
-
-
-class Fit(Protocol):
-    """Fits a point's shape from a first guess of its place (3,), by rays or by waves; None where it cannot be."""
-
-    def __call__(self, start_mm: Floats, waves: WaveShapes | None = None) -> ShapeFit | None: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,25 +174,59 @@ class Look(ABC):
     medium: Media
     light: WaveLight | None = field(default=None, kw_only=True)
 
+    # More pixels than these make a fit slower and hardly better: the model's own errors are larger than their noise.
+    most_pixels: ClassVar[int]
+
     def moved(self, scale: float, depth_mm: float) -> Look:
         """Return the look with its points nearer the axis by a scale, at another depth, if it says where they are."""
         return self
 
-    def measured(self, camera: Camera, board: BoardGeometry) -> MeasuredPoints:
-        """Fit its shape to the pixels that see the surroundings of each point."""
-        start, numbers, fit = self.begun(camera, board)
-        found = measured_points([fit(place) for place in start], numbers)
-        if self.light is None or not len(found.places_mm):
-            return found
-        near = together(found.places_mm[:, 2], camera, self.medium)
-        start = found.places_mm[near]
-        waves = WaveShapes.of(camera, self.medium, self.light, start[:, 2])
-        numbers = None if found.numbers is None else found.numbers[near]
-        return measured_points([fit(place, waves) for place in start], numbers)
+    @abstractmethod
+    def begun(self, camera: Camera, board: BoardGeometry) -> tuple[Floats, NDArray[np.int64] | None, PointShape]:
+        """Return first guesses (n, 3) of the points, image axes, their numbers (n, 2) if known, and what lies there."""
 
     @abstractmethod
-    def begun(self, camera: Camera, board: BoardGeometry) -> tuple[Floats, NDArray[np.int64] | None, Fit]:
-        """Return first guesses (n, 3) of the points, image axes, their numbers (n, 2) if known, and what fits one."""
+    def reach_mm(self, camera: Camera, board: BoardGeometry, z_mm: float) -> float:
+        """Return how far about a point at a depth the pixels see that belong to its fit."""
+
+    def measured(
+        self, camera: Camera, board: BoardGeometry, rotation_rad: float
+    ) -> tuple[Floats, Floats, NDArray[np.int64] | None]:
+        """Return where points are, fitted to what pixels see about them, by rays and from there by waves.
+
+        That is places and standard errors (n, 3), turned back to the raw sensor's axes, and numbers (n, 2) of the
+        target, turned in any way; None where the grid tells.
+        """
+        places, numbers, shape = self.begun(camera, board)
+        waves = None
+        for light in [None] if self.light is None else [None, self.light]:
+            if light is not None and len(places):
+                # Others are no points of a board, and line responses over all depths take long to compute.
+                near = np.abs(places[:, 2] - np.median(places[:, 2])) < camera.scale(self.medium).depth_mm
+                places, numbers = places[near], None if numbers is None else numbers[near]
+                waves = WaveShapes.of(camera, self.medium, light, places[:, 2])
+            fits = [self.fitted(place, camera, board, shape, waves) for place in places]
+            numbers = None if numbers is None else numbers[[fit is not None for fit in fits]]
+            places = np.array([fit.position_mm for fit in fits if fit is not None]).reshape(-1, 3)
+        sigmas = np.sqrt(np.array([np.diag(fit.covariance_mm2) for fit in fits if fit is not None])).reshape(-1, 3)
+        return camera.to_image_axes(turned(places, rotation_rad)), camera.to_image_axes(sigmas), numbers
+
+    def fitted(
+        self, start_mm: Floats, camera: Camera, board: BoardGeometry, shape: PointShape, waves: WaveShapes | None
+    ) -> ShapeFit | None:
+        """Fit a point's shape from a first guess (3,), by rays or by waves; None where that leads to none."""
+        z, medium = float(start_mm[2]), self.medium
+        reach = self.reach_mm(camera, board, z)
+        near = pixels_near((self.signal, self.passed), camera, medium, start_mm, reach, self.most_pixels)
+        if near is None:
+            return None
+        steps, rays = fit_steps(shape.step_mm, camera, medium), near.rays
+        shares_at = partial(scene_shares, rays, camera, medium, shape)
+        if waves is not None:
+            shares_at = partial(waves.shares_and_slopes, rays, shape.strips(waves.lens_mm), steps)
+        found = fit_shape(near, start_mm, steps, scene_points(rays, camera, medium, z) - start_mm[:2], shares_at)
+        # What is darker than the ground is no dot; of a corner's squares either two may be the dark ones.
+        return found if found.converged and (found.brightness > 0.0 or board.pattern != "dots") else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,9 +242,14 @@ class CornerLook(Look):
     numbers: NDArray[np.int64]
     sample: Floats
 
-    def begun(self, camera: Camera, board: BoardGeometry) -> tuple[Floats, NDArray[np.int64], Fit]:
-        """Return where the corners' lines have them."""
-        start = in_scene(straight_lines(*self.sightings(camera, board), camera), camera, self.medium)
+    most_pixels = 4_000
+
+    def begun(self, camera: Camera, board: BoardGeometry) -> tuple[Floats, NDArray[np.int64], PointShape]:
+        """Return where the corners' lines x_m = alpha X - x s_i/s_o have them."""
+        lines, s_i = straight_lines(*self.sightings(camera, board), camera), camera.image_distance_mm
+        distance = s_i / (lines[:, 2] - 1.0 + s_i / camera.focal_length_mm)
+        depth = (distance - camera.focus_distance_mm) / self.medium.depth_ratio
+        start = np.column_stack([-lines[:, :2] * (distance / s_i)[:, np.newaxis], depth])
         known = np.isfinite(start).all(axis=1)
         if known.sum() < FEWEST_CORNERS:
             raise InputError(
@@ -264,32 +259,41 @@ class CornerLook(Look):
         numbers, start = self.numbers[known], start[known]
         terms = np.column_stack([np.ones(len(numbers)), numbers])
         edges = np.asarray(np.linalg.lstsq(terms, start[:, :2], rcond=None)[0][1:], dtype=np.float64)
-        reach = clear_mm(board) - 0.5 * float(camera.lattice.pitch.max()) / abs(camera.magnification)
+        return start, numbers, corner_shape(edges)
 
-        def fit(start_mm: Floats, waves: WaveShapes | None = None) -> ShapeFit | None:
-            x, y, z = (float(value) for value in start_mm)
-            near = pixels_near((self.signal, self.passed), camera, self.medium, (x, y, z), reach, MOST_PIXELS)
-            if near is None or waves is None:
-                return None if near is None else fit_corner(near, start_mm, edges, camera, self.medium)
-            return waves.fit(near, start_mm, step_mm(edges), corner_strips(edges, waves.lens_mm))
-
-        return start, numbers, fit
+    def reach_mm(self, camera: Camera, board: BoardGeometry, z_mm: float) -> float:
+        """Return how far there is nothing but the corner's squares, less half a microlens."""
+        return clear_mm(board) - 0.5 * float(camera.lattice.pitch.max()) / abs(camera.magnification)
 
     def sightings(self, camera: Camera, board: BoardGeometry) -> tuple[Floats, Floats]:
-        """Return points of the main lens (views, 2) and where on the array each shows the corners (views, n, 2)."""
+        """Return points of the main lens (views, 2) and where on the array each shows the corners (views, n, 2).
+
+        NaN where it does not. Views are followed from the main lens's middle outward.
+        """
         step = camera.pixel_mm * camera.image_distance_mm / camera.microlens_distance_mm
         crossings = view_crossings(camera.aperture_radius_mm - RIM_PIXELS * step, step)
         crossings = crossings[np.argsort(np.hypot(crossings[:, 0], crossings[:, 1]), kind="stable")]
-        grid = ViewGrid.of(camera)
+        grid, even = ViewGrid.of(camera), evenly_lit(self.signal, self.passed)
         clear = clear_mm(board) * abs(camera.magnification) / grid.step_mm
         half = tuple(int(max(2, np.floor(WINDOW_SHARE * n))) for n in clear)
-        even = evenly_lit(self.signal, self.passed)
-        pictures = [softened(upright_view(even, camera, grid, crossing)) for crossing in crossings]
+        views = (upright_view(even, camera, grid, crossing) for crossing in crossings)
+        pictures = [np.asarray(cv2.GaussianBlur(view, (0, 0), SOFTENING), dtype=np.float32) for view in views]
         inside = np.isfinite(refined(pictures[0], self.sample, half)).all(axis=1)
-        seen = np.full((len(crossings), len(self.sample), 2), np.nan)
-        middle = grid.to_mm(self.sample[inside])
-        seen[:, inside] = followed(pictures, crossings, middle, grid, half)
-        return crossings, seen
+        middle, slope = grid.to_mm(self.sample[inside]), 0.0
+        seen = np.full((len(pictures), len(middle), 2), np.nan)
+        for round_ in range(VIEW_ROUNDS):
+            for k, (crossing, picture) in enumerate(zip(crossings, pictures, strict=True)):
+                sample = (middle + slope * crossing - grid.origin_mm) / grid.step_mm
+                seen[k] = grid.to_mm(refined(picture, sample, half))
+                known = len(pictures) if round_ else k + 1
+                if known >= FIRST_VIEWS:
+                    slope = common_slope(crossings[:known], seen[:known])
+            off = seen - slope * crossings[:, np.newaxis]
+            shown = np.isfinite(off).any(axis=(0, 2))
+            middle[shown] = np.nanmedian(off[:, shown], axis=0)
+        of_all = np.full((len(crossings), len(self.sample), 2), np.nan)
+        of_all[:, inside] = seen
+        return crossings, of_all
 
 
 @dataclass(frozen=True, eq=False)
@@ -319,42 +323,11 @@ class ViewGrid:
         return np.asarray(self.origin_mm + sample * self.step_mm, dtype=np.float64)
 
 
-def followed(
-    pictures: list[NDArray[np.float32]], crossings_mm: Floats, middle_mm: Floats, grid: ViewGrid, half: tuple[int, ...]
-) -> Floats:
-    """Return where on the array each view shows corners (views, n, 2), NaN where it does not.
-
-    Parameters
-    ----------
-    pictures, crossings_mm : (views,) and (views, 2), from the main lens's middle outward
-    middle_mm : (n, 2) where the first view shows them
-    """
-    middle, slope = middle_mm, 0.0
-    seen = np.full((len(pictures), len(middle), 2), np.nan)
-    for round_ in range(VIEW_ROUNDS):
-        for k, (crossing, picture) in enumerate(zip(crossings_mm, pictures, strict=True)):
-            sample = (middle + slope * crossing - grid.origin_mm) / grid.step_mm
-            seen[k] = grid.to_mm(refined(picture, sample, half))
-            known = len(pictures) if round_ else k + 1
-            if known >= FIRST_VIEWS:
-                slope = common_slope(crossings_mm[:known], seen[:known])
-        off = seen - slope * crossings_mm[:, np.newaxis]
-        shown = np.isfinite(off).any(axis=(0, 2))
-        middle = middle.copy()
-        middle[shown] = np.nanmedian(off[:, shown], axis=0)
-    return seen
-
-
 def upright_view(image: Floats, camera: Camera, grid: ViewGrid, crossing_mm: Floats) -> Floats:
     """Return the view from a point of the main lens on the upright samples of the grid."""
     view = sub_aperture_view(image, camera, crossing_mm)
     at = grid.origin_mm[0] + np.arange(view.shape[1]) * grid.step_mm[0]
     return np.stack([np.interp(at, lenses[:, 0], row) for lenses, row in zip(grid.lenses_mm, view, strict=True)])
-
-
-def softened(picture: Floats) -> NDArray[np.float32]:
-    """Return a view as OpenCV refines corners in it."""
-    return np.asarray(cv2.GaussianBlur(picture, (0, 0), SOFTENING), dtype=np.float32)
 
 
 def refined(picture: NDArray[np.float32], guess: Floats, half: tuple[int, ...]) -> Floats:
@@ -411,14 +384,6 @@ def straight_lines(crossing_mm: Floats, seen_mm: Floats, camera: Camera) -> Floa
     return lines
 
 
-def in_scene(lines: Floats, camera: Camera, media: Media) -> Floats:
-    """Return the places (n, 3) of points whose lines x_m = alpha X - x s_i/s_o are known."""
-    s_i = camera.image_distance_mm
-    distance = s_i / (lines[:, 2] - 1.0 + s_i / camera.focal_length_mm)
-    depth = (distance - camera.focus_distance_mm) / media.depth_ratio
-    return np.column_stack([-lines[:, :2] * (distance / s_i)[:, np.newaxis], depth])
-
-
 def first_corners(
     image: NDArray[np.float32],
     camera: Camera,
@@ -432,7 +397,19 @@ def first_corners(
     ------
     InputError : the squares are too small, or the board is not in the picture
     """
-    refuse_small(board, camera)
+    per_mm = abs(camera.magnification) / float(camera.lattice.pitch.max())
+    widths = {"the board's squares": (board.spacing_mm, SMALLEST_SQUARE_LENSES)}
+    if board.pattern == "charuco":
+        # The black border of a marker is one of its squares.
+        words = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
+        modules = int(words.markerSize) + 2
+        widths["the squares in its markers"] = (board.marker_mm / modules, SMALLEST_MODULE_LENSES)
+    for what, (width, least) in widths.items():
+        if width * per_mm < least:
+            raise InputError(
+                f"{what} are {written(width * per_mm)} microlenses wide on the array, less than {least:g}; use a board "
+                "with larger ones"
+            )
     passed = np.ones(image.shape, dtype=np.float32) if transmission is None else transmission
     picture, scale = enlarged_view(evenly_lit(image, passed), camera)
     found = charuco_corners(picture, board) if board.pattern == "charuco" else chessboard_corners(picture, board)
@@ -444,20 +421,6 @@ def first_corners(
     numbers, place = found
     medium = media.in_air() if board.medium == "air" else media
     return CornerLook(image.astype(np.float64), passed, medium, numbers, (place + 0.5) / scale - 0.5)
-
-
-def refuse_small(board: BoardGeometry, camera: Camera) -> None:
-    """Raise where the microlenses cannot resolve the target."""
-    per_mm = abs(camera.magnification) / float(camera.lattice.pitch.max())
-    widths = {"the board's squares": (board.spacing_mm, SMALLEST_SQUARE_LENSES)}
-    if board.pattern == "charuco":
-        widths["the squares in its markers"] = (board.marker_mm / marker_modules(board), SMALLEST_MODULE_LENSES)
-    for what, (width, least) in widths.items():
-        if width * per_mm < least:
-            raise InputError(
-                f"{what} are {written(width * per_mm)} microlenses wide on the array, less than {least:g}; use a board "
-                "with larger ones"
-            )
 
 
 def evenly_lit(image: NDArray[np.floating], passed: NDArray[np.float32]) -> Floats:

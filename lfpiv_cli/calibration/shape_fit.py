@@ -5,16 +5,15 @@ Axes: image axes (x along the columns, y along the rows), mm, z away from the ca
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats
-from lfpiv_cli.errors import InputError
-from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera, Lattice, nearest_point
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
 
@@ -24,8 +23,46 @@ FIT_ROUNDS = 20
 FIT_HALVINGS = 6
 FIT_TOLERANCE = 1e-4
 
+# A pixel's own width is sampled at its middle while the light it stands for is narrower than this share of half a
+# shape's width in the scene, else at 3 x 3 places, which leaves a tenth of the spread out.
+SHARP_SHARE = 0.2
+BLURRED_SAMPLES = 3
+
 # Shares of what pixels see (n,), and their derivatives (n, k).
 SharesAndSlopes = tuple[Floats, Floats]
+
+
+class Strips(NamedTuple):
+    """Strips (n,) of a shape: where along x they begin and end, how far aside they lie, and how wide they are.
+
+    Lengths in the scene, mm, from the shape's place.
+    """
+
+    begin_mm: Floats
+    end_mm: Floats
+    aside_mm: Floats
+    width_mm: Floats
+
+
+class PointShape(NamedTuple):
+    """What lies about a point of a target: a disc, or the two squares that meet in a corner.
+
+    Attributes
+    ----------
+    step_mm : in what steps a fit moves it
+    half_mm : half its width, about
+    covered : compiled; gives shares and slopes for the middles (n, 2) of what is seen, about the point, the corners of
+        a microlens as seen there (k, 2), `figure`, the width of a pixel, and its samples along each axis; the slopes
+        (n, 4) are by the middle's x and y, the logarithm of the microlens's size, and the width
+    figure : what `covered` is told of the shape
+    strips : gives its strips where a lens sees so many mm of the scene
+    """
+
+    step_mm: float
+    half_mm: float
+    covered: Callable[..., SharesAndSlopes]
+    figure: float | Floats
+    strips: Callable[[float], Strips]
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,81 +73,64 @@ class ShapeFit:
     ----------
     position_mm : (3,) x, y in image axes, z in the medium
     covariance_mm2 : (3, 3) of the position
-    brightness, background : light of the shape and around it, in the image's unit at full transmission
-    rms : root mean square misfit, in the image's unit
+    brightness : light of the shape, in the image's unit at full transmission
     converged : the steps became small before the rounds were used up
     """
 
     position_mm: Floats
     covariance_mm2: Floats
     brightness: float
-    background: float
-    rms: float
     converged: bool
 
 
-@dataclass(frozen=True, eq=False)
-class LinearFit:
-    """Brightness and background (levels) that explain pixels best for a disc at a given place.
-
-    `design` (n, 7) is what the disc's moves along x, y, z and a unit of each level put on the pixels, `residual` (n,)
-    what is left, `misfit` its square.
-    """
-
-    design: Floats
-    levels: Floats
-    residual: Floats
-    misfit: float
-
-
 def fit_shape(
-    signal: Floats,
-    passed: Floats,
-    beside_mm: Floats,
+    near: NearPixels,
     start_mm: Floats,
     steps_mm: Floats,
+    beside_mm: Floats,
     shares_at: Callable[[Floats], SharesAndSlopes],
 ) -> ShapeFit:
     """Fit a shape to pixels by least squares: x, y, z, brightness and a sloping background are free.
 
     Parameters
     ----------
-    signal, passed : (n,) light on the pixels and the share of light that each passes
-    beside_mm : (n, 2) where in the plane of the first guess pixels see, about it
+    near : light on the pixels and the share of light that each passes
     start_mm : (3,) first guess, in image axes, within about a step
     steps_mm : (3,) by which moves are measured, such that each changes the light alike
+    beside_mm : (n, 2) where in the plane of the first guess pixels see, about it
     shares_at : gives for a position (3,) the share (n,) of what pixels see that the shape covers, and slopes (n, 3)
     """
+    signal, passed = near.signal, near.passed
     ground = passed[:, np.newaxis] * np.column_stack([np.ones(len(passed)), beside_mm / steps_mm[0]])
 
-    def linear_fit(position: Floats) -> LinearFit:
+    def linear_fit(position: Floats) -> tuple[Floats, float, Floats, float]:
+        """Return what moves and levels put on the pixels (n, 7), the brightness, what is left (n,), and its square."""
         shares, moves = shares_at(position)
         design = np.column_stack([passed * shares, ground])
         levels = solved(design, signal)
         residual = signal - design @ levels
         full = np.column_stack([levels[0] * passed[:, np.newaxis] * moves * steps_mm, design])
-        return LinearFit(full, levels, residual, float(residual @ residual))
+        return full, float(levels[0]), residual, float(residual @ residual)
 
-    position = np.asarray(start_mm, dtype=np.float64)
-    best = linear_fit(position)
+    position = start_mm
+    design, brightness, residual, misfit = linear_fit(position)
     converged = False
     for _ in range(FIT_ROUNDS):
-        move = solved(best.design, best.residual)[:3] * steps_mm
+        move = solved(design, residual)[:3] * steps_mm
         for _ in range(FIT_HALVINGS):
             trial = linear_fit(position + move)
-            if trial.misfit <= best.misfit:
+            if trial[-1] <= misfit:
                 break
             move = 0.5 * move
         converged = bool(np.all(np.abs(move) <= FIT_TOLERANCE * steps_mm))
-        if trial.misfit > best.misfit:
+        if trial[-1] > misfit:
             break
-        position, best = position + move, trial
+        position, (design, brightness, residual, misfit) = position + move, trial
         if converged:
             break
-    variance = best.misfit / max(1, signal.size - best.design.shape[1])
-    covariance = np.linalg.pinv(best.design.T @ best.design)[:3, :3] * variance * np.outer(steps_mm, steps_mm)
-    rms = float(np.sqrt(best.misfit / signal.size))
-    return ShapeFit(position, covariance, float(best.levels[0]), float(best.levels[1]), rms, converged)
+    variance = misfit / max(1, signal.size - design.shape[1])
+    covariance = np.linalg.pinv(design.T @ design)[:3, :3] * variance * np.outer(steps_mm, steps_mm)
+    return ShapeFit(position, covariance, brightness, converged)
 
 
 def solved(design: Floats, values: Floats) -> Floats:
@@ -118,47 +138,14 @@ def solved(design: Floats, values: Floats) -> Floats:
     return np.asarray(np.linalg.lstsq(design, values, rcond=None)[0], dtype=np.float64)
 
 
-# The points of a calibration target as they were measured one by one.
-#
-# Axes: image axes (x along the columns, y along the rows), mm, z away from the camera in the medium of the target.
-
-
-@dataclass(frozen=True, eq=False)
-class MeasuredPoints:
-    """Points of a target.
-
-    Attributes
-    ----------
-    places_mm, sigmas_mm : (n, 3) and their standard errors
-    numbers : (n, 2) which point of the target each is, the target turned in any way; None where the grid tells
-    """
-
-    places_mm: Floats
-    sigmas_mm: Floats
-    numbers: NDArray[np.int64] | None = None
-
-
-def measured_points(fits: Sequence[ShapeFit | None], numbers: NDArray[np.int64] | None = None) -> MeasuredPoints:
-    """Return the points of the fits that came to an end."""
-    kept = [k for k, fit in enumerate(fits) if fit is not None and fit.converged]
-    good = [fit for fit in fits if fit is not None and fit.converged]
-    places = np.array([fit.position_mm for fit in good]).reshape(-1, 3)
-    sigmas = np.sqrt(np.array([np.diag(fit.covariance_mm2) for fit in good])).reshape(-1, 3)
-    return MeasuredPoints(places, sigmas, None if numbers is None else numbers[kept])
-
-
-# What a small bright disc in the scene looks like on the sensor, and the disc that explains given pixels best.
+# What a small bright shape in the scene looks like on the sensor, and a disc.
 #
 # Axes: image axes (x along the columns, y along the rows), lengths in mm about the optical axis, z away from the
 # camera from the focal plane. Rays are followed backwards: a place on the sensor under a microlens names one point of
 # the main lens per point of the microlens, and all of a microlens is, seen in the scene, a small polygon. A pixel's
-# light is the share of this polygon that the disc covers, exactly, times what the pixel passes.
+# light is the share of this polygon that the shape covers, exactly, times what the pixel passes.
 
 
-# A pixel's own width is sampled at its middle while the light it stands for is narrower than this share of the disc's
-# radius in the scene, else at 3 x 3 places, which leaves a tenth of the spread out.
-SHARP_SHARE = 0.2
-BLURRED_SAMPLES = 3
 # Undoing r' = r (1 + k1 r^2) by repetition: each round gains a factor 3 k1 r^2, below 0.01 for usable lenses.
 UNDISTORT_ROUNDS = 6
 
@@ -230,35 +217,12 @@ def lens_cell(lattice: Lattice) -> Floats:
     return np.concatenate([half, -half])
 
 
-def disc_shares(
-    rays: PixelRays, position_mm: Floats, radius_mm: float, camera: Camera, media: Media
+def scene_shares(
+    rays: PixelRays, camera: Camera, media: Media, shape: PointShape, position_mm: Floats
 ) -> SharesAndSlopes:
-    """Return for each pixel the share (n,) of the scene it sees at depth z that a disc there covers, and its slopes.
+    """Return the shares (n,) of what pixels see at depth z that a shape there covers, and its slopes.
 
     `position_mm` is (x, y, z) in image axes; the slopes (n, 3) are the share's derivatives by it, per mm.
-    """
-
-    def covered(middle: Floats, cell: Floats, width: float) -> SharesAndSlopes:
-        samples = 1 if width < SHARP_SHARE * radius_mm else BLURRED_SAMPLES
-        return covered_shares(middle, cell, radius_mm, width, samples)
-
-    return scene_shares(rays, position_mm, camera, media, covered)
-
-
-def scene_shares(
-    rays: PixelRays,
-    position_mm: Floats,
-    camera: Camera,
-    media: Media,
-    covered: Callable[[Floats, Floats, float], SharesAndSlopes],
-) -> SharesAndSlopes:
-    """Return the shares (n,) of what pixels see in the plane of `position_mm` that a shape there covers, and slopes.
-
-    Parameters
-    ----------
-    covered : gives the shares for the middles (n, 2) of what is seen, about the position, the corners of a microlens as
-        seen there (k, 2), and the width of a pixel; and their slopes (n, 4) by the middle's x and y, the logarithm of
-        the microlens's size, and the width
     """
     distance = float(equivalent_object_distance(position_mm[2], camera.focus_distance_mm, media))
     back = distance / camera.image_distance_mm
@@ -276,7 +240,8 @@ def scene_shares(
     middle = spread * crossings - back * rays.ideal_mm - position_mm[:2]
     middle_z = spread_z * crossings - back_z * rays.ideal_mm
     width = abs(spread) * pixel
-    shares, slopes = covered(middle, lens_cell(camera.lattice) * cell_scale, width)
+    samples = 1 if width < SHARP_SHARE * shape.half_mm else BLURRED_SAMPLES
+    shares, slopes = shape.covered(middle, lens_cell(camera.lattice) * cell_scale, shape.figure, width, samples)
     by_z = (
         slopes[:, 0] * middle_z[:, 0] + slopes[:, 1] * middle_z[:, 1] + slopes[:, 2] * cell_z + slopes[:, 3] * width_z
     )
@@ -380,39 +345,10 @@ def disc_triangle_area(ax: float, ay: float, bx: float, by: float, radius: float
     return sector_area(ax, ay, px, py, radius) + 0.5 * (px * qy - py * qx) + sector_area(qx, qy, bx, by, radius)
 
 
-def fit_disc(
-    signal: Floats, passed: Floats, rays: PixelRays, start_mm: Floats, radius_mm: float, camera: Camera, media: Media
-) -> ShapeFit:
-    """Fit a disc of known radius to pixels by least squares.
-
-    Parameters
-    ----------
-    signal, passed : (n,) light on the pixels and the share of light that each passes
-    start_mm : (3,) first guess, in image axes, within about the radius
-    """
-
-    def shares_at(position: Floats) -> SharesAndSlopes:
-        return disc_shares(rays, position, radius_mm, camera, media)
-
-    beside = scene_points(rays, camera, media, float(start_mm[2])) - start_mm[:2]
-    return fit_shape(signal, passed, beside, start_mm, fit_steps(radius_mm, camera, media), shares_at)
-
-
 def fit_steps(size_mm: float, camera: Camera, media: Media) -> Floats:
     """Return moves (3,) that change a shape's light alike: its size sideways, and what moves the rim's rays as far."""
     deep = size_mm * camera.focus_distance_mm / (camera.aperture_radius_mm * media.depth_ratio)
     return np.array([size_mm, size_mm, deep])
-
-
-def checked_disc_radius(radius_mm: float, camera: Camera) -> float:
-    """Return the radius, or say that the camera cannot resolve such a dot."""
-    seen = abs(camera.magnification) * radius_mm
-    if seen < 0.25 * float(camera.lattice.pitch.min()):
-        raise InputError(
-            f"the board's dots are {written(2 * seen)} mm wide on the microlens array, less than half a microlens "
-            f"({written(float(camera.lattice.pitch.min()))} mm); use a board with larger dots"
-        )
-    return radius_mm
 
 
 # The pixels that see the surroundings of a point in the scene, to fit what is there to them.
@@ -426,8 +362,6 @@ def checked_disc_radius(radius_mm: float, camera: Camera) -> float:
 RIM_PER_PATCH = np.sqrt(0.5) + 1.0
 # Fewer pixels than these are a point at the sensor's edge: five unknowns need several times as many.
 FEWEST_PIXELS = 50
-# More pixels than these make a fit slower and hardly better: the model's own errors are larger than their noise.
-MOST_PIXELS = 10_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -443,29 +377,30 @@ def pixels_near(
     picture: tuple[Floats, NDArray[np.float32]],
     camera: Camera,
     media: Media,
-    start_mm: tuple[float, float, float],
+    start_mm: Floats,
     reach_mm: float,
-    most: int = MOST_PIXELS,
+    most: int,
 ) -> NearPixels | None:
     """Return the pixels that see the plane of a point within `reach_mm` of it; None where the sensor holds too few.
 
     Parameters
     ----------
     picture : light and the share of it that pixels pass, (rows, columns) each
+    start_mm : (3,) the point, image axes
     """
-    x, y, z = start_mm
+    z = float(start_mm[2])
     signal, passed = picture
     distance = float(equivalent_object_distance(z, camera.focus_distance_mm, media))
     forward = camera.image_distance_mm / distance
     pitch = float(camera.lattice.pitch.max())
     blur = abs(float(camera.defocus(distance))) * camera.aperture_radius_mm
     half = (forward * reach_mm + blur + pitch) / camera.pixel_mm
-    middle = camera.mm_to_px(-forward * np.array([x, y]))
+    middle = camera.mm_to_px(-forward * start_mm[:2])
     low = np.maximum(np.floor(middle - half), 0).astype(np.int64)
     high = np.minimum(np.ceil(middle + half) + 1, [camera.columns, camera.rows]).astype(np.int64)
     row, column = (axis.ravel() for axis in np.mgrid[low[1] : high[1], low[0] : high[0]])
     rays = pixel_rays(camera, column, row)
-    near = np.hypot(*(scene_points(rays, camera, media, z) - (x, y)).T) <= reach_mm
+    near = np.hypot(*(scene_points(rays, camera, media, z) - start_mm[:2]).T) <= reach_mm
     rim = RIM_PER_PATCH * camera.pixel_mm * camera.image_distance_mm / camera.microlens_distance_mm
     through = np.hypot(*lens_crossings(rays, camera).T) <= camera.aperture_radius_mm - rim
     kept = np.nonzero(near & through & (passed[row, column] > 0.0))[0]

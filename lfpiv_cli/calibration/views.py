@@ -90,11 +90,6 @@ def charuco_board(board: BoardGeometry) -> cv2.aruco.CharucoBoard:
     return cv2.aruco.CharucoBoard(squares, board.spacing_mm, board.marker_mm, words)
 
 
-def marker_modules(board: BoardGeometry) -> int:
-    """Return how many squares a marker of the board's dictionary has along its side, the black border among them."""
-    return int(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary)).markerSize) + 2
-
-
 def clear_mm(board: BoardGeometry) -> float:
     """Return how far about a corner there is nothing but its four squares: markers stand in the middle of theirs."""
     to_marker = np.sqrt(0.5) * (board.spacing_mm - board.marker_mm)

@@ -12,22 +12,13 @@ Axes: image axes (x along the columns, y along the rows), mm, z away from the ca
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats
-from lfpiv_cli.calibration.shape_fit import (
-    NearPixels,
-    PixelRays,
-    ShapeFit,
-    SharesAndSlopes,
-    fit_shape,
-    fit_steps,
-    scene_points,
-)
+from lfpiv_cli.calibration.shape_fit import PixelRays, SharesAndSlopes, Strips
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.line_responses import PHASES, LineResponses, line_responses, on_pixels, spline_weights
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
@@ -50,26 +41,6 @@ class WaveLight:
 
     wavelength_mm: float
     diffusion_px: float
-
-
-class Strips(NamedTuple):
-    """Strips (n,) of a shape: where along x they begin and end, how far aside they lie, and how wide they are.
-
-    Lengths in the scene, mm, from the shape's place.
-    """
-
-    begin_mm: Floats
-    end_mm: Floats
-    aside_mm: Floats
-    width_mm: Floats
-
-
-def together(depths_mm: Floats, camera: Camera, medium: Media) -> NDArray[np.bool_]:
-    """Return which depths (n,) lie within the one over which light spreads by a lens from the middle one of them.
-
-    The others are no points of a board, and line responses over all depths take long to compute.
-    """
-    return np.asarray(np.abs(depths_mm - np.median(depths_mm)) < camera.scale(medium).depth_mm)
 
 
 def disc_strips(radius_mm: float, lens_mm: float) -> Strips:
@@ -132,24 +103,25 @@ class WaveShapes:
         """What a lens sees of the focal plane."""
         return float(self.camera.lattice.pitch.mean()) / abs(self.camera.magnification)
 
-    def fit(self, near: NearPixels, start_mm: Floats, size_mm: float, strips: Strips) -> ShapeFit:
-        """Fit a shape of about this size to pixels, from a first guess (3,)."""
-        steps = fit_steps(size_mm, self.camera, self.medium)
-
-        def shares_at(position: Floats) -> SharesAndSlopes:
-            shares = self.shares(near.rays, position, strips)
-            moved = [self.shares(near.rays, position + step, strips) for step in DIFFERENCE * np.diag(steps)]
-            return shares, (np.stack(moved, axis=1) - shares[:, np.newaxis]) / (DIFFERENCE * steps)
-
-        beside = scene_points(near.rays, self.camera, self.medium, float(start_mm[2])) - start_mm[:2]
-        return fit_shape(near.signal, near.passed, beside, start_mm, steps, shares_at)
+    def shares_and_slopes(
+        self, rays: PixelRays, strips: Strips, steps_mm: Floats, position_mm: Floats
+    ) -> SharesAndSlopes:
+        """Return the shares (n,) of a shape, and slopes (n, 3), by differences over parts of steps (3,), per mm."""
+        shares = self.shares(rays, position_mm, strips)
+        moved = [self.shares(rays, position_mm + step, strips) for step in DIFFERENCE * np.diag(steps_mm)]
+        return shares, (np.stack(moved, axis=1) - shares[:, np.newaxis]) / (DIFFERENCE * steps_mm)
 
     def shares(self, rays: PixelRays, position_mm: Floats, strips: Strips) -> Floats:
         """Return for each pixel the light (n,) of a shape over that of light that fills the scene."""
         camera, lines, z = self.camera, self.lines, float(position_mm[2])
         back = camera.image_distance_mm / float(equivalent_object_distance(z, camera.focus_distance_mm, self.medium))
         (of_column, x, u), (of_row, y, v) = (self._lines_of(rays, -back * position_mm[:2], axis) for axis in (0, 1))
-        sums = np.cumsum(_by_place(_at_depth(lines, z)), axis=0)
+        first, weights = _about((z - lines.first_depth_mm) / lines.depth_step_mm, len(lines.table))
+        plane = np.tensordot(np.array(weights), lines.table[first : first + 4], 1)
+        # From phases to places: (offsets, terms, responses).
+        offsets, _, terms, _ = plane.shape
+        by_place = np.ascontiguousarray(plane.transpose(0, 2, 3, 1).reshape(offsets, terms, -1), dtype=np.float64)
+        sums = np.cumsum(by_place, axis=0)
         begin, end = (self._read(sums, x - back * at, u) for at in (strips.begin_mm, strips.end_mm))
         half = 0.5 * strips.width_mm
         low, high = (self._read(sums, y - back * at, v) for at in (strips.aside_mm - half, strips.aside_mm + half))
@@ -178,18 +150,6 @@ class WaveShapes:
         found = np.empty((*beside_mm.shape, sums.shape[1]))
         _interpolate(sums, offset, PHASES * under_px + 0.5 * sums.shape[2], found)
         return found
-
-
-def _by_place(plane: NDArray[np.float32] | Floats) -> Floats:
-    """Return responses (offsets, terms, responses) of those by phases (offsets, phases, terms, pixels)."""
-    offsets, _, terms, _ = plane.shape
-    return np.ascontiguousarray(plane.transpose(0, 2, 3, 1).reshape(offsets, terms, -1), dtype=np.float64)
-
-
-def _at_depth(lines: LineResponses, z_mm: float) -> Floats:
-    """Return the responses at a depth, by phases."""
-    first, weights = _about((z_mm - lines.first_depth_mm) / lines.depth_step_mm, len(lines.table))
-    return np.asarray(np.tensordot(np.array(weights), lines.table[first : first + 4], 1))
 
 
 @njit(cache=True)
