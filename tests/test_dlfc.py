@@ -103,7 +103,7 @@ def test_the_entrance_pupil_follows_from_how_boards_shrink(table2, rng, entrance
     assert found == pytest.approx(100.0 * (entrance_over_exit + 1.0 / 0.6), rel=1e-9)
     assert 0.0 < sigma < 0.01 * found
     assert entrance_pupil_mm(boards[:2], 1.0 / 1.33) is None
-    assert entrance_pupil_mm([replace(each, z_mm=-each.z_mm) for each in boards], 1.0 / 1.33) is None
+    assert entrance_pupil_mm([each._replace(z_mm=-each.z_mm) for each in boards], 1.0 / 1.33) is None
 
 
 @pytest.mark.thorough

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -47,8 +47,7 @@ FEWEST_BOARDS = 3
 COMMON_SHARE = 1e-4
 
 
-@dataclass(frozen=True)
-class Shown:
+class Shown(NamedTuple):
     """How a board is shown on the array.
 
     Attributes
@@ -105,7 +104,7 @@ def entrance_pupil_mm(boards: Sequence[Shown], depth_ratio: float) -> tuple[floa
     """
     if len(boards) < FEWEST_BOARDS:
         return None
-    z, alpha, beta, sigma = np.array([(each.z_mm, each.alpha, each.beta, each.beta_sigma) for each in boards]).T
+    z, alpha, beta, sigma = np.array(boards).T
     weight = (beta**2 / sigma) ** 2  # of 1/beta
     from_mean = z - np.average(z, weights=weight)
     spread = np.sum(weight * from_mean**2)
@@ -179,8 +178,7 @@ class RayFit:
         return with_entrance_pupil(camera, found)
 
 
-@dataclass(frozen=True, eq=False)
-class Sightings:
+class Sightings(NamedTuple):
     """A board's dots in views: which dot (n,), crossings (n, 2) of the main lens, places (n, 2) on the array."""
 
     dot: NDArray[np.int64]
@@ -271,34 +269,30 @@ def _fit_as_seen_by(
             "along each axis"
         )
     seen = [sightings_of(each, camera, board, media) for each in boards]
-    grid = common_grid([settled(*pair, camera, media) for pair in zip(boards, seen, strict=True)], board)
+    # Where the dots stand, (dots along x, dots along y, 2): turned and placed as the boards are on average.
+    places = [_similarity(settled(*pair, camera, media), board) for pair in zip(boards, seen, strict=True)]
+    turn, middle = turn_matrix(float(np.mean([turn for turn, _ in places]))), np.mean([at for _, at in places], axis=0)
+    grid = _plate(np.moveaxis(np.indices(board.dots), 0, -1), board) @ turn.T + middle
     starts = []
     for one, sightings in zip(boards, seen, strict=True):
         lateral = grid[tuple(one.index[sightings.dot].T)]
         starts.append(np.column_stack([lateral, np.full(len(lateral), one.z_mm)]))
     start = np.concatenate(starts)
-    crossing, array = (np.concatenate([getattr(each, name) for each in seen]) for name in ("crossing_mm", "array_mm"))
+    _, crossing, array = (np.concatenate(each) for each in zip(*seen, strict=True))
     rays, residual, used = polynomial_fit(start, crossing, array, degree, camera)
     reach = np.stack([start[used, :2].min(axis=0), start[used, :2].max(axis=0)])
     number = np.repeat(np.arange(len(seen)), [len(each.dot) for each in seen])
     rms = [np.sqrt(np.mean(residual[used & (number == k)] ** 2, axis=0)) for k in range(len(seen))]
-    views = [alone_in_its_lens(each, camera) for each in seen]
-    sizes = [
-        shown(one.z_mm, _plate(one.index, board), each.dot, each.crossing_mm, each.array_mm)
-        for one, each in zip(boards, views, strict=True)
-        if len(each.dot)
-    ]
-    pupil = entrance_pupil_mm(sizes, media.depth_ratio) or (None, None)
-    return RayFit(rays, depths, reach, int(used.sum()), np.array(rms), *pupil)
-
-
-def alone_in_its_lens(sightings: Sightings, camera: Camera) -> Sightings:
-    """Return the sightings in views that no neighbouring lens's image reaches, where the aperture is a little wide."""
+    # In views that no neighbouring lens's image reaches, where the aperture is a little wide.
     step = camera.pixel_mm * camera.image_distance_mm / camera.microlens_distance_mm
     next_image = float(camera.lattice.pitch.min()) / camera.pixel_mm * step
-    clear = next_image - camera.aperture_radius_mm - RIM_PER_PATCH * step
-    kept = np.hypot(*sightings.crossing_mm.T) <= clear
-    return Sightings(sightings.dot[kept], sightings.crossing_mm[kept], sightings.array_mm[kept])
+    clear, sizes = next_image - camera.aperture_radius_mm - RIM_PER_PATCH * step, []
+    for one, each in zip(boards, seen, strict=True):
+        alone = np.hypot(*each.crossing_mm.T) <= clear
+        if alone.any():
+            sizes.append(shown(one.z_mm, _plate(one.index, board), *(values[alone] for values in each)))
+    pupil = entrance_pupil_mm(sizes, media.depth_ratio) or (None, None)
+    return RayFit(rays, depths, reach, int(used.sum()), np.array(rms), *pupil)
 
 
 def seen_board(
@@ -326,17 +320,6 @@ def aligned(boards: list[SeenBoard], board: BoardGeometry) -> list[SeenBoard]:
         kept = ((index >= 0) & (index < np.array(board.dots))).all(axis=1)
         result.append(replace(each, place_mm=each.place_mm[kept], index=index[kept]))
     return result
-
-
-def common_grid(boards: list[SeenBoard], board: BoardGeometry) -> Floats:
-    """Return where the dots stand, (dots along x, dots along y, 2): turned and placed as the boards are on average.
-
-    The scale under which a camera sees a board is that of its magnification; it is taken out about the optical axis.
-    """
-    found = [_similarity(each, board) for each in boards]
-    turn = turn_matrix(float(np.mean([angle for angle, _ in found])))
-    middle = np.mean([place for _, place in found], axis=0)
-    return np.asarray(_plate(np.moveaxis(np.indices(board.dots), 0, -1), board) @ turn.T + middle, dtype=np.float64)
 
 
 def _plate(index: NDArray[np.int64], board: BoardGeometry) -> Floats:

@@ -56,7 +56,7 @@ def lattice_vectors(image: Floats) -> tuple[Floats, Layout]:
     """Return two basis vectors (2, 2) of the lattice of bright spots, the first nearest the columns, and its layout.
 
     The slowest line that has a partner tells the layout by where this stands: at 90 degrees on squares, at 60 on
-    hexagons, which have no line as slow at 90.
+    hexagons, which have no line as slow at 90. The second vector is turned from the first towards the rows.
 
     Parameters
     ----------
@@ -67,24 +67,34 @@ def lattice_vectors(image: Floats) -> tuple[Floats, Layout]:
     InputError
         when the spectrum holds no such lattice with a pitch of 6 to 90 px
     """
-    power, step = centre_spectrum(image)
-    for first in spectral_lines(power, step):
-        turns: dict[Layout, float] = {"square": np.pi / 2.0, "hexagonal": np.pi / 3.0}
+    power, step, lines = spectral_lines(image)
+    turns: dict[Layout, float] = {"square": np.pi / 2.0, "hexagonal": np.pi / 3.0}
+    for first in lines:
         partner = {layout: line_power(power, step, rotated(first, turn)) for layout, turn in turns.items()}
         layout: Layout = "square" if partner["square"] >= partner["hexagonal"] else "hexagonal"
         if partner[layout] >= PARTNER_SHARE * line_power(power, step, first):
-            second = rotated(first, turns[layout])
-            return column_first(first_basis(power, step, first, second, layout), layout), layout
-    raise InputError(
-        f"no lattice of lens images with a pitch of {SMALLEST_PITCH_PX:g} to {LARGEST_PITCH_PX:g} px is visible in the "
-        "white image; check the exposure, and that it is a white image"
-    )
+            break
+    else:
+        raise InputError(
+            f"no lattice of lens images with a pitch of {SMALLEST_PITCH_PX:g} to {LARGEST_PITCH_PX:g} px is visible in "
+            "the white image; check the exposure, and that it is a white image"
+        )
+    # The vectors are the rows of the inverse transpose of the frequencies.
+    frequencies = [refined_line(power, step, line) for line in (first, rotated(first, turns[layout]))]
+    a, b = np.linalg.inv(np.stack(frequencies)).T
+    if layout == "hexagonal":
+        # Frequencies at 60 degrees make vectors at 120; the sum of these stands at 60 to the first.
+        b = b + a
+    around = np.array([a, b, -a, -b] if layout == "square" else [a, b, b - a, -a, -b, a - b])
+    nearest = int(np.argmin(np.abs(np.arctan2(around[:, 1], around[:, 0]))))
+    return np.stack([around[nearest], around[(nearest + 1) % len(around)]]), layout
 
 
-def centre_spectrum(image: Floats) -> tuple[Floats, Floats]:
-    """Return the power spectrum of the image's middle and its frequency step along (columns, rows).
+def spectral_lines(image: Floats) -> tuple[Floats, Floats, list[Floats]]:
+    """Return the power spectrum of the image's middle, its frequency step along (columns, rows), and its lines.
 
-    The power is indexed [row frequency, column frequency >= 0]; slow illumination is taken off first.
+    The power is indexed [row frequency, column frequency >= 0]; slow illumination is taken off first. Lines are the
+    strong local maxima as frequencies (column, row), the slowest first.
     """
     rows, columns = image.shape
     top, left = max(0, (rows - SIDE_PX) // 2), max(0, (columns - SIDE_PX) // 2)
@@ -93,11 +103,7 @@ def centre_spectrum(image: Floats) -> tuple[Floats, Floats]:
     window = np.outer(np.hanning(part.shape[0]), np.hanning(part.shape[1]))
     size = [fft.next_fast_len(2 * n) for n in part.shape]
     power = np.abs(fft.rfft2((part - slow) * window, s=size)) ** 2
-    return power, np.array([1.0 / size[1], 1.0 / size[0]])
-
-
-def spectral_lines(power: Floats, step: Floats) -> list[Floats]:
-    """Return the strong local maxima of the spectrum as frequencies (column, row), the slowest first."""
+    step = np.array([1.0 / size[1], 1.0 / size[0]])
     frequency = np.hypot(*np.meshgrid(step[0] * np.arange(power.shape[1]), fft.fftfreq(power.shape[0])))
     in_range = (frequency >= 1.0 / LARGEST_PITCH_PX) & (frequency <= 1.0 / (SMALLEST_PITCH_PX * np.sqrt(0.75)))
     masked = np.where(in_range, power, 0.0)
@@ -106,7 +112,7 @@ def spectral_lines(power: Floats, step: Floats) -> list[Floats]:
     strongest = around[BIN_TOLERANCE:-BIN_TOLERANCE, BIN_TOLERANCE:-BIN_TOLERANCE]
     row, column = np.nonzero((masked == strongest) & (masked > floor))
     lines = np.stack([step[0] * column, fft.fftfreq(power.shape[0])[row]], axis=1)
-    return list(lines[np.argsort(np.hypot(lines[:, 0], lines[:, 1]), kind="stable")])
+    return power, step, list(lines[np.argsort(np.hypot(lines[:, 0], lines[:, 1]), kind="stable")])
 
 
 def rotated(vector: Floats, angle_rad: float) -> Floats:
@@ -139,29 +145,6 @@ def refined_line(power: Floats, step: Floats, line: Floats) -> Floats:
     near, columns, rows = bins_around(power, step, peak, REFINE_BINS)
     total = near.sum()
     return np.array([(near * columns).sum() / total, (near * rows).sum() / total]) * step
-
-
-def first_basis(power: Floats, step: Floats, first: Floats, second: Floats, layout: Layout) -> Floats:
-    """Return lattice vectors from two neighbouring lines: the rows of the inverse transpose of the frequencies.
-
-    On hexagons the frequencies stand at 60 degrees and the vectors at 120; the sum of these stands at 60 to the first.
-    """
-    frequencies = np.stack([refined_line(power, step, first), refined_line(power, step, second)])
-    basis = np.asarray(np.linalg.inv(frequencies).T, dtype=np.float64)
-    if layout == "hexagonal":
-        basis[1] += basis[0]
-    return basis
-
-
-def column_first(basis: Floats, layout: Layout) -> Floats:
-    """Return the same lattice with the first vector nearest the columns, the second turned from it towards the rows."""
-    if layout == "square":
-        around = np.array([basis[0], basis[1], -basis[0], -basis[1]])
-    else:
-        around = np.array([basis[0], basis[1], basis[1] - basis[0], -basis[0], -basis[1], basis[0] - basis[1]])
-    angle = np.arctan2(around[:, 1], around[:, 0])
-    first = int(np.argmin(np.abs(angle)))
-    return np.stack([around[first], around[(first + 1) % len(around)]])
 
 
 # Fewer lenses leave the cubic's ten coefficients per axis without a check.
@@ -264,12 +247,24 @@ def fit_lattice(
     """
     image = checked_white(white, dark, saturation)
     fit = _lattice_of(image, layout)
-    falloff = _falloff(image, fit.lattice_px)
-    return fit if falloff is None else _lattice_of(image / falloff, layout)
+
+    # Light that falls towards the corners pulls the centroids of lens images to the middle, in proportion to the image
+    # height: as another pitch would.
+    even = image.astype(np.float32)
+    if lens_image_width(even, fit.lattice_px) < NARROWEST_LENS_IMAGE:
+        return fit
+    coefficients = fit_vignetting(relative_transmission(even, fit.lattice_px), fit.lattice_px)
+    if coefficients is None:
+        return fit
+    passed = vignetting_surface(coefficients, image.shape)
+    return _lattice_of(image / passed, layout) if np.ptp(passed) > EVEN_LIGHT else fit
 
 
 def _lattice_of(image: Floats, layout: Layout | None) -> LatticeFit:
-    """Return the lattice through the centroids of the lens images of a white image less the dark one."""
+    """Return the lattice through the centroids of the lens images of a white image less the dark one.
+
+    These are the spots that a walk from the middle of the image reaches.
+    """
     basis, seen = lattice_vectors(image)
     if layout is not None and seen != layout:
         raise InputError(
@@ -277,35 +272,11 @@ def _lattice_of(image: Floats, layout: Layout | None) -> LatticeFit:
         )
     points = find_spots(image, float(np.mean(np.hypot(basis[:, 0], basis[:, 1]))))
     centre = (np.array(image.shape[::-1]) - 1.0) / 2.0
-    indices, points = indexed_from_centre(points, basis, centre)
-    indices, points = without_strays(indices, points, float(np.hypot(*basis[0])))
-    return lattice_through(indices, points, centre, seen)
-
-
-def _falloff(image: Floats, lattice_px: Lattice) -> NDArray[np.float32] | None:
-    """Return the share (rows, columns) of light that passes, smooth over the lenses; None where that moves no centroid.
-
-    Light that falls towards the corners pulls the centroids of lens images to the middle, in proportion to the image
-    height: as another pitch would.
-    """
-    white = image.astype(np.float32)
-    if lens_image_width(white, lattice_px) < NARROWEST_LENS_IMAGE:
-        return None
-    coefficients = fit_vignetting(relative_transmission(white, lattice_px), lattice_px)
-    if coefficients is None:
-        return None
-    passed = vignetting_surface(coefficients, image.shape)
-    return passed if np.ptp(passed) > EVEN_LIGHT else None
-
-
-def indexed_from_centre(points: Floats, basis: Floats, centre: Floats) -> tuple[NDArray[np.int64], Floats]:
-    """Return lattice indices and positions of the spots that a walk from the middle of the image reaches."""
-    best = np.zeros(len(points), dtype=bool)
-    best_indices = np.zeros((len(points), 2), dtype=np.int64)
+    best, indices = np.zeros(len(points), dtype=bool), np.zeros((len(points), 2), dtype=np.int64)
     for start in np.argsort(np.hypot(*(points - centre).T), kind="stable")[:STARTS]:
-        indices, reached = index_spots(points, int(start), basis)
+        found, reached = index_spots(points, int(start), basis)
         if reached.sum() > best.sum():
-            best, best_indices = reached, indices
+            best, indices = reached, found
         if best.sum() >= REACHED_SHARE * len(points):
             break
     if best.sum() < FEWEST_LENSES:
@@ -313,7 +284,8 @@ def indexed_from_centre(points: Floats, basis: Floats, centre: Floats) -> tuple[
             f"only {int(best.sum())} lens images of the white image form a lattice, at least {FEWEST_LENSES} are "
             "needed; check microlenses.layout, the exposure, and that it is a white image"
         )
-    return best_indices[best], points[best]
+    indices, points = without_strays(indices[best], points[best], float(np.hypot(*basis[0])))
+    return lattice_through(indices, points, centre, seen)
 
 
 def polynomial_terms(indices: ArrayLike, count: int = len(EXPONENTS)) -> Floats:
@@ -357,7 +329,14 @@ def lattice_through(indices: NDArray[np.int64], points: Floats, centre: Floats, 
     cubic_used = cubic_is_significant(terms, points, np.minimum(affine_weights, cubic_weights))
     residual, weights = (cubic_residual, cubic_weights) if cubic_used else (affine_residual, affine_weights)
     spread = coefficient_sigmas(terms[:, :3], residual, weights, points)
-    pitch_sigma, rotation_sigma = affine_errors(affine[1:3], spread[1:3])
+    # Standard errors of the pitch, along the vectors, and of the rotation, across them.
+    length2 = np.sum(affine[1:3] ** 2, axis=1)
+    along2, across2 = (np.sum((each * spread[1:3]) ** 2, axis=1) / length2 for each in (affine[1:3], affine[1:3, ::-1]))
+    # Dirt on a lens, which has no weight, is not the fit's error.
+    rms, rms_affine = (
+        np.sqrt(np.mean(off[weight > 0.0] ** 2, axis=0))
+        for off, weight in ((cubic_residual, cubic_weights), (affine_residual, affine_weights))
+    )
     origin_sigma = coefficient_sigmas(terms, residual, weights, points)[0] if cubic_used else spread[0]
     return LatticeFit(
         lattice_px=Lattice(affine[0], affine[1:3], layout),
@@ -365,17 +344,12 @@ def lattice_through(indices: NDArray[np.int64], points: Floats, centre: Floats, 
         centres_px=points,
         cubic_px=cubic,
         cubic_used=cubic_used,
-        residual_px=weighted_rms(cubic_residual, cubic_weights),
-        residual_affine_px=weighted_rms(affine_residual, affine_weights),
-        pitch_sigma_px=pitch_sigma,
+        residual_px=rms,
+        residual_affine_px=rms_affine,
+        pitch_sigma_px=np.sqrt(along2),
         origin_sigma_px=origin_sigma,
-        rotation_sigma_rad=rotation_sigma,
+        rotation_sigma_rad=float(np.sqrt(np.sum(across2 / length2)) / 2.0),
     )
-
-
-def weighted_rms(residual: Floats, weights: Floats) -> Floats:
-    """Return the rms (2,) of the residuals whose weight is not zero: dirt on a lens is not the fit's error."""
-    return np.sqrt(np.mean(residual[weights > 0.0] ** 2, axis=0))
 
 
 def cubic_is_significant(terms: Floats, points: Floats, weights: Floats) -> bool:
@@ -426,11 +400,3 @@ def coefficient_sigmas(terms: Floats, residual: Floats, weights: Floats, places:
         together, apart = (inverse @ (each.T @ each) @ inverse for each in (pulls, pull))
         sigmas.append(np.sqrt(freedom * np.maximum(np.diag(together), np.diag(apart))) / scale)
     return np.stack(sigmas, axis=1)
-
-
-def affine_errors(basis: Floats, sigma: Floats) -> tuple[Floats, float]:
-    """Return the standard errors of the pitch (2,) px and the rotation (rad) from those of the basis (2, 2)."""
-    length2 = np.sum(basis**2, axis=1)
-    along = np.sqrt(np.sum((basis * sigma) ** 2, axis=1) / length2)
-    across2 = np.sum((basis[:, ::-1] * sigma) ** 2, axis=1) / length2
-    return along, float(np.sqrt(np.sum(across2 / length2)) / 2.0)

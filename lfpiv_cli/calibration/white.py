@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from itertools import pairwise
 
 import numpy as np
 from numba import njit
@@ -178,16 +178,11 @@ def relative_transmission(white: NDArray[np.float32], lattice_px: Lattice) -> ND
     white : (rows, columns) white minus dark, rectified, 0 outside the sensor
     lattice_px : lens images in the same frame
     """
-    relative = white / np.float32(centre_level(white, lattice_px))
-    return np.where(relative >= TRANSMISSION_FLOOR, relative, np.float32(0.0))
-
-
-def centre_level(white: NDArray[np.float32], lattice_px: Lattice) -> float:
-    """Return the median brightness of the middles of the lens images around the sensor's centre."""
     part, place, index = _middle_part(white, lattice_px)
     offset = place - lattice_px.points(index)
     middle = np.hypot(offset[..., 0], offset[..., 1]) <= MIDDLE_PER_PITCH * lattice_px.pitch.min()
-    return float(np.median(part[middle]))
+    relative = white / np.float32(float(np.median(part[middle])))
+    return np.where(relative >= TRANSMISSION_FLOOR, relative, np.float32(0.0))
 
 
 def lens_image_width(white: NDArray[np.float32], lattice_px: Lattice) -> float:
@@ -216,14 +211,30 @@ def fit_vignetting(transmission: NDArray[np.float32], lattice_px: Lattice) -> Fl
     lattice_px : lens images in the same frame
     """
     rows, columns = transmission.shape
-    place, level = _block_levels(transmission, lattice_px)
+    width = LENSES_PER_BLOCK * float(lattice_px.pitch.max())
+    row_edges, column_edges = (
+        np.linspace(0, side, max(1, min(VIGNETTING_BLOCKS, int(side / width))) + 1).astype(int)
+        for side in (rows, columns)
+    )
+    places, levels = [], []
+    for top, bottom in pairwise(row_edges):
+        for left, right in pairwise(column_edges):
+            row, column = np.mgrid[top:bottom, left:right]
+            place = np.stack([column, row], axis=-1).astype(np.float64)
+            offset = place - lattice_px.points(lattice_px.nearest(place))
+            part = transmission[top:bottom, left:right]
+            middle = np.hypot(offset[..., 0], offset[..., 1]) <= MIDDLE_PER_PITCH * lattice_px.pitch.min()
+            used = middle & (part > 0.0)
+            if used.sum() >= FEWEST_MIDDLES:
+                places.append(place[used].mean(axis=0))
+                levels.append(float(np.median(part[used])))
     powers = [(i, j) for i in range(VIGNETTING_DEGREE + 1) for j in range(VIGNETTING_DEGREE + 1 - i)]
-    if len(level) < 2 * len(powers):
+    if len(levels) < 2 * len(powers):
         return None
     half = np.array([columns, rows]) / 2.0
-    x, y = ((place - half) / half).T
+    x, y = ((np.array(places) - half) / half).T
     design = np.stack([x**i * y**j for i, j in powers], axis=1)
-    found = np.linalg.lstsq(design, level, rcond=None)[0]
+    found = np.linalg.lstsq(design, np.array(levels), rcond=None)[0]
     coefficients = np.zeros((VIGNETTING_DEGREE + 1, VIGNETTING_DEGREE + 1))
     for (i, j), coefficient in zip(powers, found, strict=True):
         coefficients[j, i] = coefficient / found[0]
@@ -252,29 +263,6 @@ def _middle_part(
     return part, place, lattice_px.nearest(place)
 
 
-def _block_levels(transmission: NDArray[np.float32], lattice_px: Lattice) -> tuple[Floats, Floats]:
-    """Return places (n, 2) as (column, row) and medians (n,) of the middles of lens images, block by block."""
-    rows, columns = transmission.shape
-    width = LENSES_PER_BLOCK * float(lattice_px.pitch.max())
-    row_edges, column_edges = (
-        np.linspace(0, side, max(1, min(VIGNETTING_BLOCKS, int(side / width))) + 1).astype(int)
-        for side in (rows, columns)
-    )
-    places, levels = [], []
-    for top, bottom in zip(row_edges, row_edges[1:], strict=False):
-        for left, right in zip(column_edges, column_edges[1:], strict=False):
-            row, column = np.mgrid[top:bottom, left:right]
-            place = np.stack([column, row], axis=-1).astype(np.float64)
-            offset = place - lattice_px.points(lattice_px.nearest(place))
-            part = transmission[top:bottom, left:right]
-            middle = np.hypot(offset[..., 0], offset[..., 1]) <= MIDDLE_PER_PITCH * lattice_px.pitch.min()
-            used = middle & (part > 0.0)
-            if used.sum() >= FEWEST_MIDDLES:
-                places.append(place[used].mean(axis=0))
-                levels.append(float(np.median(part[used])))
-    return np.array(places).reshape(-1, 2), np.array(levels)
-
-
 # More saturated pixels than this and the lens images have lost their brightness, which the transmission needs.
 SATURATED_SHARE = 0.05
 # The difference of two dark frames reaches 3.3 times the noise of one in its brightest hundredth; light reaches more.
@@ -294,7 +282,11 @@ def checked_white(white: ArrayLike, dark: ArrayLike | None, saturation: float | 
     if not np.isfinite(image).all():
         raise InputError("the white image holds values that are not numbers; export it again without them")
     if saturation is None:
-        saturation = saturation_level(raw)
+        # The brightest value if some camera's counts end there; else the largest one that the integer type holds.
+        saturation = float(raw.max())
+        ends = {2**bits - 1 for bits in CAMERA_BITS} | {(2**bits - 1) << (16 - bits) for bits in CAMERA_BITS}
+        if raw.dtype.kind in "iu" and saturation not in ends:
+            saturation = float(np.iinfo(raw.dtype).max)
     clipped = float(np.mean(image >= saturation))
     if image.max() > image.min() and clipped > SATURATED_SHARE:
         raise InputError(
@@ -315,25 +307,14 @@ def checked_white(white: ArrayLike, dark: ArrayLike | None, saturation: float | 
     return image
 
 
-def saturation_level(raw: NDArray[Any]) -> float:
-    """Return the level at which the camera saturates: its brightest value if some camera's counts end there.
-
-    Otherwise nothing is saturated below the largest value that the integer type holds; floats end at their brightest.
-    """
-    brightest = float(raw.max())
-    if raw.dtype.kind not in "iu":
-        return brightest
-    ends = {2**bits - 1 for bits in CAMERA_BITS} | {(2**bits - 1) << (16 - bits) for bits in CAMERA_BITS}
-    return brightest if brightest in ends else float(np.iinfo(raw.dtype).max)
-
-
-def lit_share(white: ArrayLike, dark: ArrayLike | None = None) -> float:
-    """Return the share of the pixels that are at least half as bright as a full lens image."""
-    image = np.asarray(white, dtype=np.float64) - (0.0 if dark is None else np.asarray(dark, dtype=np.float64))
-    low, high = np.percentile(image, [1.0, FULL_PERCENTILE])
-    return float(np.mean(image > 0.5 * (low + high)))
-
-
 def by_aperture(whites: Sequence[ArrayLike], dark: ArrayLike | None = None) -> list[int]:
-    """Return the order of white images from the smallest aperture, best for centres, to the widest, for vignetting."""
-    return list(np.argsort([lit_share(white, dark) for white in whites], kind="stable"))
+    """Return the order of white images from the smallest aperture, best for centres, to the widest, for vignetting.
+
+    That is by the share of the pixels that are at least half as bright as a full lens image.
+    """
+    shares = []
+    for white in whites:
+        image = np.asarray(white, dtype=np.float64) - (0.0 if dark is None else np.asarray(dark, dtype=np.float64))
+        low, high = np.percentile(image, [1.0, FULL_PERCENTILE])
+        shares.append(float(np.mean(image > 0.5 * (low + high))))
+    return list(np.argsort(shares, kind="stable"))
