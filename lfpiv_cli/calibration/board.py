@@ -102,16 +102,13 @@ def dots(picture: NDArray[np.uint8]) -> str | None:
         settings.filterByArea, settings.minArea, settings.maxArea = True, 20.0, picture.size / FEWEST_SPOTS
         settings.minDistBetweenBlobs = 4.0
         places = np.array([spot.pt for spot in cv2.SimpleBlobDetector.create(settings).detect(picture)]).reshape(-1, 2)
-        if len(places) >= FEWEST_SPOTS and _even(places):
+        if len(places) < FEWEST_SPOTS:
+            continue
+        distance = np.hypot(*np.moveaxis(places[:, np.newaxis] - places, -1, 0))
+        nearest = np.min(distance + np.diag(np.full(len(places), np.inf)), axis=1)
+        if np.mean(np.abs(nearest / np.median(nearest) - 1.0) < SAME_DISTANCE) >= EVEN_SHARE:
             return f"a board of {len(places)} {polarity} dots"
     return None
-
-
-def _even(places: Floats) -> bool:
-    """Return whether most places have their nearest neighbour at the same distance."""
-    distance = np.hypot(*np.moveaxis(places[:, np.newaxis] - places, -1, 0))
-    nearest = np.min(distance + np.diag(np.full(len(places), np.inf)), axis=1)
-    return bool(np.mean(np.abs(nearest / np.median(nearest) - 1.0) < SAME_DISTANCE) >= EVEN_SHARE)
 
 
 # In this order: a ChArUco board is a chessboard, too, and a chessboard's squares are round once they are out of focus.

@@ -334,31 +334,28 @@ def calibrate(pictures: Photographs, rig: Rig | None = None, sheet: DataSheet = 
     InputError
         when a picture cannot serve; it says why
     """
-    shape = shape_of(pictures.lit, sheet.camera)
+    shapes = [np.shape(picture) for picture in pictures.lit]
+    shapes += [] if sheet.camera is None else [(sheet.camera.rows, sheet.camera.columns)]
+    if len(set(shapes)) != 1 or len(shapes[0]) != 2:
+        raise InputError(f"the pictures are {', '.join(map(str, shapes))} (rows, columns), expected all of one shape")
     # One BLAS thread: the same bits on every machine, and small problems gain nothing from more.
     with threadpool_limits(limits=1, user_api="blas"):
-        calibration = lattice_calibration(pictures, shape, sheet)
+        calibration = lattice_calibration(pictures, (shapes[0][0], shapes[0][1]), sheet)
         if pictures.mid_plane_z_mm is not None:
             calibration = replace(calibration, mid_plane_z_mm=pictures.mid_plane_z_mm, mid_plane_given=True)
         if rig is None:
             return calibration
+        upright, passed = calibration.rectification, calibration.transmission
         if len(pictures.depth_boards):
-            boards = [pictures.less_dark(each) for each in pictures.depth_boards]
-            calibration = replace(calibration, ray_fit=ray_fit(boards, pictures.depths_mm, calibration, rig))
+            boards = [upright.apply(pictures.less_dark(each)) for each in pictures.depth_boards]
+            camera = calibration.camera(rig.camera)
+            rays = fit_rays(boards, pictures.depths_mm, camera, rig.board, rig.media, passed)
+            calibration = replace(calibration, ray_fit=rays)
         if pictures.board is None:
             return calibration
-        pose = board_pose(pictures.less_dark(pictures.board), calibration, rig)
+        board, camera = upright.apply(pictures.less_dark(pictures.board)), calibration.camera(rig.camera)
+        pose = locate_board(board, camera, rig.board, rig.media, upright.rotation_rad, passed, rig.light)
     return with_mid_plane(replace(calibration, pose=pose), pose, rig)
-
-
-def shape_of(pictures: Sequence[ArrayLike], camera: Camera | None) -> tuple[int, int]:
-    """Return the common shape (rows, columns) of the pictures, or of the camera's where there are none."""
-    shapes = [np.shape(picture) for picture in pictures]
-    if camera is not None:
-        shapes.append((camera.rows, camera.columns))
-    if len(set(shapes)) != 1 or len(shapes[0]) != 2:
-        raise InputError(f"the pictures are {', '.join(map(str, shapes))} (rows, columns), expected all of one shape")
-    return int(shapes[0][0]), int(shapes[0][1])
 
 
 def lattice_calibration(pictures: Photographs, shape: tuple[int, int], sheet: DataSheet) -> Calibration:
@@ -385,21 +382,6 @@ def known(value: ArrayLike) -> Any:
     """Return a number or an array as plain numbers, None where they are not known."""
     array = np.asarray(value, dtype=np.float64)
     return array.tolist() if np.isfinite(array).all() else None
-
-
-def board_pose(image: Floats, calibration: Calibration, rig: Rig) -> BoardPose:
-    """Return the pose of the board in its raw picture less the dark frame."""
-    rectification = calibration.rectification
-    camera = calibration.camera(rig.camera)
-    picture, turn = rectification.apply(image), rectification.rotation_rad
-    return locate_board(picture, camera, rig.board, rig.media, turn, calibration.transmission, rig.light)
-
-
-def ray_fit(images: Sequence[Floats], depths_mm: Sequence[float], calibration: Calibration, rig: Rig) -> RayFit:
-    """Return the polynomials through boards in the fluid, in raw pictures less the dark frame."""
-    rectified = [calibration.rectification.apply(image) for image in images]
-    camera = calibration.camera(rig.camera)
-    return fit_rays(rectified, depths_mm, camera, rig.board, rig.media, calibration.transmission)
 
 
 def with_mid_plane(calibration: Calibration, pose: BoardPose, rig: Rig) -> Calibration:

@@ -20,6 +20,7 @@ from lfpiv_cli.calibration.lattice import EXPONENTS, LatticeFit
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.names import ColumnAxis
 from lfpiv_cli.optics.camera import Lattice, nearest_point
+from lfpiv_cli.optics.line_responses import spline_weights
 from lfpiv_cli.threads import share_out
 
 EXPONENT_ARRAY = np.array(EXPONENTS, dtype=np.int64)
@@ -86,7 +87,9 @@ class Rectification:
         if raw.shape != self.image_shape:
             raise InputError(f"the image is {raw.shape} and the white image {self.image_shape} (rows, columns)")
         coefficients = ndimage.spline_filter(raw, order=3, mode="mirror")
-        return sample_spline(coefficients, self.shift_px, self.inside)
+        rectified = np.zeros(self.image_shape, dtype=np.float32)
+        share_out(sample_rows, len(raw), coefficients, self.shift_px, self.inside, rectified)
+        return rectified
 
     def to_world(self, points: ArrayLike, column_axis: ColumnAxis = "x") -> Floats:
         """Turn lateral world coordinates (..., 2 or 3) from the rectified frame to the raw sensor's axes."""
@@ -141,18 +144,6 @@ def write_shift(
 
 
 @njit(cache=True)
-def spline_weights(fraction: float) -> tuple[float, float, float, float]:
-    """Return the cubic B-spline at -1, 0, 1, 2 from a place `fraction` beyond a sample."""
-    rest = 1.0 - fraction
-    return (
-        rest**3 / 6.0,
-        2.0 / 3.0 - 0.5 * fraction**2 * (2.0 - fraction),
-        2.0 / 3.0 - 0.5 * rest**2 * (2.0 - rest),
-        fraction**3 / 6.0,
-    )
-
-
-@njit(cache=True)
 def mirrored(index: int, size: int) -> int:
     """Return the sample that stands for one beyond the ends: the image mirrored about its first and last pixel."""
     if index < 0:
@@ -160,13 +151,6 @@ def mirrored(index: int, size: int) -> int:
     if index >= size:
         return 2 * size - 2 - index
     return index
-
-
-def sample_spline(coefficients: Floats, shift: NDArray[np.float32], inside: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Return a cubic spline at each pixel's place plus its shift, 0 where not inside."""
-    image = np.zeros(coefficients.shape, dtype=np.float32)
-    share_out(sample_rows, coefficients.shape[0], coefficients, shift, inside, image)
-    return image
 
 
 @njit(cache=True, nogil=True)
@@ -177,7 +161,7 @@ def sample_rows(
     inside: NDArray[np.bool_],
     image: NDArray[np.float32],
 ) -> None:
-    """Write rows `part` of what `sample_spline` returns, where inside."""
+    """Write rows `part` of a cubic spline at each pixel's place plus its shift, where inside."""
     rows, columns = coefficients.shape
     for row in range(part[0], part[1]):
         for column in range(columns):

@@ -201,16 +201,6 @@ def lens_table(camera: Camera) -> NDArray[np.int64]:
     return table.astype(np.int64)
 
 
-def view_places_px(camera: Camera, crossing_mm: ArrayLike) -> Floats:
-    """Return where on the sensor (column, row) the ray through (X, Y) and each lens's centre ends, (rows, columns, 2).
-
-    With x_m = s_ux in Eq. 1 the microlens does not bend the ray: x_s = s_ux + s_mu (s_ux - X)/s_i.
-    """
-    lens = camera.lattice.points(lens_table(camera))
-    step = (lens - np.asarray(crossing_mm, dtype=np.float64)) / camera.image_distance_mm
-    return camera.mm_to_px(lens + camera.microlens_distance_mm * step)
-
-
 def view_crossings(radius_mm: float, step_mm: float) -> Floats:
     """Return points (n, 2) of the main lens, a square grid about its middle."""
     count = int(radius_mm / step_mm)
@@ -222,13 +212,17 @@ def view_crossings(radius_mm: float, step_mm: float) -> Floats:
 def sub_aperture_view(image: ArrayLike, camera: Camera, crossing_mm: ArrayLike) -> Floats:
     """Return the view (lens rows, lens columns) from the point (X, Y) of the main lens, linearly interpolated.
 
+    The ray through (X, Y) and a lens's centre is not bent there, s_ux = x_m in Eq. 1: x_s = s_ux + s_mu (s_ux - X)/s_i.
+
     Parameters
     ----------
     image : (rows, columns), rectified
     camera : with the lattice of the rectified frame
     crossing_mm : (2,) X, Y
     """
-    places = view_places_px(camera, crossing_mm)
+    lens = camera.lattice.points(lens_table(camera))
+    step = (lens - np.asarray(crossing_mm, dtype=np.float64)) / camera.image_distance_mm
+    places = camera.mm_to_px(lens + camera.microlens_distance_mm * step)
     pixels = np.asarray(image, dtype=np.float64)
     return ndimage.map_coordinates(pixels, [places[..., 1], places[..., 0]], order=1, mode="nearest")
 

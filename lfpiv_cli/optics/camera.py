@@ -254,21 +254,8 @@ class Camera:
 
     def for_kernels(self) -> KernelCamera:
         """Return the camera as compiled kernels take it."""
-        return KernelCamera(
-            focal_length_mm=self.focal_length_mm,
-            image_distance_mm=self.image_distance_mm,
-            focus_distance_mm=self.focus_distance_mm,
-            microlens_focal_length_mm=self.microlens_focal_length_mm,
-            microlens_distance_mm=self.microlens_distance_mm,
-            bend=self.bend,
-            distortion_per_mm2=self.distortion_per_mm2,
-            aperture_radius_mm=self.aperture_radius_mm,
-            pixel_mm=self.pixel_mm,
-            columns=self.columns,
-            rows=self.rows,
-            origin_mm=self.lattice.origin,
-            basis_mm=self.lattice.basis,
-        )
+        figures = [getattr(self, name) for name in KernelCamera._fields[:-2]]
+        return KernelCamera(*figures, self.lattice.origin, self.lattice.basis)
 
     def defocus(self, object_distance_mm: ArrayLike) -> Floats:
         """Return alpha = 1 + s_i/s_o - s_i/F_m, the spread on the array per unit of main-lens position; 0 in focus."""

@@ -36,7 +36,7 @@ from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.ray_bundles import aim_all, pencils
-from lfpiv_cli.optics.shapes import Reliefs, RigidMotion, Shape, reliefs_of, turned
+from lfpiv_cli.optics.shapes import RigidMotion, Shape, reliefs_of, turned
 from lfpiv_cli.optics.surfaces import Faces, Surface
 
 
@@ -138,6 +138,9 @@ class CurvedSpace:
         ConfigError : the first face lies behind the lens
         """
         shapes = self.shapes()
+        heights = [shape.relief for shape in shapes]
+        if camera.column_axis == "y":
+            heights = [None if relief is None else turned(relief) for relief in heights]
         indices = np.array([self.media.air, *(face.index for face in self.faces)])
         return Faces(
             lens_z_mm=self.lens_z_mm(camera),
@@ -148,7 +151,7 @@ class CurvedSpace:
             axes=_rows(camera.to_image_axes([shape.axis for shape in shapes]), 3),
             curvatures_per_mm=np.array([shape.curvature_per_mm for shape in shapes]),
             ratios=indices[:-1] / indices[1:],
-            reliefs=_reliefs(shapes, camera),
+            reliefs=reliefs_of(heights) if any(heights) else None,
         )
 
     def distance(self, camera: Camera, z_mm: ArrayLike) -> Floats:
@@ -171,16 +174,6 @@ class CurvedSpace:
         slopes, growth, valid = pencils(self.for_kernels(camera), _rows(points_mm, 3))
         distance = 1.0 / growth[:, [0, 1], [0, 1]]
         return Equivalent(-slopes * distance, distance, valid)
-
-
-def _reliefs(shapes: tuple[Shape, ...], camera: Camera) -> Reliefs | None:
-    """Return the heights of those faces that are given by them, in image axes; None where none is."""
-    reliefs = [shape.relief for shape in shapes]
-    if not any(reliefs):
-        return None
-    if camera.column_axis == "y":
-        reliefs = [None if relief is None else turned(relief) for relief in reliefs]
-    return reliefs_of(reliefs)
 
 
 def _rows(values: ArrayLike, columns: int) -> Floats:

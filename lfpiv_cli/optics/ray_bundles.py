@@ -218,28 +218,31 @@ def aim_all(faces: Faces, points: Floats, crossing: Floats) -> tuple[Floats, Fla
 # As in `surfaces`: what takes the heights as an argument of its own is compiled without them where there are none.
 @njit(cache=True)
 def _aim_all(reliefs: Reliefs | None, faces: Faces, points: Floats, crossing: Floats) -> tuple[Floats, Flags]:
-    if reliefs is None:
-        return _aim_lanes_all(faces, points, crossing)
-    slopes, valid = np.empty((len(points), 2)), np.empty(len(points), dtype=np.bool_)
-    for i in range(len(points)):
-        slopes[i, 0], slopes[i, 1], valid[i] = aim(
-            faces, points[i, 0], points[i, 1], points[i, 2], crossing[i, 0], crossing[i, 1]
-        )
-    return slopes, valid
-
-
-@njit(cache=True)
-def _aim_lanes_all(faces: Faces, points: Floats, crossing: Floats) -> tuple[Floats, Flags]:
-    """Return `aim_all`; a lane whose ray is found takes the next one, so that none waits for the slowest."""
     slopes, valid = np.full((len(points), 2), np.nan), np.zeros(len(points), dtype=np.bool_)
+    if reliefs is not None:
+        for i in range(len(points)):
+            slopes[i, 0], slopes[i, 1], valid[i] = aim(
+                faces, points[i, 0], points[i, 1], points[i, 2], crossing[i, 0], crossing[i, 1]
+            )
+        return slopes, valid
+    # A lane whose ray is found takes the next one, so that none waits for the slowest.
     table = np.zeros(AIM_ROWS * DOUBLES)
     ray, steps = np.full(DOUBLES, -1), np.zeros(DOUBLES, np.int64)
     following, running = 0, 0
     while True:
         for lane in range(DOUBLES):
             while ray[lane] < 0 and following < len(points):
-                if in_fluid(faces, row(points, following)):
-                    _begin(faces, row(points, following), crossing[following, 0], crossing[following, 1], table, lane)
+                x, y, z = row(points, following)
+                if in_fluid(faces, (x, y, z)):
+                    # From where `aim` begins.
+                    distance = faces.focus_distance_mm + faces.depth_ratio * z
+                    X, Y = crossing[following, 0], crossing[following, 1]
+                    table[POINT_X * DOUBLES + lane], table[POINT_Y * DOUBLES + lane] = x, y
+                    table[POINT_Z * DOUBLES + lane] = z
+                    table[LENS_X * DOUBLES + lane], table[LENS_Y * DOUBLES + lane] = X, Y
+                    table[SLOPE_X * DOUBLES + lane], table[SLOPE_Y * DOUBLES + lane] = X / distance, Y / distance
+                    table[STEP_X * DOUBLES + lane], table[STEP_Y * DOUBLES + lane] = -x / distance, -y / distance
+                    table[MISSED * DOUBLES + lane], table[SHARE * DOUBLES + lane] = np.inf, 1.0
                     ray[lane], steps[lane] = following, 0
                     running += 1
                 following += 1
@@ -260,18 +263,6 @@ def _aim_lanes_all(faces: Faces, points: Floats, crossing: Floats) -> tuple[Floa
             if valid[i] or steps[lane] == MOST_STEPS:
                 ray[lane] = -1
                 running -= 1
-
-
-@njit(cache=True, **COUNT_NO_REFERENCES)
-def _begin(faces: Faces, point: Vector, X: float, Y: float, table: Floats, lane: int) -> None:
-    """Put a ray into a lane of the table of `aim_lanes`, from where `aim` begins."""
-    distance = faces.focus_distance_mm + faces.depth_ratio * point[2]
-    table[POINT_X * DOUBLES + lane], table[POINT_Y * DOUBLES + lane] = point[0], point[1]
-    table[POINT_Z * DOUBLES + lane] = point[2]
-    table[LENS_X * DOUBLES + lane], table[LENS_Y * DOUBLES + lane] = X, Y
-    table[SLOPE_X * DOUBLES + lane], table[SLOPE_Y * DOUBLES + lane] = X / distance, Y / distance
-    table[STEP_X * DOUBLES + lane], table[STEP_Y * DOUBLES + lane] = -point[0] / distance, -point[1] / distance
-    table[MISSED * DOUBLES + lane], table[SHARE * DOUBLES + lane] = np.inf, 1.0
 
 
 @njit(cache=True)

@@ -253,35 +253,8 @@ def height_behind(faces: Faces, k: int, point: Vector) -> float:
 def _meet(
     reliefs: Reliefs | None, faces: Faces, k: int, point: Vector, direction: Vector
 ) -> tuple[float, Vector, float]:
-    if reliefs is None:
-        return _meet_round(faces, k, point, direction)
-    if reliefs.starts[k] < 0:
-        return _meet_round(faces, k, point, direction)
-    return meet_heights(reliefs, k, faces.vertices_mm[k, 2], point, direction)
-
-
-@njit(cache=True, **COUNT_NO_REFERENCES)
-def _normal_change(reliefs: Reliefs | None, faces: Faces, k: int, place: Vector, shift: Vector) -> Vector:
-    if reliefs is None:
-        return _normal_change_round(faces, k, shift)
-    if reliefs.starts[k] < 0:
-        return _normal_change_round(faces, k, shift)
-    return normal_change_of_heights(reliefs, k, place, shift)
-
-
-@njit(cache=True, **COUNT_NO_REFERENCES)
-def _height_behind(reliefs: Reliefs | None, faces: Faces, k: int, point: Vector) -> float:
-    if reliefs is None:
-        return _height_behind_round(faces, k, point)
-    if reliefs.starts[k] < 0:
-        return _height_behind_round(faces, k, point)
-    z, _, _, _, _, _, on_grid = height_at(reliefs, k, point[0], point[1])
-    return point[2] - z if on_grid else -np.inf
-
-
-@njit(cache=True, **COUNT_NO_REFERENCES)
-def _meet_round(faces: Faces, k: int, point: Vector, direction: Vector) -> tuple[float, Vector, float]:
-    """Return `meet` of a plane, cylinder or sphere."""
+    if reliefs is not None and reliefs.starts[k] >= 0:
+        return meet_heights(reliefs, k, faces.vertices_mm[k, 2], point, direction)
     vertex, axis, curvature = row(faces.vertices_mm, k), row(faces.axes, k), faces.curvatures_per_mm[k]
     # From the point at the vertex's depth on: seen from as far as the lens the crossing would lose digits.
     ahead = (vertex[2] - point[2]) / direction[2]
@@ -302,15 +275,19 @@ def _meet_round(faces: Faces, k: int, point: Vector, direction: Vector) -> tuple
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def _normal_change_round(faces: Faces, k: int, shift: Vector) -> Vector:
-    """Return `normal_change` of a plane, cylinder or sphere, the same all along its lines of curvature."""
+def _normal_change(reliefs: Reliefs | None, faces: Faces, k: int, place: Vector, shift: Vector) -> Vector:
+    if reliefs is not None and reliefs.starts[k] >= 0:
+        return normal_change_of_heights(reliefs, k, place, shift)
+    # The same all along lines of curvature.
     axis = row(faces.axes, k)
     return scaled(faces.curvatures_per_mm[k], plus(shift, -dot(axis, shift), axis))
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def _height_behind_round(faces: Faces, k: int, point: Vector) -> float:
-    """Return `height_behind` of a plane, cylinder or sphere."""
+def _height_behind(reliefs: Reliefs | None, faces: Faces, k: int, point: Vector) -> float:
+    if reliefs is not None and reliefs.starts[k] >= 0:
+        z, _, _, _, _, _, on_grid = height_at(reliefs, k, point[0], point[1])
+        return point[2] - z if on_grid else -np.inf
     axis = row(faces.axes, k)
     offset = plus(point, -1.0, row(faces.vertices_mm, k))
     along_axis = dot(axis, offset)

@@ -345,6 +345,14 @@ def slope_ratio(lateral2_mm2: float, nodes: Floats, factors: Floats) -> float:
     return value
 
 
+def slope_ratios(lateral2_mm2: Floats, nodes: Floats, factors: Floats) -> Floats:
+    """Return `slope_ratio` of lateral distances squared (n, m) or (m,), for points with their own nodes (n, nodes)."""
+    values = factors[:, -1:] + np.zeros_like(lateral2_mm2)
+    for i in range(SLOPE_NODES - 2, -1, -1):
+        values = factors[:, i : i + 1] + (lateral2_mm2 - nodes[:, i : i + 1]) * values
+    return values
+
+
 # How far paraxial optics is from the truth at the rim of the aperture, in light's place on the array.
 #
 # Two things bend the outer rays more than the equivalent point does: Snell's law at the faces of window and fluid,

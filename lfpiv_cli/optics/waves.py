@@ -37,7 +37,7 @@ from scipy.special import ndtr
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.optics.camera import Camera, nearest_point
 from lfpiv_cli.optics.curved_space import CurvedSpace
-from lfpiv_cli.optics.tracing import ObjectSpace, slope_ratio
+from lfpiv_cli.optics.tracing import ObjectSpace, slope_ratios
 
 # The pupil's phase is a polynomial of this degree in both coordinates together: what refraction and distortion leave
 # of it is below a thousandth of a wavelength for lenses up to f/2.
@@ -96,7 +96,11 @@ class WavesInCamera:
         self.samples = samples_per_pixel(camera, waves)
         self.step_mm = camera.pixel_mm / self.samples
         self._wave_number = 2.0 * np.pi / waves.wavelength_mm
-        self._pupil_places = camera.aperture_radius_mm * _even_disc(PUPIL_PLACES)
+        # In a sunflower's order they fill the pupil evenly, its rim included.
+        turn, places = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(PUPIL_PLACES), np.arange(PUPIL_PLACES)
+        radius = np.sqrt(places / (PUPIL_PLACES - 1.0))
+        disc = np.stack([radius * np.cos(turn), radius * np.sin(turn)], axis=-1)
+        self._pupil_places = camera.aperture_radius_mm * disc
         self._to_pixels = pixel_response(self.samples, camera.diffusion_px)
         self._windows: dict[int, _Window] = {}
 
@@ -123,7 +127,8 @@ class WavesInCamera:
         spot = np.concatenate([array[seen] for _, array, seen in lit])
         window = self._window(0.5 * float(np.ptp(spot, axis=0).max()))
         first, middle = self._place(0.5 * (spot.min(axis=0) + spot.max(axis=0)), window)
-        if not self._meets_sensor(first, window):
+        side, sensor = window.size // self.samples, (self.camera.rows, self.camera.columns)
+        if not all(-side < low < full for low, full in zip(first, sensor, strict=True)):
             return None
         lenses = window.lenses(self.camera, middle, self._wave_number)
         light = np.zeros((window.size, window.size), dtype=np.float32)
@@ -152,27 +157,23 @@ class WavesInCamera:
         return _slopes(self.camera, self.space, point_mm, places)[1].reshape(len(pupil_mm), -1)
 
     @cached_property
-    def _terms(self) -> Floats:
-        """Slopes (2 places, terms) that each term of the phase has on the pupil of radius 1, along x and then y."""
+    def _terms(self) -> tuple[Floats, Floats]:
+        """Slopes (2 places, terms) of each term of the phase on the pupil of radius 1, along x, then y; and back."""
         x, y = (self._pupil_places / self.camera.aperture_radius_mm).T
         i, j = _TERMS[:, 0], _TERMS[:, 1]
         along_x = i * x[:, None] ** np.maximum(i - 1, 0) * y[:, None] ** j
         along_y = j * y[:, None] ** np.maximum(j - 1, 0) * x[:, None] ** i
-        return np.concatenate([along_x, along_y])
-
-    @cached_property
-    def _slope_fit(self) -> Floats:
-        """What makes terms of slopes, where there are all."""
-        return np.asarray(np.linalg.pinv(self._terms), dtype=np.float64)
+        slopes = np.concatenate([along_x, along_y])
+        return slopes, np.linalg.pinv(slopes)
 
     def _phase(self, array_mm: Floats, seen: NDArray[np.bool_]) -> Floats:
         """Return the coefficients (y, x) of the phase, on the pupil of radius 1, whose normals meet the array there."""
         slopes = self._wave_number * self.camera.aperture_radius_mm / self.camera.image_distance_mm * array_mm
         if seen.all():
-            terms = self._slope_fit @ slopes.T.ravel()
+            terms = self._terms[1] @ slopes.T.ravel()
         else:
             rows = np.concatenate([seen, seen])
-            terms = np.linalg.lstsq(self._terms[rows], slopes[seen].T.ravel(), rcond=None)[0]
+            terms = np.linalg.lstsq(self._terms[0][rows], slopes[seen].T.ravel(), rcond=None)[0]
         coefficients = np.zeros((DEGREE + 1, DEGREE + 1))
         coefficients[_TERMS[:, 1], _TERMS[:, 0]] = terms
         return coefficients
@@ -200,11 +201,6 @@ class WavesInCamera:
         tilt = _undistorted(on_sensor, 1.0 + lever, camera.distortion_per_mm2)
         half = window.size // (2 * self.samples)
         return (int(corner[1]) - half, int(corner[0]) - half), on_sensor - lever * tilt
-
-    def _meets_sensor(self, first: tuple[int, int], window: _Window) -> bool:
-        side = window.size // self.samples
-        sensor = self.camera.rows, self.camera.columns
-        return all(-side < low < full for low, full in zip(first, sensor, strict=True))
 
 
 def steepest(camera: Camera) -> float:
@@ -388,17 +384,9 @@ def _slopes(
         return space.slopes(camera, np.broadcast_to(point_mm, (len(crossing_mm), 3)), crossing_mm)
     reach = camera.aperture_radius_mm + float(np.hypot(*point_mm[:2]))
     nodes, factors = space.slope_polynomials(camera, point_mm[2:], reach)
-    return _plane_slopes(crossing_mm - point_mm[:2], nodes[0], factors[0]), np.ones(len(crossing_mm), dtype=np.bool_)
-
-
-@njit(cache=True, nogil=True)
-def _plane_slopes(lateral: Floats, nodes: Floats, factors: Floats) -> Floats:
-    """Return the slopes of rays that move sideways by (n, 2) from `slope_polynomial`."""
-    slopes = np.empty_like(lateral)
-    for k in range(lateral.shape[0]):
-        ratio = slope_ratio(lateral[k, 0] ** 2 + lateral[k, 1] ** 2, nodes, factors)
-        slopes[k] = ratio * lateral[k]
-    return slopes
+    lateral = crossing_mm - point_mm[:2]
+    (ratio,) = slope_ratios(lateral[:, 0] ** 2 + lateral[:, 1] ** 2, nodes, factors)
+    return ratio[:, np.newaxis] * lateral, np.ones(len(crossing_mm), dtype=np.bool_)
 
 
 def _undistorted(place_mm: Floats, scale: float, distortion_per_mm2: float) -> Floats:
@@ -407,10 +395,3 @@ def _undistorted(place_mm: Floats, scale: float, distortion_per_mm2: float) -> F
     for _ in range(UNDISTORT_ROUNDS if distortion_per_mm2 else 0):
         ideal = place_mm / (scale + distortion_per_mm2 * np.sum(ideal**2))
     return ideal
-
-
-def _even_disc(count: int) -> Floats:
-    """Return points that fill a disc of radius 1 evenly, its rim included, in a sunflower's order."""
-    turn = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(count)
-    radius = np.sqrt(np.arange(count) / (count - 1.0))
-    return np.stack([radius * np.cos(turn), radius * np.sin(turn)], axis=-1)
