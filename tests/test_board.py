@@ -18,7 +18,7 @@ from lfpiv_cli.calibration.shape_fit import (
     scene_shares,
     undistorted,
 )
-from lfpiv_cli.calibration.views import Refocusing
+from lfpiv_cli.calibration.views import refocusing
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.optics.camera import Camera, Lattice
 from lfpiv_cli.optics.media import Media
@@ -170,8 +170,8 @@ def test_dots_that_gaps_cut_off_belong_to_the_board(table2: Camera) -> None:
 
 def test_a_plane_that_no_ray_meets_in_view_is_dark(table2: Camera) -> None:
     pixels = (np.array([200, 210]), np.array([230, 240]))
-    planes = Refocusing.of(small(table2), Media(), pixels, 3, 0.01)
-    (picture,) = planes.pictures(-100.0, (np.ones(2),), 1.0)
+    _, _, pictures = refocusing(small(table2), Media(), pixels, 3, 0.01, 1.0)
+    (picture,) = pictures(-100.0, np.ones(2))
     assert picture.dtype == np.float64
     assert not picture.any()
 

@@ -224,8 +224,8 @@ def test_particles_are_called_nothing(table2: Camera, rng: np.random.Generator) 
     points = np.column_stack([rng.uniform(-3.0, 3.0, 300), rng.uniform(-2.5, 2.5, 300), rng.uniform(-3.0, 3.0, 300)])
     tracers = render_points(camera, AIR, Balls(points, 1e4, 0.05), rng, rays=500)
     for image in (tracers, render_white(camera, LEVEL)):
-        assert another_kind(image.astype(np.float32), camera, DOTS) is None
-        assert another_kind(image.astype(np.float32), camera, CHESS) is None
+        assert another_kind(image, camera, DOTS) is None
+        assert another_kind(image, camera, CHESS) is None
 
 
 def test_auto_sees_whether_dots_are_bright_or_dark(rng: np.random.Generator) -> None:

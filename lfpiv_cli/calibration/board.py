@@ -18,7 +18,7 @@ from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose, on_the_grid, pose_of_dots
 from lfpiv_cli.calibration.corners import Look, enlarged_view, evenly_lit, first_corners
 from lfpiv_cli.calibration.shape_fit import PointShape, covered_shares
-from lfpiv_cli.calibration.views import Refocusing, alternating, described
+from lfpiv_cli.calibration.views import alternating, described, refocusing
 from lfpiv_cli.calibration.wave_shapes import WaveLight, disc_strips
 from lfpiv_cli.calibration.white import find_spots
 from lfpiv_cli.errors import ConfigError, InputError
@@ -28,9 +28,6 @@ from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera, refocused
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
 from lfpiv_cli.robust import BRIGHTEST_PERCENTILE
-
-# What kind of calibration target a picture shows, to name one that the config does not expect.
-
 
 # A chessboard is named by its size where at least this many corners along each side are seen.
 FEWEST_CORNERS = (3, 3)
@@ -44,12 +41,9 @@ SAME_DISTANCE = 0.15
 EVEN_SHARE = 0.8
 
 
-def another_kind(
-    image: NDArray[np.float32], camera: Camera, board: BoardGeometry, transmission: NDArray[np.float32] | None = None
-) -> str | None:
-    """Return a sentence that names the target in a rectified picture where it is not the board's; else None."""
-    passed = np.ones(image.shape, dtype=np.float32) if transmission is None else transmission
-    picture, _ = enlarged_view(evenly_lit(image, passed), camera)
+def another_kind(signal: Floats, camera: Camera, board: BoardGeometry) -> str | None:
+    """Return a sentence that names the target in an evenly lit picture where it is not the board's; else None."""
+    picture, _ = enlarged_view(signal, camera)
     for pattern, look in LOOKS_LIKE.items():
         if (found := look(picture)) is not None:
             return None if found == described(board) else sentence(found, pattern, board)
@@ -176,14 +170,9 @@ def disc_shape(radius_mm: float) -> PointShape:
 
 
 def dots_look(
-    image: NDArray[np.float32],
-    camera: Camera,
-    board: BoardGeometry,
-    media: Media,
-    transmission: NDArray[np.float32] | None = None,
+    image: NDArray[np.float32], passed: NDArray[np.float32], camera: Camera, board: BoardGeometry, media: Media
 ) -> DotLook:
-    """Find the dots of a board; parameters and errors are those of `locate_board`."""
-    medium = media.in_air() if board.medium == "air" else media
+    """Find the dots of a board; errors are those of `locate_board`."""
     radius = 0.5 * board.dot_diameter_mm
     seen, pitch = abs(camera.magnification) * radius, float(camera.lattice.pitch.min())
     if seen < 0.25 * pitch:
@@ -191,11 +180,8 @@ def dots_look(
             f"the board's dots are {written(2 * seen)} mm wide on the microlens array, less than half a microlens "
             f"({written(pitch)} mm); use a board with larger dots"
         )
-    passed = np.ones(image.shape, dtype=np.float32) if transmission is None else transmission
     signal = dot_signal(image, passed, board)
-    return DotLook(
-        signal, passed, medium, radius, *first_dots(signal, camera, board, medium, candidate_depths(camera, medium))
-    )
+    return DotLook(signal, passed, media, radius, *first_dots(signal, camera, board, media))
 
 
 def locate_board(
@@ -228,12 +214,12 @@ def locate_board(
         raise ConfigError(
             "reconstruction.wavelength_nm: by waves targets are fitted behind square lenses alone; leave it out"
         )
+    passed = np.ones(image.shape, dtype=np.float32) if transmission is None else transmission
     try:
-        return _pose(
-            LOOKS[board.pattern](image, camera, board, media, transmission), camera, board, rotation_rad, light
-        )
+        look = LOOKS[board.pattern](image, passed, camera, board, board.seen_through(media))
+        return _pose(look, camera, board, rotation_rad, light)
     except InputError as error:
-        if named := another_kind(image, camera, board, transmission):
+        if named := another_kind(evenly_lit(image, passed), camera, board):
             raise InputError(f"{named}; correct the section board") from error
         raise
 
@@ -274,7 +260,8 @@ def dots_in_world(
 
     Parameters and errors are those of `locate_board`, which believes in the spacing and asks what the camera is.
     """
-    places, _, _ = dots_look(image, camera, board, media).measured(camera, board, rotation_rad)
+    look = dots_look(image, np.ones(image.shape, dtype=np.float32), camera, board, board.seen_through(media))
+    places, _, _ = look.measured(camera, board, rotation_rad)
     kept, index = on_the_grid(places, board)
     dots = np.full((board.dots[1], board.dots[0], 3), np.nan)
     dots[index[:, 1], index[:, 0]] = places[kept]
@@ -297,39 +284,33 @@ def dot_signal(image: NDArray[np.float32], passed: NDArray[np.float32], board: B
     return np.asarray(level * passed - image, dtype=np.float64)
 
 
-def first_dots(
-    signal: Floats, camera: Camera, board: BoardGeometry, media: Media, depths_mm: Floats
-) -> tuple[Floats, float]:
+def first_dots(signal: Floats, camera: Camera, board: BoardGeometry, media: Media) -> tuple[Floats, float]:
     """Return the lateral places (n, 2) of the dots in image axes and their common depth, to within a dot's radius.
 
-    The rays of all bright pixels are carried back to planes at `depths_mm`; where the dots are smallest, the sum of
-    squares of the refocused picture is largest.
+    The rays of all bright pixels are carried back to planes at equal steps of defocus alpha about the focal plane;
+    where the dots are smallest, the sum of squares of the refocused picture is largest.
     """
     row, column = np.nonzero(signal > BRIGHT_SHARE * np.percentile(signal, BRIGHTEST_PERCENTILE))
     light = signal[row, column]
     if not light.size or light.min() <= 0.0:
         raise InputError("the board's picture shows no dots; check the exposure and board.polarity")
-    planes = Refocusing.of(camera, media, (row, column), SAMPLES_PER_LENS, HALF_WIDTH)
-    widest = max(3, round(DOT_PER_SPACING * board.spacing_mm / planes.sample_mm))
+    sample_mm, half, pictures = refocusing(
+        camera, media, (row, column), SAMPLES_PER_LENS, HALF_WIDTH, smoothing=SAMPLES_PER_LENS
+    )
+    widest = max(3, round(DOT_PER_SPACING * board.spacing_mm / sample_mm))
+
+    step = float(camera.lattice.pitch.min()) / camera.aperture_radius_mm / FOCUS_STEPS_PER_LENS
+    count, s_i = FOCUS_LENSES * FOCUS_STEPS_PER_LENS, camera.image_distance_mm
+    distance = s_i / (step * np.arange(-count, count + 1) - 1.0 + s_i / camera.focal_length_mm)
+    depths = (distance[distance > 0.0] - camera.focus_distance_mm) / media.depth_ratio
 
     def refocused(z_mm: float) -> Floats:
-        (smooth,) = planes.pictures(z_mm, (light,), SAMPLES_PER_LENS)
+        (smooth,) = pictures(z_mm, light)
         return smooth - opened(smooth, widest)
 
-    depth = float(depths_mm[np.argmax([np.sum(refocused(z) ** 2) for z in depths_mm])])
-    spots = find_spots(refocused(depth), board.spacing_mm / planes.sample_mm)
-    return (spots - planes.half[::-1]) * planes.sample_mm, depth
-
-
-def candidate_depths(camera: Camera, media: Media) -> Floats:
-    """Return depths in the medium at equal steps of defocus alpha about the focal plane."""
-    step = float(camera.lattice.pitch.min()) / camera.aperture_radius_mm / FOCUS_STEPS_PER_LENS
-    count = FOCUS_LENSES * FOCUS_STEPS_PER_LENS
-    alpha = step * np.arange(-count, count + 1)
-    s_i = camera.image_distance_mm
-    distance = s_i / (alpha - 1.0 + s_i / camera.focal_length_mm)
-    depths = (distance[distance > 0.0] - camera.focus_distance_mm) / media.depth_ratio
-    return np.asarray(depths, dtype=np.float64)
+    depth = float(depths[np.argmax([np.sum(refocused(z) ** 2) for z in depths])])
+    spots = find_spots(refocused(depth), board.spacing_mm / sample_mm)
+    return (spots - half[::-1]) * sample_mm, depth
 
 
 # How the points of each pattern are found, by `board.pattern`.

@@ -18,13 +18,11 @@ from lfpiv_cli.errors import InputError
 from lfpiv_cli.names import Medium, Pattern, Polarity
 from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.media import Media
 from lfpiv_cli.robust import MAD_TO_SIGMA
 
-# The flat regular board that fits given dots best, and the radial distortion that bends it.
-#
-# Axes: those of the dots: x, y lateral about the optical axis, z along it. Lengths in mm. The distortion acts on the
-# microlens array, r' = r (1 + k1 r^2); seen through an ideal camera it moves a dot sideways by the same share.
-
+# The distortion acts on the microlens array, r' = r (1 + k1 r^2); seen through an ideal camera it moves a dot sideways
+# by the same share.
 
 # A dot whose place or depth is this many robust deviations off the common board is dirt.
 OUTLIER_SIGMAS = 6.0
@@ -163,6 +161,10 @@ class BoardGeometry:
     def points(self) -> str:
         """What its points are called."""
         return "dots" if self.pattern == "dots" else "corners"
+
+    def seen_through(self, media: Media) -> Media:
+        """Return what is in front of it."""
+        return media.in_air() if self.medium == "air" else media
 
 
 @dataclass(frozen=True, eq=False)

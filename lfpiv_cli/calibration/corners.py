@@ -25,7 +25,6 @@ from lfpiv_cli.calibration.shape_fit import (
     PointShape,
     ShapeFit,
     fit_shape,
-    fit_steps,
     pixels_near,
     scene_points,
     scene_shares,
@@ -52,11 +51,7 @@ from lfpiv_cli.robust import MAD_TO_SIGMA
 # A pixel's light is the share of the polygon that its microlens is, seen in the scene (see `shape_fit`), that lies in
 # two opposite quadrants about the corner, exactly. With sgn u sgn v the quadrants' sign, the integral of it over a
 # polygon is that of |u| sgn v dv along its edges (Green's theorem), which is summed over the parts of an edge in one
-# quadrant.
-#
-# Axes: image axes (x along the columns, y along the rows), mm, z away from the camera from the focal plane; (u, v)
-# along the edges that meet in the corner.
-
+# quadrant; (u, v) run along the edges that meet in the corner.
 
 # Steps of the fit are measured in this share of a square.
 STEP_SHARE = 0.25
@@ -220,7 +215,9 @@ class Look(ABC):
         near = pixels_near((self.signal, self.passed), camera, medium, start_mm, reach, self.most_pixels)
         if near is None:
             return None
-        steps, rays = fit_steps(shape.step_mm, camera, medium), near.rays
+        # Moves that change the light alike: sideways, and in depth what moves the rim's rays as far.
+        deep = shape.step_mm * camera.focus_distance_mm / (camera.aperture_radius_mm * medium.depth_ratio)
+        steps, rays = np.array([shape.step_mm, shape.step_mm, deep]), near.rays
         shares_at = partial(scene_shares, rays, camera, medium, shape)
         if waves is not None:
             shares_at = partial(waves.shares_and_slopes, rays, shape.strips(waves.lens_mm), steps)
@@ -270,8 +267,7 @@ class CornerLook(Look):
 
         NaN where it does not. Views are followed from the main lens's middle outward.
         """
-        step = camera.pixel_mm * camera.image_distance_mm / camera.microlens_distance_mm
-        crossings = view_crossings(camera.aperture_radius_mm - RIM_PIXELS * step, step)
+        crossings = view_crossings(camera, RIM_PIXELS)
         crossings = crossings[np.argsort(np.hypot(crossings[:, 0], crossings[:, 1]), kind="stable")]
         grid, even = ViewGrid.of(camera), evenly_lit(self.signal, self.passed)
         clear = clear_mm(board) * abs(camera.magnification) / grid.step_mm
@@ -385,11 +381,7 @@ def straight_lines(crossing_mm: Floats, seen_mm: Floats, camera: Camera) -> Floa
 
 
 def first_corners(
-    image: NDArray[np.float32],
-    camera: Camera,
-    board: BoardGeometry,
-    media: Media,
-    transmission: NDArray[np.float32] | None = None,
+    image: NDArray[np.float32], passed: NDArray[np.float32], camera: Camera, board: BoardGeometry, media: Media
 ) -> CornerLook:
     """Find the corners of a chessboard or ChArUco board in the view from the main lens's middle.
 
@@ -410,7 +402,6 @@ def first_corners(
                 f"{what} are {written(width * per_mm)} microlenses wide on the array, less than {least:g}; use a board "
                 "with larger ones"
             )
-    passed = np.ones(image.shape, dtype=np.float32) if transmission is None else transmission
     picture, scale = enlarged_view(evenly_lit(image, passed), camera)
     found = charuco_corners(picture, board) if board.pattern == "charuco" else chessboard_corners(picture, board)
     if found is None:
@@ -419,8 +410,7 @@ def first_corners(
             "the focus"
         )
     numbers, place = found
-    medium = media.in_air() if board.medium == "air" else media
-    return CornerLook(image.astype(np.float64), passed, medium, numbers, (place + 0.5) / scale - 0.5)
+    return CornerLook(image.astype(np.float64), passed, media, numbers, (place + 0.5) / scale - 0.5)
 
 
 def evenly_lit(image: NDArray[np.floating], passed: NDArray[np.float32]) -> Floats:

@@ -13,7 +13,7 @@ those under which they are seen, on average.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,8 +21,9 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from lfpiv_cli.arrays import Floats
-from lfpiv_cli.calibration.board import candidate_depths, dot_signal, first_dots
+from lfpiv_cli.calibration.board import dot_signal, first_dots
 from lfpiv_cli.calibration.board_pose import BoardGeometry, on_the_grid
+from lfpiv_cli.calibration.corners import evenly_lit
 from lfpiv_cli.calibration.rectification import turn_matrix
 from lfpiv_cli.calibration.shape_fit import RIM_PER_PATCH
 from lfpiv_cli.calibration.views import lens_table, sub_aperture_view, view_crossings
@@ -156,13 +157,9 @@ class RayFit:
     entrance_pupil_mm: float | None = None
     entrance_pupil_sigma_mm: float | None = None
 
-    def to_tree(self) -> dict[str, Any]:
-        """Return everything as a nested dict of arrays and numbers."""
-        return {field.name: getattr(self, field.name) for field in fields(self)} | {"rays": self.rays.to_tree()}
-
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any]) -> RayFit:
-        """Return the fit that `to_tree` took apart.
+        """Return the fit of a dict of its fields, and of its rays' fields.
 
         Raises
         ------
@@ -301,13 +298,11 @@ def seen_board(
     """Find and number the dots of one board in the picture refocused to where they are sharpest."""
     signal = dot_signal(np.asarray(image, dtype=np.float32), passed, board)
     try:
-        place, seen_z = first_dots(signal, camera, board, media, candidate_depths(camera, media))
+        place, seen_z = first_dots(signal, camera, board, media)
         kept, index = on_the_grid(np.column_stack([place, np.full(len(place), z_mm)]), board)
     except InputError as error:
         raise InputError(f"the board at {z_mm:g} mm: {error}") from error
-    usable = passed > 0.0
-    level = np.where(usable, signal / np.where(usable, passed, 1.0), 0.0)
-    return SeenBoard(level, z_mm, seen_z, place[kept], index)
+    return SeenBoard(evenly_lit(signal, passed), z_mm, seen_z, place[kept], index)
 
 
 def aligned(boards: list[SeenBoard], board: BoardGeometry) -> list[SeenBoard]:
@@ -357,12 +352,11 @@ def _paraxial(seen: SeenBoard, camera: Camera, media: Media) -> tuple[float, flo
 def sightings_of(seen: SeenBoard, camera: Camera, board: BoardGeometry, media: Media) -> Sightings:
     """Look for the dots of a board in every view that the aperture gives wholly."""
     alpha, forward = _paraxial(seen, camera, media)
-    step = camera.pixel_mm * camera.image_distance_mm / camera.microlens_distance_mm
     pitch = float(camera.lattice.pitch.max())
     window = 0.5 * board.dot_diameter_mm * forward + MARGIN_LENSES * pitch
     reach = max(0.5 * board.spacing_mm * forward, window)
     lenses = camera.lattice.points(lens_table(camera))
-    crossings = view_crossings(camera.aperture_radius_mm - RIM_PER_PATCH * step, step)
+    crossings = view_crossings(camera, RIM_PER_PATCH)
     found, heights = np.empty((len(crossings), len(seen.index), 2)), np.empty((len(crossings), len(seen.index)))
     for k, crossing in enumerate(crossings):
         view = sub_aperture_view(seen.signal, camera, crossing)

@@ -30,9 +30,7 @@ from lfpiv_cli.neighbourhoods import largest_around
 from lfpiv_cli.optics.camera import Lattice
 
 # The pitch and direction of a lens lattice, from the spectrum of a white image: a guess that needs no data sheet.
-#
-# Axes: vectors are (column, row); frequencies in cycles per pixel.
-
+# Frequencies are (column, row), in cycles per pixel.
 
 # Below 6 px a lens image has no shape left to measure; the upper end leaves room beyond the 60 px of any known camera.
 SMALLEST_PITCH_PX = 6.0

@@ -6,7 +6,7 @@ Axes: pixels are (column, row); world axes are those of the raw sensor, z away f
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -205,17 +205,16 @@ class Calibration:
 
     def to_tree(self) -> dict[str, Any]:
         """Return everything as a nested dict of arrays, numbers, strings and None."""
-        fit = {field.name: getattr(self.fit, field.name) for field in fields(LatticeFit)}
+        fit = asdict(self.fit)
         lattice = fit.pop("lattice_px")
-        fit |= {"layout": lattice.layout, "origin_px": lattice.origin, "basis_px": lattice.basis}
-        pose = self.pose
+        fit |= {"layout": lattice["layout"], "origin_px": lattice["origin"], "basis_px": lattice["basis"]}
         return {
             "image_shape": np.array(self.image_shape, dtype=np.int64),
             "lattice": fit | {"cubic_used": int(self.fit.cubic_used)},
             "transmission": self.transmission,
-            "board": {field.name: getattr(pose, field.name) for field in fields(BoardPose)} if pose else None,
-            "dlfc": self.ray_fit.to_tree() if self.ray_fit else None,
-            "scene": self.scene.to_tree() if self.scene else None,
+            "board": asdict(self.pose) if self.pose else None,
+            "dlfc": asdict(self.ray_fit) if self.ray_fit else None,
+            "scene": asdict(self.scene) if self.scene else None,
             "mid_plane_given": 1 if self.mid_plane_given else None,
         } | {name: getattr(self, name) for name in CARRIED}
 

@@ -1,12 +1,17 @@
 """The place of a small shape in the scene that explains the light of pixels best, by least squares.
 
-Axes: image axes (x along the columns, y along the rows), mm, z away from the camera.
+Rays are followed backwards: a place on the sensor under a microlens names one point of the main lens per point of the
+microlens, and all of a microlens is, seen in the scene, a small polygon. A pixel's light is the share of this polygon
+that the shape covers, exactly, times what the pixel passes.
+
+Axes: image axes (x along the columns, y along the rows), mm about the optical axis, z away from the camera from the
+focal plane.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -138,20 +143,11 @@ def solved(design: Floats, values: Floats) -> Floats:
     return np.asarray(np.linalg.lstsq(design, values, rcond=None)[0], dtype=np.float64)
 
 
-# What a small bright shape in the scene looks like on the sensor, and a disc.
-#
-# Axes: image axes (x along the columns, y along the rows), lengths in mm about the optical axis, z away from the
-# camera from the focal plane. Rays are followed backwards: a place on the sensor under a microlens names one point of
-# the main lens per point of the microlens, and all of a microlens is, seen in the scene, a small polygon. A pixel's
-# light is the share of this polygon that the shape covers, exactly, times what the pixel passes.
-
-
 # Undoing r' = r (1 + k1 r^2) by repetition: each round gains a factor 3 k1 r^2, below 0.01 for usable lenses.
 UNDISTORT_ROUNDS = 6
 
 
-@dataclass(frozen=True, eq=False)
-class PixelRays:
+class PixelRays(NamedTuple):
     """Pixels and the microlenses they lie under.
 
     Attributes
@@ -345,17 +341,6 @@ def disc_triangle_area(ax: float, ay: float, bx: float, by: float, radius: float
     return sector_area(ax, ay, px, py, radius) + 0.5 * (px * qy - py * qx) + sector_area(qx, qy, bx, by, radius)
 
 
-def fit_steps(size_mm: float, camera: Camera, media: Media) -> Floats:
-    """Return moves (3,) that change a shape's light alike: its size sideways, and what moves the rim's rays as far."""
-    deep = size_mm * camera.focus_distance_mm / (camera.aperture_radius_mm * media.depth_ratio)
-    return np.array([size_mm, size_mm, deep])
-
-
-# The pixels that see the surroundings of a point in the scene, to fit what is there to them.
-#
-# Axes: image axes (x along the columns, y along the rows), mm, z away from the camera from the focal plane.
-
-
 # Pixels at the rim of a micro-image are lit in part, by light that does not come from where their middle sees, and
 # rectification mixes neighbours; a pixel is used when the main lens's rim is more than half its patch's diagonal and a
 # pixel away. Without that pixel depths are 0.2 % too large.
@@ -364,8 +349,7 @@ RIM_PER_PATCH = np.sqrt(0.5) + 1.0
 FEWEST_PIXELS = 50
 
 
-@dataclass(frozen=True, eq=False)
-class NearPixels:
+class NearPixels(NamedTuple):
     """Pixels (n,): their light, the share of it that they pass, and their rays."""
 
     signal: Floats
@@ -407,5 +391,5 @@ def pixels_near(
     if len(kept) < FEWEST_PIXELS:
         return None
     kept = kept[:: -(-len(kept) // most)]
-    chosen = replace(rays, place_mm=rays.place_mm[kept], lens_mm=rays.lens_mm[kept], ideal_mm=rays.ideal_mm[kept])
+    chosen = PixelRays(*(each[kept] for each in rays))
     return NearPixels(signal[row, column][kept], passed[row, column][kept].astype(np.float64), chosen)

@@ -172,7 +172,7 @@ def board_notices(pose: BoardPose, board: BoardGeometry, camera: Camera, media: 
         )
         yield Notice("field-curved", "board image", text, remedy, depth.value, f"within {written(largest, 2)} mm")
     # A dot's light in microlenses, at its depth from the focal plane.
-    scale = camera.scale(media.in_air() if board.medium == "air" else media)
+    scale = camera.scale(board.seen_through(media))
     dot = board.dot_diameter_mm / scale.lens_mm
     wide = dot + abs(pose.z0_mm) / scale.depth_mm
     if dots and wide < 1.0:

@@ -1,4 +1,7 @@
-"""White images: whether they can serve, and which of several shows what."""
+"""White images: where their bright spots are, how much light pixels pass, and whether they can serve.
+
+Axes: positions are (column, row) in pixels, pixel centres at integers.
+"""
 
 from __future__ import annotations
 
@@ -15,11 +18,6 @@ from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.neighbourhoods import largest_around, smallest_around
 from lfpiv_cli.optics.camera import Lattice
-
-# Bright spots in an image: where they are, to a hundredth of a pixel, and which lattice point each one is.
-#
-# Axes: positions are (column, row) in pixels, pixel centres at integers.
-
 
 # Smoothing by a sixth of the pitch leaves one maximum per lens image and does not merge neighbours.
 SMOOTHING_PER_PITCH = 1.0 / 6.0
@@ -145,9 +143,6 @@ def first_of_each(indices: NDArray[np.int64], chosen: NDArray[np.bool_]) -> NDAr
     mask = np.zeros(len(indices), dtype=bool)
     mask[where[first]] = True
     return mask
-
-
-# How much of the light each pixel passes, from a white image: vignetting, dust, the rims of the lens images.
 
 
 # What passes less than this of the centre's light says more about noise and stray light than about the scene.

@@ -20,16 +20,13 @@ from lfpiv_cli.names import ColumnAxis, Layout
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.scale import Scale
 
-# The microlens array as a plane lattice: an origin and two basis vectors.
-#
-# Lattice point (i, j) lies at origin + i * basis[0] + j * basis[1]. The same class describes the array itself (mm
-# about the optical axis) and the centres of its micro-images (pixels, column and row); each holder says which.
-# Components are always (image x, image y), that is along the columns first.
-
 
 @dataclass(frozen=True, eq=False)
 class Lattice:
-    """A plane lattice.
+    """A plane lattice: point (i, j) lies at origin + i * basis[0] + j * basis[1].
+
+    It describes the microlens array (mm about the optical axis) or the centres of its micro-images (pixels, column and
+    row); each holder says which. Components are always (image x, image y), that is along the columns first.
 
     Attributes
     ----------
@@ -255,7 +252,7 @@ class Camera:
     def for_kernels(self) -> KernelCamera:
         """Return the camera as compiled kernels take it."""
         figures = [getattr(self, name) for name in KernelCamera._fields[:-2]]
-        return KernelCamera(*figures, self.lattice.origin, self.lattice.basis)
+        return KernelCamera._make([*figures, self.lattice.origin, self.lattice.basis])
 
     def defocus(self, object_distance_mm: ArrayLike) -> Floats:
         """Return alpha = 1 + s_i/s_o - s_i/F_m, the spread on the array per unit of main-lens position; 0 in focus."""

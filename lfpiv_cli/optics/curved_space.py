@@ -36,7 +36,7 @@ from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.ray_bundles import aim_all, pencils
-from lfpiv_cli.optics.shapes import RigidMotion, Shape, reliefs_of, turned
+from lfpiv_cli.optics.shapes import RigidMotion, Shape, reliefs_of
 from lfpiv_cli.optics.surfaces import Faces, Surface
 
 
@@ -46,23 +46,6 @@ class Face:
 
     surface: Surface
     index: float
-
-
-@dataclass(frozen=True, eq=False)
-class Equivalent:
-    """Where points seem to lie in air to rays close to the one through the middle of the lens.
-
-    Along each image axis k the slope of such a ray is (X_k - place_k) / distance_k.
-
-    Attributes
-    ----------
-    place_mm, distance_mm : (n, 2) along both image axes; NaN where not valid
-    valid : (n,) the point is in the fluid and seen from the middle of the lens
-    """
-
-    place_mm: Floats
-    distance_mm: Floats
-    valid: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -140,7 +123,7 @@ class CurvedSpace:
         shapes = self.shapes()
         heights = [shape.relief for shape in shapes]
         if camera.column_axis == "y":
-            heights = [None if relief is None else turned(relief) for relief in heights]
+            heights = [each and each.exchanged() for each in heights]
         indices = np.array([self.media.air, *(face.index for face in self.faces)])
         return Faces(
             lens_z_mm=self.lens_z_mm(camera),
@@ -165,15 +148,20 @@ class CurvedSpace:
         """Return the slopes (n, 2) at the lens of the rays from points (n, 3) that cross it at (n, 2), if they do."""
         return aim_all(self.for_kernels(camera), _rows(points_mm, 3), _rows(crossing_mm, 2))
 
-    def equivalent(self, camera: Camera, points_mm: ArrayLike) -> Equivalent:
+    def equivalent(self, camera: Camera, points_mm: ArrayLike) -> tuple[Floats, Floats, NDArray[np.bool_]]:
         """Return where points (n, 3) seem to lie in air, along each image axis, to rays near the middle of the lens.
 
-        Away from a cylinder's two planes of symmetry the slope along one axis also changes with the crossing along the
-        other; that is left out.
+        Along image axis k the slope of such a ray is (X_k - place_k) / distance_k. Away from a cylinder's two planes of
+        symmetry it also changes with the crossing along the other axis; that is left out.
+
+        Returns
+        -------
+        Places and distances (n, 2), mm, NaN where there are none, and (n,) whether the point is in the fluid and seen
+        from the middle of the lens.
         """
         slopes, growth, valid = pencils(self.for_kernels(camera), _rows(points_mm, 3))
         distance = 1.0 / growth[:, [0, 1], [0, 1]]
-        return Equivalent(-slopes * distance, distance, valid)
+        return -slopes * distance, distance, valid
 
 
 def _rows(values: ArrayLike, columns: int) -> Floats:

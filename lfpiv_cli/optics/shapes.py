@@ -1,9 +1,12 @@
-"""What surfaces are made of: vectors in space, and a surface near the point where the optical axis meets it."""
+"""What surfaces are made of: vectors in space, and a surface near the point where the optical axis meets it.
+
+Axes: world axes, z away from the camera from the nominal focal point, mm.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -34,6 +37,10 @@ class Relief(NamedTuple):
     first_mm: Floats
     step_mm: Floats
     coefficients: Floats
+
+    def exchanged(self) -> Relief:
+        """Return the heights with x and y exchanged."""
+        return Relief(self.first_mm[::-1], self.step_mm[::-1], self.coefficients.transpose(1, 0, 3, 2))
 
 
 class Shape(NamedTuple):
@@ -92,14 +99,9 @@ def row(rows: Floats, k: int) -> Vector:
     return rows[k, 0], rows[k, 1], rows[k, 2]
 
 
-# A rigid motion of bodies on the bench: turned about a point, then shifted.
-#
-# Axes: world axes, z away from the camera from the nominal focal point, mm and rad.
-
-
 @dataclass(frozen=True)
 class RigidMotion:
-    """A turn about a point, and a shift.
+    """How a body on the bench is moved: turned about a point, then shifted.
 
     Attributes
     ----------
@@ -153,7 +155,7 @@ class RigidMotion:
 # for rays needs them. A line p + t d meets it where z(x, y) = z, by Newton's iteration in t; there, with the slopes
 # z_x and z_y, the normal away from the camera is (-z_x, -z_y, 1) / sqrt(1 + z_x^2 + z_y^2).
 #
-# Axes: z away from the camera, mm; world axes of a `HeightMap`, image axes of `Reliefs`.
+# `Reliefs` are in image axes.
 
 
 # Of a cubic spline along each axis whose ends are as smooth as its middle.
@@ -248,11 +250,6 @@ class Reliefs(NamedTuple):
     coefficients: Floats
 
 
-def turned(relief: Relief) -> Relief:
-    """Return heights with x and y exchanged."""
-    return Relief(relief.first_mm[::-1], relief.step_mm[::-1], relief.coefficients.transpose(1, 0, 3, 2))
-
-
 def reliefs_of(reliefs: Sequence[Relief | None]) -> Reliefs:
     """Return the heights of faces, None where a face has none, for kernels."""
     count = len(reliefs)
@@ -336,14 +333,9 @@ def normal_change_of_heights(reliefs: Reliefs, k: int, place: Vector, shift: Vec
     return plus(turn, -dot(normal, turn), normal)
 
 
-# Where a scene lies: how far from where the config says, as one rigid body, and how well that is known.
-#
-# Axes: world axes, z away from the camera from the nominal focal point, mm and degrees.
-
-
 @dataclass(frozen=True, eq=False)
 class ScenePose:
-    """How a scene lies beside the one of the config.
+    """How a scene lies beside the one of the config, as one rigid body, and how well that is known; world axes.
 
     Attributes
     ----------
@@ -375,24 +367,17 @@ class ScenePose:
             "scene_turn_deg_sigma": self.turn_sigma_deg.tolist(),
         }
 
-    def to_tree(self) -> dict[str, Any]:
-        """Return everything as a dict of arrays and strings."""
-        return {name: getattr(self, name) for name in NAMES}
-
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any]) -> ScenePose:
-        """Return the pose that `to_tree` took apart.
+        """Return the pose of a dict of its fields.
 
         Raises
         ------
         KeyError, ValueError : something is missing, or is no place
         """
-        found = {name: tree[name] for name in NAMES}
-        for name in NAMES[:-1]:
-            found[name] = np.asarray(found[name], dtype=np.float64)
-            if found[name].shape != (3,) or not np.all(np.isfinite(found[name])):
+        *places, digest = (field.name for field in fields(cls))
+        found = {name: np.asarray(tree[name], dtype=np.float64) for name in places}
+        for name, place in found.items():
+            if place.shape != (3,) or not np.all(np.isfinite(place)):
                 raise ValueError(f"scene/{name} is no place")
-        return cls(**found)
-
-
-NAMES = ("shift_mm", "turn_deg", "pivot_mm", "shift_sigma_mm", "turn_sigma_deg", "faces_sha256")
+        return cls(**found, **{digest: tree[digest]})

@@ -91,12 +91,7 @@ class TiltedPlane:
     normal: Vector
 
     def shape(self) -> Shape:
-        """Return the plane near the optical axis.
-
-        Raises
-        ------
-        ConfigError : the plane lies along the optical axis
-        """
+        """Return the plane near the optical axis."""
         normal = unit(self.normal, "normal")
         if normal[2] == 0.0:
             raise ConfigError(
@@ -129,12 +124,7 @@ class Cylinder:
     facing: Facing = "convex"
 
     def shape(self) -> Shape:
-        """Return the cylinder near the optical axis.
-
-        Raises
-        ------
-        ConfigError : the optical axis misses it
-        """
+        """Return the cylinder near the optical axis."""
         return _round_shape(self.centre_mm, unit(self.axis, "axis"), self.radius_mm, self.facing, "cylinder")
 
     def moved(self, motion: RigidMotion) -> Cylinder:
@@ -149,8 +139,7 @@ class Sphere:
     Attributes
     ----------
     centre_mm, radius_mm : centre and radius
-    facing : convex where the side nearer to the camera refracts and the medium behind it is inside; concave where the
-        farther side does, and it is outside
+    facing : as of a `Cylinder`
     """
 
     centre_mm: Vector
@@ -158,12 +147,7 @@ class Sphere:
     facing: Facing = "convex"
 
     def shape(self) -> Shape:
-        """Return the sphere near the optical axis.
-
-        Raises
-        ------
-        ConfigError : the optical axis misses it
-        """
+        """Return the sphere near the optical axis."""
         return _round_shape(self.centre_mm, NO_AXIS, self.radius_mm, self.facing, "sphere")
 
     def moved(self, motion: RigidMotion) -> Sphere:

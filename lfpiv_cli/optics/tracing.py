@@ -35,9 +35,6 @@ from lfpiv_cli.threads import COUNT_NO_REFERENCES
 #
 # Direct light-field calibration (DLFC, Hall et al. 2018) knows no main lens and no window: it has seen dots at known
 # places through known points of the aperture, and a polynomial of both tells where any other ray goes.
-#
-# Axes: image axes (x along the columns), mm, z away from the camera from the nominal focal point.
-
 
 # x, y, z of where a ray starts, X, Y of where it crosses the main lens.
 VARIABLES = 5
@@ -65,13 +62,9 @@ class PolynomialRays:
         """Largest sum of exponents."""
         return int(self.exponents.sum(axis=1).max(initial=0))
 
-    def to_tree(self) -> dict[str, Any]:
-        """Return the arrays by name."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
-
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any]) -> PolynomialRays:
-        """Return the rays that `to_tree` took apart.
+        """Return the rays of a dict of their fields.
 
         Raises
         ------
@@ -207,11 +200,7 @@ def disc_points(count: int, radius: float, rng: np.random.Generator) -> Floats:
 #
 # A ray is straight within each plane layer; seen from the lens it comes in at a slope that is nearly proportional to
 # how far sideways it has moved. Paraxial rays are straight in one layer of air, from the equivalent point (Eqs. 6,
-# 9).
-#
-# Axes: z away from the camera from the nominal focal point; lateral distances from the point to the crossing of the
-# main lens, mm.
-
+# 9). Lateral distances are those from the point to the crossing of the main lens.
 
 # The slope of a refracted ray over its lateral distance is an analytic function of that distance squared, nearly
 # constant: through five points of it, a polynomial is right to 1e-10 for lenses up to f/1.4.

@@ -119,29 +119,44 @@ class WavesInCamera:
         ------
         ConfigError : a point in front of the fluid
         """
+        camera, radius = self.camera, self.camera.aperture_radius_mm
         points = np.asarray(points_mm, dtype=np.float64).reshape(-1, 3)
         rays = [(point, *self._rays(point)) for point in points]
         lit = [ray for ray in rays if ray[2].any()]
         if not lit:
             return None
+
+        # The samples hold the light of all rays, and what edges diffract.
         spot = np.concatenate([array[seen] for _, array, seen in lit])
-        window = self._window(0.5 * float(np.ptp(spot, axis=0).max()))
+        behind = camera.microlens_distance_mm * steepest(camera) + MARGIN_PITCHES * float(camera.lattice.pitch.max())
+        pixels = int(np.ceil((0.5 * float(np.ptp(spot, axis=0).max()) + behind) / camera.pixel_mm)) + 1
+        size = 2 * self.samples * fft.next_fast_len(pixels)
+        if size not in self._windows:
+            self._windows[size] = _Window.of(camera, self.waves, size, self.step_mm)
+        window, side = self._windows[size], size // self.samples
         first, middle = self._place(0.5 * (spot.min(axis=0) + spot.max(axis=0)), window)
-        side, sensor = window.size // self.samples, (self.camera.rows, self.camera.columns)
-        if not all(-side < low < full for low, full in zip(first, sensor, strict=True)):
+        if not all(-side < low < full for low, full in zip(first, (camera.rows, camera.columns), strict=True)):
             return None
-        lenses = window.lenses(self.camera, middle, self._wave_number)
-        light = np.zeros((window.size, window.size), dtype=np.float32)
+
+        # What the array does to the light, with the curvature of light from the main lens.
+        lenses = np.empty((size, size), dtype=np.complex64)
+        half = 0.5 * self._wave_number
+        curvatures = half / camera.image_distance_mm, half / camera.microlens_focal_length_mm
+        _write_lenses(window.beside, middle, curvatures, camera.lattice.origin, camera.lattice.basis, lenses)
+        light = np.zeros((size, size), dtype=np.float32)
         for point, array, seen in lit:
-            amplitude = window.amplitude if seen.all() else window.amplitude * self._seen(point, window.pupil)
-            field = window.on_array(
-                amplitude, self._phase(array - middle - 0.5 * self.step_mm, seen), self.camera.aperture_radius_mm
-            )
-            field *= lenses
-            _add_intensity(window.on_sensor(field), light)
-        pixels = np.zeros((window.size // self.samples, window.size // self.samples))
-        _write_pixels(light, self.samples, self._to_pixels, pixels)
-        return Patch(first, pixels / len(points))
+            amplitude = window.amplitude
+            if not seen.all():
+                places = np.stack(np.meshgrid(window.pupil, window.pupil), axis=-1).reshape(-1, 2)
+                amplitude = amplitude * _slopes(camera, self.space, point, places)[1].reshape(amplitude.shape)
+            phase = self._phase(array - middle - 0.5 * self.step_mm, seen)
+            spectrum = fft.fft2(window.on_array(amplitude, phase, radius) * lenses, overwrite_x=True)
+            spectrum *= window.transfer[:, None]
+            spectrum *= window.transfer
+            _add_intensity(np.asarray(fft.ifft2(spectrum, overwrite_x=True), dtype=np.complex64), light)
+        collected = np.zeros((side, side))
+        _write_pixels(light, self.samples, self._to_pixels, collected)
+        return Patch(first, collected / len(points))
 
     def _rays(self, point_mm: Floats) -> tuple[Floats, NDArray[np.bool_]]:
         """Return where a point's rays through places of the pupil meet the array (places, 2), and which there are."""
@@ -150,11 +165,6 @@ class WavesInCamera:
         array = crossing + self.camera.image_distance_mm * (slopes - crossing / self.camera.focal_length_mm)
         array = array + self.camera.objective.aberration(crossing, array)
         return array * (1.0 + self.camera.distortion_per_mm2 * np.sum(array**2, axis=1, keepdims=True)), seen
-
-    def _seen(self, point_mm: Floats, pupil_mm: Floats) -> NDArray[np.bool_]:
-        """Return which of the pupil's samples (y, x) a ray of the point reaches."""
-        places = np.stack(np.meshgrid(pupil_mm, pupil_mm), axis=-1).reshape(-1, 2)
-        return _slopes(self.camera, self.space, point_mm, places)[1].reshape(len(pupil_mm), -1)
 
     @cached_property
     def _terms(self) -> tuple[Floats, Floats]:
@@ -177,16 +187,6 @@ class WavesInCamera:
         coefficients = np.zeros((DEGREE + 1, DEGREE + 1))
         coefficients[_TERMS[:, 1], _TERMS[:, 0]] = terms
         return coefficients
-
-    def _window(self, radius_mm: float) -> _Window:
-        """Return the samples that hold the light of rays that meet the array within a square of this half side."""
-        camera, pitch = self.camera, float(self.camera.lattice.pitch.max())
-        behind = camera.microlens_distance_mm * steepest(camera) + MARGIN_PITCHES * pitch
-        pixels = int(np.ceil((radius_mm + behind) / camera.pixel_mm)) + 1
-        size = 2 * self.samples * fft.next_fast_len(pixels)
-        if size not in self._windows:
-            self._windows[size] = _Window.of(camera, self.waves, size, self.step_mm)
-        return self._windows[size]
 
     def _place(self, spot_mm: Floats, window: _Window) -> tuple[tuple[int, int], Floats]:
         """Return the window's first (row, column) on the sensor, and its middle on the array.
@@ -276,20 +276,6 @@ class _Window:
         whole = np.zeros((self.size, self.size), dtype=np.complex64)
         whole[numbers] = fft.fft(field, axis=1, overwrite_x=True)
         return np.asarray(fft.fft(whole, axis=0, overwrite_x=True), dtype=np.complex64)
-
-    def lenses(self, camera: Camera, middle_mm: Floats, wave_number: float) -> Complex:
-        """Return what the array does to the light (y, x), with the curvature of light from the main lens."""
-        found = np.empty((self.size, self.size), dtype=np.complex64)
-        curvatures = 0.5 * wave_number / camera.image_distance_mm, 0.5 * wave_number / camera.microlens_focal_length_mm
-        _write_lenses(self.beside, middle_mm, curvatures, camera.lattice.origin, camera.lattice.basis, found)
-        return found
-
-    def on_sensor(self, field: Complex) -> Complex:
-        """Return the field on the sensor of one behind the array, which is overwritten."""
-        spectrum = fft.fft2(field, overwrite_x=True)
-        spectrum *= self.transfer[:, None]
-        spectrum *= self.transfer
-        return np.asarray(fft.ifft2(spectrum, overwrite_x=True), dtype=np.complex64)
 
 
 @njit(cache=True, nogil=True)
