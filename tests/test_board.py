@@ -16,11 +16,10 @@ from lfpiv_cli.calibration.shape_fit import (
     lens_crossings,
     pixel_rays,
     scene_shares,
-    undistorted,
 )
 from lfpiv_cli.calibration.views import refocusing
 from lfpiv_cli.errors import InputError
-from lfpiv_cli.optics.camera import Camera, Lattice
+from lfpiv_cli.optics.camera import Camera, Lattice, undistorted
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.tracing import disc_points, trace
 from tests.known_rays import slopes_equivalent

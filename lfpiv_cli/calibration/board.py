@@ -205,52 +205,41 @@ def locate_board(
 
     Raises
     ------
-    InputError
-        when too few dots are found to make a board
-    ConfigError
-        light is waves and the array is hexagonal
+    InputError : when too few dots are found to make a board
+    ConfigError : light is waves and the array is hexagonal
     """
     if light is not None and camera.lattice.layout != "square":
         raise ConfigError(
             "reconstruction.wavelength_nm: by waves targets are fitted behind square lenses alone; leave it out"
         )
     passed = np.ones(image.shape, dtype=np.float32) if transmission is None else transmission
-    try:
-        look = LOOKS[board.pattern](image, passed, camera, board, board.seen_through(media))
-        return _pose(look, camera, board, rotation_rad, light)
-    except InputError as error:
-        if named := another_kind(evenly_lit(image, passed), camera, board):
-            raise InputError(f"{named}; correct the section board") from error
-        raise
-
-
-def _pose(
-    look: Look, camera: Camera, board: BoardGeometry, rotation_rad: float, light: WaveLight | None = None
-) -> BoardPose:
-    """Return the pose of a target, again with the magnification and the distortion that the first one tells.
-
-    Rays are near enough for these; waves then take one look more.
-    """
-    micro_images = camera.micro_image_lattice_px()
+    sheet, micro_images, medium = camera, camera.micro_image_lattice_px(), board.seen_through(media)
 
     def seen(look: Look) -> tuple[BoardPose, Floats]:
         """Return the pose as the camera sees it, and where an ideal one has the points on the array (n, 2)."""
         places, sigmas, numbers = look.measured(camera, board, rotation_rad)
-        distance = equivalent_object_distance(places[:, 2], camera.focus_distance_mm, look.medium)
-        forward = camera.image_distance_mm / distance
+        forward = camera.image_distance_mm / equivalent_object_distance(places[:, 2], camera.focus_distance_mm, medium)
         array = -forward[:, np.newaxis] * camera.to_image_axes(places)[:, :2]
         return pose_of_dots(places, sigmas, array, camera, board, numbers), array
 
-    for _ in range(LENS_ROUNDS):
-        pose, array = seen(look)
-        ratio = pose.magnification / camera.magnification
-        bend = pose.distortion_per_mm2 - camera.distortion_per_mm2
-        if max(abs(ratio - 1.0), abs(bend) * float(np.sum(array**2, axis=1).max())) < SCALE_TOLERANCE:
-            break
-        camera = replace(refocused(camera, pose.magnification), distortion_per_mm2=pose.distortion_per_mm2)
-        camera = camera.with_micro_images(micro_images)
-        look = look.moved(ratio, pose.z0_mm)
-    return pose if light is None else seen(replace(look, light=light))[0]
+    try:
+        look = LOOKS[board.pattern](image, passed, camera, board, medium)
+        # Again with the magnification and the distortion that the first pose tells. Rays are near enough for these;
+        # waves then take one look more.
+        for _ in range(LENS_ROUNDS):
+            pose, array = seen(look)
+            ratio = pose.magnification / camera.magnification
+            bend = pose.distortion_per_mm2 - camera.distortion_per_mm2
+            if max(abs(ratio - 1.0), abs(bend) * float(np.sum(array**2, axis=1).max())) < SCALE_TOLERANCE:
+                break
+            camera = replace(refocused(camera, pose.magnification), distortion_per_mm2=pose.distortion_per_mm2)
+            camera = camera.with_micro_images(micro_images)
+            look = look.moved(ratio, pose.z0_mm)
+        return pose if light is None else seen(replace(look, light=light))[0]
+    except InputError as error:
+        if named := another_kind(evenly_lit(image, passed), sheet, board):
+            raise InputError(f"{named}; correct the section board") from error
+        raise
 
 
 def dots_in_world(

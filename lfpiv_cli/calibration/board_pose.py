@@ -62,8 +62,7 @@ def flat_fit(dots_mm: Floats, indices: NDArray[np.int64], board: BoardGeometry, 
 
     Raises
     ------
-    InputError
-        when the dots stand in one line
+    InputError : when the dots stand in one line
     """
     count = len(indices)
     along = (indices - (np.array(board.dots) - 1) / 2.0) * board.spacing_mm
@@ -236,8 +235,7 @@ def pose_of_dots(
 
     Raises
     ------
-    InputError
-        when too few dots lie on a common grid, or they scatter about it
+    InputError : when too few dots lie on a common grid, or they scatter about it
     """
     if numbers is None:
         kept, indices = on_the_grid(dots_mm, board)

@@ -28,7 +28,6 @@ from lfpiv_cli.calibration.shape_fit import (
     pixels_near,
     scene_points,
     scene_shares,
-    undistorted,
 )
 from lfpiv_cli.calibration.views import (
     charuco_corners,
@@ -42,7 +41,7 @@ from lfpiv_cli.calibration.views import (
 from lfpiv_cli.calibration.wave_shapes import WaveLight, WaveShapes, corner_strips
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.notice import written
-from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.camera import Camera, undistorted
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.robust import MAD_TO_SIGMA
 

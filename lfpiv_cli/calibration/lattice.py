@@ -62,8 +62,7 @@ def lattice_vectors(image: Floats) -> tuple[Floats, Layout]:
 
     Raises
     ------
-    InputError
-        when the spectrum holds no such lattice with a pitch of 6 to 90 px
+    InputError : when the spectrum holds no such lattice with a pitch of 6 to 90 px
     """
     power, step, lines = spectral_lines(image)
     turns: dict[Layout, float] = {"square": np.pi / 2.0, "hexagonal": np.pi / 3.0}
@@ -78,7 +77,14 @@ def lattice_vectors(image: Floats) -> tuple[Floats, Layout]:
             "the white image; check the exposure, and that it is a white image"
         )
     # The vectors are the rows of the inverse transpose of the frequencies.
-    frequencies = [refined_line(power, step, line) for line in (first, rotated(first, turns[layout]))]
+    frequencies = []
+    for line in (first, rotated(first, turns[layout])):
+        # To a fraction of a bin: the centroid of the power about the strongest one.
+        near, columns, rows = bins_around(power, step, line, BIN_TOLERANCE)
+        row, column = np.unravel_index(np.argmax(near), near.shape)
+        peak = np.array([columns[0, column], rows[row, 0]]) * step
+        near, columns, rows = bins_around(power, step, peak, REFINE_BINS)
+        frequencies.append(np.array([(near * columns).sum() / near.sum(), (near * rows).sum() / near.sum()]) * step)
     a, b = np.linalg.inv(np.stack(frequencies)).T
     if layout == "hexagonal":
         # Frequencies at 60 degrees make vectors at 120; the sum of these stands at 60 to the first.
@@ -133,16 +139,6 @@ def bins_around(
 def line_power(power: Floats, step: Floats, line: Floats) -> float:
     """Return the strongest power within the tolerance around a frequency."""
     return float(bins_around(power, step, line, BIN_TOLERANCE)[0].max())
-
-
-def refined_line(power: Floats, step: Floats, line: Floats) -> Floats:
-    """Return the frequency of a line to a fraction of a bin: the centroid of its power about the strongest bin."""
-    near, columns, rows = bins_around(power, step, line, BIN_TOLERANCE)
-    peak_row, peak_column = np.unravel_index(np.argmax(near), near.shape)
-    peak = np.array([columns[0, peak_column], rows[peak_row, 0]]) * step
-    near, columns, rows = bins_around(power, step, peak, REFINE_BINS)
-    total = near.sum()
-    return np.array([(near * columns).sum() / total, (near * rows).sum() / total]) * step
 
 
 # Fewer lenses leave the cubic's ten coefficients per axis without a check.
@@ -240,8 +236,7 @@ def fit_lattice(
 
     Raises
     ------
-    InputError
-        when the image is too dark, saturated or shows no lattice
+    InputError : when the image is too dark, saturated or shows no lattice
     """
     image = checked_white(white, dark, saturation)
     fit = _lattice_of(image, layout)

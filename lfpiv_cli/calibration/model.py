@@ -131,8 +131,7 @@ class Calibration:
 
         Raises
         ------
-        InputError
-            when the calibration was made with another sensor
+        InputError : when the calibration was made with another sensor
         """
         self.ensure_images_of(camera)
         if self.pose is not None:
@@ -224,8 +223,7 @@ class Calibration:
 
         Raises
         ------
-        InputError
-            when something is missing, or of another shape
+        InputError : when something is missing, or of another shape
         """
         try:
             rows, columns = (int(n) for n in tree["image_shape"])
@@ -330,8 +328,7 @@ def calibrate(pictures: Photographs, rig: Rig | None = None, sheet: DataSheet = 
 
     Raises
     ------
-    InputError
-        when a picture cannot serve; it says why
+    InputError : when a picture cannot serve; it says why
     """
     shapes = [np.shape(picture) for picture in pictures.lit]
     shapes += [] if sheet.camera is None else [(sheet.camera.rows, sheet.camera.columns)]

@@ -80,8 +80,7 @@ class Rectification:
 
         Raises
         ------
-        InputError
-            when the image is not of the white image's shape
+        InputError : when the image is not of the white image's shape
         """
         raw = np.asarray(image, dtype=np.float64)
         if raw.shape != self.image_shape:

@@ -19,7 +19,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats
-from lfpiv_cli.optics.camera import Camera, Lattice, nearest_point
+from lfpiv_cli.optics.camera import Camera, Lattice, nearest_point, undistorted
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
 
 # Gauss-Newton starts within the shape and settles in about five rounds, to a hundredth of what noise leaves; a step
@@ -143,10 +143,6 @@ def solved(design: Floats, values: Floats) -> Floats:
     return np.asarray(np.linalg.lstsq(design, values, rcond=None)[0], dtype=np.float64)
 
 
-# Undoing r' = r (1 + k1 r^2) by repetition: each round gains a factor 3 k1 r^2, below 0.01 for usable lenses.
-UNDISTORT_ROUNDS = 6
-
-
 class PixelRays(NamedTuple):
     """Pixels and the microlenses they lie under.
 
@@ -177,14 +173,6 @@ def nearest_points(points: Floats, origin: Floats, basis: Floats) -> Floats:
     for n in range(len(points)):
         found[n, 0], found[n, 1] = nearest_point(points[n, 0], points[n, 1], origin, basis)
     return found
-
-
-def undistorted(points_mm: Floats, distortion_per_mm2: float) -> Floats:
-    """Return the points (n, 2) that r' = r (1 + k1 r^2) carries to the given ones."""
-    ideal = points_mm
-    for _ in range(UNDISTORT_ROUNDS if distortion_per_mm2 else 0):
-        ideal = points_mm / (1.0 + distortion_per_mm2 * np.sum(ideal**2, axis=-1, keepdims=True))
-    return ideal
 
 
 def lens_crossings(rays: PixelRays, camera: Camera) -> Floats:

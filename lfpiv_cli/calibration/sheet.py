@@ -45,8 +45,7 @@ def check_pitch(fit: LatticeFit, sheet_pitch_px: float) -> None:
 
     Raises
     ------
-    InputError
-        when they differ by more than 5 %
+    InputError : when they differ by more than 5 %
     """
     pitch = float(fit.lattice_px.pitch.mean())
     if abs(pitch / sheet_pitch_px - 1.0) > LARGEST_DIFFERENCE:

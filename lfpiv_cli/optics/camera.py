@@ -20,6 +20,9 @@ from lfpiv_cli.names import ColumnAxis, Layout
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.scale import Scale
 
+# Undoing r' = r (1 + k1 r^2) by repetition: each round gains a factor 3 k1 r^2, below 0.01 for usable lenses.
+UNDISTORT_ROUNDS = 6
+
 
 @dataclass(frozen=True, eq=False)
 class Lattice:
@@ -119,6 +122,16 @@ def nearest_point(x: float, y: float, origin: Floats, basis: Floats) -> tuple[fl
                 best_x = px
                 best_y = py
     return origin[0] + best_x, origin[1] + best_y
+
+
+def undistorted(
+    points_mm: Floats, distortion_per_mm2: float, scale: float = 1.0, rounds: int = UNDISTORT_ROUNDS
+) -> Floats:
+    """Return the points (..., 2) that r' = r (scale + k1 r^2) carries to the given ones."""
+    ideal = points_mm / scale
+    for _ in range(rounds if distortion_per_mm2 else 0):
+        ideal = points_mm / (scale + distortion_per_mm2 * np.sum(ideal**2, axis=-1, keepdims=True))
+    return ideal
 
 
 class KernelCamera(NamedTuple):

@@ -35,7 +35,7 @@ from scipy import fft
 from scipy.special import ndtr
 
 from lfpiv_cli.arrays import Floats
-from lfpiv_cli.optics.camera import Camera, nearest_point
+from lfpiv_cli.optics.camera import Camera, nearest_point, undistorted
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.tracing import ObjectSpace, slope_ratios
 
@@ -195,10 +195,10 @@ class WavesInCamera:
         """
         camera, lever = self.camera, self.camera.microlens_distance_mm / self.camera.image_distance_mm
         axis_px = camera.sensor_centre_px + 0.5
-        ideal = _undistorted(spot_mm, 1.0, camera.distortion_per_mm2)
+        ideal = undistorted(spot_mm, camera.distortion_per_mm2, rounds=UNDISTORT_ROUNDS)
         corner = np.rint((spot_mm + lever * ideal) / camera.pixel_mm + axis_px).astype(np.int64)
         on_sensor = (corner - axis_px) * camera.pixel_mm
-        tilt = _undistorted(on_sensor, 1.0 + lever, camera.distortion_per_mm2)
+        tilt = undistorted(on_sensor, camera.distortion_per_mm2, 1.0 + lever, UNDISTORT_ROUNDS)
         half = window.size // (2 * self.samples)
         return (int(corner[1]) - half, int(corner[0]) - half), on_sensor - lever * tilt
 
@@ -373,11 +373,3 @@ def _slopes(
     lateral = crossing_mm - point_mm[:2]
     (ratio,) = slope_ratios(lateral[:, 0] ** 2 + lateral[:, 1] ** 2, nodes, factors)
     return ratio[:, np.newaxis] * lateral, np.ones(len(crossing_mm), dtype=np.bool_)
-
-
-def _undistorted(place_mm: Floats, scale: float, distortion_per_mm2: float) -> Floats:
-    """Return the x (2,) for which x (scale + k1 |x|^2) is a place; each round gains three times the distortion."""
-    ideal = place_mm / scale
-    for _ in range(UNDISTORT_ROUNDS if distortion_per_mm2 else 0):
-        ideal = place_mm / (scale + distortion_per_mm2 * np.sum(ideal**2))
-    return ideal
