@@ -215,9 +215,9 @@ def locate_board(
     passed = np.ones(image.shape, dtype=np.float32) if transmission is None else transmission
     sheet, micro_images, medium = camera, camera.micro_image_lattice_px(), board.seen_through(media)
 
-    def seen(look: Look) -> tuple[BoardPose, Floats]:
+    def seen(look: Look, by: WaveLight | None = None) -> tuple[BoardPose, Floats]:
         """Return the pose as the camera sees it, and where an ideal one has the points on the array (n, 2)."""
-        places, sigmas, numbers = look.measured(camera, board, rotation_rad)
+        places, sigmas, numbers = look.measured(camera, board, rotation_rad, by)
         forward = camera.image_distance_mm / equivalent_object_distance(places[:, 2], camera.focus_distance_mm, medium)
         array = -forward[:, np.newaxis] * camera.to_image_axes(places)[:, :2]
         return pose_of_dots(places, sigmas, array, camera, board, numbers), array
@@ -235,7 +235,7 @@ def locate_board(
             camera = replace(refocused(camera, pose.magnification), distortion_per_mm2=pose.distortion_per_mm2)
             camera = camera.with_micro_images(micro_images)
             look = look.moved(ratio, pose.z0_mm)
-        return pose if light is None else seen(replace(look, light=light))[0]
+        return pose if light is None else seen(look, light)[0]
     except InputError as error:
         if named := another_kind(evenly_lit(image, passed), sheet, board):
             raise InputError(f"{named}; correct the section board") from error

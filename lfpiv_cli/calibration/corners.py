@@ -9,7 +9,7 @@ Axes: image axes (x along the columns, y along the rows), mm; rectified pictures
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar
 
@@ -160,13 +160,11 @@ class Look(ABC):
     ----------
     signal, passed : (rows, columns) light, dots bright, and the share of it that pixels pass
     medium : what the target stands in
-    light : waves that the target sends, whose points are fitted from where rays have them; None: rays
     """
 
     signal: Floats
     passed: NDArray[np.float32]
     medium: Media
-    light: WaveLight | None = field(default=None, kw_only=True)
 
     # More pixels than these make a fit slower and hardly better: the model's own errors are larger than their noise.
     most_pixels: ClassVar[int]
@@ -184,16 +182,16 @@ class Look(ABC):
         """Return how far about a point at a depth the pixels see that belong to its fit."""
 
     def measured(
-        self, camera: Camera, board: BoardGeometry, rotation_rad: float
+        self, camera: Camera, board: BoardGeometry, rotation_rad: float, by: WaveLight | None = None
     ) -> tuple[Floats, Floats, NDArray[np.int64] | None]:
-        """Return where points are, fitted to what pixels see about them, by rays and from there by waves.
+        """Return where points are, fitted to what pixels see about them by rays, and from there by waves.
 
         That is places and standard errors (n, 3), turned back to the raw sensor's axes, and numbers (n, 2) of the
         target, turned in any way; None where the grid tells.
         """
         places, numbers, shape = self.begun(camera, board)
         waves = None
-        for light in [None] if self.light is None else [None, self.light]:
+        for light in [None] if by is None else [None, by]:
             if light is not None and len(places):
                 # Others are no points of a board, and line responses over all depths take long to compute.
                 near = np.abs(places[:, 2] - np.median(places[:, 2])) < camera.scale(self.medium).depth_mm

@@ -294,13 +294,29 @@ def disc_polygon_growth(x: float, y: float, cell: Floats, radius: float, growth:
 
 @njit(cache=True)
 def disc_polygon_area(x: float, y: float, cell: Floats, radius: float) -> float:
-    """Return the area shared by a disc about (0, 0) and the polygon `cell` moved by (x, y), with the polygon's sign."""
+    """Return the area shared by a disc about (0, 0) and the polygon `cell` moved by (x, y), with the polygon's sign.
+
+    It is the sum over the triangles of the origin and an edge, a to b.
+    """
     area = 0.0
     for k in range(cell.shape[0]):
         following = (k + 1) % cell.shape[0]
-        area += disc_triangle_area(
-            x + cell[k, 0], y + cell[k, 1], x + cell[following, 0], y + cell[following, 1], radius
-        )
+        ax, ay, bx, by = x + cell[k, 0], y + cell[k, 1], x + cell[following, 0], y + cell[following, 1]
+        dx, dy = bx - ax, by - ay
+        length2 = dx * dx + dy * dy
+        along = ax * dx + ay * dy
+        inside = along * along - length2 * (ax * ax + ay * ay - radius * radius)
+        enter, leave = 1.0, 0.0
+        if inside > 0.0:
+            enter = (-along - np.sqrt(inside)) / length2
+            leave = (-along + np.sqrt(inside)) / length2
+        if enter >= 1.0 or leave <= 0.0:
+            area += sector_area(ax, ay, bx, by, radius)
+            continue
+        enter, leave = max(enter, 0.0), min(leave, 1.0)
+        px, py = ax + enter * dx, ay + enter * dy
+        qx, qy = ax + leave * dx, ay + leave * dy
+        area += sector_area(ax, ay, px, py, radius) + 0.5 * (px * qy - py * qx) + sector_area(qx, qy, bx, by, radius)
     return area
 
 
@@ -308,25 +324,6 @@ def disc_polygon_area(x: float, y: float, cell: Floats, radius: float) -> float:
 def sector_area(ax: float, ay: float, bx: float, by: float, radius: float) -> float:
     """Return the signed area of the disc's sector between the directions of a and b."""
     return 0.5 * radius * radius * np.arctan2(ax * by - ay * bx, ax * bx + ay * by)
-
-
-@njit(cache=True)
-def disc_triangle_area(ax: float, ay: float, bx: float, by: float, radius: float) -> float:
-    """Return the signed area shared by a disc about the origin and the triangle origin, a, b."""
-    dx, dy = bx - ax, by - ay
-    length2 = dx * dx + dy * dy
-    along = ax * dx + ay * dy
-    inside = along * along - length2 * (ax * ax + ay * ay - radius * radius)
-    if inside <= 0.0:
-        return sector_area(ax, ay, bx, by, radius)
-    enter = (-along - np.sqrt(inside)) / length2
-    leave = (-along + np.sqrt(inside)) / length2
-    if enter >= 1.0 or leave <= 0.0:
-        return sector_area(ax, ay, bx, by, radius)
-    enter, leave = max(enter, 0.0), min(leave, 1.0)
-    px, py = ax + enter * dx, ay + enter * dy
-    qx, qy = ax + leave * dx, ay + leave * dy
-    return sector_area(ax, ay, px, py, radius) + 0.5 * (px * qy - py * qx) + sector_area(qx, qy, bx, by, radius)
 
 
 # Pixels at the rim of a micro-image are lit in part, by light that does not come from where their middle sees, and

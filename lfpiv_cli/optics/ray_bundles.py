@@ -70,7 +70,7 @@ def start_at_lens(faces: Faces, X: float, Y: float, slope_x: float, slope_y: flo
 @njit(cache=True, **COUNT_NO_REFERENCES)
 def in_fluid(faces: Faces, point: Vector) -> bool:
     """Return whether a point lies behind the last face, or no further in front of it than may be."""
-    return height_behind(faces, faces.ratios.size - 1, point) >= -ROUNDING_MM - faces.beyond_mm
+    return height_behind(faces.reliefs, faces, faces.ratios.size - 1, point) >= -ROUNDING_MM - faces.beyond_mm
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
@@ -78,7 +78,7 @@ def trace_in(faces: Faces, X: float, Y: float, slope_x: float, slope_y: float, z
     """Return where a ray from the lens meets the plane of depth z in the fluid: x, y and whether it does."""
     point, direction = start_at_lens(faces, X, Y, slope_x, slope_y)
     for k in range(faces.ratios.size):
-        path, normal, cosine = meet(faces, k, point, direction)
+        path, normal, cosine = meet(faces.reliefs, faces, k, point, direction)
         if cosine == 0.0 or path < -ROUNDING_MM:
             return NOWHERE
         point = plus(point, path, direction)
@@ -116,7 +116,7 @@ def _neighbour(
     ratio = faces.ratios[k]
     shift = plus(shift, path, turn)
     shift = plus(shift, -dot(normal, shift) / cosine, direction)
-    tilt = normal_change(faces, k, place, shift)
+    tilt = normal_change(faces.reliefs, faces, k, place, shift)
     cosine_change = dot(tilt, direction) + dot(normal, turn)
     bend_change = ratio * (ratio * cosine / cosine_behind - 1.0) * cosine_change
     turned = plus(plus(scaled(ratio, turn), bend_change, normal), cosine_behind - ratio * cosine, tilt)
@@ -144,7 +144,7 @@ def trace_pencil(
     first, second = shifts
     first_turn, second_turn = turns
     for k in range(faces.ratios.size):
-        path, normal, cosine = meet(faces, k, point, direction)
+        path, normal, cosine = meet(faces.reliefs, faces, k, point, direction)
         if cosine == 0.0 or path < -ROUNDING_MM:
             return point, direction, first, second, False
         point = plus(point, path, direction)

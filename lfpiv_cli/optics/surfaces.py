@@ -207,36 +207,19 @@ class Faces(NamedTuple):
     beyond_mm: float = 0.0
 
 
+# The functions below take the faces' heights as an argument of its own: where it is None, the compiler leaves out what
+# follows the question, and other faces are met as fast as if there were no heights.
+
+
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def meet(faces: Faces, k: int, point: Vector, direction: Vector) -> tuple[float, Vector, float]:
+def meet(
+    reliefs: Reliefs | None, faces: Faces, k: int, point: Vector, direction: Vector
+) -> tuple[float, Vector, float]:
     """Return how far along a line face k is met, the unit normal there, and the cosine of incidence.
 
     Of the crossings the one where the line goes from in front of the face to behind it. The direction has length 1 and
     points away from the camera. The cosine is 0 where the line misses the face.
     """
-    return _meet(faces.reliefs, faces, k, point, direction)
-
-
-@njit(cache=True, **COUNT_NO_REFERENCES)
-def normal_change(faces: Faces, k: int, place: Vector, shift: Vector) -> Vector:
-    """Return how the unit normal of face k changes with a small shift along the face from a place on it."""
-    return _normal_change(faces.reliefs, faces, k, place, shift)
-
-
-@njit(cache=True, **COUNT_NO_REFERENCES)
-def height_behind(faces: Faces, k: int, point: Vector) -> float:
-    """Return F, in mm near the face: positive behind face k, negative in front of it."""
-    return _height_behind(faces.reliefs, faces, k, point)
-
-
-# The functions below take the heights as an argument of their own: where it is None, the compiler leaves out what
-# follows the question, and other faces are met as fast as if there were no heights.
-
-
-@njit(cache=True, **COUNT_NO_REFERENCES)
-def _meet(
-    reliefs: Reliefs | None, faces: Faces, k: int, point: Vector, direction: Vector
-) -> tuple[float, Vector, float]:
     if reliefs is not None and reliefs.starts[k] >= 0:
         return meet_heights(reliefs, k, faces.vertices_mm[k, 2], point, direction)
     vertex, axis, curvature = row(faces.vertices_mm, k), row(faces.axes, k), faces.curvatures_per_mm[k]
@@ -259,7 +242,8 @@ def _meet(
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def _normal_change(reliefs: Reliefs | None, faces: Faces, k: int, place: Vector, shift: Vector) -> Vector:
+def normal_change(reliefs: Reliefs | None, faces: Faces, k: int, place: Vector, shift: Vector) -> Vector:
+    """Return how the unit normal of face k changes with a small shift along the face from a place on it."""
     if reliefs is not None and reliefs.starts[k] >= 0:
         return normal_change_of_heights(reliefs, k, place, shift)
     # The same all along lines of curvature.
@@ -268,7 +252,8 @@ def _normal_change(reliefs: Reliefs | None, faces: Faces, k: int, place: Vector,
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def _height_behind(reliefs: Reliefs | None, faces: Faces, k: int, point: Vector) -> float:
+def height_behind(reliefs: Reliefs | None, faces: Faces, k: int, point: Vector) -> float:
+    """Return F, in mm near the face: positive behind face k, negative in front of it."""
     if reliefs is not None and reliefs.starts[k] >= 0:
         z, _, _, _, _, _, on_grid = height_at(reliefs, k, point[0], point[1])
         return point[2] - z if on_grid else -np.inf
