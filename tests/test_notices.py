@@ -405,8 +405,7 @@ def told_of_board(camera: Camera, board: BoardGeometry, found: int, z_mm: float,
 def test_few_points_of_a_board_are_told(table2: Camera) -> None:
     assert told_of_board(table2, BoardGeometry((3, 3), 0.6, 0.2), 9, 5.0, -1.0) == []
     (told,) = told_of_board(table2, BoardGeometry((3, 2), 0.6, 0.2), 6, 5.0, -1.0)
-    assert told.code == "board-few-points"
-    assert told.measured == 6.0
+    assert (told.code, told.measured) == ("board-few-points", 6.0)
 
 
 def test_dots_within_single_lenses_are_told(table2: Camera) -> None:
@@ -424,12 +423,8 @@ def test_dots_within_single_lenses_are_told(table2: Camera) -> None:
 def test_a_board_in_part_or_of_another_size_is_told(table2: Camera) -> None:
     board = BoardGeometry((5, 4), 0.6, 0.2)
     # Dots 0.5 mm apart that are said to be 0.6 show a magnification of 0.836.
-    for found, magnification, codes in (
-        (19, -1.0, []),
-        (20, -1.04, []),
-        (11, -1.0, ["board-incomplete"]),
-        (20, -0.836, ["magnification"]),
-    ):
+    cases = ((19, -1.0, []), (20, -1.04, []), (11, -1.0, ["board-incomplete"]), (20, -0.836, ["magnification"]))
+    for found, magnification, codes in cases:
         assert [each.code for each in told_of_board(table2, board, found, 5.0, magnification)] == codes
 
 

@@ -376,7 +376,7 @@ class ScenePose:
         KeyError, ValueError : something is missing, or is no place
         """
         *places, digest = (field.name for field in fields(cls))
-        found = {name: np.asarray(tree[name], dtype=np.float64) for name in places}
+        found: dict[str, Any] = {name: np.asarray(tree[name], dtype=np.float64) for name in places}
         for name, place in found.items():
             if place.shape != (3,) or not np.all(np.isfinite(place)):
                 raise ValueError(f"scene/{name} is no place")
