@@ -48,38 +48,22 @@ FEWEST_BOARDS = 3
 COMMON_SHARE = 1e-4
 
 
-class Shown(NamedTuple):
-    """How a board is shown on the array.
+def shown(z_mm: float, plate_mm: Floats, dot: NDArray[np.int64], crossing_mm: Floats, array_mm: Floats) -> Floats:
+    """Return depth, alpha, beta and its error (4,) of x_m = alpha X - beta x, fitted to what was seen of a board.
 
-    Attributes
-    ----------
-    z_mm : its depth, from any origin
-    alpha : by how much its picture moves per length between crossings of the main lens
-    beta, beta_sigma : how large it is shown, and the standard error
-    """
-
-    z_mm: float
-    alpha: float
-    beta: float
-    beta_sigma: float
-
-
-def shown(z_mm: float, plate_mm: Floats, dot: NDArray[np.int64], crossing_mm: Floats, array_mm: Floats) -> Shown:
-    """Fit x_m = alpha X - beta x to what was seen of a board, turned and placed as it is.
+    The board is turned and placed as it is. Alpha is by how much its picture on the array moves per length between
+    crossings of the main lens, and beta how large it is shown.
 
     Parameters
     ----------
-    plate_mm : (dots, 2) of the dots on the board
+    z_mm : depth of the board, from any origin
+    plate_mm : (dots, 2) of the dots on it
     dot, crossing_mm, array_mm : (n,), (n, 2), (n, 2) of sightings: which dot, through where, and its picture's place
     """
     x, y = plate_mm[dot].T
     zero, one = np.zeros(len(dot)), np.ones(len(dot))
-    terms = np.concatenate(
-        [
-            np.column_stack([crossing_mm[:, 0], -x, y, one, zero]),
-            np.column_stack([crossing_mm[:, 1], -y, -x, zero, one]),
-        ]
-    )
+    along = np.column_stack([crossing_mm[:, 0], -x, y, one, zero])
+    terms = np.concatenate([along, np.column_stack([crossing_mm[:, 1], -y, -x, zero, one])])
     values = array_mm.T.ravel()
     found = np.linalg.lstsq(terms, values, rcond=None)[0]
     off = (values - terms @ found).reshape(2, -1)
@@ -90,17 +74,17 @@ def shown(z_mm: float, plate_mm: Floats, dot: NDArray[np.int64], crossing_mm: Fl
     spread = plate_mm[seen] - plate_mm[seen].mean(axis=0)
     sigma = np.sqrt(np.sum(mean**2) / max(mean.size - 4, 1) / np.sum(spread**2))
     beta = float(np.hypot(found[1], found[2]))
-    return Shown(z_mm, float(found[0]), beta, float(np.hypot(sigma, COMMON_SHARE * beta)))
+    return np.array([z_mm, found[0], beta, np.hypot(sigma, COMMON_SHARE * beta)])
 
 
-def entrance_pupil_mm(boards: Sequence[Shown], depth_ratio: float) -> tuple[float, float] | None:
+def entrance_pupil_mm(boards: Sequence[Floats], depth_ratio: float) -> tuple[float, float] | None:
     """Return how far the entrance pupil lies from the focal plane, in air, and the standard error.
 
     None where the boards do not tell it: fewer than three, or none that is shown the larger the nearer it is.
 
     Parameters
     ----------
-    boards : at different depths
+    boards : (4,) each from `shown`, at different depths
     depth_ratio : apparent depth in air of a unit of the boards' depths
     """
     if len(boards) < FEWEST_BOARDS:
@@ -191,14 +175,15 @@ class SeenBoard:
     ----------
     signal : (rows, columns), dots bright, divided by the share of light that pixels pass
     z_mm : depth of the board, as told, from any origin
-    seen_z_mm : the same as the data sheet's camera sees it, from the focal point
+    alpha, forward : of x_m = alpha X - forward x at the depth where the data sheet's camera sees it
     place_mm : (n, 2) of the dots as the data sheet's camera sees them
     index : (n, 2) which dots they are
     """
 
     signal: Floats
     z_mm: float
-    seen_z_mm: float
+    alpha: float
+    forward: float
     place_mm: Floats
     index: NDArray[np.int64]
 
@@ -265,9 +250,9 @@ def _fit_as_seen_by(
             f"{lines[0]} x {lines[1]} dots were found in a board, polynomials need at least {SMALLEST_DEGREE + 1} "
             "along each axis"
         )
-    seen = [sightings_of(each, camera, board, media) for each in boards]
+    seen = [sightings_of(each, camera, board) for each in boards]
     # Where the dots stand, (dots along x, dots along y, 2): turned and placed as the boards are on average.
-    places = [_similarity(settled(*pair, camera, media), board) for pair in zip(boards, seen, strict=True)]
+    places = [_similarity(settled(*pair), board) for pair in zip(boards, seen, strict=True)]
     turn, middle = turn_matrix(float(np.mean([turn for turn, _ in places]))), np.mean([at for _, at in places], axis=0)
     grid = _plate(np.moveaxis(np.indices(board.dots), 0, -1), board) @ turn.T + middle
     starts = []
@@ -302,7 +287,9 @@ def seen_board(
         kept, index = on_the_grid(np.column_stack([place, np.full(len(place), z_mm)]), board)
     except InputError as error:
         raise InputError(f"the board at {z_mm:g} mm: {error}") from error
-    return SeenBoard(evenly_lit(signal, passed), z_mm, seen_z, place[kept], index)
+    distance = float(equivalent_object_distance(seen_z, camera.focus_distance_mm, media))
+    alpha, forward = float(camera.defocus(distance)), camera.image_distance_mm / distance
+    return SeenBoard(evenly_lit(signal, passed), z_mm, alpha, forward, place[kept], index)
 
 
 def aligned(boards: list[SeenBoard], board: BoardGeometry) -> list[SeenBoard]:
@@ -333,34 +320,25 @@ def _similarity(seen: SeenBoard, board: BoardGeometry) -> tuple[float, Floats]:
     return float(np.arctan2(sine, cosine)), np.array([x, y]) / np.hypot(cosine, sine)
 
 
-def settled(seen: SeenBoard, sightings: Sightings, camera: Camera, media: Media) -> SeenBoard:
+def settled(seen: SeenBoard, sightings: Sightings) -> SeenBoard:
     """Return a board with its dots where all their sightings together have them, for the data sheet's camera."""
-    alpha, forward = _paraxial(seen, camera, media)
-    place = (alpha * sightings.crossing_mm - sightings.array_mm) / forward
+    place = (seen.alpha * sightings.crossing_mm - sightings.array_mm) / seen.forward
     counts = np.bincount(sightings.dot, minlength=len(seen.index))
     sums = np.stack([np.bincount(sightings.dot, values, minlength=counts.size) for values in place.T], axis=1)
     found = counts > 0
     return replace(seen, place_mm=sums[found] / counts[found, np.newaxis], index=seen.index[found])
 
 
-def _paraxial(seen: SeenBoard, camera: Camera, media: Media) -> tuple[float, float]:
-    """Return alpha and s_i/s_o of x_m = alpha X - x s_i/s_o at the depth at which a board is seen."""
-    distance = float(equivalent_object_distance(seen.seen_z_mm, camera.focus_distance_mm, media))
-    return float(camera.defocus(distance)), camera.image_distance_mm / distance
-
-
-def sightings_of(seen: SeenBoard, camera: Camera, board: BoardGeometry, media: Media) -> Sightings:
+def sightings_of(seen: SeenBoard, camera: Camera, board: BoardGeometry) -> Sightings:
     """Look for the dots of a board in every view that the aperture gives wholly."""
-    alpha, forward = _paraxial(seen, camera, media)
-    pitch = float(camera.lattice.pitch.max())
-    window = 0.5 * board.dot_diameter_mm * forward + MARGIN_LENSES * pitch
-    reach = max(0.5 * board.spacing_mm * forward, window)
+    window = 0.5 * board.dot_diameter_mm * seen.forward + MARGIN_LENSES * float(camera.lattice.pitch.max())
+    reach = max(0.5 * board.spacing_mm * seen.forward, window)
     lenses = camera.lattice.points(lens_table(camera))
     crossings = view_crossings(camera, RIM_PER_PATCH)
     found, heights = np.empty((len(crossings), len(seen.index), 2)), np.empty((len(crossings), len(seen.index)))
     for k, crossing in enumerate(crossings):
         view = sub_aperture_view(seen.signal, camera, crossing)
-        guess = alpha * crossing - forward * seen.place_mm
+        guess = seen.alpha * crossing - seen.forward * seen.place_mm
         found[k], heights[k] = dot_centroids(view, lenses, guess, window, reach)
     clear = heights > CONTRAST_SHARE * np.nanmedian(heights)
     view_of, dot = np.nonzero(clear & np.isfinite(found).all(axis=-1))

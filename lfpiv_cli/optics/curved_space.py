@@ -146,7 +146,9 @@ class CurvedSpace:
 
     def slopes(self, camera: Camera, points_mm: ArrayLike, crossing_mm: ArrayLike) -> tuple[Floats, NDArray[np.bool_]]:
         """Return the slopes (n, 2) at the lens of the rays from points (n, 3) that cross it at (n, 2), if they do."""
-        return aim_all(self.for_kernels(camera), _rows(points_mm, 3), _rows(crossing_mm, 2))
+        crossing = _rows(crossing_mm, 2)
+        points = np.ascontiguousarray(np.broadcast_to(_rows(points_mm, 3), (len(crossing), 3)))
+        return aim_all(self.for_kernels(camera), points, crossing)
 
     def equivalent(self, camera: Camera, points_mm: ArrayLike) -> tuple[Floats, Floats, NDArray[np.bool_]]:
         """Return where points (n, 3) seem to lie in air, along each image axis, to rays near the middle of the lens.

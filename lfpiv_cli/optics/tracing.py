@@ -298,6 +298,20 @@ class ObjectSpace:
             raise ConfigError(f"a point at z = {depths.min():g} mm lies in front of the fluid")
         return _polynomials_at(last_layers, reach_mm, self.layers(camera))
 
+    def slopes(self, camera: Camera, points_mm: ArrayLike, crossing_mm: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+        """Return the slopes (n, 2) at the lens of the rays from points (n, 3) that cross it at (n, 2): all of them do.
+
+        Raises
+        ------
+        ConfigError : a point in front of the fluid, or no window where one is needed
+        """
+        points = np.atleast_2d(np.asarray(points_mm, dtype=np.float64))
+        reach = camera.aperture_radius_mm + float(np.hypot(points[:, 0], points[:, 1]).max())
+        lateral = crossing_mm - points[:, :2]
+        lateral2 = lateral[:, :1] ** 2 + lateral[:, 1:] ** 2
+        ratio = slope_ratios(lateral2, *self.slope_polynomials(camera, points[:, 2], reach))
+        return ratio * lateral, np.ones(len(lateral), dtype=np.bool_)
+
 
 @njit(cache=True)
 def _polynomials_at(last_layers_mm: Floats, reach_mm: float, layers: Layers) -> tuple[Floats, Floats]:
@@ -335,7 +349,7 @@ def slope_ratio(lateral2_mm2: float, nodes: Floats, factors: Floats) -> float:
 
 
 def slope_ratios(lateral2_mm2: Floats, nodes: Floats, factors: Floats) -> Floats:
-    """Return `slope_ratio` of lateral distances squared (n, m) or (m,), for points with their own nodes (n, nodes)."""
+    """Return `slope_ratio` of lateral distances squared (n, m), for n points or one with nodes (n, nodes) of their own."""
     values = factors[:, -1:] + np.zeros_like(lateral2_mm2)
     for i in range(SLOPE_NODES - 2, -1, -1):
         values = factors[:, i : i + 1] + (lateral2_mm2 - nodes[:, i : i + 1]) * values

@@ -37,7 +37,7 @@ from scipy.special import ndtr
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.optics.camera import Camera, nearest_point, undistorted
 from lfpiv_cli.optics.curved_space import CurvedSpace
-from lfpiv_cli.optics.tracing import ObjectSpace, slope_ratios
+from lfpiv_cli.optics.tracing import ObjectSpace
 
 # The pupil's phase is a polynomial of this degree in both coordinates together: what refraction and distortion leave
 # of it is below a thousandth of a wavelength for lenses up to f/2.
@@ -148,7 +148,7 @@ class WavesInCamera:
             amplitude = window.amplitude
             if not seen.all():
                 places = np.stack(np.meshgrid(window.pupil, window.pupil), axis=-1).reshape(-1, 2)
-                amplitude = amplitude * _slopes(camera, self.space, point, places)[1].reshape(amplitude.shape)
+                amplitude = amplitude * self.space.slopes(camera, point, places)[1].reshape(amplitude.shape)
             phase = self._phase(array - middle - 0.5 * self.step_mm, seen)
             spectrum = fft.fft2(window.on_array(amplitude, phase, radius) * lenses, overwrite_x=True)
             spectrum *= window.transfer[:, None]
@@ -161,7 +161,7 @@ class WavesInCamera:
     def _rays(self, point_mm: Floats) -> tuple[Floats, NDArray[np.bool_]]:
         """Return where a point's rays through places of the pupil meet the array (places, 2), and which there are."""
         crossing = self._pupil_places
-        slopes, seen = _slopes(self.camera, self.space, point_mm, crossing)
+        slopes, seen = self.space.slopes(self.camera, point_mm, crossing)
         array = crossing + self.camera.image_distance_mm * (slopes - crossing / self.camera.focal_length_mm)
         array = array + self.camera.objective.aberration(crossing, array)
         return array * (1.0 + self.camera.distortion_per_mm2 * np.sum(array**2, axis=1, keepdims=True)), seen
@@ -355,21 +355,3 @@ def _write_pixels(light: NDArray[np.float32], samples: int, response: Floats, pi
             first = column * samples - beside
             for k in range(max(-first, 0), min(response.size, size - first)):
                 pixels[row, column] += response[k] * of_rows[first + k]
-
-
-def _slopes(
-    camera: Camera, space: ObjectSpace | CurvedSpace, point_mm: Floats, crossing_mm: Floats
-) -> tuple[Floats, NDArray[np.bool_]]:
-    """Return the slopes (n, 2) at the main lens of a point's rays that cross it at (n, 2), and which there are.
-
-    Raises
-    ------
-    ConfigError : the point lies in front of the fluid behind plane windows
-    """
-    if isinstance(space, CurvedSpace):
-        return space.slopes(camera, np.broadcast_to(point_mm, (len(crossing_mm), 3)), crossing_mm)
-    reach = camera.aperture_radius_mm + float(np.hypot(*point_mm[:2]))
-    nodes, factors = space.slope_polynomials(camera, point_mm[2:], reach)
-    lateral = crossing_mm - point_mm[:2]
-    (ratio,) = slope_ratios(lateral[:, 0] ** 2 + lateral[:, 1] ** 2, nodes, factors)
-    return ratio[:, np.newaxis] * lateral, np.ones(len(crossing_mm), dtype=np.bool_)
