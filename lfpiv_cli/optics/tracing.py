@@ -349,7 +349,7 @@ def slope_ratio(lateral2_mm2: float, nodes: Floats, factors: Floats) -> float:
 
 
 def slope_ratios(lateral2_mm2: Floats, nodes: Floats, factors: Floats) -> Floats:
-    """Return `slope_ratio` of lateral distances squared (n, m), for n points or one with nodes (n, nodes) of their own."""
+    """Return `slope_ratio` of lateral distances squared that spread against nodes (n, SLOPE_NODES), one row a point."""
     values = factors[:, -1:] + np.zeros_like(lateral2_mm2)
     for i in range(SLOPE_NODES - 2, -1, -1):
         values = factors[:, i : i + 1] + (lateral2_mm2 - nodes[:, i : i + 1]) * values
