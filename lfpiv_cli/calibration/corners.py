@@ -21,14 +21,7 @@ from numpy.typing import NDArray
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.board_pose import BoardGeometry
 from lfpiv_cli.calibration.rectification import turned
-from lfpiv_cli.calibration.shape_fit import (
-    PointShape,
-    ShapeFit,
-    fit_shape,
-    pixels_near,
-    scene_points,
-    scene_shares,
-)
+from lfpiv_cli.calibration.shape_fit import PointShape, ShapeFit, fit_shape, pixels_near, scene_points, scene_shares
 from lfpiv_cli.calibration.views import (
     charuco_corners,
     chessboard_corners,
