@@ -95,7 +95,7 @@ def trace_out(faces: Faces, point: Vector, direction: Vector) -> tuple[float, fl
         return np.nan, np.nan, np.nan, np.nan, False
     direction = scaled(-1.0 / np.sqrt(dot(direction, direction)), direction)
     for k in range(faces.ratios.size - 1, -1, -1):
-        path, normal, cosine = meet(faces, k, point, direction)
+        path, normal, cosine = meet(faces.reliefs, faces, k, point, direction)
         if cosine == 0.0 or path > ROUNDING_MM:
             return np.nan, np.nan, np.nan, np.nan, False
         point = plus(point, path, direction)

@@ -8,19 +8,18 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike, NDArray
 
-from lfpiv_cli.calibration.board import locate_board
+from lfpiv_cli.calibration.board import disc_shape, locate_board
 from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose, pose_of_dots
 from lfpiv_cli.calibration.shape_fit import (
     disc_polygon_area,
-    disc_shares,
     lens_cell,
     lens_crossings,
     pixel_rays,
-    undistorted,
+    scene_shares,
 )
-from lfpiv_cli.calibration.views import Refocusing
+from lfpiv_cli.calibration.views import refocusing
 from lfpiv_cli.errors import InputError
-from lfpiv_cli.optics.camera import Camera, Lattice
+from lfpiv_cli.optics.camera import Camera, Lattice, undistorted
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.tracing import disc_points, trace
 from tests.known_rays import slopes_equivalent
@@ -170,8 +169,8 @@ def test_dots_that_gaps_cut_off_belong_to_the_board(table2: Camera) -> None:
 
 def test_a_plane_that_no_ray_meets_in_view_is_dark(table2: Camera) -> None:
     pixels = (np.array([200, 210]), np.array([230, 240]))
-    planes = Refocusing.of(small(table2), Media(), pixels, 3, 0.01)
-    (picture,) = planes.pictures(-100.0, (np.ones(2),), 1.0)
+    _, _, pictures = refocusing(small(table2), Media(), pixels, 3, 0.01, 1.0)
+    (picture,) = pictures(-100.0, np.ones(2))
     assert picture.dtype == np.float64
     assert not picture.any()
 
@@ -216,12 +215,12 @@ def test_slopes_of_the_shares_are_their_differences(camera: Camera, water: Media
     # The sensor stands off the microlenses' focus, so that all of the cell's scale counts.
     camera = replace(small(camera), microlens_distance_mm=1.03 * camera.microlens_distance_mm)
     row, column = (axis.ravel() for axis in np.mgrid[60:380:3, 60:420:3])
-    rays, place, radius = pixel_rays(camera, column, row), np.array([0.013, -0.021, z_mm]), 0.12
-    _, slopes = disc_shares(rays, place, radius, camera, water)
+    rays, place, shape = pixel_rays(camera, column, row), np.array([0.013, -0.021, z_mm]), disc_shape(0.12)
+    _, slopes = scene_shares(rays, camera, water, shape, place)
     for axis in range(3):
         step = np.zeros(3)
         step[axis] = 1e-5
-        ahead, behind = (disc_shares(rays, place + sign * step, radius, camera, water)[0] for sign in (1, -1))
+        ahead, behind = (scene_shares(rays, camera, water, shape, place + sign * step)[0] for sign in (1, -1))
         # Where a corner meets the circle within the step the slope has a kink; there are few such pixels.
         off = np.abs((ahead - behind) / 2e-5 - slopes[:, axis])
         assert np.abs(slopes[:, axis]).max() > 0.02

@@ -182,12 +182,12 @@ def paraxial_section(space: CurvedSpace, camera: Camera, z: float, curvatures: t
 @pytest.mark.parametrize("z", [-4.0, 0.0, 3.0])
 def test_the_two_apparent_distances_behind_a_tube(table2, z: float):
     space, aside = tube(), 1e-4
-    found = space.equivalent(table2, [[aside, aside, z]])
+    (place,), (distance,), _ = space.equivalent(table2, [[aside, aside, z]])
     along, unmoved = paraxial_section(space, table2, z, (0.0, 0.0))
     across, enlarged = paraxial_section(space, table2, z, (1 / OUTER_MM, 1 / INNER_MM))
     # rays 1e-4 mm from the axis of faces of 5 mm: relative terms of second order
-    np.testing.assert_allclose(found.distance_mm[0], [along, across], rtol=1e-9)
-    np.testing.assert_allclose(found.place_mm[0], [aside * unmoved, aside * enlarged], rtol=1e-8)
+    np.testing.assert_allclose(distance, [along, across], rtol=1e-9)
+    np.testing.assert_allclose(place, [aside * unmoved, aside * enlarged], rtol=1e-8)
     assert along == pytest.approx(float(space.distance(table2, z)), rel=1e-14)
     assert unmoved == pytest.approx(1.0, rel=1e-14)
     if z == 0.0:
@@ -199,15 +199,15 @@ def test_the_two_apparent_distances_behind_a_tube(table2, z: float):
 def test_slopes_of_a_pencil_grow_as_the_equivalent_point_says(table2, rng):
     space, step = tube((1.0, 0.2, 0.1)), 0.01
     points = points_in_tube(rng, 50, 3.0)
-    found = space.equivalent(table2, points)
-    assert found.valid.all()
+    place, distance, valid = space.equivalent(table2, points)
+    assert valid.all()
     for axis in (0, 1):
         crossing = np.zeros((2, len(points), 2))
         crossing[0, :, axis], crossing[1, :, axis] = -step, step
         low, high = (aimed(space, table2, points, part)[:, axis] for part in crossing)
         # third order in 0.01 mm over 200 mm, and roundings of 1e-16 over the step
-        np.testing.assert_allclose((high - low) / (2 * step), 1 / found.distance_mm[:, axis], rtol=1e-8)
-        middle = -found.place_mm[:, axis] / found.distance_mm[:, axis]
+        np.testing.assert_allclose((high - low) / (2 * step), 1 / distance[:, axis], rtol=1e-8)
+        middle = -place[:, axis] / distance[:, axis]
         np.testing.assert_allclose((high + low) / 2, middle, atol=1e-9)
 
 
@@ -287,9 +287,9 @@ def test_rays_and_points_outside_the_fluid_are_flags(table2):
         slopes, valid = space.slopes(table2, points, np.tile(crossing, (5, 1)))
         assert valid.tolist() == [False, False, False, False, True]
         assert np.isnan(slopes[:4]).all()
-    found = space.equivalent(table2, points)
-    assert found.valid.tolist() == [False, False, False, False, True]
-    assert np.isnan(found.distance_mm[:4]).all()
+    _, distance, valid = space.equivalent(table2, points)
+    assert valid.tolist() == [False, False, False, False, True]
+    assert np.isnan(distance[:4]).all()
     for place, towards in ([[0, 0, 0], [0, 0, 1]], [[0, 0, -6], [0, 0, -1]]):
         assert not rays_to_air(space, table2, [place], [towards])[2].any()
     places, valid = rays_from_air(space, table2, middle, [[0.0, 0.1]], 0.0)

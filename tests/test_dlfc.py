@@ -103,7 +103,7 @@ def test_the_entrance_pupil_follows_from_how_boards_shrink(table2, rng, entrance
     assert found == pytest.approx(100.0 * (entrance_over_exit + 1.0 / 0.6), rel=1e-9)
     assert 0.0 < sigma < 0.01 * found
     assert entrance_pupil_mm(boards[:2], 1.0 / 1.33) is None
-    assert entrance_pupil_mm([replace(each, z_mm=-each.z_mm) for each in boards], 1.0 / 1.33) is None
+    assert entrance_pupil_mm([each * (-1.0, 1.0, 1.0, 1.0) for each in boards], 1.0 / 1.33) is None
 
 
 @pytest.mark.thorough
@@ -125,8 +125,8 @@ def test_boards_that_lost_dots_are_numbered_as_the_others():
     index = np.stack(np.meshgrid(np.arange(5), np.arange(4), indexing="ij"), axis=-1).reshape(-1, 2)
     place = 0.5 * (index - np.array([2.0, 1.5])) + (0.02, 0.01)
     lost = index[:, 0] > 0  # its first column; the others were numbered from 0
-    boards = [SeenBoard(np.zeros((1, 1)), z, z, place, index) for z in (-1.0, 1.0)]
-    boards.append(SeenBoard(np.zeros((1, 1)), 2.0, 2.0, place[lost], index[lost] - (1, 0)))
+    boards = [SeenBoard(np.zeros((1, 1)), z, 0.0, 1.0, place, index) for z in (-1.0, 1.0)]
+    boards.append(SeenBoard(np.zeros((1, 1)), 2.0, 0.0, 1.0, place[lost], index[lost] - (1, 0)))
     np.testing.assert_array_equal(aligned(boards, BOARD)[2].index, index[lost])
 
 

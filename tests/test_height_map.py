@@ -149,12 +149,14 @@ def test_the_normal_changes_along_heights(table2: Camera) -> None:
         places, normals = [], []
         for side in (-0.5, 0.0, 0.5):
             start = np.array([1.0 + side * towards[0], -0.5 + side * towards[1], -30.0])
-            path, normal, _ = meet(faces, 0, tuple(start), (0.0, 0.0, 1.0))
+            path, normal, _ = meet(faces.reliefs, faces, 0, tuple(start), (0.0, 0.0, 1.0))
             places.append(start + np.array([0.0, 0.0, path]))
             normals.append(np.array(normal))
         shift, change = (places[2] - places[0]) / step, (normals[2] - normals[0]) / step
         # of second order in the step, and roundings of 1e-15 over it
-        np.testing.assert_allclose(normal_change(faces, 0, tuple(places[1]), tuple(shift)), change, atol=1e-10)
+        np.testing.assert_allclose(
+            normal_change(faces.reliefs, faces, 0, tuple(places[1]), tuple(shift)), change, atol=1e-10
+        )
 
 
 def test_beyond_the_grid_there_is_no_surface(table2: Camera) -> None:
@@ -162,7 +164,7 @@ def test_beyond_the_grid_there_is_no_surface(table2: Camera) -> None:
     space = CurvedSpace(Media(fluid=1.33), (Face(sampled(of_sphere, half=(2.0, 1.5)), 1.33),))
     faces = space.for_kernels(table2)
     for x, y, met in ((1.999, 0.0, True), (2.001, 0.0, False), (0.0, -1.499, True), (0.0, -1.501, False)):
-        assert (meet(faces, 0, (x, y, -20.0), (0.0, 0.0, 1.0))[2] > 0.0) == met
+        assert (meet(faces.reliefs, faces, 0, (x, y, -20.0), (0.0, 0.0, 1.0))[2] > 0.0) == met
     points = np.array([[0.0, 0.0, 3.0], [2.1, 0.0, 3.0], [0.0, 0.0, -8.0]])
     slopes, seen = space.slopes(table2, points, np.zeros((3, 2)))
     assert seen.tolist() == [True, False, False]

@@ -14,15 +14,13 @@ import pytest
 from numpy.typing import NDArray
 
 import lfpiv_cli as lf
+from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose
 from lfpiv_cli.calibration.light_checks import check_residual, residual_share
 from lfpiv_cli.calibration.sheet import (
     board_notices,
     check_f_numbers,
     f_number_notices,
     image_distance_notices,
-    magnification_notices,
-    narrow_notices,
-    points_notices,
     sheet_fit,
 )
 from lfpiv_cli.calibration.white import lens_image_width
@@ -396,33 +394,44 @@ def test_doubtful_links_and_bent_tracks_are_told(summary: dict[str, Any], told: 
     assert [notice.code for notice in doubt_notices(summary, "a")] == told
 
 
-def test_few_points_of_a_board_are_told() -> None:
-    assert points_notices(9) == []
-    (told,) = points_notices(6)
-    assert told.code == "board-few-points"
-    assert told.measured == 6.0
+def told_of_board(camera: Camera, board: BoardGeometry, found: int, z_mm: float, magnification: float) -> list[Notice]:
+    """Return what is told of a board of which so many points were found, all of them where the plane has them."""
+    zeros, none = np.zeros((found, 3)), np.zeros(2)
+    seen = (zeros[:, :2].astype(np.int64), zeros, zeros, zeros, zeros[:, :2])
+    pose = BoardPose(*seen, z_mm, 0.0, none, none, 0.0, 0.0, none, none, magnification, 0.0)
+    return list(board_notices(pose, board, camera, Media(1.0, 1.49, 1.33)))
 
 
-def test_dots_within_single_lenses_are_told(table2: Camera, water: Media) -> None:
-    scale = table2.scale(water.in_air())
-    (told,) = narrow_notices(0.7 * scale.lens_mm, -0.1 * scale.depth_mm, scale)
+def test_few_points_of_a_board_are_told(table2: Camera) -> None:
+    assert told_of_board(table2, BoardGeometry((3, 3), 0.6, 0.2), 9, 5.0, -1.0) == []
+    (told,) = told_of_board(table2, BoardGeometry((3, 2), 0.6, 0.2), 6, 5.0, -1.0)
+    assert (told.code, told.measured) == ("board-few-points", 6.0)
+
+
+def test_dots_within_single_lenses_are_told(table2: Camera) -> None:
+    scale = table2.scale(Media())
+    board, larger = (BoardGeometry((5, 4), 0.6, size * scale.lens_mm) for size in (0.7, 1.1))
+    (told,) = told_of_board(table2, board, 20, -0.1 * scale.depth_mm, -1.0)
     assert told.code == "board-within-lenses"
     assert told.measured == pytest.approx(0.8)
     # To where light spreads over two lenses.
     assert "by 1 mm" in told.remedy
-    assert narrow_notices(0.7 * scale.lens_mm, -0.4 * scale.depth_mm, scale) == []
-    assert narrow_notices(1.1 * scale.lens_mm, 0.0, scale) == []
+    assert told_of_board(table2, board, 20, -0.4 * scale.depth_mm, -1.0) == []
+    assert told_of_board(table2, larger, 20, 0.0, -1.0) == []
 
 
 def test_a_board_in_part_or_of_another_size_is_told(table2: Camera) -> None:
-    assert board_notices(19, (5, 4)) == []
-    assert [each.code for each in board_notices(20, (7, 5))] == ["board-incomplete"]
-    assert magnification_notices(-1.009, table2) == []
-    # Dots 0.5 mm apart that are said to be 0.6.
-    for measured in (-0.836, -1.0112):
-        (notice,) = magnification_notices(measured, table2)
-        assert notice.code == "magnification"
-        assert f"{measured:.4g}, which is used; the rig file says -1" in notice.text
+    board = BoardGeometry((5, 4), 0.6, 0.2)
+    # Dots 0.5 mm apart that are said to be 0.6 show a magnification of 0.836.
+    cases = (
+        (19, -1.0, []),
+        (20, -1.0112, ["magnification"]),
+        (20, -1.009, []),
+        (11, -1.0, ["board-incomplete"]),
+        (20, -0.836, ["magnification"]),
+    )
+    for found, magnification, codes in cases:
+        assert [each.code for each in told_of_board(table2, board, found, 5.0, magnification)] == codes
 
 
 @pytest.mark.parametrize(

@@ -94,7 +94,7 @@ def test_a_line_meets_a_surface(surface: Surface, table2: Camera, rng: np.random
     faces = one_face(surface, table2)
     for _ in range(20):
         start, direction = np.array([*rng.uniform(-3, 3, 2), -200.0]), unit(np.array([*rng.uniform(-0.01, 0.01, 2), 1]))
-        path, normal, cosine = meet(faces, 0, tuple(start), tuple(direction))
+        path, normal, cosine = meet(faces.reliefs, faces, 0, tuple(start), tuple(direction))
         place = start + path * direction
         # some ten roundings of 200 mm
         assert distance_beyond(surface, place) == pytest.approx(0.0, abs=2e-13)
@@ -109,8 +109,10 @@ def test_a_line_meets_a_surface_at_the_same_place_from_behind(
 ) -> None:
     faces = one_face(surface, table2)
     start, direction = np.array([1.0, -0.5, -30.0]), unit(np.array([0.02, 0.05, 1.0]))
-    path, normal, cosine = meet(faces, 0, tuple(start), tuple(direction))
-    back, normal_back, cosine_back = meet(faces, 0, tuple(start + (path + 1.5) * direction), tuple(direction))
+    path, normal, cosine = meet(faces.reliefs, faces, 0, tuple(start), tuple(direction))
+    back, normal_back, cosine_back = meet(
+        faces.reliefs, faces, 0, tuple(start + (path + 1.5) * direction), tuple(direction)
+    )
     assert back == pytest.approx(-1.5, abs=1e-13)
     np.testing.assert_allclose([*normal_back, cosine_back], [*normal, cosine], atol=1e-13)
 
@@ -123,12 +125,14 @@ def test_the_normal_changes_along_a_surface(surface: Surface, table2: Camera) ->
         places, normals = [], []
         for side in (-0.5, 0.0, 0.5):
             start = np.array([1.0 + side * towards[0], -0.5 + side * towards[1], -30.0])
-            path, normal, _ = meet(faces, 0, tuple(start), direction)
+            path, normal, _ = meet(faces.reliefs, faces, 0, tuple(start), direction)
             places.append(start + path * np.array(direction))
             normals.append(np.array(normal))
         shift, change = (places[2] - places[0]) / step, (normals[2] - normals[0]) / step
         # of second order in a step of 1e-4 mm beside radii of 6 mm, and roundings of 1e-15 over it
-        np.testing.assert_allclose(normal_change(faces, 0, tuple(places[1]), tuple(shift)), change, atol=3e-10)
+        np.testing.assert_allclose(
+            normal_change(faces.reliefs, faces, 0, tuple(places[1]), tuple(shift)), change, atol=3e-10
+        )
 
 
 @pytest.mark.parametrize("surface", ALL)
@@ -139,7 +143,7 @@ def test_points_are_in_front_of_a_surface_or_behind_it(
     vertex = np.array(surface.shape().vertex_mm)
     points = vertex + rng.uniform(-4, 4, (200, 3))
     expected = [distance_beyond(surface, point) > 0.0 for point in points]
-    assert [height_behind(faces, 0, tuple(point)) > 0.0 for point in points] == expected
+    assert [height_behind(faces.reliefs, faces, 0, tuple(point)) > 0.0 for point in points] == expected
     assert len(set(expected)) == 2
 
 
@@ -147,8 +151,8 @@ def test_a_line_beside_a_surface_misses_it(table2: Camera) -> None:
     along_axis = (0.0, 0.0, 1.0)
     for surface in (Cylinder((0, 0, 0), (1, 0, 0), 5.0), Cylinder((0, 0, -9), (1, 0, 0), 5.0, "concave")):
         faces = one_face(surface, table2)
-        assert meet(faces, 0, (0.0, 4.999, -20.0), along_axis)[2] > 0.0
-        assert meet(faces, 0, (0.0, 5.001, -20.0), along_axis)[2] == 0.0
+        assert meet(faces.reliefs, faces, 0, (0.0, 4.999, -20.0), along_axis)[2] > 0.0
+        assert meet(faces.reliefs, faces, 0, (0.0, 5.001, -20.0), along_axis)[2] == 0.0
 
 
 @pytest.mark.parametrize("facing", get_args(Facing))

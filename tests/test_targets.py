@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from lfpiv_cli.calibration.board import another_kind, dot_signal, locate_board, sentence
 from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose, pose_of_dots, upright_numbers
-from lfpiv_cli.calibration.corners import corner_shares, quadrant_shares
-from lfpiv_cli.calibration.shape_fit import lens_cell, pixel_rays
+from lfpiv_cli.calibration.corners import corner_shape, quadrant_shares
+from lfpiv_cli.calibration.shape_fit import lens_cell, pixel_rays, scene_shares
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.names import Polarity
 from lfpiv_cli.optics.camera import Camera, Lattice
@@ -237,8 +237,8 @@ def test_particles_are_called_nothing(table2: Camera, rng: np.random.Generator) 
     points = np.column_stack([rng.uniform(-3.0, 3.0, 300), rng.uniform(-2.5, 2.5, 300), rng.uniform(-3.0, 3.0, 300)])
     tracers = render_points(camera, AIR, Balls(points, 1e4, 0.05), rng, rays=500)
     for image in (tracers, render_white(camera, LEVEL)):
-        assert another_kind(image.astype(np.float32), camera, DOTS) is None
-        assert another_kind(image.astype(np.float32), camera, CHESS) is None
+        assert another_kind(image, camera, DOTS) is None
+        assert another_kind(image, camera, CHESS) is None
 
 
 def test_auto_sees_whether_dots_are_bright_or_dark(rng: np.random.Generator) -> None:
@@ -269,12 +269,12 @@ def test_slopes_of_the_corners_shares_are_their_differences(camera: Camera, wate
     camera = replace(small(camera), microlens_distance_mm=1.03 * camera.microlens_distance_mm)
     row, column = (axis.ravel() for axis in np.mgrid[200:250:3, 280:330:3])
     rays, place = pixel_rays(camera, column, row), np.array([0.013, -0.021, z_mm])
-    edges = np.array([[0.79, 0.03], [-0.05, 0.8]])
-    _, slopes = corner_shares(rays, place, edges, camera, water)
+    shape = corner_shape(np.array([[0.79, 0.03], [-0.05, 0.8]]))
+    _, slopes = scene_shares(rays, camera, water, shape, place)
     for axis in range(3):
         step = np.zeros(3)
         step[axis] = 1e-5
-        ahead, behind = (corner_shares(rays, place + sign * step, edges, camera, water)[0] for sign in (1, -1))
+        ahead, behind = (scene_shares(rays, camera, water, shape, place + sign * step)[0] for sign in (1, -1))
         off = np.abs((ahead - behind) / 2e-5 - slopes[:, axis])
         assert np.abs(slopes[:, axis]).max() > 0.02
         # an edge that passes through a cell's corner within the step makes a kink; there are few

@@ -8,33 +8,26 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose, on_the_grid, pose_of_dots
-from lfpiv_cli.calibration.corners import Fit, Look, enlarged_view, evenly_lit, first_corners
-from lfpiv_cli.calibration.rectification import turned
-from lfpiv_cli.calibration.shape_fit import (
-    MeasuredPoints,
-    ShapeFit,
-    checked_disc_radius,
-    fit_disc,
-    pixels_near,
-)
-from lfpiv_cli.calibration.views import Refocusing, alternating, described
-from lfpiv_cli.calibration.wave_shapes import WaveLight, WaveShapes, disc_strips
+from lfpiv_cli.calibration.corners import Look, enlarged_view, evenly_lit, first_corners
+from lfpiv_cli.calibration.shape_fit import PointShape, covered_shares
+from lfpiv_cli.calibration.views import alternating, described, refocusing
+from lfpiv_cli.calibration.wave_shapes import WaveLight, disc_strips
 from lfpiv_cli.calibration.white import find_spots
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.names import Pattern
 from lfpiv_cli.neighbourhoods import opened
+from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera, refocused
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
 from lfpiv_cli.robust import BRIGHTEST_PERCENTILE
-
-# What kind of calibration target a picture shows, to name one that the config does not expect.
-
 
 # A chessboard is named by its size where at least this many corners along each side are seen.
 FEWEST_CORNERS = (3, 3)
@@ -48,15 +41,9 @@ SAME_DISTANCE = 0.15
 EVEN_SHARE = 0.8
 
 
-def another_kind(
-    image: NDArray[np.float32],
-    camera: Camera,
-    board: BoardGeometry,
-    transmission: NDArray[np.float32] | None = None,
-) -> str | None:
-    """Return a sentence that names the target in a rectified picture where it is not the board's; else None."""
-    passed = np.ones(image.shape, dtype=np.float32) if transmission is None else transmission
-    picture, _ = enlarged_view(evenly_lit(image, passed), camera)
+def another_kind(signal: Floats, camera: Camera, board: BoardGeometry) -> str | None:
+    """Return a sentence that names the target in an evenly lit picture where it is not the board's; else None."""
+    picture, _ = enlarged_view(signal, camera)
     for pattern, look in LOOKS_LIKE.items():
         if (found := look(picture)) is not None:
             return None if found == described(board) else sentence(found, pattern, board)
@@ -109,16 +96,13 @@ def dots(picture: NDArray[np.uint8]) -> str | None:
         settings.filterByArea, settings.minArea, settings.maxArea = True, 20.0, picture.size / FEWEST_SPOTS
         settings.minDistBetweenBlobs = 4.0
         places = np.array([spot.pt for spot in cv2.SimpleBlobDetector.create(settings).detect(picture)]).reshape(-1, 2)
-        if len(places) >= FEWEST_SPOTS and _even(places):
+        if len(places) < FEWEST_SPOTS:
+            continue
+        distance = np.hypot(*np.moveaxis(places[:, np.newaxis] - places, -1, 0))
+        nearest = np.min(distance + np.diag(np.full(len(places), np.inf)), axis=1)
+        if np.mean(np.abs(nearest / np.median(nearest) - 1.0) < SAME_DISTANCE) >= EVEN_SHARE:
             return f"a board of {len(places)} {polarity} dots"
     return None
-
-
-def _even(places: NDArray[np.float64]) -> bool:
-    """Return whether most places have their nearest neighbour at the same distance."""
-    distance = np.hypot(*np.moveaxis(places[:, np.newaxis] - places, -1, 0))
-    nearest = np.min(distance + np.diag(np.full(len(places), np.inf)), axis=1)
-    return bool(np.mean(np.abs(nearest / np.median(nearest) - 1.0) < SAME_DISTANCE) >= EVEN_SHARE)
 
 
 # In this order: a ChArUco board is a chessboard, too, and a chessboard's squares are round once they are out of focus.
@@ -136,8 +120,7 @@ SAMPLES_PER_LENS = 2
 # The refocused picture reaches this many widths of the sensor to either side: a tenth more than the focal plane has, as
 # what lies behind it is seen wider.
 HALF_WIDTH = 0.6
-# Pixels that see the plane of the dots within this many microlenses of a dot's rim, but not half-way to the next dot,
-# belong to its fit.
+# Pixels that see the plane of the dots within this many microlenses of a dot's rim belong to its fit.
 MARGIN_LENSES = 2.5
 # What is wider than this share of the dots' distance in the refocused picture is light on the board, not a dot.
 DOT_PER_SPACING = 0.5
@@ -160,40 +143,45 @@ class DotLook(Look):
     """
 
     radius_mm: float
-    start_mm: NDArray[np.float64]
+    start_mm: Floats
     depth_mm: float
+
+    most_pixels = 10_000
 
     def moved(self, scale: float, depth_mm: float) -> DotLook:
         """Return the look with its dots nearer the axis by a scale, at another depth."""
         return replace(self, start_mm=self.start_mm / scale, depth_mm=depth_mm)
 
-    def begun(self, camera: Camera, board: BoardGeometry) -> tuple[NDArray[np.float64], None, Fit]:
+    def begun(self, camera: Camera, board: BoardGeometry) -> tuple[Floats, None, PointShape]:
         """Return where the dots were first seen; their grid tells which is which."""
+        start = np.column_stack([self.start_mm, np.full(len(self.start_mm), self.depth_mm)])
+        return start, None, disc_shape(self.radius_mm)
 
-        def fit(start_mm: NDArray[np.float64], waves: WaveShapes | None = None) -> ShapeFit | None:
-            x, y, z = start_mm
-            scene = (self.signal, self.passed, camera, board, self.medium)
-            found = fit_one_dot(*scene, (x, y, z), self.radius_mm, waves)
-            return found if found is not None and found.brightness > 0.0 else None
+    def reach_mm(self, camera: Camera, board: BoardGeometry, z_mm: float) -> float:
+        """Return how far some microlenses beyond the rim are, but not half-way to the next dot."""
+        distance = float(equivalent_object_distance(z_mm, camera.focus_distance_mm, self.medium))
+        forward = camera.image_distance_mm / distance
+        return min(0.5 * board.spacing_mm, self.radius_mm + MARGIN_LENSES * float(camera.lattice.pitch.max()) / forward)
 
-        return np.column_stack([self.start_mm, np.full(len(self.start_mm), self.depth_mm)]), None, fit
+
+def disc_shape(radius_mm: float) -> PointShape:
+    """Return a dot."""
+    return PointShape(radius_mm, radius_mm, covered_shares, radius_mm, partial(disc_strips, radius_mm))
 
 
 def dots_look(
-    image: NDArray[np.float32],
-    camera: Camera,
-    board: BoardGeometry,
-    media: Media,
-    transmission: NDArray[np.float32] | None = None,
+    image: NDArray[np.float32], passed: NDArray[np.float32], camera: Camera, board: BoardGeometry, media: Media
 ) -> DotLook:
-    """Find the dots of a board; parameters and errors are those of `locate_board`."""
-    medium = media.in_air() if board.medium == "air" else media
-    radius = checked_disc_radius(0.5 * board.dot_diameter_mm, camera)
-    passed = np.ones(image.shape, dtype=np.float32) if transmission is None else transmission
+    """Find the dots of a board; errors are those of `locate_board`."""
+    radius = 0.5 * board.dot_diameter_mm
+    seen, pitch = abs(camera.magnification) * radius, float(camera.lattice.pitch.min())
+    if seen < 0.25 * pitch:
+        raise InputError(
+            f"the board's dots are {written(2 * seen)} mm wide on the microlens array, less than half a microlens "
+            f"({written(pitch)} mm); use a board with larger dots"
+        )
     signal = dot_signal(image, passed, board)
-    return DotLook(
-        signal, passed, medium, radius, *first_dots(signal, camera, board, medium, candidate_depths(camera, medium))
-    )
+    return DotLook(signal, passed, media, radius, *first_dots(signal, camera, board, media))
 
 
 def locate_board(
@@ -217,86 +205,59 @@ def locate_board(
 
     Raises
     ------
-    InputError
-        when too few dots are found to make a board
-    ConfigError
-        light is waves and the array is hexagonal
+    InputError : when too few dots are found to make a board
+    ConfigError : light is waves and the array is hexagonal
     """
     if light is not None and camera.lattice.layout != "square":
         raise ConfigError(
             "reconstruction.wavelength_nm: by waves targets are fitted behind square lenses alone; leave it out"
         )
+    passed = np.ones(image.shape, dtype=np.float32) if transmission is None else transmission
+    sheet, micro_images, medium = camera, camera.micro_image_lattice_px(), board.seen_through(media)
+
+    def seen(look: Look, by: WaveLight | None = None) -> tuple[BoardPose, Floats]:
+        """Return the pose as the camera sees it, and where an ideal one has the points on the array (n, 2)."""
+        places, sigmas, numbers = look.measured(camera, board, rotation_rad, by)
+        forward = camera.image_distance_mm / equivalent_object_distance(places[:, 2], camera.focus_distance_mm, medium)
+        array = -forward[:, np.newaxis] * camera.to_image_axes(places)[:, :2]
+        return pose_of_dots(places, sigmas, array, camera, board, numbers), array
+
     try:
-        return _pose(
-            LOOKS[board.pattern](image, camera, board, media, transmission), camera, board, rotation_rad, light
-        )
+        look = LOOKS[board.pattern](image, passed, camera, board, medium)
+        # Again with the magnification and the distortion that the first pose tells. Rays are near enough for these;
+        # waves then take one look more.
+        for _ in range(LENS_ROUNDS):
+            pose, array = seen(look)
+            ratio = pose.magnification / camera.magnification
+            bend = pose.distortion_per_mm2 - camera.distortion_per_mm2
+            if max(abs(ratio - 1.0), abs(bend) * float(np.sum(array**2, axis=1).max())) < SCALE_TOLERANCE:
+                break
+            camera = replace(refocused(camera, pose.magnification), distortion_per_mm2=pose.distortion_per_mm2)
+            camera = camera.with_micro_images(micro_images)
+            look = look.moved(ratio, pose.z0_mm)
+        return pose if light is None else seen(look, light)[0]
     except InputError as error:
-        if named := another_kind(image, camera, board, transmission):
+        if named := another_kind(evenly_lit(image, passed), sheet, board):
             raise InputError(f"{named}; correct the section board") from error
         raise
 
 
-def _pose(
-    look: Look, camera: Camera, board: BoardGeometry, rotation_rad: float, light: WaveLight | None = None
-) -> BoardPose:
-    """Return the pose of a target, again with the magnification and the distortion that the first one tells.
-
-    Rays are near enough for these; waves then take one look more.
-    """
-    micro_images = camera.micro_image_lattice_px()
-    for _ in range(LENS_ROUNDS):
-        pose, array = _seen(look, camera, board, rotation_rad)
-        ratio = pose.magnification / camera.magnification
-        bend = pose.distortion_per_mm2 - camera.distortion_per_mm2
-        if max(abs(ratio - 1.0), abs(bend) * float(np.sum(array**2, axis=1).max())) < SCALE_TOLERANCE:
-            break
-        camera = replace(refocused(camera, pose.magnification), distortion_per_mm2=pose.distortion_per_mm2)
-        camera = camera.with_micro_images(micro_images)
-        look = look.moved(ratio, pose.z0_mm)
-    return pose if light is None else _seen(replace(look, light=light), camera, board, rotation_rad)[0]
-
-
-def _seen(
-    look: Look, camera: Camera, board: BoardGeometry, rotation_rad: float
-) -> tuple[BoardPose, NDArray[np.float64]]:
-    """Return the pose as a camera sees it, and where an ideal one has the points on the array (n, 2)."""
-    found = look.measured(camera, board)
-    places, sigmas = world_places(found, camera, rotation_rad)
-    array = array_places(places, camera, look.medium)
-    return pose_of_dots(places, sigmas, array, camera, board, found.numbers), array
-
-
 def dots_in_world(
     image: NDArray[np.float32], camera: Camera, board: BoardGeometry, media: Media, rotation_rad: float = 0.0
-) -> NDArray[np.float64]:
+) -> Floats:
     """Return where the camera, believed as it is, sees each dot: (dots along y, dots along x, 3); NaN where none is.
 
     Parameters and errors are those of `locate_board`, which believes in the spacing and asks what the camera is.
     """
-    found = dots_look(image, camera, board, media).measured(camera, board)
-    places, _ = world_places(found, camera, rotation_rad)
+    look = dots_look(image, np.ones(image.shape, dtype=np.float32), camera, board, board.seen_through(media))
+    places, _, _ = look.measured(camera, board, rotation_rad)
     kept, index = on_the_grid(places, board)
     dots = np.full((board.dots[1], board.dots[0], 3), np.nan)
     dots[index[:, 1], index[:, 0]] = places[kept]
     return dots
 
 
-def world_places(
-    found: MeasuredPoints, camera: Camera, rotation_rad: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return places and standard errors (n, 3) of the measured points, turned back to the raw sensor's axes."""
-    places, sigmas = found.places_mm, found.sigmas_mm
-    return camera.to_image_axes(turned(places, rotation_rad)), camera.to_image_axes(sigmas)
-
-
-def array_places(places_mm: NDArray[np.float64], camera: Camera, media: Media) -> NDArray[np.float64]:
-    """Return where an ideal main lens shows places (n, 3) on the array (n, 2), seen through its middle, image axes."""
-    distance = equivalent_object_distance(places_mm[:, 2], camera.focus_distance_mm, media)
-    forward = camera.image_distance_mm / distance
-    return -forward[:, np.newaxis] * camera.to_image_axes(places_mm)[:, :2]
-
-
-def dot_signal(image: NDArray[np.float32], passed: NDArray[np.float32], board: BoardGeometry) -> NDArray[np.float64]:
+def dot_signal(image: NDArray[np.float32], passed: NDArray[np.float32], board: BoardGeometry) -> Floats:
     """Return the picture with the dots bright on a dim ground; dark dots are what the lit board lacks of full light.
 
     Dots cover the smaller part of a board: where the polarity is not known, most of the picture is the board.
@@ -312,68 +273,34 @@ def dot_signal(image: NDArray[np.float32], passed: NDArray[np.float32], board: B
     return np.asarray(level * passed - image, dtype=np.float64)
 
 
-def first_dots(
-    signal: NDArray[np.float64], camera: Camera, board: BoardGeometry, media: Media, depths_mm: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], float]:
+def first_dots(signal: Floats, camera: Camera, board: BoardGeometry, media: Media) -> tuple[Floats, float]:
     """Return the lateral places (n, 2) of the dots in image axes and their common depth, to within a dot's radius.
 
-    The rays of all bright pixels are carried back to planes at `depths_mm`; where the dots are smallest, the sum of
-    squares of the refocused picture is largest.
+    The rays of all bright pixels are carried back to planes at equal steps of defocus alpha about the focal plane;
+    where the dots are smallest, the sum of squares of the refocused picture is largest.
     """
     row, column = np.nonzero(signal > BRIGHT_SHARE * np.percentile(signal, BRIGHTEST_PERCENTILE))
     light = signal[row, column]
     if not light.size or light.min() <= 0.0:
         raise InputError("the board's picture shows no dots; check the exposure and board.polarity")
-    planes = Refocusing.of(camera, media, (row, column), SAMPLES_PER_LENS, HALF_WIDTH)
-    widest = max(3, round(DOT_PER_SPACING * board.spacing_mm / planes.sample_mm))
+    sample_mm, half, pictures = refocusing(
+        camera, media, (row, column), SAMPLES_PER_LENS, HALF_WIDTH, smoothing=SAMPLES_PER_LENS
+    )
+    widest = max(3, round(DOT_PER_SPACING * board.spacing_mm / sample_mm))
 
-    def refocused(z_mm: float) -> NDArray[np.float64]:
-        (smooth,) = planes.pictures(z_mm, (light,), SAMPLES_PER_LENS)
+    step = float(camera.lattice.pitch.min()) / camera.aperture_radius_mm / FOCUS_STEPS_PER_LENS
+    count, s_i = FOCUS_LENSES * FOCUS_STEPS_PER_LENS, camera.image_distance_mm
+    distance = s_i / (step * np.arange(-count, count + 1) - 1.0 + s_i / camera.focal_length_mm)
+    depths = (distance[distance > 0.0] - camera.focus_distance_mm) / media.depth_ratio
+
+    def refocused(z_mm: float) -> Floats:
+        (smooth,) = pictures(z_mm, light)
         return smooth - opened(smooth, widest)
 
-    depth = float(depths_mm[np.argmax([np.sum(refocused(z) ** 2) for z in depths_mm])])
-    spots = find_spots(refocused(depth), board.spacing_mm / planes.sample_mm)
-    return (spots - planes.half[::-1]) * planes.sample_mm, depth
-
-
-def candidate_depths(camera: Camera, media: Media) -> NDArray[np.float64]:
-    """Return depths in the medium at equal steps of defocus alpha about the focal plane."""
-    step = float(camera.lattice.pitch.min()) / camera.aperture_radius_mm / FOCUS_STEPS_PER_LENS
-    count = FOCUS_LENSES * FOCUS_STEPS_PER_LENS
-    alpha = step * np.arange(-count, count + 1)
-    s_i = camera.image_distance_mm
-    distance = s_i / (alpha - 1.0 + s_i / camera.focal_length_mm)
-    depths = (distance[distance > 0.0] - camera.focus_distance_mm) / media.depth_ratio
-    return np.asarray(depths, dtype=np.float64)
-
-
-def fit_one_dot(
-    signal: NDArray[np.float64],
-    passed: NDArray[np.float32],
-    camera: Camera,
-    board: BoardGeometry,
-    media: Media,
-    start_mm: tuple[float, float, float],
-    radius_mm: float,
-    waves: WaveShapes | None = None,
-) -> ShapeFit | None:
-    """Fit a disc to the pixels that see the surroundings of its first guess, in image axes; None off the sensor."""
-    distance = float(equivalent_object_distance(start_mm[2], camera.focus_distance_mm, media))
-    forward = camera.image_distance_mm / distance
-    pitch = float(camera.lattice.pitch.max())
-    reach = min(0.5 * board.spacing_mm, radius_mm + MARGIN_LENSES * pitch / forward)
-    near = pixels_near((signal, passed), camera, media, start_mm, reach)
-    if near is None:
-        return None
-    start = np.array(start_mm, dtype=np.float64)
-    if waves is None:
-        return fit_disc(near.signal, near.passed, near.rays, start, radius_mm, camera, media)
-    return waves.fit(near, start, radius_mm, disc_strips(radius_mm, waves.lens_mm))
+    depth = float(depths[np.argmax([np.sum(refocused(z) ** 2) for z in depths])])
+    spots = find_spots(refocused(depth), board.spacing_mm / sample_mm)
+    return (spots - half[::-1]) * sample_mm, depth
 
 
 # How the points of each pattern are found, by `board.pattern`.
-LOOKS: dict[Pattern, Callable[..., Look]] = {
-    "dots": dots_look,
-    "chessboard": first_corners,
-    "charuco": first_corners,
-}
+LOOKS: dict[Pattern, Callable[..., Look]] = {"dots": dots_look, "chessboard": first_corners, "charuco": first_corners}

@@ -12,18 +12,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.white import first_of_each
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.names import Medium, Pattern, Polarity
 from lfpiv_cli.notice import written
 from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.media import Media
 from lfpiv_cli.robust import MAD_TO_SIGMA
 
-# The flat regular board that fits given dots best, and the radial distortion that bends it.
-#
-# Axes: those of the dots: x, y lateral about the optical axis, z along it. Lengths in mm. The distortion acts on the
-# microlens array, r' = r (1 + k1 r^2); seen through an ideal camera it moves a dot sideways by the same share.
-
+# The distortion acts on the microlens array, r' = r (1 + k1 r^2); seen through an ideal camera it moves a dot sideways
+# by the same share.
 
 # A dot whose place or depth is this many robust deviations off the common board is dirt.
 OUTLIER_SIGMAS = 6.0
@@ -46,64 +45,49 @@ class FlatFit:
     k1_per_mm2, k1_sigma_per_mm2 : the distortion and its standard error; None where it was left out
     """
 
-    coefficients: NDArray[np.float64]
-    residual_mm: NDArray[np.float64]
-    sigma: NDArray[np.float64]
+    coefficients: Floats
+    residual_mm: Floats
+    sigma: Floats
     half_span_mm: float
     k1_per_mm2: float | None = None
     k1_sigma_per_mm2: float | None = None
 
 
-def bent_fit(
-    dots_mm: NDArray[np.float64],
-    indices: NDArray[np.int64],
-    array_radius_mm: NDArray[np.float64],
-    board: BoardGeometry,
-) -> FlatFit:
-    """Return the fit with the distortion, or without it where the dots cannot tell it from the magnification."""
-    if len(indices) >= FEWEST_DOTS_FOR_DISTORTION:
-        bending = dots_mm[:, :2] * array_radius_mm[:, np.newaxis] ** 2
-        try:
-            return flat_fit(dots_mm, indices, board, bending)
-        except InputError:
-            pass
-    return flat_fit(dots_mm, indices, board)
+def flat_fit(dots_mm: Floats, indices: NDArray[np.int64], board: BoardGeometry, radius_mm: Floats | None) -> FlatFit:
+    """Fit a flat regular board, and the distortion where the dots can tell it from the magnification.
 
-
-def flat_fit(
-    dots_mm: NDArray[np.float64],
-    indices: NDArray[np.int64],
-    board: BoardGeometry,
-    bending: NDArray[np.float64] | None = None,
-) -> FlatFit:
-    """Fit a flat regular board, and the coefficient of `bending` (n, 2) in the lateral places where it is given.
+    Parameters
+    ----------
+    radius_mm : (n,) of the dots' pictures on the array, from the axis; None: without distortion
 
     Raises
     ------
-    InputError
-        when the dots stand in one line, or the bending looks like a board
+    InputError : when the dots stand in one line
     """
     count = len(indices)
     along = (indices - (np.array(board.dots) - 1) / 2.0) * board.spacing_mm
     terms = np.column_stack([np.ones(count), along])
-    sideways = np.asarray(np.kron(np.eye(2), terms), dtype=np.float64)
-    if bending is not None:
-        sideways = np.column_stack([sideways, bending.T.ravel()])
-    places, place_sigma, shifts = least_squares(sideways, dots_mm[:, :2].T.ravel())
+    sideways, values = np.asarray(np.kron(np.eye(2), terms), dtype=np.float64), dots_mm[:, :2].T.ravel()
+    bent = None
+    if radius_mm is not None and count >= FEWEST_DOTS_FOR_DISTORTION:
+        bending = dots_mm[:, :2] * radius_mm[:, np.newaxis] ** 2
+        try:
+            bent = least_squares(np.column_stack([sideways, bending.T.ravel()]), values)
+        except InputError:
+            bent = None  # it looks like a board
+    places, place_sigma, shifts = bent or least_squares(sideways, values)
     depths, depth_sigma, rises = least_squares(terms, dots_mm[:, 2])
     return FlatFit(
         coefficients=np.column_stack([places[0:3], places[3:6], depths]),
         residual_mm=np.column_stack([shifts.reshape(2, count).T, rises]),
         sigma=np.column_stack([place_sigma[0:3], place_sigma[3:6], depth_sigma]),
         half_span_mm=float(np.sqrt(np.sum(np.var(along, axis=0)))),
-        k1_per_mm2=None if bending is None else float(places[6]),
-        k1_sigma_per_mm2=None if bending is None else float(place_sigma[6]),
+        k1_per_mm2=None if bent is None else float(places[6]),
+        k1_sigma_per_mm2=None if bent is None else float(place_sigma[6]),
     )
 
 
-def least_squares(
-    terms: NDArray[np.float64], values: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def least_squares(terms: Floats, values: Floats) -> tuple[Floats, Floats, Floats]:
     """Return coefficients, their standard errors by the scatter of the values, and the residuals."""
     scale = np.abs(terms).max(axis=0)
     if np.any(scale == 0.0) or np.linalg.matrix_rank(terms / scale, tol=LEAST_RANK * len(terms)) < terms.shape[1]:
@@ -114,13 +98,6 @@ def least_squares(
     variance = float(residual @ residual) / max(1, len(values) - terms.shape[1])
     sigma = np.sqrt(np.diag(np.linalg.inv(scaled.T @ scaled)) * variance) / scale
     return coefficients, sigma, residual
-
-
-def outliers(residual: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which dots (n,) are off the board sideways or in depth by far more than most."""
-    distance = np.stack([np.hypot(residual[:, 0], residual[:, 1]), np.abs(residual[:, 2])], axis=1)
-    limit = OUTLIER_SIGMAS * MAD_TO_SIGMA * np.median(distance, axis=0)
-    return (distance > limit).any(axis=1) & (distance > 0.0).any(axis=1)
 
 
 # The plane, the spacing and their errors need more than their own unknowns.
@@ -184,6 +161,10 @@ class BoardGeometry:
         """What its points are called."""
         return "dots" if self.pattern == "dots" else "corners"
 
+    def seen_through(self, media: Media) -> Media:
+        """Return what is in front of it."""
+        return media.in_air() if self.medium == "air" else media
+
 
 @dataclass(frozen=True, eq=False)
 class BoardPose:
@@ -205,18 +186,18 @@ class BoardPose:
     """
 
     indices: NDArray[np.int64]
-    dots_mm: NDArray[np.float64]
-    dots_sigma_mm: NDArray[np.float64]
-    residual_mm: NDArray[np.float64]
-    dots_px: NDArray[np.float64]
+    dots_mm: Floats
+    dots_sigma_mm: Floats
+    residual_mm: Floats
+    dots_px: Floats
     z0_mm: float
     z0_sigma_mm: float
-    tilt_deg: NDArray[np.float64]
-    tilt_sigma_deg: NDArray[np.float64]
+    tilt_deg: Floats
+    tilt_sigma_deg: Floats
     rotation_deg: float
     rotation_sigma_deg: float
-    offset_mm: NDArray[np.float64]
-    offset_sigma_mm: NDArray[np.float64]
+    offset_mm: Floats
+    offset_sigma_mm: Floats
     magnification: float
     magnification_sigma: float
     k1_per_mm2: float | None = None
@@ -236,9 +217,9 @@ class BoardPose:
 
 
 def pose_of_dots(
-    dots_mm: NDArray[np.float64],
-    sigma_mm: NDArray[np.float64],
-    array_mm: NDArray[np.float64],
+    dots_mm: Floats,
+    sigma_mm: Floats,
+    array_mm: Floats,
     camera: Camera,
     board: BoardGeometry,
     numbers: NDArray[np.int64] | None = None,
@@ -254,8 +235,7 @@ def pose_of_dots(
 
     Raises
     ------
-    InputError
-        when too few dots lie on a common grid, or they scatter about it
+    InputError : when too few dots lie on a common grid, or they scatter about it
     """
     if numbers is None:
         kept, indices = on_the_grid(dots_mm, board)
@@ -264,36 +244,36 @@ def pose_of_dots(
         kept = np.arange(len(indices))
         refuse_few(len(kept), board)
     radius = np.hypot(array_mm[:, 0], array_mm[:, 1])
-    for _ in range(OUTLIER_ROUNDS):
-        bent = bent_fit(dots_mm[kept], indices, radius[kept], board)
-        good = ~outliers(bent.residual_mm)
-        if good.all():
+    for round_ in range(OUTLIER_ROUNDS + 1):
+        fit = flat_fit(dots_mm[kept], indices, board, radius[kept])
+        off = np.stack([np.hypot(fit.residual_mm[:, 0], fit.residual_mm[:, 1]), np.abs(fit.residual_mm[:, 2])], axis=1)
+        far = off > OUTLIER_SIGMAS * MAD_TO_SIGMA * np.median(off, axis=0)
+        good = ~(far.any(axis=1) & (off > 0.0).any(axis=1))
+        if round_ == OUTLIER_ROUNDS or good.all():
             break
         kept, indices = kept[good], indices[good]
         refuse_few(len(kept), board)
-    bent = bent_fit(dots_mm[kept], indices, radius[kept], board)
-    refuse_scattered(bent, board, camera)
-    k1, k1_sigma = total_distortion(bent, camera)
+    refuse_scattered(fit, board, camera)
+    # What the camera already had and what the fit adds.
+    k1, k1_sigma = fit.k1_per_mm2, fit.k1_sigma_per_mm2
+    k1 = None if k1 is None else camera.distortion_per_mm2 + k1
     proven = k1 is not None and k1_sigma is not None and abs(k1) > DISTORTION_SIGMAS * k1_sigma
-    fit = bent if proven else flat_fit(dots_mm[kept], indices, board)
+    if not proven:
+        fit = flat_fit(dots_mm[kept], indices, board, None)
     shown = array_mm[kept] * (1.0 + (k1 if proven and k1 else 0.0) * radius[kept, np.newaxis] ** 2)
+    # The errors of single dots come from the scatter of their pixels, which does not know how well a rendering can fit.
+    freedom = len(kept) / max(1, len(kept) - 3)
+    scatter = np.sqrt(freedom * np.mean((fit.residual_mm / sigma_mm[kept]) ** 2, axis=0))
     return BoardPose(
         indices=indices,
         dots_mm=dots_mm[kept],
-        dots_sigma_mm=sigma_mm[kept] * scatter_ratio(fit.residual_mm, sigma_mm[kept]),
+        dots_sigma_mm=sigma_mm[kept] * np.maximum(1.0, scatter),
         residual_mm=fit.residual_mm,
         dots_px=camera.mm_to_px(camera.micro_image_scale * shown),
         k1_per_mm2=k1,
         k1_sigma_per_mm2=k1_sigma,
-        **lengths_and_angles(fit, camera.magnification, *common_errors_mm(camera)),
+        **lengths_and_angles(fit, camera),
     )
-
-
-def common_errors_mm(camera: Camera) -> tuple[float, float]:
-    """Return the standard errors of place and depth that all dots share."""
-    lens, lens_depth = lens_in_scene_mm(camera)
-    coarse = max(1.0, COARSE_LENS_PX * camera.pixel_mm / float(camera.lattice.pitch.min())) ** 2
-    return COMMON_SHARE_OF_LENS * lens, COMMON_SHARE_OF_LENS_DEPTH * coarse * lens_depth
 
 
 def lens_in_scene_mm(camera: Camera) -> tuple[float, float]:
@@ -302,23 +282,7 @@ def lens_in_scene_mm(camera: Camera) -> tuple[float, float]:
     return lens, lens / camera.aperture_radius_mm * camera.focus_distance_mm
 
 
-def total_distortion(bent: FlatFit, camera: Camera) -> tuple[float | None, float | None]:
-    """Return k1 and its standard error: what the camera already had and what the fit adds."""
-    if bent.k1_per_mm2 is None:
-        return None, None
-    return camera.distortion_per_mm2 + bent.k1_per_mm2, bent.k1_sigma_per_mm2
-
-
-def scatter_ratio(residual_mm: NDArray[np.float64], sigma_mm: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return by how much (3,) the dots scatter about the board beyond their own standard errors, at least 1.
-
-    The errors of single dots come from the scatter of their pixels, which does not know how well a rendering can fit.
-    """
-    freedom = len(residual_mm) / max(1, len(residual_mm) - 3)
-    return np.maximum(1.0, np.sqrt(freedom * np.mean((residual_mm / sigma_mm) ** 2, axis=0)))
-
-
-def on_the_grid(dots_mm: NDArray[np.float64], board: BoardGeometry) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def on_the_grid(dots_mm: Floats, board: BoardGeometry) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return which dots belong to the board (m,) and their indices on it (m, 2); dots may be missing."""
     refuse_few(len(dots_mm), board)
     lateral = dots_mm[:, :2]
@@ -330,20 +294,31 @@ def on_the_grid(dots_mm: NDArray[np.float64], board: BoardGeometry) -> tuple[NDA
             best, numbers = on_grid, found
     kept = np.nonzero(best)[0]
     indices = numbers[kept]
-    corner, within = best_window(indices, lateral[kept], board)
-    refuse_turned(int(within.sum()), indices, lateral[kept], board)
-    refuse_few(int(within.sum()), board)
+    corner, within = best_window(indices, board.dots)
+    count, (across, down) = int(within.sum()), board.dots
+    turned = 0 if across == down else int(best_window(indices, (down, across))[1].sum())
+    # Outside of a board that is told as it is lie strays, and not most of a row as long as its shorter side.
+    if turned - count > 0.5 * min(across, down):
+        raise InputError(
+            f"{turned} of the dots are those of a board of {down} x {across} along x and y, and {count} those of "
+            f"one of {across} x {down}; correct board.dots, or camera.sensor.column_axis"
+        )
+    refuse_few(count, board)
     return kept[within], indices[within] - corner
 
 
-def numbered_dots(
-    lateral: NDArray[np.float64], start: int, spacing_mm: float
-) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+def numbered_dots(lateral: Floats, start: int, spacing_mm: float) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Number the dots by a grid through one of them, which grows outward and adapts: (n, 2), and which are on it (n,).
 
     Missing dots leave gaps that a walk from neighbour to neighbour could not cross.
     """
-    basis, origin = rows_direction(lateral, start, spacing_mm), lateral[start]
+    # The nearest dot about one spacing away tells the direction, up to quarter turns: the first vector is near world x.
+    offset = np.delete(lateral - lateral[start], start, axis=0)
+    nearest = offset[np.argmin(np.abs(np.hypot(offset[:, 0], offset[:, 1]) - spacing_mm))]
+    angle = np.arctan2(nearest[1], nearest[0])
+    angle -= np.pi / 2.0 * np.rint(angle / (np.pi / 2.0))
+    cosine, sine = np.cos(angle), np.sin(angle)
+    basis, origin = spacing_mm * np.array([[cosine, sine], [-sine, cosine]]), lateral[start]
     farthest = float(np.hypot(*(lateral - origin).T).max())
     reach = FIRST_REACH * spacing_mm
     while True:
@@ -406,7 +381,7 @@ def refuse_scattered(fit: FlatFit, board: BoardGeometry, camera: Camera) -> None
 
 
 def upright_numbers(
-    numbers: NDArray[np.int64], lateral_mm: NDArray[np.float64], board: BoardGeometry
+    numbers: NDArray[np.int64], lateral_mm: Floats, board: BoardGeometry
 ) -> tuple[NDArray[np.int64], BoardGeometry]:
     """Return numbers (n, 2) of a board's points that grow with x and y, and the board as it is then seen."""
     terms = np.column_stack([np.ones(len(numbers)), numbers])
@@ -418,62 +393,33 @@ def upright_numbers(
     return np.where(np.diag(along) < 0.0, last - numbers, numbers), board
 
 
-def rows_direction(lateral: NDArray[np.float64], start: int, spacing_mm: float) -> NDArray[np.float64]:
-    """Return the vectors (2, 2) from a dot to its neighbours, the first one nearest world x.
+def best_window(indices: NDArray[np.int64], dots: tuple[int, int]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Return the first index (2,) of the window of so many dots that holds most, and which (n,) these are.
 
-    The nearest dot about one spacing away tells the direction, up to quarter turns.
+    Of windows that hold as many it is the most central one: the dots' mean index is nearest the window's middle, so
+    that lost rows are shared between the two sides.
     """
-    offset = np.delete(lateral - lateral[start], start, axis=0)
-    nearest = offset[np.argmin(np.abs(np.hypot(offset[:, 0], offset[:, 1]) - spacing_mm))]
-    angle = np.arctan2(nearest[1], nearest[0])
-    angle -= np.pi / 2.0 * np.rint(angle / (np.pi / 2.0))
-    cosine, sine = np.cos(angle), np.sin(angle)
-    return spacing_mm * np.array([[cosine, sine], [-sine, cosine]])
-
-
-def best_window(
-    indices: NDArray[np.int64], lateral: NDArray[np.float64], board: BoardGeometry
-) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Return the first index (2,) of the window of the board's size that holds most dots, and which (n,) these are.
-
-    Of windows that hold as many it is the most central one.
-
-    Central means the dots' mean index nearest the window's middle: lost rows are shared between the two sides.
-    """
-    size = np.array(board.dots)
+    size = np.array(dots)
     low, high = indices.min(axis=0), indices.max(axis=0)
+    ends = np.stack([low, high - size + 1])
+    first, last = ends.min(axis=0), ends.max(axis=0)
     best, best_rank = low, (-1, 0.0)
-    for i in range(min(low[0], high[0] - size[0] + 1), max(low[0], high[0] - size[0] + 1) + 1):
-        for j in range(min(low[1], high[1] - size[1] + 1), max(low[1], high[1] - size[1] + 1) + 1):
-            corner = np.array([i, j])
-            count = int(((indices >= corner) & (indices < corner + size)).all(axis=1).sum())
-            off = float(np.hypot(*(corner + (size - 1) / 2.0 - indices.mean(axis=0))))
-            if (count, -off) > best_rank:
-                best, best_rank = corner, (count, -off)
+    for corner in first + np.moveaxis(np.indices(last - first + 1), 0, -1).reshape(-1, 2):
+        count = int(((indices >= corner) & (indices < corner + size)).all(axis=1).sum())
+        off = float(np.hypot(*(corner + (size - 1) / 2.0 - indices.mean(axis=0))))
+        if (count, -off) > best_rank:
+            best, best_rank = corner, (count, -off)
     return best, ((indices >= best) & (indices < best + size)).all(axis=1)
 
 
-def refuse_turned(count: int, indices: NDArray[np.int64], lateral: NDArray[np.float64], board: BoardGeometry) -> None:
-    """Raise where the dots are those of the board turned by 90 degrees, of which it holds `count` as it is told.
-
-    Outside of a board that is told as it is lie strays, and not most of a row as long as its shorter side.
-    """
-    across, down = board.dots
-    if across == down:
-        return
-    _, turned = best_window(indices, lateral, replace(board, dots=(down, across)))
-    if turned.sum() - count > 0.5 * min(across, down):
-        raise InputError(
-            f"{turned.sum()} of the dots are those of a board of {down} x {across} along x and y, and {count} those of "
-            f"one of {across} x {down}; correct board.dots, or camera.sensor.column_axis"
-        )
-
-
-def lengths_and_angles(fit: FlatFit, magnification: float, common_mm: float, common_depth_mm: float) -> dict[str, Any]:
+def lengths_and_angles(fit: FlatFit, camera: Camera) -> dict[str, Any]:
     """Return the fitted centre and step vectors as the lengths and angles of `BoardPose` with their standard errors.
 
     What the dots have in common may differ from one side of the board to the other as well: it counts for the tilt.
     """
+    lens, lens_depth = lens_in_scene_mm(camera)
+    coarse = max(1.0, COARSE_LENS_PX * camera.pixel_mm / float(camera.lattice.pitch.min())) ** 2
+    common_mm, common_depth_mm = COMMON_SHARE_OF_LENS * lens, COMMON_SHARE_OF_LENS_DEPTH * coarse * lens_depth
     centre, steps = fit.coefficients[0], fit.coefficients[1:]
     common_slope = common_depth_mm / fit.half_span_mm
     slope_error = np.hypot(fit.sigma[1:, 2], common_slope)
@@ -490,6 +436,6 @@ def lengths_and_angles(fit: FlatFit, magnification: float, common_mm: float, com
         "rotation_sigma_deg": float(np.rad2deg(step_error)),
         "offset_mm": centre[:2],
         "offset_sigma_mm": np.hypot(fit.sigma[0, :2], common_mm),
-        "magnification": magnification * float(stretch.mean()),
-        "magnification_sigma": abs(magnification) * float(np.hypot(step_error, COMMON_SCALE)),
+        "magnification": camera.magnification * float(stretch.mean()),
+        "magnification_sigma": abs(camera.magnification) * float(np.hypot(step_error, COMMON_SCALE)),
     }

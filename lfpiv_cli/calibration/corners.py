@@ -9,45 +9,32 @@ Axes: image axes (x along the columns, y along the rows), mm; rectified pictures
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field
-from typing import Protocol
+from dataclasses import dataclass
+from functools import partial
+from typing import ClassVar
 
 import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.board_pose import BoardGeometry
-from lfpiv_cli.calibration.shape_fit import (
-    BLURRED_SAMPLES,
-    SHARP_SHARE,
-    MeasuredPoints,
-    NearPixels,
-    PixelRays,
-    ShapeFit,
-    SharesAndSlopes,
-    fit_shape,
-    fit_steps,
-    measured_points,
-    pixels_near,
-    scene_points,
-    scene_shares,
-    undistorted,
-)
+from lfpiv_cli.calibration.rectification import turned
+from lfpiv_cli.calibration.shape_fit import PointShape, ShapeFit, fit_shape, pixels_near, scene_points, scene_shares
 from lfpiv_cli.calibration.views import (
     charuco_corners,
     chessboard_corners,
     clear_mm,
     described,
     lens_table,
-    marker_modules,
     sub_aperture_view,
     view_crossings,
 )
-from lfpiv_cli.calibration.wave_shapes import WaveLight, WaveShapes, corner_strips, together
+from lfpiv_cli.calibration.wave_shapes import WaveLight, WaveShapes, corner_strips
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.notice import written
-from lfpiv_cli.optics.camera import Camera
+from lfpiv_cli.optics.camera import Camera, undistorted
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.robust import MAD_TO_SIGMA
 
@@ -56,64 +43,23 @@ from lfpiv_cli.robust import MAD_TO_SIGMA
 # A pixel's light is the share of the polygon that its microlens is, seen in the scene (see `shape_fit`), that lies in
 # two opposite quadrants about the corner, exactly. With sgn u sgn v the quadrants' sign, the integral of it over a
 # polygon is that of |u| sgn v dv along its edges (Green's theorem), which is summed over the parts of an edge in one
-# quadrant.
-#
-# Axes: image axes (x along the columns, y along the rows), mm, z away from the camera from the focal plane; (u, v)
-# along the edges that meet in the corner.
-
+# quadrant; (u, v) run along the edges that meet in the corner.
 
 # Steps of the fit are measured in this share of a square.
 STEP_SHARE = 0.25
 
 
-def fit_corner(
-    pixels: NearPixels,
-    start_mm: NDArray[np.float64],
-    edges_mm: NDArray[np.float64],
-    camera: Camera,
-    media: Media,
-) -> ShapeFit:
-    """Fit a corner to pixels by least squares: x, y, z, brightness and a sloping background are free.
-
-    Parameters
-    ----------
-    start_mm : (3,) first guess, in image axes, within about half a microlens
-    edges_mm : (2, 2) rows: the squares' sides that meet in the corner, x and y
-    """
-    size = step_mm(edges_mm)
-
-    def shares_at(position: NDArray[np.float64]) -> SharesAndSlopes:
-        return corner_shares(pixels.rays, position, edges_mm, camera, media)
-
-    beside = scene_points(pixels.rays, camera, media, float(start_mm[2])) - start_mm[:2]
-    return fit_shape(pixels.signal, pixels.passed, beside, start_mm, fit_steps(size, camera, media), shares_at)
-
-
-def step_mm(edges_mm: NDArray[np.float64]) -> float:
-    """Return in what steps a fit moves a corner, by the squares' sides (2, 2)."""
-    return STEP_SHARE * float(np.hypot(edges_mm[:, 0], edges_mm[:, 1]).mean())
-
-
-def corner_shares(
-    rays: PixelRays, position_mm: NDArray[np.float64], edges_mm: NDArray[np.float64], camera: Camera, media: Media
-) -> SharesAndSlopes:
-    """Return for each pixel the share (n,) of what it sees at depth z in two opposite quadrants, and its slopes.
-
-    `position_mm` is (x, y, z) in image axes; the slopes (n, 3) are the share's derivatives by it, per mm.
-    """
-    to_edges = np.linalg.inv(edges_mm)
-    sharp = SHARP_SHARE * 0.5 * float(np.hypot(edges_mm[:, 0], edges_mm[:, 1]).min())
-
-    def covered(middle: NDArray[np.float64], cell: NDArray[np.float64], width: float) -> SharesAndSlopes:
-        return quadrant_shares(middle, cell, to_edges, width, 1 if width < sharp else BLURRED_SAMPLES)
-
-    return scene_shares(rays, position_mm, camera, media, covered)
+def corner_shape(edges_mm: Floats) -> PointShape:
+    """Return the squares that meet in a corner, by their sides x and y (2, 2), those of one colour."""
+    side = np.hypot(edges_mm[:, 0], edges_mm[:, 1])
+    step, to_edges = STEP_SHARE * float(side.mean()), np.asarray(np.linalg.inv(edges_mm), dtype=np.float64)
+    return PointShape(step, 0.5 * float(side.min()), quadrant_shares, to_edges, partial(corner_strips, edges_mm))
 
 
 @njit(cache=True)
 def quadrant_shares(
-    middle: NDArray[np.float64], cell: NDArray[np.float64], to_edges: NDArray[np.float64], width: float, samples: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    middle: Floats, cell: Floats, to_edges: Floats, width: float, samples: int
+) -> tuple[Floats, Floats]:
     """Return the mean share of `cell`, moved to `middle` and over a square of `width` around it, where u v > 0.
 
     The slopes (n, 4) are its derivatives by the middle's x and y, the logarithm of the cell's size, and the width.
@@ -142,7 +88,7 @@ def quadrant_shares(
 
 
 @njit(cache=True)
-def quadrant_sums(u: float, v: float, cell: NDArray[np.float64], sums: NDArray[np.float64]) -> None:
+def quadrant_sums(u: float, v: float, cell: Floats, sums: Floats) -> None:
     """Write the integral of sgn u sgn v over a polygon `cell` moved to (u, v), its slopes, and the polygon's area.
 
     The slopes are by u, by v and by the logarithm of the cell's size: every part of an edge sweeps an area.
@@ -197,14 +143,6 @@ VIEW_ROUNDS = 2
 FEWEST_VIEWS = 8
 # With fewer corners than these there is no grid.
 FEWEST_CORNERS = 4
-# More pixels than these make a corner's fit slower and hardly better.
-MOST_PIXELS = 4_000
-
-
-class Fit(Protocol):
-    """Fits a point's shape from a first guess of its place (3,), by rays or by waves; None where it cannot be."""
-
-    def __call__(self, start_mm: NDArray[np.float64], waves: WaveShapes | None = None) -> ShapeFit | None: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,33 +153,67 @@ class Look(ABC):
     ----------
     signal, passed : (rows, columns) light, dots bright, and the share of it that pixels pass
     medium : what the target stands in
-    light : waves that the target sends, whose points are fitted from where rays have them; None: rays
     """
 
-    signal: NDArray[np.float64]
+    signal: Floats
     passed: NDArray[np.float32]
     medium: Media
-    light: WaveLight | None = field(default=None, kw_only=True)
+
+    # More pixels than these make a fit slower and hardly better: the model's own errors are larger than their noise.
+    most_pixels: ClassVar[int]
 
     def moved(self, scale: float, depth_mm: float) -> Look:
         """Return the look with its points nearer the axis by a scale, at another depth, if it says where they are."""
         return self
 
-    def measured(self, camera: Camera, board: BoardGeometry) -> MeasuredPoints:
-        """Fit its shape to the pixels that see the surroundings of each point."""
-        start, numbers, fit = self.begun(camera, board)
-        found = measured_points([fit(place) for place in start], numbers)
-        if self.light is None or not len(found.places_mm):
-            return found
-        near = together(found.places_mm[:, 2], camera, self.medium)
-        start = found.places_mm[near]
-        waves = WaveShapes.of(camera, self.medium, self.light, start[:, 2])
-        numbers = None if found.numbers is None else found.numbers[near]
-        return measured_points([fit(place, waves) for place in start], numbers)
+    @abstractmethod
+    def begun(self, camera: Camera, board: BoardGeometry) -> tuple[Floats, NDArray[np.int64] | None, PointShape]:
+        """Return first guesses (n, 3) of the points, image axes, their numbers (n, 2) if known, and what lies there."""
 
     @abstractmethod
-    def begun(self, camera: Camera, board: BoardGeometry) -> tuple[NDArray[np.float64], NDArray[np.int64] | None, Fit]:
-        """Return first guesses (n, 3) of the points, image axes, their numbers (n, 2) if known, and what fits one."""
+    def reach_mm(self, camera: Camera, board: BoardGeometry, z_mm: float) -> float:
+        """Return how far about a point at a depth the pixels see that belong to its fit."""
+
+    def measured(
+        self, camera: Camera, board: BoardGeometry, rotation_rad: float, by: WaveLight | None = None
+    ) -> tuple[Floats, Floats, NDArray[np.int64] | None]:
+        """Return where points are, fitted to what pixels see about them by rays, and from there by waves.
+
+        That is places and standard errors (n, 3), turned back to the raw sensor's axes, and numbers (n, 2) of the
+        target, turned in any way; None where the grid tells.
+        """
+        places, numbers, shape = self.begun(camera, board)
+        waves = None
+        for light in [None] if by is None else [None, by]:
+            if light is not None and len(places):
+                # Others are no points of a board, and line responses over all depths take long to compute.
+                near = np.abs(places[:, 2] - np.median(places[:, 2])) < camera.scale(self.medium).depth_mm
+                places, numbers = places[near], None if numbers is None else numbers[near]
+                waves = WaveShapes.of(camera, self.medium, light, places[:, 2])
+            fits = [self.fitted(place, camera, board, shape, waves) for place in places]
+            numbers = None if numbers is None else numbers[[fit is not None for fit in fits]]
+            places = np.array([fit.position_mm for fit in fits if fit is not None]).reshape(-1, 3)
+        sigmas = np.sqrt(np.array([np.diag(fit.covariance_mm2) for fit in fits if fit is not None])).reshape(-1, 3)
+        return camera.to_image_axes(turned(places, rotation_rad)), camera.to_image_axes(sigmas), numbers
+
+    def fitted(
+        self, start_mm: Floats, camera: Camera, board: BoardGeometry, shape: PointShape, waves: WaveShapes | None
+    ) -> ShapeFit | None:
+        """Fit a point's shape from a first guess (3,), by rays or by waves; None where that leads to none."""
+        z, medium = float(start_mm[2]), self.medium
+        reach = self.reach_mm(camera, board, z)
+        near = pixels_near((self.signal, self.passed), camera, medium, start_mm, reach, self.most_pixels)
+        if near is None:
+            return None
+        # Moves that change the light alike: sideways, and in depth what moves the rim's rays as far.
+        deep = shape.step_mm * camera.focus_distance_mm / (camera.aperture_radius_mm * medium.depth_ratio)
+        steps, rays = np.array([shape.step_mm, shape.step_mm, deep]), near.rays
+        shares_at = partial(scene_shares, rays, camera, medium, shape)
+        if waves is not None:
+            shares_at = partial(waves.shares_and_slopes, rays, shape.strips(waves.lens_mm), steps)
+        found = fit_shape(near, start_mm, steps, scene_points(rays, camera, medium, z) - start_mm[:2], shares_at)
+        # What is darker than the ground is no dot; of a corner's squares either two may be the dark ones.
+        return found if found.converged and (found.brightness > 0.0 or board.pattern != "dots") else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,11 +227,16 @@ class CornerLook(Look):
     """
 
     numbers: NDArray[np.int64]
-    sample: NDArray[np.float64]
+    sample: Floats
 
-    def begun(self, camera: Camera, board: BoardGeometry) -> tuple[NDArray[np.float64], NDArray[np.int64], Fit]:
-        """Return where the corners' lines have them."""
-        start = in_scene(straight_lines(*self.sightings(camera, board), camera), camera, self.medium)
+    most_pixels = 4_000
+
+    def begun(self, camera: Camera, board: BoardGeometry) -> tuple[Floats, NDArray[np.int64], PointShape]:
+        """Return where the corners' lines x_m = alpha X - x s_i/s_o have them."""
+        lines, s_i = straight_lines(*self.sightings(camera, board), camera), camera.image_distance_mm
+        distance = s_i / (lines[:, 2] - 1.0 + s_i / camera.focal_length_mm)
+        depth = (distance - camera.focus_distance_mm) / self.medium.depth_ratio
+        start = np.column_stack([-lines[:, :2] * (distance / s_i)[:, np.newaxis], depth])
         known = np.isfinite(start).all(axis=1)
         if known.sum() < FEWEST_CORNERS:
             raise InputError(
@@ -269,32 +246,40 @@ class CornerLook(Look):
         numbers, start = self.numbers[known], start[known]
         terms = np.column_stack([np.ones(len(numbers)), numbers])
         edges = np.asarray(np.linalg.lstsq(terms, start[:, :2], rcond=None)[0][1:], dtype=np.float64)
-        reach = clear_mm(board) - 0.5 * float(camera.lattice.pitch.max()) / abs(camera.magnification)
+        return start, numbers, corner_shape(edges)
 
-        def fit(start_mm: NDArray[np.float64], waves: WaveShapes | None = None) -> ShapeFit | None:
-            x, y, z = (float(value) for value in start_mm)
-            near = pixels_near((self.signal, self.passed), camera, self.medium, (x, y, z), reach, MOST_PIXELS)
-            if near is None or waves is None:
-                return None if near is None else fit_corner(near, start_mm, edges, camera, self.medium)
-            return waves.fit(near, start_mm, step_mm(edges), corner_strips(edges, waves.lens_mm))
+    def reach_mm(self, camera: Camera, board: BoardGeometry, z_mm: float) -> float:
+        """Return how far there is nothing but the corner's squares, less half a microlens."""
+        return clear_mm(board) - 0.5 * float(camera.lattice.pitch.max()) / abs(camera.magnification)
 
-        return start, numbers, fit
+    def sightings(self, camera: Camera, board: BoardGeometry) -> tuple[Floats, Floats]:
+        """Return points of the main lens (views, 2) and where on the array each shows the corners (views, n, 2).
 
-    def sightings(self, camera: Camera, board: BoardGeometry) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return points of the main lens (views, 2) and where on the array each shows the corners (views, n, 2)."""
-        step = camera.pixel_mm * camera.image_distance_mm / camera.microlens_distance_mm
-        crossings = view_crossings(camera.aperture_radius_mm - RIM_PIXELS * step, step)
+        NaN where it does not. Views are followed from the main lens's middle outward.
+        """
+        crossings = view_crossings(camera, RIM_PIXELS)
         crossings = crossings[np.argsort(np.hypot(crossings[:, 0], crossings[:, 1]), kind="stable")]
-        grid = ViewGrid.of(camera)
+        grid, even = ViewGrid.of(camera), evenly_lit(self.signal, self.passed)
         clear = clear_mm(board) * abs(camera.magnification) / grid.step_mm
         half = tuple(int(max(2, np.floor(WINDOW_SHARE * n))) for n in clear)
-        even = evenly_lit(self.signal, self.passed)
-        pictures = [softened(upright_view(even, camera, grid, crossing)) for crossing in crossings]
+        views = (upright_view(even, camera, grid, crossing) for crossing in crossings)
+        pictures = [np.asarray(cv2.GaussianBlur(view, (0, 0), SOFTENING), dtype=np.float32) for view in views]
         inside = np.isfinite(refined(pictures[0], self.sample, half)).all(axis=1)
-        seen = np.full((len(crossings), len(self.sample), 2), np.nan)
-        middle = grid.to_mm(self.sample[inside])
-        seen[:, inside] = followed(pictures, crossings, middle, grid, half)
-        return crossings, seen
+        middle, slope = grid.to_mm(self.sample[inside]), 0.0
+        seen = np.full((len(pictures), len(middle), 2), np.nan)
+        for round_ in range(VIEW_ROUNDS):
+            for k, (crossing, picture) in enumerate(zip(crossings, pictures, strict=True)):
+                sample = (middle + slope * crossing - grid.origin_mm) / grid.step_mm
+                seen[k] = grid.to_mm(refined(picture, sample, half))
+                known = len(pictures) if round_ else k + 1
+                if known >= FIRST_VIEWS:
+                    slope = common_slope(crossings[:known], seen[:known])
+            off = seen - slope * crossings[:, np.newaxis]
+            shown = np.isfinite(off).any(axis=(0, 2))
+            middle[shown] = np.nanmedian(off[:, shown], axis=0)
+        of_all = np.full((len(crossings), len(self.sample), 2), np.nan)
+        of_all[:, inside] = seen
+        return crossings, of_all
 
 
 @dataclass(frozen=True, eq=False)
@@ -307,9 +292,9 @@ class ViewGrid:
     origin_mm, step_mm : (2,) of the samples on the array
     """
 
-    lenses_mm: NDArray[np.float64]
-    origin_mm: NDArray[np.float64]
-    step_mm: NDArray[np.float64]
+    lenses_mm: Floats
+    origin_mm: Floats
+    step_mm: Floats
 
     @classmethod
     def of(cls, camera: Camera) -> ViewGrid:
@@ -319,56 +304,19 @@ class ViewGrid:
         step = np.array([lenses[0, 1, 0] - lenses[0, 0, 0], lenses[1, 0, 1] - lenses[0, 0, 1]])
         return cls(lenses, np.array([left, lenses[0, 0, 1]]), step)
 
-    def to_mm(self, sample: NDArray[np.float64]) -> NDArray[np.float64]:
+    def to_mm(self, sample: Floats) -> Floats:
         """Return places on the array (..., 2) of samples (column, row)."""
         return np.asarray(self.origin_mm + sample * self.step_mm, dtype=np.float64)
 
 
-def followed(
-    pictures: list[NDArray[np.float32]],
-    crossings_mm: NDArray[np.float64],
-    middle_mm: NDArray[np.float64],
-    grid: ViewGrid,
-    half: tuple[int, ...],
-) -> NDArray[np.float64]:
-    """Return where on the array each view shows corners (views, n, 2), NaN where it does not.
-
-    Parameters
-    ----------
-    pictures, crossings_mm : (views,) and (views, 2), from the main lens's middle outward
-    middle_mm : (n, 2) where the first view shows them
-    """
-    middle, slope = middle_mm, 0.0
-    seen = np.full((len(pictures), len(middle), 2), np.nan)
-    for round_ in range(VIEW_ROUNDS):
-        for k, (crossing, picture) in enumerate(zip(crossings_mm, pictures, strict=True)):
-            sample = (middle + slope * crossing - grid.origin_mm) / grid.step_mm
-            seen[k] = grid.to_mm(refined(picture, sample, half))
-            known = len(pictures) if round_ else k + 1
-            if known >= FIRST_VIEWS:
-                slope = common_slope(crossings_mm[:known], seen[:known])
-        off = seen - slope * crossings_mm[:, np.newaxis]
-        shown = np.isfinite(off).any(axis=(0, 2))
-        middle = middle.copy()
-        middle[shown] = np.nanmedian(off[:, shown], axis=0)
-    return seen
-
-
-def upright_view(
-    image: NDArray[np.float64], camera: Camera, grid: ViewGrid, crossing_mm: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def upright_view(image: Floats, camera: Camera, grid: ViewGrid, crossing_mm: Floats) -> Floats:
     """Return the view from a point of the main lens on the upright samples of the grid."""
     view = sub_aperture_view(image, camera, crossing_mm)
     at = grid.origin_mm[0] + np.arange(view.shape[1]) * grid.step_mm[0]
     return np.stack([np.interp(at, lenses[:, 0], row) for lenses, row in zip(grid.lenses_mm, view, strict=True)])
 
 
-def softened(picture: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return a view as OpenCV refines corners in it."""
-    return np.asarray(cv2.GaussianBlur(picture, (0, 0), SOFTENING), dtype=np.float32)
-
-
-def refined(picture: NDArray[np.float32], guess: NDArray[np.float64], half: tuple[int, ...]) -> NDArray[np.float64]:
+def refined(picture: NDArray[np.float32], guess: Floats, half: tuple[int, ...]) -> Floats:
     """Return corners (n, 2) to a fraction of a sample, NaN where the window leaves the picture or the corner it."""
     rows, columns = picture.shape
     margin = np.array(half) + 1.0
@@ -382,7 +330,7 @@ def refined(picture: NDArray[np.float32], guess: NDArray[np.float64], half: tupl
     return found
 
 
-def common_slope(crossing_mm: NDArray[np.float64], seen_mm: NDArray[np.float64]) -> float:
+def common_slope(crossing_mm: Floats, seen_mm: Floats) -> float:
     """Return the slope of the places (views, n, 2) of all corners over the points of the main lens (views, 2)."""
     seen = seen_mm[:, np.isfinite(seen_mm).any(axis=(0, 2))]
     off = seen - np.nanmean(seen, axis=0)
@@ -391,9 +339,7 @@ def common_slope(crossing_mm: NDArray[np.float64], seen_mm: NDArray[np.float64])
     return float(np.sum(np.where(known, off, 0.0) * crossing) / np.sum(crossing**2))
 
 
-def straight_lines(
-    crossing_mm: NDArray[np.float64], seen_mm: NDArray[np.float64], camera: Camera
-) -> NDArray[np.float64]:
+def straight_lines(crossing_mm: Floats, seen_mm: Floats, camera: Camera) -> Floats:
     """Return for each corner the middle (x, y) and the slope alpha of its line (n, 3), NaN where few views show it.
 
     Parameters
@@ -424,20 +370,8 @@ def straight_lines(
     return lines
 
 
-def in_scene(lines: NDArray[np.float64], camera: Camera, media: Media) -> NDArray[np.float64]:
-    """Return the places (n, 3) of points whose lines x_m = alpha X - x s_i/s_o are known."""
-    s_i = camera.image_distance_mm
-    distance = s_i / (lines[:, 2] - 1.0 + s_i / camera.focal_length_mm)
-    depth = (distance - camera.focus_distance_mm) / media.depth_ratio
-    return np.column_stack([-lines[:, :2] * (distance / s_i)[:, np.newaxis], depth])
-
-
 def first_corners(
-    image: NDArray[np.float32],
-    camera: Camera,
-    board: BoardGeometry,
-    media: Media,
-    transmission: NDArray[np.float32] | None = None,
+    image: NDArray[np.float32], passed: NDArray[np.float32], camera: Camera, board: BoardGeometry, media: Media
 ) -> CornerLook:
     """Find the corners of a chessboard or ChArUco board in the view from the main lens's middle.
 
@@ -445,8 +379,19 @@ def first_corners(
     ------
     InputError : the squares are too small, or the board is not in the picture
     """
-    refuse_small(board, camera)
-    passed = np.ones(image.shape, dtype=np.float32) if transmission is None else transmission
+    per_mm = abs(camera.magnification) / float(camera.lattice.pitch.max())
+    widths = {"the board's squares": (board.spacing_mm, SMALLEST_SQUARE_LENSES)}
+    if board.pattern == "charuco":
+        # The black border of a marker is one of its squares.
+        words = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
+        modules = int(words.markerSize) + 2
+        widths["the squares in its markers"] = (board.marker_mm / modules, SMALLEST_MODULE_LENSES)
+    for what, (width, least) in widths.items():
+        if width * per_mm < least:
+            raise InputError(
+                f"{what} are {written(width * per_mm)} microlenses wide on the array, less than {least:g}; use a board "
+                "with larger ones"
+            )
     picture, scale = enlarged_view(evenly_lit(image, passed), camera)
     found = charuco_corners(picture, board) if board.pattern == "charuco" else chessboard_corners(picture, board)
     if found is None:
@@ -455,31 +400,16 @@ def first_corners(
             "the focus"
         )
     numbers, place = found
-    medium = media.in_air() if board.medium == "air" else media
-    return CornerLook(image.astype(np.float64), passed, medium, numbers, (place + 0.5) / scale - 0.5)
+    return CornerLook(image.astype(np.float64), passed, media, numbers, (place + 0.5) / scale - 0.5)
 
 
-def refuse_small(board: BoardGeometry, camera: Camera) -> None:
-    """Raise where the microlenses cannot resolve the target."""
-    per_mm = abs(camera.magnification) / float(camera.lattice.pitch.max())
-    widths = {"the board's squares": (board.spacing_mm, SMALLEST_SQUARE_LENSES)}
-    if board.pattern == "charuco":
-        widths["the squares in its markers"] = (board.marker_mm / marker_modules(board), SMALLEST_MODULE_LENSES)
-    for what, (width, least) in widths.items():
-        if width * per_mm < least:
-            raise InputError(
-                f"{what} are {written(width * per_mm)} microlenses wide on the array, less than {least:g}; use a board "
-                "with larger ones"
-            )
-
-
-def evenly_lit(image: NDArray[np.floating], passed: NDArray[np.float32]) -> NDArray[np.float64]:
+def evenly_lit(image: NDArray[np.floating], passed: NDArray[np.float32]) -> Floats:
     """Return a picture (rows, columns) divided by the share of light that pixels pass, 0 where it is unusable."""
     usable = passed > 0.0
     return np.where(usable, image.astype(np.float64) / np.where(usable, passed, 1.0), 0.0)
 
 
-def enlarged_view(signal: NDArray[np.float64], camera: Camera) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+def enlarged_view(signal: Floats, camera: Camera) -> tuple[NDArray[np.uint8], Floats]:
     """Return the middle's view in grey levels, enlarged, its samples square, and by how much along columns and rows."""
     grid = ViewGrid.of(camera)
     view = upright_view(signal, camera, grid, np.zeros(2))

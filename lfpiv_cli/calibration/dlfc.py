@@ -13,15 +13,17 @@ those under which they are seen, on average.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from lfpiv_cli.calibration.board import candidate_depths, dot_signal, first_dots
+from lfpiv_cli.arrays import Floats
+from lfpiv_cli.calibration.board import dot_signal, first_dots
 from lfpiv_cli.calibration.board_pose import BoardGeometry, on_the_grid
+from lfpiv_cli.calibration.corners import evenly_lit
 from lfpiv_cli.calibration.rectification import turn_matrix
 from lfpiv_cli.calibration.shape_fit import RIM_PER_PATCH
 from lfpiv_cli.calibration.views import lens_table, sub_aperture_view, view_crossings
@@ -46,45 +48,22 @@ FEWEST_BOARDS = 3
 COMMON_SHARE = 1e-4
 
 
-@dataclass(frozen=True)
-class Shown:
-    """How a board is shown on the array.
+def shown(z_mm: float, plate_mm: Floats, dot: NDArray[np.int64], crossing_mm: Floats, array_mm: Floats) -> Floats:
+    """Return depth, alpha, beta and its error (4,) of x_m = alpha X - beta x, fitted to what was seen of a board.
 
-    Attributes
-    ----------
-    z_mm : its depth, from any origin
-    alpha : by how much its picture moves per length between crossings of the main lens
-    beta, beta_sigma : how large it is shown, and the standard error
-    """
-
-    z_mm: float
-    alpha: float
-    beta: float
-    beta_sigma: float
-
-
-def shown(
-    z_mm: float,
-    plate_mm: NDArray[np.float64],
-    dot: NDArray[np.int64],
-    crossing_mm: NDArray[np.float64],
-    array_mm: NDArray[np.float64],
-) -> Shown:
-    """Fit x_m = alpha X - beta x to what was seen of a board, turned and placed as it is.
+    The board is turned and placed as it is. Alpha is by how much its picture on the array moves per length between
+    crossings of the main lens, and beta how large it is shown.
 
     Parameters
     ----------
-    plate_mm : (dots, 2) of the dots on the board
+    z_mm : depth of the board, from any origin
+    plate_mm : (dots, 2) of the dots on it
     dot, crossing_mm, array_mm : (n,), (n, 2), (n, 2) of sightings: which dot, through where, and its picture's place
     """
     x, y = plate_mm[dot].T
     zero, one = np.zeros(len(dot)), np.ones(len(dot))
-    terms = np.concatenate(
-        [
-            np.column_stack([crossing_mm[:, 0], -x, y, one, zero]),
-            np.column_stack([crossing_mm[:, 1], -y, -x, zero, one]),
-        ]
-    )
+    along = np.column_stack([crossing_mm[:, 0], -x, y, one, zero])
+    terms = np.concatenate([along, np.column_stack([crossing_mm[:, 1], -y, -x, zero, one])])
     values = array_mm.T.ravel()
     found = np.linalg.lstsq(terms, values, rcond=None)[0]
     off = (values - terms @ found).reshape(2, -1)
@@ -95,22 +74,22 @@ def shown(
     spread = plate_mm[seen] - plate_mm[seen].mean(axis=0)
     sigma = np.sqrt(np.sum(mean**2) / max(mean.size - 4, 1) / np.sum(spread**2))
     beta = float(np.hypot(found[1], found[2]))
-    return Shown(z_mm, float(found[0]), beta, float(np.hypot(sigma, COMMON_SHARE * beta)))
+    return np.array([z_mm, found[0], beta, np.hypot(sigma, COMMON_SHARE * beta)])
 
 
-def entrance_pupil_mm(boards: Sequence[Shown], depth_ratio: float) -> tuple[float, float] | None:
+def entrance_pupil_mm(boards: Sequence[Floats], depth_ratio: float) -> tuple[float, float] | None:
     """Return how far the entrance pupil lies from the focal plane, in air, and the standard error.
 
     None where the boards do not tell it: fewer than three, or none that is shown the larger the nearer it is.
 
     Parameters
     ----------
-    boards : at different depths
+    boards : (4,) each from `shown`, at different depths
     depth_ratio : apparent depth in air of a unit of the boards' depths
     """
     if len(boards) < FEWEST_BOARDS:
         return None
-    z, alpha, beta, sigma = np.array([(each.z_mm, each.alpha, each.beta, each.beta_sigma) for each in boards]).T
+    z, alpha, beta, sigma = np.array(boards).T
     weight = (beta**2 / sigma) ** 2  # of 1/beta
     from_mean = z - np.average(z, weights=weight)
     spread = np.sum(weight * from_mean**2)
@@ -155,20 +134,16 @@ class RayFit:
     """
 
     rays: PolynomialRays
-    depths_mm: NDArray[np.float64]
-    reach_mm: NDArray[np.float64]
+    depths_mm: Floats
+    reach_mm: Floats
     sightings: int
-    residual_mm: NDArray[np.float64]
+    residual_mm: Floats
     entrance_pupil_mm: float | None = None
     entrance_pupil_sigma_mm: float | None = None
 
-    def to_tree(self) -> dict[str, Any]:
-        """Return everything as a nested dict of arrays and numbers."""
-        return {field.name: getattr(self, field.name) for field in fields(self)} | {"rays": self.rays.to_tree()}
-
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any]) -> RayFit:
-        """Return the fit that `to_tree` took apart.
+        """Return the fit of a dict of its fields, and of its rays' fields.
 
         Raises
         ------
@@ -184,13 +159,12 @@ class RayFit:
         return with_entrance_pupil(camera, found)
 
 
-@dataclass(frozen=True, eq=False)
-class Sightings:
+class Sightings(NamedTuple):
     """A board's dots in views: which dot (n,), crossings (n, 2) of the main lens, places (n, 2) on the array."""
 
     dot: NDArray[np.int64]
-    crossing_mm: NDArray[np.float64]
-    array_mm: NDArray[np.float64]
+    crossing_mm: Floats
+    array_mm: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,15 +175,16 @@ class SeenBoard:
     ----------
     signal : (rows, columns), dots bright, divided by the share of light that pixels pass
     z_mm : depth of the board, as told, from any origin
-    seen_z_mm : the same as the data sheet's camera sees it, from the focal point
+    alpha, forward : of x_m = alpha X - forward x at the depth where the data sheet's camera sees it
     place_mm : (n, 2) of the dots as the data sheet's camera sees them
     index : (n, 2) which dots they are
     """
 
-    signal: NDArray[np.float64]
+    signal: Floats
     z_mm: float
-    seen_z_mm: float
-    place_mm: NDArray[np.float64]
+    alpha: float
+    forward: float
+    place_mm: Floats
     index: NDArray[np.int64]
 
 
@@ -275,35 +250,31 @@ def _fit_as_seen_by(
             f"{lines[0]} x {lines[1]} dots were found in a board, polynomials need at least {SMALLEST_DEGREE + 1} "
             "along each axis"
         )
-    seen = [sightings_of(each, camera, board, media) for each in boards]
-    grid = common_grid([settled(*pair, camera, media) for pair in zip(boards, seen, strict=True)], board)
+    seen = [sightings_of(each, camera, board) for each in boards]
+    # Where the dots stand, (dots along x, dots along y, 2): turned and placed as the boards are on average.
+    places = [_similarity(settled(*pair), board) for pair in zip(boards, seen, strict=True)]
+    turn, middle = turn_matrix(float(np.mean([turn for turn, _ in places]))), np.mean([at for _, at in places], axis=0)
+    grid = _plate(np.moveaxis(np.indices(board.dots), 0, -1), board) @ turn.T + middle
     starts = []
     for one, sightings in zip(boards, seen, strict=True):
         lateral = grid[tuple(one.index[sightings.dot].T)]
         starts.append(np.column_stack([lateral, np.full(len(lateral), one.z_mm)]))
     start = np.concatenate(starts)
-    crossing, array = (np.concatenate([getattr(each, name) for each in seen]) for name in ("crossing_mm", "array_mm"))
+    _, crossing, array = (np.concatenate(each) for each in zip(*seen, strict=True))
     rays, residual, used = polynomial_fit(start, crossing, array, degree, camera)
     reach = np.stack([start[used, :2].min(axis=0), start[used, :2].max(axis=0)])
     number = np.repeat(np.arange(len(seen)), [len(each.dot) for each in seen])
     rms = [np.sqrt(np.mean(residual[used & (number == k)] ** 2, axis=0)) for k in range(len(seen))]
-    views = [alone_in_its_lens(each, camera) for each in seen]
-    sizes = [
-        shown(one.z_mm, _plate(one.index, board), each.dot, each.crossing_mm, each.array_mm)
-        for one, each in zip(boards, views, strict=True)
-        if len(each.dot)
-    ]
-    pupil = entrance_pupil_mm(sizes, media.depth_ratio) or (None, None)
-    return RayFit(rays, depths, reach, int(used.sum()), np.array(rms), *pupil)
-
-
-def alone_in_its_lens(sightings: Sightings, camera: Camera) -> Sightings:
-    """Return the sightings in views that no neighbouring lens's image reaches, where the aperture is a little wide."""
+    # In views that no neighbouring lens's image reaches, where the aperture is a little wide.
     step = camera.pixel_mm * camera.image_distance_mm / camera.microlens_distance_mm
     next_image = float(camera.lattice.pitch.min()) / camera.pixel_mm * step
-    clear = next_image - camera.aperture_radius_mm - RIM_PER_PATCH * step
-    kept = np.hypot(*sightings.crossing_mm.T) <= clear
-    return Sightings(sightings.dot[kept], sightings.crossing_mm[kept], sightings.array_mm[kept])
+    clear, sizes = next_image - camera.aperture_radius_mm - RIM_PER_PATCH * step, []
+    for one, each in zip(boards, seen, strict=True):
+        alone = np.hypot(*each.crossing_mm.T) <= clear
+        if alone.any():
+            sizes.append(shown(one.z_mm, _plate(one.index, board), *(values[alone] for values in each)))
+    pupil = entrance_pupil_mm(sizes, media.depth_ratio) or (None, None)
+    return RayFit(rays, depths, reach, int(used.sum()), np.array(rms), *pupil)
 
 
 def seen_board(
@@ -312,13 +283,13 @@ def seen_board(
     """Find and number the dots of one board in the picture refocused to where they are sharpest."""
     signal = dot_signal(np.asarray(image, dtype=np.float32), passed, board)
     try:
-        place, seen_z = first_dots(signal, camera, board, media, candidate_depths(camera, media))
+        place, seen_z = first_dots(signal, camera, board, media)
         kept, index = on_the_grid(np.column_stack([place, np.full(len(place), z_mm)]), board)
     except InputError as error:
         raise InputError(f"the board at {z_mm:g} mm: {error}") from error
-    usable = passed > 0.0
-    level = np.where(usable, signal / np.where(usable, passed, 1.0), 0.0)
-    return SeenBoard(level, z_mm, seen_z, place[kept], index)
+    distance = float(equivalent_object_distance(seen_z, camera.focus_distance_mm, media))
+    alpha, forward = float(camera.defocus(distance)), camera.image_distance_mm / distance
+    return SeenBoard(evenly_lit(signal, passed), z_mm, alpha, forward, place[kept], index)
 
 
 def aligned(boards: list[SeenBoard], board: BoardGeometry) -> list[SeenBoard]:
@@ -333,23 +304,12 @@ def aligned(boards: list[SeenBoard], board: BoardGeometry) -> list[SeenBoard]:
     return result
 
 
-def common_grid(boards: list[SeenBoard], board: BoardGeometry) -> NDArray[np.float64]:
-    """Return where the dots stand, (dots along x, dots along y, 2): turned and placed as the boards are on average.
-
-    The scale under which a camera sees a board is that of its magnification; it is taken out about the optical axis.
-    """
-    found = [_similarity(each, board) for each in boards]
-    turn = turn_matrix(float(np.mean([angle for angle, _ in found])))
-    middle = np.mean([place for _, place in found], axis=0)
-    return np.asarray(_plate(np.moveaxis(np.indices(board.dots), 0, -1), board) @ turn.T + middle, dtype=np.float64)
-
-
-def _plate(index: NDArray[np.int64], board: BoardGeometry) -> NDArray[np.float64]:
+def _plate(index: NDArray[np.int64], board: BoardGeometry) -> Floats:
     """Return places (..., 2) about the board's middle of dots given by their numbers."""
     return board.spacing_mm * (index - (np.array(board.dots) - 1) / 2)
 
 
-def _similarity(seen: SeenBoard, board: BoardGeometry) -> tuple[float, NDArray[np.float64]]:
+def _similarity(seen: SeenBoard, board: BoardGeometry) -> tuple[float, Floats]:
     """Return turn (rad) and middle (2,) of a board, its scale about the axis taken out."""
     plate = _plate(seen.index, board)
     zero, one = np.zeros(len(plate)), np.ones(len(plate))
@@ -360,35 +320,25 @@ def _similarity(seen: SeenBoard, board: BoardGeometry) -> tuple[float, NDArray[n
     return float(np.arctan2(sine, cosine)), np.array([x, y]) / np.hypot(cosine, sine)
 
 
-def settled(seen: SeenBoard, sightings: Sightings, camera: Camera, media: Media) -> SeenBoard:
+def settled(seen: SeenBoard, sightings: Sightings) -> SeenBoard:
     """Return a board with its dots where all their sightings together have them, for the data sheet's camera."""
-    alpha, forward = _paraxial(seen, camera, media)
-    place = (alpha * sightings.crossing_mm - sightings.array_mm) / forward
+    place = (seen.alpha * sightings.crossing_mm - sightings.array_mm) / seen.forward
     counts = np.bincount(sightings.dot, minlength=len(seen.index))
     sums = np.stack([np.bincount(sightings.dot, values, minlength=counts.size) for values in place.T], axis=1)
     found = counts > 0
     return replace(seen, place_mm=sums[found] / counts[found, np.newaxis], index=seen.index[found])
 
 
-def _paraxial(seen: SeenBoard, camera: Camera, media: Media) -> tuple[float, float]:
-    """Return alpha and s_i/s_o of x_m = alpha X - x s_i/s_o at the depth at which a board is seen."""
-    distance = float(equivalent_object_distance(seen.seen_z_mm, camera.focus_distance_mm, media))
-    return float(camera.defocus(distance)), camera.image_distance_mm / distance
-
-
-def sightings_of(seen: SeenBoard, camera: Camera, board: BoardGeometry, media: Media) -> Sightings:
+def sightings_of(seen: SeenBoard, camera: Camera, board: BoardGeometry) -> Sightings:
     """Look for the dots of a board in every view that the aperture gives wholly."""
-    alpha, forward = _paraxial(seen, camera, media)
-    step = camera.pixel_mm * camera.image_distance_mm / camera.microlens_distance_mm
-    pitch = float(camera.lattice.pitch.max())
-    window = 0.5 * board.dot_diameter_mm * forward + MARGIN_LENSES * pitch
-    reach = max(0.5 * board.spacing_mm * forward, window)
+    window = 0.5 * board.dot_diameter_mm * seen.forward + MARGIN_LENSES * float(camera.lattice.pitch.max())
+    reach = max(0.5 * board.spacing_mm * seen.forward, window)
     lenses = camera.lattice.points(lens_table(camera))
-    crossings = view_crossings(camera.aperture_radius_mm - RIM_PER_PATCH * step, step)
+    crossings = view_crossings(camera, RIM_PER_PATCH)
     found, heights = np.empty((len(crossings), len(seen.index), 2)), np.empty((len(crossings), len(seen.index)))
     for k, crossing in enumerate(crossings):
         view = sub_aperture_view(seen.signal, camera, crossing)
-        guess = alpha * crossing - forward * seen.place_mm
+        guess = seen.alpha * crossing - seen.forward * seen.place_mm
         found[k], heights[k] = dot_centroids(view, lenses, guess, window, reach)
     clear = heights > CONTRAST_SHARE * np.nanmedian(heights)
     view_of, dot = np.nonzero(clear & np.isfinite(found).all(axis=-1))
@@ -396,9 +346,7 @@ def sightings_of(seen: SeenBoard, camera: Camera, board: BoardGeometry, media: M
 
 
 @njit(cache=True)
-def dot_centroids(
-    view: NDArray[np.float64], lenses: NDArray[np.float64], guess: NDArray[np.float64], window: float, reach: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def dot_centroids(view: Floats, lenses: Floats, guess: Floats, window: float, reach: float) -> tuple[Floats, Floats]:
     """Return centroids (n, 2) and heights above the ground (n,) of dots in a view; NaN at its border.
 
     The ground is the median within `reach` of the guess; the light above it is weighed within `window` of the centroid.
@@ -440,12 +388,8 @@ def dot_centroids(
 
 
 def polynomial_fit(
-    start_mm: NDArray[np.float64],
-    crossing_mm: NDArray[np.float64],
-    array_mm: NDArray[np.float64],
-    degree: int,
-    camera: Camera,
-) -> tuple[PolynomialRays, NDArray[np.float64], NDArray[np.bool_]]:
+    start_mm: Floats, crossing_mm: Floats, array_mm: Floats, degree: int, camera: Camera
+) -> tuple[PolynomialRays, Floats, NDArray[np.bool_]]:
     """Return the complete polynomials through rays from (n, 3) through (n, 2) to (n, 2), and how well they fit.
 
     That is the misfit (n, 2) in mm, and which rays were used (n,).

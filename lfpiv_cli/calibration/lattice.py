@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft, ndimage
 from scipy.special import fdtrc
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.white import (
     NARROWEST_LENS_IMAGE,
     checked_white,
@@ -29,9 +30,7 @@ from lfpiv_cli.neighbourhoods import largest_around
 from lfpiv_cli.optics.camera import Lattice
 
 # The pitch and direction of a lens lattice, from the spectrum of a white image: a guess that needs no data sheet.
-#
-# Axes: vectors are (column, row); frequencies in cycles per pixel.
-
+# Frequencies are (column, row), in cycles per pixel.
 
 # Below 6 px a lens image has no shape left to measure; the upper end leaves room beyond the 60 px of any known camera.
 SMALLEST_PITCH_PX = 6.0
@@ -51,11 +50,11 @@ BIN_TOLERANCE = 2
 REFINE_BINS = 2
 
 
-def lattice_vectors(image: NDArray[np.float64]) -> tuple[NDArray[np.float64], Layout]:
+def lattice_vectors(image: Floats) -> tuple[Floats, Layout]:
     """Return two basis vectors (2, 2) of the lattice of bright spots, the first nearest the columns, and its layout.
 
     The slowest line that has a partner tells the layout by where this stands: at 90 degrees on squares, at 60 on
-    hexagons, which have no line as slow at 90.
+    hexagons, which have no line as slow at 90. The second vector is turned from the first towards the rows.
 
     Parameters
     ----------
@@ -63,27 +62,43 @@ def lattice_vectors(image: NDArray[np.float64]) -> tuple[NDArray[np.float64], La
 
     Raises
     ------
-    InputError
-        when the spectrum holds no such lattice with a pitch of 6 to 90 px
+    InputError : when the spectrum holds no such lattice with a pitch of 6 to 90 px
     """
-    power, step = centre_spectrum(image)
-    for first in spectral_lines(power, step):
-        turns: dict[Layout, float] = {"square": np.pi / 2.0, "hexagonal": np.pi / 3.0}
+    power, step, lines = spectral_lines(image)
+    turns: dict[Layout, float] = {"square": np.pi / 2.0, "hexagonal": np.pi / 3.0}
+    for first in lines:
         partner = {layout: line_power(power, step, rotated(first, turn)) for layout, turn in turns.items()}
         layout: Layout = "square" if partner["square"] >= partner["hexagonal"] else "hexagonal"
         if partner[layout] >= PARTNER_SHARE * line_power(power, step, first):
-            second = rotated(first, turns[layout])
-            return column_first(first_basis(power, step, first, second, layout), layout), layout
-    raise InputError(
-        f"no lattice of lens images with a pitch of {SMALLEST_PITCH_PX:g} to {LARGEST_PITCH_PX:g} px is visible in the "
-        "white image; check the exposure, and that it is a white image"
-    )
+            break
+    else:
+        raise InputError(
+            f"no lattice of lens images with a pitch of {SMALLEST_PITCH_PX:g} to {LARGEST_PITCH_PX:g} px is visible in "
+            "the white image; check the exposure, and that it is a white image"
+        )
+    # The vectors are the rows of the inverse transpose of the frequencies.
+    frequencies = []
+    for line in (first, rotated(first, turns[layout])):
+        # To a fraction of a bin: the centroid of the power about the strongest one.
+        near, columns, rows = bins_around(power, step, line, BIN_TOLERANCE)
+        row, column = np.unravel_index(np.argmax(near), near.shape)
+        peak = np.array([columns[0, column], rows[row, 0]]) * step
+        near, columns, rows = bins_around(power, step, peak, REFINE_BINS)
+        frequencies.append(np.array([(near * columns).sum() / near.sum(), (near * rows).sum() / near.sum()]) * step)
+    a, b = np.linalg.inv(np.stack(frequencies)).T
+    if layout == "hexagonal":
+        # Frequencies at 60 degrees make vectors at 120; the sum of these stands at 60 to the first.
+        b = b + a
+    around = np.array([a, b, -a, -b] if layout == "square" else [a, b, b - a, -a, -b, a - b])
+    nearest = int(np.argmin(np.abs(np.arctan2(around[:, 1], around[:, 0]))))
+    return np.stack([around[nearest], around[(nearest + 1) % len(around)]]), layout
 
 
-def centre_spectrum(image: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the power spectrum of the image's middle and its frequency step along (columns, rows).
+def spectral_lines(image: Floats) -> tuple[Floats, Floats, list[Floats]]:
+    """Return the power spectrum of the image's middle, its frequency step along (columns, rows), and its lines.
 
-    The power is indexed [row frequency, column frequency >= 0]; slow illumination is taken off first.
+    The power is indexed [row frequency, column frequency >= 0]; slow illumination is taken off first. Lines are the
+    strong local maxima as frequencies (column, row), the slowest first.
     """
     rows, columns = image.shape
     top, left = max(0, (rows - SIDE_PX) // 2), max(0, (columns - SIDE_PX) // 2)
@@ -92,11 +107,7 @@ def centre_spectrum(image: NDArray[np.float64]) -> tuple[NDArray[np.float64], ND
     window = np.outer(np.hanning(part.shape[0]), np.hanning(part.shape[1]))
     size = [fft.next_fast_len(2 * n) for n in part.shape]
     power = np.abs(fft.rfft2((part - slow) * window, s=size)) ** 2
-    return power, np.array([1.0 / size[1], 1.0 / size[0]])
-
-
-def spectral_lines(power: NDArray[np.float64], step: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Return the strong local maxima of the spectrum as frequencies (column, row), the slowest first."""
+    step = np.array([1.0 / size[1], 1.0 / size[0]])
     frequency = np.hypot(*np.meshgrid(step[0] * np.arange(power.shape[1]), fft.fftfreq(power.shape[0])))
     in_range = (frequency >= 1.0 / LARGEST_PITCH_PX) & (frequency <= 1.0 / (SMALLEST_PITCH_PX * np.sqrt(0.75)))
     masked = np.where(in_range, power, 0.0)
@@ -105,18 +116,18 @@ def spectral_lines(power: NDArray[np.float64], step: NDArray[np.float64]) -> lis
     strongest = around[BIN_TOLERANCE:-BIN_TOLERANCE, BIN_TOLERANCE:-BIN_TOLERANCE]
     row, column = np.nonzero((masked == strongest) & (masked > floor))
     lines = np.stack([step[0] * column, fft.fftfreq(power.shape[0])[row]], axis=1)
-    return list(lines[np.argsort(np.hypot(lines[:, 0], lines[:, 1]), kind="stable")])
+    return power, step, list(lines[np.argsort(np.hypot(lines[:, 0], lines[:, 1]), kind="stable")])
 
 
-def rotated(vector: NDArray[np.float64], angle_rad: float) -> NDArray[np.float64]:
+def rotated(vector: Floats, angle_rad: float) -> Floats:
     """Return the vector turned from the columns towards the rows."""
     cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
     return np.array([cosine * vector[0] - sine * vector[1], sine * vector[0] + cosine * vector[1]])
 
 
 def bins_around(
-    power: NDArray[np.float64], step: NDArray[np.float64], line: NDArray[np.float64], reach: int
-) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
+    power: Floats, step: Floats, line: Floats, reach: int
+) -> tuple[Floats, NDArray[np.int64], NDArray[np.int64]]:
     """Return the power near a frequency and its column and row bin numbers; the half-plane is mirrored where needed."""
     column, row = np.rint(line / step).astype(np.int64)
     columns = np.arange(column - reach, column + reach + 1)[np.newaxis, :]
@@ -125,50 +136,9 @@ def bins_around(
     return power[(rows * mirror) % power.shape[0], np.abs(columns)], columns, rows
 
 
-def line_power(power: NDArray[np.float64], step: NDArray[np.float64], line: NDArray[np.float64]) -> float:
+def line_power(power: Floats, step: Floats, line: Floats) -> float:
     """Return the strongest power within the tolerance around a frequency."""
     return float(bins_around(power, step, line, BIN_TOLERANCE)[0].max())
-
-
-def refined_line(
-    power: NDArray[np.float64], step: NDArray[np.float64], line: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return the frequency of a line to a fraction of a bin: the centroid of its power about the strongest bin."""
-    near, columns, rows = bins_around(power, step, line, BIN_TOLERANCE)
-    peak_row, peak_column = np.unravel_index(np.argmax(near), near.shape)
-    peak = np.array([columns[0, peak_column], rows[peak_row, 0]]) * step
-    near, columns, rows = bins_around(power, step, peak, REFINE_BINS)
-    total = near.sum()
-    return np.array([(near * columns).sum() / total, (near * rows).sum() / total]) * step
-
-
-def first_basis(
-    power: NDArray[np.float64],
-    step: NDArray[np.float64],
-    first: NDArray[np.float64],
-    second: NDArray[np.float64],
-    layout: Layout,
-) -> NDArray[np.float64]:
-    """Return lattice vectors from two neighbouring lines: the rows of the inverse transpose of the frequencies.
-
-    On hexagons the frequencies stand at 60 degrees and the vectors at 120; the sum of these stands at 60 to the first.
-    """
-    frequencies = np.stack([refined_line(power, step, first), refined_line(power, step, second)])
-    basis = np.asarray(np.linalg.inv(frequencies).T, dtype=np.float64)
-    if layout == "hexagonal":
-        basis[1] += basis[0]
-    return basis
-
-
-def column_first(basis: NDArray[np.float64], layout: Layout) -> NDArray[np.float64]:
-    """Return the same lattice with the first vector nearest the columns, the second turned from it towards the rows."""
-    if layout == "square":
-        around = np.array([basis[0], basis[1], -basis[0], -basis[1]])
-    else:
-        around = np.array([basis[0], basis[1], basis[1] - basis[0], -basis[0], -basis[1], basis[0] - basis[1]])
-    angle = np.arctan2(around[:, 1], around[:, 0])
-    first = int(np.argmin(np.abs(angle)))
-    return np.stack([around[first], around[(first + 1) % len(around)]])
 
 
 # Fewer lenses leave the cubic's ten coefficients per axis without a check.
@@ -214,13 +184,13 @@ class LatticeFit:
 
     lattice_px: Lattice
     indices: NDArray[np.int64]
-    centres_px: NDArray[np.float64]
-    cubic_px: NDArray[np.float64]
+    centres_px: Floats
+    cubic_px: Floats
     cubic_used: bool
-    residual_px: NDArray[np.float64]
-    residual_affine_px: NDArray[np.float64]
-    pitch_sigma_px: NDArray[np.float64]
-    origin_sigma_px: NDArray[np.float64]
+    residual_px: Floats
+    residual_affine_px: Floats
+    pitch_sigma_px: Floats
+    origin_sigma_px: Floats
     rotation_sigma_rad: float
 
     @property
@@ -229,7 +199,7 @@ class LatticeFit:
         return len(self.indices)
 
     @property
-    def coefficients_px(self) -> NDArray[np.float64]:
+    def coefficients_px(self) -> Floats:
         """Coefficients (10, 2) of the chosen model, in the order of `EXPONENTS`."""
         if self.cubic_used:
             return self.cubic_px
@@ -237,11 +207,11 @@ class LatticeFit:
         plain[0], plain[1:3] = self.lattice_px.origin, self.lattice_px.basis
         return plain
 
-    def centres(self, indices: ArrayLike) -> NDArray[np.float64]:
+    def centres(self, indices: ArrayLike) -> Floats:
         """Return the modelled centres of lens images, (column, row), indices of shape (..., 2)."""
         return polynomial_terms(indices) @ self.coefficients_px
 
-    def shifted(self, shift_px: NDArray[np.float64]) -> LatticeFit:
+    def shifted(self, shift_px: Floats) -> LatticeFit:
         """Return the lattice with all lens images moved by a shift (2,), (columns, rows)."""
         cubic = self.cubic_px.copy()
         cubic[0] += shift_px
@@ -266,17 +236,28 @@ def fit_lattice(
 
     Raises
     ------
-    InputError
-        when the image is too dark, saturated or shows no lattice
+    InputError : when the image is too dark, saturated or shows no lattice
     """
     image = checked_white(white, dark, saturation)
     fit = _lattice_of(image, layout)
-    falloff = _falloff(image, fit.lattice_px)
-    return fit if falloff is None else _lattice_of(image / falloff, layout)
+
+    # Light that falls towards the corners pulls the centroids of lens images to the middle, in proportion to the image
+    # height: as another pitch would.
+    even = image.astype(np.float32)
+    if lens_image_width(even, fit.lattice_px) < NARROWEST_LENS_IMAGE:
+        return fit
+    coefficients = fit_vignetting(relative_transmission(even, fit.lattice_px), fit.lattice_px)
+    if coefficients is None:
+        return fit
+    passed = vignetting_surface(coefficients, image.shape)
+    return _lattice_of(image / passed, layout) if np.ptp(passed) > EVEN_LIGHT else fit
 
 
-def _lattice_of(image: NDArray[np.float64], layout: Layout | None) -> LatticeFit:
-    """Return the lattice through the centroids of the lens images of a white image less the dark one."""
+def _lattice_of(image: Floats, layout: Layout | None) -> LatticeFit:
+    """Return the lattice through the centroids of the lens images of a white image less the dark one.
+
+    These are the spots that a walk from the middle of the image reaches.
+    """
     basis, seen = lattice_vectors(image)
     if layout is not None and seen != layout:
         raise InputError(
@@ -284,37 +265,11 @@ def _lattice_of(image: NDArray[np.float64], layout: Layout | None) -> LatticeFit
         )
     points = find_spots(image, float(np.mean(np.hypot(basis[:, 0], basis[:, 1]))))
     centre = (np.array(image.shape[::-1]) - 1.0) / 2.0
-    indices, points = indexed_from_centre(points, basis, centre)
-    indices, points = without_strays(indices, points, float(np.hypot(*basis[0])))
-    return lattice_through(indices, points, centre, seen)
-
-
-def _falloff(image: NDArray[np.float64], lattice_px: Lattice) -> NDArray[np.float32] | None:
-    """Return the share (rows, columns) of light that passes, smooth over the lenses; None where that moves no centroid.
-
-    Light that falls towards the corners pulls the centroids of lens images to the middle, in proportion to the image
-    height: as another pitch would.
-    """
-    white = image.astype(np.float32)
-    if lens_image_width(white, lattice_px) < NARROWEST_LENS_IMAGE:
-        return None
-    coefficients = fit_vignetting(relative_transmission(white, lattice_px), lattice_px)
-    if coefficients is None:
-        return None
-    passed = vignetting_surface(coefficients, image.shape)
-    return passed if np.ptp(passed) > EVEN_LIGHT else None
-
-
-def indexed_from_centre(
-    points: NDArray[np.float64], basis: NDArray[np.float64], centre: NDArray[np.float64]
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return lattice indices and positions of the spots that a walk from the middle of the image reaches."""
-    best = np.zeros(len(points), dtype=bool)
-    best_indices = np.zeros((len(points), 2), dtype=np.int64)
+    best, indices = np.zeros(len(points), dtype=bool), np.zeros((len(points), 2), dtype=np.int64)
     for start in np.argsort(np.hypot(*(points - centre).T), kind="stable")[:STARTS]:
-        indices, reached = index_spots(points, int(start), basis)
+        found, reached = index_spots(points, int(start), basis)
         if reached.sum() > best.sum():
-            best, best_indices = reached, indices
+            best, indices = reached, found
         if best.sum() >= REACHED_SHARE * len(points):
             break
     if best.sum() < FEWEST_LENSES:
@@ -322,18 +277,17 @@ def indexed_from_centre(
             f"only {int(best.sum())} lens images of the white image form a lattice, at least {FEWEST_LENSES} are "
             "needed; check microlenses.layout, the exposure, and that it is a white image"
         )
-    return best_indices[best], points[best]
+    indices, points = without_strays(indices[best], points[best], float(np.hypot(*basis[0])))
+    return lattice_through(indices, points, centre, seen)
 
 
-def polynomial_terms(indices: ArrayLike, count: int = len(EXPONENTS)) -> NDArray[np.float64]:
+def polynomial_terms(indices: ArrayLike, count: int = len(EXPONENTS)) -> Floats:
     """Return the first `count` monomials of the indices, shape (..., count)."""
     index = np.asarray(indices, dtype=np.float64)
     return np.stack([index[..., 0] ** a * index[..., 1] ** b for a, b in EXPONENTS[:count]], axis=-1)
 
 
-def robust_fit(
-    terms: NDArray[np.float64], points: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def robust_fit(terms: Floats, points: Floats) -> tuple[Floats, Floats]:
     """Return coefficients (terms, 2) by least squares with Tukey's weights, and these weights (n,)."""
     scale = np.abs(terms).max(axis=0)
     weights = np.ones(len(points))
@@ -348,9 +302,7 @@ def robust_fit(
     return coefficients, weights
 
 
-def without_strays(
-    indices: NDArray[np.int64], points: NDArray[np.float64], pitch_px: float
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def without_strays(indices: NDArray[np.int64], points: Floats, pitch_px: float) -> tuple[NDArray[np.int64], Floats]:
     """Drop the spots that lie more than a quarter of the pitch off the cubic: dirt between the lenses."""
     terms = polynomial_terms(indices)
     coefficients, _ = robust_fit(terms, points)
@@ -358,9 +310,7 @@ def without_strays(
     return indices[kept], points[kept]
 
 
-def lattice_through(
-    indices: NDArray[np.int64], points: NDArray[np.float64], centre: NDArray[np.float64], layout: Layout
-) -> LatticeFit:
+def lattice_through(indices: NDArray[np.int64], points: Floats, centre: Floats, layout: Layout) -> LatticeFit:
     """Fit the plain lattice and the cubic to numbered lens images and judge whether the cubic is worth it."""
     first, _ = robust_fit(polynomial_terms(indices, 3), points)
     indices = indices - Lattice(first[0], first[1:3], layout).nearest(centre)
@@ -372,7 +322,14 @@ def lattice_through(
     cubic_used = cubic_is_significant(terms, points, np.minimum(affine_weights, cubic_weights))
     residual, weights = (cubic_residual, cubic_weights) if cubic_used else (affine_residual, affine_weights)
     spread = coefficient_sigmas(terms[:, :3], residual, weights, points)
-    pitch_sigma, rotation_sigma = affine_errors(affine[1:3], spread[1:3])
+    # Standard errors of the pitch, along the vectors, and of the rotation, across them.
+    length2 = np.sum(affine[1:3] ** 2, axis=1)
+    along2, across2 = (np.sum((each * spread[1:3]) ** 2, axis=1) / length2 for each in (affine[1:3], affine[1:3, ::-1]))
+    # Dirt on a lens, which has no weight, is not the fit's error.
+    rms, rms_affine = (
+        np.sqrt(np.mean(off[weight > 0.0] ** 2, axis=0))
+        for off, weight in ((cubic_residual, cubic_weights), (affine_residual, affine_weights))
+    )
     origin_sigma = coefficient_sigmas(terms, residual, weights, points)[0] if cubic_used else spread[0]
     return LatticeFit(
         lattice_px=Lattice(affine[0], affine[1:3], layout),
@@ -380,20 +337,15 @@ def lattice_through(
         centres_px=points,
         cubic_px=cubic,
         cubic_used=cubic_used,
-        residual_px=weighted_rms(cubic_residual, cubic_weights),
-        residual_affine_px=weighted_rms(affine_residual, affine_weights),
-        pitch_sigma_px=pitch_sigma,
+        residual_px=rms,
+        residual_affine_px=rms_affine,
+        pitch_sigma_px=np.sqrt(along2),
         origin_sigma_px=origin_sigma,
-        rotation_sigma_rad=rotation_sigma,
+        rotation_sigma_rad=float(np.sqrt(np.sum(across2 / length2)) / 2.0),
     )
 
 
-def weighted_rms(residual: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the rms (2,) of the residuals whose weight is not zero: dirt on a lens is not the fit's error."""
-    return np.sqrt(np.mean(residual[weights > 0.0] ** 2, axis=0))
-
-
-def cubic_is_significant(terms: NDArray[np.float64], points: NDArray[np.float64], weights: NDArray[np.float64]) -> bool:
+def cubic_is_significant(terms: Floats, points: Floats, weights: Floats) -> bool:
     """Tell by an F-test whether the seven further coefficients per axis do enough, and more than chance.
 
     What a centroid's place within its pixel explains is the pixels' own error: behind a telecentric lens, where lens
@@ -420,9 +372,7 @@ def cubic_is_significant(terms: NDArray[np.float64], points: NDArray[np.float64]
     return bool(fdtrc(more, rest, ratio) < CUBIC_CHANCE)
 
 
-def coefficient_sigmas(
-    terms: NDArray[np.float64], residual: NDArray[np.float64], weights: NDArray[np.float64], places: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def coefficient_sigmas(terms: Floats, residual: Floats, weights: Floats, places: Floats) -> Floats:
     """Return standard errors (terms, 2) of coefficients fitted with weights, errors being alike in parts of the image.
 
     The sandwich estimate over parts: what the residuals of each part pull at the coefficients counts as one error.
@@ -443,11 +393,3 @@ def coefficient_sigmas(
         together, apart = (inverse @ (each.T @ each) @ inverse for each in (pulls, pull))
         sigmas.append(np.sqrt(freedom * np.maximum(np.diag(together), np.diag(apart))) / scale)
     return np.stack(sigmas, axis=1)
-
-
-def affine_errors(basis: NDArray[np.float64], sigma: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """Return the standard errors of the pitch (2,) px and the rotation (rad) from those of the basis (2, 2)."""
-    length2 = np.sum(basis**2, axis=1)
-    along = np.sqrt(np.sum((basis * sigma) ** 2, axis=1) / length2)
-    across2 = np.sum((basis[:, ::-1] * sigma) ** 2, axis=1) / length2
-    return along, float(np.sqrt(np.sum(across2 / length2)) / 2.0)

@@ -20,6 +20,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.lattice import LatticeFit
 from lfpiv_cli.calibration.rectification import Rectification
 from lfpiv_cli.optics.camera import Lattice
@@ -47,6 +48,8 @@ UNEVENNESS = 0.1
 # With fewer parts that tell of the shift its error is not known; with these it may grow along the sides. It is told
 # where a part tells this share of what the best one does.
 FEWEST_PARTS, PARTS_FOR_SLOPES, WELL_LIT = 3.0, 10.0, 0.3
+# Keeps a share of no light from being one of nothing.
+TINY = float(np.finfo(np.float64).tiny)
 
 
 class Cells(NamedTuple):
@@ -59,11 +62,11 @@ class Cells(NamedTuple):
     origin_px, inverse_basis : (2,), (2, 2) of the plain lattice
     """
 
-    off: NDArray[np.float64]
+    off: Floats
     first_i: int
     first_j: int
-    origin_px: NDArray[np.float64]
-    inverse_basis: NDArray[np.float64]
+    origin_px: Floats
+    inverse_basis: Floats
 
     @classmethod
     def of(cls, lattice_px: Lattice, shape: tuple[int, int], fit: LatticeFit | None = None) -> Cells:
@@ -80,7 +83,7 @@ class Cells(NamedTuple):
 class Place(NamedTuple):
     """How far beside its lens images the light lies somewhere, (2,) pixels, and the standard error along that."""
 
-    shift_px: NDArray[np.float64]
+    shift_px: Floats
     sigma_px: float
 
 
@@ -116,8 +119,8 @@ class LensImages:
 
     lattice_px: Lattice
     cells: Cells
-    area: NDArray[np.float64]
-    pattern: NDArray[np.float64]
+    area: Floats
+    pattern: Floats
     between: NDArray[np.int64]
 
     @classmethod
@@ -129,35 +132,86 @@ class LensImages:
         cells = Cells.of(lattice, shape, rectification.fit)
         bins = int(np.clip(np.rint(lattice.pitch.mean()), FEWEST_BINS, MOST_BINS))
         if transmission is None:
-            pattern = np.repeat(_discs(lattice, bins, lens_image_width)[np.newaxis], PARTS**2, axis=0)
+            # A pixel's rim is soft.
+            place, rim = cell_places(bins), 0.5 * lens_image_width * float(lattice.pitch.mean()) + 0.5
+            steps = range(-2, 4)
+            distances = (np.linalg.norm((place - (i, j)) @ lattice.basis, axis=-1) for i in steps for j in steps)
+            discs = np.asarray(sum(np.clip(rim - distance, 0.0, 1.0) for distance in distances))
+            pattern = np.repeat(discs[np.newaxis], PARTS**2, axis=0)
         else:
             upright, inside = Cells.of(rectification.lattice_px, shape), rectification.inside
             light, lit = (folded(np.where(inside, each, 0.0), 0.0, upright, bins) for each in (transmission, 1.0))
             pattern = _over(light, lit)
         area = folded(np.ones(shape), 0.0, cells, bins)
-        return cls(lattice, cells, area, pattern, _between(cells, shape, pattern.sum(axis=0)))
+
+        # Enough pixels all over a picture that uniform light leaves dark; all if it leaves none.
+        number = np.arange(0, shape[0] * shape[1], shape[0] * shape[1] // ENOUGH + 1)
+        share = (np.column_stack([number % shape[1], number // shape[1]]) - cells.origin_px) @ cells.inverse_basis
+        i, j = np.rint(share).astype(np.int64).T
+        share = share - cells.off[j - cells.first_j, i - cells.first_i]
+        column, row = np.rint(bins * share).astype(np.int64).T % bins
+        uniform = pattern.sum(axis=0)
+        between = number[uniform[row, column] <= max(DARK_SHARE * uniform.max(), uniform.min())]
+        return cls(lattice, cells, area, pattern, between)
 
     def beside(self, picture: NDArray[np.floating]) -> Beside:
         """Return where the light of a raw picture (rows, columns) less its dark image lies; unusable pixels are NaN."""
         middle, noise = self.background(picture)
         light = folded(picture, middle + LIGHT_SIGMAS * noise, self.cells, self.pattern.shape[-1])
         light = _over(light, self.area)
-        system, shift = self._settled(light, _nearest_bin(light, self.pattern, self.lattice_px))
+
+        # To a bin it is where the pattern correlates best with the light.
+        first, second = (np.fft.fft2(each.sum(axis=0) - each.sum(axis=0).mean()) for each in (light, self.pattern))
+        alike = np.fft.ifft2(first * np.conj(second)).real
+        row, column = np.unravel_index(int(np.argmax(alike)), alike.shape)
+        share = np.array([column, row]) / len(alike)
+        system, unknowns = self._settled(light, (share - np.rint(share)) @ self.lattice_px.basis)
         if system.alike >= PARTS_FOR_SLOPES:
-            system, shift = self._settled(light, np.concatenate([shift, np.zeros(4)]))
-        following, sigma = system.following(light)
-        lit = float(light.mean()) > TIMES_NOISE * NOISE_LIGHT * noise
-        return Beside(_places(shift, system), following, sigma, lit)
+            system, unknowns = self._settled(light, np.concatenate([unknowns, np.zeros(4)]))
+
+        # Standard errors are by how parts differ (the sandwich estimate), and by bins.
+        inverse = np.linalg.inv(system.matrix.sum(axis=0))
+        freedom = system.alike / max(system.alike - (0.5 * len(unknowns) + 1.0), 1.0)
+        covariance = freedom * (inverse @ (system.pull.T @ system.pull) @ inverse + inverse)
+        places, known = [], system.alike > FEWEST_PARTS
+        for lever in _levers(part_middles()[system.told >= WELL_LIT * system.told.max()])[..., : len(unknowns)]:
+            shift, spread = lever @ unknowns, lever @ covariance @ lever.T
+            along = shift / max(float(np.hypot(*shift)), TINY)
+            places.append(Place(shift, float(np.sqrt(along @ spread @ along)) if known else np.inf))
+        level = light.mean(axis=(1, 2))
+        total = max(float(level.sum()), TINY)
+        following = float(system.amount.sum()) / total
+        sigma = float(np.sqrt(np.sum((system.amount - following * level) ** 2))) / total
+        return Beside(tuple(places), following, sigma, float(light.mean()) > TIMES_NOISE * NOISE_LIGHT * noise)
 
     def background(self, picture: NDArray[np.floating]) -> tuple[float, float]:
         """Return level and noise of a picture's background: what darker pixels between lens images vary about."""
         return dark_level(picture.ravel()[self.between])
 
-    def _settled(self, light: NDArray[np.float64], unknowns: NDArray[np.float64]) -> tuple[System, NDArray[np.float64]]:
-        """Return the last normal equations, and the unknowns by Gauss-Newton from first values of them."""
+    def _settled(self, light: Floats, unknowns: Floats) -> tuple[System, Floats]:
+        """Return the last normal equations, and the unknowns (2,) or (6,) by Gauss-Newton from first values of them."""
+        lattice, parts, bins = self.lattice_px, len(light), light.shape[-1]
+        inverse, lever = np.linalg.inv(lattice.basis), _levers(part_middles())[..., : len(unknowns)]
+        cell = Lattice(np.zeros(2), lattice.basis / lattice.pitch.mean(), lattice.layout)
+        seen = light.reshape(parts, -1, 1)
         for _ in range(ROUNDS):
-            system = _system(light, self.pattern, self.lattice_px, unknowns)
-            unknowns = unknowns + system.step
+            moved, slope = _moved(self.pattern, lever @ unknowns @ inverse)
+            across = (cell_places(bins) @ lattice.basis - unknowns[:2]) / lattice.pitch.mean()
+            across -= cell.points(cell.nearest(across))
+            free = np.stack([moved, moved * across[..., 0], moved * across[..., 1], np.ones_like(moved)], axis=-1)
+            kept, upper = np.linalg.qr(free.reshape(parts, -1, 4))
+            factor = np.linalg.solve(upper, np.swapaxes(kept, 1, 2) @ seen)[:, 0]
+            amount = factor[:, 0] * moved.mean(axis=(1, 2))
+            design = np.maximum(factor, 0.0)[:, :1, np.newaxis] * (slope.reshape(parts, -1, 2) @ inverse.T)
+            rest, design = (each - kept @ (np.swapaxes(kept, 1, 2) @ each) for each in (seen, design))
+            variance = np.sum(rest[..., 0] ** 2, axis=1) / (bins**2 - 4) + (UNEVENNESS * amount) ** 2
+            weight = 1.0 / np.maximum(variance, TINY)[:, np.newaxis, np.newaxis]
+            design = design @ lever
+            matrix = weight * (np.swapaxes(design, 1, 2) @ design)
+            # nothing is known beyond half a pitch: parts without light leave the rest as it is
+            matrix += np.eye(len(unknowns)) / (parts * (0.5 * float(lattice.pitch.mean())) ** 2)
+            system = System(matrix, (weight * (np.swapaxes(design, 1, 2) @ rest))[..., 0], amount)
+            unknowns = unknowns + np.linalg.inv(matrix.sum(axis=0)) @ system.pull.sum(axis=0)
         return system, unknowns
 
 
@@ -174,7 +228,7 @@ def dark_level(pixels: NDArray[np.floating]) -> tuple[float, float]:
     return float(2.0 * one - two), float(one - two)
 
 
-def folded(picture: NDArray[np.floating], level: float, cells: Cells, bins: int) -> NDArray[np.float64]:
+def folded(picture: NDArray[np.floating], level: float, cells: Cells, bins: int) -> Floats:
     """Return the light above a level on one cell (parts, bins, bins), summed over each part of a picture.
 
     Pixels that are not numbers have none.
@@ -189,7 +243,7 @@ def folded(picture: NDArray[np.floating], level: float, cells: Cells, bins: int)
 
 @njit(cache=True, nogil=True)
 def fold_strips(
-    strips: tuple[int, int], picture: NDArray[np.float32], level: float, cells: Cells, total: NDArray[np.float64]
+    strips: tuple[int, int], picture: NDArray[np.float32], level: float, cells: Cells, total: Floats
 ) -> None:
     """Add the light of strips of parts to `total`; a pixel's is shared by the four bins around it."""
     (rows, columns), bins = picture.shape, total.shape[1] - 2
@@ -225,22 +279,12 @@ class System(NamedTuple):
     amount : (parts,) light that follows the lens images
     """
 
-    matrix: NDArray[np.float64]
-    pull: NDArray[np.float64]
-    amount: NDArray[np.float64]
+    matrix: Floats
+    pull: Floats
+    amount: Floats
 
     @property
-    def inverse(self) -> NDArray[np.float64]:
-        """(k, k) of the sum of all parts."""
-        return np.asarray(np.linalg.inv(self.matrix.sum(axis=0)))
-
-    @property
-    def step(self) -> NDArray[np.float64]:
-        """(k,) towards the solution."""
-        return np.asarray(self.inverse @ self.pull.sum(axis=0))
-
-    @property
-    def told(self) -> NDArray[np.float64]:
+    def told(self) -> Floats:
         """(parts,) how much each part tells of the shift."""
         return np.asarray(np.trace(self.matrix[:, :2, :2], axis1=1, axis2=2))
 
@@ -249,51 +293,8 @@ class System(NamedTuple):
         """How many parts that tell as much as each other would tell what they do."""
         return float(self.told.sum() ** 2 / np.sum(self.told**2))
 
-    @property
-    def covariance(self) -> NDArray[np.float64]:
-        """(k, k) by how parts differ (the sandwich estimate), and bins; of no use where too few parts tell."""
-        few = 0.5 * self.pull.shape[1] + 1.0
-        freedom = self.alike / max(self.alike - few, 1.0)
-        apart = self.inverse @ (self.pull.T @ self.pull) @ self.inverse
-        return np.asarray(freedom * (apart + self.inverse))
 
-    def following(self, light: NDArray[np.float64]) -> tuple[float, float]:
-        """Return the share of all light that follows the lens images, and its standard error by how parts differ."""
-        level = light.mean(axis=(1, 2))
-        total = max(float(level.sum()), np.finfo(np.float64).tiny)
-        share = float(self.amount.sum()) / total
-        return share, float(np.sqrt(np.sum((self.amount - share * level) ** 2))) / total
-
-
-def _system(
-    light: NDArray[np.float64], pattern: NDArray[np.float64], lattice: Lattice, unknowns: NDArray[np.float64]
-) -> System:
-    """Return the normal equations about the shift that `unknowns` (2,) or (6,) tell."""
-    parts, bins = len(light), light.shape[-1]
-    inverse = np.linalg.inv(lattice.basis)
-    lever = _levers(part_middles())[..., : len(unknowns)]
-    moved, slope = _moved(pattern, lever @ unknowns @ inverse)
-    across = (cell_places(bins) @ lattice.basis - unknowns[:2]) / lattice.pitch.mean()
-    cell = Lattice(np.zeros(2), lattice.basis / lattice.pitch.mean(), lattice.layout)
-    across -= cell.points(cell.nearest(across))
-    free = np.stack([moved, moved * across[..., 0], moved * across[..., 1], np.ones_like(moved)], axis=-1)
-    kept, upper = np.linalg.qr(free.reshape(parts, -1, 4))
-    seen = light.reshape(parts, -1, 1)
-    factor = np.linalg.solve(upper, np.swapaxes(kept, 1, 2) @ seen)[:, 0]
-    amount = factor[:, 0] * moved.mean(axis=(1, 2))
-    design = np.maximum(factor, 0.0)[:, :1, np.newaxis] * (slope.reshape(parts, -1, 2) @ inverse.T)
-    rest, design = (each - kept @ (np.swapaxes(kept, 1, 2) @ each) for each in (seen, design))
-    variance = np.sum(rest[..., 0] ** 2, axis=1) / (bins**2 - 4) + (UNEVENNESS * amount) ** 2
-    weight = 1.0 / np.maximum(variance, np.finfo(np.float64).tiny)[:, np.newaxis, np.newaxis]
-    design = design @ lever
-    matrix = weight * (np.swapaxes(design, 1, 2) @ design)
-    # nothing is known beyond half a pitch: parts without light leave the rest as it is
-    matrix += np.eye(len(unknowns)) / (parts * (0.5 * float(lattice.pitch.mean())) ** 2)
-    pull = (weight * (np.swapaxes(design, 1, 2) @ rest))[..., 0]
-    return System(matrix, pull, amount)
-
-
-def _moved(pattern: NDArray[np.float64], shift: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _moved(pattern: Floats, shift: Floats) -> tuple[Floats, Floats]:
     """Return the pattern moved by a shift (parts, 2) in cells, and its slopes (parts, bins, bins, 2) with the shift."""
     bins = pattern.shape[-1]
     frequency = np.fft.fftfreq(bins, 1.0 / bins)
@@ -305,63 +306,24 @@ def _moved(pattern: NDArray[np.float64], shift: NDArray[np.float64]) -> tuple[ND
     return np.fft.ifft2(spectrum).real, np.stack(slope, axis=-1)
 
 
-def _nearest_bin(light: NDArray[np.float64], pattern: NDArray[np.float64], lattice: Lattice) -> NDArray[np.float64]:
-    """Return the shift (2,) in pixels, to a bin, by which the pattern correlates best with the light."""
-    spectra = (np.fft.fft2(each.sum(axis=0) - each.sum(axis=0).mean()) for each in (light, pattern))
-    first, second = spectra
-    alike = np.fft.ifft2(first * np.conj(second)).real
-    row, column = np.unravel_index(int(np.argmax(alike)), alike.shape)
-    share = np.array([column, row]) / len(alike)
-    return np.asarray((share - np.rint(share)) @ lattice.basis)
-
-
-def _places(unknowns: NDArray[np.float64], system: System) -> tuple[Place, ...]:
-    """Return shifts in the middles of parts that tell of them, with the standard errors along them."""
-    places, covariance, known = [], system.covariance, system.alike > FEWEST_PARTS
-    for lever in _levers(part_middles()[system.told >= WELL_LIT * system.told.max()])[..., : len(unknowns)]:
-        shift, spread = lever @ unknowns, lever @ covariance @ lever.T
-        along = shift / max(float(np.hypot(*shift)), np.finfo(np.float64).tiny)
-        places.append(Place(shift, float(np.sqrt(along @ spread @ along)) if known else np.inf))
-    return tuple(places)
-
-
-def _levers(places: NDArray[np.float64]) -> NDArray[np.float64]:
+def _levers(places: Floats) -> Floats:
     """Return the matrices (n, 2, 6) from the unknowns to the shift at places (n, 2), from -1 to 1 along each side."""
     terms = np.column_stack([np.ones(len(places)), places])
     return np.asarray(np.einsum("nk,ab->nakb", terms, np.eye(2)).reshape(len(places), 2, 6))
 
 
-def part_middles() -> NDArray[np.float64]:
+def part_middles() -> Floats:
     """Return the middles (parts, 2) of the parts, from -1 to 1 along each side."""
     side = (2.0 * np.arange(PARTS) + 1.0) / PARTS - 1.0
     return np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
 
 
-def cell_places(bins: int) -> NDArray[np.float64]:
+def cell_places(bins: int) -> Floats:
     """Return the places (bins, bins, 2) of the bins in shares of the basis."""
     share = np.arange(bins) / bins
     return np.stack(np.meshgrid(share, share), axis=-1)
 
 
-def _discs(lattice: Lattice, bins: int, width: float) -> NDArray[np.float64]:
-    """Return discs of a width in pitches on the cell (bins, bins), a pixel's rim soft."""
-    place, radius = cell_places(bins), 0.5 * width * float(lattice.pitch.mean())
-    steps = range(-2, 4)
-    distances = (np.linalg.norm((place - (i, j)) @ lattice.basis, axis=-1) for i in steps for j in steps)
-    return np.asarray(sum(np.clip(radius + 0.5 - distance, 0.0, 1.0) for distance in distances))
-
-
-def _between(cells: Cells, shape: tuple[int, int], pattern: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the numbers of pixels, of enough all over a picture, that uniform light leaves dark; of all if none is."""
-    number = np.arange(0, shape[0] * shape[1], shape[0] * shape[1] // ENOUGH + 1)
-    place = np.column_stack([number % shape[1], number // shape[1]]) - cells.origin_px
-    share = place @ cells.inverse_basis
-    i, j = np.rint(share).astype(np.int64).T
-    share = share - cells.off[j - cells.first_j, i - cells.first_i]
-    column, row = np.rint(len(pattern) * share).astype(np.int64).T % len(pattern)
-    return np.asarray(number[pattern[row, column] <= max(DARK_SHARE * pattern.max(), pattern.min())])
-
-
-def _over(light: NDArray[np.float64], area: NDArray[np.float64]) -> NDArray[np.float64]:
+def _over(light: Floats, area: Floats) -> Floats:
     """Return the mean light (parts, bins, bins) of pixels, 0 in bins without any."""
     return np.asarray(light / np.where(area > 0.0, area, 1.0))

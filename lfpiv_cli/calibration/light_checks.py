@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 from scipy.spatial import KDTree
 
-from lfpiv_cli.calibration.board_pose import COMMON_SHARE_OF_LENS_DEPTH, BoardPose, lens_in_scene_mm
+from lfpiv_cli.arrays import Floats
+from lfpiv_cli.calibration.board_pose import COMMON_SHARE_OF_LENS_DEPTH, BoardPose
 from lfpiv_cli.calibration.lattice import LatticeFit
 from lfpiv_cli.calibration.lens_light import LensImages, cell_places, part_middles
 from lfpiv_cli.calibration.white import MIDDLE_PER_PITCH, NARROWEST_LENS_IMAGE
@@ -46,6 +47,8 @@ LARGEST_FIELD_DEPTH = 5.0 * COMMON_SHARE_OF_LENS_DEPTH
 BRIGHTEST_SHARE = 0.1
 # Dots beyond the four numbers that are fitted: fewer know their scatter badly.
 FEWEST_SPARE_DOTS = 5
+
+WHITE = "white image"
 
 
 class Fitted(NamedTuple):
@@ -77,45 +80,50 @@ class Shapes(NamedTuple):
 def shapes_of(images: LensImages, image_shape: tuple[int, int]) -> Shapes:
     """Return how the lens images of uniform light change over a picture (rows, columns)."""
     size = np.array(image_shape[::-1], dtype=np.float64)
-    place = part_middles() * size / np.hypot(*size)
-    height2 = np.sum(place**2, axis=1)
-    terms = np.column_stack([np.ones(len(place)), place, height2])
-    along_x, along_y, across = _moments(images)
+    at = part_middles() * size / np.hypot(*size)
+    terms = np.column_stack([np.ones(len(at)), at, np.sum(at**2, axis=1)])
+    lattice, pattern, least = images.lattice_px, images.pattern, np.finfo(np.float64).tiny
+
+    # Second moments (parts, 2, 2) along columns and rows, in square pixels.
+    place = cell_places(pattern.shape[-1]) @ lattice.basis
+    cell = Lattice(np.zeros(2), lattice.basis, lattice.layout)
+    place = place - cell.points(cell.nearest(place))
+    share = pattern / np.maximum(pattern.sum(axis=(1, 2), keepdims=True), least)
+    mean = np.einsum("pij,ijk->pk", share, place)
+    square = np.einsum("pij,ijk,ijl->pkl", share, place, place) - mean[:, :, np.newaxis] * mean[:, np.newaxis]
+    along_x, along_y = square[:, 0, 0], square[:, 1, 1]
     width2 = along_x + along_y
     middle = float(np.median(width2))
-    area, *_, lost = _fit(terms, _areas(images.pattern))
+
+    # Areas (parts,): light over the plateau, in bins.
+    light = np.sort(pattern.reshape(len(pattern), -1), axis=1)
+    plateau = light[:, -max(1, int(BRIGHTEST_SHARE * light.shape[1])) :].mean(axis=1)
+    area, *_, lost = _fit(terms, light.sum(axis=1) / np.maximum(plateau, least))
     growth = _fit(terms, 0.5 * width2 / middle)
-    (x, y), ones, none = place.T, np.ones(len(place)), np.zeros(len(place))
+    (x, y), ones, none = at.T, np.ones(len(at)), np.zeros(len(at))
     aslant = np.concatenate([np.column_stack([ones, none, x**2 - y**2]), np.column_stack([none, ones, 2.0 * x * y])])
-    oblong = _fit(aslant, np.concatenate([along_x - along_y, 2.0 * across]) / middle)
+    oblong = _fit(aslant, np.concatenate([along_x - along_y, 2.0 * square[:, 0, 1]]) / middle)
     return Shapes(Fitted(-lost.value / area.value, lost.sigma / area.value), oblong[2], (growth[1], growth[2]))
 
 
 def shape_notices(shapes: Shapes) -> Iterator[Notice]:
     """Say where the aperture is cut towards the corners, or else where the microlenses' distance changes."""
-    if shapes.cut.beyond(LARGEST_CUT) and shapes.oblong.beyond(0.0) and shapes.oblong.value < 0.0 < shapes.cut.value:
-        yield Notice(
-            "aperture-cut",
-            "white image",
-            f"lens images are lens-shaped towards the corners: {shapes.cut.value:.0%} of the aperture is cut off "
-            f"there, at most {LARGEST_CUT:.0%} of a good one; pitch, places and depths are off by it",
-            "stop the main lens down until lens images are alike everywhere",
-            shapes.cut.value,
-            f"at most {LARGEST_CUT:g}",
+    cut, most = shapes.cut.value, max(shapes.growth, key=lambda side: abs(side.value))
+    if shapes.cut.beyond(LARGEST_CUT) and shapes.oblong.beyond(0.0) and shapes.oblong.value < 0.0 < cut:
+        text = (
+            f"lens images are lens-shaped towards the corners: {cut:.0%} of the aperture is cut off "
+            f"there, at most {LARGEST_CUT:.0%} of a good one; pitch, places and depths are off by it"
         )
-        return
-    most = max(shapes.growth, key=lambda side: abs(side.value))
-    if most.beyond(LARGEST_GROWTH):
-        yield Notice(
-            "array-tilted",
-            "white image",
+        remedy = "stop the main lens down until lens images are alike everywhere"
+        yield Notice("aperture-cut", WHITE, text, remedy, cut, f"at most {LARGEST_CUT:g}")
+    elif most.beyond(LARGEST_GROWTH):
+        text = (
             f"lens images are {abs(most.value):.1%} wider half a diagonal from the middle along the "
             f"{'columns' if most is shapes.growth[0] else 'rows'}, and as much narrower on the other side, at most "
-            f"{LARGEST_GROWTH:.1%} of a good camera: microlenses are not everywhere as far from the sensor",
-            "mount the array parallel to the sensor, or use what is near the middle",
-            most.value,
-            f"within {LARGEST_GROWTH:g}",
+            f"{LARGEST_GROWTH:.1%} of a good camera: microlenses are not everywhere as far from the sensor"
         )
+        remedy = "mount the array parallel to the sensor, or use what is near the middle"
+        yield Notice("array-tilted", WHITE, text, remedy, most.value, f"within {LARGEST_GROWTH:g}")
 
 
 def field_depth(pose: BoardPose, camera: Camera) -> Fitted | None:
@@ -131,44 +139,7 @@ def field_depth(pose: BoardPose, camera: Camera) -> Fitted | None:
     return _fit(terms, pose.residual_mm[:, 2])[3]
 
 
-def field_notices(pose: BoardPose, camera: Camera) -> Iterator[Notice]:
-    """Say where the focus changes with the image height by more than what places in depth may be off."""
-    depth, largest = field_depth(pose, camera), LARGEST_FIELD_DEPTH * lens_in_scene_mm(camera)[1]
-    if depth is None or not depth.beyond(largest):
-        return
-    yield Notice(
-        "field-curved",
-        "board image",
-        f"a flat board seems {written(abs(depth.value))} mm {'further' if depth.value > 0.0 else 'nearer'} in the "
-        f"corners than in the middle (field curvature, or a bent board), at most {written(largest, 2)} mm may be: "
-        "depths are off by it, as the square of the image height",
-        "a flat board, a volume near the axis, another objective; for volumes boards at several --depth-mm and "
-        "method dlfc",
-        depth.value,
-        f"within {written(largest, 2)} mm",
-    )
-
-
-def _areas(pattern: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the areas of lens images (parts,), their light over their plateau, in bins."""
-    light = np.sort(pattern.reshape(len(pattern), -1), axis=1)
-    count = max(1, int(BRIGHTEST_SHARE * light.shape[1]))
-    return np.asarray(light.sum(axis=1) / np.maximum(light[:, -count:].mean(axis=1), np.finfo(np.float64).tiny))
-
-
-def _moments(images: LensImages) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return the second moments (parts,) of lens images along the columns, the rows, and of both, in square pixels."""
-    lattice, pattern = images.lattice_px, images.pattern
-    place = cell_places(pattern.shape[-1]) @ lattice.basis
-    cell = Lattice(np.zeros(2), lattice.basis, lattice.layout)
-    place = place - cell.points(cell.nearest(place))
-    share = pattern / np.maximum(pattern.sum(axis=(1, 2), keepdims=True), np.finfo(np.float64).tiny)
-    mean = np.einsum("pij,ijk->pk", share, place)
-    square = np.einsum("pij,ijk,ijl->pkl", share, place, place) - mean[:, :, np.newaxis] * mean[:, np.newaxis]
-    return square[:, 0, 0], square[:, 1, 1], square[:, 0, 1]
-
-
-def _fit(terms: NDArray[np.float64], values: NDArray[np.float64]) -> list[Fitted]:
+def _fit(terms: Floats, values: Floats) -> list[Fitted]:
     """Return the coefficients (k,) of terms (n, k) that fit values (n,) best, and standard errors by the scatter."""
     found = np.linalg.lstsq(terms, values, rcond=None)[0]
     freedom = max(1, len(values) - terms.shape[1])
@@ -195,7 +166,6 @@ DARKEST = 1e-9
 # What the data sheet says of the lens images' width is believed to this factor.
 WIDTH_TOLERANCE = 1.25
 
-WHITE = "white image"
 IS_IT_WHITE = "photograph uniform light, out of focus, at two thirds of full scale"
 
 
@@ -220,9 +190,7 @@ def residual_share(fit: LatticeFit) -> float:
     return float(residual.max() / fit.lattice_px.pitch.mean())
 
 
-def white_notices(
-    white: NDArray[np.float64], fit: LatticeFit, width: float, sheet_width: float | None
-) -> Iterator[Notice]:
+def white_notices(white: Floats, fit: LatticeFit, width: float, sheet_width: float | None) -> Iterator[Notice]:
     """Say what speaks against a white image.
 
     Parameters
@@ -234,60 +202,45 @@ def white_notices(
     """
     share = residual_share(fit)
     if share > LARGE_RESIDUAL:
-        yield Notice(
-            "lattice-residual",
-            WHITE,
+        text = (
             f"the lens images are off the lattice by {100 * share:.1f} % of their pitch, at most "
-            f"{100 * LARGE_RESIDUAL:.0f} % of a good one",
-            IS_IT_WHITE,
-            share,
-            f"at most {LARGE_RESIDUAL:g}",
+            f"{100 * LARGE_RESIDUAL:.0f} % of a good one"
         )
+        yield Notice("lattice-residual", WHITE, text, IS_IT_WHITE, share, f"at most {LARGE_RESIDUAL:g}")
     found = fit.lenses * fit.lattice_px.cell_area / white.size
     if found < FEWEST_FOUND:
-        yield Notice(
-            "lattice-incomplete",
-            WHITE,
+        text = (
             f"{fit.lenses} lens images were found, {100 * found:.0f} % of those that the sensor has room for; the "
-            "lattice is continued where there are none",
-            f"{IS_IT_WHITE}, and light the whole sensor",
-            found,
-            f"at least {FEWEST_FOUND:g}",
+            "lattice is continued where there are none"
         )
+        remedy = f"{IS_IT_WHITE}, and light the whole sensor"
+        yield Notice("lattice-incomplete", WHITE, text, remedy, found, f"at least {FEWEST_FOUND:g}")
     difference = neighbours_difference(white, fit)
     if difference > LARGEST_DIFFERENCE:
-        yield Notice(
-            "white-not-uniform",
-            WHITE,
+        text = (
             f"one lens image in ten differs by more than {100 * difference:.0f} % in brightness from those around it, "
-            f"at most {100 * LARGEST_DIFFERENCE:.0f} % under uniform light: it looks like a picture of a scene",
-            IS_IT_WHITE,
-            difference,
-            f"at most {LARGEST_DIFFERENCE:g}",
+            f"at most {100 * LARGEST_DIFFERENCE:.0f} % under uniform light: it looks like a picture of a scene"
         )
+        yield Notice("white-not-uniform", WHITE, text, IS_IT_WHITE, difference, f"at most {LARGEST_DIFFERENCE:g}")
+    told = None if sheet_width is None else min(sheet_width, 1.0)
     if width < NARROWEST_LENS_IMAGE:
-        yield Notice(
-            "white-stopped-down",
-            WHITE,
+        text = (
             f"its lens images are {width:.2f} of the pitch wide, at least {NARROWEST_LENS_IMAGE:g} is needed for the "
-            "transmission, which is left out",
-            "give a second --white, taken with the aperture of the measurements",
-            width,
-            f"at least {NARROWEST_LENS_IMAGE:g}",
+            "transmission, which is left out"
         )
-    elif sheet_width is not None and not 1.0 / WIDTH_TOLERANCE <= width / min(sheet_width, 1.0) <= WIDTH_TOLERANCE:
-        yield Notice(
-            "aperture-not-as-told",
-            "camera.main_lens.aperture_mm",
-            f"the lens images of the white image are {width:.2f} of the pitch wide, {min(sheet_width, 1.0):.2f} by the "
-            "data sheet's apertures",
-            "correct aperture_mm or f_number, or take the white image with the aperture of the measurements",
-            width,
-            f"{written(min(sheet_width, 1.0))} within a factor of {WIDTH_TOLERANCE:g}",
+        remedy = "give a second --white, taken with the aperture of the measurements"
+        yield Notice("white-stopped-down", WHITE, text, remedy, width, f"at least {NARROWEST_LENS_IMAGE:g}")
+    elif told is not None and not 1.0 / WIDTH_TOLERANCE <= width / told <= WIDTH_TOLERANCE:
+        text = (
+            f"the lens images of the white image are {width:.2f} of the pitch wide, {told:.2f} by the "
+            "data sheet's apertures"
         )
+        remedy = "correct aperture_mm or f_number, or take the white image with the aperture of the measurements"
+        expected = f"{written(told)} within a factor of {WIDTH_TOLERANCE:g}"
+        yield Notice("aperture-not-as-told", "camera.main_lens.aperture_mm", text, remedy, width, expected)
 
 
-def neighbours_difference(white: NDArray[np.float64], fit: LatticeFit) -> float:
+def neighbours_difference(white: Floats, fit: LatticeFit) -> float:
     """Return how much nine in ten lens images at most differ in brightness from the median of those around."""
     half = max(1, int(MIDDLE_PER_PITCH * fit.lattice_px.pitch.mean()))
     level = uniform_filter(np.asarray(white, dtype=np.float64), 2 * half + 1)
@@ -333,39 +286,25 @@ def position_notices(images: LensImages, picture: NDArray[np.floating], name: st
     found = images.beside(picture)
     if not found.lit:
         return []
-    if found.following + CERTAIN_SIGMAS * found.following_sigma < LEAST_FOLLOWING:
-        return [
-            Notice(
-                "light-off-lens-images",
-                name,
-                f"{max(found.following, 0.0):.0%} of its light follows the lens images of the calibration, at "
-                f"least {LEAST_FOLLOWING:.0%} of a good picture's",
-                "is it of the calibrated camera, neither scaled, turned nor mirrored? a --dark takes bright pixels off",
-                found.following,
-                f"at least {LEAST_FOLLOWING:g}",
-            )
-        ]
+    following, spread = found.following, CERTAIN_SIGMAS * found.following_sigma
+    if following + spread < LEAST_FOLLOWING:
+        text = (
+            f"{max(following, 0.0):.0%} of its light follows the lens images of the calibration, at "
+            f"least {LEAST_FOLLOWING:.0%} of a good picture's"
+        )
+        other = "is it of the calibrated camera, neither scaled, turned nor mirrored? a --dark takes bright pixels off"
+        return [Notice("light-off-lens-images", name, text, other, following, f"at least {LEAST_FOLLOWING:g}")]
     largest = max(LARGEST_SHIFT_SHARE * float(images.lattice_px.pitch.mean()), LARGEST_SHIFT_PX)
-    certain = [
-        (float(np.hypot(*place.shift_px)), place)
-        for place in found.places
-        if np.hypot(*place.shift_px) > max(largest, CERTAIN_SIGMAS * place.sigma_px)
-    ]
-    follows = found.following - CERTAIN_SIGMAS * found.following_sigma > LEAST_CERTAIN_FOLLOWING
-    if not certain or not follows:
+    sizes = [(float(np.hypot(*place.shift_px)), place) for place in found.places]
+    certain = [each for each in sizes if each[0] > max(largest, CERTAIN_SIGMAS * each[1].sigma_px)]
+    if not certain or following - spread <= LEAST_CERTAIN_FOLLOWING:
         return []
     size, place = max(certain, key=lambda each: each[0])
-    return [
-        Notice(
-            "lens-images-moved",
-            name,
-            f"its lens images lie up to {size:.2f} +- {place.sigma_px:.2f} px beside those of the calibration "
-            f"({place.shift_px[0]:+z.2f} columns, {place.shift_px[1]:+z.2f} rows), at most {largest:.2f} do no harm",
-            remedy,
-            size,
-            f"at most {written(largest, 2)} px",
-        )
-    ]
+    text = (
+        f"its lens images lie up to {size:.2f} +- {place.sigma_px:.2f} px beside those of the calibration "
+        f"({place.shift_px[0]:+z.2f} columns, {place.shift_px[1]:+z.2f} rows), at most {largest:.2f} do no harm"
+    )
+    return [Notice("lens-images-moved", name, text, remedy, size, f"at most {written(largest, 2)} px")]
 
 
 def level_notices(images: LensImages, picture: NDArray[np.floating], name: str) -> list[Notice]:
@@ -380,17 +319,12 @@ def level_notices(images: LensImages, picture: NDArray[np.floating], name: str) 
     largest = max(LARGEST_OFFSET_SIGMAS * noise, spread)
     if abs(level) <= largest:
         return []
-    return [
-        Notice(
-            "dark-level",
-            name,
-            f"where no light falls, between the lens images, it is {written(abs(level))} counts "
-            f"{'brighter' if level > 0.0 else 'darker'} than without light, at most {written(largest, 2)} may be",
-            "give a --dark with the exposure, the gain and the bits of the images",
-            level,
-            f"within {written(largest, 2)} counts",
-        )
-    ]
+    text = (
+        f"where no light falls, between the lens images, it is {written(abs(level))} counts "
+        f"{'brighter' if level > 0.0 else 'darker'} than without light, at most {written(largest, 2)} may be"
+    )
+    remedy = "give a --dark with the exposure, the gain and the bits of the images"
+    return [Notice("dark-level", name, text, remedy, level, f"within {written(largest, 2)} counts")]
 
 
 def saturated_share(
@@ -413,16 +347,9 @@ def exposure_notices(share: float, name: str) -> list[Notice]:
     """Return what is said where too large a share of a picture's lit pixels is saturated."""
     if share <= GOOD_SATURATED:
         return []
-    return [
-        Notice(
-            "frame-saturated",
-            name,
-            f"{share:.1%} of its lit pixels are saturated and left out, at most {GOOD_SATURATED:.0%} of a good image's",
-            "less light or a shorter exposure; or correct reconstruction.saturation_counts",
-            share,
-            f"at most {GOOD_SATURATED:g}",
-        )
-    ]
+    text = f"{share:.1%} of its lit pixels are saturated and left out, at most {GOOD_SATURATED:.0%} of a good image's"
+    remedy = "less light or a shorter exposure; or correct reconstruction.saturation_counts"
+    return [Notice("frame-saturated", name, text, remedy, share, f"at most {GOOD_SATURATED:g}")]
 
 
 def uniform_notices(images: LensImages, fit: LatticeFit, picture: NDArray[np.floating], name: str) -> Iterator[Notice]:
@@ -436,15 +363,11 @@ def uniform_notices(images: LensImages, fit: LatticeFit, picture: NDArray[np.flo
         return
     difference = neighbours_difference(np.nan_to_num(picture), fit)
     if difference < LARGEST_DIFFERENCE:
-        yield Notice(
-            "frame-uniform",
-            name,
+        text = (
             f"nine in ten lens images differ by less than {100 * difference:.1f} % in brightness from those around, "
-            "as under uniform light: it shows no tracers",
-            "is it a white image?",
-            difference,
-            f"above {LARGEST_DIFFERENCE:g}",
+            "as under uniform light: it shows no tracers"
         )
+        yield Notice("frame-uniform", name, text, "is it a white image?", difference, f"above {LARGEST_DIFFERENCE:g}")
 
 
 def dark_notices(images: LensImages, dark: NDArray[np.floating]) -> list[Notice]:
@@ -452,13 +375,6 @@ def dark_notices(images: LensImages, dark: NDArray[np.floating]) -> list[Notice]
     found = images.beside(dark)
     if not found.lit or found.following - CERTAIN_SIGMAS * found.following_sigma < LEAST_DARK_FOLLOWING:
         return []
-    return [
-        Notice(
-            "dark-lit",
-            "--dark",
-            f"the dark image shows the lens images: {found.following:.0%} of what stands out of its noise lies on them",
-            "take it with the cap on",
-            found.following,
-            f"at most {LEAST_DARK_FOLLOWING:g}",
-        )
-    ]
+    text = f"the dark image shows the lens images: {found.following:.0%} of what stands out of its noise lies on them"
+    expected = f"at most {LEAST_DARK_FOLLOWING:g}"
+    return [Notice("dark-lit", "--dark", text, "take it with the cap on", found.following, expected)]

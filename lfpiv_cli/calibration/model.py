@@ -6,13 +6,14 @@ Axes: pixels are (column, row); world axes are those of the raw sensor, z away f
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from threadpoolctl import threadpool_limits
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.board import locate_board
 from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose
 from lfpiv_cli.calibration.dlfc import RayFit, fit_rays
@@ -37,13 +38,7 @@ from lfpiv_cli.optics.shapes import ScenePose
 # A measured magnification replaces the data sheet's when it differs by more standard errors than chance explains.
 MAGNIFICATION_SIGMAS = 3.0
 # Numbers that the file keeps as they are.
-CARRIED = (
-    "camera_move_mm",
-    "mid_plane_z_mm",
-    "mid_plane_z_sigma_mm",
-    "image_distance_mm",
-    "image_distance_sigma_mm",
-)
+CARRIED = ("camera_move_mm", "mid_plane_z_mm", "mid_plane_z_sigma_mm", "image_distance_mm", "image_distance_sigma_mm")
 # Shapes of the arrays that the file keeps, None for any length.
 OF_RAYS: Mapping[str, tuple[int | None, ...]] = {"depths_mm": (None,), "reach_mm": (2, 2), "residual_mm": (None, 2)}
 SHAPES: Mapping[str, tuple[int | None, ...]] = {
@@ -136,8 +131,7 @@ class Calibration:
 
         Raises
         ------
-        InputError
-            when the calibration was made with another sensor
+        InputError : when the calibration was made with another sensor
         """
         self.ensure_images_of(camera)
         if self.pose is not None:
@@ -162,7 +156,7 @@ class Calibration:
                 f"columns) and the configured sensor has {camera.rows} x {camera.columns}"
             )
 
-    def vignetting(self) -> NDArray[np.float64] | None:
+    def vignetting(self) -> Floats | None:
         """Return the slow part of the transmission as coefficients; None where it was not measured."""
         if self.transmission is None:
             return None
@@ -210,17 +204,16 @@ class Calibration:
 
     def to_tree(self) -> dict[str, Any]:
         """Return everything as a nested dict of arrays, numbers, strings and None."""
-        fit = {field.name: getattr(self.fit, field.name) for field in fields(LatticeFit)}
+        fit = asdict(self.fit)
         lattice = fit.pop("lattice_px")
-        fit |= {"layout": lattice.layout, "origin_px": lattice.origin, "basis_px": lattice.basis}
-        pose = self.pose
+        fit |= {"layout": lattice["layout"], "origin_px": lattice["origin"], "basis_px": lattice["basis"]}
         return {
             "image_shape": np.array(self.image_shape, dtype=np.int64),
             "lattice": fit | {"cubic_used": int(self.fit.cubic_used)},
             "transmission": self.transmission,
-            "board": {field.name: getattr(pose, field.name) for field in fields(BoardPose)} if pose else None,
-            "dlfc": self.ray_fit.to_tree() if self.ray_fit else None,
-            "scene": self.scene.to_tree() if self.scene else None,
+            "board": asdict(self.pose) if self.pose else None,
+            "dlfc": asdict(self.ray_fit) if self.ray_fit else None,
+            "scene": asdict(self.scene) if self.scene else None,
             "mid_plane_given": 1 if self.mid_plane_given else None,
         } | {name: getattr(self, name) for name in CARRIED}
 
@@ -230,8 +223,7 @@ class Calibration:
 
         Raises
         ------
-        InputError
-            when something is missing, or of another shape
+        InputError : when something is missing, or of another shape
         """
         try:
             rows, columns = (int(n) for n in tree["image_shape"])
@@ -303,7 +295,7 @@ class Photographs:
         """All but the dark one."""
         return [*self.whites, *([] if self.board is None else [self.board]), *self.depth_boards]
 
-    def less_dark(self, picture: ArrayLike) -> NDArray[np.float64]:
+    def less_dark(self, picture: ArrayLike) -> Floats:
         """Return a picture with the dark one taken off."""
         image = np.asarray(picture, dtype=np.float64)
         return image if self.dark is None else image - np.asarray(self.dark, dtype=np.float64)
@@ -336,34 +328,30 @@ def calibrate(pictures: Photographs, rig: Rig | None = None, sheet: DataSheet = 
 
     Raises
     ------
-    InputError
-        when a picture cannot serve; it says why
+    InputError : when a picture cannot serve; it says why
     """
-    shape = shape_of(pictures.lit, sheet.camera)
+    shapes = [np.shape(picture) for picture in pictures.lit]
+    shapes += [] if sheet.camera is None else [(sheet.camera.rows, sheet.camera.columns)]
+    if len(set(shapes)) != 1 or len(shapes[0]) != 2:
+        raise InputError(f"the pictures are {', '.join(map(str, shapes))} (rows, columns), expected all of one shape")
     # One BLAS thread: the same bits on every machine, and small problems gain nothing from more.
     with threadpool_limits(limits=1, user_api="blas"):
-        calibration = lattice_calibration(pictures, shape, sheet)
+        calibration = lattice_calibration(pictures, (shapes[0][0], shapes[0][1]), sheet)
         if pictures.mid_plane_z_mm is not None:
             calibration = replace(calibration, mid_plane_z_mm=pictures.mid_plane_z_mm, mid_plane_given=True)
         if rig is None:
             return calibration
+        upright, passed = calibration.rectification, calibration.transmission
         if len(pictures.depth_boards):
-            boards = [pictures.less_dark(each) for each in pictures.depth_boards]
-            calibration = replace(calibration, ray_fit=ray_fit(boards, pictures.depths_mm, calibration, rig))
+            boards = [upright.apply(pictures.less_dark(each)) for each in pictures.depth_boards]
+            camera = calibration.camera(rig.camera)
+            rays = fit_rays(boards, pictures.depths_mm, camera, rig.board, rig.media, passed)
+            calibration = replace(calibration, ray_fit=rays)
         if pictures.board is None:
             return calibration
-        pose = board_pose(pictures.less_dark(pictures.board), calibration, rig)
+        board, camera = upright.apply(pictures.less_dark(pictures.board)), calibration.camera(rig.camera)
+        pose = locate_board(board, camera, rig.board, rig.media, upright.rotation_rad, passed, rig.light)
     return with_mid_plane(replace(calibration, pose=pose), pose, rig)
-
-
-def shape_of(pictures: Sequence[ArrayLike], camera: Camera | None) -> tuple[int, int]:
-    """Return the common shape (rows, columns) of the pictures, or of the camera's where there are none."""
-    shapes = [np.shape(picture) for picture in pictures]
-    if camera is not None:
-        shapes.append((camera.rows, camera.columns))
-    if len(set(shapes)) != 1 or len(shapes[0]) != 2:
-        raise InputError(f"the pictures are {', '.join(map(str, shapes))} (rows, columns), expected all of one shape")
-    return int(shapes[0][0]), int(shapes[0][1])
 
 
 def lattice_calibration(pictures: Photographs, shape: tuple[int, int], sheet: DataSheet) -> Calibration:
@@ -390,23 +378,6 @@ def known(value: ArrayLike) -> Any:
     """Return a number or an array as plain numbers, None where they are not known."""
     array = np.asarray(value, dtype=np.float64)
     return array.tolist() if np.isfinite(array).all() else None
-
-
-def board_pose(image: NDArray[np.float64], calibration: Calibration, rig: Rig) -> BoardPose:
-    """Return the pose of the board in its raw picture less the dark frame."""
-    rectification = calibration.rectification
-    camera = calibration.camera(rig.camera)
-    picture, turn = rectification.apply(image), rectification.rotation_rad
-    return locate_board(picture, camera, rig.board, rig.media, turn, calibration.transmission, rig.light)
-
-
-def ray_fit(
-    images: Sequence[NDArray[np.float64]], depths_mm: Sequence[float], calibration: Calibration, rig: Rig
-) -> RayFit:
-    """Return the polynomials through boards in the fluid, in raw pictures less the dark frame."""
-    rectified = [calibration.rectification.apply(image) for image in images]
-    camera = calibration.camera(rig.camera)
-    return fit_rays(rectified, depths_mm, camera, rig.board, rig.media, calibration.transmission)
 
 
 def with_mid_plane(calibration: Calibration, pose: BoardPose, rig: Rig) -> Calibration:

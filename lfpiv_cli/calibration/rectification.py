@@ -15,10 +15,12 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.lattice import EXPONENTS, LatticeFit
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.names import ColumnAxis
 from lfpiv_cli.optics.camera import Lattice, nearest_point
+from lfpiv_cli.optics.line_responses import spline_weights
 from lfpiv_cli.threads import share_out
 
 EXPONENT_ARRAY = np.array(EXPONENTS, dtype=np.int64)
@@ -78,31 +80,32 @@ class Rectification:
 
         Raises
         ------
-        InputError
-            when the image is not of the white image's shape
+        InputError : when the image is not of the white image's shape
         """
         raw = np.asarray(image, dtype=np.float64)
         if raw.shape != self.image_shape:
             raise InputError(f"the image is {raw.shape} and the white image {self.image_shape} (rows, columns)")
         coefficients = ndimage.spline_filter(raw, order=3, mode="mirror")
-        return sample_spline(coefficients, self.shift_px, self.inside)
+        rectified = np.zeros(self.image_shape, dtype=np.float32)
+        share_out(sample_rows, len(raw), coefficients, self.shift_px, self.inside, rectified)
+        return rectified
 
-    def to_world(self, points: ArrayLike, column_axis: ColumnAxis = "x") -> NDArray[np.float64]:
+    def to_world(self, points: ArrayLike, column_axis: ColumnAxis = "x") -> Floats:
         """Turn lateral world coordinates (..., 2 or 3) from the rectified frame to the raw sensor's axes."""
         return turned(points, self.rotation_rad if column_axis == "x" else -self.rotation_rad)
 
-    def from_world(self, points: ArrayLike, column_axis: ColumnAxis = "x") -> NDArray[np.float64]:
+    def from_world(self, points: ArrayLike, column_axis: ColumnAxis = "x") -> Floats:
         """Turn lateral world coordinates (..., 2 or 3) from the raw sensor's axes to the rectified frame."""
         return turned(points, -self.rotation_rad if column_axis == "x" else self.rotation_rad)
 
 
-def turn_matrix(angle_rad: float) -> NDArray[np.float64]:
+def turn_matrix(angle_rad: float) -> Floats:
     """Return the matrix that turns columns of (x, y) from x towards y."""
     cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
     return np.array([[cosine, -sine], [sine, cosine]])
 
 
-def turned(points: ArrayLike, angle_rad: float) -> NDArray[np.float64]:
+def turned(points: ArrayLike, angle_rad: float) -> Floats:
     """Return points (..., 2 or more) with their first two components turned from x towards y."""
     result = np.array(points, dtype=np.float64)
     result[..., :2] = result[..., :2] @ turn_matrix(angle_rad).T
@@ -112,10 +115,10 @@ def turned(points: ArrayLike, angle_rad: float) -> NDArray[np.float64]:
 @njit(cache=True, nogil=True)
 def write_shift(
     part: tuple[int, int],
-    origin: NDArray[np.float64],
-    basis: NDArray[np.float64],
-    model: tuple[NDArray[np.float64], NDArray[np.int64]],
-    turn: NDArray[np.float64],
+    origin: Floats,
+    basis: Floats,
+    model: tuple[Floats, NDArray[np.int64]],
+    turn: Floats,
     shift: NDArray[np.float32],
 ) -> None:
     """Write for each rectified pixel of rows `part` its raw place less its own (rows, columns, 2).
@@ -140,18 +143,6 @@ def write_shift(
 
 
 @njit(cache=True)
-def spline_weights(fraction: float) -> tuple[float, float, float, float]:
-    """Return the cubic B-spline at -1, 0, 1, 2 from a place `fraction` beyond a sample."""
-    rest = 1.0 - fraction
-    return (
-        rest**3 / 6.0,
-        2.0 / 3.0 - 0.5 * fraction**2 * (2.0 - fraction),
-        2.0 / 3.0 - 0.5 * rest**2 * (2.0 - rest),
-        fraction**3 / 6.0,
-    )
-
-
-@njit(cache=True)
 def mirrored(index: int, size: int) -> int:
     """Return the sample that stands for one beyond the ends: the image mirrored about its first and last pixel."""
     if index < 0:
@@ -161,24 +152,15 @@ def mirrored(index: int, size: int) -> int:
     return index
 
 
-def sample_spline(
-    coefficients: NDArray[np.float64], shift: NDArray[np.float32], inside: NDArray[np.bool_]
-) -> NDArray[np.float32]:
-    """Return a cubic spline at each pixel's place plus its shift, 0 where not inside."""
-    image = np.zeros(coefficients.shape, dtype=np.float32)
-    share_out(sample_rows, coefficients.shape[0], coefficients, shift, inside, image)
-    return image
-
-
 @njit(cache=True, nogil=True)
 def sample_rows(
     part: tuple[int, int],
-    coefficients: NDArray[np.float64],
+    coefficients: Floats,
     shift: NDArray[np.float32],
     inside: NDArray[np.bool_],
     image: NDArray[np.float32],
 ) -> None:
-    """Write rows `part` of what `sample_spline` returns, where inside."""
+    """Write rows `part` of a cubic spline at each pixel's place plus its shift, where inside."""
     rows, columns = coefficients.shape
     for row in range(part[0], part[1]):
         for column in range(columns):

@@ -1,20 +1,25 @@
 """The place of a small shape in the scene that explains the light of pixels best, by least squares.
 
-Axes: image axes (x along the columns, y along the rows), mm, z away from the camera.
+Rays are followed backwards: a place on the sensor under a microlens names one point of the main lens per point of the
+microlens, and all of a microlens is, seen in the scene, a small polygon. A pixel's light is the share of this polygon
+that the shape covers, exactly, times what the pixel passes.
+
+Axes: image axes (x along the columns, y along the rows), mm about the optical axis, z away from the camera from the
+focal plane.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from lfpiv_cli.errors import InputError
-from lfpiv_cli.notice import written
-from lfpiv_cli.optics.camera import Camera, Lattice, nearest_point
+from lfpiv_cli.arrays import Floats
+from lfpiv_cli.optics.camera import Camera, Lattice, nearest_point, undistorted
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
 
 # Gauss-Newton starts within the shape and settles in about five rounds, to a hundredth of what noise leaves; a step
@@ -23,8 +28,46 @@ FIT_ROUNDS = 20
 FIT_HALVINGS = 6
 FIT_TOLERANCE = 1e-4
 
+# A pixel's own width is sampled at its middle while the light it stands for is narrower than this share of half a
+# shape's width in the scene, else at 3 x 3 places, which leaves a tenth of the spread out.
+SHARP_SHARE = 0.2
+BLURRED_SAMPLES = 3
+
 # Shares of what pixels see (n,), and their derivatives (n, k).
-SharesAndSlopes = tuple[NDArray[np.float64], NDArray[np.float64]]
+SharesAndSlopes = tuple[Floats, Floats]
+
+
+class Strips(NamedTuple):
+    """Strips (n,) of a shape: where along x they begin and end, how far aside they lie, and how wide they are.
+
+    Lengths in the scene, mm, from the shape's place.
+    """
+
+    begin_mm: Floats
+    end_mm: Floats
+    aside_mm: Floats
+    width_mm: Floats
+
+
+class PointShape(NamedTuple):
+    """What lies about a point of a target: a disc, or the two squares that meet in a corner.
+
+    Attributes
+    ----------
+    step_mm : in what steps a fit moves it
+    half_mm : half its width, about
+    covered : compiled; gives shares and slopes for the middles (n, 2) of what is seen, about the point, the corners of
+        a microlens as seen there (k, 2), `figure`, the width of a pixel, and its samples along each axis; the slopes
+        (n, 4) are by the middle's x and y, the logarithm of the microlens's size, and the width
+    figure : what `covered` is told of the shape
+    strips : gives its strips where a lens sees so many mm of the scene
+    """
+
+    step_mm: float
+    half_mm: float
+    covered: Callable[..., SharesAndSlopes]
+    figure: float | Floats
+    strips: Callable[[float], Strips]
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,135 +78,72 @@ class ShapeFit:
     ----------
     position_mm : (3,) x, y in image axes, z in the medium
     covariance_mm2 : (3, 3) of the position
-    brightness, background : light of the shape and around it, in the image's unit at full transmission
-    rms : root mean square misfit, in the image's unit
+    brightness : light of the shape, in the image's unit at full transmission
     converged : the steps became small before the rounds were used up
     """
 
-    position_mm: NDArray[np.float64]
-    covariance_mm2: NDArray[np.float64]
+    position_mm: Floats
+    covariance_mm2: Floats
     brightness: float
-    background: float
-    rms: float
     converged: bool
 
 
-@dataclass(frozen=True, eq=False)
-class LinearFit:
-    """Brightness and background (levels) that explain pixels best for a disc at a given place.
-
-    `design` (n, 7) is what the disc's moves along x, y, z and a unit of each level put on the pixels, `residual` (n,)
-    what is left, `misfit` its square.
-    """
-
-    design: NDArray[np.float64]
-    levels: NDArray[np.float64]
-    residual: NDArray[np.float64]
-    misfit: float
-
-
 def fit_shape(
-    signal: NDArray[np.float64],
-    passed: NDArray[np.float64],
-    beside_mm: NDArray[np.float64],
-    start_mm: NDArray[np.float64],
-    steps_mm: NDArray[np.float64],
-    shares_at: Callable[[NDArray[np.float64]], SharesAndSlopes],
+    near: NearPixels,
+    start_mm: Floats,
+    steps_mm: Floats,
+    beside_mm: Floats,
+    shares_at: Callable[[Floats], SharesAndSlopes],
 ) -> ShapeFit:
     """Fit a shape to pixels by least squares: x, y, z, brightness and a sloping background are free.
 
     Parameters
     ----------
-    signal, passed : (n,) light on the pixels and the share of light that each passes
-    beside_mm : (n, 2) where in the plane of the first guess pixels see, about it
+    near : light on the pixels and the share of light that each passes
     start_mm : (3,) first guess, in image axes, within about a step
     steps_mm : (3,) by which moves are measured, such that each changes the light alike
+    beside_mm : (n, 2) where in the plane of the first guess pixels see, about it
     shares_at : gives for a position (3,) the share (n,) of what pixels see that the shape covers, and slopes (n, 3)
     """
+    signal, passed = near.signal, near.passed
     ground = passed[:, np.newaxis] * np.column_stack([np.ones(len(passed)), beside_mm / steps_mm[0]])
 
-    def linear_fit(position: NDArray[np.float64]) -> LinearFit:
+    def linear_fit(position: Floats) -> tuple[Floats, float, Floats, float]:
+        """Return what moves and levels put on the pixels (n, 7), the brightness, what is left (n,), and its square."""
         shares, moves = shares_at(position)
         design = np.column_stack([passed * shares, ground])
         levels = solved(design, signal)
         residual = signal - design @ levels
         full = np.column_stack([levels[0] * passed[:, np.newaxis] * moves * steps_mm, design])
-        return LinearFit(full, levels, residual, float(residual @ residual))
+        return full, float(levels[0]), residual, float(residual @ residual)
 
-    position = np.asarray(start_mm, dtype=np.float64)
-    best = linear_fit(position)
+    position = start_mm
+    design, brightness, residual, misfit = linear_fit(position)
     converged = False
     for _ in range(FIT_ROUNDS):
-        move = solved(best.design, best.residual)[:3] * steps_mm
+        move = solved(design, residual)[:3] * steps_mm
         for _ in range(FIT_HALVINGS):
             trial = linear_fit(position + move)
-            if trial.misfit <= best.misfit:
+            if trial[-1] <= misfit:
                 break
             move = 0.5 * move
         converged = bool(np.all(np.abs(move) <= FIT_TOLERANCE * steps_mm))
-        if trial.misfit > best.misfit:
+        if trial[-1] > misfit:
             break
-        position, best = position + move, trial
+        position, (design, brightness, residual, misfit) = position + move, trial
         if converged:
             break
-    variance = best.misfit / max(1, signal.size - best.design.shape[1])
-    covariance = np.linalg.pinv(best.design.T @ best.design)[:3, :3] * variance * np.outer(steps_mm, steps_mm)
-    rms = float(np.sqrt(best.misfit / signal.size))
-    return ShapeFit(position, covariance, float(best.levels[0]), float(best.levels[1]), rms, converged)
+    variance = misfit / max(1, signal.size - design.shape[1])
+    covariance = np.linalg.pinv(design.T @ design)[:3, :3] * variance * np.outer(steps_mm, steps_mm)
+    return ShapeFit(position, covariance, brightness, converged)
 
 
-def solved(design: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+def solved(design: Floats, values: Floats) -> Floats:
     """Return the coefficients of the design's columns that explain the values best."""
     return np.asarray(np.linalg.lstsq(design, values, rcond=None)[0], dtype=np.float64)
 
 
-# The points of a calibration target as they were measured one by one.
-#
-# Axes: image axes (x along the columns, y along the rows), mm, z away from the camera in the medium of the target.
-
-
-@dataclass(frozen=True, eq=False)
-class MeasuredPoints:
-    """Points of a target.
-
-    Attributes
-    ----------
-    places_mm, sigmas_mm : (n, 3) and their standard errors
-    numbers : (n, 2) which point of the target each is, the target turned in any way; None where the grid tells
-    """
-
-    places_mm: NDArray[np.float64]
-    sigmas_mm: NDArray[np.float64]
-    numbers: NDArray[np.int64] | None = None
-
-
-def measured_points(fits: Sequence[ShapeFit | None], numbers: NDArray[np.int64] | None = None) -> MeasuredPoints:
-    """Return the points of the fits that came to an end."""
-    kept = [k for k, fit in enumerate(fits) if fit is not None and fit.converged]
-    good = [fit for fit in fits if fit is not None and fit.converged]
-    places = np.array([fit.position_mm for fit in good]).reshape(-1, 3)
-    sigmas = np.sqrt(np.array([np.diag(fit.covariance_mm2) for fit in good])).reshape(-1, 3)
-    return MeasuredPoints(places, sigmas, None if numbers is None else numbers[kept])
-
-
-# What a small bright disc in the scene looks like on the sensor, and the disc that explains given pixels best.
-#
-# Axes: image axes (x along the columns, y along the rows), lengths in mm about the optical axis, z away from the
-# camera from the focal plane. Rays are followed backwards: a place on the sensor under a microlens names one point of
-# the main lens per point of the microlens, and all of a microlens is, seen in the scene, a small polygon. A pixel's
-# light is the share of this polygon that the disc covers, exactly, times what the pixel passes.
-
-
-# A pixel's own width is sampled at its middle while the light it stands for is narrower than this share of the disc's
-# radius in the scene, else at 3 x 3 places, which leaves a tenth of the spread out.
-SHARP_SHARE = 0.2
-BLURRED_SAMPLES = 3
-# Undoing r' = r (1 + k1 r^2) by repetition: each round gains a factor 3 k1 r^2, below 0.01 for usable lenses.
-UNDISTORT_ROUNDS = 6
-
-
-@dataclass(frozen=True, eq=False)
-class PixelRays:
+class PixelRays(NamedTuple):
     """Pixels and the microlenses they lie under.
 
     Attributes
@@ -173,9 +153,9 @@ class PixelRays:
     ideal_mm : (n, 2) where the main lens would have sent the rays to these centres without its distortion
     """
 
-    place_mm: NDArray[np.float64]
-    lens_mm: NDArray[np.float64]
-    ideal_mm: NDArray[np.float64]
+    place_mm: Floats
+    lens_mm: Floats
+    ideal_mm: Floats
 
 
 def pixel_rays(camera: Camera, column: NDArray[np.int64], row: NDArray[np.int64]) -> PixelRays:
@@ -187,9 +167,7 @@ def pixel_rays(camera: Camera, column: NDArray[np.int64], row: NDArray[np.int64]
 
 
 @njit(cache=True)
-def nearest_points(
-    points: NDArray[np.float64], origin: NDArray[np.float64], basis: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def nearest_points(points: Floats, origin: Floats, basis: Floats) -> Floats:
     """Return the lattice points nearest to points, both (n, 2)."""
     found = np.empty_like(points)
     for n in range(len(points)):
@@ -197,21 +175,13 @@ def nearest_points(
     return found
 
 
-def undistorted(points_mm: NDArray[np.float64], distortion_per_mm2: float) -> NDArray[np.float64]:
-    """Return the points (n, 2) that r' = r (1 + k1 r^2) carries to the given ones."""
-    ideal = points_mm
-    for _ in range(UNDISTORT_ROUNDS if distortion_per_mm2 else 0):
-        ideal = points_mm / (1.0 + distortion_per_mm2 * np.sum(ideal**2, axis=-1, keepdims=True))
-    return ideal
-
-
-def lens_crossings(rays: PixelRays, camera: Camera) -> NDArray[np.float64]:
+def lens_crossings(rays: PixelRays, camera: Camera) -> Floats:
     """Return where on the main lens (n, 2) the light comes from that reaches each pixel through its lens's centre."""
     stretch = camera.image_distance_mm / camera.microlens_distance_mm
     return rays.ideal_mm - (rays.place_mm - rays.lens_mm) * stretch
 
 
-def scene_points(rays: PixelRays, camera: Camera, media: Media, z_mm: float) -> NDArray[np.float64]:
+def scene_points(rays: PixelRays, camera: Camera, media: Media, z_mm: float) -> Floats:
     """Return where in the plane z (n, 2) the light starts that reaches each pixel through its lens's centre.
 
     From x_m = alpha X - x s_i/s_o.
@@ -222,7 +192,7 @@ def scene_points(rays: PixelRays, camera: Camera, media: Media, z_mm: float) -> 
     return (alpha * lens_crossings(rays, camera) - rays.ideal_mm) * back
 
 
-def lens_cell(lattice: Lattice) -> NDArray[np.float64]:
+def lens_cell(lattice: Lattice) -> Floats:
     """Return the corners (4 or 6, 2) of the region nearest to one lattice point, about that point, in order."""
     first, second = lattice.basis
     if lattice.layout == "square":
@@ -231,35 +201,12 @@ def lens_cell(lattice: Lattice) -> NDArray[np.float64]:
     return np.concatenate([half, -half])
 
 
-def disc_shares(
-    rays: PixelRays, position_mm: NDArray[np.float64], radius_mm: float, camera: Camera, media: Media
+def scene_shares(
+    rays: PixelRays, camera: Camera, media: Media, shape: PointShape, position_mm: Floats
 ) -> SharesAndSlopes:
-    """Return for each pixel the share (n,) of the scene it sees at depth z that a disc there covers, and its slopes.
+    """Return the shares (n,) of what pixels see at depth z that a shape there covers, and its slopes.
 
     `position_mm` is (x, y, z) in image axes; the slopes (n, 3) are the share's derivatives by it, per mm.
-    """
-
-    def covered(middle: NDArray[np.float64], cell: NDArray[np.float64], width: float) -> SharesAndSlopes:
-        samples = 1 if width < SHARP_SHARE * radius_mm else BLURRED_SAMPLES
-        return covered_shares(middle, cell, radius_mm, width, samples)
-
-    return scene_shares(rays, position_mm, camera, media, covered)
-
-
-def scene_shares(
-    rays: PixelRays,
-    position_mm: NDArray[np.float64],
-    camera: Camera,
-    media: Media,
-    covered: Callable[[NDArray[np.float64], NDArray[np.float64], float], SharesAndSlopes],
-) -> SharesAndSlopes:
-    """Return the shares (n,) of what pixels see in the plane of `position_mm` that a shape there covers, and slopes.
-
-    Parameters
-    ----------
-    covered : gives the shares for the middles (n, 2) of what is seen, about the position, the corners of a microlens as
-        seen there (k, 2), and the width of a pixel; and their slopes (n, 4) by the middle's x and y, the logarithm of
-        the microlens's size, and the width
     """
     distance = float(equivalent_object_distance(position_mm[2], camera.focus_distance_mm, media))
     back = distance / camera.image_distance_mm
@@ -277,7 +224,8 @@ def scene_shares(
     middle = spread * crossings - back * rays.ideal_mm - position_mm[:2]
     middle_z = spread_z * crossings - back_z * rays.ideal_mm
     width = abs(spread) * pixel
-    shares, slopes = covered(middle, lens_cell(camera.lattice) * cell_scale, width)
+    samples = 1 if width < SHARP_SHARE * shape.half_mm else BLURRED_SAMPLES
+    shares, slopes = shape.covered(middle, lens_cell(camera.lattice) * cell_scale, shape.figure, width, samples)
     by_z = (
         slopes[:, 0] * middle_z[:, 0] + slopes[:, 1] * middle_z[:, 1] + slopes[:, 2] * cell_z + slopes[:, 3] * width_z
     )
@@ -285,9 +233,7 @@ def scene_shares(
 
 
 @njit(cache=True)
-def covered_shares(
-    middle: NDArray[np.float64], cell: NDArray[np.float64], radius: float, width: float, samples: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def covered_shares(middle: Floats, cell: Floats, radius: float, width: float, samples: int) -> tuple[Floats, Floats]:
     """Return the mean share of `cell`, moved to `middle` and over a square of `width` around it, inside the disc.
 
     The slopes (n, 4) are its derivatives by the middle's x and y, the logarithm of the cell's size, and the width.
@@ -324,9 +270,7 @@ def covered_shares(
 
 
 @njit(cache=True)
-def disc_polygon_growth(
-    x: float, y: float, cell: NDArray[np.float64], radius: float, growth: NDArray[np.float64]
-) -> None:
+def disc_polygon_growth(x: float, y: float, cell: Floats, radius: float, growth: Floats) -> None:
     """Write the derivatives of `disc_polygon_area` by x, by y, and by the logarithm of the cell's size.
 
     Every edge sweeps an area as long as its part inside the disc.
@@ -349,14 +293,30 @@ def disc_polygon_growth(
 
 
 @njit(cache=True)
-def disc_polygon_area(x: float, y: float, cell: NDArray[np.float64], radius: float) -> float:
-    """Return the area shared by a disc about (0, 0) and the polygon `cell` moved by (x, y), with the polygon's sign."""
+def disc_polygon_area(x: float, y: float, cell: Floats, radius: float) -> float:
+    """Return the area shared by a disc about (0, 0) and the polygon `cell` moved by (x, y), with the polygon's sign.
+
+    It is the sum over the triangles of the origin and an edge, a to b.
+    """
     area = 0.0
     for k in range(cell.shape[0]):
         following = (k + 1) % cell.shape[0]
-        area += disc_triangle_area(
-            x + cell[k, 0], y + cell[k, 1], x + cell[following, 0], y + cell[following, 1], radius
-        )
+        ax, ay, bx, by = x + cell[k, 0], y + cell[k, 1], x + cell[following, 0], y + cell[following, 1]
+        dx, dy = bx - ax, by - ay
+        length2 = dx * dx + dy * dy
+        along = ax * dx + ay * dy
+        inside = along * along - length2 * (ax * ax + ay * ay - radius * radius)
+        enter, leave = 1.0, 0.0
+        if inside > 0.0:
+            enter = (-along - np.sqrt(inside)) / length2
+            leave = (-along + np.sqrt(inside)) / length2
+        if enter >= 1.0 or leave <= 0.0:
+            area += sector_area(ax, ay, bx, by, radius)
+            continue
+        enter, leave = max(enter, 0.0), min(leave, 1.0)
+        px, py = ax + enter * dx, ay + enter * dy
+        qx, qy = ax + leave * dx, ay + leave * dy
+        area += sector_area(ax, ay, px, py, radius) + 0.5 * (px * qy - py * qx) + sector_area(qx, qy, bx, by, radius)
     return area
 
 
@@ -366,122 +326,55 @@ def sector_area(ax: float, ay: float, bx: float, by: float, radius: float) -> fl
     return 0.5 * radius * radius * np.arctan2(ax * by - ay * bx, ax * bx + ay * by)
 
 
-@njit(cache=True)
-def disc_triangle_area(ax: float, ay: float, bx: float, by: float, radius: float) -> float:
-    """Return the signed area shared by a disc about the origin and the triangle origin, a, b."""
-    dx, dy = bx - ax, by - ay
-    length2 = dx * dx + dy * dy
-    along = ax * dx + ay * dy
-    inside = along * along - length2 * (ax * ax + ay * ay - radius * radius)
-    if inside <= 0.0:
-        return sector_area(ax, ay, bx, by, radius)
-    enter = (-along - np.sqrt(inside)) / length2
-    leave = (-along + np.sqrt(inside)) / length2
-    if enter >= 1.0 or leave <= 0.0:
-        return sector_area(ax, ay, bx, by, radius)
-    enter, leave = max(enter, 0.0), min(leave, 1.0)
-    px, py = ax + enter * dx, ay + enter * dy
-    qx, qy = ax + leave * dx, ay + leave * dy
-    return sector_area(ax, ay, px, py, radius) + 0.5 * (px * qy - py * qx) + sector_area(qx, qy, bx, by, radius)
-
-
-def fit_disc(
-    signal: NDArray[np.float64],
-    passed: NDArray[np.float64],
-    rays: PixelRays,
-    start_mm: NDArray[np.float64],
-    radius_mm: float,
-    camera: Camera,
-    media: Media,
-) -> ShapeFit:
-    """Fit a disc of known radius to pixels by least squares.
-
-    Parameters
-    ----------
-    signal, passed : (n,) light on the pixels and the share of light that each passes
-    start_mm : (3,) first guess, in image axes, within about the radius
-    """
-
-    def shares_at(position: NDArray[np.float64]) -> SharesAndSlopes:
-        return disc_shares(rays, position, radius_mm, camera, media)
-
-    beside = scene_points(rays, camera, media, float(start_mm[2])) - start_mm[:2]
-    return fit_shape(signal, passed, beside, start_mm, fit_steps(radius_mm, camera, media), shares_at)
-
-
-def fit_steps(size_mm: float, camera: Camera, media: Media) -> NDArray[np.float64]:
-    """Return moves (3,) that change a shape's light alike: its size sideways, and what moves the rim's rays as far."""
-    deep = size_mm * camera.focus_distance_mm / (camera.aperture_radius_mm * media.depth_ratio)
-    return np.array([size_mm, size_mm, deep])
-
-
-def checked_disc_radius(radius_mm: float, camera: Camera) -> float:
-    """Return the radius, or say that the camera cannot resolve such a dot."""
-    seen = abs(camera.magnification) * radius_mm
-    if seen < 0.25 * float(camera.lattice.pitch.min()):
-        raise InputError(
-            f"the board's dots are {written(2 * seen)} mm wide on the microlens array, less than half a microlens "
-            f"({written(float(camera.lattice.pitch.min()))} mm); use a board with larger dots"
-        )
-    return radius_mm
-
-
-# The pixels that see the surroundings of a point in the scene, to fit what is there to them.
-#
-# Axes: image axes (x along the columns, y along the rows), mm, z away from the camera from the focal plane.
-
-
 # Pixels at the rim of a micro-image are lit in part, by light that does not come from where their middle sees, and
 # rectification mixes neighbours; a pixel is used when the main lens's rim is more than half its patch's diagonal and a
 # pixel away. Without that pixel depths are 0.2 % too large.
 RIM_PER_PATCH = np.sqrt(0.5) + 1.0
 # Fewer pixels than these are a point at the sensor's edge: five unknowns need several times as many.
 FEWEST_PIXELS = 50
-# More pixels than these make a fit slower and hardly better: the model's own errors are larger than their noise.
-MOST_PIXELS = 10_000
 
 
-@dataclass(frozen=True, eq=False)
-class NearPixels:
+class NearPixels(NamedTuple):
     """Pixels (n,): their light, the share of it that they pass, and their rays."""
 
-    signal: NDArray[np.float64]
-    passed: NDArray[np.float64]
+    signal: Floats
+    passed: Floats
     rays: PixelRays
 
 
 def pixels_near(
-    picture: tuple[NDArray[np.float64], NDArray[np.float32]],
+    picture: tuple[Floats, NDArray[np.float32]],
     camera: Camera,
     media: Media,
-    start_mm: tuple[float, float, float],
+    start_mm: Floats,
     reach_mm: float,
-    most: int = MOST_PIXELS,
+    most: int,
 ) -> NearPixels | None:
     """Return the pixels that see the plane of a point within `reach_mm` of it; None where the sensor holds too few.
 
     Parameters
     ----------
     picture : light and the share of it that pixels pass, (rows, columns) each
+    start_mm : (3,) the point, image axes
     """
-    x, y, z = start_mm
+    z = float(start_mm[2])
     signal, passed = picture
     distance = float(equivalent_object_distance(z, camera.focus_distance_mm, media))
     forward = camera.image_distance_mm / distance
     pitch = float(camera.lattice.pitch.max())
     blur = abs(float(camera.defocus(distance))) * camera.aperture_radius_mm
     half = (forward * reach_mm + blur + pitch) / camera.pixel_mm
-    middle = camera.mm_to_px(-forward * np.array([x, y]))
+    middle = camera.mm_to_px(-forward * start_mm[:2])
     low = np.maximum(np.floor(middle - half), 0).astype(np.int64)
     high = np.minimum(np.ceil(middle + half) + 1, [camera.columns, camera.rows]).astype(np.int64)
     row, column = (axis.ravel() for axis in np.mgrid[low[1] : high[1], low[0] : high[0]])
     rays = pixel_rays(camera, column, row)
-    near = np.hypot(*(scene_points(rays, camera, media, z) - (x, y)).T) <= reach_mm
+    near = np.hypot(*(scene_points(rays, camera, media, z) - start_mm[:2]).T) <= reach_mm
     rim = RIM_PER_PATCH * camera.pixel_mm * camera.image_distance_mm / camera.microlens_distance_mm
     through = np.hypot(*lens_crossings(rays, camera).T) <= camera.aperture_radius_mm - rim
     kept = np.nonzero(near & through & (passed[row, column] > 0.0))[0]
     if len(kept) < FEWEST_PIXELS:
         return None
     kept = kept[:: -(-len(kept) // most)]
-    chosen = replace(rays, place_mm=rays.place_mm[kept], lens_mm=rays.lens_mm[kept], ideal_mm=rays.ideal_mm[kept])
+    chosen = PixelRays(*(each[kept] for each in rays))
     return NearPixels(signal[row, column][kept], passed[row, column][kept].astype(np.float64), chosen)

@@ -6,13 +6,17 @@ pupil to the array.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
+from lfpiv_cli.calibration.board_pose import BoardGeometry, BoardPose, lens_in_scene_mm
 from lfpiv_cli.calibration.lattice import EXPONENTS, LatticeFit
+from lfpiv_cli.calibration.light_checks import LARGEST_FIELD_DEPTH, field_depth
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.notice import Notice, written
 from lfpiv_cli.optics.camera import Camera, real_lens, with_entrance_pupil
-from lfpiv_cli.scale import Scale
+from lfpiv_cli.optics.media import Media
 
 # A lattice further from the data sheet than this is another camera, a binned sensor or a slip in the sheet: the
 # projection itself makes up to 4 % where the main lens is not known.
@@ -42,8 +46,7 @@ def check_pitch(fit: LatticeFit, sheet_pitch_px: float) -> None:
 
     Raises
     ------
-    InputError
-        when they differ by more than 5 %
+    InputError : when they differ by more than 5 %
     """
     pitch = float(fit.lattice_px.pitch.mean())
     if abs(pitch / sheet_pitch_px - 1.0) > LARGEST_DIFFERENCE:
@@ -103,37 +106,15 @@ def image_distance_notices(fit: LatticeFit, camera: Camera) -> list[Notice]:
         if difference <= max(IMAGE_DISTANCE_TOLERANCE * sheet, IMAGE_DISTANCE_SIGMAS * found[1]):
             return []
     told = "no image distance" if found is None else f"an image distance of {written(found[0], 4)} mm"
-    ratio = None if found is None else found[0] / real_lens(camera).focal_length_mm + camera.magnification
+    ratio = 0.0 if found is None else found[0] / real_lens(camera).focal_length_mm + camera.magnification
     expected = "an infinite one" if telecentric else f"{written(sheet, 4)} mm"
-    return [
-        Notice(
-            "image-distance",
-            "camera.main_lens",
-            f"the pitch of the lens images tells {told}, the data sheet {expected}",
-            "correct what is off of microlenses.pitch_mm, sensor.pixel_um, sensor.microlens_distance_mm and main_lens"
-            + (f" (pupil_ratio {written(ratio)} if all else is right)" if ratio is not None and ratio > 0.0 else ""),
-            None if found is None else found[0],
-            expected,
-        )
-    ]
-
-
-def magnification_notices(measured: float, camera: Camera) -> list[Notice]:
-    """Return what speaks against the magnification that a board shows: the data sheet's."""
-    sheet = camera.magnification
-    if abs(measured / sheet - 1.0) <= MAGNIFICATION_TOLERANCE:
-        return []
-    return [
-        Notice(
-            "magnification",
-            "board.spacing_mm",
-            f"the board shows a magnification of {written(measured, 4)}, which is used; the rig file says "
-            f"{written(sheet, 4)}",
-            "correct what is off of board.spacing_mm, board.medium and main_lens.magnification",
-            measured,
-            f"{written(sheet, 4)} within {MAGNIFICATION_TOLERANCE:.0%}",
-        )
-    ]
+    text = f"the pitch of the lens images tells {told}, the data sheet {expected}"
+    remedy = (
+        "correct what is off of microlenses.pitch_mm, sensor.pixel_um, sensor.microlens_distance_mm and main_lens"
+        + (f" (pupil_ratio {written(ratio)} if all else is right)" if ratio > 0.0 else "")
+    )
+    measured = None if found is None else found[0]
+    return [Notice("image-distance", "camera.main_lens", text, remedy, measured, expected)]
 
 
 def entrance_pupil_notices(found_mm: float | None, sigma_mm: float | None, camera: Camera) -> list[Notice]:
@@ -145,71 +126,65 @@ def entrance_pupil_notices(found_mm: float | None, sigma_mm: float | None, camer
         return []
     inverse = with_entrance_pupil(camera, found_mm).entrance_over_exit
     ratio = written(1.0 / inverse) if inverse > 0.0 else "image_distance: infinite"
-    return [
-        Notice(
-            "entrance-pupil",
-            "camera.main_lens.pupil_ratio",
-            f"the boards show the entrance pupil {written(found_mm, 4)} mm from the focal plane, the data sheet "
-            f"{written(sheet, 4)} mm",
-            "correct what is off of main_lens.focal_length_mm, media.fluid, the boards' depths and pupil_ratio "
-            f"({ratio} if all else is right)",
-            found_mm,
-            f"{written(sheet, 4)} mm within {ENTRANCE_PUPIL_TOLERANCE:.0%}",
-        )
-    ]
+    text = (
+        f"the boards show the entrance pupil {written(found_mm, 4)} mm from the focal plane, the data sheet "
+        f"{written(sheet, 4)} mm"
+    )
+    remedy = (
+        "correct what is off of main_lens.focal_length_mm, media.fluid, the boards' depths and pupil_ratio "
+        f"({ratio} if all else is right)"
+    )
+    expected = f"{written(sheet, 4)} mm within {ENTRANCE_PUPIL_TOLERANCE:.0%}"
+    return [Notice("entrance-pupil", "camera.main_lens.pupil_ratio", text, remedy, found_mm, expected)]
 
 
-def board_notices(found: int, dots: tuple[int, int]) -> list[Notice]:
-    """Return what speaks against a board of which only a part was found: which part it is, its dots do not tell."""
-    count = dots[0] * dots[1]
-    if found >= FEWEST_POINTS * count:
-        return []
-    return [
-        Notice(
-            "board-incomplete",
-            "board.dots",
-            f"{found} of the board's {dots[0]} x {dots[1]} points were found: where its middle lies is a guess",
-            "correct board.dots, or bring all of the board into view",
-            float(found),
-            f"{count}",
-        )
-    ]
-
-
-def narrow_notices(dot_mm: float, z_mm: float, scale: Scale) -> list[Notice]:
-    """Return what speaks against dots whose light is no wider than a microlens at their depth from the focal plane."""
-    dot, spread = dot_mm / scale.lens_mm, abs(z_mm) / scale.depth_mm
-    if dot + spread >= 1.0:
-        return []
-    return [
-        Notice(
-            "board-within-lenses",
-            "board.dot_diameter_mm",
-            f"at its depth a dot's light is {written(dot + spread, 2)} microlenses wide: where it falls into one it "
-            "may lie anywhere in it, and the magnification is up to 2 % off, several of its standard errors",
-            f"move the board by {written((2.0 - dot) * scale.depth_mm, 2)} mm off the focal plane, or take dots of two "
-            "microlenses",
-            dot + spread,
-            "at least 1",
-        )
-    ]
-
-
-def points_notices(found: int) -> list[Notice]:
-    """Return what speaks against so few points of a board: nobody knows how well they tell where it is."""
-    if found >= ENOUGH_POINTS:
-        return []
-    return [
-        Notice(
-            "board-few-points",
-            "board",
+def board_notices(pose: BoardPose, board: BoardGeometry, camera: Camera, media: Media) -> Iterator[Notice]:
+    """Say what speaks against a board as it was found, and what it shows that the data sheet has otherwise."""
+    (across, down), found, dots = board.dots, pose.dots_found, board.pattern == "dots"
+    if dots and found < FEWEST_POINTS * across * down:
+        # Which part it is its dots do not tell.
+        text = f"{found} of the board's {across} x {down} points were found: where its middle lies is a guess"
+        remedy = "correct board.dots, or bring all of the board into view"
+        yield Notice("board-incomplete", "board.dots", text, remedy, float(found), f"{across * down}")
+    if found < ENOUGH_POINTS:
+        text = (
             f"{found} of its points were found, at least {ENOUGH_POINTS} are needed to see how well they agree: the "
-            "stated errors may be three times too small",
-            "bring more of the board into view, or take one with smaller squares",
-            float(found),
-            f"at least {ENOUGH_POINTS}",
+            "stated errors may be three times too small"
         )
-    ]
+        remedy = "bring more of the board into view, or take one with smaller squares"
+        yield Notice("board-few-points", "board", text, remedy, float(found), f"at least {ENOUGH_POINTS}")
+    shown, sheet = pose.magnification, camera.magnification
+    if abs(shown / sheet - 1.0) > MAGNIFICATION_TOLERANCE:
+        text = f"the board shows a magnification of {written(shown, 4)}, which is used; the rig file says {written(sheet, 4)}"
+        remedy = "correct what is off of board.spacing_mm, board.medium and main_lens.magnification"
+        expected = f"{written(sheet, 4)} within {MAGNIFICATION_TOLERANCE:.0%}"
+        yield Notice("magnification", "board.spacing_mm", text, remedy, shown, expected)
+    depth, largest = field_depth(pose, camera), LARGEST_FIELD_DEPTH * lens_in_scene_mm(camera)[1]
+    if depth is not None and depth.beyond(largest):
+        text = (
+            f"a flat board seems {written(abs(depth.value))} mm {'further' if depth.value > 0.0 else 'nearer'} in the "
+            f"corners than in the middle (field curvature, or a bent board), at most {written(largest, 2)} mm may be: "
+            "depths are off by it, as the square of the image height"
+        )
+        remedy = (
+            "a flat board, a volume near the axis, another objective; for volumes boards at several --depth-mm and "
+            "method dlfc"
+        )
+        yield Notice("field-curved", "board image", text, remedy, depth.value, f"within {written(largest, 2)} mm")
+    # A dot's light in microlenses, at its depth from the focal plane.
+    scale = camera.scale(board.seen_through(media))
+    dot = board.dot_diameter_mm / scale.lens_mm
+    wide = dot + abs(pose.z0_mm) / scale.depth_mm
+    if dots and wide < 1.0:
+        text = (
+            f"at its depth a dot's light is {written(wide, 2)} microlenses wide: where it falls into one it "
+            "may lie anywhere in it, and the magnification is up to 2 % off, several of its standard errors"
+        )
+        remedy = (
+            f"move the board by {written((2.0 - dot) * scale.depth_mm, 2)} mm off the focal plane, or take dots of two "
+            "microlenses"
+        )
+        yield Notice("board-within-lenses", "board.dot_diameter_mm", text, remedy, wide, "at least 1")
 
 
 def check_f_numbers(camera: Camera) -> None:
@@ -219,41 +194,30 @@ def check_f_numbers(camera: Camera) -> None:
     ------
     ConfigError
     """
-    if _ratio(camera) > LARGEST_F_RATIO:
+    ratio, told = _f_numbers(camera)
+    if ratio > LARGEST_F_RATIO:
         raise ConfigError(
-            f"camera.main_lens.aperture_mm: {_f_numbers(camera)}; at most a factor of {LARGEST_F_RATIO:g} may be "
+            f"camera.main_lens.aperture_mm: {told}; at most a factor of {LARGEST_F_RATIO:g} may be "
             "between them; check the apertures, the focal lengths and microlens_distance_mm"
         )
 
 
 def f_number_notices(camera: Camera) -> list[Notice]:
     """Return what speaks against the f-numbers of main lens and microlenses."""
-    if _ratio(camera) <= LARGE_F_RATIO:
+    ratio, told = _f_numbers(camera)
+    if ratio <= LARGE_F_RATIO:
         return []
     turned = "stop the lens down" if camera.lens_image_width > 1.0 else "open it"
-    return [
-        Notice(
-            "f-numbers",
-            "camera.main_lens.aperture_mm",
-            _f_numbers(camera),
-            f"correct the aperture (f_number is F_m / p_m), or {turned} until lens images just touch",
-            _ratio(camera),
-            f"at most {LARGE_F_RATIO:g}",
-        )
-    ]
+    remedy = f"correct the aperture (f_number is F_m / p_m), or {turned} until lens images just touch"
+    return [Notice("f-numbers", "camera.main_lens.aperture_mm", told, remedy, ratio, f"at most {LARGE_F_RATIO:g}")]
 
 
-def _ratio(camera: Camera) -> float:
-    """Return the factor between the two f-numbers, 1 where they match."""
-    return max(camera.lens_image_width, 1.0 / camera.lens_image_width)
-
-
-def _f_numbers(camera: Camera) -> str:
-    """Return what becomes of lens images by the f-numbers, in words."""
+def _f_numbers(camera: Camera) -> tuple[float, str]:
+    """Return the factor between the two f-numbers, 1 where they match, and what becomes of lens images, in words."""
     width, main = camera.lens_image_width, camera.image_distance_mm / camera.aperture_mm
     what = f"overlap, {width:.2f} of their pitch wide" if width > 1.0 else f"fill only {width:.2f} of their pitch"
     numbers = f"the main lens is f/{written(main)} towards the array and the microlenses are f/{written(main * width)}"
-    return f"{numbers}: lens images {what}"
+    return max(width, 1.0 / width), f"{numbers}: lens images {what}"
 
 
 def _excess(fit: LatticeFit, camera: Camera) -> tuple[float, float]:

@@ -6,30 +6,27 @@ one sample per microlens; neighbouring microlenses are neighbours in it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.board_pose import BoardGeometry
-from lfpiv_cli.calibration.shape_fit import PixelRays, lens_crossings, pixel_rays, scene_points
+from lfpiv_cli.calibration.shape_fit import lens_crossings, pixel_rays, scene_points
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 
 # Chessboards and ChArUco boards in a picture of grey levels, found by OpenCV, and what is known of their pattern.
-#
-# Axes: places are (column, row) in the picture's pixels; corners are numbered along the board's columns and rows.
-
+# Places are (column, row) in the picture's pixels; corners are numbered along the board's columns and rows.
 
 # Grey levels of 255 between the brightest black and the darkest white square.
 LEAST_CONTRAST = 60.0
 
 
-def chessboard_corners(
-    picture: NDArray[np.uint8], board: BoardGeometry
-) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
+def chessboard_corners(picture: NDArray[np.uint8], board: BoardGeometry) -> tuple[NDArray[np.int64], Floats] | None:
     """Return numbers and places (n, 2) of all inner corners of a chessboard; None where it is not wholly there."""
     # CALIB_CB_NORMALIZE_IMAGE would equalise the histogram, which draws corners of small boards off by a square
     flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
@@ -40,7 +37,7 @@ def chessboard_corners(
     return board_numbers(board), np.asarray(corners, dtype=np.float64).reshape(-1, 2)
 
 
-def alternating(picture: NDArray[np.uint8], corners: NDArray[np.float64]) -> bool:
+def alternating(picture: NDArray[np.uint8], corners: Floats) -> bool:
     """Return whether the squares about corners (rows, columns, 2) are black and white by turns.
 
     OpenCV finds a grid of three by three corners in many pictures, of particles or of white light.
@@ -64,9 +61,7 @@ def board_numbers(board: BoardGeometry) -> NDArray[np.int64]:
     return np.stack(np.meshgrid(*(np.arange(n) for n in board.dots)), axis=-1).reshape(-1, 2).astype(np.int64)
 
 
-def charuco_corners(
-    picture: NDArray[np.uint8], board: BoardGeometry
-) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
+def charuco_corners(picture: NDArray[np.uint8], board: BoardGeometry) -> tuple[NDArray[np.int64], Floats] | None:
     """Return numbers and places (n, 2) of the inner corners of a ChArUco board that are seen; None where none is."""
     settings = cv2.aruco.CharucoParameters()
     settings.minMarkers = 1  # of the two beside a corner: at the picture's edge one is cut
@@ -93,11 +88,6 @@ def charuco_board(board: BoardGeometry) -> cv2.aruco.CharucoBoard:
     return cv2.aruco.CharucoBoard(squares, board.spacing_mm, board.marker_mm, words)
 
 
-def marker_modules(board: BoardGeometry) -> int:
-    """Return how many squares a marker of the board's dictionary has along its side, the black border among them."""
-    return int(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary)).markerSize) + 2
-
-
 def clear_mm(board: BoardGeometry) -> float:
     """Return how far about a corner there is nothing but its four squares: markers stand in the middle of theirs."""
     to_marker = np.sqrt(0.5) * (board.spacing_mm - board.marker_mm)
@@ -113,78 +103,49 @@ def described(board: BoardGeometry) -> str:
     return f"a {kind} of {across + 1} x {down + 1} squares"
 
 
-# Refocused pictures: the light of pixels carried back along their rays to a plane of the scene and added up there.
-#
-# Axes: pictures are [row, column], centred on the optical axis, x and y growing with columns and rows.
+# Refocused pictures: the light of pixels carried back along their rays to a plane of the scene and added up there. They
+# are [row, column], the middle sample on the optical axis, x and y growing with columns and rows.
 
 
-@dataclass(frozen=True, eq=False)
-class Refocusing:
-    """Pixels and the samples of the planes that their light is carried to.
+def refocusing(
+    camera: Camera,
+    media: Media,
+    pixels: tuple[NDArray[np.int64], NDArray[np.int64]],
+    samples_per_lens: int,
+    half_width: float,
+    smoothing: float,
+) -> tuple[float, tuple[int, int], Callable[..., list[Floats]]]:
+    """Return what carries the light of pixels (row, column), (n,) each, to planes.
 
-    Attributes
+    That is the side of the planes' samples, mm, how many rows and columns of them lie on either side of the axis, and
+    what gives the pictures at a depth of each kind of light (n,).
+
+    Parameters
     ----------
     camera : with the lattice of the rectified frame
     media : what lies before the planes
-    rays : of the pixels
-    through : (n,) which of the rays pass the main lens
-    sample_mm : side of a sample
-    half : rows and columns of samples on either side of the axis
+    samples_per_lens : samples in the width of a microlens
+    half_width : of the pictures to either side of the axis, in widths of the sensor as the focal plane has it
+    smoothing : standard deviation of the Gaussian that softens the pictures, in samples
     """
+    row, column = pixels
+    rays = pixel_rays(camera, column, row)
+    through = np.hypot(*lens_crossings(rays, camera).T) <= camera.aperture_radius_mm
+    sample_mm = float(camera.lattice.pitch.min()) / samples_per_lens / abs(camera.magnification)
+    size = np.array([camera.rows, camera.columns]) * camera.pixel_mm / abs(camera.magnification)
+    rows, columns = (int(n) for n in np.ceil(half_width * size / sample_mm))
+    shape = 2 * rows + 1, 2 * columns + 1
 
-    camera: Camera
-    media: Media
-    rays: PixelRays
-    through: NDArray[np.bool_]
-    sample_mm: float
-    half: tuple[int, int]
-
-    @classmethod
-    def of(
-        cls,
-        camera: Camera,
-        media: Media,
-        pixels: tuple[NDArray[np.int64], NDArray[np.int64]],
-        samples_per_lens: int,
-        half_width: float,
-    ) -> Refocusing:
-        """Return the refocusing of pixels (row, column), (n,) each.
-
-        Parameters
-        ----------
-        samples_per_lens : samples in the width of a microlens
-        half_width : of the pictures to either side of the axis, in widths of the sensor as the focal plane has it
-        """
-        row, column = pixels
-        rays = pixel_rays(camera, column, row)
-        through = np.hypot(*lens_crossings(rays, camera).T) <= camera.aperture_radius_mm
-        sample_mm = float(camera.lattice.pitch.min()) / samples_per_lens / abs(camera.magnification)
-        size = np.array([camera.rows, camera.columns]) * camera.pixel_mm / abs(camera.magnification)
-        rows, columns = np.ceil(half_width * size / sample_mm).astype(int)
-        return cls(camera, media, rays, through, sample_mm, (int(rows), int(columns)))
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Rows and columns of the pictures; the middle sample lies on the axis."""
-        return 2 * self.half[0] + 1, 2 * self.half[1] + 1
-
-    def pictures(
-        self, z_mm: float, light: tuple[NDArray[np.float64], ...], smoothing: float
-    ) -> list[NDArray[np.float64]]:
-        """Return what each kind of the pixels' light (n,) makes on the plane at a depth.
-
-        Parameters
-        ----------
-        smoothing : standard deviation of the Gaussian that softens the pictures, in samples
-        """
-        points = scene_points(self.rays, self.camera, self.media, z_mm)
-        place = np.rint(points[:, ::-1] / self.sample_mm).astype(np.int64) + self.half
-        seen = self.through & ((place >= 0) & (place < self.shape)).all(axis=1)
-        flat = np.ravel_multi_index(tuple(place[seen].T), self.shape)
-        length = self.shape[0] * self.shape[1]
+    def pictures(z_mm: float, *light: Floats) -> list[Floats]:
+        points = scene_points(rays, camera, media, z_mm)
+        place = np.rint(points[:, ::-1] / sample_mm).astype(np.int64) + (rows, columns)
+        seen = through & ((place >= 0) & (place < shape)).all(axis=1)
+        flat = np.ravel_multi_index(tuple(place[seen].T), shape)
         # bincount makes whole numbers of no light at all
-        sums = [np.bincount(flat, values[seen], minlength=length).astype(np.float64) for values in light]
-        return [ndimage.gaussian_filter(each.reshape(self.shape), smoothing) for each in sums]
+        sums = [np.bincount(flat, values[seen], minlength=shape[0] * shape[1]).astype(np.float64) for values in light]
+        return [ndimage.gaussian_filter(each.reshape(shape), smoothing) for each in sums]
+
+    return sample_mm, (rows, columns), pictures
 
 
 # Refocused pictures have one sample per microlens, the detail that the array records, softened by half of that so that
@@ -211,26 +172,20 @@ def lens_table(camera: Camera) -> NDArray[np.int64]:
     return table.astype(np.int64)
 
 
-def view_places_px(camera: Camera, crossing_mm: ArrayLike) -> NDArray[np.float64]:
-    """Return where on the sensor (column, row) the ray through (X, Y) and each lens's centre ends, (rows, columns, 2).
-
-    With x_m = s_ux in Eq. 1 the microlens does not bend the ray: x_s = s_ux + s_mu (s_ux - X)/s_i.
-    """
-    lens = camera.lattice.points(lens_table(camera))
-    step = (lens - np.asarray(crossing_mm, dtype=np.float64)) / camera.image_distance_mm
-    return camera.mm_to_px(lens + camera.microlens_distance_mm * step)
-
-
-def view_crossings(radius_mm: float, step_mm: float) -> NDArray[np.float64]:
-    """Return points (n, 2) of the main lens, a square grid about its middle."""
+def view_crossings(camera: Camera, rim_px: float) -> Floats:
+    """Return points (n, 2) of the main lens, a square grid about its middle, a pixel apart and some inside its rim."""
+    step_mm = camera.pixel_mm * camera.image_distance_mm / camera.microlens_distance_mm
+    radius_mm = camera.aperture_radius_mm - rim_px * step_mm
     count = int(radius_mm / step_mm)
     line = step_mm * np.arange(-count, count + 1)
     points = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
     return points[np.hypot(points[:, 0], points[:, 1]) <= radius_mm]
 
 
-def sub_aperture_view(image: ArrayLike, camera: Camera, crossing_mm: ArrayLike) -> NDArray[np.float64]:
+def sub_aperture_view(image: ArrayLike, camera: Camera, crossing_mm: ArrayLike) -> Floats:
     """Return the view (lens rows, lens columns) from the point (X, Y) of the main lens, linearly interpolated.
+
+    The ray through (X, Y) and a lens's centre is not bent there, s_ux = x_m in Eq. 1: x_s = s_ux + s_mu (s_ux - X)/s_i.
 
     Parameters
     ----------
@@ -238,14 +193,14 @@ def sub_aperture_view(image: ArrayLike, camera: Camera, crossing_mm: ArrayLike) 
     camera : with the lattice of the rectified frame
     crossing_mm : (2,) X, Y
     """
-    places = view_places_px(camera, crossing_mm)
+    lens = camera.lattice.points(lens_table(camera))
+    step = (lens - np.asarray(crossing_mm, dtype=np.float64)) / camera.image_distance_mm
+    places = camera.mm_to_px(lens + camera.microlens_distance_mm * step)
     pixels = np.asarray(image, dtype=np.float64)
     return ndimage.map_coordinates(pixels, [places[..., 1], places[..., 0]], order=1, mode="nearest")
 
 
-def views_across(
-    image: ArrayLike, camera: Camera, views_per_side: int
-) -> dict[tuple[int, int], tuple[NDArray[np.float64], NDArray[np.float64]]]:
+def views_across(image: ArrayLike, camera: Camera, views_per_side: int) -> dict[tuple[int, int], tuple[Floats, Floats]]:
     """Return the points (X, Y) in mm and the views from a square grid of them, by its row and column.
 
     The grid's cells cover the main lens; a cell whose middle lies beyond the rim has no view. X grows with the columns
@@ -262,7 +217,7 @@ def views_across(
 
 def refocused_stack(
     image: ArrayLike, camera: Camera, media: Media, depths_mm: ArrayLike, passed: ArrayLike | None = None
-) -> NDArray[np.float64]:
+) -> Floats:
     """Return what the scene looks like when focused at depths: (depths, rows, columns), one sample per microlens.
 
     Every pixel's light is carried back along its ray to the plane and averaged there. The pictures are centred on the
@@ -277,10 +232,10 @@ def refocused_stack(
     pixels = np.asarray(image, dtype=np.float64)
     share = np.ones(pixels.shape) if passed is None else np.asarray(passed, dtype=np.float64)
     row, column = np.nonzero(share > 0.0)
-    planes = Refocusing.of(camera, media, (row, column), samples_per_lens=1, half_width=0.5)
+    _, _, pictures = refocusing(camera, media, (row, column), 1, 0.5, REFOCUS_SMOOTHING)
 
-    def refocused(z_mm: float) -> NDArray[np.float64]:
-        light, passing = planes.pictures(z_mm, (pixels[row, column], share[row, column]), REFOCUS_SMOOTHING)
+    def refocused(z_mm: float) -> Floats:
+        light, passing = pictures(z_mm, pixels[row, column], share[row, column])
         enough = passing > LEAST_SEEN * np.median(passing)
         return np.where(enough, light / np.where(enough, passing, 1.0), 0.0)
 

@@ -12,21 +12,13 @@ Axes: image axes (x along the columns, y along the rows), mm, z away from the ca
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from lfpiv_cli.calibration.shape_fit import (
-    NearPixels,
-    PixelRays,
-    ShapeFit,
-    SharesAndSlopes,
-    fit_shape,
-    fit_steps,
-    scene_points,
-)
+from lfpiv_cli.arrays import Floats
+from lfpiv_cli.calibration.shape_fit import PixelRays, SharesAndSlopes, Strips
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.line_responses import PHASES, LineResponses, line_responses, on_pixels, spline_weights
 from lfpiv_cli.optics.media import Media, equivalent_object_distance
@@ -42,8 +34,6 @@ BY_RAYS = 0.05
 # Below this slope a strip is parallel to an edge.
 PARALLEL = 1e-9
 
-Values = NDArray[np.float64]
-
 
 @dataclass(frozen=True)
 class WaveLight:
@@ -51,26 +41,6 @@ class WaveLight:
 
     wavelength_mm: float
     diffusion_px: float
-
-
-class Strips(NamedTuple):
-    """Strips (n,) of a shape: where along x they begin and end, how far aside they lie, and how wide they are.
-
-    Lengths in the scene, mm, from the shape's place.
-    """
-
-    begin_mm: Values
-    end_mm: Values
-    aside_mm: Values
-    width_mm: Values
-
-
-def together(depths_mm: Values, camera: Camera, medium: Media) -> NDArray[np.bool_]:
-    """Return which depths (n,) lie within the one over which light spreads by a lens from the middle one of them.
-
-    The others are no points of a board, and line responses over all depths take long to compute.
-    """
-    return np.asarray(np.abs(depths_mm - np.median(depths_mm)) < camera.scale(medium).depth_mm)
 
 
 def disc_strips(radius_mm: float, lens_mm: float) -> Strips:
@@ -83,7 +53,7 @@ def disc_strips(radius_mm: float, lens_mm: float) -> Strips:
     return Strips(-half, half, edges[:-1] + 0.5 * width, width)
 
 
-def corner_strips(edges_mm: Values, lens_mm: float) -> Strips:
+def corner_strips(edges_mm: Floats, lens_mm: float) -> Strips:
     """Return the strips of two squares that meet in a corner, those where both of u and v have one sign.
 
     Parameters
@@ -120,7 +90,7 @@ class WaveShapes:
     lines: LineResponses
 
     @classmethod
-    def of(cls, camera: Camera, medium: Media, light: WaveLight, depths_mm: Values) -> WaveShapes:
+    def of(cls, camera: Camera, medium: Media, light: WaveLight, depths_mm: Floats) -> WaveShapes:
         """Compute the line responses about depths (n,) that rays tell, some seconds' work."""
         space, beyond = ObjectSpace(medium, refraction="paraxial"), BY_RAYS * camera.scale(medium).depth_mm
         ends = float(depths_mm.min()) - beyond, float(depths_mm.max()) + beyond
@@ -133,24 +103,25 @@ class WaveShapes:
         """What a lens sees of the focal plane."""
         return float(self.camera.lattice.pitch.mean()) / abs(self.camera.magnification)
 
-    def fit(self, near: NearPixels, start_mm: Values, size_mm: float, strips: Strips) -> ShapeFit:
-        """Fit a shape of about this size to pixels, from a first guess (3,)."""
-        steps = fit_steps(size_mm, self.camera, self.medium)
+    def shares_and_slopes(
+        self, rays: PixelRays, strips: Strips, steps_mm: Floats, position_mm: Floats
+    ) -> SharesAndSlopes:
+        """Return the shares (n,) of a shape, and slopes (n, 3), by differences over parts of steps (3,), per mm."""
+        shares = self.shares(rays, position_mm, strips)
+        moved = [self.shares(rays, position_mm + step, strips) for step in DIFFERENCE * np.diag(steps_mm)]
+        return shares, (np.stack(moved, axis=1) - shares[:, np.newaxis]) / (DIFFERENCE * steps_mm)
 
-        def shares_at(position: Values) -> SharesAndSlopes:
-            shares = self.shares(near.rays, position, strips)
-            moved = [self.shares(near.rays, position + step, strips) for step in DIFFERENCE * np.diag(steps)]
-            return shares, (np.stack(moved, axis=1) - shares[:, np.newaxis]) / (DIFFERENCE * steps)
-
-        beside = scene_points(near.rays, self.camera, self.medium, float(start_mm[2])) - start_mm[:2]
-        return fit_shape(near.signal, near.passed, beside, start_mm, steps, shares_at)
-
-    def shares(self, rays: PixelRays, position_mm: Values, strips: Strips) -> Values:
+    def shares(self, rays: PixelRays, position_mm: Floats, strips: Strips) -> Floats:
         """Return for each pixel the light (n,) of a shape over that of light that fills the scene."""
         camera, lines, z = self.camera, self.lines, float(position_mm[2])
         back = camera.image_distance_mm / float(equivalent_object_distance(z, camera.focus_distance_mm, self.medium))
         (of_column, x, u), (of_row, y, v) = (self._lines_of(rays, -back * position_mm[:2], axis) for axis in (0, 1))
-        sums = np.cumsum(_by_place(_at_depth(lines, z)), axis=0)
+        first, weights = _about((z - lines.first_depth_mm) / lines.depth_step_mm, len(lines.table))
+        plane = np.tensordot(np.array(weights), lines.table[first : first + 4], 1)
+        # From phases to places: (offsets, terms, responses).
+        offsets, _, terms, _ = plane.shape
+        by_place = np.ascontiguousarray(plane.transpose(0, 2, 3, 1).reshape(offsets, terms, -1), dtype=np.float64)
+        sums = np.cumsum(by_place, axis=0)
         begin, end = (self._read(sums, x - back * at, u) for at in (strips.begin_mm, strips.end_mm))
         half = 0.5 * strips.width_mm
         low, high = (self._read(sums, y - back * at, v) for at in (strips.aside_mm - half, strips.aside_mm + half))
@@ -159,7 +130,7 @@ class WaveShapes:
         filled = (along * lines.signs) @ across.T
         return np.asarray((light / filled)[of_column, of_row])
 
-    def _lines_of(self, rays: PixelRays, spot_mm: Values, axis: int) -> tuple[NDArray[np.int64], Values, Values]:
+    def _lines_of(self, rays: PixelRays, spot_mm: Floats, axis: int) -> tuple[NDArray[np.int64], Floats, Floats]:
         """Return the column or row of each pixel (n,), and of each of these where spot (m, 1) and pixels (m,) lie.
 
         The spot from the lens, mm, and the pixels from the middle of the lens image. Distortion moves the lenses of one
@@ -170,7 +141,7 @@ class WaveShapes:
         under = rays.place_mm[first, axis] - self.camera.micro_image_scale * rays.lens_mm[first, axis]
         return number, beside[:, np.newaxis], under / self.camera.pixel_mm
 
-    def _read(self, sums: Values, beside_mm: Values, under_px: Values) -> Values:
+    def _read(self, sums: Floats, beside_mm: Floats, under_px: Floats) -> Floats:
         """Return sums (offsets, terms, responses) up to where spots (n, m) light pixels (n,): (n, m, terms).
 
         They end halfway between the offsets of the responses.
@@ -181,18 +152,6 @@ class WaveShapes:
         return found
 
 
-def _by_place(plane: NDArray[np.float32] | Values) -> Values:
-    """Return responses (offsets, terms, responses) of those by phases (offsets, phases, terms, pixels)."""
-    offsets, _, terms, _ = plane.shape
-    return np.ascontiguousarray(plane.transpose(0, 2, 3, 1).reshape(offsets, terms, -1), dtype=np.float64)
-
-
-def _at_depth(lines: LineResponses, z_mm: float) -> Values:
-    """Return the responses at a depth, by phases."""
-    first, weights = _about((z_mm - lines.first_depth_mm) / lines.depth_step_mm, len(lines.table))
-    return np.asarray(np.tensordot(np.array(weights), lines.table[first : first + 4], 1))
-
-
 @njit(cache=True)
 def _about(place: float, count: int) -> tuple[int, tuple[float, float, float, float]]:
     """Return the first of four coefficients about a place among so many, and their weights."""
@@ -201,7 +160,7 @@ def _about(place: float, count: int) -> tuple[int, tuple[float, float, float, fl
 
 
 @njit(cache=True)
-def _interpolate(table: Values, offset: Values, response: Values, found: Values) -> None:
+def _interpolate(table: Floats, offset: Floats, response: Floats, found: Floats) -> None:
     """Write a table (offsets, terms, responses) at places (n, m) and (n,): (n, m, terms).
 
     A table of one offset is that of all.

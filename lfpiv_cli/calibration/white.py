@@ -1,9 +1,12 @@
-"""White images: whether they can serve, and which of several shows what."""
+"""White images: where their bright spots are, how much light pixels pass, and whether they can serve.
+
+Axes: positions are (column, row) in pixels, pixel centres at integers.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from itertools import pairwise
 
 import numpy as np
 from numba import njit
@@ -11,14 +14,10 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import InputError
 from lfpiv_cli.neighbourhoods import largest_around, smallest_around
 from lfpiv_cli.optics.camera import Lattice
-
-# Bright spots in an image: where they are, to a hundredth of a pixel, and which lattice point each one is.
-#
-# Axes: positions are (column, row) in pixels, pixel centres at integers.
-
 
 # Smoothing by a sixth of the pitch leaves one maximum per lens image and does not merge neighbours.
 SMOOTHING_PER_PITCH = 1.0 / 6.0
@@ -42,7 +41,7 @@ WALK_TOLERANCE = 0.25
 WALK_GAIN = 0.25
 
 
-def find_spots(image: NDArray[np.float64], pitch_px: float) -> NDArray[np.float64]:
+def find_spots(image: Floats, pitch_px: float) -> Floats:
     """Return the centres (n, 2) of the bright spots that lie wholly inside the image, in no particular order."""
     smooth = ndimage.gaussian_filter(image, SMOOTHING_PER_PITCH * pitch_px, mode="nearest")
     size = max(3, int(np.rint(SEPARATION_PER_PITCH * pitch_px)))
@@ -60,12 +59,8 @@ def find_spots(image: NDArray[np.float64], pitch_px: float) -> NDArray[np.float6
 
 @njit(cache=True)
 def spot_centroids(
-    image: NDArray[np.float64],
-    start: NDArray[np.float64],
-    base: NDArray[np.float64],
-    height: NDArray[np.float64],
-    radius_px: float,
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    image: Floats, start: Floats, base: Floats, height: Floats, radius_px: float
+) -> tuple[Floats, NDArray[np.bool_]]:
     """Return clipped centroids (n, 2) in a disc that follows them, and whether each converged inside the image."""
     rows, columns = image.shape
     centres = start.copy()
@@ -101,9 +96,7 @@ def spot_centroids(
     return centres, good
 
 
-def index_spots(
-    points: NDArray[np.float64], start: int, basis: NDArray[np.float64]
-) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+def index_spots(points: Floats, start: int, basis: Floats) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Number the points by walking outward over a lattice whose vectors may change slowly on the way.
 
     Parameters
@@ -152,9 +145,6 @@ def first_of_each(indices: NDArray[np.int64], chosen: NDArray[np.bool_]) -> NDAr
     return mask
 
 
-# How much of the light each pixel passes, from a white image: vignetting, dust, the rims of the lens images.
-
-
 # What passes less than this of the centre's light says more about noise and stray light than about the scene.
 TRANSMISSION_FLOOR = 0.05
 # The reference is the light in the middle of the lens images, within this share of the pitch from their centres, over
@@ -183,16 +173,11 @@ def relative_transmission(white: NDArray[np.float32], lattice_px: Lattice) -> ND
     white : (rows, columns) white minus dark, rectified, 0 outside the sensor
     lattice_px : lens images in the same frame
     """
-    relative = white / np.float32(centre_level(white, lattice_px))
-    return np.where(relative >= TRANSMISSION_FLOOR, relative, np.float32(0.0))
-
-
-def centre_level(white: NDArray[np.float32], lattice_px: Lattice) -> float:
-    """Return the median brightness of the middles of the lens images around the sensor's centre."""
     part, place, index = _middle_part(white, lattice_px)
     offset = place - lattice_px.points(index)
     middle = np.hypot(offset[..., 0], offset[..., 1]) <= MIDDLE_PER_PITCH * lattice_px.pitch.min()
-    return float(np.median(part[middle]))
+    relative = white / np.float32(float(np.median(part[middle])))
+    return np.where(relative >= TRANSMISSION_FLOOR, relative, np.float32(0.0))
 
 
 def lens_image_width(white: NDArray[np.float32], lattice_px: Lattice) -> float:
@@ -209,7 +194,7 @@ def lens_image_width(white: NDArray[np.float32], lattice_px: Lattice) -> float:
     return float(np.sqrt(4.0 / np.pi * area) / lattice_px.pitch.mean())
 
 
-def fit_vignetting(transmission: NDArray[np.float32], lattice_px: Lattice) -> NDArray[np.float64] | None:
+def fit_vignetting(transmission: NDArray[np.float32], lattice_px: Lattice) -> Floats | None:
     """Return what of the transmission varies slowly over the lenses, as coefficients [y power, x power]; see below.
 
     Only the middles of the lens images are used: their rims show the aperture, which the weights hold already. None
@@ -221,21 +206,37 @@ def fit_vignetting(transmission: NDArray[np.float32], lattice_px: Lattice) -> ND
     lattice_px : lens images in the same frame
     """
     rows, columns = transmission.shape
-    place, level = _block_levels(transmission, lattice_px)
+    width = LENSES_PER_BLOCK * float(lattice_px.pitch.max())
+    row_edges, column_edges = (
+        np.linspace(0, side, max(1, min(VIGNETTING_BLOCKS, int(side / width))) + 1).astype(int)
+        for side in (rows, columns)
+    )
+    places, levels = [], []
+    for top, bottom in pairwise(row_edges):
+        for left, right in pairwise(column_edges):
+            row, column = np.mgrid[top:bottom, left:right]
+            place = np.stack([column, row], axis=-1).astype(np.float64)
+            offset = place - lattice_px.points(lattice_px.nearest(place))
+            part = transmission[top:bottom, left:right]
+            middle = np.hypot(offset[..., 0], offset[..., 1]) <= MIDDLE_PER_PITCH * lattice_px.pitch.min()
+            used = middle & (part > 0.0)
+            if used.sum() >= FEWEST_MIDDLES:
+                places.append(place[used].mean(axis=0))
+                levels.append(float(np.median(part[used])))
     powers = [(i, j) for i in range(VIGNETTING_DEGREE + 1) for j in range(VIGNETTING_DEGREE + 1 - i)]
-    if len(level) < 2 * len(powers):
+    if len(levels) < 2 * len(powers):
         return None
     half = np.array([columns, rows]) / 2.0
-    x, y = ((place - half) / half).T
+    x, y = ((np.array(places) - half) / half).T
     design = np.stack([x**i * y**j for i, j in powers], axis=1)
-    found = np.linalg.lstsq(design, level, rcond=None)[0]
+    found = np.linalg.lstsq(design, np.array(levels), rcond=None)[0]
     coefficients = np.zeros((VIGNETTING_DEGREE + 1, VIGNETTING_DEGREE + 1))
     for (i, j), coefficient in zip(powers, found, strict=True):
         coefficients[j, i] = coefficient / found[0]
     return coefficients
 
 
-def vignetting_surface(coefficients: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.float32]:
+def vignetting_surface(coefficients: Floats, shape: tuple[int, int]) -> NDArray[np.float32]:
     """Return the share (rows, columns) of the middle's light that passes: a polynomial in the place over the sensor.
 
     x and y run from -1 to 1 over the columns and the rows.
@@ -247,7 +248,7 @@ def vignetting_surface(coefficients: NDArray[np.float64], shape: tuple[int, int]
 
 def _middle_part(
     white: NDArray[np.float32], lattice_px: Lattice
-) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.int64]]:
+) -> tuple[NDArray[np.float32], Floats, NDArray[np.int64]]:
     """Return the square around the sensor's centre, its pixels' places (..., 2) as (column, row), and their lenses."""
     rows, columns = white.shape
     top, left = max(0, (rows - MIDDLE_SIDE_PX) // 2), max(0, (columns - MIDDLE_SIDE_PX) // 2)
@@ -255,31 +256,6 @@ def _middle_part(
     row, column = np.indices(part.shape)
     place = np.stack([column + left, row + top], axis=-1).astype(np.float64)
     return part, place, lattice_px.nearest(place)
-
-
-def _block_levels(
-    transmission: NDArray[np.float32], lattice_px: Lattice
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return places (n, 2) as (column, row) and medians (n,) of the middles of lens images, block by block."""
-    rows, columns = transmission.shape
-    width = LENSES_PER_BLOCK * float(lattice_px.pitch.max())
-    row_edges, column_edges = (
-        np.linspace(0, side, max(1, min(VIGNETTING_BLOCKS, int(side / width))) + 1).astype(int)
-        for side in (rows, columns)
-    )
-    places, levels = [], []
-    for top, bottom in zip(row_edges, row_edges[1:], strict=False):
-        for left, right in zip(column_edges, column_edges[1:], strict=False):
-            row, column = np.mgrid[top:bottom, left:right]
-            place = np.stack([column, row], axis=-1).astype(np.float64)
-            offset = place - lattice_px.points(lattice_px.nearest(place))
-            part = transmission[top:bottom, left:right]
-            middle = np.hypot(offset[..., 0], offset[..., 1]) <= MIDDLE_PER_PITCH * lattice_px.pitch.min()
-            used = middle & (part > 0.0)
-            if used.sum() >= FEWEST_MIDDLES:
-                places.append(place[used].mean(axis=0))
-                levels.append(float(np.median(part[used])))
-    return np.array(places).reshape(-1, 2), np.array(levels)
 
 
 # More saturated pixels than this and the lens images have lost their brightness, which the transmission needs.
@@ -292,7 +268,7 @@ CAMERA_BITS = (8, 10, 12, 14, 16)
 FULL_PERCENTILE = 99.0
 
 
-def checked_white(white: ArrayLike, dark: ArrayLike | None, saturation: float | None) -> NDArray[np.float64]:
+def checked_white(white: ArrayLike, dark: ArrayLike | None, saturation: float | None) -> Floats:
     """Return white minus dark, or say why it cannot be used."""
     raw = np.asarray(white)
     image = raw.astype(np.float64)
@@ -301,7 +277,11 @@ def checked_white(white: ArrayLike, dark: ArrayLike | None, saturation: float | 
     if not np.isfinite(image).all():
         raise InputError("the white image holds values that are not numbers; export it again without them")
     if saturation is None:
-        saturation = saturation_level(raw)
+        # The brightest value if some camera's counts end there; else the largest one that the integer type holds.
+        saturation = float(raw.max())
+        ends = {2**bits - 1 for bits in CAMERA_BITS} | {(2**bits - 1) << (16 - bits) for bits in CAMERA_BITS}
+        if raw.dtype.kind in "iu" and saturation not in ends:
+            saturation = float(np.iinfo(raw.dtype).max)
     clipped = float(np.mean(image >= saturation))
     if image.max() > image.min() and clipped > SATURATED_SHARE:
         raise InputError(
@@ -322,25 +302,14 @@ def checked_white(white: ArrayLike, dark: ArrayLike | None, saturation: float | 
     return image
 
 
-def saturation_level(raw: NDArray[Any]) -> float:
-    """Return the level at which the camera saturates: its brightest value if some camera's counts end there.
-
-    Otherwise nothing is saturated below the largest value that the integer type holds; floats end at their brightest.
-    """
-    brightest = float(raw.max())
-    if raw.dtype.kind not in "iu":
-        return brightest
-    ends = {2**bits - 1 for bits in CAMERA_BITS} | {(2**bits - 1) << (16 - bits) for bits in CAMERA_BITS}
-    return brightest if brightest in ends else float(np.iinfo(raw.dtype).max)
-
-
-def lit_share(white: ArrayLike, dark: ArrayLike | None = None) -> float:
-    """Return the share of the pixels that are at least half as bright as a full lens image."""
-    image = np.asarray(white, dtype=np.float64) - (0.0 if dark is None else np.asarray(dark, dtype=np.float64))
-    low, high = np.percentile(image, [1.0, FULL_PERCENTILE])
-    return float(np.mean(image > 0.5 * (low + high)))
-
-
 def by_aperture(whites: Sequence[ArrayLike], dark: ArrayLike | None = None) -> list[int]:
-    """Return the order of white images from the smallest aperture, best for centres, to the widest, for vignetting."""
-    return list(np.argsort([lit_share(white, dark) for white in whites], kind="stable"))
+    """Return the order of white images from the smallest aperture, best for centres, to the widest, for vignetting.
+
+    That is by the share of the pixels that are at least half as bright as a full lens image.
+    """
+    shares = []
+    for white in whites:
+        image = np.asarray(white, dtype=np.float64) - (0.0 if dark is None else np.asarray(dark, dtype=np.float64))
+        low, high = np.percentile(image, [1.0, FULL_PERCENTILE])
+        shares.append(float(np.mean(image > 0.5 * (low + high))))
+    return list(np.argsort(shares, kind="stable"))

@@ -15,20 +15,21 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.names import ColumnAxis, Layout
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.scale import Scale
 
-# The microlens array as a plane lattice: an origin and two basis vectors.
-#
-# Lattice point (i, j) lies at origin + i * basis[0] + j * basis[1]. The same class describes the array itself (mm
-# about the optical axis) and the centres of its micro-images (pixels, column and row); each holder says which.
-# Components are always (image x, image y), that is along the columns first.
+# Undoing r' = r (1 + k1 r^2) by repetition: each round gains a factor 3 k1 r^2, below 0.01 for usable lenses.
+UNDISTORT_ROUNDS = 6
 
 
 @dataclass(frozen=True, eq=False)
 class Lattice:
-    """A plane lattice.
+    """A plane lattice: point (i, j) lies at origin + i * basis[0] + j * basis[1].
+
+    It describes the microlens array (mm about the optical axis) or the centres of its micro-images (pixels, column and
+    row); each holder says which. Components are always (image x, image y), that is along the columns first.
 
     Attributes
     ----------
@@ -37,8 +38,8 @@ class Lattice:
     layout : square (vectors at 90 degrees) or hexagonal (at 60 degrees)
     """
 
-    origin: NDArray[np.float64]
-    basis: NDArray[np.float64]
+    origin: Floats
+    basis: Floats
     layout: Layout = "square"
 
     @classmethod
@@ -59,7 +60,7 @@ class Lattice:
         return float(np.mean(np.arctan2(np.sin(turns), np.cos(turns))))
 
     @property
-    def pitch(self) -> NDArray[np.float64]:
+    def pitch(self) -> Floats:
         """Lengths of the two basis vectors, shape (2,)."""
         return np.hypot(self.basis[:, 0], self.basis[:, 1])
 
@@ -68,11 +69,11 @@ class Lattice:
         """Area of the plane for each point."""
         return abs(float(np.linalg.det(self.basis)))
 
-    def points(self, indices: ArrayLike) -> NDArray[np.float64]:
+    def points(self, indices: ArrayLike) -> Floats:
         """Return the positions of lattice points, indices of shape (..., 2)."""
         return self.origin + np.asarray(indices, dtype=np.float64) @ self.basis
 
-    def coordinates(self, points: ArrayLike) -> NDArray[np.float64]:
+    def coordinates(self, points: ArrayLike) -> Floats:
         """Return the fractional indices of positions, shape (..., 2)."""
         return (np.asarray(points, dtype=np.float64) - self.origin) @ np.linalg.inv(self.basis)
 
@@ -101,7 +102,7 @@ class Lattice:
 
 
 @njit(cache=True)
-def nearest_point(x: float, y: float, origin: NDArray[np.float64], basis: NDArray[np.float64]) -> tuple[float, float]:
+def nearest_point(x: float, y: float, origin: Floats, basis: Floats) -> tuple[float, float]:
     """Return the position of the lattice point nearest to (x, y): `Lattice.nearest` for kernels."""
     dx = x - origin[0]
     dy = y - origin[1]
@@ -121,6 +122,16 @@ def nearest_point(x: float, y: float, origin: NDArray[np.float64], basis: NDArra
                 best_x = px
                 best_y = py
     return origin[0] + best_x, origin[1] + best_y
+
+
+def undistorted(
+    points_mm: Floats, distortion_per_mm2: float, scale: float = 1.0, rounds: int = UNDISTORT_ROUNDS
+) -> Floats:
+    """Return the points (..., 2) that r' = r (scale + k1 r^2) carries to the given ones."""
+    ideal = points_mm / scale
+    for _ in range(rounds if distortion_per_mm2 else 0):
+        ideal = points_mm / (scale + distortion_per_mm2 * np.sum(ideal**2, axis=-1, keepdims=True))
+    return ideal
 
 
 class KernelCamera(NamedTuple):
@@ -147,8 +158,8 @@ class KernelCamera(NamedTuple):
     pixel_mm: float
     columns: int
     rows: int
-    origin_mm: NDArray[np.float64]
-    basis_mm: NDArray[np.float64]
+    origin_mm: Floats
+    basis_mm: Floats
 
 
 class Objective(NamedTuple):
@@ -169,7 +180,7 @@ class Objective(NamedTuple):
     astigmatism_per_mm2: float = 0.0
     tilt: tuple[float, float] = (0.0, 0.0)
 
-    def aberration(self, lens_mm: NDArray[np.float64], array_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+    def aberration(self, lens_mm: Floats, array_mm: Floats) -> Floats:
         """Return how far (n, 2) beside `array_mm`, where a thin lens leads, rays through `lens_mm` meet the array."""
         along = self.astigmatism_per_mm2 * np.sum(lens_mm * array_mm, axis=-1, keepdims=True)
         height2 = np.sum(array_mm**2, axis=-1, keepdims=True)
@@ -242,7 +253,7 @@ class Camera:
         return self.microlens_distance_mm / self.image_distance_mm * self.aperture_mm / float(self.lattice.pitch.mean())
 
     @property
-    def sensor_centre_px(self) -> NDArray[np.float64]:
+    def sensor_centre_px(self) -> Floats:
         """Where the optical axis meets the sensor: (column, row)."""
         return np.array([(self.columns - 1) / 2, (self.rows - 1) / 2])
 
@@ -253,32 +264,19 @@ class Camera:
 
     def for_kernels(self) -> KernelCamera:
         """Return the camera as compiled kernels take it."""
-        return KernelCamera(
-            focal_length_mm=self.focal_length_mm,
-            image_distance_mm=self.image_distance_mm,
-            focus_distance_mm=self.focus_distance_mm,
-            microlens_focal_length_mm=self.microlens_focal_length_mm,
-            microlens_distance_mm=self.microlens_distance_mm,
-            bend=self.bend,
-            distortion_per_mm2=self.distortion_per_mm2,
-            aperture_radius_mm=self.aperture_radius_mm,
-            pixel_mm=self.pixel_mm,
-            columns=self.columns,
-            rows=self.rows,
-            origin_mm=self.lattice.origin,
-            basis_mm=self.lattice.basis,
-        )
+        figures = [getattr(self, name) for name in KernelCamera._fields[:-2]]
+        return KernelCamera._make([*figures, self.lattice.origin, self.lattice.basis])
 
-    def defocus(self, object_distance_mm: ArrayLike) -> NDArray[np.float64]:
+    def defocus(self, object_distance_mm: ArrayLike) -> Floats:
         """Return alpha = 1 + s_i/s_o - s_i/F_m, the spread on the array per unit of main-lens position; 0 in focus."""
         s_i = self.image_distance_mm
         return 1.0 + s_i / np.asarray(object_distance_mm, dtype=np.float64) - s_i / self.focal_length_mm
 
-    def px_to_mm(self, px: ArrayLike) -> NDArray[np.float64]:
+    def px_to_mm(self, px: ArrayLike) -> Floats:
         """Convert (column, row) to mm about the axis, shape (..., 2)."""
         return (np.asarray(px, dtype=np.float64) - self.sensor_centre_px) * self.pixel_mm
 
-    def mm_to_px(self, mm: ArrayLike) -> NDArray[np.float64]:
+    def mm_to_px(self, mm: ArrayLike) -> Floats:
         """Convert mm about the axis to (column, row), shape (..., 2)."""
         return np.asarray(mm, dtype=np.float64) / self.pixel_mm + self.sensor_centre_px
 
@@ -292,7 +290,7 @@ class Camera:
         scale = self.pixel_mm / self.micro_image_scale
         return replace(self, lattice=lattice_px.transformed(np.eye(2), -self.sensor_centre_px).scaled(scale))
 
-    def to_image_axes(self, points_xyz: ArrayLike) -> NDArray[np.float64]:
+    def to_image_axes(self, points_xyz: ArrayLike) -> Floats:
         """Return points (..., 2 or 3) with their first two components along the columns and the rows."""
         points = np.array(points_xyz, dtype=np.float64)
         if self.column_axis == "y":

@@ -31,11 +31,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.optics.camera import Camera
 from lfpiv_cli.optics.media import Media
 from lfpiv_cli.optics.ray_bundles import aim_all, pencils
-from lfpiv_cli.optics.shapes import Reliefs, RigidMotion, Shape, reliefs_of, turned
+from lfpiv_cli.optics.shapes import RigidMotion, Shape, reliefs_of
 from lfpiv_cli.optics.surfaces import Faces, Surface
 
 
@@ -45,23 +46,6 @@ class Face:
 
     surface: Surface
     index: float
-
-
-@dataclass(frozen=True, eq=False)
-class Equivalent:
-    """Where points seem to lie in air to rays close to the one through the middle of the lens.
-
-    Along each image axis k the slope of such a ray is (X_k - place_k) / distance_k.
-
-    Attributes
-    ----------
-    place_mm, distance_mm : (n, 2) along both image axes; NaN where not valid
-    valid : (n,) the point is in the fluid and seen from the middle of the lens
-    """
-
-    place_mm: NDArray[np.float64]
-    distance_mm: NDArray[np.float64]
-    valid: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -137,6 +121,9 @@ class CurvedSpace:
         ConfigError : the first face lies behind the lens
         """
         shapes = self.shapes()
+        heights = [shape.relief for shape in shapes]
+        if camera.column_axis == "y":
+            heights = [each and each.exchanged() for each in heights]
         indices = np.array([self.media.air, *(face.index for face in self.faces)])
         return Faces(
             lens_z_mm=self.lens_z_mm(camera),
@@ -147,43 +134,38 @@ class CurvedSpace:
             axes=_rows(camera.to_image_axes([shape.axis for shape in shapes]), 3),
             curvatures_per_mm=np.array([shape.curvature_per_mm for shape in shapes]),
             ratios=indices[:-1] / indices[1:],
-            reliefs=_reliefs(shapes, camera),
+            reliefs=reliefs_of(heights) if any(heights) else None,
         )
 
-    def distance(self, camera: Camera, z_mm: ArrayLike) -> NDArray[np.float64]:
+    def distance(self, camera: Camera, z_mm: ArrayLike) -> Floats:
         """Return how far from the lens, in air, points on the optical axis would appear behind planes at the vertices.
 
         What `ObjectSpace.distance` gives for planes; along a cylinder's axis it is the apparent distance.
         """
         return camera.focus_distance_mm + self.media.depth_ratio * np.asarray(z_mm, dtype=np.float64)
 
-    def slopes(
-        self, camera: Camera, points_mm: ArrayLike, crossing_mm: ArrayLike
-    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    def slopes(self, camera: Camera, points_mm: ArrayLike, crossing_mm: ArrayLike) -> tuple[Floats, NDArray[np.bool_]]:
         """Return the slopes (n, 2) at the lens of the rays from points (n, 3) that cross it at (n, 2), if they do."""
-        return aim_all(self.for_kernels(camera), _rows(points_mm, 3), _rows(crossing_mm, 2))
+        crossing = _rows(crossing_mm, 2)
+        points = np.ascontiguousarray(np.broadcast_to(_rows(points_mm, 3), (len(crossing), 3)))
+        return aim_all(self.for_kernels(camera), points, crossing)
 
-    def equivalent(self, camera: Camera, points_mm: ArrayLike) -> Equivalent:
+    def equivalent(self, camera: Camera, points_mm: ArrayLike) -> tuple[Floats, Floats, NDArray[np.bool_]]:
         """Return where points (n, 3) seem to lie in air, along each image axis, to rays near the middle of the lens.
 
-        Away from a cylinder's two planes of symmetry the slope along one axis also changes with the crossing along the
-        other; that is left out.
+        Along image axis k the slope of such a ray is (X_k - place_k) / distance_k. Away from a cylinder's two planes of
+        symmetry it also changes with the crossing along the other axis; that is left out.
+
+        Returns
+        -------
+        Places and distances (n, 2), mm, NaN where there are none, and (n,) whether the point is in the fluid and seen
+        from the middle of the lens.
         """
         slopes, growth, valid = pencils(self.for_kernels(camera), _rows(points_mm, 3))
         distance = 1.0 / growth[:, [0, 1], [0, 1]]
-        return Equivalent(-slopes * distance, distance, valid)
+        return -slopes * distance, distance, valid
 
 
-def _reliefs(shapes: tuple[Shape, ...], camera: Camera) -> Reliefs | None:
-    """Return the heights of those faces that are given by them, in image axes; None where none is."""
-    reliefs = [shape.relief for shape in shapes]
-    if not any(reliefs):
-        return None
-    if camera.column_axis == "y":
-        reliefs = [None if relief is None else turned(relief) for relief in reliefs]
-    return reliefs_of(reliefs)
-
-
-def _rows(values: ArrayLike, columns: int) -> NDArray[np.float64]:
+def _rows(values: ArrayLike, columns: int) -> Floats:
     """Return rows of so many coordinates."""
     return np.ascontiguousarray(values, dtype=np.float64).reshape(-1, columns)

@@ -35,8 +35,9 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import spline_filter1d
 from scipy.special import j0
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.optics.camera import Camera
-from lfpiv_cli.optics.tracing import ObjectSpace
+from lfpiv_cli.optics.tracing import ObjectSpace, slope_ratios
 from lfpiv_cli.threads import COUNT_NO_REFERENCES
 
 # Spots' places per pitch at which responses are known, and samples of the array between two of them: lenses' edges lie
@@ -112,7 +113,9 @@ def line_responses(
     # The field is the same on both sides of the axis, so that light at (-xi, -u) is that at (xi, u).
     whole = np.concatenate([half[:, :0:-1, ::-1], half], axis=1)[:, :, :-1]
     positive = np.arange(TERMS) < (TERMS + 1) // 2
-    table = _mixed(_by_phases(whole), _spline_of_places(pupil.pixels))
+    depths, offsets, responses, terms = whole.shape
+    by_phase = whole.reshape(depths, offsets, responses // PHASES, PHASES, terms).transpose(0, 1, 3, 4, 2)
+    table = _mixed(np.ascontiguousarray(by_phase, dtype=np.float32), _spline_of_places(pupil.pixels))
     for axis in (0, 1):
         spline_filter1d(table, axis=axis, output=table)
     return LineResponses(
@@ -164,7 +167,7 @@ def on_pixels(points: LineResponses, diffusion_px: float) -> LineResponses:
     return points._replace(table=_mixed(points.table, np.asarray(np.linalg.solve(spline, blur @ spline))))
 
 
-def _spline_of_places(pixels: int) -> NDArray[np.float64]:
+def _spline_of_places(pixels: int) -> Floats:
     """Return what makes coefficients of a spline of values at places under the lens, (from, to)."""
     return np.asarray(spline_filter1d(np.eye(PHASES * pixels)), dtype=np.float64)
 
@@ -183,7 +186,7 @@ def spline_slopes(t: float) -> tuple[float, float, float, float]:
     return -0.5 * u * u, t * (1.5 * t - 2.0), u * (2.0 - 1.5 * u), 0.5 * t * t
 
 
-def _mixed(table: Lines, shares: NDArray[np.float64]) -> Lines:
+def _mixed(table: Lines, shares: Floats) -> Lines:
     """Return the table with each place under the lens replaced by a sum of all, `shares` (from, to)."""
     found = np.zeros_like(table)
     for before in range(PHASES):
@@ -192,19 +195,10 @@ def _mixed(table: Lines, shares: NDArray[np.float64]) -> Lines:
     return found
 
 
-def _by_phases(lines: Lines) -> Lines:
-    """Return lines (depths, offsets, responses, TERMS) as `LineResponses.table`."""
-    depths, offsets, responses, terms = lines.shape
-    by_phase = lines.reshape(depths, offsets, responses // PHASES, PHASES, terms).transpose(0, 1, 3, 4, 2)
-    return np.ascontiguousarray(by_phase, dtype=np.float32)
-
-
 class _Pupil:
     """What all depths have in common: the aperture's nodes, samples of array and sensor, and the way between them."""
 
-    def __init__(
-        self, camera: Camera, space: ObjectSpace, wavelength_mm: float, depths_mm: NDArray[np.float64]
-    ) -> None:
+    def __init__(self, camera: Camera, space: ObjectSpace, wavelength_mm: float, depths_mm: Floats) -> None:
         s_i, s_mu, radius = camera.image_distance_mm, camera.microlens_distance_mm, camera.aperture_radius_mm
         pitch, wave_number = float(camera.lattice.pitch.mean()), 2.0 * np.pi / wavelength_mm
         self.camera, self.depths_mm, self.pitch_mm = camera, depths_mm, pitch
@@ -219,7 +213,12 @@ class _Pupil:
         count = int(200 + wave_number * radius * furthest / s_i)
         nodes, weights = np.polynomial.legendre.leggauss(count)
         nodes, weights = 0.5 * radius * (nodes + 1.0), 0.5 * radius * weights
-        self.amplitude = np.exp(1j * _phases(camera, space, depths_mm, nodes, wave_number)) * nodes * weights
+        # The phase whose normals are the rays: its slope is k x_m / s_i, and x_m is an odd polynomial of degree 9.
+        few, shares = np.polynomial.legendre.leggauss(6)
+        inner = np.outer(0.5 * (few + 1.0), nodes)
+        array = _on_array(camera, space, depths_mm, inner.ravel()).reshape(len(depths_mm), len(few), -1)
+        phase = wave_number / s_i * (0.5 * nodes * np.einsum("n,dnp->dp", shares, array))
+        self.amplitude = np.exp(1j * phase) * nodes * weights
         self.amplitude *= wave_number / s_i / (np.sqrt(np.pi) * radius)
         self.radii_mm = np.arange(0.0, furthest + 4.0 * self.step_mm, wavelength_mm * s_i / (radius * PER_PERIOD))
         self.bessel = j0(wave_number / s_i * np.outer(self.radii_mm, nodes))
@@ -248,32 +247,11 @@ class _Pupil:
         return np.asarray(((basis @ left) * np.sqrt(turn * values))[:, :FIELD_TERMS].T)
 
 
-def _on_array(
-    camera: Camera, space: ObjectSpace, depths_mm: NDArray[np.float64], pupil_mm: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _on_array(camera: Camera, space: ObjectSpace, depths_mm: Floats, pupil_mm: Floats) -> Floats:
     """Return where rays of points on the axis through places of the pupil meet the array (depths, places)."""
     nodes, factors = space.slope_polynomials(camera, depths_mm, camera.aperture_radius_mm)
-    ratio = np.zeros((len(depths_mm), len(pupil_mm))) + factors[:, -1:]
-    for order in range(factors.shape[1] - 2, -1, -1):
-        ratio = factors[:, order, np.newaxis] + (pupil_mm**2 - nodes[:, order, np.newaxis]) * ratio
-    s_i = camera.image_distance_mm
+    s_i, ratio = camera.image_distance_mm, slope_ratios(pupil_mm**2, nodes, factors)
     return np.asarray(pupil_mm * (1.0 - s_i / camera.focal_length_mm + s_i * ratio))
-
-
-def _phases(
-    camera: Camera,
-    space: ObjectSpace,
-    depths_mm: NDArray[np.float64],
-    pupil_mm: NDArray[np.float64],
-    wave_number: float,
-) -> NDArray[np.float64]:
-    """Return the phase on the pupil (depths, places) whose normals are the rays: its slope is k x_m / s_i."""
-    nodes, weights = np.polynomial.legendre.leggauss(6)
-    # The integral from the axis on; x_m is an odd polynomial of degree 9.
-    places = np.outer(0.5 * (nodes + 1.0), pupil_mm)
-    array = _on_array(camera, space, depths_mm, places.ravel()).reshape(len(depths_mm), len(nodes), -1)
-    integral = 0.5 * pupil_mm * np.einsum("n,dnp->dp", weights, array)
-    return np.asarray(wave_number / camera.image_distance_mm * integral)
 
 
 def _pixel_products(pupil: _Pupil, number: int) -> NDArray[np.float32]:

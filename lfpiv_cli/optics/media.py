@@ -13,7 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from lfpiv_cli.arrays import Floats
 
 # Newton's iteration for the exact refraction starts from the paraxial ray and converges quadratically; below f/1.4 and
 # for n < 2 six steps reach 1e-15, the limit only guards against a ray that grazes.
@@ -50,11 +52,11 @@ class Window:
 class Layers(NamedTuple):
     """Plane layers, from the lens on: their thicknesses (n,), mm, and refractive indices (n,)."""
 
-    thicknesses_mm: NDArray[np.float64]
-    indices: NDArray[np.float64]
+    thicknesses_mm: Floats
+    indices: Floats
 
 
-def equivalent_object_distance(z_mm: ArrayLike, focus_distance_mm: float, media: Media) -> NDArray[np.float64]:
+def equivalent_object_distance(z_mm: ArrayLike, focus_distance_mm: float, media: Media) -> Floats:
     """Return the object distance in air of a point at depth z in the fluid (Eqs. 6 and 9); x and y stay (Eq. 10).
 
     `focus_distance_mm` is F_m (M - 1)/M, the distance of the focal point's equivalent from the lens.
@@ -77,13 +79,13 @@ def channel_window(
     return Window(distance, wall_mm)
 
 
-def object_space_matrix(z_mm: float, window: Window, focus_distance_mm: float, media: Media) -> NDArray[np.float64]:
+def object_space_matrix(z_mm: float, window: Window, focus_distance_mm: float, media: Media) -> Floats:
     """Return the 2x2 transfer matrix from a point at depth z to the main lens, paraxial refraction (Eqs. 14, 15)."""
 
-    def travel(distance: float) -> NDArray[np.float64]:
+    def travel(distance: float) -> Floats:
         return np.array([[1.0, distance], [0.0, 1.0]])
 
-    def refract(index_from: float, index_to: float) -> NDArray[np.float64]:
+    def refract(index_from: float, index_to: float) -> Floats:
         return np.array([[1.0, 0.0], [0.0, index_from / index_to]])
 
     depth = fluid_path_to_focus(window, focus_distance_mm, media) + z_mm
@@ -97,7 +99,7 @@ def object_space_matrix(z_mm: float, window: Window, focus_distance_mm: float, m
 
 
 @njit(cache=True)
-def snell_invariant(lateral_mm: float, thicknesses_mm: NDArray[np.float64], indices: NDArray[np.float64]) -> float:
+def snell_invariant(lateral_mm: float, thicknesses_mm: Floats, indices: Floats) -> float:
     """Return n sin(angle), the same in all layers, of the ray that moves `lateral_mm` >= 0 sideways through them.
 
     Solves sum t_i s / sqrt(n_i^2 - s^2) = lateral by Newton's method from the paraxial ray. The left side is convex and
@@ -124,9 +126,7 @@ def snell_invariant(lateral_mm: float, thicknesses_mm: NDArray[np.float64], indi
     return s
 
 
-def exact_lateral_mm(
-    air_slope: ArrayLike, thicknesses_mm: ArrayLike, indices: ArrayLike, air: float
-) -> NDArray[np.float64]:
+def exact_lateral_mm(air_slope: ArrayLike, thicknesses_mm: ArrayLike, indices: ArrayLike, air: float) -> Floats:
     """Return how far sideways a ray of given slope in air moves through plane layers: sum t_i tan(angle_i).
 
     The ray is the one that leaves the layers into `air` with tangent `air_slope`; n_i sin(angle_i) is conserved (Eq.

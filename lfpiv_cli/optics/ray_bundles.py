@@ -19,6 +19,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.optics.shapes import Reliefs, Vector, dot, plus, row, scaled
 from lfpiv_cli.optics.surfaces import Faces, height_behind, meet, normal_change
 from lfpiv_cli.simd.faces import (
@@ -69,7 +70,7 @@ def start_at_lens(faces: Faces, X: float, Y: float, slope_x: float, slope_y: flo
 @njit(cache=True, **COUNT_NO_REFERENCES)
 def in_fluid(faces: Faces, point: Vector) -> bool:
     """Return whether a point lies behind the last face, or no further in front of it than may be."""
-    return height_behind(faces, faces.ratios.size - 1, point) >= -ROUNDING_MM - faces.beyond_mm
+    return height_behind(faces.reliefs, faces, faces.ratios.size - 1, point) >= -ROUNDING_MM - faces.beyond_mm
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
@@ -77,7 +78,7 @@ def trace_in(faces: Faces, X: float, Y: float, slope_x: float, slope_y: float, z
     """Return where a ray from the lens meets the plane of depth z in the fluid: x, y and whether it does."""
     point, direction = start_at_lens(faces, X, Y, slope_x, slope_y)
     for k in range(faces.ratios.size):
-        path, normal, cosine = meet(faces, k, point, direction)
+        path, normal, cosine = meet(faces.reliefs, faces, k, point, direction)
         if cosine == 0.0 or path < -ROUNDING_MM:
             return NOWHERE
         point = plus(point, path, direction)
@@ -115,7 +116,7 @@ def _neighbour(
     ratio = faces.ratios[k]
     shift = plus(shift, path, turn)
     shift = plus(shift, -dot(normal, shift) / cosine, direction)
-    tilt = normal_change(faces, k, place, shift)
+    tilt = normal_change(faces.reliefs, faces, k, place, shift)
     cosine_change = dot(tilt, direction) + dot(normal, turn)
     bend_change = ratio * (ratio * cosine / cosine_behind - 1.0) * cosine_change
     turned = plus(plus(scaled(ratio, turn), bend_change, normal), cosine_behind - ratio * cosine, tilt)
@@ -143,7 +144,7 @@ def trace_pencil(
     first, second = shifts
     first_turn, second_turn = turns
     for k in range(faces.ratios.size):
-        path, normal, cosine = meet(faces, k, point, direction)
+        path, normal, cosine = meet(faces.reliefs, faces, k, point, direction)
         if cosine == 0.0 or path < -ROUNDING_MM:
             return point, direction, first, second, False
         point = plus(point, path, direction)
@@ -205,54 +206,50 @@ def aim(faces: Faces, x: float, y: float, z: float, X: float, Y: float) -> Place
     return NOWHERE
 
 
-Rays = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 
 @njit(cache=True)
-def aim_all(faces: Faces, points: Rays, crossing: Rays) -> tuple[Rays, Flags]:
+def aim_all(faces: Faces, points: Floats, crossing: Floats) -> tuple[Floats, Flags]:
     """Return `aim` from each point through each crossing: slopes (n, 2) and whether they are valid (n,)."""
     return _aim_all(faces.reliefs, faces, points, crossing)
 
 
 # As in `surfaces`: what takes the heights as an argument of its own is compiled without them where there are none.
 @njit(cache=True)
-def _aim_all(reliefs: Reliefs | None, faces: Faces, points: Rays, crossing: Rays) -> tuple[Rays, Flags]:
-    if reliefs is None:
-        return _aim_lanes_all(faces, points, crossing)
-    slopes, valid = np.empty((len(points), 2)), np.empty(len(points), dtype=np.bool_)
-    for i in range(len(points)):
-        slopes[i, 0], slopes[i, 1], valid[i] = aim(
-            faces, points[i, 0], points[i, 1], points[i, 2], crossing[i, 0], crossing[i, 1]
-        )
-    return slopes, valid
-
-
-@njit(cache=True)
-def _aim_lanes_all(faces: Faces, points: Rays, crossing: Rays) -> tuple[Rays, Flags]:
-    """Return `aim_all`; a lane whose ray is found takes the next one, so that none waits for the slowest."""
+def _aim_all(reliefs: Reliefs | None, faces: Faces, points: Floats, crossing: Floats) -> tuple[Floats, Flags]:
     slopes, valid = np.full((len(points), 2), np.nan), np.zeros(len(points), dtype=np.bool_)
+    if reliefs is not None:
+        for i in range(len(points)):
+            slopes[i, 0], slopes[i, 1], valid[i] = aim(
+                faces, points[i, 0], points[i, 1], points[i, 2], crossing[i, 0], crossing[i, 1]
+            )
+        return slopes, valid
+    # A lane whose ray is found takes the next one, so that none waits for the slowest.
     table = np.zeros(AIM_ROWS * DOUBLES)
     ray, steps = np.full(DOUBLES, -1), np.zeros(DOUBLES, np.int64)
     following, running = 0, 0
     while True:
         for lane in range(DOUBLES):
             while ray[lane] < 0 and following < len(points):
-                if in_fluid(faces, row(points, following)):
-                    _begin(faces, row(points, following), crossing[following, 0], crossing[following, 1], table, lane)
+                x, y, z = row(points, following)
+                if in_fluid(faces, (x, y, z)):
+                    # From where `aim` begins.
+                    distance = faces.focus_distance_mm + faces.depth_ratio * z
+                    X, Y = crossing[following, 0], crossing[following, 1]
+                    table[POINT_X * DOUBLES + lane], table[POINT_Y * DOUBLES + lane] = x, y
+                    table[POINT_Z * DOUBLES + lane] = z
+                    table[LENS_X * DOUBLES + lane], table[LENS_Y * DOUBLES + lane] = X, Y
+                    table[SLOPE_X * DOUBLES + lane], table[SLOPE_Y * DOUBLES + lane] = X / distance, Y / distance
+                    table[STEP_X * DOUBLES + lane], table[STEP_Y * DOUBLES + lane] = -x / distance, -y / distance
+                    table[MISSED * DOUBLES + lane], table[SHARE * DOUBLES + lane] = np.inf, 1.0
                     ray[lane], steps[lane] = following, 0
                     running += 1
                 following += 1
         if running == 0:
             return slopes, valid
         aim_lanes(
-            table,
-            faces.lens_z_mm,
-            faces.vertices_mm,
-            faces.normals,
-            faces.axes,
-            faces.curvatures_per_mm,
-            faces.ratios,
+            table, faces.lens_z_mm, faces.vertices_mm, faces.normals, faces.axes, faces.curvatures_per_mm, faces.ratios
         )
         for lane in range(DOUBLES):
             i = ray[lane]
@@ -268,22 +265,8 @@ def _aim_lanes_all(faces: Faces, points: Rays, crossing: Rays) -> tuple[Rays, Fl
                 running -= 1
 
 
-@njit(cache=True, **COUNT_NO_REFERENCES)
-def _begin(faces: Faces, point: Vector, X: float, Y: float, table: Rays, lane: int) -> None:
-    """Put a ray into a lane of the table of `aim_lanes`, from where `aim` begins."""
-    distance = faces.focus_distance_mm + faces.depth_ratio * point[2]
-    table[POINT_X * DOUBLES + lane], table[POINT_Y * DOUBLES + lane] = point[0], point[1]
-    table[POINT_Z * DOUBLES + lane] = point[2]
-    table[LENS_X * DOUBLES + lane], table[LENS_Y * DOUBLES + lane] = X, Y
-    table[SLOPE_X * DOUBLES + lane], table[SLOPE_Y * DOUBLES + lane] = X / distance, Y / distance
-    table[STEP_X * DOUBLES + lane], table[STEP_Y * DOUBLES + lane] = -point[0] / distance, -point[1] / distance
-    table[MISSED * DOUBLES + lane], table[SHARE * DOUBLES + lane] = np.inf, 1.0
-
-
 @njit(cache=True)
-def pencils(
-    faces: Faces, points: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+def pencils(faces: Faces, points: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:
     """Return, for the ray from each point through the lens' middle, its slopes (n, 2) and their growth (n, 2, 2).
 
     The growth [k, l] is how slope k grows with the crossing along axis l.

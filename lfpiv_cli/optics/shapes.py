@@ -1,9 +1,12 @@
-"""What surfaces are made of: vectors in space, and a surface near the point where the optical axis meets it."""
+"""What surfaces are made of: vectors in space, and a surface near the point where the optical axis meets it.
+
+Axes: world axes, z away from the camera from the nominal focal point, mm.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -13,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.threads import COUNT_NO_REFERENCES
 
@@ -30,9 +34,13 @@ class Relief(NamedTuple):
     coefficients : (ny - 1, nx - 1, 4, 4) of each cell: powers 0 to 3 of y, then of x, from its first node, in steps
     """
 
-    first_mm: NDArray[np.float64]
-    step_mm: NDArray[np.float64]
-    coefficients: NDArray[np.float64]
+    first_mm: Floats
+    step_mm: Floats
+    coefficients: Floats
+
+    def exchanged(self) -> Relief:
+        """Return the heights with x and y exchanged."""
+        return Relief(self.first_mm[::-1], self.step_mm[::-1], self.coefficients.transpose(1, 0, 3, 2))
 
 
 class Shape(NamedTuple):
@@ -86,19 +94,14 @@ def scaled(factor: float, a: Vector) -> Vector:
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def row(rows: NDArray[np.float64], k: int) -> Vector:
+def row(rows: Floats, k: int) -> Vector:
     """Return row k of an array (n, 3)."""
     return rows[k, 0], rows[k, 1], rows[k, 2]
 
 
-# A rigid motion of bodies on the bench: turned about a point, then shifted.
-#
-# Axes: world axes, z away from the camera from the nominal focal point, mm and rad.
-
-
 @dataclass(frozen=True)
 class RigidMotion:
-    """A turn about a point, and a shift.
+    """How a body on the bench is moved: turned about a point, then shifted.
 
     Attributes
     ----------
@@ -116,12 +119,12 @@ class RigidMotion:
         """Whether it is more than a shift."""
         return any(self.turn_rad)
 
-    def points(self, points_mm: ArrayLike) -> NDArray[np.float64]:
+    def points(self, points_mm: ArrayLike) -> Floats:
         """Return where points (..., 3) are moved to."""
         pivot = np.asarray(self.pivot_mm)
         return self.directions(np.asarray(points_mm, dtype=np.float64) - pivot) + pivot + np.asarray(self.shift_mm)
 
-    def directions(self, directions: ArrayLike) -> NDArray[np.float64]:
+    def directions(self, directions: ArrayLike) -> Floats:
         """Return how directions (..., 3) are turned."""
         return np.asarray(np.asarray(directions, dtype=np.float64) @ self._rotation.as_matrix().T)
 
@@ -152,7 +155,7 @@ class RigidMotion:
 # for rays needs them. A line p + t d meets it where z(x, y) = z, by Newton's iteration in t; there, with the slopes
 # z_x and z_y, the normal away from the camera is (-z_x, -z_y, 1) / sqrt(1 + z_x^2 + z_y^2).
 #
-# Axes: z away from the camera, mm; world axes of a `HeightMap`, image axes of `Reliefs`.
+# `Reliefs` are in image axes.
 
 
 # Of a cubic spline along each axis whose ends are as smooth as its middle.
@@ -242,14 +245,9 @@ class Reliefs(NamedTuple):
 
     starts: NDArray[np.int64]
     cells: NDArray[np.int64]
-    firsts_mm: NDArray[np.float64]
-    steps_mm: NDArray[np.float64]
-    coefficients: NDArray[np.float64]
-
-
-def turned(relief: Relief) -> Relief:
-    """Return heights with x and y exchanged."""
-    return Relief(relief.first_mm[::-1], relief.step_mm[::-1], relief.coefficients.transpose(1, 0, 3, 2))
+    firsts_mm: Floats
+    steps_mm: Floats
+    coefficients: Floats
 
 
 def reliefs_of(reliefs: Sequence[Relief | None]) -> Reliefs:
@@ -257,7 +255,7 @@ def reliefs_of(reliefs: Sequence[Relief | None]) -> Reliefs:
     count = len(reliefs)
     starts, cells = np.full(count, -1), np.zeros((count, 2), np.int64)
     firsts, steps = np.zeros((count, 2)), np.ones((count, 2))
-    flat: list[NDArray[np.float64]] = []
+    flat: list[Floats] = []
     for k, relief in enumerate(reliefs):
         if relief is not None:
             starts[k] = sum(part.size for part in flat)
@@ -335,14 +333,9 @@ def normal_change_of_heights(reliefs: Reliefs, k: int, place: Vector, shift: Vec
     return plus(turn, -dot(normal, turn), normal)
 
 
-# Where a scene lies: how far from where the config says, as one rigid body, and how well that is known.
-#
-# Axes: world axes, z away from the camera from the nominal focal point, mm and degrees.
-
-
 @dataclass(frozen=True, eq=False)
 class ScenePose:
-    """How a scene lies beside the one of the config.
+    """How a scene lies beside the one of the config, as one rigid body, and how well that is known; world axes.
 
     Attributes
     ----------
@@ -352,11 +345,11 @@ class ScenePose:
     faces_sha256 : of the config's scene that it is counted from
     """
 
-    shift_mm: NDArray[np.float64]
-    turn_deg: NDArray[np.float64]
-    pivot_mm: NDArray[np.float64]
-    shift_sigma_mm: NDArray[np.float64]
-    turn_sigma_deg: NDArray[np.float64]
+    shift_mm: Floats
+    turn_deg: Floats
+    pivot_mm: Floats
+    shift_sigma_mm: Floats
+    turn_sigma_deg: Floats
     faces_sha256: str
 
     @property
@@ -374,24 +367,17 @@ class ScenePose:
             "scene_turn_deg_sigma": self.turn_sigma_deg.tolist(),
         }
 
-    def to_tree(self) -> dict[str, Any]:
-        """Return everything as a dict of arrays and strings."""
-        return {name: getattr(self, name) for name in NAMES}
-
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any]) -> ScenePose:
-        """Return the pose that `to_tree` took apart.
+        """Return the pose of a dict of its fields.
 
         Raises
         ------
         KeyError, ValueError : something is missing, or is no place
         """
-        found = {name: tree[name] for name in NAMES}
-        for name in NAMES[:-1]:
-            found[name] = np.asarray(found[name], dtype=np.float64)
-            if found[name].shape != (3,) or not np.all(np.isfinite(found[name])):
+        *places, digest = (field.name for field in fields(cls))
+        found: dict[str, Any] = {name: np.asarray(tree[name], dtype=np.float64) for name in places}
+        for name, place in found.items():
+            if place.shape != (3,) or not np.all(np.isfinite(place)):
                 raise ValueError(f"scene/{name} is no place")
-        return cls(**found)
-
-
-NAMES = ("shift_mm", "turn_deg", "pivot_mm", "shift_sigma_mm", "turn_sigma_deg", "faces_sha256")
+        return cls(**found, **{digest: tree[digest]})

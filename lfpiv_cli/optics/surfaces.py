@@ -24,8 +24,8 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.names import Facing, SurfaceKind
 from lfpiv_cli.optics.shapes import (
@@ -91,12 +91,7 @@ class TiltedPlane:
     normal: Vector
 
     def shape(self) -> Shape:
-        """Return the plane near the optical axis.
-
-        Raises
-        ------
-        ConfigError : the plane lies along the optical axis
-        """
+        """Return the plane near the optical axis."""
         normal = unit(self.normal, "normal")
         if normal[2] == 0.0:
             raise ConfigError(
@@ -129,12 +124,7 @@ class Cylinder:
     facing: Facing = "convex"
 
     def shape(self) -> Shape:
-        """Return the cylinder near the optical axis.
-
-        Raises
-        ------
-        ConfigError : the optical axis misses it
-        """
+        """Return the cylinder near the optical axis."""
         return _round_shape(self.centre_mm, unit(self.axis, "axis"), self.radius_mm, self.facing, "cylinder")
 
     def moved(self, motion: RigidMotion) -> Cylinder:
@@ -149,8 +139,7 @@ class Sphere:
     Attributes
     ----------
     centre_mm, radius_mm : centre and radius
-    facing : convex where the side nearer to the camera refracts and the medium behind it is inside; concave where the
-        farther side does, and it is outside
+    facing : as of a `Cylinder`
     """
 
     centre_mm: Vector
@@ -158,12 +147,7 @@ class Sphere:
     facing: Facing = "convex"
 
     def shape(self) -> Shape:
-        """Return the sphere near the optical axis.
-
-        Raises
-        ------
-        ConfigError : the optical axis misses it
-        """
+        """Return the sphere near the optical axis."""
         return _round_shape(self.centre_mm, NO_AXIS, self.radius_mm, self.facing, "sphere")
 
     def moved(self, motion: RigidMotion) -> Sphere:
@@ -214,74 +198,30 @@ class Faces(NamedTuple):
     lens_z_mm: float
     focus_distance_mm: float
     depth_ratio: float
-    vertices_mm: NDArray[np.float64]
-    normals: NDArray[np.float64]
-    axes: NDArray[np.float64]
-    curvatures_per_mm: NDArray[np.float64]
-    ratios: NDArray[np.float64]
+    vertices_mm: Floats
+    normals: Floats
+    axes: Floats
+    curvatures_per_mm: Floats
+    ratios: Floats
     reliefs: Reliefs | None = None
     beyond_mm: float = 0.0
 
 
+# The functions below take the faces' heights as an argument of its own: where it is None, the compiler leaves out what
+# follows the question, and other faces are met as fast as if there were no heights.
+
+
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def meet(faces: Faces, k: int, point: Vector, direction: Vector) -> tuple[float, Vector, float]:
+def meet(
+    reliefs: Reliefs | None, faces: Faces, k: int, point: Vector, direction: Vector
+) -> tuple[float, Vector, float]:
     """Return how far along a line face k is met, the unit normal there, and the cosine of incidence.
 
     Of the crossings the one where the line goes from in front of the face to behind it. The direction has length 1 and
     points away from the camera. The cosine is 0 where the line misses the face.
     """
-    return _meet(faces.reliefs, faces, k, point, direction)
-
-
-@njit(cache=True, **COUNT_NO_REFERENCES)
-def normal_change(faces: Faces, k: int, place: Vector, shift: Vector) -> Vector:
-    """Return how the unit normal of face k changes with a small shift along the face from a place on it."""
-    return _normal_change(faces.reliefs, faces, k, place, shift)
-
-
-@njit(cache=True, **COUNT_NO_REFERENCES)
-def height_behind(faces: Faces, k: int, point: Vector) -> float:
-    """Return F, in mm near the face: positive behind face k, negative in front of it."""
-    return _height_behind(faces.reliefs, faces, k, point)
-
-
-# The functions below take the heights as an argument of their own: where it is None, the compiler leaves out what
-# follows the question, and other faces are met as fast as if there were no heights.
-
-
-@njit(cache=True, **COUNT_NO_REFERENCES)
-def _meet(
-    reliefs: Reliefs | None, faces: Faces, k: int, point: Vector, direction: Vector
-) -> tuple[float, Vector, float]:
-    if reliefs is None:
-        return _meet_round(faces, k, point, direction)
-    if reliefs.starts[k] < 0:
-        return _meet_round(faces, k, point, direction)
-    return meet_heights(reliefs, k, faces.vertices_mm[k, 2], point, direction)
-
-
-@njit(cache=True, **COUNT_NO_REFERENCES)
-def _normal_change(reliefs: Reliefs | None, faces: Faces, k: int, place: Vector, shift: Vector) -> Vector:
-    if reliefs is None:
-        return _normal_change_round(faces, k, shift)
-    if reliefs.starts[k] < 0:
-        return _normal_change_round(faces, k, shift)
-    return normal_change_of_heights(reliefs, k, place, shift)
-
-
-@njit(cache=True, **COUNT_NO_REFERENCES)
-def _height_behind(reliefs: Reliefs | None, faces: Faces, k: int, point: Vector) -> float:
-    if reliefs is None:
-        return _height_behind_round(faces, k, point)
-    if reliefs.starts[k] < 0:
-        return _height_behind_round(faces, k, point)
-    z, _, _, _, _, _, on_grid = height_at(reliefs, k, point[0], point[1])
-    return point[2] - z if on_grid else -np.inf
-
-
-@njit(cache=True, **COUNT_NO_REFERENCES)
-def _meet_round(faces: Faces, k: int, point: Vector, direction: Vector) -> tuple[float, Vector, float]:
-    """Return `meet` of a plane, cylinder or sphere."""
+    if reliefs is not None and reliefs.starts[k] >= 0:
+        return meet_heights(reliefs, k, faces.vertices_mm[k, 2], point, direction)
     vertex, axis, curvature = row(faces.vertices_mm, k), row(faces.axes, k), faces.curvatures_per_mm[k]
     # From the point at the vertex's depth on: seen from as far as the lens the crossing would lose digits.
     ahead = (vertex[2] - point[2]) / direction[2]
@@ -302,15 +242,21 @@ def _meet_round(faces: Faces, k: int, point: Vector, direction: Vector) -> tuple
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def _normal_change_round(faces: Faces, k: int, shift: Vector) -> Vector:
-    """Return `normal_change` of a plane, cylinder or sphere, the same all along its lines of curvature."""
+def normal_change(reliefs: Reliefs | None, faces: Faces, k: int, place: Vector, shift: Vector) -> Vector:
+    """Return how the unit normal of face k changes with a small shift along the face from a place on it."""
+    if reliefs is not None and reliefs.starts[k] >= 0:
+        return normal_change_of_heights(reliefs, k, place, shift)
+    # The same all along lines of curvature.
     axis = row(faces.axes, k)
     return scaled(faces.curvatures_per_mm[k], plus(shift, -dot(axis, shift), axis))
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def _height_behind_round(faces: Faces, k: int, point: Vector) -> float:
-    """Return `height_behind` of a plane, cylinder or sphere."""
+def height_behind(reliefs: Reliefs | None, faces: Faces, k: int, point: Vector) -> float:
+    """Return F, in mm near the face: positive behind face k, negative in front of it."""
+    if reliefs is not None and reliefs.starts[k] >= 0:
+        z, _, _, _, _, _, on_grid = height_at(reliefs, k, point[0], point[1])
+        return point[2] - z if on_grid else -np.inf
     axis = row(faces.axes, k)
     offset = plus(point, -1.0, row(faces.vertices_mm, k))
     along_axis = dot(axis, offset)

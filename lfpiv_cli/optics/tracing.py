@@ -16,6 +16,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.names import Refraction, TracedMethod
 from lfpiv_cli.optics.camera import Camera, KernelCamera, nearest_point
@@ -34,9 +35,6 @@ from lfpiv_cli.threads import COUNT_NO_REFERENCES
 #
 # Direct light-field calibration (DLFC, Hall et al. 2018) knows no main lens and no window: it has seen dots at known
 # places through known points of the aperture, and a polynomial of both tells where any other ray goes.
-#
-# Axes: image axes (x along the columns), mm, z away from the camera from the nominal focal point.
-
 
 # x, y, z of where a ray starts, X, Y of where it crosses the main lens.
 VARIABLES = 5
@@ -55,22 +53,18 @@ class PolynomialRays:
     coefficients_mm : (terms, 2) of both coordinates on the array
     """
 
-    scale_mm: NDArray[np.float64]
+    scale_mm: Floats
     exponents: NDArray[np.int64]
-    coefficients_mm: NDArray[np.float64]
+    coefficients_mm: Floats
 
     @property
     def degree(self) -> int:
         """Largest sum of exponents."""
         return int(self.exponents.sum(axis=1).max(initial=0))
 
-    def to_tree(self) -> dict[str, Any]:
-        """Return the arrays by name."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
-
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any]) -> PolynomialRays:
-        """Return the rays that `to_tree` took apart.
+        """Return the rays of a dict of their fields.
 
         Raises
         ------
@@ -87,14 +81,14 @@ class PolynomialRays:
             raise ValueError("polynomials with coefficients that are no numbers")
         return rays
 
-    def on_array(self, start_mm: ArrayLike, crossing_mm: ArrayLike) -> NDArray[np.float64]:
+    def on_array(self, start_mm: ArrayLike, crossing_mm: ArrayLike) -> Floats:
         """Return where rays from (n, 3) through (n, 2) meet the array, (n, 2)."""
         return polynomial_terms(start_mm, crossing_mm, self.scale_mm, self.exponents) @ self.coefficients_mm
 
 
 def polynomial_terms(
-    start_mm: ArrayLike, crossing_mm: ArrayLike, scale_mm: NDArray[np.float64], exponents: NDArray[np.int64]
-) -> NDArray[np.float64]:
+    start_mm: ArrayLike, crossing_mm: ArrayLike, scale_mm: Floats, exponents: NDArray[np.int64]
+) -> Floats:
     """Return each term (n, terms) for rays from (n, 3) through (n, 2)."""
     rays = np.concatenate([np.atleast_2d(start_mm), np.atleast_2d(crossing_mm)], axis=1) / scale_mm
     terms = np.ones((len(rays), len(exponents)))
@@ -122,16 +116,14 @@ class Hits:
     valid : (n,) the ray passes the aperture
     """
 
-    sensor_mm: NDArray[np.float64]
-    array_mm: NDArray[np.float64]
-    lens_mm: NDArray[np.float64]
+    sensor_mm: Floats
+    array_mm: Floats
+    lens_mm: Floats
     valid: NDArray[np.bool_]
 
 
 @njit(cache=True)
-def exact_slope(
-    dx: float, dy: float, thicknesses_mm: NDArray[np.float64], indices: NDArray[np.float64]
-) -> tuple[float, float]:
+def exact_slope(dx: float, dy: float, thicknesses_mm: Floats, indices: Floats) -> tuple[float, float]:
     """Return the slopes in the first layer of the ray that moves (dx, dy) sideways through the layers."""
     lateral = np.sqrt(dx * dx + dy * dy)
     if lateral == 0.0:
@@ -197,7 +189,7 @@ def struck_pixel(camera: KernelCamera, x: float, y: float) -> int:
     return row * camera.columns + column if 0 <= column < camera.columns and 0 <= row < camera.rows else -1
 
 
-def disc_points(count: int, radius: float, rng: np.random.Generator) -> NDArray[np.float64]:
+def disc_points(count: int, radius: float, rng: np.random.Generator) -> Floats:
     """Return `count` random points (n, 2), uniform over a disc."""
     r = radius * np.sqrt(rng.random(count))
     angle = 2.0 * np.pi * rng.random(count)
@@ -208,11 +200,7 @@ def disc_points(count: int, radius: float, rng: np.random.Generator) -> NDArray[
 #
 # A ray is straight within each plane layer; seen from the lens it comes in at a slope that is nearly proportional to
 # how far sideways it has moved. Paraxial rays are straight in one layer of air, from the equivalent point (Eqs. 6,
-# 9).
-#
-# Axes: z away from the camera from the nominal focal point; lateral distances from the point to the crossing of the
-# main lens, mm.
-
+# 9). Lateral distances are those from the point to the crossing of the main lens.
 
 # The slope of a refracted ray over its lateral distance is an analytic function of that distance squared, nearly
 # constant: through five points of it, a polynomial is right to 1e-10 for lenses up to f/1.4.
@@ -241,7 +229,7 @@ class ObjectSpace:
         """True where rays are straight from the equivalent point: paraxial refraction, or nothing but air."""
         return self.refraction == "paraxial" or self.media == self.media.in_air()
 
-    def distance(self, camera: Camera, z_mm: ArrayLike) -> NDArray[np.float64]:
+    def distance(self, camera: Camera, z_mm: ArrayLike) -> Floats:
         """Return how far from the lens, in air, points at depth z appear to paraxial rays.
 
         Raises
@@ -279,7 +267,7 @@ class ObjectSpace:
             air = camera.focus_distance_mm - wall * media.air / media.window - path * media.depth_ratio
         return Layers(np.array([air, wall, path]), np.array([media.air, media.window, media.fluid]))
 
-    def last_layers_mm(self, camera: Camera, z_mm: ArrayLike) -> NDArray[np.float64]:
+    def last_layers_mm(self, camera: Camera, z_mm: ArrayLike) -> Floats:
         """Return how thick the last of `layers` is in front of points at depth z; not above 0 in front of the fluid.
 
         Raises
@@ -289,9 +277,7 @@ class ObjectSpace:
         growth = self.media.depth_ratio if self.straight else 1.0
         return self.layers(camera).thicknesses_mm[-1] + growth * np.asarray(z_mm, dtype=np.float64)
 
-    def slope_polynomials(
-        self, camera: Camera, z_mm: ArrayLike, reach_mm: float
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def slope_polynomials(self, camera: Camera, z_mm: ArrayLike, reach_mm: float) -> tuple[Floats, Floats]:
         """Return nodes and factors (n, SLOPE_NODES) of `slope_ratio` for points at depths z (n,).
 
         Parameters
@@ -312,11 +298,23 @@ class ObjectSpace:
             raise ConfigError(f"a point at z = {depths.min():g} mm lies in front of the fluid")
         return _polynomials_at(last_layers, reach_mm, self.layers(camera))
 
+    def slopes(self, camera: Camera, points_mm: ArrayLike, crossing_mm: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+        """Return the slopes (n, 2) at the lens of the rays from points (n, 3) that cross it at (n, 2): all of them do.
+
+        Raises
+        ------
+        ConfigError : a point in front of the fluid, or no window where one is needed
+        """
+        points = np.atleast_2d(np.asarray(points_mm, dtype=np.float64))
+        reach = camera.aperture_radius_mm + float(np.hypot(points[:, 0], points[:, 1]).max())
+        lateral = crossing_mm - points[:, :2]
+        lateral2 = lateral[:, :1] ** 2 + lateral[:, 1:] ** 2
+        ratio = slope_ratios(lateral2, *self.slope_polynomials(camera, points[:, 2], reach))
+        return ratio * lateral, np.ones(len(lateral), dtype=np.bool_)
+
 
 @njit(cache=True)
-def _polynomials_at(
-    last_layers_mm: NDArray[np.float64], reach_mm: float, layers: Layers
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _polynomials_at(last_layers_mm: Floats, reach_mm: float, layers: Layers) -> tuple[Floats, Floats]:
     """Return nodes and factors for points behind as much of the last layer as given."""
     nodes, factors = np.empty((last_layers_mm.size, SLOPE_NODES)), np.empty((last_layers_mm.size, SLOPE_NODES))
     thicknesses = layers.thicknesses_mm.copy()
@@ -327,9 +325,7 @@ def _polynomials_at(
 
 
 @njit(cache=True)
-def slope_polynomial(
-    reach_mm: float, layers: NDArray[np.float64], indices: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def slope_polynomial(reach_mm: float, layers: Floats, indices: Floats) -> tuple[Floats, Floats]:
     """Return nodes and divided differences of slope / lateral over lateral^2, up to the lateral distance `reach_mm`."""
     nodes = np.empty(SLOPE_NODES)
     factors = np.empty(SLOPE_NODES)
@@ -344,12 +340,20 @@ def slope_polynomial(
 
 
 @njit(cache=True, **COUNT_NO_REFERENCES)
-def slope_ratio(lateral2_mm2: float, nodes: NDArray[np.float64], factors: NDArray[np.float64]) -> float:
+def slope_ratio(lateral2_mm2: float, nodes: Floats, factors: Floats) -> float:
     """Return slope / lateral distance from `slope_polynomial`."""
     value = factors[-1]
     for i in range(SLOPE_NODES - 2, -1, -1):
         value = factors[i] + (lateral2_mm2 - nodes[i]) * value
     return value
+
+
+def slope_ratios(lateral2_mm2: Floats, nodes: Floats, factors: Floats) -> Floats:
+    """Return `slope_ratio` of lateral distances squared that spread against nodes (n, SLOPE_NODES), one row a point."""
+    values = factors[:, -1:] + np.zeros_like(lateral2_mm2)
+    for i in range(SLOPE_NODES - 2, -1, -1):
+        values = factors[:, i : i + 1] + (lateral2_mm2 - nodes[:, i : i + 1]) * values
+    return values
 
 
 # How far paraxial optics is from the truth at the rim of the aperture, in light's place on the array.
@@ -365,7 +369,7 @@ def slope_ratio(lateral2_mm2: float, nodes: NDArray[np.float64], factors: NDArra
 LARGEST_ERROR_PX = 0.5
 
 
-def refraction_error_mm(camera: Camera, media: Media, window: Window | None, depths_mm: NDArray[np.float64]) -> float:
+def refraction_error_mm(camera: Camera, media: Media, window: Window | None, depths_mm: Floats) -> float:
     """Return how far from a paraxial ray's the place of a refracted one on the array is at most, at the rim.
 
     Parameters
@@ -392,7 +396,7 @@ def rim_tangent(camera: Camera) -> float:
     return camera.aperture_radius_mm / camera.focus_distance_mm
 
 
-def sine_error_mm(camera: Camera, media: Media, depths_mm: NDArray[np.float64]) -> float:
+def sine_error_mm(camera: Camera, media: Media, depths_mm: Floats) -> float:
     """Return how far a thin lens is at most from one that keeps sines, in the place of a rim ray on the array."""
     tangent = rim_tangent(camera)
     defocus = media.depth_ratio * float(np.abs(depths_mm).max())

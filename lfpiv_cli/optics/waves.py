@@ -34,9 +34,10 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 from scipy.special import ndtr
 
-from lfpiv_cli.optics.camera import Camera, nearest_point
+from lfpiv_cli.arrays import Floats
+from lfpiv_cli.optics.camera import Camera, nearest_point, undistorted
 from lfpiv_cli.optics.curved_space import CurvedSpace
-from lfpiv_cli.optics.tracing import ObjectSpace, slope_ratio
+from lfpiv_cli.optics.tracing import ObjectSpace
 
 # The pupil's phase is a polynomial of this degree in both coordinates together: what refraction and distortion leave
 # of it is below a thousandth of a wavelength for lenses up to f/2.
@@ -76,9 +77,9 @@ class Patch:
     """Light on a part of the sensor; `first` is its (row, column) on the sensor, which may lie beyond it."""
 
     first: tuple[int, int]
-    light: NDArray[np.float64]
+    light: Floats
 
-    def add_to(self, image: NDArray[np.float64], counts: float) -> None:
+    def add_to(self, image: Floats, counts: float) -> None:
         """Add `counts` times the light to what lies on the sensor."""
         (row, column), (height, width) = self.first, self.light.shape
         top, bottom = np.clip([row, row + height], 0, image.shape[0])
@@ -95,7 +96,11 @@ class WavesInCamera:
         self.samples = samples_per_pixel(camera, waves)
         self.step_mm = camera.pixel_mm / self.samples
         self._wave_number = 2.0 * np.pi / waves.wavelength_mm
-        self._pupil_places = camera.aperture_radius_mm * _even_disc(PUPIL_PLACES)
+        # In a sunflower's order they fill the pupil evenly, its rim included.
+        turn, places = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(PUPIL_PLACES), np.arange(PUPIL_PLACES)
+        radius = np.sqrt(places / (PUPIL_PLACES - 1.0))
+        disc = np.stack([radius * np.cos(turn), radius * np.sin(turn)], axis=-1)
+        self._pupil_places = camera.aperture_radius_mm * disc
         self._to_pixels = pixel_response(self.samples, camera.diffusion_px)
         self._windows: dict[int, _Window] = {}
 
@@ -114,96 +119,88 @@ class WavesInCamera:
         ------
         ConfigError : a point in front of the fluid
         """
+        camera, radius = self.camera, self.camera.aperture_radius_mm
         points = np.asarray(points_mm, dtype=np.float64).reshape(-1, 3)
         rays = [(point, *self._rays(point)) for point in points]
         lit = [ray for ray in rays if ray[2].any()]
         if not lit:
             return None
-        spot = np.concatenate([array[seen] for _, array, seen in lit])
-        window = self._window(0.5 * float(np.ptp(spot, axis=0).max()))
-        first, middle = self._place(0.5 * (spot.min(axis=0) + spot.max(axis=0)), window)
-        if not self._meets_sensor(first, window):
-            return None
-        lenses = window.lenses(self.camera, middle, self._wave_number)
-        light = np.zeros((window.size, window.size), dtype=np.float32)
-        for point, array, seen in lit:
-            amplitude = window.amplitude if seen.all() else window.amplitude * self._seen(point, window.pupil)
-            field = window.on_array(
-                amplitude, self._phase(array - middle - 0.5 * self.step_mm, seen), self.camera.aperture_radius_mm
-            )
-            field *= lenses
-            _add_intensity(window.on_sensor(field), light)
-        pixels = np.zeros((window.size // self.samples, window.size // self.samples))
-        _write_pixels(light, self.samples, self._to_pixels, pixels)
-        return Patch(first, pixels / len(points))
 
-    def _rays(self, point_mm: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        # The samples hold the light of all rays, and what edges diffract.
+        spot = np.concatenate([array[seen] for _, array, seen in lit])
+        behind = camera.microlens_distance_mm * steepest(camera) + MARGIN_PITCHES * float(camera.lattice.pitch.max())
+        pixels = int(np.ceil((0.5 * float(np.ptp(spot, axis=0).max()) + behind) / camera.pixel_mm)) + 1
+        size = 2 * self.samples * fft.next_fast_len(pixels)
+        if size not in self._windows:
+            self._windows[size] = _Window.of(camera, self.waves, size, self.step_mm)
+        window, side = self._windows[size], size // self.samples
+        first, middle = self._place(0.5 * (spot.min(axis=0) + spot.max(axis=0)), window)
+        if not all(-side < low < full for low, full in zip(first, (camera.rows, camera.columns), strict=True)):
+            return None
+
+        # What the array does to the light, with the curvature of light from the main lens.
+        lenses = np.empty((size, size), dtype=np.complex64)
+        half = 0.5 * self._wave_number
+        curvatures = half / camera.image_distance_mm, half / camera.microlens_focal_length_mm
+        _write_lenses(window.beside, middle, curvatures, camera.lattice.origin, camera.lattice.basis, lenses)
+        light = np.zeros((size, size), dtype=np.float32)
+        for point, array, seen in lit:
+            amplitude = window.amplitude
+            if not seen.all():
+                places = np.stack(np.meshgrid(window.pupil, window.pupil), axis=-1).reshape(-1, 2)
+                amplitude = amplitude * self.space.slopes(camera, point, places)[1].reshape(amplitude.shape)
+            phase = self._phase(array - middle - 0.5 * self.step_mm, seen)
+            spectrum = fft.fft2(window.on_array(amplitude, phase, radius) * lenses, overwrite_x=True)
+            spectrum *= window.transfer[:, None]
+            spectrum *= window.transfer
+            _add_intensity(np.asarray(fft.ifft2(spectrum, overwrite_x=True), dtype=np.complex64), light)
+        collected = np.zeros((side, side))
+        _write_pixels(light, self.samples, self._to_pixels, collected)
+        return Patch(first, collected / len(points))
+
+    def _rays(self, point_mm: Floats) -> tuple[Floats, NDArray[np.bool_]]:
         """Return where a point's rays through places of the pupil meet the array (places, 2), and which there are."""
         crossing = self._pupil_places
-        slopes, seen = _slopes(self.camera, self.space, point_mm, crossing)
+        slopes, seen = self.space.slopes(self.camera, point_mm, crossing)
         array = crossing + self.camera.image_distance_mm * (slopes - crossing / self.camera.focal_length_mm)
         array = array + self.camera.objective.aberration(crossing, array)
         return array * (1.0 + self.camera.distortion_per_mm2 * np.sum(array**2, axis=1, keepdims=True)), seen
 
-    def _seen(self, point_mm: NDArray[np.float64], pupil_mm: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which of the pupil's samples (y, x) a ray of the point reaches."""
-        places = np.stack(np.meshgrid(pupil_mm, pupil_mm), axis=-1).reshape(-1, 2)
-        return _slopes(self.camera, self.space, point_mm, places)[1].reshape(len(pupil_mm), -1)
-
     @cached_property
-    def _terms(self) -> NDArray[np.float64]:
-        """Slopes (2 places, terms) that each term of the phase has on the pupil of radius 1, along x and then y."""
+    def _terms(self) -> tuple[Floats, Floats]:
+        """Slopes (2 places, terms) of each term of the phase on the pupil of radius 1, along x, then y; and back."""
         x, y = (self._pupil_places / self.camera.aperture_radius_mm).T
         i, j = _TERMS[:, 0], _TERMS[:, 1]
         along_x = i * x[:, None] ** np.maximum(i - 1, 0) * y[:, None] ** j
         along_y = j * y[:, None] ** np.maximum(j - 1, 0) * x[:, None] ** i
-        return np.concatenate([along_x, along_y])
+        slopes = np.concatenate([along_x, along_y])
+        return slopes, np.linalg.pinv(slopes)
 
-    @cached_property
-    def _slope_fit(self) -> NDArray[np.float64]:
-        """What makes terms of slopes, where there are all."""
-        return np.asarray(np.linalg.pinv(self._terms), dtype=np.float64)
-
-    def _phase(self, array_mm: NDArray[np.float64], seen: NDArray[np.bool_]) -> NDArray[np.float64]:
+    def _phase(self, array_mm: Floats, seen: NDArray[np.bool_]) -> Floats:
         """Return the coefficients (y, x) of the phase, on the pupil of radius 1, whose normals meet the array there."""
         slopes = self._wave_number * self.camera.aperture_radius_mm / self.camera.image_distance_mm * array_mm
         if seen.all():
-            terms = self._slope_fit @ slopes.T.ravel()
+            terms = self._terms[1] @ slopes.T.ravel()
         else:
             rows = np.concatenate([seen, seen])
-            terms = np.linalg.lstsq(self._terms[rows], slopes[seen].T.ravel(), rcond=None)[0]
+            terms = np.linalg.lstsq(self._terms[0][rows], slopes[seen].T.ravel(), rcond=None)[0]
         coefficients = np.zeros((DEGREE + 1, DEGREE + 1))
         coefficients[_TERMS[:, 1], _TERMS[:, 0]] = terms
         return coefficients
 
-    def _window(self, radius_mm: float) -> _Window:
-        """Return the samples that hold the light of rays that meet the array within a square of this half side."""
-        camera, pitch = self.camera, float(self.camera.lattice.pitch.max())
-        behind = camera.microlens_distance_mm * steepest(camera) + MARGIN_PITCHES * pitch
-        pixels = int(np.ceil((radius_mm + behind) / camera.pixel_mm)) + 1
-        size = 2 * self.samples * fft.next_fast_len(pixels)
-        if size not in self._windows:
-            self._windows[size] = _Window.of(camera, self.waves, size, self.step_mm)
-        return self._windows[size]
-
-    def _place(self, spot_mm: NDArray[np.float64], window: _Window) -> tuple[tuple[int, int], NDArray[np.float64]]:
+    def _place(self, spot_mm: Floats, window: _Window) -> tuple[tuple[int, int], Floats]:
         """Return the window's first (row, column) on the sensor, and its middle on the array.
 
         The middle is seen at the corner of pixels that is nearest to the spot, with as many samples on either side.
         """
         camera, lever = self.camera, self.camera.microlens_distance_mm / self.camera.image_distance_mm
         axis_px = camera.sensor_centre_px + 0.5
-        ideal = _undistorted(spot_mm, 1.0, camera.distortion_per_mm2)
+        ideal = undistorted(spot_mm, camera.distortion_per_mm2, rounds=UNDISTORT_ROUNDS)
         corner = np.rint((spot_mm + lever * ideal) / camera.pixel_mm + axis_px).astype(np.int64)
         on_sensor = (corner - axis_px) * camera.pixel_mm
-        tilt = _undistorted(on_sensor, 1.0 + lever, camera.distortion_per_mm2)
+        tilt = undistorted(on_sensor, camera.distortion_per_mm2, 1.0 + lever, UNDISTORT_ROUNDS)
         half = window.size // (2 * self.samples)
         return (int(corner[1]) - half, int(corner[0]) - half), on_sensor - lever * tilt
-
-    def _meets_sensor(self, first: tuple[int, int], window: _Window) -> bool:
-        side = window.size // self.samples
-        sensor = self.camera.rows, self.camera.columns
-        return all(-side < low < full for low, full in zip(first, sensor, strict=True))
 
 
 def steepest(camera: Camera) -> float:
@@ -218,7 +215,7 @@ def samples_per_pixel(camera: Camera, waves: Waves) -> int:
     return int(np.ceil(2.0 * STEEPNESS * steepest(camera) * camera.pixel_mm / waves.wavelength_mm))
 
 
-def pixel_response(samples: int, diffusion_px: float) -> NDArray[np.float64]:
+def pixel_response(samples: int, diffusion_px: float) -> Floats:
     """Return the share of the charge of samples about a pixel that it collects; `samples` of them lie on the pixel.
 
     Charge diffuses as a Gaussian before the pixel adds it up.
@@ -245,9 +242,9 @@ class _Window:
     """
 
     size: int
-    pupil: NDArray[np.float64]
-    amplitude: NDArray[np.float64]
-    beside: NDArray[np.float64]
+    pupil: Floats
+    amplitude: Floats
+    beside: Floats
     transfer: Complex
 
     @classmethod
@@ -270,7 +267,7 @@ class _Window:
             ).astype(np.complex64),
         )
 
-    def on_array(self, amplitude: NDArray[np.float64], phase: NDArray[np.float64], radius_mm: float) -> Complex:
+    def on_array(self, amplitude: Floats, phase: Floats, radius_mm: float) -> Complex:
         """Return the field on the array (y, x), without the lenses, of this amplitude and phase on the pupil."""
         half = len(self.pupil) // 2
         numbers = np.arange(-half, half + 1) % self.size
@@ -280,25 +277,9 @@ class _Window:
         whole[numbers] = fft.fft(field, axis=1, overwrite_x=True)
         return np.asarray(fft.fft(whole, axis=0, overwrite_x=True), dtype=np.complex64)
 
-    def lenses(self, camera: Camera, middle_mm: NDArray[np.float64], wave_number: float) -> Complex:
-        """Return what the array does to the light (y, x), with the curvature of light from the main lens."""
-        found = np.empty((self.size, self.size), dtype=np.complex64)
-        curvatures = 0.5 * wave_number / camera.image_distance_mm, 0.5 * wave_number / camera.microlens_focal_length_mm
-        _write_lenses(self.beside, middle_mm, curvatures, camera.lattice.origin, camera.lattice.basis, found)
-        return found
-
-    def on_sensor(self, field: Complex) -> Complex:
-        """Return the field on the sensor of one behind the array, which is overwritten."""
-        spectrum = fft.fft2(field, overwrite_x=True)
-        spectrum *= self.transfer[:, None]
-        spectrum *= self.transfer
-        return np.asarray(fft.ifft2(spectrum, overwrite_x=True), dtype=np.complex64)
-
 
 @njit(cache=True, nogil=True)
-def _write_pupil(
-    amplitude: NDArray[np.float64], phase: NDArray[np.float64], places: NDArray[np.float64], field: Complex
-) -> None:
+def _write_pupil(amplitude: Floats, phase: Floats, places: Floats, field: Complex) -> None:
     """Write the field of each sample of the pupil (n, size), those left of the middle at the end, by frequency."""
     count, degree = places.size, phase.shape[0] - 1
     along_x = np.empty(degree + 1)
@@ -320,12 +301,7 @@ def _write_pupil(
 
 @njit(cache=True, nogil=True)
 def _write_lenses(
-    beside: NDArray[np.float64],
-    middle: NDArray[np.float64],
-    curvatures: tuple[float, float],
-    origin: NDArray[np.float64],
-    basis: NDArray[np.float64],
-    found: Complex,
+    beside: Floats, middle: Floats, curvatures: tuple[float, float], origin: Floats, basis: Floats, found: Complex
 ) -> None:
     """Write the phase factor of each sample on the array: the converging light's, less that of the nearest lens.
 
@@ -365,9 +341,7 @@ def _add_intensity(field: Complex, light: NDArray[np.float32]) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _write_pixels(
-    light: NDArray[np.float32], samples: int, response: NDArray[np.float64], pixels: NDArray[np.float64]
-) -> None:
+def _write_pixels(light: NDArray[np.float32], samples: int, response: Floats, pixels: Floats) -> None:
     """Add up what pixels collect of the light of samples, those of `pixel_response`."""
     size, beside = light.shape[0], (response.size - samples) // 2
     of_rows = np.zeros(size)
@@ -381,46 +355,3 @@ def _write_pixels(
             first = column * samples - beside
             for k in range(max(-first, 0), min(response.size, size - first)):
                 pixels[row, column] += response[k] * of_rows[first + k]
-
-
-def _slopes(
-    camera: Camera, space: ObjectSpace | CurvedSpace, point_mm: NDArray[np.float64], crossing_mm: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Return the slopes (n, 2) at the main lens of a point's rays that cross it at (n, 2), and which there are.
-
-    Raises
-    ------
-    ConfigError : the point lies in front of the fluid behind plane windows
-    """
-    if isinstance(space, CurvedSpace):
-        return space.slopes(camera, np.broadcast_to(point_mm, (len(crossing_mm), 3)), crossing_mm)
-    reach = camera.aperture_radius_mm + float(np.hypot(*point_mm[:2]))
-    nodes, factors = space.slope_polynomials(camera, point_mm[2:], reach)
-    return _plane_slopes(crossing_mm - point_mm[:2], nodes[0], factors[0]), np.ones(len(crossing_mm), dtype=np.bool_)
-
-
-@njit(cache=True, nogil=True)
-def _plane_slopes(
-    lateral: NDArray[np.float64], nodes: NDArray[np.float64], factors: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return the slopes of rays that move sideways by (n, 2) from `slope_polynomial`."""
-    slopes = np.empty_like(lateral)
-    for k in range(lateral.shape[0]):
-        ratio = slope_ratio(lateral[k, 0] ** 2 + lateral[k, 1] ** 2, nodes, factors)
-        slopes[k] = ratio * lateral[k]
-    return slopes
-
-
-def _undistorted(place_mm: NDArray[np.float64], scale: float, distortion_per_mm2: float) -> NDArray[np.float64]:
-    """Return the x (2,) for which x (scale + k1 |x|^2) is a place; each round gains three times the distortion."""
-    ideal = place_mm / scale
-    for _ in range(UNDISTORT_ROUNDS if distortion_per_mm2 else 0):
-        ideal = place_mm / (scale + distortion_per_mm2 * np.sum(ideal**2))
-    return ideal
-
-
-def _even_disc(count: int) -> NDArray[np.float64]:
-    """Return points that fill a disc of radius 1 evenly, its rim included, in a sunflower's order."""
-    turn = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(count)
-    radius = np.sqrt(np.arange(count) / (count - 1.0))
-    return np.stack([radius * np.cos(turn), radius * np.sin(turn)], axis=-1)

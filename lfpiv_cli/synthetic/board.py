@@ -15,10 +15,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.calibration.board_pose import BoardGeometry
-from lfpiv_cli.calibration.shape_fit import nearest_points, undistorted
+from lfpiv_cli.calibration.shape_fit import nearest_points
 from lfpiv_cli.calibration.views import charuco_board
 from lfpiv_cli.errors import ConfigError
-from lfpiv_cli.optics.camera import Camera, Lattice, Objective
+from lfpiv_cli.optics.camera import Camera, Lattice, Objective, undistorted
 from lfpiv_cli.optics.curved_space import CurvedSpace
 from lfpiv_cli.optics.media import Media, equivalent_object_distance, exact_lateral_mm
 from lfpiv_cli.optics.tracing import ObjectSpace

@@ -15,7 +15,6 @@ from lfpiv_cli.calibration import model
 from lfpiv_cli.calibration.lens_light import LensImages
 from lfpiv_cli.calibration.light_checks import (
     dark_notices,
-    field_notices,
     position_notices,
     shape_notices,
     shapes_of,
@@ -28,9 +27,6 @@ from lfpiv_cli.calibration.sheet import (
     entrance_pupil_notices,
     f_number_notices,
     image_distance_notices,
-    magnification_notices,
-    narrow_notices,
-    points_notices,
 )
 from lfpiv_cli.calibration.white import by_aperture, lens_image_width
 from lfpiv_cli.console import CONSOLE, Console
@@ -144,16 +140,8 @@ def calibration_notices(rig: Config, pictures: Photographs, found: Calibration) 
     """Return what speaks against a calibration and the pictures that it is from."""
     camera = rig.camera.model()
     notices = [] if camera is None else f_number_notices(camera)
-    if found.pose is not None and rig.board.dots is not None and rig.board.pattern != "charuco":
-        notices += board_notices(found.pose.dots_found, rig.board.dots)
-    if found.pose is not None:
-        notices += points_notices(found.pose.dots_found)
     if found.pose is not None and camera is not None:
-        notices += [*magnification_notices(found.pose.magnification, camera), *field_notices(found.pose, camera)]
-        geometry, media = rig.rig().board, rig.media_model()
-        if geometry.pattern == "dots":
-            medium = media.in_air() if geometry.medium == "air" else media
-            notices += narrow_notices(geometry.dot_diameter_mm, found.pose.z0_mm, camera.scale(medium))
+        notices += board_notices(found.pose, rig.rig().board, camera, rig.media_model())
     if found.ray_fit is not None and camera is not None:
         rays = found.ray_fit
         notices += entrance_pupil_notices(rays.entrance_pupil_mm, rays.entrance_pupil_sigma_mm, camera)

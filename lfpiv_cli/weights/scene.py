@@ -406,8 +406,8 @@ def seen_depths_mm(camera: Camera, space: CurvedSpace, grid: Grid) -> NDArray[np
 
     Behind a cylinder a point has two, which differ.
     """
-    seen = space.equivalent(camera, sample(camera, grid))
-    depths = (seen.distance_mm[seen.valid].ravel() - camera.focus_distance_mm) / space.media.depth_ratio
+    _, distance, seen = space.equivalent(camera, sample(camera, grid))
+    depths = (distance[seen].ravel() - camera.focus_distance_mm) / space.media.depth_ratio
     return np.append(depths, 0.0)
 
 
