@@ -19,7 +19,7 @@ from typing import ClassVar, Self
 
 import numba
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.fields.evidence import Box, first_expectation, most_probable
@@ -154,7 +154,7 @@ class PressureField:
     mean: Floats
     wrong_share: float
     expected: Expectation
-    probability: NDArray[np.float64]
+    probability: Floats
     reduced_chi2: float
 
     def value_at(self, points_mm: Floats) -> Floats:

@@ -106,7 +106,14 @@ class Derived:
 
 def derived_fields(field: VectorField) -> Derived:
     """Return the derived fields by central differences, one-sided at the faces and exact for quadratic flows there."""
-    return derived_from(velocity_gradient(field))
+    velocity = field.velocity
+    gradient = np.full((*velocity.shape, 3), np.nan)
+    for axis, spacing_mm in enumerate(field.grid.spacing_mm):
+        planes = field.grid.shape_xyz[axis]
+        if planes > 1:
+            step_m = spacing_mm * MM_TO_M
+            gradient[..., axis] = np.gradient(velocity, step_m, axis=2 - axis, edge_order=2 if planes > 2 else 1)
+    return derived_from(gradient)
 
 
 def derived_from(gradient: Floats) -> Derived:
@@ -121,18 +128,6 @@ def derived_from(gradient: Floats) -> Derived:
         strain_rate=np.sqrt(2.0 * strain_squared),
         q_criterion=0.5 * (np.sum(rotation**2, axis=(-1, -2)) - strain_squared),
     )
-
-
-def velocity_gradient(field: VectorField) -> Floats:
-    """Return d(u, v, w)/d(x, y, z), (nz, ny, nx, 3, 3) in 1/s: the component, then the direction."""
-    velocity = field.velocity
-    gradient = np.full((*velocity.shape, 3), np.nan)
-    for axis, spacing_mm in enumerate(field.grid.spacing_mm):
-        planes = field.grid.shape_xyz[axis]
-        if planes > 1:
-            step_m = spacing_mm * MM_TO_M
-            gradient[..., axis] = np.gradient(velocity, step_m, axis=2 - axis, edge_order=2 if planes > 2 else 1)
-    return gradient
 
 
 # Mean and fluctuations over the vector fields of a batch.
@@ -207,8 +202,6 @@ def statistics_of(fields: Iterable[VectorField]) -> Statistics:
 # the divergence that the stated standard deviations make, a ratio of 1 confirms them; a large one says that they are
 # too small. Two measurements of one flow by different ways differ likewise by what their standard deviations let
 # expect.
-#
-# Axes: arrays `[z, y, x]`, components last.
 
 
 # Fewer places than this tell no ratio.

@@ -22,7 +22,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats
-from lfpiv_cli.flow.windows import Triple, WindowLayout
+from lfpiv_cli.flow.windows import Triple, WindowLayout, triple
 from lfpiv_cli.robust import of_half_the_sum
 from lfpiv_cli.simd.block_sums import FEW_SHIFTS, MANY_SHIFTS, products
 from lfpiv_cli.simd.vectors import LANES
@@ -42,11 +42,10 @@ SMALLEST_AMPLITUDE = 0.07
 class Blocks:
     """How the windows of one layout are made of blocks, along (z, y, x); along x each is a block of its own.
 
-    Block k along an axis covers voxels first + k stride ... + size - 1; window k is the sum of blocks k hop ... k hop +
-    per_window - 1.
+    Block k along an axis covers `size` voxels from k stride on, counted from the first window's first voxel; window k
+    is the sum of blocks k hop ... k hop + per_window - 1.
     """
 
-    first: Triple
     size: Triple
     stride: Triple
     count: Triple
@@ -54,17 +53,8 @@ class Blocks:
     hop: Triple
 
 
-def blocks_of(layout: WindowLayout) -> Blocks:
-    """Return the blocks that make up the windows, axis by axis; one block a window where sharing does not pay."""
-    axes = [_blocks_along(layout.size[axis], layout.step[axis], layout.count[axis]) for axis in (2, 1)]
-    axes.append((layout.size[0], layout.step[0], layout.count[0], 1, 1))
-    size, stride, count, per_window, hop = ((a[0], a[1], a[2]) for a in zip(*axes, strict=True))
-    first = (layout.first[2], layout.first[1], layout.first[0])
-    return Blocks(first, size, stride, count, per_window, hop)
-
-
-def _blocks_along(size: int, step: int, count: int) -> tuple[int, int, int, int, int]:
-    """Return size, stride, count, blocks per window and hop along one axis."""
+def blocks_along(size: int, step: int, count: int) -> tuple[int, int, int, int, int]:
+    """Return size, stride, count, blocks per window and hop along one axis; where sharing does not pay, windows."""
     block = gcd(size, step)
     if block < SMALLEST_BLOCK or step >= size:
         return size, step, count, 1, 1
@@ -84,7 +74,7 @@ def margins(layout: WindowLayout, shape_zyx: Triple, radius: int) -> tuple[Tripl
             last = max(last, layout.first[axis] + LANES)
         before.append(max(0, radius - layout.first[axis]))
         after.append(max(0, last + radius - voxels))
-    return (before[0], before[1], before[2]), (after[0], after[1], after[2])
+    return triple(before), triple(after)
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,12 +103,6 @@ class MapSums:
             self.blocks,
         )
 
-    def amplitude(self) -> Floats:
-        """Return the root of the sum of squares over each window where it stands, the mean of both volumes' in logs."""
-        middle = self.energies_a.shape[1] // 2
-        energy_a, energy_b = (e[:, middle, :, middle, :, middle] for e in (self.energies_a, self.energies_b))
-        return np.asarray((energy_a.astype(np.float64) * energy_b).transpose(0, 2, 1) ** 0.25)
-
     def correlation(self) -> Floats:
         """Return R, (nz, ny, nx, 2r + 1, 2r + 1, 2r + 1), zero where a window holds no tracers."""
         energies, per_window, hop = (self.energies_a, self.energies_b), self.blocks.per_window[:2], self.blocks.hop[:2]
@@ -129,8 +113,10 @@ class MapSums:
         maps = np.empty((nz, ny, nx, shifts**3))
         share_out(write_maps, nz * ny, blocks, energies, per_window, hop, SMALLEST_ENERGY**2 * brightest, maps)
         maps = maps.reshape(nz, ny, nx, shifts, shifts, shifts)
+        # The root of the sum of squares over each window where it stands, the mean of both volumes' in logs.
+        energy_a, energy_b = (e[:, shifts // 2, :, shifts // 2, :, shifts // 2] for e in energies)
+        amplitude = (energy_a.astype(np.float64) * energy_b).transpose(0, 2, 1) ** 0.25
         # The other windows are what most of the light comes from.
-        amplitude = self.amplitude()
         maps[amplitude < SMALLEST_AMPLITUDE * of_half_the_sum(amplitude)] = 0.0
         return maps
 
@@ -149,8 +135,10 @@ def map_sums(
     layout : windows, in voxels of the volume without margins
     before : the margins before the volume, (z, y, x)
     """
-    blocks = blocks_of(layout)
-    first = (blocks.first[0] + before[0], blocks.first[1] + before[1], blocks.first[2] + before[2])
+    axes = [blocks_along(layout.size[axis], layout.step[axis], layout.count[axis]) for axis in (2, 1)]
+    axes.append((layout.size[0], layout.step[0], layout.count[0], 1, 1))
+    blocks = Blocks(*(triple(each) for each in zip(*axes, strict=True)))
+    first = triple(low + margin for low, margin in zip(layout.first[::-1], before, strict=True))
     shifts = 2 * radius + 1
     found = np.empty((*blocks.count, shifts, shifts, shifts))
     share_out(sum_products, blocks.count[0] * blocks.count[1], (a, b), first, blocks.size, blocks.stride, found)
@@ -166,8 +154,8 @@ def energies_of(
     One axis after the other. Differences of running sums would take less, but an empty window next to bright ones must
     be exactly zero.
     """
-    size, step, count, low = (triple[::-1] for triple in (layout.size, layout.step, layout.count, layout.first))
-    first = (low[0] + before[0], low[1] + before[1], low[2] + before[2])
+    size, step, count, low = (each[::-1] for each in (layout.size, layout.step, layout.count, layout.first))
+    first = triple(begin + margin for begin, margin in zip(low, before, strict=True))
     shifts = 2 * radius + 1
     nz, ny, nx = count
     planes = (nz - 1) * step[0] + size[0] + 2 * radius
@@ -202,7 +190,9 @@ def sum_laterally(
     for z in range(part[0], part[1]):
         squares = np.empty(volume.shape[1:], dtype=np.float32)
         for y in range(volume.shape[1]):
-            square_row(volume[lowest + z, y], squares[y])
+            row, squared = volume[lowest + z, y], squares[y]
+            for x in range(row.size):
+                squared[x] = row[x] * row[x]
         along_y = np.empty((ny * shifts, volume.shape[2]), dtype=np.float32)
         for k in range(ny):
             sum_rows(squares, first[1] + k * step[1], size[1], radius, along_y[k * shifts : (k + 1) * shifts])
@@ -234,7 +224,9 @@ def sum_ahead(values: NDArray[np.float32], spare: NDArray[np.float32], size: int
             done += length
         if 2 * length > size:
             return
-        write_sum(spare, values, values[length:])
+        later = values[length:]
+        for i in range(later.size):
+            spare[i] = values[i] + later[i]
         values, spare = spare, values
         length *= 2
 
@@ -263,20 +255,6 @@ def sum_rows(rows: NDArray[np.float32], first: int, size: int, radius: int, sums
             add_row(target, rows[row])
         for row in range(end, lowest + shift + size):
             add_row(target, rows[row])
-
-
-@njit(cache=True)
-def write_sum(target: NDArray[np.float32], one: NDArray[np.float32], other: NDArray[np.float32]) -> None:
-    """Write the sum of two rows, as far as the second one goes."""
-    for i in range(other.size):
-        target[i] = one[i] + other[i]
-
-
-@njit(cache=True)
-def square_row(row: NDArray[np.float32], squares: NDArray[np.float32]) -> None:
-    """Write the squares of a row."""
-    for x in range(row.size):
-        squares[x] = row[x] * row[x]
 
 
 @njit(cache=True, nogil=True)

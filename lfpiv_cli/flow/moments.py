@@ -16,15 +16,14 @@ Axes: cells and windows are ordered (z, y, x); vectors hold (u, v, w) along (x, 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import gcd
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats
-from lfpiv_cli.flow.maps import SMALLEST_BLOCK
-from lfpiv_cli.flow.windows import Triple, WindowLayout
+from lfpiv_cli.flow.maps import blocks_along
+from lfpiv_cli.flow.windows import Triple, WindowLayout, triple
 from lfpiv_cli.simd.block_sums import MOMENTS
 from lfpiv_cli.simd.block_sums import moments as lane_moments
 from lfpiv_cli.simd.vectors import LANES
@@ -66,26 +65,16 @@ class Cells:
 
 def cells_of(layout: WindowLayout) -> Cells:
     """Return the cells that make up the windows, axis by axis."""
-    axes = [_cells_along(layout.size[axis], layout.step[axis], layout.count[axis]) for axis in (2, 1, 0)]
-    start, size, per_window, hop = ((a[0], a[1], a[2]) for a in zip(*axes, strict=True))
-    return Cells(start, size, per_window, hop)
-
-
-def _cells_along(size: int, step: int, count: int) -> tuple[NDArray[np.int64], NDArray[np.int64], int, int]:
-    """Return the starts and sizes of the cells, the cells per window and the hop along one axis.
-
-    Windows share cells of their step's and size's common divisor, or parts of these; where it is small, each window has
-    cells of its own.
-    """
-    shared = gcd(size, step)
-    if shared < SMALLEST_BLOCK or step > size:
-        first, length, hop = step * np.arange(count), size, 1
-    else:
-        first, length, hop = shared * np.arange(((count - 1) * step + size) // shared), shared, step // shared
-    parts = min(length, -(-CELLS_PER_WINDOW * length // size))
-    edges = np.arange(parts + 1) * length // parts
-    start = (first[:, np.newaxis] + edges[:-1]).ravel()
-    return start, np.tile(np.diff(edges), first.size), parts * (size // length), parts * hop
+    axes = []
+    for size, step, count in zip(layout.size[::-1], layout.step[::-1], layout.count[::-1], strict=True):
+        # The blocks that windows share, or parts of these; where they share none, each window has cells of its own.
+        length, stride, blocks, per_window, hop = blocks_along(size, step, count)
+        parts = min(length, -(-CELLS_PER_WINDOW * length // size))
+        edges = np.arange(parts + 1) * length // parts
+        start = (stride * np.arange(blocks)[:, np.newaxis] + edges[:-1]).ravel()
+        axes.append((start, np.tile(np.diff(edges), blocks), parts * per_window, parts * hop))
+    starts, sizes, numbers, hops = ((a[0], a[1], a[2]) for a in zip(*axes, strict=True))
+    return Cells(starts, sizes, numbers, hops)
 
 
 def pair_moments(
@@ -119,23 +108,19 @@ def gauss_newton(moments: Floats, layout: WindowLayout, particle_sigma: Floats) 
     particle_sigma : (3,) standard deviation of a particle image along x, y, z, voxels
     """
     cells = cells_of(layout)
-    groups = [
-        _cells_a_group(per_window, length, sigma)
-        for per_window, length, sigma in zip(cells.per_window, layout.size[::-1], particle_sigma[::-1], strict=True)
-    ]
-    grouped = (groups[0], groups[1], groups[2])
-    count = layout.count_zyx
+    grouped = []
+    for per_window, length, sigma in zip(cells.per_window, layout.size[::-1], particle_sigma[::-1], strict=True):
+        # The fewest cells, a divisor of those of a window, that are `GROUP_SIGMAS` long; or all.
+        long_enough = (
+            number
+            for number in range(1, per_window)
+            if per_window % number == 0 and number * length >= GROUP_SIGMAS * sigma * per_window
+        )
+        grouped.append(next(long_enough, per_window))
+    count = layout.count[::-1]
     solved = np.full((3, *count, 3), np.nan)
-    share_out(solve_windows, count[0] * count[1], moments, cells.per_window, cells.hop, grouped, solved)
+    share_out(solve_windows, count[0] * count[1], moments, cells.per_window, cells.hop, triple(grouped), solved)
     return solved[0], solved[1], solved[2]
-
-
-def _cells_a_group(per_window: int, length: int, sigma: float) -> int:
-    """Return the fewest cells, a divisor of those of a window of `length`, that are `GROUP_SIGMAS` long; or all."""
-    for cells in range(1, per_window):
-        if per_window % cells == 0 and cells * length >= GROUP_SIGMAS * sigma * per_window:
-            return cells
-    return per_window
 
 
 @njit(cache=True, nogil=True)
@@ -295,7 +280,12 @@ def write_deviation(groups: Floats, inverse: Floats, solution: Floats, deviation
             dependent *= 2.0 - 1.0 / layers
     if used < FEWEST_GROUPS * dependent:
         return
-    sum_neighbours(rest)
+    # Of each place and the next along z, y and x, in place; the last ones along each axis are left half done.
+    for stride in (rest[0].size, rest[0, 0].size, rest[0, 0, 0].size):
+        flat = rest.reshape(rest.size)
+        here, after = flat[: flat.size - stride], flat[stride:]
+        for i in range(here.size):
+            here[i] += after[i]
     for i in range(3):
         variance = 0.0
         for z in range(nz + 1):
@@ -304,16 +294,3 @@ def write_deviation(groups: Floats, inverse: Floats, solution: Floats, deviation
                     variance += rest[z, y, x, i] * rest[z, y, x, i]
         # Each group is in two blocks along each axis.
         deviation[i] = np.sqrt(variance / 8.0 / (1.0 - dependent / used))
-
-
-@njit(cache=True)
-def sum_neighbours(values: Floats) -> None:
-    """Replace values (z, y, x, 3) by the sums of those from each place to the next along z, y and x, in place.
-
-    The last ones along each axis are left half done.
-    """
-    for stride in (values[0].size, values[0, 0].size, values[0, 0, 0].size):
-        flat = values.reshape(values.size)
-        here, after = flat[: flat.size - stride], flat[stride:]
-        for i in range(here.size):
-            here[i] += after[i]

@@ -6,6 +6,7 @@ Axes: triples are ordered (x, y, z). Positions are voxel indices; voxel k covers
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
@@ -117,7 +118,9 @@ class RoundWall:
         first, second = (
             np.moveaxis((corner - middle)[..., self._across] / self.radius_mm, -1, 0) for corner in (low_mm, high)
         )
-        area = rectangle_in_circle(first[0], second[0], first[1], second[1]) * self.radius_mm**2
+        x0, y0, x1, y1 = *first, *second
+        corners = [_from_origin(x1, y1), _from_origin(x0, y0), _from_origin(x1, y0), _from_origin(x0, y1)]
+        area = np.maximum(corners[0] + corners[1] - corners[2] - corners[3], 0.0) * self.radius_mm**2
         return np.asarray(area * (high - low_mm)[..., self.along])
 
     def points(self, low_mm: Floats, high_mm: Floats, step_mm: Floats) -> Floats:
@@ -157,14 +160,8 @@ def spaced(low: float, high: float, step: float) -> Floats:
     return np.linspace(low, high, int(np.ceil((high - low) / step)) + 1)
 
 
-def rectangle_in_circle(x0: Floats, x1: Floats, y0: Floats, y1: Floats) -> Floats:
-    """Return the area (...) of rectangles, x0 <= x1 and y0 <= y1, inside the circle of radius 1 about the origin."""
-    corners = [_from_origin(x1, y1), _from_origin(x0, y0), _from_origin(x1, y0), _from_origin(x0, y1)]
-    return np.maximum(corners[0] + corners[1] - corners[2] - corners[3], 0.0)
-
-
 def _from_origin(x: Floats, y: Floats) -> Floats:
-    """Return the area inside the circle of rectangles from the origin to (x, y), with the sign of x y."""
+    """Return the area inside the circle of radius 1 of rectangles from the origin to (x, y), with the sign of x y."""
     width, height = np.minimum(np.abs(x), 1.0), np.minimum(np.abs(y), 1.0)
     # up to here the rectangle's upper side lies in the circle, then the circle bounds it
     bend = np.minimum(np.sqrt(1.0 - height**2), width)
@@ -194,26 +191,16 @@ class WindowLayout:
     count: Triple
     first: Triple
 
-    @property
-    def count_zyx(self) -> Triple:
-        """Shape of an array with one element per window."""
-        nx, ny, nz = self.count
-        return nz, ny, nx
-
-    def centres_voxel(self, axis: int) -> NDArray[np.float64]:
+    def centres_voxel(self, axis: int) -> Floats:
         """Return the window centres along axis 0 (x), 1 (y) or 2 (z) as (fractional) voxel indices."""
         first_centre = self.first[axis] + 0.5 * (self.size[axis] - 1)
         return first_centre + self.step[axis] * np.arange(self.count[axis], dtype=np.float64)
 
     def grid(self, volume: Grid) -> Grid:
         """Return the grid of the window centres, in mm, for windows in a volume on the grid `volume`."""
-        spacing = tuple(s * d for s, d in zip(self.step, volume.spacing_mm, strict=True))
-        origin = volume.voxel_to_mm(np.array([self.centres_voxel(axis)[0] for axis in range(3)]))
-        return Grid(
-            self.count,
-            (spacing[0], spacing[1], spacing[2]),
-            (float(origin[0]), float(origin[1]), float(origin[2])),
-        )
+        x, y, z = (s * d for s, d in zip(self.step, volume.spacing_mm, strict=True))
+        x0, y0, z0 = volume.voxel_to_mm(np.array([self.centres_voxel(axis)[0] for axis in range(3)])).tolist()
+        return Grid(self.count, (x, y, z), (x0, y0, z0))
 
 
 def layout_windows(shape_xyz: Triple, size_xyz: Triple, overlap: tuple[float, float, float]) -> WindowLayout:
@@ -229,17 +216,20 @@ def layout_windows(shape_xyz: Triple, size_xyz: Triple, overlap: tuple[float, fl
     overlap : share of a window that it has in common with the next one, 0 <= overlap < 1; the step is then rounded to
         whole voxels, or rounded down where so many windows would not fit
     """
-    axes = [_layout_axis(n, w, o) for n, w, o in zip(shape_xyz, size_xyz, overlap, strict=True)]
-    (sx, nx, fx), (sy, ny, fy), (sz, nz, fz) = axes
-    return WindowLayout(size_xyz, (sx, sy, sz), (nx, ny, nz), (fx, fy, fz))
+    steps, counts, firsts = [], [], []
+    for voxels, size, share in zip(shape_xyz, size_xyz, overlap, strict=True):
+        exact = size * (1.0 - share)
+        count = max(1, math.floor(voxels / exact + ROUNDING))
+        # Of whole voxels, and no more than leave all windows' cells inside the volume.
+        step = max(1, min(math.floor(exact + 0.5), voxels // count))
+        steps.append(step)
+        counts.append(count)
+        # Doubled, to stay in whole numbers; an odd remainder leaves its last voxel at the far end.
+        firsts.append(((voxels - count * step) + step - size) // 2)
+    return WindowLayout(size_xyz, triple(steps), triple(counts), triple(firsts))
 
 
-def _layout_axis(voxels: int, size: int, overlap: float) -> Triple:
-    """Return step, count and first voxel along one axis."""
-    exact = size * (1.0 - overlap)
-    count = max(1, math.floor(voxels / exact + ROUNDING))
-    # Of whole voxels, and no more than leave all windows' cells inside the volume.
-    step = max(1, min(math.floor(exact + 0.5), voxels // count))
-    # Doubled, to stay in whole numbers; an odd remainder leaves its last voxel at the far end.
-    twice_first = (voxels - count * step) + step - size
-    return step, count, twice_first // 2
+def triple(values: Iterable[int]) -> Triple:
+    """Return three numbers as a triple, which a tuple of any length is not for the type checker."""
+    x, y, z = values
+    return x, y, z

@@ -359,12 +359,7 @@ def _terms(time: Floats, count: int) -> Floats:
     return np.stack([time**power / factorial(power) for power in range(count)], axis=1)
 
 
-def _cubic(
-    position_mm: Floats,
-    sigma_mm: Floats,
-    time: Floats,
-    expected: Floats,
-) -> tuple[Floats, Floats]:
+def _cubic(position_mm: Floats, sigma_mm: Floats, time: Floats, expected: Floats) -> tuple[Floats, Floats]:
     """Return the derivatives (n, 3, 4) of each component at time 0, and their covariances (n, 3, 4, 4).
 
     `expected` : (2, 3) variances of the second and third derivatives

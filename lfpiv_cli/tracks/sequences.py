@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lfpiv_cli.arrays import Floats
 from lfpiv_cli.robust import MAD_TO_SIGMA
 from lfpiv_cli.scale import Scale
 from lfpiv_cli.tracks.candidates import NO_PARTICLE, NO_TRACK, Frames, Seen, Trajectories, long_ones, places, tracks_in
@@ -45,9 +46,9 @@ class Ahead:
     light_sigma : of the logarithm of a particle's light from frame to frame
     """
 
-    position_mm: NDArray[np.float64]
-    sigma_mm: NDArray[np.float64]
-    light: NDArray[np.float64]
+    position_mm: Floats
+    sigma_mm: Floats
+    light: Floats
     light_sigma: float
 
 
@@ -132,7 +133,7 @@ def _expected_displacements(ahead: Ahead, frame: Seen) -> Forecast | None:
     return Forecast(ahead.position_mm[own] - frame.position_mm + unknown, ahead.sigma_mm[own])
 
 
-def _surprise(first: Seen, second: Seen, links: Tracks, forecast: Forecast | None) -> NDArray[np.float64] | None:
+def _surprise(first: Seen, second: Seen, links: Tracks, forecast: Forecast | None) -> Floats | None:
     """Return how large errors (3,) of a forecast are over what is expected of them, at least 1; None: not known.
 
     Few frames know little of how tracks bend, and a parabola nothing of how their bending changes.
@@ -148,16 +149,14 @@ def _surprise(first: Seen, second: Seen, links: Tracks, forecast: Forecast | Non
     return np.maximum(MAD_TO_SIGMA * np.median(ratio, axis=0), 1.0)
 
 
-def _widened(forecast: Forecast | None, factor: NDArray[np.float64] | None) -> Forecast | None:
+def _widened(forecast: Forecast | None, factor: Floats | None) -> Forecast | None:
     """Return a forecast with so much larger errors; None where there is none, or its errors are not known."""
     if forecast is None or factor is None:
         return None
     return Forecast(forecast.displacement_mm, forecast.sigma_mm * factor)
 
 
-def _blended(
-    by_past: Forecast | None, by_others: Forecast | None, others_factor: NDArray[np.float64] | None
-) -> Forecast | None:
+def _blended(by_past: Forecast | None, by_others: Forecast | None, others_factor: Floats | None) -> Forecast | None:
     """Return the forecast by both; where others are not known, the past is all there is."""
     if by_others is None:
         return by_past
