@@ -19,7 +19,7 @@ from scipy.linalg import cho_factor, cho_solve
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.fields import stencils
 from lfpiv_cli.fields.samples import Samples, belonging, error_covariance, without_itself
-from lfpiv_cli.fields.stencils import DIVERGENCE, ORDERS, Expectation, Lattice, bound, inverse_of, penalty, spread_of
+from lfpiv_cli.fields.stencils import DIVERGENCE, ORDERS, Expectation, Lattice, bound, inverse_of, penalty
 from lfpiv_cli.threads import in_threads
 
 # Cells of a box along each axis: some thousand unknowns.
@@ -125,7 +125,9 @@ def boxes_in(samples: Samples, lattice: Lattice, rng: np.random.Generator, kind:
 
 def first_expectation(samples: Samples, lattice: Lattice, names: Sequence[str], kind: type[Box] = Box) -> Expectation:
     """Return what lets any field pass that varies by the samples' spread within a few cells."""
-    spread = spread_of(samples.value_mm)
+    # By how much samples differ: 1.48 times the median distance from their median.
+    off = np.abs(samples.value_mm - np.median(samples.value_mm, axis=0))
+    spread = max(float(1.4826 * np.median(off.max(axis=1))), np.finfo(np.float64).tiny)
     size = BOX_CELLS * float(np.min(lattice.cell_mm))
     reach = spread * size**kind.integrals
     powers = {name: 2 if name == DIVERGENCE else 2 * ORDERS[name] for name in names}
@@ -193,10 +195,9 @@ def _updated(
     before = bounded + sum(weight * parts[name] for name, weight in expected.weights.items())
     before_inverse, _ = _inverse(before)
 
-    def tell(box: Box, belief: Floats) -> Told:
-        return _told(box, belief, expected, parts, before, before_inverse)
-
-    told = in_threads(lambda pair: tell(*pair), list(zip(boxes, beliefs_before, strict=True)))
+    told = in_threads(
+        lambda pair: _told(*pair, expected, parts, before, before_inverse), zip(boxes, beliefs_before, strict=True)
+    )
     had, decided = (np.sum([getattr(each, name) for each in told], axis=0) for name in ("had", "decided"))
     tiny = np.finfo(np.float64).tiny
     change = np.maximum(decided, SMALLEST_SHARE * had) / np.maximum(had, tiny)
@@ -235,44 +236,22 @@ def _told(
     """Return what a box tells of the weights and scales."""
     covariance = error_covariance(box.samples, expected.scale, expected.unresolved_mm)
     weight = belief[:, np.newaxis, np.newaxis] * np.linalg.inv(covariance)
-    coefficients, inverse = _fit(box, before, weight)
-    by_data = before_inverse - inverse
+    matrix, right = box.normal(weight)
+    inverse, factor = _inverse(matrix + before)
+    coefficients, by_data = cho_solve(factor, right), before_inverse - inverse
     had = [expected.weights[name] * float(coefficients @ (part @ coefficients)) for name, part in parts.items()]
     decided = [expected.weights[name] * float(np.vdot(by_data, part)) for name, part in parts.items()]
     error, field = box.samples.value_mm - box.field(coefficients), box.covariance(inverse)
-    errors_had, errors_decided = _error_parts(box, error, field, weight, belief, expected)
-    alone = without_itself(error, field, weight, covariance)
-    return Told(
-        np.array([*had, *errors_had]),
-        np.array([*decided, *errors_decided]),
-        belonging(box.samples, *alone, expected.spread_mm),
-        alone[1] - covariance,
-    )
-
-
-def _fit(box: Box, before: Floats, weight: Floats) -> tuple[Floats, Floats]:
-    """Return the coefficients of the field through a box' samples, and their covariance."""
-    matrix, right = box.normal(weight)
-    inverse, factor = _inverse(matrix + before)
-    return cho_solve(factor, right), inverse
-
-
-def _error_parts(
-    box: Box, error: Floats, field: Floats, weight: Floats, probability: Floats, expected: Expectation
-) -> tuple[Floats, Floats]:
-    """Return what the errors have of the stated ones and of the unresolved, and what they would be expected to have."""
-    weighted = np.einsum("nij,nj->ni", weight, error)
-    shares = np.maximum(probability, np.finfo(np.float64).tiny)
-    had, expects = np.zeros(2), np.zeros(2)
-    kinds = (
-        expected.scale**2 * box.samples.covariance_mm2,
-        np.broadcast_to(expected.unresolved_mm**2 * np.eye(3), weight.shape),
-    )
-    for number, kind in enumerate(kinds):
-        had[number] = np.sum(np.einsum("ni,nij,nj->n", weighted, kind, weighted) / shares)
+    # What the errors have of the stated ones and of the unresolved, and what they would be expected to have.
+    weighted, shares = np.einsum("nij,nj->ni", weight, error), np.maximum(belief, np.finfo(np.float64).tiny)
+    unresolved = np.broadcast_to(expected.unresolved_mm**2 * np.eye(3), weight.shape)
+    for kind in (expected.scale**2 * box.samples.covariance_mm2, unresolved):
+        had.append(float(np.sum(np.einsum("ni,nij,nj->n", weighted, kind, weighted) / shares)))
         through = np.einsum("nij,njk,nkl->nil", weight, kind, weight) / shares[:, np.newaxis, np.newaxis]
-        expects[number] = np.einsum("nij,nji->", weight, kind) - np.einsum("nij,nji->", through, field)
-    return had, expects
+        decided.append(float(np.einsum("nij,nji->", weight, kind) - np.einsum("nij,nji->", through, field)))
+    alone = without_itself(error, field, weight, covariance)
+    belief = belonging(box.samples, *alone, expected.spread_mm)
+    return Told(np.array(had), np.array(decided), belief, alone[1] - covariance)
 
 
 def _inverse(matrix: Floats) -> tuple[Floats, tuple[Floats, bool]]:

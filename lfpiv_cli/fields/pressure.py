@@ -19,7 +19,6 @@ from typing import ClassVar, Self
 
 import numba
 import numpy as np
-from numpy.typing import ArrayLike
 
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.fields.evidence import Box, first_expectation, most_probable
@@ -122,8 +121,6 @@ WIDE = 1.6
 POINTS_AT_ONCE = 500
 # Knots are so many times the samples' mean distance apart, as a velocity field's.
 KNOTS_OF_DISTANCE = 1.8
-# A factorisation of so many unknowns takes seconds; knots that are too many are set apart by this factor.
-MOST_UNKNOWNS, COARSER = 3000, 1.05
 # Gradients are not known better than to this share of their spread: the constant that they do not tell would drown.
 LEAST_ERROR = 1e-3
 # Differences over so many mm give second derivatives; fields have none within less.
@@ -236,13 +233,6 @@ def knots_for(points_mm: Floats) -> float:
     return KNOTS_OF_DISTANCE * float(np.prod(size) / max(len(points_mm), 1)) ** (1.0 / 3.0)
 
 
-def lattice_over(low_mm: ArrayLike, high_mm: ArrayLike, knot_mm: float) -> Lattice:
-    """Return the lattice over a box, with knots further apart where they would be too many."""
-    while int(np.prod((lattice := Lattice.over(low_mm, high_mm, knot_mm)).shape)) > MOST_UNKNOWNS:
-        knot_mm *= COARSER
-    return lattice
-
-
 def pressure_field(
     samples: Samples, lattice: Lattice, rng: np.random.Generator, wrong_share: float = 0.0
 ) -> PressureField:
@@ -265,6 +255,10 @@ def pressure_field(
         last, probability = probability, belonging(samples, fit.error, covariance, expected.spread_mm)
         if np.mean(np.abs(probability - last)) < LAST_CHANGE:
             break
+    # Each spline's mean over the box; the splines' sum is 1 everywhere.
+    x, y, z = (
+        lattice.integrals(axis, 0, 0).sum(axis=1) / (lattice.cells[axis] * lattice.cell_mm[axis]) for axis in range(3)
+    )
     put_back = fit.taken(fit.error)
     error = fit.error - gradient_at(samples.points_mm, lattice, put_back)
     chi2 = squares(error, samples.covariance_mm2)
@@ -273,7 +267,7 @@ def pressure_field(
         fit.coefficients + put_back,
         fit.taken(error),
         fit.factor,
-        _means(lattice),
+        (x[:, None, None] * y[:, None] * z).ravel(),
         wrong_share,
         expected,
         probability,
@@ -325,11 +319,3 @@ def _first_beliefs(samples: Samples, lattice: Lattice, expected: Expectation) ->
         if np.mean(np.abs(probability - last)) < LAST_CHANGE:
             break
     return probability
-
-
-def _means(lattice: Lattice) -> Floats:
-    """Return each spline's mean over the box; the splines' sum is 1 everywhere."""
-    x, y, z = (
-        lattice.integrals(axis, 0, 0).sum(axis=1) / (lattice.cells[axis] * lattice.cell_mm[axis]) for axis in range(3)
-    )
-    return np.asarray((x[:, None, None] * y[:, None] * z).ravel())

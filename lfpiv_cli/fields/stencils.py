@@ -36,6 +36,10 @@ NEIGHBOURS = 2 * DEGREE + 1
 GAUSS_POINTS = 4
 # A box that is a whole number of cells long but for rounding has this number.
 ROUNDING = 1e-9
+# A factorisation of three components of so many splines, and what is needed of its inverse, takes seconds and 600 MB.
+MOST_SPLINES = 3000
+# Knots that are too many are set apart by this factor until they are not.
+COARSER = 1.05
 
 
 @dataclass(frozen=True)
@@ -63,6 +67,13 @@ class Lattice:
         dx, dy, dz = (size / cells).tolist()
         nx, ny, nz = cells.tolist()
         return cls((x, y, z), (dx, dy, dz), (nx, ny, nz))
+
+    @classmethod
+    def affordable(cls, low_mm: ArrayLike, high_mm: ArrayLike, knot_mm: float) -> Lattice:
+        """Return the lattice over a box, with knots further apart where splines would be too many."""
+        while int(np.prod((lattice := cls.over(low_mm, high_mm, knot_mm)).shape)) > MOST_SPLINES:
+            knot_mm *= COARSER
+        return lattice
 
     @property
     def high_mm(self) -> Floats:
@@ -329,17 +340,8 @@ def expected_inverse(lattice: Lattice, expected: Expectation, components: int = 
     """Return the inverse covariance of a field before any sample."""
     matrix = bound(lattice, expected.spread_mm, components)
     for name, weight in expected.weights.items():
-        if name == DIVERGENCE:
-            matrix += weight * divergence(lattice)
-        else:
-            add_scalar(matrix, weight, smoothness(lattice, ORDERS[name]))
+        matrix += weight * penalty(lattice, name, components)
     return matrix
-
-
-def spread_of(values: np.ndarray) -> float:
-    """Return by how much values (n, c) differ, 1.48 times the median distance from their median."""
-    off = np.abs(values - np.median(values, axis=0))
-    return max(float(1.4826 * np.median(off.max(axis=1))), np.finfo(np.float64).tiny)
 
 
 # Cholesky's factorisation of block tridiagonal matrices, and those blocks of the inverse that variances need.

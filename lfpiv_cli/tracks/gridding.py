@@ -80,12 +80,33 @@ def fit_around(offset_mm: Floats, values: Floats, sigma: Floats, degree: int) ->
     radius = np.where(distance[:, -1:] > 0.0, distance[:, -1:], 1.0)
     terms = _terms(offset_mm / radius[..., np.newaxis], degree)
     kernel = np.exp(-0.5 * (distance / (KERNEL_WIDTH * radius)) ** 2)
-    each = [
-        _fit_component(terms, values[..., axis], np.maximum(sigma[..., axis], SMALLEST_SIGMA_SHARE * radius), kernel)
-        for axis in range(3)
-    ]
-    value, weights, scatter2 = (np.stack(parts, axis=1) for parts in zip(*each, strict=True))
-    return LocalFits(value, weights, scatter2, radius[:, 0])
+    value, weights, scatter2 = [], [], []
+    for axis in range(3):
+        wanted, error = values[..., axis], np.maximum(sigma[..., axis], SMALLEST_SIGMA_SHARE * radius)
+        robust = np.ones_like(wanted)
+        for number in range(CAUCHY_ROUNDS + TUKEY_ROUNDS):
+            weighted, matrix = _equations(terms, kernel * robust / error**2)
+            coefficients = np.linalg.solve(matrix, weighted @ wanted[..., np.newaxis])
+            off = np.abs(wanted - (terms @ coefficients)[..., 0]) / error
+            spread = np.maximum(MAD_TO_SIGMA * np.median(off, axis=1, keepdims=True), SMALLEST_SPREAD)
+            if number < CAUCHY_ROUNDS:
+                robust = 1.0 / (1.0 + (off / spread) ** 2)
+            else:
+                robust = np.clip(1.0 - (off / (TUKEY * spread)) ** 2, 0.0, None) ** 2
+        weighted, matrix = _equations(terms, kernel * robust / error**2)
+        inverse = np.linalg.inv(matrix)
+        # The share of each track's variance that a fit leaves in its residual: the kernel lets the tracks next to a
+        # place draw the polynomial to them, where their number alone says little.
+        solved = terms @ inverse
+        own = np.einsum("mkp,mpk->mk", solved, weighted)
+        noise = (weighted * error[:, np.newaxis] ** 2) @ weighted.swapaxes(1, 2)
+        from_all = np.einsum("mkp,mkp->mk", solved @ noise, solved) / error**2
+        left = TUKEY_VARIANCE * (1.0 - 2.0 * own + from_all)
+        expected = np.maximum(np.sum(kernel * robust * left, axis=1), SMALLEST_SPREAD)
+        scatter2.append(np.sum(kernel * robust * off**2, axis=1) / expected)
+        weights.append((inverse[:, :1] @ weighted)[:, 0] * error)
+        value.append(coefficients[:, 0, 0])
+    return LocalFits(np.stack(value, axis=1), np.stack(weights, axis=1), np.stack(scatter2, axis=1), radius[:, 0])
 
 
 def _terms(offset: Floats, degree: int) -> Floats:
@@ -97,27 +118,6 @@ def _terms(offset: Floats, degree: int) -> Floats:
     return np.stack(terms, axis=-1)
 
 
-def _fit_component(terms: Floats, values: Floats, sigma: Floats, kernel: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return value (m,), weights (m, k) and scatter2 (m,) of one component, whose arrays are (m, k)."""
-    robust = np.ones_like(values)
-    for number in range(CAUCHY_ROUNDS + TUKEY_ROUNDS):
-        weighted, matrix = _equations(terms, kernel * robust / sigma**2)
-        coefficients = np.linalg.solve(matrix, weighted @ values[..., np.newaxis])
-        off = np.abs(values - (terms @ coefficients)[..., 0]) / sigma
-        spread = np.maximum(MAD_TO_SIGMA * np.median(off, axis=1, keepdims=True), SMALLEST_SPREAD)
-        if number < CAUCHY_ROUNDS:
-            robust = 1.0 / (1.0 + (off / spread) ** 2)
-        else:
-            robust = np.clip(1.0 - (off / (TUKEY * spread)) ** 2, 0.0, None) ** 2
-    weighted, matrix = _equations(terms, kernel * robust / sigma**2)
-    inverse = np.linalg.inv(matrix)
-    left = TUKEY_VARIANCE * _left_by_fit(terms @ inverse, weighted, sigma)
-    expected = np.maximum(np.sum(kernel * robust * left, axis=1), SMALLEST_SPREAD)
-    scatter2 = np.asarray(np.sum(kernel * robust * off**2, axis=1) / expected)
-    weights = np.asarray((inverse[:, :1] @ weighted)[:, 0] * sigma)
-    return np.asarray(coefficients[:, 0, 0]), weights, scatter2
-
-
 def _equations(terms: Floats, weight: Floats) -> tuple[Floats, Floats]:
     """Return the weighted terms (m, p, k) and the matrix (m, p, p) of the normal equations."""
     weighted = (terms * weight[..., np.newaxis]).swapaxes(1, 2)
@@ -125,17 +125,6 @@ def _equations(terms: Floats, weight: Floats) -> tuple[Floats, Floats]:
     diagonal = np.arange(matrix.shape[1])
     matrix[:, diagonal, diagonal] += RIDGE * np.trace(matrix, axis1=1, axis2=2)[:, np.newaxis] / len(diagonal)
     return weighted, matrix
-
-
-def _left_by_fit(solved: Floats, weighted: Floats, sigma: Floats) -> Floats:
-    """Return the share (m, k) of each track's variance that a fit leaves in its residual, fit = solved @ weighted @ v.
-
-    The kernel lets the tracks next to a place draw the polynomial to them, where their number alone says little.
-    """
-    own = np.einsum("mkp,mpk->mk", solved, weighted)
-    noise = (weighted * sigma[:, np.newaxis] ** 2) @ weighted.swapaxes(1, 2)
-    from_all = np.einsum("mkp,mkp->mk", solved @ noise, solved) / sigma**2
-    return np.asarray(1.0 - 2.0 * own + from_all)
 
 
 # Degrees and numbers of tracks to choose from: three to ten tracks for each of ten unknowns, five to fifteen for each
@@ -256,21 +245,20 @@ def _by_kriging(
 def _candidates(offset_mm: Floats, values: Floats, sigma: Floats, choices: list[tuple[int, int]]) -> Choices:
     """Return what the choices say at nodes whose nearest tracks (m, k, 3) are given."""
     fits = [fit_around(offset_mm[:, :k], values[:, :k], sigma[:, :k], degree) for degree, k in choices]
+    reference, of_differences = fits[REFERENCE], []
+    for fit in fits:
+        # The two share their nearest tracks.
+        common = min(fit.weights.shape[2], reference.weights.shape[2])
+        difference = fit.weights[..., :common] - reference.weights[..., :common]
+        rest = [np.sum(each.weights[..., common:] ** 2, axis=2) for each in (fit, reference)]
+        of_differences.append(np.sum(difference**2, axis=2) + rest[0] + rest[1])
     return Choices(
         value=np.stack([fit.value for fit in fits]),
         variance=np.stack([np.sum(fit.weights**2, axis=2) for fit in fits]),
-        difference_variance=np.stack([_difference_variance(fit, fits[REFERENCE]) for fit in fits]),
+        difference_variance=np.stack(of_differences),
         radius_mm=np.stack([fit.radius_mm for fit in fits]),
-        scatter2=fits[REFERENCE].scatter2,
+        scatter2=reference.scatter2,
     )
-
-
-def _difference_variance(fit: LocalFits, reference: LocalFits) -> Floats:
-    """Return the variance (m, 3) of the difference of two fits, which share their nearest tracks."""
-    common = min(fit.weights.shape[2], reference.weights.shape[2])
-    difference = fit.weights[..., :common] - reference.weights[..., :common]
-    rest = [np.sum(each.weights[..., common:] ** 2, axis=2) for each in (fit, reference)]
-    return np.asarray(np.sum(difference**2, axis=2) + rest[0] + rest[1])
 
 
 def _best(found: Choices, nodes_mm: Floats, choices: list[tuple[int, int]]) -> tuple[Floats, Floats]:
@@ -279,28 +267,24 @@ def _best(found: Choices, nodes_mm: Floats, choices: list[tuple[int, int]]) -> t
     scatter2 = np.median(found.scatter2[together], axis=1)
     error2 = found.variance * scatter2
     if len(choices) > 1:
-        error2 = error2 + _missed2(found, scatter2, together, choices)
+        # The mean square of what each fit misses of the flow around a node.
+        excess = np.stack(
+            [
+                _excess(value - found.value[REFERENCE], variance * scatter2, together)
+                for value, variance in zip(found.value, found.difference_variance, strict=True)
+            ]
+        )
+        missed = found.radius_mm[..., np.newaxis] ** MISSED_ORDER
+        growth = np.maximum(missed[WIDER] - missed[REFERENCE], np.finfo(np.float64).tiny)
+        of_parabolas = excess[WIDER] * (missed / growth) ** 2
+        is_parabola = np.array([degree == 2 for degree, _ in choices])[:, np.newaxis, np.newaxis]
+        error2 = error2 + np.where(is_parabola, of_parabolas, of_parabolas[REFERENCE] + excess)
         off = np.abs(found.value - np.median(found.value, axis=0))
         outlier = off > LARGEST_DEVIATION * np.sqrt(error2)
         error2 = np.where(outlier & ~outlier.all(axis=0), np.inf, error2)
     best = np.argmin(error2, axis=0)[np.newaxis]
     value, smallest = (np.take_along_axis(array, best, axis=0)[0] for array in (found.value, error2))
     return value, np.sqrt(smallest)
-
-
-def _missed2(found: Choices, scatter2: Floats, together: NDArray[np.int64], choices: list[tuple[int, int]]) -> Floats:
-    """Return the mean square (c, m, 3) of what each fit misses of the flow around a node."""
-    excess = np.stack(
-        [
-            _excess(value - found.value[REFERENCE], variance * scatter2, together)
-            for value, variance in zip(found.value, found.difference_variance, strict=True)
-        ]
-    )
-    missed = found.radius_mm[..., np.newaxis] ** MISSED_ORDER
-    growth = np.maximum(missed[WIDER] - missed[REFERENCE], np.finfo(np.float64).tiny)
-    of_parabolas = excess[WIDER] * (missed / growth) ** 2
-    is_parabola = np.array([degree == 2 for degree, _ in choices])[:, np.newaxis, np.newaxis]
-    return np.where(is_parabola, of_parabolas, of_parabolas[REFERENCE] + excess)
 
 
 def _excess(difference: Floats, noise2: Floats, together: NDArray[np.int64]) -> Floats:

@@ -70,17 +70,14 @@ def structure_of(points: Floats, displacement: Floats, noise2: Floats) -> Struct
     if len(groups) < 3:
         nearest = max(float(apart.mean()), np.finfo(np.float64).tiny)
         return Structure(np.zeros(3), np.asarray(square.mean(axis=0) / nearest**PLAIN_EXPONENT), PLAIN_EXPONENT)
-    fits = [(_fitted(apart, square, exponent), exponent) for exponent in EXPONENTS]
-    (nugget, factor, _), exponent = min(fits, key=lambda fit: fit[0][2])
-    return Structure(nugget, factor, float(exponent))
-
-
-def _fitted(apart: Floats, square: Floats, exponent: float) -> tuple[Floats, Floats, float]:
-    """Return nugget, factor (3,) and misfit of the structure function with an exponent, by relative errors."""
-    terms = np.stack([np.ones_like(apart), apart**exponent], axis=1)
-    found = [nnls(terms / values[:, np.newaxis], np.ones(len(values))) for values in square.T]
-    nugget, factor = np.array([solution for solution, _ in found]).T
-    return nugget, factor, float(sum(misfit for _, misfit in found))
+    fits = []
+    for exponent in EXPONENTS:
+        # By relative errors.
+        terms = np.stack([np.ones_like(apart), apart**exponent], axis=1)
+        found = [nnls(terms / values[:, np.newaxis], np.ones(len(values))) for values in square.T]
+        nugget, factor = np.array([solution for solution, _ in found]).T
+        fits.append((float(sum(misfit for _, misfit in found)), Structure(nugget, factor, float(exponent))))
+    return min(fits, key=lambda fit: fit[0])[1]
 
 
 def kriged(
@@ -99,9 +96,32 @@ def kriged(
     value, variance = np.empty(at.shape), np.empty(at.shape)
 
     def work(part: slice) -> None:
-        near = tree.query(at[part], k=np.arange(1, count + 2))[1]
-        near = without_own(near, own[part])
-        value[part], variance[part] = _solved(at[part], near, points, displacement, noise2, structure)
+        """Solve the equations of universal kriging."""
+        here, each = at[part], np.arange(count)
+        near = without_own(tree.query(here, k=np.arange(1, count + 2))[1], own[part])
+        offset = points[near] - here[:, np.newaxis]
+        distance = np.linalg.norm(offset, axis=2)
+        apart = np.linalg.norm(offset[:, :, np.newaxis] - offset[:, np.newaxis], axis=3)
+        furthest = np.maximum(distance[:, -1:], np.finfo(np.float64).tiny)[..., np.newaxis]
+        trend = np.ones((*near.shape, 1))
+        if count >= FEWEST_OF_TREND:
+            trend = np.concatenate([trend, offset / furthest], axis=2)
+        terms = trend.shape[2]
+        apart, distance = apart**structure.exponent, distance**structure.exponent
+        for axis in range(3):
+            half = 0.5 * structure.factor[axis]
+            between, to = half * apart, half * distance
+            noise = noise2[near, axis] + 0.5 * structure.nugget[axis]
+            matrix = np.zeros((len(here), count + terms, count + terms))
+            matrix[:, :count, :count] = -between
+            matrix[:, each, each] += noise
+            matrix[:, :count, count:] = trend
+            matrix[:, count:, :count] = trend.swapaxes(1, 2)
+            right = np.concatenate([-to, np.ones((len(here), 1)), np.zeros((len(here), terms - 1))], axis=1)
+            weight = np.linalg.solve(matrix, right[..., np.newaxis])[:, :count, 0]
+            value[part, axis] = np.sum(weight * displacement[near, axis], axis=1)
+            missed = 2.0 * np.sum(weight * to, axis=1) - np.einsum("mi,mij,mj->m", weight, between, weight)
+            variance[part, axis] = np.maximum(missed, 0.0) + np.sum(weight**2 * noise, axis=1)
 
     in_threads(work, blocks(len(at), PLACES_AT_ONCE))
     return value, variance
@@ -113,36 +133,3 @@ def without_own(near: NDArray[np.int64], own: NDArray[np.int64]) -> NDArray[np.i
     drop = np.where(is_own.any(axis=1), is_own.argmax(axis=1), near.shape[1] - 1)
     kept = np.arange(near.shape[1]) != drop[:, np.newaxis]
     return near[kept].reshape(len(near), -1)
-
-
-def _solved(
-    at: Floats, near: NDArray[np.int64], points: Floats, displacement: Floats, noise2: Floats, structure: Structure
-) -> tuple[Floats, Floats]:
-    """Return values and variances by the equations of universal kriging, whose neighbours (m, k) are given."""
-    count = near.shape[1]
-    offset = points[near] - at[:, np.newaxis]
-    distance = np.linalg.norm(offset, axis=2)
-    apart = np.linalg.norm(offset[:, :, np.newaxis] - offset[:, np.newaxis], axis=3)
-    furthest = np.maximum(distance[:, -1:], np.finfo(np.float64).tiny)[..., np.newaxis]
-    trend = np.ones((*near.shape, 1))
-    if count >= FEWEST_OF_TREND:
-        trend = np.concatenate([trend, offset / furthest], axis=2)
-    terms = trend.shape[2]
-    value, variance = np.empty(at.shape), np.empty(at.shape)
-    each = np.arange(count)
-    apart, distance = apart**structure.exponent, distance**structure.exponent
-    for axis in range(3):
-        half = 0.5 * structure.factor[axis]
-        between, to = half * apart, half * distance
-        noise = noise2[near, axis] + 0.5 * structure.nugget[axis]
-        matrix = np.zeros((len(at), count + terms, count + terms))
-        matrix[:, :count, :count] = -between
-        matrix[:, each, each] += noise
-        matrix[:, :count, count:] = trend
-        matrix[:, count:, :count] = trend.swapaxes(1, 2)
-        right = np.concatenate([-to, np.ones((len(at), 1)), np.zeros((len(at), terms - 1))], axis=1)
-        weight = np.linalg.solve(matrix, right[..., np.newaxis])[:, :count, 0]
-        value[:, axis] = np.sum(weight * displacement[near, axis], axis=1)
-        missed = 2.0 * np.sum(weight * to, axis=1) - np.einsum("mi,mij,mj->m", weight, between, weight)
-        variance[:, axis] = np.maximum(missed, 0.0) + np.sum(weight**2 * noise, axis=1)
-    return value, variance

@@ -108,8 +108,10 @@ def followed_further(so_far: SoFar, frames: Frames, search_mm: float, scale: Sca
         (*so_far.found.probability, np.full(count, np.nan)),
     )
     start, end = frames[number], frames[number + 1]
-    forecast = _expected_displacements(so_far.ahead, start)
-    links = track(start, end, search_mm, scale, forecast)
+    ahead, own = so_far.ahead, slice(0, len(start))
+    known = np.isfinite(ahead.sigma_mm[own])
+    moved = ahead.position_mm[own] - start.position_mm + np.where(known, 0.0, np.nan)
+    links = track(start, end, search_mm, scale, Forecast(moved, ahead.sigma_mm[own]) if known.any() else None)
     found = _linked(found, number, number + 1, links)
     if number:
         earlier = _forecast(found, frames, number - 1, 2, so_far.scatter)
@@ -122,15 +124,6 @@ def followed_further(so_far: SoFar, frames: Frames, search_mm: float, scale: Sca
     forecast = _blended(_widened(by_past, past_factor), by_others, others_factor)
     over_two = _widened(_forecast(found, frames, number, 2, scatter), past_factor)
     return SoFar(found, scatter, by_past, by_others, _ahead(found, frames, forecast, over_two))
-
-
-def _expected_displacements(ahead: Ahead, frame: Seen) -> Forecast | None:
-    """Return what is ahead of a frame's particles as displacements; None where nothing is known."""
-    own = slice(0, len(frame))
-    if not np.isfinite(ahead.sigma_mm[own]).any():
-        return None
-    unknown = np.where(np.isfinite(ahead.sigma_mm[own]), 0.0, np.nan)
-    return Forecast(ahead.position_mm[own] - frame.position_mm + unknown, ahead.sigma_mm[own])
 
 
 def _surprise(first: Seen, second: Seen, links: Tracks, forecast: Forecast | None) -> Floats | None:
@@ -189,7 +182,15 @@ def _ahead(found: Trajectories, frames: Frames, forecast: Forecast | None, over_
         at = np.concatenate([at, (frames[last - 1].position_mm + over_two.displacement_mm)[lost]])
         sigma = np.concatenate([sigma, over_two.sigma_mm[lost]])
         light = np.concatenate([light, frames[last - 1].light_value()[lost]])
-    return Ahead(at, sigma, light, _light_sigma(found, frames))
+    # The spread of the logarithm of a particle's light from frame to frame, by tracks through the last two.
+    numbers, light_sigma = (last - 1, last), 0.0
+    tracks = np.intersect1d(tracks_in(found, [numbers[0]]), tracks_in(found, [numbers[1]]))
+    before, now = (frames[k].light_value()[found.particles(k, tracks)] for k in numbers)
+    lit = (before > 0.0) & (now > 0.0)
+    if lit.any():
+        ratio = np.log(now[lit] / before[lit])
+        light_sigma = float(MAD_TO_SIGMA * np.median(np.abs(ratio - np.median(ratio))))
+    return Ahead(at, sigma, light, light_sigma)
 
 
 def _by_others(found: Trajectories, frames: Frames) -> Forecast | None:
@@ -209,32 +210,17 @@ def _by_others(found: Trajectories, frames: Frames) -> Forecast | None:
     return Forecast(displacement, np.sqrt(variance + np.median(noise2, axis=0) + 0.5 * structure.nugget))
 
 
-def _light_sigma(found: Trajectories, frames: Frames) -> float:
-    """Return the spread of the logarithm of a particle's light from frame to frame, by tracks through the last two."""
-    numbers = (len(found.labels) - 2, len(found.labels) - 1)
-    tracks = np.intersect1d(tracks_in(found, [numbers[0]]), tracks_in(found, [numbers[1]]))
-    if not len(tracks):
-        return 0.0
-    before, now = (frames[k].light_value()[found.particles(k, tracks)] for k in numbers)
-    lit = (before > 0.0) & (now > 0.0)
-    if not lit.any():
-        return 0.0
-    ratio = np.log(now[lit] / before[lit])
-    return float(MAD_TO_SIGMA * np.median(np.abs(ratio - np.median(ratio))))
-
-
 def scatter_in(found: Trajectories, frames: Sequence[Seen]) -> tuple[Scatter, int]:
     """Return noise and bending of the tracks of a sequence, and how many frames on either side of a time to take."""
-    wide, narrow = (_scatter_of_windows(found, frames, 2 * half + 1) for half in HALVES_FRAMES)
+    told = []
+    for width in (2 * half + 1 for half in HALVES_FRAMES):
+        # Windows of so many frames that do not overlap.
+        windows = [_frames_before(end, width) for end in range(min(width, len(frames)), len(frames) + 1, width)]
+        pieces = (places(found, frames, window, tracks_in(found, window)) for window in windows)
+        told.append(scatter_of_pieces(pieces, np.arange(len(windows[0]), dtype=np.float64)))
+    wide, narrow = told
     is_followed = np.all(wide.noise <= LARGEST_MISFIT * narrow.noise)
     return (wide, HALVES_FRAMES[0]) if is_followed else (narrow, HALVES_FRAMES[1])
-
-
-def _scatter_of_windows(found: Trajectories, frames: Sequence[Seen], width: int) -> Scatter:
-    """Return noise and bending of the tracks in windows of so many frames that do not overlap."""
-    windows = [_frames_before(end, width) for end in range(min(width, len(frames)), len(frames) + 1, width)]
-    pieces = (places(found, frames, window, tracks_in(found, window)) for window in windows)
-    return scatter_of_pieces(pieces, np.arange(len(windows[0]), dtype=np.float64))
 
 
 def states_at(

@@ -205,12 +205,8 @@ class Known:
     variance_mm2: Floats
 
 
-@dataclass(frozen=True, eq=False)
-class Expected:
-    """Displacements (n, 3) that are expected of particles, and the variances (n, 3) of what is missed, mm, mm^2."""
-
-    displacement_mm: Floats
-    variance_mm2: Floats
+# Displacements (n, 3) that are expected of particles, and the variances (n, 3) of what is missed, mm, mm^2.
+Expected = tuple[Floats, Floats]
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,7 +227,17 @@ def track(first: Seen, second: Seen, search_mm: float, scale: Scale, forecast: F
     candidates = candidates_of(first, second, *_sought(first, second, search_mm, scale, forecast))
     density = density_per_mm3(first, second, search_mm)
     score = votes(first.position_mm, candidates, density, scale, of_equal_errors(scale))
-    links, share = _exclusive(candidates, score + _log_near(candidates, search_mm, forecast)), PARTNERED
+    # Short displacements, or those near a forecast, where nobody votes.
+    off = candidates.displacement_mm
+    if forecast is not None:
+        off = off - np.nan_to_num(forecast.displacement_mm)[candidates.first]
+    score = score + -0.5 * np.sum((off / search_mm) ** 2, axis=1)
+    # Each first particle's best pair, and of those that share a second one the best.
+    order = np.lexsort((-score, candidates.first))
+    best = order[np.unique(candidates.first[order], return_index=True)[1]]
+    best = best[np.isfinite(score[best])]
+    order = best[np.argsort(-score[best], kind="stable")]
+    links, share = np.sort(order[np.unique(candidates.second[order], return_index=True)[1]]), PARTNERED
     probability = np.zeros(len(candidates.first))
     for _ in range(ROUNDS):
         known = known_of(first, second, candidates.first[links], candidates.second[links], scale)
@@ -296,11 +302,11 @@ def expected_of(
         # The place where a displacement ends is known as badly as the places of the neighbours' are.
         variance = variance + np.median(known.variance_mm2, axis=0) + 0.5 * structure.nugget
     if forecast is None:
-        return Expected(value, variance)
+        return value, variance
     past2 = forecast.sigma_mm**2 + _variance_of(SMALLEST_SIGMA_LENSES, scale)
     weight = variance / (variance + past2)
     has_past = np.isfinite(weight) & np.isfinite(forecast.displacement_mm)
-    return Expected(
+    return (
         np.where(has_past, value + weight * (forecast.displacement_mm - value), value),
         np.where(has_past, weight * past2, variance),
     )
@@ -317,8 +323,8 @@ def probability_of(
     density : of the second frame's particles, per mm^3
     """
     matrix = first.covariances()[candidates.first] + second.covariances()[candidates.second]
-    matrix[:, [0, 1, 2], [0, 1, 2]] += expected.variance_mm2[candidates.first]
-    off = candidates.displacement_mm - expected.displacement_mm[candidates.first]
+    matrix[:, [0, 1, 2], [0, 1, 2]] += expected[1][candidates.first]
+    off = candidates.displacement_mm - expected[0][candidates.first]
     near = np.flatnonzero(np.sum(off**2 / np.diagonal(matrix, axis1=1, axis2=2), axis=1) < FURTHEST_SIGMAS**2)
     distance2 = np.einsum("ci,cij,cj->c", off[near], np.linalg.inv(matrix[near]), off[near])
     height = 1.0 / np.sqrt((2.0 * np.pi) ** 3 * np.linalg.det(matrix[near]))
@@ -369,28 +375,12 @@ def _sought(
     return middle, reach
 
 
-def _log_near(candidates: Candidates, search_mm: float, forecast: Forecast | None) -> Floats:
-    """Return what is added to the votes (c,): short displacements, or those near a forecast, where nobody votes."""
-    off = candidates.displacement_mm
-    if forecast is not None:
-        off = off - np.nan_to_num(forecast.displacement_mm)[candidates.first]
-    return np.asarray(-0.5 * np.sum((off / search_mm) ** 2, axis=1))
-
-
-def _exclusive(candidates: Candidates, score: Floats) -> NDArray[np.int64]:
-    """Return each first particle's best pair, and of those that share a second one the best."""
-    order = np.lexsort((-score, candidates.first))
-    best = order[np.unique(candidates.first[order], return_index=True)[1]]
-    best = best[np.isfinite(score[best])]
-    order = best[np.argsort(-score[best], kind="stable")]
-    return np.sort(order[np.unique(candidates.second[order], return_index=True)[1]])
-
-
 def _calibrated(expected: Expected, known: Known) -> Expected:
     """Return what is expected with variances that the residuals of the known displacements bear out."""
     if len(known.number) < FEWEST_OF_FIT:
         return expected
-    off = known.displacement_mm - expected.displacement_mm[known.number]
-    ratio = np.abs(off) / np.sqrt(expected.variance_mm2[known.number])
+    displacement, variance = expected
+    off = known.displacement_mm - displacement[known.number]
+    ratio = np.abs(off) / np.sqrt(variance[known.number])
     factor = np.maximum(MAD_TO_SIGMA * np.median(ratio, axis=0), SMALLEST_FACTOR)
-    return Expected(expected.displacement_mm, expected.variance_mm2 * factor**2)
+    return displacement, variance * factor**2
