@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import ClassVar, Self
 
 import numpy as np
@@ -150,8 +151,20 @@ def most_probable(
     beliefs, first = [box.samples.probability for box in boxes], expected
     last = np.zeros(len(names))
     for _ in range(ROUNDS):
-        updated, told = _updated(boxes, expected, beliefs, parts, bounded)
-        beliefs = [each.belief for each in told]
+        before = bounded + sum(weight * parts[name] for name, weight in expected.weights.items())
+        tell = partial(_told, expected, parts, before, _inverse(before)[0])
+        told = in_threads(lambda pair, tell=tell: tell(*pair), zip(boxes, beliefs, strict=True))
+        all_had, all_decided, beliefs, by_others = zip(*told, strict=True)
+        had, decided = np.sum(all_had, axis=0), np.sum(all_decided, axis=0)
+        change = np.maximum(decided, SMALLEST_SHARE * had) / np.maximum(had, np.finfo(np.float64).tiny)
+        change[: len(names)] = np.clip(change[: len(names)], 1.0 / LARGEST_STEP, LARGEST_STEP)
+        scales = np.sqrt(np.clip(1.0 / change[len(names) :], 1.0 / LARGEST_STEP, LARGEST_STEP))
+        updated = Expectation(
+            {name: expected.weights[name] * float(change[number]) for number, name in enumerate(names)},
+            expected.spread_mm,
+            max(expected.scale * float(scales[0]), SMALLEST_SCALE),
+            max(expected.unresolved_mm * float(scales[1]), SMALLEST_UNRESOLVED * expected.spread_mm),
+        )
         step = np.array([np.log(updated.weights[name] / expected.weights[name]) for name in names])
         further = np.where(step * last > 0.0, ONWARD * step, 0.0)
         weights = {name: updated.weights[name] * float(np.exp(more)) for name, more in zip(names, further, strict=True)}
@@ -166,7 +179,7 @@ def most_probable(
         expected, last = onward, step
         if settled:
             break
-    return expected, np.median(np.concatenate([each.by_others for each in told]), axis=0)
+    return expected, np.median(np.concatenate(by_others), axis=0)
 
 
 def divergence_weight(expected: Expectation, lattice: Lattice, times: float) -> float:
@@ -184,56 +197,18 @@ def held(expected: Expectation, lattice: Lattice) -> Expectation:
     return replace(expected, weights={**expected.weights, DIVERGENCE: weight})
 
 
-def _updated(
-    boxes: Sequence[Box],
-    expected: Expectation,
-    beliefs_before: Sequence[Floats],
-    parts: dict[str, Floats],
-    bounded: Floats,
-) -> tuple[Expectation, list[Told]]:
-    """Return weights and scales under which the boxes' samples are more probable, and what the boxes tell."""
-    before = bounded + sum(weight * parts[name] for name, weight in expected.weights.items())
-    before_inverse, _ = _inverse(before)
+def _told(
+    expected: Expectation, parts: dict[str, Floats], before: Floats, before_inverse: Floats, box: Box, belief: Floats
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return what a box tells: of each penalty, of the stated errors and of what is left unresolved.
 
-    told = in_threads(
-        lambda pair: _told(*pair, expected, parts, before, before_inverse), zip(boxes, beliefs_before, strict=True)
-    )
-    had, decided = (np.sum([getattr(each, name) for each in told], axis=0) for name in ("had", "decided"))
-    tiny = np.finfo(np.float64).tiny
-    change = np.maximum(decided, SMALLEST_SHARE * had) / np.maximum(had, tiny)
-    change[: len(parts)] = np.clip(change[: len(parts)], 1.0 / LARGEST_STEP, LARGEST_STEP)
-    scales = np.sqrt(np.clip(1.0 / change[len(parts) :], 1.0 / LARGEST_STEP, LARGEST_STEP))
-    updated = Expectation(
-        {name: expected.weights[name] * float(change[number]) for number, name in enumerate(parts)},
-        expected.spread_mm,
-        max(expected.scale * float(scales[0]), SMALLEST_SCALE),
-        max(expected.unresolved_mm * float(scales[1]), SMALLEST_UNRESOLVED * expected.spread_mm),
-    )
-    return updated, told
-
-
-@dataclass(frozen=True, eq=False)
-class Told:
-    """What a box tells: of each penalty, of the stated errors and of what is left unresolved.
-
-    Attributes
-    ----------
+    Returns
+    -------
     had : what the field and the errors have of each
     decided : how many degrees of freedom each decides
     belief : (n,) the samples' probabilities to belong to the field
     by_others : (n, 3, 3) covariances of the field that each sample's neighbours make without it
     """
-
-    had: Floats
-    decided: Floats
-    belief: Floats
-    by_others: Floats
-
-
-def _told(
-    box: Box, belief: Floats, expected: Expectation, parts: dict[str, Floats], before: Floats, before_inverse: Floats
-) -> Told:
-    """Return what a box tells of the weights and scales."""
     covariance = error_covariance(box.samples, expected.scale, expected.unresolved_mm)
     weight = belief[:, np.newaxis, np.newaxis] * np.linalg.inv(covariance)
     matrix, right = box.normal(weight)
@@ -251,7 +226,7 @@ def _told(
         decided.append(float(np.einsum("nij,nji->", weight, kind) - np.einsum("nij,nji->", through, field)))
     alone = without_itself(error, field, weight, covariance)
     belief = belonging(box.samples, *alone, expected.spread_mm)
-    return Told(np.array(had), np.array(decided), belief, alone[1] - covariance)
+    return np.array(had), np.array(decided), belief, alone[1] - covariance
 
 
 def _inverse(matrix: Floats) -> tuple[Floats, tuple[Floats, bool]]:

@@ -29,8 +29,7 @@ from lfpiv_cli.fields.structure import (
     unknown_variance,
 )
 from lfpiv_cli.robust import MAD_TO_SIGMA
-from lfpiv_cli.tracks.gridding import FEWEST_OF_STRUCTURE, ROUGH_EXPONENT
-from lfpiv_cli.tracks.kriging import without_own
+from lfpiv_cli.tracks.gridding import FEWEST_OF_STRUCTURE, ROUGH_EXPONENT, without_own
 
 # A velocity field kriged from samples as vectors: the best linear unbiased estimate where the flow is rough.
 #

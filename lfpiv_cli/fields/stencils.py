@@ -108,12 +108,17 @@ class Lattice:
         """
         place = (points_mm - np.asarray(self.low_mm)) / np.asarray(self.cell_mm)
         first = np.clip(np.floor(place).astype(np.int64), 0, np.asarray(self.cells) - 1)
-        inside = place - first
-        values = [
-            _slopes(inside[:, axis]) / self.cell_mm[axis] if axis == along else _values(inside[:, axis])
-            for axis in range(3)
-        ]
-        return first, values
+        found = []
+        for axis, u in enumerate((place - first).T):
+            # At places u of a unit cell.
+            rest = 1.0 - u
+            if axis == along:
+                slopes = [-(rest**2), 3.0 * u**2 - 4.0 * u, -3.0 * rest**2 + 4.0 * rest, u**2]
+                found.append(0.5 * np.stack(slopes, axis=1) / self.cell_mm[axis])
+            else:
+                values = [rest**3, 3.0 * u**3 - 6.0 * u**2 + 4.0, 3.0 * rest**3 - 6.0 * rest**2 + 4.0, u**3]
+                found.append(np.stack(values, axis=1) / 6.0)
+        return first, found
 
     def integrals(self, axis: int, first: int, second: int) -> Floats:
         """Return the integrals (n, 7) of derivatives of splines i and i + k - 3 along an axis over the box, 0 beyond.
@@ -133,20 +138,6 @@ class Lattice:
             rows = np.arange(max(0, -shift), min(count, count - shift))
             banded[rows, k] = product[rows, rows + shift]
         return banded
-
-
-def _values(u: Floats) -> Floats:
-    """Return the four splines (n, 4) at places u of a unit cell."""
-    rest = 1.0 - u
-    terms = [rest**3, 3.0 * u**3 - 6.0 * u**2 + 4.0, 3.0 * rest**3 - 6.0 * rest**2 + 4.0, u**3]
-    return np.stack(terms, axis=1) / 6.0
-
-
-def _slopes(u: Floats) -> Floats:
-    """Return the derivatives of the four splines (n, 4) at places u of a unit cell."""
-    rest = 1.0 - u
-    terms = [-(rest**2), 3.0 * u**2 - 4.0 * u, -3.0 * rest**2 + 4.0 * rest, u**2]
-    return 0.5 * np.stack(terms, axis=1)
 
 
 Stencil = Floats

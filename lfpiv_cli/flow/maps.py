@@ -26,7 +26,7 @@ from lfpiv_cli.flow.windows import Triple, WindowLayout, triple
 from lfpiv_cli.robust import of_half_the_sum
 from lfpiv_cli.simd.block_sums import FEW_SHIFTS, MANY_SHIFTS, products
 from lfpiv_cli.simd.vectors import LANES
-from lfpiv_cli.threads import share_out
+from lfpiv_cli.threads import in_threads, share_out
 
 # Blocks narrower than this cost more in sums of sums than the products they save.
 SMALLEST_BLOCK = 4
@@ -163,7 +163,7 @@ def energies_of(
     share_out(sum_laterally, planes, volume, first, size, step, radius, lateral)
     rows = lateral.reshape(planes, nx * shifts * ny * shifts)
     found = np.empty((nz, shifts, rows.shape[1]), dtype=np.float32)
-    share_out(sum_planes, nz, rows, size[0], step[0], radius, found)
+    in_threads(lambda k: sum_rows(rows, k * step[0] + radius, size[0], radius, found[k]), range(nz))
     return found.reshape(nz, shifts, nx, shifts, ny, shifts)
 
 
@@ -201,15 +201,6 @@ def sum_laterally(
             sum_rows(turned, first[2] + k * step[2], size[2], radius, lateral[z, k * shifts : (k + 1) * shifts])
 
 
-@njit(cache=True, nogil=True)
-def sum_planes(
-    part: tuple[int, int], planes: NDArray[np.float32], size: int, step: int, radius: int, sums: NDArray[np.float32]
-) -> None:
-    """Write the sums of flat planes (z, n) over the windows `part` of (windows z, shifts z, n)."""
-    for k in range(part[0], part[1]):
-        sum_rows(planes, k * step + radius, size, radius, sums[k])
-
-
 @njit(cache=True)
 def sum_ahead(values: NDArray[np.float32], spare: NDArray[np.float32], size: int, sums: NDArray[np.float32]) -> None:
     """Write the sum of the `size` values from each place on to `sums`; nothing of use near the end.
@@ -231,7 +222,7 @@ def sum_ahead(values: NDArray[np.float32], spare: NDArray[np.float32], size: int
         length *= 2
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def sum_rows(rows: NDArray[np.float32], first: int, size: int, radius: int, sums: NDArray[np.float32]) -> None:
     """Write sums of `size` rows of (rows, columns), those from first + shift on for each shift up to `radius`.
 

@@ -19,8 +19,8 @@ from lfpiv_cli.arrays import Floats
 from lfpiv_cli.robust import MAD_TO_SIGMA
 from lfpiv_cli.scale import Scale
 from lfpiv_cli.tracks.candidates import NO_PARTICLE, NO_TRACK, Frames, Seen, Trajectories, long_ones, places, tracks_in
+from lfpiv_cli.tracks.gridding import kriged, structure_of
 from lfpiv_cli.tracks.in_time import FEWEST_TRACKS, Scatter, State, fit_in_time, scatter_of, scatter_of_pieces
-from lfpiv_cli.tracks.kriging import kriged, structure_of
 from lfpiv_cli.tracks.tracking import NO_TRACKS, Forecast, Tracks, known_of, link_some, track
 
 # A forecast takes a track's last four places: enough for a parabola and to see its noise.
@@ -121,7 +121,16 @@ def followed_further(so_far: SoFar, frames: Frames, search_mm: float, scale: Sca
     scatter = scatter_of(position, sigma, np.arange(len(window), dtype=np.float64))
     past_factor, others_factor = (_surprise(start, end, links, each) for each in (so_far.by_past, so_far.by_others))
     by_past, by_others = _forecast(found, frames, number + 1, 1, scatter), _by_others(found, frames)
-    forecast = _blended(_widened(by_past, past_factor), by_others, others_factor)
+    # By both; where others are not known, the past is all there is.
+    forecast = past = _widened(by_past, past_factor)
+    if by_others is not None:
+        variance = (by_others.sigma_mm * (1.0 if others_factor is None else others_factor)) ** 2
+        forecast = Forecast(by_others.displacement_mm, np.sqrt(variance))
+        if past is not None:
+            past2 = past.sigma_mm**2
+            weight = np.where(np.isfinite(past2), variance / (variance + past2), 0.0)
+            off = np.nan_to_num(past.displacement_mm - by_others.displacement_mm)
+            forecast = Forecast(by_others.displacement_mm + weight * off, np.sqrt((1.0 - weight) * variance))
     over_two = _widened(_forecast(found, frames, number, 2, scatter), past_factor)
     return SoFar(found, scatter, by_past, by_others, _ahead(found, frames, forecast, over_two))
 
@@ -147,19 +156,6 @@ def _widened(forecast: Forecast | None, factor: Floats | None) -> Forecast | Non
     if forecast is None or factor is None:
         return None
     return Forecast(forecast.displacement_mm, forecast.sigma_mm * factor)
-
-
-def _blended(by_past: Forecast | None, by_others: Forecast | None, others_factor: Floats | None) -> Forecast | None:
-    """Return the forecast by both; where others are not known, the past is all there is."""
-    if by_others is None:
-        return by_past
-    variance = (by_others.sigma_mm * (1.0 if others_factor is None else others_factor)) ** 2
-    if by_past is None:
-        return Forecast(by_others.displacement_mm, np.sqrt(variance))
-    past2 = by_past.sigma_mm**2
-    weight = np.where(np.isfinite(past2), variance / (variance + past2), 0.0)
-    off = np.nan_to_num(by_past.displacement_mm - by_others.displacement_mm)
-    return Forecast(by_others.displacement_mm + weight * off, np.sqrt((1.0 - weight) * variance))
 
 
 def _ahead(found: Trajectories, frames: Frames, forecast: Forecast | None, over_two: Forecast | None) -> Ahead:

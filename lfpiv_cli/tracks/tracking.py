@@ -23,7 +23,7 @@ from lfpiv_cli.robust import MAD_TO_SIGMA
 from lfpiv_cli.scale import Scale
 from lfpiv_cli.threads import share_out
 from lfpiv_cli.tracks.candidates import Candidates, Seen, candidates_of
-from lfpiv_cli.tracks.kriging import kriged, structure_of
+from lfpiv_cli.tracks.gridding import kriged, structure_of
 
 # The first guess of links: neighbours vote for displacements that resemble their own.
 #
