@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from lfpiv_cli.errors import ConfigError, InputError
-from lfpiv_cli.flow.correlation import CorrelationSettings, correlate, count_passes
+from lfpiv_cli.flow.correlation import correlate, count_passes
 from lfpiv_cli.flow.deformation import (
     SLACK,
     SPLINE_PAD,
@@ -18,9 +18,9 @@ from lfpiv_cli.flow.deformation import (
     spline_matrix,
 )
 from lfpiv_cli.flow.field import MASKED, REJECTED, VectorField
-from lfpiv_cli.flow.maps import map_sums, margins
 from lfpiv_cli.flow.peaks import find_peaks, vertex
-from lfpiv_cli.flow.windows import layout_windows
+from lfpiv_cli.flow.sums import map_sums, margins
+from lfpiv_cli.flow.windows import CorrelationSettings, layout_windows
 from lfpiv_cli.grid import Grid
 
 HALF = (0.5, 0.5, 0.5)

@@ -153,9 +153,9 @@ def most_probable(
     for _ in range(ROUNDS):
         before = bounded + sum(weight * parts[name] for name, weight in expected.weights.items())
         tell = partial(_told, expected, parts, before, _inverse(before)[0])
-        told = in_threads(lambda pair, tell=tell: tell(*pair), zip(boxes, beliefs, strict=True))
-        all_had, all_decided, beliefs, by_others = zip(*told, strict=True)
-        had, decided = np.sum(all_had, axis=0), np.sum(all_decided, axis=0)
+        told = in_threads(tell, list(zip(boxes, beliefs, strict=True)))
+        had, decided = (np.sum([each[number] for each in told], axis=0) for number in range(2))
+        beliefs = [each[2] for each in told]
         change = np.maximum(decided, SMALLEST_SHARE * had) / np.maximum(had, np.finfo(np.float64).tiny)
         change[: len(names)] = np.clip(change[: len(names)], 1.0 / LARGEST_STEP, LARGEST_STEP)
         scales = np.sqrt(np.clip(1.0 / change[len(names) :], 1.0 / LARGEST_STEP, LARGEST_STEP))
@@ -179,7 +179,7 @@ def most_probable(
         expected, last = onward, step
         if settled:
             break
-    return expected, np.median(np.concatenate(by_others), axis=0)
+    return expected, np.median(np.concatenate([each[3] for each in told]), axis=0)
 
 
 def divergence_weight(expected: Expectation, lattice: Lattice, times: float) -> float:
@@ -198,9 +198,9 @@ def held(expected: Expectation, lattice: Lattice) -> Expectation:
 
 
 def _told(
-    expected: Expectation, parts: dict[str, Floats], before: Floats, before_inverse: Floats, box: Box, belief: Floats
+    expected: Expectation, parts: dict[str, Floats], before: Floats, before_inverse: Floats, of_box: tuple[Box, Floats]
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return what a box tells: of each penalty, of the stated errors and of what is left unresolved.
+    """Return what a box, with its samples' probabilities, tells: of penalties, stated errors and what is unresolved.
 
     Returns
     -------
@@ -209,6 +209,7 @@ def _told(
     belief : (n,) the samples' probabilities to belong to the field
     by_others : (n, 3, 3) covariances of the field that each sample's neighbours make without it
     """
+    box, belief = of_box
     covariance = error_covariance(box.samples, expected.scale, expected.unresolved_mm)
     weight = belief[:, np.newaxis, np.newaxis] * np.linalg.inv(covariance)
     matrix, right = box.normal(weight)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,7 +17,7 @@ from threadpoolctl import threadpool_limits
 
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.fields.samples import Samples
-from lfpiv_cli.fields.spline_field import lattice_for, spline_field
+from lfpiv_cli.fields.spline_field import SplineField, lattice_for, spline_field
 from lfpiv_cli.fields.structure import (
     INDEPENDENT,
     Estimates,
@@ -314,33 +314,8 @@ UNRESOLVED_CHI2 = 3.0
 FEW_SAMPLES = 600
 
 
-class Field(Protocol):
-    """A velocity field that is known everywhere in a box, as displacements from one frame to the next."""
-
-    @property
-    def probability(self) -> Floats:
-        """The probability (n,) of each sample to belong to the field."""
-        ...
-
-    def value_at(self, points_mm: Floats) -> Floats:
-        """Return displacements (m, 3), mm."""
-        ...
-
-    def estimate_at(self, points_mm: Floats) -> tuple[Floats, Floats]:
-        """Return displacements and their variances at once."""
-        ...
-
-    def variance_at(self, points_mm: Floats) -> Floats:
-        """Return the variances (m, 3) of the displacements, mm^2."""
-        ...
-
-    def gradient_at(self, points_mm: Floats) -> Floats:
-        """Return the gradients (m, 3, 3) of the displacements per mm: the component, then the direction."""
-        ...
-
-    def told(self) -> dict[str, Any]:
-        """Return how the field was fitted: figures with their units in their names."""
-        ...
+# A velocity field that is known everywhere in a box, as displacements from one frame to the next.
+Field = SplineField | KrigedField
 
 
 def fit_field(

@@ -44,8 +44,7 @@ from lfpiv_cli.files.yaml_nodes import (
     sentence,
     with_heights,
 )
-from lfpiv_cli.flow.correlation import CorrelationSettings
-from lfpiv_cli.flow.windows import ParallelWalls, Walls
+from lfpiv_cli.flow.windows import CorrelationSettings, ParallelWalls, Walls
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import Refraction
 from lfpiv_cli.optics.camera import Camera

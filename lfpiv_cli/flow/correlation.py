@@ -24,11 +24,11 @@ from lfpiv_cli.arrays import Floats
 from lfpiv_cli.errors import ConfigError, InputError
 from lfpiv_cli.flow.deformation import Spline, deform_pair, matrices_to_voxels, spline_coefficients, spline_matrix
 from lfpiv_cli.flow.field import VectorField
-from lfpiv_cli.flow.maps import MapSums, map_sums, margins, valid_shares
-from lfpiv_cli.flow.moments import cells_of, gauss_newton, pair_moments
+from lfpiv_cli.flow.moments import gauss_newton
 from lfpiv_cli.flow.outliers import expected_noise, fill_field, mixing, smooth_field, unresolved, validate_vectors
 from lfpiv_cli.flow.peaks import ELONGATED_WIDTH, Peaks, absolute, find_peaks, typical_width, undiluted
-from lfpiv_cli.flow.windows import Triple, WindowLayout, layout_windows, triple
+from lfpiv_cli.flow.sums import MapSums, cells_of, map_sums, margins, pair_moments, valid_shares
+from lfpiv_cli.flow.windows import CorrelationSettings, Triple, WindowLayout, triple
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.simd.block_sums import MOMENTS
 from lfpiv_cli.threads import share_out
@@ -55,13 +55,13 @@ class Coarse:
     cells_zyx: Triple
 
     @classmethod
-    def over(cls, shape_xyz: Triple, windows: Sequence[Triple], overlap: tuple[float, float, float]) -> Coarse:
-        """Return the windows that fill a volume, for passes with `windows`."""
-        size = coarse_size(windows)
+    def over(cls, shape_xyz: Triple, settings: CorrelationSettings) -> Coarse:
+        """Return the windows that fill a volume of so many voxels."""
+        size = coarse_size(settings.windows)
         bins = triple(max(1, round(w / COARSE_CELLS)) for w in size)
         cells = triple(-(-n // width) for n, width in zip(shape_xyz, bins, strict=True))
         binned_size = triple(max(2, round(w / width)) for w, width in zip(size, bins, strict=True))
-        return cls(layout_windows(cells, binned_size, overlap), bins, cells[::-1])
+        return cls(settings.layout(cells, binned_size), bins, cells[::-1])
 
     def sums(self, volumes: Iterable[NDArray[np.float32]]) -> MapSums:
         """Return what the correlation of two volumes is made of after binning."""
@@ -129,31 +129,6 @@ SMALLEST_VALID_FRACTION = 0.25
 
 
 @dataclass(frozen=True)
-class CorrelationSettings:
-    """How two volumes are correlated.
-
-    Attributes
-    ----------
-    windows : sizes of the interrogation windows in voxels along (x, y, z), coarse to fine; the last gives the vectors
-    overlap : share of a window in common with the next one along (x, y, z), 0 <= overlap < 1
-    dt_s : time from the first volume to the second, or None where it is not known
-    exponent : power of the intensities that is correlated, 0 < exponent <= 1, negative ones being zero where it is
-        below 1. In volumes of a solver that sharpens, as EM does, the brightest particles outweigh all others and are
-        narrower than a voxel: the root lets the others speak and makes peaks wide enough to be located. In volumes with
-        a noisy background it raises that, and harms.
-    """
-
-    windows: Sequence[Triple]
-    overlap: tuple[float, float, float]
-    dt_s: float | None = None
-    exponent: float = 1.0
-
-    def layout(self, shape_xyz: Triple) -> WindowLayout:
-        """Return the final windows in a volume of so many voxels, each of which gives a vector."""
-        return layout_windows(shape_xyz, self.windows[-1], self.overlap)
-
-
-@dataclass(frozen=True)
 class Pass:
     """One pass over the deformed volumes: its windows, how far it looks, and whether its vectors are the result."""
 
@@ -213,7 +188,7 @@ def correlate(
     """
     _ensure_possible(settings)
     report = progress or (lambda units: None)
-    coarse = Coarse.over(grid.shape_xyz, settings.windows, settings.overlap)
+    coarse = Coarse.over(grid.shape_xyz, settings)
     sums, ready = None, []
     for pair in pairs:
         usable, *volumes = _usable_voxels(*pair, mask, grid)
@@ -230,7 +205,7 @@ def correlate(
     report(1)
     # One BLAS thread: with more, the bits of the predictor would depend on their number.
     with threadpool_limits(limits=1, user_api="blas"):
-        for step in plan(grid.shape_xyz, settings.windows, settings.overlap):
+        for step in plan(grid.shape_xyz, settings):
             if layout != step.layout:
                 old, layout = layout, step.layout
                 x, y, z = (spline_matrix(old.centres_voxel(k), layout.centres_voxel(k)) for k in range(3))
@@ -301,14 +276,14 @@ def _refined_sizes(windows: Sequence[Triple]) -> list[Triple]:
     return [*larger, *[windows[-1]] * FINAL_PASSES]
 
 
-def plan(shape_xyz: Triple, windows: Sequence[Triple], overlap: tuple[float, float, float]) -> list[Pass]:
+def plan(shape_xyz: Triple, settings: CorrelationSettings) -> list[Pass]:
     """Return the passes after the coarse one."""
-    sizes = _refined_sizes(windows)
+    sizes = _refined_sizes(settings.windows)
     passes = []
     for number, size in enumerate(sizes):
         changed = number == 0 or size != sizes[number - 1]
         radius = FIRST_RADIUS if changed else LATER_RADIUS
-        passes.append(Pass(layout_windows(shape_xyz, size, overlap), radius))
+        passes.append(Pass(settings.layout(shape_xyz, size), radius))
     passes[-1] = Pass(passes[-1].layout, LAST_RADIUS, is_last=True)
     return passes
 
@@ -363,7 +338,7 @@ MOMENT_BYTES = 8
 def held_bytes(shape_xyz: Triple, settings: CorrelationSettings) -> float:
     """Return what a correlation of two volumes holds in memory at once, in bytes, without the program."""
     of_passes = []
-    for step in plan(shape_xyz, settings.windows, settings.overlap):
+    for step in plan(shape_xyz, settings):
         # Moments are those of the last pass, and of few others.
         cells = math.prod(starts.size for starts in cells_of(step.layout).start) if step.is_last else 0
         shifts = (2 * step.radius + 1) ** 3 * math.prod(step.layout.count)

@@ -6,9 +6,9 @@ Axes: triples are ordered (x, y, z). Positions are voxel indices; voxel k covers
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,27 +18,11 @@ from lfpiv_cli.grid import Grid
 
 # Where there is fluid, and vectors can be measured: between the walls of a channel, or in a round pipe.
 #
-# Axes: points and sides (x, y, z) in mm, arrays [z, y, x]. A kind of walls is a class with the methods of `Walls`.
+# Axes: points and sides (x, y, z) in mm, arrays [z, y, x]. The kinds of `Walls` have the same methods.
 
 
 # Pipes that are tilted further from x or y are other pipes than `RoundWall` knows.
 LARGEST_TILT_DEG = 5.0
-
-
-class Walls(Protocol):
-    """What bounds the fluid."""
-
-    def contain(self, points_mm: Floats) -> NDArray[np.bool_]:
-        """Return which points (..., 3) lie in the fluid or on its walls."""
-
-    def shares(self, centres_mm: Floats, sides_mm: Floats) -> Floats:
-        """Return the share (...) of boxes with sides (3,) about centres (..., 3) that lies in the fluid."""
-
-    def volumes_mm3(self, low_mm: Floats, high_mm: Floats) -> Floats:
-        """Return the volume (...) in the fluid of boxes from one corner (..., 3) to the other, 0 of empty ones."""
-
-    def points(self, low_mm: Floats, high_mm: Floats, step_mm: Floats) -> Floats:
-        """Return points (k, 3) on the walls that a box holds, at most a step (3,) apart."""
 
 
 @dataclass(frozen=True)
@@ -148,6 +132,9 @@ class RoundWall:
         return points
 
 
+Walls = ParallelWalls | RoundWall
+
+
 def inside(grid: Grid, walls: Walls) -> NDArray[np.bool_]:
     """Return the voxels (nz, ny, nx) whose centres lie in the fluid."""
     # plane by plane: the places of all voxels together take more memory than the volume
@@ -233,3 +220,28 @@ def triple(values: Iterable[int]) -> Triple:
     """Return three numbers as a triple, which a tuple of any length is not for the type checker."""
     x, y, z = values
     return x, y, z
+
+
+@dataclass(frozen=True)
+class CorrelationSettings:
+    """How two volumes are correlated.
+
+    Attributes
+    ----------
+    windows : sizes of the interrogation windows in voxels along (x, y, z), coarse to fine; the last gives the vectors
+    overlap : share of a window in common with the next one along (x, y, z), 0 <= overlap < 1
+    dt_s : time from the first volume to the second, or None where it is not known
+    exponent : power of the intensities that is correlated, 0 < exponent <= 1, negative ones being zero where it is
+        below 1. In volumes of a solver that sharpens, as EM does, the brightest particles outweigh all others and are
+        narrower than a voxel: the root lets the others speak and makes peaks wide enough to be located. In volumes with
+        a noisy background it raises that, and harms.
+    """
+
+    windows: Sequence[Triple]
+    overlap: tuple[float, float, float]
+    dt_s: float | None = None
+    exponent: float = 1.0
+
+    def layout(self, shape_xyz: Triple, size_xyz: Triple | None = None) -> WindowLayout:
+        """Return windows in a volume of so many voxels: those of a size, or the final ones, which give the vectors."""
+        return layout_windows(shape_xyz, size_xyz or self.windows[-1], self.overlap)

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.calibration.model import Channel
-from lfpiv_cli.flow.correlation import CorrelationSettings, correlate
+from lfpiv_cli.flow.correlation import correlate
 from lfpiv_cli.flow.field import REJECTED
+from lfpiv_cli.flow.windows import CorrelationSettings
 from lfpiv_cli.paper.small_rig import (
     BRIGHTNESS,
     HALF_DEPTH_MM,

@@ -175,26 +175,13 @@ def _spread(directions: Floats, covariance: Floats) -> Floats:
     return np.asarray(np.sqrt(np.diag(directions @ covariance @ directions.T)), dtype=np.float64)
 
 
-@dataclass(frozen=True)
-class PipeFlow:
-    """What is known of a flow in a pipe.
-
-    Attributes
-    ----------
-    volume : says where along the pipe particles are looked for, and how fine
-    particle_diameter_mm : of the tracers; None: by their images
-    """
-
-    volume: Grid
-    particle_diameter_mm: float | None
-
-
 def refine_scene(
     images: Sequence[NDArray[np.float32]],
     calibration: Calibration,
     sheet: Camera,
     space: CurvedSpace,
-    flow: PipeFlow,
+    volume: Grid,
+    particle_diameter_mm: float | None,
     progress: Callable[[int], None] | None = None,
 ) -> SceneRefinement:
     """Find the particles of images and the pipe that they are in.
@@ -204,6 +191,8 @@ def refine_scene(
     images : (rows, columns) raw, dark and background taken off, counts
     sheet : camera as the data sheet has it
     space : what lies before the particles, by config and calibration
+    volume : says where along the pipe particles are looked for, and how fine
+    particle_diameter_mm : of the tracers; None: by their images
 
     Raises
     ------
@@ -214,12 +203,12 @@ def refine_scene(
     """
     camera = calibration.camera(sheet)
     scene = MovableScene.of(space, camera)
-    given, lens_mm = flow.particle_diameter_mm, camera.scale(space.media).lens_mm
+    given, lens_mm = particle_diameter_mm, camera.scale(space.media).lens_mm
     view = raw_view(camera, space.media, 0.5 * (given or UNKNOWN_LENSES * lens_mm), calibration, space)
     start = Nuisances()
     for number in range(SEARCHES):
         seen = start.applied(view, scene)
-        weights = _weights(scene, start.scene, flow.volume, calibration, seen)
+        weights = _weights(scene, start.scene, volume, calibration, seen)
         sums = normalisers(weights.padded)
 
         def task(image: NDArray[np.float32], seen: View, weights: Weights = weights, sums: Any = sums) -> Task:
@@ -272,7 +261,7 @@ def refine_scene(
         return refinement
     # The mean of the two, weighed by what is known of them.
     by_wall, by_images = np.linalg.inv(axis_covariance), np.diag(images_sigma.scene**-2)
-    covariance = np.linalg.inv(by_wall + by_images)
+    covariance = np.asarray(np.linalg.inv(by_wall + by_images), dtype=np.float64)
     together = covariance @ (by_wall @ axis + by_images @ fit.found.scene)
     return replace(refinement, axis=together, covariance=covariance)
 

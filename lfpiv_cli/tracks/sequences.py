@@ -181,10 +181,10 @@ def _ahead(found: Trajectories, frames: Frames, forecast: Forecast | None, over_
     # The spread of the logarithm of a particle's light from frame to frame, by tracks through the last two.
     numbers, light_sigma = (last - 1, last), 0.0
     tracks = np.intersect1d(tracks_in(found, [numbers[0]]), tracks_in(found, [numbers[1]]))
-    before, now = (frames[k].light_value()[found.particles(k, tracks)] for k in numbers)
-    lit = (before > 0.0) & (now > 0.0)
+    earlier, now = (frames[k].light_value()[found.particles(k, tracks)] for k in numbers)
+    lit = (earlier > 0.0) & (now > 0.0)
     if lit.any():
-        ratio = np.log(now[lit] / before[lit])
+        ratio = np.log(now[lit] / earlier[lit])
         light_sigma = float(MAD_TO_SIGMA * np.median(np.abs(ratio - np.median(ratio))))
     return Ahead(at, sigma, light, light_sigma)
 

@@ -12,6 +12,7 @@ Axes: points (n, 3) in mm. Depth is known worse than the lateral place, so dista
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -205,8 +206,11 @@ class Known:
     variance_mm2: Floats
 
 
-# Displacements (n, 3) that are expected of particles, and the variances (n, 3) of what is missed, mm, mm^2.
-Expected = tuple[Floats, Floats]
+class Expected(NamedTuple):
+    """Displacements (n, 3) that are expected of particles, and the variances (n, 3) of what is missed, mm, mm^2."""
+
+    displacement_mm: Floats
+    variance_mm2: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -302,11 +306,11 @@ def expected_of(
         # The place where a displacement ends is known as badly as the places of the neighbours' are.
         variance = variance + np.median(known.variance_mm2, axis=0) + 0.5 * structure.nugget
     if forecast is None:
-        return value, variance
+        return Expected(value, variance)
     past2 = forecast.sigma_mm**2 + _variance_of(SMALLEST_SIGMA_LENSES, scale)
     weight = variance / (variance + past2)
     has_past = np.isfinite(weight) & np.isfinite(forecast.displacement_mm)
-    return (
+    return Expected(
         np.where(has_past, value + weight * (forecast.displacement_mm - value), value),
         np.where(has_past, weight * past2, variance),
     )
@@ -323,8 +327,8 @@ def probability_of(
     density : of the second frame's particles, per mm^3
     """
     matrix = first.covariances()[candidates.first] + second.covariances()[candidates.second]
-    matrix[:, [0, 1, 2], [0, 1, 2]] += expected[1][candidates.first]
-    off = candidates.displacement_mm - expected[0][candidates.first]
+    matrix[:, [0, 1, 2], [0, 1, 2]] += expected.variance_mm2[candidates.first]
+    off = candidates.displacement_mm - expected.displacement_mm[candidates.first]
     near = np.flatnonzero(np.sum(off**2 / np.diagonal(matrix, axis1=1, axis2=2), axis=1) < FURTHEST_SIGMAS**2)
     distance2 = np.einsum("ci,cij,cj->c", off[near], np.linalg.inv(matrix[near]), off[near])
     height = 1.0 / np.sqrt((2.0 * np.pi) ** 3 * np.linalg.det(matrix[near]))
@@ -383,4 +387,4 @@ def _calibrated(expected: Expected, known: Known) -> Expected:
     off = known.displacement_mm - displacement[known.number]
     ratio = np.abs(off) / np.sqrt(variance[known.number])
     factor = np.maximum(MAD_TO_SIGMA * np.median(ratio, axis=0), SMALLEST_FACTOR)
-    return displacement, variance * factor**2
+    return Expected(displacement, variance * factor**2)

@@ -1,4 +1,4 @@
-"""Symmetric normalised direct correlation of two volumes, window by window.
+"""What is summed over windows: the symmetric normalised direct correlation of two volumes, and their moments.
 
 For a window W and a shift s of whole voxels,
 
@@ -14,6 +14,7 @@ over blocks of that size once, and blocks into windows. Axes: everything here is
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import gcd
 
@@ -24,12 +25,15 @@ from numpy.typing import NDArray
 from lfpiv_cli.arrays import Floats
 from lfpiv_cli.flow.windows import Triple, WindowLayout, triple
 from lfpiv_cli.robust import of_half_the_sum
-from lfpiv_cli.simd.block_sums import FEW_SHIFTS, MANY_SHIFTS, products
+from lfpiv_cli.simd.block_sums import FEW_SHIFTS, MANY_SHIFTS, MOMENTS, products
+from lfpiv_cli.simd.block_sums import moments as lane_moments
 from lfpiv_cli.simd.vectors import LANES
 from lfpiv_cli.threads import in_threads, share_out
 
 # Blocks narrower than this cost more in sums of sums than the products they save.
 SMALLEST_BLOCK = 4
+# Cells along an axis of a window, at least, where it has as many voxels: groups enough for a variance.
+CELLS_PER_WINDOW = 4
 # A window whose energy is below this share of the brightest one's is empty: what the splines carry into empty space
 # reaches amplitudes of 1e-5.
 SMALLEST_ENERGY = 1e-9
@@ -38,28 +42,44 @@ SMALLEST_ENERGY = 1e-9
 SMALLEST_AMPLITUDE = 0.07
 
 
-@dataclass(frozen=True)
-class Blocks:
-    """How the windows of one layout are made of blocks, along (z, y, x); along x each is a block of its own.
+Starts = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]
 
-    Block k along an axis covers `size` voxels from k stride on, counted from the first window's first voxel; window k
-    is the sum of blocks k hop ... k hop + per_window - 1.
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """How the windows of one layout are made of cells, along (z, y, x).
+
+    Cell k along an axis covers `size[k]` voxels from `start[k]` on, counted from the first window's first voxel; window
+    k is the sum of cells k hop ... k hop + per_window - 1.
     """
 
-    size: Triple
-    stride: Triple
-    count: Triple
+    start: Starts
+    size: Starts
     per_window: Triple
     hop: Triple
 
 
-def blocks_along(size: int, step: int, count: int) -> tuple[int, int, int, int, int]:
-    """Return size, stride, count, blocks per window and hop along one axis; where sharing does not pay, windows."""
-    block = gcd(size, step)
-    if block < SMALLEST_BLOCK or step >= size:
-        return size, step, count, 1, 1
-    hop, per_window = step // block, size // block
-    return block, block, (count - 1) * hop + per_window, per_window, hop
+def cells_of(layout: WindowLayout, least: int = CELLS_PER_WINDOW, alone: Sequence[int] = ()) -> Cells:
+    """Return the cells that make up the windows, axis by axis.
+
+    Windows share cells of their step's and size's common divisor, or parts of these; where it is small, and along the
+    axes `alone` of (z, y, x), each window has cells of its own. A window has `least` along each axis, or its voxels.
+    """
+    starts, sizes, per_window, hops = [], [], [], []
+    for axis, (size, step, count) in enumerate(zip(layout.size, layout.step, layout.count, strict=True)):
+        shared = gcd(size, step)
+        if shared < SMALLEST_BLOCK or step >= size or 2 - axis in alone:
+            length, stride, blocks, hop = size, step, count, 1
+        else:
+            length, stride, blocks, hop = shared, shared, ((count - 1) * step + size) // shared, step // shared
+        parts = min(length, -(-least * length // size))
+        edges = np.arange(parts + 1) * length // parts
+        starts.append((stride * np.arange(blocks)[:, np.newaxis] + edges[:-1]).ravel())
+        sizes.append(np.tile(np.diff(edges), blocks))
+        per_window.append(parts * (size // length))
+        hops.append(parts * hop)
+    (x, y, z), (width, height, depth) = starts, sizes
+    return Cells((z, y, x), (depth, height, width), triple(per_window[::-1]), triple(hops[::-1]))
 
 
 def margins(layout: WindowLayout, shape_zyx: Triple, radius: int) -> tuple[Triple, Triple]:
@@ -92,7 +112,7 @@ class MapSums:
     products: Floats
     energies_a: NDArray[np.float32]
     energies_b: NDArray[np.float32]
-    blocks: Blocks
+    blocks: Cells
 
     def __add__(self, other: MapSums) -> MapSums:
         """Return the sums over two sets of pairs."""
@@ -135,13 +155,12 @@ def map_sums(
     layout : windows, in voxels of the volume without margins
     before : the margins before the volume, (z, y, x)
     """
-    axes = [blocks_along(layout.size[axis], layout.step[axis], layout.count[axis]) for axis in (2, 1)]
-    axes.append((layout.size[0], layout.step[0], layout.count[0], 1, 1))
-    blocks = Blocks(*(triple(each) for each in zip(*axes, strict=True)))
+    blocks = cells_of(layout, 1, alone=(2,))
     first = triple(low + margin for low, margin in zip(layout.first[::-1], before, strict=True))
     shifts = 2 * radius + 1
-    found = np.empty((*blocks.count, shifts, shifts, shifts))
-    share_out(sum_products, blocks.count[0] * blocks.count[1], (a, b), first, blocks.size, blocks.stride, found)
+    count = triple(starts.size for starts in blocks.start)
+    found = np.empty((*count, shifts, shifts, shifts))
+    share_out(sum_products, count[0] * count[1], (a, b), first, blocks.start, blocks.size, found)
     energies_a, energies_b = (energies_of(volume, layout, before, radius) for volume in (a, b))
     return MapSums(found, energies_a, energies_b, blocks)
 
@@ -172,6 +191,25 @@ def valid_shares(valid: NDArray[np.uint8], layout: WindowLayout, before: Triple)
     # The squares of 0 and 1 are themselves; float32, for which the sums are compiled anyway.
     seen = energies_of(valid.astype(np.float32), layout, before)[:, 0, :, 0, :, 0].transpose(0, 2, 1)
     return seen / np.prod(layout.size, dtype=np.float64)
+
+
+def pair_moments(
+    a: NDArray[np.float32], b: NDArray[np.float32], valid: NDArray[np.uint8], layout: WindowLayout, before: Triple
+) -> Floats:
+    """Return the moments of all cells of two deformed volumes; of several pairs these add up.
+
+    Parameters
+    ----------
+    a, b, valid : of `deform_pair`, with a margin of at least 1 around all windows
+    layout : windows, in voxels of the volume without margins
+    before : the margins before the volume, (z, y, x)
+    """
+    cells = cells_of(layout)
+    first = triple(low + margin for low, margin in zip(layout.first[::-1], before, strict=True))
+    count = tuple(starts.size for starts in cells.start)
+    found = np.empty((*count, MOMENTS))
+    share_out(sum_cells, count[0] * count[1], (a, b), valid, first, cells.start, cells.size, found)
+    return found
 
 
 @njit(cache=True, nogil=True)
@@ -299,8 +337,8 @@ def sum_products(
     part: tuple[int, int],
     pair: tuple[NDArray[np.float32], NDArray[np.float32]],
     first: Triple,
-    size: Triple,
-    stride: Triple,
+    start: Starts,
+    size: Starts,
     found: Floats,
 ) -> None:
     """Write the products of `MapSums` for the rows of blocks `part`."""
@@ -309,17 +347,17 @@ def sum_products(
     radius = shifts // 2
     row, plane = a.shape[2], a.shape[1] * a.shape[2]
     flat_a, flat_b = a.reshape(a.size), b.reshape(b.size)
-    length = max(LANES, (count[2] - 1) * stride[2] + size[2])
+    length = max(LANES, start[2][-1] + size[2][-1])
     together = MANY_SHIFTS if shifts >= MANY_SHIFTS else FEW_SHIFTS
     for job in range(part[0], part[1]):
         bz, by = job // count[1], job % count[1]
-        begin = (first[0] + bz * stride[0]) * plane + (first[1] + by * stride[1]) * row + first[2]
+        begin = (first[0] + start[0][bz]) * plane + (first[1] + start[1][by]) * row + first[2]
         room = np.empty((3, shifts**3 * length), dtype=np.float32)
         flat, spare, sums = room[0], room[1], room[2]
         # All shifts of a few columns before the next ones: their voxels then stay in the fastest cache.
-        for start in range(0, length, LANES):
+        for lane in range(0, length, LANES):
             # The last lanes, and the last shifts below, begin early enough to end with the others.
-            x = min(start, length - LANES)
+            x = min(lane, length - LANES)
             for sz in range(shifts):
                 for sy in range(shifts):
                     for group in range(0, shifts, together):
@@ -327,10 +365,50 @@ def sum_products(
                         at = ((sz * shifts + sy) * shifts + sx) * length + x
                         shift = (sz - radius) * plane + (sy - radius) * row + sx - radius
                         places, shifted = (begin + x, plane, row), (shift, together)
-                        products(flat, (at, length), flat_a, flat_b, places, (size[0], size[1]), shifted)
-        sum_ahead(flat, spare, size[2], sums)
+                        products(flat, (at, length), flat_a, flat_b, places, (size[0][bz], size[1][by]), shifted)
+        sum_ahead(flat, spare, size[2][0], sums)
         lines = sums.reshape(-1, length)
         for kx in range(count[2]):
             window = found[bz, by, kx].reshape(lines.shape[0])
             for shift in range(window.size):
-                window[shift] = lines[shift, kx * stride[2]]
+                window[shift] = lines[shift, start[2][kx]]
+
+
+@njit(cache=True, nogil=True)
+def sum_cells(
+    part: tuple[int, int],
+    pair: tuple[NDArray[np.float32], NDArray[np.float32]],
+    valid: NDArray[np.uint8],
+    first: Triple,
+    start: Starts,
+    size: Starts,
+    found: Floats,
+) -> None:
+    """Write the moments of cells, rows `part` of (cells z, y, x, MOMENTS), of windows that begin at the voxel `first`.
+
+    The upper triangle of the products of (dM/dx, dM/dy, dM/dz, M), row by row, those of each with B - A, and the
+    squares of the slopes of (B - A) / 2. Voxels with a neighbour that is not valid are left out: their gradient would
+    be that of the rim.
+    """
+    a, b = pair
+    count = found.shape[:3]
+    row, plane = a.shape[2], a.shape[1] * a.shape[2]
+    flat_a, flat_b, flat_valid = a.reshape(a.size), b.reshape(b.size), valid.reshape(valid.size)
+    length = max(LANES, start[2][-1] + size[2][-1])
+    for job in range(part[0], part[1]):
+        cz, cy = job // count[1], job % count[1]
+        begin = (first[0] + start[0][cz]) * plane + (first[1] + start[1][cy]) * row + first[2]
+        # Summed over the planes and rows of the cells first, many columns at once; float32 serves for so few.
+        columns = np.empty((MOMENTS, length), dtype=np.float32)
+        flat = columns.reshape(columns.size)
+        for lane in range(0, length, LANES):
+            # The last lanes begin early enough to end with the others.
+            x = min(lane, length - LANES)
+            places = (begin + x, plane, row)
+            lane_moments(flat, (x, length), flat_a, flat_b, flat_valid, places, (size[0][cz], size[1][cy]))
+        for cx in range(count[2]):
+            for moment in range(MOMENTS):
+                total = 0.0
+                for x in range(start[2][cx], start[2][cx] + size[2][cx]):
+                    total += columns[moment, x]
+                found[cz, cy, cx, moment] = total
