@@ -351,9 +351,9 @@ class Config:
 
     def correlation_settings(self, voxel_mm: tuple[float, float, float]) -> CorrelationSettings:
         """Return how volumes of such voxels are correlated."""
-        return CorrelationSettings(
-            self.windows_voxel(voxel_mm), self.overlap(voxel_mm), self.correlation.dt_s, self.correlation_exponent()
-        )
+        chosen = {field.name: getattr(self.correlation, field.name) for field in fields(CorrelationSettings)}
+        chosen |= {"windows": self.windows_voxel(voxel_mm), "overlap": self.overlap(voxel_mm)}
+        return CorrelationSettings(**chosen | {"exponent": self.correlation_exponent()})
 
     def simulated_flow(self, reference: Reference = FOCAL_POINT) -> Flow:
         """Return the flow to render, a function of points: z as in the config, or from the focal point as in `grid`."""

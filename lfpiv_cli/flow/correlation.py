@@ -190,21 +190,21 @@ def correlate(
     report = progress or (lambda units: None)
     coarse = Coarse.over(grid.shape_xyz, settings)
     sums, ready = None, []
-    for pair in pairs:
-        usable, *volumes = _usable_voxels(*pair, mask, grid)
-        if settings.exponent != 1.0:
-            power = np.float32(settings.exponent)
-            volumes = [np.power(np.maximum(volume, np.float32(0.0)), power) for volume in volumes]
-        found = coarse.sums(volumes)
-        sums = found if sums is None else sums + found
-        a, b = (spline_coefficients(volume) for volume in volumes)
-        ready.append(Pair(a, b, usable))
-    if sums is None:
-        raise InputError("there are no pairs of volumes to correlate")
-    predictor, layout, is_elongated = coarse.field(sums)
-    report(1)
-    # One BLAS thread: with more, the bits of the predictor would depend on their number.
+    # One BLAS thread: with more, the bits of products of matrices would depend on their number.
     with threadpool_limits(limits=1, user_api="blas"):
+        for pair in pairs:
+            usable, *volumes = _usable_voxels(*pair, mask, grid)
+            if settings.exponent != 1.0:
+                power = np.float32(settings.exponent)
+                volumes = [np.power(np.maximum(volume, np.float32(0.0)), power) for volume in volumes]
+            found = coarse.sums(volumes)
+            sums = found if sums is None else sums + found
+            a, b = (spline_coefficients(volume) for volume in volumes)
+            ready.append(Pair(a, b, usable))
+        if sums is None:
+            raise InputError("there are no pairs of volumes to correlate")
+        predictor, layout, is_elongated = coarse.field(sums)
+        report(1)
         for step in plan(grid.shape_xyz, settings):
             if layout != step.layout:
                 old, layout = layout, step.layout
