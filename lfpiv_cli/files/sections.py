@@ -6,6 +6,8 @@ keys is checked in `files.checks`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, Tag
@@ -396,3 +398,12 @@ class CorrelationSection(Section):
     dt_s: Positive | None = None
     mask: Mask | None = None
     exponent: Annotated[float, Field(gt=0.0, le=1.0)] | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class CorrelationKeys:
+    """Keys of the section `correlation` that options take the place of; None leaves a key as it is."""
+
+    dt_s: float | None = None
+    windows: Sequence[int | Sequence[int]] | None = None
+    overlap: float | Sequence[float] | None = None
