@@ -137,13 +137,8 @@ class Pass:
     is_last: bool = False
 
 
-@dataclass(frozen=True, eq=False)
-class Pair:
-    """Two volumes ready for deformation: their splines, and where both may be used (size 0 for everywhere)."""
-
-    a: Spline
-    b: Spline
-    mask: NDArray[np.bool_]
+# Two volumes ready for deformation: their splines, and where both may be used (size 0 for everywhere).
+Pair = tuple[Spline, Spline, NDArray[np.bool_]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,7 +195,7 @@ def correlate(
             found = coarse.sums(volumes)
             sums = found if sums is None else sums + found
             a, b = (spline_coefficients(volume) for volume in volumes)
-            ready.append(Pair(a, b, usable))
+            ready.append((a, b, usable))
         if sums is None:
             raise InputError("there are no pairs of volumes to correlate")
         predictor, layout, is_elongated = coarse.field(sums)
@@ -290,12 +285,12 @@ def plan(shape_xyz: Triple, settings: CorrelationSettings) -> list[Pass]:
 
 def _refine(pairs: Sequence[Pair], predictor: Floats, step: Pass, is_elongated: bool) -> Measured:
     """Return what is measured in volumes deformed by `predictor`, given at the windows of `step`, in voxels."""
-    layout, shape_zyx = step.layout, pairs[0].a.shape_zyx
+    layout, shape_zyx = step.layout, pairs[0][0].shape_zyx
     before, after = margins(layout, shape_zyx, step.radius)
     to_voxels = matrices_to_voxels(layout, shape_zyx[::-1])
     parts = []
     for pair in pairs:
-        a, b, valid = deform_pair(pair.a, pair.b, pair.mask, predictor, to_voxels, before, after)
+        a, b, valid = deform_pair(*pair, predictor, to_voxels, before, after)
         fraction = valid_shares(valid, layout, before)
         moments = pair_moments(a, b, valid, layout, before) if step.is_last or is_elongated else None
         parts.append((map_sums(a, b, layout, before, step.radius), fraction, moments))

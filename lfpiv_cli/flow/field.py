@@ -75,9 +75,7 @@ class VectorField:
         return velocity
 
 
-# What follows from the gradients of a velocity field.
-#
-# Axes: arrays `[z, y, x]`, vectors (u, v, w) along (x, y, z) last; rates in 1/s.
+# What follows from the gradients of a velocity field; rates in 1/s.
 
 
 @dataclass(frozen=True, eq=False)

@@ -43,29 +43,22 @@ def most_likely(
     The first ones are sought with edges of each blur, coarse to fine, then all that are free; the others are left as
     they are, and have no variance. The covariance is from the scatter of the single particles' slopes.
     """
-    for blur in blurs:
-        best[BLUR] = np.log(blur)
-        best = _improved(best, first, _units(best, places), log_likelihood)
-    best = _improved(best, free, _units(best, places), log_likelihood)
+    for blur, sought in [*((blur, first) for blur in blurs), (None, free)]:
+        if blur is not None:
+            best[BLUR] = np.log(blur)
+        unit = _units(best, places)[sought]
+
+        def cost(change: Floats, start: Floats = best, sought: list[int] = sought, unit: Floats = unit) -> float:
+            packed = start.copy()
+            packed[sought] += change * unit
+            return -float(np.mean(log_likelihood(packed)))
+
+        found, best = minimize(cost, np.zeros(len(sought)), method="BFGS"), best.copy()
+        best[sought] += found.x * unit
     step = SLOPE_STEP * np.where(np.isin(np.arange(len(best)), free), _units(best, places), 0.0)
     slopes = [(log_likelihood(best + change) - log_likelihood(best - change)) / 2.0 for change in np.diag(step)]
     design = np.stack(slopes, axis=1)
     return best, np.asarray(np.linalg.pinv(design.T @ design) * np.outer(step, step), dtype=np.float64)
-
-
-def _improved(start: Floats, free: list[int], units: Floats, log_likelihood: LogLikelihood) -> Floats:
-    """Return the parameters with the free ones made most likely."""
-    unit = units[free]
-
-    def cost(change: Floats) -> float:
-        packed = start.copy()
-        packed[free] += change * unit
-        return -float(np.mean(log_likelihood(packed)))
-
-    found = minimize(cost, np.zeros(len(free)), method="BFGS")
-    best = start.copy()
-    best[free] += found.x * unit
-    return best
 
 
 def _units(packed: Floats, places: int) -> Floats:

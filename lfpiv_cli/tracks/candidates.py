@@ -250,8 +250,6 @@ def candidates_of(first: Seen, second: Seen, middle_mm: Floats, reach_mm: Floats
 
 
 # Which particles of a sequence belong together, and where the tracks so made have been.
-#
-# Axes: places (n, 3) in mm of each frame.
 
 
 NO_TRACK = NO_PARTICLE = -1

@@ -29,8 +29,6 @@ from lfpiv_cli.tracks.candidates import NO_TRACK, Seen, Trajectories
 # each track's are drawn to zero as far as derivatives of that size are what noise makes. What is left out is alike
 # among neighbours, noise is not: a fit to many tracks lessens noise alone, so that derivatives are drawn to zero less
 # than would be best for one track.
-#
-# Axes: places (n, m, 3) in mm of n tracks in m frames, NaN where a track has none; times in frames.
 
 
 # 1, t, t^2/2, t^3/6, t^4/24; the first three are whatever the places say.

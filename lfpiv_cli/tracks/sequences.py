@@ -292,8 +292,6 @@ def _bridges(
 # Once a sequence has been followed, a frame is known from both sides: a particle that it has lost lies between two
 # places of its track, and one whose track begins or ends beside it lies on the way on. As a Kalman smoother does
 # after its filter, what comes later now counts as what came before.
-#
-# Axes: places (n, 3) in mm of each frame.
 
 
 # Frames on either side that are looked at: a cubic has a place or more to spare.
