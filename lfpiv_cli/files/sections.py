@@ -27,6 +27,7 @@ from lfpiv_cli.names import (
     Refraction,
     Sampling,
     Start,
+    Weighting,
 )
 from lfpiv_cli.reconstruction.registry import SolverName
 
@@ -390,6 +391,7 @@ class CorrelationSection(Section):
     what lies outside the section pipe.
     exponent: power of the intensities that is correlated (default: 0.5 for volumes of the solvers em, smart and mart;
     their brightest particles outweigh all others; and 1 for sart's).
+    weighting: uniform counts all voxels of a window alike, gaussian those near its middle more.
     """
 
     windows: Windows | None = None
@@ -398,6 +400,7 @@ class CorrelationSection(Section):
     dt_s: Positive | None = None
     mask: Mask | None = None
     exponent: Annotated[float, Field(gt=0.0, le=1.0)] | None = None
+    weighting: Weighting = "uniform"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -407,3 +410,4 @@ class CorrelationKeys:
     dt_s: float | None = None
     windows: Sequence[int | Sequence[int]] | None = None
     overlap: float | Sequence[float] | None = None
+    weighting: Weighting | None = None

@@ -14,9 +14,10 @@ over blocks of that size once, and blocks into windows. Axes: everything here is
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from math import gcd
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -43,6 +44,7 @@ SMALLEST_AMPLITUDE = 0.07
 
 
 Starts = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]
+Weights = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,13 +64,14 @@ class Cells:
 def cells_of(layout: WindowLayout, least: int = CELLS_PER_WINDOW, alone: Sequence[int] = ()) -> Cells:
     """Return the cells that make up the windows, axis by axis.
 
-    Windows share cells of their step's and size's common divisor, or parts of these; where it is small, and along the
-    axes `alone` of (z, y, x), each window has cells of its own. A window has `least` along each axis, or its voxels.
+    Windows share cells of their step's and size's common divisor, or parts of these; where it is small or windows are
+    weighted, and along the axes `alone` of (z, y, x), each window has cells of its own. A window has `least` along each
+    axis, or its voxels.
     """
     starts, sizes, per_window, hops = [], [], [], []
     for axis, (size, step, count) in enumerate(zip(layout.size, layout.step, layout.count, strict=True)):
         shared = gcd(size, step)
-        if shared < SMALLEST_BLOCK or step >= size or 2 - axis in alone:
+        if shared < SMALLEST_BLOCK or step >= size or layout.is_weighted or 2 - axis in alone:
             length, stride, blocks, hop = size, step, count, 1
         else:
             length, stride, blocks, hop = shared, shared, ((count - 1) * step + size) // shared, step // shared
@@ -159,10 +162,62 @@ def map_sums(
     first = triple(low + margin for low, margin in zip(layout.first[::-1], before, strict=True))
     shifts = 2 * radius + 1
     count = triple(starts.size for starts in blocks.start)
-    found = np.empty((*count, shifts, shifts, shifts))
-    share_out(sum_products, count[0] * count[1], (a, b), first, blocks.start, blocks.size, found)
     energies_a, energies_b = (energies_of(volume, layout, before, radius) for volume in (a, b))
-    return MapSums(found, energies_a, energies_b, blocks)
+    if not layout.is_weighted:
+        found = np.empty((*count, shifts, shifts, shifts))
+        share_out(sum_products, count[0] * count[1], (a, b), first, blocks.start, blocks.size, found)
+        return MapSums(found, energies_a, energies_b, blocks)
+    weights = weight_matrices(layout, blocks)
+    here = Region(first, weights)
+
+    def products_of(z: int) -> Iterator[NDArray[np.float32]]:
+        still_a, still_b = here.of(a, z), here.of(b, z)
+        for shift in np.ndindex(shifts, shifts, shifts):
+            dz, dy, dx = (each - radius for each in shift)
+            yield still_a * here.of(b, z + dz, dy, dx) + here.of(a, z - dz, -dy, -dx) * still_b
+
+    products = weighted_sums(products_of, weights).transpose(0, 2, 3, 1).astype(np.float64)
+    return MapSums(products.reshape(*count, shifts, shifts, shifts), energies_a, energies_b, blocks)
+
+
+class Region(NamedTuple):
+    """The voxels that weighted windows cover: the first one (z, y, x), and the weights, of whose widths it is."""
+
+    first: Triple
+    weights: Weights
+
+    def of(self, volume: NDArray[Any], z: int, dy: int = 0, dx: int = 0) -> NDArray[Any]:
+        """Return a plane of the region in a volume with margins, moved by so many rows and columns."""
+        (z0, y0, x0), (_, rows, columns) = self.first, (weights.shape[1] for weights in self.weights)
+        return volume[z0 + z, y0 + dy : y0 + dy + rows, x0 + dx : x0 + dx + columns]
+
+
+def weight_matrices(layout: WindowLayout, cells: Cells, radius: int = 0) -> Weights:
+    """Return the weights (sums, voxels) along z, y, x with which voxels count in cells of weighted windows.
+
+    Voxels begin `radius` before the first window; each cell has a sum for each shift, from -radius to radius.
+    """
+    matrices = []
+    for axis in range(3):
+        start, size, weights = cells.start[axis], cells.size[axis], layout.weights(2 - axis)
+        matrix = np.zeros((start.size, 2 * radius + 1, start[-1] + size[-1] + 2 * radius), dtype=np.float32)
+        for cell, (begin, length) in enumerate(zip(start, size, strict=True)):
+            # The place in its own window.
+            place = begin - cell // cells.per_window[axis] * layout.step[2 - axis]
+            for shift in range(2 * radius + 1):
+                matrix[cell, shift, begin + shift : begin + shift + length] = weights[place : place + length]
+        matrices.append(matrix.reshape(-1, matrix.shape[2]))
+    return matrices[0], matrices[1], matrices[2]
+
+
+def weighted_sums(plane: Callable[[int], Iterable[NDArray[np.float32]]], weights: Weights) -> NDArray[np.float32]:
+    """Return sums (z, fields, y, x) over weighted windows of fields that are made plane by plane, (rows, columns).
+
+    By products of matrices, of which the threads of the caller do one each.
+    """
+    along_z, along_y, along_x = weights
+    lateral = in_threads(lambda z: [along_y @ field @ along_x.T for field in plane(z)], range(along_z.shape[1]))
+    return np.tensordot(along_z, np.array(lateral), axes=1)
 
 
 def energies_of(
@@ -177,6 +232,11 @@ def energies_of(
     first = triple(begin + margin for begin, margin in zip(low, before, strict=True))
     shifts = 2 * radius + 1
     nz, ny, nx = count
+    if layout.is_weighted:
+        weights = weight_matrices(layout, cells_of(layout, 1), radius)
+        whole = Region(triple(begin - radius for begin in first), weights)
+        sums = weighted_sums(lambda z: [whole.of(volume, z) ** 2], weights)
+        return sums.reshape(nz, shifts, ny, shifts, nx, shifts).transpose(0, 1, 4, 5, 2, 3).copy()
     planes = (nz - 1) * step[0] + size[0] + 2 * radius
     lateral = np.empty((planes, nx * shifts, ny * shifts), dtype=np.float32)
     share_out(sum_laterally, planes, volume, first, size, step, radius, lateral)
@@ -188,8 +248,9 @@ def energies_of(
 
 def valid_shares(valid: NDArray[np.uint8], layout: WindowLayout, before: Triple) -> Floats:
     """Return the share of each window's voxels that are valid, (nz, ny, nx), from their flags 0 or 1."""
-    # The squares of 0 and 1 are themselves; float32, for which the sums are compiled anyway.
-    seen = energies_of(valid.astype(np.float32), layout, before)[:, 0, :, 0, :, 0].transpose(0, 2, 1)
+    # The squares of 0 and 1 are themselves; float32, for which the sums are compiled anyway. Each counts alike.
+    counted = replace(layout, weighting="uniform")
+    seen = energies_of(valid.astype(np.float32), counted, before)[:, 0, :, 0, :, 0].transpose(0, 2, 1)
     return seen / np.prod(layout.size, dtype=np.float64)
 
 
@@ -207,9 +268,29 @@ def pair_moments(
     cells = cells_of(layout)
     first = triple(low + margin for low, margin in zip(layout.first[::-1], before, strict=True))
     count = tuple(starts.size for starts in cells.start)
-    found = np.empty((*count, MOMENTS))
-    share_out(sum_cells, count[0] * count[1], (a, b), valid, first, cells.start, cells.size, found)
-    return found
+    if not layout.is_weighted:
+        found = np.empty((*count, MOMENTS))
+        share_out(sum_cells, count[0] * count[1], (a, b), valid, first, cells.start, cells.size, found)
+        return found
+    weights = weight_matrices(layout, cells)
+    here, steps = Region(first, weights), ((0, 0, 1), (0, 1, 0), (1, 0, 0))
+
+    def moments_of(z: int) -> Iterator[NDArray[np.float32]]:
+        """The terms of `sum_cells`, in its order."""
+        mean, difference = 0.5 * (here.of(a, z) + here.of(b, z)), here.of(b, z) - here.of(a, z)
+        kept, of_mean, of_difference = here.of(valid, z).astype(np.float32), [], []
+        for dz, dy, dx in steps:
+            a_before, b_before = (here.of(volume, z - dz, -dy, -dx) for volume in (a, b))
+            a_after, b_after = (here.of(volume, z + dz, dy, dx) for volume in (a, b))
+            of_mean.append(0.25 * ((a_after + b_after) - (a_before + b_before)))
+            of_difference.append(0.25 * ((b_after - a_after) - (b_before - a_before)))
+            kept = kept * here.of(valid, z - dz, -dy, -dx) * here.of(valid, z + dz, dy, dx)
+        of_mean.append(mean)
+        yield from (kept * one * other for number, one in enumerate(of_mean) for other in of_mean[number:])
+        yield from (kept * one * difference for one in of_mean)
+        yield from (kept * one**2 for one in of_difference)
+
+    return weighted_sums(moments_of, weights).transpose(0, 2, 3, 1).astype(np.float64, order="C")
 
 
 @njit(cache=True, nogil=True)

@@ -6,14 +6,15 @@ Axes: triples are ordered (x, y, z). Positions are voxel indices; voxel k covers
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lfpiv_cli.arrays import Floats
+from lfpiv_cli.errors import ConfigError
 from lfpiv_cli.grid import Grid
 
 # Where there is fluid, and vectors can be measured: between the walls of a channel, or in a round pipe.
@@ -166,17 +167,43 @@ Triple = tuple[int, int, int]
 ROUNDING = 1e-9
 
 
+# The standard deviation of a Gaussian weighting, in sizes of the window: at the middle of a face it is exp(-2). The
+# spread of its weights along an axis is 0.22 of the size, that of uniform ones 0.29.
+GAUSSIAN_SIGMA = 0.25
+
+
+def gaussian(offset: Floats) -> Floats:
+    """Return the weights of a Gaussian about a window's middle, 1 there; offsets are in sizes of the window."""
+    return np.asarray(np.exp(-0.5 * (offset / GAUSSIAN_SIGMA) ** 2))
+
+
+# How voxels count in what is summed over a window: the weight along one axis by the offset from the window's middle in
+# sizes of the window, -0.5 to 0.5. A voxel has the product of its three.
+WEIGHTINGS: dict[str, Callable[[Floats], Floats]] = {"uniform": np.ones_like, "gaussian": gaussian}
+
+
 @dataclass(frozen=True)
 class WindowLayout:
     """A regular arrangement of equal windows; window k along an axis covers voxels first + k step ... + size - 1.
 
-    Windows may overhang the volume: `first` is then negative.
+    Windows may overhang the volume: `first` is then negative. Their voxels count by a `weighting` of `WEIGHTINGS`.
     """
 
     size: Triple
     step: Triple
     count: Triple
     first: Triple
+    weighting: str = "uniform"
+
+    @property
+    def is_weighted(self) -> bool:
+        """Whether voxels of a window count differently."""
+        return self.weighting != "uniform"
+
+    def weights(self, axis: int) -> Floats:
+        """Return the weights (size,) of a window's voxels along axis 0 (x), 1 (y) or 2 (z)."""
+        size = self.size[axis]
+        return WEIGHTINGS[self.weighting]((np.arange(size) - 0.5 * (size - 1)) / size)
 
     def centres_voxel(self, axis: int) -> Floats:
         """Return the window centres along axis 0 (x), 1 (y) or 2 (z) as (fractional) voxel indices."""
@@ -235,13 +262,24 @@ class CorrelationSettings:
         below 1. In volumes of a solver that sharpens, as EM does, the brightest particles outweigh all others and are
         narrower than a voxel: the root lets the others speak and makes peaks wide enough to be located. In volumes with
         a noisy background it raises that, and harms.
+    weighting : how voxels count by their place in a window, of `WEIGHTINGS`
     """
 
     windows: Sequence[Triple]
     overlap: tuple[float, float, float]
     dt_s: float | None = None
     exponent: float = 1.0
+    weighting: str = "uniform"
 
     def layout(self, shape_xyz: Triple, size_xyz: Triple | None = None) -> WindowLayout:
-        """Return windows in a volume of so many voxels: those of a size, or the final ones, which give the vectors."""
-        return layout_windows(shape_xyz, size_xyz or self.windows[-1], self.overlap)
+        """Return windows in a volume of so many voxels: those of a size, or the final ones, which give the vectors.
+
+        Raises
+        ------
+        ConfigError
+            The weighting is none of those that there are.
+        """
+        if self.weighting not in WEIGHTINGS:
+            raise ConfigError(f"the weighting of the windows is {self.weighting}; it must be one of {list(WEIGHTINGS)}")
+        layout = layout_windows(shape_xyz, size_xyz or self.windows[-1], self.overlap)
+        return replace(layout, weighting=self.weighting)
