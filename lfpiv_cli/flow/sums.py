@@ -176,7 +176,7 @@ def map_sums(
             dz, dy, dx = (each - radius for each in shift)
             yield still_a * here.of(b, z + dz, dy, dx) + here.of(a, z - dz, -dy, -dx) * still_b
 
-    products = weighted_sums(products_of, weights).transpose(0, 2, 3, 1).astype(np.float64)
+    products = weighted_sums(shifts**3, products_of, weights).transpose(0, 2, 3, 1).astype(np.float64, order="C")
     return MapSums(products.reshape(*count, shifts, shifts, shifts), energies_a, energies_b, blocks)
 
 
@@ -210,14 +210,19 @@ def weight_matrices(layout: WindowLayout, cells: Cells, radius: int = 0) -> Weig
     return matrices[0], matrices[1], matrices[2]
 
 
-def weighted_sums(plane: Callable[[int], Iterable[NDArray[np.float32]]], weights: Weights) -> NDArray[np.float32]:
-    """Return sums (z, fields, y, x) over weighted windows of fields that are made plane by plane, (rows, columns).
-
-    By products of matrices, of which the threads of the caller do one each.
-    """
+def weighted_sums(
+    fields: int, plane: Callable[[int], Iterable[NDArray[np.float32]]], weights: Weights
+) -> NDArray[np.float32]:
+    """Return sums (z, fields, y, x) over weighted windows of fields that are made plane by plane, (rows, columns)."""
     along_z, along_y, along_x = weights
-    lateral = in_threads(lambda z: [along_y @ field @ along_x.T for field in plane(z)], range(along_z.shape[1]))
-    return np.tensordot(along_z, np.array(lateral), axes=1)
+    lateral = np.empty((along_z.shape[1], fields, len(along_y), len(along_x)), dtype=np.float32)
+
+    def work(z: int) -> None:
+        for number, field in enumerate(plane(z)):
+            lateral[z, number] = along_y @ field @ along_x.T
+
+    in_threads(work, range(len(lateral)))
+    return np.tensordot(along_z, lateral, axes=1)
 
 
 def energies_of(
@@ -235,7 +240,7 @@ def energies_of(
     if layout.is_weighted:
         weights = weight_matrices(layout, cells_of(layout, 1), radius)
         whole = Region(triple(begin - radius for begin in first), weights)
-        sums = weighted_sums(lambda z: [whole.of(volume, z) ** 2], weights)
+        sums = weighted_sums(1, lambda z: [whole.of(volume, z) ** 2], weights)
         return sums.reshape(nz, shifts, ny, shifts, nx, shifts).transpose(0, 1, 4, 5, 2, 3).copy()
     planes = (nz - 1) * step[0] + size[0] + 2 * radius
     lateral = np.empty((planes, nx * shifts, ny * shifts), dtype=np.float32)
@@ -290,7 +295,7 @@ def pair_moments(
         yield from (kept * one * difference for one in of_mean)
         yield from (kept * one**2 for one in of_difference)
 
-    return weighted_sums(moments_of, weights).transpose(0, 2, 3, 1).astype(np.float64, order="C")
+    return weighted_sums(MOMENTS, moments_of, weights).transpose(0, 2, 3, 1).astype(np.float64, order="C")
 
 
 @njit(cache=True, nogil=True)

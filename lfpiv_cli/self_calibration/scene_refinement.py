@@ -237,11 +237,8 @@ def refine_scene(
     axis, axis_covariance, wall, placed = wall_by_places(
         position[seen_wall], covariance[seen_wall], scene, start.scene, len(images)
     )
-    images_sigma = replace(
-        fit.sigma,
-        axis_across_mm=float(np.hypot(fit.sigma.axis_across_mm, NOT_NOISE_LENSES * lens_mm)),
-        axis_away_mm=float(np.hypot(fit.sigma.axis_away_mm, NOT_NOISE_LENSES * lens_mm)),
-    )
+    across, away = np.hypot(fit.sigma.scene[:2], NOT_NOISE_LENSES * lens_mm).tolist()
+    images_sigma = replace(fit.sigma, axis_across_mm=across, axis_away_mm=away)
     refinement = SceneRefinement(
         scene=scene,
         axis=axis,
@@ -330,18 +327,13 @@ def _weights(scene: MovableScene, values: Floats, volume: Grid, calibration: Cal
     deep = PLANES_APART * view.scale.depth_mm
     middle = scene.motion(values).points(scene.pivot_mm)
     reach = scene.wall.radius_mm + scene.beyond_mm
-    shape, spacing, centre = [0, 0, 0], [*volume.spacing_mm[:2], deep], middle.tolist()
+    (dx, dy, _), centre, lengths = volume.spacing_mm, middle.tolist(), [2.0 * reach] * 3
     # Along the pipe the volume's own length, across it all of the section.
     along = int(np.argmax(np.abs(scene.along)))
-    for axis in range(3):
-        low, high = volume.bounds_mm(axis)
-        length = high - low if axis == along else 2.0 * reach
-        shape[axis] = max(1, int(np.ceil(length / spacing[axis])))
-        if axis == along:
-            centre[axis] = 0.5 * (low + high)
-    grid = Grid.centred(
-        (shape[0], shape[1], shape[2]), (spacing[0], spacing[1], deep), (centre[0], centre[1], centre[2])
-    )
+    low, high = volume.bounds_mm(along)
+    centre[along], lengths[along] = 0.5 * (low + high), high - low
+    nx, ny, nz = (max(1, int(np.ceil(length / step))) for length, step in zip(lengths, (dx, dy, deep), strict=True))
+    grid = Grid.centred((nx, ny, nz), (dx, dy, deep), (centre[0], centre[1], centre[2]))
     padding = curved_padding(camera, space, grid)
     return Weights(grid, padding, operator_of(camera, space, grid.padded(padding)), camera.column_axis, calibration)
 
