@@ -219,8 +219,8 @@ def divergence_over_stated(field: VectorField) -> float | None:
     inner = tuple(n - 2 for n in field.flag.shape)
     divergence, variance = np.zeros(inner), np.zeros(inner)
     for axis, spacing_mm in enumerate(field.grid.spacing_mm):
-        divergence = divergence + _difference(moved[..., axis], axis, 1.0, -1.0) / (2.0 * spacing_mm)
-        variance = variance + _difference(sigma[..., axis] ** 2, axis, 1.0, 1.0) / (2.0 * spacing_mm) ** 2
+        divergence = divergence + _beside(moved[..., axis], axis, -1.0) / (2.0 * spacing_mm)
+        variance = variance + _beside(sigma[..., axis] ** 2, axis, 1.0) / (2.0 * spacing_mm) ** 2
     return _ratio(divergence, np.sqrt(variance))
 
 
@@ -246,12 +246,12 @@ def _sigma_mm(field: VectorField) -> Floats | None:
     return None if field.uncertainty_voxel is None else field.uncertainty_voxel * field.voxel_mm
 
 
-def _difference(values: Floats, axis: int, after: float, before: float) -> Floats:
-    """Return after * values one further along x, y or z (0, 1, 2) + before * values one back, of the inner places."""
+def _beside(values: Floats, axis: int, sign: float) -> Floats:
+    """Return the values one further along x, y or z (0, 1, 2) and sign times those one back, of the inner places."""
     inner = [slice(1, -1)] * 3
     ahead, back = list(inner), list(inner)
     ahead[2 - axis], back[2 - axis] = slice(2, None), slice(None, -2)
-    return np.asarray(after * values[tuple(ahead)] + before * values[tuple(back)])
+    return np.asarray(values[tuple(ahead)] + sign * values[tuple(back)])
 
 
 def _ratio(errors: Floats, sigma: Floats) -> float | None:
