@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,15 +11,18 @@ from numpy.typing import NDArray
 
 from benchmarks.volumes import Seeding, volume_pair
 from lfpiv_cli.errors import ConfigError
-from lfpiv_cli.flow.correlation import correlate
+from lfpiv_cli.files.config import load_config
+from lfpiv_cli.flow.correlation import Coarse, correlate, plan
 from lfpiv_cli.flow.field import VectorField
 from lfpiv_cli.flow.moments import gauss_newton
 from lfpiv_cli.flow.sums import cells_of, map_sums, margins, pair_moments
 from lfpiv_cli.flow.windows import WEIGHTINGS, CorrelationSettings, WindowLayout, layout_windows
 from lfpiv_cli.grid import Grid
 from lfpiv_cli.names import Weighting, names_in
+from lfpiv_cli.verbs.correlate import CorrelateOptions
 
 HALF = (0.5, 0.5, 0.5)
+TABLE2 = Path(__file__).parents[1] / "configs" / "table2.yaml"
 # An odd size, shared and unshared cells, windows that overhang and leave gaps.
 LAYOUTS = [((8, 7, 6), HALF), ((8, 8, 8), HALF), ((9, 6, 4), (0.75, 0.0, 0.5))]
 
@@ -44,6 +48,14 @@ def test_the_registry_has_the_names_that_the_configuration_takes() -> None:
     assert tuple(WEIGHTINGS) == names_in(Weighting)
     with pytest.raises(ConfigError, match="weighting of the windows is round"):
         CorrelationSettings([(8, 8, 8)], HALF, weighting="round").layout((16, 16, 16))
+
+
+def test_config_and_option_choose_the_weighting() -> None:
+    config, voxel_mm = load_config(TABLE2), (0.1, 0.1, 0.1)
+    assert config.correlation_settings(voxel_mm).weighting == "uniform"
+    chosen = config.overridden_by("correlation", CorrelateOptions(weighting="gaussian")).correlation_settings(voxel_mm)
+    assert {step.layout.weighting for step in plan((100, 100, 100), chosen)} == {"gaussian"}
+    assert Coarse.over((100, 100, 100), chosen).layout.weighting == "gaussian"
 
 
 @pytest.mark.parametrize(("size", "overlap"), LAYOUTS)
