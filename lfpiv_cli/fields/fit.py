@@ -124,7 +124,7 @@ def _structure(parameters: Floats, spacing: float, share: float) -> VectorStruct
     difference, power, inner, outer, nugget, error = parameters.tolist()
     inner, outer, nugget, error = (math.exp(value) for value in (inner, outer, nugget, error))
     unit = VectorStructure(1.0, 2.0 / (1.0 + math.exp(-power)), inner, outer, nugget, error, share)
-    return unit.scaled(math.exp(difference) / unit.mean_at(spacing))
+    return replace(unit, factor=math.exp(difference) / unit.mean_at(spacing))
 
 
 # Samples that an estimate is made of, and those that show whether one of them is an outlier. With twice as many the

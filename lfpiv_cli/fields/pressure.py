@@ -24,7 +24,7 @@ from lfpiv_cli.arrays import Floats
 from lfpiv_cli.fields.evidence import Box, first_expectation, most_probable
 from lfpiv_cli.fields.fit import Field
 from lfpiv_cli.fields.samples import Samples, belonging, error_covariance, squares
-from lfpiv_cli.fields.spline_field import SplineField, gradient_covariance_at
+from lfpiv_cli.fields.spline_field import LAST_CHANGE, POINTS_AT_ONCE, ROUNDS, SplineField, gradient_covariance_at
 from lfpiv_cli.fields.stencils import (
     DEGREE,
     SECOND,
@@ -114,11 +114,6 @@ def _add_rows(matrix, first, rows):  # type: ignore[no-untyped-def]  # numba
 
 
 MM_PER_M = 1000.0
-# Rounds of weighing samples; the last change of their probabilities that matters, on the average.
-ROUNDS, LAST_CHANGE = 4, 0.002
-# Knots so many times wider tell which samples are far off.
-WIDE = 1.6
-POINTS_AT_ONCE = 500
 # Knots are so many times the samples' mean distance apart, as a velocity field's.
 KNOTS_OF_DISTANCE = 1.8
 # Gradients are not known better than to this share of their spread: the constant that they do not tell would drown.
@@ -248,7 +243,7 @@ def pressure_field(
     least = (LEAST_ERROR * expected.spread_mm) ** 2 * np.eye(3)
     samples = replace(samples, covariance_mm2=samples.covariance_mm2 + least)
     # The first probabilities are those to belong to a pressure of wide knots, which no single sample can bend.
-    wide = Lattice.over(lattice.low_mm, lattice.high_mm, WIDE * max(lattice.cell_mm))
+    wide = lattice.wide()
     unresolved, probability = expected.unresolved_mm, samples.probability
     for _ in range(ROUNDS):
         covariance = error_covariance(samples, 1.0, unresolved)

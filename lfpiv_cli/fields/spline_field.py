@@ -37,8 +37,6 @@ KNOTS_OF_DISTANCE = 1.4
 # Rounds of weighing samples; the last change of their probabilities that matters, on the average.
 ROUNDS, LAST_CHANGE = 4, 0.002
 POINTS_AT_ONCE = 500
-# Knots so many times wider tell how the flow changes around each sample.
-WIDE = 1.6
 # So many samples for each unknown tell such a field.
 ENOUGH_OF_UNKNOWNS = 1
 # Walls hold the field to 0 within this share of the samples' spread at each of their points.
@@ -149,7 +147,7 @@ def spline_field(
     penalties = (SECOND, THIRD) if divergence == "off" else (SECOND, THIRD, DIVERGENCE)
     expected = first_expectation(about, lattice, penalties)
     # The gradients of a field of wide knots tell what errors of places add.
-    wide = Lattice.over(lattice.low_mm, lattice.high_mm, WIDE * max(lattice.cell_mm))
+    wide = lattice.wide()
     few = np.sort(rng.choice(len(about), min(len(about), ENOUGH_OF_UNKNOWNS * wide.unknowns), replace=False))
     part = about.subset(few)
     covariance = error_covariance(part, 1.0, expected.unresolved_mm)

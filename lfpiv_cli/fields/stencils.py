@@ -38,8 +38,8 @@ GAUSS_POINTS = 4
 ROUNDING = 1e-9
 # A factorisation of three components of so many splines, and what is needed of its inverse, takes seconds and 600 MB.
 MOST_SPLINES = 3000
-# Knots that are too many are set apart by this factor until they are not.
-COARSER = 1.05
+# Knots that are too many are set apart by this factor until they are not; those that a first field has, by this one.
+COARSER, WIDE = 1.05, 1.6
 
 
 @dataclass(frozen=True)
@@ -75,6 +75,10 @@ class Lattice:
             knot_mm *= COARSER
         return lattice
 
+    def wide(self) -> Lattice:
+        """Return one over the same box whose knots are further apart: no single sample bends a field of such knots."""
+        return Lattice.over(self.low_mm, self.high_mm, WIDE * max(self.cell_mm))
+
     @property
     def high_mm(self) -> Floats:
         """The box' corner with the largest x, y, z."""
@@ -90,11 +94,6 @@ class Lattice:
     def unknowns(self) -> int:
         """Number of coefficients of a field of three components."""
         return 3 * int(np.prod(self.shape))
-
-    @property
-    def volume_mm3(self) -> float:
-        """The box' volume."""
-        return float(np.prod(np.multiply(self.cells, self.cell_mm)))
 
     @property
     def smallest_mm(self) -> float:
@@ -322,7 +321,7 @@ def penalty(lattice: Lattice, name: str, components: int = 3) -> Stencil:
 def bound(lattice: Lattice, spread_mm: float, components: int = 3) -> Stencil:
     """Return what keeps fields bounded that no other penalty sees."""
     matrix = empty(lattice, components)
-    factor = 1.0 / ((SPREADS * spread_mm) ** 2 * lattice.volume_mm3)
+    factor = 1.0 / ((SPREADS * spread_mm) ** 2 * float(np.prod(np.multiply(lattice.cells, lattice.cell_mm))))
     add_scalar(matrix, factor, smoothness(lattice, 0))
     return matrix
 

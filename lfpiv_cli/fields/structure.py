@@ -15,7 +15,7 @@ Axes: offsets (..., 3) in mm, displacements in mm.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,10 +69,6 @@ class VectorStructure:
         )
         slope, kappa = over * share, self.potential_share
         return slope + (1.0 - kappa) * (slope + square * curved), (3.0 * kappa - 1.0) * curved
-
-    def scaled(self, times: float) -> VectorStructure:
-        """Return the one of a flow whose mean squares are so many times as large."""
-        return replace(self, factor=float(self.factor * times))
 
     def steepness(self, distance_mm: float) -> float:
         """Return the power of the distance with which g grows at one."""

@@ -266,14 +266,10 @@ def fit_in_time(position_mm: Floats, sigma_mm: Floats, time: Floats, scatter: Sc
     return State(solution[..., 0], solution[..., 1], error[..., 0], error[..., 1])
 
 
-def scatter_of(position_mm: Floats, sigma_mm: Floats, time: Floats) -> Scatter:
-    """Return noise and bending of tracks; the unknown ones where too few tracks are long enough."""
-    return scatter_of_pieces([(position_mm, sigma_mm)], time)
+def scatter_of(pieces: Iterable[tuple[Floats, Floats]], time: Floats) -> Scatter:
+    """Return noise and bending of tracks that come in pieces: of the places and errors of each but little is kept.
 
-
-def scatter_of_pieces(pieces: Iterable[tuple[Floats, Floats]], time: Floats) -> Scatter:
-    """Return noise and bending as `scatter_of` does, of tracks that come in pieces: of each but little is kept.
-
+    They are the unknown ones where too few tracks are long enough.
     Third derivatives are told by tracks of five places or more; where these are too few they are taken for those of
     circles with the velocities and the bendings that there are.
     """

@@ -20,7 +20,7 @@ from lfpiv_cli.robust import MAD_TO_SIGMA
 from lfpiv_cli.scale import Scale
 from lfpiv_cli.tracks.candidates import NO_PARTICLE, NO_TRACK, Frames, Seen, Trajectories, long_ones, places, tracks_in
 from lfpiv_cli.tracks.gridding import kriged, structure_of
-from lfpiv_cli.tracks.in_time import FEWEST_TRACKS, Scatter, State, fit_in_time, scatter_of, scatter_of_pieces
+from lfpiv_cli.tracks.in_time import FEWEST_TRACKS, Scatter, State, fit_in_time, scatter_of
 from lfpiv_cli.tracks.tracking import NO_TRACKS, Forecast, Tracks, known_of, link_some, track
 
 # A forecast takes a track's last four places: enough for a parabola and to see its noise.
@@ -118,7 +118,7 @@ def followed_further(so_far: SoFar, frames: Frames, search_mm: float, scale: Sca
         found = _linked(found, number - 1, number + 1, _bridges(found, frames, number, earlier, search_mm, scale))
     window = _frames_before(number + 2, PAST_FRAMES)
     position, sigma = places(found, frames, window, tracks_in(found, window))
-    scatter = scatter_of(position, sigma, np.arange(len(window), dtype=np.float64))
+    scatter = scatter_of([(position, sigma)], np.arange(len(window), dtype=np.float64))
     past_factor, others_factor = (_surprise(start, end, links, each) for each in (so_far.by_past, so_far.by_others))
     by_past, by_others = _forecast(found, frames, number + 1, 1, scatter), _by_others(found, frames)
     # By both; where others are not known, the past is all there is.
@@ -213,7 +213,7 @@ def scatter_in(found: Trajectories, frames: Sequence[Seen]) -> tuple[Scatter, in
         # Windows of so many frames that do not overlap.
         windows = [_frames_before(end, width) for end in range(min(width, len(frames)), len(frames) + 1, width)]
         pieces = (places(found, frames, window, tracks_in(found, window)) for window in windows)
-        told.append(scatter_of_pieces(pieces, np.arange(len(windows[0]), dtype=np.float64)))
+        told.append(scatter_of(pieces, np.arange(len(windows[0]), dtype=np.float64)))
     wide, narrow = told
     is_followed = np.all(wide.noise <= LARGEST_MISFIT * narrow.noise)
     return (wide, HALVES_FRAMES[0]) if is_followed else (narrow, HALVES_FRAMES[1])
@@ -310,7 +310,7 @@ def expected_in(found: Trajectories, frames: Frames, number: int) -> Ahead:
     told = known.sum(axis=1) > 1
     tracks, position, sigma, known = tracks[told], position[told], sigma[told], known[told]
     time = np.array(window, dtype=np.float64) - number
-    state = fit_in_time(position, sigma, time, scatter_of(position, sigma, time))
+    state = fit_in_time(position, sigma, time, scatter_of([(position, sigma)], time))
     light = np.full(known.shape, np.nan)
     for column, frame in enumerate(window):
         there = known[:, column]
